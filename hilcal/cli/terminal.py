@@ -14,7 +14,7 @@ from typing import TextIO
 
 from rich.console import Console, RenderableType
 
-from hilcal.cli.failing import error_document
+from hilcal.cli import error_document
 from hilcal.errors import HilcalError
 from hilcal.identification.fit_document import plain
 from hilcal.present.progress import SafeConsole
