@@ -1,5 +1,6 @@
 """`import`, `info`, `accept`, `repair`, `fleet`: campaign files, and which revision is used."""
 
+from contextlib import suppress
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -14,7 +15,7 @@ from hilcal.cli.terminal import Terminal, terminal
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.full_covariance import covariance_parts
 from hilcal.identification.misdescription import examine, other_arm
-from hilcal.identification.registration import Registration, register
+from hilcal.identification.registration import register
 from hilcal.identification.table_preview import preview_table
 from hilcal.identification.torques import check_torques
 from hilcal.import_campaign import import_campaign
@@ -39,7 +40,6 @@ from hilcal.store.repair import put_robot
 from hilcal.store.repair import repair as repaired
 from hilcal.store.revision import RevisionRecord
 from hilcal.store.robot_file import ROBOT_FILE
-from hilcal.tables.proposal import Proposal
 from hilcal.whole_file import replace_file
 
 
@@ -72,26 +72,28 @@ def import_(
     notes = (*found.notes, covariance_words(found.parts, noise), *cell.arm.notes)
     loads = [readings.load_names[k] for k in np.unique(readings.load)]
     poses = len(np.unique(readings.pose))
+    kind = f"each reading is a position{'' if readings.m == 3 else ' and an orientation'}"
+    kind = observed_words(readings) if readings.observers else kind
     t.show(heading(f"{len(readings)} readings of {poses} poses"))
-    t.show(f"  robot {settings.robot.model}; {_kind(readings)}\n  loads: {', '.join(loads)}")
+    t.show(f"  robot {settings.robot.model}; {kind}\n  loads: {', '.join(loads)}")
     targets = _targets(cell, readings)
     if targets:
         t.show("  targets: " + "; ".join(target_words(**x) for x in targets))
-    t.show(Words(note, indent=2) for note in notes)
-    torques = check_torques(cell, readings)
-    t.show(Words(line, indent=2) for line in torque_lines(torques))
-    registered = _registered(cell, readings)
-    wrong = None if registered is None else examine(registered, readings)
-    if registered is not None and not (wrong is not None and wrong.refused):
-        t.show(Words(line, indent=2) for line in registration_lines(registered))
-    refused = wrong is not None and wrong.refused
-    other = None if registered is None or refused else other_arm(registered, readings)
+    torques, registered, wrong, other = check_torques(cell, readings), None, None, None
+    lines = [*notes, *torque_lines(torques)]
+    with suppress(CannotAnswerError):  # the readings do not determine the registration
+        registered = register(cell, readings)
+    if registered is not None:
+        wrong = examine(registered, readings)
+        if wrong is None or not wrong.refused:
+            lines += registration_lines(registered)
+            other = other_arm(registered, readings)
     if other is not None:
-        t.show(Words(f"Note: {other_arm_line(other)}", indent=2))
+        lines.append(f"Note: {other_arm_line(other)}")
     if wrong is not None:
-        said = wrong.words(cell, readings)
         begin = "Nothing can be fitted yet" if wrong.refused else "Note"
-        t.show(Words(f"{begin}: {said}.", indent=2))
+        lines.append(f"{begin}: {wrong.words(cell, readings)}.")
+    t.show(Words(line, indent=2) for line in lines)
     t.document(
         campaign=str(output),
         robot=settings.robot.model,
@@ -109,20 +111,6 @@ def import_(
         torques=None if torques is None else torques.to_json(),
         frames=None if registered is None else registered.to_json(),
     )
-
-
-def _kind(readings: Readings) -> str:
-    if readings.observers:
-        return observed_words(readings)
-    return f"each reading is a position{'' if readings.m == 3 else ' and an orientation'}"
-
-
-def _registered(cell: Cell, readings: Readings) -> Registration | None:
-    """Return the registration; None where the readings do not determine it."""
-    try:
-        return register(cell, readings)
-    except CannotAnswerError:
-        return None
 
 
 def _targets(cell: Cell, readings: Readings) -> list[dict[str, Any]]:
@@ -153,8 +141,10 @@ def show_preview(
         t.show(heading("with this mapping:"))
         t.show(Words(words, indent=2) for words in outcome)
     if output is not None:
-        if second is not None:
-            _relative_second(proposal, output)
+        if second is not None:  # its path is relative to the mapping file
+            whole, here = second.absolute(), output.absolute().parent
+            path = whole.relative_to(here) if whole.is_relative_to(here) else whole
+            proposal.sections["second_file"]["path"] = str(path)
         replace_file(output, proposal.to_toml(table.name))
         t.notice(f"{output}: the mapping; import with --format {output}")
     else:
@@ -171,15 +161,6 @@ def show_preview(
         outcome=outcome,
         written=None if output is None else str(output),
     )
-
-
-def _relative_second(proposal: Proposal, output: Path) -> None:
-    """Write the second file's path relative to the mapping file."""
-    section = proposal.sections["second_file"]
-    section["path"] = str(Path(section["path"]).absolute())
-    here = output.absolute().parent
-    if Path(section["path"]).is_relative_to(here):
-        section["path"] = str(Path(section["path"]).relative_to(here))
 
 
 @command()
@@ -240,19 +221,20 @@ def repair(run: Path, robot: Path | None = None, as_json: bool = False) -> None:
     if robot is not None:
         put_robot(run, robot)
         t.show(f"{run} holds its robot now: {robot}")
-    put = None if robot is None else str(robot)
-    if done is None:
-        if robot is None:
-            t.show(f"{run}: no revision is bad; nothing was changed.")
-        t.document({"set_aside": [], "original": None, "robot": put})
-        return
-    numbers = ", ".join(map(str, done.revisions))
-    t.show(
-        f"{run}: {done.why}. Set aside: revision{'s' * (len(done.revisions) > 1)} {numbers}. All "
-        f"readings are there; the file as it was is {done.original}. Fit again with:"
+    if done is None and robot is None:
+        t.show(f"{run}: no revision is bad; nothing was changed.")
+    if done is not None:
+        numbers = ", ".join(map(str, done.revisions))
+        t.show(
+            f"{run}: {done.why}. Set aside: revision{'s' * (len(done.revisions) > 1)} {numbers}. "
+            f"All readings are there; the file as it was is {done.original}. Fit again with:"
+        )
+        t.command(f"hilcal identify {quoted(run)}")
+    t.document(
+        set_aside=[] if done is None else list(done.revisions),
+        original=None if done is None else str(done.original),
+        robot=None if robot is None else str(robot),
     )
-    t.command(f"hilcal identify {quoted(run)}")
-    t.document({"set_aside": list(done.revisions), "original": str(done.original), "robot": put})
 
 
 def _named(record: RevisionRecord) -> str:
