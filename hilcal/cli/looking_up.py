@@ -175,13 +175,9 @@ DRIVERS_OWN: dict[str, type[Section]] = {
 def config(section: str | None = None, as_json: bool = False) -> None:
     """Explain the sections and keys of CELL.toml: unit, default, example."""
     t, known = terminal(as_json), reference.tables(DRIVERS_OWN)
-    if section is None:
-        t.show(sections_overview(known))
-        t.document({"sections": [asdict(s) for s in known]})
-        return
-    found = reference.table(section, known)
-    t.show(section_report(found))
-    t.document({"sections": [asdict(found)]})
+    found = known if section is None else (reference.table(section, known),)
+    t.show(sections_overview(found) if section is None else section_report(found[0]))
+    t.document(sections=[asdict(s) for s in found])
 
 
 def write_page(path: str = "docs/reference/cell-configuration.md") -> None:
