@@ -115,13 +115,11 @@ def doubtful_case(
 ) -> tuple[RehearsalSettings, Plan, bool]:
     """Draw an effect to hide and a small campaign that leaves it in doubt.
 
-    Both come from the seed; another `number` is another case. The effect is one of those that are
-    hard to separate where None is given. A case counts when for each of `DRAWS` draws of the noise
-    a rival explains the readings about as well as the hidden effect, and when the diagnosis of the
-    first draw names both, and says that more readings would separate them.
-
-    Returned are the settings with the effect and the seed of this case, the plan of its first
-    campaign, and whether that leaves a doubt; it is the last case where none of `TRIES` does.
+    Both come from the seed; another `number` is another case. A case counts when for each of
+    `DRAWS` draws of the noise a rival explains the readings about as well as the hidden effect, and
+    when the diagnosis of the first draw names both, and says that more readings would separate
+    them. Returned are its settings, the plan of its first campaign, and whether that leaves a
+    doubt; it is the last case where none of `TRIES` does.
     """
     loads = told.config.loads[1::2] or told.config.loads
     quick = {"candidates": min(told.config.planning.candidates, CANDIDATES), "against": ()}

@@ -313,16 +313,10 @@ def fit_stream(
     """Fit a model to a stream of absolute readings.
 
     Args:
-        stream: the readings.
-        cell: the cell that they were measured in.
-        engine: what the passes run on.
         effects: options by effect, besides unknown frames; the baseline where None.
-        catalogue: the effects that a model can have; the installed ones unless given.
-        prior: what another campaign taught of the arm.
         counting: shows how far a pass is, as `present.progress.counting` does.
 
     Raises:
-        InputError: a row that cannot be right, or effects that cannot be.
         CannotAnswerError: too few readings, or an unknown frame that they do not determine.
     """
     work = PassTask(stream, Model(cell, ()), _scatter(stream, cell), {})

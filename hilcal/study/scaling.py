@@ -253,16 +253,9 @@ def scaling_study(
 ) -> ScalingStudy:
     """Simulate the identification of joint compliances with every scaling.
 
-    Each correlation is an experiment of its own, with unloaded readings shared or not: that is what
-    the engine computes side by side, `experiments` of them.
-
-    Args:
-        rng: source of poses and noise.
-        runs: Monte-Carlo runs; all scalings and units see the same noise.
-        correlations: shares ρ of variance that the six elements have in common, each in [0, 1).
-        arm: the arm; None for the UR10e.
-        engine: what the experiments are computed on.
-        advance: told 1 for each experiment that is done.
+    Each correlation, a share ρ of variance that the six elements have in common, is an experiment
+    of its own, with unloaded readings shared or not: that is what the engine computes side by side,
+    `experiments` of them. All scalings and units see the same noise. The arm is the UR10e for None.
     """
     check(runs, correlations, poses)
     design = make_design(rng, arm or load_arm("ur10e"), poses)

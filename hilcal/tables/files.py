@@ -60,12 +60,7 @@ def open_tables(
 
 @limits.bounded
 def open_grid(path: str | Path, how: FileFormat, check: Check | None = None) -> Grid:
-    """Open one file as a table of cells.
-
-    Args:
-        how: it is written.
-        check: is given the names of its columns as it has them, with repeats and empty ones.
-    """
+    """Open one file as a table of cells; `check` is given the names of its columns."""
     name, content = str(path), content_of(path)
     kind = kind_of(name, content)
     with _undamaged(name, "what its first bytes say"):

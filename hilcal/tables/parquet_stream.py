@@ -85,9 +85,8 @@ def open_stream(
 ) -> ReadingStream:
     """Open a Parquet file of readings; only its description and its first rows are read.
 
-    Args:
-        noise: gives the covariances where the file has none.
-        station: (3,) where the tracker's beam starts, m; the origin where None.
+    `noise` gives the covariances where the file has none; the tracker's beam starts at `station`
+    (3,), m, or at the origin.
     """
     file = _opened(path)
     header = list(file.schema_arrow.names)

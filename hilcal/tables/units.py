@@ -96,13 +96,9 @@ intrinsic). Rotations about fixed axes are intrinsic ones in the reverse order."
 
 
 def rotations(convention: str, numbers: Floats, unit: float) -> Floats:
-    """(N, 3, 3) rotation matrices of the numbers (N, k) of a convention.
+    """(N, 3, 3) rotations of the numbers (N, k) of a convention; `unit` of angles, rad.
 
-    Args:
-        convention: a key of `CONVENTIONS`.
-        numbers: in the order of the convention's columns; quaternions and matrices need not be
-            exactly normalised, the nearest rotation is taken.
-        unit: radians in the unit of angles.
+    Quaternions and matrices need not be exactly normalised, the nearest rotation is taken.
     """
     from scipy.spatial.transform import Rotation  # slow to import
 

@@ -40,9 +40,7 @@ def check_suffix(path: Path) -> None:
 def write_columns(path: Path, columns: Mapping[str, Column], about: Mapping[str, object]) -> None:
     """Write columns of equal length; a file of that name is replaced when the new one is complete.
 
-    Args:
-        path: ends in .csv or .parquet.
-        about: what the table is about, for the metadata of Parquet; CSV has no place for it.
+    `about` says what the table is about, for the metadata of Parquet; CSV has no place for it.
     """
     check_suffix(path)
     plain = {
@@ -145,11 +143,7 @@ def plan_csv(
     """Return a plan as CSV: `x_order` from 1, pose, load, cycle, q1_rad ... (and wrenches).
 
     The columns are those of the exchange table: who measures by hand adds x_m, y_m, z_m and
-    imports it.
-
-    Args:
-        wrenches: (6,) by load, base axes, N and N·m; adds fx_N ... mz_Nm where given.
-        units: of the joints' values (`Arm.units`); all in rad where None.
+    imports it. `units` are those of the joints' values, all rad where None.
     """
     columns: dict[str, Column] = {ORDER: list(range(1, 1 + len(plan.steps)))}
     columns |= {name: [getattr(step, name) for step in plan.steps] for name in TEXT}
