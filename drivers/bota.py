@@ -8,9 +8,14 @@ the status: 0 skipped samples, 1 over range, 2 invalid measurement, 3 raw values
 import numpy as np
 
 from hilcal.config import CellConfig
-from hilcal.drivers.force_stream import SensorFormat, checked_config, open_streaming
-from hilcal.drivers.frame_losses import ByDeviceClock
-from hilcal.drivers.frames import FrameFormat, crc_x25
+from hilcal.drivers.force_stream import (
+    ByDeviceClock,
+    FrameFormat,
+    SensorFormat,
+    checked_config,
+    crc_x25,
+    open_streaming,
+)
 from hilcal.measuring.devices import ForceSensorDevice
 from hilcal.types import Floats
 
@@ -43,10 +48,5 @@ SENSOR = SensorFormat(
 
 
 def open_force_sensor(config: CellConfig) -> ForceSensorDevice:
-    """Open the port of [force_sensor] and wait for the first frame.
-
-    Raises:
-        DeviceError: no such port, in use, nothing or nothing sensible comes.
-        InputError: no [force_sensor], or an unknown option.
-    """
+    """Open the port of [force_sensor] and wait for the first frame."""
     return open_streaming(checked_config(config), BAUD, SENSOR)

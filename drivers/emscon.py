@@ -23,26 +23,29 @@ from scipy.spatial.transform import Rotation
 from hilcal.config import CellConfig
 from hilcal.config.cell import Tracker as TrackerConfig
 from hilcal.drivers import emscon_packets as es
-from hilcal.drivers.network import network_failures, own_axes
+from hilcal.drivers.links import network_failures, own_axes
 from hilcal.errors import DeviceError, InputError
-from hilcal.measuring.devices import Clock, Report, TargetLostError, TrackerSample
+from hilcal.measuring.devices import (
+    Clock,
+    Report,
+    Row,
+    TargetLostError,
+    TrackerSample,
+    report_of,
+)
 from hilcal.readings.covariance import tracker_covariance, tracker_noise
 from hilcal.toml import Positive, Section, check_section
 from hilcal.types import Floats
 
 DEVICE = "tracker"
-CONNECT_S = 2.0
-"""How long the connection may take, real s."""
-DEADLINE_S = 4.0
-"""How long a command may take beside what is measured or moved, real s."""
+CONNECT_S = 2.0  # how long the connection may take, real s
+DEADLINE_S = 4.0  # how long a command may take beside what is measured or moved, real s
 SEARCHING_S = 30.0
 """How long turning or a search for the reflector may take, cell s; at least `_LEAST_S` real s."""
-HOMING_S = 120.0
-"""How long the tracker may take to find its zeros, cell s."""
+HOMING_S = 120.0  # how long the tracker may take to find its zeros, cell s
 HOMED = "the tracker was initialised again before this reading: its axes may have moved"
 _LEAST_S, _PAUSE_S = 1.0, 0.1
-_FARTHEST_M = 500.0
-"""Beyond the reach of any tracker."""
+_FARTHEST_M = 500.0  # beyond the reach of any tracker
 _UNITS = struct.pack("<5I", 0, 0, 0, 0, 0)  # m, rad, °C, mbar, % of relative humidity
 _ORDERS = ("xyz", "XYZ")
 _STEP, _SAME = 1e-6, 1e-4
@@ -71,11 +74,7 @@ class EmsconOptions(Section):
 
 
 class EmsconConnection:
-    """One connection to an emScon server: commands, results, and what it sends by itself.
-
-    Attributes:
-        changes: changes of its state that nobody has looked at yet.
-    """
+    """One connection to an emScon server; `changes` of its state wait to be looked at."""
 
     def __init__(self, host: str, port: int) -> None:
         """Connect; raises DeviceError where nobody answers within `CONNECT_S`."""
@@ -92,11 +91,7 @@ class EmsconConnection:
         self._socket.close()
 
     def ask(self, command: int, parameters: bytes = b"", *, until: float) -> tuple[int, bytes]:
-        """Send a command; return its status and what it returns. Waits while the server is busy.
-
-        Raises:
-            DeviceError: no answer in time, or the connection failed; it is closed then.
-        """
+        """Send a command; return its status and what it returns. Waits while the server is busy."""
         while True:
             body = struct.pack("<I", command) + parameters
             self._send(es.HEADER.pack(es.HEADER.size + len(body), es.COMMAND) + body)
@@ -156,7 +151,7 @@ class EmsconConnection:
             raise
 
     def _packet(self, until: float) -> tuple[int, bytes]:
-        """Return type and content of the next packet; changes of state are kept aside.
+        """Type and content of the next packet; changes of state are kept aside.
 
         With `until` 0, BlockingIOError tells that none waits.
         """
@@ -214,12 +209,7 @@ class EmsconTracker:
         options: EmsconOptions,
         clock: Clock,
     ) -> None:
-        """Connect and set units, axes and mode; nothing turns.
-
-        Raises:
-            DeviceError: nobody answers, or the tracker cannot be used.
-            InputError: the reflector is not in its list.
-        """
+        """Connect and set units, axes and mode; nothing turns."""
         self._connect, self._config, self._options, self._clock = connect, config, options, clock
         self._reflector: tuple[int, str] | None = None
         self._remarks: list[str] = []
@@ -232,10 +222,7 @@ class EmsconTracker:
             raise
 
     def measure(self) -> TrackerSample:
-        """Measure once, see `hilcal.measuring.devices.TrackerDevice.measure`.
-
-        Also refused is a reading of another reflector than the one that was set.
-        """
+        """Measure once; a reading of another reflector than the one that was set is refused."""
         found = self._measure()
         self._distance = float(np.linalg.norm(found.position))
         stated = found.covariance
@@ -283,21 +270,23 @@ class EmsconTracker:
         if status == es.OK:
             _, words, number = self._line.unpack("<I64si", body)
             name, serial = es.text(words) or name, number
-        facts: list[tuple[str, str]] = []
-        fields: list[tuple[str, object]] = [("name", name), ("serial_number", serial or None)]
+        rows: list[Row] = [("", "", "name", name), ("", "", "serial_number", serial or None)]
         problems: list[str] = []
         if self._reflector is not None:
-            facts.append(("reflector", self._reflector[1]))
-            fields.append(("reflector", self._reflector[1]))
+            rows.append(("reflector", self._reflector[1], "reflector", self._reflector[1]))
         body = self._do("reading the environment", es.GET_ENVIRONMENT, until=until)
         celsius, mbar, humid = self._line.unpack("<3d", body)
-        facts.append(("environment", f"{celsius:.1f} °C, {mbar:.1f} mbar, {humid:.0f} %"))
-        fields += [("temperature_degC", celsius), ("pressure_mbar", mbar), ("humidity", humid)]
+        air = f"{celsius:.1f} °C, {mbar:.1f} mbar, {humid:.0f} %"
         _, state, _, _, *version, weather, _, _ = self._system(until)
         firmware = ".".join(map(str, version))
         station = dict(enumerate(es.WEATHER)).get(weather, f"state {weather}")
-        facts += [("emScon", firmware), ("weather station", station)]
-        fields += [("emscon", firmware), ("weather_station", station)]
+        rows += [
+            ("environment", air, "temperature_degC", celsius),
+            ("", "", "pressure_mbar", mbar),
+            ("", "", "humidity", humid),
+            ("emScon", firmware, "emscon", firmware),
+            ("weather station", station, "weather_station", station),
+        ]
         if state != es.INITIALIZED:
             problems.append("it has not found its zeros (it is not initialised); initialise it")
         elif self._options.target == "pose" or self._holds_reflector(until):
@@ -305,9 +294,9 @@ class EmsconTracker:
                 sample = self.measure()
                 std = 1e6 * float(np.sqrt(np.trace(sample.covariance[:3, :3])))
                 where = f"{self._distance:.4f} m away; standard deviation of a point {std:.1f} µm"
-                facts.append(("target", where))
-                fields += [("distance_m", self._distance), ("std_m", 1e-6 * std)]
-                facts += [("remark", sample.warning)] * bool(sample.warning)
+                rows.append(("target", where, "distance_m", self._distance))
+                remark = "remark" if sample.warning else ""
+                rows.append((remark, sample.warning, "std_m", 1e-6 * std))
             except DeviceError as error:
                 if not self._line.open:
                     raise
@@ -315,7 +304,7 @@ class EmsconTracker:
         else:
             problems.append("it holds no reflector; put the beam on it")
         full = f"{name}, serial {serial}" if serial else name
-        return Report(DEVICE, full, tuple(facts), tuple(problems), tuple(fields))
+        return report_of(DEVICE, full, rows, problems)
 
     def close(self) -> None:
         """Close the connection; the tracker stays as it is. Never raises, may be called twice."""
@@ -367,11 +356,7 @@ class EmsconTracker:
         return time.monotonic() + DEADLINE_S + seconds
 
     def _ready(self, seconds: float = 0.0) -> float:
-        """See that the tracker is there and set as at first; return a deadline so much later.
-
-        A connection that failed is made anew; where the server says that something was changed,
-        settings are looked at again.
-        """
+        """See that the tracker is connected and set as at first; a deadline so much later."""
         until = self._soon(seconds)
         again = not self._line.open
         if again:
@@ -493,12 +478,7 @@ def _positive(covariance: Floats) -> bool:
 
 
 def open_tracker(config: CellConfig) -> EmsconTracker:
-    """Connect to the tracker that [tracker] names; nothing turns.
-
-    Raises:
-        InputError: [tracker] lacks the host, has another frame, or an unknown option.
-        DeviceError: nobody answers there.
-    """
+    """Connect to the tracker that [tracker] names; nothing turns."""
     tracker = config.tracker
     host, port = own_axes(tracker, "emscon", es.PORT)
     options = check_section(tracker.options, EmsconOptions, "[tracker] options")

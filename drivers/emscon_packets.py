@@ -19,8 +19,7 @@ from hilcal.types import Floats
 
 PORT = 700
 HEADER = struct.Struct("<iI")
-LARGEST = 1 << 16
-"""Bytes that no packet has."""
+LARGEST = 1 << 16  # bytes that no packet has
 
 # types of packets
 COMMAND, ERROR, SINGLE, PROBE, CHANGE, SINGLE2 = 0, 1, 2, 4, 8, 9
@@ -45,14 +44,12 @@ CLOSING = {
     998: "its server is being shut down",
 }
 REFLECTOR_FOUND, LEVELLED = 2048, 32768
-BOOTED, INITIALIZED = 3, 5
-"""States of the tracker in GET_SYSTEM_STATUS."""
+BOOTED, INITIALIZED = 3, 5  # states of the tracker in GET_SYSTEM_STATUS
 WEATHER = ("none: temperature, pressure, humidity as set", "read, but not used", "used")
 """States of the weather station there."""
 
 OK, BUSY, NOT_IMPLEMENTED, NOT_INITIALIZED = 0, 1, 2, 39
-GOOD = frozenset({OK, *range(11, 22, 2)})
-"""Done; or a parameter is out of its range, and done."""
+GOOD = frozenset({OK, *range(11, 22, 2)})  # done; or a parameter is out of its range, and done
 NO_DISTANCE, NO_RESULT = 37, 10009
 
 LOST = {
@@ -122,11 +119,7 @@ _PROBE = struct.Struct("<IiIiiiIii41d")
 
 
 def measurement(kind: int, body: bytes) -> Measurement:
-    """Return what a result of type `SINGLE`, `SINGLE2` or `PROBE` says, without its status.
-
-    Raises:
-        struct.error: another length than that of its type.
-    """
+    """Return what a result of type `SINGLE`, `SINGLE2` or `PROBE` says, without its status."""
     none = np.zeros((3, 3))
     if kind == PROBE:
         d = np.array(_PROBE.unpack(body)[9:])

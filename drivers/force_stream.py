@@ -4,24 +4,230 @@ One thread takes what waits on the line every few milliseconds (the kernel keeps
 110 frames of the longest kind), finds the frames and keeps the last ones in a ring.
 """
 
+import math
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from hilcal.config import CellConfig
 from hilcal.config.sections import PORT
 from hilcal.config.sections import ForceSensor as Section
-from hilcal.drivers.frame_losses import LossCounter
-from hilcal.drivers.frames import Deframer, FrameFormat
-from hilcal.drivers.serial_line import close_port, drain, line_failures, open_port
+from hilcal.drivers.links import close_port, drain, line_failures, open_port
 from hilcal.errors import DeviceError, InputError
-from hilcal.measuring.devices import Losses, Report, WrenchSample
+from hilcal.measuring.devices import Losses, Report, Row, WrenchSample, report_of
 from hilcal.types import Floats, Ints
+
+
+def crc_table(polynomial: int) -> tuple[int, ...]:
+    """Return the 256 remainders of a reflected 16-bit polynomial, for one byte at a time."""
+    table = []
+    for value in range(256):
+        for _ in range(8):
+            value = (value >> 1) ^ (polynomial if value & 1 else 0)
+        table.append(value)
+    return tuple(table)
+
+
+_MODBUS = crc_table(0xA001)
+_X25 = crc_table(0x8408)
+
+
+def crc_modbus(data: bytes) -> int:
+    """Return CRC-16/MODBUS: polynomial 0x8005 reflected, start 0xFFFF; 0x4B37 for b"123456789"."""
+    crc = 0xFFFF
+    for byte in data:
+        crc = (crc >> 8) ^ _MODBUS[(crc ^ byte) & 0xFF]
+    return crc
+
+
+def crc_x25(data: bytes) -> int:
+    """Return CRC-16/X-25: polynomial 0x1021 reflected, start and end 0xFFFF; 0x906E likewise."""
+    crc = 0xFFFF
+    for byte in data:
+        crc = (crc >> 8) ^ _X25[(crc ^ byte) & 0xFF]
+    return crc ^ 0xFFFF
+
+
+@dataclass(frozen=True, slots=True)
+class FrameFormat:
+    """What a frame of fixed length looks like: header, body, two bytes of checksum."""
+
+    header: bytes  # the bytes that every frame begins with
+    size: int  # of a whole frame, bytes
+    checksum: Callable[[bytes], bytes]
+    """What the last two bytes must be, from all the bytes before them."""
+    weak: bool = False
+    """Whether the checksum is a mere sum; then a frame counts only once the header of the next one
+    follows it directly."""
+
+
+class Deframer:
+    """Finds frames in bytes that come in pieces; after a bad one it gives up one byte only.
+
+    A 16-bit checksum passes 1 of 65536 wrong candidates, and while looking for the next header
+    every byte is a candidate. So a frame that does not follow a good one directly counts only
+    once a second good frame follows it directly. `corrupt` frames (several candidates inside one
+    length are one) and `skipped` bytes count from the first good frame on.
+    """
+
+    def __init__(self, frame: FrameFormat) -> None:
+        self.frames = self.corrupt = self.skipped = 0
+        self._format = frame
+        self._buffer = bytearray()
+        self._in_step = self._begun = False
+        self._taken = 0  # position in the stream of the buffer's first byte
+        self._bad_until = 0  # stream position up to which a bad frame has been counted
+
+    def push(self, data: bytes) -> list[bytes]:
+        """Take bytes, return the bodies (without header and checksum) of the frames they end."""
+        buffer, size, header = self._buffer, self._format.size, self._format.header
+        buffer += data
+        out: list[bytes] = []
+        at = 0
+        while True:
+            start = buffer.find(header, at)
+            if start < 0:
+                start = max(at, len(buffer) - len(header) + 1)  # may hold a part of a header
+                self._skip(start - at)
+                at = start
+                break
+            self._skip(start - at)
+            at = start
+            if len(buffer) - at < size:
+                break
+            good = self._good(at)
+            if good and (not self._in_step or self._format.weak):
+                needed = len(header) if self._in_step else size
+                if len(buffer) - at < size + needed:
+                    break  # the next frame will tell
+                next_ = at + size
+                good = buffer.startswith(header, next_) if self._in_step else self._good(next_)
+            if good:
+                self._in_step = self._begun = True
+                out.append(bytes(buffer[at + len(header) : at + size - 2]))
+                at += size
+            else:
+                if self._taken + at >= self._bad_until:
+                    self.corrupt += self._begun
+                    self._bad_until = self._taken + at + size
+                self._skip(1)
+                at += 1
+        del buffer[:at]
+        self._taken += at
+        self.frames += len(out)
+        return out
+
+    def _skip(self, count: int) -> None:
+        """Count bytes that belong to no frame."""
+        if count:
+            self.skipped += count * self._begun
+            self._in_step = False
+
+    def _good(self, at: int) -> bool:
+        """Whether a frame with a right checksum begins there."""
+        frame = bytes(self._buffer[at : at + self._format.size])
+        checksum = self._format.checksum
+        return frame.startswith(self._format.header) and checksum(frame[:-2]) == frame[-2:]
+
+
+class ByDeviceClock:
+    """From the device's own time stamps, whose counter may wrap.
+
+    A frame whose time is not shortly after its predecessor's is out of place, unless its
+    successor follows on it (then the device has begun to count anew).
+    """
+
+    LEARN = 20
+    LONGEST_S = 30.0
+
+    def __init__(self, tick_s: float, bits: int) -> None:
+        self.lost = 0
+        self._tick, self._wrap = tick_s, 1 << bits
+        self._last: int | None = None
+        self._stray: int | None = None
+        self._steps: list[int] = []
+        self._period = 0.0  # ticks; 0 until `LEARN` steps have been seen
+
+    @property
+    def rate(self) -> float:
+        """Frames per second of device time; 0 while that is unknown."""
+        return 1.0 / (self._period * self._tick) if self._period else 0.0
+
+    def follow(self, count: int, ticks: Sequence[int], now: float) -> list[bool]:
+        """Return which of the frames that came together, read at `now`, s, are in their place."""
+        return [self._in_place(tick) for tick in ticks]
+
+    def _in_place(self, tick: int) -> bool:
+        if self._last is not None:
+            step = (tick - self._last) % self._wrap
+            if not 0 < step * self._tick <= self.LONGEST_S:
+                stray, self._stray = self._stray, tick
+                if stray is None or not 0 < (tick - stray) % self._wrap * self._tick <= 1.0:
+                    return False
+                self._last = stray  # it counts anew; the stray one stays out, and is lost
+                self.lost += 1
+                step = (tick - stray) % self._wrap
+            self._count(step)
+        self._last, self._stray = tick, None
+        return True
+
+    def _count(self, step: int) -> None:
+        if self._period:
+            self.lost += max(0, round(step / self._period) - 1)
+            return
+        self._steps.append(step)
+        if len(self._steps) == self.LEARN:
+            self._period = float(np.median(self._steps))
+            for known in self._steps:
+                self.lost += max(0, round(known / self._period) - 1)
+
+
+class ByArrival:
+    """From the times of arrival, for a device without a clock whose rate is known.
+
+    Each frame has a time when it is due, one period after the one before; the schedule follows
+    frames that come early at once and late ones slowly (sender and host have different
+    clocks). One that is late by almost a period or more shows how many are missing. Frames that
+    were only held up come early by this schedule, and are taken off the count again; for that
+    the schedule stays for ten times as long as they were late.
+    """
+
+    LATE = 0.9
+    FOLLOW = 0.05
+    DOUBT = 10.0
+
+    def __init__(self, rate: float) -> None:
+        self.lost = 0
+        self.rate = rate
+        self._due: float | None = None  # when the newest frame was due
+        self._doubt_until = -math.inf  # until then missing ones may only be held up
+
+    def follow(self, count: int, ticks: Sequence[int], now: float) -> list[bool]:
+        """See `ByDeviceClock.follow`; all are in their place."""
+        period = 1.0 / self.rate
+        self._due = now if self._due is None else self._due + count * period
+        late = (now - self._due) / period  # periods
+        missing = 0
+        if late >= self.LATE:
+            missing = math.floor(late + 1.0 - self.LATE)
+            self._doubt_until = now + self.DOUBT * late * period
+        elif now < self._doubt_until and late < 0.0:
+            missing = -min(self.lost, math.floor(-late + 1.0 - self.LATE))
+        self.lost += missing
+        late -= missing
+        follow = self.FOLLOW if late > 0.0 else 1.0
+        if now < self._doubt_until:
+            follow = 0.0
+        self._due += (missing + follow * late) * period
+        return [True] * count
+
+
+LossCounter = ByDeviceClock | ByArrival  # counts from what comes
 
 DEVICE = "force sensor"
 STALE_S = 0.5
@@ -31,10 +237,8 @@ POLL_S = 0.005
 LOOK_S = 1.0
 """The reader gets so long to look once more; it takes two passes where the computer is idle."""
 SLICE_S = 0.05
-MIN_SHARE = 0.5
-"""Share of the frames due in a window that has to come for a mean."""
-FEW, MAX_LOST = 5, 0.01
-"""So many lost frames, and this share of all, are no problem yet."""
+MIN_SHARE = 0.5  # share of the frames due in a window that has to come for a mean
+FEW, MAX_LOST = 5, 0.01  # so many lost frames, and this share of all, are no problem yet
 RING = 4096
 FIRST_FRAME_S, OLD_S = 1.0, 0.05
 
@@ -54,69 +258,29 @@ class SensorFormat:
     """(wrench (6,), status) to what is wrong with such a frame, "" where nothing."""
 
 
-class Port(Protocol):
-    """What a stream is read from: a serial port, or datagrams behind the same few names."""
-
-    @property
-    def port(self) -> Any:
-        """Its name."""
-
-    @property
-    def baudrate(self) -> int:
-        """Rate of the line, Bd; 0 where there is none."""
-
-    @property
-    def in_waiting(self) -> int:
-        """Bytes that have come."""
-
-    def read(self, size: int) -> bytes:
-        """Return so many of them."""
-
-    def close(self) -> None:
-        """Give it back."""
-
-
-class FrameSource(Protocol):
-    """What takes frames out of bytes, and counts; see `frames.Deframer`."""
-
-    frames: int
-    corrupt: int
-    skipped: int
-
-    def push(self, data: bytes) -> list[bytes]:
-        """Take bytes, return the bodies of the frames in them."""
-        ...
-
-
 class ForceStream:
     """A sensor that is sending; see `hilcal.measuring.devices.ForceSensorDevice`."""
 
     def __init__(
         self,
-        port: Port,
+        port: Any,
         sensor: SensorFormat,
         name: str = "",
         facts: tuple[tuple[str, str], ...] = (),
         *,
-        deframer: FrameSource | None = None,
+        deframer: Any = None,
         failures: Callable[[str, str], AbstractContextManager[None]] = line_failures,
         before_close: Callable[[], None] = lambda: None,
     ) -> None:
-        """Start to read an open port, which `close` closes.
+        """Start to read an open port, which `close` closes: a serial one, or what has its names.
 
-        Args:
-            port: open.
-            sensor: what it sends.
-            name: the maker's, with the serial number where known.
-            facts: for the report, besides those of the stream.
-            deframer: takes the frames out of the bytes where `sensor.frame` does not tell how.
-            failures: turns what the port raises into DeviceError, from the device and its place.
-            before_close: sends the last command to the sensor; must not raise.
+        `deframer` takes the frames out of the bytes where `sensor.frame` does not tell how;
+        `failures` turns what the port raises into DeviceError; `before_close` must not raise.
         """
         self._name, self._facts, self._before_close = name or sensor.name, facts, before_close
         self._port, self._sensor, self._failures = port, sensor, failures
         self._path = str(port.port)
-        self._deframer: FrameSource = Deframer(sensor.frame) if deframer is None else deframer
+        self._deframer = deframer or Deframer(sensor.frame)
         self._counter = sensor.losses()
         self._lock = threading.Lock()
         self._failure = ""
@@ -140,11 +304,7 @@ class ForceStream:
             raise DeviceError(self._silence())
 
     def latest(self) -> WrenchSample:
-        """Return the newest frame, at most `STALE_S` old.
-
-        Raises:
-            DeviceError: the stream is dead or stale, or the sensor is loaded over its range.
-        """
+        """Return the newest frame, at most `STALE_S` old."""
         self._check()
         with self._lock:
             at = (self._kept - 1) % RING
@@ -154,12 +314,7 @@ class ForceStream:
         return WrenchSample(int(stamp), wrench, np.zeros((6, 6)), 1, temperature)
 
     def average(self, seconds: float) -> WrenchSample:
-        """Return the mean of the frames of the next so many real seconds.
-
-        Raises:
-            DeviceError: the stream is dead, gave under half of its frames, or the sensor was
-                loaded over its range meanwhile.
-        """
+        """Return the mean of the frames of the next so many real seconds."""
         if not np.isfinite(seconds) or seconds < 0.0:
             raise ValueError(f"seconds = {seconds}; valid: 0 or more")
         self._check()
@@ -207,23 +362,19 @@ class ForceStream:
 
     def report(self) -> Report:
         """Say who answered, rate, temperature, counters, and every problem."""
-        count, warm = self.losses(), self._temperature
-        facts = [*self._facts, ("port", self._path)]
-        if self.rate:
-            facts.append(("rate", f"{self.rate:.0f} Hz"))
-        if warm is not None:
-            facts.append(("temperature", f"{warm:.1f} °C"))
-        facts.append(("frames", f"{count.frames}, lost {count.lost}, corrupt {count.corrupt}"))
-        fields: list[tuple[str, object]] = [
-            *((what.replace(" ", "_"), value) for what, value in self._facts),
-            ("port", self._path),
-            ("rate_Hz", self.rate or None),
-            ("temperature_degC", warm),
-            ("frames", count.frames),
-            ("lost", count.lost),
-            ("corrupt", count.corrupt),
+        count, warm, rate = self.losses(), self._temperature, self.rate
+        rows: list[Row] = [(what, x, what.replace(" ", "_"), x) for what, x in self._facts]
+        counted = f"{count.frames}, lost {count.lost}, corrupt {count.corrupt}"
+        heat = "" if warm is None else f"{warm:.1f} °C"
+        rows += [
+            ("port", self._path, "port", self._path),
+            ("rate" if rate else "", f"{rate:.0f} Hz", "rate_Hz", rate or None),
+            ("temperature" if heat else "", heat, "temperature_degC", warm),
+            ("frames", counted, "frames", count.frames),
+            ("", "", "lost", count.lost),
+            ("", "", "corrupt", count.corrupt),
         ]
-        return Report(DEVICE, self._name, tuple(facts), self._problems(), tuple(fields))
+        return report_of(DEVICE, self._name, rows, self._problems())
 
     def _problems(self) -> tuple[str, ...]:
         try:
@@ -327,11 +478,7 @@ class ForceStream:
 
 
 def streaming(stream: ForceStream, seconds: float = FIRST_FRAME_S) -> ForceStream:
-    """Return a stream whose first frame has come; it is closed where none does.
-
-    Raises:
-        DeviceError: nothing or nothing sensible came in time.
-    """
+    """Return a stream whose first frame has come; it is closed where none does."""
     try:
         stream.wait_for_first(seconds)
     except BaseException:
@@ -341,13 +488,7 @@ def streaming(stream: ForceStream, seconds: float = FIRST_FRAME_S) -> ForceStrea
 
 
 def open_streaming(section: Section, baud: int, sensor: SensorFormat) -> ForceStream:
-    """Open the port of a sensor that streams from power-on, and wait for the first frame.
-
-    The rate of the configuration comes before `baud`, the one of the sensor as delivered, Bd.
-
-    Raises:
-        DeviceError: no such port, in use, nothing or nothing sensible comes.
-    """
+    """Open the port of a sensor that streams from power-on, and wait for the first frame."""
     path = serial_port(section)
     port = open_port(DEVICE, path, section.baud or baud)
     try:
@@ -360,22 +501,14 @@ def open_streaming(section: Section, baud: int, sensor: SensorFormat) -> ForceSt
 
 
 def serial_port(section: Section) -> str:
-    """Return the serial port of a sensor that needs one.
-
-    Raises:
-        InputError: there is none.
-    """
+    """Return the serial port of a sensor that needs one."""
     if section.port is None:
         raise InputError(f'[force_sensor] driver = "{section.driver}" lacks "port": {PORT}')
     return section.port
 
 
 def checked_config(config: CellConfig, options: tuple[str, ...] = ()) -> Section:
-    """Return [force_sensor], with no option that the driver does not know.
-
-    Raises:
-        InputError: the section is missing, or has an unknown option.
-    """
+    """Return [force_sensor], with no option that the driver does not know."""
     section = config.force_sensor
     if section is None:
         raise InputError("[force_sensor] is missing; give driver and port")

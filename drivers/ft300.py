@@ -20,15 +20,16 @@ import serial
 from hilcal.config import CellConfig
 from hilcal.drivers.force_stream import (
     DEVICE,
+    ByArrival,
     ForceStream,
+    FrameFormat,
     SensorFormat,
     checked_config,
+    crc_modbus,
     serial_port,
     streaming,
 )
-from hilcal.drivers.frame_losses import ByArrival
-from hilcal.drivers.frames import FrameFormat, crc_modbus
-from hilcal.drivers.serial_line import close_port, drain, line_failures, open_port
+from hilcal.drivers.links import close_port, drain, line_failures, open_port
 from hilcal.errors import DeviceError
 from hilcal.measuring.devices import ForceSensorDevice
 from hilcal.types import Floats
@@ -39,8 +40,7 @@ RATE_HZ = 100.0
 FIRMWARE, SERIAL_NUMBER = (500, 6), (510, 4)
 STREAM_REGISTER, STREAM = 410, 0x0200
 STOP = b"\xff" * 50
-RANGE = np.repeat((300.0, 30.0), 3)
-"""Full scale, N and N·m."""
+RANGE = np.repeat((300.0, 30.0), 3)  # full scale, N and N·m
 COMPONENTS = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 FIRST_FRAME_S = 0.5
 T = TypeVar("T")
@@ -51,7 +51,6 @@ class NoAnswerError(DeviceError):
     """No sound answer came; `heard` is whether anything came at all."""
 
     def __init__(self, heard: bool) -> None:
-        """Without a text: the caller knows what device it is."""
         super().__init__("no answer")
         self.heard = heard
 
@@ -61,13 +60,7 @@ class RefusedError(DeviceError):
 
 
 def read_registers(port: serial.Serial, slave: int, address: int, count: int) -> tuple[int, ...]:
-    """Return `count` holding registers (16 bits each) from an address on.
-
-    Raises:
-        NoAnswerError: no sound answer, twice.
-        RefusedError: the device has no such registers.
-        OSError: the port failed; termios.error likewise.
-    """
+    """Return `count` holding registers (16 bits each) from an address on."""
     return tuple(_ask(port, slave, lambda device: device.read_registers(address, count)))
 
 
@@ -115,12 +108,7 @@ SENSOR = SensorFormat(
 
 
 def open_force_sensor(config: CellConfig) -> ForceSensorDevice:
-    """Open the port of [force_sensor], ask who is there, and start the stream.
-
-    Raises:
-        DeviceError: no such port, in use, no answer, a wrong one, or no stream.
-        InputError: no [force_sensor], or an unknown option.
-    """
+    """Open the port of [force_sensor], ask who is there, and start the stream."""
     section = checked_config(config)
     path = serial_port(section)
     port = open_port(DEVICE, path, section.baud or BAUD, timeout=0.1)

@@ -4,42 +4,316 @@ A reading is hz, v (from the zenith) and slope distance d, turned into
 
     x = d sin(v) sin(hz)    y = d sin(v) cos(hz)    z = d cos(v)
 
-Source: Leica Geosystems, GeoCOM Reference Manual.
+geocompy writes the requests and checks the replies; what it leaves open is settled here: a reply
+without checksum is refused, whatever fails on the line is remembered, damaged exchanges are
+repeated after the line has been drained, and every exchange has a deadline. geocompy never raises
+from a request, and `bool` of its response is False for usable codes too: only codes are looked at.
+Source: Leica Geosystems, GeoCOM Reference Manual (return codes; TMC, AUT, BAP, CSV, COM).
 """
 
+import re
+import termios
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
 import numpy as np
+import serial
+from geocompy.communication import SerialConnection
+from geocompy.geo import GeoCom
+from geocompy.geo.gctypes import GeoComCode
 from pydantic import Field
 
 from hilcal.config import CellConfig
 from hilcal.config.cell import Tracker as TrackerConfig
-from hilcal.drivers import geocom_codes as geo
-from hilcal.drivers.geocom_line import ANSWER_S, DEVICE, Link, Reply
+from hilcal.drivers.links import close_port, drain, line_failures, open_port
 from hilcal.errors import DeviceError, InputError
-from hilcal.measuring.devices import Clock, Report, TargetLostError, TrackerSample
+from hilcal.measuring.devices import (
+    Clock,
+    Report,
+    Row,
+    TargetLostError,
+    TrackerSample,
+    report_of,
+)
 from hilcal.readings.covariance import TrackerNoise, tracker_covariance
 from hilcal.toml import NonNegative, Positive, Section, check_section
 from hilcal.types import Floats
 
+NULL = 0
+GEOCOM_VERSION = 110
+DO_MEASURE = 2008
+FACE = 2026
+GET_ATMOSPHERE = 2029
+FULL_MEASUREMENT = 2167
+SERIAL_NUMBER = 5003
+NAME = 5004
+FIRMWARE = 5034
+POWER = 5039
+LOCK_IN = 9013
+TURN = 9027
+LOCK_STATE = 9021
+FINE_ADJUST = 9037
+MEASURE_DISTANCE_ANGLE = 17017
+SEARCH = 17020
+
+OK = 0
+UNKNOWN = frozenset({5, 27, 3081})
+"""Not implemented, not available, no such request: this instrument does without it."""
+BUSY = frozenset({13, 1293})
+"""Another process inside the instrument is at work; ask again a little later."""
+GARBLED = frozenset(
+    {3073, 3074, 3076, 3078, 3080, 3082, 3085, 3087, 3093, 3094, 3101, 3102},
+)
+"""Request or reply were damaged or out of step on the line; ask again after draining it."""
+
+WARNINGS = {
+    1283: "not all corrections were applied (code 1283: level or compensator?)",
+    1284: "the instrument does not guarantee its accuracy (code 1284)",
+}
+"""A full measurement that may be used, with a remark."""
+
+LOST = {
+    1285: "only angles were measured, no distance (beam broken?)",
+    1288: "only angles were measured, without full correction",
+    1289: "only angles were measured, without guarantee",
+    1292: "the distance could not be measured (beam broken, or no reflector?)",
+    1294: "no signal returns from the target",
+    8704: "the target was not found in time",
+    8706: "the target could not be aimed at",
+    8708: "the target could not be aimed at exactly",
+    8710: "no target in sight",
+    8711: "more than one target in sight; cover the others",
+    8712: "the target cannot be made out (stray light?)",
+    8725: "the lock on the target was lost",
+}
+"""No reading, but another try after a search may give one."""
+
+_ADVICE = {
+    16: "charge or change its battery",
+    18: "charge or change its battery",
+    21: "it is too cold or too hot",
+    22: "level it",
+    25: "wake it up",
+    1290: "level it and check its compensator",
+    1291: "set its atmospheric correction and prism constant",
+    8714: "switch on its automatic target recognition",
+}
+"""What a person can do about other codes."""
+
+
+_MEANING = {
+    13: "busy with something else",
+    16: "its battery is empty",
+    21: "its temperature is out of range",
+    22: "its tilt is out of range",
+    25: "asleep",
+    1293: "still busy measuring",
+}
+"""What the commonest codes say, alone or after a colon."""
+
+
+def words(code: int) -> str:
+    """Return a return code for people: what it means, and the number."""
+    try:
+        name = GeoComCode(code).name.replace("_", " ").lower()
+        known = _MEANING.get(code) or f'"{name}"'
+        return f"{known} (code {code})"
+    except ValueError:
+        return f"code {code}"
+
+
+def failure(doing: str, code: int) -> DeviceError:
+    """Return the exception for a return code that gave no reading, e.g. of "measuring"."""
+    if code in LOST:
+        return TargetLostError(f"tracker: {doing}: {LOST[code]} (code {code})")
+    advice = f"; {_ADVICE[code]}" if code in _ADVICE else ""
+    return DeviceError(f"tracker: {doing}: the instrument reports: {words(code)}{advice}")
+
+
+DEVICE = "tracker"
+ANSWER_S = 1.0  # how long an answer may take beside motors and measurements, real s
+_FIRST_ANSWER_S = 0.7
+_TRIES = 8
+_PAUSE_S = 0.1
+_QUIET_S, _DRAIN_S = 0.03, 0.4
+_REPLY = re.compile(r"%R1P,(\d+),\d+,\d+:(\d+)(?:,.*)?$")
+_UNPROTECTED = re.compile(rb"%R1P,\d+,\d+:\d+(,.*)?\r\n$")
+_MISMATCH, _CLIENT_CHECKSUM = 3093, 3102
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """A reply whose checksum and transaction were right."""
+
+    code: int  # the return code, of the line if that is not 0, else of the request
+    values: tuple[Any, ...]
+    """What came with it; empty where it is not of the form that was asked for."""
+    host_ns: int  # `time.monotonic_ns` right after it came
+
+
+class _Connection(SerialConnection):
+    """geocompy's serial connection; remembers what came and what failed."""
+
+    def __init__(self, port: serial.Serial) -> None:
+        super().__init__(port)
+        self.came = b""
+        self.failure: Exception | None = None
+
+    def exchange(self, cmd: str) -> str:
+        """Send a request and return the reply, as geocompy asks for it."""
+        self.came, self.failure = b"", None
+        try:
+            return super().exchange(cmd)
+        except (OSError, termios.error, UnicodeDecodeError) as error:
+            self.failure = error
+            raise
+
+    def receive_binary(self) -> bytes:
+        """Return a line without its end; what came instead is kept in `came`."""
+        self.came = self._port.read_until(self.eoabytes)
+        if not self.came.endswith(self.eoabytes):
+            raise TimeoutError
+        return self.came.removesuffix(self.eoabytes)
+
+    @property
+    def broken(self) -> Exception | None:
+        """What the port itself raised in the last exchange, if it did."""
+        quiet = isinstance(self.failure, TimeoutError | UnicodeDecodeError)
+        return None if quiet else self.failure
+
+
+class Link:
+    """A GeoCOM instrument at the other end of a serial port."""
+
+    def __init__(self, path: str, baud: int) -> None:
+        """Open the port for this program alone and see that an instrument answers."""
+        self._path, self._baud = path, baud
+        self._port = open_port(DEVICE, path, baud, _FIRST_ANSWER_S)
+        try:
+            with line_failures(DEVICE, path):
+                if not drain(self._port, _QUIET_S, _DRAIN_S):
+                    raise DeviceError(
+                        f"{DEVICE}: bytes keep coming from port {path} that nobody asked for; "
+                        f"is another instrument connected there, or is {baud} Bd wrong?"
+                    )
+            self._connection = _Connection(self._port)
+            self._instrument = self._greet()
+        except BaseException:
+            self.close()
+            raise
+
+    def ask(
+        self,
+        request: int,
+        values: Sequence[int | float] = (),
+        parsers: Sequence[Callable[[str], Any]] = (),
+        *,
+        until: float,
+        seconds: float = ANSWER_S,
+    ) -> Reply:
+        """Send a request until it is answered without damage, by `until`, `time.monotonic` s.
+
+        `parsers` are one per value of the reply; one answer may take `seconds`.
+        """
+        complaint, silent, damaged = "", 0, 0
+        while damaged < _TRIES and time.monotonic() < until:
+            answer, complaint = self._once(request, values, parsers, seconds, until)
+            if answer is not None and answer.code not in BUSY:
+                return answer
+            if answer is not None:
+                time.sleep(max(0.0, min(_PAUSE_S, until - time.monotonic())))
+                continue
+            damaged += 1
+            if isinstance(self._connection.failure, TimeoutError):
+                silent += 1
+                if silent > 1 or self._mute(until):
+                    break
+        raise DeviceError(f"{DEVICE} at {self._path}: {complaint or 'no answer in time'}")
+
+    def close(self) -> None:
+        """Give the port back. Never raises, may be called twice."""
+        close_port(self._port)
+
+    def _greet(self) -> GeoCom:
+        """Let geocompy make its acquaintance with the instrument."""
+        with line_failures(DEVICE, self._path):
+            try:
+                return GeoCom(self._connection, attempts=2, checksum=True)
+            except ConnectionRefusedError:
+                self._raise_if_broken()
+        raise DeviceError(f"{DEVICE} at {self._path}: {self._silence()}")
+
+    def _once(
+        self,
+        request: int,
+        values: Sequence[int | float],
+        parsers: Sequence[Callable[[str], Any]],
+        seconds: float,
+        until: float,
+    ) -> tuple[Reply | None, str]:
+        """One exchange; a good answer, or the complaint about what came instead."""
+        with line_failures(DEVICE, self._path):
+            self._port.timeout = max(0.05, min(seconds, until - time.monotonic()))
+            response = self._instrument.request(request, values, parsers)
+            host_ns = time.monotonic_ns()
+            self._raise_if_broken()
+            reply = _REPLY.match(response.response)
+            code = 0 if reply is None else int(reply[1]) or int(reply[2])
+            local = int(response.error)  # geocompy's own finding, or the instrument's
+            if (
+                reply is not None
+                and self._connection.failure is None
+                and local not in (_MISMATCH, _CLIENT_CHECKSUM)
+                and code not in GARBLED
+            ):
+                found = response.params
+                several = found if isinstance(found, tuple) else (found,)
+                return Reply(code, () if found is None else several, host_ns), words(code)
+            drain(self._port, _QUIET_S, min(_DRAIN_S, max(0.0, until - time.monotonic())))
+            self._connection.reset()
+        if self._connection.failure is not None or reply is None:
+            return None, self._silence()
+        return None, f"answers stay damaged or out of step ({words(code or local)}); {self._hint()}"
+
+    def _mute(self, until: float) -> bool:
+        """Whether nothing comes to the simplest request either."""
+        self._once(NULL, (), (), ANSWER_S, until)
+        return isinstance(self._connection.failure, TimeoutError)
+
+    def _raise_if_broken(self) -> None:
+        if self._connection.broken is not None:
+            raise self._connection.broken
+
+    def _silence(self) -> str:
+        came = self._connection.came
+        if not came:
+            return (
+                f"no answer; is it switched on, connected there, and set to GeoCOM at "
+                f"{self._baud} Bd?"
+            )
+        if _UNPROTECTED.match(came):
+            return "it answers without checksum, so damage on the line would go unnoticed"
+        if came.startswith(b"%R1P,"):
+            return f"answers arrive damaged or cut short; {self._hint()}"
+        return f"what comes is no GeoCOM; {self._hint()}"
+
+    def _hint(self) -> str:
+        return f"is {self._baud} Bd right, and does no other program use this port?"
+
+
 BAUD = 115200
-DEADLINE_S = 4.0
-"""How long a call may take beside what is measured or moved, real s."""
-MEASURING_S = 3.0
-"""How long a distance may take to measure, cell s."""
+DEADLINE_S = 4.0  # how long a call may take beside what is measured or moved, real s
+MEASURING_S = 3.0  # how long a distance may take to measure, cell s
 SEARCHING_S = 20.0
 """How long one search for the target may take, cell s; at least `_LEAST_S` real s."""
 _LEAST_S = 1.0
 _DISTANCE, _CORRECTED, _DISTANCE_PROGRAM = 1, 1, 2  # TMC_DEF_DIST, TMC_AUTO_INC, BAP_DEF_DIST
 _LOW_BATTERY, _INTERNAL = 10, 2  # %, power source
-TURN = 2.0 * np.pi + 1e-6
-"""Of a full circle, rad, with what rounding adds."""
-LARGEST_STD = 0.01
-"""rad; a choice, a thousand times what the poorest total station states (2 mgon)."""
-LARGEST_TILT = 0.5 * np.pi
-"""rad; no station measures upside down."""
+CIRCLE = 2.0 * np.pi + 1e-6  # of a full circle, rad, with what rounding adds
+LARGEST_STD = 0.01  # rad; a choice, a thousand times what the poorest total station states (2 mgon)
+LARGEST_TILT = 0.5 * np.pi  # rad; no station measures upside down
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +350,6 @@ class GeoComTracker:
     def __init__(
         self, link: Link, config: TrackerConfig, options: GeoComOptions, clock: Clock
     ) -> None:
-        """Take over an open link; sends nothing yet."""
         self._link, self._config, self._options, self._clock = link, config, options, clock
         self._full_known = True
         self._last_ms = 0.0
@@ -88,10 +361,6 @@ class GeoComTracker:
 
         with σ_t = c + e d from the configuration, or d times the standard deviation that the
         instrument states of its angles if that is larger; J = d(x, y, z)/d(hz, v, d).
-
-        Raises:
-            TargetLostError: no target, no distance, or an implausible one.
-            DeviceError: the instrument or its line failed.
         """
         polar = self._measure()
         sine = np.sin(polar.v)
@@ -108,10 +377,10 @@ class GeoComTracker:
         hz, v = np.arctan2(x, y) % (2 * np.pi), np.arctan2(np.hypot(x, y), z)
         until = time.monotonic() + DEADLINE_S + moving
         answer = self._link.ask(
-            geo.TURN, (float(hz), float(v), 0, 0, 0), until=until, seconds=ANSWER_S + moving
+            TURN, (float(hz), float(v), 0, 0, 0), until=until, seconds=ANSWER_S + moving
         )
-        if answer.code != geo.OK:
-            raise geo.failure("turning to the target", answer.code)
+        if answer.code != OK:
+            raise failure("turning to the target", answer.code)
         distance = max(float(np.linalg.norm(position)), self._options.min_distance_m)
         self._find(min(2 * radius / distance, self._options.search_rad), search=False)
 
@@ -127,70 +396,61 @@ class GeoComTracker:
             answer = self._link.ask(request, values, until=until, seconds=ANSWER_S + moving)
             return answer.code
 
-        code = do(geo.FINE_ADJUST, window, window, 0)
-        if code in geo.LOST and search:
-            code = do(geo.SEARCH, 0)
-            if code != geo.OK:
-                raise geo.failure("searching for the target", code)
-            code = do(geo.FINE_ADJUST, window, window, 0)
-        if code != geo.OK:
-            raise geo.failure("aiming at the target", code)
+        code = do(FINE_ADJUST, window, window, 0)
+        if code in LOST and search:
+            code = do(SEARCH, 0)
+            if code != OK:
+                raise failure("searching for the target", code)
+            code = do(FINE_ADJUST, window, window, 0)
+        if code != OK:
+            raise failure("aiming at the target", code)
         if self._options.lock:
-            code = do(geo.LOCK_IN)
-            if code != geo.OK:
-                raise geo.failure("locking on the target", code)
+            code = do(LOCK_IN)
+            if code != OK:
+                raise failure("locking on the target", code)
             if self._locked(until) is False:
                 raise TargetLostError(f"{DEVICE}: the instrument does not hold its target locked")
 
     def report(self) -> Report:
         """Ask the instrument who it is and how it is, and measure once; nothing turns."""
         until = time.monotonic() + DEADLINE_S + self._clock.real(MEASURING_S)
-        name = self._told(until, geo.NAME, lambda told: told.strip('"')) or ("GeoCOM instrument",)
-        serial = self._told(until, geo.SERIAL_NUMBER, int)
-        facts: list[tuple[str, str]] = []
-        fields: list[tuple[str, object]] = [("name", name[0])]
+        name = self._told(until, NAME, lambda said: said.strip('"')) or ("GeoCOM instrument",)
+        serial = self._told(until, SERIAL_NUMBER, int)
+        rows: list[Row] = [("", "", "name", name[0])]
         if serial:
-            fields.append(("serial_number", str(serial[0])))
-        for what, request in (("firmware", geo.FIRMWARE), ("GeoCOM", geo.GEOCOM_VERSION)):
-            version = self._told(until, request, int, int, int)
-            if version:
-                facts.append((what, ".".join(map(str, version))))
-                fields.append((what.lower(), facts[-1][1]))
-        face = self._told(until, geo.FACE, int)
+            rows.append(("", "", "serial_number", str(serial[0])))
+        for what, request in (("firmware", FIRMWARE), ("GeoCOM", GEOCOM_VERSION)):
+            numbers = self._told(until, request, int, int, int)
+            if numbers:
+                version = ".".join(map(str, numbers))
+                rows.append((what, version, what.lower(), version))
+        face = self._told(until, FACE, int)
         if face:
-            facts.append(("face", "second" if face[0] else "first"))
-            fields.append(("face", 2 if face[0] else 1))
+            rows.append(("face", "second" if face[0] else "first", "face", 2 if face[0] else 1))
         problems: list[str] = []
-        power = self._told(until, geo.POWER, int, int, int)
+        power = self._told(until, POWER, int, int, int)
         if power:
-            facts.append(("battery", f"{power[0]} %"))
-            fields.append(("battery_percent", power[0]))
+            rows.append(("battery", f"{power[0]} %", "battery_percent", power[0]))
             if power[0] < _LOW_BATTERY and power[1] == _INTERNAL:
                 problems.append(f"its battery is at {power[0]} %; change it or connect power")
-        air = self._told(until, geo.GET_ATMOSPHERE, float, float, float, float)
+        air = self._told(until, GET_ATMOSPHERE, float, float, float, float)
         if air:
-            facts.append(("atmosphere set", f"{air[1]:.1f} hPa, {air[2]:.1f} °C"))
-            fields += [("pressure_hPa", air[1]), ("temperature_degC", air[2])]
+            said = f"{air[1]:.1f} hPa, {air[2]:.1f} °C"
+            rows.append(("atmosphere set", said, "pressure_hPa", air[1]))
+            rows.append(("", "", "temperature_degC", air[2]))
         locked = self._locked(until)
         if locked is not None:
-            facts.append(("lock", "on the target" if locked else "none"))
-            fields.append(("locked", locked))
+            rows.append(("lock", "on the target" if locked else "none", "locked", locked))
             if self._options.lock and not locked:
                 problems.append("it is not locked on its target")
         try:
-            polar = self._measure()
-            facts += self._sight(polar)
-            along, across = self._spread(polar)
-            fields += [("distance_m", polar.distance), ("tilt_rad", polar.tilt)]
-            fields += [("std_along_m", along), ("std_across_m", across)]
-        except TargetLostError as error:
-            problems.append(str(error).removeprefix(f"{DEVICE}: "))
+            rows += self._sight(self._measure())
         except DeviceError as error:
-            if not self._answers(until):
+            if not isinstance(error, TargetLostError) and not self._answers(until):
                 raise
             problems.append(str(error).removeprefix(f"{DEVICE}: "))
         full_name = f"{name[0]}, serial {serial[0]}" if serial else str(name[0])
-        return Report(DEVICE, full_name, tuple(facts), tuple(problems), tuple(fields))
+        return report_of(DEVICE, full_name, rows, problems)
 
     def close(self) -> None:
         """Give the port back. Never raises, may be called twice."""
@@ -215,20 +475,20 @@ class GeoComTracker:
 
     def _full(self, until: float, measuring: float) -> PolarReading | None:
         """Measurement with the standard deviation of the angles; None if it is unknown."""
-        started = self._link.ask(geo.DO_MEASURE, (_DISTANCE, _CORRECTED), until=until)
-        if started.code in geo.UNKNOWN:
+        started = self._link.ask(DO_MEASURE, (_DISTANCE, _CORRECTED), until=until)
+        if started.code in UNKNOWN:
             self._full_known = False
             return None
-        if started.code != geo.OK:
-            raise geo.failure("starting a measurement", started.code)
+        if started.code != OK:
+            raise failure("starting a measurement", started.code)
         answer = self._link.ask(
-            geo.FULL_MEASUREMENT,
+            FULL_MEASUREMENT,
             (round(1000 * MEASURING_S), _CORRECTED),
             (float,) * 8,
             until=until,
             seconds=ANSWER_S + measuring,
         )
-        if answer.code in geo.UNKNOWN:
+        if answer.code in UNKNOWN:
             self._full_known = False
             return None
         warning = usable(answer)
@@ -244,7 +504,7 @@ class GeoComTracker:
     def _simple(self, until: float, measuring: float) -> PolarReading:
         """Measurement without a word on its accuracy, as older instruments know it."""
         answer = self._link.ask(
-            geo.MEASURE_DISTANCE_ANGLE,
+            MEASURE_DISTANCE_ANGLE,
             (_DISTANCE_PROGRAM,),
             (float,) * 4,
             until=until,
@@ -260,48 +520,42 @@ class GeoComTracker:
         across = known.transverse_std_m + known.transverse_std_per_m * d
         return known.range_std_m + known.range_std_per_m * d, max(across, polar.angle_std * d)
 
-    def _sight(self, polar: PolarReading) -> list[tuple[str, str]]:
-        """Facts about a measurement for people."""
+    def _sight(self, polar: PolarReading) -> list[Row]:
         along, across = self._spread(polar)
-        facts = [
-            (
-                "target",
-                f"{polar.distance:.4f} m away; standard deviation {1e6 * along:.1f} µm along "
-                f"the beam, {1e6 * across:.1f} µm across",
-            )
+        seen = (
+            f"{polar.distance:.4f} m away; standard deviation {1e6 * along:.1f} µm along the "
+            f"beam, {1e6 * across:.1f} µm across"
+        )
+        tilt = polar.tilt
+        leans = tuple(f"{1e3 * angle:.3f} mrad" for angle in tilt or ())
+        said = " across, ".join(leans) + " along"
+        return [
+            ("target", seen, "distance_m", polar.distance),
+            ("inclination" if tilt else "", said, "tilt_rad", tilt),
+            ("remark" if polar.warning else "", polar.warning, "std_along_m", along),
+            ("", "", "std_across_m", across),
         ]
-        if polar.tilt is not None:
-            cross, length = (1e3 * angle for angle in polar.tilt)
-            facts.append(("inclination", f"{cross:.3f} mrad across, {length:.3f} mrad along"))
-        if polar.warning:
-            facts.append(("remark", polar.warning))
-        return facts
 
     def _locked(self, until: float) -> bool | None:
         """Whether it follows the target; None where the instrument does not report it."""
-        state = self._told(until, geo.LOCK_STATE, int)
+        state = self._told(until, LOCK_STATE, int)
         return None if state is None else bool(state[0])
 
     def _told(self, until: float, request: int, *parsers: Any) -> tuple[Any, ...] | None:
         """What the instrument answers to a simple question; None where it does not know."""
         answer = self._link.ask(request, (), parsers, until=until)
-        return answer.values if answer.code == geo.OK and answer.values else None
+        return answer.values if answer.code == OK and answer.values else None
 
     def _answers(self, until: float) -> bool:
         try:
-            self._link.ask(geo.NULL, until=until)
+            self._link.ask(NULL, until=until)
         except DeviceError:
             return False
         return True
 
 
 def open_tracker(config: CellConfig) -> GeoComTracker:
-    """Connect to the instrument that [tracker] names; nothing turns.
-
-    Raises:
-        InputError: [tracker] lacks the port, or is not one of a GeoCOM instrument.
-        DeviceError: no such port, port in use, or nobody answers, within 5 s.
-    """
+    """Connect to the instrument that [tracker] names; nothing turns."""
     tracker = config.tracker
     if tracker.port is None:
         raise InputError(
@@ -319,25 +573,16 @@ def open_tracker(config: CellConfig) -> GeoComTracker:
 
 
 def usable(answer: Reply) -> str:
-    """Return the remark of a usable measurement, empty for none.
-
-    Raises:
-        TargetLostError: it has no distance.
-        DeviceError: it is none.
-    """
-    if answer.code == geo.OK:
+    """Return the remark of a usable measurement, empty for none."""
+    if answer.code == OK:
         return ""
-    if answer.code in geo.WARNINGS:
-        return geo.WARNINGS[answer.code]
-    raise geo.failure("measuring", answer.code)
+    if answer.code in WARNINGS:
+        return WARNINGS[answer.code]
+    raise failure("measuring", answer.code)
 
 
 def numbers(answer: Reply, count: int) -> Floats:
-    """Return the (count,) numbers of a measurement.
-
-    Raises:
-        DeviceError: there are more or fewer, or one is not finite.
-    """
+    """Return the (count,) numbers of a measurement."""
     numbers = np.array(answer.values, dtype=np.float64)
     if numbers.shape != (count,):
         _strange(f"{len(answer.values)} values instead of {count}")
@@ -347,13 +592,8 @@ def numbers(answer: Reply, count: int) -> Floats:
 
 
 def plausible(polar: PolarReading) -> PolarReading:
-    """Return a measurement whose angles are some that an instrument can have.
-
-    Raises:
-        DeviceError: an angle beyond a full turn (`TURN`), or a standard deviation or inclination
-            of angles beyond `LARGEST_STD`, `LARGEST_TILT`.
-    """
-    if not (abs(polar.hz) <= TURN and 0.0 <= polar.v <= TURN):
+    """Return a measurement whose angles are some that an instrument can have."""
+    if not (abs(polar.hz) <= CIRCLE and 0.0 <= polar.v <= CIRCLE):
         _strange(f"angles of {polar.hz:.6g} and {polar.v:.6g} rad")
     if not 0.0 <= polar.angle_std <= LARGEST_STD:
         _strange(f"a standard deviation of its angles of {polar.angle_std:.3g} rad")

@@ -20,21 +20,18 @@ from scipy.spatial.transform import Rotation
 from hilcal.config import CellConfig
 from hilcal.config.sections import Whole
 from hilcal.drivers import natnet_frames as nn
-from hilcal.drivers.network import network_failures, own_axes
+from hilcal.drivers.links import network_failures, own_axes
 from hilcal.errors import DeviceError, InputError
-from hilcal.measuring.devices import Report, TargetLostError, TrackerSample
+from hilcal.measuring.devices import Report, Row, TargetLostError, TrackerSample, report_of
 from hilcal.toml import Section, check_section
 
 DEVICE = "tracker"
 ANSWER_S, TRIES = 0.5, 4
 """How long an answer may take, real s, and how often it is asked for: datagrams may be lost."""
-DEADLINE_S = 4.0
-"""How long frames may take, real s."""
+DEADLINE_S = 4.0  # how long frames may take, real s
 SLOWEST_HZ = 20.0
-LOST_S = 1.0
-"""A body that is not seen for so long is lost, real s."""
-FLOOR = 1e-7
-"""Least standard deviation of a frame, m and rad: frames are in single precision."""
+LOST_S = 1.0  # a body that is not seen for so long is lost, real s
+FLOOR = 1e-7  # least standard deviation of a frame, m and rad: frames are in single precision
 
 
 class NatNetOptions(Section):
@@ -62,12 +59,7 @@ class NatNetTracker:
     """A rigid body as a `hilcal.measuring.devices.TrackerDevice`; m = 6, or 3."""
 
     def __init__(self, host: str, port: int, options: NatNetOptions) -> None:
-        """Connect, agree on a version, find the rigid body.
-
-        Raises:
-            DeviceError: nobody answers, or in no known version.
-            InputError: there is no such rigid body.
-        """
+        """Connect, agree on a version, find the rigid body."""
         self._options, self._to = options, (host, port)
         self.where = f"{host}:{port}"
         self._data: socket.socket | None = None
@@ -114,18 +106,21 @@ class NatNetTracker:
         s = self._server
         version = f"{s.version[0]}.{s.version[1]}"
         sent = f"multicast {s.group}:{s.data_port}" if s.group else "to this computer"
-        facts = [("NatNet", version), ("frames", sent), ("rigid body", self._name)]
-        fields: list[tuple[str, object]] = [("name", s.name), ("natnet", version)]
-        fields.append(("rigid_body", self._name))
+        rows: list[Row] = [
+            ("", "", "name", s.name),
+            ("NatNet", version, "natnet", version),
+            ("frames", sent, "", None),
+            ("rigid body", self._name, "rigid_body", self._name),
+        ]
         problems: list[str] = []
         try:
             sample = self.measure()
             std = float(np.sqrt(self._options.frames * sample.covariance[0, 0]))
-            facts.append(("target", f"a frame scatters by {1e6 * std:.0f} µm along each axis"))
-            fields.append(("frame_std_m", std))
+            said = f"a frame scatters by {1e6 * std:.0f} µm along each axis"
+            rows.append(("target", said, "frame_std_m", std))
         except TargetLostError as error:
             problems.append(str(error).removeprefix(f"{DEVICE} at {self.where}: "))
-        return Report(DEVICE, f"{s.name} {s.program}", tuple(facts), tuple(problems), tuple(fields))
+        return report_of(DEVICE, f"{s.name} {s.program}", rows, problems)
 
     def close(self) -> None:
         """Close the sockets. Never raises, may be called twice."""
@@ -284,12 +279,7 @@ def _drain(line: socket.socket) -> None:
 
 
 def open_tracker(config: CellConfig) -> NatNetTracker:
-    """Connect to the server that [tracker] names.
-
-    Raises:
-        InputError: [tracker] lacks the host, has another frame, or an unknown option.
-        DeviceError: nobody answers there.
-    """
+    """Connect to the server that [tracker] names."""
     tracker = config.tracker
     host, port = own_axes(tracker, "natnet", nn.PORT)
     options = check_section(tracker.options, NatNetOptions, "[tracker] options")

@@ -20,8 +20,7 @@ REQUEST_DESCRIPTIONS, DESCRIPTIONS, FRAME, KEEP_ALIVE = 4, 5, 7, 10
 Version = tuple[int, int]
 OLDEST: Version = (3, 0)
 NEWEST: Version = (4, 2)
-SIZED: Version = (4, 1)
-"""From here on lists tell their length in bytes."""
+SIZED: Version = (4, 1)  # from here on lists tell their length in bytes
 LARGEST = 1 << 16
 MARKER_SET, RIGID_BODY = 0, 1
 _HEAD = struct.Struct("<HH")
@@ -90,7 +89,6 @@ class Reader:
     """Reads a content from its beginning on; raises struct.error where that ends before."""
 
     def __init__(self, content: bytes, version: Version) -> None:
-        """Begin."""
         self.content, self.version, self.at = content, version, 0
 
     def take(self, layout: struct.Struct) -> tuple[float, ...]:
@@ -129,11 +127,7 @@ _COUNT = struct.Struct("<I")
 
 
 def frame(content: bytes, version: Version) -> tuple[int, list[Body]]:
-    """Return a frame's number and its rigid bodies.
-
-    Raises:
-        struct.error: it is cut short, or of another version.
-    """
+    """Return a frame's number and its rigid bodies."""
     r = Reader(content, version)
     number = r.count()
     sets, end = r.listed()
@@ -154,11 +148,7 @@ def frame(content: bytes, version: Version) -> tuple[int, list[Body]]:
 
 
 def names(content: bytes, version: Version) -> dict[int, str]:
-    """Return the names of the rigid bodies by their streaming IDs, from the descriptions.
-
-    Raises:
-        struct.error: they are cut short, or of another version.
-    """
+    """Return the names of the rigid bodies by their streaming IDs, from the descriptions."""
     r = Reader(content, version)
     found: dict[int, str] = {}
     for _ in range(r.count()):

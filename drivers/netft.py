@@ -23,14 +23,14 @@ from hilcal.config import CellConfig
 from hilcal.config.sections import Whole
 from hilcal.drivers.force_stream import (
     DEVICE,
+    ByDeviceClock,
     ForceStream,
+    FrameFormat,
     SensorFormat,
     checked_config,
     streaming,
 )
-from hilcal.drivers.frame_losses import ByDeviceClock
-from hilcal.drivers.frames import FrameFormat
-from hilcal.drivers.network import address, network_failures
+from hilcal.drivers.links import address, network_failures
 from hilcal.errors import DeviceError
 from hilcal.measuring.devices import ForceSensorDevice
 from hilcal.toml import Positive, Section, check_section
@@ -72,25 +72,12 @@ class NetFtOptions(Section):
 
 
 class Datagrams:
-    """Records as they come, behind the names of a port and of a deframer (`force_stream`).
-
-    Attributes:
-        port: where the sensor is.
-        baudrate: 0, there is none.
-        frames: good records.
-        corrupt: datagrams of a wrong length.
-        skipped: 0.
-    """
+    """Records as they come, behind the names of a port and of a deframer (`force_stream`)."""
 
     baudrate = 0
     skipped = 0
 
     def __init__(self, host: str, port: int) -> None:
-        """Ask the sensor to send.
-
-        Raises:
-            DeviceError: there is no way to this address.
-        """
         self.port = f"{host}:{port}"
         self.frames = self.corrupt = 0
         self._came = bytearray()
@@ -158,11 +145,7 @@ def _overload(wrench: Floats, status: int) -> str:
 
 
 def page(host: str, port: int) -> str:
-    """Return the sensor's page.
-
-    Raises:
-        DeviceError: nobody answers, or there is no such page.
-    """
+    """Return the sensor's page."""
     where = f"{host}:{port}"
     line = http.client.HTTPConnection(host, port, timeout=_PAGE_S)
     with network_failures(DEVICE, where), contextlib.closing(line):
@@ -201,11 +184,7 @@ def _number(words: str, *names: str) -> float:
 
 
 def sensor_format(words: str, options: NetFtOptions, where: str) -> SensorFormat:
-    """Return what the sensor sends, by its page.
-
-    Raises:
-        DeviceError: counts, units or rate are missing or unknown.
-    """
+    """Return what the sensor sends, by its page."""
     counts = [_number(words, name) for name in ("cfgcpf", "cfgcpt")]
     names = [_value(words, f"s{name}", name) for name in ("cfgfu", "cfgtu")]
     units = [
@@ -236,12 +215,7 @@ def sensor_format(words: str, options: NetFtOptions, where: str) -> SensorFormat
 
 
 def open_force_sensor(config: CellConfig) -> ForceSensorDevice:
-    """Read the sensor's page, ask it to send, and wait for the first record.
-
-    Raises:
-        DeviceError: nobody answers, it is no Net F/T, or no record comes.
-        InputError: no [force_sensor], no host, or an unknown option.
-    """
+    """Read the sensor's page, ask it to send, and wait for the first record."""
     section = checked_config(config, tuple(NetFtOptions.model_fields))
     options = check_section(section.options, NetFtOptions, "[force_sensor] options")
     host, port = address("[force_sensor]", "netft", section.host, PORT)

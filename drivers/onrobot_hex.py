@@ -15,9 +15,13 @@ from typing import Any
 import numpy as np
 
 from hilcal.config import CellConfig
-from hilcal.drivers.force_stream import SensorFormat, checked_config, open_streaming
-from hilcal.drivers.frame_losses import ByDeviceClock
-from hilcal.drivers.frames import FrameFormat
+from hilcal.drivers.force_stream import (
+    ByDeviceClock,
+    FrameFormat,
+    SensorFormat,
+    checked_config,
+    open_streaming,
+)
 from hilcal.errors import InputError
 from hilcal.measuring.devices import ForceSensorDevice
 from hilcal.types import Floats
@@ -47,12 +51,7 @@ def _sensor(counts_per_N: float, counts_per_Nm: float, rate: float) -> SensorFor
 
 
 def open_force_sensor(config: CellConfig) -> ForceSensorDevice:
-    """Open the port of [force_sensor] and wait for the first frame.
-
-    Raises:
-        DeviceError: no such port, in use, nothing or nothing sensible comes.
-        InputError: no [force_sensor], an unknown option, or one that is missing or no number.
-    """
+    """Open the port of [force_sensor] and wait for the first frame."""
     section = checked_config(config, ("counts_per_N", "counts_per_Nm", "rate_hz"))
     given = {"rate_hz": 1000.0, **section.options}
     values = []

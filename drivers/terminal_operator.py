@@ -22,14 +22,9 @@ ANSWERS = "Enter = done, q = give up: "
 
 
 class TerminalOperator:
-    """Asks on standard error and listens to standard input.
-
-    Attributes:
-        at_terminal: true, see `hilcal.measuring.devices.TerminalPerson`.
-    """
+    """Asks on standard error and listens to standard input."""
 
     def __init__(self, config: CellConfig) -> None:
-        """Remember where loads act and which way weights pull."""
         self.at_terminal = True
         self._point = config.tool.load_point_m
         self._gravity = config.robot.gravity_m_s2
@@ -46,20 +41,12 @@ class TerminalOperator:
         )
 
     def hang(self, load: CellLoad | None, why: str) -> None:
-        """Ask for a load and wait for Enter; what was typed before the question is dropped.
-
-        Raises:
-            DeviceError: the person gives up with q, or nobody is there to be asked.
-        """
+        """Ask for a load and wait for Enter; what was typed before the question is dropped."""
         said = "nothing hangs" if load is None else f"{load.name} hangs"
         self._ask(f"Not yet: {why}" if why else "", self._request(load), said)
 
     def confirm(self, question: str) -> None:
-        """Ask whether the arm may go on; see `hilcal.measuring.devices.ConfirmingOperator`.
-
-        Raises:
-            DeviceError: the person gives up with q, or nobody is there to be asked.
-        """
+        """Ask whether the arm may go on; see `hilcal.measuring.devices.ConfirmingOperator`."""
         self._ask(f"Look at the arm: {question}.", ["May it go on?"], "it goes on")
 
     def _ask(self, warning: str, request: list[str], said: str) -> None:
@@ -119,11 +106,7 @@ class TerminalOperator:
 
 
 def open_operator(config: CellConfig) -> TerminalOperator:
-    """Return the person at the terminal.
-
-    Raises:
-        InputError: [operator] options that this driver does not have.
-    """
+    """Return the person at the terminal."""
     if config.operator.options:
         raise InputError(
             f"[operator] options has {', '.join(config.operator.options)}; "

@@ -17,17 +17,9 @@ from typing import NoReturn
 import numpy as np
 
 from hilcal.config import CellConfig
+from hilcal.drivers.ur_link import control as command
 from hilcal.drivers.ur_link import probe, states
-from hilcal.drivers.ur_link.brakes import (
-    UNWATCHED,
-    Brakes,
-    cause_of,
-    not_commanded,
-    program_ended,
-)
-from hilcal.drivers.ur_link.control import Control, take
 from hilcal.drivers.ur_link.lines import LinkError
-from hilcal.drivers.ur_link.motion import MotionInProgress, deceleration, stands
 from hilcal.drivers.ur_link.reading import (
     OPTIONAL,
     OUTPUTS,
@@ -36,11 +28,16 @@ from hilcal.drivers.ur_link.reading import (
     N,
     Reading,
     Receiver,
+    survey,
 )
-from hilcal.drivers.ur_link.services import UrOptions
 from hilcal.drivers.ur_link.states import CHECK_LINK, CONTROL, HOLD_ON, failure
-from hilcal.drivers.ur_link.supervision import PRIMARY_PORT, Generation, generation, why_silent
-from hilcal.drivers.ur_link.survey import survey
+from hilcal.drivers.ur_link.supervision import (
+    PRIMARY_PORT,
+    Generation,
+    UrOptions,
+    generation,
+    why_silent,
+)
 from hilcal.drivers.ur_link.torque_reader import TORQUE, TorqueReader
 from hilcal.drivers.ur_link.worker import WorkerError
 from hilcal.errors import InputError
@@ -75,16 +72,15 @@ class UrArm:
         receiver: Receiver,
         torques: TorqueReader | None = None,
     ) -> None:
-        """Use an open link; `open_arm` makes one."""
         self._torques = torques
         self._host, self._hz, self._model = host, hz, config.robot.model
         self._arrival, self._clock = config.motion.arrival_rad, config.simulation.clock
         self._controller, self._generation, self._silent = controller, generation, silent
         self._receiver = receiver
-        self._brakes = Brakes(host, receiver, generation)
-        self._control: Control | None = None
-        self._motion: MotionInProgress | None = None
-        self._brake = deceleration(config.motion.speed_rad_s)
+        self._brakes = command.Brakes(host, receiver, generation)
+        self._control: command.Control | None = None
+        self._motion: command.MotionInProgress | None = None
+        self._brake = command.deceleration(config.motion.speed_rad_s)
         self._fault = ""
         self._was_ours = False
 
@@ -143,7 +139,7 @@ class UrArm:
         if self._silent:
             raise failure(self._host, f"cannot take control: {self._silent}")
         self._end_program()
-        self._control = take(self._host, self._receiver, self._generation)
+        self._control = command.take(self._host, self._receiver, self._generation)
         self._was_ours = True
         self._fault = ""
         try:
@@ -166,7 +162,7 @@ class UrArm:
         try:
             control.set_payload(mass, com)
         except WorkerError as error:
-            self._not_done(not_commanded(error))
+            self._not_done(command.not_commanded(error))
         end = time.monotonic() + _PAYLOAD_S
         while True:
             reading = self._read()
@@ -205,15 +201,15 @@ class UrArm:
         reading = self._read()
         self._check_state(reading)
         if reading.runtime != states.PLAYING:
-            self._fail(program_ended(reading, 0.0))
-        motion = MotionInProgress(
+            self._fail(command.program_ended(reading, 0.0))
+        motion = command.MotionInProgress(
             reading.sample.q, q, speed, acceleration, self._arrival, self._clock
         )
         self._motion, self._brake = motion, motion.brake
         try:
             taken = control.move(q, speed, acceleration, motion.brake)
         except WorkerError as error:
-            self._not_done(not_commanded(error))
+            self._not_done(command.not_commanded(error))
         if not taken:
             self._not_done("it did not take the motion")
 
@@ -232,9 +228,9 @@ class UrArm:
         try:
             pulse = control.alive()
         except WorkerError as error:
-            self._fail(not_commanded(error))
+            self._fail(command.not_commanded(error))
         if pulse.expired:
-            self._fail(UNWATCHED)
+            self._fail(command.UNWATCHED)
         if motion.arrived(reading):
             self._motion = None
             with contextlib.suppress(WorkerError):  # at rest; the next command tells
@@ -273,7 +269,7 @@ class UrArm:
         if self._torques is not None:
             self._torques.close()
 
-    def _in_control(self) -> Control:
+    def _in_control(self) -> command.Control:
         if self._control is None:
             why = f" ({self._fault})" if self._fault else ""
             raise failure(self._host, f"it is not under control{why}", CONTROL)
@@ -285,10 +281,7 @@ class UrArm:
             control.give_back()
 
     def _end_program(self) -> None:
-        """End a program of ours that has outlived its process.
-
-        After a lost link ur_rtde may have uploaded it again, with no watchdog.
-        """
+        """End a program of ours that ur_rtde may have uploaded again after a lost link."""
         if self._was_ours and not self._silent:
             with contextlib.suppress(LinkError):
                 self._generation.supervision.stop(_ASK_S)
@@ -298,7 +291,7 @@ class UrArm:
         """Whether an arm that is not under control stands."""
         with contextlib.suppress(LinkError):
             first, second = self._receiver.read(), self._receiver.read()
-            return stands(first) and stands(second)
+            return command.stands(first) and command.stands(second)
         return False
 
     def _read(self) -> Reading:
@@ -320,26 +313,26 @@ class UrArm:
         with contextlib.suppress(LinkError):  # the stop finds it lost, too
             reading = self._receiver.read(STALE_S)
             if reading.runtime != states.PLAYING:
-                noticed = f"{noticed}: {program_ended(reading, 0.0)}"
+                noticed = f"{noticed}: {command.program_ended(reading, 0.0)}"
         self._fail(noticed)
 
     def _fail(self, noticed: str, lost: str = "") -> NoReturn:
         """Stop the arm first, then find out the cause and raise it."""
         halt = self._brakes.halt(self._control, self._brake, lost)
         self._control = self._motion = None
-        self._fault, advice = cause_of(self._generation.supervision, halt, noticed)
+        self._fault, advice = command.cause_of(self._generation.supervision, halt, noticed)
         if not halt.stands:
             advice = f"{HOLD_ON}; {advice}"
         raise failure(self._host, self._fault, advice)
 
 
-def _why_ended(reading: Reading, control: Control) -> str:
+def _why_ended(reading: Reading, control: command.Control) -> str:
     """Return why the robot's program does not play any more, as far as both sides know it."""
     try:
         pulse = control.alive(_PULSE_S)
     except WorkerError:
-        return program_ended(reading, 0.0)
-    return UNWATCHED if pulse.expired else program_ended(reading, pulse.late)
+        return command.program_ended(reading, 0.0)
+    return command.UNWATCHED if pulse.expired else command.program_ended(reading, pulse.late)
 
 
 def _is_foreign(problem: str) -> bool:
@@ -355,12 +348,7 @@ def _lacking(python: tuple[int, ...]) -> str:
 
 
 def open_arm(config: CellConfig) -> UrArm:
-    """Connect to the controller of [robot] host; moves nothing and uploads nothing.
-
-    Raises:
-        InputError: [robot] host is missing, [robot.options] is wrong, or ur-rtde not installed.
-        DeviceError: no controller answers there.
-    """
+    """Connect to the controller of [robot] host; moves nothing and uploads nothing."""
     host = config.robot.host
     if host is None:
         raise InputError(

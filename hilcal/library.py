@@ -11,7 +11,7 @@ import numpy as np
 from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell
 from hilcal.diagnosis.serial_noise import with_serial_noise
-from hilcal.discovery.proposal import LawSearch
+from hilcal.discovery.discovery import LawSearch
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.effects.options import Options
 from hilcal.engine.engine import open_engine

@@ -21,14 +21,14 @@ from hilcal.diagnosis.serial_noise import serial_noise, with_serial_noise
 from hilcal.diagnosis.stepwise import Refits, add, exchange, predicts_better, remove
 from hilcal.diagnosis.stepwise_alternatives import Alternative
 from hilcal.diagnosis.verdict import NOTHING, judge, judge_naming
-from hilcal.discovery.proposal import LawSearch
+from hilcal.discovery.discovery import LawSearch
 from hilcal.identification.arm_scatter import with_arm_scatter, with_prior_scatter
 from hilcal.identification.background import (
     allows_background,
     with_background,
     with_pooled_lines,
 )
-from hilcal.identification.carried_evidence import carried_effects
+from hilcal.identification.drift import carried_effects
 from hilcal.identification.fit import Fit, fit
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings

@@ -8,8 +8,7 @@ from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.revisions import mode_of
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification import validation
-from hilcal.identification.acceptance import CampaignValidation, Judged, acceptance
-from hilcal.identification.extrapolation import extrapolation
+from hilcal.identification.validation import CampaignValidation, Judged, acceptance, extrapolation
 from hilcal.readings.same_readings import never_fitted
 from hilcal.store.revision import RevisionRecord
 

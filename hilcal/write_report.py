@@ -5,21 +5,19 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import hilcal
 from hilcal.campaign.campaign import Campaign
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.fit import Fit, fit
 from hilcal.names import quoted
-from hilcal.present.html.certificate import ReportContent, Tested
+from hilcal.present.html.report import ReportContent, Tested, first_screen, page
 from hilcal.present.story import build_story, of_left_out
 from hilcal.procedure.state import IMPROVED, Files
 from hilcal.readings.whitening import SCALINGS, Scaling
 from hilcal.store.overview import overview
-from hilcal.store.plan import Plan
 from hilcal.store.procedure_log import ProcedureLog
-from hilcal.store.revision import RevisionRecord, utc_now
+from hilcal.store.revision import utc_now
 from hilcal.store.run_log import PLAN, RunLog
 from hilcal.transfer.fleet import Fleet
 from hilcal.validation import validate
@@ -30,19 +28,12 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True)
 class ReportSummary:
-    """What a page says first.
+    """What a page says first."""
 
-    Attributes:
-        headline: the verdict in a few words.
-        limit: whether the limit is kept, in words; empty without one.
-        passed: the same; None without a limit.
-        verdict: of the diagnosis; None where nothing was diagnosed.
-    """
-
-    headline: str
-    limit: str
-    passed: bool | None
-    verdict: str | None
+    headline: str  # the verdict in a few words
+    limit: str  # whether the limit is kept, in words; empty without one
+    passed: bool | None  # the same; None without a limit
+    verdict: str | None  # of the diagnosis; None where nothing was diagnosed
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +94,7 @@ def write_report(
     run: Campaign, path: Path, asked: Asked, say: Say = lambda text: None
 ) -> ReportSummary:
     """Write a page as `report` does, and return what it says first."""
-    later, validation = asked.later, asked.validation
+    later, validation, verdict = asked.later, asked.validation, None
     if path.resolve() in {c.path.resolve() for c in (run, later, validation) if c is not None}:
         raise InputError(f"{path}: this is the campaign itself; name another file for the page")
     if not path.absolute().parent.is_dir():  # said before minutes of work
@@ -119,11 +110,8 @@ def write_report(
         found = compare(run, later, asked.revision, say=say)
         names = ((run.path.name, _sha256(run.path)), (later.path.name, _sha256(later.path)))
         html = comparison_page(found, names, asked.operator, utc_now(), hilcal.__version__)
-        first, verdict = comparison_screen(found, run.path.name), None
+        first = comparison_screen(found, run.path.name)
     else:
-        from hilcal.present.html.certificate import first_screen
-        from hilcal.present.html.sections import page
-
         with ExitStack() as stack:
             beside = Files(run.path).validation
             if validation is None and beside.is_file():
@@ -142,22 +130,24 @@ def content_of(
     run: Campaign, asked: Asked | None = None, say: Say = lambda text: None
 ) -> ReportContent:
     """Collect what a report of one campaign says; errors as of `report`."""
-    asked = Asked() if asked is None else asked
+    asked = asked or Asked()
     validation, limit_m, revision = asked.validation, asked.limit_m, asked.revision
-    limit = run.config.limits.accuracy_m if limit_m is None else limit_m
     record = run.in_use(revision)
     chapters = run.chapters(say, revision)
     last = chapters[-1].fit
     say("preparing the story")
     name = quoted(run.path.name)
-    commands = [f"hilcal info {quoted(run.path.name)}"]
     number = "" if record is None else f" --revision {record.number}"
+    commands = [f"hilcal info {quoted(run.path.name)}"]
     commands += [f"hilcal {c} {name}{number}" for c in ("compare", "diagnose")]
-    tested = None
+    tested = corrected = None
     if validation is not None:
         found = validate(run, validation, record, limit_m, say=say)
         tested = Tested(validation.path.name, _sha256(validation.path), found)
         commands.append(f"hilcal validate {name} {quoted(validation.path.name)}{number}")
+    improved = ProcedureLog(run.file).last(IMPROVED)
+    if improved and record and improved["revision"] == record.number:
+        corrected = improved  # the gain that was measured with this very revision
     story = build_story(chapters)
     return ReportContent(
         name=run.path.name,
@@ -171,10 +161,10 @@ def content_of(
         story=story,
         left_out=of_left_out(story.revisions[-1], last),
         scalings=_scalings(last, say) if asked.appendix else {},
-        plan=_plan(run),
+        plan=None if run.file.about(PLAN) is None else RunLog(run.file).plan,
         tested=tested,
-        corrected=_corrected(run, record),
-        limit_m=limit,
+        corrected=corrected,
+        limit_m=run.config.limits.accuracy_m if limit_m is None else limit_m,
         operator=asked.operator,
         commands=tuple(commands),
         appendix=asked.appendix,
@@ -194,28 +184,14 @@ def write_fleet_report(found: Fleet, directory: Path, path: Path) -> None:
 
 def _scalings(last: Fit, say: Say) -> dict[Scaling, Fit]:
     """Fit the last model with each scaling, where its own is gc."""
-    if last.scaling != "gc":
-        return {}
     out: dict[Scaling, Fit] = {}
-    for s in SCALINGS:
+    for s in SCALINGS if last.scaling == "gc" else ():
         say(f"fitting with scaling {s}")
         try:
             out[s] = last if s == "gc" else fit(last.model, last.readings, last.mode, s)
         except CannotAnswerError:
             continue
     return out
-
-
-def _corrected(run: Campaign, record: RevisionRecord | None) -> dict[str, Any] | None:
-    """Return the gain at corrected targets that was measured with this very revision."""
-    found = ProcedureLog(run.file).last(IMPROVED)
-    if found is None or record is None or found["revision"] != record.number:
-        return None
-    return found
-
-
-def _plan(run: Campaign) -> Plan | None:
-    return None if run.file.about(PLAN) is None else RunLog(run.file).plan
 
 
 def _sha256(path: Path) -> str:

@@ -29,9 +29,8 @@ from hilcal.drivers.simulated.rehearsal import measurement_noise, simulate
 from hilcal.drivers.simulated.world import World, stand
 from hilcal.errors import HilcalError
 from hilcal.identification.baseline import with_effects
-from hilcal.identification.earlier_fit import EarlierFit, earlier_fit
 from hilcal.identification.fit import fit
-from hilcal.identification.later_readings import setting
+from hilcal.identification.later_readings import EarlierFit, earlier_fit, setting
 from hilcal.readings.readings import Readings
 from hilcal.regression.power import noncentrality_of_power
 from hilcal.types import Floats

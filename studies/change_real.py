@@ -14,9 +14,8 @@ from hilcal.cell import Cell
 from hilcal.diagnosis.change import find_changes
 from hilcal.diagnosis.completed import completed
 from hilcal.identification.baseline import with_effects
-from hilcal.identification.earlier_fit import EarlierFit, earlier_fit
 from hilcal.identification.fit import fit
-from hilcal.identification.later_readings import setting
+from hilcal.identification.later_readings import EarlierFit, earlier_fit, setting
 from hilcal.library import read_table
 from hilcal.readings.readings import Readings
 from hilcal.robot import se3

@@ -17,7 +17,7 @@ import numpy as np
 import typer
 
 from hilcal.calibration.calibration import Calibration
-from hilcal.calibration.compensated import BAND, ToolPoses, band
+from hilcal.calibration.compensation import BAND, ToolPoses, band
 from hilcal.cell import Cell
 from hilcal.cli.options import Json, OneJob, Scheduler, one_by_default
 from hilcal.cli.terminal import terminal

@@ -19,9 +19,9 @@ from hilcal.cli.demo import CELL
 from hilcal.cli.options import Json
 from hilcal.cli.terminal import terminal
 from hilcal.config import CellConfig, load_config
+from hilcal.discovery.amplitudes import variables
 from hilcal.discovery.discovery import agreement, discover
 from hilcal.discovery.sites import motions_of, site_motions
-from hilcal.discovery.variables import variables
 from hilcal.identification.linearisation import linearise
 from hilcal.identification.residual import residual
 from hilcal.present.document import table

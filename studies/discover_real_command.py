@@ -13,14 +13,14 @@ from hilcal.cli.options import Json, OneJob, Scheduler, one_by_default
 from hilcal.cli.terminal import terminal
 from hilcal.diagnosis.residual_regression import residual_regression
 from hilcal.discovery.discovery import Discovery, discover
-from hilcal.discovery.write_effect import effect_class
+from hilcal.discovery.law import effect_class
 from hilcal.engine.engine import open_engine
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.linearisation import linearise
 from hilcal.library import read_table
 from hilcal.numbers import length, percent
-from hilcal.present.discovery import coefficient
+from hilcal.present.diagnosis import coefficient
 from hilcal.present.progress import counting
 from hilcal.refinement import refine
 from hilcal.robot.catalogue import configs_dir

@@ -24,8 +24,8 @@ from hilcal.cli.terminal import terminal
 from hilcal.design.choice import choose, objective_of
 from hilcal.design.information import problem
 from hilcal.design.nominal_model import nominal_model
-from hilcal.design.prediction_poses import prediction_poses
-from hilcal.design.undetermined import without_undetermined
+from hilcal.design.planner import without_undetermined
+from hilcal.design.predicted import prediction_poses
 from hilcal.engine.engine import open_engine
 from hilcal.identification.arm_scatter import with_arm_scatter
 from hilcal.identification.baseline import baseline

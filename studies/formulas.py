@@ -23,6 +23,7 @@ import typer
 
 from hilcal.cli.options import Json
 from hilcal.cli.terminal import terminal
+from hilcal.discovery.amplitudes import Variable
 from hilcal.discovery.grammar import grammar
 from hilcal.discovery.law import form_of
 from hilcal.discovery.problem import SearchProblem
@@ -30,7 +31,6 @@ from hilcal.discovery.refit import refine
 from hilcal.discovery.screen import screened
 from hilcal.discovery.search import search
 from hilcal.discovery.sites import Site
-from hilcal.discovery.variables import Variable
 from hilcal.identification.linearisation import Linearisation
 from hilcal.present.document import table
 from hilcal.present.progress import counting

@@ -24,11 +24,10 @@ from hilcal.cli.terminal import terminal
 from hilcal.config import load_config
 from hilcal.discovery.law import form_of
 from hilcal.discovery.problem import SearchProblem
-from hilcal.discovery.screen import Screen, screen
+from hilcal.discovery.screen import LawTerm, Screen, screen
 from hilcal.discovery.search import search
 from hilcal.discovery.sites import motions_of
 from hilcal.discovery.structures import averaged, structure_of, structures
-from hilcal.discovery.terms import LawTerm
 from hilcal.drivers.simulated.injected_effects import nothing_hidden
 from hilcal.drivers.simulated.rehearsal import measurement_noise, simulate
 from hilcal.identification.baseline import baseline

@@ -21,8 +21,8 @@ from hilcal.drivers.simulated.rehearsal import NOTHING, case_of_plan, read_plan
 from hilcal.identification.baseline import baseline
 from hilcal.identification.family_sizes import FamilySize
 from hilcal.identification.fit import fit
-from hilcal.present.charts import style
-from hilcal.present.charts.comparisons import made_of
+from hilcal.present import chart_style as style
+from hilcal.present.charts import made_of
 from hilcal.readings.covariance import (
     TrackerNoise,
     measurement_covariance,

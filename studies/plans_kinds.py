@@ -12,8 +12,13 @@ from hilcal.design.choice import choose, compound_objective
 from hilcal.design.feasible import Space, draw
 from hilcal.design.information import DesignProblem, problem
 from hilcal.design.nominal_model import NominalModel, nominal_model
-from hilcal.design.predicted import PredictedUncertainty, predicted, rms
-from hilcal.design.prediction_poses import PredictionPoses, prediction_poses
+from hilcal.design.predicted import (
+    PredictedUncertainty,
+    PredictionPoses,
+    predicted,
+    prediction_poses,
+    rms,
+)
 from hilcal.errors import CannotAnswerError
 from hilcal.types import Floats, Ints
 

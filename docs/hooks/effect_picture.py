@@ -17,11 +17,11 @@ from plotly.subplots import make_subplots
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
 from hilcal.effects.catalogue import installed
-from hilcal.effects.example import ROBOT, example_cell
+from hilcal.effects.check import ROBOT, example_cell
 from hilcal.effects.protocol import Effect, Parameter
 from hilcal.model.model import Model
 from hilcal.numbers import unit_for
-from hilcal.present.charts.style import AMBER, HOLDOUT, MEASURED, NOISE, template
+from hilcal.present.chart_style import AMBER, HOLDOUT, MEASURED, NOISE, template
 from hilcal.readings.readings import States
 from hilcal.types import Floats
 

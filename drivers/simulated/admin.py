@@ -20,11 +20,7 @@ Handler = Callable[[str, dict[str, Any]], Any]
 
 
 def ask(path: Path, op: str, timeout: float = 5.0, **arguments: Any) -> Any:
-    """Send one request to the simulated device behind `path` and return its answer.
-
-    Raises:
-        DeviceError: nobody answers, or the device refuses the request.
-    """
+    """Send one request to the simulated device behind `path` and return its answer."""
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as line:
             line.settimeout(timeout)
@@ -42,8 +38,7 @@ def ask(path: Path, op: str, timeout: float = 5.0, **arguments: Any) -> Any:
 def serve(path: Path, handler: Handler) -> None:
     """Answer requests in a daemon thread; `handler(op, arguments)` returns what JSON can hold.
 
-    An exception of the handler is returned to the client. The socket appears only when it
-    answers, so its existence shows that the device is ready.
+    An exception is returned to the client. The socket appears only when it answers.
     """
     new = path.with_name(path.name + ".new")
     new.unlink(missing_ok=True)
@@ -77,27 +72,21 @@ def serve(path: Path, handler: Handler) -> None:
 
 
 class Operations:
-    """What can be asked of a device by name: its faults and its state, a function each.
+    """What can be asked of a device by name, a function each; None is answered with the state.
 
-    Arguments are given by name. What returns nothing is answered with the state. `die` ends the
-    process at once, as a crash does.
+    Arguments are given by name. `die` ends the process at once, as a crash does.
     """
 
     def __init__(
         self, functions: Mapping[str, Callable[..., Any]], state: Callable[[], Any] | None = None
     ) -> None:
-        """Take the functions, and one that returns the state."""
         self._state = state or (lambda: None)
         self.functions = {**functions, "die": threading.Timer(0.02, os._exit, (70,)).start}
         if state is not None:
             self.functions["state"] = state
 
     def __call__(self, op: str, arguments: dict[str, Any]) -> Any:
-        """Carry out an operation.
-
-        Raises:
-            ValueError: an unknown one; lists the valid ones.
-        """
+        """Carry out an operation."""
         if op not in self.functions:
             raise ValueError(f"unknown op {op!r}; valid: {', '.join(self.functions)}")
         result = self.functions[op](**arguments)
@@ -114,21 +103,26 @@ def setter(target: object, name: str, kind: Callable[[Any], Any] = bool) -> Call
     return store
 
 
-def device_parser(doc: str | None) -> argparse.ArgumentParser:
-    """Return the parser of what the process of every device is told."""
+NETWORK: dict[str, dict[str, Any]] = {"--host": {"required": True}, "--port": {"type": int}}
+NOISE: dict[str, dict[str, Any]] = {
+    f"--{name}-std": {"type": float, "nargs": 2, "required": True}
+    for name in ("range", "transverse")
+}
+
+
+def begin(doc: str | None, more: Mapping[str, dict[str, Any]]) -> argparse.Namespace:
+    """Return the options of a device's process, which ends at once when standard input closes.
+
+    The parent holds its other end; `more` options are arguments of `add_argument` by name.
+    """
     parser = argparse.ArgumentParser(
         description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--directory", type=Path, required=True, help="where the devices meet")
     parser.add_argument("--seed", type=int, default=0, help="of everything random")
-    return parser
-
-
-def end_with_parent() -> None:
-    """Exit at once when standard input closes (the parent holds its other end).
-
-    A pipe ends with any death, also of kill -9; asynchronous and on every platform.
-    """
+    for name, how in more.items():
+        parser.add_argument(name, **how)
+    options = parser.parse_args()
 
     def wait() -> None:
         while os.read(sys.stdin.fileno(), 4096):
@@ -137,3 +131,4 @@ def end_with_parent() -> None:
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the one who started it
     threading.Thread(target=wait, daemon=True).start()
+    return options

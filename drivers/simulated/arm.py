@@ -1,11 +1,17 @@
-"""The simulated arm of any make: driver `hilcal.drivers.simulated.arm:open_arm`.
+"""The simulated arm of any make, of any number of joints, also of slides, and its controller.
 
-For rehearsals: the controller is `hilcal.drivers.simulated.arm_server`, which moves
-the commanded arm of a simulated cell, of any number of joints, in real time. Arms of
-Universal Robots have a simulated controller of their own, which speaks their protocols.
+    python -m hilcal.drivers.simulated.arm --directory DIR [--seed N]
+
+is the controller of the arm in DIR/world.json. It speaks no maker's protocol: the driver `open_arm`
+asks it on its admin line, DIR/arm.sock. Operations: `sample`, `move {q, speed, acceleration}`,
+`stop`, `payload {mass, com}`, `state`, `jog {q}` as somebody who moves the arm by hand,
+`protective_stop`, `release`, `die`. A motion stops where nobody asks for half a second. Arms of
+Universal Robots have a controller of their own, which speaks their protocols.
 """
 
 import contextlib
+import sys
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -14,19 +20,117 @@ import numpy as np
 
 from hilcal.config import CellConfig
 from hilcal.drivers.simulated import admin
-from hilcal.errors import DeviceError, InputError
+from hilcal.drivers.simulated.blackboard import Blackboard
+from hilcal.drivers.simulated.ur_state import Kinematics, Trajectory, WorldClock, pose
+from hilcal.drivers.simulated.world_server import read_world
+from hilcal.errors import DeviceError, HilcalError, InputError
 from hilcal.measuring.devices import ArmSample, Report
+from hilcal.robot.arm import Arm
 from hilcal.types import Floats
 
-_STOPPED_S = 5.0
-"""In which a stopped arm has to stand, real s."""
+WATCHDOG_S = 0.5  # a motion that nobody has looked at for so long is stopped, real s
+PROTECTIVE = "protective stop"
+_STEP_S, _REFRESH_S = 0.004, 0.01  # real s between steps in motion, and at rest
+_STOPPING = 2.0  # rad/s² of the leading joint (a slide: m/s²)
+
+
+class ArmController:
+    """The trajectory of the arm, and who may command it; every method from any thread."""
+
+    def __init__(self, arm: Arm, board: Blackboard, rng: np.random.Generator) -> None:
+        kept = board.read("arm")
+        self._board, self._clock, self._lock = board, WorldClock(board), threading.RLock()
+        self._arm, self._kinematics = arm, Kinematics(arm)
+        side = kept["side"] if kept["alive"] else rng.choice([-1.0, 1.0], arm.n)
+        arrivals = int(kept["arrivals"]) + bool(kept["moving"])
+        self._motion = Trajectory(kept["q"], side, arrivals, self._clock.now)
+        self._payload, self._com = float(kept["payload"]), kept["payload_com"].copy()
+        self._safety, self._asked = "normal", time.monotonic()
+
+    def step(self) -> bool:
+        """Go on to now, and publish; returns whether the arm moves."""
+        with self._lock:
+            motion = self._motion
+            if motion.moving and time.monotonic() - self._asked > WATCHDOG_S:
+                motion.stop(_STOPPING, self._clock.now)
+            motion.advance(self._clock.now)
+            motion.publish(self._board, self._payload, self._com)
+            return motion.moving
+
+    def sample(self) -> dict[str, Any]:
+        """Return what the controller knows of the arm now, as JSON can hold it."""
+        with self._lock:
+            self._asked = time.monotonic()
+            self.step()
+            motion, truth = self._motion, self._board.read("truth")
+            told = int(truth["arrivals"]) == motion.arrivals and truth["flange"][3, 3] == 1.0
+            q = truth["encoder"] if told and not motion.moving else motion.q
+            return {
+                "timestamp": self._clock.now,
+                "q": q.tolist(),
+                "q_target": motion.q.tolist(),
+                "qd": motion.qd.tolist(),
+                "moving": motion.moving,
+                "torque": self._kinematics.weight_torque(q, self._payload, self._com).tolist(),
+                "joint_temperature": truth["joint_temperature"].tolist(),
+                "flange": pose(self._kinematics.flange(q)).tolist(),
+                "payload": self._payload,
+                "payload_com": self._com.tolist(),
+                "safety": self._safety,
+                "arrivals": motion.arrivals,
+            }
+
+    def move(self, q: list[float], speed: float, acceleration: float) -> None:
+        """Begin a straight line in joint space."""
+        goal = self._joints(q)
+        with self._lock:
+            if self._safety != "normal":
+                raise DeviceError(f"the arm is in a {self._safety}")
+            self._asked = time.monotonic()
+            self._motion.start(goal, speed, acceleration, self._clock.now)
+
+    def stop(self) -> None:
+        """Stop the motion."""
+        with self._lock:
+            self._motion.stop(_STOPPING, self._clock.now)
+
+    def payload(self, mass: float, com: list[float]) -> None:
+        """Set what hangs at the flange, kg and m (flange axes)."""
+        with self._lock:
+            self._payload, self._com = float(mass), np.array(com, dtype=float)
+
+    def jog(self, q: list[float]) -> None:
+        """Stand elsewhere at once, as an arm that somebody has moved."""
+        with self._lock:
+            self._motion.place(self._joints(q))
+
+    def protective_stop(self) -> None:
+        """Stop, and refuse motions until `release`."""
+        with self._lock:
+            self.stop()
+            self._safety = PROTECTIVE
+
+    def release(self) -> None:
+        """Allow motions again."""
+        with self._lock:
+            self._safety = "normal"
+
+    def _joints(self, q: list[float]) -> Floats:
+        goal, arm = np.asarray(q, dtype=float), self._arm
+        if goal.shape != (arm.n,) or not np.isfinite(goal).all():
+            raise DeviceError(f"joint values {q}; {arm.name} has {arm.n} joints")
+        if np.any((goal < arm.q_min) | (goal > arm.q_max)):
+            raise DeviceError(f"joint values {q} are beyond the limits of {arm.name}")
+        return goal
+
+
+_STOPPED_S = 5.0  # in which a stopped arm has to stand, real s
 
 
 class SimulatedArm:
     """See `hilcal.measuring.devices.ArmDevice`."""
 
     def __init__(self, socket: Path) -> None:
-        """Use the admin line of the simulated controller; `open_arm` makes one."""
         self._socket, self._ours = socket, False
 
     def report(self) -> Report:
@@ -75,22 +179,14 @@ class SimulatedArm:
         self._ask("move", q=q.tolist(), speed=float(speed), acceleration=float(acceleration))
 
     def moving(self) -> bool:
-        """Whether the motion goes on.
-
-        Raises:
-            DeviceError: the arm was stopped by its safety system.
-        """
+        """Whether the motion goes on."""
         now = self._ask("sample")
         if now["safety"] != "normal":
             raise DeviceError(f"arm: {now['safety']}; release it, then go on with --resume")
         return bool(now["moving"])
 
     def stop(self) -> None:
-        """Stop the arm and wait until it stands.
-
-        Raises:
-            DeviceError: it does not stand in time.
-        """
+        """Stop the arm and wait until it stands."""
         self._ask("stop")
         end = time.monotonic() + _STOPPED_S
         while self._ask("sample")["moving"]:
@@ -113,12 +209,7 @@ class SimulatedArm:
 
 
 def open_arm(config: CellConfig) -> SimulatedArm:
-    """Return the simulated arm of a configuration, whose [robot] options have its `socket`.
-
-    Raises:
-        InputError: the option is missing: the arm exists in a simulated cell alone.
-        DeviceError: it does not answer.
-    """
+    """Return the simulated arm of a configuration, whose [robot] options have its `socket`."""
     socket = config.robot.options.get("socket")
     if not isinstance(socket, str) or not socket:
         raise InputError(
@@ -128,3 +219,25 @@ def open_arm(config: CellConfig) -> SimulatedArm:
     arm = SimulatedArm(Path(socket))
     arm.sample()
     return arm
+
+
+def main() -> int:
+    """Run until the parent ends; returns the exit code."""
+    options = admin.begin(__doc__, {})
+    try:
+        world, _ = read_world(options.directory / "world.json")
+        board = Blackboard(options.directory / "world.bin")
+    except HilcalError as error:
+        sys.stderr.write(f"{error}\n")
+        return error.exit_code
+    controller = ArmController(world.cell.arm, board, np.random.default_rng(options.seed))
+    controller.step()
+    names = ("move", "stop", "payload", "jog", "protective_stop", "release", "sample")
+    asked = {name: getattr(controller, name) for name in names}
+    admin.serve(options.directory / "arm.sock", admin.Operations(asked, controller.sample))
+    while True:
+        time.sleep(_STEP_S if controller.step() else _REFRESH_S)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-MOST_TARGETS = 8
-"""Targets that a tool can carry in the simulated cell."""
+MOST_TARGETS = 8  # targets that a tool can carry in the simulated cell
 _SEQUENCE = 8
 _TRIES = 10_000
 
@@ -66,14 +65,9 @@ def _offsets(n: int) -> tuple[dict[str, int], int]:
 
 
 class Blackboard:
-    """An open shared file; use `create` once and `attach` in every process.
-
-    Attributes:
-        joints: of the arm in the cell.
-    """
+    """An open shared file; use `create` once."""
 
     def __init__(self, path: Path) -> None:
-        """Map an existing file."""
         with path.open("r+b") as stream:
             self._map = mmap.mmap(stream.fileno(), 0)
         self.joints = int(np.frombuffer(self._map, "<i8", 1, _SEQUENCE)[0])
@@ -90,10 +84,7 @@ class Blackboard:
 
     @classmethod
     def create(cls, path: Path, scale: float, begun: float = 0.0, joints: int = 6) -> "Blackboard":
-        """Make the file and start the world's clock.
-
-        It begins at `begun`, s, and goes `scale` world seconds per real second.
-        """
+        """Make the file; the clock begins at `begun`, s, and goes `scale` s per real second."""
         number = np.array([0, joints], "<i8").tobytes()
         path.write_bytes(number + bytes(_offsets(joints)[1] - len(number)))
         board = cls(path)
@@ -101,16 +92,8 @@ class Blackboard:
         board.write("world", start_ns=start, scale=scale)
         return board
 
-    @classmethod
-    def attach(cls, path: Path) -> "Blackboard":
-        """Map the file of a running world."""
-        return cls(path)
-
     def write(self, section: str, **fields: Any) -> None:
-        """Set fields of a section, all at once for readers; only its one writer may.
-
-        A writer that was killed on the way has left the number odd; the next one mends that.
-        """
+        """Set fields of a section, all at once for readers; only its one writer may."""
         sequence, content = self._sequence[section], self._content[section]
         begun = int(sequence[0]) | 1
         sequence[0] = begun + 2 if begun == int(sequence[0]) else begun
@@ -146,15 +129,13 @@ class Blackboard:
         return float(self._content["world"]["scale"][0])
 
 
-_LATE_S = 0.2
-"""How long an instrument waits for the world to catch up with an arm that has arrived."""
+_LATE_S = 0.2  # how long an instrument waits for the world to catch up with an arm that has arrived
 
 
 def settled_truth(board: Blackboard) -> Any:
     """Return the truth; where the arm has just arrived, that of its arrival.
 
-    The world looks at the arm some hundred times a second of real time. Where its clock goes
-    faster than that, an instrument would see the arm still on its way.
+    The world looks at the arm some hundred times a second of real time; its clock may be faster.
     """
     end = time.monotonic() + _LATE_S
     while True:

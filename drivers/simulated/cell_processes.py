@@ -22,25 +22,33 @@ from hilcal.errors import DeviceError, InputError
 from hilcal.robot.arm import Arm
 from hilcal.types import Floats
 
+START_TIMEOUT = 20.0  # real time in which every simulated device has to be ready, s
+UR_PORTS = (29999, 30001, 30003, 30004)
+UR_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+EMSCON_PORT = 7000  # of the simulated tracker: the real one, 700, is for the administrator alone
+RDT_PORT, WEB_PORT, NATNET_PORT = 49152, 8081, 1510
+PORTS = (*UR_PORTS, EMSCON_PORT, WEB_PORT)
+TRACKERS = ("geocom", "emscon", "natnet")
+FORCE_SENSORS = ("ft300", "bota", "hex", "netft")
+_STALE = ("world.json", "world.bin", "tracker", "force", "world.sock", "arm.sock", "tracker.sock",
+          "force.sock")  # fmt: skip
+_SOCKET_PATH = 100  # bytes; Linux allows 107 (unix(7)), and the line is made as "*.sock.new"
+_HOSTS = 3  # addresses tried when another program is faster
+_POLL = 0.01  # s
 _END = 2.0  # s that a process has to end by itself, and again after it was asked to
 
 
 class DeviceProcess:
     """Starts, watches and ends `python -m MODULE --directory DIR ...`.
 
-    Its standard input is a pipe held by this process, whose end it follows; its output goes
-    to DIR/NAME.log; it is ready when DIR/NAME.sock appears.
+    It ends with its standard input, a pipe held here; its output goes to DIR/NAME.log; it is ready
+    when DIR/NAME.sock appears.
     """
 
     def __init__(self, name: str, module: str, directory: Path, arguments: tuple[str, ...]) -> None:
-        """Prepare; nothing is started."""
         self.name = name
-        self.socket = directory / f"{name}.sock"
-        self.log = directory / f"{name}.log"
-        self._command = (
-            *(sys.executable, "-m", module, "--directory", str(directory)),
-            *arguments,
-        )
+        self.socket, self.log = directory / f"{name}.sock", directory / f"{name}.log"
+        self._command = (sys.executable, "-m", module, "--directory", str(directory), *arguments)
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
@@ -72,11 +80,7 @@ class DeviceProcess:
         return self._process is not None and not self.socket.exists()
 
     def check(self) -> None:
-        """Raise where it has ended.
-
-        Raises:
-            DeviceError: with the last line that it said.
-        """
+        """Raise DeviceError with the last line that it said where it has ended."""
         if self._process is None or not self.ended:
             return
         words = self.log.read_text(encoding="utf-8", errors="replace").split("\n")
@@ -112,38 +116,8 @@ class DeviceProcess:
             self.end()
 
 
-START_TIMEOUT = 20.0
-"""Real time in which every simulated device has to be ready, s."""
-
-UR_PORTS = (29999, 30001, 30003, 30004)
-UR_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
-ARM_DRIVER = "hilcal.drivers.simulated.arm:open_arm"
-"""Of every other arm, by its place: it is of use in a simulated cell alone."""
-EMSCON_PORT = 7000
-"""Of the simulated tracker: the real one, 700, is for the administrator alone."""
-RDT_PORT, WEB_PORT = 49152, 8081
-PORTS = (*UR_PORTS, EMSCON_PORT, WEB_PORT)
-NATNET_PORT = 1510
-TRACKERS = ("geocom", "emscon", "natnet")
-FORCE_SENSORS = ("ft300", "bota", "hex", "netft")
-_STALE = (
-    "world.json",
-    "world.bin",
-    *(f"{name}.sock" for name in ("world", "arm", "tracker", "force")),
-    "tracker",
-    "force",
-)
-_SOCKET_PATH = 100  # bytes; Linux allows 107 (unix(7)), and the line is made as "*.sock.new"
-_HOSTS = 3  # addresses tried when another program is faster
-_POLL = 0.01  # s
-
-
 class SimulatedCell:
-    """The running processes of a simulated cell, and the configuration that leads to them.
-
-    Attributes:
-        config: the given configuration, with the simulated devices filled in.
-    """
+    """The running processes of a simulated cell; `config` leads to them."""
 
     def __init__(
         self,
@@ -152,11 +126,7 @@ class SimulatedCell:
         devices: dict[str, DeviceProcess],
         board: Blackboard,
     ) -> None:
-        """Take over processes that have not been started; use `start`."""
-        self.config = config
-        self.directory = directory
-        self._devices = devices
-        self._board = board
+        self.config, self.directory, self._devices, self._board = config, directory, devices, board
 
     @classmethod
     def start(
@@ -172,18 +142,9 @@ class SimulatedCell:
     ) -> Self:
         """Start every device of the cell, and return when all of them are ready.
 
-        Args:
-            world: what is true.
-            config: what the program is given; the world's cell was made from it.
-            directory: a directory for this cell alone; made where it is missing.
-            seed: of everything random.
-            base_dir: directory that a robot's file path in `config` is relative to.
-            begun: world time at the start, s: over 0 where the world was there before.
-            home: (n,) where the arm stands at first; an arm of UR stands upright.
-
-        Raises:
-            InputError: a cell that cannot be simulated.
-            DeviceError: a device ended early or was not ready in time.
+        The world's cell was made from `config`, whose robot's file path is relative to `base_dir`;
+        `directory` is for this cell alone. The world's time begins at `begun`, s: over 0 where it
+        was there before. At `home` (n,) the arm stands at first; an arm of UR stands upright.
         """
         _check(world, config, directory)
         try:
@@ -217,12 +178,7 @@ class SimulatedCell:
         raise AssertionError("unreachable")
 
     def ask(self, device: str, op: str, **arguments: Any) -> Any:
-        """Send a request to a device's admin line: "world", "arm", "tracker" or "force".
-
-        Raises:
-            InputError: no such device.
-            DeviceError: it does not answer, or refuses.
-        """
+        """Send a request to a device's admin line: "world", "arm", "tracker" or "force"."""
         return admin.ask(self._device(device).socket, op, **arguments)
 
     def kill(self, device: str) -> None:
@@ -230,11 +186,7 @@ class SimulatedCell:
         self._device(device).kill()
 
     def restart(self, device: str) -> None:
-        """Start a device again, after ending it where it still runs; returns when it is ready.
-
-        Raises:
-            DeviceError: it ended early or was not ready in time.
-        """
+        """Start a device again, after ending it where it still runs; returns when it is ready."""
         process = self._device(device)
         process.kill()
         self._begin([process])
@@ -251,35 +203,33 @@ class SimulatedCell:
             device.end()
 
     def __enter__(self) -> Self:
-        """Return the running cell."""
         return self
 
     def __exit__(self, *error: object) -> None:
-        """End every process."""
         self.close()
 
     def _begin(self, devices: Iterable[DeviceProcess]) -> None:
         """Start devices side by side, and wait until they are ready and agree."""
         deadline = time.monotonic() + START_TIMEOUT
+
+        def wait(checked: Iterable[DeviceProcess], late: str) -> None:
+            for device in checked:
+                device.check()
+            if time.monotonic() > deadline:
+                raise DeviceError(late)
+            time.sleep(_POLL)
+
         for device in devices:
             device.start()
         while waiting := [d for d in self._devices.values() if d.running_unready()]:
-            for device in waiting:
-                device.check()
-            if time.monotonic() > deadline:
-                names = ", ".join(d.name for d in waiting)
-                raise DeviceError(
-                    f"simulated {names}: not ready within {START_TIMEOUT:g} s; see {waiting[0].log}"
-                )
-            time.sleep(_POLL)
+            names = ", ".join(d.name for d in waiting)
+            late = f"simulated {names}: not ready within {START_TIMEOUT:g} s; see {waiting[0].log}"
+            wait(waiting, late)
         while not self._agree():
-            for device in devices:
-                device.check()
-            if time.monotonic() > deadline:
-                raise DeviceError(
-                    "simulated cell: the arm or the world is ready but does not write its state"
-                )
-            time.sleep(_POLL)
+            wait(
+                devices,
+                "simulated cell: the arm or the world is ready but does not write its state",
+            )
 
     def _agree(self) -> bool:
         """Whether the truth belongs to what the arm does (where both run)."""
@@ -291,29 +241,20 @@ class SimulatedCell:
 
     def _device(self, name: str) -> DeviceProcess:
         if name not in self._devices:
-            raise InputError(
-                f"simulated cell: no device {name!r}; valid: {', '.join(self._devices)}"
-            )
+            valid = ", ".join(self._devices)
+            raise InputError(f"simulated cell: no device {name!r}; valid: {valid}")
         return self._devices[name]
 
 
 def free_host() -> str:
-    """Return a loopback address whose ports of devices are free now.
-
-    Raises:
-        DeviceError: none was found.
-    """
+    """Return a loopback address whose ports of devices are free now."""
     for _ in range(50):
-        host = f"127.{secrets.randbelow(254) + 1}.{secrets.randbelow(256)}"
-        host = f"{host}.{secrets.randbelow(254) + 1}"
-        try:
-            with contextlib.ExitStack() as stack:
-                for port in PORTS:
-                    line = stack.enter_context(socket.socket())
-                    line.bind((host, port))
-        except OSError:
-            continue
-        return host
+        parts = (secrets.randbelow(254) + 1, secrets.randbelow(256), secrets.randbelow(254) + 1)
+        host = "127.{}.{}.{}".format(*parts)
+        with contextlib.suppress(OSError), contextlib.ExitStack() as stack:
+            for port in PORTS:
+                stack.enter_context(socket.socket()).bind((host, port))
+            return host
     raise DeviceError(
         "simulated arm: no free loopback address 127.x.y.z with the ports "
         f"{', '.join(map(str, PORTS))}; is the loopback network up?"
@@ -328,17 +269,15 @@ def _check(world: World, config: CellConfig, directory: Path) -> None:
             'lies within the arm\'s reach; valid: [tracker] frame = "tracker", with a base that '
             "is unknown or farther away than the arm reaches"
         )
-    tracker = config.tracker.driver or TRACKERS[0]
-    if tracker not in TRACKERS:
-        raise InputError(
-            f"simulated cell: no simulated tracker {tracker!r}; valid: {', '.join(TRACKERS)}"
-        )
     sensor = config.force_sensor
-    if sensor is not None and sensor.driver not in FORCE_SENSORS:
-        raise InputError(
-            f"simulated cell: no simulated force sensor {sensor.driver!r}; "
-            f"valid: {', '.join(FORCE_SENSORS)}"
-        )
+    for what, driver, valid in (
+        ("tracker", config.tracker.driver or TRACKERS[0], TRACKERS),
+        ("force sensor", "ft300" if sensor is None else sensor.driver, FORCE_SENSORS),
+    ):
+        if driver not in valid:
+            raise InputError(
+                f"simulated cell: no simulated {what} {driver!r}; valid: {', '.join(valid)}"
+            )
     longest = len(str((directory / "tracker.sock").absolute()).encode())
     if longest > _SOCKET_PATH:
         raise InputError(
@@ -354,83 +293,77 @@ def _devices(
     world: World, config: CellConfig, directory: Path, seed: int, host: str, base_dir: Path
 ) -> dict[str, DeviceProcess]:
     noise, arm, sensor = world.noise, config.robot, config.force_sensor
-    stated = {"range_std": noise.range_std, "transverse_std": noise.transverse_std}
-    at: dict[str, object] = {"host": host}
-    of_tracker: dict[str, dict[str, object]] = {
-        "geocom": {**stated},
+    std = {"range_std": noise.range_std, "transverse_std": noise.transverse_std}
+    trackers: dict[str, dict[str, Any]] = {
+        "geocom": std,
         "emscon": {
-            **at,
-            "port": EMSCON_PORT,
-            **stated,
-            "orientation_std": noise.orientation_std,
+            **{"host": host, "port": EMSCON_PORT, "orientation_std": noise.orientation_std},
+            **std,
         },
-        "natnet": {**at, "port": NATNET_PORT},  # its errors are its own
+        "natnet": {"host": host, "port": NATNET_PORT},  # its errors are its own
     }
     tracker = config.tracker.driver or TRACKERS[0]
 
-    def device(name: str, server: str, number: int, options: dict[str, object]) -> DeviceProcess:
-        words = ["--seed", str(number)]
+    def device(name: str, server: str, more: int, options: dict[str, Any]) -> DeviceProcess:
+        words = ["--seed", str(seed + more)]
         for key, value in options.items():
             values = value if isinstance(value, tuple) else (value,)
-            told = (repr(float(v)) if isinstance(v, float) else str(v) for v in values)
-            words += [f"--{key.replace('_', '-')}", *told]
+            words += [f"--{key.replace('_', '-')}", *map(str, values)]
         return DeviceProcess(name, f"hilcal.drivers.simulated.{server}", directory, tuple(words))
 
-    of_arm: tuple[str, dict[str, object]] = "arm_server", {}
+    controller, about = "arm", dict[str, Any]()
     if is_ur(world.cell.arm):
         version = config.simulation.controller_version
-        of_arm = "ur_server", {**at, "robot": arm.model, "version": version}
+        controller, about = "ur_server", {"host": host, "robot": arm.model, "version": version}
         if arm.calibration is not None:
-            of_arm[1]["calibration"] = base_dir / arm.calibration
+            about["calibration"] = base_dir / arm.calibration
     out = {
-        "world": device("world", "world_server", seed, {}),
-        "arm": device("arm", of_arm[0], seed + 3, of_arm[1]),
-        "tracker": device("tracker", f"{tracker}_server", seed + 1, of_tracker[tracker]),
+        "world": device("world", "world_server", 0, {}),
+        "arm": device("arm", controller, 3, about),
+        "tracker": device("tracker", f"{tracker}_server", 1, trackers[tracker]),
     }
     if sensor is not None:
-        of_sensor: tuple[str, dict[str, object]] = "force_server", {"kind": sensor.driver}
+        kind: dict[str, Any] = {"kind": sensor.driver}
         if sensor.driver == "netft":
-            of_sensor = "netft_server", {**at, "port": RDT_PORT, "web_port": WEB_PORT}
-        out["force"] = device("force", of_sensor[0], seed + 2, of_sensor[1])
+            kind |= {"host": host, "port": RDT_PORT, "web_port": WEB_PORT}
+        out["force"] = device("force", "force_server", 2, kind)
     return out
 
 
 def is_ur(arm: Arm) -> bool:
     """Whether an arm is one of Universal Robots in the catalogue: its own protocol is simulated."""
-    return arm.name.startswith("ur") and arm.n == len(UR_JOINTS) and arm.joint_names == UR_JOINTS
+    return arm.name.startswith("ur") and arm.joint_names == UR_JOINTS
 
 
 def _filled_in(config: CellConfig, directory: Path, host: str, ur: bool) -> CellConfig:
-    """Return the configuration that leads to the simulated devices.
-
-    What it gives stays, but for the driver of an arm whose own protocol is not simulated.
-    """
+    """Return the configuration that leads to the simulated devices."""
     from hilcal.drivers.simulated.ur_server import API, POLYSCOPE_X  # loads asyncio
 
-    options: dict[str, Any] = {**config.robot.options}
-    if int(config.simulation.controller_version.partition(".")[0]) >= POLYSCOPE_X:
-        options["robot_api_port"] = API
     directory = directory.absolute()
-    driver = config.robot.driver or "ur"
-    robot: dict[str, Any] = {"host": host, "driver": driver, "options": options}
-    if not ur:
-        robot = {"driver": ARM_DRIVER, "options": {"socket": str(directory / "arm.sock")}}
-    tracker = {"driver": config.tracker.driver or TRACKERS[0]}
-    ports = {"emscon": EMSCON_PORT, "natnet": NATNET_PORT}
-    if tracker["driver"] in ports:
-        tracker["host"] = f"{host}:{ports[tracker['driver']]}"
-    else:
-        tracker["port"] = str(directory / "tracker")
-    operator = {**config.operator.options, "socket": str(directory / "world.sock")}
-    changes: dict[str, Any] = {
-        "robot": config.robot.model_copy(update=robot),
-        "tracker": config.tracker.model_copy(update=tracker),
-        "operator": config.operator.model_copy(update={"driver": "simulated", "options": operator}),
+    tracker = config.tracker.driver or TRACKERS[0]
+    at = {"emscon": {"host": f"{host}:{EMSCON_PORT}"}, "natnet": {"host": f"{host}:{NATNET_PORT}"}}
+    changes: dict[str, dict[str, Any]] = {
+        "robot": {
+            "driver": "hilcal.drivers.simulated.arm:open_arm",
+            "options": {"socket": str(directory / "arm.sock")},
+        },
+        "tracker": {"driver": tracker, **at.get(tracker, {"port": str(directory / "tracker")})},
+        "operator": {
+            "driver": "simulated",
+            "options": {**config.operator.options, "socket": str(directory / "world.sock")},
+        },
     }
-    if config.force_sensor is not None:
-        where: dict[str, Any] = {"port": str(directory / "force")}
-        if config.force_sensor.driver == "netft":
-            web = {**config.force_sensor.options, "web_port": WEB_PORT}
-            where = {"host": f"{host}:{RDT_PORT}", "options": web}
-        changes["force_sensor"] = config.force_sensor.model_copy(update=where)
-    return config.model_copy(update=changes)
+    if ur:
+        options: dict[str, Any] = {**config.robot.options}
+        if int(config.simulation.controller_version.partition(".")[0]) >= POLYSCOPE_X:
+            options["robot_api_port"] = API
+        driver = config.robot.driver or "ur"
+        changes["robot"] = {"host": host, "driver": driver, "options": options}
+    sensor = config.force_sensor
+    if sensor is not None:
+        changes["force_sensor"] = {"port": str(directory / "force")}
+        if sensor.driver == "netft":
+            web = {**sensor.options, "web_port": WEB_PORT}
+            changes["force_sensor"] = {"host": f"{host}:{RDT_PORT}", "options": web}
+    filled = {name: getattr(config, name).model_copy(update=new) for name, new in changes.items()}
+    return config.model_copy(update=filled)

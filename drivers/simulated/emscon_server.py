@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 from hilcal.drivers import emscon_packets as es
 from hilcal.drivers.simulated import admin
 from hilcal.drivers.simulated.blackboard import Blackboard, settled_truth
-from hilcal.drivers.simulated.geocom_station import Beam, PolarPoint, Station
+from hilcal.drivers.simulated.geocom_server import Beam, PolarPoint, Station
 from hilcal.drivers.simulated.world import SimulatedNoise
 from hilcal.types import Floats
 
@@ -76,6 +76,10 @@ class SimulatedTracker:
     client: socket.socket | None = None
     asked: deque[int] = field(default_factory=lambda: deque(maxlen=10_000))
 
+    def setting(self, command: int, layout: str) -> tuple[Any, ...]:
+        """Return the values that a command reads."""
+        return struct.unpack(layout, self.settings[command])
+
     def send(self, kind: int, body: bytes) -> None:
         """Send a packet to who is connected."""
         if self.client is not None and not self.mute:
@@ -84,12 +88,8 @@ class SimulatedTracker:
 
     def tell(self, change: int) -> None:
         """Tell a change of state, where the client wants to hear of it."""
-        if struct.unpack("<I8i", self.settings[es.GET_SETTINGS])[4]:
+        if self.setting(es.GET_SETTINGS, "<I8i")[4]:
             self.send(es.CHANGE, struct.pack("<I", change))
-
-    def answer(self, command: int, status: int, body: bytes = b"") -> None:
-        """Answer a command."""
-        self.send(es.COMMAND, struct.pack("<II", command, status) + body)
 
     def carry_out(self, command: int, body: bytes) -> None:
         """Carry out a command and answer it."""
@@ -97,68 +97,86 @@ class SimulatedTracker:
         status, count = self.failing.pop(command, (es.OK, 0))
         if count > 1:
             self.failing[command] = status, count - 1
+        changed, answers = None, [b""]
         if status != es.OK:
-            self.answer(command, status)
+            pass
         elif command in self.settings:
-            self.answer(command, es.OK, self.settings[command])
+            answers = [self.settings[command]]
         elif command in SETS:
             what, change = SETS[command]
             if len(body) != len(self.settings[what]):
-                self.answer(command, WRONG_PARAMETER)
-                return
-            changed = self.settings[what] != body
-            self.settings[what] = body
-            self.answer(command, es.OK)
-            if changed:
-                self.tell(change)
-        elif command in _DO:
-            _DO[command](self, body)
-        else:
-            self.answer(command, es.NOT_IMPLEMENTED)
-
-    def status(self) -> int:
-        """Return the bits of its state."""
-        held = es.REFLECTOR_FOUND if self.station.held() is not None else 0
-        return 15 | 4096 | es.LEVELLED | held
+                status = WRONG_PARAMETER
+            else:
+                changed = change if self.settings[what] != body else None
+                self.settings[what] = body
+        elif command in _TELL:
+            answers = _TELL[command](self)
+        elif command == es.INITIALIZE:
+            self.station.wait(5.0)
+            self.initialized, changed = True, es.INITIALIZATION_CHANGED
+        elif command not in (es.START_MEASUREMENT, es.GO_POSITION, es.FIND_REFLECTOR):
+            status = es.NOT_IMPLEMENTED
+        elif command != es.GO_POSITION and not self.initialized:
+            status = es.NOT_INITIALIZED
+        elif command != es.START_MEASUREMENT:
+            status = self._acquire(command, body)
+        for answer in answers:
+            self.send(es.COMMAND, struct.pack("<II", command, status) + answer)
+        if changed is not None:
+            self.tell(changed)
+        if command == es.START_MEASUREMENT and status == es.OK:
+            self._measure()
 
     def environment(self) -> tuple[float, float, float]:
         """Return temperature °C, pressure mbar, relative humidity %."""
         air = float(self.station.board.read("truth")["air_temperature"])
         return (air if air != 0.0 else ROOM), MBAR, HUMIDITY
 
-    def measured(self) -> es.Measurement | None:
-        """Measure, in m and rad; None without a target."""
-        milliseconds, _ = struct.unpack("<2i", self.settings[es.GET_STATIONARY])
-        self.station.meas_s = milliseconds * 1e-3
-        self.station.start_ranging()
-        self.station.finish_ranging(self.station.meas_s)
-        seen = self.station.seen
-        if seen is None or self.station.distance == 0.0:
-            return None
+    def _acquire(self, command: int, body: bytes) -> int:
+        """Go to where a reflector is expected, and search for it; return the status."""
+        station = self.station
+        if command == es.GO_POSITION:
+            at = PolarPoint.of(np.array(struct.unpack("<3di", body)[:3]))
+            station.turn(at.hz, at.v)
+            station.pointing = at
+            if not self.initialized:
+                return es.NOT_INITIALIZED
+        distance = station.pointing.distance or station.distance or 2.0
+        radius = self.setting(44, "<di")[0]
+        found = station.acquire(float(np.arctan2(radius, distance)))
+        return es.OK if found else es.NO_RESULT
+
+    def _measure(self) -> None:
+        """Measure and send the result, in the units and coordinates that are set."""
+        station, noise = self.station, self.noise
+        station.meas_s = self.setting(es.GET_STATIONARY, "<2i")[0] * 1e-3
+        station.start_ranging()
+        station.finish_ranging(station.meas_s)
+        seen = station.seen
+        if seen is None or station.distance == 0.0:
+            self.send(es.ERROR, struct.pack("<II", es.START_MEASUREMENT, es.NO_RESULT))
+            return
+        (mode,) = self.setting(es.GET_MODE, "<I")
+        length, angle, *_ = self.setting(es.GET_UNITS, "<5I")
+        a, b = (1.0, 1e3, 1e6)[length], (1.0, np.rad2deg(1.0), 200 / np.pi)[angle]
+        transformed = self.setting(es.GET_SETTINGS, "<I8i")[1]
+        moved = np.array([1.0, 2.0, 3.0]) if transformed else np.zeros(3)
         position: Floats = seen.distance * seen.direction()
-        covariance = self.noise.covariance(position[None], 3)[0]
+        covariance = a * a * noise.covariance(position[None], 3)[0]
         turn: Floats | None = None
         turned: Floats = np.zeros((3, 3))
-        angles = np.zeros(3)
-        if struct.unpack("<I", self.settings[es.GET_MODE])[0] == es.STATIONARY_6D:
-            rotation = settled_truth(self.station.board)["target_rotation"]
-            moved = Rotation.from_rotvec(self.noise.orientation_std * self.rng.normal(size=3))
-            seen_turn = moved * Rotation.from_matrix(rotation)
+        angles: Floats = np.zeros(3)
+        if mode == es.STATIONARY_6D:
+            rotation = settled_truth(station.board)["target_rotation"]
+            off = Rotation.from_rotvec(noise.orientation_std * self.rng.normal(size=3))
+            seen_turn = off * Rotation.from_matrix(rotation)
             turn, angles = np.roll(seen_turn.as_quat(), 1), seen_turn.as_euler("xyz")
             J = _rates(angles)
-            turned = np.asarray(self.noise.orientation_std**2 * np.linalg.inv(J.T @ J))
-        return es.Measurement(position, covariance, turn, angles, turned, self.environment())
-
-    def in_units(self, m: es.Measurement) -> es.Measurement:
-        """Return a measurement in the units and coordinates that are set."""
-        length, angle, *_ = struct.unpack("<5I", self.settings[es.GET_UNITS])
-        a, b = (1.0, 1e3, 1e6)[length], (1.0, np.rad2deg(1.0), 200 / np.pi)[angle]
-        settings = struct.unpack("<I8i", self.settings[es.GET_SETTINGS])
-        moved = np.array([1.0, 2.0, 3.0]) if settings[1] else np.zeros(3)
-        c, t = a * a * m.covariance, b * b * m.angle_covariance
-        return es.Measurement(
-            a * (m.position + moved), c, m.quaternion, b * m.angles, t, m.environment
-        )
+            turned = np.asarray((b * noise.orientation_std) ** 2 * np.linalg.inv(J.T @ J))
+        at = a * (position + moved)
+        m = es.Measurement(at, covariance, turn, b * angles, turned, self.environment())
+        kind, packed = es.pack_measurement(m, mode)
+        self.send(kind, struct.pack("<I", es.OK) + packed)
 
 
 def _rates(angles: Floats) -> Floats:
@@ -168,79 +186,40 @@ def _rates(angles: Floats) -> Floats:
     return np.array([[cc * cb, -sc, 0.0], [sc * cb, cc, 0.0], [-sb, 0.0, 1.0]])
 
 
-def _measure(t: SimulatedTracker, body: bytes) -> None:
-    if not t.initialized:
-        t.answer(es.START_MEASUREMENT, es.NOT_INITIALIZED)
-        return
-    t.answer(es.START_MEASUREMENT, es.OK)
-    m = t.measured()
-    if m is None:
-        t.send(es.ERROR, struct.pack("<II", es.START_MEASUREMENT, es.NO_RESULT))
-        return
-    mode = struct.unpack("<I", t.settings[es.GET_MODE])[0]
-    kind, packed = es.pack_measurement(t.in_units(m), mode)
-    t.send(kind, struct.pack("<I", es.OK) + packed)
+def _text(words: str) -> bytes:
+    return words.encode("utf-16-le").ljust(64, b"\0")
 
 
-def _initialize(t: SimulatedTracker, body: bytes) -> None:
-    t.station.wait(5.0)
-    t.initialized = True
-    t.answer(es.INITIALIZE, es.OK)
-    t.tell(es.INITIALIZATION_CHANGED)
+def _reflectors(t: SimulatedTracker) -> list[bytes]:
+    return [
+        struct.pack("<iiId64s", len(REFLECTORS), number, 5, 0, _text(name))
+        for number, name in REFLECTORS.items()
+    ]
 
 
-def _acquire(t: SimulatedTracker, command: int) -> None:
-    if not t.initialized:
-        t.answer(command, es.NOT_INITIALIZED)
-        return
-    distance = t.station.pointing.distance or t.station.distance or 2.0
-    radius = struct.unpack("<di", t.settings[44])[0]
-    found = t.station.acquire(float(np.arctan2(radius, distance)))
-    t.answer(command, es.OK if found else es.NO_RESULT)
-
-
-def _go(t: SimulatedTracker, body: bytes) -> None:
-    at = PolarPoint.of(np.array(struct.unpack("<3di", body)[:3]))
-    t.station.turn(at.hz, at.v)
-    t.station.pointing = at
-    _acquire(t, es.GO_POSITION)
-
-
-def _reflectors(t: SimulatedTracker, body: bytes) -> None:
-    for number, name in REFLECTORS.items():
-        words = name.encode("utf-16-le").ljust(64, b"\0")
-        t.answer(
-            es.GET_REFLECTORS, es.OK, struct.pack("<iiId64s", len(REFLECTORS), number, 5, 0, words)
-        )
-
-
-def _info(t: SimulatedTracker, body: bytes) -> None:
-    words = NAME.encode("utf-16-le").ljust(64, b"\0")
+def _info(t: SimulatedTracker) -> list[bytes]:
     rest = struct.pack("<iiiidddiiddIii", 1, 1, 1, 1, 0.0, 160.0, 0.8, 10, 2, 3.14, 3.14, 1, 1, 0)
-    t.answer(es.GET_TRACKER_INFO, es.OK, struct.pack("<I64si", 70, words, SERIAL) + rest)
+    return [struct.pack("<I64si", 70, _text(NAME), SERIAL) + rest]
 
 
-def _system(t: SimulatedTracker, body: bytes) -> None:
+def _system(t: SimulatedTracker) -> list[bytes]:
     state = es.INITIALIZED if t.initialized else es.BOOTED
-    packed = struct.pack("<4I3iI2i", es.OK, state, 3, 2, 3, 8, 900, 2, 0, SERIAL)
-    t.answer(es.GET_SYSTEM_STATUS, es.OK, packed)
+    return [struct.pack("<4I3iI2i", es.OK, state, 3, 2, 3, 8, 900, 2, 0, SERIAL)]
 
 
-_DO: dict[int, Callable[[SimulatedTracker, bytes], None]] = {
+def _status(t: SimulatedTracker) -> list[bytes]:
+    held = es.REFLECTOR_FOUND if t.station.held() is not None else 0
+    return [struct.pack("<Ii", es.OK, 15 | 4096 | es.LEVELLED | held)]
+
+
+_TELL: dict[int, Callable[[SimulatedTracker], list[bytes]]] = {
     es.GET_SYSTEM_STATUS: _system,
-    es.INITIALIZE: _initialize,
-    es.START_MEASUREMENT: _measure,
-    es.FIND_REFLECTOR: lambda t, body: _acquire(t, es.FIND_REFLECTOR),
-    es.GO_POSITION: _go,
     es.GET_REFLECTORS: _reflectors,
     es.GET_TRACKER_INFO: _info,
-    es.GET_ENVIRONMENT: lambda t, body: t.answer(
-        es.GET_ENVIRONMENT, es.OK, struct.pack("<3d", *t.environment())
-    ),
-    es.GET_STATUS_INFO: lambda t, body: t.answer(
-        es.GET_STATUS_INFO, es.OK, struct.pack("<Ii", es.OK, t.status())
-    ),
+    es.GET_ENVIRONMENT: lambda t: [struct.pack("<3d", *t.environment())],
+    es.GET_STATUS_INFO: _status,
 }
+"""What answers a question, a packet each."""
 
 
 def operations(t: SimulatedTracker) -> admin.Operations:
@@ -256,7 +235,7 @@ def operations(t: SimulatedTracker) -> admin.Operations:
         t.tell(es.REFLECTOR_CHANGED)
 
     def transform(on: bool) -> None:
-        settings = list(struct.unpack("<I8i", t.settings[es.GET_SETTINGS]))
+        settings = list(t.setting(es.GET_SETTINGS, "<I8i"))
         settings[1] = int(on)
         t.settings[es.GET_SETTINGS] = struct.pack("<I8i", *settings)
         t.tell(8)
@@ -325,23 +304,15 @@ def serve(t: SimulatedTracker, door: socket.socket) -> None:
 
 def main() -> None:
     """Run until the parent ends."""
-    parser = admin.device_parser(__doc__)
-    parser.add_argument("--host", required=True)
-    parser.add_argument("--port", type=int, default=7000)
-    parser.add_argument("--range-std", type=float, nargs=2, required=True)
-    parser.add_argument("--transverse-std", type=float, nargs=2, required=True)
-    parser.add_argument("--orientation-std", type=float, default=8.7e-5)
-    options = parser.parse_args()
-    admin.end_with_parent()
+    orientation: dict[str, Any] = {"--orientation-std": {"type": float, "default": 8.7e-5}}
+    options = admin.begin(__doc__, {**admin.NETWORK, **admin.NOISE, **orientation})
     measuring, turning = np.random.default_rng(options.seed).spawn(2)
     along, across = tuple(options.range_std), tuple(options.transverse_std)
-    board = Blackboard.attach(options.directory / "world.bin")
-    tracker = SimulatedTracker(
-        Station(board, Beam(along, across), measuring),
-        SimulatedNoise(along, across, options.orientation_std),
-        turning,
-    )
-    door = socket.create_server((options.host, options.port), backlog=1)
+    board = Blackboard(options.directory / "world.bin")
+    station = Station(board, Beam(along, across), measuring)
+    noise = SimulatedNoise(along, across, options.orientation_std)
+    tracker = SimulatedTracker(station, noise, turning)
+    door = socket.create_server((options.host, options.port or 7000), backlog=1)
     admin.serve(options.directory / "tracker.sock", operations(tracker))
     serve(tracker, door)
 

@@ -1,18 +1,30 @@
-"""A simulated force sensor on a pseudo-terminal: `DIR/force`, admin `force.sock`.
+"""A simulated force sensor: on a pseudo-terminal `DIR/force`, or in a network; admin `force.sock`.
 
-    python -m hilcal.drivers.simulated.force_server --directory DIR --kind ft300|bota|hex --seed N
-        [--rate HZ] [--on S]
+    python -m hilcal.drivers.simulated.force_server --directory DIR --kind ft300|bota|hex|netft
+        --seed N [--rate HZ] [--on S] [--host 127.A.B.C --port 49152 --web-port 8081]
 
-Admin operations besides those of the line (`PtyPort.faults`): `overload {force}` adds a wrench
-(6 numbers, N and N·m), `freeze {on}` repeats one reading, `stall {on}` stops sending while the
-sensor's clock goes on, `state`; Bota: `saturate {on}` and `clock {us}`.
+Admin operations: `overload {force}` adds a wrench (6 numbers, N and N·m), `freeze {on}` repeats one
+reading, `stall {on}` stops sending while the sensor's clock goes on, `state`; Bota: `saturate {on}`
+and `clock {us}`; those of the line (`PtyPort.faults`) where it has one.
+
+An ATI Net F/T sends records by RDT on UDP and has its page on HTTP. Its further operations:
+`restart` as after a power cut: it counts anew and waits for a request, `lose {share}` of the
+datagrams, `twice {share}` sends some again, `cut {share}` of them short, `status {word}` sends this
+status, `page {words}` other elements of its page. Source: as `hilcal.drivers.netft`. pynetft, a
+client of others, is tested against it.
 """
 
+import argparse
 import binascii
+import contextlib
+import select
+import socket
 import struct
+import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from typing import Any
 
 import numpy as np
@@ -22,27 +34,19 @@ from hilcal.drivers.simulated.blackboard import Blackboard
 from hilcal.drivers.simulated.pty_port import PtyPort, crc16
 from hilcal.types import Floats
 
-TICK_S = 0.004
-"""Frames are handed over in batches at least so far apart, as a USB adapter does."""
-LATE_S = 2.0
-"""Frames that are later than this are lost: the process was suspended."""
+TICK_S = 0.004  # frames are handed over in batches at least so far apart, as a USB adapter does
+LATE_S = 2.0  # frames that are later than this are lost: the process was suspended
 
-BIAS_STD = np.repeat((4.0, 0.2), 3)
-"""The zero of a sensor as delivered and bolted on, N and N·m."""
+BIAS_STD = np.repeat((4.0, 0.2), 3)  # the zero of a sensor as delivered and bolted on, N and N·m
 DRIFT_STD = np.repeat((0.05, 0.002), 3)
 """Drift of the zero with the sensor's temperature, N/K and N·m/K."""
-WARM_K, WARM_S = 7.0, 600.0
-"""Own heat above the air and how fast it comes (world time)."""
-ROOM = 22.0
-"""Air temperature where the world does not tell, °C."""
+WARM_K, WARM_S = 7.0, 600.0  # own heat above the air and how fast it comes (world time)
+ROOM = 22.0  # air temperature where the world does not tell, °C
 
 
 @dataclass(slots=True, eq=False)
 class StrainGauge:
-    """The sensor's measuring bridge: what strain gauges make of the true wrench.
-
-    wrench = true + bias + drift (T - T_start) + overload + noise
-    """
+    """The measuring bridge: wrench = true + bias + drift (T - T_start) + overload + noise."""
 
     board: Blackboard
     rng: np.random.Generator
@@ -86,33 +90,33 @@ class StrainGauge:
         """Repeat one reading, or no longer."""
         self.frozen = self.read(1)[0] if on else None
 
+    def faults(self, stream: object) -> dict[str, Callable[..., object]]:
+        """Return what can go wrong with a sensor and its stream, by name."""
+        stall = admin.setter(stream, "stalled")
+        return {"overload": self.add, "freeze": self.freeze, "stall": stall}
+
+    def state(self) -> dict[str, Any]:
+        """Return zero and noise."""
+        return {"bias": list(self.bias), "noise": list(self.noise)}
+
     def _own_heat(self, time: float) -> float:
         """Return by how much it is warmer than the air at a world time (s), K."""
         return float(WARM_K * (1.0 - np.exp(-(time + self.on) / WARM_S)))
 
 
 class SensorProtocol:
-    """A sensor's wire protocol; this one streams from power-on and takes no commands.
-
-    Attributes:
-        baud: the line's rate, Bd.
-        noise: of one frame, force in N and moment in N·m.
-    """
+    """A sensor's wire protocol; this one streams from power-on and takes no commands."""
 
     baud = 0
     noise = (0.0, 0.0)
     usual_rate = 1000.0
 
     def __init__(self, rate: float | None = None) -> None:
-        """Switch on."""
         self.rate = self.usual_rate if rate is None else rate
         self.streaming = True
 
     def frame(self, number: int, wrench: Floats, temperature: float) -> bytes:
-        """Return one frame of a wrench (6,), N and N·m, and a temperature, °C.
-
-        `number` counts frames since power-on, lost ones, too.
-        """
+        """Return frame `number` since power-on of a wrench (6,) and a temperature, °C."""
         raise NotImplementedError
 
     def receive(self, data: bytes, wrench: Floats) -> bytes:
@@ -134,22 +138,15 @@ def crc16_x25(data: bytes) -> int:
 
 
 class Bota(SensorProtocol):
-    """Bota Systems Rokubi and SensONE.
-
-    Frame (Bota Systems' public Arduino and ROS drivers): `AA`, `<H6fIf` of status, wrench, device
-    time in µs and °C, then CRC-16/X25 over those 34 bytes, little-endian: 37 bytes at 460800 Bd.
-    Status bits: 0 skipped samples, 1 over range, 2 invalid measurement, 3 raw values.
-    """
+    """Bota Systems Rokubi and SensONE; the frame is described in `hilcal.drivers.bota`."""
 
     baud = 460800
     noise = (0.05, 0.002)
     over_range = 1 << 1
-    full = np.array([500.0, 500.0, 1200.0, 15.0, 15.0, 10.0])
-    """Full scale of a SensONE, N and N·m."""
+    full = np.array([500.0, 500.0, 1200.0, 15.0, 15.0, 10.0])  # full scale of a SensONE, N and N·m
     _body = struct.Struct("<H6fIf")
 
     def __init__(self, rate: float | None = None) -> None:
-        """Switch on."""
         super().__init__(rate)
         self.saturated = False
         self._start_us = 0
@@ -171,12 +168,7 @@ class Bota(SensorProtocol):
 
 
 class Hex(SensorProtocol):
-    """OptoForce (OnRobot) HEX, 10 to 1000 Hz.
-
-    Frame (OptoForce, "OptoForce General DAQ", 6-axis): `AA 07 08 10`, `>HH6h` of counter, status,
-    wrench in counts, then the sum of all bytes before it as a big-endian u16: 22 bytes at 1 MBd.
-    The counts per newton are each sensor's own; here 50 per N and 2000 per N·m.
-    """
+    """OptoForce (OnRobot) HEX, 10 to 1000 Hz, described in `hilcal.drivers.onrobot_hex`."""
 
     baud = 1_000_000
     noise = (0.05, 0.001)
@@ -201,22 +193,15 @@ _STOP_BYTES = 50
 
 
 class Ft300(SensorProtocol):
-    """Robotiq FT 300: Modbus RTU slave 9, and a stream of its own; it tells no time.
-
-    Robotiq, "FT 300 Instruction Manual", chapters "Modbus RTU" and "Data stream": 19200 Bd 8N1,
-    100 Hz, frame `20 4E`, six int16 (N·100, N·m·1000), CRC-16/MODBUS over all before it, everything
-    little-endian. Writing 0200 to register 410 starts the stream, fifty bytes FF stop it.
-    """
+    """Robotiq FT 300, described in `hilcal.drivers.ft300`; it tells no time."""
 
     baud = 19200
     noise = (0.1, 0.005)
     usual_rate = 100.0
-    full = np.repeat((300.0, 30.0), 3)
-    """Full scale, N and N·m."""
+    full = np.repeat((300.0, 30.0), 3)  # full scale, N and N·m
     scale = np.repeat((100.0, 1000.0), 3)
 
     def __init__(self, rate: float | None = None) -> None:
-        """Switch on: it waits for requests."""
         super().__init__(rate)
         self.streaming = False
         self._stop_bytes = 0
@@ -360,44 +345,203 @@ class Stream:
 
     def operations(self) -> admin.Operations:
         """Return what can be asked."""
-        own: dict[str, Callable[..., object]] = {
-            "overload": self.gauge.add,
-            "freeze": self.gauge.freeze,
-            "stall": admin.setter(self, "stalled"),
-        }
-        return admin.Operations(own | self.sensor.operations() | self.port.faults(), self.state)
+        own = self.gauge.faults(self) | self.sensor.operations() | self.port.faults()
+        return admin.Operations(own, self.state)
 
     def state(self) -> dict[str, Any]:
         """Return sensor, line and faults."""
-        return self.port.state() | {
-            "bias": list(self.gauge.bias),
-            "noise": list(self.gauge.noise),
-            "temperature": self.gauge.temperature(),
-            "rate": self.sensor.rate,
-            "streaming": self.sensor.streaming,
-            "stalled": self.stalled,
-            "frames": self.number,
-            "lost": self.lost,
+        return (
+            self.port.state()
+            | self.gauge.state()
+            | {
+                "temperature": self.gauge.temperature(),
+                "rate": self.sensor.rate,
+                "streaming": self.sensor.streaming,
+                "stalled": self.stalled,
+                "frames": self.number,
+                "lost": self.lost,
+            }
+        )
+
+
+COUNTS = np.repeat((1_000_000.0, 1_000_000.0), 3)
+RDT_NOISE = (0.02, 0.0005)
+FULL = np.array([660.0, 660.0, 1980.0, 60.0, 60.0, 60.0])  # full scale, N and N·m; a Delta's
+MEASURING_HZ = 7000
+SATURATED = 0x80020000
+_FACTORS = {"N": 1.0, "lbf": 1.0 / 4.4482216152605}
+
+
+@dataclass(slots=True, eq=False)
+class NetFt:
+    """The sensor: who is sent to, and how far it has counted."""
+
+    gauge: StrainGauge
+    rng: np.random.Generator
+    rate: float
+    line: socket.socket
+    client: tuple[str, int] | None = None  # address that asked for records; None is nobody
+    left: int = 0  # how many records are left to send; 0 is without end
+    number: int = 0
+    due: float = 0.0  # when the next one is due, `time.monotonic`
+    begun: float = field(default_factory=time.monotonic)
+    stalled: bool = False
+    lose: float = 0.0
+    twice: float = 0.0  # share of datagrams that come again later
+    cut: float = 0.0  # share of datagrams that are cut short
+    status: int | None = None  # sent instead of its own where it is not None
+    elements: dict[str, str] = field(default_factory=dict)
+
+    def page(self) -> str:
+        """Return its page netftapi2.xml."""
+        elements = {
+            "prodname": "SIM NET F/T",
+            "runstat": "0x00000000",
+            "cfgcalsn": "FT31415",
+            "scfgfu": "N",
+            "scfgtu": "N-m",
+            "cfgtfx": "0;0;0;0;0;0",
+            "scfgtdu": "mm",
+            "scfgtau": "degrees",
+            "cfgcpf": f"{COUNTS[0]:.0f}",
+            "cfgcpt": f"{COUNTS[3]:.0f}",
+            "comrdte": "Enabled",
+            "comrdtrate": f"{self.rate:.0f}",
+            "comrdtbsiz": "1",
+            **self.elements,
         }
+        lines = "".join(f"<{name}>{value}</{name}>\n" for name, value in elements.items() if value)
+        return f'<?xml version="1.0"?>\n<netft>\n{lines}</netft>\n'
+
+    def step(self) -> None:
+        """Wait for a request or the next batch, and serve it."""
+        wait = TICK_S if self.client is not None else 10 * TICK_S
+        if select.select([self.line], [], [], wait)[0]:
+            data, sender = self.line.recvfrom(64)
+            if len(data) == 8:
+                self._asked(sender, *struct.unpack(">HHI", data))
+        now = time.monotonic()
+        if self.client is None or now < self.due:
+            return
+        count = int((now - self.due) * self.rate) + 1
+        late = count - int(LATE_S * self.rate)
+        if late > 0:
+            self._skip(late)
+            count -= late
+        for wrench in self.gauge.read(count):
+            self._skip(1)
+            if not self.stalled:
+                self._send(wrench)
+
+    def _asked(self, sender: tuple[str, int], header: int, command: int, count: int) -> None:
+        if header != 0x1234:
+            return
+        if command == 0:
+            self.client = None
+        elif command in (2, 3):
+            self.client, self.left, self.number = sender, count, 0
+            self.due = time.monotonic()
+
+    def _skip(self, count: int) -> None:
+        self.number += count
+        self.due += count / self.rate
+
+    def _send(self, wrench: Any) -> None:
+        inside = np.clip(wrench, -FULL, FULL)
+        over = SATURATED if np.any(inside != wrench) else 0
+        status = over if self.status is None else self.status
+        measured = int((self.due - self.begun) * MEASURING_HZ) & 0xFFFFFFFF
+        unit = np.repeat([_FACTORS[self.elements.get("scfgfu", "N")], 1.0], 3)
+        counts = np.rint(inside * unit * COUNTS).astype(int)
+        record = struct.pack(">3I6i", self.number & 0xFFFFFFFF, measured, status, *counts)
+        lost, again, cut = self.rng.random(3) < (self.lose, self.twice, self.cut)
+        with contextlib.suppress(OSError):  # nobody listens there any more
+            if not lost and self.client is not None:
+                self.line.sendto(record[: 20 if cut else None], self.client)
+                if again:
+                    self.line.sendto(record, self.client)
+        if self.left:
+            self.left -= 1
+            if not self.left:
+                self.client = None
+
+    def restart(self) -> None:
+        """Count anew, and wait for a request."""
+        self.client, self.number, self.begun = None, 0, time.monotonic()
+
+    def operations(self) -> admin.Operations:
+        """Return what can be asked."""
+        own = self.gauge.faults(self) | {
+            "restart": self.restart,
+            **{name: admin.setter(self, name, float) for name in ("lose", "twice", "cut")},
+            "status": admin.setter(self, "status", lambda word: word),
+            "page": admin.setter(self, "elements", dict),
+        }
+        return admin.Operations(own, self.state)
+
+    def state(self) -> dict[str, Any]:
+        """Return what it does."""
+        return self.gauge.state() | {"frames": self.number, "streaming": self.client is not None}
+
+
+def serve_page(sensor: NetFt, host: str, port: int) -> None:
+    """Answer on HTTP in a daemon thread."""
+
+    class Page(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            there = self.path.split("?")[0] == "/netftapi2.xml"
+            words = (sensor.page() if there else "not found").encode()
+            self.send_response(200 if there else 404)
+            self.send_header("Content-Type", "text/xml")
+            self.send_header("Content-Length", str(len(words)))
+            self.end_headers()
+            self.wfile.write(words)
+
+        def log_message(self, format: str, *args: Any) -> None:
+            """Say nothing."""
+
+    server = HTTPServer((host, port), Page)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+
+
+def start_rdt(options: argparse.Namespace, board: Blackboard) -> NetFt:
+    """Return the sensor of a network, which answers on HTTP already."""
+    measuring, faults = np.random.default_rng(options.seed).spawn(2)
+    line = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    line.bind((options.host, options.port or 49152))
+    gauge = StrainGauge.draw(board, RDT_NOISE, measuring, options.on)
+    sensor = NetFt(gauge, faults, options.rate or 1000.0, line)
+    serve_page(sensor, options.host, options.web_port)
+    return sensor
+
+
+def start_serial(options: argparse.Namespace, board: Blackboard) -> Stream:
+    """Return the sensor of a serial line."""
+    measuring, faults = np.random.default_rng(options.seed).spawn(2)
+    sensor = KINDS[options.kind](options.rate)
+    gauge = StrainGauge.draw(board, sensor.noise, measuring, options.on)
+    port = PtyPort(options.directory / "force", sensor.baud, faults)
+    return Stream(sensor, gauge, port, due=time.monotonic())
 
 
 def main() -> None:
     """Run until the parent ends."""
-    parser = admin.device_parser(__doc__)
-    parser.add_argument("--kind", choices=sorted(KINDS), required=True)
-    parser.add_argument("--rate", type=float, help="frames per second")
-    parser.add_argument("--on", type=float, default=1200.0, help="s that it has been on")
-    options = parser.parse_args()
-    admin.end_with_parent()
-    sensor = KINDS[options.kind](options.rate)
-    measuring, faults = np.random.default_rng(options.seed).spawn(2)
-    board = Blackboard.attach(options.directory / "world.bin")
-    gauge = StrainGauge.draw(board, sensor.noise, measuring, options.on)
-    port = PtyPort(options.directory / "force", sensor.baud, faults)
-    stream = Stream(sensor, gauge, port, due=time.monotonic())
-    admin.serve(options.directory / "force.sock", stream.operations())
+    options = admin.begin(
+        __doc__,
+        {
+            "--kind": {"choices": [*sorted(KINDS), "netft"], "required": True},
+            "--host": {},
+            "--port": {"type": int},
+            "--web-port": {"type": int, "default": 8081},
+            "--rate": {"type": float, "help": "frames per second"},
+            "--on": {"type": float, "default": 1200.0, "help": "s that it has been on"},
+        },
+    )
+    board = Blackboard(options.directory / "world.bin")
+    sensor = (start_rdt if options.kind == "netft" else start_serial)(options, board)
+    admin.serve(options.directory / "force.sock", sensor.operations())
     while True:
-        stream.step()
+        sensor.step()
 
 
 if __name__ == "__main__":

@@ -16,24 +16,258 @@ CRC-16/ARC over the line without the checksum and its comma.
 
 import re
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
 
 from hilcal.drivers.simulated import admin
-from hilcal.drivers.simulated.blackboard import Blackboard
-from hilcal.drivers.simulated.geocom_station import AIM_S, Beam, Station
+from hilcal.drivers.simulated.admin import setter
+from hilcal.drivers.simulated.blackboard import Blackboard, settled_truth
 from hilcal.drivers.simulated.pty_port import PtyPort, crc16
+from hilcal.types import Floats
+
+
+@dataclass(frozen=True, slots=True)
+class PolarPoint:
+    """A direction and a slope distance: x = d sinV sinHz, y = d sinV cosHz, z = d cosV."""
+
+    hz: float  # horizontal angle, 0 to 2 pi, rad
+    v: float  # zenith angle, 0 to pi, rad
+    distance: float  # m
+
+    @staticmethod
+    def of(point: Floats) -> "PolarPoint":
+        """Return the polar coordinates of a point (3,), m."""
+        x, y, z = map(float, point)
+        level = float(np.hypot(x, y))
+        hz, v = np.arctan2(x, y) % (2 * np.pi), np.arctan2(level, z)
+        return PolarPoint(float(hz), float(v), float(np.hypot(level, z)))
+
+    def angle_to(self, other: "PolarPoint") -> float:
+        """Return the angle between two directions, rad."""
+        return float(np.arccos(np.clip(self.direction() @ other.direction(), -1.0, 1.0)))
+
+    def direction(self) -> Floats:
+        """Return the unit vector (3,)."""
+        level = np.sin(self.v)
+        return np.array([level * np.sin(self.hz), level * np.cos(self.hz), np.cos(self.v)])
+
+
+@dataclass(frozen=True, slots=True)
+class Beam:
+    """Noise of one measurement at the distance d.
+
+    sigma_range = a + b d,   sigma_transverse = c + e d in each direction across the beam,
+    sigma_v = sigma_transverse / d,   sigma_hz = sigma_transverse / (d sin v)
+    """
+
+    range_std: tuple[float, float]  # (a, b) in m and m/m
+    transverse_std: tuple[float, float]  # (c, e) in m and m/m
+
+    def angle_std(self, distance: float) -> float:
+        """Return sigma_transverse / d, rad."""
+        return self.transverse_std[0] / distance + self.transverse_std[1]
+
+    def observe(self, true: PolarPoint, rng: np.random.Generator) -> PolarPoint:
+        """Return one measurement of a target; every call draws anew."""
+        across = self.angle_std(true.distance)
+        draw = rng.standard_normal(3)
+        # straight above the station the horizontal angle is arbitrary
+        hz = true.hz + draw[0] * min(across / max(np.sin(true.v), 1e-12), np.pi)
+        v = true.v + draw[1] * across
+        if not 0.0 <= v <= np.pi:  # over the zenith or the nadir
+            hz, v = hz + np.pi, (-v if v < 0.0 else 2 * np.pi - v)
+        along = self.range_std[0] + self.range_std[1] * true.distance
+        return PolarPoint(float(hz % (2 * np.pi)), float(v), float(true.distance + draw[2] * along))
+
+
+WARNINGS = (0, 1283, 1284)
+BEHIND_M = 0.2  # two reflectors are at two places
+AIM_S = 0.3  # world time of a search, a fine adjustment, a lock-in or a turn, s
+FIELD_OF_VIEW = 0.026  # half angle in which the camera sees its target, rad (1.5°)
+LEVEL_STD = 1e-6  # noise of the inclinations, rad
+
+
+@dataclass(slots=True, eq=False)
+class Station:
+    """A tracking station: it holds its target through jumps as long as the beam is free."""
+
+    board: Blackboard
+    beam: Beam
+    rng: np.random.Generator
+    meas_s: float = 0.3  # world time of one distance measurement, s
+    locked: bool = True  # whether the target is held; no lock, no distance
+    broken: bool = False  # whether something stands in the beam
+    dist_error: bool = False  # whether distance measurements fail (1292)
+    warning: int = 0  # code given instead of 0 with a good measurement, 0 is none
+    busy: bool = False  # whether measurements are refused (1293)
+    delays: dict[int, tuple[float, int]] = field(default_factory=dict)
+    """By procedure, s of real time and how many answers are late."""
+    wrong_transactions: int = 0  # so many next answers carry a wrong transaction number
+    lock_enabled: bool = True  # what 9020 has set
+    atr_enabled: bool = True  # what 9018 has set
+    digits: int = 15  # decimals of floating-point numbers
+    atmosphere: tuple[float, ...] = (658e-9, 1013.25, 20.0, 20.0)
+    """Wavelength m, pressure mbar, dry and wet temperature °C."""
+    settings: dict[int, str] = field(
+        default_factory=lambda: {2020: "2", 17019: "0", 17021: "0", 17008: "0"}
+    )
+    """Values of plain settings by the procedure that sets them."""
+    pointing: PolarPoint = field(default_factory=lambda: PolarPoint(0.0, np.pi / 2, 0.0))
+    """Where the telescope looks."""
+    distance: float = 0.0  # the last distance, m; 0 is none
+    distance_ms: int = 0  # station time of it, ms
+    ranging: float | None = None
+    """Until when a distance measurement runs, `time.monotonic`; None is not."""
+    tracking: bool = False  # whether the distance meter goes on by itself
+    requests: deque[tuple[int, tuple[str, ...]]] = field(
+        default_factory=lambda: deque(maxlen=10_000)
+    )
+    measured: int = 0
+    number: int = 0  # of the target that is held, or was last
+    hidden: set[int] = field(default_factory=set)  # numbers of targets that cannot be seen
+    several: bool = False
+    seen: PolarPoint | None = None
+    stuck: PolarPoint | None = None
+    """What is measured to the last digit whatever the target does; None is the target."""
+    stray: PolarPoint | None = None
+    """A reflector at rest that is followed instead; None is the target."""
+
+    def faults(self) -> dict[str, Callable[..., None]]:
+        """Return what can go wrong between instrument and target, by name."""
+        return {
+            "beam": setter(self, "broken"),
+            "hide": self.hide,
+            "lock_lost": lambda: setattr(self, "locked", False),
+            "freeze": lambda on: setattr(self, "stuck", self.seen if on else None),
+            "stray": self.follow_stray,
+        }
+
+    def hide(self, targets: Iterable[int]) -> None:
+        """Cover these targets by number, and no others."""
+        self.hidden = {int(k) for k in targets}
+        self.locked = self.locked and self.number not in self.hidden
+
+    def follow_stray(self, on: bool) -> None:
+        """Follow a reflector at rest behind where the target is now, or the target again."""
+        seen = self.target() if on else None
+        self.stray = seen and replace(seen, distance=seen.distance + BEHIND_M)
+
+    def warn(self, code: int) -> None:
+        """Give a warning with every good measurement, or none (0)."""
+        if code not in WARNINGS:
+            raise ValueError(f"code = {code}; valid: {WARNINGS}")
+        self.warning = code
+
+    def targets(self) -> dict[int, PolarPoint]:
+        """Return where the targets that can be seen truly are at this moment, by number."""
+        if self.broken:
+            return {}
+        truth = settled_truth(self.board)
+        points = truth["targets"]
+        given = np.isfinite(points).all(axis=1) & points.any(axis=1)
+        self.several = bool(given.any())
+        if not self.several:
+            points = truth["target"][None]
+            given = np.isfinite(points).all(axis=1) & points.any(axis=1)  # the world has begun
+        seen = (k for k in np.flatnonzero(given).tolist() if k not in self.hidden)
+        return {k: PolarPoint.of(points[k]) for k in seen}
+
+    def target(self) -> PolarPoint | None:
+        """Return where its target truly is at this moment; None where it cannot be seen."""
+        return self.stray or self.targets().get(self.number)
+
+    def held(self) -> PolarPoint | None:
+        """Return where the held target truly is; None without lock or sight."""
+        return self.target() if self.locked else None
+
+    def look(self) -> PolarPoint | None:
+        """Measure the held target once and turn the telescope to it; None without one."""
+        true = self.held()
+        if true is None:
+            return None
+        seen = self.stuck or self.beam.observe(true, self.rng)
+        self.pointing = self.seen = seen
+        self.measured += 1
+        return seen
+
+    def wait(self, world_seconds: float) -> None:
+        """Take so much world time."""
+        time.sleep(max(0.0, world_seconds) / self.board.scale)
+
+    def acquire(self, window: float = np.inf) -> bool:
+        """Search and hold the target that is closest to where it looks: whether there is any.
+
+        Of several targets only those within `window` of that direction count, rad.
+        """
+        self.wait(AIM_S)
+        seen = self.targets()
+        if self.several:
+            seen = {k: at for k, at in seen.items() if at.angle_to(self.pointing) <= window}
+        if seen:
+            self.number = min(seen, key=lambda k: seen[k].angle_to(self.pointing))
+        self.locked = bool(seen)
+        self.look()
+        return self.locked
+
+    def start_ranging(self) -> None:
+        """Start a distance measurement; it takes `meas_s` of world time."""
+        self.distance, self.distance_ms = 0.0, 0
+        self.ranging = time.monotonic() + self.meas_s / self.board.scale
+
+    def stop_ranging(self, *, clear: bool) -> None:
+        """Measure no distance any more, and forget the last one."""
+        self.ranging = None
+        self.distance = 0.0 if clear else self.distance
+
+    def finish_ranging(self, patience: float) -> None:
+        """Wait for a running distance measurement, at most `patience` s of world time."""
+        if self.ranging is not None:
+            left = self.ranging - time.monotonic()
+            time.sleep(max(0.0, min(left, patience / self.board.scale)))
+            self.tick()
+
+    def tick(self) -> None:
+        """Take the distance if its time has come: where the target is at that moment."""
+        if self.ranging is None or time.monotonic() < self.ranging:
+            return
+        self.ranging = None
+        seen = self.look()
+        if seen is not None and not self.dist_error:
+            self.distance, self.distance_ms = seen.distance, int(self.board.time * 1e3)
+
+    def turn(self, hz: float, v: float) -> None:
+        """Point elsewhere; the lock ends unless the target is in the field of view there."""
+        self.pointing = PolarPoint(hz % (2 * np.pi), v, 0.0)
+        true = self.target()
+        if true is None or true.angle_to(self.pointing) > FIELD_OF_VIEW:
+            self.locked = False
+
+    def inclination(self) -> tuple[float, float, float]:
+        """Return cross and lengthwise inclination and their accuracy, rad: it stands level."""
+        cross, length = self.rng.normal(0.0, LEVEL_STD, 2)
+        return float(cross), float(length), LEVEL_STD
+
+    def temperature(self) -> float:
+        """Return the temperature inside, °C: some kelvins above the air's."""
+        air = float(self.board.read("truth")["air_temperature"])
+        return (air if air != 0.0 else 20.0) + 6.0
+
 
 OK = 0
-CANNOT_DECODE = 3080  # COM_CANT_DECODE_REQ
-UNKNOWN_PROCEDURE = 3081  # COM_PROC_UNAVAIL
+INVALID_PARAMETER = 2
+ANGLES_ONLY = 1285  # TMC_ANGLE_OK: no distance, which is given as 0
+DISTANCE_ERROR, BUSY = 1292, 1293
+CANNOT_DECODE, UNKNOWN_PROCEDURE = 3080, 3081  # COM_CANT_DECODE_REQ, COM_PROC_UNAVAIL
 BAD_CHECKSUM = 3101  # COM_SRVR_RX_CHECKSUM_ERROR
+NO_TARGET, NOT_ENABLED = 8710, 8714
 
 _REQUEST = re.compile(r"%R1Q,(\d{1,5})(?:,(\d{1,5}))?(?:,(\d{1,5}))?:(.*)")
+NAME, SERIAL = "SIM LASER STATION", 123456
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,11 +289,9 @@ def parse(line: str) -> GeocomRequest | None:
     if match is None:
         return GeocomRequest(-1, 0, (), False, CANNOT_DECODE)
     rpc, transaction, crc, rest = match.groups()
+    bare = f"%R1Q,{rpc},{transaction}:{rest}".encode("ascii", "replace")
+    error = OK if crc is None or int(crc) == crc16(bare, 0) else BAD_CHECKSUM
     parameters = tuple(rest.split(",")) if rest else ()
-    error = OK
-    if crc is not None:
-        bare = f"%R1Q,{rpc},{transaction}:{rest}"
-        error = OK if int(crc) == crc16(bare.encode("ascii", "replace"), 0) else BAD_CHECKSUM
     return GeocomRequest(int(rpc), int(transaction or 0), parameters, crc is not None, error)
 
 
@@ -74,27 +306,18 @@ def reply(
     return f"{head}:{body}\r\n".encode()
 
 
-INVALID_PARAMETER = 2
-ANGLES_ONLY = 1285  # TMC_ANGLE_OK: no distance, which is given as 0
-DISTANCE_ERROR = 1292
-BUSY = 1293
-NO_TARGET = 8710
-NOT_ENABLED = 8714
-
 Answer = tuple[int, list[str]]
-Procedure = Callable[[Station, tuple[str, ...]], Answer]
-
-NAME = "SIM LASER STATION"
-SERIAL = 123456
+Parameters = tuple[str, ...]
+Procedure = Callable[[Station, Parameters], Answer | None]  # none is `OK` without values
 
 
-def answer(station: Station, rpc: int, parameters: tuple[str, ...]) -> Answer:
+def answer(station: Station, rpc: int, parameters: Parameters) -> Answer:
     """Carry out a procedure; takes the time that it takes."""
     procedure = _PROCEDURES.get(rpc)
     if procedure is None:
         return UNKNOWN_PROCEDURE, []
     try:
-        return procedure(station, parameters)
+        return procedure(station, parameters) or (OK, [])
     except (ValueError, IndexError):  # too few parameters or no numbers
         return INVALID_PARAMETER, []
 
@@ -108,9 +331,8 @@ def _constant(*values: str) -> Procedure:
 
 
 def _setting(number: int) -> Procedure:
-    def store(station: Station, parameters: tuple[str, ...]) -> Answer:
+    def store(station: Station, parameters: Parameters) -> None:
         station.settings[number] = str(int(parameters[0]))
-        return OK, []
 
     return store
 
@@ -119,69 +341,65 @@ def _stored(number: int) -> Procedure:
     return lambda station, parameters: (OK, [station.settings[number]])
 
 
-def _set_precision(station: Station, parameters: tuple[str, ...]) -> Answer:
+def _tells(values: Callable[[Station], list[str]]) -> Procedure:
+    return lambda station, parameters: (OK, values(station))
+
+
+def _set_precision(station: Station, parameters: Parameters) -> None:
     digits = int(parameters[0])
     if not 0 <= digits <= 15:
-        return INVALID_PARAMETER, []
+        raise ValueError
     station.digits = digits
-    return OK, []
 
 
-def _date(station: Station, parameters: tuple[str, ...]) -> Answer:
+def _date(station: Station, parameters: Parameters) -> Answer:
     now = datetime.now(UTC)
     rest = (now.month, now.day, now.hour, now.minute, now.second)
     return OK, [str(now.year), *(f"'{value:02x}'" for value in rest)]
 
 
-def _set_atmosphere(station: Station, parameters: tuple[str, ...]) -> Answer:
+def _set_atmosphere(station: Station, parameters: Parameters) -> None:
     wavelength, pressure, dry, wet = map(float, parameters)
     station.atmosphere = (wavelength, pressure, dry, wet)
-    return OK, []
 
 
-def _switch_atr(station: Station, parameters: tuple[str, ...]) -> Answer:
+def _switch_atr(station: Station, parameters: Parameters) -> None:
     station.atr_enabled = bool(int(parameters[0]))
-    return OK, []
 
 
-def _switch_lock(station: Station, parameters: tuple[str, ...]) -> Answer:
+def _switch_lock(station: Station, parameters: Parameters) -> None:
     station.lock_enabled = bool(int(parameters[0]))
-    if not station.lock_enabled:
-        station.locked = False
-    return OK, []
+    station.locked = station.locked and station.lock_enabled
 
 
-def _lock_in(station: Station, parameters: tuple[str, ...]) -> Answer:
-    if not station.lock_enabled:
-        return NOT_ENABLED, []
-    return _acquire(station, parameters)
+def _lock_in(station: Station, parameters: Parameters) -> Answer:
+    return _acquire(station, parameters) if station.lock_enabled else (NOT_ENABLED, [])
 
 
-def _acquire(station: Station, parameters: tuple[str, ...]) -> Answer:
-    return (OK if station.acquire() else NO_TARGET), []
-
-
-def _fine_adjust(station: Station, parameters: tuple[str, ...]) -> Answer:
-    """AUT_FineAdjust: within a window, rad; the reference manual's are whole widths."""
-    window = 0.5 * max(float(parameters[0]), float(parameters[1]))
+def _acquire(station: Station, parameters: Parameters, window: float = np.inf) -> Answer:
     return (OK if station.acquire(window) else NO_TARGET), []
 
 
-def _turn(station: Station, parameters: tuple[str, ...]) -> Answer:
-    hz, v = float(parameters[0]), float(parameters[1])
-    station.turn(hz, v)
+def _fine_adjust(station: Station, parameters: Parameters) -> Answer:
+    """AUT_FineAdjust: within a window, rad; the reference manual's are whole widths."""
+    window = 0.5 * max(float(parameters[0]), float(parameters[1]))
+    return _acquire(station, parameters, window)
+
+
+def _turn(station: Station, parameters: Parameters) -> Answer | None:
+    station.turn(float(parameters[0]), float(parameters[1]))
     if len(parameters) > 3 and int(parameters[3]) == 1:  # AUT_TARGET: find it there
         return _acquire(station, parameters)
     station.wait(AIM_S)
-    return OK, []
+    return None
 
 
-def _lock_quality(station: Station, parameters: tuple[str, ...]) -> Answer:
+def _lock_quality(station: Station, parameters: Parameters) -> Answer:
     """0 not locked, 1 locked, 2 prediction: it was lost from sight."""
     return OK, ["0" if not station.locked else "1" if station.target() is not None else "2"]
 
 
-def _start_measuring(station: Station, parameters: tuple[str, ...]) -> Answer:
+def _start_measuring(station: Station, parameters: Parameters) -> Answer | None:
     """TMC_DoMeasure: 0 stop, 1 distance, 2 track, 3 clear, 6 restart."""
     if station.busy:
         return BUSY, []
@@ -190,64 +408,56 @@ def _start_measuring(station: Station, parameters: tuple[str, ...]) -> Answer:
     if command in (1, 2, 6):
         station.start_ranging()
     elif command in (0, 3):
-        station.ranging = None
-        station.distance = 0.0 if command == 3 else station.distance
+        station.stop_ranging(clear=command == 3)
     else:
-        return INVALID_PARAMETER, []
-    return OK, []
+        raise ValueError
+    return None
 
 
-def _angles(station: Station, parameters: tuple[str, ...]) -> Answer:
+def _angles(station: Station, parameters: Parameters) -> Answer:
     if station.busy:
         return BUSY, []
     seen = station.look() or station.pointing
     return station.warning, _number(station, seen.hz, seen.v)
 
 
-def _with_distance(station: Station, patience: float) -> tuple[int, float, float, float]:
-    """Return code, hz, v and distance of the measurement that 2008 has started."""
-    if station.busy:
-        return BUSY, 0.0, 0.0, 0.0
-    if station.tracking and station.ranging is None:
-        station.start_ranging()
-    station.finish_ranging(patience)
-    if station.dist_error:
-        return DISTANCE_ERROR, 0.0, 0.0, 0.0
-    seen = station.look() or station.pointing
-    code = station.warning if station.distance > 0.0 else ANGLES_ONLY
-    return code, seen.hz, seen.v, station.distance
+def _with_distance(full: bool) -> Procedure:
+    """TMC_GetSimpleMea, and TMC_GetFullMeas: of the measurement that 2008 has started.
+
+    hz, v, in full their accuracy, inclinations and theirs; distance, in full its time in ms.
+    """
+
+    def measured(station: Station, parameters: Parameters) -> Answer:
+        if station.busy:
+            return BUSY, []
+        if station.tracking and station.ranging is None:
+            station.start_ranging()
+        station.finish_ranging(int(parameters[0]) * 1e-3)
+        if station.dist_error:
+            return DISTANCE_ERROR, []
+        seen, distance = station.look() or station.pointing, station.distance
+        code = station.warning if distance > 0.0 else ANGLES_ONLY
+        if not full:
+            return code, _number(station, seen.hz, seen.v, distance)
+        accuracy = station.beam.angle_std(distance) if distance > 0.0 else 0.0
+        values = (seen.hz, seen.v, accuracy, *station.inclination(), distance)
+        return code, [*_number(station, *values), str(station.distance_ms)]
+
+    return measured
 
 
-def _simple(station: Station, parameters: tuple[str, ...]) -> Answer:
-    code, hz, v, distance = _with_distance(station, int(parameters[0]) * 1e-3)
-    if code in (BUSY, DISTANCE_ERROR):
-        return code, []
-    return code, _number(station, hz, v, distance)
-
-
-def _full(station: Station, parameters: tuple[str, ...]) -> Answer:
-    """TMC_GetFullMeas: hz, v, their accuracy, inclinations and theirs, distance, its time in ms."""
-    code, hz, v, distance = _with_distance(station, int(parameters[0]) * 1e-3)
-    if code in (BUSY, DISTANCE_ERROR):
-        return code, []
-    accuracy = station.beam.angle_std(distance) if distance > 0.0 else 0.0
-    cross, length, inclination = station.inclination()
-    values = (hz, v, accuracy, cross, length, inclination, distance)
-    return code, [*_number(station, *values), str(station.distance_ms)]
-
-
-def _measure(station: Station, parameters: tuple[str, ...]) -> Answer:
+def _measure(station: Station, parameters: Parameters) -> Answer:
     """BAP_MeasDistanceAngle: 0 last values, 1 angles, 2 to 4 distance, 5 clear, 6 stop."""
     if station.busy:
         return BUSY, []
     mode = int(parameters[0])
     if not 0 <= mode <= 6:
-        return INVALID_PARAMETER, []
+        raise ValueError
+    seen, distance = station.pointing, 0.0
     if mode in (5, 6):
-        station.ranging, station.tracking = None, False
-        station.distance = 0.0 if mode == 5 else station.distance
-        return OK, [*_number(station, station.pointing.hz, station.pointing.v, 0.0), str(mode)]
-    distance = 0.0
+        station.stop_ranging(clear=mode == 5)
+        station.tracking = False
+        return OK, [*_number(station, seen.hz, seen.v, 0.0), str(mode)]
     if mode >= 2:
         if not station.locked:
             station.wait(AIM_S)
@@ -256,8 +466,7 @@ def _measure(station: Station, parameters: tuple[str, ...]) -> Answer:
         station.finish_ranging(station.meas_s)
         if station.dist_error:
             return DISTANCE_ERROR, []
-        distance = station.distance
-        seen = station.pointing
+        seen, distance = station.pointing, station.distance
     else:
         seen = station.look() or station.pointing
         distance = station.distance if mode == 0 else 0.0
@@ -268,31 +477,31 @@ def _measure(station: Station, parameters: tuple[str, ...]) -> Answer:
 _PROCEDURES: dict[int, Procedure] = {
     0: _constant(),
     107: _set_precision,
-    108: lambda station, parameters: (OK, [str(station.digits)]),
+    108: _tells(lambda s: [str(s.digits)]),
     110: _constant("1", "50", "0"),
     2007: _constant("1"),
     2008: _start_measuring,
     2020: _setting(2020),
     2021: _stored(2020),
-    2022: lambda station, parameters: (OK, [*_number(station, 80.0), str(int(station.board.time))]),
+    2022: _tells(lambda s: [*_number(s, 80.0), str(int(s.board.time))]),
     2026: _constant("0"),
     2028: _set_atmosphere,
-    2029: lambda station, parameters: (OK, _number(station, *station.atmosphere)),
+    2029: _tells(lambda s: _number(s, *s.atmosphere)),
     2107: _angles,
-    2108: _simple,
-    2167: _full,
+    2108: _with_distance(full=False),
+    2167: _with_distance(full=True),
     5003: _constant(str(SERIAL)),
     5004: _constant(f'"{NAME}"'),
     5008: _date,
-    5011: lambda station, parameters: (OK, _number(station, station.temperature())),
+    5011: _tells(lambda s: _number(s, s.temperature())),
     5034: _constant("6", "20", "0"),
     5039: _constant("100", "1", "1"),
     6021: _lock_quality,
     9013: _lock_in,
     9018: _switch_atr,
-    9019: lambda station, parameters: (OK, [str(int(station.atr_enabled))]),
+    9019: _tells(lambda s: [str(int(s.atr_enabled))]),
     9020: _switch_lock,
-    9021: lambda station, parameters: (OK, [str(int(station.locked))]),
+    9021: _tells(lambda s: [str(int(s.locked))]),
     9027: _turn,
     9037: _fine_adjust,
     11001: _constant(),
@@ -381,18 +590,11 @@ def serve(station: Station, port: PtyPort) -> None:
 
 def main() -> None:
     """Run until the parent ends."""
-    parser = admin.device_parser(__doc__)
-    parser.add_argument("--range-std", type=float, nargs=2, required=True)
-    parser.add_argument("--transverse-std", type=float, nargs=2, required=True)
-    parser.add_argument("--baud", type=int, default=115200)
-    options = parser.parse_args()
-    admin.end_with_parent()
+    baud: dict[str, Any] = {"--baud": {"type": int, "default": 115200}}
+    options = admin.begin(__doc__, {**admin.NOISE, **baud})
     measuring, faults = np.random.default_rng(options.seed).spawn(2)
-    station = Station(
-        Blackboard.attach(options.directory / "world.bin"),
-        Beam(tuple(options.range_std), tuple(options.transverse_std)),
-        measuring,
-    )
+    beam = Beam(tuple(options.range_std), tuple(options.transverse_std))
+    station = Station(Blackboard(options.directory / "world.bin"), beam, measuring)
     port = PtyPort(options.directory / "tracker", options.baud, faults)
     admin.serve(options.directory / "tracker.sock", operations(station, port))
     serve(station, port)

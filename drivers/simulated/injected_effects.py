@@ -42,10 +42,7 @@ def typical_torque(arm: Arm) -> Floats:
 
 
 def typical_tilt(arm: Arm) -> Floats:
-    """Return the (n,) middle of twice the bearings' compliances, rad/(N·m).
-
-    Of a slide's carriage 1 mrad at its rated force half a metre off.
-    """
+    """Return the (n,) middle of twice the bearings' compliances, rad/(N·m)."""
     carriage = 2e-3 / (0.5 * typical_torque(arm))
     return np.where(arm.slides, carriage, typical_compliance(arm))
 
@@ -159,10 +156,8 @@ EFFECTS = (
     "tracker_scale",
 )
 """Every effect that can be hidden in any arm."""
-OF_SLIDES = ("guide_error",)
-"""Those that only arms with joints that slide have."""
-ALL_EFFECTS = (*EFFECTS, *OF_SLIDES)
-"""Every effect that can be hidden."""
+OF_SLIDES = ("guide_error",)  # those that only arms with joints that slide have
+ALL_EFFECTS = (*EFFECTS, *OF_SLIDES)  # every effect that can be hidden
 
 HARD_TO_SEPARATE = ("base_compliance", "link_compliance")
 """Effects that a campaign of six poses often does not separate from each other, or from
@@ -187,14 +182,8 @@ def nothing_hidden(
 ) -> World:
     """Return a world whose arm has joint compliance and nothing else that is wrong.
 
-    Where the cell does not know its registration or its target, the world draws its own.
-
-    Args:
-        cell: the cell as configured.
-        rng: generator.
-        noise: the tracker's noise; the usual class of laser trackers when None.
-        joint_std: the arm's repeatability at each joint, rad; 2e-5 is 0.02 mm to 0.03 mm at
-            the flange of an arm of 1.3 m.
+    Where the cell does not know its registration or its target, the world draws its own. The arm's
+    repeatability `joint_std`, rad, is 0.02 mm to 0.03 mm at the flange of an arm of 1.3 m.
     """
     registration, station = stand(cell, rng)
     truth = Truth.rigid(cell.arm)
@@ -254,17 +243,11 @@ def hide(
         strength_sigma: RMS over all whitened elements, >= 0.
         readings_mode: "absolute" or "deflection".
         rng: generator.
-        world: the world that the effect is added to; a fresh one when None (with drives half
-            as soft again where they stiffen, as real ones are at small torque).
+        world: the world that the effect is added to; a fresh one when None.
         m: elements per reading, 3 or 6.
         pose: (N,) index of the pose, for deflections; equal joints are one pose when None.
         cycle: (N,) index of the cycle, for deflections; one cycle when None.
         harmonics: number of harmonics of a hidden transmission error.
-
-    Raises:
-        InputError: an unknown effect or mode, an effect that deflections do not show, a
-            deflection without an unloaded reading, states that lack what the effect depends
-            on, or a strength that cannot be reached.
     """
     _check(effect, strength_sigma, readings_mode, m)
     if world is None:

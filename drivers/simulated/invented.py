@@ -9,15 +9,11 @@ import numpy as np
 from hilcal.effects.protocol import Columns, Effect, Parameter, Response, Situation
 from hilcal.types import Floats
 
-JOINT, BY = 2, 4
-"""Index of the joint that gives way, and of the one by whose angle it does."""
+JOINT, BY = 2, 4  # index of the joint that gives way, and of the one by whose angle it does
 
 
 class Invented(Effect):
-    """dq_3 = a cos(q_5) τ_3: joint 3 gives way to its torque τ_3 by the angle q_5 of the wrist.
-
-    As where a bundle of hoses along the forearm stiffens it, or not, with the turn of the wrist.
-    """
+    """dq_3 = a cos(q_5) τ_3: joint 3 gives way by the angle of the wrist, as with hoses."""
 
     name = "invented"
     summary = "dq_3 = a·cos(q_5)·τ_3"

@@ -45,10 +45,7 @@ def skew(vector: Floats) -> Floats:
 
 
 def moved_by(jacobian: Floats, arm: Floats) -> Floats:
-    """Return Jacobians (N, 6, k) taken at a point that lies `arm` (N, 3) further, same axes.
-
-    v' = v + omega × arm; rows are (v, omega), m and rad.
-    """
+    """Return Jacobians (N, 6, k) at a point `arm` (N, 3) further: v' = v + omega × arm."""
     out = jacobian.copy()
     out[:, :3] += np.cross(jacobian[:, 3:], arm[:, :, None], axis=1)
     return out
@@ -99,20 +96,10 @@ def build(
     moments: Floats | None = None,
     guides: bool = False,
 ) -> ElasticTree:
-    """Build the tree from the true links (n + 1, 4, 4); lengths in m, masses in kg.
+    """Build the tree from the true links (n + 1, 4, 4), m; first moments (n, 3) add to the bodies'.
 
-    Args:
-        arm: the arm; its own links are not used, `links` are.
-        links: (n + 1, 4, 4) the constant transforms as they truly are.
-        tool_mass: what the flange carries permanently, kg.
-        tool_com: (3,) its centre of mass, flange axes, m.
-        gravity: (3,) base axes, m/s².
-        tilts: whether base and bearings can tilt.
-        beams: whether long links get elastic tips.
-        tool: whether the flange can tilt; only then no constant transform is left behind the
-            last degree of freedom.
-        moments: (n, 3) first moments of the bodies beyond their own, body axes, kg·m.
-        guides: whether carriages of slides can be displaced by errors of their guides.
+    Only where the flange (`tool`) can tilt is no constant transform left behind the last degree of
+    freedom.
     """
     model = pin.Model()
     model.gravity.linear = np.asarray(gravity, dtype=float)
@@ -205,11 +192,7 @@ class Elasticity:
     turns: Floats | None = None  # (v, v) T; None: 1
 
     def give(self, tau: Floats, states: Ints) -> tuple[Floats, Floats]:
-        """Return delta (K, v) and its derivative by tau (K, v, v) in K of the states.
-
-        Raises:
-            InputError: the gear would soften to nothing.
-        """
+        """Return delta (K, v) and its derivative by tau (K, v, v) in K of the states."""
         if self.turns is None:
             return self._give(tau, states)
         delta, slack = self._give(tau @ self.turns, states)
@@ -252,24 +235,13 @@ def elasticity(
     extra: Floats | None = None,
     drive: Floats | None = None,
 ) -> Elasticity:
-    """Assemble the elastic law from physical constants.
+    """Assemble the elastic law from physical constants, named as in `Truth`.
 
     A beam of length L that carries (F, M) at its tip gives way there by L³/3EI F + L²/2EI M,
     turns by L²/2EI F + L/EI M and twists by L/GJ M (Euler-Bernoulli; e.g. Gere and
-    Timoshenko, Mechanics of Materials, table of cantilever deflections).
-
-    Args:
-        tree: the degrees of freedom.
-        joint: (n,) compliances of the drives, rad/(N·m).
-        stiffening: (n,) their cubic terms, rad/(N·m)³.
-        tilt: (n,) compliances of the bearings, rad/(N·m).
-        base: (3,) compliance of the base about x, y, z, rad/(N·m).
-        beam: (b, 2) 1/EI and 1/GJ of the long links, 1/(N·m²).
-        tool: (2,) compliance of the flange along and across its z axis, rad/(N·m).
-        play: (n,) half of the play of the drives, rad.
-        crossing: (n,) torque that crosses it, over 0, N·m.
-        extra: (N, n) compliances of the drives that belong to N states, rad/(N·m).
-        drive: (n, n) how far each drive turns each joint; None: its own.
+    Timoshenko, Mechanics of Materials, table of cantilever deflections). `play` (n,) is crossed at
+    the torque `crossing` (n,); `extra` (N, n) belongs to N states; `drive` (n, n) is how far each
+    drive turns each joint, its own where None.
     """
     size = tree.model.nv
     linear, cubic = np.zeros((size, size)), np.zeros(size)
@@ -330,27 +302,14 @@ def equilibrium(
     sensor: Misreading | None = None,
     guide: Floats | None = None,
 ) -> Equilibrium:
-    """Solve delta = law(tau(delta)) by Newton's method, to rounding.
+    """Solve delta = law(tau(delta)) by Newton's method, to rounding, for N states.
 
     tau(delta) is what weight and load exert on each degree of freedom *at the deflected
     configuration*. The load is dead: force and moment keep their directions in base axes
     while the point where they act moves with the deflected flange. Where a force sensor
     misread it, what it said is what keeps its directions in base axes: what acts follows from
-    that and from how the deflected flange holds the sensor.
-
-    Args:
-        tree: the arm.
-        law: its elasticity.
-        q: (N, n) joint angles without elasticity, rad.
-        wrench: (N, 6) force and moment at the load point, base axes, N and N·m.
-        load_point: (3,) flange axes, m.
-        growth: (N,) factor on every constant translation of the links, for a tree whose
-            flange can tilt; None: 1.
-        sensor: how `wrench` was misread, where it is not zero; None: it is true.
-        guide: (N, g, 5) errors of the guides, for a tree that has them; None: 0.
-
-    Raises:
-        InputError: when a state has no equilibrium, or the gear would soften to nothing.
+    that and from how the deflected flange holds the sensor. `growth` (N,) is a factor on the links,
+    of a tree whose flange can tilt; `guide` (N, g, 5) the errors of guides.
     """
     arm = _Loaded(tree, law, load_point, sensor)
     parts = [slice(k, k + _AT_ONCE) for k in range(0, max(len(q), 1), _AT_ONCE)]
@@ -374,11 +333,7 @@ class _Pull(NamedTuple):
 
 
 class _Loaded:
-    """One elastic arm with a dead load; Pinocchio's work space is reused from state to state.
-
-    Pinocchio takes one state at a time and a hundredth of a millisecond for each; everything
-    else is done for all states at once.
-    """
+    """One elastic arm with a dead load; only Pinocchio takes one state at a time."""
 
     def __init__(
         self,
@@ -387,7 +342,6 @@ class _Loaded:
         load_point: Floats,
         sensor: Misreading | None = None,
     ) -> None:
-        """Prepare the work space; `load_point` (3,) in flange axes, m."""
         self.tree, self.law = tree, law
         self.model = tree.model
         self.data = tree.model.createData()
@@ -399,12 +353,7 @@ class _Loaded:
         self.links: list[tuple[int, pin.SE3]] = []
 
     def grow(self, factor: float) -> None:
-        """Make every constant translation of the links so many times as long.
-
-        Raises:
-            ValueError: the flange cannot tilt, so that the last link has no degree of freedom
-                behind it.
-        """
+        """Make every constant translation of the links so many times as long."""
         if not self.links:
             if factor == 1.0:
                 return

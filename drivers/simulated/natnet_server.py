@@ -26,21 +26,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hilcal.drivers.natnet_frames import (
-    CONNECT,
-    DATA_PORT,
-    DESCRIPTIONS,
-    FRAME,
-    KEEP_ALIVE,
-    REQUEST,
-    REQUEST_DESCRIPTIONS,
-    RESPONSE,
-    SERVER_INFO,
-    SIZED,
-    Version,
-    message,
-    opened,
-)
+from hilcal.drivers import natnet_frames as nn
 from hilcal.drivers.simulated import admin
 from hilcal.drivers.simulated.blackboard import Blackboard, settled_truth
 from hilcal.types import Floats
@@ -60,12 +46,12 @@ class Cameras:
     board: Blackboard
     rng: np.random.Generator
     line: socket.socket
-    version: Version
+    version: nn.Version
     frame_std: float  # of a frame, m
     waves: Floats  # (6, 4) per coordinate and turn: direction and phase of the distortion
     distortion: float  # its amplitude, m
     group: str = ""  # multicast group; empty for none
-    clients: dict[tuple[str, int], tuple[Version, float]] = field(default_factory=dict)
+    clients: dict[tuple[str, int], tuple[nn.Version, float]] = field(default_factory=dict)
     """Version and when it was heard of last, by address."""
     name: str = "tool"
     others: int = 0  # rigid bodies beside it
@@ -93,7 +79,7 @@ class Cameras:
         self.seen = at + off[:3], turned.as_quat()
         return self.seen
 
-    def frame(self, version: Version) -> bytes:
+    def frame(self, version: nn.Version) -> bytes:
         """Return the content of a frame."""
         at, turn = self.pose()
         own = struct.pack("<I3f4ffH", BODY, *at, *turn, 2e-4, 0 if self.hidden else 1)
@@ -103,17 +89,17 @@ class Cameras:
         )
         markers = b"all\0" + struct.pack("<I6f", 2, *range(6))
         lists = [(1, markers), (1, struct.pack("<3f", 9, 9, 9)), (1 + self.others, bodies)]
-        lists += [(0, b"")] * (2 if version >= SIZED else 1)  # skeletons, assets
+        lists += [(0, b"")] * (2 if version >= nn.SIZED else 1)  # skeletons, assets
         lists += [(1, struct.pack("<I3ffHf", 1, 0, 0, 0, 0.01, 2, 1e-4)), (0, b""), (0, b"")]
         out = _COUNT.pack(self.number)
         for count, content in lists:
             out += _COUNT.pack(count)
-            out += (_COUNT.pack(len(content)) if version >= SIZED else b"") + content
+            out += (_COUNT.pack(len(content)) if version >= nn.SIZED else b"") + content
         suffix = struct.pack("<IId3Q", 0, 0, self.board.time, 0, 0, 0)
         precise = struct.pack("<II", 0, 0) if version >= (4, 0) else b""
         return out + suffix + precise + struct.pack("<HI", 0, 0)
 
-    def descriptions(self, version: Version) -> bytes:
+    def descriptions(self, version: nn.Version) -> bytes:
         """Return the content of the descriptions: a marker set, then the rigid bodies."""
         parts = [(0, b"all\0" + _COUNT.pack(2) + b"a\0b\0")]
         names = {BODY: self.name} | {BODY + 1 + k: f"other {k}" for k in range(self.others)}
@@ -123,11 +109,11 @@ class Cameras:
             content += struct.pack("<I6f2I", 2, *range(6), 0, 0)
             content += b"m1\0m2\0" if version >= (4, 0) else b""
             parts.append((1, content))
-        if version < SIZED:  # something that comes after the rigid bodies
+        if version < nn.SIZED:  # something that comes after the rigid bodies
             parts.append((5, b"camera\0" + struct.pack("<7f", *range(7))))
         out = _COUNT.pack(len(parts))
         for kind, content in parts:
-            size = _COUNT.pack(len(content)) if version >= SIZED else b""
+            size = _COUNT.pack(len(content)) if version >= nn.SIZED else b""
             out += _COUNT.pack(kind) + size + content
         return out
 
@@ -137,11 +123,11 @@ class Cameras:
             return
         data, sender = self.line.recvfrom(1 << 16)
         with contextlib.suppress(struct.error):
-            self._serve(*opened(data), sender)
+            self._serve(*nn.opened(data), sender)
 
     def _serve(self, number: int, content: bytes, sender: tuple[str, int]) -> None:
         version, _ = self.clients.get(sender, (self.version, 0.0))
-        if number == CONNECT:
+        if number == nn.CONNECT:
             wanted = (content[265], content[266]) if len(content) > 266 else self.version
             version = self.version
             if version >= (4, 0) and not self.group and not self.insist:
@@ -149,18 +135,18 @@ class Cameras:
             name = NAME.encode().ljust(256, b"\0")
             group = bytes(map(int, self.group.split("."))) if self.group else bytes(4)
             told = struct.pack("<4B4B", 3, 1, 0, 0, *version, 0, 0)
-            told += struct.pack("<QHB4B", 10_000_000, DATA_PORT, bool(self.group), *group)
-            self._answer(sender, message(SERVER_INFO, name + told))
-        elif number == REQUEST_DESCRIPTIONS:
-            self._answer(sender, message(DESCRIPTIONS, self.descriptions(version)))
-        elif number == REQUEST:
+            told += struct.pack("<QHB4B", 10_000_000, nn.DATA_PORT, bool(self.group), *group)
+            self._answer(sender, nn.message(nn.SERVER_INFO, name + told))
+        elif number == nn.REQUEST_DESCRIPTIONS:
+            self._answer(sender, nn.message(nn.DESCRIPTIONS, self.descriptions(version)))
+        elif number == nn.REQUEST:
             words = content.split(b"\0")[0].decode("ascii", "replace")
             asked = words.removeprefix("Bitstream,").split(".")
             good = words.startswith("Bitstream,") and self.version >= (4, 0) and not self.group
             if good:
                 version = int(asked[0]), int(asked[1])
-            self._answer(sender, message(RESPONSE, struct.pack("<i", 0 if good else 1)))
-        elif number != KEEP_ALIVE or sender not in self.clients:
+            self._answer(sender, nn.message(nn.RESPONSE, struct.pack("<i", 0 if good else 1)))
+        elif number != nn.KEEP_ALIVE or sender not in self.clients:
             return
         self.clients[sender] = version, time.monotonic()
 
@@ -174,14 +160,14 @@ class Cameras:
         if self.stalled or self.rng.random() < self.lose:
             return
         if self.group:
-            self._answer((self.group, DATA_PORT), message(FRAME, self.frame(self.version)))
+            self._answer((self.group, nn.DATA_PORT), nn.message(nn.FRAME, self.frame(self.version)))
             return
         now = time.monotonic()
         self.clients = {
             who: (v, heard) for who, (v, heard) in self.clients.items() if now - heard < FORGOTTEN_S
         }
         for who, (version, _) in list(self.clients.items()):
-            self._answer(who, message(FRAME, self.frame(version)))
+            self._answer(who, nn.message(nn.FRAME, self.frame(version)))
 
 
 def operations(cameras: Cameras) -> admin.Operations:
@@ -206,19 +192,20 @@ def operations(cameras: Cameras) -> admin.Operations:
 
 def main() -> None:
     """Run until the parent ends."""
-    parser = admin.device_parser(__doc__)
-    parser.add_argument("--host", required=True)
-    parser.add_argument("--port", type=int, default=1510)
-    parser.add_argument("--version", default="4.1")
-    parser.add_argument("--multicast", default="")
-    parser.add_argument("--frame-std", type=float, default=5e-5)
-    parser.add_argument("--distortion", type=float, default=1e-4)
-    options = parser.parse_args()
-    admin.end_with_parent()
+    options = admin.begin(
+        __doc__,
+        {
+            **admin.NETWORK,
+            "--version": {"default": "4.1"},
+            "--multicast": {"default": ""},
+            "--frame-std": {"type": float, "default": 5e-5},
+            "--distortion": {"type": float, "default": 1e-4},
+        },
+    )
     seeing, drawn = np.random.default_rng(options.seed).spawn(2)
-    board = Blackboard.attach(options.directory / "world.bin")
+    board = Blackboard(options.directory / "world.bin")
     line = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    line.bind((options.host, options.port))
+    line.bind((options.host, options.port or nn.PORT))
     if options.multicast:
         here = socket.inet_aton(options.host)
         line.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, here)

@@ -9,8 +9,7 @@ from hilcal.drivers.terminal_operator import TerminalOperator
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.devices import Clock, Report
 
-HAND_S = 20.0
-"""Time that a person takes to change a load, s."""
+HAND_S = 20.0  # time that a person takes to change a load, s
 
 _OPTIONS = ("socket", "hand_s", "person")
 
@@ -46,12 +45,7 @@ class SimulatedOperator:
         return Report("operator", name, facts, problems, fields)
 
     def hang(self, load: CellLoad | None, why: str) -> None:
-        """Hang a load in the simulated world, or take it off; a person is asked first.
-
-        Raises:
-            DeviceError: the simulated world is gone or does not have this load, or the person
-                gives up.
-        """
+        """Hang a load in the simulated world, or take it off; a person is asked first."""
         if self.person is not None:
             self.person.hang(load, why)
         else:
@@ -59,11 +53,7 @@ class SimulatedOperator:
         admin.ask(self.socket, "hang", name=None if load is None else load.name)
 
     def confirm(self, question: str) -> None:
-        """Say that the arm may go on; a person is asked.
-
-        Raises:
-            DeviceError: the person gives up.
-        """
+        """Say that the arm may go on; a person is asked."""
         if self.person is not None:
             self.person.confirm(question)
 
@@ -74,12 +64,8 @@ class SimulatedOperator:
 def open_operator(config: CellConfig) -> SimulatedOperator:
     """Return the simulated operator of a configuration.
 
-    Its [operator] options are `socket`, the admin socket of the simulated world, `hand_s`, how long
-    a change of the load takes, s of cell time, and `person`: true where it is left to the person at
-    the terminal, whose every answer is then true in the simulated world.
-
-    Raises:
-        InputError: a missing or bad option.
+    Its [operator] options are `socket`, the world's admin socket, `hand_s`, how long a change of a
+    load takes, s of cell time, and `person`: true where it is left to the person at the terminal.
     """
     options = config.operator.options
     for key in options:

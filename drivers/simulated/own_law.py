@@ -51,14 +51,7 @@ class OwnLaw:
     ) -> tuple[Floats, Floats]:
         """Return by how much N readings are displaced (N, 3) and turned (N, 3, 3), sensor axes.
 
-        Args:
-            cell: the cell as configured.
-            frame: (4, 4) the true T_sensor_base.
-            compliance: (n,) of the drives, rad/(N·m), which the law may build on.
-            states: N states.
-
-        Raises:
-            InputError: the states lack what the law depends on.
+        `frame` is the true T_sensor_base, `compliance` (n,) that of the drives, rad/(N·m).
         """
         if not self.effect.computable(states):
             needs = ", ".join(self.effect.needs)
@@ -87,11 +80,7 @@ class OwnLaw:
 
     @staticmethod
     def from_json(cell: Cell, data: dict[str, Any]) -> "OwnLaw":
-        """Return the law of `to_json`.
-
-        Raises:
-            InputError: its file cannot be used, or has changed.
-        """
+        """Return the law of `to_json`."""
         catalogue = installed()
         if data["file"] is not None:
             check_hash(Path(data["file"]), data["sha256"])  # before it is run
@@ -102,11 +91,7 @@ class OwnLaw:
 
 
 def check_hash(path: Path, sha256: str) -> None:
-    """Refuse a file that is not the one that a world was made with.
-
-    Raises:
-        InputError: it cannot be read, or has changed.
-    """
+    """Refuse a file that is not the one that a world was made with."""
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -121,10 +106,6 @@ def own_names(catalogue: Catalogue, known: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def own_law(catalogue: Catalogue, name: str, cell: Cell, states: States) -> OwnLaw:
-    """Return an effect without strength, set up for the states of a campaign.
-
-    Raises:
-        InputError: an unknown effect, or states that lack what it needs.
-    """
+    """Return an effect without strength, set up for the states of a campaign."""
     effect = catalogue.make(name, cell, states)
     return OwnLaw(effect, states, catalogue, np.zeros(len(effect.parameters)))

@@ -22,8 +22,7 @@ import numpy as np
 from hilcal.drivers.simulated.admin import setter
 
 BITS_PER_BYTE = 10
-FIFO = 16384
-"""Bytes that wait for a reader beyond what the terminal itself holds."""
+FIFO = 16384  # bytes that wait for a reader beyond what the terminal itself holds
 
 _RATES = {getattr(termios, name): int(name[1:]) for name in dir(termios) if name[1:].isdigit()}
 _SPEEDS = {rate: speed for speed, rate in _RATES.items()}
@@ -44,16 +43,11 @@ def crc16(data: bytes, start: int) -> int:
 class PtyPort:
     """One serial line under a stable name; safe to be used from several threads.
 
-    Attributes:
-        baud: the instrument's rate, Bd.
-        sent: frames that went out whole into the line, faults included.
-        dropped: frames lost because nobody read them in time.
-        flip: probability that one bit of a frame is flipped.
-        cut: probability that a frame is truncated.
+    `dropped` frames are those that nobody read in time; `flip` and `cut` are the probabilities that
+    a bit of a frame is flipped, and that it is truncated.
     """
 
     def __init__(self, link: Path, baud: int, rng: np.random.Generator) -> None:
-        """Plug the line in; `link` is the port's name, `baud` the instrument's rate, Bd."""
         if baud not in _SPEEDS:
             raise ValueError(f"baud = {baud}; valid: {sorted(_SPEEDS)}")
         self.link, self.baud = link, baud
@@ -108,10 +102,7 @@ class PtyPort:
             self._inbox.clear()
 
     def send(self, frame: bytes, born: float | None = None) -> None:
-        """Put a frame on the wire; it arrives by `pump` when its last bit has passed.
-
-        `born` is when the instrument began to send it, `time.monotonic`; None is now.
-        """
+        """Put a frame on the wire, begun when `born`; it arrives when its last bit has passed."""
         with self._lock:
             if self.mute or not self.plugged:
                 return

@@ -35,8 +35,7 @@ from hilcal.types import Floats, Ints
 
 NOTHING = "nothing"
 RANDOM = "random"
-INVENTED = "invented"
-"""A law that the catalogue lacks; see `invented_law`."""
+INVENTED = "invented"  # a law that the catalogue lacks; see `invented_law`
 REGISTRATION_XYZ = (2.4, -1.6, -0.5)
 REGISTRATION_ROTVEC = (0.0, 0.0, 2.1)
 
@@ -57,11 +56,7 @@ def invented_law(catalogue: Catalogue) -> Catalogue:
 
 
 def check_choice(choice: str, catalogue: Catalogue | None = None) -> None:
-    """Refuse what cannot be hidden.
-
-    Raises:
-        InputError: lists the valid choices.
-    """
+    """Refuse what cannot be hidden; lists the valid choices."""
     valid = (*choices(), *own_choices(catalogue), RANDOM, NOTHING)
     if choice not in valid:
         raise InputError(f"hide {choice!r}{suggest(choice, valid)}; valid: {', '.join(valid)}")
@@ -69,22 +64,16 @@ def check_choice(choice: str, catalogue: Catalogue | None = None) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulationCase:
-    """A simulated cell with something hidden in it.
-
-    Attributes:
-        mode: the kind of readings that shows the hidden effect.
-        hidden: the name of the hidden effect, or "nothing".
-        strength_sigma: rms of what it does to the readings, in units of their noise.
-        home: (n,) where the arm stands at first; None where no plan says it.
-    """
+    """A simulated cell with something hidden in it."""
 
     config: CellConfig
     cell: Cell
-    mode: Mode
+    mode: Mode  # the kind of readings that shows the hidden effect
     world: World
-    hidden: str
-    strength_sigma: float
+    hidden: str  # the name of the hidden effect, or "nothing"
+    strength_sigma: float  # rms of what it does to the readings, in units of their noise
     home: Floats | None = field(default=None, kw_only=True)
+    """(n,) where the arm stands at first; None where no plan says it."""
 
     def measured(self, readings: Readings, config: CellConfig | None = None) -> "Rehearsal":
         """Return what was measured in it, with the configuration that it was measured with."""
@@ -99,11 +88,7 @@ class Rehearsal(SimulationCase):
     readings: Readings
 
     def save(self, path: str | Path) -> None:
-        """Write a new campaign file of the readings, which `Campaign.open` and commands take.
-
-        Raises:
-            InputError: a file is there already, or it cannot be written.
-        """
+        """Write a new campaign file of the readings, which `Campaign.open` and commands take."""
         CampaignFile.create(
             Path(path),
             self.config.to_json(),
@@ -137,12 +122,7 @@ def measurement_noise(config: CellConfig, samples: int = 1) -> SimulatedNoise:
 
 
 def as_told(config: CellConfig, choice: str, catalogue: Catalogue | None = None) -> CellConfig:
-    """Return the configuration that the program is given when an effect is hidden.
-
-    Raises:
-        InputError: an unknown choice; lists the valid ones. An effect that loads show, in a cell
-            without any.
-    """
+    """Return the configuration that the program is given when an effect is hidden."""
     check_choice(choice, catalogue)
     if not config.loads and choice in DEFLECTION_EFFECTS:
         shown = ", ".join((*(e for e in choices() if e not in DEFLECTION_EFFECTS), NOTHING))
@@ -170,10 +150,6 @@ def simulation_case(
 
     `choice` is one of `choices()` or `own_choices(catalogue)`, "random" or "nothing"; the strength
     holds at the states that `visit` returns, with the tracker's `noise` of one reading.
-
-    Raises:
-        InputError: an unknown choice; lists the valid ones. An effect that loads show, in a cell
-            without any.
     """
     config = as_told(config, choice, catalogue)
     cell = cell_from_config(config, base_dir)
@@ -220,13 +196,9 @@ def simulate(
     rng: np.random.Generator,
     m: int = 3,
 ) -> Readings:
-    """Return what the tracker reads of N states, with the covariance of every reading.
+    """Return what the tracker reads (m = 3 or 6) of N states, with the covariance of every reading.
 
-    `pose` (N,), `load` (N,) into `load_names` ("none" for unloaded) and `cycle` (N,) are their
-    indices; m is 3 for positions, 6 for poses.
-
-    Raises:
-        InputError: another m.
+    `pose`, `load` (into `load_names`, "none" for unloaded) and `cycle` (N,) are their indices.
     """
     if m not in (3, 6):
         raise InputError(f"a reading has {m} elements; valid: 3 (position) or 6 (pose)")
@@ -256,14 +228,10 @@ _MEASURING = 5.0  # s, to settle and to measure
 def planned_states(
     cell: Cell, config: CellConfig, plan: Plan, begun: float = 0.0
 ) -> CampaignStates:
-    """Return the N states of a plan's steps in order, with times as they will about be.
+    """Return the N states of a plan's steps in order, with their times from `begun` on, s.
 
-    Of several targets, each is read at every step.
-
-    The arm takes the route of a session, which tells from which sides the joints arrive. They warm
-    up as those of the cell behind the wires do.
-
-    The time begins at `begun`, in that of the campaign, s.
+    Of several targets, each is read at every step. The arm takes the route of a session; its joints
+    warm up as those of the cell behind the wires do.
     """
     names = [UNLOADED, *(load.name for load in config.loads)]
     pulls = {load.name: load.wrench(cell.gravity) for load in config.loads}
@@ -311,9 +279,6 @@ def case_of_plan(
 
     Its strength holds for the readings of the plan, each the mean of several measurements; the
     world's tracker has the noise of a single one.
-
-    Raises:
-        InputError: an unknown choice, or a cell without loads.
     """
     rng = np.random.default_rng(seed)
     mean = measurement_noise(config, config.acquire.samples)
@@ -331,11 +296,7 @@ def case_of_plan(
 
 
 def read_plan(s: SimulationCase, plan: Plan, seed: Sequence[int], begun: float = 0.0) -> Rehearsal:
-    """Draw the readings of a plan in a simulated cell that is there already.
-
-    Each is the mean of several measurements; the first is taken at `begun`, in the time of the
-    campaign, s.
-    """
+    """Draw the readings of a plan, from the time `begun` of the campaign on, s; each is a mean."""
     config = s.config
     world = replace(s.world, noise=measurement_noise(config, config.acquire.samples))
     v = planned_states(s.cell, config, plan, begun)
@@ -353,13 +314,7 @@ def simulated_cell(
     directory: Path | None = None,
     begun: float = 0.0,
 ) -> Iterator[SimulatedCell]:
-    """Run the simulated devices of a cell; they end with the block.
-
-    They meet in `directory`, a temporary one if None; the world's time begins at `begun`, s.
-
-    Raises:
-        DeviceError: a device did not start.
-    """
+    """Run the simulated devices of a cell, which meet in `directory`; they end with the block."""
     with tempfile.TemporaryDirectory(prefix="hilcal-") as made:
         where = directory or Path(made)
         with SimulatedCell.start(

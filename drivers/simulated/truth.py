@@ -38,10 +38,7 @@ _GUIDE = {"x": (2, 3, 4), "y": (2, 3, 4), "z": (1,)} | dict.fromkeys(_TURNS, (1,
 
 
 def long_links(arm: Arm) -> Ints:
-    """Return the numbers k of the (at most two) links that are longer than a third of the longest.
-
-    Only links between two joints count: upper arm and forearm of a usual arm.
-    """
+    """Return the numbers k of the two links between joints that are over a third of the longest."""
     lengths = np.linalg.norm(arm.links[1:-1, :3, 3], axis=1)
     longest = np.argsort(-lengths, kind="stable")[:2]
     return np.sort(longest[lengths[longest] > lengths.max() / 3.0]) + 1
@@ -139,15 +136,13 @@ def _labels(effect: str, shape: tuple[int, ...], arm: Arm) -> list[str]:
     return [f"{name}.{part}" for name in parts[effect][0] for part in parts[effect][1]]
 
 
-LINK_REFERENCE = 20.0
-"""Temperature at which links have their nominal length, °C (ISO 1)."""
+LINK_REFERENCE = 20.0  # temperature at which links have their nominal length, °C (ISO 1)
 
 _UNKNOWN_TORQUE, _UNKNOWN_FORCE = 150.0, 1500.0  # N·m and N, of a drive of unknown limit
 _CROSSING = 0.01  # of the rated torque: within it a joint crosses its play
 
 
-AIR = 22.0
-"""Air temperature of the cell behind the wires, and of a rehearsal's start, °C."""
+AIR = 22.0  # air temperature of the cell behind the wires, and of a rehearsal's start, °C
 
 _WARM_START = 4.0  # °C above the air at the world's start
 _WARM_RISE = np.array([9.0, 11.0, 10.0, 8.0, 8.0, 7.0])  # °C above the air in the end
@@ -171,10 +166,6 @@ def drive_errors(hidden: Truth, arm: Arm, states: States, reference: float) -> F
            + sum_k a_jk cos k q_j + b_jk sin k q_j
 
     Joints do not drift at the temperature `reference`, °C.
-
-    Raises:
-        InputError: hysteresis without approach sides, or drifting joints without their
-            temperatures.
     """
     error = np.broadcast_to(hidden.encoder_offset, states.q.shape).copy()
     if np.any(hidden.hysteresis):
@@ -194,10 +185,7 @@ def drive_errors(hidden: Truth, arm: Arm, states: States, reference: float) -> F
 
 
 def guide_motion(hidden: Truth, arm: Arm, states: States) -> Floats | None:
-    """Return the (N, g, 6) motions of the carriages of slides by errors of their guides; or None.
-
-    About the carriage, axes with z along the travel, m and rad; P_1 to P_4 are written out.
-    """
+    """Return the (N, g, 6) motions of carriages by errors of their guides, z along; or None."""
     if not np.any(hidden.guide_error):
         return None
     slides = arm.slides
@@ -212,11 +200,7 @@ def guide_motion(hidden: Truth, arm: Arm, states: States) -> Floats | None:
 
 
 def joint_temperature(states: States) -> Floats:
-    """Return the (N, n) temperatures of the joints, °C.
-
-    Raises:
-        InputError: the states do not carry them.
-    """
+    """Return the (N, n) temperatures of the joints, °C."""
     if states.joint_temperature is None:
         raise InputError(
             "joint_temperature: thermal_joint_drift is hidden but the states carry no "
@@ -229,9 +213,6 @@ def further_compliance(hidden: Truth, arm: Arm, states: States) -> Floats | None
     """Return the (N, n) compliances of the drives beyond c_j, rad/(N·m); None: none anywhere.
 
     a_j cos 2 q_j + b_j sin 2 q_j + k c_j log10(1 + t / 1 s), q the commanded angle
-
-    Raises:
-        InputError: creep without the time under load.
     """
     extra: Floats | None = None
     if np.any(hidden.periodic_joint_compliance):
@@ -259,13 +240,7 @@ def crossing_torque(arm: Arm) -> Floats:
 
 
 def link_growth(hidden: Truth, states: States) -> Floats | None:
-    """Return the (N,) factor on all lengths of the links, 1 + alpha (T - 20 °C); None: 1.
-
-    T is that of the air, or the mean of the joints' where the states do not carry it.
-
-    Raises:
-        InputError: growing links without any temperature.
-    """
+    """Return the (N,) factor on lengths, 1 + alpha (T - 20 °C), T of air or joints; None: 1."""
     if not np.any(hidden.thermal_growth):
         return None
     temperature = states.air_temperature
@@ -292,11 +267,7 @@ class Misreading:
 
     @classmethod
     def of(cls, truth: Truth) -> "Misreading | None":
-        """Return that of a truth, flange axes; None where the sensor is perfect.
-
-        Raises:
-            InputError: a gain of nothing or less.
-        """
+        """Return that of a truth, flange axes; None where the sensor is perfect."""
         parts = (truth.wrench_bias, truth.wrench_gain, truth.sensor_misalignment)
         if not any(np.any(part) for part in parts):
             return None

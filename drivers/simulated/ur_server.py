@@ -18,7 +18,6 @@ as somebody who moves the arm by hand; `set {version, slider, speed_scaling, unl
 import argparse
 import asyncio
 import inspect
-import math
 import os
 import sys
 import time
@@ -30,11 +29,15 @@ import numpy as np
 
 from hilcal.drivers.simulated import admin
 from hilcal.drivers.simulated.blackboard import Blackboard
-from hilcal.drivers.simulated.ur.controller import Controller, DashboardServer
-from hilcal.drivers.simulated.ur.primary import NOT_INITIALISED, PrimaryPort
-from hilcal.drivers.simulated.ur.robot_api import RobotApiServer
-from hilcal.drivers.simulated.ur.rtde import Faults, RtdeLink, RtdeLinks, Sensors
-from hilcal.drivers.simulated.ur.state import ArmState, Kinematics, Trajectory, WorldClock
+from hilcal.drivers.simulated.ur_controller import (
+    NOT_INITIALISED,
+    Controller,
+    DashboardServer,
+    PrimaryPort,
+    RobotApiServer,
+)
+from hilcal.drivers.simulated.ur_rtde import Faults, RtdeLink, RtdeLinks, Sensors
+from hilcal.drivers.simulated.ur_state import ArmState, Kinematics, Trajectory, WorldClock
 from hilcal.errors import DeviceError, HilcalError, InputError
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm
@@ -56,13 +59,11 @@ def switched_on(
     arm: Arm, board: Blackboard, version: Version, rng: np.random.Generator
 ) -> ArmState:
     """Return the state of a controller right after power-up; the arm stands where it stood."""
-    kept = board.read("arm")
-    clock = WorldClock(board)
+    kept, clock = board.read("arm"), WorldClock(board)
     known = bool(kept["alive"])
     arrivals = int(kept["arrivals"]) + bool(kept["moving"])
     q, side = (kept["q"], kept["side"]) if known else (HOME, rng.choice([-1.0, 1.0], arm.n))
-    trajectory = Trajectory(q, side, arrivals, clock.now)
-    state = ArmState(clock, Kinematics(arm), trajectory, version)
+    state = ArmState(clock, Kinematics(arm), Trajectory(q, side, arrivals, clock.now), version)
     if known:
         state.payload, state.payload_com = float(kept["payload"]), kept["payload_com"].copy()
     state.note("switched on")
@@ -81,36 +82,27 @@ class UrServer:
         api_port: int = API,
         factory: FactoryKinematics | None = None,
     ) -> None:
-        """Put the parts together; nothing is opened."""
-        self.arm = state
-        self.faults = Faults()
+        self.arm, self.faults = state, Faults()
         self.controller = Controller(state, board)
         sensors = Sensors(state, board, rng)
         self.rtde = RtdeLinks(state, sensors, self.faults, self.controller.step)
         self.controller.hears = self.rtde.hears
-        model = state.kinematics.arm.name
+        arm = state.kinematics.arm
         self.is_x = state.version[0] >= POLYSCOPE_X
         supervision = RobotApiServer if self.is_x else DashboardServer
-        self.dashboard = supervision(self.controller, self.faults, model)
+        self.dashboard = supervision(self.controller, self.faults, arm.name)
         status = NOT_INITIALISED if factory is None else factory.status
         rows = None if factory is None else factory.rows
-        rows = _rows(state.kinematics.arm) if rows is None else rows
-        self.primary = PrimaryPort(self.controller, rows, status)
-        self._api_port = api_port
-        self._host = host
+        self.primary = PrimaryPort(self.controller, _rows(arm) if rows is None else rows, status)
+        self._host, self._supervised = host, api_port if self.is_x else DASHBOARD
         self._listening: asyncio.Server | None = None
         self._others: list[asyncio.Server] = []
 
     async def open(self) -> None:
-        """Listen.
-
-        Raises:
-            DeviceError: an address is in use, or is none of this computer's.
-        """
-        supervised = self._api_port if self.is_x else DASHBOARD
+        """Listen."""
         self._others = [
             await self._listen(self.primary.run, PRIMARY),
-            await self._listen(self.dashboard.run, supervised),
+            await self._listen(self.dashboard.run, self._supervised),
         ]
         if not self.is_x:
             self._others.append(await self._listen(self._run_script, SCRIPT))
@@ -134,13 +126,9 @@ class UrServer:
         motion = self.arm.trajectory
         while True:
             self.controller.step()
-            now = time.monotonic()
-            self.rtde.send(now)
-            wait = _STILL
-            if motion.moving:
-                wait = min(_MOVING, self.arm.clock.real(motion.left))
-            wait = min(wait, self.rtde.due(now) - time.monotonic())
-            await asyncio.sleep(max(0.0, wait))
+            self.rtde.send(time.monotonic())
+            wait = min(_MOVING, self.arm.clock.real(motion.left)) if motion.moving else _STILL
+            await asyncio.sleep(max(0.0, min(wait, self.rtde.due() - time.monotonic())))
 
     async def _listen(self, client: Any, port: int) -> asyncio.Server:
         try:
@@ -170,11 +158,7 @@ def _rows(arm: Arm) -> Floats:
 
 
 def read_version(text: str) -> Version:
-    """Return the four numbers of a PolyScope version such as 5.11.6.1010327.
-
-    Raises:
-        InputError: it is something else.
-    """
+    """Return the four numbers of a PolyScope version such as 5.11.6.1010327."""
     parts = text.split(".")
     if len(parts) == 4 and all(part.isascii() and part.isdigit() for part in parts):
         a, b, c, d = map(int, parts)
@@ -190,16 +174,15 @@ def operations(server: UrServer, loop: asyncio.AbstractEventLoop) -> admin.Handl
     """Return what may be asked and switched, from other threads than that of the loop."""
     arm, controller, links = server.arm, server.controller, server.rtde.links
 
-    def switch(name: str) -> Callable[..., object]:
-        return lambda on=True: setattr(server.faults, name, bool(on))
+    def switch(name: str, of: object = server.faults) -> Callable[..., object]:
+        return lambda on=True: setattr(of, name, bool(on))
 
-    def drop() -> None:
-        for link in list(links):
-            link.writer.transport.abort()
+    def each(do: Callable[[RtdeLink], None]) -> Callable[[], None]:
+        def all_links() -> None:
+            for link in list(links):
+                do(link)
 
-    def half_frame() -> None:
-        for link in list(links):
-            link.half()
+        return all_links
 
     def freeze(on: bool = True) -> None:
         arm.frozen_q = arm.trajectory.q.copy() if on else None
@@ -209,21 +192,20 @@ def operations(server: UrServer, loop: asyncio.AbstractEventLoop) -> admin.Handl
 
     known = admin.Operations(
         {
-            "state": state,
             "protective_stop": lambda: controller.protective_stop("admin"),
             "emergency_stop": controller.emergency_stop,
             "release_emergency_stop": controller.release_emergency_stop,
             "local_mode": lambda: controller.set_remote(False),
             "remote_mode": lambda: controller.set_remote(True),
             "kill_script": lambda: controller.stop_program("killed"),
-            "rtde_drop": drop,
+            "rtde_drop": each(lambda link: link.writer.transport.abort()),
             "rtde_stall": switch("rtde_stall"),
             "rtde_mute": switch("rtde_mute"),
-            "rtde_half_frame": half_frame,
+            "rtde_half_frame": each(RtdeLink.half),
             "dashboard_mute": switch("dashboard_mute"),
             "dashboard_drop": server.dashboard.drop,
             "refuse": lambda on=True: server.accept(not on),
-            "refuse_motion": lambda on=True: setattr(arm, "refuses_motion", bool(on)),
+            "refuse_motion": switch("refuses_motion", arm),
             "freeze": freeze,
             "jog": lambda q: arm.trajectory.place(_joints(q)),
             "set": lambda **settings: _set(server, settings),
@@ -270,30 +252,22 @@ def _set(server: UrServer, settings: dict[str, Any]) -> None:
 
 
 def _state(server: UrServer) -> dict[str, Any]:
-    arm = server.arm
-    server.controller.step()
-    motion = arm.trajectory
+    arm, controller, motion = server.arm, server.controller, server.arm.trajectory
+    controller.step()
     return {
-        "q": motion.q.tolist(),
-        "qd": motion.qd.tolist(),
-        "side": motion.side.tolist(),
-        "moving": motion.moving,
-        "arrivals": motion.arrivals,
+        **{name: getattr(motion, name).tolist() for name in ("q", "qd", "side")},
+        **{name: getattr(arm, name).tolist() for name in ("payload_com", "tcp")},
+        **{name: getattr(motion, name) for name in ("moving", "arrivals")},
+        **{name: getattr(arm, name) for name in ("remote", "payload", "fault_ns", "input_ns")},
         "runtime": int(arm.runtime),
         "safety": int(arm.safety_bits),
         "robot_mode": int(arm.robot_mode),
-        "remote": arm.remote,
-        "payload": arm.payload,
-        "payload_com": arm.payload_com.tolist(),
-        "tcp": arm.tcp.tolist(),
-        "scripts": server.controller.scripts,
-        "script_running": server.controller.program_runs,
-        "watchdog_hz": server.controller.watchdog,
+        "scripts": controller.scripts,
+        "script_running": controller.program_runs,
+        "watchdog_hz": controller.watchdog,
         "rtde_clients": len(server.rtde.links),
         "dashboard_clients": server.dashboard.clients,
         "rest_ns": arm.clock.real_ns(motion.rest_time),
-        "fault_ns": arm.fault_ns,
-        "input_ns": arm.input_ns,
         "now_ns": time.monotonic_ns(),
     }
 
@@ -306,28 +280,22 @@ def _joints(q: Any) -> Floats:
 
 
 def _share(key: str, value: Any) -> float:
-    if not isinstance(value, int | float) or not (math.isfinite(value) and 0 <= value <= 1):
+    if not isinstance(value, int | float) or not 0 <= value <= 1:
         raise InputError(f"{key} = {value!r}; valid: 0 to 1")
     return float(value)
 
 
 async def serve(options: argparse.Namespace) -> None:
-    """Open everything, and run until the process ends.
-
-    Raises:
-        InputError: an arm that cannot be simulated.
-        DeviceError: no shared world, or an address that cannot be had.
-    """
-    arm = load_arm(options.robot)
+    """Open everything, and run until the process ends."""
+    arm, factory = load_arm(options.robot), None
     if arm.n != len(HOME):
         raise InputError(f"--robot {options.robot}: {arm.n} joints; an arm of UR has {len(HOME)}")
-    factory = None
     if options.calibration is not None:
         factory = read_factory(options.calibration, arm)
         arm = with_factory(arm, factory)
     world = options.directory / "world.bin"
     try:
-        board = Blackboard.attach(world)
+        board = Blackboard(world)
     except (OSError, ValueError) as error:
         raise DeviceError(f"simulated arm: no shared world at {world} ({error})") from None
     rng = np.random.default_rng(options.seed)
@@ -339,22 +307,25 @@ async def serve(options: argparse.Namespace) -> None:
     await server.run()
 
 
-def main() -> None:
-    """Read the command line and serve; exit code 3 and one line where that is impossible."""
-    parser = admin.device_parser(__doc__)
-    parser.add_argument("--host", required=True)
-    parser.add_argument("--robot", required=True)
-    parser.add_argument("--version", default="5.11.6.1010327")
-    parser.add_argument("--api-port", type=int, default=API)
-    parser.add_argument("--calibration", type=Path)
-    options = parser.parse_args()
-    admin.end_with_parent()
+def main() -> int:
+    """Read the command line and serve; one line and an exit code where that is impossible."""
+    options = admin.begin(
+        __doc__,
+        {
+            "--host": {"required": True},
+            "--robot": {"required": True},
+            "--version": {"default": "5.11.6.1010327"},
+            "--api-port": {"type": int, "default": API},
+            "--calibration": {"type": Path},
+        },
+    )
     try:
         asyncio.run(serve(options))
     except HilcalError as error:
         sys.stderr.write(f"{error}\n")
-        sys.exit(error.exit_code)
+        return error.exit_code
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -5,29 +5,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.drivers.simulated.mechanics import (
-    Elasticity,
-    ElasticTree,
-    Equilibrium,
-    build,
-    displacement,
-    elasticity,
-    equilibrium,
-    inverse,
-    moved_by,
-    rotation_vector,
-    turned,
-)
+from hilcal.drivers.simulated import mechanics as mech
+from hilcal.drivers.simulated import truth as laws
 from hilcal.drivers.simulated.own_law import OwnLaw
-from hilcal.drivers.simulated.truth import (
-    Misreading,
-    Truth,
-    crossing_torque,
-    drive_errors,
-    further_compliance,
-    guide_motion,
-    link_growth,
-)
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.types import Floats, Ints
@@ -78,7 +58,7 @@ class SimulatedNoise:
         # turn about `up` moves the sight to the left (azimuth), about -left moves it upwards
         azimuth = up * (draw[0] * across / distance)[:, None]
         elevation = -left * (draw[1] * across / distance)[:, None]
-        seen = turned(azimuth + elevation) @ sight[:, :, None]
+        seen = mech.turned(azimuth + elevation) @ sight[:, :, None]
         return np.asarray(seen[:, :, 0] * (distance + draw[2] * along)[:, None])
 
     def observe_turn(self, count: int, rng: np.random.Generator) -> Floats:
@@ -114,7 +94,7 @@ class IdealReading:
         """Return (N, m): the position and, for m = 6, the rotation vector."""
         if m == 3:
             return self.position
-        return np.hstack([self.position, rotation_vector(self.rotation)])
+        return np.hstack([self.position, mech.rotation_vector(self.rotation)])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,7 +102,7 @@ class World:
     """One simulated cell with everything about it that the program is not told."""
 
     cell: Cell  # the cell as configured: what the program believes
-    physics: Truth  # the hidden parameters
+    physics: laws.Truth  # the hidden parameters
     registration: Floats  # (4, 4) the true T_sensor_base, before `physics.base_frame`
     station: Floats  # (4, 4) T_station_sensor: where the instrument stands
     noise: SimulatedNoise  # the tracker's noise
@@ -133,17 +113,17 @@ class World:
     None for none. `physics.target_offset` moves all of them."""
     own: OwnLaw | None = None
     """An effect of a user's own, on top of what the mechanics do; None for none."""
-    _tree: ElasticTree = field(init=False, repr=False)
+    _tree: mech.ElasticTree = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Build the elastic arm once."""
         links = np.array(
             [
-                link @ displacement(twist)
+                link @ mech.displacement(twist)
                 for link, twist in zip(self.cell.arm.links, self.physics.link_geometry, strict=True)
             ]
         )
-        tree = build(
+        tree = mech.build(
             self.cell.arm,
             links,
             self.cell.tool_mass,
@@ -187,43 +167,33 @@ class World:
 
         dq_j = o_j + h_j s_j + kappa_j (T_j - reference) + sum_i k_ji q_i
                + sum_k a_jk cos k q_j + b_jk sin k q_j
-
-        Raises:
-            InputError: hysteresis without approach sides, or drifting joints without their
-                temperatures.
         """
         arm, hidden = self.cell.arm, self.physics
-        off = drive_errors(hidden, arm, states, self.joint_reference)
+        off = laws.drive_errors(hidden, arm, states, self.joint_reference)
         error = np.asarray(arm.driven(off) + states.q @ hidden.joint_coupling.T)
-        guided = guide_motion(hidden, arm, states)
+        guided = laws.guide_motion(hidden, arm, states)
         if guided is not None:
             error[:, arm.slides] += guided[:, :, 2]
         return error
 
-    def rest(self, states: States, slip: Floats | None = None) -> Equilibrium:
-        """Return the static equilibrium of N states.
-
-        `slip` (N, n) is how far each drive missed its command, rad (repeatability).
-
-        Raises:
-            InputError: the states lack what a hidden effect depends on, or find no equilibrium.
-        """
+    def rest(self, states: States, slip: Floats | None = None) -> mech.Equilibrium:
+        """Return the equilibrium of N states; drives missed their command by `slip` (N, n), rad."""
         q = self.cell.arm.chain_angles(states.q) + self.joint_errors(states)
-        guided = guide_motion(self.physics, self.cell.arm, states)
-        return equilibrium(
+        guided = laws.guide_motion(self.physics, self.cell.arm, states)
+        return mech.equilibrium(
             self._tree,
             self._elasticity(states),
             q if slip is None else q + self.cell.arm.driven(slip),
             states.wrench,
             self.cell.load_point + self.physics.load_point,
-            growth=link_growth(self.physics, states),
-            sensor=Misreading.of(self.physics),
+            growth=laws.link_growth(self.physics, states),
+            sensor=laws.Misreading.of(self.physics),
             guide=None if guided is None else guided[:, :, [0, 1, 3, 4, 5]],
         )
 
-    def _elasticity(self, states: States) -> Elasticity:
+    def _elasticity(self, states: States) -> mech.Elasticity:
         hidden, tree = self.physics, self._tree
-        return elasticity(
+        return mech.elasticity(
             tree,
             hidden.joint_compliance,
             hidden.joint_stiffening,
@@ -232,8 +202,8 @@ class World:
             hidden.link_compliance[: len(tree.beam)],
             tool=hidden.tool_compliance,
             play=hidden.backlash,
-            crossing=crossing_torque(self.cell.arm),
-            extra=further_compliance(hidden, self.cell.arm, states),
+            crossing=laws.crossing_torque(self.cell.arm),
+            extra=laws.further_compliance(hidden, self.cell.arm, states),
             drive=self.cell.arm.drive,
         )
 
@@ -242,7 +212,7 @@ class World:
         return self.cell.arm.drive_torques(self.rest(states).torque[:, self.drives])
 
     def sight(
-        self, states: States, slip: Floats | None = None, rest: Equilibrium | None = None
+        self, states: States, slip: Floats | None = None, rest: mech.Equilibrium | None = None
     ) -> IdealReading:
         """Return what the tracker would read of N states without noise of its own.
 
@@ -250,24 +220,20 @@ class World:
         T_flange_target, the target shifted by its offset; the position then 1 + s times as long,
         about the origin of the sensor's axes. An effect of a user's own displaces the target before
         drift and scale. `slip` is as for `rest`, which is the equilibrium where that is known.
-
-        Raises:
-            InputError: the states lack what a hidden effect depends on, e.g. a drifting
-                tracker without time stamps.
         """
         hidden, rest = self.physics, rest or self.rest(states, slip)
         target = np.array(self.cell.target_of(states.target))
         target[..., :3, 3] += hidden.target_offset
         if self.offsets is not None:
             target[..., :3, 3] += self.offsets[0 if states.target is None else states.target]
-        frame = self.registration @ displacement(hidden.base_frame)
+        frame = self.registration @ mech.displacement(hidden.base_frame)
         view = frame[:3, :3]
         pose = frame @ rest.flange @ target
         position, rotation = pose[:, :3, 3], pose[:, :3, :3]
         by_drive = (
             rest.jacobian if self.cell.arm.drive is None else (rest.jacobian @ self.cell.arm.drive)
         )
-        jac = moved_by(by_drive, (rest.flange[:, :3, :3] @ target[..., :3, 3:])[:, :, 0])
+        jac = mech.moved_by(by_drive, (rest.flange[:, :3, :3] @ target[..., :3, 3:])[:, :, 0])
         jac = np.concatenate([view @ jac[:, :3], view @ jac[:, 3:]], axis=1)
         if self.own is not None:
             shift, turn = self.own.moved(self.cell, frame, hidden.joint_compliance, states)
@@ -278,7 +244,7 @@ class World:
                     "time: tracker_drift is hidden but the states carry no time stamps; "
                     "valid: seconds since the campaign's start"
                 )
-            moved = np.array([displacement(hidden.tracker_drift * t) for t in states.time])
+            moved = np.array([mech.displacement(hidden.tracker_drift * t) for t in states.time])
             position = (moved[:, :3, :3] @ position[:, :, None])[:, :, 0] + moved[:, :3, 3]
             rotation = moved[:, :3, :3] @ rotation
         if np.any(hidden.tracker_scale):
@@ -307,12 +273,12 @@ class World:
         slip = self.joint_std * rng.standard_normal((int(each.max()) + 1, states.q.shape[1]))[each]
         sight = self.sight(states, slip)
         seen = self.noise.observe(self._from_station(sight.position), rng)
-        back = inverse(self.station)
+        back = mech.inverse(self.station)
         position = seen @ back[:3, :3].T + back[:3, 3]
         if m == 3:
             return position
-        turn = turned(self.noise.observe_turn(len(states), rng))
-        return np.hstack([position, rotation_vector(turn @ sight.rotation)])
+        turn = mech.turned(self.noise.observe_turn(len(states), rng))
+        return np.hstack([position, mech.rotation_vector(turn @ sight.rotation)])
 
     def _from_station(self, position: Floats) -> Floats:
         """Return sensor coordinates (N, 3) as the instrument sees them."""
@@ -322,12 +288,10 @@ class World:
 def stand(cell: Cell, rng: np.random.Generator, distance: float = 3.0) -> tuple[Floats, Floats]:
     """Place the tracker: return the true T_sensor_base and T_station_sensor, (4, 4) each.
 
-    An unknown registration is drawn: the station `distance` away from the base at a height
+    An unknown registration is drawn: the station `distance`, m, away from the base at a height
     near the arm's, turned about the vertical at random. A known one is the truth; where its
     origin lies within the arm's reach (readings in base axes) the instrument itself stands
     `distance` away from it.
-
-    `distance` is from the base to the station, m.
     """
     if cell.arm.slides.any():  # beside the rail, wherever on it the arm stands
         distance = max(distance, cell.arm.reach + 1.0)

@@ -1,23 +1,102 @@
-"""The command of the arm, through the control worker."""
+"""The command of the arm through the control worker: motions, and bringing it to a stand.
+
+The third way to stop is a program on the port that takes URScript: one that arrives there replaces
+the one that runs. Source: Universal Robots, "Remote Control via TCP/IP", port 30003; the primary
+port, 30001, takes the same and is the one that PolyScope X opens.
+"""
 
 import contextlib
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from hilcal.drivers.ur_link import probe, states
-from hilcal.drivers.ur_link.lines import LinkError
-from hilcal.drivers.ur_link.reading import Receiver
-from hilcal.drivers.ur_link.states import CHECK_LINK, failure
-from hilcal.drivers.ur_link.supervision import PRIMARY_PORT, Generation
+from hilcal.drivers.ur_link.control_worker import WATCHDOG_HZ
+from hilcal.drivers.ur_link.lines import Connection, LinkError
+from hilcal.drivers.ur_link.reading import STALE_S, Reading, Receiver
+from hilcal.drivers.ur_link.states import CHECK_LINK, RESUME, failure
+from hilcal.drivers.ur_link.supervision import PRIMARY_PORT, Generation, Supervision
 from hilcal.drivers.ur_link.worker import Worker, WorkerError
+from hilcal.measuring.route import duration
 from hilcal.types import Floats
 
-LEASE_S = 0.5
-"""Lease of a motion: not renewed for so long, the motion is stopped, real s."""
-COMMAND_S = 0.5
-"""Deadline of a command, real s."""
-CONNECT_S = 8.0
-"""Deadline for taking control, real s."""
+STANDS_RAD_S = 0.01  # joints slower than this stand; measured speeds are noisy, rad/s
+MARGIN_S = 5.0
+"""What a motion may take longer than it should, and how long it may be paused, real s."""
+SLACK = 1.5  # a motion may take so many times its computed time
+SLOWEST = 0.02  # a motion is not waited for at a smaller share of its speed
+_TARGET_RAD = 1e-5
+_BRAKE_S = 0.15
+_BRAKE_MIN, _BRAKE_MAX = 2.0, 10.0
+
+
+def deceleration(speed: float) -> float:
+    """Return how the leading joint brakes from a speed, rad/s²; about 0.15 s to a stand."""
+    return float(np.clip(speed / _BRAKE_S, _BRAKE_MIN, _BRAKE_MAX))
+
+
+def stands(reading: Reading) -> bool:
+    """Whether no joint moves."""
+    return float(np.abs(reading.sample.qd).max()) < STANDS_RAD_S
+
+
+class MotionInProgress:
+    """A commanded motion, how much of its time it has used, and how it `brake`s, rad/s²."""
+
+    def __init__(
+        self,
+        start: Floats,
+        goal: Floats,
+        speed: float,
+        acceleration: float,
+        arrival: float,
+        clock: float,
+    ) -> None:
+        """Begin, from `start` to `goal` (6,), rad; `clock` is cell seconds per real second."""
+        self.brake = deceleration(speed)
+        self._goal, self._arrival = goal, arrival
+        self._usual = duration(start, goal, speed, acceleration) / clock
+        self._spent = 0.0
+        self._looked = time.monotonic()
+        self._paused: float | None = None
+
+    def arrived(self, reading: Reading) -> bool:
+        """Whether target and actual joints are at the goal, and stand."""
+        sample = reading.sample
+        return (
+            float(np.abs(sample.q_target - self._goal).max()) <= _TARGET_RAD
+            and float(np.abs(sample.q - self._goal).max()) <= self._arrival
+            and stands(reading)
+        )
+
+    def overdue(self, reading: Reading) -> str | None:
+        """Return in one line why the motion is given up, or None; call at every look.
+
+        Time counts by the share of the speed that the controller allows.
+        """
+        sample, now = reading.sample, time.monotonic()
+        since, self._looked = now - self._looked, now
+        self._spent += since * max(min(sample.speed_scaling, 1.0), SLOWEST)
+        if sample.speed_scaling >= SLOWEST:
+            self._paused = None
+        elif self._paused is None:
+            self._paused = now
+        elif now - self._paused > MARGIN_S:
+            return f"its speed has been scaled to 0 for {MARGIN_S:g} s (speed slider, or paused)"
+        if self._spent <= SLACK * self._usual + MARGIN_S:
+            return None
+        off = np.abs(sample.q - self._goal)
+        k = int(np.argmax(off))
+        return (
+            f"it did not arrive in time: joint {k + 1} stands {off[k]:.3g} rad off its goal "
+            f"(arrival_rad is {self._arrival:g})"
+        )
+
+
+LEASE_S = 0.5  # lease of a motion: not renewed for so long, the motion is stopped, real s
+COMMAND_S = 0.5  # deadline of a command, real s
+CONNECT_S = 8.0  # deadline for taking control, real s
 _ORPHAN_S = 1.6
 _HZ = 125.0
 _NO_COG = 1e-6
@@ -36,7 +115,6 @@ class Control:
     """Commands the arm; every call may raise WorkerError, and ends by its deadline."""
 
     def __init__(self, worker: Worker) -> None:
-        """Use a worker that has taken control."""
         self._worker = worker
 
     @property
@@ -86,11 +164,7 @@ class Control:
 
 
 def take(host: str, receiver: Receiver, generation: Generation) -> Control:
-    """Take control of an arm that is ready for it.
-
-    Raises:
-        DeviceError: it is not, somebody else controls it, or it does not answer in time.
-    """
+    """Take control of an arm that is ready for it."""
     end = time.monotonic() + CONNECT_S
     try:
         _ready(host, receiver)
@@ -169,3 +243,144 @@ def _wait_for(receiver: Receiver, wanted: tuple[int, ...], seconds: float) -> No
         if time.monotonic() > end:
             raise LinkError(f"the robot's program is {states.runtime_word(runtime)}")
         time.sleep(0.01)
+
+
+ASK_S = 0.25  # deadline of each way to stop, real s
+_GENTLE_S = 0.6
+_SURE_S = 1.0
+_AGAIN_S = 0.3
+_RENEW_S = 1.5
+_TAKEN_S = 0.05
+"""Time before the connection is closed: a program is lost where its sender has gone before it was
+taken; a choice."""
+UNWATCHED = "nobody watched its motion for 0.5 s, so it was stopped"
+
+
+@dataclass(frozen=True, slots=True)
+class Halt:
+    """How a stop ended."""
+
+    reading: Reading | None  # after the stop; None where the arm's state cannot be read
+    stands: bool
+    lost: str  # why the state could not be read before it was connected to anew; else empty
+
+
+@dataclass(frozen=True, slots=True)
+class Brakes:
+    """The ways to stop one arm."""
+
+    host: str
+    receiver: Receiver
+    generation: Generation
+
+    def ease(self, control: Control, brake: float) -> bool:
+        """Stop through the control worker and keep control; whether the arm stands."""
+        with contextlib.suppress(WorkerError, LinkError):
+            control.stop(brake, 0.3)
+            reading = self._until_still(_GENTLE_S, program=False)
+            if reading is not None and reading.runtime == states.PLAYING:
+                control.rest()
+                return True
+        return False
+
+    def halt(self, control: Control | None, brake: float, lost: str = "") -> Halt:
+        """Stop in every way, which ends control; never raises.
+
+        `brake` is the deceleration of the leading joint, rad/s²; `lost` why the link is lost.
+        """
+        if control is not None:
+            try:
+                if not lost:
+                    control.stop(brake, 0.1)
+            except WorkerError:
+                pass
+            finally:
+                control.kill()  # and the robot's watchdog stops it, whatever else fails
+        if not self._by_order():
+            self._by_script(brake)
+        try:
+            if not lost:
+                return self._watch(brake)
+        except LinkError as error:
+            lost = str(error)
+        try:
+            self.receiver.renew(_RENEW_S)
+            return replace(self._watch(brake), lost=lost)
+        except LinkError:
+            return Halt(None, False, lost)
+
+    def _watch(self, brake: float) -> Halt:
+        """Wait until the arm stands; command the stop once more if it does not."""
+        reading = self._until_still(_AGAIN_S, program=True)
+        if reading is None:
+            self._by_script(brake)
+            reading = self._until_still(_SURE_S - _AGAIN_S, program=True)
+        return Halt(reading or self.receiver.read(STALE_S), reading is not None, "")
+
+    def _by_order(self) -> bool:
+        with contextlib.suppress(LinkError):
+            self.generation.supervision.stop(ASK_S)
+            return True
+        return False
+
+    def _by_script(self, brake: float) -> None:
+        """Send a program that brakes the arm along its path, rad/s² of the leading joint."""
+        program = f"def stop_arm():\n  stopj({brake:.3f})\nend\n"
+        with (
+            contextlib.suppress(LinkError),
+            Connection(self.host, self.generation.script_port, "script port", ASK_S) as line,
+        ):
+            line.send(program.encode())
+            time.sleep(_TAKEN_S)
+
+    def _until_still(self, seconds: float, *, program: bool) -> Reading | None:
+        """The second of two readings at rest in a row; with `program`, of one that ended."""
+        end, still = time.monotonic() + seconds, 0
+        while time.monotonic() < end:
+            reading = self.receiver.read(STALE_S)
+            ended = reading.runtime not in (states.PLAYING, states.RESUMING)
+            safe = not program or ended or reading.sample.safety != states.NORMAL
+            still = still + 1 if stands(reading) and safe else 0
+            if still == 2:
+                return reading
+        return None
+
+
+def cause_of(supervision: Supervision, halt: Halt, noticed: str) -> tuple[str, str]:
+    """Return what happened and what to do about it, after the arm has been stopped.
+
+    A safety stop ends the program, and a lost link the process that commands the arm: what was
+    noticed first is reported only where nothing deeper is found.
+    """
+    reading = halt.reading
+    if reading is not None and reading.sample.safety != states.NORMAL:
+        return reading.sample.safety, f"{states.safety_advice(reading.safety_bits)}, {RESUME}"
+    if reading is not None and reading.mode != states.RUNNING:
+        word = states.mode_word(reading.mode)
+        return f"it does not run any more ({word})", f"switch it on, {RESUME}"
+    with contextlib.suppress(LinkError):
+        if supervision.in_remote_control(ASK_S) is False:
+            return "it was switched to local mode", f"switch it to remote control, {RESUME}"
+    if halt.lost:
+        return f"the link is lost: {halt.lost}", CHECK_LINK
+    return noticed, f"look at the pendant, {RESUME}"
+
+
+def program_ended(reading: Reading, late: float) -> str:
+    """Return why the robot's program ended; `late` is the longest pause in the signs of life, s."""
+    busy = f"this computer was too busy for {late:.2f} s to show that it lives"
+    if late > 1.0 / WATCHDOG_HZ:
+        return f"its watchdog stopped it: {busy}"
+    word = states.runtime_word(reading.runtime)
+    told = f" ({busy})" if late > 0.0 else ""
+    return (
+        f"its program is {word}: stopped by another program, on the pendant, or by its "
+        f"watchdog{told}"
+    )
+
+
+def not_commanded(error: WorkerError) -> str:
+    """Return why a command did not get through."""
+    if error.lost:
+        return f"the process that commands it ended ({error})"
+    return f"it did not take a command ({error})"

@@ -12,15 +12,13 @@ import time
 from typing import Any
 
 from hilcal.drivers.ur_link import relay
-from hilcal.drivers.ur_link.child import Line, answered, outliving, start, words
+from hilcal.drivers.ur_link.worker import Line, answered, outliving, start, words
 
 WATCHDOG_HZ = 10.0
 REST_HZ = 1.0
 KICK_S = 0.02
-TAKING_S = 8.0
-"""How long taking control may last when the parent has ended meanwhile, s."""
-LATE_S = 0.8 / WATCHDOG_HZ
-"""A longer pause between two kicks may have set off the watchdog, s."""
+TAKING_S = 8.0  # how long taking control may last when the parent has ended meanwhile, s
+LATE_S = 0.8 / WATCHDOG_HZ  # a longer pause between two kicks may have set off the watchdog, s
 
 
 class ControlInterface:

@@ -7,30 +7,18 @@ from typing import Self
 
 
 class LinkError(Exception):
-    """A connection failed; the text names it and the reason.
-
-    Attributes:
-        refused: nobody listens on the port.
-    """
+    """A connection failed; the text names it and the reason; `refused`: nobody listens there."""
 
     def __init__(self, text: str, *, refused: bool = False) -> None:
-        """Keep the cause."""
         super().__init__(text)
         self.refused = refused
 
 
 class Connection:
-    """An open connection; every call ends before the deadline, given at the opening at first.
-
-    Where the connection broke or the deadline passed a call raises LinkError.
-    """
+    """An open connection; every call ends before the deadline, or raises LinkError."""
 
     def __init__(self, host: str, port: int, what: str, seconds: float) -> None:
-        """Connect to the service `what`; all of it has to be done within so many seconds.
-
-        Raises:
-            LinkError: nobody answers.
-        """
+        """Connect to the service `what`; all of it has to be done within so many seconds."""
         self._where = f"{what} (port {port})"
         self._seconds = seconds
         self._end = time.monotonic() + seconds
@@ -87,11 +75,9 @@ class Connection:
                     break
 
     def __enter__(self) -> Self:
-        """Return the open connection."""
         return self
 
     def __exit__(self, *error: object) -> None:
-        """End the connection."""
         self.close()
 
     def _more(self) -> None:

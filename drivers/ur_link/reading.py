@@ -1,24 +1,81 @@
-"""The state of the arm: packets from the receive worker, each checked."""
+"""State and kinematics of the arm: packets from the receive worker, each checked; the survey.
+
+The kinematics come from the controller's primary port. A package there is its size (i32, all
+included), its type (u8) and a body; of type 16, a robot state, the body is a row of parts of the
+same form. Part 5, the kinematics, is of checksums (6 u32), theta, a, d and alpha of classic rows
+(6 f64 each), and the status of the calibration (u32). The controller sends it when a client has
+connected. All big-endian. Source: Universal Robots, "Remote Control via TCP/IP", and
+`KinematicsInfo` of the Universal Robots Client Library.
+"""
 
 import math
+import re
+import struct
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from hilcal.drivers.ur_link import probe, states
-from hilcal.drivers.ur_link.lines import LinkError
+from hilcal.drivers.ur_link.lines import Connection, LinkError
+from hilcal.drivers.ur_link.probe import ControllerFacts
 from hilcal.drivers.ur_link.receive_worker import GETTERS
+from hilcal.drivers.ur_link.supervision import Supervision
 from hilcal.drivers.ur_link.worker import Worker, WorkerError
-from hilcal.measuring.devices import ArmSample
+from hilcal.errors import InputError
+from hilcal.measuring.devices import ArmSample, Report, Row, report_of
+from hilcal.robot.factory import FactoryKinematics, of_rows
 from hilcal.types import Floats
 
-N = 6
-"""Joints of every arm of this maker."""
+PRIMARY_PORT = 30001
+_PRIMARY = f"the primary port ({PRIMARY_PORT})"
+_HEAD = struct.Struct(">iB")
+_KINEMATICS = struct.Struct(">6I24dI")
+_STATE, _PART = 16, 5
+_LONGEST = 1 << 20
+_PACKAGES = 50  # packages that are looked at: the state comes ten times a second, among messages
 
-OUTPUTS = tuple(GETTERS)
-"""The outputs of the client library that are recorded."""
+
+def read_kinematics(host: str, seconds: float) -> FactoryKinematics:
+    """Return the kinematics of the controller's arm."""
+    with Connection(host, PRIMARY_PORT, "primary port", seconds) as line:
+        for _ in range(_PACKAGES):
+            size, kind = _HEAD.unpack(line.read(_HEAD.size))
+            if not _HEAD.size <= size <= _LONGEST:
+                raise LinkError(f"{_PRIMARY} does not answer as a controller does")
+            body = line.read(size - _HEAD.size)
+            part = _find(body) if kind == _STATE else None
+            if part is not None:
+                return _kinematics_of(part)
+    raise LinkError(f"{_PRIMARY} does not tell the arm's kinematics")
+
+
+def _find(body: bytes) -> bytes | None:
+    at = 0
+    while at + _HEAD.size <= len(body):
+        size, kind = _HEAD.unpack_from(body, at)
+        if size < _HEAD.size or at + size > len(body):
+            break
+        if kind == _PART and size >= _HEAD.size + _KINEMATICS.size:
+            return body[at + _HEAD.size : at + size]
+        at += size
+    return None
+
+
+def _kinematics_of(part: bytes) -> FactoryKinematics:
+    told = _KINEMATICS.unpack_from(part)
+    rows = np.array(told[6:30]).reshape(4, 6)
+    try:
+        return of_rows(rows, "the controller", told[30], tuple(told[:6]))
+    except InputError as error:
+        raise LinkError(f"{_PRIMARY}: {error}") from None
+
+
+N = 6  # joints of every arm of this maker
+
+OUTPUTS = tuple(GETTERS)  # the outputs of the client library that are recorded
 
 OPTIONAL = frozenset({"target_speed_fraction", "payload", "payload_cog", "ft_raw_wrench"})
 """Outputs that older controllers lack (payload and payload_cog come with 5.5.1, ft_raw_wrench
@@ -48,8 +105,7 @@ the way has changed is as a rule far outside."""
 
 STALE_S = 0.2
 """In a motion, the link is lost when the controller's timestamp stands for so long, real s."""
-PATIENCE_S = 0.8
-"""At rest, new data are waited for so long, real s."""
+PATIENCE_S = 0.8  # at rest, new data are waited for so long, real s
 _ANSWER_S = 0.3
 
 
@@ -68,11 +124,7 @@ class Reading:
 
 
 def read(answer: dict[str, Any]) -> Reading:
-    """Return the reading in the answer of the receive worker.
-
-    Raises:
-        ReadingError: a field has a wrong length, is not finite, or larger than can be.
-    """
+    """Return the reading in the answer of the receive worker."""
     fields, host_ns = answer["fields"], int(answer["host_ns"])
 
     def number(name: str) -> float:
@@ -162,3 +214,122 @@ class Receiver:
             return Worker("hilcal.drivers.ur_link.receive_worker", self._arguments, seconds)
         except WorkerError as error:
             raise LinkError(f"no data over RTDE: {error}") from None
+
+
+_RATE_S = (0.4, 2.0)  # how long packets are counted, and again where they were too few; choices
+_SHARE = 0.5
+"""Of the packets that were asked for: with fewer the line is not fit for a run; a choice."""
+_ASK_S = 1.5
+
+
+def survey(
+    host: str,
+    model: str,
+    hz: float,
+    controller: ControllerFacts,
+    receiver: Receiver,
+    supervision: Supervision,
+    silent: str,
+    needs_primary: bool,
+) -> Report:
+    """Ask everything that can be asked without moving; `silent` is why nobody supervises."""
+    version = states.version_word(controller.version)
+    rows: list[Row] = [
+        ("address", host, "address", host),
+        ("controller version", version, "controller_version", version),
+    ]
+    problems: list[str] = []
+    name, kinematics = "Universal Robots arm", None
+    try:
+        kinematics = read_kinematics(host, _ASK_S)
+        rows.append(("", "", "kinematics", kinematics.to_dict()))
+    except LinkError as error:
+        rows.append(("its kinematics", f"not told: {error}", "", None))
+        if needs_primary:
+            problems.append(
+                f"{error}; programs go by it, so that the arm cannot be controlled without it: "
+                "enable the primary client interface in the controller's settings, under services"
+            )
+    if silent:
+        rows.append((supervision.name, silent, "", None))
+    try:
+        if silent:
+            raise LinkError(silent)
+        robot = supervision.describe(_ASK_S)
+    except LinkError as error:
+        problems.append(f"{error}; the arm cannot be controlled without it")
+    else:
+        serial = f", serial number {robot.serial}" if robot.serial else ""
+        name = f"Universal Robots {robot.model or 'arm'}{serial}"
+        remote = {True: "yes", False: "no (local mode)", None: "not known to this controller"}
+        rows += [
+            ("model", robot.model, "model", robot.model),
+            ("serial number", robot.serial, "serial_number", robot.serial),
+            ("PolyScope", robot.version, "software_version", robot.version),
+            ("remote control", remote[robot.remote], "remote_control", robot.remote),
+            ("program", robot.program, "program", robot.program),
+        ]
+        if robot.remote is False:
+            problems.append("it is in local mode; switch it to remote control on the pendant")
+        # "UR10" may stand for an UR10e or UR12e as well: only the size decides
+        size, configured = _size(robot.model), _size(model)
+        if size and configured and configured != size:
+            problems.append(f'it is a {robot.model}; the configuration says model = "{model}"')
+    try:
+        reading = receiver.read()
+        rate = settled_rate(receiver.rate, hz)
+    except LinkError as error:
+        problems.append(str(error))
+    else:
+        rows += _state(reading)
+        rows.append(("RTDE rate", f"{rate:.0f} Hz of {hz:g} Hz", "rtde_rate_Hz", rate))
+        rows.append(("", "", "rtde_rate_asked_Hz", hz))
+        problems += _hindrances(reading)
+        if rate < _SHARE * hz:
+            problems.append(f"RTDE comes at {rate:.0f} Hz instead of {hz:g} Hz; check the network")
+    return report_of("arm", name, rows, problems, kinematics)
+
+
+def settled_rate(count: Callable[[float], float], hz: float) -> float:
+    """Packets per second of the `hz` that were asked for; counted again for longer where few."""
+    rate = count(_RATE_S[0])
+    return rate if rate >= _SHARE * hz else count(_RATE_S[1])
+
+
+def _size(model: str) -> str:
+    """Return the number in the name of an arm of this maker; UR7e and UR12e have their old one."""
+    found = re.match(r"ur(\d+)", model.lower())
+    return "" if found is None else {"7": "5", "12": "10"}.get(found[1], found[1])
+
+
+def _state(reading: Reading) -> list[Row]:
+    sample, mode = reading.sample, states.mode_word(reading.mode)
+    com, warm = sample.payload_com, sample.joint_temperature
+    at = "" if com is None else f" at {_list(1e3 * com)} mm"
+    mass = None if math.isnan(sample.payload) else sample.payload
+    payload = "not reported" if mass is None else f"{mass:.3f} kg{at}"
+    return [
+        ("robot mode", mode, "robot_mode", mode),
+        ("safety", sample.safety, "safety", sample.safety),
+        ("payload", payload, "payload_kg", mass),
+        ("", "", "payload_com_m", None if com is None else com.tolist()),
+        ("joint temperatures", f"{_list(warm)} °C", "joint_temperature_degC", warm.tolist()),
+    ]
+
+
+def _hindrances(reading: Reading) -> list[str]:
+    out, sample = [], reading.sample
+    if sample.safety != states.NORMAL:
+        out.append(f"{sample.safety}: {states.safety_advice(reading.safety_bits)}")
+    if reading.mode != states.RUNNING:
+        word = states.mode_word(reading.mode)
+        out.append(f"it is not running ({word}); switch it on and release the brakes")
+    if reading.runtime in (states.PLAYING, states.RESUMING):
+        out.append("a program runs on the robot; stop it on the pendant")
+    if math.isnan(sample.payload) or sample.payload_com is None:
+        out.append("it does not report its payload; that needs PolyScope 5.5.1 or newer")
+    return out
+
+
+def _list(values: Floats) -> str:
+    return ", ".join(f"{v:.1f}" for v in values)

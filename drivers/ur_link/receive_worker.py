@@ -8,7 +8,7 @@ its getters go on with the last values for ever; that it calls itself disconnect
 import time
 from typing import Any
 
-from hilcal.drivers.ur_link.child import answered, start, words
+from hilcal.drivers.ur_link.worker import answered, start, words
 
 GETTERS = {
     "timestamp": "getTimestamp",

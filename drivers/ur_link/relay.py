@@ -29,10 +29,7 @@ _CHUNK = 65536
 
 
 def start(host: str) -> tuple[subprocess.Popen[str], str]:
-    """Start a relay to a controller; return the process and the address to use.
-
-    The process ends when its standard input is closed, as when this process ends.
-    """
+    """Start a relay, which ends with this process; return the process and the address to use."""
     process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
         [sys.executable, "-P", "-m", "hilcal.drivers.ur_link.relay", host],
         stdin=subprocess.PIPE,

@@ -12,9 +12,8 @@ import struct
 import numpy as np
 
 from hilcal.drivers.ur_link import probe
-from hilcal.drivers.ur_link.child import start, words
 from hilcal.drivers.ur_link.lines import LinkError
-from hilcal.drivers.ur_link.worker import Worker, WorkerError
+from hilcal.drivers.ur_link.worker import Worker, WorkerError, start, words
 from hilcal.types import Floats
 
 TORQUE = "actual_current_as_torque"

@@ -23,25 +23,18 @@ from typing import Any
 
 import numpy as np
 
-from hilcal.calibration.compensated import Compensation, ToolPoses
-from hilcal.calibration.compensation import Inverse, Pose, invert
+from hilcal.calibration.compensation import Compensation, Inverse, Pose, ToolPoses, invert
 from hilcal.calibration.compiled import Compiled, compiled
 from hilcal.calibration.covariance_source import CovarianceSource
-from hilcal.calibration.measured import Condition, Measured, conditions_of, needed
+from hilcal.calibration.measured import Condition, Measured, SensorMount, conditions_of, needed
 from hilcal.calibration.scatter import Scatter, scatter_of
-from hilcal.calibration.sensed import SensorMount
 from hilcal.calibration.tool import ToolPose, in_chain, tool_of, tool_poses
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.errors import InputError
 from hilcal.identification.fit import Fit
 from hilcal.identification.predictive import position_factor, predictive
-from hilcal.identification.robot_frames import (
-    RobotFrames,
-    one_of_each,
-    robot_frames,
-    whole_turns,
-)
+from hilcal.identification.robot_frames import RobotFrames, one_of_each, robot_frames, whole_turns
 from hilcal.model.model import Model, Prediction
 from hilcal.readings.readings import States
 from hilcal.readings.whitening import Mode
@@ -51,6 +44,7 @@ from hilcal.robot.chain import evaluate
 from hilcal.robot.factory import SAME, flange_difference, of_dict, with_factory
 from hilcal.shown import Brief
 from hilcal.store.schema import is_campaign
+from hilcal.stream.fit import StreamFit
 from hilcal.types import Bools, Floats, Ints
 
 
@@ -122,6 +116,10 @@ class Calibration(Brief):
         # A deflection is the difference of two readings.
         readings = 2 if found.mode == "deflection" else 1
         loads = () if model.cell.config is None else model.cell.config.loads
+        learnt = None
+        if model.prior is None:  # else the covariance does not follow from these readings alone
+            stated = p.excess.of_readings(used, found.mode)
+            learnt = CovarianceSource(stated, p.prior, p.noise, kappa)
         made = cls(
             model=replace(model, readings=None, prior=None),
             theta=found.theta,
@@ -133,15 +131,7 @@ class Calibration(Brief):
             loads={load.name: load.wrench(model.cell.gravity) for load in loads},
             source=dict(source or {}),
             sensor=SensorMount.of(model.cell),
-            # With a carried prior the covariance does not follow from these readings alone.
-            learnt=None
-            if model.prior is not None
-            else CovarianceSource(
-                p.excess.of_readings(used, found.mode),
-                p.prior,
-                p.noise,
-                kappa,
-            ),
+            learnt=learnt,
         )
         return replace(made, conditions=conditions_of(model, used.states, made._moves))
 
@@ -226,7 +216,7 @@ class Calibration(Brief):
         if wanted is not None:
             given = np.broadcast_to(np.asarray(wanted, dtype=float), (len(states), 4, 4))
             goal = np.array(given[:, :3, :3]), np.array(given[:, :3, 3])
-        fast = self._compiled if of is self._tracked else compiled(of, self.mode)
+        fast = self._kernel(of)
         if isinstance(fast, Compiled):
             found, left = fast.compensate(states, goal)
             inverse = Inverse(found, left[:, 0], left[:, 1])
@@ -236,11 +226,7 @@ class Calibration(Brief):
 
     @cached_property
     def controller(self) -> Arm:
-        """The arm by which the controller computes poses, as far as it was told; else the nominal.
-
-        Raises:
-            InputError: what is kept of it is damaged.
-        """
+        """The arm by which the controller computes poses, as far as known; else the nominal one."""
         arm, told = self.model.cell.arm, self.source.get("kinematics")
         if told is None or arm.sign is not None or arm.coupling is not None:
             return arm
@@ -252,10 +238,12 @@ class Calibration(Brief):
         """The model for the compiled kernel, with the tracked target as the tool."""
         return compiled(self._tracked, self.mode)
 
+    def _kernel(self, of: ToolPose) -> Compiled | tuple[str, ...]:
+        return self._compiled if of is self._tracked else compiled(of, self.mode)
+
     def without_kernel(self, tool: Floats | None = None) -> tuple[str, ...]:
         """Names of what the compiled kernel has no form for: some hundred times slower with it."""
-        of = self._tool(tool)
-        found = self._compiled if of is self._tracked else compiled(of, self.mode)
+        found = self._kernel(self._tool(tool))
         return () if isinstance(found, Compiled) else found
 
     def _invert(self, of: ToolPose, states: States, goal: tuple[Floats, Floats]) -> Inverse:
@@ -366,13 +354,10 @@ class Calibration(Brief):
         std: bool,
         untold: tuple[str, ...] = (),
     ) -> ToolPoses:
-        """Return where a tool is.
+        """Return where a tool is at N points.
 
-        Args:
-            states: N points.
-            nominal: orientation (N, 3, 3) and position (N, 3) that errors are counted from.
-            std: also state the uncertainty.
-            untold: columns of the states that are means of `conditions`.
+        `nominal` (N, 3, 3) and (N, 3) are orientations and positions that errors are counted from,
+        `untold` columns of the states that are means of `conditions`.
         """
         prediction = of.model.predict(states, of.theta)
         rotation, position = tool_poses(of, prediction)
@@ -422,3 +407,22 @@ class Calibration(Brief):
 
 def _unloaded(states: States) -> States:
     return replace(states, wrench=np.zeros((len(states), 6)))
+
+
+def calibration_of_stream(found: StreamFit, source: Mapping[str, Any]) -> Calibration:
+    """Return the calibration: parameters and covariance of the stream, ranges of its sample.
+
+    The limit of the standard deviation is that of the sample, scaled to the number of readings.
+    """
+    of_sample = Calibration.of(found.sample, source)
+    values, vectors = np.linalg.eigh(found.covariance)
+    share = np.sqrt(len(found.sample.readings) / found.readings)
+    measured = of_sample.measured
+    return replace(
+        of_sample,
+        model=replace(found.model, readings=None, prior=None),
+        theta=found.theta,
+        root=vectors * np.sqrt(np.maximum(values, 0.0)),
+        measured=replace(measured, most_std_m=float(share * measured.most_std_m)),
+        learnt=None,
+    )

@@ -9,15 +9,25 @@ Every residual is of the whole model at equilibrium, so the solution is exact; l
 out of J only costs a step or two, each about 10³ times closer.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.stats import chi2
 
+from hilcal.calibration.measured import Outside
+from hilcal.calibration.tool import ToolPose
+from hilcal.errors import InputError
+from hilcal.readings.readings import States
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.robot.chain import Chain, evaluate, joint_jacobian
 from hilcal.types import Bools, Floats, Ints
+
+if TYPE_CHECKING:
+    from hilcal.calibration.calibration import Calibration
 
 TOLERANCE = 1e-10
 """Residual at which a point is solved, m and rad."""
@@ -35,17 +45,11 @@ Pose = tuple[Floats, Floats, Chain]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Inverse:
-    """The solution for N points.
+    """The solution for N points."""
 
-    Attributes:
-        q: (N, n) joint values.
-        residual_m: (N,) distance from the wanted position that is left.
-        residual_rad: (N,) angle from the wanted orientation that is left.
-    """
-
-    q: Floats
-    residual_m: Floats
-    residual_rad: Floats
+    q: Floats  # (N, n) joint values
+    residual_m: Floats  # (N,) distance from the wanted position that is left
+    residual_rad: Floats  # (N,) angle from the wanted orientation that is left
 
     @property
     def solved(self) -> Bools:
@@ -54,28 +58,18 @@ class Inverse:
 
 
 def invert(
-    arm: Arm,
-    poses: Callable[[Floats, Ints], Pose],
-    q: Floats,
-    rotation: Floats,
-    position: Floats,
+    arm: Arm, poses: Callable[[Floats, Ints], Pose], q: Floats, rotation: Floats, position: Floats
 ) -> Inverse:
-    """Find joint values.
-
-    Args:
-        poses: takes joint values (K, n) and the numbers (K,) of their points; returns the poses.
-        q: (N, n) joint values to begin with.
-        rotation: (N, 3, 3) wanted orientation of the tool, base axes.
-        position: (N, 3) wanted position, base axes, m.
-    """
+    """Find joint values for wanted orientations (N, 3, 3) and positions (N, 3), from q (N, n)."""
     q, count = q.copy(), len(q)
     left = np.full((count, 2), np.inf)
     active = np.arange(count)
     scale = np.array([arm.reach] * 3 + [1.0] * 3)
     for _ in range(MOST_STEPS):
         r, p, chain = poses(q[active], active)
-        e = _error(r, p, rotation[active], position[active])
-        left[active] = np.stack([np.linalg.norm(part, axis=1) for part in (e[:, :3], e[:, 3:])], 1)
+        turn = se3.rotation_vector(se3.product(rotation[active], np.swapaxes(r, 1, 2)))
+        e = np.concatenate([position[active] - p, turn], axis=1)  # what is missing, base axes
+        left[active] = np.linalg.norm(e.reshape(-1, 2, 3), axis=2)
         u, s, vt = np.linalg.svd(_jacobian(arm, chain, p), full_matrices=False)
         step = np.einsum("nji,nj,nkj,nk->ni", vt, 1.0 / np.maximum(s, 1e-6), u, e / scale)
         going = left[active].max(axis=1) > TOLERANCE
@@ -98,13 +92,8 @@ def invert_nominal(
     arm: Arm, tool: Floats, q: Floats, rotation: Floats, position: Floats
 ) -> Inverse:
     """Find joint values at which the nominal arm has a tool; one pose or N, else as `invert`."""
-    return invert(
-        arm,
-        lambda at, _: nominal_pose(arm, tool, at),
-        q,
-        np.broadcast_to(rotation, (len(q), 3, 3)),
-        np.broadcast_to(position, (len(q), 3)),
-    )
+    goal = np.broadcast_to(rotation, (len(q), 3, 3)), np.broadcast_to(position, (len(q), 3))
+    return invert(arm, lambda at, _: nominal_pose(arm, tool, at), q, *goal)
 
 
 def singular(arm: Arm, chain: Chain, position: Floats) -> Bools:
@@ -120,7 +109,197 @@ def _jacobian(arm: Arm, chain: Chain, position: Floats) -> Floats:
     return jacobian if arm.coupling is None else np.asarray(jacobian @ arm.coupling)
 
 
-def _error(r: Floats, p: Floats, rotation: Floats, position: Floats) -> Floats:
-    """(N, 6) displacement and turn that are missing, base axes."""
-    turn = se3.rotation_vector(se3.product(rotation, np.swapaxes(r, 1, 2)))
-    return np.concatenate([position - p, turn], axis=1)
+BAND = 0.95
+"""Share of points whose error lies within the stated band."""
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorSize:
+    """Sizes of 3-D position errors, m."""
+
+    mean_m: float
+    rms_m: float
+    max_m: float
+
+    @classmethod
+    def of(cls, errors: Floats) -> "ErrorSize":
+        """Return the sizes of (N,) distances."""
+        rms = float(np.sqrt(np.mean(errors**2)))
+        return cls(float(errors.mean()), rms, float(errors.max()))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ToolPoses:
+    """Where the tool is at N points, base axes."""
+
+    position: Floats  # (N, 3) m
+    rotation: Floats  # (N, 3, 3)
+    nominal_position: Floats
+    """(N, 3) where it is asked to be: where the nominal arm has it, of a fit to deflections where
+    the unloaded arm has it."""
+    nominal_rotation: Floats  # (N, 3, 3)
+    covariance: Floats | None
+    """(N, 3, 3) of the true position about `position`, m²; None where it was not asked for."""
+    outside: tuple[Outside, ...]  # what the points leave of that which was measured
+
+    @property
+    def error_m(self) -> Floats:
+        """(N,) distance of the tool from where it is asked to be, m."""
+        return np.asarray(np.linalg.norm(self.position - self.nominal_position, axis=1))
+
+    @property
+    def error_rad(self) -> Floats:
+        """(N,) angle between the two, rad."""
+        turn = se3.product(self.rotation, np.swapaxes(self.nominal_rotation, 1, 2))
+        return np.asarray(np.linalg.norm(se3.rotation_vector(turn), axis=1))
+
+    @property
+    def std_m(self) -> Floats:
+        """(N,) standard deviation of the position, over three dimensions, m."""
+        return np.asarray(np.sqrt(np.trace(self._known(), axis1=1, axis2=2)))
+
+    @property
+    def band_m(self) -> Floats:
+        """(N,) distance from `position` that `BAND` of the points stay within, m.
+
+        Of a normal error with covariance Σ, |e|² ≈ g χ²_ν with the same mean and variance:
+        g = tr Σ²/tr Σ, ν = (tr Σ)²/tr Σ² (Satterthwaite, Biometrics Bulletin 2 (1946) 110-114).
+        """
+        return band(self._known())
+
+    def _known(self) -> Floats:
+        if self.covariance is None:
+            raise InputError("the uncertainty was left out; ask for it with std=True")
+        return self.covariance
+
+
+def band(covariance: Floats) -> Floats:
+    """(N,) radius that `BAND` of normal vectors with covariance (N, 3, 3) stay within.
+
+    By the χ² with the same mean and variance (Satterthwaite); 0 where the covariance is.
+    """
+    size = np.trace(covariance, axis1=1, axis2=2)
+    shape = covariance / np.where(size > 0, size, 1.0)[:, None, None]
+    second = np.einsum("nij,nji->n", shape, shape)
+    second = np.where(size > 0, second, 1.0)
+    return np.asarray(np.sqrt(size * second * chi2.ppf(BAND, 1.0 / second)))
+
+
+@dataclass(frozen=True, eq=False)
+class Compensation:
+    """Joint values that put the tool where it was asked to be, and what follows from them."""
+
+    inverse: Inverse  # joint values, and what is left
+    _calibration: "Calibration"
+    _tool: ToolPose
+    _states: States
+    _wanted: tuple[Floats, Floats] | None
+    _std: bool
+    untold: tuple[str, ...] = ()
+    """Columns of `States` that the model needs and the points did not have."""
+
+    @property
+    def q(self) -> Floats:
+        """(N, n) the joint values, rad."""
+        return self.inverse.q
+
+    @property
+    def given(self) -> Floats:
+        """(N, n) the joint values that were given, rad."""
+        return self._states.q
+
+    @property
+    def inside(self) -> Bools:
+        """(N,) whether the point lies within what was measured."""
+        out = np.ones(len(self.q), dtype=bool)
+        for o in self.after.outside:
+            out &= ~o.points
+        return out
+
+    @cached_property
+    def before(self) -> ToolPoses:
+        """The tool at the joint values that were given; without uncertainties."""
+        return self._calibration.poses(self._tool, self._states, self._goal, std=False)
+
+    @cached_property
+    def after(self) -> ToolPoses:
+        """The tool at the joint values that were found."""
+        found = replace(self._states, q=self.q)
+        return self._calibration.poses(self._tool, found, self._goal, self._std, self.untold)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """(n,) units of the joint values: rad, of joints that slide m."""
+        return self._tool.model.cell.arm.units
+
+    @property
+    def limits(self) -> Bools:
+        """(N, n) joint values that are beyond the arm's limits."""
+        arm = self._tool.model.cell.arm
+        return np.asarray((self.q < arm.q_min) | (self.q > arm.q_max))
+
+    @cached_property
+    def singular(self) -> Bools:
+        """(N,) whether the pose is singular."""
+        arm = self._tool.model.cell.arm
+        return singular(arm, evaluate(arm, self.q), self.after.position)
+
+    @property
+    def turned_on(self) -> tuple[Outside, ...]:
+        """Joint angles that are inside of what was measured by whole turns alone."""
+        counted = self._calibration.measured.turned_on(replace(self._states, q=self.q))
+        left = {o.of.variable: o.points for o in self.after.outside}
+        nowhere = np.zeros(len(self.q), dtype=np.bool_)
+        found = [replace(o, points=o.points & ~left.get(o.of.variable, nowhere)) for o in counted]
+        return tuple(o for o in found if o.points.any())
+
+    @property
+    def usable(self) -> Bools:
+        """(N,) points that are solved, not singular, within limits and what was measured."""
+        good = self.inverse.solved & ~self.singular & ~self.limits.any(axis=1)
+        return np.asarray(good & self.inside)
+
+    @cached_property
+    def _goal(self) -> tuple[Floats, Floats]:
+        if self._wanted is None:
+            return self._calibration.nominal(self._tool, self._states)
+        return self._wanted
+
+    def to_dict(self, names: Sequence[str]) -> dict[str, object]:
+        """Return the document of `compensate --json`, SI; `names` are those of the points.
+
+        `expected_error_m` is rms: what the inversion leaves, and the standard deviation of the
+        position.
+        """
+        of, after, inside = self._calibration, self.after, self.inside
+        expected = np.hypot(self.inverse.residual_m, after.std_m)
+        return {
+            "calibration": dict(of.source),
+            "readings": of.mode,
+            "base_in_tracker": se3.six(of.base_in_tracker()),
+            "base_is": of.frames.base_is,
+            "n_points": len(names),
+            "error_before": asdict(ErrorSize.of(self.before.error_m)),
+            "error_after": {
+                "std_m": ErrorSize.of(after.std_m).rms_m,
+                "band_m": float(after.band_m.max()),
+                "band_share": BAND,
+            },
+            "points": [
+                {
+                    "name": name,
+                    "q_command": self.given[k].tolist(),
+                    "q_corrected": self.q[k].tolist(),
+                    "expected_error_m": float(expected[k]),
+                    "inside": bool(inside[k]),
+                    "q_rad": self.q[k].tolist(),
+                    "before_m": float(self.before.error_m[k]),
+                    "before_rad": float(self.before.error_rad[k]),
+                    "residual_m": float(self.inverse.residual_m[k]),
+                    "std_m": float(after.std_m[k]),
+                    "band_m": float(after.band_m[k]),
+                    "refused": None,
+                }
+                for k, name in enumerate(names)
+            ],
+        }

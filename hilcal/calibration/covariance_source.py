@@ -13,14 +13,13 @@ and its eigenvectors takes seconds, once, when an uncertainty is first asked for
 import base64
 import math
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 
 from hilcal import limits
-from hilcal.calibration.check_stored import check_numbers
 from hilcal.identification.gauss_newton import whitened_jacobian
 from hilcal.model.model import Model
 from hilcal.readings.readings import ObserverName, Readings, States
@@ -28,29 +27,32 @@ from hilcal.readings.serial_noise import SerialNoise
 from hilcal.readings.whitening import Mode, whitening
 from hilcal.types import Floats
 
+LARGEST = 1e9
+"""No length, angle, mass, force or parameter is as large, in SI units."""
+
+
+def check_numbers(
+    what: str, values: Floats | float, shape: Sequence[int] = (), *, least: float = -LARGEST
+) -> None:
+    """Refuse numbers of another shape, or that nothing in a cell has, by a ValueError."""
+    array = np.asarray(values, dtype=float)
+    if array.shape != tuple(shape):
+        raise ValueError(f"{what} has shape {array.shape}; expected {tuple(shape)}")
+    if not np.all((array >= least) & (array <= LARGEST)):
+        raise ValueError(f"{what} has a number that cannot be")
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CovarianceSource:
-    """What the covariance follows from.
+    """What the covariance follows from."""
 
-    Attributes:
-        readings: the fitted ones; their values are not used.
-        prior: (P,) S.
-        noise: σ².
-        factor: κ.
-    """
-
-    readings: Readings
-    prior: Floats
-    noise: float
-    factor: float
+    readings: Readings  # the fitted ones; their values are not used
+    prior: Floats  # (P,) S
+    noise: float  # σ²
+    factor: float  # κ
 
     def root(self, model: Model, theta: Floats, mode: Mode) -> Floats:
-        """Return R (P, P) with κ C = R Rᵀ.
-
-        Args:
-            theta: (P,) its parameters.
-        """
+        """Return R (P, P) with κ C = R Rᵀ; `theta` (P,) are its parameters."""
         w = whitening(self.readings, mode, "gc")
         prediction = model.predict(self.readings.states, theta)
         a = whitened_jacobian(model, prediction, theta, w, np.arange(model.size))
@@ -60,12 +62,7 @@ class CovarianceSource:
         return np.asarray(self.prior[:, None] * vectors * np.sqrt(spread))
 
     def check(self, model: Model) -> None:
-        """Refuse what does not go with a model.
-
-        Raises:
-            InputError: too large.
-            ValueError: says why.
-        """
+        """Refuse what does not go with a model."""
         r, n = self.readings, model.cell.arm.n
         count = len(r.states)
         limits.check_numbers("what its covariance follows from", count * r.m * max(model.size, 1))
@@ -82,17 +79,15 @@ class CovarianceSource:
         check_numbers("covariance", r.covariance, (count, r.m, r.m))
         if r.common is not None:
             check_numbers("common", r.common, (count, r.m, r.common.shape[-1]))
-        for index, names in ((r.pose, r.pose_names), (r.load, r.load_names)):
-            if index.shape != (count,) or np.any((index < 0) | (index >= len(names))):
-                raise ValueError("readings without a pose or load")
-        if r.states.target is not None and np.any(
-            (r.states.target < 0) | (r.states.target >= max(len(r.target_names), 1))
-        ):
-            raise ValueError("readings without a target")
-        if r.states.observer is not None and np.any(
-            (r.states.observer < 0) | (r.states.observer >= len(r.observers))
-        ):
-            raise ValueError("readings without an observer")
+        indices = {
+            "pose": (r.pose, r.pose_names),
+            "load": (r.load, r.load_names),
+            "target": (r.target, r.target_names or ("",)),
+            "observer": (r.observer, r.observers or ("",)),
+        }
+        for name, (index, known) in indices.items():
+            if index.shape != (count,) or np.any((index < 0) | (index >= len(known))):
+                raise ValueError(f"readings without a known {name}")
 
     def to_json(self) -> dict[str, object]:
         """Return it as JSON; numbers of the readings with 7 digits."""

@@ -46,47 +46,24 @@ TRIALS = 200
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DhRows:
-    """A table of n joints.
+    """A table of n joints."""
 
-    Attributes:
-        convention: of the rows, see `robot.dh.arm_from_dh`.
-        a: (n,) m.
-        d: (n,) m.
-        alpha: (n,) rad.
-        offset: (n,) rad.
-        base: (4, 4) B.
-        flange: (4, 4) E.
-        base_moves: most that the flange moves where B is left out, m.
-        flange_moves: the same of E, m.
-        table_moves: the same of both together.
-        disagreement: most that the flange is elsewhere with B and E, m: rounding.
-        slides: joints that slide, counted from 0: q adds to d.
-    """
-
-    convention: Convention
-    a: Floats
-    d: Floats
-    alpha: Floats
-    offset: Floats
-    base: Floats
-    flange: Floats
-    base_moves: float = 0.0
-    flange_moves: float = 0.0
-    table_moves: float = 0.0
-    disagreement: float = 0.0
-    slides: tuple[int, ...] = ()
+    convention: Convention  # of the rows, see `robot.dh.arm_from_dh`
+    a: Floats  # (n,) m
+    d: Floats  # (n,) m
+    alpha: Floats  # (n,) rad
+    offset: Floats  # (n,) rad
+    base: Floats  # (4, 4) B
+    flange: Floats  # (4, 4) E
+    base_moves: float = 0.0  # most that the flange moves where B is left out, m
+    flange_moves: float = 0.0  # the same of E, m
+    table_moves: float = 0.0  # the same of both together
+    disagreement: float = 0.0  # most that the flange is elsewhere with B and E, m: rounding
+    slides: tuple[int, ...] = ()  # joints that slide, counted from 0: q adds to d
 
 
 def dh_rows(arm: Arm, convention: Convention = "standard") -> DhRows:
-    """Return the table of an arm.
-
-    Args:
-        arm: without couplings.
-        convention: "standard" (classic) or "modified" (Craig) rows.
-
-    Raises:
-        InputError: joints of the arm are coupled.
-    """
+    """Return the table of an arm, of "standard" (classic) or "modified" (Craig) rows."""
     if arm.coupling is not None or arm.drive is not None:
         raise InputError(f"{arm.name}: joints are coupled, which a DH table cannot hold")
     n = arm.n
@@ -150,11 +127,7 @@ def to_csv(rows: DhRows, arm: Arm) -> str:
 
 
 def to_toml(rows: DhRows, arm: Arm, title: str) -> str:
-    """Return a file of the robot catalogue, which `[robot] model = "F.toml"` of a cell reads.
-
-    Args:
-        arm: gives masses, limits and payload; what its description lacks is left out.
-    """
+    """Return a file of the robot catalogue with masses, limits and payload of an arm."""
     com = _centres(rows, arm)
     content: dict[str, object] = {
         "title": escaped(title),

@@ -37,24 +37,17 @@ FULL_TURN = 2 * np.pi
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Corrected:
-    """An arm with what is constant of a calibration.
-
-    Attributes:
-        within: effects that it contains.
-        beyond: effects that it does not contain.
-    """
+    """An arm with what is constant of a calibration."""
 
     arm: Arm
-    within: tuple[str, ...]
-    beyond: tuple[str, ...]
+    within: tuple[str, ...]  # effects that it contains
+    beyond: tuple[str, ...]  # effects that it does not contain
 
 
 def corrected(calibration: Calibration) -> Corrected:
     """Return the arm with the constant effects of a calibration in its transforms.
 
-    Raises:
-        CannotAnswerError: the calibration is of deflections, which do not show constant errors.
-        InputError: joints of the arm are coupled.
+    Deflections do not show constant errors: of these it raises a CannotAnswerError.
     """
     if calibration.mode == "deflection":
         raise CannotAnswerError(
@@ -69,12 +62,7 @@ def corrected(calibration: Calibration) -> Corrected:
 
 
 def urdf(arm: Arm, note: str = "") -> str:
-    """Return an arm as URDF: links base_link, link_1 ..., tool0.
-
-    Args:
-        arm: without couplings.
-        note: stands in a comment at the top.
-    """
+    """Return an arm as URDF: links base_link, link_1 ..., tool0."""
     root = Element("robot", name=escaped(arm.name))
     SubElement(root, "link", name="base_link")
     links = ["base_link", *(f"link_{k}" for k in range(1, arm.n + 1)), "tool0"]
@@ -104,10 +92,6 @@ def matlab(arm: Arm, name: str, note: str = "") -> str:
     """Return a MATLAB function that builds an arm as a `rigidBodyTree` (Robotics System Toolbox).
 
     Bodies base, link_1 …, tool0; each joint turns about z of its fixed transform.
-
-    Args:
-        arm: without couplings.
-        note: stands in a comment at the top.
     """
     out = [f"function robot = {name}()"]
     out += [f"% {escaped(line)}" for line in note.split("\n")]
@@ -153,14 +137,8 @@ def ur_kinematics(
 ) -> tuple[str, Floats]:
     """Return UR's kinematics file, and (4, 4) from its last frame to the flange.
 
-    Args:
-        nominal: the arm of the catalogue.
-        note: stands in a comment at the top.
-        digest: the driver's name of the connected arm's own calibration, "calib_…"; the driver logs
-            an error where the file has another. One of the file's content where None.
-
-    Raises:
-        InputError: it is no UR arm, or the digest is none.
+    `digest` is the driver's name of the connected arm's own calibration, "calib_…"; the driver logs
+    an error where the file has another. One of the file's content where None.
     """
     if not nominal.name.startswith("ur") or arm.n != len(UR_JOINTS):
         raise InputError(f"{nominal.name}: UR's kinematics file is for UR arms")
@@ -193,11 +171,7 @@ def frames(calibration: Calibration, found: Corrected, beyond_flange: Floats | N
     `base_in_tracker` is the one base of all that is handed out, `base_is` how it is known.
     `tool_on_flange` is that of the corrected arm. A controller computes with its own arm: its tool
     centre point has the constant part of the last link with it, under "controller", in m and, as
-    PolyScope shows them, in mm.
-
-    Args:
-        beyond_flange: (4, 4) from the last frame of UR's kinematics file to the flange; None where
-            that file is not written.
+    PolyScope shows them, in mm. `beyond_flange` (4, 4) is what `ur_kinematics` returns, or None.
     """
     tool, base = calibration.tool_pose(), calibration.base_in_tracker()
     nominal, arm = calibration.model.cell.arm, found.arm

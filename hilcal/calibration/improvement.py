@@ -23,28 +23,13 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from hilcal.calibration.calibration import Calibration
-from hilcal.calibration.compensated import BAND, band
+from hilcal.calibration.compensation import BAND, ErrorSize, band
 from hilcal.calibration.tool import tool_of, tool_poses
 from hilcal.identification.predictive import Predictive
 from hilcal.identification.residual import noise_floor, residual
 from hilcal.readings.readings import Readings, States
 from hilcal.readings.whitening import Mode, whitening
 from hilcal.types import Bools, Floats
-
-
-@dataclass(frozen=True, slots=True)
-class ErrorSize:
-    """Sizes of 3-D position errors, m."""
-
-    mean_m: float
-    rms_m: float
-    max_m: float
-
-    @classmethod
-    def of(cls, errors: Floats) -> "ErrorSize":
-        """Return the sizes of (N,) distances."""
-        rms = float(np.sqrt(np.mean(errors**2)))
-        return cls(float(errors.mean()), rms, float(errors.max()))
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,27 +61,18 @@ class Improved:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Improvement:
-    """Errors of N points before and after the correction, as measured.
+    """Errors of N points before and after the correction, as measured."""
 
-    Attributes:
-        mode: kind of readings of the model.
-        poses: their names.
-        loads: name of each one's load.
-        before_m: (N,) distance from where the tool was asked to be.
-        after_m: (N,) the same at the corrected joint values.
-        band_m: (N,) distance within which `BAND` of such readings were predicted to be.
-        noise_m: (N,) root mean square distance by the tracker's noise and the arm's repeatability.
-        left_out: points that could not be corrected or reached, with the reason.
-    """
-
-    mode: Mode
-    poses: tuple[str, ...]
-    loads: tuple[str, ...]
-    before_m: Floats
-    after_m: Floats
-    band_m: Floats
+    mode: Mode  # kind of readings of the model
+    poses: tuple[str, ...]  # their names
+    loads: tuple[str, ...]  # name of each one's load
+    before_m: Floats  # (N,) distance from where the tool was asked to be
+    after_m: Floats  # (N,) the same at the corrected joint values
+    band_m: Floats  # (N,) distance within which `BAND` of such readings were predicted to be
     noise_m: Floats
+    """(N,) root mean square distance by the tracker's noise and the arm's repeatability."""
     left_out: tuple[tuple[str, str], ...] = ()
+    """Points that could not be corrected or reached, with the reason."""
 
     @property
     def everything(self) -> Improved:
@@ -130,20 +106,15 @@ class Improvement:
 
     def to_dict(self) -> dict[str, object]:
         """Return it as JSON, SI."""
-        rows = zip(self.poses, self.loads, self.before_m, self.after_m, self.band_m, strict=True)
+        numbers = (x.tolist() for x in (self.before_m, self.after_m, self.band_m))
+        rows = zip(self.poses, self.loads, *numbers, strict=True)
         return {
             "readings": self.mode,
             "error": asdict(self.everything),
             "loads": [asdict(part) for part in self.by_load],
             "band_share": BAND,
             "points": [
-                {
-                    "pose": pose,
-                    "load": load,
-                    "before_m": float(before),
-                    "after_m": float(after),
-                    "band_m": float(width),
-                }
+                {"pose": pose, "load": load, "before_m": before, "after_m": after, "band_m": width}
                 for pose, load, before, after, width in rows
             ],
             "left_out": [{"point": name, "why": why} for name, why in self.left_out],
@@ -160,15 +131,9 @@ def improvement(
 ) -> Improvement:
     """Compare readings of the same points at uncorrected and at corrected joint values.
 
-    Args:
-        calibration: by which the points were corrected.
-        p: what its fit knows of readings that it has not seen.
-        before: readings at the uncorrected joint values; for deflections with the unloaded readings
-            of the points.
-        after: the same at the corrected ones, with the same poses, in the same order.
-        goal: (M,) states of `before` that say where the tool was asked to be: where the nominal arm
-            has it at their joint values; for deflections not used.
-        left_out: points that are missing in both, with the reason.
+    Both have the same poses in the same order, for deflections with the unloaded readings of the
+    points. `goal` are states of `before` at which the nominal arm has the tool where it was asked
+    to be; not used for deflections.
     """
     first, _, _ = _errors(calibration, p, before, goal)
     last, covariance, noise = _errors(calibration, p, after, goal)

@@ -88,18 +88,10 @@ def _exp(twist: Floats, r: Floats, v: Floats) -> None:
 
 @njit(cache=True)
 def _chain(
-    arm: Arrays,
-    dq: Floats,
-    twist: Floats,
-    q: Floats,
-    rotation: Floats,
-    position: Floats,
-    body: Floats,
-    com: Floats,
-    scratch: Floats,
+    arm: Arrays, dq: Floats, twist: Floats, q: Floats, frames: Arrays, scratch: Floats
 ) -> None:
     """Write frames of the slots, axes of the bodies and their centres of mass."""
-    link_r, link_p, coms = arm
+    (link_r, link_p, coms), (rotation, position, body, com) = arm, frames
     n = len(q)
     step_r, start, before = scratch[0], scratch[1], scratch[2]
     step_p = scratch[3, 0]
@@ -152,17 +144,9 @@ def _add_sensed(
 
 
 @njit(cache=True)
-def _wrenches(
-    load: Any,
-    applied: Floats,
-    rotation: Floats,
-    position: Floats,
-    body: Floats,
-    com: Floats,
-    out: Floats,
-    scratch: Floats,
-) -> None:
+def _wrenches(load: Any, applied: Floats, frames: Arrays, out: Floats, scratch: Floats) -> None:
     """Write the wrench (n + 1, 6) through each slot, slot axes."""
+    rotation, position, body, com = frames
     point, tool_mass, tool_com, gravity, masses, moments, gain, bias = load
     n = len(com)
     f, t, lever, weight = scratch[0, 0], scratch[0, 1], scratch[0, 2], scratch[1, 0]
@@ -211,18 +195,8 @@ def _deviations(
     """Write the deviations; returns their largest change."""
     a, linear, by_wrench, b, compliance, by_values = laws
     own_dq, own_twist, own_soft = own
-    (
-        by_angle,
-        angle_slopes,
-        angle_low,
-        angle_step,
-        by_torque,
-        torque_slopes,
-        torque_low,
-        torque_step,
-        soft,
-        soft_slopes,
-    ) = tables
+    angle_low, angle_step, torque_low, torque_step = tables[0]
+    by_angle, angle_slopes, by_torque, torque_slopes, soft, soft_slopes = tables[1]
     n, change = len(q), 0.0
     for j in range(n):
         new = a[j] + own_dq[j] + own_soft[j] * wrench[j, 5]
@@ -322,26 +296,17 @@ def invert_all(
     """Invert N points; without `newton` write the poses at q into `rotations` and `positions`.
 
     Args:
-        arm: links (n + 1, 3, 3) and (n + 1, 3), centres of mass (n, 3).
-        load: where the load acts, and all weights.
-        laws: constants and compliances of the deviations.
-        tables: of what depends on one angle, or one torque.
-        own: displacements (K, n), twists (K, n + 1, 6) and compliances (K, n) of the points, K
-            each its own; the last ones are those of all further points.
         tool: (4, 4) T_flange_tool.
-        most_turn: largest step of a joint, rad.
-        tolerance: residual at which a point is solved, m and rad.
         q: (N, n) joint values to begin with, rad.
         applied: (N, 6) wrenches at the load point, base axes.
         rotations: (N, 3, 3) wanted orientations.
         positions: (N, 3) wanted positions, m.
-        newton: whether to change q.
         out_q: (N, n) joint values found.
         left: (N, 2) residuals, m and rad.
     """
     count, n = q.shape
     rotation, position = np.empty((n + 1, 3, 3)), np.empty((n + 1, 3))
-    body, com = np.empty((n, 3, 3)), np.empty((n, 3))
+    frames = rotation, position, np.empty((n, 3, 3)), np.empty((n, 3))
     wrench, dq, twist = np.empty((n + 1, 6)), np.empty(n), np.empty((n + 1, 6))
     jacobian, e, at = np.empty((n, n)), np.empty(n), np.empty(n)
     scratch, r = np.empty((4, 3, 3)), np.empty((3, 3))
@@ -356,11 +321,11 @@ def invert_all(
         dq[:] = 0.0
         twist[:] = 0.0
         for _ in range(ROUNDS):
-            _chain(arm, dq, twist, at, rotation, position, body, com, scratch)
+            _chain(arm, dq, twist, at, frames, scratch)
             _product(rotation[n], tool[:3, :3], r)
             p[:] = position[n]
             _add_turned(rotation[n], tool[:3, 3], p)
-            _wrenches(load, applied[point], rotation, position, body, com, wrench, scratch)
+            _wrenches(load, applied[point], frames, wrench, scratch)
             change = _deviations(laws, tables, mine, at, wrench, dq, twist)
             if not newton:
                 rotations[point] = r

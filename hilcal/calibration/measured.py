@@ -7,16 +7,23 @@ of each axis of the tool's position p:
     v = mean over measured states of (|p(x) − p(x̄)|² + |(J(x) − J(x̄)) R|²) / 3
 
 J the derivative of p by the parameters, R Rᵀ their covariance.
+
+The force sensor stands between flange and tool. With R its axes and p its origin in base axes, r
+the load point, and (f, M) what the load adds to its reading, sensor axes:
+
+    force = R f,   moment = R M − (r − p) × R f
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
-from hilcal.identification.extrapolation import FAR
+from hilcal.cell import Cell
 from hilcal.identification.predictive import Predictive
+from hilcal.identification.validation import FAR
+from hilcal.measuring.force import shift
 from hilcal.model.model import Model
 from hilcal.readings.ranges import (
     Range,
@@ -27,45 +34,36 @@ from hilcal.readings.ranges import (
     variables,
 )
 from hilcal.readings.readings import States
+from hilcal.robot import se3
+from hilcal.robot.chain import evaluate
 from hilcal.types import Bools, Floats
 
 
 @dataclass(frozen=True, slots=True)
 class Outside:
-    """Points outside of what was measured.
+    """Points outside of what was measured."""
 
-    Attributes:
-        of: the range that they leave; for the uncertainty, its limit, m.
-        points: (N,) which points.
-        values: (N,) their values.
-    """
-
-    of: Range
-    points: Bools
-    values: Floats
+    of: Range  # the range that they leave; for the uncertainty, its limit, m
+    points: Bools  # (N,) which points
+    values: Floats  # (N,) their values
 
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """Where the fitted readings lie.
+    """Where the fitted readings lie."""
 
-    Attributes:
-        ranges: of joint angles, force, moment, temperatures.
-        most_std_m: standard deviation of a prediction, by the parameters alone, from which on a
-            point is far from all fitted ones; see `extrapolation`. For the tracked target.
-    """
-
-    ranges: tuple[Range, ...]
+    ranges: tuple[Range, ...]  # of joint angles, force, moment, temperatures
     most_std_m: float
+    """Standard deviation of a prediction, by the parameters alone, from which on a point is far
+    from all fitted ones; see `extrapolation`. For the tracked target."""
 
     @classmethod
     def of(cls, states: States, p: Predictive, noise: Floats, units: Sequence[str]) -> "Measured":
         """Return where fitted states lie.
 
         Args:
-            p: what the fit knows of others.
-            noise: (D,) trace of the position's covariance of each measurement, by noise and
-                misfit, m².
+            noise: (D,) trace of the position's covariance of each measurement, by noise and misfit,
+                m².
             units: (n,) of the joints' values.
         """
         spread = noise * p.leverage / (1 - p.leverage)
@@ -80,10 +78,8 @@ class Measured:
     def outside(self, states: States, std_m: Floats | None, turns: Bools) -> list[Outside]:
         """Return what points leave, by variable.
 
-        Args:
-            states: N points.
-            std_m: (N,) standard deviation of the predictions; None where it is not known.
-            turns: (n,) joints that are the same whole turns on.
+        `std_m` (N,) are the standard deviations of the predictions, None where they are not known;
+        `turns` (n,) joints that are the same whole turns on.
         """
         known, turning = {r.variable: r for r in self.ranges}, turning_variables(turns)
         units = ["m" if travel_name(j) in known else "rad" for j in range(states.q.shape[1])]
@@ -117,15 +113,10 @@ MOST = 200
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Condition:
-    """A quantity on the whole while measuring.
+    """A quantity on the whole while measuring."""
 
-    Attributes:
-        mean: x̄: a number, or (n,).
-        variance_m2: v, m².
-    """
-
-    mean: Floats
-    variance_m2: float
+    mean: Floats  # x̄: a number, or (n,)
+    variance_m2: float  # v, m²
 
 
 def needed(model: Model, states: States) -> tuple[str, ...]:
@@ -138,12 +129,7 @@ def needed(model: Model, states: States) -> tuple[str, ...]:
 def conditions_of(
     model: Model, states: States, moves: Callable[[States], tuple[Floats, Floats]]
 ) -> dict[str, Condition]:
-    """Return the conditions that effects of a model need, by column.
-
-    Args:
-        states: that it was fitted to.
-        moves: position (N, 3) of the tool and J R (N, 3, K) at N states.
-    """
+    """Return the conditions that effects of a model need, by column."""
     names = needed(model, States(states.q, states.wrench))
     some = states[:: -(-len(states) // MOST)]
     own = moves(some) if names else None
@@ -158,3 +144,31 @@ def conditions_of(
         moved = np.sum((own[0] - position) ** 2) + np.sum((own[1] - spread) ** 2)
         out[name] = Condition(np.asarray(mean), float(moved) / (3 * len(some)))
     return out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensorMount:
+    """Where the force sensor stands."""
+
+    origin_m: Floats  # (3,) its origin, flange axes, m
+    rotvec_rad: Floats  # (3,) its axes in flange axes, a rotation vector, rad
+
+    @classmethod
+    def of(cls, cell: Cell) -> Self | None:
+        """Return where the sensor of a cell stands; None where it has none."""
+        sensor = None if cell.config is None else cell.config.force_sensor
+        if sensor is None:
+            return None
+        return cls(np.array(sensor.origin_m), np.array(sensor.rotvec_rad))
+
+    def load_wrench(self, cell: Cell, q: Floats, reading: Floats) -> Floats:
+        """Return force and moment (N, 6) of the load at the load point, base axes, N and N·m.
+
+        At q (N, n), rad, it adds `reading` (N, 6) to the sensor's reading, sensor axes; the arm is
+        the nominal one.
+        """
+        chain = evaluate(cell.arm, q)
+        axes = se3.product(chain.rotation[-1], se3.rotation(self.rotvec_rad))
+        turned = [se3.apply(axes, part) for part in (reading[:, :3], reading[:, 3:])]
+        lever = chain.point(cell.load_point) - chain.point(self.origin_m)
+        return shift(np.concatenate(turned, axis=1), lever)

@@ -68,25 +68,19 @@ LARGEST = 4.0 * np.pi
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Points:
-    """N points.
-
-    Attributes:
-        q: (N, n) joint values, rad; rows of NaN where only a pose is given.
-        wanted: (N, 4, 4) T_base_tool, NaN where the joint values say where to go; None for all.
-        wrench: (N, 6) force and moment at the load point, base axes; None where none are given.
-        sensed: (N, 6) what the load adds to the force sensor's reading, sensor axes; None where
-            it is not given.
-        recorded: other columns of `States`.
-        taken: which columns were taken for what, where their names are not ours.
-    """
+    """N points."""
 
     names: tuple[str, ...]
-    q: Floats
+    q: Floats  # (N, n) joint values, rad; rows of NaN where only a pose is given
     wanted: Floats | None = None
+    """(N, 4, 4) T_base_tool, NaN where the joint values say where to go; None for all."""
     wrench: Floats | None = None
+    """(N, 6) force and moment at the load point, base axes; None where none are given."""
     sensed: Floats | None = None
-    recorded: Mapping[str, Floats] = field(default_factory=dict)
-    taken: str = ""
+    """(N, 6) what the load adds to the force sensor's reading, sensor axes; None where it is not
+    given."""
+    recorded: Mapping[str, Floats] = field(default_factory=dict)  # other columns of `States`
+    taken: str = ""  # which columns were taken for what, where their names are not ours
 
 
 class _OtherNamesError(InputError):
@@ -96,27 +90,16 @@ class _OtherNamesError(InputError):
 def read_points(
     path: Path, arm: Arm, loads: Mapping[str, Floats], mapping: PointMapping | None = None
 ) -> Points:
-    """Read a table of points.
-
-    Args:
-        path: any kind of table that `import` reads.
-        loads: (6,) wrench by the name of the load.
-        mapping: what its columns hold, where they are not called as above.
-
-    Raises:
-        InputError: no such file, an unknown column, an incomplete group, an unknown load.
-    """
+    """Read a table of points; `loads` are wrenches (6,) by the name of the load."""
     table, taken = (None, "") if mapping is not None else _plain(path, arm)
     if table is None:
         if mapping is None:
             mapping, taken = _guessed(path, arm)
         table = _mapped(path, arm, mapping)
     groups = _groups(arm)
-    found = {k: table.matrix(names) for k, names in groups.items() if names[0] in table.number}
-    q = found.pop("q_rad", None)
-    if "q_deg" in found:
-        q = found.pop("q_deg")
-        q = np.where(arm.slides, 1e-3 * q, np.radians(q))
+    there = [group for group in groups if group[1][0] in table.number]
+    found = {what: table.matrix(names) * factor for what, names, factor in there}
+    q = found.pop("q", None)
     if q is not None and np.any(large := (np.abs(q) > LARGEST) & ~arm.slides):
         k = int(np.argmax(np.any(large, axis=1)))
         raise InputError(
@@ -131,8 +114,8 @@ def read_points(
     wanted = _poses(found, q, arm)
     if q is None and wanted is None:
         raise InputError(
-            f"{path}: neither joint values nor poses; valid: columns {groups['q_rad'][0]} … "
-            f"{groups['q_rad'][-1]}, or x_m, y_m, z_m with rx_rad, ry_rad, rz_rad"
+            f"{path}: neither joint values nor poses; valid: columns {groups[0][1][0]} … "
+            f"{groups[0][1][-1]}, or x_m, y_m, z_m with rx_rad, ry_rad, rz_rad"
         )
     if q is None:
         q = np.full((len(names), arm.n), np.nan)
@@ -155,17 +138,10 @@ def _plain(path: Path, arm: Arm) -> tuple[ColumnTable | None, str]:
 
 
 def on_branch(points: Points, arm: Arm, tool: Floats, near: Floats | None) -> Floats:
-    """Return the joint values (N, n) at which the nominal arm has the tool at the points.
+    """Return the joint values (N, n) at which the nominal arm has the tool (4, 4) at the points.
 
     Of all solutions of a pose, that nearest to the joint values that are given with it, else to
-    those of the point before it.
-
-    Args:
-        tool: (4, 4) T_flange_tool.
-        near: (n,) joint values that the first point is near to, rad.
-
-    Raises:
-        InputError: no joint values to begin with, or a pose that the arm does not reach.
+    those of the point before it, of the first one to `near` (n,), rad.
     """
     if points.wanted is None:
         return points.q
@@ -187,13 +163,9 @@ def on_branch(points: Points, arm: Arm, tool: Floats, near: Floats | None) -> Fl
 
 
 def solutions(arm: Arm, tool: Floats, near: Floats | None, goal: Floats) -> Floats:
-    """Return joint values (K, n) at which the nominal arm has the tool at a pose.
+    """Return joint values (K, n) at which the nominal arm has the tool (4, 4) at a pose (4, 4).
 
-    Args:
-        arm: the arm; each joint turns by itself.
-        tool: (4, 4) T_flange_tool.
-        near: (K, n) joint values to search from, rad; all over the range of the joints where None.
-        goal: (4, 4) T_base_tool.
+    They are sought from `near` (K, n), rad; all over the range of the joints where None.
     """
     starts = _everywhere(arm) if near is None else near
     found = invert_nominal(arm, tool, starts, goal[:3, :3], goal[:3, 3])
@@ -216,11 +188,7 @@ def _everywhere(arm: Arm) -> Floats:
 
 
 def _nearest(arm: Arm, tool: Floats, name: str, near: Floats, goal: Floats) -> Floats:
-    """Return of all joint values (n,) of a pose those nearest to given ones.
-
-    The solution that Newton's method finds from there, where it is near; else the nearest of those
-    that it finds from everywhere.
-    """
+    """Return of all joint values (n,) of a pose those nearest to given ones."""
     starts = near[None]
     for _ in range(2):
         solved = invert_nominal(arm, tool, starts, goal[:3, :3], goal[:3, 3])
@@ -308,31 +276,35 @@ def _mapped(path: Path, arm: Arm, mapping: PointMapping) -> ColumnTable:
     return replace(table, text=text)
 
 
-def _groups(arm: Arm) -> dict[str, tuple[str, ...]]:
-    """Columns by what they give; those of one group come together."""
-    q, n = joint_columns(arm.units), arm.n
-    return {
-        "q_rad": q,
-        "q_deg": tuple(f"{n}m" if n.endswith("_m") else n.replace("_rad", "_deg") for n in q),
-        "position_m": POSITION,
-        "position_mm": tuple(name.replace("_m", "_mm") for name in POSITION),
-        "rotation_rad": ROTATION,
-        "rotation_deg": tuple(name.replace("_rad", "_deg") for name in ROTATION),
-        "wrench": WRENCH,
-        "sensed": tuple(f"sensor_{name}" for name in WRENCH),
-        "air_temperature": ("air_degC",),
-        "joint_temperature": temperature_columns(n),
-        "load_time": ("load_time_s",),
-        "time": ("time_s",),
-        "approach": approach_columns(n),
-    }
+_Groups = list[tuple[str, tuple[str, ...], Floats | float]]
+
+
+def _groups(arm: Arm) -> _Groups:
+    """What columns give, their names, and the factor to SI; those of one group come together."""
+    q, n, degree = joint_columns(arm.units), arm.n, np.pi / 180
+    others = tuple(f"{c}m" if c.endswith("_m") else c.replace("_rad", "_deg") for c in q)
+    return [
+        ("q", q, 1.0),
+        ("q", others, np.where(arm.slides, 1e-3, degree)),
+        ("position", POSITION, 1.0),
+        ("position", tuple(name.replace("_m", "_mm") for name in POSITION), 1e-3),
+        ("rotation", ROTATION, 1.0),
+        ("rotation", tuple(name.replace("_rad", "_deg") for name in ROTATION), degree),
+        ("wrench", WRENCH, 1.0),
+        ("sensed", tuple(f"sensor_{name}" for name in WRENCH), 1.0),
+        ("air_temperature", ("air_degC",), 1.0),
+        ("joint_temperature", temperature_columns(n), 1.0),
+        ("load_time", ("load_time_s",), 1.0),
+        ("time", ("time_s",), 1.0),
+        ("approach", approach_columns(n), 1.0),
+    ]
 
 
 def _checked(
-    path: Path, header: Sequence[str], groups: Mapping[str, tuple[str, ...]], arm: Arm
+    path: Path, header: Sequence[str], groups: _Groups, arm: Arm
 ) -> tuple[Sequence[str], Sequence[str]]:
     """Check a header; returns its text and its number columns."""
-    known = [name for names in groups.values() for name in names]
+    known = [name for _, names, _ in groups for name in names]
     exchanged = set(known_columns(arm.units))
     ours = {*known, *exchanged} - {"pose", "load", "target"}
     for name in header:
@@ -346,20 +318,17 @@ def _checked(
             )
         if header.count(name) > 1:
             raise InputError(f"{path}: column '{name}' is there twice")
-    for names in groups.values():
+    first: dict[str, list[str]] = {"hung": ["load"] * ("load" in header)}
+    for what, names, _ in groups:
         missing = [name for name in names if name not in header]
         if missing and len(missing) < len(names):
             raise InputError(f"{path}: column '{missing[0]}' is missing beside its group")
-    for a, b in (
-        ("q_rad", "q_deg"),
-        ("position_m", "position_mm"),
-        ("rotation_rad", "rotation_deg"),
-    ):
-        if groups[a][0] in header and groups[b][0] in header:
-            raise InputError(f"{path}: both {groups[a][0]} and {groups[b][0]}; give one of them")
-    told = [n for n in ("load", WRENCH[0], groups["sensed"][0]) if n in header]
-    if len(told) > 1:
-        raise InputError(f"{path}: both {told[0]} and {told[1]}; give one of them")
+        if not missing:
+            key = "hung" if what in ("wrench", "sensed") else what
+            first.setdefault(key, []).append(names[0])
+    for given in first.values():
+        if len(given) > 1:
+            raise InputError(f"{path}: both {given[0]} and {given[1]}; give one of them")
     text = [name for name in ("pose", "load") if name in header]
     return text, [name for name in header if name in known]
 
@@ -377,11 +346,7 @@ def _load(table: ColumnTable, row: int, loads: Mapping[str, Floats]) -> Floats:
 
 def _poses(found: dict[str, Floats], q: Floats | None, arm: Arm) -> Floats | None:
     """(N, 4, 4) poses, taken out of what was found; None where there are none."""
-    position, rotation = found.pop("position_m", None), found.pop("rotation_rad", None)
-    if "position_mm" in found:
-        position = 1e-3 * found.pop("position_mm")
-    if "rotation_deg" in found:
-        rotation = np.radians(found.pop("rotation_deg"))
+    position, rotation = found.pop("position", None), found.pop("rotation", None)
     if position is None and rotation is None:
         return None
     if position is None or (rotation is None and q is None):

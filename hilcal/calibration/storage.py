@@ -9,38 +9,27 @@ else is decimal numbers, exactly.
 import base64
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, fields, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 
 from hilcal import __version__, limits
 from hilcal.calibration.calibration import Calibration
-from hilcal.calibration.check_stored import (
-    check_arm,
-    check_cell,
-    check_conditions,
-    check_numbers,
-    check_spread,
-)
-from hilcal.calibration.covariance_source import CovarianceSource
-from hilcal.calibration.measured import Condition, Measured
-from hilcal.calibration.scatter import Scatter, ScatterSource
-from hilcal.calibration.sensed import SensorMount
+from hilcal.calibration.covariance_source import CovarianceSource, check_numbers
+from hilcal.calibration.measured import WORDS, Condition, Measured, SensorMount
+from hilcal.calibration.scatter import Scatter
 from hilcal.cell import Cell, Observer
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import InputError
 from hilcal.identification.robot_frames import one_of_each
 from hilcal.model.model import Model
-from hilcal.names import check_names
-from hilcal.readings.ranges import Range
-from hilcal.readings.readings import ObserverKind, ObserverName
+from hilcal.readings.readings import ObserverName
 from hilcal.readings.whitening import MODES
 from hilcal.robot.arm import Arm
-from hilcal.toml import parse_json
+from hilcal.store.codec import decode, encode, read_document, read_file, write_document
 from hilcal.types import Floats
-from hilcal.whole_file import replace_file
 
 FORMAT, VERSION = "hilcal-calibration", 2
 BY_FACTOR = 1
@@ -49,36 +38,20 @@ AGREES = 5e-3
 """Share by which a standard deviation may change where the small form is written; a choice."""
 TRIED = 40
 """Fitted states at which that is tried."""
-_CELL = ("target", "load_point", "tool_mass", "tool_com", "gravity", "registration", "targets")
+_CELL = (
+    *("target", "load_point", "tool_mass", "tool_com", "gravity", "registration", "targets"),
+    *("target_names", "known_targets", "registration_known", "measured_torques"),
+)
 
 
 def write(c: Calibration, path: Path) -> None:
-    """Write a calibration to a file.
-
-    Raises:
-        InputError: it cannot be written.
-    """
-    content = json.dumps(to_json(c), indent=1, allow_nan=False)
-    replace_file(path, content + "\n")
+    """Write a calibration to a file."""
+    write_document(path, to_json(c), indent=1)
 
 
-@limits.bounded
 def read(path: Path, catalogue: Catalogue | None = None) -> Calibration:
-    """Read a calibration from a file.
-
-    Raises:
-        InputError: see `from_json`; or the file cannot be read.
-    """
-    try:
-        content = parse_json(limits.read_text(path, limits.DOCUMENT))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: no calibration: {error}") from None
-    try:
-        return from_json(content, catalogue)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
-        raise InputError(f"{path}: a damaged calibration: {error!r}") from None
+    """Read a calibration from a file."""
+    return read_file(path, "calibration", lambda content: from_json(content, catalogue))
 
 
 def to_json(c: Calibration) -> dict[str, object]:
@@ -90,64 +63,48 @@ def to_json(c: Calibration) -> dict[str, object]:
         scaled = c.covariance_root / np.where(std > 0, std, 1.0)[:, None]
         text = base64.b64encode(scaled.astype("<f4").tobytes()).decode("ascii")
         known = {"covariance_root": text}
-    return {
+    observers = [
+        {"kind": o.name.kind, "name": o.name.name, "free": o.free, "offset_m": o.offset}
+        | {"frame": o.frame}
+        for o in cell.observers
+    ]
+    content = {
         "format": FORMAT,
         "version": BY_FACTOR if small is None else VERSION,
         "hilcal": __version__,
         "source": dict(c.source),
         "readings": c.mode,
-        "arm": {f.name: _plain(getattr(cell.arm, f.name)) for f in fields(cell.arm)},
-        "cell": {
-            **{name: _plain(getattr(cell, name)) for name in _CELL},
-            "target_names": list(cell.target_names),
-            "known_targets": list(cell.known_targets),
-            "registration_known": cell.registration_known,
-            "measured_torques": cell.measured_torques,
-            "observers": [
-                {
-                    "kind": o.name.kind,
-                    "name": o.name.name,
-                    "free": list(o.free),
-                    "offset_m": o.offset,
-                    "frame": o.frame.tolist(),
-                }
-                for o in cell.observers
-            ],
-        },
-        "effects": [{"name": e.name, "options": _plain(dict(e.options))} for e in c.model.effects],
+        "arm": cell.arm,
+        "cell": {**{name: getattr(cell, name) for name in _CELL}, "observers": observers},
+        "effects": [{"name": e.name, "options": dict(e.options)} for e in c.model.effects],
         "parameters": [f"{e.name}.{p.name}" for e in c.model.effects for p in e.parameters],
-        "theta": c.theta.tolist(),
-        "std": std.tolist(),
+        "theta": c.theta,
+        "std": std,
         **known,
         "misfit_m2": c.misfit,
-        "scatter": {**_plain(asdict(c.scatter)), "known": c.scatter.known},
-        "measured": asdict(c.measured),
-        "conditions": {name: _plain(asdict(x)) for name, x in c.conditions.items()},
-        "loads": {name: wrench.tolist() for name, wrench in c.loads.items()},
-        "force_sensor": None if c.sensor is None else _plain(asdict(c.sensor)),
+        "scatter": {**encode(c.scatter), "known": c.scatter.known},
+        "measured": c.measured,
+        "conditions": c.conditions,
+        "loads": c.loads,
+        "force_sensor": c.sensor,
     }
+    return {key: encode(value) for key, value in content.items()}
 
 
 def from_json(content: Mapping[str, Any], catalogue: Catalogue | None = None) -> Calibration:
-    """Return the calibration that `to_json` wrote.
+    """Return the calibration that `to_json` wrote."""
+    return read_document(
+        content,
+        "calibration",
+        FORMAT,
+        (BY_FACTOR, VERSION),
+        lambda stored: _read(stored, catalogue or installed()),
+    )
 
-    Raises:
-        InputError: another kind of document, a newer version, or an effect that is not at hand.
-    """
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise InputError(f'no calibration; valid: a JSON document with "format": "{FORMAT}"')
-    if content["version"] not in (BY_FACTOR, VERSION):
-        raise InputError(
-            f"a calibration of version {content['version']}, written by hilcal "
-            f"{content['hilcal']}; this program reads versions {BY_FACTOR} and {VERSION}"
-        )
-    check_names({k: v for k, v in content.items() if k != "source"}, "calibration")
-    known = catalogue or installed()
-    arm = _arm(content["arm"])
-    check_arm(arm)
-    cell = _cell(content["cell"], arm)
-    check_cell(cell)
-    effects = []
+
+def _read(content: Mapping[str, Any], known: Catalogue) -> Calibration:
+    cell = _cell(content["cell"], decode(Arm, content["arm"]))
+    n, effects = cell.arm.n, []
     for e in content["effects"]:
         if e["name"] not in known.names:
             raise InputError(
@@ -162,7 +119,7 @@ def from_json(content: Mapping[str, Any], catalogue: Catalogue | None = None) ->
         raise InputError(
             f"written by hilcal {content['hilcal']}, whose effects have other parameters"
         )
-    theta, std = (np.array(content[k], dtype=float) for k in ("theta", "std"))
+    theta, std = (decode(Floats, content[k]) for k in ("theta", "std"))
     check_numbers("theta", theta, (len(names),))
     check_numbers("std", std, (len(names),), least=0.0)
     root = learnt = None
@@ -173,24 +130,9 @@ def from_json(content: Mapping[str, Any], catalogue: Catalogue | None = None) ->
         flat = np.frombuffer(base64.b64decode(content["covariance_root"]), dtype="<f4")
         root = flat.reshape(len(std), -1).astype(float) * std[:, None]
         check_numbers("covariance_root", root, root.shape)
-    check_numbers("misfit_m2", float(content["misfit_m2"]), least=0.0)
-    of = content["measured"]
-    measured = Measured(tuple(Range(**r) for r in of["ranges"]), float(of["most_std_m"]))
-    scatter = _scatter(content["scatter"])
-    check_spread(scatter, measured, arm.n)
-    conditions = {
-        k: Condition(_array(x["mean"]), float(x["variance_m2"]))
-        for k, x in content.get("conditions", {}).items()
-    }
-    check_conditions(conditions, arm.n)
-    loads = {name: _array(wrench) for name, wrench in content["loads"].items()}
-    for name, wrench in loads.items():
-        check_numbers(f"load {name}", wrench, (6,))
-    sensor = None
-    if (mount := content.get("force_sensor")) is not None:
-        sensor = SensorMount(_array(mount["origin_m"]), _array(mount["rotvec_rad"]))
-        check_numbers("force_sensor", np.array([sensor.origin_m, sensor.rotvec_rad]), (2, 3))
-    return Calibration(
+    stored = dict(content["scatter"])  # older programs told whether it was known alone
+    scatter = decode(Scatter, {"source": "stated" if stored["known"] else "unknown"} | stored)
+    calibration = Calibration(
         model=model,
         theta=theta,
         mode=MODES[MODES.index(content["readings"])],
@@ -198,12 +140,14 @@ def from_json(content: Mapping[str, Any], catalogue: Catalogue | None = None) ->
         learnt=learnt,
         misfit=float(content["misfit_m2"]),
         scatter=scatter,
-        measured=measured,
-        loads=loads,
+        measured=decode(Measured, content["measured"]),
+        loads=decode(Mapping[str, Floats], content["loads"]),
         source=content["source"],
-        sensor=sensor,
-        conditions=conditions,
+        sensor=decode(SensorMount | None, content.get("force_sensor")),
+        conditions=decode(Mapping[str, Condition], content.get("conditions", {})),
     )
+    _check(calibration, n)
+    return calibration
 
 
 def _small(c: Calibration) -> dict[str, object] | None:
@@ -223,66 +167,87 @@ def _small(c: Calibration) -> dict[str, object] | None:
     return small if np.all(np.abs(found - stated) <= AGREES * stated) else None
 
 
-def _arm(content: Mapping[str, Any]) -> Arm:
-    """Return an arm as it was stored."""
-    given = {f.name: content[f.name] for f in fields(Arm)}
-    for name, value in given.items():
-        if isinstance(value, list):
-            words = name in ("joint_names", "notes")
-            given[name] = tuple(value) if words else _array(value)
-    return Arm(**given)
-
-
 def _cell(content: Mapping[str, Any], arm: Arm) -> Cell:
-    """Return a cell as it was stored."""
+    """Return a cell as it was stored; refuses one that cannot be."""
+    _check_arm(arm)
+    arrays = ("target", "load_point", "tool_com", "gravity", "registration")
+    numbers: dict[str, Any] = {name: decode(Floats, content[name]) for name in arrays}
     cell = Cell(
         arm=arm,
-        target=_array(content["target"]),
-        load_point=_array(content["load_point"]),
         tool_mass=float(content["tool_mass"]),
-        tool_com=_array(content["tool_com"]),
-        gravity=_array(content["gravity"]),
-        registration=_array(content["registration"]),
         registration_known=bool(content["registration_known"]),
         target_known=all(content["known_targets"]),
         measured_torques=bool(content.get("measured_torques", False)),
         observers=tuple(map(_observer, content.get("observers", ()))),
+        **numbers,
     )
-    if content["targets"] is None:
+    for name, shape in (("load_point", (3,)), ("tool_com", (3,)), ("gravity", (3,))):
+        check_numbers(name, getattr(cell, name), shape)
+    check_numbers("tool_mass", cell.tool_mass, least=0.0)
+    targets = decode(Floats | None, content["targets"])
+    frames = {"target": cell.target, "registration": cell.registration, "targets": targets}
+    for name, frame in frames.items():
+        if frame is not None:
+            _check_frames(name, frame)
+    if targets is None:
         return cell
-    several = replace(
-        cell, targets=_array(content["targets"]), target_names=tuple(content["target_names"])
-    )
-    return several.with_targets(_array(content["targets"]), content["known_targets"])
-
-
-def _scatter(content: Mapping[str, Any]) -> Scatter:
-    """Return a scatter; older programs told whether it was known alone."""
-    source = content.get("source", "stated" if content["known"] else "unknown")
-    if source not in get_args(ScatterSource):
-        raise ValueError(f"a scatter from {source!r}")
-    return Scatter(_array(content["joint_std"]), float(content["std_m"]), source)
+    several = replace(cell, targets=targets, target_names=tuple(content["target_names"]))
+    return several.with_targets(targets, content["known_targets"])
 
 
 def _observer(content: Mapping[str, Any]) -> Observer:
-    kind, frame = content["kind"], _array(content["frame"])
-    if kind not in get_args(ObserverKind) or frame.shape != (4, 4):
-        raise ValueError("an observer that is none")
-    name = ObserverName(kind, str(content["name"]))
-    return Observer(name, frame, tuple(map(int, content["free"])), float(content["offset_m"]))
+    frame = decode(Floats, content["frame"])
+    _check_frames("observer", frame)
+    free = decode(tuple[int, ...], content["free"])
+    return Observer(decode(ObserverName, content), frame, free, float(content["offset_m"]))
 
 
-def _array(value: object) -> Floats:
-    """Return numbers as an array; "inf" and "-inf" are among them."""
-    return np.array(value, dtype=float)
+def _check_frames(what: str, frames: Floats) -> None:
+    """Refuse (..., 4, 4) matrices that are no rotation and translation."""
+    check_numbers(what, frames, (*frames.shape[:-2], 4, 4))
+    turn = frames[..., :3, :3]
+    orthonormal = np.allclose(turn @ np.swapaxes(turn, -1, -2), np.eye(3), atol=1e-6)
+    if not orthonormal or np.any(frames[..., 3, :] != [0.0, 0.0, 0.0, 1.0]):
+        raise ValueError(f"{what} is no frame")
 
 
-def _plain(value: Any) -> Any:
-    """Return arrays and tuples as lists, infinite numbers, which JSON lacks, as text."""
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, float) and np.isinf(value):
-        return str(value)
-    if isinstance(value, dict):
-        return {k: _plain(v) for k, v in value.items()}
-    return [_plain(v) for v in value] if isinstance(value, tuple | list) else value
+def _check_arm(arm: Arm) -> None:
+    """Refuse an arm that cannot be."""
+    n = arm.links.shape[0] - 1
+    if n < 1:
+        raise ValueError("the arm has no joints")
+    _check_frames("links", arm.links)
+    check_numbers("masses", arm.masses, (n,), least=0.0)
+    check_numbers("coms", arm.coms, (n, 3))
+    check_numbers("payload", arm.payload, least=0.0)
+    for name, shape in (("coupling", (n, n)), ("drive", (n, n)), ("mimic", (n, n + 1))):
+        if getattr(arm, name) is not None:
+            check_numbers(name, getattr(arm, name), shape)
+    if arm.sign is not None and not np.all(np.abs(arm.sign) == np.ones(n)):
+        raise ValueError("sign is not ±1 for each joint")
+    for ends in (arm.q_min, arm.q_max, arm.torque_max):
+        if ends.shape != (n,) or np.any(np.isnan(ends)):
+            raise ValueError("limits are not one for each joint")
+    if len(arm.joint_names) != n or (arm.prismatic is not None and len(arm.prismatic) != n):
+        raise ValueError("joints are not named each")
+
+
+def _check(c: Calibration, n: int) -> None:
+    """Refuse numbers of a calibration of n joints that cannot be."""
+    check_numbers("misfit_m2", c.misfit, least=0.0)
+    check_numbers("joint_std", c.scatter.joint_std, (n,), least=0.0)
+    check_numbers("std_m", c.scatter.std_m, least=0.0)
+    if np.isnan(c.measured.most_std_m):
+        raise ValueError("most_std_m is no number")
+    for r in c.measured.ranges:
+        check_numbers(f"range of {r.variable}", np.array([r.low, r.high]), (2,))
+    for name, x in c.conditions.items():
+        if name not in WORDS:
+            raise ValueError(f"{name!r} is no condition")
+        check_numbers(name, x.mean, (n,) if name in ("joint_temperature", "approach") else ())
+        check_numbers(f"variance by {name}", x.variance_m2, least=0.0)
+    for name, wrench in c.loads.items():
+        check_numbers(f"load {name}", wrench, (6,))
+    if c.sensor is not None:
+        place = np.stack([c.sensor.origin_m, c.sensor.rotvec_rad])
+        check_numbers("force_sensor", place, (2, 3))

@@ -10,49 +10,32 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilcal.cell import Cell
 from hilcal.effects.protocol import FRAME_ROLES, Effect
 from hilcal.identification.robot_frames import one_of_each, robot_frames
 from hilcal.model.model import Model, Prediction
-from hilcal.readings.readings import States
 from hilcal.robot import se3
 from hilcal.types import Floats, Ints
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ToolPose:
-    """What is to be put somewhere.
+    """What is to be put somewhere."""
 
-    Attributes:
-        model: whose target is the tool; without effects that place another target.
-        theta: (P,) its parameters.
-        kept: (P,) which of the parameters of the fitted model they are.
-        nominal: (4, 4) T_flange_tool.
-        pose: (4, 4) T_chainflange_tool, the same on the flange of the fitted chain.
-        registered: (4, 4) from the axes of the registration to those of the base.
-        base: (4, 4) from the axes of the chain to those of the base, constant effects alone.
-        frames: effects that say where the base is, with their parameters.
-        moving: effects that move base or target and are no frames, with their parameters.
-    """
-
-    model: Model
-    theta: Floats
-    kept: Ints
-    nominal: Floats
-    pose: Floats
-    registered: Floats
-    base: Floats
+    model: Model  # whose target is the tool; without effects that place another target
+    theta: Floats  # (P,) its parameters
+    kept: Ints  # (P,) which of the parameters of the fitted model they are
+    nominal: Floats  # (4, 4) T_flange_tool
+    pose: Floats  # (4, 4) T_chainflange_tool, the same on the flange of the fitted chain
+    registered: Floats  # (4, 4) from the axes of the registration to those of the base
+    base: Floats  # (4, 4) from the axes of the chain to those of the base, constant effects alone
     frames: tuple[tuple[Effect, slice], ...]
+    """Effects that say where the base is, with their parameters."""
     moving: tuple[tuple[Effect, slice], ...]
+    """Effects that move base or target and are no frames, with their parameters."""
 
 
 def tool_of(model: Model, theta: Floats, pose: Floats | None) -> ToolPose:
-    """Return the tracked target as fitted, or a tool with another pose.
-
-    Args:
-        theta: (P,) its parameters.
-        pose: (4, 4) T_flange_tool; the (first) tracked target where None.
-    """
+    """Return the tracked target as fitted, or a tool with another pose T_flange_tool (4, 4)."""
     every = np.arange(model.size)
     at = robot_frames(model, theta)
     if pose is None:
@@ -64,6 +47,17 @@ def tool_of(model: Model, theta: Floats, pose: Floats | None) -> ToolPose:
         cell = replace(model.cell, targets=None, target_names=(), targets_known=())
         cell = replace(cell, target=at.flange @ pose, target_known=True)
         own = replace(model, cell=cell, effects=tuple(named))
+    state = one_of_each(own.cell)
+    if own.cell.targets is not None:
+        state = replace(state, target=np.zeros(1, dtype=np.int64))
+    situation = own.predict(state, theta[kept]).situation
+    pairs = list(zip(own.effects, own.slices(), strict=True))
+    moving = [
+        (e, mine)
+        for e, mine in pairs
+        if e.role not in FRAME_ROLES
+        and any(c.field in ("target", "base") for c in e.columns(situation))
+    ]
     return ToolPose(
         model=own,
         theta=theta[kept],
@@ -72,8 +66,8 @@ def tool_of(model: Model, theta: Floats, pose: Floats | None) -> ToolPose:
         pose=at.flange @ nominal,
         registered=at.registered,
         base=at.chain,
-        frames=_base_frames(own),
-        moving=_moving(own, theta[kept]),
+        frames=tuple((e, mine) for e, mine in pairs if e.role == "registration"),
+        moving=tuple(moving),
     )
 
 
@@ -101,26 +95,3 @@ def in_chain(tool: ToolPose, rotation: Floats, position: Floats) -> tuple[Floats
     """Poses (N, 3, 3) and (N, 3) in the axes of the fitted chain, from those in base axes."""
     turn = tool.base[:3, :3].T
     return se3.product(turn, rotation), se3.apply(turn, position - tool.base[:3, 3])
-
-
-def _moving(model: Model, theta: Floats) -> tuple[tuple[Effect, slice], ...]:
-    """Effects that move base or target and are no frames, with where their parameters are."""
-    situation = model.predict(_one(model.cell), theta).situation
-    return tuple(
-        (e, mine)
-        for e, mine in zip(model.effects, model.slices(), strict=True)
-        if e.role not in FRAME_ROLES
-        and any(c.field in ("target", "base") for c in e.columns(situation))
-    )
-
-
-def _base_frames(model: Model) -> tuple[tuple[Effect, slice], ...]:
-    """Effects that say where the base is, with where their parameters are."""
-    pairs = zip(model.effects, model.slices(), strict=True)
-    return tuple((e, mine) for e, mine in pairs if e.role == "registration")
-
-
-def _one(cell: Cell) -> States:
-    """Return one state of the first target."""
-    first = one_of_each(cell)
-    return first if cell.targets is None else replace(first, target=np.zeros(1, dtype=np.int64))

@@ -10,6 +10,12 @@ changes on the way, a value that depends on where the arm stands) refuses the pr
 
 A pose is of the tool centre point that `set_tcp(p[…])` set before it. The controller takes the
 solution near to where the arm stands; that is the waypoint before where this one always follows it.
+
+A pose has up to eight solutions. `get_inverse_kin(pose, qnear=joints)` and `movej` to a pose take
+the one nearest to given joint values, or to where the arm stands; the manual does not say by which
+measure. A straight motion stays on the branch that it begins on, whatever joint values its target
+is stated by. A correction is right on one branch only.
+
 Source: Universal Robots, *The URScript Programming Language*, e-Series, software 5.11.
 """
 
@@ -24,12 +30,14 @@ from pathlib import Path
 import numpy as np
 
 from hilcal import limits
+from hilcal.calibration.compensation import invert_nominal, nominal_pose
 from hilcal.calibration.points import Points
 from hilcal.calibration.urscript_statements import Statement, statements
 from hilcal.errors import InputError
 from hilcal.names import escaped
 from hilcal.robot import se3
-from hilcal.types import Floats
+from hilcal.robot.arm import Arm
+from hilcal.types import Bools, Floats
 
 JOINTS = 6
 STRAIGHT = ("movel", "movep")
@@ -86,39 +94,23 @@ Value = float | tuple[str, tuple[float, ...]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Waypoint:
-    """One waypoint of a program, or another motion.
+    """One waypoint of a program, or another motion."""
 
-    Attributes:
-        line: of the program, from 1.
-        begin: where its target begins in the text.
-        end: where it ends.
-        q: (6,) joint values, or those that its branch is near to, rad; None where neither is given.
-        pose: (4, 4) T_base_tool; None where the joint values are the target.
-        tool: (4, 4) T_flange_tool that was set; None where none was.
-        blend_m: radius within which the arm passes it without a stop, m.
-        left: why it is left as it is; empty where it is understood.
-        straight: whether the tool moves to it on a straight line.
-        follows: whether the waypoint before it in the text always comes right before it.
-    """
-
-    line: int
-    begin: int
-    end: int
+    line: int  # of the program, from 1
+    begin: int  # where its target begins in the text
+    end: int  # where it ends
     q: Floats | None = None
-    pose: Floats | None = None
-    tool: Floats | None = None
-    blend_m: float = 0.0
-    left: str = ""
-    straight: bool = False
-    follows: bool = False
+    """(6,) joint values, or those that its branch is near to, rad; None where neither is given."""
+    pose: Floats | None = None  # (4, 4) T_base_tool; None where the joint values are the target
+    tool: Floats | None = None  # (4, 4) T_flange_tool that was set; None where none was
+    blend_m: float = 0.0  # radius within which the arm passes it without a stop, m
+    left: str = ""  # why it is left as it is; empty where it is understood
+    straight: bool = False  # whether the tool moves to it on a straight line
+    follows: bool = False  # whether the waypoint before it in the text always comes right before it
 
 
 def waypoints(program: str) -> tuple[Waypoint, ...]:
-    """Find the waypoints of a program, in the order of its text.
-
-    Raises:
-        InputError: there are none, or something that could change what they mean; names the line.
-    """
+    """Find the waypoints of a program, in the order of its text."""
     try:
         found = _waypoints(_Program.of(statements(program)))
     except RecursionError:
@@ -131,14 +123,7 @@ def waypoints(program: str) -> tuple[Waypoint, ...]:
 def program_points(
     path: Path, leave: bool = False
 ) -> tuple[str, tuple[Waypoint, ...], Points, Floats | None]:
-    """Read a program: its text, its waypoints, the understood ones as points, and T_flange_tool.
-
-    Args:
-        leave: keep waypoints that are not understood as they are.
-
-    Raises:
-        InputError: see `waypoints`; or a waypoint that is not understood.
-    """
+    """Read a program: its text, its waypoints, the understood ones as points, and T_flange_tool."""
     try:
         # ends of lines stay as they are
         program = limits.read_bytes(path, limits.SCRIPT).decode("utf-8-sig")
@@ -185,22 +170,15 @@ def movej_program(names: Sequence[str], q: Floats) -> str:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Program:
-    """Statements, and what their names stand for.
+    """Statements, and what their names stand for."""
 
-    Attributes:
-        statements: in the order of the text.
-        functions: names that it defines.
-        bound: by name, the number of each statement that gives it a value, with that value; None
-            for a parameter, an element or a function.
-        aliased: whether an element is assigned of what may be another variable's list.
-        known: values that were computed.
-    """
-
-    statements: tuple[Statement, ...]
-    functions: frozenset[str]
+    statements: tuple[Statement, ...]  # in the order of the text
+    functions: frozenset[str]  # names that it defines
     bound: dict[str, list[tuple[int, ast.expr | None]]]
-    aliased: bool
-    known: dict[int, Value | None] = field(default_factory=dict)
+    """By name, the number of each statement that gives it a value, with that value; None for a
+    parameter, an element or a function."""
+    aliased: bool  # whether an element is assigned of what may be another variable's list
+    known: dict[int, Value | None] = field(default_factory=dict)  # values that were computed
 
     @classmethod
     def of(cls, found: tuple[Statement, ...]) -> "_Program":
@@ -219,7 +197,8 @@ class _Program:
                     given = {name: None}
                     elements.add(name)
             for name, value in given.items():
-                if _of_urscript(name):
+                words = ("p", *MOVES, *_OTHER_MOVES, *_STOPS, *_SETUP)
+                if name in words or _HARMLESS.fullmatch(name) or _WHERE.fullmatch(name):
                     raise InputError(
                         f"line {s.line}: '{name}' is a name of URScript's own; valid: another name"
                     )
@@ -281,10 +260,7 @@ class _Program:
         return self.statements[k].blocks[: len(blocks)] == blocks
 
     def target(self, node: ast.expr, k: int) -> tuple[Floats | None, Floats | None] | None:
-        """Joint values (6,) and pose (4, 4) of a waypoint, each None where it has none.
-
-        None where it is not understood.
-        """
+        """Joint values (6,) and pose (4, 4) of a waypoint, each None where it has none."""
         match node:
             case ast.Call(func=ast.Name("get_inverse_kin"), args=[pose, *more], keywords=named):
                 near = [*more, *(n.value for n in named if n.arg == "qnear")]
@@ -432,12 +408,6 @@ def _check_calls(p: _Program, s: Statement) -> None:
             )
 
 
-def _of_urscript(name: str) -> bool:
-    """Whether a name has a meaning that a program must not change."""
-    words = ("p", *MOVES, *_OTHER_MOVES, *_STOPS, *_SETUP)
-    return name in words or bool(_HARMLESS.fullmatch(name) or _WHERE.fullmatch(name))
-
-
 def _is_pose(node: ast.expr) -> bool:
     """Whether it is p[…]; `_known` has no other subscript of several parts."""
     return isinstance(node, ast.Subscript) and isinstance(node.slice, ast.Tuple)
@@ -455,3 +425,101 @@ def _six(value: Value | None) -> Floats:
 def _pose(value: Value | None) -> Floats:
     six = _six(value)
     return se3.matrix(se3.rotation(six[3:]), six[:3])
+
+
+STEPS = 40
+"""Poses between two waypoints of a straight motion; a choice."""
+LARGEST_STEP = 0.5
+"""Turn of a joint from one of these to the next beyond which the motion passes a singularity, rad;
+a choice."""
+SAME = 1e-6
+"""Joint values that are the same solution, rad: far above the residual of one, far below what is
+between two."""
+AS_NEAR = 0.05
+"""What another solution must be farther for this one to be the nearest by any measure, rad. A
+controller has its own calibrated arm: of 1,024 motions of ur3e, ur5e and ur10e the branch is wrong
+in 1 at 0.02 and in none from 0.05 on, where each joint of each solution may be 10 mrad elsewhere;
+17 are left uncertain at 0.05, 33 at 0.1, 62 at 0.2."""
+NEAREST = "another branch of the arm is as near; joint values in place of the pose say which"
+NOT_STRAIGHT = (
+    "a straight motion from the waypoint before ends on another branch of the arm; use movej"
+)
+UNKNOWN = "the branch of the waypoint before it is not known"
+
+
+def doubts(
+    arm: Arm, tool: Floats, waypoints: Sequence[Waypoint], q: Floats, near: Floats | None
+) -> list[str]:
+    """Say why the branch of each of N waypoints is not certain; empty where it is.
+
+    At joint values q (N, 6) the nominal arm has the tool (4, 4) there; `near` (6,) are those that
+    the first one is near to, rad, None where none are given.
+    """
+    if not waypoints:
+        return []
+    before = np.concatenate([q[:1] if near is None else near[None], q[:-1]])
+    stated = np.stack([before[k] if w.q is None else w.q for k, w in enumerate(waypoints)])
+    led = np.array([k > 0 and w.straight and w.follows for k, w in enumerate(waypoints)])
+    chosen = np.array([w.pose is not None for w in waypoints])
+    chosen &= ~led | np.array([w.q is not None for w in waypoints])
+    other = chosen & ~_nearest(arm, tool, stated, q)
+    bent = led & ~_straight(arm, tool, before, q)
+    out: list[str] = []
+    for k, w in enumerate(waypoints):
+        unknown = k > 0 and out[-1] and (led[k] or (w.q is None and w.pose is not None))
+        out.append(UNKNOWN if unknown else NEAREST if other[k] else NOT_STRAIGHT if bent[k] else "")
+    return out
+
+
+def _nearest(arm: Arm, tool: Floats, near: Floats, q: Floats) -> Bools:
+    """(N,) whether no other solution of the poses at q (N, 6) is as near to joint values (N, 6)."""
+    rotation, position, _ = nominal_pose(arm, tool, q)
+    mine = _turn(q - near)
+    out = np.ones(len(q), dtype=bool)
+    for start in _flipped(q):
+        found = invert_nominal(arm, tool, start, rotation, position)
+        other = found.solved & (np.abs(_turn(found.q - q)).max(axis=1) > SAME)
+        theirs = _turn(found.q - near)
+        for order in (1, 2, np.inf):
+            least = np.linalg.norm(mine, order, axis=1) + AS_NEAR
+            farther = np.linalg.norm(theirs, order, axis=1) > least
+            out &= ~other | farther
+    return out
+
+
+def _flipped(q: Floats) -> list[Floats]:
+    """Joint values (N, 6) from which Newton's method finds the other solutions."""
+    wrist = q + np.array([0, 0, 0, np.pi, 0, np.pi])
+    wrist[:, 4] = -q[:, 4]
+    out = [q, wrist]
+    for one in (q, wrist):
+        elbow = one.copy()
+        elbow[:, 2] *= -1
+        elbow[:, [1, 3]] += one[:, 2:3]
+        out.append(elbow)
+    for one in list(out):
+        shoulder = one.copy()
+        shoulder[:, 0] += np.pi
+        shoulder[:, 1] = -np.pi - one[:, 1]
+        shoulder[:, 2:4] *= -1
+        out.append(shoulder)
+    return [_turn(one) for one in out[1:]]
+
+
+def _straight(arm: Arm, tool: Floats, begin: Floats, q: Floats) -> Bools:
+    """(N,) whether the straight motion from joint values (N, 6) to the poses at q ends at q."""
+    r0, p0, _ = nominal_pose(arm, tool, begin)
+    r1, p1, _ = nominal_pose(arm, tool, q)
+    turn = se3.rotation_vector(se3.product(r1, np.swapaxes(r0, 1, 2)))
+    at, out = begin, np.ones(len(q), dtype=bool)
+    for share in np.arange(1, STEPS + 1) / STEPS:
+        rotation = se3.product(se3.rotation(share * turn), r0)
+        found = invert_nominal(arm, tool, at, rotation, p0 + share * (p1 - p0))
+        out &= found.solved & (np.abs(found.q - at).max(axis=1) < LARGEST_STEP)
+        at = found.q
+    return np.asarray(out & (np.abs(_turn(at - q)).max(axis=1) < SAME))
+
+
+def _turn(angle: Floats) -> Floats:
+    """Angles from -π to π."""
+    return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi)

@@ -33,27 +33,16 @@ VALID = "valid: one statement of URScript per line, as chapter 1 of its manual h
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Statement:
-    """One statement.
+    """One statement."""
 
-    Attributes:
-        line: of the program, from 1.
-        number: of the block that it opens, where it opens one.
-        begin: where in the program the text begins that `node` is of.
-        text: that text.
-        node: as parsed; of `if`, `while` and `def` only the head.
-        blocks: numbers of the blocks that it stands in, the outermost first.
-        kinds: the words that these begin with.
-        called: all calls in it, with the names of their functions.
-    """
-
-    line: int
-    number: int
-    begin: int
-    text: str
-    node: ast.stmt
-    blocks: tuple[int, ...]
-    kinds: tuple[str, ...]
-    called: dict[ast.Call, str]
+    line: int  # of the program, from 1
+    number: int  # of the block that it opens, where it opens one
+    begin: int  # where in the program the text begins that `node` is of
+    text: str  # that text
+    node: ast.stmt  # as parsed; of `if`, `while` and `def` only the head
+    blocks: tuple[int, ...]  # numbers of the blocks that it stands in, the outermost first
+    kinds: tuple[str, ...]  # the words that these begin with
+    called: dict[ast.Call, str]  # all calls in it, with the names of their functions
 
     @property
     def call(self) -> ast.Call | None:
@@ -74,11 +63,7 @@ class Statement:
 
 
 def statements(program: str) -> tuple[Statement, ...]:
-    """Parse a program.
-
-    Raises:
-        InputError: names the line that is not understood.
-    """
+    """Parse a program."""
     out: list[Statement] = []
     open_blocks: list[tuple[str, int]] = []
     at = made = 0
@@ -118,7 +103,9 @@ def statements(program: str) -> tuple[Statement, ...]:
             continue
         text, shift = _as_python(body, word)
         node = _parsed(text, number, word)
-        out.append(Statement(number, made, begin + shift, text, node, blocks, kinds, _called(node)))
+        calls = (n for n in ast.walk(node) if isinstance(n, ast.Call))
+        called = {n: n.func.id for n in calls if isinstance(n.func, ast.Name)}
+        out.append(Statement(number, made, begin + shift, text, node, blocks, kinds, called))
     if open_blocks:
         raise _refused(number, f"the program ends inside of {open_blocks[-1][0]}")
     return tuple(out)
@@ -188,11 +175,6 @@ def _parts(node: ast.stmt) -> Iterator[ast.AST]:
             yield node.value
         case _:
             raise ValueError
-
-
-def _called(node: ast.stmt) -> dict[ast.Call, str]:
-    calls = (n for n in ast.walk(node) if isinstance(n, ast.Call))
-    return {n: n.func.id for n in calls if isinstance(n.func, ast.Name)}
 
 
 def _known(node: ast.AST, text: str) -> bool:

@@ -3,25 +3,12 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
 
 from hilcal.calibration.calibration import Calibration
-from hilcal.campaign.revisions import (
-    chain,
-    chain_in_cell,
-    check_sources,
-    history,
-    is_again,
-    mode_of,
-    restore,
-    restore_model,
-    restore_predictive,
-    sound,
-    to_record,
-)
+from hilcal.campaign import revisions
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
 from hilcal.config.changes import INSTRUMENT_NOISE, Changes, changed
@@ -53,12 +40,11 @@ from hilcal.readings.whitening import Mode, usual_mode
 from hilcal.refinement import Refinement
 from hilcal.shown import Brief
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.command_line import typed_now
+from hilcal.store.kept_texts import CALIBRATION_FILE, ROBOT_FILE, check_robot, typed_now
 from hilcal.store.overview import overview
-from hilcal.store.purpose import refuse_fitting
-from hilcal.store.records import content_hash
+from hilcal.store.procedure_log import refuse_fitting
 from hilcal.store.revision import CELL, STORED, RevisionRecord
-from hilcal.store.robot_file import CALIBRATION_FILE, ROBOT_FILE, check_robot
+from hilcal.store.rows import content_hash
 from hilcal.store.run_log import PLAN, RunLog
 from hilcal.tables.table import with_what_rounding_does, write_table
 from hilcal.types import Floats
@@ -69,6 +55,8 @@ Say = Callable[[str], None]
 @dataclass(frozen=True, slots=True, eq=False)
 class Campaign(Brief):
     """An open campaign file; close it, or use it in a `with` statement.
+
+    Where a method takes the number of a `revision`, it is the one in use (see `in_use`) where None.
 
     >>> with hc.Campaign.open(RUN) as run:
     ...     len(run.readings), run.cell.arm.name, run.mode()
@@ -109,15 +97,14 @@ class Campaign(Brief):
         try:
             number, records = file.accepted(), file.revisions()
             used = records[-1:] if number is None else records[number - 1 : number]
-            changes = used[0].cell if used else {}
-            return cls._of(file, catalogue or installed(), changes)
+            return cls._of(file, catalogue or installed(), used[0].cell if used else {})
         except BaseException:
             file.close()
             raise
 
     def _repr_html_(self) -> str:
         from hilcal.present.campaign import info_report  # notebooks alone need them
-        from hilcal.present.html.page import fragment
+        from hilcal.present.html import fragment
         from hilcal.present.registration import covariance_words
 
         covariance = covariance_words(self.covariance_parts, self.noise)
@@ -132,21 +119,17 @@ class Campaign(Brief):
             raise InputError(f"{file.path}: a revision is damaged ({error})") from None
         kept = file.about(ROBOT_FILE), file.about(CALIBRATION_FILE)
         check_robot(file.path, file.config_json, *kept)
-        cell = cell_from_config(config, None, *kept)
-        readings, covers = file.readings(), file.about(COVERS)
-        noise = None if _restates(file, changes) else estimated_noise(file)
-        readings = _with_instrument(readings, file, config, changes, noise)
-        covers = INSTRUMENT if _restates(file, changes) else covers
-        readings = full_readings(readings, covers, cell, config)
-        readings = replace(readings, noise_stated=noise is None)
+        cell, restated = cell_from_config(config, None, *kept), _restates(file, changes)
+        noise = None if restated else estimated_noise(file)
+        readings = _with_instrument(file.readings(), config, restated, noise)
+        covers = INSTRUMENT if restated else file.about(COVERS)
+        readings = replace(
+            full_readings(readings, covers, cell, config), noise_stated=noise is None
+        )
         return cls(file, config, cell, readings, catalogue, changes, noise)
 
     def at(self, changes: Changes) -> Self:
-        """Return the campaign with what a revision changed in the cell, on the same open file.
-
-        Args:
-            changes: see `RevisionRecord.cell`.
-        """
+        """Return the campaign with what a revision changed in the cell, on the same open file."""
         return self if changes == self.changes else self._of(self.file, self.catalogue, changes)
 
     def with_cell(self, changes: Changes) -> Self:
@@ -175,8 +158,7 @@ class Campaign(Brief):
     def unchangeable(self, changes: Changes | None = None) -> dict[tuple[str, str], str]:
         """Return sections and keys of the cell that these readings do not let change, and why.
 
-        Args:
-            changes: in the cell with all of which they are asked for; those of now where None.
+        With all of `changes` in it; with those of now where None.
         """
         found: dict[tuple[str, str], str] = {}
         noise, changes = self.file.about(NOISE), self.changes if changes is None else changes
@@ -219,11 +201,8 @@ class Campaign(Brief):
         A file that does not say is read as it is: where importing would add the arm's scatter, its
         table says that it is in it.
         """
-        stored = self._stated_covers
-        if stored is not None:
-            return stored
         added = covariance_parts(INSTRUMENT, self.config) != "instrument"
-        return WHOLE if added else INSTRUMENT
+        return self._stated_covers or (WHOLE if added else INSTRUMENT)
 
     @property
     def data_hash(self) -> str:
@@ -246,9 +225,10 @@ class Campaign(Brief):
         if as_stored:
             readings, covers = self.file.readings(), self.stored_covers
             about["readings_sha256"] = content_hash(readings)
-            readings = _with_instrument(readings, self.file, self.config, self.changes, self.noise)
-        told = with_what_rounding_does(covers, readings)
-        write_table(readings, path, told, about, self.cell.arm.units)
+            restated = _restates(self.file, self.changes)
+            readings = _with_instrument(readings, self.config, restated, self.noise)
+        covers = with_what_rounding_does(covers, readings)
+        write_table(readings, path, covers, about, self.cell.arm.units)
 
     def close(self) -> None:
         """Close the file."""
@@ -258,68 +238,54 @@ class Campaign(Brief):
         """Return the campaign."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close the file."""
         self.close()
 
     def latest(self) -> RevisionRecord | None:
         """Return the latest revision, if there is any."""
-        records = self.file.revisions()
-        return records[-1] if records else None
+        return next(reversed(self.file.revisions()), None)
 
     def in_use(self, revision: int | None = None) -> RevisionRecord | None:
-        """Return the revision that is used: as asked, else the accepted, else the latest one.
-
-        Args:
-            revision: its number, where one is asked for.
-
-        Raises:
-            InputError: no such revision.
-        """
+        """Return the revision that is used: as asked, else the accepted, else the latest one."""
         number = self.file.accepted() if revision is None else revision
         return self.latest() if number is None else self.file.revision(number)
 
-    def accept(self, revision: int | None) -> None:
-        """Make a revision the one that is used unless another is asked for; None: the latest.
+    def _fitted(self, revision: int | None) -> RevisionRecord:
+        """Return the revision that is used; refuses a campaign without any."""
+        record = self.in_use(revision)
+        if record is None:
+            raise InputError(f"{self.path}: no revision yet; run hilcal identify or refine first")
+        return record
 
-        Raises:
-            InputError: no such revision.
-        """
+    def accept(self, revision: int | None) -> None:
+        """Make a revision the one that is used unless another is asked for; None: the latest."""
         self.file.accept(revision)
 
     def mode(self) -> Mode:
         """Kind of readings: that of the revision in use, else as planned and the readings allow."""
         record = self.in_use()
         if record is not None:
-            return mode_of(record)
+            return revisions.mode_of(record)
         return usual_mode(self.readings, self.config.planning.readings)
 
     def fit(self, revision: int | None = None) -> Fit:
         """Return a stored fit, found again from its stored parameters.
 
-        Args:
-            revision: its number; the one in use where None, see `in_use`.
-
         Raises:
             InputError: no such revision, or its readings or effects are not at hand as they were
                 when it was stored.
         """
-        record = self.in_use(revision)
-        if record is None:
-            raise InputError(f"{self.path}: no revision yet; fit a model and append it first")
-        return self.restore(record)
+        return self.restore(self._fitted(revision))
 
     def restore(self, record: RevisionRecord) -> Fit:
         """Return the fit of a stored revision; raises as `fit` does."""
-        check_sources(record, self.path, self.catalogue)
+        revisions.check_sources(record, self.path, self.catalogue)
         self._require_its_cell(record)
         try:
-            return restore(record, self.cell, self.readings, self.catalogue, self.data_hash)
+            return revisions.restore(
+                record, self.cell, self.readings, self.catalogue, self.data_hash
+            )
         except InputError as error:
             raise InputError(f"{error}{self._until_used(record.number)}") from None
 
@@ -332,15 +298,7 @@ class Campaign(Brief):
             )
 
     def require_gc(self, number: int | None, scaling: str, what: str) -> None:
-        """Refuse a fit whose residual is not whitened.
-
-        Args:
-            number: of its revision; None for a baseline that is not kept.
-            what: is to be done with it.
-
-        Raises:
-            InputError: another scaling than gc; says how to get one.
-        """
+        """Refuse a fit, of revision `number`, whose residual is not whitened."""
         if scaling != "gc":
             raise InputError(
                 f"revision {number} has scaling {scaling}; {what} needs gc: run hilcal identify "
@@ -348,14 +306,7 @@ class Campaign(Brief):
             )
 
     def _until_used(self, number: int | None) -> str:
-        """Return what a new fit lacks until commands use it in the place of a revision.
-
-        Args:
-            number: of the revision that will not do.
-
-        Returns:
-            Words to go after "run hilcal identify again"; nothing where the latest one is used.
-        """
+        """Words after "run hilcal identify again": what the new fit lacks until it is used."""
         if number is None or number != self.file.accepted():
             return ""
         return (
@@ -366,42 +317,33 @@ class Campaign(Brief):
     def fitted_readings(self, record: RevisionRecord) -> Readings:
         """Return the readings that a revision was fitted to; later ones come after them."""
         self._require_its_cell(record)
-        with sound(record):
+        with revisions.sound(record):
             return self.readings[: int(record.result_json["identify"]["n_readings"])]
 
     def restore_model(self, record: RevisionRecord) -> tuple[Model, Floats]:
         """Return model and parameters (P,) of a stored revision; raises as `fit` does."""
-        check_sources(record, self.path, self.catalogue)
-        return restore_model(record, self.cell, self.fitted_readings(record), self.catalogue)
+        revisions.check_sources(record, self.path, self.catalogue)
+        return revisions.restore_model(
+            record, self.cell, self.fitted_readings(record), self.catalogue
+        )
 
     def predictive(self, record: RevisionRecord, model: Model, theta: Floats) -> Predictive:
         """Return what a stored revision knows of readings that it has not seen."""
-        return restore_predictive(record, model, theta, self.fitted_readings(record))
+        return revisions.restore_predictive(record, model, theta, self.fitted_readings(record))
 
     def calibration(self, revision: int | None = None) -> Calibration:
-        """Return a stored fit ready for use, see `Calibration`.
-
-        Args:
-            revision: its number; the one in use where None, see `in_use`.
-
-        Raises:
-            InputError: no such revision, or see `fit`.
-        """
-        record = self.in_use(revision)
-        if record is None:
-            raise InputError(f"{self.path}: no revision yet; run hilcal identify or refine first")
+        """Return a stored fit ready for use, see `Calibration`; raises as `fit` does."""
+        record = self._fitted(revision)
         judged: Mapping[str, Any] = record.result_json.get("diagnose", {})
-        return Calibration.of(
-            self.restore(record),
-            {
-                "campaign": self.path.name,
-                "revision": record.number,
-                "effects": list(record.effects),
-                "verdict": judged.get("verdict"),
-                "readings_sha256": record.data_hash,
-                **self._kinematics(),
-            },
-        )
+        source = {
+            "campaign": self.path.name,
+            "revision": record.number,
+            "effects": list(record.effects),
+            "verdict": judged.get("verdict"),
+            "readings_sha256": record.data_hash,
+            **self._kinematics(),
+        }
+        return Calibration.of(self.restore(record), source)
 
     def _kinematics(self) -> dict[str, object]:
         """Return the controller's kinematics as a calibration keeps them, where they were told."""
@@ -411,34 +353,25 @@ class Campaign(Brief):
                 if "kinematics" in answer.get("fields", {}):
                     return {"kinematics": answer["fields"]["kinematics"]}
         factory = self.cell.factory
-        if factory is None or factory.rows is None:
-            return {}
-        return {"kinematics": factory.to_dict()}
+        return {} if factory is None or factory.rows is None else {"kinematics": factory.to_dict()}
 
     def posterior(self, revision: int | None = None) -> Posterior:
         """Return what a stored fit taught of the arm, which is the prior of another campaign.
 
-        Args:
-            revision: its number; the one in use where None, see `in_use`.
-
         Raises:
-            InputError: no such revision, see `fit`, or one that is not fitted with scaling gc.
+            InputError: see `fit`, or one that is not fitted with scaling gc.
             CannotAnswerError: its model has no effect of the arm.
         """
-        record = self.in_use(revision)
-        if record is None:
-            raise InputError(f"{self.path}: no revision yet; run hilcal identify or refine first")
+        record = self._fitted(revision)
         source = Source(self.path.name, record.number, record.created)
         return Posterior.of(self.restore(record), source)
 
     def history(self, revision: int | None = None) -> History:
-        """Return how the model of a revision was reached, which `diagnose` takes.
-
-        Args:
-            revision: its number; the one in use where None.
-        """
+        """Return how the model of a revision was reached, which `diagnose` takes."""
         record = self.in_use(revision)
-        return history(() if record is None else chain(self.file.revisions(), record.number))
+        return revisions.history(
+            () if record is None else revisions.chain(self.file.revisions(), record.number)
+        )
 
     def append(self, found: Fit | Diagnosis | Refinement) -> int:
         """Store a fit, a diagnosed fit, or all steps of a refinement; revisions only append.
@@ -452,13 +385,12 @@ class Campaign(Brief):
             InputError: it was fitted to other readings than those of this campaign.
         """
         if isinstance(found, Refinement):
-            steps = found.steps
-            return self.append_records(
-                [self.record(s.fit, s.diagnosis, s.added, s.removed) for s in steps]
-            )[-1]
-        if isinstance(found, Diagnosis):
-            return self.append_records([self.record(found.fit, found)])[-1]
-        return self.append_records([self.record(found)])[-1]
+            records = [self.record(s.fit, s.diagnosis, s.added, s.removed) for s in found.steps]
+        elif isinstance(found, Diagnosis):
+            records = [self.record(found.fit, found)]
+        else:
+            records = [self.record(found)]
+        return self.append_records(records)[-1]
 
     def append_records(
         self, records: Sequence[RevisionRecord], parent: int | None = None
@@ -472,9 +404,9 @@ class Campaign(Brief):
         """
         if not records:
             return ()
-        last = chain(self.file.revisions())[-len(records) :]
+        last = revisions.chain(self.file.revisions())[-len(records) :]
         there = last and last[0].made_from == parent and len(last) == len(records)
-        if there and all(map(is_again, records, last)):
+        if there and all(map(revisions.is_again, records, last)):
             return tuple(r.number for r in last)
         numbers: list[int] = []
         for record in records:
@@ -501,7 +433,7 @@ class Campaign(Brief):
 
         Raises:
             InputError: it was fitted to other readings than those of this campaign, or these are
-                of a validation campaign (`store.purpose`).
+                of a validation campaign (`store.procedure_log`).
         """
         return self.file.append_revision(self.record(found, diagnosis, added, removed, parent))
 
@@ -519,11 +451,11 @@ class Campaign(Brief):
         if hashed != content_hash(self.readings):
             raise InputError(f"{self.path}: the fit is of other readings than this campaign's")
         document = None if diagnosis is None else to_json(diagnosis)
-        record = to_record(found, document, added, hashed, removed, parent)
-        own: dict[str, Any] = {STORED: self.data_hash, **typed_now()}
+        record = revisions.to_record(found, document, added, hashed, removed, parent)
+        more: dict[str, Any] = {STORED: self.data_hash, **typed_now()}
         if self.changes:
-            own[CELL] = self.changes
-        return replace(record, options={**record.options, **own})
+            more[CELL] = self.changes
+        return replace(record, options={**record.options, **more})
 
     def fit_in_use(
         self, say: Say = lambda text: None, revision: int | None = None
@@ -531,14 +463,6 @@ class Campaign(Brief):
         """Return number and fit of the revision in use; without any, fit the baseline.
 
         Nothing is stored; the number is None where the baseline was fitted.
-
-        Args:
-            revision: number of the revision; see `in_use`.
-
-        Raises:
-            InputError: no such revision, or its readings or effects are not at hand as they were
-                when it was stored.
-            CannotAnswerError: the readings do not determine the baseline.
         """
         record = self.in_use(revision)
         if record is not None:
@@ -552,21 +476,14 @@ class Campaign(Brief):
     def chapters(self, say: Say = lambda text: None, revision: int | None = None) -> list[Chapter]:
         """Return the revision in use and those that it was made from, diagnosed; see `view`.
 
-        Without any revision it is the baseline, which is not stored.
-
-        Args:
-            revision: number of the revision; see `in_use`.
-
-        Raises:
-            InputError: no such revision, or its readings or effects are not at hand as they were
-                when it was stored.
+        Without any revision it is the baseline, which is not stored. Raises as `fit` does.
         """
         last = self.in_use(revision)
         if last is None:
             _, found = self.fit_in_use(say)
             say("diagnosing it")
             return [Chapter(1, None, found, diagnose(found, say=say))]
-        records = chain_in_cell(self.file.revisions(), last.number)
+        records = revisions.chain_in_cell(self.file.revisions(), last.number)
         fits = []
         for record in records:
             say(f"restoring revision {record.number}")
@@ -576,24 +493,25 @@ class Campaign(Brief):
         while len(judged) < len(fits):
             same = _named_from(fits[len(judged) :])
             say(f"diagnosing revision {numbers[id(same[-1])]}")
-            judged += self._judged(same, lambda f: self.history(numbers[id(f)]), say)
+            judged += _judged(same, lambda f: self.history(numbers[id(f)]), say)
         return [
             Chapter(r.number, r.added, f, d, r.removed)
             for r, f, d in zip(records, fits, judged, strict=True)
         ]
 
-    def _judged(
-        self, fits: Sequence[Fit], history: Callable[[Fit], History], say: Say
-    ) -> Sequence[Diagnosis | None]:
-        """Judge one fit, or one with a background of which more and more is named."""
-        if fits[0].scaling != "gc":
-            return [None]
-        if len(fits) == 1:
-            return [diagnose(fits[0], history(fits[0]), say)]
-        tested = background_evidence(fits[0])
-        return judge_naming(
-            fits, tested, history, lambda left: Evidence(fits[-1], say=say, background=left)
-        )[0]
+
+def _judged(
+    fits: Sequence[Fit], history: Callable[[Fit], History], say: Say
+) -> Sequence[Diagnosis | None]:
+    """Judge one fit, or one with a background of which more and more is named."""
+    if fits[0].scaling != "gc":
+        return [None]
+    if len(fits) == 1:
+        return [diagnose(fits[0], history(fits[0]), say)]
+    tested = background_evidence(fits[0])
+    return judge_naming(
+        fits, tested, history, lambda left: Evidence(fits[-1], say=say, background=left)
+    )[0]
 
 
 def _named_from(fits: Sequence[Fit]) -> Sequence[Fit]:
@@ -608,26 +526,18 @@ def _named_from(fits: Sequence[Fit]) -> Sequence[Fit]:
 
 
 def estimated_noise(file: CampaignFile) -> NoiseEstimate | None:
-    """Return the noise as it was estimated at import, or after measuring; None where it is stated.
-
-    Raises:
-        InputError: it is damaged.
-    """
+    """Return the noise as estimated at import, or after measuring; None where it is stated."""
     if file.about(PLAN) is None:
         return NoiseEstimate.from_json(file.about(NOISE))
-    told = RunLog(file).last(NOISE)
-    return None if told is None or told["factors"] is None else NoiseEstimate.of(told)
+    event = RunLog(file).last(NOISE)
+    return None if event is None or event["factors"] is None else NoiseEstimate.of(event)
 
 
 def _with_instrument(
-    readings: Readings,
-    file: CampaignFile,
-    config: CellConfig,
-    changes: Changes,
-    noise: NoiseEstimate | None,
+    readings: Readings, config: CellConfig, restated: bool, noise: NoiseEstimate | None
 ) -> Readings:
     """Return stored readings with the instrument's covariance as it is stated or estimated now."""
-    if _restates(file, changes):
+    if restated:
         return with_noise_of(config.tracker, readings)
     if noise is not None and noise.factors is not None:
         return with_noise_factors(readings, config.tracker, noise.factors)

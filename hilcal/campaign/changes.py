@@ -24,25 +24,19 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Changed:
-    """A revision and the one that it was made from.
+    """A revision and the one that it was made from."""
 
-    Attributes:
-        before_number: number of the revision before.
-        number: of the new revision.
-        added: the effect that was added, with its options where a finer form took its place.
-        removed: the effect that was taken out.
-        expected: what the fit before promised of an effect that was added, and what was kept of it;
-            None where it has no whitened residual.
-    """
-
-    before_number: int
+    before_number: int  # number of the revision before
     before: Fit
-    number: int
+    number: int  # of the new revision
     fit: Fit
     diagnosis: Diagnosis
     added: str | None
-    removed: str | None
+    """The effect that was added, with its options where a finer form took its place."""
+    removed: str | None  # the effect that was taken out
     expected: Suspect | None
+    """What the fit before promised of an effect that was added, and what was kept of it; None where
+    it has no whitened residual."""
 
 
 def add_effect(
@@ -56,15 +50,9 @@ def add_effect(
 ) -> Changed:
     """Add an effect to a revision's model, and store the fit as a revision that comes from it.
 
-    Args:
-        o: the campaign.
-        number: of the revision; None where there is none yet: `before` then becomes one, too, when
-            the effect could be added.
-        judged: the diagnosis of `before`, which is kept with it.
-
-    Raises:
-        InputError: an effect that the model has already, or that these readings do not allow.
-        CannotAnswerError: fewer measured elements than identifiable parameters.
+    Where there is no revision yet, `number` is None, and `before` becomes one, too, when the effect
+    could be added. Raises an InputError where the model has the effect already, or the readings do
+    not allow it, and a CannotAnswerError where they are too few.
     """
     named = write_effect(effect, options)
     say(f"adding {named}")
@@ -121,14 +109,8 @@ def refit(o: Campaign, record: RevisionRecord, say: Say, history: History = NOTH
 
     Frames that were unknown are in it where the cell does not know them now. What the revision has
     beside its effects it has again, estimated anew: another campaign's prior, a background, the
-    arm's scatter. Nothing is stored.
-
-    Args:
-        history: how its model was reached, where the new revision is made from it.
-
-    Raises:
-        InputError: an effect that the readings do not allow.
-        CannotAnswerError: the readings do not determine the model.
+    arm's scatter. Nothing is stored. `history` is how its model was reached. Raises as `add_effect`
+    does.
     """
     mode = mode_of(record)
     frames = o.catalogue.unknown_frames(o.at(record.cell).cell)
@@ -158,18 +140,8 @@ def change_cell(
 ) -> tuple[Campaign, int, Diagnosis]:
     """Fit a revision's model in a changed cell, and store the fit as a revision that says so.
 
-    Args:
-        o: the campaign, in the cell of the revision.
-        number: of the revision; None where there is none yet: `before` then becomes one, too.
-        changes: as for `Campaign.with_cell`.
-        judged: the diagnosis of `before`, which is kept with it.
-
-    Returns:
-        The campaign in the changed cell, number and diagnosis of the new revision.
-
-    Raises:
-        InputError: changes that are not valid; see `refit`.
-        CannotAnswerError: see `refit`.
+    Returns the campaign in that cell, number and diagnosis of the new revision. Where there is none
+    yet, `number` is None, and `before` becomes one, too. Raises as `add_effect` does.
     """
     there = o.with_cell(changes)
     record = o.record(before) if number is None else o.file.revision(number)

@@ -13,7 +13,6 @@ from hilcal import __version__
 from hilcal.cell import Cell
 from hilcal.diagnosis.diagnosis import History
 from hilcal.effects.catalogue import Catalogue, installed
-from hilcal.effects.protocol import Effect
 from hilcal.errors import InputError
 from hilcal.identification import fit_document
 from hilcal.identification.arm_scatter import with_arm_scatter
@@ -26,9 +25,9 @@ from hilcal.readings.arm_scatter import ArmScatter
 from hilcal.readings.readings import Readings
 from hilcal.readings.serial_noise import SerialNoise
 from hilcal.readings.whitening import MODES, SCALINGS, Mode, Scaling
-from hilcal.store.command_line import COMMAND
-from hilcal.store.records import content_hash
+from hilcal.store.kept_texts import COMMAND
 from hilcal.store.revision import CARRIED, STORED, RevisionRecord, to_text
+from hilcal.store.rows import content_hash
 from hilcal.types import Floats
 
 _LARGEST = 1e9
@@ -52,86 +51,67 @@ def to_record(
     removed: str | None = None,
     parent: int | None = None,
 ) -> RevisionRecord:
-    """Store a fit: enough to find it again, and what was reported of it.
+    """Return what is stored of a fit: enough to find it again, and what was reported of it.
 
-    Args:
-        diagnosis: its document, see `present.diagnosis_document`, where it was diagnosed.
-        added: the effect that made it from the revision before; without any change a new chain
-            starts.
-        data_hash: `content_hash` of its readings.
-        removed: the effect that was taken out of the revision before.
-        parent: number of the revision that it was made from, where that is not the one before.
+    Without an effect `added` or `removed` a new chain starts; `parent` is the number of the
+    revision that it was made from, where that is not the one before.
     """
-    effects, cell = found.model.effects, found.model.cell
-    scatter, serial = found.readings.arm_scatter, found.readings.serial
-    observers = [{"frame": o.frame.tolist(), "offset_m": o.offset} for o in cell.observers]
+    model, cell, readings = found.model, found.model.cell, found.readings
+    files = {name: model.catalogue.file_of(name) for name in model.names}
+    sources = {n: {"file": f.path, "sha256": f.sha256} for n, f in files.items() if f is not None}
+    std = {name: values.tolist() for name, values in model.random.items()}
+    optional = {
+        "targets": None if cell.targets is None else cell.targets.tolist(),
+        "observers": [{"frame": o.frame.tolist(), "offset_m": o.offset} for o in cell.observers],
+        "arm_scatter": readings.arm_scatter and readings.arm_scatter.to_json(),
+        SERIAL: readings.serial and readings.serial.to_json(),
+        CARRIED: model.prior and model.prior.to_json(),
+        RANDOM: {"effects": list(model.names), "std": std} if std else None,
+    }
     result: dict[str, object] = {"identify": fit_document.to_json(found)}
     if diagnosis is not None:
         result["diagnose"] = fit_document.plain(diagnosis)
     return RevisionRecord(
-        effects=found.model.named,
+        effects=model.named,
         added=added,
         removed=removed,
         parent=parent,
         options={
             "readings": found.mode,
             "scaling": found.scaling,
-            "effects": {e.name: dict(e.options) for e in effects},
-            **_sources(found.model),
+            "effects": {e.name: dict(e.options) for e in model.effects},
+            **({SOURCES: sources} if sources else {}),
         },
         data_hash=data_hash,
         program_version=__version__,
         parameters_json={
-            "names": [f"{e.name}.{p.name}" for e in effects for p in e.parameters],
+            "names": _names(model),
             "theta": found.theta.tolist(),
             "std": [fit_document.finite(s) for s in found.uncertainty.std],
             "prior": [fit_document.finite(s) for s in found.solution.prior],
             "registration": cell.registration.tolist(),
             "target": cell.target.tolist(),
-            **({} if cell.targets is None else {"targets": cell.targets.tolist()}),
-            **({"observers": observers} if cell.observers else {}),
             "outliers": np.flatnonzero(found.outlier).tolist(),
-            **({} if scatter is None else {"arm_scatter": scatter.to_json()}),
-            **({} if serial is None else {SERIAL: serial.to_json()}),
-            **({} if found.model.prior is None else {CARRIED: found.model.prior.to_json()}),
-            **_random_to_json(found.model),
+            **{key: value for key, value in optional.items() if value},
         },
         result_json=result,
     )
 
 
-def _placed(cell: Cell, stored: Sequence[Mapping[str, Any]]) -> Cell:
-    """Return a cell with its observers where a revision has them."""
-    frames = [np.array(o["frame"], dtype=float) for o in stored]
-    if not all(f.shape == (4, 4) and _is_frame(f) for f in frames):
-        raise ValueError("the stored frames are no rigid transforms")
-    pairs = zip(cell.observers, frames, stored, strict=True)
-    found = [replace(o, frame=f, offset=float(s["offset_m"])) for o, f, s in pairs]
-    return replace(cell, observers=tuple(found))
+def _names(model: Model) -> list[str]:
+    return [f"{e.name}.{p.name}" for e in model.effects for p in e.parameters]
 
 
 def is_again(new: RevisionRecord, stored: RevisionRecord) -> bool:
-    """Whether a stored revision holds all of a new one but the time and the command.
+    """Whether a stored revision holds all of a new one but the time and the command."""
 
-    That is the same model, readings, options, program and numbers, exactly; the stored one may be
-    diagnosed where the new one is not.
-    """
-
-    def plain(r: RevisionRecord) -> dict[str, Any]:
-        told = {key: r.result_json.get(key) for key in new.result_json}
+    def plain(r: RevisionRecord) -> Any:
+        result = {key: r.result_json.get(key) for key in new.result_json}
         options = {key: value for key, value in r.options.items() if key != COMMAND}
-        alike = replace(r, options=options, result_json=told, created="", parent=None)
-        return dict(json.loads(to_text(alike)))
+        alike = replace(r, options=options, result_json=result, created="", parent=None)
+        return json.loads(to_text(alike))
 
-    return plain(new) == plain(stored)
-
-
-def _random_to_json(model: Model) -> dict[str, object]:
-    """Key `random`: all effects in order, and the standard deviations of the random ones, SI."""
-    if not model.random:
-        return {}
-    std = {name: values.tolist() for name, values in model.random.items()}
-    return {RANDOM: {"effects": list(model.names), "std": std}}
+    return bool(plain(new) == plain(stored))
 
 
 def restore(
@@ -143,13 +123,7 @@ def restore(
 ) -> Fit:
     """Find a stored fit again: the same model from the stored parameters, quickly.
 
-    Args:
-        cell: the cell of the campaign's configuration.
-        catalogue: has its effects; the installed ones unless given.
-        stored: hash of the readings as the file stores them, where there is a file.
-
-    Raises:
-        InputError: readings were appended since, or the record is of another model.
+    `stored` is the hash of the readings as the file stores them, where there is a file.
     """
     if not _fitted_to(record, readings, stored):
         raise InputError(
@@ -158,8 +132,8 @@ def restore(
         )
     model, theta = restore_model(record, cell, readings, catalogue)
     with sound(record):
-        prior = _prior(record)
-        mode, scaling = mode_of(record), scaling_of(record)
+        prior, mode = _prior(record), mode_of(record)
+        scaling: Scaling = SCALINGS[SCALINGS.index(record.options["scaling"])]
         scatter = record.parameters_json.get("arm_scatter")
         if scatter is not None:
             readings = with_arm_scatter(model.cell, readings, ArmScatter.from_json(scatter))
@@ -177,23 +151,18 @@ def _fitted_to(record: RevisionRecord, readings: Readings, stored: str | None) -
     readings cannot be changed, only appended, and each has a checksum.
     """
     reported = record.result_json.get("identify")
-    told = reported.get("n_readings") if isinstance(reported, Mapping) else None
-    if told is not None and told != len(readings):
+    count = reported.get("n_readings") if isinstance(reported, Mapping) else None
+    if count is not None and count != len(readings):
         return False
     if stored is not None and stored == record.options.get(STORED):
         return True
-    if record.data_hash == content_hash(readings):
-        return True
-    return STORED not in record.options and told is not None
+    known = record.data_hash == content_hash(readings)
+    return known or (STORED not in record.options and count is not None)
 
 
 @contextmanager
 def sound(record: RevisionRecord) -> Iterator[None]:
-    """Say that a revision is damaged where its entries are not what this program stores.
-
-    Raises:
-        InputError: names the revision.
-    """
+    """Say that a revision is damaged where its entries are not what this program stores."""
     try:
         yield
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
@@ -214,31 +183,18 @@ def _prior(record: RevisionRecord) -> Floats:
 def restore_model(
     record: RevisionRecord, cell: Cell, readings: Readings, catalogue: Catalogue | None = None
 ) -> tuple[Model, Floats]:
-    """Model and parameters (P,) of a revision, in the cell as it was registered then.
-
-    Args:
-        cell: the cell of the campaign's configuration.
-        readings: the readings that it was fitted to.
-        catalogue: has its effects; the installed ones unless given.
-
-    Raises:
-        InputError: the parameters are not those of the model.
-    """
+    """Model and parameters (P,) of a revision, in the cell as it was registered then."""
     with sound(record):
-        return _restored(record, cell, readings, catalogue)
+        return _restored(record, cell, readings, catalogue or installed())
 
 
 def _restored(
-    record: RevisionRecord, cell: Cell, readings: Readings, catalogue: Catalogue | None
+    record: RevisionRecord, cell: Cell, readings: Readings, catalogue: Catalogue
 ) -> tuple[Model, Floats]:
-    """Return `restored` of a record that may be damaged: then any exception can be raised."""
+    """Do the same of a record that may be damaged: then any exception can be raised."""
     stored: Mapping[str, Any] = record.parameters_json
-    targets = np.array(stored.get("targets", [stored["target"]]), dtype=float)
-    registration = np.array(stored["registration"], dtype=float)
-    if registration.shape != (4, 4) or targets.shape[1:] != (4, 4):
-        raise ValueError("the stored frames are no rigid transforms")
-    if not all(_is_frame(frame) for frame in (registration, *targets)):
-        raise ValueError("the stored frames are no rigid transforms")
+    targets = _frames(stored.get("targets", [stored["target"]]))
+    (registration,) = _frames([stored["registration"]])
     if len(targets) != len(cell.known_targets):
         raise InputError(
             f"revision {record.number} is of {len(targets)} targets, the cell has "
@@ -247,46 +203,44 @@ def _restored(
     cell = replace(cell.with_targets(targets), registration=registration)
     cell = cell.observed_by(readings.observers)
     if cell.observers:
-        cell = _placed(cell, stored["observers"])
-    options, known = record.options["effects"], catalogue or installed()
-    of_random = stored.get(RANDOM, {"effects": record.effects, "std": {}})
-    names = tuple(of_random["effects"])
-    effects = tuple(known.make(e, cell, readings.states, options.get(e)) for e in names)
-    random = _random(of_random["std"], effects)
+        observed = stored["observers"]
+        frames = _frames([o["frame"] for o in observed])
+        trios = zip(cell.observers, frames, observed, strict=True)
+        placed = (replace(o, frame=f, offset=float(s["offset_m"])) for o, f, s in trios)
+        cell = replace(cell, observers=tuple(placed))
+    options, of_random = record.options["effects"], stored.get(RANDOM)
+    names = tuple(of_random["effects"] if of_random else record.effects)
+    effects = tuple(catalogue.make(e, cell, readings.states, options.get(e)) for e in names)
+    size = {e.name: len(e.magnitudes) for e in effects}
+    std = of_random["std"] if of_random else {}
+    random = {name: np.array(values, dtype=float) for name, values in std.items()}
+    for name, values in random.items():
+        if values.shape != (size.get(name),) or not np.all((values > 0) & (values < _LARGEST)):
+            raise ValueError("random effects with standard deviations that are none")
     background = frozenset(names) - frozenset(record.effects)
     if not background <= random.keys() or not set(record.effects) <= set(names):
         raise ValueError("a background that is not random")
-    model = Model(cell, effects, known, readings, carried_of(record), random, background)
-    parameters = [f"{e.name}.{p.name}" for e in model.effects for p in e.parameters]
-    if parameters != stored["names"]:
+    model = Model(cell, effects, catalogue, readings, carried_of(record), random, background)
+    if _names(model) != stored["names"]:
         raise InputError(
             f"revision {record.number} was made by hilcal {record.program_version}, whose effects "
             "have other parameters; run hilcal identify again"
         )
     theta = np.array(stored["theta"], dtype=float)
-    if theta.shape != (len(parameters),) or not np.all(np.abs(theta) < _LARGEST):
+    if theta.shape != (model.size,) or not np.all(np.abs(theta) < _LARGEST):
         raise ValueError("parameters that are none")
     return model, theta
 
 
-def _random(stored: Mapping[str, Any], effects: tuple[Effect, ...]) -> dict[str, Floats]:
-    """Standard deviations of the random effects."""
-    size = {e.name: len(e.magnitudes) for e in effects}
-    found = {name: np.array(values, dtype=float) for name, values in stored.items()}
-    for name, std in found.items():
-        if std.shape != (size.get(name),) or not np.all((std > 0) & (std < _LARGEST)):
-            raise ValueError("random effects with standard deviations that are none")
-    return found
-
-
-def _is_frame(frame: Floats) -> bool:
-    """Whether a matrix is a rotation and a translation, to rounding."""
-    turn = frame[:3, :3]
-    return bool(
-        np.all(np.abs(frame) < _LARGEST)
-        and np.allclose(turn @ turn.T, np.eye(3), atol=1e-6)
-        and np.array_equal(frame[3], [0.0, 0.0, 0.0, 1.0])
-    )
+def _frames(stored: Sequence[Any]) -> Floats:
+    """(K, 4, 4) rotations and translations; refuses others."""
+    frames = np.array(stored, dtype=float)
+    rigid = frames.shape[1:] == (4, 4) and bool(np.all(np.abs(frames) < _LARGEST))
+    turn = frames[:, :3, :3] if rigid else np.zeros((1, 3, 3))
+    rigid = rigid and np.allclose(turn @ np.swapaxes(turn, 1, 2), np.eye(3), atol=1e-6)
+    if not rigid or np.any(frames[:, 3] != [0.0, 0.0, 0.0, 1.0]):
+        raise ValueError("the stored frames are no rigid transforms")
+    return frames
 
 
 def carried_of(record: RevisionRecord) -> CarriedPrior | None:
@@ -298,12 +252,7 @@ def carried_of(record: RevisionRecord) -> CarriedPrior | None:
 def restore_predictive(
     record: RevisionRecord, model: Model, theta: Floats, readings: Readings
 ) -> Predictive:
-    """Return what a stored fit knows of readings that it has not seen.
-
-    Args:
-        theta: (P,) its parameters.
-        readings: all readings that it was fitted to.
-    """
+    """Return what a stored fit with parameters (P,) knows of readings that it has not seen."""
     stored: Mapping[str, Any] = record.parameters_json
     with sound(record):
         prior, mode = _prior(record), mode_of(record)
@@ -314,8 +263,13 @@ def restore_predictive(
 
 def has_background(record: RevisionRecord) -> bool:
     """Whether effects that are not named predict with the model of a revision."""
-    every = record.parameters_json.get(RANDOM, {}).get("effects", ())
-    return not set(every) <= set(record.effects)
+    return not set(_predicting(record)) <= set(record.effects)
+
+
+def _predicting(record: RevisionRecord) -> Sequence[str]:
+    """Names of all effects of a revision, those of its background too."""
+    every: Sequence[str] = record.parameters_json.get(RANDOM, {}).get("effects", record.effects)
+    return every
 
 
 def mode_of(record: RevisionRecord) -> Mode:
@@ -323,19 +277,10 @@ def mode_of(record: RevisionRecord) -> Mode:
     return MODES[MODES.index(record.options["readings"])]
 
 
-def scaling_of(record: RevisionRecord) -> Scaling:
-    """Scaling of a revision."""
-    return SCALINGS[SCALINGS.index(record.options["scaling"])]
-
-
 def chain(
     records: tuple[RevisionRecord, ...], last: int | None = None
 ) -> tuple[RevisionRecord, ...]:
-    """Return a revision and those that it was made from, oldest first.
-
-    Args:
-        last: number of the revision; the latest where None.
-    """
+    """Return a revision, the latest where None, and those that it was made from, oldest first."""
     by_number = {r.number: r for r in records}
     found: list[RevisionRecord] = []
     number = max(by_number, default=None) if last is None else last
@@ -352,11 +297,7 @@ def chain_in_cell(records: tuple[RevisionRecord, ...], last: int) -> tuple[Revis
 
 
 def history(records: tuple[RevisionRecord, ...]) -> History:
-    """Return how the model of the last of these revisions was reached.
-
-    Args:
-        records: revisions that were made from each other, oldest first; see `chain`.
-    """
+    """Return how the model of the last of the revisions of a `chain` was reached."""
     if not records:
         return History()
     last = records[-1]
@@ -369,22 +310,10 @@ def history(records: tuple[RevisionRecord, ...]) -> History:
     )
 
 
-def _sources(model: Model) -> dict[str, dict[str, dict[str, str]]]:
-    """File and hash of those effects that are from files; nothing where none is."""
-    files = {name: model.catalogue.file_of(name) for name in model.names}
-    own = {n: {"file": f.path, "sha256": f.sha256} for n, f in files.items() if f is not None}
-    return {SOURCES: own} if own else {}
-
-
 def check_sources(record: RevisionRecord, run: Path, catalogue: Catalogue) -> None:
-    """Refuse a revision whose effects are not at hand as they were when it was fitted.
-
-    Raises:
-        InputError: an effect is not in the catalogue, or its file has changed since.
-    """
+    """Refuse a revision whose effects are not at hand as they were when it was fitted."""
     stored = record.options.get(SOURCES, {})
-    every = record.parameters_json.get(RANDOM, {}).get("effects", record.effects)
-    for name in every:
+    for name in _predicting(record):
         then, now = stored.get(name), catalogue.file_of(name)
         if name not in catalogue.names:
             where, known = "FILE.py", ""

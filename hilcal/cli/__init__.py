@@ -39,7 +39,7 @@ from hilcal.errors import (
 )
 from hilcal.names import escaped
 from hilcal.optional import lacking
-from hilcal.store.command_line import typed
+from hilcal.store.kept_texts import typed
 
 DEBUG = "HILCAL_DEBUG"
 _COMPLETE = "_HILCAL_COMPLETE"
@@ -309,7 +309,7 @@ def _explained(error: Exception, name: str) -> tuple[str, int]:
         return words, _USAGE
     if words := lacking(error):
         return words, _USAGE
-    from hilcal.effects.failure import failure_of  # loads numpy, which takes a while
+    from hilcal.effects.from_file import failure_of
 
     if failed := failure_of(error):
         return str(failed), failed.exit_code

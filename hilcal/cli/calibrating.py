@@ -27,7 +27,7 @@ from hilcal.errors import (
     MovedFileError,
     StoppedError,
 )
-from hilcal.measuring.kinematics import with_kinematics
+from hilcal.measuring.connect import with_kinematics
 from hilcal.measuring.run import HOW_ON
 from hilcal.names import quoted
 from hilcal.present.calibration import (

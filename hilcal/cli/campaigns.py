@@ -20,10 +20,9 @@ from hilcal.identification.table_preview import preview_table
 from hilcal.identification.torques import check_torques
 from hilcal.import_campaign import import_campaign
 from hilcal.names import quoted
-from hilcal.present.campaign import info_report
+from hilcal.present.campaign import import_preview, info_report
 from hilcal.present.document import Words, heading
 from hilcal.present.fit import model_name, target_words
-from hilcal.present.preparing import import_preview
 from hilcal.present.progress import counting, working
 from hilcal.present.registration import (
     covariance_words,
@@ -35,11 +34,11 @@ from hilcal.present.registration import (
 from hilcal.readings.covariance import COVERS
 from hilcal.readings.readings import Readings
 from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.kept_texts import ROBOT_FILE
 from hilcal.store.overview import overview, to_json
 from hilcal.store.repair import put_robot
 from hilcal.store.repair import repair as repaired
 from hilcal.store.revision import RevisionRecord
-from hilcal.store.robot_file import ROBOT_FILE
 from hilcal.whole_file import replace_file
 
 
@@ -256,7 +255,7 @@ def fleet(
     from hilcal.cli.showing import opening
     from hilcal.engine.engine import open_engine
     from hilcal.identification.posterior_document import write
-    from hilcal.present.fleet import fleet_report
+    from hilcal.present.comparison import fleet_report
     from hilcal.transfer.fleet import fleet as pool_fleet
     from hilcal.transfer.fleet import to_json
     from hilcal.transfer.members import entries

@@ -13,6 +13,7 @@ from hilcal.errors import CannotAnswerError, HilcalError, InputError, LimitError
 from hilcal.identification.fit import all_left_out
 from hilcal.identification.full_prediction import full_prediction
 from hilcal.identification.linearisation import linearise
+from hilcal.present.calibration import opening, shares_report, validation_failure, validation_report
 from hilcal.present.comparison import comparison_json, comparison_report, next_command
 from hilcal.present.document import heading
 from hilcal.present.fit import (
@@ -25,7 +26,6 @@ from hilcal.present.fit import (
     worst_table,
 )
 from hilcal.present.progress import working
-from hilcal.present.validation import opening, shares_report, validation_failure, validation_report
 from hilcal.tables.units import parse_length
 from hilcal.transfer.compare import compare as compare_campaigns
 from hilcal.validation import validate as validate_campaign

@@ -9,12 +9,18 @@ from pathlib import Path
 
 import numpy as np
 
-from hilcal.calibration.branches import doubts
 from hilcal.calibration.calibration import Calibration
-from hilcal.calibration.compensated import Compensation
+from hilcal.calibration.compensation import Compensation
 from hilcal.calibration.points import Points, on_branch, read_points
 from hilcal.calibration.programs.languages import READERS, UnderstoodProgram, understood
-from hilcal.calibration.urscript import JOINTS, Waypoint, movej_program, program_points, with_joints
+from hilcal.calibration.urscript import (
+    JOINTS,
+    Waypoint,
+    doubts,
+    movej_program,
+    program_points,
+    with_joints,
+)
 from hilcal.campaign.campaign import Campaign
 from hilcal.cli.options import catalogue_with, check_new, command
 from hilcal.cli.terminal import terminal

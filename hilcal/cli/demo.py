@@ -35,9 +35,7 @@ from hilcal.diagnosis.doubt import in_doubt as left_open
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
 from hilcal.diagnosis.evidence import Evidence
 from hilcal.diagnosis.verdict import diagnose, judge
-from hilcal.discovery.discovery import agreement
-from hilcal.discovery.document import laws_json
-from hilcal.discovery.proposal import LawSearch
+from hilcal.discovery.discovery import LawSearch, agreement, laws_json
 from hilcal.discovery.search import SAME
 from hilcal.drivers.simulated.injected_effects import HARD_TO_SEPARATE, RESEMBLING
 from hilcal.drivers.simulated.rehearsal import (
@@ -55,18 +53,18 @@ from hilcal.errors import CannotAnswerError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.linearisation import linearise
-from hilcal.measuring.dry_run import dry_run
+from hilcal.measuring.route import dry_run
 from hilcal.names import quoted
 from hilcal.present.calibration import improvement_report
 from hilcal.present.diagnosis import (
     compared,
     key,
+    refined_laws,
     revisions_table,
     step_report,
     truth_table,
     verdict_line,
 )
-from hilcal.present.discovery import refined_laws
 from hilcal.present.document import heading
 from hilcal.present.fit import model_name
 from hilcal.present.plan import next_report
@@ -80,7 +78,7 @@ from hilcal.refinement import refine as refine_model
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.campaign_file import may_write
 from hilcal.store.plan import REFERENCE, Plan
-from hilcal.store.records import content_hash
+from hilcal.store.rows import content_hash
 
 STRENGTH = 4.0  # Of what is hidden, in units of the noise: clearly there in so few readings
 FIRST = 6  # Poses of the first campaign

@@ -19,13 +19,13 @@ from hilcal.cli.options import catalogue_with, check_new, command
 from hilcal.cli.terminal import terminal
 from hilcal.errors import InputError
 from hilcal.identification import parameters_document
-from hilcal.identification.residual_table import residual_table
+from hilcal.identification.full_prediction import residual_table
 from hilcal.numbers import length
 from hilcal.present.progress import Say, working
 from hilcal.present.registration import base_line
 from hilcal.readings.covariance import INSTRUMENT
+from hilcal.store.kept_texts import ROBOT_FILE
 from hilcal.store.revision import RevisionRecord
-from hilcal.store.robot_file import ROBOT_FILE
 from hilcal.tables.write import check_suffix, revision_table, write_columns
 from hilcal.whole_file import replace_file
 

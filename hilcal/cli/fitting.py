@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 
 from hilcal import numbers
-from hilcal.calibration.streamed import calibration_of_stream
+from hilcal.calibration.calibration import calibration_of_stream
 from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell
 from hilcal.cli.options import catalogue_with, check_folder, check_workers, command
@@ -27,15 +27,15 @@ from hilcal.identification.fit_document import to_json
 from hilcal.identification.misdescription import other_arm_of
 from hilcal.identification.torques import check_torques
 from hilcal.model.model import Model
+from hilcal.present.calibration import bootstrap_remarks, bootstrap_report
 from hilcal.present.fit import fit_report, model_name, prior_lines, scalings_table, stream_report
 from hilcal.present.progress import Say, counting, working
 from hilcal.present.registration import covariance_words, other_arm_line, torque_lines
 from hilcal.present.story import Chapter, build_story
-from hilcal.present.validation import bootstrap_remarks, bootstrap_report
 from hilcal.readings.covariance import tracker_noise
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import MODES, SCALINGS, Mode, Scaling
-from hilcal.store.purpose import purpose_of, refuse_fitting, release
+from hilcal.store.procedure_log import purpose_of, refuse_fitting, release
 from hilcal.store.revision import RevisionRecord
 from hilcal.stream.fit import fit_stream
 from hilcal.stream.fit import to_json as stream_json

@@ -15,19 +15,18 @@ from hilcal.drivers.emscon import EmsconOptions as EmsconOptions
 from hilcal.drivers.geocom import GeoComOptions as GeoComOptions
 from hilcal.drivers.natnet import NatNetOptions as NatNetOptions
 from hilcal.drivers.netft import NetFtOptions as NetFtOptions
-from hilcal.drivers.ur_link.services import UrOptions
+from hilcal.drivers.ur_link.supervision import UrOptions
 from hilcal.effects import template
 from hilcal.effects.catalogue import BUILT_IN, Catalogue, installed
-from hilcal.effects.check import NAME
-from hilcal.effects.example import ROBOT, example_cell, example_states
+from hilcal.effects.check import NAME, ROBOT, example_cell, example_states
 from hilcal.effects.protocol import Effect
 from hilcal.effects.written import option_defaults, written
 from hilcal.errors import InputError
 from hilcal.identification.fit_document import plain
 from hilcal.mixed.families import expected_sizes
 from hilcal.names import quoted
+from hilcal.present.campaign import reference_page, section_report, sections_overview
 from hilcal.present.document import Table, note, table
-from hilcal.present.preparing import reference_page, section_report, sections_overview
 from hilcal.present.progress import counting
 from hilcal.toml import Section
 from hilcal.whole_file import replace_file

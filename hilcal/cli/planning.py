@@ -32,13 +32,12 @@ from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import DeviceError, HilcalError, InputError
 from hilcal.identification.carried import CarriedPrior
 from hilcal.identification.fit_document import plain
-from hilcal.measuring.connect import ConnectionResult, connect
-from hilcal.measuring.dry_run import DryRun, dry_run
-from hilcal.measuring.kinematics import told_by, with_kinematics
+from hilcal.measuring.connect import ConnectionResult, connect, told_by, with_kinematics
+from hilcal.measuring.route import DryRun, dry_run
 from hilcal.names import quoted
+from hilcal.present.campaign import check_report
 from hilcal.present.plan import brief_plan, next_report, plan_report, plan_screen, poses_report
 from hilcal.present.progress import Say, working
-from hilcal.present.running import check_report
 from hilcal.procedure.next_plan import Doubt, doubt_to_settle, next_plan, without
 from hilcal.procedure.state import reference_in
 from hilcal.store.plan import Plan, load_plan

@@ -18,14 +18,14 @@ from hilcal.config.sections import GEOMETRY, LOADED
 from hilcal.design.nominal_model import check_effects
 from hilcal.doctor.computer import Finding, computer, program
 from hilcal.doctor.ports import adapters, reachable, serial_ports
-from hilcal.drivers.ur_link.services import services
+from hilcal.drivers.ur_link.supervision import services
 from hilcal.effects.catalogue import installed
 from hilcal.errors import DeviceError, HilcalError, InputError, StoppedError
 from hilcal.measuring import devices
 from hilcal.measuring.connect import driver
 from hilcal.names import quoted
+from hilcal.present.campaign import doctor_report, doctor_summary
 from hilcal.present.document import heading
-from hilcal.present.preparing import doctor_report, doctor_summary
 from hilcal.present.progress import working
 from hilcal.robot.catalogue import OTHER_ARMS, load_arm, robot_names
 from hilcal.tables.units import METRIC

@@ -31,10 +31,8 @@ from hilcal.diagnosis.document import suspect_json, to_json
 from hilcal.diagnosis.serial_noise import with_serial_noise
 from hilcal.diagnosis.verdict import NOTHING
 from hilcal.diagnosis.verdict import diagnose as judge
+from hilcal.discovery.discovery import LawSearch, discovery_json, laws_json, rival_sources
 from hilcal.discovery.discovery import discover as search
-from hilcal.discovery.discovery import rival_sources
-from hilcal.discovery.document import discovery_json, laws_json
-from hilcal.discovery.proposal import LawSearch
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.check import NAME
 from hilcal.effects.options import Options
@@ -42,23 +40,25 @@ from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.effects.written import read_effects_text, write_effect
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.background import background_of
+from hilcal.identification.baseline import masses_note
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.fit_document import frames_to_json, prior_to_json
 from hilcal.identification.misdescription import other_arm_of
-from hilcal.identification.missing_masses import masses_note
 from hilcal.identification.torques import check_torques
 from hilcal.names import quoted
 from hilcal.present.diagnosis import (
     addition_lines,
     curves,
     diagnosis_report,
+    discovery_report,
     fell,
     key,
+    refined_laws,
     revisions_table,
     rose,
+    silence,
     verdict_line,
 )
-from hilcal.present.discovery import discovery_report, refined_laws, silence
 from hilcal.present.fit import follows, model_name, prior_lines, set_aside
 from hilcal.present.progress import working
 from hilcal.present.registration import covariance_words, fitted_lines, other_arm_line, torque_lines
@@ -66,7 +66,7 @@ from hilcal.present.story import Chapter
 from hilcal.present.verdict import message
 from hilcal.refinement import RefinementStep as RefinementStep
 from hilcal.refinement import refine as refine_model
-from hilcal.store.purpose import refuse_fitting
+from hilcal.store.procedure_log import refuse_fitting
 from hilcal.store.revision import change
 from hilcal.whole_file import replace_file
 

@@ -29,7 +29,7 @@ from hilcal.cli.terminal import Terminal, agreed, handled, somebody_there, termi
 from hilcal.config import CellConfig
 from hilcal.config.reference import to_toml
 from hilcal.design.checked_plan import refuse
-from hilcal.design.goal_rule import GoalRule
+from hilcal.design.goal import GoalRule
 from hilcal.diagnosis.live_model import LiveModel
 from hilcal.drivers.simulated.rehearsal import (
     NOTHING,
@@ -52,21 +52,27 @@ from hilcal.errors import (
 )
 from hilcal.identification.full_covariance import full_readings
 from hilcal.identification.noise_estimate import NOISE, measured_noise
-from hilcal.measuring.connect import ConnectionResult, Rig, connect
+from hilcal.measuring.connect import (
+    ConnectionResult,
+    Rig,
+    connect,
+    nominal_arm,
+    told_by,
+    with_kinematics,
+)
 from hilcal.measuring.devices import Clock
-from hilcal.measuring.dry_run import dry_run
-from hilcal.measuring.kinematics import nominal_arm, told_by, with_kinematics
 from hilcal.measuring.progress import Watcher
+from hilcal.measuring.route import dry_run
 from hilcal.measuring.run import HOW_ON
 from hilcal.measuring.run import run as run_plan
 from hilcal.names import quoted
 from hilcal.numbers import sentence
+from hilcal.present.campaign import factory_words
 from hilcal.present.diagnosis import NEWCOMER
 from hilcal.present.live_viewer import LiveViewer, Several
 from hilcal.present.plan import plan_facts
-from hilcal.present.progress import Say, counting, working
+from hilcal.present.progress import Say, counting, full_words, missed_words, watching, working
 from hilcal.present.registration import covariance_words
-from hilcal.present.running import factory_words, full_words, missed_words, watching
 from hilcal.procedure.procedure import Measure, Procedure
 from hilcal.procedure.state import WORLD
 from hilcal.readings.covariance import COVERS, WHOLE

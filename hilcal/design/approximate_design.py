@@ -1,22 +1,273 @@
 """The approximate design: optimal weights of units, with a certified bound of φ."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
+import scipy.linalg as sl
 
-from hilcal.design import barrier as interior
-from hilcal.design.barrier import BarrierProgram, Optimum
-from hilcal.design.bound import best_first, prices, total_information, upper_bound
-from hilcal.design.candidate_set import CandidateSet
-from hilcal.design.criterion import Criterion, Smooth, square
+from hilcal.design.criterion import (
+    CandidateSet,
+    Criterion,
+    Root,
+    Smooth,
+    best_first,
+    prices,
+    square,
+    upper_bound,
+)
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.types import Bools, Floats, Ints
 
-TOLERANCE = 1e-7
-"""Relative gap between the continuous optimum and its bound."""
-KINKED_TOLERANCE = 1e-3
-"""The same for criteria with kinks. A choice: the bound closes slowly there."""
+# Choices, usual in interior-point methods (Wright 1997); none has a study of its own.
+_STEPS = 80
+_BACK = 0.995  # share of the way to the boundary
+_CENTRAL = 1.0  # square of Newton's decrement at which μ may fall
+_KEPT = 20_000_000  # elements of products that are kept, 160 MB
+_CLAMP = 1e4  # how far a dual may be from μ / w
+
+
+@dataclass(frozen=True, eq=False)
+class BarrierProgram:
+    """Maximise φ(M0 + Σ w_k A_kᵀA_k) over w with Σ w_k c_k ≤ B, 0 ≤ w_k ≤ most."""
+
+    criterion: Criterion  # φ
+    units: CandidateSet  # n of them
+    budget: float  # B
+    most: float  # bound of each weight; infinity for none
+    prior: Floats  # (P, P) M0
+
+    def information(self, weight: Floats) -> Floats:
+        """Return (P, P) M."""
+        return np.asarray(self.prior + self.change(weight))
+
+    def change(self, weight: Floats) -> Floats:
+        """Return (P, P) Σ w_k A_kᵀA_k; weights of either sign."""
+        rows = self.units.rows
+        flat = rows.reshape(-1, rows.shape[2])
+        if self._grams is None:
+            return np.asarray((flat * np.repeat(weight, rows.shape[1])[:, None]).T @ flat)
+        out = np.zeros((flat.shape[1], flat.shape[1]))
+        up, across = np.triu_indices(len(out))
+        out[up, across] = out[across, up] = weight @ self._grams
+        return out
+
+    @cached_property
+    def _grams(self) -> Floats | None:
+        """(n, P (P + 1) / 2) upper triangles of A_kᵀA_k; None where they are too large to keep."""
+        up, across = np.triu_indices(self.units.size)
+        if len(self.units) * len(up) > _KEPT:
+            return None
+        out = np.empty((len(self.units), len(up)))
+        for k, a in enumerate(self.units.rows):
+            out[k] = (a.T @ a)[up, across]
+        return out
+
+    def scan(self, smooth: Smooth) -> tuple[Floats, float]:
+        """Return tr(Z A_kᵀA_k) of all units, and the bound of φ over them."""
+        rows = self.units.rows
+        above = prices(rows, smooth.above)
+        below = None if smooth.below is None else prices(rows, smooth.below)
+        cost = self.units.cost
+        return above, upper_bound(smooth, self.prior, above, cost, self.budget, self.most, below)
+
+    def curvature(self, smooth: Smooth) -> Floats:
+        """Return (n, n) −∂²f/∂w_k∂w_l, positive semidefinite."""
+        rows = self.units.rows
+        n, size, p = rows.shape
+        flat = rows.reshape(-1, p)
+        out = np.zeros((n, n))
+        for c, x, y in smooth.products:
+            out -= c * _product(rows, x, y)
+        for factor, v in smooth.squares:
+            if isinstance(factor, np.ndarray):
+                each = np.sum((flat @ v).reshape(n, size, -1) ** 2, axis=1)
+                out -= each @ factor @ each.T
+            else:
+                price = prices(rows, v)
+                out -= factor * np.outer(price, price)
+        return np.asarray(0.5 * (out + out.T))
+
+
+def _product(rows: Floats, x: Floats | Root, y: Floats | Root) -> Floats:
+    """Return (n, n) tr(X H_k Y H_l) of (n, R, P) rows, for semidefinite X and Y (P, P)."""
+    n, size = rows.shape[:2]
+    flat = rows.reshape(n * size, -1)
+    left = flat @ _root(x)
+    right = left if y is x else flat @ _root(y)
+    if 2 * size * size <= min(left.shape[1], right.shape[1]):  # by the rows
+        seen = left @ left.T
+        seen *= seen if y is x else right @ right.T
+        return np.asarray(seen.reshape(n, size, n, size).sum(axis=3).sum(axis=1))
+    # By the matrices T_k = L_xᵀ H_k L_y: the sum of T_k ∘ T_l.
+    t = np.matmul(left.reshape(n, size, -1).transpose(0, 2, 1), right.reshape(n, size, -1))
+    if y is x:  # symmetric: half of each does
+        up, across = np.triu_indices(t.shape[1])
+        half = np.take(t.reshape(n, -1), up * t.shape[1] + across, axis=1)
+        half *= np.where(up == across, 1.0, np.sqrt(2.0))
+        return _gram(half)
+    return _gram(t.reshape(n, -1))
+
+
+def _gram(t: Floats) -> Floats:
+    upper = np.asarray(sl.blas.dsyrk(1.0, t.T, trans=1))
+    return upper + np.triu(upper, 1).T
+
+
+def _root(x: Floats | Root) -> Floats:
+    """Return L (P, r) of a semidefinite X = L Lᵀ."""
+    if isinstance(x, Root):
+        return x.matrix
+    size = np.sqrt(np.diag(x))
+    there = np.flatnonzero(size > 0.0)
+    unit = x[np.ix_(there, there)] / np.outer(size[there], size[there])
+    values, vectors = np.linalg.eigh(unit)
+    kept = values > 1e-15 * float(values.max(initial=0.0))
+    root = np.zeros((len(x), int(kept.sum())))
+    root[there] = size[there, None] * vectors[:, kept] * np.sqrt(values[kept])
+    return root
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Optimum:
+    """A continuous optimum."""
+
+    weight: Floats  # (n,) w
+    smooth: Smooth  # f there, with the matrices of the bound
+    value: float  # φ
+    bound: float  # of φ over these units
+    order: float
+
+    @property
+    def gap(self) -> float:
+        """How far φ may be below the optimum, relative."""
+        return self.bound / self.value - 1.0 if self.value > 0.0 else np.inf
+
+
+def solve(program: BarrierProgram, start: Floats, tolerance: float, order: float = 1.0) -> Optimum:
+    """Return the optimum to a relative gap, from (n,) weights over 0, under `most`, that spend B.
+
+    Newton's method on the barrier problem f(w) + μ Σ log w_k + μ Σ log(most − w_k), with the duals
+    z of the bounds as variables of their own (Wright 1997, Primal-Dual Interior-Point Methods), μ
+    falling to 0 from `order` / n. Criteria with a kink have a surrogate of order μ.
+    """
+    w, n = start, len(start)
+    capped = np.isfinite(program.most)
+    m = program.information(w)
+    mu = max(min(order, 1.0), tolerance) / n
+    z = mu / w
+    y = mu / (program.most - w) if capped else np.zeros(n)
+    best: Optimum | None = None
+    central = False
+    for step in range(_STEPS):
+        surrogate = program.criterion.surrogate(m, mu)
+        smooth = surrogate(m)
+        if smooth is None:
+            break
+        value = float(program.criterion.value(m))
+        found = Optimum(w, smooth, value, program.scan(smooth)[1], mu)
+        if best is None or found.gap < best.gap:
+            best = found
+        if found.gap <= tolerance or step == _STEPS - 1:
+            break
+        if central:
+            mu = max(0.2 * mu, 0.1 * tolerance / n)
+            central, z, y = False, 0.2 * z, 0.2 * y
+            surrogate = program.criterion.surrogate(m, mu)
+            smooth = surrogate(m) or smooth
+        slope = prices(program.units.rows, smooth.gradient)
+        top = program.most - w if capped else np.ones(n)
+        lean = slope + mu / w - (mu / top if capped else 0.0)
+        move = _newton(program, program.curvature(smooth) + np.diag(z / w + y / top), lean, w)
+        if move is None:
+            break
+        length = min(1.0, _BACK * _room(w, move))
+        if capped:
+            length = min(length, _BACK * _room(top, -move))
+        push = float(lean @ move)
+        moved = program.change(move)
+        length = _search(program, surrogate, smooth, (w, m), (move, moved), length, mu, push)
+        if length == 0.0 and (program.criterion.kinked or mu <= tolerance / (10 * n)):
+            break
+        z = _dual(z, mu / w - z - z / w * move)
+        if capped:
+            y = _dual(y, mu / top - y + y / top * move)
+        w = w + length * move
+        m = program.information(w)
+        z = np.clip(z, mu / (_CLAMP * w), _CLAMP * mu / w)
+        complement = float(z @ w) / n
+        if capped:
+            top = program.most - w
+            y = np.clip(y, mu / (_CLAMP * top), _CLAMP * mu / top)
+            complement = 0.5 * (complement + float(y @ top) / n)
+        if program.criterion.kinked:  # μ is also the width of the kink: it falls only where central
+            central = push <= _CENTRAL * mu
+        else:
+            fall = 0.1 if length > 0.9 else 0.3 if length > 0.5 else 0.8
+            mu = max(min(fall * complement, mu), 0.05 * tolerance / n)
+    if best is None:
+        smooth_none = Smooth(0.0, m * 0.0, (), (), m * 0.0)
+        return Optimum(w, smooth_none, 0.0, np.inf, mu)
+    return best
+
+
+def _newton(program: BarrierProgram, matrix: Floats, lean: Floats, w: Floats) -> Floats | None:
+    """Return the step that spends the budget: K dw + λ c = lean, c·dw = B − c·w."""
+    diagonal = np.diag(matrix).copy()
+    for ridge in (1e-14, 1e-10, 1e-6):
+        matrix[np.diag_indices_from(matrix)] = diagonal * (1.0 + ridge)
+        try:
+            factor = sl.cho_factor(matrix, lower=True, check_finite=False)
+        except (np.linalg.LinAlgError, ValueError):
+            continue
+        both = sl.cho_solve(factor, np.column_stack([lean, program.units.cost]), check_finite=False)
+        if np.isfinite(both).all():
+            short = program.budget - float(program.units.cost @ w)
+            price = (float(program.units.cost @ both[:, 0]) - short) / float(
+                program.units.cost @ both[:, 1]
+            )
+            return np.asarray(both[:, 0] - price * both[:, 1])
+    return None
+
+
+def _room(x: Floats, move: Floats) -> float:
+    with np.errstate(divide="ignore"):
+        return float(np.min(np.where(move < 0.0, -x / move, np.inf), initial=np.inf))
+
+
+def _dual(z: Floats, move: Floats) -> Floats:
+    return np.asarray(z + min(1.0, _BACK * _room(z, move)) * move)
+
+
+def _search(
+    program: BarrierProgram, surrogate: Callable[[Floats], Smooth | None], here: Smooth,
+    at: tuple[Floats, Floats], step: tuple[Floats, Floats], length: float, mu: float,
+    slope: float,
+) -> float:  # fmt: skip
+    """Return the length of a step of weights and information: halved until it helps; 0 if never."""
+    capped = np.isfinite(program.most)
+    (w, m), (move, moved) = at, step
+
+    def barrier(x: Floats) -> float:
+        out = float(np.log(x).sum())
+        return out + (float(np.log(program.most - x).sum()) if capped else 0.0)
+
+    start = barrier(w)
+    noise = 1e-13 * (1.0 + abs(here.value))
+    for _ in range(30):
+        x = w + length * move
+        there = surrogate(m + length * moved)
+        if there is not None:
+            gain = there.value - here.value + mu * (barrier(x) - start)
+            if gain >= 1e-4 * length * slope - noise:
+                return length
+        length *= 0.5
+    return 0.0
+
+
+TOLERANCE = 1e-7  # Relative gap between the continuous optimum and its bound
+KINKED_TOLERANCE = 1e-3  # the same with kinks, where the bound closes slowly; a choice
 
 _ROUNDS = 200
 _STALE = 4  # rounds in which the gap must fall; this and the next two are choices
@@ -26,23 +277,14 @@ _WARM = 12  # multiplicative steps that find where the weight goes
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ApproximateDesign:
-    """A continuous optimum with its certificate.
+    """A continuous optimum with its certificate."""
 
-    Attributes:
-        index: (S,) ascending indices of the units that have weight.
-        weight: (S,) their weights w; Σ w c ≤ B.
-        value: φ of these weights.
-        bound: φ of no plan within the budget exceeds it.
-        price: (K,) marginal value of each unit, ∂f/∂w_k: units with little are never taken.
-        information: (P, P) M0 + Σ w_k A_kᵀA_k.
-    """
-
-    index: Ints
-    weight: Floats
-    value: float
-    bound: float
-    price: Floats
-    information: Floats
+    index: Ints  # (S,) ascending indices of the units that have weight
+    weight: Floats  # (S,) their weights w; Σ w c ≤ B
+    value: float  # φ of these weights
+    bound: float  # φ of no plan within the budget exceeds it
+    price: Floats  # (K,) marginal value of each unit, ∂f/∂w_k: units with little are never taken
+    information: Floats  # (P, P) M0 + Σ w_k A_kᵀA_k
 
     @property
     def gap(self) -> float:
@@ -59,39 +301,26 @@ class ApproximateDesign:
 
 def relax(
     units: CandidateSet,
-    criterion: Criterion,
-    budget: float,
-    prior: Floats | None = None,
+    criterion: Criterion,  # φ
+    budget: float,  # B, in the units of the cost
+    prior: Floats | None = None,  # (P, P) M0, what is known before; zero by default
     *,
-    most: int | None = None,
+    most: int | None = None,  # how often a unit may be taken; any number of times by default
     names: Sequence[str] | None = None,
-    tolerance: float | None = None,
-    start: ApproximateDesign | None = None,
+    tolerance: float | None = None,  # relative gap to stop at; by default 1e-7, of kinks 1e-3
+    start: ApproximateDesign | None = None,  # optimum of a similar problem over the same units
 ) -> ApproximateDesign:
     """Return the continuous optimum of φ(M0 + Σ w_k A_kᵀA_k), Σ w_k c_k ≤ B, 0 ≤ w_k ≤ most.
 
-    Column generation: the optimum over few units by an interior-point method, then a scan of
-    all for units whose price exceeds those in use, until none is left (equivalence theorem).
-    The bound is of the scan of all units.
-
-    Args:
-        criterion: φ.
-        budget: B, in the units of the cost.
-        prior: (P, P) M0, what is known before; zero by default.
-        most: how often a unit may be taken; any number of times by default.
-        tolerance: relative gap at which to stop; 1e-7, or 1e-3 of criteria with kinks.
-        start: optimum of a similar problem over the same units.
-
-    Raises:
-        InputError: a budget that takes no unit, or arrays that do not fit.
-        CannotAnswerError: parameters that no candidate determines.
+    Column generation: the optimum over few units, then a scan of all for units whose price exceeds
+    those in use, until none is left (equivalence theorem). The bound is of the scan of all units.
     """
     if tolerance is None:
         tolerance = KINKED_TOLERANCE if criterion.kinked else TOLERANCE
     cap = np.inf if most is None else float(most)
     prior = checked(units, budget, prior, most)
     share = min(budget / float(units.cost.sum()), cap)
-    spread = prior + total_information(units, np.full(len(units), share))
+    spread = prior + units.information(np.full(len(units), share))
     criterion.require(spread, names)
     criterion = criterion.relevant(units, prior, budget)
     if share == cap and criterion.monotone:
@@ -101,9 +330,9 @@ def relax(
             all_of_them, np.full(len(units), cap), value, value, np.ones(len(units)), spread
         )
     most_spent = (1.0 - 1e-9) * cap * float(units.cost.sum())
-    scan = _Scan(units, criterion, min(budget, most_spent), cap, prior)
+    whole = BarrierProgram(criterion, units, min(budget, most_spent), cap, prior)
     if start is None:
-        active, weight = _first(scan, spread)
+        active, weight = _first(whole, spread)
         order = 0.3
     else:
         active, weight, order = start.index, start.weight, 0.03
@@ -112,8 +341,10 @@ def relax(
     for _ in range(_ROUNDS):
         last = len(active) == len(units)
         goal = 0.3 * tolerance if last else max(0.3 * tolerance, 0.1 * order)
-        found = scan.solve(active, weight, goal, order)
-        rate, bound = scan.all(found.smooth)
+        found = _solved(whole, active, weight, goal, order)
+        price, bound = whole.scan(found.smooth)
+        if found.smooth.below is not None:
+            price = prices(units.rows, found.smooth.gradient)
         best = min(best, bound)
         if top is None or found.value > top[0].value:
             top = found, active
@@ -121,19 +352,15 @@ def relax(
         gaps.append(gap)
         if gap <= tolerance or last or (len(gaps) > _STALE and gap > 0.8 * min(gaps[:-_STALE])):
             break
-        active, weight = _exchanged(scan, active, found.weight, rate)
+        active, weight = _exchanged(whole, active, found.weight, price / units.cost)
         order = max(min(0.5 * gap, order), tolerance)
     if top is None or not top[0].value > 0.0:
         raise CannotAnswerError("the candidates determine too little: the criterion stays 0")
-    return _pruned(scan, top[1], top[0].weight, best)
+    return _pruned(whole, top[1], top[0].weight, best)
 
 
 def checked(units: CandidateSet, budget: float, prior: Floats | None, most: int | None) -> Floats:
-    """Return the prior information after a check of what a plan is made of.
-
-    Raises:
-        InputError: what cannot be.
-    """
+    """Return the prior information after a check of what a plan is made of."""
     rows, cost = units.rows, units.cost
     if rows.ndim != 3 or cost.shape != (len(rows),) or not len(rows) or not rows.shape[2]:
         raise InputError(f"rows of shape {rows.shape} with costs of shape {cost.shape}")
@@ -152,37 +379,19 @@ def checked(units: CandidateSet, budget: float, prior: Floats | None, most: int 
     return prior
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Scan:
-    """All units of a relaxation."""
-
-    units: CandidateSet
-    criterion: Criterion
-    budget: float
-    cap: float
-    prior: Floats
-
-    def all(self, smooth: Smooth) -> tuple[Floats, float]:
-        """Return the price per cost (K,) of all units, up to a factor, and the bound."""
-        u = self.units
-        above = prices(u.rows, smooth.above)
-        below = None if smooth.below is None else prices(u.rows, smooth.below)
-        bound = upper_bound(smooth, self.prior, above, u.cost, self.budget, self.cap, below)
-        net = above if below is None else prices(u.rows, smooth.gradient)
-        return net / u.cost, bound
-
-    def solve(self, active: Ints, weight: Floats, goal: float, order: float) -> Optimum:
-        """Return the optimum over some units; what is not monotone may leave budget."""
-        rows, cost = self.units.rows[active], self.units.cost[active]
-        start = _feasible(weight, cost, self.budget, self.cap)
-        if not self.criterion.monotone:  # one more unit without information
-            rows = np.concatenate([rows, np.zeros((1, *rows.shape[1:]))])
-            cost = np.append(cost, self.budget)
-            left = min(max(1.0 - float(weight @ cost[:-1]) / self.budget, 0.01), 0.99)
-            start = np.append((1.0 - left) * start, left)
-        program = BarrierProgram(self.criterion, rows, cost, self.budget, self.cap, self.prior)
-        found = interior.solve(program, start, goal, order)
-        return replace(found, weight=found.weight[: len(active)])
+def _solved(
+    whole: BarrierProgram, active: Ints, weight: Floats, goal: float, order: float
+) -> Optimum:
+    """Return the optimum over some units; what is not monotone may leave budget."""
+    rows, cost = whole.units.rows[active], whole.units.cost[active]
+    start = _feasible(weight, cost, whole.budget, whole.most)
+    if not whole.criterion.monotone:  # one more unit without information
+        rows = np.concatenate([rows, np.zeros((1, *rows.shape[1:]))])
+        cost = np.append(cost, whole.budget)
+        left = min(max(1.0 - float(weight @ cost[:-1]) / whole.budget, 0.01), 0.99)
+        start = np.append((1.0 - left) * start, left)
+    found = solve(replace(whole, units=CandidateSet(rows, cost)), start, goal, order)
+    return replace(found, weight=found.weight[: len(active)])
 
 
 def _feasible(weight: Floats, cost: Floats, budget: float, cap: float) -> Floats:
@@ -194,15 +403,15 @@ def _feasible(weight: Floats, cost: Floats, budget: float, cap: float) -> Floats
     return np.asarray(w + (budget - spent) / float((cap - w) @ cost) * (cap - w))
 
 
-def _first(scan: _Scan, spread: Floats) -> tuple[Ints, Floats]:
+def _first(whole: BarrierProgram, spread: Floats) -> tuple[Ints, Floats]:
     """Return units that a few multiplicative steps give the most weight.
 
-    w_k <- w_k (price_k / mean price)^(2/3), over the units of the best prices at the uniform
-    plan and some of all. Silvey, Titterington & Torsney (1978), Comm. Statistics A7.
+    w_k <- w_k (price_k / mean price)^(2/3). Silvey, Titterington & Torsney (1978), Comm. Statistics
+    A7.
     """
-    units, budget = scan.units, scan.budget
-    count = min(len(units), max(_SHORT, int(4 * budget / (scan.cap * float(units.cost.min())))))
-    smooth = scan.criterion.surrogate(spread, 0.1)(spread)
+    units, budget = whole.units, whole.budget
+    count = min(len(units), max(_SHORT, int(4 * budget / (whole.most * float(units.cost.min())))))
+    smooth = whole.criterion.surrogate(spread, 0.1)(spread)
     if smooth is None or count == len(units):
         some = np.arange(len(units))
     else:
@@ -210,56 +419,60 @@ def _first(scan: _Scan, spread: Floats) -> tuple[Ints, Floats]:
         even = np.linspace(0, len(units) - 1, count // 4).astype(np.int64)
         some = np.union1d(best_first(rate, count - len(even)), even)
     rows, cost = units.rows[some], units.cost[some]
-    program = BarrierProgram(scan.criterion, rows, cost, budget, scan.cap, scan.prior)
+    program = replace(whole, units=CandidateSet(rows, cost))
     w = np.full(len(some), budget / float(cost.sum()))
     for _ in range(_WARM):
         m = program.information(w)
-        smooth = scan.criterion.surrogate(m, 0.1)(m)
+        smooth = whole.criterion.surrogate(m, 0.1)(m)
         if smooth is None:
             break
         rate = np.maximum(prices(rows, smooth.gradient) / cost, 0.0)
         w = w * (rate + 1e-3 * float(rate.max())) ** (2 / 3)
         w *= budget / float(w @ cost)
-    needed = budget / scan.cap
+    needed = budget / whole.most
     order = np.argsort(-w * cost, kind="stable")
     size = max(units.size, int(np.searchsorted(np.cumsum(cost[order]), 2 * needed)) + 1)
     while size < len(some):
         chosen = order[:size]
         m = program.information(np.where(np.isin(np.arange(len(w)), chosen), w, 0.0))
-        smooth = scan.criterion.surrogate(m, 0.1)(m)
-        if smooth is not None and float(scan.criterion.value(m)) > 0.0:
+        smooth = whole.criterion.surrogate(m, 0.1)(m)
+        if smooth is not None and float(whole.criterion.value(m)) > 0.0:
             break
         size *= 2
     chosen = np.sort(order[:size])
     return some[chosen], w[chosen]
 
 
-def _exchanged(scan: _Scan, active: Ints, weight: Floats, rate: Floats) -> tuple[Ints, Floats]:
+def _exchanged(
+    whole: BarrierProgram, active: Ints, weight: Floats, rate: Floats
+) -> tuple[Ints, Floats]:
     """Return the units without those of no weight, with those of the best prices, and weights."""
-    cost = scan.units.cost
-    inner = weight < 0.99 * scan.cap if np.isfinite(scan.cap) else np.ones(len(weight), np.bool_)
+    cost = whole.units.cost
+    inner = (
+        weight < 0.99 * whole.most if np.isfinite(whole.most) else np.ones(len(weight), np.bool_)
+    )
     price = float(rate[active[inner]].max()) if inner.any() else float(rate[active].min())
-    share = weight * cost[active] / scan.budget
+    share = weight * cost[active] / whole.budget
     kept = (share > 1e-5 / len(active)) | (rate[active] > 0.999 * price)
     outside = rate.copy()
     outside[active] = -np.inf
-    new = best_first(outside, 2 * scan.units.size)
+    new = best_first(outside, 2 * whole.units.size)
     new = new[outside[new] > price * (1.0 + 1e-12)]
-    little = 0.02 * scan.budget / (cost[new] * max(len(new), 1))
+    little = 0.02 * whole.budget / (cost[new] * max(len(new), 1))
     index = np.concatenate([active[kept], new])
     order = np.argsort(index)
     return index[order], np.concatenate([weight[kept], little])[order]
 
 
-def _pruned(scan: _Scan, active: Ints, weight: Floats, bound: float) -> ApproximateDesign:
+def _pruned(whole: BarrierProgram, active: Ints, weight: Floats, bound: float) -> ApproximateDesign:
     """Return the optimum without weights that change nothing."""
-    units, criterion = scan.units, scan.criterion
-    share = weight * units.cost[active] / scan.budget
+    units, criterion = whole.units, whole.criterion
+    share = weight * units.cost[active] / whole.budget
     kept = share > 1e-8 * float(share.max())
     index, w = active[kept], weight[kept]
     if criterion.monotone:
-        w = np.minimum(w * (scan.budget / float(w @ units.cost[index])), scan.cap)
-    m = scan.prior + units.information(w, index)
+        w = np.minimum(w * (whole.budget / float(w @ units.cost[index])), whole.most)
+    m = whole.prior + units.information(w, index)
     smooth = criterion.surrogate(m, 1e-3)(m)
     value = float(criterion.value(m))
     price = np.ones(len(units)) if smooth is None else prices(units.rows, smooth.gradient)

@@ -7,7 +7,7 @@ from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.design.summary import PlanSummary
 from hilcal.errors import InputError
-from hilcal.measuring.dry_run import DryRun, dry_run
+from hilcal.measuring.route import DryRun, dry_run
 from hilcal.shown import Shown, Tabular
 from hilcal.store.plan import Plan
 from hilcal.whole_file import replace_file
@@ -15,16 +15,11 @@ from hilcal.whole_file import replace_file
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CheckedPlan(Shown, Tabular):
-    """A plan whose dry run passed, and its summary.
+    """A plan whose dry run passed, and its summary."""
 
-    Attributes:
-        plan: poses, loads and steps, as a plan file holds them.
-        summary: cost, predicted precision and efficiency.
-    """
-
-    plan: Plan
+    plan: Plan  # poses, loads and steps, as a plan file holds them
     dry: DryRun
-    summary: PlanSummary
+    summary: PlanSummary  # cost, predicted precision and efficiency
 
     @property
     def efficiency(self) -> float | None:
@@ -32,11 +27,7 @@ class CheckedPlan(Shown, Tabular):
         return self.summary.efficiency
 
     def save(self, path: str | Path) -> None:
-        """Write the plan file, which `hilcal run --plan` takes.
-
-        Raises:
-            InputError: it cannot be written.
-        """
+        """Write the plan file, which `hilcal run --plan` takes."""
         replace_file(path, self.plan.to_json() + "\n")
 
     def to_dict(self) -> dict[str, object]:
@@ -51,11 +42,7 @@ class CheckedPlan(Shown, Tabular):
 
 
 def checked(cell: Cell, config: CellConfig, plan: Plan, summary: PlanSummary) -> CheckedPlan:
-    """Check a plan in a dry run, whose remarks come first in the summary.
-
-    Raises:
-        InputError: a plan that may not be run.
-    """
+    """Check a plan in a dry run, whose remarks come first in the summary."""
     dry = dry_run(cell, config, plan)
     refuse(dry, "the plan")
     remarks = tuple(dict.fromkeys((*dry.remarks, *summary.remarks)))
@@ -63,11 +50,7 @@ def checked(cell: Cell, config: CellConfig, plan: Plan, summary: PlanSummary) ->
 
 
 def refuse(dry: DryRun, what: str) -> None:
-    """Refuse a plan that did not pass its dry run.
-
-    Raises:
-        InputError: the first problem, and the number of others.
-    """
+    """Refuse a plan that did not pass its dry run."""
     if (found := refusal(dry, what)) is not None:
         raise found
 

@@ -17,50 +17,36 @@ import numpy as np
 
 from hilcal.config import CellConfig
 from hilcal.design.approximate_design import KINKED_TOLERANCE, ApproximateDesign, relax
-from hilcal.design.candidate_set import CandidateSet
-from hilcal.design.criteria import D, E, K, MeanVariance
-from hilcal.design.criterion import Criterion
+from hilcal.design.criteria import D, E, K, MeanVariance, Separate, condensed
+from hilcal.design.criterion import CandidateSet, Criterion
 from hilcal.design.discriminated_pairs import DiscriminatedPairs, discriminated_pairs
 from hilcal.design.information import DesignProblem
 from hilcal.design.mixed_design import balanced, mixed_design
 from hilcal.design.optimum import Design, best
-from hilcal.design.prediction_poses import PredictionPoses
-from hilcal.design.t_optimality import Separate, condensed
+from hilcal.design.predicted import PredictionPoses
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.types import Bools, Floats, Ints
 
 CRITERIA = ("D", "A", "E", "K", "I", "separate")
-LOOSE = 3e-3
-"""Relative gap at which sets of loads are compared. A choice."""
-EFFORT = 200
-"""Of the exchange search. Read from the demo's plan: 98 % of the bound in a second; more effort
-gains a part per thousand."""
-SAMPLE = 150
-"""Poses by which sets of loads are compared. A choice."""
+LOOSE = 3e-3  # Relative gap at which sets of loads are compared. A choice.
+EFFORT = 200  # of the exchange search: 98 % of the bound of the demo's plan in a second
+SAMPLE = 150  # Poses by which sets of loads are compared. A choice.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Objective:
     """A design problem with its criterion.
 
-    D and A are of all parameters, the potential terms with their priors among them; in A these are
-    nuisance parameters. I is of predictions with all effects; see `mixed_design`. E and K are of
-    the model's parameters alone, as the observability indices of the literature are, without those
-    that have a prior.
-
-    Attributes:
-        criterion: φ.
-        units: the units by the parameters that φ is of.
-        prior: (P, P) prior information of these.
-        names: of the parameters; none where they are combinations.
-        apart: the pairs of effects that "separate" is of; None of other criteria.
+    D and A are of all parameters, the potential terms with their priors among them (nuisance
+    parameters in A), I of predictions with all effects (`mixed_design`), E and K of the model's
+    parameters without a prior.
     """
 
-    criterion: Criterion
-    units: CandidateSet
-    prior: Floats
-    names: tuple[str, ...]
-    apart: DiscriminatedPairs | None = None
+    criterion: Criterion  # φ
+    units: CandidateSet  # the units by the parameters that φ is of
+    prior: Floats  # (P, P) prior information of these
+    names: tuple[str, ...]  # of the parameters; none where they are combinations
+    apart: DiscriminatedPairs | None = None  # the pairs of "separate"; None of others
 
     def relaxed(
         self, budget: float, tolerance: float = LOOSE, start: ApproximateDesign | None = None
@@ -80,23 +66,14 @@ def canonical(name: str) -> str:
 def objective_of(
     problem: DesignProblem, config: CellConfig, name: str, work: PredictionPoses | None
 ) -> Objective:
-    """Return a design problem with a criterion.
-
-    Args:
-        name: one of `CRITERIA`, or "test", the former name of "I".
-        work: the prediction poses, for "I".
-
-    Raises:
-        InputError: an unknown name, or "I" without prediction poses.
-    """
+    """Return a design problem with a criterion by its name; "I" needs prediction poses."""
     name = canonical(name)
     names = tuple(t.name for t in problem.terms)
-    size = problem.model_size
     whole = Objective(D(), problem.units, problem.prior, names)
     if name == "D":
         return whole
     if name == "A":
-        return replace(whole, criterion=MeanVariance(_mean_of(size, len(names)), "A"))
+        return replace(whole, criterion=MeanVariance(problem.mean_variance, "A"))
     if name == "I":
         if work is None:
             raise InputError('criterion "I" needs prediction poses; see [planning] work_q_rad')
@@ -123,12 +100,9 @@ def unknown(problem: DesignProblem) -> Ints:
 
 
 def choose(
-    asked: Objective,
-    budget: float,
-    rng: np.random.Generator,
-    effort: int = EFFORT,
+    asked: Objective, budget: float, rng: np.random.Generator, effort: int = EFFORT,
     relaxed: ApproximateDesign | None = None,
-) -> Design:
+) -> Design:  # fmt: skip
     """Return the exact design; see `optimum.best`."""
     return best(
         asked.units, asked.criterion, budget, asked.prior, rng, names=asked.names, effort=effort,
@@ -139,18 +113,15 @@ def choose(
 def choose_poses(
     asked: Objective,
     problem: DesignProblem,
-    usable: Bools,
+    usable: Bools,  # (K,) which units there are to choose from
     poses: int,
     rng: np.random.Generator,
     effort: int = EFFORT,
 ) -> Design:
     """Return the exact design of so many poses, each read once under all that it bears.
 
-    Where the cell leaves fewer poses, some are read again. The design's bound is that of as many
-    readings at any number of poses, under any loads.
-
-    Args:
-        usable: (K,) which units there are to choose from.
+    Where the cell leaves fewer poses, some are read again. The bound is that of as many readings at
+    any number of poses, under any loads.
     """
     free, index = only(asked, usable), np.flatnonzero(usable)
     of: dict[int, list[int]] = {}
@@ -196,12 +167,8 @@ def costly_loads(
 ) -> tuple[tuple[str, float], ...]:
     """Return loads without which the same time buys more, with the gain as a share of φ.
 
-    Hanging a load costs as much time as so many readings; a plan without it takes these
-    instead. Compared are the continuous optima over some of the poses, one load after the other.
-
-    Args:
-        budget: readings of the plan with all loads.
-        change: readings that fit into the time of one load change.
+    Hanging a load costs as much time as `change` readings; a plan without it takes these instead.
+    Compared are the continuous optima over some of the poses, one load after the other.
     """
     poses = np.array([pose for pose, _ in problem.what])
     few = rng.permutation(len(problem.candidates))[:SAMPLE]
@@ -243,37 +210,22 @@ def _value(
         return 0.0
 
 
-def _mean_of(size: int, every: int) -> Floats:
-    """(P, P) C of the mean variance of the first s parameters."""
-    return np.diag(np.where(np.arange(every) < size, 1.0 / size, 0.0))
-
-
 def compound_objective(
     problem: DesignProblem,
     config: CellConfig,
     name: str,
-    work: PredictionPoses | None,
-    budget: float,
-    rng: np.random.Generator,
+    work: PredictionPoses | None,  # the prediction poses, for "I"
+    budget: float,  # readings, for which the two optima of A are found
+    rng: np.random.Generator,  # generator; they are found among some of the poses
 ) -> Objective:
-    """Return a design problem with a criterion; D and A are compound with potential terms.
-
-    Args:
-        work: the prediction poses, for "I".
-        budget: readings, for which the two optima of A are found.
-        rng: generator; they are found among some of the poses.
-
-    Raises:
-        CannotAnswerError: so many readings do not determine the model.
-        InputError: from `objective_of`.
-    """
+    """Return a design problem with a criterion; D and A are compound with potential terms."""
     name = canonical(name)
     asked, size = objective_of(problem, config, name, work), problem.model_size
     if size == len(problem.terms) or name not in ("A", "D"):
         return asked
     if name == "D":
         return replace(asked, criterion=D(size))
-    c = _mean_of(size, len(problem.terms))
+    c = problem.mean_variance
     whole, own = MeanVariance(c, name), MeanVariance(c[:size, :size], name)
     poses = np.array([pose for pose, _ in problem.what])
     some = only(asked, np.isin(poses, rng.permutation(len(problem.candidates))[:SAMPLE]))

@@ -1,26 +1,56 @@
 """The protocol of a design criterion: concave in the information, with a smooth surrogate."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilcal.design.candidate_set import CandidateSet
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.regression.schur import DETERMINED
-from hilcal.types import Bools, Floats
+from hilcal.types import Bools, Floats, Ints
+
+_CHUNK = 2048
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CandidateSet:
+    """K units, each of which a plan may take any whole number of times n_k.
+
+    A unit is one reading, or one pose with its unloaded reading and some loads (deflections).
+
+        M = M0 + Σ n_k A_kᵀ A_k,    cost = Σ n_k c_k
+    """
+
+    # (K, R, P) whitened Jacobians A_k by the parameters in ordinary magnitudes (pure numbers);
+    # units with fewer rows are filled up with zeros
+    rows: Floats
+    cost: Floats  # (K,) what taking the unit once costs, over 0: readings, or seconds
+
+    def __len__(self) -> int:
+        """Return the number of units K."""
+        return len(self.rows)
+
+    @property
+    def size(self) -> int:
+        """Number of parameters P."""
+        return int(self.rows.shape[2])
+
+    def information(self, weight: Floats, which: Ints | None = None) -> Floats:
+        """Return (P, P) Σ w_k A_kᵀ A_k of all units, or of those of some indices."""
+        rows, out = self.rows if which is None else self.rows[which], np.zeros((self.size,) * 2)
+        for start in range(0, len(rows), _CHUNK):
+            part = slice(start, start + _CHUNK)
+            root = (rows[part] * np.sqrt(weight[part])[:, None, None]).reshape(-1, self.size)
+            out += root.T @ root
+        return out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Root:
-    """A semidefinite matrix L Lᵀ (P, P), where its root is known.
+    """A semidefinite matrix L Lᵀ (P, P), where its root is known."""
 
-    Attributes:
-        matrix: (P, r) L.
-    """
-
-    matrix: Floats
+    matrix: Floats  # (P, r) L
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,77 +60,57 @@ class Smooth:
     With H_k = A_kᵀ A_k, the second derivative by the weights of units k and l is
 
         Σ c · tr(X H_k Y H_l) over products (c, X, Y) + Σ c · tr(V H_k) tr(V H_l) over squares
-
-    Attributes:
-        value: f(M).
-        gradient: (P, P) of f.
-        products: terms of its curvature.
-        squares: terms of its curvature; (C, V) with matrices C (r, r) and V (P, r) of columns v_a
-            stands for Σ C_ab tr(v_a v_aᵀ H_k) tr(v_b v_bᵀ H_l).
-        above: (P, P) Z such that φ(N) ≤ tr(Z N) for every information N ⪰ 0,
-        below: or with Y (P, P): φ(N) ≤ tr(Z N) / tr(Y N).
     """
 
-    value: float
-    gradient: Floats
-    products: tuple[tuple[float, Floats | Root, Floats | Root], ...]
+    value: float  # f(M)
+    gradient: Floats  # (P, P) of f
+    products: tuple[tuple[float, Floats | Root, Floats | Root], ...]  # terms of its curvature
+    # terms of its curvature; (C, V) with matrices C (r, r) and V (P, r) of columns v_a stands for Σ
+    # C_ab tr(v_a v_aᵀ H_k) tr(v_b v_bᵀ H_l)
     squares: tuple[tuple[float | Floats, Floats], ...]
-    above: Floats
-    below: Floats | None = None
+    above: Floats  # (P, P) Z such that φ(N) ≤ tr(Z N) for every information N ⪰ 0,
+    below: Floats | None = None  # or with Y (P, P): φ(N) ≤ tr(Z N) / tr(Y N)
+
+    def scaled(self, by: float) -> "Smooth":
+        """Return a multiple of f, with the same bound."""
+        products = tuple((by * c, x, y) for c, x, y in self.products)
+        squares = tuple((by * c, v) for c, v in self.squares)
+        return replace(
+            self, value=by * self.value, gradient=by * self.gradient, products=products,
+            squares=squares,
+        )  # fmt: skip
 
 
-class Criterion(Protocol):
+class Criterion(ABC):
     """φ(M) of an information matrix M (P, P): more is better.
 
-    Concave and positively homogeneous of degree 1, so that φ(N) ≤ tr(G(M) N) for all M, N; only
-    the ratio of eigenvalues (`K`) is quasi-concave and of degree 0.
+    Concave and positively homogeneous of degree 1, so that φ(N) ≤ tr(G(M) N) for all M, N; only the
+    ratio of eigenvalues (`K`) is quasi-concave and of degree 0.
     """
 
-    @property
-    def name(self) -> str:
-        """Name by which a configuration calls it."""
+    name: str  # by which a configuration calls it
+    monotone = True  # whether more information is never worse
+    kinked = True  # whether φ has kinks, so that the surrogate depends on its order
 
-    @property
-    def monotone(self) -> bool:
-        """Whether more information is never worse."""
-
-    @property
-    def kinked(self) -> bool:
-        """Whether φ has kinks, so that the surrogate depends on its order."""
-
+    @abstractmethod
     def value(self, m: Floats) -> Floats:
         """Return φ of (..., P, P) information matrices; 0 where they are singular."""
 
+    @abstractmethod
     def surrogate(self, m: Floats, order: float) -> Callable[[Floats], Smooth | None]:
-        """Return f near M = m, which tends to a function of φ alone as `order` tends to 0.
-
-        It is near φ / φ(m), or log φ, so that its changes are relative. It returns None for
-        an M at which it does not exist.
-        """
+        """Return f near φ / φ(m), or log φ, and nearer as `order` tends to 0; None if undefined."""
 
     def relevant(self, units: CandidateSet, prior: Floats, budget: float) -> "Criterion":
         """Return φ without what is decided: equal near the optimum of the plans of a budget."""
         return self
 
     def require(self, m: Floats, names: Sequence[str] | None) -> None:
-        """Refuse an M, the information of all candidates, that does not determine φ.
-
-        Raises:
-            CannotAnswerError: names the parameters that no candidate determines.
-        """
+        """Refuse an M, the information of all candidates, that does not determine φ."""
         require_determined(m, names)
 
 
 def require_determined(m: Floats, names: Sequence[str] | None = None) -> None:
-    """Refuse a singular information matrix, and name what is not determined.
-
-    Args:
-        m: (P, P) of all candidates, and of what is known before.
-        names: of the P parameters; numbers from 1 by default.
-
-    Raises:
-        CannotAnswerError: a direction of parameters that no candidate determines.
-    """
+    """Refuse a singular information matrix (P, P), and name what is not determined."""
     label = tuple(f"parameter {k + 1}" for k in range(len(m))) if names is None else names
     diagonal = np.diag(m)
     blind = np.flatnonzero(diagonal <= 0.0)
@@ -123,7 +133,6 @@ def require_determined(m: Floats, names: Sequence[str] | None = None) -> None:
 
 
 def _listed(names: Sequence[str]) -> str:
-    """Return the first few names."""
     more = f" and {len(names) - 6} more" if len(names) > 6 else ""
     return ", ".join(names[:6]) + more
 
@@ -144,8 +153,8 @@ def inverse(m: Floats) -> tuple[Floats, float] | None:
 def factors(m: Floats) -> tuple[Floats, Bools]:
     """Return Cholesky factors of (N, P, P) matrices, and which (N,) of them are regular.
 
-    A pivot is what is left of a parameter's information when those before it are unknown; in
-    place of zero, rounding leaves about 1e-16 P of it.
+    A pivot is what is left of a parameter's information when those before it are unknown; in place
+    of zero, rounding leaves about 1e-16 P of it.
     """
     try:
         factor = np.linalg.cholesky(m)
@@ -161,13 +170,10 @@ def factors(m: Floats) -> tuple[Floats, Bools]:
 
 
 def soft_least(values: Floats, width: float) -> tuple[float, Floats]:
-    """Smooth least of numbers s: F = max over t of t + μ Σ log((s_i − t) / μ).
+    """Return the smooth least F = max over t of t + μ Σ log((s_i − t) / μ) of numbers s, and p.
 
-    Its derivatives p_i = μ / (s_i − t) are over 0 and sum to 1, so that min s' ≤ Σ p_i s'_i for
-    any other numbers s'. Σ p_i s_i exceeds min s by at most (n − 1) μ.
-
-    Returns:
-        F, and (n,) p.
+    Its derivatives p_i = μ / (s_i − t) sum to 1, so that min s' ≤ Σ p_i s'_i for any other numbers
+    s'. Σ p_i s_i exceeds min s by at most (n − 1) μ.
     """
     least = float(values.min())
     gap = values - least
@@ -186,11 +192,7 @@ def soft_least(values: Floats, width: float) -> tuple[float, Floats]:
 
 
 def square(m: Floats, what: str, size: int | None = None) -> Floats:
-    """Return a finite symmetric (P, P) matrix.
-
-    Raises:
-        InputError: it is not one.
-    """
+    """Return a finite symmetric (P, P) matrix."""
     m = np.asarray(m, dtype=float)
     p = m.shape[-1] if size is None and m.ndim else size
     if m.shape != (p, p) or not np.isfinite(m).all():
@@ -198,3 +200,77 @@ def square(m: Floats, what: str, size: int | None = None) -> Floats:
     if not np.allclose(m, m.T, rtol=1e-8, atol=1e-12 * float(np.abs(m).max(initial=0.0))):
         raise InputError(f"{what} is not symmetric")
     return 0.5 * (m + m.T)
+
+
+def prices(rows: Floats, matrix: Floats) -> Floats:
+    """Return (K,) tr(G A_kᵀA_k) of (K, R, P) rows, for a symmetric (P, P) matrix G.
+
+    G = L Lᵀ where it is positive definite, else V diag(s) Vᵀ: sums of squares do not cancel.
+    """
+    try:
+        root, minus = np.linalg.cholesky(matrix), None
+    except np.linalg.LinAlgError:
+        values, vectors = np.linalg.eigh(matrix)
+        kept = np.abs(values) > 1e-15 * float(np.abs(values).max(initial=0.0))
+        root = vectors[:, kept] * np.sqrt(np.abs(values[kept]))
+        minus = np.flatnonzero(values[kept] < 0.0)
+    count, size = rows.shape[:2]
+    out = np.empty(count)
+    for start in range(0, count, _CHUNK):
+        part = rows[start : start + _CHUNK].reshape(-1, rows.shape[2]) @ root
+        total = np.einsum("ij,ij->i", part, part)
+        if minus is not None and len(minus):
+            total -= 2.0 * np.einsum("ij,ij->i", part[:, minus], part[:, minus])
+        out[start : start + _CHUNK] = total.reshape(-1, size).sum(axis=1)
+    return out
+
+
+def upper_bound(
+    smooth: Smooth,  # with Z and Y
+    prior: Floats,  # (P, P) M0
+    gains: Floats,  # (K,) tr(Z H_k)
+    cost: Floats,  # (K,) c
+    budget: float,  # B
+    most: float,  # how often a unit may be taken
+    below: Floats | None = None,  # (K,) tr(Y H_k)
+) -> float:
+    """Return what φ of no plan within the budget exceeds, whole or not.
+
+    φ(M0 + Σ n_k H_k) ≤ tr(Z M0) + max of Σ n_k tr(Z H_k) over n ≥ 0, Σ n_k c_k ≤ B: the budget goes
+    to the best prices per cost. Kiefer & Wolfowitz (1960), Canadian J. Math. 12; Pukelsheim (1993),
+    Optimal Design of Experiments, ch. 7. Of a ratio tr(Z N)/tr(Y N) of eigenvalues, the largest
+    value over the same plans (Dinkelbach 1967), at most 1.
+    """
+    known = float(np.sum(smooth.above * prior))
+    if below is None or smooth.below is None:
+        return known + float(gains @ spend(gains, cost, budget, most))
+    known_below = float(np.sum(smooth.below * prior))
+    if known_below <= 0.0:  # the best unit alone
+        return min(1.0, float(np.max(gains / np.maximum(below, np.finfo(float).tiny))))
+    ratio = known / known_below
+    for _ in range(100):
+        weight = spend(gains - ratio * below, cost, budget, most)
+        new = (known + float(gains @ weight)) / (known_below + float(below @ weight))
+        if new <= ratio * (1.0 + 1e-13):
+            break
+        ratio = new
+    return min(1.0, ratio)
+
+
+def spend(gains: Floats, cost: Floats, budget: float, most: float) -> Floats:
+    """Return the weights (K,) of the fractional knapsack: best gain per cost first."""
+    rate = gains / cost
+    # no more than so many of the best are reached by the budget
+    best = best_first(rate, int(np.ceil(budget / (most * float(cost.min())))) + 1)
+    before = np.concatenate([[0.0], np.cumsum(most * cost[best[:-1]])])
+    taken = np.clip((budget - before) / cost[best], 0.0, most)
+    weight = np.zeros(len(gains))
+    weight[best] = np.where(rate[best] > 0.0, taken, 0.0)
+    return weight
+
+
+def best_first(rate: Floats, count: int) -> Ints:
+    """Return the indices of the `count` largest, best first."""
+    count = min(count, len(rate))
+    chosen = np.argpartition(-rate, count - 1)[:count] if count < len(rate) else np.arange(count)
+    return np.asarray(chosen[np.argsort(-rate[chosen], kind="stable")])

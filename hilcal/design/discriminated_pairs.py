@@ -16,13 +16,14 @@ scale are those that a diagnosis scores the effect with; see `regression.evidenc
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 
 from hilcal.design.approximate_design import relax
+from hilcal.design.criteria import Pair, Separate
 from hilcal.design.information import DesignProblem
-from hilcal.design.t_optimality import Pair, Separate
 from hilcal.effects.protocol import Effect
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.effect_columns import computable, effect_columns
@@ -32,49 +33,34 @@ from hilcal.regression.schur import schur_complement
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Floats
 
-LEVEL = 0.01
-"""Chance of a false alarm of the test."""
+LEVEL = 0.01  # Chance of a false alarm of the test
 DRAWS = 3
-MANY = 100
-"""Readings by which a pair counts as not separable ..."""
-LEAST_POWER = 0.2
-"""... where the best plan of so many has less power than this. Guesses, both."""
+MANY = 100  # Readings by which a pair counts as not separable ...
+LEAST_POWER = 0.2  # ... where the best plan of so many has less power than this. Guesses, both.
 _LOOSE = 0.05
 _SEED = 20240609
-SUPPORTED = 3.0
-"""Log evidence from which the readings support an effect: odds of 20 : 1, e³."""
+SUPPORTED = 3.0  # Log evidence from which the readings support an effect: odds of 20 : 1, e³
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DiscriminatedPairs:
-    """Pairs of effects to discriminate.
+    """Pairs of effects to discriminate."""
 
-    Attributes:
-        pairs: as the criterion takes them.
-        names: (effect that is there, rival that is fitted) of each pair.
-        prior: (P, P) information before, without the priors of potential terms: neither must
-            an effect be found by what was supposed of it, nor a rival be held small.
-        not_separable: names of the pairs that no measurement separates; they are left out.
-    """
-
-    pairs: tuple[Pair, ...]
-    names: tuple[tuple[str, str], ...]
+    pairs: tuple[Pair, ...]  # as the criterion takes them
+    names: tuple[tuple[str, str], ...]  # (effect that is there, rival that is fitted) of each pair
+    # (P, P) information before, without the priors of potential terms: neither must an effect be
+    # found by what was supposed of it, nor a rival be held small
     prior: Floats
-    not_separable: tuple[tuple[str, str], ...] = ()
+    not_separable: tuple[tuple[str, str], ...] = ()  # names of pairs that are left out
 
 
 def discriminated_pairs(problem: DesignProblem) -> DiscriminatedPairs:
     """Return the pairs of potential terms, both ways round, that some measurement separates.
 
-    None does where the best of all plans of `MANY` readings, with the prior information, has a
-    power below `LEAST_POWER`: for the first of the parameters of the effect that is there. These
-    are those that the readings so far support, see `supported_parameters`. Of the others a few
-    directions are drawn (always the same), each of an RMS strength of 1 σ of a measured element
-    over all units.
-
-    Raises:
-        InputError: fewer than two potential terms.
-        CannotAnswerError: no pair can be separated.
+    None does where the best plan of `MANY` readings, with the prior information, has a power below
+    `LEAST_POWER` at the first parameters of the effect. Parameters are those that the readings so
+    far support; of other effects a few directions are drawn, the same every time, each of an RMS
+    strength of 1 σ of a measured element over all units.
     """
     names = tuple(e.name for e in problem.families)
     if len(names) < 2:
@@ -103,10 +89,7 @@ def pair_of(problem: DesignProblem, names: tuple[str, str], beta: Floats) -> Pai
 
 
 def supported_parameters(problem: DesignProblem, count: int) -> dict[str, Floats]:
-    """Return (count, E) parameters of the families that the readings so far support, SI.
-
-    Draws from their posterior, its mean first; see `effect_estimate`.
-    """
+    """Return (count, E) draws, SI, of the families that the readings so far support."""
     fit, out = problem.nominal.fit, {}
     if fit is None:
         return {}
@@ -119,14 +102,18 @@ def supported_parameters(problem: DesignProblem, count: int) -> dict[str, Floats
 
 
 def _separable(problem: DesignProblem, of: DiscriminatedPairs) -> DiscriminatedPairs:
-    """Leave out the pairs that no measurement separates."""
     spread = of.prior + problem.units.information(
         np.full(len(problem.units), MANY / float(problem.units.cost.sum()))
     )
     not_separable = []
     for names in dict.fromkeys(of.names):
         pair = of.pairs[of.names.index(names)]
-        if power(pair, spread) < LEAST_POWER and _best_power(problem, of, pair) < LEAST_POWER:
+        best = power(pair, spread)
+        if best < LEAST_POWER:
+            with suppress(CannotAnswerError):
+                found = relax(problem.units, Separate((pair,)), MANY, of.prior, tolerance=_LOOSE)
+                best = power(pair, found.information)
+        if best < LEAST_POWER:
             not_separable.append(names)
     keep = [k for k, names in enumerate(of.names) if names not in not_separable]
     if not keep:
@@ -135,44 +122,28 @@ def _separable(problem: DesignProblem, of: DiscriminatedPairs) -> DiscriminatedP
     return DiscriminatedPairs(pairs, both, of.prior, tuple(not_separable))
 
 
+def _by_effect(pairs: Sequence[tuple[str, str]]) -> dict[str, str]:
+    return {e: " or ".join(f for x, f in pairs if x == e) for e, _ in pairs}
+
+
 def not_separable_message(pairs: Sequence[tuple[str, str]]) -> str:
     """Name the pairs that no measurement separates."""
-    named: dict[str, list[str]] = {}
-    for e, f in pairs:
-        if e not in named.get(f, ()):
-            named.setdefault(e, []).append(f)
-    each = [f"{e} from {' or '.join(fs)}" for e, fs in named.items()]
+    both = [pair for k, pair in enumerate(pairs) if pair[::-1] not in pairs[:k]]
+    each = [f"{e} from {fs}" for e, fs in _by_effect(both).items()]
     return f"no measurement in this cell separates {', nor '.join(each)}"
 
 
 def not_ruled_out(pairs: Sequence[tuple[str, str]]) -> str:
     """Say of pairs (effect that is there, rival) that no measurement rules out the rival."""
-    named: dict[str, list[str]] = {}
-    for e, f in pairs:
-        named.setdefault(e, []).append(f)
-    each = [f"{' or '.join(fs)} where {e} is there" for e, fs in named.items()]
+    each = [f"{fs} where {e} is there" for e, fs in _by_effect(pairs).items()]
     return (
         f"no measurement in this cell rules out {', nor '.join(each)}: {MANY} of the best readings "
         f"would do so with a chance of less than {100 * LEAST_POWER:.0f} %"
     )
 
 
-def _best_power(problem: DesignProblem, of: DiscriminatedPairs, pair: Pair) -> float:
-    """Power of the best plan of `MANY` readings for one pair."""
-    try:
-        found = relax(problem.units, Separate((pair,)), MANY, of.prior, tolerance=_LOOSE)
-    except CannotAnswerError:
-        return LEVEL
-    return power(pair, found.information)
-
-
 def power(pair: Pair, information: Floats) -> float:
-    """Return the power of the test at 1 % of the effect beyond model and rival.
-
-    Args:
-        pair: the effect, and what is fitted.
-        information: (P, P) of a plan, with `DiscriminatedPairs.prior`.
-    """
+    """Return the power of the test of a pair at the information (P, P) of a plan and the prior."""
     s = schur_complement(information, pair.effect, pair.nuisance)
     return family_power(s, pair.beta, LEVEL)
 
@@ -194,17 +165,11 @@ def _directions(problem: DesignProblem, effect: str) -> list[Floats]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EffectEstimate:
-    """Posterior of the P parameters of an effect that is not in the model.
+    """Posterior of the P parameters of an effect that is not in the model."""
 
-    Attributes:
-        mean: (P,) SI.
-        root: (P, P) root of their scale matrix, SI.
-        log_evidence: gain in log evidence by adding the effect.
-    """
-
-    mean: Floats
-    root: Floats
-    log_evidence: float
+    mean: Floats  # (P,) SI
+    root: Floats  # (P, P) root of their scale matrix, SI
+    log_evidence: float  # gain in log evidence by adding the effect
 
     @property
     def supported(self) -> bool:
@@ -219,14 +184,7 @@ class EffectEstimate:
 
 
 def estimate(linear: Linearisation, effect: Effect) -> EffectEstimate | None:
-    """Estimate an effect beside the model.
-
-    None where these readings lack a column that it needs, or cannot show any direction of it.
-
-    Args:
-        linear: of a fit in scaling gc, of a model without the effect.
-        effect: built for any states.
-    """
+    """Estimate an effect beside the model of a gc-scaled fit; None where its readings cannot."""
     if not computable(linear.fit, effect):
         return None
     columns = effect_columns(linear.fit, effect)

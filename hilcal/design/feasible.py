@@ -16,8 +16,7 @@ from hilcal.robot.chain import evaluate, joint_jacobian
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Bools, Floats
 
-PLANNED = Margins(joint=1e-6, inside=0.02, clear=0.02, itself=0.01, bear=0.98)
-"""What a planner keeps beyond the limits: choices, no study behind them."""
+PLANNED = Margins(joint=1e-6, inside=0.02, clear=0.02, itself=0.01, bear=0.98)  # choices
 
 REASONS = {
     "joint limits": ("keep the joint limits", "[limits] joint_margin_rad"),
@@ -40,10 +39,7 @@ what in the cell's configuration decides it."""
 
 
 class Space(Feasibility):
-    """The states that a plan may use: `Feasibility` with margins, at most half a turn of a joint.
-
-    All targets have to be seen, and the pose is no singular one.
-    """
+    """The states that a plan may use: `Feasibility` with margins, at most half a turn a joint."""
 
     def __init__(self, cell: Cell, config: CellConfig, margins: Margins = PLANNED) -> None:
         """Build the shapes once."""
@@ -74,11 +70,7 @@ class Space(Feasibility):
         return (*(() if self.sight is not None else (TRACKER_UNKNOWN,)), *super().remarks)
 
     def reasons(self, q: Floats, load: str = UNLOADED) -> dict[str, Bools]:
-        """Return by reason (N,) which states keep it; in the order of `REASONS`.
-
-        Args:
-            q: (N, n) joint angles, rad.
-        """
+        """Return by reason, in the order of `REASONS`, (N,) which states (N, n) keep it."""
         return {reason: self.keeps(reason, q, load) for reason in REASONS}
 
     def keeps(self, kind: str, q: Floats, load: str = UNLOADED) -> Bools:
@@ -102,10 +94,7 @@ class Space(Feasibility):
         return good
 
     def begins(self, q: Floats, loads: Iterable[str]) -> bool:
-        """Return whether a run may begin and read again at a state (n,) under some loads.
-
-        The arm comes there from `beside` it.
-        """
+        """Return whether a run may begin and read again at a state (n,) under some loads."""
         away = beside(q, self.cell.arm, self.config.limits.joint_margin_rad)[None]
         return all(
             self.allowed(away, load, STATE).all() and self.passable(q, away, load).all()
@@ -147,45 +136,25 @@ _OF_LOADS = ("payload", "torque", "force sensor", "hanging", "sight")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DrawnPoses:
-    """K poses that are allowed unloaded, and the loads that each may bear.
+    """K poses that are allowed unloaded, and the loads that each may bear."""
 
-    Attributes:
-        q: (K, n) joint angles, rad.
-        loads: 1 + L names, "none" first.
-        allowed: (K, 1 + L) which loads each pose bears.
-        drawn: how many states were looked at.
-        left: by reason, how many of them were left after it, in the order of checking.
-        remarks: what people should know.
-    """
-
-    q: Floats
-    loads: tuple[str, ...]
-    allowed: Bools
-    drawn: int
-    left: dict[str, int]
-    remarks: tuple[str, ...]
+    q: Floats  # (K, n) joint angles, rad
+    loads: tuple[str, ...]  # 1 + L names, "none" first
+    allowed: Bools  # (K, 1 + L) which loads each pose bears
+    drawn: int  # how many states were looked at
+    left: dict[str, int]  # by reason, how many of them were left after it, in the order of checking
+    remarks: tuple[str, ...]  # what people should know
 
 
 def draw(
     space: Space,
-    count: int,
-    rng: np.random.Generator,
+    count: int,  # poses wanted; fewer where the cell leaves fewer
+    rng: np.random.Generator,  # shift of the sequence
     *,
-    least: int = 1,
-    most: int | None = None,
+    least: int = 1,  # so many have to be found
+    most: int | None = None,  # so many states are drawn at most; by default many times `count`
 ) -> DrawnPoses:
-    """Return poses from a Sobol sequence over the joint space, turned by a random shift.
-
-    Args:
-        count: poses wanted; fewer where the cell leaves fewer.
-        rng: shift of the sequence.
-        least: so many have to be found.
-        most: so many states are drawn at most; by default many times `count`.
-
-    Raises:
-        CannotAnswerError: too few poses, or no load that any of them bears; names the
-            constraint that leaves nothing.
-    """
+    """Return poses from a Sobol sequence over the joint space, turned by a random shift."""
     low, high = space.low, space.high
     if np.any(low >= high):
         j = int(np.argmax(low - high)) + 1
@@ -221,10 +190,7 @@ def draw(
 
 
 def _kept(space: Space, q: Floats, left: dict[str, int], lost: dict[str, Floats]) -> Floats:
-    """Those of the states that are allowed unloaded.
-
-    Counts what each reason leaves, and keeps the last states that each has taken.
-    """
+    """Return the states that are allowed unloaded; note what each reason leaves and takes."""
     for reason in _FUNNEL:
         if len(q):
             keeps = space.keeps(reason, q, UNLOADED)
@@ -268,7 +234,6 @@ def _touching(space: Space, reason: str, lost: dict[str, Floats]) -> str:
 
 
 def _unusable(space: Space, q: Floats, load: str) -> str:
-    """Why no pose bears a load."""
     if (heavy := space.unbearable(load).get("payload")) is not None:
         return heavy
     told = []

@@ -1,29 +1,36 @@
 """A goal of a campaign: how well parameters or positions are to be known."""
 
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hilcal.cell import Cell
+from hilcal.config import CellConfig
+from hilcal.design.feasible import Space
+from hilcal.design.nominal_model import after, nominal_model, planned_effects
+from hilcal.design.predicted import positions_of, prediction_poses, rms
+from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.effects.joint_compliance import JointCompliance
-from hilcal.errors import InputError
-from hilcal.identification.fit import Fit
+from hilcal.errors import HilcalError, InputError
+from hilcal.identification.baseline import with_effects
+from hilcal.identification.fit import Fit, fit
+from hilcal.identification.full_covariance import with_joint_scatter
+from hilcal.identification.priors import scales_of
 from hilcal.measuring.progress import GoalStatus
+from hilcal.readings.readings import Readings
+from hilcal.readings.whitening import Mode, has_unloaded
 from hilcal.tables.units import METRIC
+from hilcal.types import Floats
 
-JOINTS = JointCompliance.name
-"""The effect that "joint" and "j3" are short for."""
+JOINTS = JointCompliance.name  # The effect that "joint" and "j3" are short for
 FORMS = (
-    '"joint std < 2 %"',
-    '"j3 std < 3 %"',
-    '"joint_compliance.j3 std < 1e-7 rad/(N·m)"',
-    '"joint_tilt_compliance std < 10 %"',
-    '"position std < 20 um"',
-    '"deflection std < 20 um"',
-)
-POSITIONS = ("position", "deflection")
-"""What is predicted where the robot will work: by absolute readings, and by deflections."""
+    '"joint std < 2 %"', '"j3 std < 3 %"', '"joint_compliance.j3 std < 1e-7 rad/(N·m)"',
+    '"joint_tilt_compliance std < 10 %"', '"position std < 20 um"', '"deflection std < 20 um"',
+)  # fmt: skip
+POSITIONS = ("position", "deflection")  # predicted where the robot will work
 _ANGLES = {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "µrad": 1e-6, "μrad": 1e-6}
 _SHAPE = re.compile(
     r"\s*(?P<what>[\w.]+)\s+std\s*(?:<=|<|≤)\s*(?P<number>[-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*"
@@ -33,21 +40,13 @@ _SHAPE = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class Goal:
-    """Standard uncertainties to be reached.
+    """Standard uncertainties to be reached."""
 
-    Attributes:
-        text: as it was given.
-        what: "position" or "deflection", or a parameter or an effect by name.
-        limit: largest standard uncertainty: a share of the value, or SI.
-        relative: whether it is a share of the parameter's value.
-        unit: SI unit that the limit was given in; "" for a share.
-    """
-
-    text: str
-    what: str
-    limit: float
-    relative: bool
-    unit: str
+    text: str  # as it was given
+    what: str  # "position" or "deflection", or a parameter or an effect by name
+    limit: float  # largest standard uncertainty: a share of the value, or SI
+    relative: bool  # whether it is a share of the parameter's value
+    unit: str  # SI unit that the limit was given in; "" for a share
 
     @property
     def of_position(self) -> bool:
@@ -55,11 +54,7 @@ class Goal:
         return self.what in POSITIONS
 
     def names(self, known: Mapping[str, float]) -> tuple[str, ...]:
-        """Return the parameters that the goal is about, of those that are known.
-
-        Raises:
-            InputError: none; lists what a goal could be about.
-        """
+        """Return the parameters that the goal is about, of those that are known."""
         found = tuple(n for n in known if n == self.what or n.split(".")[0] == self.what)
         if not found:
             effects = dict.fromkeys(name.split(".")[0] for name in known)
@@ -70,14 +65,7 @@ class Goal:
         return found
 
     def check(self, units: Mapping[str, str]) -> None:
-        """Refuse a goal that does not fit the parameters of a model.
-
-        Args:
-            units: SI unit of each parameter by name.
-
-        Raises:
-            InputError: no such parameter, or another unit.
-        """
+        """Refuse a goal that does not fit the parameters of a model, by the SI unit of each."""
         if self.of_position or self.relative:
             if not self.of_position:
                 self.names(dict.fromkeys(units, 0.0))
@@ -90,23 +78,12 @@ class Goal:
 
     def met(
         self,
-        stds: Mapping[str, float],
+        stds: Mapping[str, float],  # of each parameter, SI; infinite where not identifiable
         values: Mapping[str, float],
-        position: float | None = None,
-        predicted: str = "",
+        position: float | None = None,  # of what is predicted, m; infinite if undetermined
+        predicted: str = "",  # what that is, e.g. "deflection under 5kg at 100 poses"
     ) -> GoalStatus:
-        """Judge standard uncertainties.
-
-        Args:
-            stds: standard uncertainty of each parameter by name, SI; infinite where it is not
-                identifiable.
-            position: standard uncertainty of what is predicted where the robot will work, m;
-                infinite where the readings do not determine it.
-            predicted: what that is, e.g. "deflection under 5kg at 100 poses in the work box".
-
-        Raises:
-            InputError: a goal for positions without any, or for a parameter that is not there.
-        """
+        """Judge standard uncertainties."""
         if self.of_position:
             if position is None:
                 raise InputError(
@@ -135,11 +112,7 @@ class Goal:
 
 
 def parse_goal(text: str) -> Goal:
-    """Read a goal, e.g. "joint std < 2 %"; `joint` are all joint compliances, `j3` is one.
-
-    Raises:
-        InputError: anything else; lists the valid forms.
-    """
+    """Read a goal, e.g. "joint std < 2 %"; `joint` are all joint compliances, `j3` is one."""
     match = _SHAPE.fullmatch(text)
     if match is None:
         raise _wrong(text, "not understood")
@@ -176,7 +149,6 @@ def figures(fit: Fit) -> tuple[dict[str, float], dict[str, float]]:
 
 
 def _ratio(std: float, limit: float) -> float:
-    """Return std / limit; infinite where std is not a number."""
     return float(np.inf) if np.isnan(std) else std / limit
 
 
@@ -188,3 +160,128 @@ def _plain(unit: str) -> str:
 
 def _wrong(text: str, why: str) -> InputError:
     return InputError(f'goal "{text}": {why}; valid: {", ".join(FORMS)}')
+
+
+SHARE = 0.1  # Share of the time that may be spent on fits while measuring
+
+
+class GoalRule:
+    """Judges a campaign by its goal, with the fit that `hilcal identify` would make at its end.
+
+    The goal counts as met by a fit that converged, to readings that determine what the goal is
+    about. Where the residual is more than noise, the stated uncertainty is itself an estimate, and
+    a check after every reading will once find it small by chance: then two fits in a row have to
+    meet the goal, except at the plan's end. Fits take at most a tenth of the time (`SHARE`).
+    """
+
+    def __init__(
+        self,
+        text: str,  # the goal, e.g. "joint std < 2 %".
+        cell: Cell,
+        config: CellConfig,  # `[planning]`, loads, repeatability
+        catalogue: Catalogue | None = None,  # the installed effects by default
+        now: Callable[[], float] = time.monotonic,  # seconds that pass for people
+    ) -> None:
+        """Read a goal, and check it against the cell's model."""
+        self.goal: Goal = parse_goal(text)
+        self.status = GoalStatus(text)
+        self._cell, self._config, self._now = cell, config, now
+        self._catalogue = catalogue or installed()
+        self._scatter = config.repeatability.per_joint(cell.arm.n)
+        model = nominal_model(cell, config, 3, catalogue)
+        effects = model.model.effects
+        self.goal.check({f"{e.name}.{p.name}": p.unit for e in effects for p in e.parameters})
+        self._work_q: tuple[tuple[float, ...], ...] = ()
+        self._predicted = ""
+        if self.goal.of_position:
+            shown = "position" if config.fitted == "absolute" else "deflection"
+            if self.goal.what != shown:
+                raise InputError(
+                    f'goal "{text}": [planning] readings = "{config.fitted}", which show the '
+                    f"{shown}; valid: {shown}"
+                )
+            planning = config.planning
+            if not planning.work_q_rad and planning.work_min_m is None:
+                self.goal.met({}, {})  # raises: names the missing keys
+            some = prediction_poses(
+                model, config, np.zeros((0, cell.arm.n)), Space(cell, config).clear
+            )
+            self._work_q = tuple(dict.fromkeys(tuple(q) for q in some.q.tolist()))
+            self._predicted = some.what
+        self._good = False  # whether the fit before met the goal
+        self._ended = self._took = -np.inf
+
+    def __call__(self, readings: Readings, last: bool) -> GoalStatus:
+        """Return the status of the goal, see `measuring.stopping_rule.StoppingRule`."""
+        begun = self._now()
+        if last or (begun - self._ended >= self._took / SHARE and self._news(readings)):
+            found = self._fit(readings)
+            if found is None:
+                self.status, self._good = GoalStatus(self.goal.text), False
+            else:
+                status, fitted = found
+                good = status.met and fitted.solution.converged
+                sure = last or self._good or not fitted.uncertainty.inflated
+                self.status, self._good = replace(status, met=good and sure), good
+            self._ended = self._now()
+            self._took = self._ended - begun
+        return self.status
+
+    def _fitted(self, readings: Readings) -> tuple[Readings, Mode]:
+        """Return the readings that are judged, and how; deflections need an unloaded one."""
+        if self._config.planning.readings == "absolute":
+            return readings, "absolute"
+        kept = readings[has_unloaded(readings)]
+        return kept, "absolute" if kept.unloaded.all() else "deflection"
+
+    def _news(self, readings: Readings) -> bool:
+        """Whether the last reading is more than an unloaded one that no deflection has yet."""
+        free = readings.unloaded
+        if not free[-1] or self._fitted(readings)[1] == "absolute":
+            return True
+        same = (readings.pose == readings.pose[-1]) & (readings.cycle == readings.cycle[-1])
+        return bool((same & ~free).any())
+
+    def _fit(self, readings: Readings) -> tuple[GoalStatus, Fit] | None:
+        try:
+            readings, mode = self._fitted(readings)
+            readings = with_joint_scatter(self._cell, readings, self._scatter)
+            wanted = planned_effects(self._config, self._catalogue)
+            model = with_effects(self._cell, readings, mode, wanted, wanted, self._catalogue)
+            found = fit(model, readings, mode)
+            std, value = figures(found)
+            held = dict(zip(std, found.solution.prior == 0, strict=True))
+            std = {name: s for name, s in std.items() if not held[name]}
+            position = self._position(found) if self._work_q else None
+            status = self.goal.met(std, value, position, self._predicted)
+            return replace(status, model=found.model.named, fitted=found.mode), found
+        except (HilcalError, np.linalg.LinAlgError):
+            return None
+
+    def _position(self, found: Fit) -> float:
+        """RMS standard uncertainty of what is predicted where the robot will work, m.
+
+        That of the fit's covariance T H⁻¹ Tᵀ, widened as `identify` widens the parameters'.
+        Infinite where directions that the readings do not determine move it, and where there are no
+        more degrees of freedom than a family has parameters that the fit holds at zero for want of
+        readings.
+        """
+        if found.mode != self._config.planning.readings:
+            return float(np.inf)
+        if found.dof <= max(int((found.solution.prior == 0).sum()), 1):
+            return float(np.inf)
+        where = {"work_q_rad": self._work_q, "work_min_m": None, "work_max_m": None}
+        planning = self._config.planning.model_copy(update=where)
+        config = self._config.model_copy(update={"planning": planning})
+        model = after(found, config)
+        work = prediction_poses(model, config, np.zeros((0, self._cell.arm.n)))
+        solution, u = found.solution, found.uncertainty
+        basis, scale = solution.equations.basis, scales_of(found.model)
+        least = np.sqrt(max(found.variance_factor, 1.0)) if u.inflated else 1.0
+        seen = u.identifiable & (u.formal > 0)
+        wider = np.full(len(scale), least)
+        wider[seen] = u.std[seen] / u.formal[seen]
+        root: Floats = basis.transform * (wider / scale)[:, None]
+        covariance = root @ solution.equations.inverse(solution.beta) @ root.T
+        live = model.live
+        return rms(positions_of(work, covariance[np.ix_(live, live)], basis.null[live]))

@@ -16,36 +16,203 @@ from itertools import combinations, pairwise
 import numpy as np
 
 from hilcal.config import CellConfig
-from hilcal.design.candidate_set import CandidateSet
-from hilcal.design.candidates import (
-    Candidates,
-    ReadingDerivatives,
-    absolute_rows,
-    candidates,
-    deflection_rows,
-    reading_derivatives,
-    sizes,
+from hilcal.design.criterion import CandidateSet
+from hilcal.design.nominal_model import (
+    NominalModel,
+    build,
+    nominal_states,
+    potential_names,
+    random_columns,
 )
-from hilcal.design.nominal_model import NominalModel, build, potential_names, random_columns
 from hilcal.effects.protocol import Effect
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.effect_columns import computable, effect_columns
 from hilcal.identification.gauss_newton import whitened_jacobian
 from hilcal.identification.priors import scales_of
+from hilcal.model.model import Prediction
+from hilcal.readings.covariance import (
+    expected_share_of_mean,
+    joint_scatter,
+    scatter_factor,
+    tracker_covariance,
+    tracker_noise,
+)
+from hilcal.readings.readings import States
 from hilcal.readings.whitening import Mode
+from hilcal.robot.chain import drive_jacobian
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Bools, Floats, Ints
 
-PAIRS_UP_TO = 4
-"""Pairs of loads are units of their own where there are no more loads than this. A choice."""
-MOST_BYTES = 600_000_000
-"""Memory that the rows of all units may take. A choice."""
+CHUNK = 4096  # States that are evaluated at once. A choice, of memory.
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidates:
+    """N poses, each of them unloaded and under those of the L loads that it can bear."""
+
+    q: Floats  # (N, n) joint angles, rad
+    loads: tuple[str, ...]  # 1 + L names, "none" first
+    wrench: Floats  # (1 + L, 6) at the load point, base axes, N and N·m
+    allowed: Bools  # (N, 1 + L) which states may be taken
+
+    def __len__(self) -> int:
+        """Return the number of poses N."""
+        return len(self.q)
+
+    def __getitem__(self, rows: slice) -> "Candidates":
+        """Return the chosen poses."""
+        return Candidates(self.q[rows], self.loads, self.wrench, self.allowed[rows])
+
+    def states(self) -> States:
+        """All N·(1 + L) states, pose by pose, with nominal times and sides of approach."""
+        count = len(self.loads)
+        return nominal_states(
+            np.repeat(self.q, count, axis=0), np.tile(self.wrench, (len(self), 1))
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReadingDerivatives:
+    """What would be read of a chunk of N poses under 1 + L loads."""
+
+    rows: slice
+    jacobian: Floats  # (N, 1 + L, m, P) by the parameters; m of all that one arrival reads
+    covariance: Floats  # (N, 1 + L, m, m) of them
+
+
+def candidates(
+    nominal: NominalModel, config: CellConfig, q: Floats, allowed: Bools | None = None
+) -> Candidates:
+    """Return the states of poses (N, n) under the loads of a cell; all are allowed by default."""
+    gravity = nominal.cell.gravity
+    names = (UNLOADED, *(load.name for load in config.loads))
+    wrench = np.array([np.zeros(6), *(load.wrench(gravity) for load in config.loads)])
+    if allowed is None:
+        allowed = np.ones((len(q), len(names)), dtype=np.bool_)
+    return Candidates(np.asarray(q, dtype=float), names, wrench, allowed)
+
+
+def reading_derivatives(
+    nominal: NominalModel,  # the model, whose live parameters come first
+    config: CellConfig,
+    of: Candidates,
+    more: tuple[Effect, ...],  # effects that are not in the model
+    scale: Floats,  # (P,) what one unit of each parameter is, SI
+) -> Iterator[ReadingDerivatives]:
+    """Yield derivatives and covariances of candidates, some poses at a time."""
+    model, m, loads = nominal.model, nominal.elements, len(of.loads)
+    states, each = nominal.arrivals(of.states()), nominal.each
+    live = np.concatenate([nominal.live, np.arange(model.size, model.size + sizes(more))])
+    step = max(CHUNK // (loads * each), 1)
+    for start in range(0, len(of), step):
+        rows = slice(start, min(start + step, len(of)))
+        count = rows.stop - rows.start
+        per_pose = loads * each
+        p = model.predict(states[slice(rows.start * per_pose, rows.stop * per_pose)], nominal.theta)
+        jacobian = model.jacobian_of((*model.effects, *more), p, nominal.theta, nominal.m, live)
+        covariance = arrival_covariance(nominal, config, p)
+        yield ReadingDerivatives(
+            rows,
+            (jacobian * scale).reshape(count, loads, m, len(scale)),
+            covariance.reshape(count, loads, m, m),
+        )
+
+
+def sizes(effects: tuple[Effect, ...]) -> int:
+    """Return the number of parameters of effects."""
+    return sum(len(e.parameters) for e in effects)
+
+
+def absolute_rows(of: ReadingDerivatives) -> Floats:
+    """Whitened derivatives S⁻¹ J (N, 1 + L, m, P) of single readings, V = S Sᵀ."""
+    return np.asarray(np.linalg.solve(np.linalg.cholesky(of.covariance), of.jacobian))
+
+
+def deflection_rows(of: ReadingDerivatives, which: Ints, loads: tuple[int, ...]) -> Floats:
+    """Whitened derivatives (k, S·m, P) of deflections of k poses under S loads.
+
+    Block (i, j) of their covariance is δ_ij V_i + V_u: the unloaded reading's error is in all.
+    """
+    jacobian, v = of.jacobian[which], of.covariance[which]
+    count, _, m, size = jacobian.shape
+    each, taken = np.arange(len(loads)), list(loads)
+    height = len(loads) * m
+    change = (jacobian[:, taken] - jacobian[:, :1]).reshape(count, height, size)
+    shape = (count, len(loads), m, len(loads), m)
+    shared = np.broadcast_to(v[:, 0][:, None, :, None, :], shape).copy()
+    shared[:, each, :, each, :] += np.moveaxis(v[:, taken], 1, 0)
+    covariance = shared.reshape(count, height, height)
+    return np.asarray(np.linalg.solve(np.linalg.cholesky(covariance), change))
+
+
+def arrival_covariance(nominal: NominalModel, config: CellConfig, predicted: Prediction) -> Floats:
+    """Covariance (N, T·m, T·m) of all that is read in each arrival: of N·T states in succession.
+
+    They have the arm's repeatability in common: block (i, j) is δ_ij V_instrument + F_i F_jᵀ with F
+    = R J Σ_q^½ (see `reading_covariance`).
+    """
+    single = reading_covariance(nominal, config, predicted)
+    count, m = nominal.each, nominal.m
+    if count == 1:
+        return single
+    o = predicted.observation
+    s = predicted.situation
+    jac = drive_jacobian(s.cell.arm, s.chain, o.base_position)
+    joint_std = config.repeatability.per_joint(nominal.cell.arm.n)
+    factor = scatter_factor(jac, joint_std, o.axes, m).reshape(-1, count * m, jac.shape[2])
+    out = (factor @ np.swapaxes(factor, 1, 2)).reshape(-1, count, m, count, m)
+    each = np.arange(count)
+    out[:, each, :, each, :] = np.moveaxis(single.reshape(-1, count, m, m), 1, 0)
+    return out.reshape(-1, count * m, count * m)
+
+
+def reading_covariance(nominal: NominalModel, config: CellConfig, predicted: Prediction) -> Floats:
+    """Covariance (N, m, m) of the mean of K samples at predicted states, and of the arm's return.
+
+        V = (s + (1 − s)/K) Σ + R J Σ_q Jᵀ Rᵀ
+
+    with Σ what the tracker states of one sample, s its systematic share, in sensor axes; m², m·rad,
+    rad².
+    """
+    a, o, m = config.acquire, predicted.observation, nominal.m
+    stated = _instrument(nominal, config, predicted)
+    out = expected_share_of_mean(a.samples, a.systematic_share) * stated
+    joint_std = config.repeatability.per_joint(nominal.cell.arm.n)
+    if np.any(joint_std):
+        jac = drive_jacobian(
+            predicted.situation.cell.arm, predicted.situation.chain, o.base_position
+        )
+        out = out + joint_scatter(jac, joint_std, o.axes, m)
+    unread = np.diagonal(out, axis1=1, axis2=2) == 0  # of readings of one number; any noise does
+    return np.asarray(out + unread[:, :, None] * np.eye(m))
+
+
+def _instrument(nominal: NominalModel, config: CellConfig, predicted: Prediction) -> Floats:
+    """(N, m, m) covariance that the instrument states; zero in elements that are not read."""
+    o, m, t = predicted.observation, nominal.m, config.tracker
+    number, by = predicted.situation.states.observer, nominal.cell.observers
+    if number is None or not by:
+        return tracker_covariance(o.position, tracker_noise(t), nominal.station, m)
+    out = np.zeros((len(o.position), m, m))
+    for k, one in enumerate(by):
+        mine = number == k
+        if one.name.kind == "station":
+            place = np.zeros(3) if k else nominal.station
+            out[mine] = tracker_covariance(o.position[mine], tracker_noise(t), place, m)
+            continue
+        far = one.name.kind == "point"
+        section = (config.points if far else config.gauges).get(one.name.name)
+        std = None if section is None else section.std_m
+        length = t.range_std_m + t.range_std_per_m * np.abs(o.position[mine, 0])
+        out[mine, 0, 0] = np.square(length if std is None else std)
+    return out
+
+
+PAIRS_UP_TO = 4  # pairs of loads are units of their own up to so many loads; a choice
+MOST_BYTES = 600_000_000  # Memory that the rows of all units may take. A choice.
 MOST_PARAMETERS = 200
-SAMPLE = 300
-"""Candidate poses by which strengths are judged. A choice."""
-MOST_ORDINARY = 5.0
-"""A family that reaches one σ only with more than so many ordinary magnitudes is left out.
-A choice."""
+SAMPLE = 300  # Candidate poses by which strengths are judged. A choice.
+MOST_ORDINARY = 5.0  # ordinary magnitudes with which a family has to reach one σ; a choice
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,57 +235,40 @@ class Potential:
 
 @dataclass(frozen=True, slots=True)
 class DesignTerm:
-    """A parameter of the problem.
+    """A parameter of the problem."""
 
-    Attributes:
-        effect: canonical name of its effect.
-        name: as identification prints it, e.g. "joint_compliance.j1".
-        unit: physical unit, SI.
-        scale: what one unit of the problem's parameter is, SI: an ordinary magnitude, or τ of
-            a potential term.
-        value: at which it is assumed, SI.
-        potential: whether it belongs to an effect that is not in the model.
-    """
-
-    effect: str
-    name: str
-    unit: str
-    scale: float
-    value: float
-    potential: bool
+    effect: str  # canonical name of its effect
+    name: str  # as identification prints it, e.g. "joint_compliance.j1".
+    unit: str  # physical unit, SI
+    scale: float  # of one unit of the problem's, SI: an ordinary magnitude, or τ if potential
+    value: float  # at which it is assumed, SI
+    potential: bool  # whether it belongs to an effect that is not in the model
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DesignProblem:
-    """Everything that a plan is chosen by.
+    """Everything that a plan is chosen by."""
 
-    Attributes:
-        nominal: the model that is planned for.
-        mode: "deflection" or "absolute".
-        units: K units; their parameters are those of the model, then potential terms.
-        what: pose and loads of each unit; "none" is the unloaded reading of absolute positions,
-            that of deflections goes without saying.
-        families: effects of the potential terms.
-        prior: (P, P) what is known before: priors, and what was measured already.
-        measured: (P, P) the part of it that was measured already.
-        notes: what was assumed and left out, one line each.
-    """
-
-    nominal: NominalModel
-    mode: Mode
+    nominal: NominalModel  # the model that is planned for
+    mode: Mode  # "deflection" or "absolute"
     candidates: Candidates
-    units: CandidateSet
-    what: tuple[tuple[int, tuple[str, ...]], ...]
+    units: CandidateSet  # K units; their parameters are those of the model, then potential terms
+    what: tuple[tuple[int, tuple[str, ...]], ...]  # pose and loads of each; "none" is unloaded
     terms: tuple[DesignTerm, ...]
-    families: tuple[Effect, ...]
-    prior: Floats
-    measured: Floats
-    notes: tuple[str, ...]
+    families: tuple[Effect, ...]  # effects of the potential terms
+    prior: Floats  # (P, P) what is known before: priors, and what was measured already
+    measured: Floats  # (P, P) the part of it that was measured already
+    notes: tuple[str, ...]  # what was assumed and left out, one line each
 
     @property
     def model_size(self) -> int:
         """Number of the model's parameters, which come first."""
         return sum(not t.potential for t in self.terms)
+
+    @property
+    def mean_variance(self) -> Floats:
+        """(P, P) C whose tr(C M⁻¹) is the mean variance of the model's parameters."""
+        return np.diag([(not t.potential) / self.model_size for t in self.terms])
 
     @property
     def scale(self) -> Floats:
@@ -139,20 +289,11 @@ class DesignProblem:
 def problem(
     nominal: NominalModel, config: CellConfig, q: Floats, allowed: Bools | None = None
 ) -> DesignProblem:
-    """Return the design problem of candidate poses under the loads of a cell.
+    """Return the design problem of candidate poses (N, n), rad, under the loads of a cell.
 
-    A unit of absolute positions is one reading. A unit of deflections is a pose with its
-    unloaded reading and some loads: each by itself, all that the pose bears, and pairs where
-    there are few loads. It costs as many readings as it takes, the unloaded one included.
-
-    Args:
-        config: loads, noise, and `[planning]`: kind of readings, potential terms.
-        q: (N, n) candidate poses, rad.
-        allowed: (N, 1 + L) which states may be taken, the unloaded ones first; all by default.
-
-    Raises:
-        InputError: an unknown effect; deflections without any load; too many candidates.
-        CannotAnswerError: no state is allowed.
+    A unit of absolute positions is one reading. A unit of deflections is a pose with its unloaded
+    reading and some loads: each by itself, all that the pose bears, and pairs where there are few
+    loads. It costs as many readings as it takes, the unloaded one included.
     """
     mode = config.planning.readings
     if mode == "deflection" and not config.loads:
@@ -173,17 +314,11 @@ def problem(
     precision = np.ones(len(terms))
     precision[:count] = (scale[:count] / nominal.prior_std[nominal.live]) ** 2
     return DesignProblem(
-        nominal=nominal,
-        mode=mode,
-        candidates=of,
-        units=CandidateSet(rows, layout.cost),
-        what=layout.what,
-        terms=terms,
-        families=against.effects,
-        prior=measured + np.diag(precision),
-        measured=measured,
+        nominal=nominal, mode=mode, candidates=of, units=CandidateSet(rows, layout.cost),
+        what=layout.what, terms=terms, families=against.effects,
+        prior=measured + np.diag(precision), measured=measured,
         notes=(*nominal.notes, *against.notes, *layout.notes),
-    )
+    )  # fmt: skip
 
 
 def _terms(nominal: NominalModel, against: Potential) -> tuple[DesignTerm, ...]:
@@ -263,19 +398,13 @@ def _subsets(allowed: Ints, mode: Mode, kinds: set[str]) -> Iterator[tuple[int, 
 
 
 def unit_rows(
-    parts: Iterable[ReadingDerivatives],
-    loads: tuple[str, ...],
-    what: Sequence[tuple[int, tuple[str, ...]]],
+    parts: Iterable[ReadingDerivatives],  # of every `step`-th candidate pose
+    loads: tuple[str, ...],  # names of all loads, "none" first
+    what: Sequence[tuple[int, tuple[str, ...]]],  # pose and loads of each unit
     mode: Mode,
     step: int = 1,
 ) -> Iterator[tuple[Ints, Floats]]:
-    """Yield indices of units and their whitened rows (k, R, P), some poses at a time.
-
-    Args:
-        parts: of every `step`-th candidate pose.
-        loads: names of all loads, "none" first.
-        what: pose and loads of each unit.
-    """
+    """Yield indices of units and their whitened rows (k, R, P), some poses at a time."""
     several: dict[tuple[str, ...], list[int]] = {}
     for k, (pose, names) in enumerate(what):
         if pose % step == 0:
@@ -299,11 +428,7 @@ def readings_of(what: tuple[int, tuple[str, ...]], mode: Mode) -> tuple[str, ...
 
 
 def potential(nominal: NominalModel, config: CellConfig, of: Candidates) -> Potential:
-    """Choose the families of `[planning] against` and how strong they could be.
-
-    Raises:
-        InputError: an unknown effect (lists the valid ones).
-    """
+    """Choose the families of `[planning] against` and how strong they could be."""
     names = potential_names(config, nominal.model)
     known = nominal.model.catalogue
     families = tuple(build(known, name, nominal.cell, nominal.m) for name in names)
@@ -361,18 +486,11 @@ def _strengths(
 
 
 def information_of(nominal: NominalModel, more: tuple[Effect, ...], scale: Floats) -> Floats:
-    """Return AᵀA (P, P) of the readings that the assumed model was fitted to; zero without any.
+    """Return AᵀA (P, P) of the readings that the model was fitted to, and of a carried prior.
 
-    With the information of a prior that is carried over from another campaign.
-
-    A is the Jacobian at the fit, whitened by the readings' own covariances: what the fit's normal
-    equations hold, without its priors.
-
-    Args:
-        nominal: the model, whose live parameters come first.
-        more: effects that are not in the model. Those that cannot be computed from these readings,
-            which lack a column, have no information.
-        scale: (P,) what one unit of each parameter is, SI.
+    A is the Jacobian at the fit, whitened by the readings' own covariances, by the live parameters
+    and those of `more` effects in units of `scale` (P,). Effects that lack a column of the readings
+    have no information.
     """
     fit, count = nominal.fit, len(nominal.live)
     known = np.zeros((len(scale), len(scale)))

@@ -25,54 +25,38 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from hilcal.config import CellConfig
-from hilcal.design.bound import total_information
-from hilcal.design.candidate_set import CandidateSet
-from hilcal.design.candidates import (
+from hilcal.design.criterion import CandidateSet, inverse
+from hilcal.design.information import (
     Candidates,
+    DesignProblem,
+    information_of,
     reading_derivatives,
+    unit_rows,
 )
-from hilcal.design.criterion import inverse
-from hilcal.design.information import DesignProblem, information_of, unit_rows
 from hilcal.design.nominal_model import NominalModel, build, potential_names
-from hilcal.design.prediction_poses import PredictionPoses, position_derivative
+from hilcal.design.predicted import PredictionPoses, position_derivative
 from hilcal.effects.protocol import Effect
 from hilcal.identification.mixed_fit import HARMONICS, SCATTER_RAD
 from hilcal.mixed.families import families_of
 from hilcal.types import Bools, Floats, Ints
 
-DIRECTIONS = 150
-"""Most directions Q. A choice: at the poses of a real UR10 (920 parameters) the others together
-move a reading by 0.5 of its noise (rms)."""
-SAMPLE = 300
-"""Candidate poses by which they are found. A choice."""
-LEAST = 1e-3
-"""Directions that move the units by less than this in units of the noise (rms) are left out."""
+DIRECTIONS = 150  # most of Q; a choice: of a real UR10 (920) the others move 0.5 σ (rms)
+SAMPLE = 300  # Candidate poses by which they are found. A choice.
+LEAST = 1e-3  # directions that move the units by less, in their noise (rms), are left out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MixedDesign:
-    """A design problem in the coordinates (b, Qᵀ v).
+    """A design problem in the coordinates (b, Qᵀ v)."""
 
-    Attributes:
-        units: the units of the problem.
-        prior: (P, P) what is known before.
-        c: (P, P) C, m².
-        names: of b, then of Qᵀ v by number; by number alone of `balanced`.
-    """
-
-    units: CandidateSet
-    prior: Floats
-    c: Floats
-    names: tuple[str, ...]
+    units: CandidateSet  # the units of the problem
+    prior: Floats  # (P, P) what is known before
+    c: Floats  # (P, P) C, m²
+    names: tuple[str, ...]  # of b, then of Qᵀ v by number; by number alone of `balanced`
 
 
 def mixed_design(of: DesignProblem, config: CellConfig, work: PredictionPoses) -> MixedDesign:
-    """Return the design problem of predictions with all effects.
-
-    Args:
-        of: the design problem of the model.
-        config: its noise; where it states no repeatability, an ordinary one is assumed.
-    """
+    """Return the design problem of predictions with all effects."""
     nominal, config = of.nominal, _with_scatter(of.nominal, config)
     more, std = other_effects(nominal, config)
     prior_std = nominal.prior_std[nominal.live]
@@ -102,7 +86,7 @@ def balanced(of: MixedDesign) -> MixedDesign:
     and rounding would decide. Where they determine nothing of one it stays as it is, by its name.
     """
     units = of.units
-    every = of.prior + total_information(units, np.full(len(units), 1.0 / len(units)))
+    every = of.prior + units.information(np.full(len(units), 1.0 / len(units)))
     size = np.sqrt(np.diag(every))
     if not np.all(size > 0):
         return of
@@ -119,8 +103,7 @@ def balanced(of: MixedDesign) -> MixedDesign:
 def other_effects(nominal: NominalModel, config: CellConfig) -> tuple[tuple[Effect, ...], Floats]:
     """Return the effects beside the model, and the standard deviations of their parameters, SI.
 
-    Those of `[planning] against` at the sizes that arms have; none where a fit has a background,
-    which holds them already.
+    Those of `[planning] against`; none where a fit has a background, which holds them already.
     """
     model, known = nominal.model, nominal.model.catalogue
     names = () if model.background else potential_names(config, model)
@@ -161,7 +144,6 @@ class _AllColumns:
     scale: Floats
 
     def rows(self, candidates: Candidates, step: int = 1) -> Iterator[tuple[Ints, Floats]]:
-        """Yield units and their whitened rows (k, R, P), of every `step`-th candidate pose."""
         of, some = self.of, candidates[slice(None, None, step)]
         parts = reading_derivatives(of.nominal, self.config, some, self.more, self.scale)
         yield from unit_rows(parts, of.candidates.loads, of.what, of.mode, step)
@@ -169,22 +151,14 @@ class _AllColumns:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Coordinates:
-    """The change of coordinates.
+    """The change of coordinates."""
 
-    Attributes:
-        flat: (P, b) columns of A' by those of all parameters.
-        random: (P, r) columns Z H^−½ Q.
-        root: (P, u) columns Z H^−½.
-        prior: (b, b) F − G H⁻¹ Gᵀ.
-    """
-
-    flat: Floats
-    random: Floats
-    root: Floats
-    prior: Floats
+    flat: Floats  # (P, b) columns of A' by those of all parameters
+    random: Floats  # (P, r) columns Z H^−½ Q
+    root: Floats  # (P, u) columns Z H^−½
+    prior: Floats  # (b, b) F − G H⁻¹ Gᵀ
 
     def columns(self, rows: Floats) -> Floats:
-        """(..., b + r) of rows (..., P)."""
         return np.concatenate([rows @ self.flat, rows @ self.random], axis=-1)
 
     def whitened(self, rows: Floats) -> Floats:

@@ -7,6 +7,7 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
+from hilcal.design.criteria import Pair
 from hilcal.design.discriminated_pairs import (
     LEAST_POWER,
     LEVEL,
@@ -21,7 +22,6 @@ from hilcal.design.information import DesignProblem, readings_of
 from hilcal.design.planner import Planned, Request, Say, make, ordered
 from hilcal.design.predicted import predicted
 from hilcal.design.run_order import Ordering
-from hilcal.design.t_optimality import Pair
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.fit import Fit
 from hilcal.regression.power import family_power
@@ -30,78 +30,48 @@ from hilcal.robot.chain import evaluate
 from hilcal.store.plan import REFERENCE, UNLOADED
 from hilcal.types import Floats, Ints
 
-CANDIDATES = 600
-"""Most poses to choose from. A choice: more cost time and hardly raise the power."""
-DRAWS = 24
-"""Parameters of each suspect over which a power is averaged. A choice."""
-SURE = 0.9
-"""Power from which on two suspects count as separated. A choice."""
+CANDIDATES = 600  # Most poses to choose from. A choice: more cost time and hardly raise the power.
+DRAWS = 24  # Parameters of each suspect over which a power is averaged. A choice.
+SURE = 0.9  # Power from which on two suspects count as separated. A choice.
 
 
 @dataclass(frozen=True, slots=True)
 class PairPower:
-    """The power of separating one suspect from another.
+    """The power of separating one suspect from another."""
 
-    Attributes:
-        effect: the effect that is there.
-        rival: the one that is fitted in its stead.
-        now: chance that the readings so far reject the rival, by a test at 1 %.
-        then: the same with the planned readings.
-        not_separable: whether no measurement in this cell would do: neither these readings nor
-            `discriminated_pairs.MANY` others reach a power of `LEAST_POWER`.
-    """
-
-    effect: str
-    rival: str
-    now: float
-    then: float
-    not_separable: bool
+    effect: str  # the effect that is there
+    rival: str  # the one that is fitted in its stead
+    now: float  # chance that the readings so far reject the rival, by a test at 1 %
+    then: float  # the same with the planned readings
+    not_separable: bool  # neither these readings nor `MANY` others reach `LEAST_POWER`
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Next:
-    """The measurements that separate suspects.
-
-    Attributes:
-        powers: of each pair, both ways round.
-        shares: by load, the share of what separates the weakest pair.
-        reach_ratio: horizontal reach of the target, averaged over the planned poses by how much
-            they separate the weakest pair, over its mean in all candidate poses.
-        notes: what was left out, one line each.
-    """
+    """The measurements that separate suspects."""
 
     planned: Planned
-    powers: tuple[PairPower, ...]
-    shares: dict[str, float]
+    powers: tuple[PairPower, ...]  # of each pair, both ways round
+    shares: dict[str, float]  # by load, the share of what separates the weakest pair
+    # horizontal reach of the target, averaged over the planned poses by how much they separate the
+    # weakest pair, over its mean in all candidate poses
     reach_ratio: float
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  # what was left out, one line each
 
 
 def measure_next(
     cell: Cell,
     config: CellConfig,
-    fit: Fit,
-    suspects: Sequence[str],
-    request: Request,
+    fit: Fit,  # what has been measured, in scaling gc, of a model without the suspects
+    suspects: Sequence[str],  # two effects or more
+    request: Request,  # readings, or as many as so many poses take under every load
     rng: np.random.Generator,
     say: Say = lambda words: None,
-    reference: Floats | None = None,
+    reference: Floats | None = None,  # (n,) the campaign's joints, rad; else a new one
 ) -> Next:
     """Plan the measurements that separate suspects.
 
-    The criterion is the least non-centrality over all pairs of them, at the parameters that the
-    readings so far tell of each and at others that could be as well; see `discriminated_pairs`.
-
-    Args:
-        fit: what has been measured, in scaling gc, of a model without the suspects.
-        suspects: two effects or more.
-        request: how many readings, or as many as so many poses take under every load: which
-            poses and loads tell most of a difference is what the plan chooses.
-        reference: (n,) joints of the campaign's reference pose, rad; a new one where None.
-
-    Raises:
-        InputError: suspects that cannot be.
-        CannotAnswerError: no measurement separates any two of them, or no plan can be made.
+    The criterion is the least non-centrality over all pairs of them; see `discriminated_pairs`.
     """
     names = tuple(dict.fromkeys(suspects))
     if len(names) < 2:
@@ -143,13 +113,7 @@ def measure_next(
 def expected(
     problem: DesignProblem, names: tuple[str, str], betas: Sequence[Floats], information: Floats
 ) -> float:
-    """Return the power of a pair, the mean over parameters that its effect may have.
-
-    Args:
-        names: effect that is there, rival that is fitted.
-        betas: (E,) parameters of the effect, in the problem's units.
-        information: (P, P) of all readings, with `DiscriminatedPairs.prior`.
-    """
+    """Return the power of a pair (effect, rival), the mean over parameters β (E,) of the effect."""
     if not len(betas):
         return LEVEL
     pair = pair_of(problem, names, betas[0])
@@ -160,7 +124,6 @@ def expected(
 def _pair_powers(
     problem: DesignProblem, of: DiscriminatedPairs, names: tuple[str, ...], then: Floats
 ) -> Iterator[PairPower]:
-    """Yield all pairs of the suspects."""
     seen = {e.name for e in problem.families}
     supported = supported_parameters(problem, DRAWS)
     for e in names:
@@ -179,13 +142,9 @@ def _pair_powers(
 
 
 def _from_reference(
-    cell: Cell,
-    config: CellConfig,
-    made: Planned,
-    reference: Floats,
-    rng: np.random.Generator,
+    cell: Cell, config: CellConfig, made: Planned, reference: Floats, rng: np.random.Generator,
     request: Request,
-) -> Planned:
+) -> Planned:  # fmt: skip
     """Return the plan in an order from another reference pose, without what that cannot reach."""
     space, of = Space(cell, config), made.problem
     counts = made.counts.astype(np.int64)
@@ -208,17 +167,12 @@ def _from_reference(
 def reordered(
     space: Space,
     made: Planned,
-    counts: Ints,
-    reference: Floats,
+    counts: Ints,  # (K,) how often each unit is taken
+    reference: Floats,  # (n,) joints of the reference pose, from which all units are reached, rad
     rng: np.random.Generator,
     how: Ordering,
 ) -> Planned:
-    """Return a plan with other units of its problem, in an order of its own.
-
-    Args:
-        counts: (K,) how often each unit is taken.
-        reference: (n,) joints of the reference pose, from which all units are reached, rad.
-    """
+    """Return a plan with other units of its problem, in an order of its own."""
     of, usable, asked = made.problem, np.flatnonzero(made.usable), made.asked
     information = asked.prior + asked.units.information(counts.astype(float))
     design = replace(
@@ -234,11 +188,7 @@ def reordered(
 
 
 def _where(made: Planned, pair: Pair, then: Floats) -> tuple[dict[str, float], float]:
-    """Return the shares of the loads in uᵀ M u of a pair, and the ratio of the reach (see `Next`).
-
-    Deflections that share an unloaded reading are correlated: a load's share is then what it
-    adds to those before it.
-    """
+    """Return the loads' shares in uᵀ M u of a pair, and the ratio of the reach (see `Next`)."""
     of, u = made.problem, pair.residual(then)
     taken = np.flatnonzero(made.counts)
     worth = np.array([float(np.sum((of.units.rows[k] @ u) ** 2)) for k in taken])
@@ -261,37 +211,26 @@ def _where(made: Planned, pair: Pair, then: Floats) -> tuple[dict[str, float], f
     return shares, reach / float(np.mean(at))
 
 
-CRITERION = "D"
-"""By which the plan's efficiency is stated; its poses are not chosen by it."""
-SPARE = 2
-"""Candidates per pose: some are not reached from the reference. A choice."""
-LEAST = 60
-"""Candidates at least, so that a reference is found; a choice."""
-REPEATED = 10
-"""One pose of so many is arrived at twice, for the arm's repeatability. A choice."""
+CRITERION = "D"  # By which the plan's efficiency is stated; its poses are not chosen by it
+SPARE = 2  # Candidates per pose: some are not reached from the reference. A choice.
+LEAST = 60  # Candidates at least, so that a reference is found; a choice
+REPEATED = 10  # One pose of so many is arrived at twice, for the arm's repeatability. A choice.
 
 
 def measure_poses(
     cell: Cell,
     config: CellConfig,
-    fit: Fit,
+    fit: Fit,  # what has been measured, absolute readings
     poses: int,
     rng: np.random.Generator,
     say: Say = lambda words: None,
-    reference: Floats | None = None,
+    reference: Floats | None = None,  # (n,) the campaign's joints, rad; else a new one
 ) -> Planned:
     """Plan distinct poses spread evenly over the joint space, each read once without a load.
 
     An optimal design would take few poses many times, which is best for a model that is known. What
     errs from pose to pose, finer than the poses so far resolve, needs poses where nothing was read.
     The candidates' order is that of a Sobol sequence: the first ones that are reached are taken.
-
-    Args:
-        fit: what has been measured, absolute readings.
-        reference: (n,) joints of the campaign's reference pose, rad; a new one where None.
-
-    Raises:
-        CannotAnswerError: the cell leaves no such poses.
     """
     count = max(SPARE * poses, LEAST)
     planning = config.planning.model_copy(update={"readings": fit.mode, "candidates": count})

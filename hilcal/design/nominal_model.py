@@ -11,54 +11,38 @@ from hilcal.effects.options import Options
 from hilcal.effects.protocol import FRAME_ROLES, Effect
 from hilcal.effects.written import read_effects_text
 from hilcal.errors import InputError
-from hilcal.identification.carried import CarriedPrior, check_arm
-from hilcal.identification.coordinates import coordinates_of
+from hilcal.identification.carried import CarriedPrior, check_arm, coordinates_of
 from hilcal.identification.drift import least
 from hilcal.identification.fit import Fit
-from hilcal.identification.priors import prior_of
+from hilcal.identification.priors import prior_of, scales_of
 from hilcal.model.model import Model
 from hilcal.readings.readings import ObserverKind, ObserverName, States
 from hilcal.robot import se3
 from hilcal.types import Floats, Ints
 
-DISTANCE = 2.0
-"""Reaches from the base to a tracker whose place is not given. A choice."""
+DISTANCE = 2.0  # Reaches from the base to a tracker whose place is not given. A choice.
 FRAME_PRIOR = {"prior_m": 3e-3, "prior_rad": 6e-3}
 """In deflections the frames act only by turning them; they are known from the positions, about
 as well as the arm's elastic sag lets them be."""
 DURATION_S = 3600.0
 LOAD_TIMES_S = (5.0, 100.0)
-TEMPERATURES = (25.0, 35.0)
-"""Of joints that warm up while they are measured, °C."""
+TEMPERATURES = (25.0, 35.0)  # Of joints that warm up while they are measured, °C
 _SEED = 20240607
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NominalModel:
-    """The model that is planned for.
+    """The model that is planned for."""
 
-    Attributes:
-        model: frames where unknown, and effects; its cell has a tracker in its place.
-        theta: (P,) parameters, SI.
-        live: (L,) indices of the parameters that are not held at zero.
-        prior_std: (P,) prior standard deviations, infinite where nothing is known, SI.
-        station: (3,) where the beam starts, sensor axes, m.
-        m: elements of a reading: 3 or 6.
-        fit: of what has been measured already; None at first.
-        notes: what was assumed, one line each.
-        carried: (L, L) information of a prior that is carried over from another campaign, 1/SI²;
-            None without one. Those parameters have no other prior.
-    """
-
-    model: Model
-    theta: Floats
-    live: Ints
-    prior_std: Floats
-    station: Floats
-    m: int
-    fit: Fit | None
-    notes: tuple[str, ...]
-    carried: Floats | None = None
+    model: Model  # frames where unknown, and effects; its cell has a tracker in its place
+    theta: Floats  # (P,) parameters, SI
+    live: Ints  # (L,) indices of the parameters that are not held at zero
+    prior_std: Floats  # (P,) prior standard deviations, infinite where nothing is known, SI
+    station: Floats  # (3,) where the beam starts, sensor axes, m
+    m: int  # elements of a reading: 3 or 6
+    fit: Fit | None  # of what has been measured already; None at first
+    notes: tuple[str, ...]  # what was assumed, one line each
+    carried: Floats | None = None  # (L, L) information of a carried prior, 1/SI²
 
     @property
     def elements(self) -> int:
@@ -90,24 +74,16 @@ class NominalModel:
 def nominal_model(
     cell: Cell,
     config: CellConfig,
-    m: int = 3,
-    catalogue: Catalogue | None = None,
+    m: int = 3,  # 3 for positions, 6 for poses
+    catalogue: Catalogue | None = None,  # the installed effects by default
+    # what another campaign taught. Its effects are in the model, too, but for families that share a
+    # prior, which a plan is not made for unless they are named, and those that need what a plan
+    # does not fix.
     prior: CarriedPrior | None = None,
 ) -> NominalModel:
-    """Return the model of `[planning]` with ordinary parameters.
+    """Return the model of `[planning]`: the baseline's parameters ordinary, all others zero.
 
-    What is planned hardly depends on the parameters: deflections are linear in them to about
-    1e-3. Those of the baseline's effects are ordinary, all others zero.
-
-    Args:
-        m: 3 for positions, 6 for poses.
-        catalogue: the effects that a model can have; the installed ones unless given.
-        prior: what another campaign taught. Its effects are in the model, too, but for families
-            that share a prior, which a plan is not made for unless they are named, and those that
-            need what a plan does not fix.
-
-    Raises:
-        InputError: an unknown effect (lists the valid ones), or a prior of another arm.
+    What is planned hardly depends on them: deflections are linear in them to about 1e-3.
     """
     known = catalogue or installed()
     place, given = nominal_tracker_place(cell, config)
@@ -134,7 +110,8 @@ def nominal_model(
     parts = [(e.role == "baseline") * np.array([p.scale for p in e.parameters]) for e in effects]
     notes += random_columns(effects)
     theta = np.concatenate(parts)
-    prior_std = _prior_std(model)
+    prior_std, groups = prior_of(model)  # a shrunk family is ordinary
+    prior_std = np.where(groups >= 0, scales_of(model), prior_std)
     if prior is not None:
         s = prior.posterior.source
         called = f"{s.campaign}: " if s.campaign else ""
@@ -173,16 +150,7 @@ def carried_information(model: Model, live: Ints) -> Floats | None:
 
 
 def after(fit: Fit, config: CellConfig) -> NominalModel:
-    """Return the model and the parameters of what has been measured already.
-
-    Args:
-        fit: the newest revision of the campaign.
-        config: the configuration of the cell that is planned for.
-
-    Raises:
-        InputError: a fit whose residual is not whitened, or an effect that needs what a plan
-            does not determine, as a temperature.
-    """
+    """Return the model and the parameters of what has been measured already, by its newest fit."""
     if fit.scaling != "gc":
         raise InputError(f"planning on needs a fit with scaling gc, this one has {fit.scaling}")
     cell, prior = replace(fit.model.cell, registration_known=True), fit.solution.prior
@@ -212,11 +180,7 @@ def build(
 
 
 def random_columns(effects: tuple[Effect, ...]) -> tuple[str, ...]:
-    """Say of which effects a plan has to guess what they need, one line each.
-
-    Raises:
-        InputError: an effect that needs what a plan does not determine, as a temperature.
-    """
+    """Say of which effects a plan has to guess what they need, one line each."""
     known = nominal_states(np.zeros((1, 1)), np.zeros((1, 6)))
     for e in effects:
         if e.role not in FRAME_ROLES and not type(e).computable(known):
@@ -233,13 +197,7 @@ def random_columns(effects: tuple[Effect, ...]) -> tuple[str, ...]:
 
 
 def planned_effects(config: CellConfig, catalogue: Catalogue) -> dict[str, dict[str, object]]:
-    """Return the effects of `[planning] model`, by name, with the options written behind them.
-
-    Each is written as for `identify --effects`, e.g. "joint_compliance(joints=2-6)".
-
-    Raises:
-        InputError: an unknown effect (lists the valid ones), or options that cannot be read.
-    """
+    """Return the effects of `[planning] model` with their options, written as for `--effects`."""
     try:
         return read_effects_text(", ".join(config.planning.model), "effects", catalogue)
     except InputError as error:
@@ -247,27 +205,17 @@ def planned_effects(config: CellConfig, catalogue: Catalogue) -> dict[str, dict[
 
 
 def checked(names: tuple[str, ...], key: str, catalogue: Catalogue) -> tuple[str, ...]:
-    """Return the names of effects, each once.
-
-    Raises:
-        InputError: an unknown effect (lists the valid ones).
-    """
+    """Return the names of effects, each once."""
     for name in names:
         try:
             catalogue[name]
         except InputError as error:
-            raise InputError(f"[planning] {key}: {error}") from None
+            raise InputError(f"{key}: {error}") from None
     return tuple(dict.fromkeys(names))
 
 
 def check_effects(cell: Cell, config: CellConfig, catalogue: Catalogue) -> None:
-    """Refuse effects of a configuration that cannot be planned with, before anything is done.
-
-    Raises:
-        InputError: an unknown effect in `[planning] model` or `against`, in `[plausible]` or
-            `[ordinary]` (lists the valid ones), options that cannot be read, or an effect that
-            needs what a plan does not fix.
-    """
+    """Refuse effects of a configuration that cannot be planned with, before anything is done."""
     try:
         model = nominal_model(cell, config, catalogue=catalogue).model
     except InputError as error:
@@ -276,21 +224,14 @@ def check_effects(cell: Cell, config: CellConfig, catalogue: Catalogue) -> None:
         raise InputError(words if known else f"[planning] model: {words}") from None
     potential_names(config, model)
     for section in ("plausible", "ordinary"):
-        for name in getattr(config, section):
-            try:
-                catalogue[name]
-            except InputError as error:
-                raise InputError(f"[{section}]: {error}") from None
+        checked(tuple(getattr(config, section)), f"[{section}]", catalogue)
 
 
 def potential_names(config: CellConfig, model: Model) -> tuple[str, ...]:
     """Names of the effects of `[planning] against`, without those of the model.
 
-    Of the whole catalogue those are left out that need what only the order of a plan determines, as
-    the time or the side of approach.
-
-    Raises:
-        InputError: an unknown effect (lists the valid ones).
+    Of the whole catalogue those are left out that need what the order of a plan determines, as
+    time.
     """
     asked = config.planning.against
     if asked == "catalogue":
@@ -300,7 +241,7 @@ def potential_names(config: CellConfig, model: Model) -> tuple[str, ...]:
             if kind.applies(model.cell) and not kind.needs and kind.role != "observer"
         )
     else:
-        names = checked(asked, "against", model.catalogue)
+        names = checked(asked, "[planning] against", model.catalogue)
     return tuple(name for name in names if name not in model.names)
 
 
@@ -313,23 +254,14 @@ def nominal_tracker_place(cell: Cell, config: CellConfig) -> tuple[Floats, bool]
 
 
 def nominal_states(q: Floats, wrench: Floats) -> States:
-    """Return states (N) with times, temperatures and sides, as a shuffled order would have them.
-
-    Args:
-        q: (N, n) joint angles, rad.
-        wrench: (N, 6) at the load point, base axes, N and N·m.
-    """
+    """Return states (N) with times, temperatures and sides, as a shuffled order would have them."""
     rng = np.random.default_rng(_SEED)
     time = rng.uniform(0.0, DURATION_S, len(q))
     approach = rng.choice([-1.0, 1.0], q.shape)
     return States(
-        q=q,
-        wrench=wrench,
-        time=time,
-        load_time=rng.uniform(*LOAD_TIMES_S, len(q)),
-        joint_temperature=rng.uniform(*TEMPERATURES, q.shape),
-        approach=approach,
-    )
+        q=q, wrench=wrench, time=time, load_time=rng.uniform(*LOAD_TIMES_S, len(q)),
+        joint_temperature=rng.uniform(*TEMPERATURES, q.shape), approach=approach,
+    )  # fmt: skip
 
 
 def _registered(cell: Cell, config: CellConfig, place: Floats) -> tuple[Cell, Floats]:
@@ -344,10 +276,7 @@ def _registered(cell: Cell, config: CellConfig, place: Floats) -> tuple[Cell, Fl
 
 
 def _observed(cell: Cell, config: CellConfig, place: Floats) -> Cell:
-    """Return the cell with what `[tracker] observes` plans for; a point of unknown place is there.
-
-    A plane of unknown place is level, at the height of the tracker.
-    """
+    """Return the cell with what `[tracker] observes`; a plane of unknown place is level."""
     kind: ObserverKind = "point" if config.tracker.observes == "distance" else "gauge"
     if config.tracker.observes == "position":
         return cell
@@ -364,10 +293,3 @@ def _observed(cell: Cell, config: CellConfig, place: Floats) -> Cell:
             frame = se3.matrix(np.eye(3), -turn @ place)
         found.append(replace(o, frame=frame))
     return replace(seen, observers=tuple(found))
-
-
-def _prior_std(model: Model) -> Floats:
-    """(P,) what effects know of their parameters; a shrunk family is ordinary."""
-    prior, groups = prior_of(model)
-    scale = np.array([p.scale for e in model.effects for p in e.parameters])
-    return np.asarray(np.where(groups >= 0, scale, prior))

@@ -2,40 +2,28 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg as sl
-from numpy.typing import NDArray
 
 from hilcal.design.approximate_design import KINKED_TOLERANCE, ApproximateDesign, checked, relax
-from hilcal.design.bound import best_first
-from hilcal.design.candidate_set import CandidateSet
-from hilcal.design.criterion import Criterion
+from hilcal.design.criterion import CandidateSet, Criterion, best_first
 from hilcal.errors import CannotAnswerError
 from hilcal.types import Floats, Ints
 
-TOLERANCE = 1e-4
-"""Relative gap of the continuous optimum: whole numbers lose 1 to 5 % anyway. Study: the demo's
-plan and the benchmark's 40 of 100,000 states keep their certified efficiency to 0.01 %."""
+TOLERANCE = 1e-4  # relative gap of the continuous optimum: whole numbers lose 1 to 5 % anyway
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Design:
-    """What is taken, and how good it is.
+    """What is taken, and how good it is."""
 
-    Attributes:
-        counts: (K,) how often each unit is taken.
-        value: φ of it.
-        bound: φ of no plan within the budget exceeds it.
-        information: (P, P) of it, with what was known before.
-        cost: Σ n_k c_k.
-    """
-
-    counts: Ints
-    value: float
-    bound: float
-    information: Floats
-    cost: float
+    counts: Ints  # (K,) how often each unit is taken
+    value: float  # φ of it
+    bound: float  # φ of no plan within the budget exceeds it
+    information: Floats  # (P, P) of it, with what was known before
+    cost: float  # Σ n_k c_k
     relaxed: ApproximateDesign
 
     @property
@@ -46,32 +34,23 @@ class Design:
 
 def best(
     units: CandidateSet,
-    criterion: Criterion,
-    budget: float,
-    prior: Floats | None = None,
-    rng: np.random.Generator | None = None,
+    criterion: Criterion,  # φ
+    budget: float,  # B, in the units of the cost
+    prior: Floats | None = None,  # (P, P) M0: what is known before, or taken in any case
+    rng: np.random.Generator | None = None,  # nothing else is random
     *,
-    most: int | None = None,
+    most: int | None = None,  # how often a unit may be taken; any number of times by default
     names: Sequence[str] | None = None,
-    tolerance: float | None = None,
-    effort: int | None = None,
-    relaxed: ApproximateDesign | None = None,
+    tolerance: float | None = None,  # relative gap of the continuous optimum
+    effort: int | None = None,  # units put into a plan before the search ends; by default `EFFORT`
+    relaxed: ApproximateDesign | None = None,  # the continuous optimum, where it is known
 ) -> Design:
     """Return a plan with Σ n_k c_k ≤ B whose φ(M0 + Σ n_k A_kᵀA_k) is nearly the largest.
 
-    Args:
-        criterion: φ.
-        budget: B, in the units of the cost.
-        prior: (P, P) M0: what is known before, and units that are in the plan in any case.
-        rng: generator; the plan depends on nothing else that is random.
-        most: how often a unit may be taken; any number of times by default.
-        tolerance: relative gap of the continuous optimum; `TOLERANCE` by default.
-        effort: of the search for whole numbers; see `exact`.
-        relaxed: the continuous optimum, where it is known.
-
-    Raises:
-        InputError: a budget that takes no unit, or arrays that do not fit.
-        CannotAnswerError: parameters that no candidate determines, or not within the budget.
+    The whole parts of the continuous weights are completed unit by unit: the next one is that with
+    which the plan, ideally completed by the continuous optimum, is best. Then each unit is taken
+    out in turn and its budget spent anew (Fedorov 1972); where this no longer helps, a few random
+    ones are taken out at once, and what is a little worse is gone on from for a while.
     """
     rng = np.random.default_rng(0) if rng is None else rng
     if tolerance is None:
@@ -82,7 +61,9 @@ def best(
         )
     known = checked(units, budget, prior, most)
     felt = criterion.relevant(units, known, budget)
-    counts = exact(units, felt, budget, prior, relaxed, rng, most=most, effort=effort)
+    search = _Search(units, felt, budget, known, relaxed, most)
+    usual, enough = (KINKED_EFFORT, KINKED_ENOUGH) if felt.kinked else (EFFORT, ENOUGH)
+    counts = search.counts(rng, usual if effort is None else effort, relaxed.bound, enough)
     used = np.flatnonzero(counts)
     information = known + units.information(counts[used].astype(float), used)
     value = float(criterion.value(information))
@@ -100,14 +81,9 @@ def best(
     return Design(counts, value, max(relaxed.bound, value), information, cost, relaxed)
 
 
-EFFORT = 6000
-"""Units that are put into a plan before the search ends, at most; fewer of small plans.
-A choice: the 40 of 100,000 states of the benchmark are certified at 98 % within it."""
-KINKED_EFFORT = 1500
-"""The same for criteria with kinks, whose values cost more."""
-ENOUGH, KINKED_ENOUGH = 1.0 - 1e-6, 0.99
-"""Share of the bound at which the search ends; for criteria with kinks. A choice: a percent of what
-separates two effects is a percent of the readings, and to find it takes as long as the rest."""
+EFFORT = 6000  # units that are put into a plan at most, fewer of small plans; a choice
+KINKED_EFFORT = 1500  # The same for criteria with kinks, whose values cost more
+ENOUGH, KINKED_ENOUGH = 1.0 - 1e-6, 0.99  # share of the bound to end at; with kinks, a choice
 
 # Choices for speed; the certificate does not depend on them.
 _POOL = 4000  # units of the best prices, among which a plan is sought
@@ -121,127 +97,86 @@ _VARIED = 0.1  # share of the plans that vary at random; more of small ones
 _WORSE = 0.12  # of the distance to the bound, by which a plan may be worse and be gone on from
 
 
-def exact(
-    units: CandidateSet,
-    criterion: Criterion,
-    budget: float,
-    prior: Floats | None,
-    relaxed: ApproximateDesign,
-    rng: np.random.Generator,
-    *,
-    most: int | None = None,
-    effort: int | None = None,
-) -> Ints:
-    """Return (K,) whole numbers n of units with Σ n_k c_k ≤ B that nearly maximise φ.
-
-    The whole parts of the continuous weights are completed unit by unit: the next one is that
-    with which the plan, ideally completed by the continuous optimum, is best. Then each unit is
-    taken out in turn and its budget spent anew (Fedorov 1972; with units of different cost a
-    unit may give way to several); where this no longer helps, a few random ones are taken out at
-    once, and what is a little worse is gone on from for a while.
-
-    Args:
-        criterion: φ.
-        budget: B.
-        prior: (P, P) what is known before, and units that are in any case in the plan.
-        most: how often a unit may be taken; any number of times by default.
-        effort: units put into a plan before the search ends; `EFFORT` by default.
-    """
-    prior = checked(units, budget, prior, most)
-    if effort is None:
-        effort = KINKED_EFFORT if criterion.kinked else EFFORT
-    enough = KINKED_ENOUGH if criterion.kinked else ENOUGH
-    search = _search(units, criterion, budget, prior, relaxed, most)
-    floor = np.floor(search.ideal_weight + 1e-6).astype(np.int64)
-    plan = search.refilled(np.minimum(floor, search.most))
-    goal = enough * relaxed.bound
-    left = min(effort, _EACH * int(plan.counts.sum()))
-    plan, left = search.polished(plan, rng, left, goal)
-    best, left = search.wandered(plan, rng, left, relaxed.bound, goal)
-    best, left = search.polished(best, rng, max(left, 0) + int(best.counts.sum()), goal)
-    out = np.zeros(len(units), dtype=np.int64)
-    out[search.index] = best.counts
-    return out
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Plan:
-    """Whole numbers (S,) of the pool's units, their information and value."""
+class _Plan(NamedTuple):
+    """Whole numbers (S,) of the pool's units, and their value φ."""
 
     counts: Ints
-    information: Floats
     value: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class _Search:
-    """The pool of units in which a plan is sought.
+    """The pool of units in which a plan is sought: those of weight and of the best prices."""
 
-    Attributes:
-        criterion: φ.
-        index: (S,) the pool's units among all.
-        rows: (S, R, P) of the pool.
-        cost: (S,) of the pool.
-        budget: B.
-        most: how often a unit may be taken.
-        prior: (P, P) M0.
-        ideal: (P, P) information per cost of the continuous optimum, without M0.
-        ideal_weight: (S,) its weights.
-        root: (P, P) L with L Lᵀ the information of the continuous optimum.
-        table: (S, P (P + 1) / 2) upper triangles of L⁻¹ A_kᵀA_k L⁻ᵀ, off the diagonal doubled:
-            tr(G A_kᵀA_k) of all units is one product with the triangle of Lᵀ G L. In these
-            coordinates single precision is enough for an order of prices.
-        triangle: indices of the upper triangle.
-    """
+    def __init__(
+        self, units: CandidateSet, criterion: Criterion, budget: float, prior: Floats,
+        relaxed: ApproximateDesign, most: int | None,
+    ) -> None:  # fmt: skip
+        most_of_one = budget / float(units.cost.min())
+        fits = 2 * _TABLE // (units.size * (units.size + 1))
+        count = max(min(_POOL, fits), 3 * int(np.ceil(most_of_one)))
+        index = np.union1d(best_first(relaxed.price / units.cost, count), relaxed.index)
+        weight = np.zeros(len(units))
+        weight[relaxed.index] = relaxed.weight
+        self.criterion, self.budget, self.prior = criterion, budget, prior
+        self.count, self.index, self.ideal_weight = len(units), index, weight[index]
+        self.pool = CandidateSet(units.rows[index], units.cost[index])
+        self.most = int(np.floor(most_of_one * (1 + _SLACK))) if most is None else most
+        spent = float(units.cost[relaxed.index] @ relaxed.weight)
+        # information per cost of the continuous optimum, without M0
+        self.ideal = (relaxed.information - prior) / max(spent, _SLACK * budget)
+        # L, lower triangular, with L Lᵀ near the information of the continuous optimum
+        scale = np.sqrt(np.maximum(np.diag(relaxed.information), np.finfo(float).tiny))
+        scaled = relaxed.information / np.outer(scale, scale) + 1e-9 * np.eye(units.size)
+        self.root = scale[:, None] * np.linalg.cholesky(scaled)
+        self.triangle = first, second = np.triu_indices(units.size)
+        # (S, P (P + 1) / 2) upper triangles of L⁻¹ A_kᵀA_k L⁻ᵀ, off the diagonal doubled:
+        # tr(G A_kᵀA_k) of all units is one product with the triangle of Lᵀ G L, for whose order
+        # single precision is enough
+        self.table: Floats = np.empty((len(index), len(first)), dtype=np.float32)
+        for start in range(0, len(index), 256):
+            part = self.pool.rows[start : start + 256]
+            flat = sl.solve_triangular(self.root, part.reshape(-1, units.size).T, lower=True)
+            part = np.ascontiguousarray(flat.T).reshape(part.shape)
+            squares = np.matmul(part.transpose(0, 2, 1), part)[:, first, second]
+            squares[:, first != second] *= 2.0
+            self.table[start : start + 256] = squares
 
-    criterion: Criterion
-    index: Ints
-    rows: Floats
-    cost: Floats
-    budget: float
-    most: int
-    prior: Floats
-    ideal: Floats
-    ideal_weight: Floats
-    table: NDArray[np.float32]
-    triangle: tuple[Ints, Ints]
-    root: Floats
+    def counts(self, rng: np.random.Generator, effort: int, bound: float, enough: float) -> Ints:
+        """Return (K,) how often each of all units is taken."""
+        floor = np.floor(self.ideal_weight + 1e-6).astype(np.int64)
+        plan, goal = self.refilled(np.minimum(floor, self.most)), enough * bound
+        left = min(effort, _EACH * int(plan.counts.sum()))
+        plan, left = self.polished(plan, rng, left, goal)
+        plan, left = self.wandered(plan, rng, left, bound, goal)
+        plan, left = self.polished(plan, rng, max(left, 0) + int(plan.counts.sum()), goal)
+        out = np.zeros(self.count, dtype=np.int64)
+        out[self.index] = plan.counts
+        return out
 
     def _information(self, counts: Ints) -> Floats:
-        """Return (P, P) M of whole numbers."""
         used = np.flatnonzero(counts)
-        root = self.rows[used] * np.sqrt(counts[used])[:, None, None]
-        root = root.reshape(-1, self.rows.shape[2])
-        return np.asarray(self.prior + root.T @ root)
-
-    def _plan(self, counts: Ints) -> _Plan:
-        """Return a plan with its information worked out anew."""
-        m = self._information(counts)
-        return _Plan(counts, m, float(self.criterion.value(m)))
+        return np.asarray(self.prior + self.pool.information(counts[used].astype(float), used))
 
     def _prices(self, gradient: Floats) -> Floats:
         """Return (S,) tr(G A_kᵀA_k), in single precision."""
         turned = (self.root.T @ gradient @ self.root)[self.triangle]
         scale = float(np.abs(turned).max(initial=0.0)) or 1.0
-        return (self.table @ (turned / scale).astype(np.float32)).astype(float) * scale
+        return np.asarray((self.table @ (turned / scale).astype(np.float32)).astype(float) * scale)
 
     def refilled(
         self, counts: Ints, banned: int = -1, rng: np.random.Generator | None = None
     ) -> _Plan:
-        """Return the plan after its free budget is spent, one unit after another.
+        """Return the plan after its free budget is spent unit by unit, `banned` not first.
 
-        Args:
-            counts: (S,) of the plan.
-            banned: a unit not to be taken first.
-            rng: passes over some units at random; the best is always taken by default.
+        The best unit is taken; with `rng`, some are passed over at random.
         """
         counts = counts.copy()
         m = self._information(counts)
-        slack = self.budget - float(counts @ self.cost)
+        slack = self.budget - float(counts @ self.pool.cost)
         tiny = _SLACK * self.budget
-        least = float(self.cost.min())
+        least = float(self.pool.cost.min())
         while slack >= least - tiny:
-            fits = (self.cost <= slack + tiny) & (counts < self.most)
+            fits = (self.pool.cost <= slack + tiny) & (counts < self.most)
             if banned >= 0:
                 fits[banned], banned = False, -1
             allowed = np.flatnonzero(fits)
@@ -251,12 +186,12 @@ class _Search:
             smooth = self.criterion.surrogate(base, _ORDER)(base)
             if smooth is None:
                 break
-            rest = slack - self.cost
+            rest = slack - self.pool.cost
             rest = np.where(rest >= least - tiny, rest, 0.0)
             gain = self._prices(smooth.gradient)
             gain += rest * float(np.sum(smooth.gradient * self.ideal))
             tried = allowed[best_first(gain[allowed], _TRIED)]
-            ends = m + np.matmul(self.rows[tried].transpose(0, 2, 1), self.rows[tried])
+            ends = m + np.matmul(self.pool.rows[tried].transpose(0, 2, 1), self.pool.rows[tried])
             values = self.criterion.value(ends + rest[tried, None, None] * self.ideal)
             if rng is not None:
                 values = np.where(rng.random(len(values)) < rng.random(), -1.0, values)
@@ -264,9 +199,9 @@ class _Search:
             if not self.criterion.monotone and values[k] <= float(self.criterion.value(m)) > 0.0:
                 break
             counts[tried[k]] += 1
-            slack -= float(self.cost[tried[k]])
+            slack -= float(self.pool.cost[tried[k]])
             m = ends[k]
-        return self._plan(counts)
+        return _Plan(counts, float(self.criterion.value(self._information(counts))))
 
     def polished(
         self, plan: _Plan, rng: np.random.Generator, left: int, goal: float
@@ -295,8 +230,7 @@ class _Search:
     ) -> tuple[_Plan, int]:
         """Return the best of plans in which a few random units give way to others, again and again.
 
-        A plan that is little worse than the best so far is gone on from, ever less so
-        (record-to-record travel, Dueck 1993, J. Computational Physics 104(1)).
+        Record-to-record travel, Dueck (1993), J. Computational Physics 104(1).
         """
         best, whole = plan, left
         while left > 0 and 0.0 < best.value < goal:
@@ -313,58 +247,3 @@ class _Search:
             if new.value > best.value * (1.0 + _BETTER):
                 best = new
         return best, left
-
-
-def _search(
-    units: CandidateSet,
-    criterion: Criterion,
-    budget: float,
-    prior: Floats,
-    relaxed: ApproximateDesign,
-    most: int | None,
-) -> _Search:
-    """Return the pool: the units of weight and those of the best prices."""
-    limit = int(np.floor(budget / float(units.cost.min()) * (1 + _SLACK))) if most is None else most
-    fits = 2 * _TABLE // (units.size * (units.size + 1))
-    count = max(min(_POOL, fits), 3 * int(np.ceil(budget / float(units.cost.min()))))
-    rate = relaxed.price / units.cost
-    index = np.union1d(best_first(rate, count), relaxed.index)
-    weight = np.zeros(len(units))
-    weight[relaxed.index] = relaxed.weight
-    spent = float(units.cost[relaxed.index] @ relaxed.weight)
-    root = _root(relaxed.information)
-    ideal = (relaxed.information - prior) / max(spent, _SLACK * budget)
-    return _Search(
-        criterion,
-        index,
-        units.rows[index],
-        units.cost[index],
-        budget,
-        limit,
-        prior,
-        ideal,
-        weight[index],
-        *_triangles(units.rows[index], root),
-        root,
-    )
-
-
-def _root(m: Floats) -> Floats:
-    """Return L, lower triangular, with L Lᵀ near M, of full rank."""
-    scale = np.sqrt(np.maximum(np.diag(m), np.finfo(float).tiny))
-    scaled = m / np.outer(scale, scale)
-    return np.asarray(scale[:, None] * np.linalg.cholesky(scaled + 1e-9 * np.eye(len(m))))
-
-
-def _triangles(rows: Floats, root: Floats) -> tuple[NDArray[np.float32], tuple[Ints, Ints]]:
-    """Return the table of a pool and the indices of the upper triangle."""
-    first, second = np.triu_indices(rows.shape[2])
-    table = np.empty((len(rows), len(first)), dtype=np.float32)
-    for start in range(0, len(rows), 256):
-        part = rows[start : start + 256]
-        part = sl.solve_triangular(root, part.reshape(-1, len(root)).T, lower=True)
-        part = np.ascontiguousarray(part.T).reshape(-1, *rows.shape[1:])
-        whole = np.matmul(part.transpose(0, 2, 1), part)[:, first, second]
-        whole[:, first != second] *= 2.0
-        table[start : start + 256] = whole
-    return table, (first, second)

@@ -1,6 +1,6 @@
 """From a cell to a plan: candidates, loads, the optimum with its certificate, and the order."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Literal
@@ -9,7 +9,6 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.design.candidates import reading_covariance
 from hilcal.design.choice import (
     EFFORT,
     Objective,
@@ -21,85 +20,172 @@ from hilcal.design.choice import (
     only,
     promising,
 )
+from hilcal.design.criterion import CandidateSet
 from hilcal.design.feasible import DrawnPoses, Space, draw
-from hilcal.design.information import DesignProblem, problem, readings_of
+from hilcal.design.information import DesignProblem, problem, reading_covariance, readings_of
 from hilcal.design.nominal_model import after, nominal_model
 from hilcal.design.optimum import Design
-from hilcal.design.predicted import PredictedUncertainty, predicted
-from hilcal.design.prediction_poses import PredictionPoses, prediction_poses
-from hilcal.design.run_order import Chosen, Ordered, Ordering, order_plan
-from hilcal.design.timing import pace
-from hilcal.design.undetermined import UndeterminedParameter, without_undetermined
+from hilcal.design.predicted import (
+    PredictedUncertainty,
+    PredictionPoses,
+    predicted,
+    prediction_poses,
+)
+from hilcal.design.run_order import Chosen, Ordered, Ordering, order_plan, pace
 from hilcal.effects.catalogue import Catalogue
+from hilcal.effects.per_joint import PerJoint
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.carried import CarriedPrior
 from hilcal.identification.fit import Fit
 from hilcal.identification.registration import MIN_POSES
+from hilcal.regression.normal_equations import INFORMATION
+from hilcal.regression.schur import DETERMINED
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Bools, Floats, Ints
 
-HOMES = 4
-"""Central poses of which one becomes the reference. A choice."""
-PROBES = 60
-"""Poses by which the reference is judged. A choice."""
-SAMPLE = 50
-"""Poses by which the noise of a reading is judged. A choice."""
-ROUNDS = 6
-"""How often poses that are not reached from the reference may be replaced. A choice."""
+SHARE = 0.1  # parameters with a larger share of a singular direction are confounded; a choice
+
+
+@dataclass(frozen=True, slots=True)
+class UndeterminedParameter:
+    """A parameter that is left out of a plan."""
+
+    name: str  # as identification prints it, e.g. "joint_compliance.j1".
+    unit: str  # SI
+    value: float  # at which it is assumed, SI
+    confounded: tuple[str, ...] = ()  # not separated from these; none where nothing changes
+    joint: str = ""  # "joint 1" or "joints 1-2" where it is the compliance of these; else empty
+
+    @property
+    def remark(self) -> str:
+        """What is not determined, why, and what would determine it, in a sentence or two."""
+        if self.confounded:
+            return (
+                f"{self.name}: not determined; no reading in this cell separates it from "
+                f"{', '.join(self.confounded)}. The plan goes on without it"
+            )
+        if self.joint and self.unit == "m/N":
+            return (
+                f"{self.name}: not determined; no load of this cell makes a force along the travel "
+                f"of {self.joint}. The plan goes on without it: {self.joint} needs a pull along "
+                "it, [[loads]] with force_N, e.g. [80.0, 0.0, 0.0]"
+            )
+        if self.joint:
+            needs = "need" if self.joint.startswith("joints") else "needs"
+            return (
+                f"{self.name}: not determined; no load of this cell makes a torque about "
+                f"{self.joint}. The plan goes on without it: {self.joint} {needs} a side pull, "
+                "[[loads]] with force_N across the axis, e.g. [80.0, 0.0, 0.0]"
+            )
+        return (
+            f"{self.name}: not determined; no reading in this cell changes with it. The plan goes "
+            "on without it"
+        )
+
+
+def without_undetermined(
+    of: DesignProblem,
+) -> tuple[DesignProblem, tuple[UndeterminedParameter, ...]]:
+    """Return the problem of those parameters that the candidates determine, and the others.
+
+    A parameter without a prior is left out where all candidates together change by less than
+    `INFORMATION` with an ordinary magnitude of it; of those that are confounded as many as it
+    takes.
+    """
+    size = of.model_size
+    every = of.prior + of.units.information(np.ones(len(of.units)))
+    flat = np.isinf(of.nominal.prior_std[of.nominal.live])
+    lost = dict(_lost(every[:size, :size], flat))
+    if not lost:
+        return of, ()
+    found = tuple(_named(of, k, others) for k, others in lost.items())
+    if len(lost) == int(flat.sum()):
+        raise CannotAnswerError("; ".join(dict.fromkeys(f.remark for f in found[:1])))
+    kept = np.setdiff1d(np.arange(len(of.terms)), list(lost))
+    own, carried = kept[kept < size], of.nominal.carried
+    nominal = replace(
+        of.nominal,
+        live=of.nominal.live[own],
+        carried=None if carried is None else carried[np.ix_(own, own)],
+    )
+    rows = np.ascontiguousarray(of.units.rows[:, :, kept])
+    reduced = replace(
+        of,
+        nominal=nominal,
+        units=CandidateSet(rows, of.units.cost),
+        terms=tuple(of.terms[k] for k in kept),
+        prior=of.prior[np.ix_(kept, kept)],
+        measured=of.measured[np.ix_(kept, kept)],
+    )
+    return reduced, found
+
+
+def _lost(m: Floats, flat: Bools) -> Iterator[tuple[int, Ints]]:
+    """Yield parameters that M (P, P) does not determine, and those that each is confounded with."""
+    keep = np.arange(len(m))
+    blind = np.flatnonzero(flat & (np.diag(m) < INFORMATION**2))
+    for k in blind:
+        yield int(k), np.zeros(0, dtype=np.int64)
+    keep = np.setdiff1d(keep, blind)
+    while flat[keep].any():
+        root = np.sqrt(np.diag(m)[keep])
+        values, vectors = np.linalg.eigh(m[np.ix_(keep, keep)] / np.outer(root, root))
+        share = np.abs(vectors[:, 0]) * flat[keep]
+        if values[0] > DETERMINED or not share.any():
+            return
+        worst = int(np.argmax(share))
+        others = np.flatnonzero(share > SHARE * share.max())
+        yield int(keep[worst]), keep[others[others != worst]]
+        keep = np.delete(keep, worst)
+
+
+def _named(of: DesignProblem, k: int, others: Ints) -> UndeterminedParameter:
+    term = of.terms[k]
+    confounded = tuple(of.terms[int(j)].name for j in others)
+    joint = ""
+    for e in of.nominal.model.effects:
+        if isinstance(e, PerJoint) and e.role == "baseline" and e.name == term.effect:
+            names = [f"{e.name}.{p.name}" for p in e.parameters]
+            joint = e.shared.words[names.index(term.name)]
+    return UndeterminedParameter(term.name, term.unit, term.value, confounded, joint)
+
+
+HOMES = 4  # Central poses of which one becomes the reference. A choice.
+PROBES = 60  # Poses by which the reference is judged. A choice.
+SAMPLE = 50  # Poses by which the noise of a reading is judged. A choice.
+ROUNDS = 6  # How often poses that are not reached from the reference may be replaced. A choice.
 
 Say = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """Size and criterion of a plan.
+    """Size and criterion of a plan."""
 
-    Attributes:
-        poses: just so many, each read once unloaded and under every load that it bears.
-        readings: or this many readings, those at the reference and repeats not counted, spread
-            over as many poses, and under those loads, as determine most.
-        criterion: of `[planning]` where None; that has I for absolute readings and D for
-            deflections unless it states one.
-        effort: of the search for whole numbers.
-        unloaded: "around" or "first", see `Ordering`.
-    """
-
-    poses: int = 20
-    readings: int | None = None
-    criterion: str | None = None
-    effort: int = EFFORT
-    unloaded: Literal["around", "first"] = "around"
+    poses: int = 20  # just so many, each read once unloaded and under every load that it bears
+    readings: int | None = None  # or this many, but for reference and repeats
+    criterion: str | None = None  # of `[planning]` by default, else I, or D for deflections
+    effort: int = EFFORT  # of the search for whole numbers
+    unloaded: Literal["around", "first"] = "around"  # "around" or "first", see `Ordering`
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Planned:
-    """A plan with its design problem.
+    """A plan with its design problem."""
 
-    Attributes:
-        ordered: the plan in order, with what the order costs.
-        design: the units that were chosen, with the certificate.
-        costly: loads that cost more than they tell, with what leaving each out would gain.
-        asked: the design problem with its criterion.
-        usable: (K,) which units were to choose from.
-        budget: readings of the design.
-        predicted: standard uncertainties that a fit to the readings will have.
-        undetermined: parameters of the model that no reading of the cell determines.
-        asked_poses: poses that were asked for, see `Request`; None where readings were.
-    """
-
-    ordered: Ordered
-    design: Design
-    costly: tuple[tuple[str, float], ...]
+    ordered: Ordered  # the plan in order, with what the order costs
+    design: Design  # the units that were chosen, with the certificate
+    costly: tuple[tuple[str, float], ...]  # loads not worth their change, and the gain
     problem: DesignProblem
-    asked: Objective
-    usable: Bools
+    asked: Objective  # the design problem with its criterion
+    usable: Bools  # (K,) which units were to choose from
     work: PredictionPoses
     drawn: DrawnPoses
-    budget: float
+    budget: float  # readings of the design
     criterion: str
-    predicted: PredictedUncertainty
-    undetermined: tuple[UndeterminedParameter, ...]
-    asked_poses: int | None
+    predicted: PredictedUncertainty  # standard uncertainties that a fit to the readings will have
+    undetermined: tuple[UndeterminedParameter, ...]  # by no reading of the cell
+    asked_poses: int | None  # poses that were asked for, see `Request`; None where readings were
 
     @property
     def counts(self) -> Floats:
@@ -111,32 +197,16 @@ class Planned:
 
 def make(
     cell: Cell,
-    config: CellConfig,
-    request: Request,
+    config: CellConfig,  # limits, loads, noise, and `[planning]`: what it is for
+    request: Request,  # how many readings, and the criterion
     rng: np.random.Generator,
-    known: Fit | None = None,
+    known: Fit | None = None,  # fit of what has been measured already
     say: Say = lambda words: None,
-    catalogue: Catalogue | None = None,
-    prior: CarriedPrior | None = None,
-    reference: Floats | None = None,
+    catalogue: Catalogue | None = None,  # those of `known`, or the installed effects
+    prior: CarriedPrior | None = None,  # what another campaign taught, if nothing is known
+    reference: Floats | None = None,  # (n,) the campaign's joints, rad; else a new one
 ) -> Planned:
-    """Return the plan.
-
-    Args:
-        config: limits, loads, noise, and `[planning]`: what it is for.
-        request: how many readings, and the criterion.
-        known: fit of what has been measured already.
-        catalogue: the effects that a model can have; the installed ones unless given, or those
-            of `known`.
-        prior: what another campaign taught, where nothing has been measured yet.
-        reference: (n,) joints of the reference pose of the campaign that the plan is appended to,
-            rad; a new one where None.
-
-    Raises:
-        InputError: numbers or names that cannot be.
-        CannotAnswerError: the cell leaves too few states, its readings determine nothing of the
-            model, or they are too few; names the constraint or the parameter.
-    """
+    """Return the plan."""
     usual = "I" if config.planning.readings == "absolute" else "D"
     criterion = canonical(request.criterion or config.planning.criterion or usual)
     say("drawing candidate poses")
@@ -196,7 +266,12 @@ def make(
     counts = np.zeros(len(usable), dtype=np.int64)
     counts[np.flatnonzero(usable)] = design.counts
     repeats = max(2, (visited - 1) // 10)
-    how = Ordering(unloaded=request.unloaded, repeats=repeats, reading_std=_reading_std(space, of))
+    some = of.candidates[slice(0, SAMPLE)].states()
+    covariance = reading_covariance(
+        of.nominal, config, of.nominal.model.predict(some, of.nominal.theta)
+    )
+    std = float(np.sqrt(np.mean(np.diagonal(covariance[:, :3, :3], axis1=1, axis2=2))))
+    how = Ordering(unloaded=request.unloaded, repeats=repeats, reading_std=std)
     order = ordered(space, of, home, counts, rng, how)
     knows = predicted(of, counts.astype(float), work=work)
     return Planned(
@@ -206,14 +281,11 @@ def make(
 
 
 def _budget(request: Request, of: DesignProblem) -> float:
-    """Readings that are to be taken."""
-    if request.readings is not None:
-        if request.readings < 1:
-            raise InputError(f"{request.readings} readings; valid: a whole number from 1")
-        return float(request.readings)
-    if request.poses < 1:
-        raise InputError(f"{request.poses} poses; valid: a whole number from 1")
-    return float(request.poses * len(of.candidates.loads))
+    whole = request.readings is None
+    count, what = (request.poses, "poses") if whole else (request.readings or 0, "readings")
+    if count < 1:
+        raise InputError(f"{count} {what}; valid: a whole number from 1")
+    return float(count * (len(of.candidates.loads) if whole else 1))
 
 
 def _reference(space: Space, drawn: DrawnPoses, rng: np.random.Generator) -> tuple[Floats, Ints]:
@@ -261,17 +333,12 @@ def _unreachable(space: Space, of: DesignProblem, home: Floats, units: Ints) -> 
 def ordered(
     space: Space,
     of: DesignProblem,
-    home: Floats,
-    counts: Ints,
+    home: Floats,  # (n,) joints of the reference pose, from which all units are reached, rad
+    counts: Ints,  # (K,) how often each unit is taken
     rng: np.random.Generator,
     how: Ordering,
 ) -> Ordered:
-    """Name the poses of the chosen units p1, p2, ..., and put their readings in order.
-
-    Args:
-        home: (n,) joints of the reference pose, from which all units are reached, rad.
-        counts: (K,) how often each unit is taken.
-    """
+    """Name the poses of the chosen units p1, p2, ..., and put their readings in order."""
     taken = np.flatnonzero(counts)
     poses = sorted({of.what[k][0] for k in taken})
     name = {pose: f"p{k}" for k, pose in enumerate(poses, start=1)}
@@ -282,11 +349,3 @@ def ordered(
     return order_plan(
         space.cell, space.config, list(name.values()), q, home, chosen, space.passable, rng, how
     )
-
-
-def _reading_std(space: Space, of: DesignProblem) -> float:
-    """Typical standard uncertainty of a reading in one coordinate, m."""
-    model, theta = of.nominal.model, of.nominal.theta
-    some = of.candidates[slice(0, SAMPLE)].states()
-    covariance = reading_covariance(of.nominal, space.config, model.predict(some, theta))
-    return float(np.sqrt(np.mean(np.diagonal(covariance[:, :3, :3], axis1=1, axis2=2))))

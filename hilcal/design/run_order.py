@@ -5,8 +5,8 @@ clear; the blocks follow each other in random order.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from itertools import permutations
+from dataclasses import asdict, dataclass, field
+from itertools import pairwise, permutations
 from typing import Literal
 
 import numpy as np
@@ -14,48 +14,200 @@ import numpy as np
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.design import tour
-from hilcal.design.timing import Confounding, Duration, Pace, confounding, pace, timeline
 from hilcal.design.tour import NEVER
 from hilcal.errors import CannotAnswerError, InputError
+from hilcal.measuring.route import duration, route, seconds_at_rest
+from hilcal.robot.arm import Arm
 from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step
 from hilcal.types import Bools, Floats, Ints
+
+
+@dataclass(frozen=True, slots=True)
+class Pace:
+    """What motions, readings and load changes take."""
+
+    speed: float  # of the leading joint, rad/s
+    acceleration: float  # of the leading joint, rad/s²
+    reading_s: float  # seconds at rest for one step: the readings of all targets
+    change_s: float  # seconds that a person needs for another load
+
+    def legs(self, starts: Floats, ends: Floats) -> Floats:
+        """Return (N, M) seconds of straight motions; `route.duration` for many."""
+        way = np.abs(starts[:, None] - ends[None]).max(axis=-1, initial=0.0)
+        long = way / self.speed + self.speed / self.acceleration
+        short = 2.0 * np.sqrt(way / self.acceleration)
+        return np.asarray(np.where(way >= self.speed**2 / self.acceleration, long, short))
+
+
+@dataclass(frozen=True, slots=True)
+class Duration:
+    """Seconds of a campaign."""
+
+    motion: float
+    readings: float  # at rest
+    load_changes: float  # by hand
+
+    @property
+    def total(self) -> float:
+        """All of it, s."""
+        return self.motion + self.readings + self.load_changes
+
+    def about(self) -> dict[str, float]:
+        """Return it for a plan's file, s."""
+        split = {"total": self.total, **asdict(self)}
+        return {key: round(value, 1) for key, value in split.items()}
+
+
+def pace(config: CellConfig) -> Pace:
+    """Return the pace of a cell, from [motion], [planning] and [acquire]."""
+    motion, change = config.motion, config.planning.load_change_s
+    return Pace(motion.speed_rad_s, motion.acceleration_rad_s2, seconds_at_rest(config), change)
+
+
+def timeline(plan: Plan, arm: Arm, margin: float, at: Pace) -> tuple[Duration, Floats]:
+    """Return the duration of a plan and (S,) the middle of each step's reading, s."""
+    stops = route(plan, arm, margin)
+    motion = readings = changes = 0.0
+    times = []
+    for before, stop in pairwise(stops):
+        motion += duration(before.q, stop.q, at.speed, at.acceleration)
+        if stop.change_to is not None:
+            changes += at.change_s
+        if stop.step is not None:
+            times.append(motion + readings + changes + at.reading_s / 2)
+            readings += at.reading_s
+    return Duration(motion, readings, changes), np.array(times)
+
+
+_WRENCH = ("fx", "fy", "fz", "mx", "my", "mz")
+
+
+@dataclass(frozen=True, slots=True)
+class Confounding:
+    """Time against what the model explains, and the error that a linear drift makes.
+
+    A deflection's lag is the time from its unloaded to its loaded reading.
+    """
+
+    deflections: int  # beside the reference pose; 0: what follows is of readings and their time
+    # the largest |correlation| ρ of the lag with a regressor; ρ² is the share of its information
+    # that a parameter with this regressor loses where a drift has to be estimated as well
+    correlation: float
+    regressor: str  # which one, e.g. "fz cos q3".
+    lag_mean_s: float  # times a constant drift this is common to all deflections
+    lag_rms_s: float  # root mean square of the lag, s
+    drift: float  # rate of the stated drift in one coordinate, m/s
+    error_m: float  # rms error of a deflection from that drift, m
+    bias_m: float  # mean error, m
+    drift_std: float | None  # of a rate estimated by the reference poses, m/s
+
+    @property
+    def returned_m(self) -> float | None:
+        """Rms error of a deflection, m, after a correction by the drift at the reference."""
+        return None if self.drift_std is None else self.drift_std * self.lag_rms_s
+
+    def about(self) -> dict[str, object]:
+        """Return it for a plan's file."""
+        left, rate = self.returned_m, self.drift_std
+        return {
+            "deflections": self.deflections, "correlation": round(self.correlation, 4),
+            "correlated_with": self.regressor, "lag_mean_s": round(self.lag_mean_s, 1),
+            "lag_rms_s": round(self.lag_rms_s, 1), "drift_m_per_h": 3600.0 * self.drift,
+            "error_m": self.error_m, "bias_m": self.bias_m, "error_with_returns_m": left,
+            "drift_std_m_per_h": None if rate is None else 3600.0 * rate,
+        }  # fmt: skip
+
+
+def confounding(
+    plan: Plan,
+    times: Floats,  # (S,) of the steps, s
+    wrenches: Mapping[str, Floats],  # (6,) by load
+    drift: float,
+    reading_std: float,  # standard uncertainty of a reading in one coordinate, m
+) -> Confounding:
+    """Return how a plan's time is confounded with its joints and loads.
+
+    A drift v moves a deflection by v τ, with the lag τ = t_loaded - t_unloaded. Regressors are the
+    components of the load's wrench and their products with cos and sin of every joint; the
+    correlation is the uncentred one, since a deflection has no constant term:
+
+        ρ = |τᵀx| / (|τ| |x|)
+
+    and estimating v beside a parameter with the column x leaves 1 - ρ² of its information. Without
+    deflections it is the centred correlation of t with the cos, the sin and the wrench. A slope
+    fitted to readings at the reference pose, each load with its own mean, has the variance σ²/Σ(t -
+    t̄)².
+    """
+    when = dict(zip(plan.steps, times.tolist(), strict=True))
+    unloaded = {(s.pose, s.cycle): t for s, t in when.items() if s.load == UNLOADED}
+    taken = [s for s in plan.steps if s.pose != REFERENCE]
+    pairs = [s for s in taken if s.load != UNLOADED and (s.pose, s.cycle) in unloaded]
+    rows = pairs or taken
+    lag = np.array([when[s] - (unloaded[s.pose, s.cycle] if pairs else 0.0) for s in rows])
+    q = np.array([plan.joints(s.pose) for s in rows]).reshape(len(rows), plan.q.shape[1])
+    wrench = np.array([wrenches[s.load] if s.load != UNLOADED else np.zeros(6) for s in rows])
+    slope = _slope_std(plan, times, reading_std)
+    names, columns = _regressors(q, wrench.reshape(-1, 6), product=bool(pairs))
+    if not rows or not names:
+        return Confounding(0, 0.0, "", 0.0, 0.0, drift, 0.0, 0.0, slope)
+    if not pairs:
+        lag, columns = lag - lag.mean(), columns - columns.mean(axis=0)
+    size = np.linalg.norm(lag) * np.linalg.norm(columns, axis=0)
+    tiny = 1e-12 * np.linalg.norm(lag) * np.sqrt(len(lag))
+    rho = np.abs(lag @ columns) / np.where(size > tiny, size, np.inf)
+    worst, mean, rms = int(np.argmax(rho)), float(lag.mean()), float(np.sqrt(np.mean(lag**2)))
+    return Confounding(
+        len(pairs), float(rho[worst]), names[worst], mean, rms, drift, drift * rms, drift * mean,
+        slope,
+    )  # fmt: skip
+
+
+def _regressors(q: Floats, wrench: Floats, *, product: bool) -> tuple[list[str], Floats]:
+    """Names and (N, k) columns; cos and sin times the wrench where they are products."""
+    turns = (("cos", np.cos), ("sin", np.sin))
+    turned = [(f"{w} q{j + 1}", f(q[:, j])) for w, f in turns for j in range(q.shape[1])]
+    live = np.flatnonzero(np.any(wrench != 0, axis=0)).tolist()
+    out = [(_WRENCH[k], wrench[:, k]) for k in live]
+    if product:
+        out += [(f"{_WRENCH[k]} {name}", wrench[:, k] * x) for k in live for name, x in turned]
+    else:
+        out += turned
+    return [name for name, _ in out], np.array([x for _, x in out]).reshape(len(out), -1).T
+
+
+def _slope_std(plan: Plan, times: Floats, reading_std: float) -> float | None:
+    """Standard uncertainty of a drift's rate from the readings at the reference pose, m/s."""
+    here: dict[str, list[float]] = {}
+    for s, t in zip(plan.steps, times.tolist(), strict=True):
+        if s.pose == REFERENCE:
+            here.setdefault(s.load, []).append(t)
+    moment = sum(len(some) * float(np.var(some)) for some in here.values())
+    return reading_std / float(np.sqrt(moment)) if moment > 0 else None
+
 
 _SHRINK = 0.75  # of the time given to the walks, where a draw became too long; a choice
 _TRIES = 10  # draws of one order that may become too long; a choice
 _MOVES = 30  # steps of a random walk per stop; a choice: each stop is moved many times
-Passable = Callable[[Floats, Floats, str], Bools]
-"""passable(start (n,), ends (M, n), load) -> (M,): which straight motions in joint space are
-clear under a load."""
-NEAR = 24
-"""Neighbours of a pose to which motions are tested; to others the arm goes by the reference.
-A choice."""
+Passable = Callable[[Floats, Floats, str], Bools]  # start (n,), ends (M, n), load -> (M,)
+NEAR = 24  # neighbours to which motions are tested, else by the reference; a choice
 _ALL = 6  # loads up to which every order is tried
 
 
 @dataclass(frozen=True, slots=True)
 class PlannedStop:
-    """A reading at a pose under the load of its block.
+    """A reading at a pose under the load of its block."""
 
-    Attributes:
-        pose: index from 1; 0 is the reference.
-    """
-
-    pose: int
+    pose: int  # index from 1; 0 is the reference
     cycle: int
 
 
 @dataclass(frozen=True, slots=True)
 class LoadBlock:
-    """What is measured while one load hangs.
-
-    Attributes:
-        loops: stops of each loop from the reference.
-        seconds: what the loops take, s.
-    """
+    """What is measured while one load hangs."""
 
     load: str
-    loops: tuple[tuple[PlannedStop, ...], ...]
-    seconds: float
+    loops: tuple[tuple[PlannedStop, ...], ...]  # stops of each loop from the reference
+    seconds: float  # what the loops take, s
 
     @property
     def count(self) -> int:
@@ -65,15 +217,10 @@ class LoadBlock:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ways:
-    """Ways under one load between the reference, index 0, and P poses.
+    """Ways under one load between the reference, index 0, and P poses."""
 
-    Attributes:
-        direct: (P + 1, P + 1) seconds of straight motions, `NEVER` where none is known clear.
-        seconds: the same, or by the reference with a reading there where that is needed.
-    """
-
-    direct: Floats
-    seconds: Floats
+    direct: Floats  # (P + 1, P + 1) seconds of straight motions, `NEVER` where none is known clear
+    seconds: Floats  # the same, or by the reference with a reading there where that is needed
 
     def among(self, which: Ints) -> "Ways":
         """Return the ways between the reference and some stops, poses (m,) from 1.
@@ -86,61 +233,42 @@ class Ways:
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """Readings to take at a pose.
-
-    Attributes:
-        loads: under which loads, "none" among them where it is measured unloaded.
-        count: how often all of it; each time is a cycle of its own.
-    """
+    """Readings to take at a pose."""
 
     pose: str
-    loads: tuple[str, ...]
-    count: int = 1
+    loads: tuple[str, ...]  # under which loads, "none" among them where it is measured unloaded
+    count: int = 1  # how often all of it; each time is a cycle of its own
 
 
 @dataclass(frozen=True, slots=True)
 class Ordering:
-    """How to order.
+    """How to order."""
 
-    Attributes:
-        slack: share of the shortest campaign that may be spent on a random order; 0 for the
-            shortest order. With 40 poses and four loads ρ falls from 0.64 to 0.14 for 2 %, and
-            no further for 30 %.
-        unloaded: "around" takes half of the unloaded readings before the loads and half after,
-            "first" all before: deflections are then known while the loads are measured.
-        reference_every_s: longest time between two readings at the reference pose, s.
-        repeats: poses that are measured unloaded a second time, for the arm's repeatability.
-        draws: random orders of which the least confounded is taken.
-        drift: rate of the drift that figures are stated for, in one coordinate, m/s. There is
-            no figure for all cells; 20 µm/h is a tenth of the drift that the effect
-            `tracker_drift` takes as ordinary in a campaign of an hour.
-        reading_std: standard uncertainty of a reading in one coordinate, m.
-    """
-
+    # share of the shortest campaign that may be spent on a random order; 0 for the shortest order.
+    # With 40 poses and four loads ρ falls from 0.64 to 0.14 for 2 %, and no further for 30 %.
     slack: float = 0.05
+    # "around" takes half of the unloaded readings before the loads and half after, "first" all
+    # before: deflections are then known while the loads are measured
     unloaded: Literal["around", "first"] = "around"
-    reference_every_s: float = 900.0
-    repeats: int = 2
-    draws: int = 16
+    reference_every_s: float = 900.0  # longest time between two readings at the reference pose, s
+    repeats: int = 2  # poses that are measured unloaded a second time, for the arm's repeatability
+    draws: int = 16  # random orders of which the least confounded is taken
+    # rate of the drift that figures are stated for, in one coordinate, m/s. There is no figure for
+    # all cells; 20 µm/h is a tenth of the drift that the effect `tracker_drift` takes as ordinary
+    # in a campaign of an hour.
     drift: float = 20e-6 / 3600
-    reading_std: float = 15e-6
+    reading_std: float = 15e-6  # standard uncertainty of a reading in one coordinate, m
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ordered:
-    """A plan and what its order costs and loses.
+    """A plan and what its order costs and loses."""
 
-    Attributes:
-        plan: the plan; `about` holds these figures too.
-        shortest: of the shortest order with the same readings.
-        confounding_shortest: of the shortest order.
-    """
-
-    plan: Plan
+    plan: Plan  # the plan; `about` holds these figures too
     duration: Duration
-    shortest: Duration
+    shortest: Duration  # of the shortest order with the same readings
     confounding: Confounding
-    confounding_shortest: Confounding
+    confounding_shortest: Confounding  # of the shortest order
 
     @property
     def longer(self) -> float:
@@ -151,9 +279,9 @@ class Ordered:
 def order_plan(
     cell: Cell,
     config: CellConfig,
-    names: Sequence[str],
-    q: Floats,
-    reference: Floats,
+    names: Sequence[str],  # (P) names of poses
+    q: Floats,  # (P, n) their joint angles, rad
+    reference: Floats,  # (n,) joint angles of the reference pose, rad
     chosen: Sequence[Chosen],
     passable: Passable,
     rng: np.random.Generator,
@@ -161,32 +289,18 @@ def order_plan(
 ) -> Ordered:
     """Put chosen readings in order.
 
-    Time. Every load is hung once. Under a load the arm goes along a short tour in the metric of
-    the leading joint's time, cut into loops from the reference pose so that this is read every
-    so many minutes, also loaded, and before and after each load; where no straight motion is
-    clear it goes by the reference, which then counts as a return.
+    Every load is hung once. Under a load the arm goes along a short tour in the metric of the
+    leading joint's time, cut into loops from the reference pose so that this is read every so many
+    minutes; where no straight motion is clear it goes by the reference, which then counts as a
+    return.
 
-    Loss. Readings of a pose under different loads are far apart in time, so that a drift looks
-    like a load, or like a pose. What is lost is stated as ρ², see `Confounding`: the share of
-    its information that the parameter hit hardest loses where the drift has to be estimated as
-    well; and as the error of a deflection where it is not. Three things keep it small:
-    - half of the unloaded readings, drawn at random, come after the loads: lags of both signs,
-      at no cost but a second tour;
-    - loads in the order that is least correlated with time, which costs nothing, since every
-      load begins and ends at the reference;
-    - orders drawn at random among those whose campaign is at most 1 + slack times the shortest:
-      walks through the orders, loops in random order and direction. Of some draws the one with
-      the least ρ is taken (rerandomisation, Morgan & Rubin 2012, Ann. Statist. 40, 1263): the
-      order stays random towards everything that is no regressor, such as temperatures.
-
-    Args:
-        names: (P) names of poses.
-        q: (P, n) their joint angles, rad.
-        reference: (n,) joint angles of the reference pose, rad.
-
-    Raises:
-        InputError: nothing is chosen, or a name is unknown.
-        CannotAnswerError: a pose cannot be reached from the reference under a load.
+    Readings of a pose under different loads are far apart in time, so that a drift looks like a
+    load, or like a pose. What is lost is stated as ρ², see `Confounding`. It is kept small by
+    - half of the unloaded readings, drawn at random, after the loads: lags of both signs;
+    - loads in the order that is least correlated with time;
+    - random orders of campaigns that take at most 1 + slack times the shortest; of some draws the
+      one with the least ρ (rerandomisation, Morgan & Rubin 2012, Ann. Statist. 40, 1263), so that
+      it stays random towards everything that is no regressor, such as temperatures.
     """
     how = how or Ordering()
     _check(config, names, chosen, how)
@@ -226,7 +340,6 @@ def order_plan(
 def _check(
     config: CellConfig, names: Sequence[str], chosen: Sequence[Chosen], how: Ordering
 ) -> None:
-    """Refuse what cannot be."""
     if not chosen:
         raise InputError("no reading is chosen; a plan needs at least one")
     if how.slack < 0 or how.reference_every_s <= 0 or how.repeats < 0:
@@ -270,26 +383,17 @@ def stops_of(
 
 @dataclass(slots=True)
 class OrderDraws:
-    """Plans of the same readings in different orders: short ones and random ones.
-
-    Attributes:
-        config: its loads, motion and acquisition.
-        names: (P) names of the poses that are measured.
-        q: (P + 1, n) joint angles of the reference and of these, rad.
-        stops: by load.
-        ways: between the stops under each load.
-        short: shortest order of the stops under each load, counted from 1.
-    """
+    """Plans of the same readings in different orders: short ones and random ones."""
 
     cell: Cell
-    config: CellConfig
-    names: tuple[str, ...]
-    q: Floats
+    config: CellConfig  # its loads, motion and acquisition
+    names: tuple[str, ...]  # (P) names of the poses that are measured
+    q: Floats  # (P + 1, n) joint angles of the reference and of these, rad
     how: Ordering
     rng: np.random.Generator
-    stops: dict[str, list[PlannedStop]] = field(default_factory=dict)
-    ways: dict[str, Ways] = field(default_factory=dict)
-    short: dict[str, list[int]] = field(default_factory=dict)
+    stops: dict[str, list[PlannedStop]] = field(default_factory=dict)  # by load
+    ways: dict[str, Ways] = field(default_factory=dict)  # between the stops under each load
+    short: dict[str, list[int]] = field(default_factory=dict)  # order of the stops, from 1
 
     @property
     def pace(self) -> Pace:
@@ -325,12 +429,7 @@ class OrderDraws:
         return self._plan(self.short, half=False, mixed=False)
 
     def _plan(self, orders: Mapping[str, Sequence[int]], *, half: bool, mixed: bool) -> Plan:
-        """Return the plan for an order of the stops under each load.
-
-        Args:
-            half: whether the second half of the unloaded order comes after the loads.
-            mixed: whether loops come in random order and direction.
-        """
+        """Return the plan for an order of the stops; loops may be mixed at random."""
         loads = [load for load in self.stops if load != UNLOADED]
         free = list(orders.get(UNLOADED, ()))
         cut = (len(free) + 1) // 2 if half else len(free)
@@ -366,7 +465,6 @@ class OrderDraws:
         return self._plan(orders, half=half, mixed=True)
 
     def _part(self, seconds: Floats, part: list[int]) -> list[int]:
-        """Return a short tour of some of the stops."""
         at = [0, *part]
         return [at[k] for k in tour.improved(seconds[np.ix_(at, at)], range(1, len(at)))]
 
@@ -409,13 +507,7 @@ class OrderDraws:
 
 
 def ways(q: Floats, load: str, passable: Passable, pace: Pace, near: int = NEAR) -> Ways:
-    """Return the ways between poses under a load.
-
-    Args:
-        q: (P + 1, n) joint angles, rad; the reference first.
-        load: name of the load that hangs.
-        near: neighbours to which motions are tested; the nearest in time.
-    """
+    """Return the ways between poses (P + 1, n) under a load, the reference first."""
     legs = pace.legs(q, q)
     count = len(q)
     close = np.argsort(legs, axis=1, kind="stable")[:, : near + 1]
@@ -435,17 +527,14 @@ def ways(q: Floats, load: str, passable: Passable, pace: Pace, near: int = NEAR)
 
 
 def load_order(
-    before: LoadBlock,
-    loaded: Sequence[LoadBlock],
-    after: LoadBlock,
-    wrenches: Mapping[str, Floats],
-    at: Pace,
-) -> list[int]:
+    before: LoadBlock, loaded: Sequence[LoadBlock], after: LoadBlock,
+    wrenches: Mapping[str, Floats], at: Pace,
+) -> list[int]:  # fmt: skip
     """Return the order of the loads whose wrenches are least correlated with their lags.
 
-    With the middle t_l of the time of each load, t0 the mean time of the unloaded readings and
-    n_l readings it is the least max over components k of |Σ n w_k (t - t0)| / (|w_k| |t - t0|),
-    the lengths weighted by n as well. Of equal orders the first one in the order given.
+    With the middle t_l of the time of each load, t0 the mean time of the unloaded readings and n_l
+    readings it is the least max over components k of |Σ n w_k (t - t0)| / (|w_k| |t - t0|), the
+    lengths weighted by n as well.
     """
     count = len(loaded)
     if count < 2:
@@ -476,8 +565,7 @@ def assembled(
 ) -> tuple[Step, ...]:
     """Return the steps of the blocks; the reference is read before and after every loop.
 
-    Unloaded readings there are cycles 0, 1, ...; those under a load share their cycles, spread
-    over all of them, so that each has its unloaded one.
+    Unloaded readings there are cycles 0, 1, ...; those under a load share their cycles.
     """
     free = (*before.loops, *after.loops)
     passes = max([len(block.loops) + 1 for block in loaded], default=0)

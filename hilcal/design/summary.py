@@ -9,12 +9,11 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from hilcal.config import CellConfig
-from hilcal.design.candidates import reading_derivatives
 from hilcal.design.choice import choose, choose_poses, compound_objective, only, unknown
-from hilcal.design.information import DesignProblem
+from hilcal.design.information import DesignProblem, reading_derivatives
 from hilcal.design.planner import Planned, Say
-from hilcal.design.predicted import PredictedUncertainty, predicted
-from hilcal.design.timing import Confounding, Duration
+from hilcal.design.predicted import predicted
+from hilcal.design.run_order import Confounding, Duration
 from hilcal.effects.protocol import FRAME_ROLES, Role
 from hilcal.errors import CannotAnswerError
 from hilcal.regression.schur import schur_complement
@@ -22,18 +21,14 @@ from hilcal.regression.spectrum import VISIBLE
 from hilcal.store.plan import REFERENCE
 from hilcal.types import Floats
 
-COMPARED = ("D", "A", "E", "K", "I")
-"""Criteria of the comparison: all but T-optimality, which needs suspects."""
-SHARES = (0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
-"""Budgets of the sample-size curve by the plan's own. A choice."""
-WORTH = 0.9
-"""Efficiency of a plan below which it is said what another one would give; a choice."""
+COMPARED = ("D", "A", "E", "K", "I")  # all but T-optimality, which needs suspects
+SHARES = (0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)  # budgets of the curve by the plan's; a choice
+WORTH = 0.9  # Efficiency of a plan below which it is said what another one would give; a choice
 _LEFT_OUT = {
     "deflection": "geometry, registration, repeatability and effects outside of the model",
     "position": "repeatability and effects outside of the model",
 }
-DRAWS = 5
-"""Random directions of an effect whose median is its minimum detectable strength. A choice."""
+DRAWS = 5  # random directions of an effect, of whose strengths the median counts; a choice
 _SEED = 20240611
 
 
@@ -112,44 +107,27 @@ class CurvePoint:
 
 @dataclass(frozen=True, slots=True)
 class PlanSummary:
-    """Cost, predicted precision and efficiency of a plan.
+    """Cost, predicted precision and efficiency of a plan."""
 
-    Attributes:
-        poses: number of poses beside the reference.
-        readings: of all, those at the reference included.
-        loads: readings by load, "none" among them, in the order in which they are hung.
-        efficiency: certified lower bound of the efficiency; None without a certificate.
-        parameters: predicted precision by parameter.
-        position_std_m: RMS standard uncertainty of the prediction at the prediction poses, m; None
-            without. It is not the accuracy of the robot, see `position_note`.
-        position: what is predicted there, e.g. "deflection under 5kg at 100 poses".
-        criteria: criterion comparison, the plan's own among them.
-        curve: sample-size curve, fewest poses first.
-        detectable: minimum detectable effects.
-        longer: share of time beyond the shortest order.
-        confounding: of the plan's order with a linear drift; None where it is not known.
-        shortest: confounding of the shortest order.
-        remarks: assumptions and omissions, one sentence each.
-        asked_poses: poses that were asked for, see `planner.Request`; None where readings were.
-    """
-
-    poses: int
-    readings: int
-    loads: dict[str, int]
+    poses: int  # number of poses beside the reference
+    readings: int  # of all, those at the reference included
+    loads: dict[str, int]  # readings by load, "none" among them, in their order
     duration: Duration
     criterion: str
-    efficiency: float | None
-    parameters: tuple[PredictedParameter, ...]
+    efficiency: float | None  # certified lower bound of the efficiency; None without a certificate
+    parameters: tuple[PredictedParameter, ...]  # predicted precision by parameter
+    # RMS standard uncertainty of the prediction at the prediction poses, m; None without. It is not
+    # the accuracy of the robot, see `position_note`.
     position_std_m: float | None
-    position: str = ""
-    criteria: tuple[CriterionResult, ...] = ()
-    curve: tuple[CurvePoint, ...] = ()
-    detectable: tuple[DetectableEffect, ...] = ()
-    longer: float = 0.0
-    confounding: Confounding | None = None
-    shortest: Confounding | None = None
-    remarks: tuple[str, ...] = ()
-    asked_poses: int | None = None
+    position: str = ""  # what is predicted there, e.g. "deflection under 5kg at 100 poses".
+    criteria: tuple[CriterionResult, ...] = ()  # criterion comparison, the plan's own among them
+    curve: tuple[CurvePoint, ...] = ()  # sample-size curve, fewest poses first
+    detectable: tuple[DetectableEffect, ...] = ()  # minimum detectable effects
+    longer: float = 0.0  # share of time beyond the shortest order
+    confounding: Confounding | None = None  # of the order with a linear drift
+    shortest: Confounding | None = None  # confounding of the shortest order
+    remarks: tuple[str, ...] = ()  # assumptions and omissions, one sentence each
+    asked_poses: int | None = None  # see `planner.Request`; None where readings were
 
     @property
     def quantity(self) -> str:
@@ -180,18 +158,13 @@ class PlanSummary:
             }
         same = ("poses", "readings", "criterion", "efficiency", "position_std_m", "parameters")
         return {
-            **{key: known[key] for key in same},
-            "asked_poses": self.asked_poses,
-            "position": self.position,
-            "position_note": self.position_note,
+            **{key: known[key] for key in same}, "asked_poses": self.asked_poses,
+            "position": self.position, "position_note": self.position_note,
             "predicted_std": {p.name: p.std for p in self.parameters},
-            "readings_by_load": self.loads,
-            "criteria": known["criteria"],
-            "curve": known["curve"],
-            "detectable": known["detectable"],
-            "order": order,
+            "readings_by_load": self.loads, "criteria": known["criteria"],
+            "curve": known["curve"], "detectable": known["detectable"], "order": order,
             "remarks": list(self.remarks),
-        }
+        }  # fmt: skip
 
 
 def summarise(
@@ -200,37 +173,25 @@ def summarise(
     rng: np.random.Generator,
     say: Say = lambda words: None,
     *,
-    compare: bool = True,
-    curve: bool = True,
+    compare: bool = True,  # whether to compute the criterion comparison
+    curve: bool = True,  # whether to compute the sample-size curve
 ) -> PlanSummary:
-    """Return the summary of a plan.
-
-    Args:
-        compare: whether to compute the criterion comparison.
-        curve: whether to compute the sample-size curve.
-    """
+    """Return the summary of a plan."""
     plan, knows = planned.ordered.plan, planned.predicted
     if compare or curve:
         say("comparing criteria and numbers of poses" if compare else "comparing numbers of poses")
     return PlanSummary(
-        poses=len({s.pose for s in plan.steps} - {REFERENCE}),
-        readings=len(plan.steps),
+        poses=len({s.pose for s in plan.steps} - {REFERENCE}), readings=len(plan.steps),
         loads={name: sum(s.load == name for s in plan.steps) for name in plan.loads},
-        duration=planned.ordered.duration,
-        criterion=planned.criterion,
-        efficiency=planned.design.efficiency,
-        parameters=_parameters(planned),
-        position_std_m=_finite(knows.position),
-        position=planned.work.what,
+        duration=planned.ordered.duration, criterion=planned.criterion,
+        efficiency=planned.design.efficiency, parameters=_parameters(planned),
+        position_std_m=_finite(knows.position), position=planned.work.what,
         criteria=tuple(_criteria(planned, config, rng)) if compare else (),
         curve=tuple(_curve(planned)) if curve else (),
-        detectable=tuple(detectable_effects(planned, config)),
-        longer=planned.ordered.longer,
-        confounding=planned.ordered.confounding,
-        shortest=planned.ordered.confounding_shortest,
-        remarks=remarks(planned),
-        asked_poses=planned.asked_poses,
-    )
+        detectable=tuple(detectable_effects(planned, config)), longer=planned.ordered.longer,
+        confounding=planned.ordered.confounding, shortest=planned.ordered.confounding_shortest,
+        remarks=remarks(planned), asked_poses=planned.asked_poses,
+    )  # fmt: skip
 
 
 def position_note(quantity: str) -> str:
@@ -242,7 +203,6 @@ def position_note(quantity: str) -> str:
 
 
 def _parameters(planned: Planned) -> tuple[PredictedParameter, ...]:
-    """Return the predicted precision of each parameter, in the order of the model."""
     knows, frames = planned.predicted, _prefixes(planned.problem, *FRAME_ROLES)
     known = {
         name: PredictedParameter(name, float(std), float(value) or None, unit)
@@ -313,7 +273,6 @@ def _finite(value: float | None) -> float | None:
 def _criteria(
     planned: Planned, config: CellConfig, rng: np.random.Generator
 ) -> Iterator[CriterionResult]:
-    """Yield the design of each criterion with as many readings."""
     of = planned.problem
     for name in dict.fromkeys((*COMPARED, planned.criterion)):
         if name == planned.criterion:
@@ -341,12 +300,18 @@ def _result(planned: Planned, name: str, counts: Floats, efficiency: float) -> C
     sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(left), 0.0))
     alone = np.sqrt(np.maximum(np.linalg.eigvalsh(known[np.ix_(free, free)]), 0.0))
     readings = float(counts @ of.units.cost)
+    baseline = _prefixes(of, "baseline")
+    shares = [
+        std / abs(value)
+        for name, std, value in zip(knows.names, knows.std, knows.values, strict=True)
+        if name.startswith(baseline) and value
+    ]
     volume = float(np.exp(np.mean(np.log(np.maximum(sigma, 1e-300)))))
     return CriterionResult(
         criterion=name,
         position_std_m=_finite(knows.position),
         position_open_m=_finite(knows.position_open),
-        joint_share=_joint_share(knows, _prefixes(of, "baseline")),
+        joint_share=_finite(max(shares)) if shares else None,
         o1=volume / np.sqrt(readings),
         o2=float(alone[0] / alone[-1]),
         o3=float(sigma[0]),
@@ -355,22 +320,10 @@ def _result(planned: Planned, name: str, counts: Floats, efficiency: float) -> C
 
 
 def _prefixes(of: DesignProblem, *roles: Role) -> tuple[str, ...]:
-    """Return what the names of the parameters of some roles begin with."""
     return tuple(f"{e.name}." for e in of.nominal.model.effects if e.role in roles)
 
 
-def _joint_share(knows: PredictedUncertainty, joints: tuple[str, ...]) -> float | None:
-    """Largest relative standard uncertainty of a joint compliance."""
-    shares = [
-        std / abs(value)
-        for name, std, value in zip(knows.names, knows.std, knows.values, strict=True)
-        if name.startswith(joints) and value
-    ]
-    return _finite(max(shares)) if shares else None
-
-
 def _curve(planned: Planned) -> Iterator[CurvePoint]:
-    """Yield the sample-size curve, of continuous optima."""
     of = planned.problem
     asked, usable = only(planned.asked, planned.usable), np.flatnonzero(planned.usable)
     own = len({of.what[k][0] for k in np.flatnonzero(planned.counts)})
@@ -390,8 +343,8 @@ def _curve(planned: Planned) -> Iterator[CurvePoint]:
 def detectable_effects(planned: Planned, config: CellConfig) -> Iterator[DetectableEffect]:
     """Yield the minimum detectable strength of each effect outside of the model.
 
-    Of some directions of the effect's parameters the median: rms of the displacement, over the
-    plan's poses and loads, divided by the root of the non-centrality beyond the model.
+    The median over some directions of its parameters: rms of the displacement over the plan's poses
+    and loads, divided by the root of the non-centrality beyond the model.
     """
     of, size = planned.problem, planned.problem.model_size
     taken = np.flatnonzero(planned.counts)

@@ -9,10 +9,9 @@ from itertools import pairwise, permutations
 
 import numpy as np
 
-from hilcal.types import Floats, Ints
+from hilcal.types import Floats
 
-NEVER = 1e7
-"""Seconds of a way that does not exist: more than any campaign, so that sums stay exact."""
+NEVER = 1e7  # Seconds of a way that does not exist: more than any campaign, so that sums stay exact
 _EXACT = 7  # stops up to which every order is tried
 _LONGEST = 3  # stops of a segment that is moved as one
 _GAIN = 1e-9  # s, below which a change is rounding
@@ -27,11 +26,8 @@ def length(seconds: Floats, order: Sequence[int]) -> float:
 def shortest(seconds: Floats, rng: np.random.Generator, kicks: int = 20) -> list[int]:
     """Return an order of stops 1 to m whose tour is short; the shortest up to 7 stops.
 
-    Nearest insertion, then 2-opt and Or-opt exchanges until none helps, then the same again
-    after each of some double bridges (Martin, Otto & Felten 1991), of which the best is kept.
-
-    Args:
-        seconds: (m + 1, m + 1), also asymmetric.
+    Nearest insertion, then 2-opt and Or-opt exchanges until none helps, then the same again after
+    each of some double bridges (Martin, Otto & Felten 1991), of which the best is kept.
     """
     count = len(seconds) - 1
     if count <= _EXACT:
@@ -47,7 +43,6 @@ def shortest(seconds: Floats, rng: np.random.Generator, kicks: int = 20) -> list
 
 
 def _by_trial(seconds: Floats) -> list[int]:
-    """Return the best of all orders."""
     count = len(seconds) - 1
     if count == 0:
         return []
@@ -89,9 +84,7 @@ def improved(seconds: Floats, order: Sequence[int]) -> list[int]:
     return [int(k) for k in way[1:-1]]
 
 
-_Change = tuple[float, int, int, int, bool]
-"""Seconds gained (negative), first and last place of a part, after which place it is put (one
-outside of the part), and whether it is turned round."""
+_Change = tuple[float, int, int, int, bool]  # s gained, part, place to be put, turned
 
 
 def _turn_cost(p: Floats) -> Floats:
@@ -136,15 +129,10 @@ def _moved(p: Floats) -> _Change:
 def shaken(
     seconds: Floats, order: Sequence[int], budget: float, rng: np.random.Generator, moves: int
 ) -> list[int]:
-    """Return a random order whose tour takes at most `budget`, or no longer than `order`'s.
+    """Return a random order whose tour takes at most `budget`, s, or no longer than `order`'s.
 
-    A random walk by turns and moves of parts; a step that would exceed the budget is not taken.
-    Turns and moves are as probable as their inverses, so that a long walk comes to every order
-    within the budget that it can reach with the same probability.
-
-    Args:
-        seconds: (m + 1, m + 1).
-        budget: s.
+    A random walk by turns and moves of parts, which are as probable as their inverses; a step that
+    would exceed the budget is not taken.
     """
     way = [0, *order, 0]
     here, count = length(seconds, order), len(order)
@@ -178,19 +166,10 @@ def shaken(
 def loops(
     direct: Floats, order: Sequence[int], reading_s: float, limit_s: float
 ) -> list[list[int]] | None:
-    """Return a tour cut into loops from the reference, each within the limit, in least time.
+    """Return a tour cut into loops from the reference in least time; None if there is none.
 
-    Dynamic programming over the places where the tour may be cut (Beasley 1983, route first and
-    cluster second): T(j) = min over i of T(i) + loop(i + 1 … j). A loop of one stop is always
-    allowed.
-
-    Args:
-        direct: (m + 1, m + 1) s, `NEVER` where no straight motion is clear.
-        reading_s: s at each stop and at the reference.
-        limit_s: s from leaving the reference to coming back.
-
-    Returns:
-        The loops in order; None where there is no such tour.
+    Dynamic programming over the places where the tour may be cut (Beasley 1983): T(j) = min over i
+    of T(i) + loop(i + 1 … j). A loop of one stop is always allowed.
     """
     count = len(order)
     best, cut = np.full(count + 1, np.inf), np.zeros(count + 1, dtype=np.int64)
@@ -212,14 +191,8 @@ def loops(
                 best[j + 1], cut[j + 1] = best[i] + whole + reading_s, i
     if not np.isfinite(best[count]):
         return None
-    return _parts(order, cut)
-
-
-def _parts(order: Sequence[int], cut: Ints) -> list[list[int]]:
-    """Follow the cuts from the end."""
-    out, j = [], len(order)
-    while j > 0:
-        i = int(cut[j])
-        out.append(list(order[i:j]))
-        j = i
+    out, j = [], count
+    while j > 0:  # follow the cuts from the end
+        out.append(list(order[int(cut[j]) : j]))
+        j = int(cut[j])
     return out[::-1]

@@ -10,8 +10,9 @@ from itertools import groupby
 
 import numpy as np
 
-from hilcal.diagnosis.effect_ranking import Detection, LeftOut, Suspect
+from hilcal.diagnosis.effect_ranking import SAME_EVIDENCE, Detection, LeftOut, Suspect
 from hilcal.diagnosis.minimum_detectable_effect import Strength
+from hilcal.identification.background import UNSURE
 from hilcal.identification.fit import Fit, all_left_out
 from hilcal.identification.linearisation import HeldOut
 from hilcal.identification.mixed_fit import (
@@ -111,12 +112,12 @@ def background_evidence(fit: Fit) -> tuple[BackgroundEffect, ...]:
     found = mixed_fit_at(model, kept, fit.mode, fit.theta)
     problem, log_std = found.equations.problem, found.log_std
     rng, families = np.random.default_rng(SEED), problem.families.random
-    moves = _motion(fit)
+    moves, most = _motion(fit), {e.name: e.most() for e in model.effects}
     tested = []
     numbered = [(k, f) for k, f in enumerate(families) if f.effect in model.background]
     for name, own in groupby(numbered, lambda kf: kf[1].effect):
         mine = list(own)
-        test = evidence(problem, [k for k, _ in mine], rng, log_std)
+        test = evidence(problem, [k for k, _ in mine], rng, log_std, UNSURE * most[name])
         if not test.rank:
             continue
         index = np.concatenate([f.parameters for _, f in mine])
@@ -157,8 +158,13 @@ def _white(e: Equations, numbers: list[int]) -> float:
 
 
 def proved(found: tuple[BackgroundEffect, ...]) -> tuple[str, ...]:
-    """Names of those that are proved, the strongest evidence first."""
-    return tuple(b.effect for b in found if b.p_value * len(found) < PROVED)
+    """Names of those that are proved, the strongest evidence first.
+
+    The likelihood must rise beyond 20 : 1 at a plausible size: the p-value alone says nothing of
+    an effect that would have to be far larger.
+    """
+    sure = [b for b in found if b.ratio > 2 * SAME_EVIDENCE]
+    return tuple(b.effect for b in sure if b.p_value * len(found) < PROVED)
 
 
 def as_suspects(found: tuple[BackgroundEffect, ...]) -> Iterator[Suspect]:

@@ -25,8 +25,7 @@ from hilcal.diagnosis.change_candidates import Candidate, candidates
 from hilcal.diagnosis.change_found import Change, Changes, ChangeSize, Limit
 from hilcal.diagnosis.effect_ranking import SAME_EVIDENCE
 from hilcal.errors import CannotAnswerError
-from hilcal.identification.earlier_fit import EarlierFit
-from hilcal.identification.later_readings import Remeasured, Setting, remeasure
+from hilcal.identification.later_readings import EarlierFit, Remeasured, Setting, remeasure
 from hilcal.regression.evidence import FamilyScore, log_evidence, score_family
 from hilcal.regression.power import noncentrality_of_power
 from hilcal.regression.spectrum import visible

@@ -13,8 +13,7 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.effects.catalogue import Catalogue
-from hilcal.effects.changed import Changeable, Directions, Kind
-from hilcal.effects.protocol import Effect
+from hilcal.effects.protocol import Changeable, Directions, Effect, Kind
 from hilcal.identification.later_readings import Moving
 from hilcal.readings.readings import States
 from hilcal.types import Floats

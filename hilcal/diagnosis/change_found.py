@@ -3,9 +3,8 @@
 from dataclasses import dataclass
 
 from hilcal.diagnosis.change_candidates import Candidate
-from hilcal.effects.changed import Changeable
-from hilcal.identification.earlier_fit import EarlierFit
-from hilcal.identification.later_readings import Remeasured
+from hilcal.effects.protocol import Changeable
+from hilcal.identification.later_readings import EarlierFit, Remeasured
 
 UNEXPLAINED = 1e-3
 """Level at which what is left after all changes is called unexplained; a choice."""

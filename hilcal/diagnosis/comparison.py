@@ -7,12 +7,11 @@ from scipy.stats import f as f_distribution
 
 from hilcal.diagnosis.change import LEVEL
 from hilcal.diagnosis.change_found import Changes
-from hilcal.identification.extrapolation import Extrapolation, extrapolation
 from hilcal.identification.fit import Fit
 from hilcal.identification.later_readings import Setting, beside_frames, frames_alone, remeasure
-from hilcal.identification.parameter_differences import Differences
+from hilcal.identification.posterior import Differences
 from hilcal.identification.residual import error_block
-from hilcal.identification.validation import Validation
+from hilcal.identification.validation import Extrapolation, Validation, extrapolation
 from hilcal.readings.whitening import Mode
 from hilcal.shown import Shown
 

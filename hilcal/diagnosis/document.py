@@ -11,6 +11,7 @@ from hilcal.diagnosis.minimum_detectable_effect import Strength
 from hilcal.diagnosis.noise import PureError
 from hilcal.diagnosis.residual_regression import Dependence
 from hilcal.shown import presenter
+from hilcal.store.codec import encode
 
 if TYPE_CHECKING:
     from hilcal.diagnosis.diagnosis import Diagnosis
@@ -29,39 +30,25 @@ def to_json(d: "Diagnosis") -> dict[str, object]:
         "where": [asdict(v) for v in d.misfit_breakdown],
         "suspects": [suspect_json(s) for s in d.suspects],
         "not_shown": list(d.not_shown),
-        "tests": {
-            "count": d.tested,
-            "level": FALSE_ALARM,
-            "each": FALSE_ALARM / max(d.tested, 1),
-        },
+        "tests": {"count": d.tested, "level": FALSE_ALARM, "each": FALSE_ALARM / max(d.tested, 1)},
         "apart": [
             {"effect": a.effect, "unlike": a.unlike, "times": a.times if a.possible else None}
             for a in d.separability
         ],
-        "beyond": None
-        if d.insufficiency is None
-        else {
-            "effects": list(d.insufficiency.effects),
-            "refitted": d.insufficiency.refitted,
-            "share": d.insufficiency.share,
-            "variance_factor": d.insufficiency.variance_factor,
-        },
-        "background": [
-            {"effect": b.effect, "p_value": b.p_value, "rms_m": b.rms_m} for b in d.background
-        ],
+        "beyond": d.insufficiency
+        and _some(d.insufficiency, "effects", "refitted", "share", "variance_factor"),
+        "background": [_some(b, "effect", "p_value", "rms_m") for b in d.background],
         "wrong_figures": [asdict(f) for f in d.wrong_figures],
-        "pose_alone": None if d.pose_alone is None else asdict(d.pose_alone),
+        "pose_alone": d.pose_alone and asdict(d.pose_alone),
         "rejected": list(d.history.rejected),
         "alternatives": [
-            {"effect": a.effect, "same_as": list(a.same_as), "others": list(a.others)}
-            for a in d.alternatives
-            if a.inseparable
+            _some(a, "effect", "same_as", "others") for a in d.alternatives if a.inseparable
         ],
         "needless": list(d.redundant),
         "carriers": carriers(d.dependences),
-        "arm_scatter": None if d.scatter is None else d.scatter.to_json(),
-        "serial_noise": None if d.fit.readings.serial is None else d.fit.readings.serial.to_json(),
-        "pure_error": None if d.pure_error is None else repeats(d.pure_error),
+        "arm_scatter": d.scatter and d.scatter.to_json(),
+        "serial_noise": d.fit.readings.serial and d.fit.readings.serial.to_json(),
+        "pure_error": d.pure_error and repeats(d.pure_error),
     }
 
 
@@ -122,19 +109,10 @@ def repeats(e: PureError) -> dict[str, object]:
 
 def carriers(found: Sequence[Dependence]) -> list[dict[str, object]]:
     """Return variables that carry what is predictable, with their curves, SI units."""
-    return [
-        {
-            "variable": v.variable,
-            "unit": v.unit,
-            "share": v.share,
-            "moves": v.moves,
-            "direction": v.direction.tolist(),
-            "labels": list(v.labels),
-            "x": v.x.tolist(),
-            "y": v.y.tolist(),
-            "error": v.error.tolist(),
-            "y_unit": v.y_unit,
-            "determined": v.determined,
-        }
-        for v in found
-    ]
+    names = ("variable", "unit", "share", "moves", "direction", "labels", "x", "y", "error")
+    return [_some(v, *names, "y_unit", "determined") for v in found]
+
+
+def _some(of: object, *names: str) -> dict[str, object]:
+    """Return some attributes by name."""
+    return {name: encode(getattr(of, name)) for name in names}

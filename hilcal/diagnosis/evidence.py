@@ -41,7 +41,7 @@ from hilcal.diagnosis.wrong_figures import WrongFigure, wrong_figures
 from hilcal.effects.protocol import Effect
 from hilcal.errors import InputError
 from hilcal.identification.arm_scatter import estimate_arm_scatter, with_arm_scatter
-from hilcal.identification.carried_evidence import carried_effects, evidence_of_carried
+from hilcal.identification.drift import carried_effects, evidence_of_carried
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.linearisation import (
     Linearisation,

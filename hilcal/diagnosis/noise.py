@@ -17,7 +17,7 @@ from scipy.stats import f as f_distribution
 from hilcal.diagnosis.noise_where import NoiseWhere, noise_where
 from hilcal.diagnosis.repeats import contrasts
 from hilcal.identification.fit import Fit
-from hilcal.identification.variance_factor import variance_interval
+from hilcal.identification.residual import variance_interval
 
 FEWEST = 10
 """Degrees of freedom of pure error below which it is not used; a guess."""

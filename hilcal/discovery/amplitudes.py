@@ -8,16 +8,200 @@ two joints make together, is max(u − u0, 0) with u = cos q_5·cos q_6. A funct
 transmitted wrenches W by the chain rule, ∂f/∂W = f'(u) Σ w_i ∂φ_i/∂W.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
+from itertools import chain, combinations
+from types import CodeType
+from typing import Literal
 
 import numpy as np
 
 from hilcal.discovery.shapes import Numbers, Shape
-from hilcal.discovery.variables import Variable
+from hilcal.effects.force_sensor import recorded
 from hilcal.effects.protocol import Situation
 from hilcal.types import Floats
+
+Kind = Literal[
+    "angle", "sum", "torque", "force", "load", "gravity", "temperature", "time", "hanging", "side",
+    "place", "sight", "sensor", "composed",
+]  # fmt: skip
+VARIES = 1e-6  # Least spread, as a share of the largest value, of a quantity that counts as varying
+_AXES = "xyz"
+_COMPONENTS = tuple(
+    (c, *(("force", "f") if c < 3 else ("moment", "m")), _AXES[c % 3], "N" if c < 3 else "N·m")
+    for c in range(6)
+)
+"""Of a wrench: index, word, letter, axis, unit."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Variable:
+    """A recorded quantity."""
+
+    kind: Kind  # what functions of it are tried
+    names: tuple[str, ...]  # what the diagnosis calls it, or those that it is a sum of
+    symbol: str  # in formulas
+    latex: str  # likewise
+    unit: str  # SI; °C for temperatures, "1" for a number
+    code: str  # how an effect reads it of its situation s; the search reads it so, too
+    need: str = ""  # column of the readings that it needs; empty for none
+    slot: tuple[int, int] | None = None  # slot and component of the wrench that it is
+    joint: int = -1  # index of the joint that it belongs to; −1 for none
+    vector: str = ""  # what it is a component of; empty for none
+    axis: int = -1  # along which; −1 for none
+
+    def read(self, s: Situation) -> Floats:
+        """(N,) it in the states."""
+        known = {"np": np, "recorded": recorded, "s": s}
+        return np.asarray(eval(_compiled(self.code), known))  # noqa: S307 - made below
+
+    @property
+    def cost(self) -> int:
+        """Complexity that it adds to a function of it."""
+        return int(self.kind == "sum")
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Columns of the readings that it needs."""
+        return (self.need,) if self.need else ()
+
+    @property
+    def recorded(self) -> tuple["Variable", ...]:
+        """The recorded quantities that it is made of: itself."""
+        return (self,)
+
+    def slopes(self) -> tuple[tuple[tuple[int, int], str], ...]:
+        """Slots and components of the transmitted wrenches, and ∂x by each as Python."""
+        return () if self.slot is None else ((self.slot, ""),)
+
+
+@cache
+def _compiled(code: str) -> CodeType:
+    return compile(code, "<quantity>", "eval")
+
+
+def variables(s: Situation) -> list[Variable]:
+    """Return all quantities that vary over the states of a situation."""
+    n = s.angle.shape[1]
+    every = chain(_angles(s), _wrenches(n), _attitude(n), _recorded(s, n), _places())
+    found = ((v, v.read(s)) for v in every)
+    return [v for v, x in found if np.ptp(x) > VARIES * max(float(np.abs(x).max()), 1e-300)]
+
+
+def _angles(s: Situation) -> Iterator[Variable]:
+    """Angles of joints and their sums; of a joint that slides the phase of its travel, φ."""
+    arm = s.cell.arm
+    for j, slides in enumerate(arm.slides.tolist()):
+        letter, latex = ("φ", r"\phi") if slides else ("q", "q")
+        yield Variable(
+            "angle", (f"joint {j + 1} {arm.kind(j)}",), f"{letter}_{j + 1}", f"{latex}_{j + 1}",
+            "rad", f"s.angle[:, {j}]", joint=j,
+        )  # fmt: skip
+    for i, j in combinations(np.flatnonzero(~arm.slides).tolist(), 2):
+        for sign in "+-":
+            names = f"joint {i + 1} angle", f"joint {j + 1} angle"
+            text = f"(q_{i + 1} {sign} q_{j + 1})"
+            code = f"(s.angle[:, {i}] {sign} s.angle[:, {j}])"
+            yield Variable("sum", names, text, text, "rad", code)
+    for a, b in ((i, i + k) for k in range(3, arm.n + 1) for i in range(arm.n - k + 1)):
+        # The turn of a link against another one: of consecutive joints.
+        if not arm.slides[a:b].any():
+            text = f"({' + '.join(f'q_{j + 1}' for j in range(a, b))})"
+            mine = tuple(f"joint {j + 1} angle" for j in range(a, b))
+            yield Variable("sum", mine, text, text, "rad", f"s.angle[:, {a}:{b}].sum(axis=1)")
+
+
+def _wrenches(n: int) -> Iterator[Variable]:
+    """Torques of the drives, wrenches through joints and flange, the load, the force sensor's."""
+    for j in range(n):
+        yield Variable(
+            "torque", (f"joint {j + 1} torque",), f"τ_{j + 1}", rf"\tau_{j + 1}", "N·m",
+            f"s.torque[:, {j}]", slot=(j, 5), joint=j,
+        )  # fmt: skip
+    for k in range(n + 1):
+        where, short, joint = (f"joint {k + 1}", str(k + 1), k) if k < n else ("flange", "F", -1)
+        for c, word, letter, axis, unit in _COMPONENTS[: 5 if k < n else 6]:
+            yield Variable(
+                "force", (f"{where} {word} {axis}",), f"{letter}{short}_{axis}",
+                f"{letter}_{{{short},{axis}}}", unit, f"s.wrench[:, {k}, {c}]", slot=(k, c),
+                joint=joint, vector=f"{letter}{short}", axis=c % 3,
+            )  # fmt: skip
+    for c, _, letter, axis, unit in _COMPONENTS:
+        if c % 3 == 0:
+            norm = f"np.linalg.norm(s.states.wrench[:, {c}:{c + 3}], axis=1)"
+            yield Variable("load", ("load",), f"|{letter}|", f"|{letter}|", unit, norm)
+        text, code = f"{letter}_{axis}", f"s.states.wrench[:, {c}]"
+        yield Variable("load", ("load",), text, text, unit, code, vector=letter, axis=c % 3)
+    for c, word, letter, axis, unit in _COMPONENTS:  # causes of the sensor's own errors
+        yield Variable(
+            "sensor", (f"force sensor {word} {axis}",), f"{letter}S_{axis}",
+            rf"{letter}_{{S,{axis}}}", unit, f"recorded(s)[:, {c}]",
+            vector=f"{letter}S", axis=c % 3,
+        )  # fmt: skip
+
+
+def _attitude(n: int) -> Iterator[Variable]:
+    """Direction of gravity along the axes of the joints, and across the flange."""
+    places = [(k, 2, f"axis of joint {k + 1} to gravity", f"g{k + 1}") for k in range(n)]
+    places += [(n, c, "flange attitude", f"gF_{_AXES[c]}") for c in range(3)]
+    for k, c, name, symbol in places:
+        yield Variable(
+            "gravity", (name,), symbol, symbol.replace("g", "g_", 1).replace("_F_", "_"), "1",
+            f"(s.chain.rotation[{k}][:, :, {c}]"
+            " @ (s.cell.gravity / np.linalg.norm(s.cell.gravity)))",
+            joint=k if k < n else -1, vector="gravity" if k == n else "", axis=c,
+        )  # fmt: skip
+
+
+def _recorded(s: Situation, n: int) -> Iterator[Variable]:
+    """Temperatures, times, and sides of approach: columns that readings may have."""
+    of = s.states
+    if of.air_temperature is not None:
+        zero = round(float(np.median(of.air_temperature)), 1)
+        yield Variable(
+            "temperature", ("air temperature",), f"(T_air - {zero})",
+            rf"(T_\mathrm{{air}} - {zero})", "°C", f"(s.states.air_temperature - {zero})",
+            "air_temperature",
+        )  # fmt: skip
+    if of.joint_temperature is not None:
+        zero = round(float(np.median(of.joint_temperature)), 1)
+        for j in range(n):
+            name, text = (f"joint {j + 1} temperature",), f"(T_{j + 1} - {zero})"
+            code = f"(s.states.joint_temperature[:, {j}] - {zero})"
+            yield Variable(
+                "temperature", name, text, text, "°C", code, "joint_temperature", joint=j
+            )
+    if of.time is not None:
+        zero = float(np.floor(of.time.min()))
+        text = "t" if zero == 0 else f"(t - {zero:.0f})"
+        yield Variable("time", ("time",), text, text, "s", f"(s.states.time - {zero})", "time")
+    if of.load_time is not None:
+        latex, code = r"t_\mathrm{load}", "s.states.load_time"
+        yield Variable("hanging", ("time under load",), "t_load", latex, "s", code, "load_time")
+    for j in range(n if of.approach is not None else 0):
+        name, text, code = (f"joint {j + 1} approach",), f"s_{j + 1}", f"s.states.approach[:, {j}]"
+        yield Variable("side", name, text, text, "1", code, "approach", joint=j)
+
+
+def _places() -> Iterator[Variable]:
+    """Where the target is: from the base, and as the tracker sees it."""
+    at = "s.chain.point(s.cell.target[:3, 3])"
+    seen = f"({at} @ s.cell.registration[:3, :3].T + s.cell.registration[:3, 3])"
+    for name, text, latex, code in (
+        ("reach", "ρ", r"\rho", f"np.linalg.norm({at}[:, :2], axis=1)"),
+        ("height", "z", "z", f"{at}[:, 2]"),
+        ("distance", "d", "d", f"np.linalg.norm({seen}, axis=1)"),
+        ("target x", "x", "x", f"{at}[:, 0]"),
+        ("target y", "y", "y", f"{at}[:, 1]"),
+    ):
+        axis = _AXES.find(text)
+        vector = "target" if axis >= 0 else ""
+        yield Variable("place", (name,), text, latex, "m", code, vector=vector, axis=axis)
+    flat = f"np.hypot({seen}[:, 0], {seen}[:, 1])"
+    turns = f"{seen}[:, 1], {seen}[:, 0]", f"{seen}[:, 2], {flat}"
+    yield Variable("sight", ("azimuth",), "az", r"\alpha", "rad", f"np.arctan2({turns[0]})")
+    yield Variable("sight", ("elevation",), "el", r"\varepsilon", "rad", f"np.arctan2({turns[1]})")
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,21 +226,14 @@ class Factor:
         """Power of the variable's unit that the factor has."""
         return self.shape.power(self.numbers)
 
-    def text(self) -> str:
-        """Return it as text."""
-        return self.shape.text(self.variable.symbol, [f"{x:g}" for x in self.numbers])
-
-    def latex(self) -> str:
-        """Return it in LaTeX."""
-        return self.shape.latex(self.variable.latex, [f"{x:g}" for x in self.numbers])
-
-    def code(self) -> str:
-        """Return it as Python, of a situation s."""
-        return self.shape.code(self.variable.code, [repr(x) for x in self.numbers])
-
-    def slope_code(self) -> str:
-        """Return its derivative by the variable likewise."""
-        return self.shape.slope_code(self.variable.code, [repr(x) for x in self.numbers])
+    def written(self, way: str) -> str:
+        """Return it as "text", "latex", Python "code" of a situation s, or its "slope_code"."""
+        v = self.variable
+        if way in ("text", "latex"):
+            x, numbers = v.symbol if way == "text" else v.latex, [f"{x:g}" for x in self.numbers]
+        else:
+            x, numbers = v.code, [repr(x) for x in self.numbers]
+        return str(getattr(self.shape, way)(x, numbers))
 
 
 @dataclass(frozen=True)
@@ -108,15 +285,15 @@ class Amplitude:
 
     def text(self) -> str:
         """Return the product as text."""
-        return "·".join(f.text() for f in self.factors)
+        return "·".join(f.written("text") for f in self.factors)
 
     def latex(self) -> str:
         """Return the product in LaTeX."""
-        return r"\,".join(f.latex() for f in self.factors)
+        return r"\,".join(f.written("latex") for f in self.factors)
 
     def code(self) -> str:
         """Return the product as Python, of a situation s."""
-        parts = [f.code() for f in self.factors] or ["np.ones(len(s.angle))"]
+        parts = [f.written("code") for f in self.factors] or ["np.ones(len(s.angle))"]
         return parts[0] if len(parts) == 1 else " * ".join(f"({part})" for part in parts)
 
     def slopes(self) -> Iterator[tuple[tuple[int, int], str]]:
@@ -124,7 +301,7 @@ class Amplitude:
         for i, f in enumerate(self.factors):
             others = Amplitude((*self.factors[:i], *self.factors[i + 1 :]))
             for slot, inner in f.variable.slopes():
-                parts = [f.slope_code(), *([inner] if inner else [])]
+                parts = [f.written("slope_code"), *([inner] if inner else [])]
                 parts += [others.code()] if others.factors else []
                 yield slot, " * ".join(f"({part})" for part in parts)
 
@@ -134,44 +311,46 @@ class Amplitude:
 
     def of_joint(self, old: int, new: int, known: list[Variable]) -> "Amplitude | None":
         """Return the same law of another joint's own quantities; None where it has none."""
-        out = []
-        for f in self.factors:
-            v = f.variable
-            if v.joint == old and v.kind != "sum":
-                same = [w for w in known if w.kind == v.kind and w.joint == new and _alike(w, v)]
-                if not same:
-                    return None
-                f = replace(f, variable=same[0])
-            out.append(f)
-        return Amplitude(tuple(out))
+        return self._with(
+            lambda v: v.joint == old and v.kind != "sum",
+            lambda v, w: (
+                w.kind == v.kind
+                and w.joint == new
+                and (w.slot is None or v.slot is None or w.slot[1] == v.slot[1])
+            ),
+            known,
+        )
 
     def of_axis(self, old: int, new: int, known: list[Variable]) -> "Amplitude | None":
         """Return the same law of another axis: vectors' components along both change places."""
-        swap, out = {old: new, new: old}, []
+        swap = {old: new, new: old}
+        return self._with(
+            lambda v: bool(v.vector) and v.axis in swap,
+            lambda v, w: w.vector == v.vector and w.axis == swap[v.axis],
+            known,
+        )
+
+    def _with(
+        self,
+        changes: Callable[[Variable], bool],
+        same: Callable[[Variable, Variable], bool],
+        known: list[Variable],
+    ) -> "Amplitude | None":
+        """Return the product with other quantities where they change; None where there is none."""
+        out = []
         for f in self.factors:
             v = f.variable
-            if v.vector and v.axis in swap:
-                same = [w for w in known if w.vector == v.vector and w.axis == swap[v.axis]]
-                if not same:
-                    return None
-                f = replace(f, variable=same[0])
-            out.append(f)
+            found = next((w for w in known if same(v, w)), None) if changes(v) else v
+            if found is None:
+                return None
+            out.append(replace(f, variable=found))
         return Amplitude(tuple(out))
-
-
-def _alike(a: Variable, b: Variable) -> bool:
-    return a.slot is None or b.slot is None or a.slot[1] == b.slot[1]
 
 
 def unit_of(powers: dict[str, float]) -> str:
     """Return a product of units by their powers; "1" where there is none."""
-    return "·".join(_raised(u, p) for u, p in powers.items()) or "1"
-
-
-def _raised(unit: str, power: float) -> str:
-    if power == 1:
-        return unit
-    return f"({unit})^{power:g}" if "·" in unit else f"{unit}^{power:g}"
+    parts = {u: f"({u})" if "·" in u else u for u in powers}
+    return "·".join(u if p == 1 else f"{parts[u]}^{p:g}" for u, p in powers.items()) or "1"
 
 
 def different(a: Factor, b: Factor) -> bool:
@@ -183,13 +362,9 @@ def different(a: Factor, b: Factor) -> bool:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Composed(Variable):
-    """A weighted sum of products, as a quantity.
+    """A weighted sum of products, as a quantity."""
 
-    Attributes:
-        terms: (weight, product); the first weight is 1, and all products have one unit.
-    """
-
-    terms: tuple[tuple[float, Amplitude], ...] = ()
+    terms: tuple[tuple[float, Amplitude], ...] = ()  # weights, the first 1, and products
 
     def read(self, s: Situation) -> Floats:
         """(N,) it in the states."""
@@ -217,25 +392,17 @@ class Composed(Variable):
 
 
 def composed(terms: tuple[tuple[float, Amplitude], ...]) -> Composed:
-    """Return the quantity of a weighted sum of products.
-
-    Args:
-        terms: (weight, product); the first weight is 1, and all products have one unit.
-    """
+    """Return the quantity of a weighted sum of products of one unit; the first weight is 1."""
     products = [a for _, a in terms]
     slots = [f.variable.slot for a in products for f in a.factors if f.variable.slot is not None]
     joints = {f.variable.joint for a in products for f in a.factors}
     return Composed(
-        "composed",
-        tuple(dict.fromkeys(n for a in products for n in a.names)),
+        "composed", tuple(dict.fromkeys(n for a in products for n in a.names)),
         _sum([(w, a.text()) for w, a in terms], "·"),
-        _sum([(w, a.latex()) for w, a in terms], r"\,"),
-        products[0].unit(),
-        _code(terms),
-        slot=slots[0] if slots else None,
-        joint=joints.pop() if len(joints) == 1 else -1,
+        _sum([(w, a.latex()) for w, a in terms], r"\,"), products[0].unit(), _code(terms),
+        slot=slots[0] if slots else None, joint=joints.pop() if len(joints) == 1 else -1,
         terms=terms,
-    )
+    )  # fmt: skip
 
 
 def _sum(terms: list[tuple[float, str]], times: str) -> str:

@@ -1,4 +1,4 @@
-"""Functions of composed quantities: the best of the bends, extended to sums, and refined.
+"""Candidates beyond the screening: functions of composed quantities, more factors, other numbers.
 
 f(u) with u = φ₁ + Σ w_i φ_i, the φ products of functions of two quantities at most, is a
 single-index model, one step of projection pursuit (Friedman and Stuetzle 1981, JASA 76, 817).
@@ -11,6 +11,10 @@ single-index model, one step of projection pursuit (Friedman and Stuetzle 1981, 
 
 What is found pays for all arguments of its complexity, for the levels, and for each weight and
 exponent ½ ln ν.
+
+Of the best candidates of the screening, too, each is multiplied by every function of another
+quantity, up to the complexity `MOST`, and each number that is free is varied (`grown`). What is
+found pays as if all products of its kind had been tried, or for the values that were.
 """
 
 from __future__ import annotations
@@ -21,64 +25,44 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hilcal.discovery import shapes
-from hilcal.discovery.amplitudes import Amplitude, Factor, composed
+from hilcal.discovery.amplitudes import Amplitude, Factor, composed, different
 from hilcal.discovery.screen import LEAST_MOTION, SEEN, unit_rows
 from hilcal.discovery.shapes import Shape
 from hilcal.types import Floats
 
 if TYPE_CHECKING:
     from hilcal.discovery.problem import Beside
-    from hilcal.discovery.terms import LawTerm
+    from hilcal.discovery.screen import LawTerm, ScreenedTerm
 
-BEST, EXTENDED = 10, 3
-"""Bends that are extended, and further products that are tried of each; a choice, by time."""
-LARGEST_SUM = 3
-"""Products of a sum at most; a choice."""
-QUANTITIES = 2
-"""Recorded quantities of an argument at most; a choice: sums of more are too many."""
-REFINED = 2
-"""Functions of single products, and of sums, that are refined; a choice, by time."""
-QUANTILES = tuple(k / 20 for k in range(1, 20))
-TIMES = (0.4, 0.7, 1.0, 1.5, 2.2)
-"""Levels, and weights by that of the linearisation, that are tried; a choice."""
-EVALUATIONS = 60
-"""Of the sum of squares, for each number that is refined; a choice."""
+BEST, EXTENDED = 10, 3  # bends, and further products of each, that are extended; a choice, by time
+LARGEST_SUM = 3  # Products of a sum at most; a choice
+QUANTITIES = 2  # Recorded quantities of an argument at most; a choice: sums of more are too many
+REFINED = 2  # Functions of single products, and of sums, that are refined; a choice, by time
+QUANTILES = tuple(k / 20 for k in range(1, 20))  # Levels tried, shares of the readings below
+TIMES = (0.4, 0.7, 1.0, 1.5, 2.2)  # weights tried, by that of the linearisation; a choice
+EVALUATIONS = 60  # Of the sum of squares, for each number that is refined; a choice
 DIGITS = 3
-LEFT = 1e-3
-"""Share of a column's square that others must leave; a choice."""
+LEFT = 1e-3  # Share of a column's square that others must leave; a choice
 WORST = 1e12
 POWERS = {"above": shapes.ABOVE_POWER, "below": shapes.BELOW_POWER}
-LEAST_POWER, MOST_POWER = 0.5, 4.0
-"""Exponents of a bend; at least 1 where wrenches bend, as a slope without limit has no equilibrium.
-A choice."""
+LEAST_POWER, MOST_POWER = 0.5, 4.0  # exponents of a bend, from 1 on under wrenches; a choice
 LOG2 = float(np.log(2.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Bent:
-    """A function of a composed quantity at a site.
+    """A function of a composed quantity at a site."""
 
-    Attributes:
-        s: the site.
-        which: products of the argument, by index in the grammar.
-        weights: of these; the first is 1.
-        shape: the function.
-        numbers: of it.
-        evidence: logarithm, without what the search costs.
-        price: what the choice of the argument costs.
-    """
-
-    s: int
-    which: tuple[int, ...]
-    weights: tuple[float, ...]
-    shape: Shape
-    numbers: tuple[float, ...]
-    evidence: float
-    price: float
+    s: int  # the site
+    which: tuple[int, ...]  # products of the argument, by index in the grammar
+    weights: tuple[float, ...]  # of these; the first is 1
+    shape: Shape  # the function
+    numbers: tuple[float, ...]  # of it
+    evidence: float  # logarithm, without what the search costs
+    price: float  # what the choice of the argument costs
 
     @property
     def odds(self) -> float:
-        """Evidence less what the argument costs."""
         return self.evidence - self.price
 
 
@@ -237,11 +221,9 @@ def _extended(beside: Beside, site: SiteSums, b: _Bent) -> list[_Bent]:
 
 
 def _gains(site: SiteSums, x: Floats) -> tuple[Floats, Floats]:
-    """Gain of each further column of X (2 + P, K) beside the first two, and coefficients.
+    """Gain (P,) of each further column of X (2 + P, K) beside the first two, −inf if no other.
 
-    Returns:
-        (P,) reduction of the sum of squares by the further column, −inf where it is no other one;
-        (2, P) coefficients of the first column and of the further one, fitted together.
+    Also (2, P) coefficients of the first column and of the further one, fitted together.
     """
     free = (x @ site.free).astype(float)
     slope = (x @ site.slope).astype(float)
@@ -343,3 +325,88 @@ def _refined(beside: Beside, site: SiteSums, b: _Bent) -> Amplitude:
     recorded = len(terms) == 1 and len(factors) == 1 and factors[0].shape is shapes.LINEAR
     quantity = factors[0].variable if recorded else composed(terms)
     return Amplitude((Factor(quantity, b.shape, own),))
+
+
+MOST = 4  # Complexity of a product; a choice
+MOST_FACTORS = 3  # Factors of a product; a choice
+GROWN, VARIED = 12, 24  # candidates that are multiplied, and varied; a choice, by time
+KEPT = 24  # Of either the best that are scored in full; a choice
+FACTORS = (0.35, 0.5, 0.7, 0.85, 1.2, 1.4, 2.0, 2.8)  # of numbers of the grid; a choice
+
+
+def grown(beside: Beside, best: list[ScreenedTerm]) -> list[LawTerm]:
+    """Return terms of further factors and other numbers, of the best of the screening."""
+    found = list({(x.s, x.f): x for x in best}.values())
+    products = [(x.s, a, 0.0) for x in found[:GROWN] for a in _products(beside, x.s, x.f)]
+    numbers = [(x.s, a, price) for x in found[:VARIED] for a, price in _numbers(beside, x.f)]
+    return [*_best_terms(beside, products), *_best_terms(beside, numbers)]
+
+
+def _products(beside: Beside, s: int, f: int) -> list[Amplitude]:
+    screen = beside.problem.screen
+    a = screen.grammar.at(f)
+    if not a.factors or len(a.factors) >= MOST_FACTORS:
+        return []
+    out = []
+    for more in screen.grammar.singles:
+        if a.cost + more.cost > MOST or not all(different(more, x) for x in a.factors):
+            continue
+        product = Amplitude((*a.factors, more))
+        known = screen.grammar.place(product)
+        if known is not None and known < len(screen.grammar.amplitudes):
+            continue  # it is screened
+        if screen.sites[s].takes(product.elastic, product.sensed):
+            out.append(product)
+    return out
+
+
+def _numbers(beside: Beside, f: int) -> list[tuple[Amplitude, float]]:
+    grammar = beside.problem.screen.grammar
+    a = grammar.at(f)
+    out = []
+    for i, factor in enumerate(a.factors):
+        for n in factor.shape.free:
+            values = _other_values(factor, n, grammar.read(factor.variable))
+            price = float(np.log(len(values) + 1))
+            for value in values:
+                numbers = (*factor.numbers[:n], value, *factor.numbers[n + 1 :])
+                other = replace(factor, numbers=numbers)
+                out.append((Amplitude((*a.factors[:i], other, *a.factors[i + 1 :])), price))
+    return out
+
+
+def _other_values(factor: Factor, n: int, x: Floats) -> list[float]:
+    if n in factor.shape.places:
+        values = np.quantile(x, QUANTILES).tolist()
+    else:
+        values = [factor.numbers[n] * k for k in FACTORS]
+    return sorted({float(f"{v:.2g}") for v in values} - {factor.numbers[n]})
+
+
+def _best_terms(beside: Beside, made: list[tuple[int, Amplitude, float]]) -> list[LawTerm]:
+    screen = beside.problem.screen
+    ranked: list[tuple[float, int, Amplitude, float]] = []
+    for s in dict.fromkeys(s for s, _, _ in made):
+        mine = [(a, price) for at, a, price in made if at == s]
+        values = np.array([screen.grammar.values_of(a)[screen.readings] for a, _ in mine])
+        size = np.sqrt(np.mean(values**2, axis=1, keepdims=True))
+        good = np.isfinite(size[:, 0]) & (size[:, 0] > 0)
+        values = (values[good] / size[good]).astype(np.float32)
+        some = [m for m, ok in zip(mine, good.tolist(), strict=True) if ok]
+        odds = SiteSums(beside, s).odds(values, constant=False)
+        ranked += [
+            (float(x) - price, s, a, price)
+            for x, (a, price) in zip(odds, some, strict=True)
+            if np.isfinite(x)
+        ]
+    ranked.sort(key=lambda r: -r[0])
+    out: list[LawTerm] = []
+    for _, s, a, price in ranked[:KEPT]:
+        k = screen.grammar.index(a)
+        if k is None:
+            continue
+        out.append(beside.term(((s, k),), price))
+        other = screen.grammar.turned(k)
+        if other is not None:
+            out.append(beside.term(((s, k), (s, other)), price + LOG2))
+    return out

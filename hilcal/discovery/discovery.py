@@ -16,7 +16,8 @@ law then explains of their misfit is what the whole procedure may claim.
 """
 
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -26,16 +27,15 @@ from hilcal.diagnosis.noise_verdict import MISFIT_ALARM, PREDICTABLE
 from hilcal.diagnosis.residual_regression import Dependence, residual_regression
 from hilcal.discovery.curve import Curve, curves
 from hilcal.discovery.known_effects import KnownEffects, instead_of_law, known_effects, resembling
-from hilcal.discovery.law import Again, Coefficient, Form, Law, form_of
+from hilcal.discovery.law import Again, Coefficient, Form, Law, form_of, source_of_form
 from hilcal.discovery.problem import SearchProblem
 from hilcal.discovery.refit import exact, refine
-from hilcal.discovery.screen import Screen, screen
+from hilcal.discovery.screen import LawTerm, Screen, screen
 from hilcal.discovery.search import LEAST, MOST_TERMS, Selection, search
-from hilcal.discovery.structures import Structure, averaged, structure_of, structures
-from hilcal.discovery.terms import LawTerm
-from hilcal.discovery.write_effect import source_of_form
+from hilcal.discovery.structures import Structure, averaged, pareto, structure_of, structures
+from hilcal.effects.from_file import effects_of
 from hilcal.errors import CannotAnswerError, HilcalError, InputError
-from hilcal.identification.fit import Fit
+from hilcal.identification.fit import Fit, fit
 from hilcal.identification.folds import random_folds
 from hilcal.identification.linearisation import by_pose, left_out_by_pose, linearise
 from hilcal.readings.readings import Readings
@@ -43,6 +43,7 @@ from hilcal.regression.evidence import score_family
 from hilcal.regression.paired_test import improves
 from hilcal.shown import Shown
 from hilcal.types import Bools, Floats
+from hilcal.whole_file import replace_file
 
 Reason = Literal["law", "adequate", "catalogue", "no_law", "unpredictable"]
 """Why there are laws, or none:
@@ -54,68 +55,40 @@ Reason = Literal["law", "adequate", "catalogue", "no_law", "unpredictable"]
   can be fitted with;
 - unpredictable: nothing recorded predicts it.
 """
-LEAST_SHARE = 0.1
-"""Share of the misfit on poses left out that a law must explain, searched for without them."""
-NEAR = 0.7
-"""Cosine from which an effect of the catalogue is named as resembling; a choice."""
+LEAST_SHARE = 0.1  # of the misfit on poses left out, that a law found without them explains
+NEAR = 0.7  # Cosine from which an effect of the catalogue is named as resembling; a choice
 
 
-MOST_RIVALS = 2
-"""Alternatives that can be written as effects; a choice: `next` separates few."""
+MOST_RIVALS = 2  # Alternatives that can be written as effects; a choice: `next` separates few
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FoldSearch:
-    """What the search without each fold came to.
+    """What the search without each fold came to."""
 
-    Attributes:
-        share: of the misfit of the poses left out that its laws explain.
-        sure: whether their error falls by more than it scatters from pose to pose.
-        found: the laws of each fold; empty where it proposes none.
-    """
-
-    share: float
-    sure: bool
-    found: tuple[Selection | None, ...]
+    share: float  # of the misfit of the poses left out that its laws explain
+    sure: bool  # whether their error falls by more than it scatters from pose to pose
+    found: tuple[Selection | None, ...]  # the laws of each fold; empty where it proposes none
 
 
 @dataclass(frozen=True, eq=False)
 class Discovery(Shown):
-    """What the search for laws came to.
+    """What the search for laws came to."""
 
-    Attributes:
-        fit: the fit whose misfit it explains.
-        reason: why there are laws, or none.
-        laws: simplest first of those that predict as well as any.
-        attainable: share of the misfit that anything recorded predicts on poses left out.
-        searched_share: that of the laws that the search without each pose finds.
-        catalogue: effects of the catalogue that explain the misfit, where they do.
-        candidates: number of candidates that were tried.
-        after: the fit with the first law.
-        source: of the first law's effect, as a Python file.
-        curves: the first law over what it depends on, with the readings.
-        carried: where no law is found, recorded variables that the misfit depends on.
-        refused: laws that predict the misfit and are not proposed, and why: their exact refits
-            failed.
-        unfitted: effects of the catalogue that the exact model could not be fitted with, and why.
-        structures: likely laws with their posterior probabilities, the likeliest first, and the
-            best of each complexity; see `structures`.
-    """
-
-    fit: Fit
-    reason: Reason
-    laws: tuple[Law, ...] = ()
-    attainable: float = 0.0
-    searched_share: float = 0.0
-    catalogue: tuple[str, ...] = ()
-    candidates: int = 0
-    after: Fit | None = None
-    source: str = ""
-    curves: tuple[Curve, ...] = ()
-    carried: tuple[Dependence, ...] = ()
-    refused: tuple[tuple[str, str], ...] = ()
-    unfitted: tuple[tuple[str, str], ...] = ()
-    structures: tuple[Structure, ...] = ()
+    fit: Fit  # the fit whose misfit it explains
+    reason: Reason  # why there are laws, or none
+    laws: tuple[Law, ...] = ()  # simplest first of those that predict as well as any
+    attainable: float = 0.0  # share of the misfit that anything recorded predicts on poses left out
+    searched_share: float = 0.0  # that of the laws that the search without each pose finds
+    catalogue: tuple[str, ...] = ()  # effects that explain the misfit, where they do
+    candidates: int = 0  # number of candidates that were tried
+    after: Fit | None = None  # the fit with the first law
+    source: str = ""  # of the first law's effect, as a Python file
+    curves: tuple[Curve, ...] = ()  # the first law over what it depends on, with the readings
+    carried: tuple[Dependence, ...] = ()  # recorded variables it depends on, without a law
+    refused: tuple[tuple[str, str], ...] = ()  # laws whose exact refits failed, and why
+    unfitted: tuple[tuple[str, str], ...] = ()  # effects that could not be refitted, why
+    structures: tuple[Structure, ...] = ()  # likely laws, and the best of each complexity
 
     def __repr__(self) -> str:
         """Return the reason, and the formulas with their probabilities."""
@@ -123,15 +96,7 @@ class Discovery(Shown):
         return f"Discovery({self.reason!r}{''.join(rows)})"
 
     def average(self, readings: Readings) -> tuple[Floats, Floats]:
-        """Return what the likely laws add to the fit's prediction of D measurements.
-
-        Returns:
-            (D, m) mean over the laws by their probability, and (D, m) standard deviation of the
-            prediction with it, without the noise; see `averaged`.
-
-        Raises:
-            CannotAnswerError: there is no law.
-        """
+        """Return what the likely laws add to the fit's prediction, and its uncertainty."""
         if not self.structures:
             raise CannotAnswerError(f"no law was found ({self.reason}), so none is averaged")
         return averaged(self.fit, self.structures, readings)
@@ -222,15 +187,9 @@ def _silent(fit: Fit, found: Screen, say: Callable[[str], None], searched: float
 
 
 def _laws(
-    fit: Fit,
-    problem: SearchProblem,
-    selections: list[Selection],
-    folds: FoldSearch,
-    known: KnownEffects,
-    say: Callable[[str], None],
-    name: str,
-) -> Discovery:
-    """Refit the laws, and order them."""
+    fit: Fit, problem: SearchProblem, selections: list[Selection], folds: FoldSearch,
+    known: KnownEffects, say: Callable[[str], None], name: str,
+) -> Discovery:  # fmt: skip
     found = problem.screen
     before = left_out_by_pose(fit)
     rank = fit.whitening.rank
@@ -267,7 +226,10 @@ def _laws(
         silent = _silent(fit, found, say, folds.share)
         return replace(silent, reason="no_law", refused=tuple(refused))
     best = min(range(len(made)), key=lambda k: float(made[k][2].sum()))
-    kept = [k for k in range(len(made)) if _as_good(made[k][2], made[best][2])]
+    # those that predict poses left out as well, to within one standard error
+    more = [m[2] - made[best][2] for m in made]
+    root = np.sqrt(max(len(more[0]) - 1, 1))
+    kept = [k for k, x in enumerate(more) if float(x.mean()) <= float(np.std(x)) / root]
     say("asking what is predictable at all")
     attainable = residual_regression(found.linear).share
     laws = tuple(
@@ -276,38 +238,19 @@ def _laws(
     )
     named = {kinds[k]: law.name for k, law in reversed([*zip(kept, laws, strict=True)])}
     return Discovery(
-        fit,
-        "law",
-        laws,
+        fit, "law", laws,
         float(np.clip(max(attainable, folds.share, laws[0].holdout_share), 0.0, 1.0)),
-        folds.share,
-        (),
-        found.candidates,
-        made[kept[0]][1],
-        made[kept[0]][3],
-        curves(made[kept[0]][1], laws[0].form),
-        refused=tuple(refused),
+        folds.share, (), found.candidates, made[kept[0]][1], made[kept[0]][3],
+        curves(made[kept[0]][1], laws[0].form), refused=tuple(refused),
         structures=tuple(replace(x, law=named.get(x.kind, "")) for x in likely),
-    )
-
-
-def _as_good(left: Floats, best: Floats) -> bool:
-    """Whether poses left out are predicted as well, to within one standard error."""
-    more = left - best
-    return bool(float(more.mean()) <= float(np.std(more)) / np.sqrt(max(len(more) - 1, 1)))
+    )  # fmt: skip
 
 
 def _law(
-    problem: SearchProblem,
-    s: Selection,
-    form: Form,
-    name: str,
-    coefficients: tuple[Coefficient, ...],
-    share: float,
-    after: Fit,
-    folds: FoldSearch,
+    problem: SearchProblem, s: Selection, form: Form, name: str,
+    coefficients: tuple[Coefficient, ...], share: float, after: Fit, folds: FoldSearch,
     known: KnownEffects,
-) -> Law:
+) -> Law:  # fmt: skip
     linear = problem.screen.linear
     x = np.hstack([problem.columns(t) for t in s.terms])
     score = score_family(linear.information(x), x.T @ linear.residual, linear.rss, linear.fit.dof)
@@ -322,22 +265,13 @@ def _law(
         values = v.read(situation)
         ranges.append((symbol, float(values.min()), float(values.max()), v.unit))
     return Law(
-        name=name,
-        form=form,
-        parameters=coefficients,
-        p_value=p_value,
-        odds=s.total,
-        holdout_share=share,
-        left=after.variance_factor,
-        probability=0.0,
-        resembles=near[:3],
-        ranges=tuple(ranges),
-        again=found_again(problem.screen, folds, s.terms),
-    )
+        name=name, form=form, parameters=coefficients, p_value=p_value, odds=s.total,
+        holdout_share=share, left=after.variance_factor, probability=0.0, resembles=near[:3],
+        ranges=tuple(ranges), again=found_again(problem.screen, folds, s.terms),
+    )  # fmt: skip
 
 
-FOLDS = 5
-"""As in the regression of the residual; a choice."""
+FOLDS = 5  # As in the regression of the residual; a choice
 RIDGE = 1e-6
 
 
@@ -402,12 +336,8 @@ def _causes(
 def agreement(before: Fit, after: Fit, moved: Floats) -> float:
     """Return the correlation of what was hidden with what the added effects do.
 
-    Both are whitened, and what the model without the effect describes is projected out.
-
-    Args:
-        before: the fit without the added effects.
-        after: the fit with more effects, behind those of the first model.
-        moved: (N, 3) by how much the hidden law moves each reading, sensor axes, m.
+    Both are whitened, and what the model without the effect describes is projected out. `after` has
+    more effects, behind those of `before`; moved: (N, 3) by the hidden law, sensor axes, m.
     """
     linear, w = linearise(before), before.whitening
     truth = linear.project_out(w.whiten(w.raw(moved[~before.outlier])).reshape(-1))
@@ -417,3 +347,157 @@ def agreement(before: Fit, after: Fit, moved: Floats) -> float:
     told = linear.project_out(w.whiten(w.raw(jacobian @ theta)).reshape(-1))
     size = float(np.linalg.norm(truth) * np.linalg.norm(told))
     return float(truth @ told) / max(size, 1e-300)
+
+
+def discovery_json(d: Discovery) -> dict[str, object]:
+    """Return the document of `discover`."""
+    return {
+        "model": list(d.fit.model.named),
+        "reason": d.reason,
+        "attainable_share": d.attainable,
+        "searched_share": d.searched_share,
+        "candidates": d.candidates,
+        "catalogue": list(d.catalogue),
+        "carried_by": [
+            {"variable": c.variable, "share": c.share, "moves": c.moves} for c in d.carried
+        ],
+        "laws": [law_json(law, d) for law in d.laws],
+        "structures": [
+            {
+                "formula": x.form.text(),
+                "probability": x.probability,
+                "complexity": x.form.complexity,
+                "holdout_share": x.holdout_share,
+                "pareto": x in pareto(d.structures),
+                "law": x.law or None,
+            }
+            for x in d.structures
+        ],
+        "refused": [{"formula": formula, "why": why} for formula, why in d.refused],
+        "unfitted": [{"effect": effect, "why": why} for effect, why in d.unfitted],
+        "average": dict(zip(("rms_m", "std_m"), d.average_m(), strict=True)) if d.laws else None,
+        "curves": [curve_json(c) for c in d.curves],
+    }
+
+
+def law_json(law: Law, d: Discovery) -> dict[str, object]:
+    """Return a law as JSON."""
+    return {
+        "name": law.name,
+        "formula": law.formula,
+        "latex": law.form.latex(),
+        "acts_on": list(law.acts_on),
+        "variables": list(law.variables),
+        "parameters": [asdict(c) for c in law.parameters],
+        "holdout_share": law.holdout_share,
+        "p_value": law.p_value,
+        "variance_factor": law.left,
+        "probability": law.probability,
+        "found_again": [{**asdict(a), "variables": list(a.variables)} for a in law.again],
+        "alternatives": [x.form.text() for x in alternatives(d, law)],
+        "resembles": [asdict(r) for r in law.resembles],
+        "ranges": [
+            {"quantity": symbol, "min": low, "max": high, "unit": unit}
+            for symbol, low, high, unit in law.ranges
+        ],
+    }
+
+
+def curve_json(c: Curve) -> dict[str, object]:
+    """Return a curve as JSON: what is drawn, the binned readings, and the law; SI."""
+    x, y, std, count = c.binned
+    return {
+        "site": c.site,
+        "of": c.of,
+        "unit": c.unit,
+        "quantity": c.quantity,
+        "quantity_unit": c.quantity_unit,
+        "binned": [
+            {"x": float(a), "y": float(b), "std": float(e), "readings": int(n)}
+            for a, b, e, n in zip(x, y, std, count, strict=True)
+        ],
+        "law": [[float(a), float(b)] for a, b in c.line.T],
+    }
+
+
+MOST_SEARCHES = 3  # Searches of one refinement at most; a choice, by time
+NAME = "found"
+
+
+class LawSearch:
+    """Searches laws for one refinement, and keeps what it found.
+
+    Attributes:
+        found: the searches, in order.
+        files: of laws that stayed, by name; see `write`.
+    """
+
+    def __init__(self, folder: Path, name: str = NAME, replacing: bool = False) -> None:
+        """Laws are named after the files that they will be; old ones may be replaced."""
+        if replacing:
+            for k in range(1, MOST_SEARCHES + 1):
+                (folder / f"{_numbered(name, k)}.py").unlink(missing_ok=True)
+        self.found: list[Discovery] = []
+        self.files: dict[str, Path] = {}
+        self._folder, self._name = folder, name
+        self._sources: dict[str, str] = {}
+
+    def propose(self, of: Fit, say: Callable[[str], None]) -> tuple[Fit, str] | None:
+        """Return the fit with a law, and the law's name; None where no law is proposed."""
+        if any(d.fit is of for d in self.found) or len(self.found) == MOST_SEARCHES:
+            return None
+        name = self._free(of)
+        d = discover(of, say, name)
+        self.found.append(d)
+        if d.after is None:
+            return None
+        model, after = of.model, d.after
+        where = self.path(name)
+        file = effects_of(d.source.encode(), where)
+        catalogue = model.catalogue.with_effects(*file.effects)
+        catalogue = replace(catalogue, files=(*catalogue.files, file))
+        made = catalogue.make(name, model.cell, of.readings.states, m=of.readings.m)
+        grown = replace(model, effects=(*model.effects, made), catalogue=catalogue)
+        self._sources[name] = d.source
+        return fit(grown, of.readings, of.mode, of.scaling, after.theta), name
+
+    def path(self, name: str) -> Path:
+        """Return the file of a law."""
+        return self._folder.absolute() / f"{name}.py"
+
+    def write(self, names: tuple[str, ...]) -> None:
+        """Write the files of those effects that are proposed laws."""
+        for name in names:
+            if name not in self._sources:
+                continue
+            where = self.path(name)
+            replace_file(where, self._sources[name], must_be_new=True)
+            self.files[name] = where
+
+    def _free(self, of: Fit) -> str:
+        taken = {*of.model.catalogue.names, *of.model.names, *self._sources}
+        names = (_numbered(self._name, k) for k in range(1, 10_000))
+        free = (n for n in names if n not in taken and not self.path(n).exists())
+        try:
+            return next(free)
+        except StopIteration:
+            raise InputError(f"{self._folder}: no free name for a law's file") from None
+
+
+def _numbered(name: str, k: int) -> str:
+    return name if k == 1 else f"{name}_{k}"
+
+
+def laws_json(s: LawSearch) -> dict[str, object]:
+    """Return the searches of a refinement as JSON."""
+    return {
+        "discover": [
+            {
+                **discovery_json(d),
+                "written": str(s.files[d.laws[0].name])
+                if d.laws and d.laws[0].name in s.files
+                else None,
+            }
+            for d in s.found
+        ]
+    }

@@ -7,6 +7,7 @@ What a law costs for the search that found it is the logarithm of the number of 
 complexity, and log 2 for each unit of complexity: simple laws are few, and pay little.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import comb, log
@@ -14,57 +15,149 @@ from math import comb, log
 import numpy as np
 
 from hilcal.discovery import shapes
-from hilcal.discovery.amplitudes import Amplitude, Composed, Factor, different
-from hilcal.discovery.functions import FINEST, fine_waves, functions
+from hilcal.discovery.amplitudes import Amplitude, Composed, Factor, Variable, different
 from hilcal.discovery.shapes import Numbers
-from hilcal.discovery.variables import Variable
 from hilcal.effects.protocol import Situation
 from hilcal.types import Floats, Ints
 
-MOST = 3
-"""Complexity of a product; a choice, by the number of candidates (about 10⁶ with all sites)."""
-MOST_FACTORS = 2
-"""Factors of a product; a choice, likewise."""
-SOME = 2000
-"""Products that are formed at a time; a choice, for memory."""
-ARGUMENT = 2
-"""Complexity of a product in a composed quantity; a choice, by the number of them."""
+HARMONICS = 4  # Multiples of an angle; as in the diagnosis
+FINEST = 512  # highest multiple of an angle, at most one per pose; a choice, as of encoders
+
+
+def functions(v: Variable, x: Floats, most: int) -> list[Factor]:
+    """Return the functions of a quantity x (N,); those of complexity `most` are in no product."""
+    linear = Factor(v, shapes.LINEAR)
+    if v.kind in WAVES:
+        waves = [
+            Factor(v, f, (float(k),))
+            for k in range(1, WAVES[v.kind] + 1)
+            for f in (shapes.COS, shapes.SIN)
+        ]
+        return [linear, *waves, *_bent(v, x, most)] if v.kind == "angle" else waves
+    if v.kind == "side":
+        return [linear]
+    return [linear, *_CURVED[v.kind](v, x), *_bent(v, x, most)]
+
+
+WAVES = {"angle": HARMONICS, "sum": 2, "sight": 2}  # multiples of an angle; a choice
+BENDS = (0.3, 0.7)  # shares of the readings below a bend to begin with; a choice
+_Made = Callable[[Variable, Floats], list[Factor]]
+
+
+def _bent(v: Variable, x: Floats, most: int) -> list[Factor]:
+    """Return functions that are zero up to some value, by either side, and symmetric ones."""
+    alone = v.kind in (
+        "force",
+        "load",
+        "sensor",
+        "place",
+    )  # many, and rarely with a bend: in no product
+    made = [
+        Factor(v, replace(f, cost=most) if alone else f, (_round(at),))
+        for at in np.quantile(x, BENDS).tolist()
+        for f in (shapes.ABOVE, shapes.BELOW)
+    ]
+    if x.min() < 0 < x.max() and v.kind in ("angle", "torque"):
+        near = _round(0.01 * _middle(x))
+        made.append(Factor(v, shapes.THRESHOLD, (_round(0.5 * _middle(x)),)))
+        made.append(Factor(v, shapes.SATURATION, (_round(_middle(x)),)))
+        made += [Factor(v, shapes.EVEN, (p, near)) for p in (1.0, 2.0)]
+    return list({(f.shape.name, f.numbers): f for f in made}.values())
+
+
+def _middle(x: Floats) -> float:
+    return float(np.median(np.abs(x[x != 0]))) if np.any(x) else 1.0
+
+
+def _wrench(v: Variable, x: Floats) -> list[Factor]:
+    middle = _middle(x)
+    near = _round(0.01 * middle)
+    if not x.min() < 0 < x.max():
+        if v.kind == "load":
+            return _grown(v, x)
+        return [Factor(v, shapes.EVEN, (2.0, near)), Factor(v, shapes.ODD, (0.5, near))]
+    out = [Factor(v, shapes.PLUS), Factor(v, shapes.MINUS)]
+    out.append(Factor(v, shapes.SATURATION, (_round(0.05 * middle),)))
+    if v.kind == "torque":
+        out += [Factor(v, shapes.ODD, (p, near)) for p in (0.5, 2.0, 3.0)]
+    return out
+
+
+def _read_by_sensor(v: Variable, x: Floats) -> list[Factor]:
+    """Curvature, and a sensor that is another one for pull and push."""
+    if not x.min() < 0 < x.max():
+        return _even(v, x, 2.0)
+    return [Factor(v, shapes.PLUS), *_even(v, x, 1.0, 2.0)]
+
+
+def _gravity(v: Variable, x: Floats) -> list[Factor]:
+    return [Factor(v, shapes.SATURATION, (_round(0.05 * _middle(x)),)), *_even(v, x, 1.0, 2.0)]
+
+
+def _temperature(v: Variable, x: Floats) -> list[Factor]:
+    return [*_even(v, x, 2.0, 1.0), Factor(v, shapes.PLUS)]
+
+
+def _even(v: Variable, x: Floats, *powers: float) -> list[Factor]:
+    return [Factor(v, shapes.EVEN, (p, _round(0.01 * _middle(x)))) for p in powers]
+
+
+def _grown(v: Variable, x: Floats) -> list[Factor]:
+    if x.min() < 0:
+        return [Factor(v, shapes.EVEN, (2.0, _round(0.01 * _middle(x))))]
+    return [Factor(v, shapes.POWER, (p,)) for p in (0.5, 2.0)]
+
+
+def _lasting(v: Variable, x: Floats) -> list[Factor]:
+    last = float(x.max())
+    out = [*_grown(v, x), Factor(v, shapes.LOG)]
+    out += [Factor(v, shapes.RELAXATION, (_round(k * last),)) for k in (0.03, 0.1, 0.3)]
+    if v.kind == "time":
+        out += [
+            Factor(v, shapes.STEP, (_round(a * last), _round(w * last)))
+            for a in (0.15, 0.3, 0.5, 0.7, 0.85)
+            for w in (0.02, 0.1)
+        ]
+    return out
+
+
+_CURVED: dict[str, _Made] = {
+    "torque": _wrench, "force": _wrench, "load": _wrench, "sensor": _read_by_sensor,
+    "gravity": _gravity, "temperature": _temperature, "time": _lasting, "hanging": _lasting,
+    "place": _grown,
+}  # fmt: skip
+
+
+def _round(x: float) -> float:
+    return float(f"{x:.2g}")
+
+
+MOST = 3  # complexity of a product; a choice: about 10⁶ candidates with all sites
+MOST_FACTORS = 2  # Factors of a product; a choice, likewise
+SOME = 2000  # Products that are formed at a time; a choice, for memory
+ARGUMENT = 2  # Complexity of a product in a composed quantity; a choice, by the number of them
 COMPOSED_OF = {
     "angle", "torque", "load", "gravity", "temperature", "time", "hanging", "place",
 }  # fmt: skip
 """Quantities of which others are composed; a choice: components in joint axes are too many."""
-WAVES_OF_ARGUMENT = 2
-"""Multiples of an angle in a composed quantity; a choice."""
-SHAPES = 5
-"""Functions of a composed quantity: bends to both sides, the same with an exponent, steps."""
-FLAT = 0.1
-"""Factors whose spread is a smaller share of their size are in no product: it would be the other
-factor's law to within that share. A choice."""
+WAVES_OF_ARGUMENT = 2  # Multiples of an angle in a composed quantity; a choice
+SHAPES = 5  # of a composed quantity: bends to both sides, also with an exponent, steps
+FLAT = 0.1  # spread by size of factors that are in no product, as good as constant; a choice
 
 
 @dataclass(frozen=True, eq=False)
 class Grammar:
-    """All amplitudes that are tried, and their values.
-
-    Attributes:
-        values: (F, N) their values, single precision, each with root mean square 1.
-        size: (F,) what they were divided by.
-        cost: (F,) complexities.
-        partner: (F,) the amplitude with sine for cosine in its first periodic factor; −1 for none.
-        less: (2, F) the amplitude without the first and without the second factor of a product of
-            two; −1 for no product.
-        singles: the functions of one quantity from which products are made.
-    """
+    """All amplitudes that are tried, and their values."""
 
     known: list[Variable]
     amplitudes: tuple[Amplitude, ...]
-    values: Floats
-    size: Floats
-    cost: Ints
-    partner: Ints
-    less: Ints
+    values: Floats  # (F, N) their values, single precision, each with root mean square 1
+    size: Floats  # (F,) what they were divided by
+    cost: Ints  # (F,) complexities
+    partner: Ints  # (F,) with sine for cosine in the first periodic factor; −1 for none
+    less: Ints  # (2, F) of a product of two without its first, and its second factor; else −1
     situation: Situation
-    singles: tuple[Factor, ...]
+    singles: tuple[Factor, ...]  # the functions of one quantity from which products are made
     _more: list[tuple[Amplitude, Floats, float]] = field(default_factory=list)
     _read: dict[str, Floats] = field(default_factory=dict)
 
@@ -109,12 +202,8 @@ class Grammar:
         """Return the amplitude with sine for cosine in its first periodic factor."""
         if k < len(self.amplitudes):
             return int(self.partner[k]) if self.partner[k] >= 0 else None
-        factors = list(self.at(k).factors)
-        for i, f in enumerate(factors):
-            if f.shape.name == "cos":
-                factors[i] = replace(f, shape=replace(shapes.SIN, cost=f.shape.cost))
-                return self.index(Amplitude(tuple(factors)))
-        return None
+        other = _turned(self.at(k))
+        return None if other is None else self.index(other)
 
     def place(self, amplitude: Amplitude) -> int | None:
         """Return the index of an amplitude; None where it is not tried."""
@@ -130,8 +219,7 @@ class Grammar:
 
     @cached_property
     def _grid(self) -> frozenset[tuple[str, str, Numbers]]:
-        alone = (a for a in self.amplitudes if len(a.factors) == 1)
-        return frozenset(k for a in alone for k in _key(a))
+        return frozenset(k for a in self.amplitudes if len(a.factors) == 1 for k in _key(a))
 
     def inner(self, k: int) -> list[int]:
         """Return the amplitudes with one factor less."""
@@ -212,13 +300,15 @@ def _key(a: Amplitude) -> frozenset[tuple[str, str, Numbers]]:
 
 
 def grammar(known: list[Variable], s: Situation, poses: int = 0) -> Grammar:
-    """Return all products of the functions of the quantities.
-
-    Args:
-        poses: number of poses, which limits the multiples of an angle; see `FINEST`.
-    """
+    """Return all products of functions of the quantities; poses limit the multiples of an angle."""
     singles = [f for v in known for f in functions(v, v.read(s), MOST)]
-    singles += [f for v in known if v.kind == "angle" for f in fine_waves(v, min(poses, FINEST))]
+    singles += [  # fine waves, as complex as a product, so in none
+        Factor(v, f, (float(k),))
+        for v in known
+        if v.kind == "angle"
+        for k in range(HARMONICS + 1, min(poses, FINEST) + 1)
+        for f in (shapes.FINE_COS, shapes.FINE_SIN)
+    ]
     value = np.array([f.values(s) for f in singles]).reshape(len(singles), -1)
     cost = np.array([f.cost for f in singles])
     flat = np.std(value, axis=1) < FLAT * np.sqrt(np.mean(value**2, axis=1))
@@ -236,8 +326,9 @@ def grammar(known: list[Variable], s: Situation, poses: int = 0) -> Grammar:
         Amplitude(tuple(singles[i] for i in pairs[k] if i >= 0)) for k in kept.tolist()
     )
     place = {pairs[k]: at for at, k in enumerate(kept.tolist())}
-    turned = _turned(singles)
-    partner = np.array([_partner(pairs[k], turned, place) for k in kept.tolist()])
+    named = {_key(a): k for k, a in enumerate(amplitudes)}
+    turned = (_turned(a) for a in amplitudes)
+    partner = np.array([-1 if t is None else named.get(_key(t), -1) for t in turned])
     alone = np.array([place.get((i, -1), -1) for i in range(-1, len(singles))])
     first, second = np.array(pairs)[kept].T
     less = np.where(second >= 0, [alone[second + 1], alone[first + 1]], -1)
@@ -259,15 +350,9 @@ def grammar(known: list[Variable], s: Situation, poses: int = 0) -> Grammar:
 
 
 def _products(value: Floats, pairs: Ints) -> tuple[Floats, Floats, Ints]:
-    """Products of pairs of rows, each with root mean square 1, some at a time to save memory.
+    """Products (F', N) of pairs (F, 2) of rows, each with root mean square 1, in single precision.
 
-    Args:
-        value: (C, N) functions.
-        pairs: (F, 2) rows of both factors.
-
-    Returns:
-        (F', N) products in single precision, (F',) what they were divided by, and which of the
-        pairs they are: those that are not zero throughout.
+    Also (F',) what they were divided by, and which of the pairs they are: those that are not zero.
     """
     size = np.empty(len(pairs))
     for part in (slice(a, a + SOME) for a in range(0, len(pairs), SOME)):
@@ -281,23 +366,10 @@ def _products(value: Floats, pairs: Ints) -> tuple[Floats, Floats, Ints]:
     return out, size[kept], kept
 
 
-def _turned(singles: list[Factor]) -> dict[int, int]:
-    """Sine by cosine of the same quantity."""
-    place = {(id(f.variable), f.shape.name, f.numbers): k for k, f in enumerate(singles)}
-    return {
-        k: place[id(f.variable), "sin", f.numbers]
-        for k, f in enumerate(singles)
-        if f.shape.name == "cos"
-    }
-
-
-def _partner(
-    pair: tuple[int, int], turned: dict[int, int], place: dict[tuple[int, int], int]
-) -> int:
-    for at, k in enumerate(pair):
-        if k in turned:
-            other = [*pair]
-            other[at] = turned[k]
-            low, high = sorted(other, key=lambda i: (i < 0, i))
-            return place.get((low, high), -1)
-    return -1
+def _turned(a: Amplitude) -> Amplitude | None:
+    """Return the amplitude with sine for cosine in its first periodic factor; None without any."""
+    for i, f in enumerate(a.factors):
+        if f.shape.name == "cos":
+            sine = replace(f, shape=replace(shapes.SIN, cost=f.shape.cost))
+            return Amplitude((*a.factors[:i], sine, *a.factors[i + 1 :]))
+    return None

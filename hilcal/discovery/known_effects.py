@@ -24,27 +24,18 @@ from hilcal.regression.forward_selection import families_beside
 from hilcal.regression.leave_out import left_out_residuals
 from hilcal.types import Floats
 
-MOST_TOGETHER = 6
-"""Effects that are added at most; a choice."""
+MOST_TOGETHER = 6  # Effects that are added at most; a choice
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KnownEffects:
-    """The effects of the catalogue beside a fit.
+    """The effects of the catalogue beside a fit."""
 
-    Attributes:
-        names: of those that explain the misfit together, in the order of adding them.
-        odds: that each adds: log evidence less the choice.
-        left: variance factor that the linearisation leaves with each of them.
-        white: (R, P) columns of all that could be added.
-        columns: which are whose.
-    """
-
-    names: tuple[str, ...]
-    odds: tuple[float, ...]
-    left: tuple[float, ...]
-    white: Floats
-    columns: dict[str, slice]
+    names: tuple[str, ...]  # of those that explain the misfit together, in the order of adding them
+    odds: tuple[float, ...]  # that each adds: log evidence less the choice
+    left: tuple[float, ...]  # variance factor that the linearisation leaves with each of them
+    white: Floats  # (R, P) columns of all that could be added
+    columns: dict[str, slice]  # which are whose
 
     @property
     def total(self) -> float:
@@ -72,15 +63,10 @@ def known_effects(fit: Fit) -> KnownEffects:
 
 @dataclass(frozen=True, slots=True)
 class Instead:
-    """What the catalogue has in the place of a law.
+    """What the catalogue has in the place of a law."""
 
-    Attributes:
-        names: effects that explain the misfit as well; none where the law is preferred.
-        unfitted: effects that the exact model could not be fitted with, and why.
-    """
-
-    names: tuple[str, ...] = ()
-    unfitted: tuple[tuple[str, str], ...] = ()
+    names: tuple[str, ...] = ()  # that explain as well; none where the law is preferred
+    unfitted: tuple[tuple[str, str], ...] = ()  # that could not be refitted, and why
 
 
 def instead_of_law(
@@ -162,11 +148,7 @@ def resembling(
 
 
 def tells_more(problem: SearchProblem, s: Selection, known: KnownEffects, effect: str) -> bool:
-    """Whether odds of 20 : 1, the search paid for, ask for a law beside an effect that is near it.
-
-    An effect of the catalogue is preferred to a law that describes the same; a law that readings
-    tell from it, as a power of 2.3 from a cube, is not the same.
-    """
+    """Whether odds of 20 : 1, the search paid for, ask for a law beside an effect near it."""
     x, columns = known.white, known.columns
     law = np.hstack([problem.columns(t) for t in s.terms])
     both = np.hstack([x[:, columns[effect]], law])

@@ -1,17 +1,53 @@
 """A law in readable form: where it acts, its formula, its parameters, what speaks for it."""
 
-from collections.abc import Callable, Sequence
+import hashlib
+import re
+import sys
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from types import ModuleType
 
 import numpy as np
 
 from hilcal.discovery.amplitudes import Amplitude, Factor, unit_of
-from hilcal.discovery.expressions import expressions
-from hilcal.discovery.screen import Screen
+from hilcal.discovery.screen import LawTerm, Screen
 from hilcal.discovery.sites import ORDINARY, Site
-from hilcal.discovery.terms import LawTerm
-from hilcal.effects.protocol import Situation
+from hilcal.effects.check import NAME
+from hilcal.effects.protocol import Effect, Situation
+from hilcal.errors import InputError
+from hilcal.names import escaped, quoted
 from hilcal.types import Floats
+
+_QUANTITIES = {"angle": "q", "torque": "tau"}
+_JOINT = re.compile(r"s\.(angle|torque)\[:, (\d+)(?::(\d+))?\](\.sum\(axis=1\))?")
+_FORCE = re.compile(r"np\.linalg\.norm\(s\.states\.wrench\[:, 0:3\], axis=1\)")
+_RECORDED = re.compile(r"s\.states\.(time|air)(?:_temperature)?|np\.")
+_OTHER = re.compile(r"\bs\.|\brecorded\(|\bwhere\(|\bhypot\(|\[")
+
+
+def expressions(law: "Law") -> dict[str, str]:
+    """Return the value of a law by site, in its unit, where plain arithmetic says it.
+
+    E.g. {"dq_3": "0.0002*(sin(3 * q4))"}. Quantities are `q1` ... (rad), `tau1` ... (torques of the
+    drives, N·m), `force` (of the load, N), `time` (s) and `air` (air temperature, °C); operators
+    are Python's, functions have numpy's names, but for `max`. Other sites are left out.
+    """
+    terms: dict[str, list[str]] = {}
+    for p in law.form.parts:
+        value = law.parameters[p.coefficient].value
+        terms.setdefault(p.site.symbol, []).append(f"{value!r}*({p.amplitude.code()})")
+    plain = {}
+    for symbol, own in terms.items():
+        text = " + ".join(own).replace("np.ones(len(s.angle))", "1.0").replace("np.maximum", "max")
+        text = _FORCE.sub("force", _JOINT.sub(_joints, text))
+        plain[symbol] = _RECORDED.sub(lambda m: m[1] or "", text)
+    return {symbol: text for symbol, text in plain.items() if not _OTHER.search(text)}
+
+
+def _joints(m: re.Match[str]) -> str:
+    first, last = int(m[2]), int(m[3] or int(m[2]) + 1)
+    return "(" + " + ".join(f"{_QUANTITIES[m[1]]}{j + 1}" for j in range(first, last)) + ")"
+
 
 LETTERS = "abcdefghklmnoprsuvwxyz"
 
@@ -83,25 +119,19 @@ class Form:
 
     def text(self) -> str:
         """Return the formula as plain text, one equation per site."""
-        return "; ".join(
-            f"{symbol} = {' + '.join(terms)}"
-            for symbol, terms in self._equations(lambda s: s.symbol, _amplitude_text).items()
-        )
+        return "; ".join(self._equations("symbol", "·", Amplitude.text))
 
     def latex(self) -> str:
         """Return the formula in LaTeX."""
-        return r",\quad ".join(
-            f"{symbol} = {' + '.join(terms)}"
-            for symbol, terms in self._equations(lambda s: s.latex, _amplitude_latex).items()
-        )
+        return r",\quad ".join(self._equations("latex", r"\,", Amplitude.latex))
 
-    def _equations(
-        self, symbol: Callable[[Site], str], write: Callable[[str, Amplitude], str]
-    ) -> dict[str, list[str]]:
+    def _equations(self, symbol: str, times: str, write: Callable[[Amplitude], str]) -> list[str]:
         out: dict[str, list[str]] = {}
         for p in self.parts:
-            out.setdefault(symbol(p.site), []).append(write(LETTERS[p.coefficient], p.amplitude))
-        return out
+            letter, inner = LETTERS[p.coefficient], write(p.amplitude)
+            term = f"{letter}{times}{inner}" if inner else letter
+            out.setdefault(getattr(p.site, symbol), []).append(term)
+        return [f"{symbol} = {' + '.join(terms)}" for symbol, terms in out.items()]
 
     def motion(self, sites: tuple[Site, ...], motion: Floats, s: Situation) -> Floats:
         """(N, m, P) motion of each reading, by ordinary motions (N, m, S) of the sites."""
@@ -115,14 +145,6 @@ class Form:
         """(R, P) whitened columns by ordinary motions, at the fit of a screen."""
         w = screen.linear.fit.whitening
         return w.whiten_readings(self.motion(screen.sites, screen.motion, s))
-
-
-def _amplitude_text(letter: str, a: Amplitude) -> str:
-    return f"{letter}·{a.text()}" if a.factors else letter
-
-
-def _amplitude_latex(letter: str, a: Amplitude) -> str:
-    return rf"{letter}\,{a.latex()}" if a.factors else letter
 
 
 def form_of(screen: Screen, terms: tuple[LawTerm, ...]) -> Form:
@@ -182,58 +204,36 @@ def coefficients(form: Form, step: Floats, std: Floats) -> tuple[Coefficient, ..
 
 @dataclass(frozen=True, slots=True)
 class Again:
-    """How often a cause was found again.
-
-    Attributes:
-        variables: the quantities that move it.
-        share: share of the searches without some poses that find the same.
-    """
+    """How often a cause was found again."""
 
     acts_on: str
-    variables: tuple[str, ...]
-    share: float
+    variables: tuple[str, ...]  # the quantities that move it
+    share: float  # share of the searches without some poses that find the same
 
 
 @dataclass(frozen=True, slots=True)
 class Resemblance:
-    """An effect of the catalogue, and how near a law is to what it can describe.
-
-    Attributes:
-        cosine: correlation of the law with what the effect predicts of it on poses left out.
-    """
+    """An effect of the catalogue, and how near a law is to what it can describe."""
 
     effect: str
-    cosine: float
+    cosine: float  # correlation of the law with what the effect predicts of it on poses left out
 
 
 @dataclass(frozen=True, eq=False)
 class Law:
-    """A law that the readings speak for.
+    """A law that the readings speak for."""
 
-    Attributes:
-        name: of its effect.
-        form: where it acts, and how.
-        p_value: of the joint test of its columns, times the number of candidates that were tried.
-        odds: logarithm of the odds against no law, the search paid for.
-        holdout_share: share of the misfit that it explains on poses left out.
-        left: variance factor that is left.
-        again: for each site and its quantities, the share of them that find these.
-        probability: posterior, of its structure.
-        resembles: effects of the catalogue that are near, the nearest first.
-        ranges: least and largest of each quantity in the readings.
-    """
-
-    name: str
-    form: Form
+    name: str  # of its effect
+    form: Form  # where it acts, and how
     parameters: tuple[Coefficient, ...]
-    p_value: float
-    odds: float
-    holdout_share: float
-    left: float
-    probability: float
-    resembles: tuple[Resemblance, ...]
-    ranges: tuple[tuple[str, float, float, str], ...]
-    again: tuple[Again, ...] = ()
+    p_value: float  # of the joint test of its columns, times the number of candidates
+    odds: float  # logarithm of the odds against no law, the search paid for
+    holdout_share: float  # share of the misfit that it explains on poses left out
+    left: float  # variance factor that is left
+    probability: float  # posterior, of its structure
+    resembles: tuple[Resemblance, ...]  # effects of the catalogue that are near, the nearest first
+    ranges: tuple[tuple[str, float, float, str], ...]  # of each quantity in the readings
+    again: tuple[Again, ...] = ()  # how often each site and its quantities were found
 
     @property
     def formula(self) -> str:
@@ -254,3 +254,172 @@ class Law:
     def variables(self) -> tuple[str, ...]:
         """What it depends on."""
         return self.form.variables
+
+
+USUAL = 1e-4  # Ordinary magnitude of a coefficient that nothing is known of, SI; a choice
+_HEAD = '''"""`{name}`: {formula}
+
+Proposed by `hilcal discover`; change it as you like. Every command takes it:
+
+    hilcal effects --effects-from {file}
+    hilcal add RUN.hilcal {name} --effects-from {file}
+    hilcal diagnose RUN.hilcal --effects-from {file}
+
+{evidence}
+
+All is in SI units: m, rad, N, N·m, s; temperatures in °C. N is the number of states, n that of
+joints.
+"""
+
+import numpy as np
+
+from hilcal.effects.protocol import Columns, Effect, Parameter{imports}, Situation
+from hilcal.types import Floats
+
+
+class {class_name}(Effect):
+    """{formula}"""
+
+    name = "{name}"
+    summary = "{formula}"
+{attributes}
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The coefficients; the scale is the magnitude that was found, to one digit."""
+        return (
+{parameters}
+        )
+
+    def columns(self, s: Situation) -> tuple[Columns, ...]:
+        """Derivative of the deviation by the coefficients."""
+{columns}
+'''
+_RESPONSE = '''
+    def response(self, theta: Floats, s: Situation, change: Floats) -> Response:
+        """Change of the deviation by changes (N, P, n + 1, 6) of the wrenches: the chain rule."""
+        slots = change.shape[2]
+        dq = np.zeros((len(s.angle), change.shape[1], slots - 1))
+        twist = np.zeros((len(s.angle), change.shape[1], slots, 6))
+{body}
+        return Response(dq=dq, twist=twist)
+'''
+_SENSOR = '''
+    def sensor_columns(self, s: Situation) -> Floats:
+        """Derivative of the force sensor's error by the coefficients, flange axes."""
+        out = np.zeros((len(s.angle), {count}, 6))
+{body}
+        return out
+
+    def wrench_change(self, theta: Floats, s: Situation) -> Floats:
+        """Change of the load's wrench: what acts is what was recorded less the error."""
+        return acting_change(s, np.einsum("npc,p->nc", self.sensor_columns(s), theta))
+
+    def wrench_columns(self, theta: Floats, s: Situation) -> Floats:
+        """Derivative of the wrenches through the arm by the coefficients."""
+        return acting_columns(s, self.sensor_columns(s))
+'''
+_IMPORTED = "from hilcal.effects.force_sensor import acting_change, acting_columns, recorded\n"
+_PROTOCOL = "from hilcal.effects.protocol"
+_FLOATS = "from hilcal.types import Floats\n"
+
+
+def source_of_form(
+    form: Form,
+    name: str,
+    found: tuple[Coefficient, ...] = (),  # its coefficients, for their ordinary magnitudes
+    evidence: str = "Nothing is stated of its evidence.",  # what speaks for it, in lines
+    file: str = "F.py",
+) -> str:
+    """Return the Python file of a law."""
+    if not NAME.fullmatch(name):
+        raise InputError(f"effect {escaped(name)!r}; valid: lower-case letters, digits and _")
+    attributes = ["    elastic = True\n"] if form.elastic else []
+    if form.of_setup:
+        attributes.append("    of_setup = True\n")
+    if form.needs:
+        needs = "".join(f'"{n}", ' for n in form.needs).rstrip()
+        attributes.append(f"    needs = ({needs})\n")
+    source = _HEAD.format(
+        name=name, formula=form.text(), file=_in_docstring(quoted(file)),
+        evidence="\n".join(map(_in_docstring, evidence.split("\n"))),
+        imports=", Response" if form.elastic else "", class_name=class_name(name),
+        attributes="".join(attributes), parameters="\n".join(_parameters(form, found)),
+        columns="\n".join(_moving(form)),
+    )  # fmt: skip
+    if form.elastic:
+        source += _RESPONSE.format(body="\n".join(_responses(form)))
+    if any(p.site.field == "sensor" for p in form.parts):
+        source += _SENSOR.format(count=form.count, body="\n".join(_misread(form)))
+        names = _IMPORTED if "recorded(s)" in source else _IMPORTED.replace(", recorded", "")
+        source = source.replace(_PROTOCOL, names + _PROTOCOL, 1)
+    elif not form.elastic:
+        source = source.replace(_FLOATS, "")
+    return source
+
+
+def _in_docstring(line: str) -> str:
+    return escaped(line).replace("\\", "\\\\").replace('"', '\\"')
+
+
+def class_name(name: str) -> str:
+    """Return the name of the class of an effect."""
+    return "".join(part.capitalize() for part in name.split("_"))
+
+
+def effect_class(source: str, name: str) -> type[Effect]:
+    """Return the effect of a source, as a file with it would give it."""
+    hashed = hashlib.sha256(source.encode()).hexdigest()[:16]
+    module = ModuleType(f"law_{hashed}")
+    module.__file__ = f"<law {name}>"
+    sys.modules[module.__name__] = module
+    try:
+        exec(compile(source, module.__file__, "exec"), module.__dict__)  # noqa: S102 - made above
+    finally:
+        del sys.modules[module.__name__]
+    found: type[Effect] = module.__dict__[class_name(name)]
+    return found
+
+
+def _parameters(form: Form, found: tuple[Coefficient, ...]) -> Iterator[str]:
+    size = {c.name: abs(c.value) for c in found}
+    scales = {k: float(f"{x:.0e}") for k, x in size.items() if x > 0 and np.isfinite(x)}
+    for k, letter in enumerate(LETTERS[: form.count]):
+        where = ", ".join(dict.fromkeys(p.site.words for p in form.parts if p.coefficient == k))
+        scale = scales.get(letter, USUAL)
+        yield f'            Parameter("{letter}", "{form.unit(k)}", {scale!r}, "{where}"),'
+
+
+def _moving(form: Form) -> Iterator[str]:
+    parts = [(k, p) for k, p in enumerate(form.parts) if p.site.field != "sensor"]
+    if not parts:
+        yield "        return ()"
+        return
+    yield from (f"        by_{k} = {p.amplitude.code()}" for k, p in parts)
+    yield "        return ("
+    yield from (f"            {_columns(k, p)}," for k, p in parts)
+    yield "        )"
+
+
+def _misread(form: Form) -> Iterator[str]:
+    for p in form.parts:
+        if p.site.field == "sensor":
+            yield f"        by = {p.amplitude.code()}"
+            yield f"        out[:, {p.coefficient}, {p.site.axis}] += by"
+
+
+def _columns(k: int, p: LawPart) -> str:
+    index = f"np.array([{p.coefficient}]), np.array([{p.site.element}])"
+    if p.site.field in ("dq", "scale"):
+        return f'Columns("{p.site.field}", {index}, by_{k}[:, None])'
+    axis = np.eye(6, dtype=int)[p.site.axis].tolist()
+    return f'Columns("{p.site.field}", {index}, by_{k}[:, None, None] * np.array({axis}))'
+
+
+def _responses(form: Form) -> Iterator[str]:
+    for p in form.parts:
+        for (slot, component), slope in p.amplitude.slopes():
+            to = f"dq[:, :, {p.site.element}]"
+            if p.site.field != "dq":
+                to = f"twist[:, :, {p.site.element}, {p.site.axis}]"
+            yield f"        slope = theta[{p.coefficient}] * {slope}"
+            yield f"        {to} += slope[:, None] * change[:, :, {slot}, {component}]"

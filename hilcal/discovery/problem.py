@@ -11,36 +11,26 @@ from functools import cached_property
 
 import numpy as np
 
-from hilcal.discovery.compose import composed_terms
-from hilcal.discovery.grow import grown
-from hilcal.discovery.screen import Screen
-from hilcal.discovery.terms import LawTerm, Scored, ScreenedTerm, Screening
+from hilcal.discovery.compose import composed_terms, grown
+from hilcal.discovery.screen import LawTerm, Scored, Screen, ScreenedTerm, Screening
 from hilcal.regression.evidence import FamilyScore, score_family
 from hilcal.regression.projection import Projection, projection
 from hilcal.types import Bools, Floats, Ints
 
-EXTENDED = 40
-"""Of these, those that are extended to other axes and joints; a choice."""
+EXTENDED = 40  # Of these, those that are extended to other axes and joints; a choice
 
 
-LEFT = 1e-3
-"""Share of a column's square that chosen terms must leave for it to count as another; a choice."""
+LEFT = 1e-3  # share of a column's square that chosen terms must leave; a choice
 LOG2 = float(np.log(2.0))
-LOG_ZERO = 2 * LOG2
-"""Price of a free zero of one of two factors: for having one, and for which."""
-LEAST_RIDGE = 1e-6
-"""Least ridge of the model's directions, not all of which some rows determine; a choice."""
+LOG_ZERO = 2 * LOG2  # Price of a free zero of one of two factors: for having one, and for which
+LEAST_RIDGE = 1e-6  # of the model's directions, not all of which some rows determine; a choice
 
 
 class SearchProblem:
     """The search on some of the rows."""
 
     def __init__(self, screen: Screen, rows: Bools | None = None) -> None:
-        """Refit the model to the rows.
-
-        Args:
-            rows: (R,) those that are used; all by default.
-        """
+        """Refit the model to some of the rows (R,); all by default."""
         linear = screen.linear
         self.screen = screen
         every = np.ones(len(linear.residual), dtype=np.bool_)
@@ -96,11 +86,7 @@ class SearchProblem:
         return self.screen.inner(whole)
 
     def shadows(self, x: Floats) -> tuple[list[Floats], Floats, list[Floats]]:
-        """What columns (R', P) of chosen terms take from all candidates in the screening.
-
-        Returns:
-            (S, F) xᵀ u of orthonormal directions u beside the model, uᵀ r, and u.
-        """
+        """What columns (R', P) of chosen terms take: (S, F) xᵀ u of directions u, uᵀ r, and u."""
         x = x[self.screened[self.rows]]
         u = orthonormal(self._thin, x)
         told = u.T @ self._thin_residual
@@ -165,7 +151,6 @@ class Beside:
 
     @cached_property
     def _known(self) -> tuple[frozenset[int], frozenset[str]]:
-        """Sites and quantities of the chosen terms."""
         screen = self.problem.screen
         parts = [part for t in self.chosen for part in t.parts]
         names = (n for _, f in parts for n in screen.grammar.at(f).names)
@@ -214,7 +199,7 @@ class Beside:
 
         Keys: "" for nothing; "p" for the phase: with the partner; "c" for a constant at the site,
         and "pc" for both; "1" and "2" for the zero of the first and of the second factor of a
-        product: with the other factor alone.
+        product.
         """
         p, all_ = self.problem, self.screened
         words, one = p.screen.grammar, p.screen.one
@@ -369,12 +354,9 @@ class Beside:
             yield self.term(parts, LOG2, common=True)
 
 
-SHORT_LIST = 200
-"""Candidates that are scored in full at each step; a choice."""
-OF_SITE = 60
-"""Of each site at most; a choice."""
-SPANNED = 1e-9
-"""Directions of chosen columns below this share of the largest are rounding."""
+SHORT_LIST = 200  # Candidates that are scored in full at each step; a choice
+OF_SITE = 60  # Of each site at most; a choice
+SPANNED = 1e-9  # Directions of chosen columns below this share of the largest are rounding
 
 
 def orthonormal(model: Projection, x: Floats) -> Floats:
@@ -391,13 +373,8 @@ def together(
 ) -> Floats:
     """(H,) gain of candidates at a site with another column each; zero where they are alike.
 
-    Args:
-        square: (F,) xᵀ M x, not zero.
-        slope: (F,) xᵀ r.
-        across: (F,) xᵀ M x' with the other.
-        seen: (F,) whether the model leaves something of a candidate.
-        which: (H,) of the candidates.
-        other: (F,) the other of each.
+    Of all at the site: (F,) xᵀ M x, xᵀ r, xᵀ M x', whether the model leaves something; (H,) which,
+    and (F,) the other of each.
     """
     a, b, h = square[which], square[other[which]], across[which]
     g, k = slope[which], slope[other[which]]

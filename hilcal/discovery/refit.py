@@ -17,26 +17,23 @@ from hilcal.discovery.law import (
     Coefficient,
     Form,
     coefficients,
+    effect_class,
+    source_of_form,
     with_coefficients,
     with_factors,
 )
 from hilcal.discovery.screen import Screen
-from hilcal.discovery.write_effect import effect_class, source_of_form
 from hilcal.effects.check import check_effect
 from hilcal.effects.protocol import Effect, Situation
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.fit import Fit, fit
 from hilcal.types import Floats
 
-WORTH = 3.0
-"""Gain in log likelihood that a refined number needs, beside ½ ln ν; 20 : 1."""
+WORTH = 3.0  # Gain in log likelihood that a refined number needs, beside ½ ln ν; 20 : 1
 DIGITS = 3
-SPANNED = 1e-10
-"""Directions of a law's columns below this share of the largest are rounding."""
-FACTOR = 30.0
-"""Factor by which a positive number may change at most; a choice."""
-SPREADS = 3.0
-"""Standard deviations of its quantity by which a level may move at most; a choice."""
+SPANNED = 1e-10  # Directions of a law's columns below this share of the largest are rounding
+FACTOR = 30.0  # Factor by which a positive number may change at most; a choice
+SPREADS = 3.0  # Standard deviations of its quantity by which a level may move at most; a choice
 
 
 def refine(screen: Screen, form: Form) -> Form:
@@ -92,18 +89,10 @@ def at_linearisation(screen: Screen, form: Form) -> tuple[Coefficient, ...]:
 def exact(
     screen: Screen, form: Form, name: str
 ) -> tuple[Fit, Form, tuple[Coefficient, ...], type[Effect]]:
-    """Refit the model with the law as an effect that keeps to the protocol.
+    """Refit the model with the law as an effect that keeps to the protocol; return both.
 
     A coefficient that the model absorbs is dropped, as the zero of a compliance that grows with
-    time, a τ (t − t0), beside a compliance of the model: it is no part of what is found.
-
-    Returns:
-        The fit, the law as it was fitted, its coefficients, and the effect.
-
-    Raises:
-        CannotAnswerError: the readings do not determine the law, or the model finds no equilibrium
-            with it.
-        InputError: the effect does not keep to the protocol.
+    time beside a compliance of the model: it is no part of what is found.
     """
     before = screen.linear.fit
     s = before.solution.prediction.situation
@@ -132,22 +121,14 @@ def exact(
 
 @dataclass(frozen=True, slots=True)
 class FreeNumber:
-    """A number, wherever it is in a law.
+    """A number, wherever it is in a law."""
 
-    Attributes:
-        places: (part, factor) of each function that has it.
-        index: of it among the function's numbers, or among the weights of its quantity.
-        weight: whether it is a weight.
-        scale: one unit of its change; 0 where it changes by factors instead, eˣ.
-        least: value that it has at least.
-    """
-
-    places: tuple[tuple[int, int], ...]
-    index: int
-    weight: bool
+    places: tuple[tuple[int, int], ...]  # (part, factor) of each function that has it
+    index: int  # of it among the function's numbers, or among the weights of its quantity
+    weight: bool  # whether it is a weight
     begin: float
-    scale: float
-    least: float = -np.inf
+    scale: float  # one unit of its change; 0 where it changes by factors instead, eˣ
+    least: float = -np.inf  # value that it has at least
 
     def at(self, x: float) -> float:
         """Return its value after a change; infinite where that is too large."""
@@ -171,10 +152,7 @@ def _terms(factor: Factor) -> tuple[tuple[float, Amplitude], ...]:
 
 
 def free_numbers(form: Form, s: Situation) -> list[FreeNumber]:
-    """Return the free numbers of a law.
-
-    The same function of the same quantity in several products has one number.
-    """
+    """Return the free numbers of a law; the same function in several products has one number."""
     groups: dict[tuple[str, str, tuple[float, ...]], list[tuple[int, int]]] = {}
     for k, p in enumerate(form.parts):
         for i, f in enumerate(p.amplitude.factors):

@@ -21,80 +21,98 @@ from typing import Any
 import numpy as np
 
 from hilcal.discovery import shapes
-from hilcal.discovery.amplitudes import Amplitude
+from hilcal.discovery.amplitudes import Amplitude, variables
 from hilcal.discovery.grammar import Grammar, grammar
 from hilcal.discovery.shapes import Shape
 from hilcal.discovery.sites import Site, site_motions
-from hilcal.discovery.terms import LawTerm
-from hilcal.discovery.variables import variables
 from hilcal.identification.fit import Fit
 from hilcal.identification.linearisation import Linearisation
+from hilcal.regression.evidence import FamilyScore
 from hilcal.regression.projection import projection
 from hilcal.types import Bools, Floats, Ints
 
-MOST_READINGS = 400
-"""Readings that the screening uses at most; a choice, by time: it takes their square."""
-SEEN = 1e-4
-"""Share that must be left of a column's square, of what the readings move each by itself. Less is
-explained by the model, or cancels in deflections, and single precision does not resolve it."""
-ALIKE = 1 - 1e-9
-"""Cosine of two sites' motions from which on they are the same; rounding."""
-LEAST_MOTION = 1e-4
-"""Square of a column that counts as none, in units of the noise: all readings together move by less
-than 0.01 σ at an ordinary motion. As in `regression.evidence`."""
+
+@dataclass(frozen=True, slots=True)
+class LawTerm:
+    """Columns of a law that are chosen together."""
+
+    parts: tuple[tuple[int, int], ...]  # (site, amplitude) of each column, by index
+    price: float  # what the search costs it
+    common: bool = False  # whether all columns have one coefficient
+    alone: float = 0.0  # what it would cost as the first term
+
+    @property
+    def count(self) -> int:
+        """Number of coefficients."""
+        return 1 if self.common else len(self.parts)
+
+
+@dataclass(frozen=True, eq=False)
+class Scored:
+    """A term beside others."""
+
+    term: LawTerm
+    score: FamilyScore  # its score as a family
+
+    @property
+    def odds(self) -> float:
+        """Evidence less what the search costs."""
+        return self.score.log_evidence - self.term.price
+
+
+@dataclass(frozen=True, slots=True)
+class ScreenedTerm:
+    """A candidate of the screening: site, amplitude, and its odds."""
+
+    s: int
+    f: int
+    odds: float
+
+
+@dataclass(frozen=True, eq=False)
+class Screening:
+    """All candidates beside some columns, as in `Screen`."""
+
+    slope: Floats  # (S, F) xᵀ r
+    square: Floats  # (S, F) xᵀ M x; zero where little of a column is left
+    across: Floats  # (S, F) xᵀ M x' with the partner
+    across_one: Floats  # (S, F) xᵀ M x' with a constant at the site
+
+
+MOST_READINGS = 400  # that the screening uses; a choice, by time: it takes their square
+SEEN = 1e-4  # share of a column's square that must be left, for single precision
+ALIKE = 1 - 1e-9  # Cosine of two sites' motions from which on they are the same; rounding
+LEAST_MOTION = 1e-4  # square of a column, in the noise, that counts as none
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bends:
-    """Functions of composed quantities, and their sums of squares.
+    """Functions of composed quantities, and their sums of squares."""
 
-    Attributes:
-        argument: (C,) index of the product in the grammar.
-        shape: function of each.
-        values: (C, K) at the readings of the screening, with root mean square 1.
-        square: (S, C) xᵀ M x; zero where a site does not take it.
-        across_one: (S, C) xᵀ M x' with a constant at the site.
-    """
-
-    argument: Ints
-    shape: tuple[Shape, ...]
+    argument: Ints  # (C,) index of the product in the grammar
+    shape: tuple[Shape, ...]  # function of each
     numbers: tuple[tuple[float, ...], ...]
-    values: Floats
-    square: Floats
-    across_one: Floats
+    values: Floats  # (C, K) at the readings of the screening, with root mean square 1
+    square: Floats  # (S, C) xᵀ M x; zero where a site does not take it
+    across_one: Floats  # (S, C) xᵀ M x' with a constant at the site
 
 
 @dataclass(frozen=True, eq=False)
 class Screen:
-    """All candidates beside a model.
+    """All candidates beside a model."""
 
-    Attributes:
-        linear: the fit as a linear problem.
-        grammar: amplitudes.
-        sites: where they act.
-        motion: (N, m, S) motion of each reading by an ordinary motion of each site.
-        rows: (R,) which of the whitened rows the screening uses.
-        readings: (K,) which of the fitted readings it uses.
-        form: (S, R', K) T_s of these rows and readings, single precision.
-        free: (S, K, K) Q_s of these.
-        square: (S, F) xᵀ M x; zero where the model explains a column.
-        across: (S, F) xᵀ M x' with the partner of each amplitude.
-        across_one: (S, F) xᵀ M x' with a constant at the site.
-        across_less: (2, S, F) xᵀ M x' of a product with what is left without either factor.
-    """
-
-    linear: Linearisation
-    grammar: Grammar
-    sites: tuple[Site, ...]
-    motion: Floats
-    rows: Bools
-    readings: Ints
-    form: Floats
-    free: Floats
-    square: Floats
-    across: Floats
-    across_one: Floats
-    across_less: Floats
+    linear: Linearisation  # the fit as a linear problem
+    grammar: Grammar  # amplitudes
+    sites: tuple[Site, ...]  # where they act
+    motion: Floats  # (N, m, S) motion of each reading by an ordinary motion of each site
+    rows: Bools  # (R,) which of the whitened rows the screening uses
+    readings: Ints  # (K,) which of the fitted readings it uses
+    form: Floats  # (S, R', K) T_s of these rows and readings, single precision
+    free: Floats  # (S, K, K) Q_s of these
+    square: Floats  # (S, F) xᵀ M x; zero where the model explains a column
+    across: Floats  # (S, F) xᵀ M x' with the partner of each amplitude
+    across_one: Floats  # (S, F) xᵀ M x' with a constant at the site
+    across_less: Floats  # (2, S, F) xᵀ M x' of a product with what is left without either factor
 
     @cached_property
     def price(self) -> Floats:
@@ -180,13 +198,9 @@ def screen(linear: Linearisation) -> Screen:
 
 
 def screened(
-    linear: Linearisation,
-    words: Grammar,
-    places: tuple[Site, ...],
-    motion: Floats,
-    rows: Bools,
+    linear: Linearisation, words: Grammar, places: tuple[Site, ...], motion: Floats, rows: Bools,
     readings: Ints,
-) -> Screen:
+) -> Screen:  # fmt: skip
     """Return all candidates of some amplitudes and sites, as `Screen` has them."""
     w = linear.fit.whitening
     own = projection(linear.rows[rows], linear.projection.ridge)
@@ -227,10 +241,6 @@ def _across_factors(words: Grammar, values: Floats, lifted: Floats) -> Floats:
     """(2, F) xᵀ Q x' of products with what is left without the first, and the second factor.
 
     With a product f g and Q symmetric, (f g)ᵀ Q g = fᵀ (g ∘ Q g): no product is formed.
-
-    Args:
-        values: (F, K) these, each with root mean square 1.
-        lifted: (F, K) Q of them.
     """
     out: Floats = np.zeros((2, len(words.size)), dtype=np.float32)
     products = np.flatnonzero((words.less >= 0).all(axis=0))
@@ -261,26 +271,16 @@ def _thinned(fit: Fit) -> tuple[Bools, Ints]:
 
 
 LEVELS = (0.2, 0.35, 0.5, 0.65, 0.8)
-STEPS = (0.25, 0.5, 0.75)
-"""Shares of the readings below a bend, and a step, to begin with; a choice, by time."""
-WIDTH = 0.3
-"""Of a step, by the standard deviation of the argument; a choice."""
-MOST_ARGUMENTS = 4000
-"""Arguments at most, the simplest first; a choice, by memory."""
+STEPS = (0.25, 0.5, 0.75)  # shares of the readings below a bend, and a step; a choice, by time
+WIDTH = 0.3  # Of a step, by the standard deviation of the argument; a choice
+MOST_ARGUMENTS = 4000  # Arguments at most, the simplest first; a choice, by memory
 
 
 def bends(
     grammar: Grammar, sites: tuple[Site, ...], readings: Ints, form: Floats, free: Floats,
     seen: tuple[float, float],
 ) -> Bends:  # fmt: skip
-    """Form all of them.
-
-    Args:
-        readings: (K,) those of the screening.
-        form: (S, R', K) whitened motion of each site; see `screen`.
-        free: (S, K, K) its products, the model projected out.
-        seen: share of a column's square, and square, that must be left.
-    """
+    """Form all bends of (K,) readings, motions (S, R', K) of the sites, products (S, K, K)."""
     which = grammar.smooth[:MOST_ARGUMENTS]
     argument, made, numbers, rows = [], [], [], []
     for k in which.tolist():

@@ -12,37 +12,25 @@ from itertools import pairwise
 import numpy as np
 
 from hilcal.discovery.problem import SHORT_LIST, SearchProblem
-from hilcal.discovery.screen import Screen
-from hilcal.discovery.terms import LawTerm, Scored
+from hilcal.discovery.screen import LawTerm, Scored, Screen
 from hilcal.regression.evidence import FamilyScore
 from hilcal.regression.forward_selection import families_beside
 from hilcal.types import Floats
 
-BEAM = 3
-"""First terms with which selections are begun; a choice."""
-MOST_TERMS = 3
-"""Terms of a law at most; a choice."""
-MOST_COEFFICIENTS = 8
-"""Coefficients of a law at most; a choice: more is no law that one reads."""
-LEAST = 3.0
-"""Logarithm of the odds, the search paid for, that a further term needs: 20 : 1."""
-FALSE_ALARM = 1e-3
-"""Chance of a first term where nothing is hidden, over the whole search."""
-SAME = 0.98
-"""Correlation of two projected columns from which on they count as the same law."""
+BEAM = 3  # First terms with which selections are begun; a choice
+MOST_TERMS = 3  # Terms of a law at most; a choice
+MOST_COEFFICIENTS = 8  # Coefficients of a law at most; a choice: more is no law that one reads
+LEAST = 3.0  # Logarithm of the odds, the search paid for, that a further term needs: 20 : 1
+FALSE_ALARM = 1e-3  # Chance of a first term where nothing is hidden, over the whole search
+SAME = 0.98  # Correlation of two projected columns from which on they count as the same law
 
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """Terms that were chosen.
+    """Terms that were chosen."""
 
-    Attributes:
-        terms: in the order of choosing them.
-        odds: that each added.
-    """
-
-    terms: tuple[LawTerm, ...]
-    odds: tuple[float, ...]
+    terms: tuple[LawTerm, ...]  # in the order of choosing them
+    odds: tuple[float, ...]  # that each added
 
     @property
     def total(self) -> float:
@@ -103,10 +91,7 @@ def _ordered(problem: SearchProblem, chosen: tuple[LawTerm, ...] = ()) -> list[S
 
 
 def _preference(screen: Screen, c: Scored) -> tuple[float, ...]:
-    """Which of terms as good is taken: the simplest, and of equally simple ones the likeliest.
-
-    The rank of functions decides only where the odds are the same to within one.
-    """
+    """Which of terms as good is taken: the simplest, and of equally simple ones the likeliest."""
     *simple, functions = _simplicity(screen, c.term)
     return (*simple, -round(c.odds), functions, -c.odds)
 
@@ -114,30 +99,27 @@ def _preference(screen: Screen, c: Scored) -> tuple[float, ...]:
 def _simplicity(screen: Screen, t: LawTerm) -> tuple[float, ...]:
     """Numbers and complexity, rank of sites, joints apart, rank of functions; smaller is simpler.
 
-    A coefficient, and a number that is not of the grid, count as much as a unit of complexity: the
-    free zero of a factor is no less simple than an exponent of 4. Of causes that the readings do
-    not tell apart, as joints that warm alike, the one of the joint itself is simpler than that of
-    another. A joint's temperature seldom moves anything but this joint and stands for whatever
-    else changes with time: elsewhere it counts a unit more.
+    A coefficient, and a number that is not of the grid, count as much as a unit of complexity. Of
+    causes that the readings do not tell apart, the one of the joint itself is simpler than that of
+    another. A joint's temperature stands for whatever else changes with time: elsewhere it counts a
+    unit more.
     """
     amplitudes = [screen.grammar.at(a) for _, a in t.parts]
     cost = max(a.cost + screen.grammar.tuned(a) for a in amplitudes)
     sites = max(screen.sites[s].rank for s, _ in t.parts)
     functions = max(sum(f.shape.rank for f in a.factors) for a in amplitudes)
     far = [
-        [(_far(f.variable.joint, screen.sites[s].joint), f.variable.kind) for f in a.factors]
+        [
+            # of the site's own joint, of none, or of another one
+            (0 if f.variable.joint == screen.sites[s].joint else 1 + (f.variable.joint >= 0),
+             f.variable.kind)
+            for f in a.factors
+        ]
         for a, (s, _) in zip(amplitudes, t.parts, strict=True)
-    ]
+    ]  # fmt: skip
     apart = max(sum(distance for distance, _ in each) for each in far)
     cost += any((2, "temperature") in each for each in far)
     return t.count + cost, sites, apart, functions
-
-
-def _far(quantity: int, site: int) -> int:
-    """Whether a quantity is that of the site's own joint (0), of none (1), or of another (2)."""
-    if quantity == site:
-        return 0
-    return 1 if quantity < 0 else 2
 
 
 def _keep(problem: SearchProblem, best: dict[int, Selection], s: Selection) -> None:
@@ -162,14 +144,12 @@ def _better(problem: SearchProblem, s: Selection, other: Selection) -> bool:
 
 
 def _sure(c: Scored, problem: SearchProblem) -> bool:
-    """Whether chance would not do the same, over the whole search."""
     return c.odds > LEAST and np.log(max(c.score.p_value, 1e-300)) + c.term.price < np.log(
         FALSE_ALARM
     )
 
 
 def _distinct(problem: SearchProblem, found: list[Scored], count: int) -> list[Scored]:
-    """Return the best terms that are not the same law."""
     out: list[Scored] = []
     units: list[Floats] = []
     for c in found[:SHORT_LIST]:
@@ -206,10 +186,7 @@ def _pruned(problem: SearchProblem, s: Selection) -> Selection:
 
 
 def _exchanged(problem: SearchProblem, s: Selection, last: int) -> Selection:
-    """Exchange each term, up to some, for a better one beside the others.
-
-    These were not there when it was chosen.
-    """
+    """Exchange each of the first terms for a better one beside the others, which came later."""
     for k in range(last):
         others = (*s.terms[:k], *s.terms[k + 1 :])
         found = _ordered(problem, others)
@@ -239,10 +216,7 @@ def _extent(problem: SearchProblem, terms: tuple[LawTerm, ...]) -> tuple[float, 
 
 
 def chain(problem: SearchProblem, terms: tuple[LawTerm, ...]) -> tuple[float, ...]:
-    """Odds of each term beside those before it, whose coefficients keep their priors.
-
-    So they add up to the odds of the whole law, and compare with those of effects.
-    """
+    """Odds of each term beside those before it; they add up to the odds of the whole law."""
     scores = chained(problem, terms)
     return tuple(s.log_evidence - t.price for s, t in zip(scores, terms, strict=True))
 

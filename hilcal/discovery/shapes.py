@@ -31,27 +31,16 @@ _Written = Callable[[str, list[str]], str]
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """A function f(x; p) of one quantity.
+    """A function f(x; p) of one quantity."""
 
-    Attributes:
-        name: e.g. "saturation".
-        cost: its complexity.
-        code: f as Python, of the name of x and the numbers p as Python.
-        slope_code: ∂f/∂x likewise.
-        text: f as text, likewise.
-        power: p of the unit of x that f has.
-        free: which of the numbers p a refinement may change.
-        places: which of these are values of x, which may be zero or negative.
-    """
-
-    name: str
-    cost: int
-    code: _Written
-    slope_code: _Written
-    text: _Written
-    power: Callable[[Numbers], float] = lambda p: 0.0
-    free: tuple[int, ...] = ()
-    places: tuple[int, ...] = ()
+    name: str  # e.g. "saturation".
+    cost: int  # its complexity
+    code: _Written  # f as Python, of the name of x and the numbers p as Python
+    slope_code: _Written  # ∂f/∂x likewise
+    text: _Written  # f as text, likewise
+    power: Callable[[Numbers], float] = lambda p: 0.0  # p of the unit of x that f has
+    free: tuple[int, ...] = ()  # which of the numbers p a refinement may change
+    places: tuple[int, ...] = ()  # which of these are values of x, which may be zero or negative
 
     def value(self, x: Floats, p: Any) -> Floats:
         """Return f at x; numbers may be arrays that broadcast with it."""
@@ -137,8 +126,7 @@ SIN = Shape(
     lambda x, p: f"{p[0]} * np.cos({_times(p[0], x, ' * ')})",
     lambda x, p: f"sin({_times(p[0], x)})",
 )  # fmt: skip
-FINE_COS, FINE_SIN = replace(COS, cost=3), replace(SIN, cost=3)
-"""Of high orders, which are many to choose from."""
+FINE_COS, FINE_SIN = replace(COS, cost=3), replace(SIN, cost=3)  # of high orders
 ODD = Shape(
     "odd", 2,
     lambda x, p: f"{x} * {_root(x, p)} ** ({p[0]} - 1)",

@@ -20,36 +20,23 @@ ORDINARY = {"rad": 1e-4, "m": 1e-4, "1": 1e-5, "N": 1.0, "N·m": 0.1}
 a force sensor; a choice. It only sets the range of strengths that the evidence tries, which is a
 million wide."""
 Place = Field | Literal["sensor"]
-SETUP = ("target", "tracker", "force sensor")
-"""What is set up anew for another campaign of the same arm."""
+SETUP = ("target", "tracker", "force sensor")  # set up anew for another campaign
 _AXES = "xyz"
 
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """A unit motion.
+    """A unit motion."""
 
-    Attributes:
-        field: of `Deviation`; "sensor" for the recorded wrench, flange axes.
-        element: joint or slot; 0 where the field has none.
-        axis: component of the twist; 0 for joints and the scale.
-        group: what moves, e.g. "joint 2 bearing tilts".
-        words: the same with the axis.
-        symbol: in formulas.
-        latex: likewise.
-        unit: rad, m, 1, N or N·m.
-        joint: index of the joint that it belongs to; −1 for none.
-    """
-
-    field: Place
-    element: int
-    axis: int
-    group: str
-    words: str
-    symbol: str
-    latex: str
-    unit: str
-    joint: int = -1
+    field: Place  # of `Deviation`; "sensor" for the recorded wrench, flange axes
+    element: int  # joint or slot; 0 where the field has none
+    axis: int  # component of the twist; 0 for joints and the scale
+    group: str  # what moves, e.g. "joint 2 bearing tilts".
+    words: str  # the same with the axis
+    symbol: str  # in formulas
+    latex: str  # likewise
+    unit: str  # rad, m, 1, N or N·m
+    joint: int = -1  # index of the joint that it belongs to; −1 for none
 
     @property
     def rank(self) -> int:
@@ -67,9 +54,9 @@ class Site:
     def takes(self, elastic: bool, sensed: bool = False) -> bool:
         """Whether a law that depends on transmitted or on recorded wrenches, or not, may act here.
 
-        Transmitted wrenches move parts of the arm only. They move the base as the frame of joint 1,
-        other causes as the frame of the base itself. What the force sensor reads, in its own axes,
-        is the cause of its own errors only.
+        Transmitted wrenches move parts of the arm only, the base as the frame of joint 1; other
+        causes move it as the frame of the base. What the force sensor reads is the cause of its own
+        errors only.
         """
         if self.field == "sensor" or sensed:
             return self.field == "sensor" and not elastic
@@ -112,14 +99,9 @@ def sites(n: int) -> tuple[Site, ...]:
 
 
 def _twists(
-    element: int,
-    group: str,
-    symbol: str,
-    latex: str,
-    axes: tuple[int, ...],
-    joint: int = -1,
+    element: int, group: str, symbol: str, latex: str, axes: tuple[int, ...], joint: int = -1,
     field: Field = "twist",
-) -> list[Site]:
+) -> list[Site]:  # fmt: skip
     out = []
     for c in axes:
         axis, way = _AXES[c % 3], "along" if c < 3 else "about"

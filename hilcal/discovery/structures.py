@@ -27,7 +27,7 @@ from hilcal.discovery.amplitudes import Composed, Factor
 from hilcal.discovery.law import Coefficient, Form, coefficients, form_of
 from hilcal.discovery.problem import SearchProblem
 from hilcal.discovery.refit import refine
-from hilcal.discovery.screen import Screen
+from hilcal.discovery.screen import LawTerm, Screen
 from hilcal.discovery.search import (
     LEAST,
     MOST_COEFFICIENTS,
@@ -38,41 +38,28 @@ from hilcal.discovery.search import (
     plain,
 )
 from hilcal.discovery.sites import motions_of
-from hilcal.discovery.terms import LawTerm
 from hilcal.identification.fit import Fit
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import whitening
 from hilcal.types import Floats
 
 Terms = tuple[LawTerm, ...]
-MOST_LIKELY = 8
-"""Structures within Occam's window that are kept; a choice."""
-CLOSE = 12.0
-"""Log odds from the best within which a structure counts; a choice: others are e⁻¹² of it."""
+MOST_LIKELY = 8  # Structures within Occam's window that are kept; a choice
+CLOSE = 12.0  # log odds from the best within which a structure counts; a choice
 
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """A structure of a law, its numbers where they explain most.
+    """A structure of a law, its numbers where they explain most."""
 
-    Attributes:
-        kind: sites and functions; see `structure_of`.
-        probability: posterior, of all that were met.
-        holdout_share: share of the misfit that it explains on poses left out, by algebra.
-        step: (P,) posterior mean of its coefficients, in ordinary motions.
-        root: (P, Q) root of their posterior covariance.
-        absorbed: (K, P) change of the model's coordinates that describes most of each column.
-        law: name of the law that it is, where it is proposed.
-    """
-
-    kind: Hashable
+    kind: Hashable  # sites and functions; see `structure_of`
     form: Form
-    probability: float
-    holdout_share: float
-    step: Floats
-    root: Floats
-    absorbed: Floats
-    law: str = ""
+    probability: float  # posterior, of all that were met
+    holdout_share: float  # share of the misfit that it explains on poses left out, by algebra
+    step: Floats  # (P,) posterior mean of its coefficients, in ordinary motions
+    root: Floats  # (P, Q) root of their posterior covariance
+    absorbed: Floats  # (K, P) change of the model's coordinates that describes most of each column
+    law: str = ""  # name of the law that it is, where it is proposed
 
     @property
     def parameters(self) -> tuple[Coefficient, ...]:
@@ -81,10 +68,7 @@ class Structure:
 
 
 def posterior(odds: Mapping[Hashable, Sequence[float]]) -> dict[Hashable, float]:
-    """Return the probability of each structure, from the log odds of its members against no law.
-
-    They and that of no law, which is not returned, sum to one.
-    """
+    """Return the probability of each structure, from the log odds of its members against no law."""
     each = {kind: float(logsumexp(of)) for kind, of in odds.items()}
     whole = float(logsumexp([0.0, *each.values()]))
     return {kind: float(np.exp(x - whole)) for kind, x in each.items()}
@@ -189,15 +173,9 @@ def pareto(of: Sequence[Structure]) -> tuple[Structure, ...]:
 
 
 def averaged(fit: Fit, of: Sequence[Structure], readings: Readings) -> tuple[Floats, Floats]:
-    """Return what likely laws add to a fit's prediction of D measurements, and its uncertainty.
+    """Return the (D, m) mean of what likely laws add to a prediction of readings, and its std.
 
-    Args:
-        of: structures; their probabilities are taken relative to their sum.
-        readings: of the same cell, measured or planned.
-
-    Returns:
-        (D, m) mean of the average, and (D, m) standard deviation of the prediction with it: of
-        the model's parameters, the laws' coefficients, and the choice of the law.
+    The uncertainty is of the model's parameters, the laws' coefficients, and the choice of the law.
     """
     prediction = fit.model.predict(readings.states, fit.theta)
     w, s = whitening(readings, fit.mode), prediction.situation

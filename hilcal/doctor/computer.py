@@ -12,9 +12,10 @@ import struct
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from datetime import datetime
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 from typing import Literal
@@ -34,7 +35,8 @@ class Finding:
     mend: str = ""  # what to do about it; empty where nothing is to be done
 
 
-COMPUTER = "computer"
+COMPUTER = partial(Finding, "computer")
+PROGRAM = partial(Finding, "program")
 LEAST_FREE = 1e9
 """Free space below which a campaign may fill the disk, bytes: its recordings take up to 0.1 GB."""
 SLOW_WRITE = 0.1
@@ -45,9 +47,7 @@ FIRST_DAY = datetime(2026, 1, 1).astimezone()
 """A clock before this day has never been set."""
 ON_NETWORK = ("nfs", "nfs4", "cifs", "smb3", "9p", "fuse.sshfs")
 """File systems on which SQLite's locks are not to be relied on (SQLite FAQ, question 5)."""
-_TIME_ERROR = 5
-_WRITES = 9
-PROGRAM = "program"
+_TIME_ERROR, _WRITES = 5, 9
 LOWEST = (3, 11)
 DISTRIBUTION = "hilcal"
 NATIVE = {"pin": "pinocchio", "ur-rtde": "rtde_control", "rerun-sdk": "rerun", "numba": "numba"}
@@ -67,7 +67,7 @@ _EXTRA = re.compile(r"""extra\s*==\s*["']([^"']+)["']""")
 
 def computer(folder: Path) -> tuple[Finding, ...]:
     """Return the findings on this computer, and on the folder where campaigns are stored."""
-    return (clock(), *disk(folder), memory(), load())
+    return (clock(), *disk(folder), _memory(), load())
 
 
 def clock(
@@ -75,17 +75,16 @@ def clock(
     state: Callable[[], int | None] = lambda: _kernel_clock(),
 ) -> Finding:
     """Return whether the clock is set and kept right: readings and revisions bear its time."""
-    is_now = now()
+    is_now, status = now(), state()
     said = is_now.strftime("%Y-%m-%d %H:%M:%S %Z")
     mend = "switch time synchronisation on: timedatectl set-ntp true"
     if is_now < FIRST_DAY:
-        return Finding(COMPUTER, "clock", "problem", f"{said}: it was never set", mend)
-    status = state()
+        return COMPUTER("clock", "problem", f"{said}: it was never set", mend)
     if status is None:
-        return Finding(COMPUTER, "clock", "ok", f"{said}; whether it is synchronised is not known")
+        return COMPUTER("clock", "ok", f"{said}; whether it is synchronised is not known")
     if status == _TIME_ERROR:
-        return Finding(COMPUTER, "clock", "warning", f"{said}, not synchronised", mend)
-    return Finding(COMPUTER, "clock", "ok", f"{said}, synchronised")
+        return COMPUTER("clock", "warning", f"{said}, not synchronised", mend)
+    return COMPUTER("clock", "ok", f"{said}, synchronised")
 
 
 def _kernel_clock() -> int | None:
@@ -101,33 +100,33 @@ def _kernel_clock() -> int | None:
 
 def disk(folder: Path) -> tuple[Finding, ...]:
     """Return whether campaigns can be stored in a folder, durably and fast."""
+    return tuple(_disk(folder))
+
+
+def _disk(folder: Path) -> Iterator[Finding]:
     name = f"disk of {folder}"
     if not folder.is_dir():
         mend = "make it, or name another with --folder"
-        return (Finding(COMPUTER, name, "problem", "there is no such folder", mend),)
-    out = []
+        yield COMPUTER(name, "problem", "there is no such folder", mend)
+        return
     free = shutil.disk_usage(folder).free
-    said = f"{free / 1e9:.1f} GB free"
-    if free < LEAST_FREE:
-        out.append(Finding(COMPUTER, name, "warning", said, "free some space before a campaign"))
-    else:
-        out.append(Finding(COMPUTER, name, "ok", said))
+    little = free < LEAST_FREE
+    mend = "free some space before a campaign" if little else ""
+    yield COMPUTER(name, "warning" if little else "ok", f"{free / 1e9:.1f} GB free", mend)
     kind = _file_system(folder)
     if kind in ON_NETWORK:
         said = f"a file system on the network ({kind}): its locks are not to be relied on"
         mend = "measure into a folder of a local disk, and copy the file afterwards"
-        out.append(Finding(COMPUTER, "file system", "warning", said, mend))
+        yield COMPUTER("file system", "warning", said, mend)
     try:
         seconds = _durable_write(folder)
     except (OSError, sqlite3.Error) as error:
         mend = f"make {folder} writable, or name another with --folder"
-        out.append(Finding(COMPUTER, "writing", "problem", f"fails: {error}", mend))
+        yield COMPUTER("writing", "problem", f"fails: {error}", mend)
     else:
-        said = f"a reading is stored durably in {1e3 * seconds:.1f} ms"
-        slow = seconds > SLOW_WRITE
+        said, slow = f"a reading is stored durably in {1e3 * seconds:.1f} ms", seconds > SLOW_WRITE
         mend = "measure into a folder of a local disk" if slow else ""
-        out.append(Finding(COMPUTER, "writing", "warning" if slow else "ok", said, mend))
-    return tuple(out)
+        yield COMPUTER("writing", "warning" if slow else "ok", said, mend)
 
 
 def _file_system(folder: Path, mounts: Path = Path("/proc/mounts")) -> str:
@@ -159,45 +158,41 @@ def _durable_write(folder: Path) -> float:
     return statistics.median(times)
 
 
-def memory() -> Finding:
+def _memory() -> Finding:
     """Return whether there is memory for large campaigns."""
     try:
-        free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-        whole = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+        pages = (os.sysconf(name) for name in ("SC_AVPHYS_PAGES", "SC_PHYS_PAGES"))
+        free, whole = (n * os.sysconf("SC_PAGE_SIZE") for n in pages)
     except (ValueError, OSError):
-        return Finding(COMPUTER, "memory", "ok", "not known")
-    said = f"{whole / 1e9:.1f} GB, of which {free / 1e9:.1f} GB unused"
-    if whole < LEAST_MEMORY:
-        mend = "campaigns of thousands of readings need another computer"
-        return Finding(COMPUTER, "memory", "warning", said, mend)
-    return Finding(COMPUTER, "memory", "ok", said)
+        return COMPUTER("memory", "ok", "not known")
+    said, little = (
+        f"{whole / 1e9:.1f} GB, of which {free / 1e9:.1f} GB unused",
+        whole < LEAST_MEMORY,
+    )
+    mend = "campaigns of thousands of readings need another computer" if little else ""
+    return COMPUTER("memory", "warning" if little else "ok", said, mend)
 
 
 def load(measured: Callable[[], tuple[float, float, float]] = os.getloadavg) -> Finding:
     """Return whether other programs keep the processors busy: an arm must hear from us in time."""
     cores, busy = os.cpu_count() or 1, measured()[0]
-    said = f"{cores}; in the last minute {busy:.1f} programs wanted one at a time"
+    said, mend = f"{cores}; in the last minute {busy:.1f} programs wanted one at a time", ""
     if busy > cores:
         mend = "end other programs: the arm stops by itself where this program is 0.1 s late"
-        return Finding(COMPUTER, "processors", "warning", said, mend)
-    return Finding(COMPUTER, "processors", "ok", said)
+    return COMPUTER("processors", "warning" if mend else "ok", said, mend)
 
 
 def program(version: str) -> tuple[Finding, ...]:
     """Return the findings on what is installed, of hilcal in this version."""
+    old = sys.version_info < LOWEST
+    said = f"{platform.python_version()} at {sys.executable}, {platform.platform()}"
+    mend = "install Python 3.11 or later" if old else ""
     return (
-        Finding(PROGRAM, "hilcal", "ok", f"version {version}"),
-        _python(),
+        PROGRAM("hilcal", "ok", f"version {version}"),
+        PROGRAM("Python", "problem" if old else "ok", said, mend),
         *packages(metadata.requires(DISTRIBUTION) or ()),
         *_drivers(),
     )
-
-
-def _python() -> Finding:
-    said = f"{platform.python_version()} at {sys.executable}, {platform.platform()}"
-    if sys.version_info < LOWEST:
-        return Finding(PROGRAM, "Python", "problem", said, "install Python 3.11 or later")
-    return Finding(PROGRAM, "Python", "ok", said)
 
 
 def packages(requirements: Iterable[str]) -> tuple[Finding, ...]:
@@ -220,38 +215,31 @@ def packages(requirements: Iterable[str]) -> tuple[Finding, ...]:
             if extra is not None:
                 lacking.setdefault(extra[1], []).append(name)
             elif below is not None and sys.version_info[:2] >= tuple(map(int, below.groups())):
-                version = ".".join(map(str, sys.version_info[:2]))
-                said = f"has no wheel for Python {version}; the driver that needs it says so"
+                python = ".".join(map(str, sys.version_info[:2]))
+                said = f"has no wheel for Python {python}; the driver that needs it says so"
                 mend = "use Python 3.11 or 3.12 for the computer of a cell with such a device"
-                out.append(Finding(PROGRAM, name, "warning", said, mend))
+                out.append(PROGRAM(name, "warning", said, mend))
             else:
                 mend = f"install it: pip install '{requirement}'"
-                out.append(Finding(PROGRAM, name, "problem", "is not installed", mend))
+                out.append(PROGRAM(name, "problem", "is not installed", mend))
             continue
-        why = _loads(NATIVE[name]) if name in NATIVE else ""
-        if why:
+        try:
+            if name in NATIVE:
+                importlib.import_module(NATIVE[name])
+        except Exception as error:
+            why = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
             mend = f"install it anew: pip install --force-reinstall {name}=={version}"
-            out.append(Finding(PROGRAM, name, "problem", f"{version} does not load: {why}", mend))
+            out.append(PROGRAM(name, "problem", f"{version} does not load: {why}", mend))
         else:
             there.append(f"{name} {version}")
-    for extra_name, names in lacking.items():
+    for of, names in lacking.items():
         said = f"{', '.join(names)}: not installed; what needs them says so"
-        mend = f'where it is wanted: pip install "hilcal[{extra_name}]"'
-        out.append(Finding(PROGRAM, f"optional: {extra_name}", "ok", said, mend))
-    return (Finding(PROGRAM, "packages", "ok", ", ".join(there)), *out)
+        mend = f'where it is wanted: pip install "hilcal[{of}]"'
+        out.append(PROGRAM(f"optional: {of}", "ok", said, mend))
+    return (PROGRAM("packages", "ok", ", ".join(there)), *out)
 
 
-def _loads(module: str) -> str:
-    """Return why a module does not load; empty where it does."""
-    try:
-        importlib.import_module(module)
-    except Exception as error:
-        return f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
-    return ""
-
-
-def _drivers() -> tuple[Finding, ...]:
-    out = []
+def _drivers() -> Iterator[Finding]:
     for group, what in GROUPS.items():
         names = []
         for point in metadata.entry_points(group=group):
@@ -260,8 +248,7 @@ def _drivers() -> tuple[Finding, ...]:
             except Exception as error:
                 said = f"{point.value} does not load ({type(error).__name__}: {error})"
                 mend = f"repair or remove the package that brings {point.name}"
-                out.append(Finding(PROGRAM, f"driver {point.name}", "warning", said, mend))
+                yield PROGRAM(f"driver {point.name}", "warning", said, mend)
             else:
                 names.append(point.name)
-        out.append(Finding(PROGRAM, f"drivers of {what}", "ok", ", ".join(sorted(names)) or "none"))
-    return tuple(out)
+        yield PROGRAM(f"drivers of {what}", "ok", ", ".join(sorted(names)) or "none")

@@ -6,15 +6,18 @@ import re
 import socket
 import stat
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from serial.tools import list_ports
 
 from hilcal.doctor.computer import Finding, State
 
-PORTS = "serial ports"
+PORT = partial(Finding, "serial ports")
+NETWORK = partial(Finding, "network")
 LATE_MS = 1
 """Latency timer that answers within a few milliseconds need, ms. The driver's default is 16: it
 holds bytes back for so long (FTDI, AN232B-04)."""
@@ -23,7 +26,6 @@ MEDDLERS = {
     "brltty": "it takes adapters for Braille displays",
 }
 """Services that open adapters of others."""
-NETWORK = "network"
 SECONDS = 1.0
 """How long an answer may take, s. A choice: on a cell's own network it takes a millisecond."""
 SLOW = 0.02
@@ -58,90 +60,72 @@ def serial_ports(
         if not Path(path).exists():
             there = ", ".join(names.get(p, p) for p in found) or "none"
             mend = f"plug its adapter in, or name another port in the cell; ports now: {there}"
-            said = f"there is no {path}"
-            out.append(Finding(PORTS, what, "problem", said, mend))
+            out.append(PORT(what, "problem", f"there is no {path}", mend))
     every = {str(Path(p).resolve()): about for p, about in found.items()}
     every.update({p: every.get(p, "") for p in used if Path(p).exists()})
     for path, description in sorted(every.items()):
         name = ": ".join(filter(None, (used.get(path), names.get(path, path))))
         out.extend(_port(name, path, description, path in used, at))
     if not wanted and not found:
-        out.append(Finding(PORTS, "adapters", "ok", "none is plugged in"))
+        out.append(PORT("adapters", "ok", "none is plugged in"))
     if found:
-        out.extend(_meddlers(at.proc))
+        running = {_program(at.proc, number) for number in _numbers(at.proc)}
+        for name, why in MEDDLERS.items():
+            if name in running:
+                mend = f"sudo systemctl stop {name}"
+                out.append(PORT(name, "warning", f"it runs: {why}", mend))
     return tuple(out)
 
 
 def _port(name: str, path: str, about: str, wanted: bool, at: System) -> Iterator[Finding]:
     worse: State = "problem" if wanted else "warning"
     said = " ".join(filter(None, (path if path not in name else "", about))) or "there"
-    if not stat.S_ISCHR(os.stat(path).st_mode):
-        yield Finding(PORTS, name, worse, f"{path} is no serial port", "name another in the cell")
+    of = os.stat(path)
+    if not stat.S_ISCHR(of.st_mode):
+        yield PORT(name, worse, f"{path} is no serial port", "name another in the cell")
         return
     if not os.access(path, os.R_OK | os.W_OK):
-        group = _group(path)
+        group = str(of.st_gid)
+        with suppress(KeyError):
+            group = grp.getgrgid(of.st_gid).gr_name
         mend = f"sudo usermod -aG {group} $USER, then log in again"
-        yield Finding(PORTS, name, worse, f"{said}; you have no right to use it", mend)
+        yield PORT(name, worse, f"{said}; you have no right to use it", mend)
         return
-    holder = _holder(path, at.proc)
+    holder = _holder(of.st_rdev, at.proc)
     if holder:
         mend = "end that program before a campaign"
-        yield Finding(PORTS, name, "warning", f"{said}; {holder} has it open", mend)
-    timer = at.sys / "bus" / "usb-serial" / "devices" / Path(path).name / "latency_timer"
-    try:
+        yield PORT(name, "warning", f"{said}; {holder} has it open", mend)
+    timer, late = at.sys / "bus/usb-serial/devices" / Path(path).name / "latency_timer", 0
+    with suppress(OSError, ValueError):
         late = int(timer.read_text(encoding="ascii"))
-    except (OSError, ValueError):
-        late = 0
     if late > LATE_MS:
-        late_said = f"{said}; holds answers back for up to {late} ms (latency timer)"
-        mend = f"echo {LATE_MS} | sudo tee {timer}"
-        yield Finding(PORTS, name, "warning", late_said, mend)
+        slow = f"{said}; holds answers back for up to {late} ms (latency timer)"
+        yield PORT(name, "warning", slow, f"echo {LATE_MS} | sudo tee {timer}")
     elif not holder:
-        yield Finding(PORTS, name, "ok", f"{said}; free, and you may use it")
+        yield PORT(name, "ok", f"{said}; free, and you may use it")
 
 
 def _by_id(dev: Path) -> dict[str, str]:
     """Return the names that do not change when an adapter is replugged, by path of the port."""
-    folder = dev / "serial" / "by-id"
     try:
-        return {str(link.resolve()): str(link) for link in sorted(folder.iterdir())}
+        links = sorted((dev / "serial" / "by-id").iterdir())
+        return {str(link.resolve()): str(link) for link in links}
     except OSError:
         return {}
 
 
-def _group(path: str) -> str:
-    number = os.stat(path).st_gid
-    try:
-        return grp.getgrgid(number).gr_name
-    except KeyError:
-        return str(number)
-
-
-def _holder(path: str, proc: Path) -> str:
-    """Return which other process has a port open, as far as this user may see; else empty."""
-    wanted = os.stat(path).st_rdev
+def _holder(wanted: int, proc: Path) -> str:
+    """Return which other process has a device open, as far as this user may see; else empty."""
     for number in _numbers(proc):
         if number == os.getpid():
             continue
-        try:
-            files: Iterable[Path] = list((proc / str(number) / "fd").iterdir())
-        except OSError:
-            continue
-        for file in files:
-            try:
-                if str(file.readlink()).startswith("/dev/") and file.stat().st_rdev == wanted:
-                    return f"{_program(proc, number)} (process {number})"
-            except OSError:
-                continue
+        with suppress(OSError):
+            for file in list((proc / str(number) / "fd").iterdir()):
+                with suppress(OSError):
+                    device = str(file.readlink()).startswith("/dev/")
+                    if device and file.stat().st_rdev == wanted:
+                        return f"{_program(proc, number)} (process {number})"
     return ""
-
-
-def _meddlers(proc: Path) -> Iterator[Finding]:
-    running = {_program(proc, number) for number in _numbers(proc)}
-    for name, why in MEDDLERS.items():
-        if name in running:
-            mend = f"sudo systemctl stop {name}"
-            yield Finding(PORTS, name, "warning", f"it runs: {why}", mend)
 
 
 def _numbers(proc: Path) -> list[int]:
@@ -165,7 +149,7 @@ def reachable(host: str, services: Mapping[int, str], seconds: float = SECONDS) 
     except (OSError, UnicodeError) as error:
         mend = "check the address in the cell, or name the host in /etc/hosts"
         said = f"its name is not known ({getattr(error, 'strerror', None) or error})"
-        return [Finding(NETWORK, host, "problem", said, mend)]
+        return [NETWORK(host, "problem", said, mend)]
     out = []
     for port, what in services.items():
         name, begun = f"{what}, {host} port {port}", time.monotonic()
@@ -174,15 +158,12 @@ def reachable(host: str, services: Mapping[int, str], seconds: float = SECONDS) 
                 took = time.monotonic() - begun
         except TimeoutError:
             mend = "check cable, address and network of the cell; is the controller switched on?"
-            out.append(Finding(NETWORK, name, "problem", f"no answer in {seconds:g} s", mend))
+            out.append(NETWORK(name, "problem", f"no answer in {seconds:g} s", mend))
         except OSError as error:
             mend = "check the address, and that the service is enabled on the controller"
-            out.append(Finding(NETWORK, name, "problem", f"{error.strerror or error}", mend))
+            out.append(NETWORK(name, "problem", f"{error.strerror or error}", mend))
         else:
-            said = f"answers in {1e3 * took:.1f} ms"
-            if took > SLOW:
-                mend = "connect by cable, without other networks between"
-                out.append(Finding(NETWORK, name, "warning", said, mend))
-            else:
-                out.append(Finding(NETWORK, name, "ok", said))
+            mend = "connect by cable, without other networks between" if took > SLOW else ""
+            state: State = "warning" if mend else "ok"
+            out.append(NETWORK(name, state, f"answers in {1e3 * took:.1f} ms", mend))
     return out

@@ -4,10 +4,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from hilcal.effects.changed import Changeable
 from hilcal.effects.options import positive, rated_torques
-from hilcal.effects.per_joint import PerJoint
-from hilcal.effects.protocol import Columns, Parameter, Response, Situation
+from hilcal.effects.per_joint import PerJoint, joint_change
+from hilcal.effects.protocol import Columns, Response, Situation
 from hilcal.readings.readings import States
 from hilcal.types import Floats
 
@@ -16,12 +15,10 @@ class Backlash(PerJoint):
     """dq_j = b_j sign(τ_j), crossing smoothly: b_j tanh(τ_j/τ0_j) [rad]."""
 
     name = "backlash"
+    unit, size, meaning = "rad", 5e-5, "half the play of {joint}"
     summary = "dq_j = b_j sign(τ_j): the joint's play is taken up to the side of the torque"
-    change = Changeable(
-        "joint", words="play", cause="wear or repair?", listed=True, options={"joints": "each"}
-    )
-    plausible = 20.0
-    """1 mrad; makers of gears state 0.3 mrad at most. A choice."""
+    change = joint_change("play", "wear or repair?", listed=True)
+    plausible = 20.0  # 1 mrad; makers of gears state 0.3 mrad at most. A choice.
     elastic = True
     local_response = True
     option_help: ClassVar = {
@@ -34,12 +31,6 @@ class Backlash(PerJoint):
         super().setup(states)
         self.options.setdefault("crossing", 0.01)
         self.crossing = positive(self.name, self.options, "crossing") * rated_torques(self.cell)
-
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """Half the play, per joint."""
-        ordinary = np.full(self.cell.arm.n, 5e-5)
-        return self.group_parameters("rad", ordinary, "half the play of {joint}")
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:
         """Sides: ∂dq_j/∂b_j = tanh(τ_j/τ0_j)."""

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from hilcal.effects.changed import Changeable
-from hilcal.effects.protocol import Columns, Effect, Parameter, Response, Situation
+from hilcal.effects.protocol import Changeable, Columns, Effect, Parameter, Response, Situation
 from hilcal.robot import se3
 from hilcal.types import Floats
 
@@ -18,8 +17,7 @@ class BaseCompliance(Effect):
     name = "base_compliance"
     summary = "rotation B t_0 about the base origin: the ground gives way"
     change = Changeable("base", "base", "the ground under the base", "loose bolts?")
-    plausible = 30.0
-    """90 µrad/(N·m): an arm on a trolley. A choice."""
+    plausible = 30.0  # 90 µrad/(N·m): an arm on a trolley. A choice.
     elastic = True
     local_response = True
 

@@ -4,9 +4,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from hilcal.effects.options import PRIOR_HELP, prior_of_lengths_and_turns
+from hilcal.effects.options import PRIOR_HELP
 from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
-from hilcal.types import Floats
 
 
 class BaseFrame(Effect):
@@ -14,8 +13,7 @@ class BaseFrame(Effect):
 
     name = "base_frame"
     summary = "registration of the tracker to the arm's base is off"
-    plausible = 20.0
-    """20 mm, 20 mrad: a base that was surveyed by hand. A choice."""
+    plausible = 20.0  # 20 mm, 20 mrad: a base that was surveyed by hand. A choice.
     of_setup = True
     option_help: ClassVar = PRIOR_HELP
     role = "registration"
@@ -31,7 +29,3 @@ class BaseFrame(Effect):
         """Unit twists of the base."""
         index = np.arange(6)
         return (Columns("base", index, 0 * index, np.eye(6)[None]),)
-
-    def prior_std(self) -> Floats | None:
-        """Prior of displacement and rotation, where given."""
-        return prior_of_lengths_and_turns(self.name, self.options, 6)

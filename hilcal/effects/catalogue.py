@@ -44,34 +44,12 @@ from hilcal.toml import suggest
 ENTRY_POINT_GROUP = "hilcal.effects"
 
 BUILT_IN: tuple[type[Effect], ...] = (
-    BaseFrame,
-    TargetOffset,
-    EncoderOffset,
-    JointCoupling,
-    LinkGeometry,
-    TransmissionError,
-    GuideError,
-    Hysteresis,
-    JointCompliance,
-    JointStiffening,
-    JointTiltCompliance,
-    LinkCompliance,
-    BaseCompliance,
-    ToolCompliance,
-    PeriodicJointCompliance,
-    Backlash,
-    Creep,
-    ThermalGrowth,
-    ThermalJointDrift,
-    LinkMass,
-    LoadPoint,
-    WrenchBias,
-    WrenchGain,
-    SensorMisalignment,
-    TrackerDrift,
-    TrackerScale,
-    ObserverFrame,
-)
+    BaseFrame, TargetOffset, EncoderOffset, JointCoupling, LinkGeometry, TransmissionError,
+    GuideError, Hysteresis, JointCompliance, JointStiffening, JointTiltCompliance,
+    LinkCompliance, BaseCompliance, ToolCompliance, PeriodicJointCompliance, Backlash, Creep,
+    ThermalGrowth, ThermalJointDrift, LinkMass, LoadPoint, WrenchBias, WrenchGain,
+    SensorMisalignment, TrackerDrift, TrackerScale, ObserverFrame,
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,11 +70,7 @@ class Catalogue:
         return tuple(kind.name for kind in self.effects)
 
     def __getitem__(self, name: str) -> type[Effect]:
-        """Return the class of an effect.
-
-        Raises:
-            InputError: on an unknown name; lists the valid ones.
-        """
+        """Return the class of an effect."""
         for kind in self.effects:
             if kind.name == name:
                 return kind

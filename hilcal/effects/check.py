@@ -2,15 +2,15 @@
 
 import re
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any, get_args
 
 import numpy as np
 
-from hilcal.cell import Cell
-from hilcal.effects.example import example_cell, example_situation, example_states
-from hilcal.effects.failure import failure_of
-from hilcal.effects.options import PRIOR_HELP
+from hilcal.cell import Cell, cell_from_config
+from hilcal.config import CellConfig, Robot
+from hilcal.effects.from_file import failure_of
+from hilcal.effects.options import PRIOR_HELP, typical_compliances
 from hilcal.effects.protocol import (
     FRAME_ROLES,
     Columns,
@@ -26,31 +26,73 @@ from hilcal.effects.protocol import (
 )
 from hilcal.errors import HilcalError, InputError
 from hilcal.names import escaped
-from hilcal.readings.readings import States
+from hilcal.readings.readings import ObserverName, States
+from hilcal.robot import chain as chains
 from hilcal.robot.chain import Deviation
-from hilcal.robot.statics import load_wrench_change, slot_wrenches
+from hilcal.robot.statics import Load, load_wrench_change, slot_wrenches
 from hilcal.types import Floats
 
+ROBOT = "ur10e"
+
+
+def example_cell(joints: int | None = None, *, slides: bool = False) -> Cell:
+    """Return the cell of an example arm of so many joints, of which the first may slide."""
+    cell = cell_from_config(CellConfig(robot=Robot(model=ROBOT)))
+    arm = cell.arm
+    rows = np.minimum(np.arange(arm.n if joints is None else joints), arm.n - 1)
+    longer = replace(
+        arm, links=arm.links[[*rows, arm.n]], masses=arm.masses[rows], coms=arm.coms[rows],
+        q_min=arm.q_min[rows], q_max=arm.q_max[rows], torque_max=arm.torque_max[rows],
+        prismatic=np.arange(len(rows)) == 0 if slides else None,
+        joint_names=tuple(f"joint {k + 1}" for k in range(len(rows))),
+    )  # fmt: skip
+    names = [ObserverName("station", "S1"), ObserverName("station", "S2")]
+    names += [ObserverName("point", "P"), ObserverName("gauge", "G")]
+    longer_cell = replace(cell, arm=longer, load_point=np.array([0.02, -0.01, 0.1]))
+    return longer_cell.observed_by(names)
+
+
+def example_states(cell: Cell, count: int = 30) -> States:
+    """Return states drawn at random, the same ones every time, in arrays that cannot be changed."""
+    rng, n = np.random.default_rng(0), cell.arm.n
+    q = rng.uniform(-1.5, 1.5, (count, n))
+    wrench = rng.normal(size=(count, 6)) * [60, 60, 60, 8, 8, 8]
+    wrench[::3] = 0.0
+    time = np.cumsum(rng.uniform(20, 60, count))
+    warm = 1.0 - np.exp(-time[:, None] / 600)
+    states = States(
+        q=q, wrench=wrench, time=time, load_time=rng.uniform(5, 300, count),
+        air_temperature=21.0 + rng.normal(size=count),
+        joint_temperature=22.0 + rng.uniform(5, 15, n) * warm,
+        approach=rng.choice([-1.0, 1.0], (count, n)),
+        q_actual=q + 1e-5 * rng.normal(size=q.shape), observer=np.arange(count) % 4,
+    )  # fmt: skip
+    for field in fields(states):
+        if (given := getattr(states, field.name)) is not None:
+            given.flags.writeable = False
+    return states
+
+
+def example_situation(cell: Cell, states: States) -> Situation:
+    """Return the states on the rigid arm, with what its weight and the loads transmit."""
+    angle = states.q if states.q_actual is None else states.q_actual
+    chain = chains.evaluate(cell.arm, angle)
+    load = Load(states.wrench, cell.load_point, cell.tool_mass, cell.tool_com, cell.gravity)
+    wrench = slot_wrenches(cell.arm, chain, load)
+    wrench.flags.writeable = False
+    turned = cell.arm.phases(angle)
+    return Situation(cell, states, turned, chain, wrench, load, typical_compliances(cell))
+
+
 NAME = re.compile(r"[a-z][a-z0-9_]*")
-JOINTS = (6, 7)
-"""Arms to try an effect on; it has to pass on one, since it may be made for that arm alone."""
-NEEDS = (
-    "time",
-    "load_time",
-    "air_temperature",
-    "joint_temperature",
-    "approach",
-    "q_actual",
-)
-"""Columns of `States` that readings may lack."""
+JOINTS = (6, 7)  # of arms to try an effect on; it has to pass on one
+NEEDS = ("time", "load_time", "air_temperature", "joint_temperature", "approach", "q_actual")
 AGREES = 1e-3
 """Share of the largest value by which a derivative may be outside of the difference quotients of
 both sides, between which it lies, at a bend as well: max(τ, 0) has its own at τ = 0. A guess, far
 above rounding."""
-ROUNDING = 1e-9
-"""Share of the largest value that rounding may change; a guess, far above 1e-16."""
-STEP = 1e-4
-"""Step of difference quotients, in ordinary magnitudes; a guess between rounding and curvature."""
+ROUNDING = 1e-9  # Share of the largest value that rounding may change; a guess, far above 1e-16
+STEP = 1e-4  # of difference quotients, in ordinary magnitudes; between rounding and curvature
 _FIELDS = Deviation.__slots__
 
 
@@ -77,7 +119,8 @@ def check_effect(kind: type[Effect], cell: Cell | None = None) -> None:
     except InputError as error:
         raise InputError(f"{where}: class {kind.__name__} {error}") from None
     problems = []
-    for example in _examples(kind) if cell is None else (cell,):
+    slides = cell is None and not kind.applies(example_cell())
+    for example in [example_cell(n, slides=slides) for n in JOINTS] if cell is None else [cell]:
         try:
             _try(kind, example)
         except HilcalError as error:
@@ -90,12 +133,6 @@ def check_effect(kind: type[Effect], cell: Cell | None = None) -> None:
     raise problems[0]
 
 
-def _examples(kind: type[Effect]) -> tuple[Cell, ...]:
-    """Arms to try an effect on, with a slide where it is of slides."""
-    slides = not kind.applies(example_cell())
-    return tuple(example_cell(joints, slides=slides) for joints in JOINTS)
-
-
 def _need(good: object, wrong: str) -> None:
     if not good:
         raise InputError(wrong)
@@ -106,47 +143,34 @@ def _is_text(value: object) -> bool:
 
 
 def _class(kind: type[Effect]) -> None:
-    """Check the attributes of a class."""
     missing = sorted(getattr(kind, "__abstractmethods__", ()))
     _need(not missing, f"lacks {' and '.join(missing)}")
     own = kind.deviation is Effect.deviation
     _need(own, "overrides deviation; give columns, in whose parameters the law is linear")
-    rules: tuple[tuple[str, str, Callable[[Any], bool]], ...] = (
-        (
-            "name",
+    flag = "True, False", lambda v: isinstance(v, bool)
+    positive = (
+        "a number of ordinary magnitudes, more than 0",
+        lambda v: isinstance(v, int | float) and not isinstance(v, bool) and v > 0,
+    )
+    rules: dict[str, tuple[str, Callable[[Any], bool]]] = {
+        "name": (
             "lower-case letters, digits and _, a letter first",
             lambda v: isinstance(v, str) and bool(NAME.fullmatch(v)),
         ),
-        ("summary", "the law in one line", _is_text),
-        ("elastic", "True, False", lambda v: isinstance(v, bool)),
-        ("local_response", "True, False", lambda v: isinstance(v, bool)),
-        ("of_setup", "True, False", lambda v: isinstance(v, bool)),
-        (
-            "needs",
+        "summary": ("the law in one line", _is_text),
+        **dict.fromkeys(("elastic", "local_response", "of_setup"), flag),
+        "needs": (
             f"a tuple of some of {', '.join(NEEDS)}",
             lambda v: isinstance(v, tuple) and _columns_of(v) <= set(NEEDS),
         ),
-        (
-            "option_help",
+        "option_help": (
             "the meaning of each option by its name",
             lambda v: isinstance(v, dict) and all(map(_is_text, (*v, *v.values()))),
         ),
-        ("role", ", ".join(get_args(Role)), lambda v: v in get_args(Role)),
-        (
-            "plausible",
-            "a number of ordinary magnitudes, more than 0",
-            lambda v: isinstance(v, int | float) and not isinstance(v, bool) and v > 0,
-        ),
-        *(
-            (
-                key,
-                "a number of ordinary magnitudes, more than 0",
-                lambda v: isinstance(v, int | float) and not isinstance(v, bool) and v > 0,
-            )
-            for key in ("drift", "spread")
-        ),
-    )
-    for key, valid, good in rules:
+        "role": (", ".join(get_args(Role)), lambda v: v in get_args(Role)),
+        **dict.fromkeys(("plausible", "drift", "spread"), positive),
+    }
+    for key, (valid, good) in rules.items():
         found = getattr(kind, key, None)
         _need(good(found), f"has {key} = {found!r}; valid: {valid}")
     has_priors = kind.role not in FRAME_ROLES or set(PRIOR_HELP) <= set(kind.option_help)
@@ -154,12 +178,10 @@ def _class(kind: type[Effect]) -> None:
 
 
 def _columns_of(needs: tuple[str, ...]) -> set[str]:
-    """Return the columns that needs name, each alone or as one of several, "a or b"."""
     return {column for need in needs for column in str(need).split(" or ")}
 
 
 def _try(kind: type[Effect], cell: Cell) -> None:
-    """Compute an effect on an arm, and check what it returns."""
     states = example_states(cell)
     effect, s = kind(cell, states), example_situation(cell, states)
     _parameters(effect)
@@ -192,7 +214,6 @@ def _parameters(effect: Effect) -> None:
 
 
 def _columns(effect: Effect, s: Situation) -> None:
-    """Check fields, indices, shapes and values of the columns."""
     found: Any = effect.columns(s)
     good = isinstance(found, tuple) and all(isinstance(c, Columns) for c in found)
     _need(good, f"columns returns {type(found).__name__}; expected a tuple of Columns")
@@ -214,7 +235,6 @@ def _columns(effect: Effect, s: Situation) -> None:
 
 
 def _results(effect: Effect, theta: Floats, s: Situation) -> None:
-    """Check types, shapes and values of what the other methods return."""
     (count, n), size = s.angle.shape, len(theta)
     step, prior = np.zeros((count, 2, n + 1, 6)), effect.prior_std()
     change: Any = effect.load_change(theta)
@@ -242,7 +262,6 @@ def _results(effect: Effect, theta: Floats, s: Situation) -> None:
 
 
 def _array(what: str, found: Any, *shapes: tuple[int, ...]) -> None:
-    """Check an array: its type, its shape, and that all values are finite."""
     good = isinstance(found, np.ndarray) and found.dtype.kind in "fiub"
     _need(good, f"{what} of type {type(found).__name__}; expected an array of numbers")
     expected = " or ".join(str(shape) for shape in dict.fromkeys(shapes))
@@ -265,7 +284,6 @@ def _states(effect: Effect, theta: Floats, s: Situation) -> None:
 
 
 def _elastic(effect: Effect, theta: Floats, s: Situation) -> None:
-    """Compare `elastic` and `response` with how the deviation follows the wrenches."""
     rng = np.random.default_rng(2)
     step = STEP * rng.normal(size=s.wrench.shape) * [60, 60, 60, 20, 20, 20]
     up, down = (replace(s, wrench=w) for w in (s.wrench + step, s.wrench - step))
@@ -300,7 +318,6 @@ def _local(effect: Effect, theta: Floats, s: Situation) -> None:
 
 
 def _compliance(effect: Effect, theta: Floats, s: Situation) -> None:
-    """Compare `compliance_columns` with how the deviation follows the joint compliances."""
     step = STEP * s.compliance * np.random.default_rng(4).normal(size=len(s.compliance))
     up, down = (replace(s, compliance=c) for c in (s.compliance + step, s.compliance - step))
     found = total(effect.compliance_columns(theta, s), step, s)
@@ -310,7 +327,6 @@ def _compliance(effect: Effect, theta: Floats, s: Situation) -> None:
 
 
 def _load(effect: Effect, theta: Floats, s: Situation, scale: Floats) -> None:
-    """Compare `wrench_columns` with how the effect changes the load."""
     step = STEP * scale * np.random.default_rng(3).normal(size=len(scale))
     up, at, down = (_transmitted(effect, t, s) for t in (theta + step, theta, theta - step))
     found = effect.wrench_columns(theta, s)
@@ -334,7 +350,6 @@ def _transmitted(effect: Effect, theta: Floats, s: Situation) -> Floats:
 
 
 def _needs(kind: type[Effect], cell: Cell, states: States) -> None:
-    """Check that an effect uses no column that it does not name."""
     for column in (c for c in NEEDS if c not in _columns_of(kind.needs)):
         nothing: dict[str, Any] = {column: None}
         fewer = replace(states, **nothing)
@@ -360,7 +375,6 @@ def _field(deviation: Deviation, key: str) -> Floats:
 
 
 def _agree(method: str, of_what: str, found: Floats, above: Floats, below: Floats) -> None:
-    """Compare a derivative with the difference quotients of both sides."""
     outside = found - np.clip(found, np.minimum(above, below), np.maximum(above, below))
     size = float(max(np.abs(x).max() for x in (found, above, below)))
     off = float(np.abs(outside).max()) / size if size > 0 else 0.0

@@ -12,8 +12,7 @@ from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.types import Floats
 
-SECOND = 1.0
-"""Unit of time of the law, s."""
+SECOND = 1.0  # Unit of time of the law, s
 
 
 class Creep(PerJoint):
@@ -26,9 +25,9 @@ class Creep(PerJoint):
     """
 
     name = "creep"
+    unit, size, meaning = "1", 0.02, "creep of {joint} per decade of time"
     summary = "dq_j = k c_j τ_j log10(1 + t/1 s): joints go on giving way under the load"
-    plausible = 10.0
-    """20 % per decade of time: polymers; metals creep by less than 2 %. A choice."""
+    plausible = 10.0  # 20 % per decade of time: polymers; metals creep by less than 2 %. A choice.
     elastic = True
     local_response = True
     needs = ("load_time",)
@@ -53,12 +52,10 @@ class Creep(PerJoint):
     def parameters(self) -> tuple[Parameter, ...]:
         """The share of the elastic twist that every decade of time adds."""
         if self.shared.text == COMMON:
-            return (Parameter("k", "1", 0.02, "creep of all joints per decade of time"),)
-        ordinary = np.full(self.cell.arm.n, 0.02)
-        return self.group_parameters("1", ordinary, "creep of {joint} per decade of time")
+            return (Parameter("k", "1", self.size, "creep of all joints per decade of time"),)
+        return super().parameters
 
     def _decades(self, s: Situation) -> Floats:
-        """(N, 1) log10(1 + t/1 s)."""
         assert s.states.load_time is not None  # noqa: S101 - checked at construction
         return np.asarray(np.log10(1 + s.states.load_time / SECOND))[:, None]
 

@@ -2,34 +2,21 @@
 
 import numpy as np
 
-from hilcal.effects.changed import Changeable
-from hilcal.effects.per_joint import PerJoint
-from hilcal.effects.protocol import Columns, Parameter, Situation
+from hilcal.effects.per_joint import PerJoint, joint_change
+from hilcal.effects.protocol import Columns, Situation
 
 
 class EncoderOffset(PerJoint):
     """dq_j = o_j, constant [rad]."""
 
     name = "encoder_offset"
+    unit, size, meaning = "rad", 1e-3, "zero offset of {joint}"
     summary = "dq_j = o_j: the zero of each joint is off"
     kinematic = True
-    change = Changeable(
-        "joint",
-        words="zero",
-        cause="repair, crash or a slipped joint?",
-        listed=True,
-        by_frame=True,
-        options={"joints": "each"},
-        with_others=True,
+    change = joint_change(
+        "zero", "repair, crash or a slipped joint?", listed=True, by_frame=True, with_others=True
     )
-    plausible = 5.0
-    """5 mrad: mastering to a mark, without a gauge, leaves 0.1° to 0.5°. A choice."""
-
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """One offset per joint."""
-        ordinary = np.full(self.cell.arm.n, 1e-3)
-        return self.group_parameters("rad", ordinary, "zero offset of {joint}")
+    plausible = 5.0  # 5 mrad: mastering to a mark, without a gauge, leaves 0.1° to 0.5°. A choice.
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:
         """Unit steps: ∂dq_j/∂o_j = 1."""

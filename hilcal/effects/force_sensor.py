@@ -13,8 +13,7 @@ from hilcal.robot.statics import load_wrench_change
 from hilcal.types import Floats
 
 FORCE_AXES = ("x", "y", "z")
-ALONG_FLANGE: Floats = np.eye(3)
-"""Axes of a force sensor that are those of the flange."""
+ALONG_FLANGE: Floats = np.eye(3)  # Axes of a force sensor that are those of the flange
 
 
 class ForceSensorEffect(Effect):
@@ -67,11 +66,7 @@ class ForceSensorEffect(Effect):
 
 
 def recorded(s: Situation, axes: Floats = ALONG_FLANGE) -> Floats:
-    """Return the recorded wrench (N, 6) in sensor axes, N and N·m.
-
-    Args:
-        axes: (3, 3) the sensor's axes in flange axes.
-    """
+    """Return the recorded wrench (N, 6) in sensor axes (3, 3) of the flange, N and N·m."""
     return _turned(np.swapaxes(_sensor(s, axes), 1, 2), s.states.wrench)
 
 

@@ -2,40 +2,54 @@
 
 import hashlib
 import sys
+import traceback
 from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from types import CodeType, ModuleType
 
 from hilcal import limits
-from hilcal.effects.failure import line_in
 from hilcal.effects.protocol import Effect
 from hilcal.errors import InputError
+
+_OWN = "hilcal."
+
+
+def failure_of(error: Exception) -> InputError | None:
+    """Return the error of a method of a user's effect as one line; None where it is not one.
+
+    It is found from the traceback, so that calls of effects need no guard.
+    """
+    for frame, _ in traceback.walk_tb(error.__traceback__):
+        effect = frame.f_locals.get("self", frame.f_locals.get("cls"))
+        kind = effect if isinstance(effect, type) else type(effect)
+        file = frame.f_code.co_filename
+        if issubclass(kind, Effect) and not str(frame.f_globals.get("__name__")).startswith(_OWN):
+            return InputError(
+                f"{file}{line_in(error, file)}: effect {kind.name}: {frame.f_code.co_name} raises "
+                f"{type(error).__name__}: {error}"
+            )
+    return None
+
+
+def line_in(error: BaseException, file: str) -> str:
+    """Return ", line N" with the last line of a file that an exception passed; "" for none."""
+    frames = traceback.extract_tb(error.__traceback__)
+    lines = [frame.lineno for frame in frames if frame.filename == file]
+    return f", line {lines[-1]}" if lines else ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EffectFile:
-    """A file of effects.
+    """A file of effects."""
 
-    Attributes:
-        path: the file, absolute.
-        sha256: hash (hex) of its content.
-        effects: the effects that it defines.
-    """
-
-    path: str
-    sha256: str
-    effects: tuple[type[Effect], ...]
+    path: str  # the file, absolute
+    sha256: str  # hash (hex) of its content
+    effects: tuple[type[Effect], ...]  # the effects that it defines
 
 
 def read_effects(path: Path) -> EffectFile:
-    """Run a Python file and return the effects that it defines.
-
-    These are all classes derived from `Effect` in it, but for those whose name begins with "_".
-
-    Raises:
-        InputError: it cannot be read or run, or has no effect.
-    """
+    """Run a Python file and return the effects in it; names that begin with "_" do not count."""
     return effects_of(_content(path), path)
 
 

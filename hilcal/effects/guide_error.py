@@ -9,7 +9,6 @@ from hilcal.cell import Cell
 from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
-from hilcal.types import Floats
 
 KINDS = ("x", "y", "z", "rx", "ry", "rz")
 USUAL_ORDERS, MOST_ORDERS = 4, 12
@@ -32,11 +31,8 @@ class GuideError(Effect):
 
     name = "guide_error"
     summary = "carriage of a slide moves by Σ a_k P_k(travel): straightness, tilts and scale"
-    plausible = 50.0
-    """1 mm and 2.5 mrad at either end, as of a track that was laid by hand. A choice."""
-    option_help: ClassVar = {
-        "orders": f"K, 1 to {MOST_ORDERS}; unless given, {USUAL_ORDERS}.",
-    }
+    plausible = 50.0  # 1 mm and 2.5 mrad at either end, as of a track laid by hand. A choice.
+    option_help: ClassVar = {"orders": f"K, 1 to {MOST_ORDERS}; unless given, {USUAL_ORDERS}."}
 
     @classmethod
     def applies(cls, cell: Cell) -> bool:
@@ -79,15 +75,11 @@ class GuideError(Effect):
         values = np.zeros((len(travel), len(element), 6))
         for n, j in enumerate(np.flatnonzero(arm.slides).tolist()):
             # The limits are those of the controller's value; a coupling leaves the base as it is.
-            waves = legvander(self._share(s.values[:, j], j), self.orders)
+            low, high = arm.q_min[j], arm.q_max[j]
+            waves = legvander((2 * s.values[:, j] - low - high) / (high - low), self.orders)
             for p, (kind, k) in enumerate(self._terms, start=n * count):
                 values[:, p, KINDS.index(kind)] = waves[:, k]
             mine = values[:, n * count : (n + 1) * count]
             mine[..., 0] -= mine[..., 4] * travel[:, None, j]
             mine[..., 1] += mine[..., 3] * travel[:, None, j]
         return (Columns("twist", np.arange(len(element)), element, values),)
-
-    def _share(self, q: Floats, j: int) -> Floats:
-        """Place within the travel, −1 to 1."""
-        low, high = self.cell.arm.q_min[j], self.cell.arm.q_max[j]
-        return np.asarray((2 * q - low - high) / (high - low))

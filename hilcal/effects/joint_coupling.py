@@ -10,8 +10,7 @@ from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.robot.conventions import may_follow
 
-ABOUT, ALONG = np.eye(6)[5], np.eye(6)[2]
-"""Twists of a slot by a turn about its z, the axis of its joint, and by a shift along it."""
+ABOUT, ALONG = np.eye(6)[5], np.eye(6)[2]  # twists of a slot about, along its joint's axis
 _PAIR = re.compile(r"([0-9]{1,3}):([0-9]{1,3})")
 
 
@@ -70,10 +69,7 @@ class JointCoupling(Effect):
         )
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:
-        """Controller's values: ∂dq_j/∂k_ji = q_i, a turn of slot j − 1 about the joint's axis.
-
-        Not a displacement of drive j, which turns others along where joints are coupled.
-        """
+        """Controller's values: ∂dq_j/∂k_ji = q_i, a turn of slot j − 1 about the joint's axis."""
         turned, by = self._pairs.T
         moved = np.where(self.cell.arm.slides[turned, None], ALONG, ABOUT)
         twist = s.values[:, by, None] * moved

@@ -2,7 +2,7 @@
 
 from hilcal.effects.options import ordinary_give, rated_torques
 from hilcal.effects.per_joint import PerJoint
-from hilcal.effects.protocol import Columns, Parameter, Response, Situation
+from hilcal.effects.protocol import Columns, Response, Situation
 from hilcal.types import Floats
 
 
@@ -10,17 +10,15 @@ class JointStiffening(PerJoint):
     """dq_j = s_j τ_j³ beside the linear term; a gear that stiffens has s_j < 0."""
 
     name = "joint_stiffening"
+    unit, meaning = "rad/(N·m)³", "stiffening of {joint}"
     summary = "dq_j = s_j τ_j³: compliance changes with the torque (s_j < 0: stiffens)"
-    plausible = 10.0
-    """30 mrad at the rated torque, as for joint_compliance. A choice."""
+    plausible = 10.0  # 30 mrad at the rated torque, as for joint_compliance. A choice.
     elastic = True
     local_response = True
 
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """One coefficient per joint; as much as the compliance at the joint's rated torque."""
-        ordinary = ordinary_give(self.cell) / rated_torques(self.cell) ** 3
-        return self.group_parameters("rad/(N·m)³", ordinary, "stiffening of {joint}")
+    def ordinary(self) -> Floats:
+        """As much as the compliance at the joint's rated torque."""
+        return ordinary_give(self.cell) / rated_torques(self.cell) ** 3
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:
         """Cubes of the torques: ∂dq_j/∂s_j = τ_j³."""

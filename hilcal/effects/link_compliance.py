@@ -26,8 +26,7 @@ class LinkCompliance(Effect):
 
     name = "link_compliance"
     summary = "tip moves L³/3EI F + L²/2EI M, turns L²/2EI F + L/EI M, twists L/GJ M: links bend"
-    plausible = 10.0
-    """Ten times as soft as a link of ordinary section, see `parameters`. A choice."""
+    plausible = 10.0  # Ten times as soft as a link of ordinary section, see `parameters`. A choice.
     elastic = True
     local_response = True
 
@@ -82,8 +81,7 @@ class LinkCompliance(Effect):
 def long_links(arm: Arm) -> Ints:
     """(b,) numbers k, at most two, of the links L_k that count as beams, ascending.
 
-    The longest between two joints, and the next one where it is longer than a third of that;
-    where no link between joints has a length, the last one, to the flange.
+    Where no link between joints has a length, the last one, to the flange.
     """
     lengths = np.linalg.norm(arm.links[1:-1, :3, 3], axis=1)
     if not np.any(lengths):

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from hilcal.effects.changed import Changeable
-from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
+from hilcal.effects.protocol import Changeable, Columns, Effect, Parameter, Situation
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 
@@ -19,8 +18,7 @@ class LinkGeometry(Effect):
     summary = "constant displacement and rotation of each link's end (over-complete)"
     kinematic = True
     change = Changeable("link", words="geometry", cause="crash?")
-    plausible = 3.0
-    """3 mm, 3 mrad; links differ from their drawings by 0.1 to 2 mm and mrad. A choice."""
+    plausible = 3.0  # 3 mm, 3 mrad; links differ from drawings by 0.1 to 2. A choice.
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

@@ -2,8 +2,15 @@
 
 import numpy as np
 
-from hilcal.effects.changed import Changeable, Directions
-from hilcal.effects.protocol import Columns, Effect, LoadChange, Parameter, Situation
+from hilcal.effects.protocol import (
+    Changeable,
+    Columns,
+    Directions,
+    Effect,
+    LoadChange,
+    Parameter,
+    Situation,
+)
 from hilcal.robot.statics import first_moment_change
 from hilcal.types import Floats
 
@@ -34,8 +41,7 @@ class LinkMass(Effect):
     summary = "moment (R_k δ_k) × g at joint k: links are heavier or balanced otherwise"
     change = Changeable("tool", "tool", "the tool's weight", directions=tool_weight)
     for_missing_weight = True
-    plausible = 20.0
-    """1 kg·m: a fifth of the first moment of an upper arm of 20 kg. A choice."""
+    plausible = 20.0  # 1 kg·m: a fifth of the first moment of an upper arm of 20 kg. A choice.
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from hilcal.effects.changed import Changeable
-from hilcal.effects.protocol import Columns, Effect, LoadChange, Parameter, Situation
+from hilcal.effects.protocol import Changeable, Columns, Effect, LoadChange, Parameter, Situation
 from hilcal.robot import se3
 from hilcal.robot.statics import slot_wrench_change
 from hilcal.types import Floats
@@ -19,8 +18,7 @@ class LoadPoint(Effect):
     name = "load_point"
     summary = "the load acts elsewhere than configured (flange axes)"
     change = Changeable("tool", "load point", "where the load acts on the tool")
-    plausible = 10.0
-    """10 cm: a hook or an eye instead of the flange. A choice."""
+    plausible = 10.0  # 10 cm: a hook or an eye instead of the flange. A choice.
     of_setup = True
 
     @property

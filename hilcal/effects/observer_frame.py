@@ -4,10 +4,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from hilcal.effects.options import PRIOR_HELP, prior_of_lengths_and_turns
+from hilcal.effects.options import PRIOR_HELP
 from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
 from hilcal.readings.readings import States
-from hilcal.types import Floats
 
 _OF = ("x", "y", "z", "rx", "ry", "rz")
 
@@ -21,8 +20,7 @@ class ObserverFrame(Effect):
 
     name = "observer_frame"
     summary = "one of several stations, points or gauges stands elsewhere than described"
-    plausible = 20.0
-    """20 mm, 20 mrad, as of `base_frame`. A choice."""
+    plausible = 20.0  # 20 mm, 20 mrad, as of `base_frame`. A choice.
     of_setup = True
     option_help: ClassVar = PRIOR_HELP
     role = "observer"
@@ -63,10 +61,3 @@ class ObserverFrame(Effect):
                 away = self.cell.observers[k].name.kind == "point" and element < 3
                 values[s.states.observer == k, p, element] = -1.0 if away else 1.0
         return (Columns("observer", index, 0 * index, values),)
-
-    def prior_std(self) -> Floats | None:
-        """Prior of shifts and turns, where given."""
-        six = prior_of_lengths_and_turns(self.name, self.options, 6)
-        if six is None:
-            return None
-        return np.array([six[0 if p.unit == "m" else 3] for p in self.parameters], dtype=float)

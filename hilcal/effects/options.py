@@ -1,6 +1,6 @@
 """Options of effects: small checked readers."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -15,10 +15,8 @@ TYPICAL_TWIST, TYPICAL_SHIFT = 2e-3, 7e-5
 """Twist of a joint at its rated torque where its compliance is unknown, rad, and shift of a slide
 at its rated force, m. Guesses within the 0.3 to 5 mrad of most arms, and for racks and screws of
 10 to 100 N/µm."""
-ORDINARY_TWIST, ORDINARY_SHIFT = 3e-3, 1e-4
-"""The same as ordinary magnitudes of the compliance, rad and m."""
-LEVER = 0.5
-"""Moment on a carriage per rated force of its drive, m: a choice."""
+ORDINARY_TWIST, ORDINARY_SHIFT = 3e-3, 1e-4  # ordinary ones, rad and m
+LEVER = 0.5  # Moment on a carriage per rated force of its drive, m: a choice
 
 PRIOR_HELP = dict.fromkeys(
     ("prior_m", "prior_rad"), "standard deviation of what is known of it already."
@@ -26,11 +24,7 @@ PRIOR_HELP = dict.fromkeys(
 
 
 def number(effect: str, options: Options, key: str) -> float:
-    """Read an option that must be a finite number.
-
-    Raises:
-        InputError: where it is anything else.
-    """
+    """Read an option that must be a finite number."""
     value = options[key]
     if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
         raise InputError(f"effect {effect}: {key} = {value!r}; valid: a finite number")
@@ -38,11 +32,7 @@ def number(effect: str, options: Options, key: str) -> float:
 
 
 def positive(effect: str, options: Options, key: str) -> float:
-    """Read an option that must be a number above zero.
-
-    Raises:
-        InputError: where it is anything else.
-    """
+    """Read an option that must be a number above zero."""
     value = number(effect, options, key)
     if value <= 0:
         raise InputError(f"effect {effect}: {key} = {value:g}; valid: more than 0")
@@ -50,11 +40,7 @@ def positive(effect: str, options: Options, key: str) -> float:
 
 
 def numbers(effect: str, options: Options, key: str, count: int) -> Floats:
-    """Read an option that must be a finite number for all, or a list of `count` of them.
-
-    Raises:
-        InputError: where it is anything else.
-    """
+    """Read an option that must be a finite number for all, or a list of `count` of them."""
     value = options[key]
     if not isinstance(value, list | tuple):
         return np.full(count, number(effect, options, key))
@@ -64,11 +50,7 @@ def numbers(effect: str, options: Options, key: str, count: int) -> Floats:
 
 
 def choice(effect: str, options: Options, key: str, valid: tuple[str, ...]) -> str:
-    """Read an option that must be one of a few words.
-
-    Raises:
-        InputError: where it is anything else.
-    """
+    """Read an option that must be one of a few words."""
     value = options[key]
     if not isinstance(value, str) or value not in valid:
         raise InputError(f"effect {effect}: {key} = {value!r}; valid: {', '.join(valid)}")
@@ -76,10 +58,7 @@ def choice(effect: str, options: Options, key: str, valid: tuple[str, ...]) -> s
 
 
 def rated_torques(cell: Cell) -> Floats:
-    """(n,) rated torques, of slides forces: the measure of how stiff a joint is built.
-
-    150 N·m and 1500 N where unknown.
-    """
+    """(n,) rated torques, of slides forces; 150 N·m and 1500 N where unknown."""
     return cell.arm.ratings
 
 
@@ -98,12 +77,8 @@ def typical_compliances(cell: Cell) -> Floats:
     return np.where(cell.arm.slides, TYPICAL_SHIFT, TYPICAL_TWIST) / rated_torques(cell)
 
 
-def prior_of_lengths_and_turns(effect: str, options: Options, size: int) -> Floats | None:
-    """Prior (size,) from `prior_m` for the first three and `prior_rad` for the others.
-
-    Raises:
-        InputError: where only one of the two is given, or one is not positive.
-    """
+def prior_of_units(effect: str, options: Options, units: Sequence[str]) -> Floats | None:
+    """(P,) `prior_m` of parameters in m, `prior_rad` of those in rad; None where not given."""
     keys = ("prior_m", "prior_rad")
     given = [k for k in keys if k in options]
     if not given:
@@ -115,4 +90,4 @@ def prior_of_lengths_and_turns(effect: str, options: Options, size: int) -> Floa
     values = [number(effect, options, k) for k in keys]
     if min(values) <= 0:
         raise InputError(f"effect {effect}: prior_m and prior_rad must be positive")
-    return np.repeat(values, 3)[:size]
+    return np.array([values[unit == "rad"] for unit in units])

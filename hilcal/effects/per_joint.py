@@ -9,7 +9,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from hilcal.effects.options import Options
-from hilcal.effects.protocol import Columns, Effect, Parameter
+from hilcal.effects.protocol import Changeable, Columns, Effect, Parameter
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.types import Floats, Ints
@@ -23,19 +23,12 @@ _RANGE = re.compile(r"([0-9]{1,3})(?:-([0-9]{1,3}))?")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointGroups:
-    """Which joints have a parameter, and which of them share one.
+    """Which joints have a parameter, and which of them share one."""
 
-    Attributes:
-        text: "each", "common", or the groups, as "2/3/4-6".
-        labels: (G,) joints of each group, as "2" or "4-6".
-        joint: (J,) indices of the joints that have a parameter, ascending.
-        group: (J,) the group of each of them, 0..G−1.
-    """
-
-    text: str
-    labels: tuple[str, ...]
-    joint: Ints
-    group: Ints
+    text: str  # "each", "common", or the groups, as "2/3/4-6"
+    labels: tuple[str, ...]  # (G,) joints of each group, as "2" or "4-6"
+    joint: Ints  # (J,) indices of the joints that have a parameter, ascending
+    group: Ints  # (J,) the group of each of them, 0..G−1
 
     @property
     def words(self) -> tuple[str, ...]:
@@ -46,11 +39,7 @@ class JointGroups:
 def joint_groups(effect: str, options: Options, count: int) -> JointGroups:
     """Read the option `joints` for an arm of `count` joints.
 
-    Groups are separated by "/", the joints of a group by "+" or as a range: "2/3/4-6" is one
-    parameter for joint 2, one for 3 and one for 4 to 6; a joint that is not named has none.
-
-    Raises:
-        InputError: what is wrong with it, and what would be valid.
+    Groups are separated by "/", the joints of a group by "+" or as a range.
     """
     given = options["joints"]
     text = str(given) if type(given) is int else given
@@ -81,39 +70,40 @@ def joint_groups(effect: str, options: Options, count: int) -> JointGroups:
 def _read(text: str, count: int) -> tuple[list[list[int]], str]:
     """Return the groups of joint indices; or none, and what is wrong."""
     groups: list[list[int]] = []
-    used: set[int] = set()
     for part in text.split("/"):
-        group: list[int] = []
+        groups.append([])
         for piece in part.split("+"):
             found = _RANGE.fullmatch(piece.strip())
             if found is None:
                 return [], f", {piece.strip()!r} is no joint and no range"
-            first = int(found[1])
-            last = first if found[2] is None else int(found[2])
+            first, last = int(found[1]), int(found[2] or found[1])
             if last < first:
                 return [], f", {piece.strip()} runs backwards"
             for joint in range(first, last + 1):
                 if not 1 <= joint <= count:
                     return [], f", there is no joint {joint}"
-                if joint in used:
+                if any(joint - 1 in group for group in groups):
                     return [], f", joint {joint} is there twice"
-                used.add(joint)
-                group.append(joint - 1)
-        groups.append(group)
+                groups[-1].append(joint - 1)
     return groups, ""
 
 
 def _label(group: list[int]) -> str:
-    """Write ascending joint indices, as "1+4-6"."""
-    runs: list[list[int]] = []
-    for j in group:
-        if runs and runs[-1][-1] == j - 1:
-            runs[-1].append(j)
-        else:
-            runs.append([j])
-    return "+".join(
-        str(run[0] + 1) if len(run) == 1 else f"{run[0] + 1}-{run[-1] + 1}" for run in runs
-    )
+    starts = [j for j in group if j - 1 not in group]
+    ends = [j for j in group if j + 1 not in group]
+    pairs = zip(starts, ends, strict=True)
+    return "+".join(f"{a + 1}" if a == b else f"{a + 1}-{b + 1}" for a, b in pairs)
+
+
+def joint_change(
+    words: str, cause: str, *, listed: bool = False, by_frame: bool = False,
+    with_others: bool = False, **options: object,
+) -> Changeable:  # fmt: skip
+    """Return how the parameters of a joint may change, each by itself; see `Changeable`."""
+    return Changeable(
+        "joint", words=words, cause=cause, listed=listed, by_frame=by_frame,
+        options={"joints": EACH, **options}, with_others=with_others,
+    )  # fmt: skip
 
 
 class PerJoint(Effect):
@@ -125,12 +115,24 @@ class PerJoint(Effect):
         "apart); joints that are not named have none. Unless given, each."
     }
     usual_joints: ClassVar[str] = EACH
+    unit: ClassVar[str]  # of the parameters of joints that turn
+    size: ClassVar[float]  # their ordinary magnitude, unless `ordinary` says more
+    meaning: ClassVar[str]  # with "{joint}" where it belongs
 
     def setup(self, states: States) -> None:
         """Read which joints share a parameter."""
         self.options.setdefault("joints", self.usual_joints)
         self.shared = joint_groups(self.name, self.options, self.cell.arm.n)
         self.options["joints"] = self.shared.text
+
+    def ordinary(self) -> Floats:
+        """(n,) ordinary magnitude of a parameter of each joint."""
+        return np.full(self.cell.arm.n, self.size)
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """One per joint, or group of joints."""
+        return self.group_parameters(self.unit, self.ordinary(), self.meaning)
 
     def refined(self, states: States) -> "PerJoint | None":
         """Return the effect with a parameter of its own for each joint that has one."""
@@ -152,30 +154,16 @@ class PerJoint(Effect):
 
     def group_parameters(
         self,
-        unit: str,
-        ordinary: Floats,
-        meaning: str,
-        kinds: Mapping[str, str] | None = None,
+        unit: str,  # of joints that turn; that of slides has m for rad, N for N·m
+        ordinary: Floats,  # (n,) magnitudes; a group has the geometric mean
+        meaning: str,  # with "{joint}" and "{kind}" where they belong
+        kinds: Mapping[str, str] | None = None,  # suffixes, as ".cos2", with their words
         *,
-        of_drive: bool = True,
+        of_drive: bool = True,  # of what the drive moves; else slides have the same unit
     ) -> tuple[Parameter, ...]:
-        """Parameters of all groups, one for each, or one for each of `kinds`.
-
-        Args:
-            unit: of joints that turn; that of slides has m for rad, N for N·m.
-            ordinary: (n,) ordinary magnitude at each joint; that of a group is the geometric
-                mean of its joints'.
-            meaning: with "{joint}" and "{kind}" where they belong.
-            kinds: suffixes of the parameters of one group, as ".cos2", each with its words.
-            of_drive: whether it is of what the drive moves; else slides have the same unit.
-
-        Raises:
-            InputError: joints that turn and joints that slide share a parameter.
-        """
+        """Parameters of all groups, one for each, or one for each of `kinds`."""
         g = self.shared
-        sizes: list[list[float]] = [[] for _ in g.labels]
-        for size, k in zip(ordinary[g.joint].tolist(), g.group.tolist(), strict=True):
-            sizes[k].append(size)
+        sizes = [ordinary[g.joint[g.group == k]].tolist() for k in range(len(g.labels))]
         scales = [math.prod(s) ** (1 / len(s)) for s in sizes]
         units = [unit] * len(scales)
         if of_drive and unit in OF_SLIDES and self.cell.arm.prismatic is not None:

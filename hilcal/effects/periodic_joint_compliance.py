@@ -18,13 +18,11 @@ class PeriodicJointCompliance(PerJoint):
     """dq_j = τ_j Σ_k (a_jk cos k q_j + b_jk sin k q_j) beside the mean c_j τ_j [rad/(N·m)].
 
     Joints that share parameters have the same phase at their zeros.
-
     """
 
     name = "periodic_joint_compliance"
     summary = "dq_j = τ_j (a_j cos 2q_j + b_j sin 2q_j): compliance changes with the joint angle"
-    plausible = 10.0
-    """Twice an ordinary compliance; more would make it negative. A choice."""
+    plausible = 10.0  # Twice an ordinary compliance; more would make it negative. A choice.
     elastic = True
     local_response = True
     option_help: ClassVar = {

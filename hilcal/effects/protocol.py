@@ -7,8 +7,8 @@ returns `load_change` or `wrench_change`, and their derivative `wrench_columns`.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import groupby
 from typing import ClassVar, Literal, Self
@@ -16,8 +16,7 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.effects.changed import Changeable
-from hilcal.effects.options import Options
+from hilcal.effects.options import Options, prior_of_units
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.robot.batch import zeros
@@ -25,55 +24,69 @@ from hilcal.robot.chain import Chain, Deviation
 from hilcal.robot.statics import Load
 from hilcal.types import Bools, Floats, Ints
 
+Kind = Literal["joint", "link", "base", "tool", "setup", "surroundings"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Directions:
+    """Directions of an effect's P parameters that change together."""
+
+    name: str
+    parameters: tuple[str, ...]  # (k,) names of the directions
+    units: tuple[str, ...]  # (k,) their units
+    scale: Floats  # (k,) their ordinary magnitudes, SI
+    matrix: Floats  # (P, k) parameters by directions in ordinary magnitudes
+
+
+@dataclass(frozen=True, slots=True)
+class Changeable:
+    """How the parameters of an effect may have changed between two campaigns."""
+
+    # of what they are. Of a "joint" or a "link" each one's parameters, named "j3..." or "link2...",
+    # change by themselves.
+    kind: Kind
+    part: str = ""  # what people call it; empty for joints and links
+    words: str = ""  # what has changed, e.g. "the tracker's scale", of a joint e.g. "zero"
+    cause: str = ""  # what may have done it, as a question; empty where there is nothing to say
+    listed: bool = False  # whether the smallest change that shows is listed by joint
+    by_frame: bool = False  # whether a frame that is estimated anew may absorb it
+    options: Mapping[str, object] = field(default_factory=dict)  # of the effect of a change
+    with_others: bool = False  # whether a repair changes it together with the others
+    directions: "Callable[[Effect], Directions] | None" = None  # if not each parameter
+
+
 Field = Literal["dq", "twist", "base", "station", "target", "scale", "observer"]
 Role = Literal["registration", "target", "observer", "baseline", "effect"]
 FRAME_ROLES: tuple[Role, ...] = ("registration", "target", "observer")
-OWN_SPREAD = 0.7
-"""Of the logarithm of a pool's standard deviation, beside what is shared; a choice."""
+OWN_SPREAD = 0.7  # Of the logarithm of a pool's standard deviation, beside what is shared; a choice
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One parameter of an effect.
+    """One parameter of an effect."""
 
-    Attributes:
-        name: within the effect, e.g. "j2" or "j3.cos4".
-        unit: physical unit, SI.
-        scale: a magnitude that would be ordinary in practice; it defines when a direction
-            counts as identifiable and how parameters of one effect compare.
-        meaning: one phrase for people.
-    """
-
-    name: str
-    unit: str
-    scale: float
-    meaning: str = ""
+    name: str  # within the effect, e.g. "j2" or "j3.cos4".
+    unit: str  # physical unit, SI
+    scale: float  # an ordinary magnitude, by which identifiability is judged
+    meaning: str = ""  # one phrase for people
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Situation:
-    """N states at their deflected configuration: everything that a law may depend on.
-
-    Attributes:
-        angle: (N, n) joint angles at which laws are evaluated, rad: the actual ones where
-            recorded; those of the drives where joints are coupled, and the phase of its travel
-            where a joint slides (`Arm.phases`).
-        chain: the deviated chain, or None before it is known.
-        wrench: (N, n + 1, 6) wrench transmitted through each slot, slot axes; element
-            (j, 5) is the torque τ about the axis of joint j + 1, (j, 2) the force along it.
-        load: the recorded wrench (`states.wrench`) as the model corrects it, where it acts, and
-            the weights.
-        compliance: (n,) joint compliances, rad/(N·m): those of the model, or typical ones where
-            no effect of it has any.
-    """
+    """N states at their deflected configuration: everything that a law may depend on."""
 
     cell: Cell
     states: States
+    # (N, n) joint angles at which laws are evaluated, rad: the actual ones where recorded; those of
+    # the drives where joints are coupled, and the phase of its travel where a joint slides
+    # (`Arm.phases`)
     angle: Floats
-    chain: Chain
+    chain: Chain  # the deviated chain, or None before it is known
+    # (N, n + 1, 6) wrench transmitted through each slot, slot axes; element (j, 5) is the torque τ
+    # about the axis of joint j + 1, (j, 2) the force along it
     wrench: Floats
-    load: Load
-    compliance: Floats
+    load: Load  # the recorded wrench as the model corrects it, where it acts, and weights
+    compliance: Floats  # (n,) of joints, rad/(N·m): the model's, or typical ones
 
     @property
     def values(self) -> Floats:
@@ -108,20 +121,12 @@ class Situation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Columns:
-    """Derivative of one field of the deviation by P of an effect's parameters.
+    """Derivative of one field of the deviation by P of an effect's parameters."""
 
-    Attributes:
-        field: the field of `Deviation` that moves.
-        parameter: (P,) indices of the parameters within the effect; one that moves several
-            elements occurs several times.
-        element: (P,) joint (for dq) or slot (for twist) that moves; ignored otherwise.
-        values: (N, P) for dq and scale, (N, P, 6) for the others; N may be 1 (constant).
-    """
-
-    field: Field
-    parameter: Ints
-    element: Ints
-    values: Floats
+    field: Field  # the field of `Deviation` that moves
+    parameter: Ints  # (P,) indices within the effect, also several times the same
+    element: Ints  # (P,) joint (for dq) or slot (for twist) that moves; ignored otherwise
+    values: Floats  # (N, P) for dq and scale, (N, P, 6) for the others; N may be 1 (constant)
 
     def only(self, wanted: Bools) -> "Columns":
         """Return the columns of some of the parameters."""
@@ -141,29 +146,18 @@ class Columns:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Response:
-    """Derivative of an elastic deviation by P changes of the wrenches at the slots of the chain.
+    """Derivative of an elastic deviation by P changes of the wrenches at the slots of the chain."""
 
-    Attributes:
-        dq: (N, P, n) or None.
-        twist: (N, P, n + 1, 6) or None.
-    """
-
-    dq: Floats | None = None
-    twist: Floats | None = None
+    dq: Floats | None = None  # (N, P, n) or None
+    twist: Floats | None = None  # (N, P, n + 1, 6) or None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadChange:
-    """Change of the load on the arm, in axes that move with it.
+    """Change of the load on the arm, in axes that move with it."""
 
-    Attributes:
-        point: (3,) shift of the load point, flange axes, m; None for none.
-        first_moment: (n, 3) change of each link's mass × centre of mass, link axes (as
-            `Arm.coms`), kg·m; None for none.
-    """
-
-    point: Floats | None = None
-    first_moment: Floats | None = None
+    point: Floats | None = None  # (3,) shift of the load point, flange axes, m; None for none
+    first_moment: Floats | None = None  # (n, 3) of links, mass × centre, link axes, kg·m
 
 
 class Effect(ABC):
@@ -229,11 +223,7 @@ class Effect(ABC):
     change: ClassVar[Changeable | None] = None
 
     def __init__(self, cell: Cell, states: States, options: Options | None = None) -> None:
-        """Build the effect for a cell and the states at hand.
-
-        Raises:
-            InputError: on an unknown option, or where `states` lacks a needed column.
-        """
+        """Build the effect for a cell and the states at hand."""
         self.cell = cell
         self.options: dict[str, object] = dict(options or {})
         for key in self.options:
@@ -368,8 +358,11 @@ class Effect(ABC):
         return mean + float(np.log(factor)), spread
 
     def prior_std(self) -> Floats | None:
-        """(P,) standard deviations of a fixed zero-mean prior, or None for a flat one."""
-        return None
+        """(P,) standard deviations of a fixed zero-mean prior, or None for a flat one.
+
+        By default from the options `prior_m` and `prior_rad` of effects that have these.
+        """
+        return prior_of_units(self.name, self.options, [p.unit for p in self.parameters])
 
     def most(self) -> float:
         """Largest plausible standard deviation of the parameters, in ordinary magnitudes.

@@ -8,15 +8,10 @@ from hilcal.effects.protocol import Effect
 
 @dataclass(frozen=True, slots=True)
 class EffectSpec:
-    """An effect that a model builds for its own cell and readings when it is added.
+    """An effect that a model builds for its own cell and readings when it is added."""
 
-    Attributes:
-        kind: its name in the catalogue of the model, or its class.
-        options: those that are not the usual ones.
-    """
-
-    kind: str | type[Effect]
-    options: Options = field(default_factory=dict)
+    kind: str | type[Effect]  # its name in the catalogue of the model, or its class
+    options: Options = field(default_factory=dict)  # those that are not the usual ones
 
     @property
     def name(self) -> str:

@@ -5,9 +5,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from hilcal.effects.changed import Changeable
-from hilcal.effects.options import PRIOR_HELP, Options, prior_of_lengths_and_turns
-from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
+from hilcal.effects.options import PRIOR_HELP, Options
+from hilcal.effects.protocol import Changeable, Columns, Effect, Parameter, Situation
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.types import Floats
@@ -23,8 +22,7 @@ class TargetOffset(Effect):
     name = "target_offset"
     summary = "the tracked target sits elsewhere on the flange than configured"
     change = Changeable("setup", "target", "the target's place on the tool")
-    plausible = 10.0
-    """10 mm, 10 mrad: a target that was mounted anew. A choice."""
+    plausible = 10.0  # 10 mm, 10 mrad: a target that was mounted anew. A choice.
     of_setup = True
     option_help: ClassVar = {
         "rotation": "True where the readings are poses, so that the target's axes matter.",
@@ -77,8 +75,3 @@ class TargetOffset(Effect):
     def usual_options(cls, m: int) -> Options:
         """Return `rotation` where readings are poses."""
         return {"rotation": True} if m == 6 else {}
-
-    def prior_std(self) -> Floats | None:
-        """Prior of displacement and rotation, where given."""
-        one = prior_of_lengths_and_turns(self.name, self.options, self.size)
-        return None if one is None else np.tile(one, len(self.moved))

@@ -4,15 +4,13 @@ from typing import ClassVar
 
 import numpy as np
 
-from hilcal.effects.changed import Changeable
 from hilcal.effects.options import choice, number
-from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
+from hilcal.effects.protocol import Changeable, Columns, Effect, Parameter, Situation
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.types import Floats
 
-REFERENCE_DEGC = 20.0
-"""Standard reference temperature of lengths, ISO 1."""
+REFERENCE_DEGC = 20.0  # Standard reference temperature of lengths, ISO 1
 SOURCES = ("air", "joints")
 FORMS = ("common", "each")
 
@@ -22,7 +20,6 @@ class ThermalGrowth(Effect):
 
     T is one temperature for the whole arm; slot k moves along L_k, by L_kᵀ p_k α ΔT in its
     own axes.
-
     """
 
     name = "thermal_growth"
@@ -30,8 +27,7 @@ class ThermalGrowth(Effect):
     change = Changeable(
         "surroundings", "temperature", "the length of the links with the temperature"
     )
-    plausible = 5.0
-    """60e-6 per kelvin: polymers; aluminium has 23e-6. A choice."""
+    plausible = 5.0  # 60e-6 per kelvin: polymers; aluminium has 23e-6. A choice.
     needs = ("air_temperature or joint_temperature",)
     option_help: ClassVar = {
         "reference_degC": "T_ref, at which the links are as long as configured; unless given, 20.",
@@ -71,7 +67,6 @@ class ThermalGrowth(Effect):
         return (Columns("twist", slots if self.each else 0 * slots, slots, values),)
 
     def _temperature(self, states: States) -> Floats:
-        """(N,) temperature of the arm, °C."""
         air, joints = states.air_temperature, states.joint_temperature
         if self.source == "air" and air is not None:
             return air

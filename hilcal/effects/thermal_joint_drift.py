@@ -6,7 +6,7 @@ import numpy as np
 
 from hilcal.effects.options import numbers
 from hilcal.effects.per_joint import PerJoint
-from hilcal.effects.protocol import Columns, Parameter, Situation
+from hilcal.effects.protocol import Columns, Situation
 from hilcal.readings.readings import States
 
 
@@ -14,9 +14,9 @@ class ThermalJointDrift(PerJoint):
     """dq_j = κ_j ΔT_j, ΔT_j = T_j − T_ref,j with the joint's own temperature [rad/K]."""
 
     name = "thermal_joint_drift"
+    unit, size, meaning = "rad/K", 5e-6, "drift of {joint} with the temperature"
     summary = "dq_j = κ_j ΔT_j: the zero of each joint wanders with its temperature"
-    plausible = 20.0
-    """0.1 mrad/K, 2 mrad for the 20 K that a drive warms up. A choice."""
+    plausible = 20.0  # 0.1 mrad/K, 2 mrad for the 20 K that a drive warms up. A choice.
     needs = ("joint_temperature",)
     option_help: ClassVar = {
         **PerJoint.option_help,
@@ -33,12 +33,6 @@ class ThermalJointDrift(PerJoint):
             first = 0 if states.time is None else int(np.argmin(states.time))
             self.options["reference_degC"] = [float(t) for t in warm[first]]
         self.reference = numbers(self.name, self.options, "reference_degC", self.cell.arm.n)
-
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """One coefficient per joint; 0.1 mrad for 20 K is ordinary."""
-        ordinary = np.full(self.cell.arm.n, 5e-6)
-        return self.group_parameters("rad/K", ordinary, "drift of {joint} with the temperature")
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:
         """Warming: ∂dq_j/∂κ_j = ΔT_j."""

@@ -2,13 +2,11 @@
 
 import numpy as np
 
-from hilcal.effects.changed import Changeable
 from hilcal.effects.options import rated_moments
-from hilcal.effects.protocol import Columns, Effect, Parameter, Response, Situation
+from hilcal.effects.protocol import Changeable, Columns, Effect, Parameter, Response, Situation
 from hilcal.types import Floats
 
-PARTS = np.array([[0, 0, 0, 0, 0, 1.0], [0, 0, 0, 1.0, 1.0, 0]])
-"""Moments about the flange's z axis and across it."""
+PARTS = np.array([[0, 0, 0, 0, 0, 1.0], [0, 0, 0, 1.0, 1.0, 0]])  # about z, and across it
 
 
 class ToolCompliance(Effect):
@@ -22,8 +20,7 @@ class ToolCompliance(Effect):
     name = "tool_compliance"
     summary = "rotation a t_z + c t_⊥ at the flange: tool or force sensor tilts under the moment"
     change = Changeable("tool", "tool", "the stiffness of what is bolted to the flange")
-    plausible = 30.0
-    """30 mrad at the rated torque of the last joint: a long, slender tool. A choice."""
+    plausible = 30.0  # 30 mrad at the rated torque of the last joint: a slender tool. A choice.
     of_setup = True
     elastic = True
     local_response = True

@@ -16,8 +16,7 @@ class TrackerDrift(Effect):
 
     name = "tracker_drift"
     summary = "the tracker's station moves linearly in time"
-    plausible = 20.0
-    """4 mm, 4 mrad over the campaign: a tripod on a soft floor. A choice."""
+    plausible = 20.0  # 4 mm, 4 mrad over the campaign: a tripod on a soft floor. A choice.
     of_setup = True
     needs = ("time",)
     option_help: ClassVar = {

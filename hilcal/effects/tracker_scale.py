@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from hilcal.effects.changed import Changeable
-from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
+from hilcal.effects.protocol import Changeable, Columns, Effect, Parameter, Situation
 
 
 class TrackerScale(Effect):
@@ -15,8 +14,7 @@ class TrackerScale(Effect):
     name = "tracker_scale"
     summary = "position read = (1 + s) position: the tracker's ranges have a scale error"
     change = Changeable("setup", "tracker's scale", "the tracker's scale")
-    plausible = 100.0
-    """1 mm/m: photogrammetry without a scale bar; refraction alone makes 0.05. A choice."""
+    plausible = 100.0  # 1 mm/m: photogrammetry without a bar; refraction makes 0.05. A choice.
     of_setup = True
 
     @property

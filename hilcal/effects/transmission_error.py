@@ -5,8 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from hilcal.effects.changed import Changeable
-from hilcal.effects.per_joint import PerJoint
+from hilcal.effects.per_joint import PerJoint, joint_change
 from hilcal.effects.protocol import OWN_SPREAD, Columns, Effect, Parameter, Situation
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
@@ -14,13 +13,9 @@ from hilcal.types import Floats, Ints
 
 MOST_HARMONICS = 120
 FEWEST_HARMONICS = 4
-POSES_PER_HARMONIC = 5
-"""A harmonic has two amplitudes per joint, which every pose shows: five poses leave the data in the
-majority. A guess, as the bounds are: the upper one limits the cost."""
-ORDINARY, ORDINARY_M = 5e-5, 1e-5
-"""Ordinary amplitude of a harmonic, rad; of a slide m."""
-SCORED_HARMONICS = 40
-"""Bounds the cost of scoring; a guess."""
+POSES_PER_HARMONIC = 5  # leave the data in the majority over its two amplitudes; a guess
+ORDINARY, ORDINARY_M = 5e-5, 1e-5  # Ordinary amplitude of a harmonic, rad; of a slide m
+SCORED_HARMONICS = 40  # Bounds the cost of scoring; a guess
 
 
 class TransmissionError(PerJoint):
@@ -34,17 +29,10 @@ class TransmissionError(PerJoint):
 
     name = "transmission_error"
     summary = "dq_j = Σ a_jk cos k q_j + b_jk sin k q_j: gear and encoder error"
-    change = Changeable(
-        "joint",
-        words="transmission error",
-        cause="another gear or encoder?",
-        options={"joints": "each", "harmonics": 4},
-    )
+    change = joint_change("transmission error", "another gear or encoder?", harmonics=4)
     """Few readings resolve no more than four harmonics; finer ones act as scatter. A choice."""
-    plausible = 30.0
-    """1.5 mrad per harmonic; strain wave gears state 0.3 mrad, spur gears 1 mrad. A choice."""
-    spread = 2.0**0.5
-    """Another gear errs as much, but elsewhere: the difference of two."""
+    plausible = 30.0  # 1.5 mrad per harmonic; gears state 0.3 to 1 mrad. A choice.
+    spread = 2.0**0.5  # Another gear errs as much, but elsewhere: the difference of two
     option_help: ClassVar = {
         **PerJoint.option_help,
         "harmonics": "K, the harmonics tried per joint, 1 to 1000; unless given, one for every "
@@ -78,7 +66,6 @@ class TransmissionError(PerJoint):
 
     @property
     def _ordinary(self) -> Floats:
-        """(n,) ordinary amplitudes of a harmonic."""
         return np.where(self.cell.arm.slides, ORDINARY_M, ORDINARY)
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:

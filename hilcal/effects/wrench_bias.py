@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from hilcal.effects.changed import Changeable
 from hilcal.effects.force_sensor import ForceSensorEffect
-from hilcal.effects.protocol import Parameter
+from hilcal.effects.protocol import Changeable, Parameter
 from hilcal.types import Floats
 
 
@@ -14,8 +13,7 @@ class WrenchBias(ForceSensorEffect):
     name = "wrench_bias"
     summary = "wrench read = true + b: the force sensor has a constant offset, in its own axes"
     change = Changeable("setup", "force sensor", "the zero of the force sensor")
-    plausible = 30.0
-    """30 N, 3 N·m: a sensor that was not zeroed with its tool. A choice."""
+    plausible = 30.0  # 30 N, 3 N·m: a sensor that was not zeroed with its tool. A choice.
     of_setup = True
 
     @property

@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from hilcal.effects.changed import Changeable
 from hilcal.effects.force_sensor import ForceSensorEffect
-from hilcal.effects.protocol import Parameter
+from hilcal.effects.protocol import Changeable, Parameter
 from hilcal.errors import CannotAnswerError
 from hilcal.types import Floats
 
@@ -19,8 +18,7 @@ class WrenchGain(ForceSensorEffect):
     name = "wrench_gain"
     summary = "wrench read = (1 + g) true per axis: the force sensor has a gain error"
     change = Changeable("setup", "force sensor", "the gain of the force sensor")
-    plausible = 50.0
-    """50 %: a wrong calibration matrix, a channel that hardly reads. A choice."""
+    plausible = 50.0  # 50 %: a wrong calibration matrix, a channel that hardly reads. A choice.
     of_setup = True
 
     @property
@@ -33,11 +31,7 @@ class WrenchGain(ForceSensorEffect):
         )
 
     def error(self, theta: Floats, recorded: Floats) -> Floats:
-        """Return g/(1 + g) w per axis.
-
-        Raises:
-            CannotAnswerError: a gain of −100 % or less, which no sensor has.
-        """
+        """Return g/(1 + g) w per axis."""
         if np.any(theta <= -1):
             raise CannotAnswerError(
                 f"{self.name}: a gain error of {100 * theta.min():.0f} % turns the wrench round; "

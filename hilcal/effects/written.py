@@ -24,20 +24,11 @@ _TRUTH = {"true": True, "false": False}
 
 
 def read_effects_text(text: str, where: str, catalogue: Catalogue) -> dict[str, dict[str, object]]:
-    """Read names of effects, with their options in parentheses, separated by commas.
+    """Read names of effects, with their options in parentheses, separated by commas, by name.
 
-    Options are separated by "," or ";". A value is a number, true or false, a word, text in
-    quotes, or a list of them in brackets.
-
-    Args:
-        text: e.g. "joint_compliance, transmission_error(harmonics=20)".
-        where: begins the message, e.g. "--effects".
-
-    Returns:
-        Options by name of the effect, in order.
-
-    Raises:
-        InputError: what is wrong, and what would be valid.
+    E.g. "joint_compliance, transmission_error(harmonics=20)". Options are separated by "," or ";".
+    A value is a number, true or false, a word, text in quotes, or a list of them in brackets.
+    `where` begins a refusal, e.g. "--effects".
     """
     out: dict[str, dict[str, object]] = {}
     for part in _split(text, ",", f"{where} {text!r}", EXAMPLE):
@@ -77,13 +68,7 @@ def written(value: object) -> str:
 
 
 def chosen_options(effect: Effect, states: States, m: int) -> dict[str, object]:
-    """Options of an effect other than it has by itself on these states, without its priors.
-
-    Args:
-        effect: the effect.
-        states: those that it was made for.
-        m: 3 for positions, 6 for poses.
-    """
+    """Options of an effect other than it has by itself on its states, without its priors."""
     usual = type(effect)(effect.cell, states, effect.usual_options(m)).options
     return {
         key: value
@@ -114,15 +99,13 @@ def _options(text: str, where: str) -> dict[str, object]:
             raise InputError(f"{where}: {part!r} is not an option with a value; {EXAMPLE}")
         if key in out:
             raise InputError(f"{where}: option {key} is there twice")
-        out[key] = _value(value, f"{where}: {key}")
+        here = f"{where}: {key}"
+        if value.startswith("[") and value.endswith("]"):
+            each = _split(value[1:-1], ",;", here, f"valid: {_VALUES}")
+            out[key] = [_single(v, here) for v in each]
+        else:
+            out[key] = _single(value, here)
     return out
-
-
-def _value(text: str, where: str) -> object:
-    """Read a value, or a list of values."""
-    if text.startswith("[") and text.endswith("]"):
-        return [_single(v, where) for v in _split(text[1:-1], ",;", where, f"valid: {_VALUES}")]
-    return _single(text, where)
 
 
 def _single(text: str, where: str) -> object:

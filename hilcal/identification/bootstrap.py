@@ -6,16 +6,14 @@ readings, and fits the model to them:
     θ*_b = argmin over the readings of the poses g_1 … g_G,   g_i uniform on the G distinct poses
     std(θ_p)² = Σ_b (θ*_bp − mean_b θ*_bp)² / (B − 1)
 
-It assumes that errors of different poses are independent, and nothing else of the noise: neither
-its size, nor that readings of one pose are independent. The standard uncertainties of a fit without
-a misfit assume both, so that the two together tell whether what is stated can be believed. With a
-misfit, neighbouring poses share errors; then the stated ones are those of a jackknife over regions
-of joint space, and the larger and better ones. With few poses for many parameters the bootstrap is
-too wide: a draw has 63 % of the poses.
-
-Strengths of shrunk families are chosen anew in each draw. The spread of a shrunk parameter is that
-of its estimate about a mean that shrinkage has pulled towards zero; its stated standard uncertainty
-counts that pull as well, and is the larger one. They are not compared.
+It assumes that errors of different poses are independent, and nothing else of the noise. The
+standard uncertainties of a fit without a misfit assume the size of the noise and independent
+readings of a pose, too, so that the two together tell whether what is stated can be believed. With
+a misfit, neighbouring poses share errors; then the stated ones are those of a jackknife over
+regions of joint space, and the larger and better ones. With few poses for many parameters the
+bootstrap is too wide: a draw has 63 % of the poses. Strengths of shrunk families are chosen anew in
+each draw; their spread is about a mean that shrinkage has pulled towards zero, which the stated one
+counts as well, and they are not compared.
 
 Source: Efron and Tibshirani, *An Introduction to the Bootstrap*, chapters 6, 9 and 13; Cameron and
 Miller, *A Practitioner's Guide to Cluster-Robust Inference*, on drawing whole groups.
@@ -39,41 +37,11 @@ from hilcal.readings.whitening import Mode, Scaling, whitening
 from hilcal.shown import Shown
 from hilcal.types import Bools, Floats, Ints
 
-LEVEL = 0.95
-"""Of the percentile interval, unless another is asked for."""
-DRAWS = 200
-"""Usual number of draws: the standard deviation is known to 5 %; Efron and Tibshirani, 6.4."""
-LEAST_DRAWS = 20
-"""Fewest draws; a choice: the standard deviation is known to 16 %."""
-LEAST_POSES = 10
-"""Fewest distinct poses; a choice: of fewer, draws are too often the same few."""
-TOGETHER = 5
-"""Draws that a worker makes at a time; a choice. It does not depend on the number of workers."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Campaign:
-    """What is drawn from; all that a worker needs.
-
-    Attributes:
-        model: the model, without readings of its own.
-        readings: those that were fitted.
-        group: (N,) distinct pose of each.
-        mode: what is fitted.
-        scaling: its scaling.
-        start: (P,) parameters that each fit starts from.
-        null: directions of the parameters that all poses together leave open.
-        seed: of the draws.
-    """
-
-    model: Model
-    readings: Readings
-    group: Ints
-    mode: Mode
-    scaling: Scaling
-    start: Floats
-    null: int
-    seed: int
+LEVEL = 0.95  # of the percentile interval, unless another is asked for
+DRAWS = 200  # usual: the standard deviation is known to 5 % (Efron and Tibshirani, 6.4)
+LEAST_DRAWS = 20  # a choice: the standard deviation is known to 16 %
+LEAST_POSES = 10  # distinct ones; a choice: of fewer, draws are too often the same few
+TOGETHER = 5  # draws that a worker makes at a time, on any number of workers; a choice
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,15 +68,9 @@ class Bootstrap(Shown):
     @cached_property
     def compared(self) -> Bools:
         """(P,) parameters with a stated standard uncertainty that are not shrunk."""
-        u = self.fit.uncertainty
-        shrunk = prior_of(self.fit.model)[1] >= 0
-        return np.asarray(
-            u.identifiable
-            & np.isfinite(u.std)
-            & (u.std > 0)
-            & self.fit.solution.estimated
-            & ~shrunk
-        )
+        u, shrunk = self.fit.uncertainty, prior_of(self.fit.model)[1] >= 0
+        stated = u.identifiable & np.isfinite(u.std) & (u.std > 0)
+        return np.asarray(stated & self.fit.solution.estimated & ~shrunk)
 
     @cached_property
     def ratio(self) -> Floats:
@@ -118,11 +80,7 @@ class Bootstrap(Shown):
         return out
 
     def interval(self, level: float = LEVEL) -> Floats:
-        """(2, P) ends of the percentile interval.
-
-        Raises:
-            InputError: a level outside of (0, 1).
-        """
+        """(2, P) ends of the percentile interval; a level outside of (0, 1) is refused."""
         if not 0 < level < 1:
             raise InputError(f"level {level:g}; valid: between 0 and 1")
         tail = (1 - level) / 2
@@ -187,13 +145,19 @@ def bootstrap(
             f"{poses} distinct poses were fitted: a bootstrap draws whole poses, and needs at "
             f"least {LEAST_POSES}"
         )
-    of = _Campaign(
-        replace(fit.model, readings=None), kept, group, fit.mode, fit.scaling, fit.theta,
-        fit.solution.equations.basis.null.shape[1], seed,
-    )  # fmt: skip
+    drawn = partial(
+        _drawn,
+        model=replace(fit.model, readings=None),
+        readings=kept,
+        group=group,
+        like=(fit.mode, fit.scaling),
+        start=fit.theta,
+        null=fit.solution.equations.basis.null.shape[1],
+        seed=seed,
+    )
     parts = [range(a, min(a + TOGETHER, draws)) for a in range(0, draws, TOGETHER)]
     found: dict[int, Floats] = {}
-    for k, theta in engine.results(partial(_drawn, of=of), parts):
+    for k, theta in engine.results(drawn, parts):
         found[k] = theta
         if advance is not None:
             advance(len(parts[k]))
@@ -208,28 +172,32 @@ def bootstrap(
 
 
 def check_draws(draws: int, seed: int) -> None:
-    """Refuse numbers that cannot be.
-
-    Raises:
-        InputError: too few draws, or a negative seed.
-    """
+    """Refuse too few draws, or a negative seed."""
     if draws < LEAST_DRAWS or seed < 0:
         raise InputError(
             f"draws {draws}, seed {seed}; valid: at least {LEAST_DRAWS} draws, a seed from 0"
         )
 
 
-def _drawn(draws: range, of: _Campaign) -> Floats:
-    """(K, P) parameters of some draws; NaN where a draw does not determine them."""
-    out = np.full((len(draws), of.model.size), np.nan)
+def _drawn(
+    draws: range,
+    model: Model,
+    readings: Readings,
+    group: Ints,
+    like: tuple[Mode, Scaling],
+    start: Floats,
+    null: int,
+    seed: int,
+) -> Floats:
+    """(K, P) parameters of some draws; NaN where a draw does not determine as many as all poses."""
+    out = np.full((len(draws), model.size), np.nan)
     for row, draw in enumerate(draws):
-        readings = again(of.readings, of.group, np.random.default_rng([of.seed, draw]))
+        some = again(readings, group, np.random.default_rng([seed, draw]))
         try:
-            w = whitening(readings, of.mode, of.scaling)
-            found = solve(of.model, readings, w, start=of.start)
+            found = solve(model, some, whitening(some, *like), start=start)
         except CannotAnswerError:
             continue
-        if found.converged and found.equations.basis.null.shape[1] <= of.null:
+        if found.converged and found.equations.basis.null.shape[1] <= null:
             out[row] = found.theta
     return out
 
@@ -239,11 +207,6 @@ def again(readings: Readings, group: Ints, rng: np.random.Generator) -> Readings
 
     A group that is drawn twice gives two poses, so that each loaded reading keeps its own unloaded
     one, and each arrival its own common error.
-
-    Args:
-        readings: N readings.
-        group: (N,) number of the group of each, from 0.
-        rng: source of the draw.
     """
     count = int(group.max()) + 1
     order = np.argsort(group, kind="stable")

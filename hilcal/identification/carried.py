@@ -8,39 +8,50 @@ since then, with one strength δ per group: the parameters of an effect that bel
 one link. S are the ordinary magnitudes of the parameters, of a shrunk family their strengths. δ_g
 is at least `least`, and beyond that what the new readings ask for (`drift`). A model that
 lacks an effect of the posterior leaves it out of the prior by marginalising it out.
+
+Fits have coordinates y in which the prior is independent (`Coordinates`):
+
+    θ = m + U y
+
+y of unit variance, or flat along directions without information; y = θ for parameters without a
+carried prior. With Λ the prior information in ordinary magnitudes and E its eigenvectors with
+eigenvalues λ > 0, N the others, D the variances of the drift,
+
+    U = [E L, N],    L Lᵀ = (1 + δ_0²) diag(1/λ) + Eᵀ D E
+
+so that the prior has the information ((1 + δ_0²) Λ⁻¹ + D)⁻¹ where Λ has some, and none elsewhere.
 """
 
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, Literal, get_args
 
 import numpy as np
+import scipy.linalg as sl
 
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import InputError
 from hilcal.identification.posterior import Posterior
+from hilcal.identification.priors import names_of
+from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
 from hilcal.readings.same_readings import among
+from hilcal.regression.normal_equations import INFORMATION
+from hilcal.regression.schur import schur_complement
 from hilcal.robot.arm import Arm
-from hilcal.types import Floats, Ints
+from hilcal.types import Bools, Floats, Ints
 
 Relation = Literal["arm", "type"]
 RELATIONS: tuple[Relation, ...] = get_args(Relation)
 _JOINT = re.compile(r"j([1-9][0-9]*)$")
-SAME_M = 1e-6
-"""Difference of two nominal link lengths up to which they are the same; rounding of a table."""
+SAME_M = 1e-6  # difference of two nominal link lengths that are the same: rounding of a table
 
 
 @dataclass(frozen=True, slots=True)
 class DriftGroup:
-    """Parameters that drift together.
-
-    Attributes:
-        effect: their effect.
-        part: "j3", "link2", or empty for the whole effect.
-    """
+    """Parameters that drift together: a part ("j3", "link2", or all) of an effect."""
 
     effect: str
     part: str
@@ -59,21 +70,13 @@ class DriftGroup:
 
 @dataclass(frozen=True, eq=False)
 class CarriedPrior:
-    """A posterior as prior, and the drift that it is given.
-
-    Attributes:
-        posterior: what the other campaign taught.
-        relation: "arm": it was of the same arm; "type": of another one of the same type.
-        least: least drift of each effect by name, in units of S.
-        expected: drift that it may well have had, likewise.
-        drift: (1 + G,) δ_0, and δ of each of `groups`, as a fit has chosen them; None before.
-    """
+    """A posterior as prior, and the drift that it is given."""
 
     posterior: Posterior
-    relation: Relation = "arm"
-    least: Mapping[str, float] = field(default_factory=dict)
-    expected: Mapping[str, float] = field(default_factory=dict)
-    drift: Floats | None = None
+    relation: Relation = "arm"  # of the same arm, or of another one of the same type
+    least: Mapping[str, float] = field(default_factory=dict)  # drift of each effect, in units of S
+    expected: Mapping[str, float] = field(default_factory=dict)  # that it may well have had
+    drift: Floats | None = None  # (1 + G,) δ_0, and δ of each of `groups`, as a fit has chosen them
 
     @cached_property
     def groups(self) -> tuple[DriftGroup, ...]:
@@ -83,25 +86,21 @@ class CarriedPrior:
     @cached_property
     def group(self) -> Ints:
         """(K,) group of each parameter of the posterior."""
-        place = {g: i for i, g in enumerate(self.groups)}
-        return np.array([place[group_of(name)] for name in self.posterior.names])
+        return np.array([self.groups.index(group_of(name)) for name in self.posterior.names])
 
     @cached_property
     def unit(self) -> Floats:
         """(K,) S, what a drift of 1 is: the ordinary magnitude, or the strength in a family."""
-        own = self.posterior.own_precision
-        strength = 1.0 / np.sqrt(np.where(own > 0, own, 1.0))
-        return np.where(own > 0, strength, self.posterior.scale)
+        precision = self.posterior.own_precision
+        strength = 1.0 / np.sqrt(np.where(precision > 0, precision, 1.0))
+        return np.where(precision > 0, strength, self.posterior.scale)
 
     def index_in(self, names: tuple[str, ...]) -> tuple[Ints, Ints]:
-        """Return the parameters of a model that it is of, and their places in the posterior.
-
-        Args:
-            names: of the model's parameters, "effect.parameter".
-        """
+        """Parameters (K,) of a model, by their names, and their places in the posterior."""
         place = {name: k for k, name in enumerate(self.posterior.names)}
-        index = np.array([k for k, name in enumerate(names) if name in place], dtype=np.int64)
-        return index, np.array([place[names[k]] for k in index.tolist()], dtype=np.int64)
+        index = [k for k, name in enumerate(names) if name in place]
+        both = np.array([index, [place[names[k]] for k in index]], dtype=np.int64)
+        return both[0], both[1]
 
     def with_drift(self, drift: Floats | None) -> "CarriedPrior":
         """Return the prior with other drifts (1 + G,)."""
@@ -132,9 +131,9 @@ class CarriedPrior:
 
 def group_of(name: str) -> DriftGroup:
     """Return the group of a parameter "effect.part" or "effect.part.kind"."""
-    effect, _, own = name.partition(".")
-    part = own.split(".", 1)[0]
-    return DriftGroup(effect, part if "." in own or _JOINT.match(part) else "")
+    effect, _, parameter = name.partition(".")
+    part = parameter.split(".", 1)[0]
+    return DriftGroup(effect, part if "." in parameter or _JOINT.match(part) else "")
 
 
 def carried_prior(
@@ -182,12 +181,7 @@ def carried_prior(
 
 
 def check_prior(prior: CarriedPrior, arm: Arm, readings: Readings) -> None:
-    """Refuse a prior that is not one of these readings.
-
-    Raises:
-        InputError: of an arm with other joints or other links, or learnt from readings that are to
-            be fitted.
-    """
+    """Refuse a prior of another arm, or learnt from readings that are to be fitted."""
     check_arm(prior, arm)
     both = int(among(readings, prior.posterior.prints).sum())
     if both:
@@ -198,13 +192,8 @@ def check_prior(prior: CarriedPrior, arm: Arm, readings: Readings) -> None:
 
 
 def check_arm(prior: CarriedPrior, arm: Arm) -> None:
-    """Refuse a prior of another arm.
-
-    Raises:
-        InputError: of an arm with other joints or other links.
-    """
-    p = prior.posterior
-    of = _called(p)
+    """Refuse a prior of an arm with other joints or other links."""
+    p, of = prior.posterior, _called(prior.posterior)
     if p.links.shape != arm.links.shape:
         raise InputError(
             f"{of} is of the arm {p.arm} with {len(p.links) - 1} joints, this one, {arm.name}, has "
@@ -218,5 +207,117 @@ def check_arm(prior: CarriedPrior, arm: Arm) -> None:
 
 
 def _called(p: Posterior) -> str:
-    """Name a posterior."""
     return f"the prior{f' of {p.source.campaign}' if p.source.campaign else ''}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Coordinates:
+    """θ = m + U y of the K parameters at `index`, θ = y of all others."""
+
+    index: (
+        Ints  # (K,) parameters of the model with a carried prior; y has theirs at the same places
+    )
+    mean: Floats  # (K,) m, SI
+    matrix: Floats  # (K, K) U, SI
+    inverse: Floats  # (K, K) y = inverse (θ − m)
+    std: Floats  # (K,) standard deviations of y: 1, infinite for flat ones, 0 for those left out
+    rest: Floats  # (K,) variance of θ by the coordinates that were left out, SI
+
+    def _with(self, x: Floats, values: Floats | float | bool) -> Floats:
+        """Return x (P, ...) with values of the parameters that have a carried prior."""
+        out = x.copy()
+        out[self.index] = values
+        return out
+
+    def theta(self, y: Floats) -> Floats:
+        """(P,) parameters."""
+        return self._with(y, self.mean + self.matrix @ y[self.index])
+
+    def of_theta(self, theta: Floats) -> Floats:
+        """(P,) y."""
+        return self._with(theta, self.inverse @ (theta[self.index] - self.mean))
+
+    def transform(self, t: Floats) -> Floats:
+        """(P, Q) change of θ by changes of y (P, Q)."""
+        return self._with(t, self.matrix @ t[self.index])
+
+    def columns(self, a: Floats) -> Floats:
+        """(R, P) derivatives by y of derivatives by θ (R, P)."""
+        if not len(self.index):
+            return a
+        out = a.copy()
+        out[:, self.index] = a[:, self.index] @ self.matrix
+        return out
+
+    def prior(self, std: Floats) -> Floats:
+        """Prior standard deviations (P,) of y; `std` where there is no carried one."""
+        return self._with(std, self.std)
+
+    def scales(self, scale: Floats) -> Floats:
+        """(P,) ordinary magnitudes of y, of those of θ."""
+        return self._with(scale, 1.0)
+
+    def carried(self, size: int) -> Bools:
+        """(P,) which parameters have a carried prior."""
+        return np.isin(np.arange(size), self.index)
+
+    def felt(self, a: Floats) -> "Coordinates":
+        """Return those of which only what rows A (R, P) by θ depend on is kept.
+
+        The others stay where the prior has them. The same with more rows than coordinates.
+        """
+        held = np.flatnonzero(self.std == 1.0)
+        if len(a) >= len(held):
+            return self
+        u = self.matrix[:, held]
+        turn = sl.qr((a[:, self.index] @ u).T, mode="economic", check_finite=False)[0]
+        matrix, inverse, std = self.matrix.copy(), self.inverse.copy(), self.std.copy()
+        matrix[:, held], inverse[held], std[held] = 0.0, 0.0, 0.0
+        kept = held[: turn.shape[1]]
+        matrix[:, kept], inverse[kept], std[kept] = u @ turn, turn.T @ self.inverse[held], 1.0
+        rest = np.sum(u**2, axis=1) - np.sum(matrix[:, kept] ** 2, axis=1)
+        return replace(self, matrix=matrix, inverse=inverse, std=std, rest=np.maximum(rest, 0.0))
+
+
+def coordinates_of(model: Model) -> Coordinates:
+    """Return the coordinates of a model's parameters; y = θ where it has no carried prior."""
+    if model.prior is None:
+        none, square = np.zeros(0), np.zeros((0, 0))
+        return Coordinates(none.astype(np.int64), none, square, square, none, none)
+    return _coordinates(model.prior, names_of(model))
+
+
+@lru_cache(maxsize=3)
+def _coordinates(prior: CarriedPrior, names: tuple[str, ...]) -> Coordinates:
+    p = prior.posterior
+    index, place = prior.index_in(names)
+    values, vectors = _spectrum(p, tuple(place.tolist()))
+    scale, seen = p.scale[place], values > 0
+    e, values = vectors[:, seen], values[seen]
+    root, back = e / np.sqrt(values), np.sqrt(values)[:, None] * e.T
+    if prior.drift is not None and prior.drift.any():
+        drift = prior.drift[1:][prior.group[place]]
+        inner = (e.T * (drift * prior.unit[place] / scale) ** 2) @ e
+        inner[np.diag_indices_from(inner)] += (1.0 + prior.drift[0] ** 2) / values
+        low = np.linalg.cholesky(inner)
+        root = e @ low
+        back = sl.solve_triangular(low, e.T, lower=True, check_finite=False)
+    matrix = np.hstack([root, vectors[:, ~seen]])
+    inverse = np.vstack([back, vectors[:, ~seen].T])
+    std = np.concatenate([np.ones(root.shape[1]), np.full(int((~seen).sum()), np.inf)])
+    mean, rest = p.mean[place], np.zeros(len(index))
+    return Coordinates(index, mean, scale[:, None] * matrix, inverse / scale, std, rest)
+
+
+@lru_cache(maxsize=3)
+def _spectrum(p: Posterior, place: tuple[int, ...]) -> tuple[Floats, Floats]:
+    """Eigenvalues and eigenvectors of the information on some parameters, in ordinary magnitudes.
+
+    Those without information are zero. Without any information the axes are the parameters.
+    """
+    scaled = p.information * (p.scale[:, None] * p.scale)
+    rows = np.array(place, dtype=np.int64)
+    some = scaled if len(place) == len(scaled) else schur_complement(scaled, rows)
+    values, vectors = np.linalg.eigh((some + some.T) / 2)
+    values[values < INFORMATION**2 / 2] = 0.0
+    return values, vectors if values.any() else np.eye(len(values))

@@ -1,30 +1,36 @@
-"""Which readings are gross errors: data snooping (Baarda) from a robust start.
+"""Which readings are gross errors: data snooping from a robust start.
 
 Least trimmed squares finds the readings, more than half, that agree best on the model. What a model
 without some effect leaves of them sizes smooth nuisance functions that stand in for it, as random
-effects. Then readings join or leave by their distance t² from the fit to the
-others, which is χ²_m of a good reading (`reading_model`), until none does.
+effects: joint displacements by functions of the joint's angle, torque and side of approach, link
+twists, constant and by the moments that the link carries, a drift of the target with time. Then
+readings join or leave by their distance t² from the fit to the others, which is χ²_m of a good
+reading, until none does (Baarda, *A testing procedure for use in geodetic networks*, 1968).
 
-Source: Baarda, *A testing procedure for use in geodetic networks* (1968).
-
-Smooth nuisance columns, so that data snooping does not take a misfit for gross errors.
-
-Joint displacements by smooth functions of the joint's angle, torque and side of approach; link
-twists, constant and by the moments that the link carries; a drift of the target with time.
+Readings that are off for one cause are no gross errors: those off by the same shift in a row, in
+the axes of the sensor or of the target, as by another reflector, a target that was moved on the
+tool, a tracker that was bumped (`off_alike`); and those off along what one site of the arm can do.
+What a law of a joint, of a link that bends or of the force sensor does to a reading goes along one
+direction there, whatever the law depends on; a gross error goes anywhere. Of a random error in m
+dimensions the share beside a direction is sin² ~ Beta((m − 1)/2, 1/2), with p its distribution
+function uniform. So n of F gross errors are as near to a site's direction as p_(n), ascending, with
+the probability P(B(F, p_(n)) ≥ n), times F and the number of sites for the least of all. Where that
+is too small, what is along the site, at two poses at least, is a law's (`along_one_site`).
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from scipy.stats import binom, chi2
+from scipy.stats import beta, binom, chi2
 
-from hilcal.identification.common_cause import along_one_site, off_alike, site_columns
 from hilcal.identification.gauss_newton import Solution
 from hilcal.identification.least_trimmed_squares import (
     MISFIT,
     MOST,
+    ReadingModel,
     bulk,
     limit,
     nearest,
@@ -32,48 +38,37 @@ from hilcal.identification.least_trimmed_squares import (
     variance,
 )
 from hilcal.identification.priors import scales_of
-from hilcal.identification.reading_model import ReadingModel
 from hilcal.model.model import Model, Prediction
 from hilcal.model.observe import motion
-from hilcal.readings.reading_groups import deflection_groups
 from hilcal.readings.readings import Readings
-from hilcal.readings.whitening import Mode, inverse_root
+from hilcal.readings.whitening import Mode, deflection_groups, inverse_root
 from hilcal.robot import se3
 from hilcal.types import Bools, Floats, Ints
 
-SMALLEST = 3e-3
-"""Share of the largest t² of the used readings below which none leaves before a new fit; a choice,
-no study set it."""
-ACCIDENT = 1e-3
-"""Binomial probability of so many shared unloaded readings among the gross errors, below which the
-cause is a misfit; a choice, the tests of effects on unloaded readings confirm it."""
-CORE = 0.99
-"""Probability of the χ² quantile up to which readings join the robust start; a choice."""
-MOST_COLUMNS = 200
-"""Most parameters that are fitted anew with each choice of readings; where there are more, those
-with a prior are held. A choice by timing: hundreds of harmonics hardly depend on one reading."""
-ROUGH_M = 1e-3
-"""Scatter of most readings about model and smooth functions, m, from which on they disagree; a
-choice: more than any arm leaves beside its geometry."""
-ROUNDS = 20
-"""Most rounds in which readings join and leave; a choice."""
-WHITENED = 4096
-"""Readings that are whitened at a time."""
-EXACT = 1e-6
-"""Share of a group's mean covariance that each of its readings has at least; a choice: an unloaded
-reading that is stated to be exact is so all the same."""
-MOST_SHARE = 0.35
-"""Most columns, as a share of the whitened rows; a choice, no study set it."""
+# All of these are choices.
+SMALLEST = 3e-3  # share of the largest used t² below which none leaves before a new fit
+ACCIDENT = 1e-3  # probability of so many shared unloaded readings that are off: a misfit
+CORE = 0.99  # of the χ² quantile up to which readings join the robust start
+MOST_COLUMNS = 200  # parameters fitted anew with each choice; of more, those without a prior
+ROUGH_M = 1e-3  # scatter of most readings, m, from which on they disagree: no arm leaves as much
+ROUNDS = 20  # most rounds in which readings join and leave
+WHITENED = 4096  # readings that are whitened at a time
+EXACT = 1e-6  # share of a group's mean covariance that each has: exact unloaded readings stay so
+MOST_SHARE = 0.35  # most nuisance columns, as a share of the whitened rows
+SAME = 0.25  # largest difference of two shifts that are the same one, as a share of the larger
+BETWEEN = 1  # readings between two alike ones that may be off otherwise
+RUN = 4  # fewest readings that are off alike: two in a row agree by chance
+ACCIDENTAL = 0.05  # share of readings up to which those off alike count as gross errors
+CHANCE = 1e-2  # that so many are along any one site; that noise moves one beside its law so far
+FEWEST = 2  # poses that a law moves at least: axes may agree at one
+ROUGH = 0.05  # share of a law's shift that may be beside its direction, as the model is linear
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Disagreement:
-    """Readings that are far off, and no gross errors that could be set aside.
+    """Readings (rows) that are far off, and no gross errors that could be set aside.
 
-    Attributes:
-        kind: "many", where more are off than can be told from good ones; "alike", where readings in
-            a row are off by the same shift.
-        rows: of the readings.
+    "many": more are off than can be told from good ones; "alike": in a row, by the same shift.
     """
 
     kind: Literal["many", "alike"]
@@ -82,45 +77,30 @@ class Disagreement:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Screened:
-    """Readings that were tested for gross errors.
+    """Readings that were tested for gross errors."""
 
-    Attributes:
-        agree: (N,) that agree with the model.
-        used: (N,) to fit to: these, and those of a disagreement; without deflections from an
-            unloaded reading that is off.
-        misfit: variance of what the model leaves of good readings, in units of the noise.
-        disagreement: readings that are off and yet used.
-    """
-
-    agree: Bools
-    used: Bools
-    misfit: float
-    disagreement: Disagreement | None
+    agree: Bools  # (N,) that agree with the model
+    used: Bools  # (N,) to fit to: these, and those of a disagreement; without deflections from an
+    # unloaded reading that is off
+    misfit: float  # variance of what the model leaves of good readings, in units of the noise
+    disagreement: Disagreement | None = None  # readings that are off and yet used
 
 
 @dataclass(frozen=True, eq=False)
 class Snooping:
-    """The readings of a fit, as they are tested for gross errors.
-
-    Attributes:
-        model: robot and effects.
-        readings: all of them.
-        mode: "deflection" or "absolute".
-        solution: of some of them.
-        y: (P,) parameters that the model is linearised at.
-    """
+    """The readings of a fit, as they are tested for gross errors."""
 
     model: Model
-    readings: Readings
+    readings: Readings  # all of them
     mode: Mode
-    solution: Solution
-    y: Floats
+    solution: Solution  # of some of them
+    y: Floats  # (P,) coordinates that the model is linearised at
 
     def begin(self, rng: np.random.Generator) -> Screened:
         """Test all readings from a robust start; the solution may be of bad readings, too."""
         every = np.ones(len(self.readings), dtype=np.bool_)
         if self._all_noise():
-            return Screened(every, every, 1.0, None)
+            return Screened(every, every, 1.0)
         at, used = robust_start(linearised(self, self.y), rng)
         of = at.linear
         d2, centre = of.near(of.fitted(used)[0])
@@ -147,6 +127,7 @@ class Snooping:
         return self._screened(linearised(self, self.y), before.agree, before.misfit)
 
     def _screened(self, at: "_LinearModel", used: Bools, misfit: float) -> Screened:
+        readings = self.readings
         every, kept = np.ones_like(used), np.zeros_like(used)
         count = int(np.count_nonzero(at.linear.tested))
         while True:
@@ -155,23 +136,22 @@ class Snooping:
             agree = used | ~of.tested
             off = np.flatnonzero(~agree)
             if self._accident(of, off):
-                return Screened(every, every, misfit, None)
-            size = np.sqrt(scale * np.mean(np.trace(self.readings.covariance[:, :3, :3], 0, 1, 2)))
+                return Screened(every, every, misfit)
+            size = np.sqrt(scale * np.mean(np.trace(readings.covariance[:, :3, :3], 0, 1, 2)))
             if len(off) > MOST * count or (scale > MISFIT[1] and size > ROUGH_M):
                 off = np.flatnonzero((t2 > limit(of.m, count)) & of.tested)
                 return Screened(every, every, misfit, Disagreement("many", off))
             if not len(off):
-                return Screened(agree, every, misfit, None)
+                return Screened(agree, every, misfit)
             white = of.residuals(used)[off, :, None]
             shift = (np.linalg.pinv(of.root[off]) @ white)[:, :, 0]
-            axes = self.model.predict(self.readings.states[off], self.solution.theta).observation
-            alike = off_alike(self.readings, of.tested, off, shift[:, :3], axes.rotation)
-            rest = ~np.isin(off, alike) & ~self.readings.scalar[off]  # no direction to tell
-            unit = _units(self.readings.covariance[off[rest]])
-            sites = at.sites[off[rest]] / unit[:, :, None]
-            law = off[rest][
-                along_one_site(shift[rest] / unit, sites, self.readings.pose[off[rest]])
-            ]
+            axes = self.model.predict(readings.states[off], self.solution.theta).observation
+            alike = off_alike(readings, of.tested, off, shift[:, :3], axes.rotation)
+            rest = ~np.isin(off, alike) & ~readings.scalar[off]  # no direction to tell
+            rows = off[rest]
+            unit = _units(readings.covariance[rows])
+            sites = at.sites[rows] / unit[:, :, None]
+            law = rows[along_one_site(shift[rest] / unit, sites, readings.pose[rows])]
             if not len(law):
                 fitted = agree | np.isin(np.arange(len(agree)), alike)
                 found = Disagreement("alike", alike) if len(alike) else None
@@ -183,10 +163,7 @@ class Snooping:
     def _snooped(self, of: ReadingModel, used: Bools, kept: Bools) -> tuple[Bools, Floats, float]:
         """Readings (N,) that are not off, t² (N,) from the fit to them, and the scale of its bulk.
 
-        Args:
-            of: the linear model.
-            used: (N,) those to begin with.
-            kept: (N,) of these, those that stay.
+        It begins with the `used` ones (N,), of which those that are `kept` (N,) stay.
         """
         count = int(np.count_nonzero(of.tested))
         for _ in range(ROUNDS):
@@ -209,12 +186,10 @@ class Snooping:
 
     def _fittable(self, of: ReadingModel, agree: Bools) -> Bools:
         """(N,) readings without deflections of which the loaded or all unloaded ones are off."""
-        used = agree.copy()
         if not len(of.members):
-            return used
-        there = of.members >= 0
-        unloaded = self.readings.unloaded[of.members]
-        good = agree[of.members] & there
+            return agree
+        unloaded, used = self.readings.unloaded[of.members], agree.copy()
+        good = agree[of.members] & (of.members >= 0)
         lost = ~((good & unloaded).any(axis=1) & (good & ~unloaded).any(axis=1))
         gone = of.members[lost]
         used[gone[gone >= 0]] = False
@@ -223,21 +198,12 @@ class Snooping:
 
 @dataclass(frozen=True, eq=False)
 class _LinearModel:
-    """The linear model of all readings at parameters y (P,).
-
-    Attributes:
-        of: the fit.
-        y: coordinates of the parameters.
-        live: (K,) those that are estimated, and the columns of `linear`.
-        scale: (K,) their ordinary magnitudes, the units of the columns.
-        prediction: there.
-        linear: the linear model.
-    """
+    """The linear model of all readings at coordinates y (P,)."""
 
     of: Snooping
     y: Floats
-    live: Ints
-    scale: Floats
+    live: Ints  # (K,) those that are estimated, and the columns of `linear`
+    scale: Floats  # (K,) their ordinary magnitudes, the units of the columns
     prediction: Prediction
     linear: ReadingModel
 
@@ -255,9 +221,8 @@ class _LinearModel:
 
     def with_nuisance(self, misfit: float) -> ReadingModel:
         """Return the linear model with smooth nuisance columns of some variance above the noise."""
-        of, readings = self.of, self.of.readings
-        rank = int(self.linear.read[self.linear.tested].sum())
-        columns = smooth_nuisance_columns(of.model, self.prediction, readings, rank)
+        of, rank = self.of, int(self.linear.read[self.linear.tested].sum())
+        columns = smooth_nuisance_columns(of.model, self.prediction, of.readings, rank)
         for k in range(0, len(columns), WHITENED):  # in place: they are the largest array of a fit
             rows = slice(k, k + WHITENED)
             columns[rows] = self.linear.root[rows] @ columns[rows]
@@ -281,15 +246,14 @@ def linearised(of: Snooping, y: Floats) -> _LinearModel:
     if len(live) > MOST_COLUMNS:
         live = np.flatnonzero(np.isinf(s.prior))
     scale = s.space.scales(scales_of(model))[live]
-    if len(s.space.index):
-        jacobian = model.jacobian(prediction, theta, readings.m).reshape(-1, model.size)
-        columns = s.space.columns(jacobian)[:, live] * scale
-    else:
-        columns = model.jacobian(prediction, theta, readings.m, live) * scale
+    carried = bool(len(s.space.index))
+    jacobian = model.jacobian(prediction, theta, readings.m, None if carried else live)
+    if carried:
+        jacobian = s.space.columns(jacobian.reshape(-1, model.size))[:, live]
     precision = s.beta * (scale / s.prior[live]) ** 2
     linear = ReadingModel(
         residual=(root @ off[:, :, None])[:, :, 0],
-        columns=root @ columns.reshape(*off.shape, len(live)),
+        columns=root @ (jacobian * scale).reshape(*off.shape, len(live)),
         precision=precision,
         pull=precision * y[live] / scale,
         root=root,
@@ -300,13 +264,15 @@ def linearised(of: Snooping, y: Floats) -> _LinearModel:
 
 def _groups(readings: Readings) -> Ints:
     """(G, S) rows that share unloaded readings, unloaded first, −1 beyond the last."""
-    groups = deflection_groups(replace(readings, common=None))
-    most = max(loaded.shape[1] + unloaded.shape[1] for loaded, unloaded, _ in groups)
-    out = []
-    for loaded, unloaded, _ in groups:
-        rows = np.concatenate([unloaded, loaded], axis=1)
-        out.append(np.pad(rows, ((0, 0), (0, most - rows.shape[1])), constant_values=-1))
-    return np.concatenate(out)
+    rows = [
+        np.concatenate([unloaded, loaded], axis=1)
+        for loaded, unloaded, _ in deflection_groups(replace(readings, common=None))
+    ]
+    most = max(part.shape[1] for part in rows)
+    pad = [((0, 0), (0, most - part.shape[1])) for part in rows]
+    return np.concatenate(
+        [np.pad(r, p, constant_values=-1) for r, p in zip(rows, pad, strict=True)]
+    )
 
 
 def _covariance(readings: Readings, members: Ints) -> Floats:
@@ -360,22 +326,106 @@ def smooth_nuisance_columns(
     model: Model, prediction: Prediction, readings: Readings, rank: int
 ) -> Floats:
     """Columns (N, m, P); only the simplest ones where the `rank` of the readings is small."""
-    situation, s = prediction.situation, readings.states
-    moves = motion(
-        model.cell, prediction.observation, situation.chain, prediction.deviation, readings.m
-    )
-    one = np.ones_like(situation.angle)
-    functions = [one, situation.torque]
+    at, s = prediction.situation, readings.states
+    moves = motion(model.cell, prediction.observation, at.chain, prediction.deviation, readings.m)
+    functions = [np.ones_like(at.angle), at.torque]
     if s.approach is not None:
         functions.append(s.approach)
-    functions += [np.cos(situation.angle), np.sin(situation.angle)]
+    functions += [np.cos(at.angle), np.sin(at.angle)]
     joints = [moves.drives * f[:, None, :] for f in functions]
-    links, loads = [], []
-    for slot in range(situation.wrench.shape[1]):
-        moved = moves.by_slot(slot)
-        links.append(moved)
-        loads.append(moved[:, :, 3:5] * situation.wrench[:, slot, None, 3:5])
+    links = [moves.by_slot(k) for k in range(at.wrench.shape[1])]
+    loads = [x[:, :, 3:5] * at.wrench[:, k, None, 3:5] for k, x in enumerate(links)]
     drift = [] if s.time is None else [moves.by_station() * (s.time - s.time.mean())[:, None, None]]
-    harmonics = [moves.drives * f(2 * situation.angle)[:, None, :] for f in (np.cos, np.sin)]
+    harmonics = [moves.drives * f(2 * at.angle)[:, None, :] for f in (np.cos, np.sin)]
     most = int(MOST_SHARE * rank)
     return np.concatenate([*joints, *drift, *loads, *harmonics, *links], axis=2)[:, :, :most]
+
+
+def off_alike(readings: Readings, tested: Bools, off: Ints, shift: Floats, axes: Floats) -> Ints:
+    """Return the rows that are off alike, more than `ACCIDENTAL` of the tested ones (N,), or none.
+
+    Of rows `off` (F,), ascending, with their shifts (F, 3) and the target's axes (F, 3, 3), both in
+    axes of the sensor.
+    """
+    order = np.zeros(len(readings), dtype=np.int64)
+    found = np.zeros(len(off), dtype=np.bool_)
+    target = readings.target
+    for k in np.unique(target[off]):
+        rows = tested & (target == k)
+        order[rows] = np.arange(np.count_nonzero(rows))
+        at = np.flatnonzero(target[off] == k)
+        turned = (shift[at, None] @ axes[at])[:, 0]
+        found[at] = _in_a_row(order[off[at]], shift[at]) | _in_a_row(order[off[at]], turned)
+    few = np.count_nonzero(found) <= ACCIDENTAL * np.count_nonzero(tested)
+    return off[:0] if few else off[found]
+
+
+def _in_a_row(order: Ints, shift: Floats) -> Bools:
+    """(F,) which shifts (F, 3) are the same as `RUN` in a row, all readings between off as well."""
+    count = len(shift)
+    run, size = np.arange(count), np.linalg.norm(shift, axis=1)
+    for ahead in range(1, BETWEEN + 2):
+        for k in range(count - ahead):
+            then = k + ahead
+            apart = np.linalg.norm(shift[then] - shift[k])
+            if order[then] - order[k] == ahead and apart <= SAME * max(size[k], size[then]):
+                run[run == run[then]] = run[k]
+    return np.asarray(np.bincount(run, minlength=count)[run] >= RUN)
+
+
+def site_columns(model: Model, theta: Floats, prediction: Prediction, readings: Readings) -> Floats:
+    """(N, m, P) changes of N readings by each site."""
+    p = prediction
+    moves = motion(model.cell, p.observation, p.situation.chain, p.deviation, readings.m)
+    turns = [moves.by_slot(k, slice(3, 6)) for k in range(p.situation.wrench.shape[1])]
+    sensor = np.stack([*_by_wrench(model, theta, p, readings)], axis=2)
+    return np.concatenate([*turns, sensor], axis=2)
+
+
+def _by_wrench(model: Model, theta: Floats, p: Prediction, readings: Readings) -> Iterator[Floats]:
+    """Changes (N, m) by 1 N and 1 N·m along the axes of the flange, which the sensor reads."""
+    states, at = readings.states, p.observation
+    for part in (slice(0, 3), slice(3, 6)):
+        for axis in np.moveaxis(p.situation.chain.rotation[-1], 2, 0):
+            wrench = states.wrench.copy()
+            wrench[:, part] += axis
+            o = model.predict(replace(states, wrench=wrench), theta, p).observation
+            turn = se3.rotation_vector(o.rotation @ at.rotation.swapaxes(1, 2))
+            yield np.concatenate([o.position - at.position, turn], axis=1)[:, : readings.m]
+
+
+def along_one_site(shift: Floats, columns: Floats, pose: Ints) -> Bools:
+    """(F,) which readings that are off a law moves.
+
+    Shifts (F, m) and the changes by each site (F, m, P) are in units of the noise, the same for all
+    directions: random ones are not drawn to those of little noise. `pose` (F,) is where they are.
+    """
+    count, m, sites = columns.shape
+    if not count:
+        return np.zeros(0, dtype=np.bool_)
+    square, length = np.sum(shift**2, axis=1), np.linalg.norm(columns, axis=1)
+    along = np.einsum("fi,fip->fp", shift, columns) / np.where(length > 0, length, np.inf)
+    beside = np.maximum(square[:, None] - along**2, 0.0)
+    near = beside <= (chi2.isf(CHANCE, m - 1) + ROUGH**2 * square)[:, None]
+    p = np.where(near, beta.cdf(beside / square[:, None], (m - 1) / 2, 0.5), 1.0)
+    ascending: Floats = np.sort(p[_different(shift, pose)], axis=0)
+    count = len(ascending)
+    so_many = np.asarray(binom.sf(np.arange(count)[:, None], count, ascending))
+    law = [
+        k
+        for k, least in enumerate(np.argmin(so_many, axis=0))
+        if so_many[least, k] * count * sites < CHANCE
+        and len(np.unique(pose[p[:, k] <= ascending[least, k]])) >= FEWEST
+    ]
+    return np.asarray(near[:, law].any(axis=1))
+
+
+def _different(shift: Floats, pose: Ints) -> Bools:
+    """(F,) readings without the shift of an earlier one at their pose, which has one cause."""
+    out = np.ones(len(pose), dtype=np.bool_)
+    for rows in (np.flatnonzero(pose == p) for p in np.unique(pose)):
+        size = np.linalg.norm(shift[rows], axis=1)
+        apart = np.linalg.norm(shift[rows, None] - shift[rows], axis=2)
+        same = apart <= SAME * np.maximum(size[:, None], size)
+        out[rows] = ~np.tril(same, -1).any(axis=1)
+    return out

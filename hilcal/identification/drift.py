@@ -1,4 +1,4 @@
-"""How far an arm has drifted since a prior was learnt, and where prior and readings disagree.
+"""Whether new readings agree with a carried prior: its drift, its conflicts, its effects' evidence.
 
 At the linearisation of a fit, with A_g the whitened columns of the parameters of group g, S_g their
 unit of drift, C the covariance of the prior and F the columns of parameters without a prior,
@@ -16,50 +16,50 @@ P = V⁻¹ − V⁻¹ F (Fᵀ V⁻¹ F)⁻ Fᵀ V⁻¹ the fixed point is
 and β, at least 1, follows from P y alike. The statistic yᵀ P K_g P y at v_g = 0, the others as they
 are, is a sum of weighted χ² when group g has not moved: its tail is the p-value of the group.
 
+An effect of the prior has the log evidence of the new readings that is the difference of the
+restricted log likelihoods
+
+    ℓ = −½ (log |V| + log |Fᵀ V⁻¹ F| + yᵀ P y)
+
+with the whole prior, and with what is left of it when the effect is held at zero and the others
+keep their marginal distribution. What the earlier readings said for it counts by the prior alone:
+without need its drift is zero, and readings that do not see it say nothing against it. Directions
+of the prior without information have a standard deviation of one ordinary magnitude.
+
 Sources: Patterson and Thompson, Biometrika 58 (1971) 545-554; Polson and Scott, Bayesian Analysis 7
 (2012) 887-902 (half-Cauchy priors of variances).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg as sl
 from scipy.stats import norm
 
-from hilcal.identification.carried import CarriedPrior, DriftGroup
-from hilcal.identification.coordinates import coordinates_of
+from hilcal.identification.carried import CarriedPrior, DriftGroup, coordinates_of
 from hilcal.identification.gauss_newton import Solution, whitened_jacobian
 from hilcal.identification.priors import names_of
 from hilcal.model.model import Model
 from hilcal.readings.whitening import Whitening
 from hilcal.regression.quadratic_form import ratio_tail
 from hilcal.regression.schur import inverse_root
-from hilcal.types import Floats
+from hilcal.types import Floats, Ints
 
-ITERATIONS = 40
-"""Most fixed-point iterations; a choice."""
-TOLERANCE = 0.1
-"""Change of the degrees of freedom v tr P K of a group at which it has converged; a choice."""
-NEGLIGIBLE = 1e-6
-"""Variance in units of S² that counts as none."""
-MANY = 1e6
-"""Dimension at which a ratio of quadratic forms is one of them: its denominator is constant."""
+ITERATIONS = 40  # of the fixed point, at most; a choice
+TOLERANCE = 0.1  # change of the degrees of freedom v tr P K of a group that ends them; a choice
+NEGLIGIBLE = 1e-6  # variance in units of S² that counts as none
+MANY = 1e6  # dimension at which a ratio of quadratic forms is one of them
 LEAST_P = 1e-300
 
 
 @dataclass(frozen=True, slots=True)
 class Conflict:
-    """How far a prior and new readings disagree about a group of parameters.
-
-    Attributes:
-        group: the parameters.
-        p_value: of what was found if they had not moved.
-        drift: standard deviation of the drift that the fit gave them, in units of S.
-    """
+    """How far a prior and new readings disagree about a group of parameters."""
 
     group: DriftGroup
-    p_value: float
-    drift: float
+    p_value: float  # of what was found if they had not moved
+    drift: float  # standard deviation of the drift that the fit gave them, in units of S
 
     @property
     def moved_sigma(self) -> float:
@@ -68,83 +68,84 @@ class Conflict:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Rows:
-    """The linear problem, its rows reduced to those that columns act on.
+class _Linear:
+    """A fit's linear problem, its Q rows reduced to those that columns act on."""
 
-    Attributes:
-        y: (Q,) residual at the prior's mean.
-        flat: (Q, F) columns without a prior.
-        known: (Q, C) columns of unit variance: of the prior, and of other parameters' priors.
-        drift: (Q, k) of the prior as a whole, and A_g S_g of each group.
-        rest: number of rows that no column acts on.
-        square: their sum of squares.
-    """
+    y: Floats  # (Q,) residual at the prior's mean
+    flat: Floats  # (Q, F) columns without a prior
+    known: Floats  # (Q, C) columns of unit variance: of the prior, and of other parameters' priors
+    drift: tuple[Floats, ...]  # (Q, k) of the prior as a whole, and A_g S_g of each group
+    rest: int  # number of rows that no column acts on
+    square: float  # their sum of squares
 
-    y: Floats
-    flat: Floats
-    known: Floats
-    drift: tuple[Floats, ...]
-    rest: int
-    square: float
+    def projected(self, covariance: Floats) -> tuple[Floats, Floats]:
+        """P for V (Q, Q), and P y."""
+        inverse = np.asarray(sl.lapack.dpotri(np.linalg.cholesky(covariance), lower=1)[0])
+        inverse = np.tril(inverse) + np.tril(inverse, -1).T
+        lifted = inverse @ self.flat
+        root = inverse_root(self.flat.T @ lifted) @ lifted.T
+        p = inverse - root.T @ root
+        return p, p @ self.y
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Projector:
-    """P, and P y."""
+class _Columns:
+    """Whitened columns of a fit, by whether they have a prior of their own."""
 
-    matrix: Floats
-    residual: Floats
+    a: Floats  # (R, P) of all parameters, zero for those that are not estimated
+    flat: Floats  # (R, F) without a carried prior, and without another
+    known: Floats  # (R, C) without a carried prior, in units of their own
+    y: Floats  # (R,) residual with every known parameter at zero
 
     @classmethod
-    def of(cls, rows: _Rows, covariance: Floats) -> "_Projector":
-        """Form them for V (Q, Q)."""
-        low = np.linalg.cholesky(covariance)
-        inverse = np.asarray(sl.lapack.dpotri(low, lower=1)[0])
-        inverse = np.tril(inverse) + np.tril(inverse, -1).T
-        lifted = inverse @ rows.flat
-        root = inverse_root(rows.flat.T @ lifted) @ lifted.T
-        p = inverse - root.T @ root
-        return cls(p, p @ rows.y)
+    def of(cls, model: Model, solution: Solution, w: Whitening) -> "_Columns":
+        """Return those at the fit."""
+        s, carried = solution, solution.space.carried(model.size)
+        others = np.flatnonzero(s.estimated & ~carried)
+        used, std = np.flatnonzero(s.estimated | carried), s.prior[others]
+        free = np.isinf(std)
+        a = np.zeros((len(s.white), model.size))
+        a[:, used] = whitened_jacobian(model, s.prediction, s.theta, w, used)
+        theta = np.where(s.estimated | carried, s.theta, 0.0)
+        theta[others[free]] = 0.0  # flat ones may stay where they are
+        known = a[:, others[~free]] * std[~free]
+        return cls(a, a[:, others[free]], known, s.white + a @ theta)
 
 
 def chosen_drift(model: Model, solution: Solution, w: Whitening) -> Floats:
-    """Return δ (1 + G,): the doubt of the model's carried prior, and the drift of its groups.
-
-    Args:
-        model: with a carried prior.
-        solution: its fit.
-        w: the gc-scaling of the fit.
-    """
-    prior = _with_least(model)
-    rows = _rows(model, prior, solution, w)
+    """Return δ (1 + G,) at a fit: the doubt of its carried prior, and the drift of its groups."""
+    prior, lowest, rows = _linear(model, solution, w)
     scale2 = np.array([1.0, *(prior.expected.get(g.effect, 1.0) ** 2 for g in prior.groups)])
     forms = [g @ g.T for g in rows.drift]
-    base, size = rows.known @ rows.known.T, len(rows.y)
+
+    def moments(p: Floats, residual: Floats) -> tuple[Floats, Floats]:
+        """YᵀP K_g P y and tr P K_g of each K_g (1 + G,), at least zero but for rounding."""
+        squares = [float(residual @ k @ residual) for k in forms]
+        traces = [float(np.vdot(p, k)) for k in forms]
+        return np.maximum(squares, 0.0), np.maximum(traces, 0.0)
+
     # No larger noise than stated to begin with: it would take the place of any drift.
-    beta, v = 1.0, np.zeros(len(forms))
-    p = _Projector.of(rows, base + beta * np.eye(size))
-    squares, traces = _moments(forms, p)
+    beta, v, base = 1.0, np.zeros(len(forms)), rows.known @ rows.known.T
+    p, residual = rows.projected(base + np.eye(len(base)))
+    squares, traces = moments(p, residual)
     slope = (squares - traces) / 2 - 1.0 / scale2
     for k in np.flatnonzero(slope > 0):
-        inner = rows.drift[k].T @ p.matrix @ rows.drift[k]
+        inner = rows.drift[k].T @ p @ rows.drift[k]
         v[k] = (squares[k] - traces[k]) / float(np.sum(inner**2))
     for _ in range(ITERATIONS):
-        active = v > NEGLIGIBLE
-        if not active.any():
+        v = np.where(v > NEGLIGIBLE, v, 0.0)
+        if not v.any():
             break
-        v = np.where(active, v, 0.0)
-        total = base + sum(v[k] * forms[k] for k in np.flatnonzero(active))
-        total[np.diag_indices(size)] += beta
-        p = _Projector.of(rows, total)
-        squares, traces = _moments(forms, p)
+        total = base + sum(v[k] * forms[k] for k in np.flatnonzero(v))
+        p, residual = rows.projected(total + beta * np.eye(len(base)))
+        squares, traces = moments(p, residual)
         new = v * np.sqrt(squares / np.maximum(traces + 2.0 / (scale2 + v), 1e-300))
-        beta = _noise(rows, p, beta)
-        change = np.abs(new - v) * traces
-        v = new
+        square = float(residual @ residual) + rows.square / beta**2
+        beta = max(1.0, beta * float(np.sqrt(square / (np.trace(p) + rows.rest / beta))))
+        change, v = np.abs(new - v) * traces, new
         if change.max() < TOLERANCE:
             break
-    v[v <= NEGLIGIBLE] = 0.0
-    return np.asarray(np.sqrt(v + least(prior) ** 2))
+    return np.asarray(np.sqrt(np.where(v > NEGLIGIBLE, v, 0.0) + lowest**2))
 
 
 def conflicts(model: Model, solution: Solution, w: Whitening) -> tuple[Conflict, ...]:
@@ -152,32 +153,24 @@ def conflicts(model: Model, solution: Solution, w: Whitening) -> tuple[Conflict,
 
     Each is tested beside the drift that the others were given, since a joint that has moved makes
     its neighbours look as if they had. Groups that the readings do not see are left out.
-
-    Args:
-        model: fitted; without a carried prior there are none.
-        solution: its fit.
-        w: the gc-scaling of the fit.
     """
     if model.prior is None:
         return ()
-    prior = _with_least(model)
-    rows = _rows(model, prior, solution, w)
-    used = least(prior) if model.prior.drift is None else model.prior.drift
-    v = used**2 - least(prior) ** 2
+    prior, lowest, rows = _linear(model, solution, w)
+    used = lowest if model.prior.drift is None else model.prior.drift
+    v = used**2 - lowest**2
     total = rows.known @ rows.known.T + solution.beta * np.eye(len(rows.y))
     for given in np.flatnonzero(v > NEGLIGIBLE):
         total += v[given] * rows.drift[given] @ rows.drift[given].T
-    common = _Projector.of(rows, total)
-    found = []
+    common, found = rows.projected(total), []
     for k, group in enumerate(prior.groups, 1):
-        x, p = rows.drift[k], common
-        if v[k] > NEGLIGIBLE:
-            p = _Projector.of(rows, total - v[k] * x @ x.T)
-        inner = x.T @ p.matrix @ x
+        x = rows.drift[k]
+        p, residual = rows.projected(total - v[k] * x @ x.T) if v[k] > NEGLIGIBLE else common
+        inner = x.T @ p @ x
         if not inner.size or float(np.trace(inner)) <= NEGLIGIBLE:
             continue
         values = np.maximum(np.linalg.eigvalsh(inner), 0.0)
-        square = float(np.sum((x.T @ p.residual) ** 2))
+        square = float(np.sum((x.T @ residual) ** 2))
         chance = ratio_tail(values[values > 0] / MANY, MANY, square / MANY**2)
         found.append(Conflict(group, chance, float(used[k])))
     return tuple(sorted(found, key=lambda c: c.p_value))
@@ -188,57 +181,74 @@ def least(prior: CarriedPrior) -> Floats:
     return np.array([0.0, *(prior.least.get(g.effect, 0.0) for g in prior.groups)])
 
 
-def _with_least(model: Model) -> CarriedPrior:
-    """Return the carried prior with the least drift."""
+def _linear(model: Model, solution: Solution, w: Whitening) -> tuple[CarriedPrior, Floats, _Linear]:
+    """The carried prior with its least drift (1 + G,), that drift, and the linear problem."""
     assert model.prior is not None  # noqa: S101 - the callers' condition
-    return model.prior.with_drift(least(model.prior))
-
-
-def _moments(forms: list[Floats], p: _Projector) -> tuple[Floats, Floats]:
-    """YᵀP K_g P y and tr P K_g of each K_g (1 + G,)."""
-    squares = [float(p.residual @ k @ p.residual) for k in forms]
-    traces = [float(np.vdot(p.matrix, k)) for k in forms]
-    # At least zero but for rounding, as where an effect is not in the model.
-    return np.maximum(squares, 0.0), np.maximum(traces, 0.0)
-
-
-def _noise(rows: _Rows, p: _Projector, beta: float) -> float:
-    """Fixed point of the noise factor."""
-    square = float(p.residual @ p.residual) + rows.square / beta**2
-    return max(1.0, beta * float(np.sqrt(square / (np.trace(p.matrix) + rows.rest / beta))))
-
-
-def _rows(model: Model, prior: CarriedPrior, solution: Solution, w: Whitening) -> _Rows:
-    """Form the linear problem at a fit."""
+    prior = model.prior.with_drift(least(model.prior))
     of = coordinates_of(replace(model, prior=prior))
-    index, own = prior.index_in(names_of(model))
-    a = whitened_jacobian(model, solution.prediction, solution.theta, w, np.arange(model.size))
-    mine = a[:, index]
-    held = of.std == 1.0
-    others = np.setdiff1d(np.flatnonzero(solution.estimated), index)
-    std = solution.prior[others]
-    free = np.isinf(std)
-    flat = [a[:, others[free]], mine @ of.matrix[:, ~held]]
-    known = [mine @ of.matrix[:, held], a[:, others[~free]] * std[~free]]
-    group, unit = prior.group[own], prior.unit[own]
-    drift = [mine @ of.matrix[:, held]]
-    drift += [mine[:, group == g] * unit[group == g] for g in range(len(prior.groups))]
-    y = solution.white + mine @ (solution.theta[index] - of.mean)
-    y = y + a[:, others[~free]] @ solution.theta[others[~free]]
-    parts = [np.hstack(flat), np.hstack(known), *drift]
-    count = mine.shape[1] + sum(x.shape[1] for x in (flat[0], known[1]))
-    if len(y) <= count:
-        return _Rows(y, parts[0], parts[1], tuple(drift), 0, 0.0)
+    index, place = prior.index_in(names_of(model))
+    c, held = _Columns.of(model, solution, w), of.std == 1.0
+    a = c.a[:, index]
+    group, unit = prior.group[place], prior.unit[place]
+    drift = [a @ of.matrix[:, held]]
+    flat, known = np.hstack([c.flat, a @ of.matrix[:, ~held]]), np.hstack([*drift, c.known])
+    drift += [a[:, group == g] * unit[group == g] for g in range(len(prior.groups))]
+    y = c.y - a @ of.mean
+    if len(y) <= a.shape[1] + c.flat.shape[1] + c.known.shape[1]:
+        return prior, least(prior), _Linear(y, flat, known, tuple(drift), 0, 0.0)
     # All columns are combinations of these; the rows beyond their span are noise.
-    span = sl.qr(
-        np.hstack([mine * prior.posterior.scale[own], flat[0], known[1]]),
-        mode="economic",
-        check_finite=False,
-    )[0]
+    every = np.hstack([a * prior.posterior.scale[place], c.flat, c.known])
+    span = sl.qr(every, mode="economic", check_finite=False)[0]
     inside = span.T @ y
-    seen = w.rank - len(inside)
-    square = max(float(y @ y - inside @ inside), 0.0)
-    return _Rows(
-        inside, span.T @ parts[0], span.T @ parts[1], tuple(span.T @ g for g in drift),
-        max(seen, 0), square,
-    )  # fmt: skip
+    rest, square = max(w.rank - len(inside), 0), max(float(y @ y - inside @ inside), 0.0)
+    turned = tuple(span.T @ g for g in drift)
+    flat, known = np.asarray(span.T @ flat), np.asarray(span.T @ known)
+    return prior, least(prior), _Linear(inside, flat, known, turned, rest, square)
+
+
+def carried_effects(model: Model) -> tuple[str, ...]:
+    """Effects of a model that are there because its carried prior has them."""
+    if model.prior is None:
+        return ()
+    learnt = {e.name for e in model.prior.posterior.effects}
+    return tuple(e.name for e in model.effects if e.name in learnt and e.role == "effect")
+
+
+def evidence_of_carried(
+    model: Model, solution: Solution, w: Whitening, effects: Sequence[str]
+) -> dict[str, float]:
+    """Return the log evidence of the readings for each effect, beside the others of the model."""
+    c = _Columns.of(model, solution, w)
+    y, a, flat, known = c.y, c.a, c.flat, c.known
+    whole = coordinates_of(model)
+    columns = np.hstack([flat, known, a[:, whole.index] @ whole.matrix])
+    if columns.shape[1] < len(y):
+        span = sl.qr(columns, mode="economic", check_finite=False)[0]
+        y, a, flat, known = span.T @ y, span.T @ a, span.T @ flat, span.T @ known
+
+    def likelihood(of: Model, place: Ints) -> float:
+        """ℓ with the prior of some parameters, which are at `place`."""
+        space = coordinates_of(of)
+        used = a[:, place[space.index]]
+        x = np.hstack([known, used @ space.matrix])
+        return _restricted(y - used @ space.mean, flat, x, solution.beta)
+
+    every = np.arange(model.size)
+    with_all, found = likelihood(model, every), {}
+    for name in effects:
+        rest = replace(model, effects=tuple(e for e in model.effects if e.name != name))
+        kept = np.delete(every, model.slices()[model.names.index(name)])
+        found[name] = with_all - likelihood(rest, kept)
+    return found
+
+
+def _restricted(y: Floats, flat: Floats, x: Floats, beta: float) -> float:
+    """ℓ for V = β 1 + X Xᵀ."""
+    low = np.linalg.cholesky(x @ x.T + beta * np.eye(len(x)))
+    white = sl.solve_triangular(low, np.column_stack([flat, y]), lower=True, check_finite=False)
+    f, r = white[:, :-1], white[:, -1]
+    values, vectors = np.linalg.eigh(f.T @ f)
+    seen = values > 1e-12 * values.max(initial=0.0)
+    along = (f @ vectors[:, seen]).T @ r / np.sqrt(values[seen])
+    log_det = 2 * float(np.log(np.diag(low)).sum()) + float(np.log(values[seen]).sum())
+    return -0.5 * (log_det + float(r @ r) - float(along @ along))

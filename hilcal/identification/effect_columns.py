@@ -3,7 +3,7 @@
 Those of many effects are computed and whitened together.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -14,34 +14,20 @@ from hilcal.identification.fit import Fit
 from hilcal.readings.whitening import Whitening
 from hilcal.types import Bools, Floats
 
-TOGETHER = 8_000_000
-"""Numbers of the columns of effects that are computed together, 64 MB; a choice by memory."""
-WHITENED = 2_000_000
-"""Numbers of the columns that are whitened together, 16 MB, and kept while one of their effects is;
-a choice by memory."""
+TOGETHER = 4_000_000  # numbers of columns computed together, 32 MB, kept while one effect is
 
 
 @dataclass(frozen=True, eq=False)
 class EffectColumns:
-    """The columns of an effect in ordinary magnitudes of its parameters.
-
-    Attributes:
-        effect: the effect.
-        scale: (P,) ordinary magnitudes, SI.
-        together: (R, Q) whitened columns of all effects that were whitened together.
-        within: which of them are this effect's, P.
-        of_readings: (N, m, P) motion of the fitted readings, sensor axes, m and rad.
-        whitening: of the readings.
-        bare: (N,) which readings are unloaded.
-    """
+    """The columns of an effect in ordinary magnitudes of its parameters."""
 
     effect: Effect
-    scale: Floats
-    together: Floats
-    within: slice
-    of_readings: Floats
-    whitening: Whitening
-    bare: Bools
+    scale: Floats  # (P,) ordinary magnitudes, SI
+    together: Floats  # (R, Q) whitened columns of all effects that were whitened together
+    within: slice  # which of them are this effect's, P
+    of_readings: Floats  # (N, m, P) motion of the fitted readings, sensor axes, m and rad
+    whitening: Whitening  # of the readings
+    bare: Bools  # (N,) which readings are unloaded
 
     @property
     def white(self) -> Floats:
@@ -82,46 +68,21 @@ def columns_of_each(fit: Fit, effects: Sequence[Effect]) -> Iterator[EffectColum
 def columns_in_parts(fit: Fit, effects: Sequence[Effect]) -> Iterator[tuple[EffectColumns, ...]]:
     """Yield `effect_columns` of several effects in order, those computed together in one part.
 
-    The equilibrium is differentiated once for as many of them as have `TOGETHER` numbers; as many
-    as have `WHITENED` are whitened together.
+    The equilibrium is differentiated, and columns are whitened, once for as many of them as have
+    `TOGETHER` numbers.
     """
-    w, solution = fit.whitening, fit.solution
-    s = solution.prediction.situation
-    count, bare = len(s.angle), fit.readings[~fit.outlier].unloaded
-
-    def numbers(effect: Effect) -> int:
-        return count * len(effect.magnitudes) * w.m
-
-    for group in _groups(effects, numbers, TOGETHER):
-        scale = np.concatenate([e.magnitudes for e in group])
-        jacobian = fit.model.jacobian_of(
-            group, solution.prediction, solution.theta, w.m, scale=scale
+    w, s = fit.whitening, fit.solution
+    count, bare = len(s.prediction.situation.angle) * w.m, fit.readings[~fit.outlier].unloaded
+    ends = np.cumsum([0, *(count * len(e.magnitudes) for e in effects)])
+    start = 0
+    while start < len(effects):
+        more = int(np.searchsorted(ends, ends[start] + TOGETHER, side="right")) - 1
+        stop = max(more, start + 1)
+        part, start = tuple(effects[start:stop]), stop
+        scale = np.concatenate([e.magnitudes for e in part])
+        columns = fit.model.jacobian_of(part, s.prediction, s.theta, w.m, scale=scale)
+        white, at = w.whiten_readings(columns), np.cumsum([0, *(len(e.magnitudes) for e in part)])
+        yield tuple(
+            EffectColumns(e, e.magnitudes, white, within, columns[:, :, within], w, bare)
+            for e, within in zip(part, map(slice, at[:-1], at[1:]), strict=True)
         )
-        parts, start = tuple(_groups(group, numbers, WHITENED)), 0
-        for part in parts:
-            ends = np.cumsum([0, *(len(e.magnitudes) for e in part)]).tolist()
-            own = jacobian[:, :, start : start + ends[-1]]
-            start += ends[-1]
-            if len(parts) > 1:  # what is kept of a part does not keep the others
-                own = own.copy()
-            white = w.whiten_readings(own)
-            yield tuple(
-                EffectColumns(e, e.magnitudes, white, within, own[:, :, within], w, bare)
-                for e, within in zip(part, map(slice, ends[:-1], ends[1:]), strict=True)
-            )
-
-
-def _groups(
-    effects: Sequence[Effect], numbers: Callable[[Effect], int], most: int
-) -> Iterator[tuple[Effect, ...]]:
-    """Split effects into successive groups of at most `most` numbers, or of one effect."""
-    group: list[Effect] = []
-    size = 0
-    for effect in effects:
-        if group and size + numbers(effect) > most:
-            yield tuple(group)
-            group, size = [], 0
-        group.append(effect)
-        size += numbers(effect)
-    if group:
-        yield tuple(group)

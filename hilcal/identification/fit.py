@@ -1,8 +1,9 @@
 """A fit: parameters, their uncertainties, residuals and errors."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import TYPE_CHECKING, Literal, overload
 
 import numpy as np
 
@@ -10,36 +11,127 @@ from hilcal import limits
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.data_snooping import Disagreement, Snooping
 from hilcal.identification.drift import Conflict, chosen_drift, conflicts
-from hilcal.identification.estimates import Estimates, summary
-from hilcal.identification.folds import distinct_poses, random_folds
+from hilcal.identification.folds import distinct_poses, leave_out, random_folds
 from hilcal.identification.gauss_newton import Solution, solve
-from hilcal.identification.holdout import leave_out
 from hilcal.identification.least_trimmed_squares import limit
-from hilcal.identification.residual import ErrorBlock, error_block, residual
+from hilcal.identification.residual import ErrorBlock, WithVarianceFactor, error_block, residual
 from hilcal.identification.robot_frames import RobotFrames, robot_frames
 from hilcal.identification.uncertainty import Uncertainty, uncertainty
-from hilcal.identification.variance_factor import WithVarianceFactor
 from hilcal.model.model import Model
 from hilcal.model.observe import Observation
+from hilcal.optional import needed_by
 from hilcal.readings.readings import Readings, States
 from hilcal.readings.whitening import Mode, Scaling, Whitening, inverse_root, whitening
 from hilcal.shown import Tabular
+from hilcal.toml import suggest
 from hilcal.types import Bools, Floats, Ints
 
-Frame = Literal["sensor", "base"]
-OUTLIER_ROUNDS = 6
-"""Most fits without gross errors, each followed by a new test; a choice, no study set it."""
-SEED = 0
-"""Of the random subsets of the robust start, so that equal readings give equal fits."""
+if TYPE_CHECKING:
+    import pandas as pd
 
-DRIFT_ROUNDS = 2
-"""Most choices of the drift of a carried prior, each followed by a new fit; a choice: the first is
-at a linearisation that the drift hardly changes."""
-DRIFT_CHANGED = 0.1
-"""Change of a drift, as a share of the largest one, that is worth another fit; a choice."""
+Frame = Literal["sensor", "base"]
+OUTLIER_ROUNDS = 6  # most fits without gross errors, each followed by a new test; a choice
+SEED = 0  # of the random subsets of the robust start, so that equal readings give equal fits
+DRIFT_ROUNDS = 2  # most choices of the drift of a carried prior: the first is at a linearisation
+DRIFT_CHANGED = 0.1  # that it hardly changes; change, as a share of the largest, worth another fit
 
 _Solved = tuple[Whitening, Solution]
-_Used = tuple[Bools, Disagreement | None, _Solved]
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """One fitted parameter."""
+
+    name: str  # effect and parameter, e.g. "joint_compliance.j2"
+    value: float | None  # estimate, SI; None where the data do not determine it
+    std: float | None  # standard uncertainty, SI; None where the data do not determine it
+    unit: str
+    identifiable: bool  # whether the data determine it
+
+    def line(self, width: int = 0) -> str:
+        """Return it in a line, the name padded to a width."""
+        value = "not determined"
+        if self.value is not None and self.std is not None:
+            value = f"{self.value: .4e} ± {self.std:.1e} {self.unit}"
+        return f"  {self.name:<{width}}  {value}"
+
+
+@dataclass(frozen=True, slots=True)
+class Estimates(Sequence[Estimate]):
+    """The fitted parameters, in the order of the model; those of dropped groups are left out."""
+
+    rows: tuple[Estimate, ...]
+
+    @classmethod
+    def of(
+        cls, model: Model, theta: Floats, std: Floats, identifiable: Bools, kept: Bools
+    ) -> "Estimates":
+        """Return the parameters (P,) of a model that are `kept`.
+
+        A standard uncertainty (P,) that is infinite stands for none.
+        """
+        names = [(f"{e.name}.{p.name}", p.unit) for e in model.effects for p in e.parameters]
+        stated = identifiable & np.isfinite(std)
+        return cls(
+            tuple(
+                Estimate(
+                    name,
+                    float(theta[k]) if identifiable[k] else None,
+                    float(std[k]) if stated[k] else None,
+                    unit,
+                    bool(identifiable[k]),
+                )
+                for k, (name, unit) in enumerate(names)
+                if kept[k]
+            )
+        )
+
+    def lines(self, most: int | None = None) -> list[str]:
+        """Return a line for each, or for the first of them."""
+        width = max((len(row.name) for row in self.rows), default=0)
+        return [row.line(width) for row in self.rows[:most]]
+
+    def __repr__(self) -> str:
+        """Return the first parameters, a line each."""
+        lines = self.lines(12)
+        left = len(self.rows) - len(lines)
+        return "\n".join(["Estimates(", *lines, *([f"  ... and {left} more"] * bool(left)), ")"])
+
+    def __len__(self) -> int:
+        """Return the number of parameters."""
+        return len(self.rows)
+
+    def __iter__(self) -> Iterator[Estimate]:
+        """Yield the parameters in order."""
+        return iter(self.rows)
+
+    @overload
+    def __getitem__(self, key: int | str) -> Estimate: ...
+    @overload
+    def __getitem__(self, key: slice) -> Sequence[Estimate]: ...
+    def __getitem__(self, key: int | str | slice) -> Estimate | Sequence[Estimate]:
+        """Return a parameter by place or by name, which is refused where there is none."""
+        if isinstance(key, int | slice):
+            return self.rows[key]
+        for row in self.rows:
+            if row.name == key:
+                return row
+        names = tuple(row.name for row in self.rows)
+        raise InputError(f"no parameter {key!r}{suggest(key, names)}; valid: {', '.join(names)}")
+
+    def to_dicts(self) -> list[dict[str, object]]:
+        """Return one dictionary per parameter, as JSON documents hold them."""
+        return [asdict(row) for row in self.rows]
+
+    def to_frame(self) -> "pd.DataFrame":
+        """Return a pandas data frame, indexed by the names.
+
+        Raises:
+            InputError: pandas is not installed.
+        """
+        with needed_by("to_frame (to_dicts returns the same without pandas)"):
+            import pandas as pd
+        return pd.DataFrame(self.to_dicts()).set_index("name")
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,20 +239,22 @@ class Fit(WithVarianceFactor, Tabular):
         Those of dropped groups are left out.
         """
         u, kept = self.uncertainty, self.solution.estimated.copy()
-        for name, mine in zip(self.model.names, self.model.slices(), strict=True):
-            kept[mine] &= name not in self.model.background
+        for name, rows in zip(self.model.names, self.model.slices(), strict=True):
+            kept[rows] &= name not in self.model.background
         return Estimates.of(self.model, self.theta, u.std, u.identifiable, kept)
 
     def summary(self) -> str:
         """Return the model, its errors and its parameters as plain text."""
-        return summary(
-            self.model.named,
-            f"{len(self.raw)} {self.mode} readings, scaling {self.scaling}",
-            self.parameters,
-            (self.error, self.holdout),
-            self.variance_factor,
-            self.variance_factor_interval,
-        )
+        model = " + ".join(self.model.named) or "nominal arm"
+        lines = [f"{model}, fitted to {len(self.raw)} {self.mode} readings, scaling {self.scaling}"]
+        for what, e in (("fitted poses", self.error), ("poses left out", self.holdout)):
+            lines.append(
+                f"  error on {what}: {1e6 * e.rms_m:.1f} µm rms, {1e6 * e.max_m:.1f} µm largest, "
+                f"{e.rms_sigma:.2f} σ"
+            )
+        low, high = self.variance_factor_interval
+        lines.append(f"  variance factor {self.variance_factor:.3g} [{low:.3g}, {high:.3g}]")
+        return "\n".join([*lines, *self.parameters.lines()])
 
     def residuals(self, frame: Frame = "sensor") -> Floats:
         """Residuals (D, m), measured − predicted, m and rad.
@@ -187,14 +281,7 @@ class Fit(WithVarianceFactor, Tabular):
         return robot_frames(self.model, self.theta)
 
     def predict(self, states: States) -> Observation:
-        """Predict what the sensor reads in N states.
-
-        Args:
-            states: joints, wrenches and what else the model's effects need.
-
-        Raises:
-            CannotAnswerError: no static equilibrium.
-        """
+        """Predict what the sensor reads in N states, if there is a static equilibrium."""
         return self.model.predict(states, self.theta).observation
 
 
@@ -225,49 +312,60 @@ def fit(
             readings.
     """
     limits.check_fitted(len(readings), readings.m)
-    given = model.prior
-    if given is not None and prior is None:
-        model = replace(model, prior=given.with_drift(None))
-    used, disagree, solved = _set_aside(model, readings, mode, start, prior)
+    if model.prior is not None and prior is None:
+        model = replace(model, prior=model.prior.with_drift(None))
+    used, disagreement, (w, solution) = _set_aside(model, readings, mode, start, prior)
     if model.prior is not None and prior is None:
         for _ in range(DRIFT_ROUNDS):
-            drift = chosen_drift(model, solved[1], solved[0])
-            if _same_drift(model.prior.drift, drift):
+            drift, old = chosen_drift(model, solution, w), model.prior.drift
+            change = np.abs(drift - (0.0 if old is None else old)).max()
+            if change <= DRIFT_CHANGED * drift.max(initial=0.0):
                 break
             model = replace(model, prior=model.prior.with_drift(drift))
-            begun = solved[1].theta
-            used, disagree, solved = _set_aside(model, readings, mode, begun, None)
+            begun = solution.theta
+            used, disagreement, (w, solution) = _set_aside(model, readings, mode, begun, None)
+    kept, fitted = readings[used], w
     if scaling != "gc":
-        solved = _solve(model, readings[used], mode, scaling, start, prior)
-    return replace(_assemble(model, readings, ~used, mode, scaling, *solved), disagreement=disagree)
-
-
-def _same_drift(before: Floats | None, after: Floats) -> bool:
-    """Whether two drifts (G,) make no difference; None is none at all."""
-    old = np.zeros_like(after) if before is None else before
-    return bool(np.abs(after - old).max() <= DRIFT_CHANGED * after.max(initial=0.0))
+        fitted, solution = _solve(model, kept, mode, scaling, start, prior)
+        w = whitening(kept, mode, "gc")
+    white = w.whiten(solution.raw).reshape(-1)
+    return Fit(
+        model=model,
+        readings=readings,
+        mode=mode,
+        scaling=scaling,
+        whitening=w,
+        fitted=fitted,
+        solution=solution,
+        pose=distinct_poses(kept)[w.reading],
+        raw=solution.raw,
+        white=white,
+        outlier=~used,
+        chi2=float(white @ white),
+        dof=max(w.rank - solution.effective, 1.0),
+        error=error_block(solution.raw, w),
+        disagreement=disagreement,
+    )
 
 
 def _set_aside(
     model: Model, readings: Readings, mode: Mode, start: Floats | None, prior: Floats | None
-) -> _Used:
+) -> tuple[Bools, Disagreement | None, _Solved]:
     """Readings (N,) without gross errors, what they disagree in, their solution in scaling gc."""
     used = np.ones(len(readings), dtype=bool)
-    solved = _solve(model, readings, mode, "gc", start, prior)
-    w, solution = solved
+    w, solution = _solve(model, readings, mode, "gc", start, prior)
     distance2 = mahalanobis2(solution.raw, w.covariance)
     if distance2.max() <= limit(w.m, len(distance2)):
-        return used, None, solved
+        return used, None, (w, solution)
     y = np.zeros(model.size) if start is None else solution.space.of_theta(start)
     found = Snooping(model, readings, mode, solution, y).begin(np.random.default_rng(SEED))
     for _ in range(OUTLIER_ROUNDS):
         if np.array_equal(found.used, used):
             break
         used = found.used
-        solved = _solve(model, readings[used], mode, "gc", solution.theta, prior)
-        solution = solved[1]
+        w, solution = _solve(model, readings[used], mode, "gc", solution.theta, prior)
         found = Snooping(model, readings, mode, solution, solution.y).again(found)
-    return used, found.disagreement, solved
+    return used, found.disagreement, (w, solution)
 
 
 def _solve(
@@ -282,46 +380,12 @@ def _solve(
     solution = solve(model, readings, w, start, prior)
     free = solution.equations.basis.structural
     if w.rank <= free:
+        what = "loaded readings with their unloaded ones" if mode == "deflection" else "readings"
         raise CannotAnswerError(
             f"{w.rank} measured elements for {free} parameters: nothing is left to judge the model "
-            f"by; measure at least {free // w.m + 2} {_what(mode)}, better {3 * free // w.m + 1}"
+            f"by; measure at least {free // w.m + 2} {what}, better {3 * free // w.m + 1}"
         )
     return w, solution
-
-
-def _what(mode: Mode) -> str:
-    return "loaded readings with their unloaded ones" if mode == "deflection" else "readings"
-
-
-def _assemble(
-    model: Model,
-    readings: Readings,
-    outlier: Bools,
-    mode: Mode,
-    scaling: Scaling,
-    fitted: Whitening,
-    solution: Solution,
-) -> Fit:
-    kept, raw = readings[~outlier], solution.raw
-    w = fitted if scaling == "gc" else whitening(kept, mode, "gc")
-    white = w.whiten(raw).reshape(-1)
-    total = float(white @ white)
-    return Fit(
-        model=model,
-        readings=readings,
-        mode=mode,
-        scaling=scaling,
-        whitening=w,
-        fitted=fitted,
-        solution=solution,
-        pose=distinct_poses(kept)[w.reading],
-        raw=raw,
-        white=white,
-        outlier=outlier,
-        chi2=total,
-        dof=max(w.rank - solution.effective, 1.0),
-        error=error_block(raw, w),
-    )
 
 
 def with_outliers(of: Fit) -> tuple[Floats, Whitening]:
@@ -338,9 +402,7 @@ def all_left_out(of: Fit) -> tuple[Floats, Whitening]:
     raw, w = with_outliers(of)
     if w is of.whitening:
         return of.left_out, w
-    place = {int(r): i for i, r in enumerate(np.flatnonzero(~of.outlier)[of.whitening.reading])}
-    raw = raw.copy()
-    for i, r in enumerate(w.reading):
-        if int(r) in place:
-            raw[i] = of.left_out[place[int(r)]]
-    return raw, w
+    place = np.full(len(of.readings), -1)
+    place[np.flatnonzero(~of.outlier)[of.whitening.reading]] = np.arange(len(of.raw))
+    at = place[w.reading]
+    return np.where((at >= 0)[:, None], of.left_out[at], raw), w

@@ -6,10 +6,14 @@ from dataclasses import asdict
 import numpy as np
 
 from hilcal.identification.background import background_of
+from hilcal.identification.baseline import masses_note
 from hilcal.identification.fit import Fit
-from hilcal.identification.full_prediction import error_before, full_prediction
-from hilcal.identification.gross_errors import disagreement_words, gross_errors
-from hilcal.identification.missing_masses import masses_note
+from hilcal.identification.full_prediction import (
+    disagreement_words,
+    error_before,
+    full_prediction,
+    gross_errors,
+)
 from hilcal.identification.registration import register
 
 
@@ -48,8 +52,8 @@ def to_json(fit: Fit) -> dict[str, object]:
         },
         "noise_floor_m": full_prediction(fit).noise_floor,
         "outliers": outliers(fit),
-        "arm_scatter": None if scatter is None else scatter.to_json(),
-        "serial_noise": None if serial is None else serial.to_json(),
+        "arm_scatter": scatter and scatter.to_json(),
+        "serial_noise": serial and serial.to_json(),
         "registration": fit.frames.base.tolist(),
         "frames": frames_to_json(fit),
         "notes": list(notes(fit)),

@@ -1,19 +1,34 @@
-"""Which readings belong to one pose, for leaving out.
+"""Prediction of poses that were left out, and what leaving out does to the parameters.
 
-Two commanded poses that agree in every joint within `SAME_POSE` are one pose here, whatever
-their names: a repeated pose that is left out must not be predicted from its repetition.
+Whole poses are left out, never single readings: readings of one pose share its errors. Two
+commanded poses that agree in every joint within `SAME_POSE` are one pose here, whatever their
+names: a repeated pose that is left out must not be predicted from its repetition. Each fold is
+refitted by one Gauss-Newton step from the full fit, in which the fold's rows are taken out of the
+normal equations exactly. The strengths of shrunk families are chosen anew in each fold
+(`regression.fold_evidence`).
+
+Without a fold the flat parameters have a prior about zero (see `regression.leave_out`), whose
+standard deviation is their ordinary magnitude, or the rms of the effect's parameters in the full
+fit where that is more.
 """
 
 import numpy as np
 
+from hilcal.identification.gauss_newton import Solution, whitened_jacobian
+from hilcal.identification.priors import FIRST_GUESS, prior_of, scales_of
+from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
+from hilcal.readings.whitening import Whitening
 from hilcal.regression.connected import groups_within
+from hilcal.regression.fold_evidence import FamilyProblem, solutions
+from hilcal.regression.leave_out import Fold, folds
 from hilcal.types import Floats, Ints
 
-SAME_POSE = 2e-3
-"""Difference of joint angles within which two poses are one, rad; a choice, no study set it."""
-FOLDS = 10
-"""Number of folds; a choice, the usual one."""
+# All of these are choices.
+SAME_POSE = 2e-3  # difference of joint angles within which two poses are one, rad
+FOLDS = 10  # the usual number
+MOST_ELEMENTS = 5e7  # of the columns of dropped groups up to which they may enter again in a fold,
+# for memory; with more readings a fold of a tenth hardly decides what is dropped
 
 
 def distinct_poses(readings: Readings) -> Ints:
@@ -41,12 +56,7 @@ def region_folds(angle: Floats, pose: Ints, count: int = FOLDS) -> Ints:
     """Fold of each measurement: poses close to each other in joint space are in one fold.
 
     The largest group of poses is halved, repeatedly, across the first principal component of its
-    joint angles.
-
-    Args:
-        angle: (D, n) joint angles.
-        pose: (D,) distinct pose of each measurement.
-        count: number of regions aimed at.
+    joint angles (D, n).
     """
     total = int(pose.max()) + 1
     q = np.zeros((total, angle.shape[1]))
@@ -63,3 +73,87 @@ def region_folds(angle: Floats, pose: Ints, count: int = FOLDS) -> Ints:
     for number, rows in enumerate(regions):
         fold[rows] = number
     return fold[pose]
+
+
+def folds_of(model: Model, solution: Solution, fold: Ints) -> tuple[Fold, ...]:
+    """Return the normal equations of a fit without each fold, of fold (R,) of each row."""
+    s, magnitude = solution, ordinary_y(model, solution)
+    return folds(s.projection(), s.white, s.equations, s.y, s.prior, magnitude, s.beta, fold)
+
+
+def ordinary(model: Model, theta: Floats) -> Floats:
+    """Magnitude (P,) of each parameter: the ordinary one, or the rms over its effect if more."""
+    out = scales_of(model)
+    for rows in model.slices():
+        out[rows] *= max(1.0, float(np.sqrt(np.mean((theta[rows] / out[rows]) ** 2))))
+    return out
+
+
+def ordinary_y(model: Model, solution: Solution) -> Floats:
+    """(P,) the same for the coordinates y."""
+    return solution.space.scales(ordinary(model, solution.theta))
+
+
+def changes(model: Model, solution: Solution, fold: Ints, w: Whitening) -> Floats:
+    """Return the parameters without each fold (D,) minus those with it (F, P)."""
+    steps = [one.step() for one in folds_of(model, solution, w.rows_of(fold))]
+    return np.asarray(np.array(steps) @ solution.transform.T)
+
+
+def leave_out(model: Model, solution: Solution, fold: Ints, w: Whitening) -> Floats:
+    """Return the residual (D, m) of each measurement, predicted without its fold (D,)."""
+    groups = prior_of(model)[1]
+    if w.scaling != "none" and bool((groups >= 0).any()):
+        change = _with_families(model, solution, fold, w, groups)
+    else:
+        change = changes(model, solution, fold, w)
+    moved = np.flatnonzero(np.any(change != 0, axis=0))
+    columns = w.raw(model.jacobian(solution.prediction, solution.theta, w.m, moved))
+    predicted = solution.raw.copy()
+    for f, by in enumerate(change[:, moved]):
+        predicted[fold == f] -= columns[fold == f] @ by
+    return predicted
+
+
+def _with_families(
+    model: Model, solution: Solution, fold: Ints, w: Whitening, groups: Ints
+) -> Floats:
+    """`changes` for a model with shrunk families, whose strengths each fold chooses."""
+    s, basis = solution, solution.equations.basis
+    flat, count = len(basis.singular), len(basis.prior_precision)
+    dropped = np.flatnonzero((groups >= 0) & (s.prior == 0))
+    if len(dropped) * s.raw.size > MOST_ELEMENTS:
+        dropped = dropped[:0]
+    guess = FIRST_GUESS * scales_of(model)[dropped]
+    more = whitened_jacobian(model, s.prediction, s.theta, w, dropped)
+    shrunk = groups[basis.held] >= 0
+    kept = flat + np.flatnonzero(shrunk)
+    others = np.concatenate([np.arange(flat), flat + np.flatnonzero(~shrunk)])
+    family = np.concatenate([groups[basis.held[shrunk]], groups[dropped]])
+    coordinates, order = s.coordinates(), np.concatenate([others, kept])
+    # Flat parameters have the prior about zero of `folds_of`, unshrunk ones their own.
+    magnitude = ordinary_y(model, s)
+    per = basis.transform[:, :flat] / magnitude[:, None]
+    stand = np.where(basis.flat, s.y / magnitude, 0.0)
+    ridge = s.beta * np.eye(len(others))
+    ridge[:flat, :flat] = s.beta * per.T @ per
+    rows = s.rows  # copied only where it must be: it may take a gigabyte
+    if len(dropped) or np.any(np.diff(order) != 1):
+        rows = np.hstack([rows[:, order], more * guess])
+    found = solutions(
+        FamilyProblem(
+            rows=rows,
+            target=s.white + s.rows @ coordinates,
+            ridge=ridge,
+            pull=np.concatenate([-s.beta * per.T @ stand, np.zeros(len(others) - flat)]),
+            groups=np.unique(family, return_inverse=True)[1],
+            std=np.concatenate([np.ones(len(kept)), np.zeros(len(dropped))]),
+            beta=s.beta,
+        ),
+        w.rows_of(fold),
+    )
+    z = np.empty((len(found), count))
+    z[:, order] = found[:, :count]
+    change = (z - coordinates) @ s.transform.T
+    change[:, dropped] = found[:, count:] * guess
+    return np.asarray(change)

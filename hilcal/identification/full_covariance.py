@@ -40,13 +40,8 @@ def full_readings(
 ) -> Readings:
     """Return readings with their full covariance, see `readings.covariance`.
 
-    The arm's repeatability is added where the covariances cover the instrument alone.
-
-    Args:
-        readings: with the covariance of a file or a table.
-        covers: what that covers; None for a file that does not say.
-        cell: the cell.
-        config: its configuration.
+    The arm's repeatability is added where the covariances of a file or a table cover the instrument
+    alone; `covers` says what they cover, None for a file that does not say.
     """
     parts = covariance_parts(covers, config)
     joint_std = config.repeatability.per_joint(cell.arm.n)
@@ -60,12 +55,7 @@ def full_readings(
 def with_noise_of(tracker: Tracker, readings: Readings) -> Readings:
     """Return readings with the instrument's covariance that [tracker] states, as imports make it.
 
-    Args:
-        tracker: the section.
-        readings: N readings.
-
-    Raises:
-        InputError: a reading lies at the tracker's station.
+    A reading at the tracker's station is refused.
     """
     whole, station = ~readings.scalar, tracker.station_m or (0.0, 0.0, 0.0)
     if not whole.any():
@@ -77,12 +67,7 @@ def with_noise_of(tracker: Tracker, readings: Readings) -> Readings:
 
 
 def covariance_parts(covers: str | None, config: CellConfig) -> CovarianceParts:
-    """Return what the full covariance of a campaign's readings consists of.
-
-    Args:
-        covers: what the stored covariances cover, as the campaign's file states it.
-        config: of the cell.
-    """
+    """Return what the full covariance consists of, of stored covariances that cover `covers`."""
     if covers == WHOLE:
         return "instrument and arm as stated"
     if covers != INSTRUMENT:
@@ -113,15 +98,10 @@ def with_common_scatter(cell: Cell, readings: Readings, joint_std: Floats) -> Re
 
     Only several targets share any. The factor F of a reading is shortened where F Fᵀ is more than
     its covariance.
-
-    Args:
-        cell: the cell.
-        readings: N readings with their full covariances.
-        joint_std: (n,) standard deviations from one arrival to the next, rad.
     """
-    factor = None
-    if readings.states.target is not None or readings.states.observer is not None:
-        factor = _scatter(cell, readings, joint_std)
+    s = readings.states
+    several = s.target is not None or s.observer is not None
+    factor = _scatter(cell, readings, joint_std) if several else None
     if factor is None:
         return readings
     largest = np.linalg.norm(inverse_root(readings.covariance) @ factor, ord=2, axis=(1, 2))
@@ -140,13 +120,7 @@ def _scatter(cell: Cell, readings: Readings, joint_std: Floats) -> Floats | None
 
 
 def joint_factors(cell: Cell, readings: Readings, joint_std: Floats) -> Floats:
-    """Return the factors F (N, m, n) of the joints' scatter, see `readings.covariance`.
-
-    Args:
-        cell: with its registration and targets as they are.
-        readings: N readings.
-        joint_std: (n,) standard deviations, rad.
-    """
+    """Factors F (N, m, n) of the joints' scatter (n,), rad, with frames as they are in the cell."""
     offset = cell.target_of(readings.states.target)[..., :3, 3]
     turn = cell.registration[:3, :3]
     if readings.states.observer is not None:

@@ -1,39 +1,48 @@
-"""Prediction of all readings of a fit, those set aside included; and the error before any fit."""
+"""All readings of a fit, those set aside included: their prediction, and why they were set aside.
 
-from dataclasses import dataclass
+Also the error before any fit, and the residuals as columns of a table.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
+from scipy.stats import chi2
 
 from hilcal.effects.protocol import FRAME_ROLES
-from hilcal.identification.fit import Fit, mahalanobis2
+from hilcal.identification.fit import Fit, all_left_out, mahalanobis2, with_outliers
 from hilcal.identification.gauss_newton import solve
+from hilcal.identification.least_trimmed_squares import MOST
 from hilcal.identification.residual import ErrorBlock, error_block, noise_floor, residual
 from hilcal.model.model import Model, Prediction
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Whitening, whitening
-from hilcal.types import Floats
+from hilcal.tables.write import Column
+from hilcal.types import Floats, Ints
+
+ALIKE = 1e-3  # χ² quantile of the distance below which two readings are alike; a choice
+SAME = 1e-3  # a reading that repeats another to this share of σ was not taken anew; a choice
+MOSTLY = 0.8  # share of the whitened error that an axis must have to be named; a choice
+SWAPPED = 0.1  # share of an error that another target's place may leave: centimetres; a choice
+AXES = ("x", "y", "z", "rotation about x", "rotation about y", "rotation about z")
+ELEMENTS = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FullPrediction:
-    """D measurements, fitted or set aside; the same ones for all fits of equal readings.
+    """D measurements, fitted or set aside; the same ones for all fits of equal readings."""
 
-    Attributes:
-        readings: all readings.
-        whitening: their gc-scaling; `whitening.reading` (D,) are rows of `readings`.
-        prediction: of all readings.
-        raw: (D, m) residual, sensor axes.
-        model: the model of the fit.
-        theta: (P,) its parameters.
-    """
-
-    readings: Readings
-    whitening: Whitening
-    prediction: Prediction
-    raw: Floats
+    readings: Readings  # all of them
+    whitening: Whitening  # their gc-scaling; `whitening.reading` (D,) are rows of `readings`
+    raw: Floats  # (D, m) residual, sensor axes
     model: Model
-    theta: Floats
+    theta: Floats  # (P,) parameters of the model
+
+    @property
+    def prediction(self) -> Prediction:
+        """Prediction of all readings."""
+        return self.model.predict(self.readings.states, self.theta)
 
     @property
     def mahalanobis2(self) -> Floats:
@@ -64,14 +73,8 @@ def names(readings: Readings, row: int) -> tuple[str, str]:
 
 def full_prediction(fit: Fit) -> FullPrediction:
     """Predict all readings of a fit."""
-    if not fit.outlier.any():
-        return FullPrediction(
-            fit.readings, fit.whitening, fit.solution.prediction, fit.raw, fit.model, fit.theta
-        )
-    w = whitening(fit.readings, fit.mode, "gc")
-    prediction = fit.model.predict(fit.readings.states, fit.theta)
-    raw = residual(fit.readings, prediction, w)
-    return FullPrediction(fit.readings, w, prediction, raw, fit.model, fit.theta)
+    raw, w = with_outliers(fit)
+    return FullPrediction(fit.readings, w, raw, fit.model, fit.theta)
 
 
 @lru_cache(maxsize=1)
@@ -90,3 +93,176 @@ def error_before(fit: Fit) -> ErrorBlock:
     if rigid.effects:
         theta = solve(rigid, used, whitening(used, fit.mode, fit.scaling), None, None).theta
     return error_block(residual(used, rigid.predict(used.states, theta), w), w)
+
+
+def residual_table(fit: Fit) -> dict[str, Column]:
+    """Return residuals, measured − predicted, with what was measured; SI, one row per reading.
+
+    `residual_…` is of the fit, `left_out_…` of predictions without the reading's pose, both in
+    axes of the sensor and, with `base_` in the name, of the base. `sigma` is the root of the
+    squared Mahalanobis distance of the fit's residual, `set_aside` marks gross errors, which were
+    not fitted. A reading that is no measurement of its own (the unloaded one of a deflection) has
+    no residual.
+    """
+    r, (raw, w) = fit.readings, with_outliers(fit)
+
+    def spread(values: Floats) -> Sequence[list[float | None]]:
+        """Columns of values (D, k) at their readings, None elsewhere."""
+        at = dict(zip(w.reading.tolist(), values.tolist(), strict=True))
+        return [[at[k][c] if k in at else None for k in range(len(r))]
+                for c in range(values.shape[1])]  # fmt: skip
+
+    table: dict[str, Column] = {
+        "reading": np.arange(1, len(r) + 1),
+        "pose": [r.pose_names[k] for k in r.pose.tolist()],
+        "load": [r.load_names[k] for k in r.load.tolist()],
+        "cycle": r.cycle,
+    }
+    if r.states.target is not None:
+        table["target"] = [r.target_names[k] for k in r.target.tolist()]
+    table["set_aside"] = fit.outlier.astype(int)
+    table["sigma"] = spread(np.sqrt(mahalanobis2(raw, w.covariance))[:, None])[0]
+    for what, values in (("residual", raw), ("left_out", all_left_out(fit)[0])):
+        base = (values.reshape(len(values), -1, 3) @ fit.frames.base[:3, :3]).reshape(values.shape)
+        for frame, of in (("", values), ("base_", base)):
+            for element, column in zip(ELEMENTS, spread(of), strict=False):
+                table[f"{what}_{frame}{element}"] = column
+    return table
+
+
+@dataclass(frozen=True, slots=True)
+class GrossError:
+    """A reading that was set aside."""
+
+    row: int  # of the readings
+    pose: str
+    load: str
+    sigma: float  # Mahalanobis distance from the prediction of the fit
+    reason: str  # likely cause, or the error by axes, in a phrase
+
+
+def gross_errors(fit: Fit) -> tuple[GrossError, ...]:
+    """List the readings set aside, in order.
+
+    Of deflections that share an unloaded reading that was set aside, only that one is listed.
+    """
+    if not fit.outlier.any():
+        return ()
+    e = full_prediction(fit)
+    found: dict[int, GrossError] = {}
+    first = 0
+    for b in e.whitening.buckets:
+        size = b.loaded.shape[1]
+        for g in range(len(b.loaded)):
+            at = first + g * size + np.arange(size)
+            out = fit.outlier[b.reference[g]]
+            for u in np.flatnonzero(out):
+                row, taken = int(b.reference[g, u]), b.weights[:, u] > 0
+                found[row] = _shared(e, row, at[taken], bool(np.all(b.weights[taken, u] == 1.0)))
+            # Deflections of which no unloaded reading is left are not listed one by one.
+            lost = (b.weights @ out > 1.0 - 1e-9) if len(out) else np.zeros(size, dtype=bool)
+            for k, r in zip(at[~lost], b.loaded[g, ~lost], strict=True):
+                if fit.outlier[r]:
+                    found[int(r)] = _one(e, int(r), e.raw[k], e.whitening.covariance[k])
+        first += b.loaded.size
+    return tuple(found[row] for row in sorted(found))
+
+
+def _shared(e: FullPrediction, row: int, measurements: Ints, alone: bool) -> GrossError:
+    """Gross error of an unloaded reading, from the deflections that are taken from it."""
+    rows, v = e.whitening.reading[measurements], e.readings.covariance
+    off, many = -np.median(e.raw[measurements], axis=0), len(rows)
+    one = _one(e, row, off, v[row] + v[rows].sum(axis=0) / many**2)
+    if not alone:
+        return one
+    which = f"its {many} deflections" if many > 1 else "its deflection"
+    return replace(one, reason=f"{one.reason}; {which} set aside with it")
+
+
+def _one(e: FullPrediction, row: int, off: Floats, covariance: Floats) -> GrossError:
+    r = e.readings
+    reason = (
+        _stale(r, row)
+        or _another_target(e, row, off)
+        or _like_another(r, row)
+        or _off(off, covariance)
+    )
+    if r.states.target is not None:
+        reason = f"target {r.target_names[r.target[row]]}: {reason}"
+    return GrossError(row, *names(r, row), _distance(off, covariance), reason)
+
+
+def _another_target(e: FullPrediction, row: int, off: Floats) -> str:
+    """Phrase for a reading that lies where the prediction has another target, or ''."""
+    r = e.readings
+    if r.states.target is None:
+        return ""
+    here, count = r.states[row : row + 1], len(r.target_names)
+    places = [
+        e.model.predict(replace(here, target=np.array([k])), e.theta).observation.position[0]
+        for k in range(count)
+    ]
+    away = [float(np.linalg.norm(off[:3] - (x - places[r.target[row]]))) for x in places]
+    found = min((k for k in range(count) if k != r.target[row]), key=lambda k: away[k], default=-1)
+    if found < 0 or away[found] >= SWAPPED * float(np.linalg.norm(off[:3])):
+        return ""
+    return f"lies where {r.target_names[found]} is: were they swapped?"
+
+
+def _stale(r: Readings, row: int) -> str:
+    std = np.sqrt(np.maximum(np.diagonal(r.covariance[row]), 1e-300))
+    if row and np.all(np.abs(r.value[row] - r.value[row - 1]) <= SAME * std):
+        return "equal to the reading before: not taken anew (stale)?"
+    return ""
+
+
+def _like_another(r: Readings, row: int) -> str:
+    """Phrase for a reading that agrees with one under another load at the same pose, or ''."""
+    beside = (r.pose == r.pose[row]) & (r.load != r.load[row]) & (r.target == r.target[row])
+    away = {
+        other: _distance(r.value[row] - r.value[other], r.covariance[row] + r.covariance[other])
+        for other in np.flatnonzero(beside).tolist()
+    }
+    found = min(away, key=lambda other: away[other], default=-1)
+    if found < 0 or away[found] ** 2 >= float(chi2.isf(ALIKE, r.m)):
+        return ""
+    load = r.load_names[r.load[found]]
+    if load == "none":
+        return "like the unloaded reading: was the load hung?"
+    if r.unloaded[row]:
+        return f'like the reading under "{load}": was the load still hung?'
+    return f'like the reading under "{load}": was that load hung?'
+
+
+def _off(off: Floats, covariance: Floats) -> str:
+    white = np.abs(off) / np.sqrt(np.maximum(np.diagonal(covariance), 1e-300))
+    axis, sigma = int(np.argmax(white)), _distance(off, covariance)
+    mostly = white[axis] >= MOSTLY * float(np.linalg.norm(white))
+    return f"{sigma:.0f} σ off in {AXES[axis]}" if mostly else f"{sigma:.0f} σ off"
+
+
+def _distance(off: Floats, covariance: Floats) -> float:
+    """Mahalanobis distance in the range of a covariance, which may be singular."""
+    square = float(off @ np.linalg.pinv(covariance, hermitian=True) @ off)
+    return float(np.sqrt(max(square, 0.0)))
+
+
+def disagreement_words(fit: Fit) -> str:
+    """Return the disagreement of a fit's readings in a sentence; empty where there is none."""
+    found, readings = fit.disagreement, fit.readings
+    if found is None:
+        return ""
+    count = f"{len(found.rows)} of {len(readings)}"
+    if found.kind == "many":
+        return (
+            f"more than {100 * MOST:.0f} % of the readings disagree with what the others agree on, "
+            f"too many to tell wrong ones from right ones ({count} are beyond the noise): none was "
+            "set aside, and nothing that is fitted to them holds; find out what went wrong in "
+            "measuring"
+        )
+    first, last = ("/".join(names(readings, int(found.rows[k]))) for k in (0, -1))
+    return (
+        f"{count} readings, between {first} and {last}, are off by the same shift, so that they "
+        "have one cause: another reflector, a target moved on the tool, a tracker that was bumped. "
+        "They were not set aside; give them a target of their own, or leave them out"
+    )

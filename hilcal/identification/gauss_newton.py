@@ -1,69 +1,373 @@
-"""Whitened Gauss-Newton on the exact chain.
+"""Whitened Gauss-Newton on the exact chain, of readings in memory or in a stream.
 
     minimise ‖w(θ)‖² + β ‖y/σ‖²,    θ = m + U y
 
 w (R,) whitened residual, y coordinates in which the prior is independent and about zero, θ itself
-without a carried prior (see `coordinates`), σ their prior standard deviations, β the noise factor
-they are weighed against.
+without a carried prior (`carried.Coordinates`), σ their prior standard deviations. The noise factor
+β they are weighed against is the variance of the residual in units of the stated noise, at least 1.
+Priors of shrunk families maximise the evidence (`regression.empirical_bayes`). The rank counts the
+flat directions that the data determine against the residual.
+
+What a problem has to say of itself is `NewtonProblem`: the objective at a point, and the linear
+problem there, whose rows may be any that have the same products.
 """
 
 from dataclasses import dataclass, replace
+from typing import ClassVar, Generic, TypeVar
 
 import numpy as np
 
-from hilcal.identification.coordinates import Coordinates, coordinates_of
-from hilcal.identification.gauss_newton_steps import (
-    NewtonPoint,
-    NewtonProblem,
-    linear_problem,
-    minimum,
-)
-from hilcal.identification.priors import prior_of
-from hilcal.identification.regularisation import LinearProblem, spent_parameters
+from hilcal.identification.carried import Coordinates, coordinates_of
+from hilcal.identification.priors import prior_of, scales_of
 from hilcal.identification.residual import residual
+from hilcal.identification.solver import shortened
 from hilcal.model.model import Model, Prediction
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Whitening
-from hilcal.regression.normal_equations import Basis, NormalEquations
+from hilcal.regression.empirical_bayes import maximise_evidence, spent_by_groups
+from hilcal.regression.normal_equations import (
+    TALL,
+    Basis,
+    NormalEquations,
+    find_basis,
+    normal_equations,
+)
 from hilcal.regression.projection import Projection, projection
+from hilcal.regression.triangle import triangle_of
 from hilcal.types import Bools, Floats, Ints
+
+# All of these are choices.
+MAX_ITERATIONS = 20  # steps; the tests of convergence allow 8
+CONVERGED = 1e-5  # a step that moves the whitened readings by less than this, in units of the noise
+SETTLED = 0.02  # priors and rank are chosen until the residual changes by less than this share from
+# one step to the next, or is within the noise; then they are kept
+DEPTH = 3  # earlier steps that a step is combined with: there are as few weak directions
+HALVINGS = 8  # most step lengths of a line search
+NOISE_STEPS, NOISE_TOLERANCE = 50, 1e-9  # iterations of the noise factor, and relative change
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinearProblem:
+    """Minimise ‖y − A (θ − θ_0)‖² over live parameters: whitened, at one point."""
+
+    live: Ints  # (L,) indices of the parameters that are not held at zero
+    origin: Floats  # (P,) θ_0: the point for flat parameters, zero for those with a prior
+    a: Floats  # (R', L) A, or rows that have the same products with each other and with y
+    gram: Floats  # (L, L) AᵀA
+    target: Floats  # (R',) y
+    rank: int  # number of rows that carry information
+    noise: float  # variance of the rows: 1 where the scaling whitens, else that of the residual
+    whitened: bool  # whether rows are in units of the stated noise
+    rows: Floats  # (R, L) A itself, one row per element of the readings
+
+    def restricted(self, prior: Floats) -> "LinearProblem":
+        """Return the problem without the parameters that a prior (P,) of zero holds at zero."""
+        kept = prior[self.live] > 0
+        if kept.all():
+            return self
+        a = self.a[:, kept]
+        rows = a if self.rows is self.a else self.rows[:, kept]
+        return replace(
+            self, live=self.live[kept], a=a, gram=self.gram[np.ix_(kept, kept)], rows=rows
+        )
+
+    def basis(self, scale: Floats, prior: Floats, spread: float) -> Basis:
+        """Return identifiable coordinates for magnitudes (P,), priors (P,), and the residual's σ.
+
+        Without whitening only rounding decides the rank.
+        """
+        threshold = spread if self.whitened else None
+        return find_basis(self.a, scale[self.live], prior[self.live], threshold)
+
+    def equations(self, basis: Basis) -> NormalEquations:
+        """Return the normal equations in the coordinates of a basis."""
+        return normal_equations(self.a, self.target, basis, self.gram)
+
+    def rss(self, equations: NormalEquations, z: Floats) -> float:
+        """Return ‖y − A (θ − θ_0)‖² at the coordinates z (K,) of normal equations."""
+        yy = float(self.target @ self.target)
+        return yy - 2 * float(equations.rhs @ z) + float(z @ equations.gram @ z)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Regularisation:
+    """What a linear problem is solved with."""
+
+    prior: Floats  # (P,) prior standard deviations (infinite: flat, zero: held at zero)
+    beta: float  # noise variance factor that the priors are weighed against
+    basis: Basis  # identifiable coordinates of the parameters that are not held at zero
+
+
+def regularise(
+    p: LinearProblem, scale: Floats, prior: Floats, groups: Ints, choose: bool
+) -> Regularisation:
+    """Choose priors, noise factor and rank for a linear problem.
+
+    From ordinary magnitudes, priors so far and shrinkage groups or −1 (P,); the evidence chooses
+    the priors of shrunk families where asked to.
+    """
+    # Rms of the residual at the solution: it does not depend on where the linearisation started.
+    basis = p.basis(scale, prior, 1.0)
+    equations = p.equations(basis)
+    rss = p.rss(equations, equations.solve(p.noise))
+    spread = float(np.sqrt(max(rss, 1e-30) / max(p.rank - len(basis.singular), 1)))
+    beta = 1.0 if p.whitened else spread**2
+    if choose:
+        prior, beta = _family_priors(p, scale, prior, groups, spread)
+    basis = p.basis(scale, prior, spread).restricted(prior[p.live] > 0)
+    return Regularisation(prior, beta, basis)
+
+
+def _family_priors(
+    p: LinearProblem, scale: Floats, prior: Floats, groups: Ints, spread: float
+) -> tuple[Floats, float]:
+    """Priors (P,) with those of the shrunk families chosen, and the noise factor."""
+    beta = max(spread**2, 1.0)
+    family = np.isin(np.arange(len(prior)), p.live) & (groups >= 0)
+    if not family.any():
+        return prior, beta
+    # The families' columns unscaled, all others in well-conditioned coordinates.
+    basis = p.basis(scale, np.where(family, 1.0, prior), spread)
+    equations = p.equations(basis)
+    of_family = np.append(np.zeros(len(basis.singular), dtype=bool), family[p.live[basis.held]])
+    order, others = np.argsort(of_family, kind="stable"), int(np.sum(~of_family))
+    gram = equations.gram[np.ix_(order, order)]
+    gram[np.arange(others), np.arange(others)] += beta * basis.prior_precision[order[:others]]
+    square, rhs = float(p.target @ p.target), equations.rhs[order]
+    found = maximise_evidence(
+        gram, rhs, square, p.rank, others, groups[family], prior[family], beta
+    )
+    out = prior.copy()
+    out[family] = found.std
+    return out, found.beta
+
+
+def noise_factor(p: LinearProblem, equations: NormalEquations, beta: float = 1.0) -> float:
+    """Fixed point of β = max(1, RSS(β) / (R − effective parameters)), from β on, given priors."""
+    for _ in range(NOISE_STEPS):
+        root = equations.inverse_root(beta)
+        z = root.T @ (root @ equations.rhs)
+        free = max(p.rank - effective_parameters(equations, beta, root), 1.0)
+        beta, before = max(1.0, p.rss(equations, z) / free), beta
+        if abs(beta - before) < NOISE_TOLERANCE * beta:
+            break
+    return beta
+
+
+def effective_parameters(equations: NormalEquations, beta: float, root: Floats) -> float:
+    """Effective number of parameters: flat directions + Σ (1 − β Λ_kk H⁻¹_kk) over the others.
+
+    With (K, K) T, Tᵀ T = H⁻¹.
+    """
+    return len(equations.basis.singular) + float(np.sum(_determined(equations, beta, root)))
+
+
+def spent_parameters(equations: NormalEquations, beta: float, groups: Ints) -> float:
+    """Degrees of freedom that a fit spends: `effective_parameters`, and the choice of strengths.
+
+    Of normal equations over all parameters, with their shrinkage groups or −1 (P,).
+    """
+    group = groups[equations.basis.held]
+    determined = _determined(equations, beta, equations.inverse_root(beta))
+    chosen = group >= 0
+    others = float(np.sum(determined[~chosen])) + len(equations.basis.singular)
+    place = np.unique(group[chosen], return_inverse=True)[1]
+    size = np.bincount(place)
+    share = np.bincount(place, weights=determined[chosen]) / size
+    return others + float(np.sum(spent_by_groups(share, size)))
+
+
+def _determined(equations: NormalEquations, beta: float, root: Floats) -> Floats:
+    """Share (H,) of each parameter with a prior that the data determine: 1 − β Λ_kk H⁻¹_kk."""
+    flat, precision = len(equations.basis.singular), equations.basis.prior_precision
+    variance = np.sum(root[:, flat:] ** 2, axis=0)
+    return np.asarray(1 - beta * precision[flat:] * variance)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NewtonPoint:
+    """A point of the parameters."""
+
+    y: Floats  # (P,) coordinates
+    theta: Floats  # (P,) parameters
+    rss: float  # sum of squares of the whitened residual
+    elements: int  # its number of elements
+
+    def objective(self, by: Regularisation) -> float:
+        """Return ‖w‖² + β ‖y/σ‖² over the y that have a prior."""
+        held = np.isfinite(by.prior) & (by.prior > 0)
+        return self.rss + by.beta * float(np.sum((self.y[held] / by.prior[held]) ** 2))
+
+    def mean_square(self, parameters: int = 0) -> float:
+        """Return the mean square of the whitened residual with some parameters estimated."""
+        return max(self.rss / max(self.elements - parameters, 1), 1e-300)
+
+
+P = TypeVar("P", bound=NewtonPoint)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Minimum(Generic[P]):
+    """Where the steps ended."""
+
+    point: P
+    by: Regularisation  # of the last linear problem
+    iterations: int
+    converged: bool  # whether the last step was negligible
+    rows: Floats | None  # (R, L) of the last linearisation, where the point is as near to it
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NewtonProblem(Generic[P]):
+    """A model, its coordinates, and the readings that it is fitted to."""
+
+    same_rows: ClassVar[bool] = True
+    """Whether row i of every linearisation is of the same element of the readings."""
+
+    model: Model
+    coordinates: Coordinates
+    whitened: bool  # whether rows are in units of the stated noise
+
+    def at(self, y: Floats) -> P:
+        """Return the point of coordinates (P,)."""
+        raise NotImplementedError
+
+    def linearise(self, point: P, prior: Floats) -> LinearProblem:
+        """Return the linear problem at a point over the coordinates whose prior (P,) is not 0."""
+        raise NotImplementedError
+
+
+def linear_problem(
+    point: NewtonPoint,
+    prior: Floats,
+    a: Floats,
+    white: Floats,
+    rank: int,
+    noise: float,
+    whitened: bool,
+) -> LinearProblem:
+    """Return the linear problem of whitened rows (R, L) and residual (R,) at a point.
+
+    Flat parameters step from where they are, so that unidentifiable directions stay put; those with
+    a prior are solved for as a whole, since the prior is about zero.
+
+    Many rows are reduced to a triangle once, which rank analysis, priors and solution then take in
+    place of them; unless most columns have a prior, whose products alone cost less.
+    """
+    live, rows = np.flatnonzero(prior > 0), a
+    origin = np.where(np.isinf(prior), point.y, 0.0)
+    if len(a) > TALL and 2 * np.count_nonzero(np.isinf(prior)) > len(live):
+        triangle = triangle_of(a, white)
+        a, white = triangle[:, :-1], triangle[:, -1]
+    target = white + a @ (point.y - origin)[live]
+    return LinearProblem(live, origin, a, a.T @ a, target, rank, noise, whitened, rows)
+
+
+def minimum(problem: NewtonProblem[P], start: Floats | None, prior: Floats | None) -> Minimum[P]:
+    """Return the minimum from a start (P,) on, with priors (P,) that are kept where given."""
+    model, of = problem.model, problem.coordinates
+    sigma, groups = prior_of(model)
+    choose = prior is None and bool((groups >= 0).any())
+    sigma, scale = of.prior(sigma if prior is None else prior), of.scales(scales_of(model))
+    y = np.zeros(model.size) if start is None else start
+    point = problem.at(np.where(sigma > 0, y, 0.0))
+    by: Regularisation  # set in the first step
+    square, settled, path = np.inf, False, Acceleration()
+    for iterations in range(1, MAX_ITERATIONS + 1):
+        linear = problem.linearise(point, sigma)
+        if not settled:
+            by = regularise(linear, scale, sigma, groups, choose)
+            sigma = by.prior
+        linear = linear.restricted(sigma)
+        equations = linear.equations(by.basis)
+        if (groups[linear.live] >= 0).any() or len(of.index):  # priors that are weighed
+            by = replace(by, beta=noise_factor(linear, equations, by.beta))
+        aim = linear.origin.copy()
+        aim[linear.live] += by.basis.transform @ equations.solve(by.beta)
+        moved = linear.rows @ (aim - point.y)[linear.live]
+        shortcut = path.accelerated(aim, moved) if settled and problem.same_rows else None
+        begin, point = point, _line_search(problem, point, aim, by, shortcut)
+        before, square = square, point.mean_square(len(by.basis.singular))
+        noise = max(square, by.beta) * linear.rank
+        if settled and float(moved @ moved) <= CONVERGED**2 * noise:
+            moved = linear.rows @ (point.y - begin.y)[linear.live]
+            near = float(moved @ moved) <= CONVERGED**2 * noise
+            return Minimum(point, by, iterations, True, linear.rows if near else None)
+        del linear  # before the next one is made
+        settled = (problem.whitened and square < 1) or abs(square / before - 1) <= SETTLED
+    return Minimum(point, by, iterations, False, None)
+
+
+class Acceleration:
+    """Anderson's acceleration of the steps that follow once priors and rank are settled.
+
+    Where a residual remains, steps in a weakly determined direction shrink by a constant factor
+    only. With f_i the motion of the whitened readings by step i, and g_i where it leads to, the
+    combination Σ α_i f_i, Σ α_i = 1, of the last steps that is shortest leads to Σ α_i g_i.
+
+    Source: Walker and Ni, *Anderson acceleration for fixed-point iterations*, SIAM J. Numer. Anal.
+    49 (2011) 1715-1735.
+    """
+
+    def __init__(self) -> None:
+        """Begin without steps."""
+        self._steps: list[tuple[Floats, Floats]] = []
+
+    def accelerated(self, aim: Floats, moved: Floats) -> Floats | None:
+        """Return where the steps so far lead to; None after the first.
+
+        A step leads to `aim` (P,) by itself, and moves the whitened readings by `moved` (R,).
+        """
+        self._steps = [*self._steps[-DEPTH:], (aim, moved)]
+        if len(self._steps) == 1:
+            return None
+        aims, moves = (np.diff(part, axis=0) for part in zip(*self._steps, strict=True))
+        gamma = np.linalg.lstsq(moves.T, moved, rcond=None)[0]
+        return np.asarray(aim - gamma @ aims)
+
+
+def _line_search(
+    problem: NewtonProblem[P], point: P, aim: Floats, by: Regularisation, shortcut: Floats | None
+) -> P:
+    """Go to the `shortcut` (P,), unless the objective grows; else towards `aim` (P,).
+
+    On the way to `aim` half as far each time while the objective grows: the chain may be strongly
+    nonlinear along a step in a weakly determined direction.
+    """
+
+    def cost(trial: P) -> float:
+        return trial.objective(by)
+
+    now, begin = cost(point), np.where(by.prior > 0, point.y, 0.0)
+    found = None if shortcut is None else shortened(problem.at, shortcut, 1, cost, now)
+    if found is None:
+        limit = now * (1 + 1e-9) + 1e-12
+        found = shortened(lambda step: problem.at(begin + step), aim - begin, HALVINGS, cost, limit)
+    return problem.at(begin) if found is None else found
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """The minimum that Gauss-Newton reached.
+    """The minimum that Gauss-Newton reached."""
 
-    Attributes:
-        theta: (P,) parameters.
-        y: (P,) the same in coordinates in which the prior is independent.
-        space: these coordinates.
-        prior: (P,) prior standard deviations of y (infinite: flat, zero: held at zero).
-        beta: noise variance factor that the priors were weighed against.
-        equations: normal equations at the solution, in identifiable coordinates z of y.
-        live: (L,) indices of the y that are not held at zero.
-        rows: (R, K) whitened derivative of the measurements by z.
-        prediction: prediction at the solution.
-        raw: (D, m) residual.
-        white: (R,) whitened residual.
-        effective: degrees of freedom that the fit spends, the choice of strengths included.
-        iterations: steps taken.
-        converged: whether the last step was negligible.
-    """
-
-    theta: Floats
-    y: Floats
-    space: Coordinates
-    prior: Floats
-    beta: float
-    equations: NormalEquations
-    live: Ints
-    rows: Floats
+    theta: Floats  # (P,) parameters
+    y: Floats  # (P,) the same in coordinates in which the prior is independent
+    space: Coordinates  # these coordinates
+    prior: Floats  # (P,) prior standard deviations of y (infinite: flat, zero: held at zero)
+    beta: float  # noise variance factor that the priors were weighed against
+    equations: NormalEquations  # at the solution, in identifiable coordinates z of y
+    rows: Floats  # (R, K) whitened derivative of the measurements by z
     prediction: Prediction
-    raw: Floats
-    white: Floats
-    effective: float
+    raw: Floats  # (D, m) residual
+    white: Floats  # (R,) whitened residual
+    effective: float  # degrees of freedom that the fit spends, the choice of strengths included
     iterations: int
-    converged: bool
+    converged: bool  # whether the last step was negligible
+
+    @property
+    def live(self) -> Ints:
+        """(L,) indices of the y that are not held at zero."""
+        return np.flatnonzero(self.prior > 0)
 
     @property
     def transform(self) -> Floats:
@@ -75,14 +379,10 @@ class Solution:
         """(P,) parameters that are not held at zero."""
         return np.asarray((self.prior != 0) | self.space.carried(len(self.theta)))
 
-    @property
-    def ridge(self) -> Floats:
-        """(K,) prior precisions of z, weighed against the noise factor."""
-        return self.beta * self.equations.basis.prior_precision
-
     def projection(self) -> Projection:
         """Return the projection off the columns of the model."""
-        return projection(self.rows, self.ridge, self.equations.gram)
+        ridge = self.beta * self.equations.basis.prior_precision
+        return projection(self.rows, ridge, self.equations.gram)
 
     def coordinates(self) -> Floats:
         """Return z (K,) of the parameters that have a prior; zero for flat directions."""
@@ -117,9 +417,8 @@ class _Problem(NewtonProblem[_Iterate]):
         return _Iterate(y, theta, float(np.sum(white**2)), white.size, prediction, raw, white)
 
     def linearise(self, point: _Iterate, prior: Floats) -> LinearProblem:
-        live = np.flatnonzero(prior > 0)
+        a = self.columns(point, np.flatnonzero(prior > 0))
         noise = 1.0 if self.whitened else point.mean_square()
-        a = self.columns(point, live)
         return linear_problem(point, prior, a, point.white, self.w.rank, noise, self.whitened)
 
     def columns(self, point: _Iterate, live: Ints) -> Floats:
@@ -144,19 +443,17 @@ def solve(
         prior: (P,) prior standard deviations to keep as they are; otherwise those of
             shrunk families are chosen by the evidence.
     """
-    coordinates = coordinates_of(model)
-    if len(coordinates.index):
-        theta = coordinates.theta(np.zeros(model.size)) if start is None else start
+    space = coordinates_of(model)
+    if len(space.index):
+        theta = space.theta(np.zeros(model.size)) if start is None else start
         prediction = model.predict(readings.states, theta)
         a = whitened_jacobian(model, prediction, theta, w, np.arange(model.size))
-        coordinates = coordinates.felt(a)
-    problem = _Problem(model, coordinates, w.scaling != "none", readings, w)
-    y = None if start is None else coordinates.of_theta(start)
-    found = minimum(problem, y, prior)
+        space = space.felt(a)
+    problem = _Problem(model, space, w.scaling != "none", readings, w)
+    found = minimum(problem, None if start is None else space.of_theta(start), prior)
     point, by = found.point, found.by
     live = np.flatnonzero(by.prior > 0)
-    columns = problem.columns(point, live) if found.rows is None else found.rows
-    rows = by.basis.rows(columns)
+    rows = by.basis.rows(problem.columns(point, live) if found.rows is None else found.rows)
     beta = point.mean_square(len(by.basis.singular)) if w.scaling == "none" else by.beta
     # Formed anew at the solution, so that folds can be taken out of them exactly.
     basis = over_all_parameters(by.basis, live, model.size)
@@ -165,11 +462,10 @@ def solve(
     return Solution(
         theta=point.theta,
         y=point.y,
-        space=coordinates,
+        space=space,
         prior=by.prior,
         beta=beta,
         equations=equations,
-        live=live,
         rows=rows,
         prediction=point.prediction,
         raw=point.raw,
@@ -189,35 +485,31 @@ def whitened_jacobian(
 
 def columns_of(
     model: Model,
-    coordinates: Coordinates,
+    space: Coordinates,
     prediction: Prediction,
     theta: Floats,
     w: Whitening,
     live: Ints,
 ) -> Floats:
     """Whitened derivative (R, L) of the measurements by the live coordinates y."""
-    if not len(coordinates.index):
+    if not len(space.index):
         return whitened_jacobian(model, prediction, theta, w, live)
-    needed = np.union1d(live, coordinates.index)
+    needed = np.union1d(live, space.index)
     found = whitened_jacobian(model, prediction, theta, w, needed)
     a = np.zeros((len(found), model.size))
     a[:, needed] = found
-    return coordinates.columns(a)[:, live]
+    return space.columns(a)[:, live]
 
 
 def prior_coordinates(basis: Basis, y: Floats, prior: Floats) -> Floats:
     """Return z (K,) of the y that have a prior; zero for flat directions."""
-    z = np.zeros(len(basis.prior_precision))
-    z[len(basis.singular) :] = y[basis.held] / prior[basis.held]
-    return z
+    flat = np.zeros(len(basis.singular))
+    return np.concatenate([flat, y[basis.held] / prior[basis.held]])
 
 
 def over_all_parameters(basis: Basis, live: Ints, size: int) -> Basis:
     """Express a basis over the live parameters over all of them."""
     transform = np.zeros((size, basis.transform.shape[1]))
-    transform[live] = basis.transform
-    null = np.zeros((size, basis.null.shape[1]))
-    null[live] = basis.null
-    flat = np.zeros(size, dtype=bool)
-    flat[live] = basis.flat
+    null, flat = np.zeros((size, basis.null.shape[1])), np.zeros(size, dtype=bool)
+    transform[live], null[live], flat[live] = basis.transform, basis.null, basis.flat
     return replace(basis, transform=transform, null=null, flat=flat, held=live[basis.held])

@@ -6,9 +6,10 @@ later readings are
     y = f(θ_A + R u + F b + D δ) + e + p,    R Rᵀ = κC,  u ~ N(0, 1),  b and δ flat
 
 b the twist of the base where the tracker was set up anew, δ changes of the arm (none to begin
-with), e ~ N(0, a V) the noise and p ~ N(0, c V̄) a misfit that all readings of a pose share. a + c
-is the factor κσ² by which the earlier fit missed poses that it had left out; what is beyond the
-stated noise, κσ² − 1, is divided as its residual says. The minimum over u, p, b and δ of
+with), e ~ N(0, a V) the noise and p ~ N(0, c V̄) a misfit that all readings of a pose share: a few
+poses under several loads then tell less than as many poses. a + c is the factor κσ² by which the
+earlier fit missed poses that it had left out; what is beyond the stated noise, κσ² − 1, is divided
+as its residual says (`earlier_fit`). The minimum over u, p, b and δ of
 
     ‖y − f‖² / (a V) + ‖u‖² + ‖p‖² / (c V̄)
 
@@ -25,77 +26,139 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config.cell import Tool
-from hilcal.effects.protocol import FRAME_ROLES, Effect, Role
-from hilcal.effects.target_offset import TargetOffset
+from hilcal.effects.protocol import Effect, Role
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.arm_scatter import with_arm_scatter
 from hilcal.identification.baseline import ARM
-from hilcal.identification.earlier_fit import EarlierFit
 from hilcal.identification.fit import Fit
+from hilcal.identification.predictive import Predictive, predictive
 from hilcal.identification.priors import scales_of
-from hilcal.identification.registration import register
+from hilcal.identification.registration import register, targets_as_fitted
 from hilcal.identification.residual import residual
 from hilcal.identification.solver import shortened
+from hilcal.identification.validation import require_columns
 from hilcal.model.model import Model, Prediction
 from hilcal.readings.readings import Readings
-from hilcal.readings.whitening import Whitening, whitening
+from hilcal.readings.whitening import Mode, Whitening, covariance_blocks, whitening
 from hilcal.regression.projection import Projection, projection
 from hilcal.types import Floats
 
-STEPS = 20
-"""Most Gauss-Newton steps; a choice, they converge within four."""
-CONVERGED = 1e-4
-"""Step that ends them, rms of the whitened rows; a choice."""
-ABSURD = 1e4
-"""Change of a parameter, in ordinary magnitudes, that is not tried; 10 m of a link. A choice."""
-LEAST = 1e-6
-"""Directions of the prior that move the readings by less, in σ, are left at its mean; a choice."""
-LEAST_SHARED = 1e-3
-"""Share of a pose in the misfit that is neglected; a choice."""
-HALVINGS = 6
-"""Most halvings of a step that makes the sum of squares grow; a choice."""
+# All of these are choices.
+STEPS = 20  # most Gauss-Newton steps; they converge within four
+CONVERGED = 1e-4  # step that ends them, rms of the whitened rows
+ABSURD = 1e4  # change of a parameter, in ordinary magnitudes, that is not tried; 10 m of a link
+LEAST = 1e-6  # directions of the prior that move readings by less, in σ, are left at its mean
+LEAST_SHARED = 1e-3  # share of a pose in the misfit that is neglected
+HALVINGS = 6  # of a step that makes the sum of squares grow
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EarlierFit:
+    """A gc-scaled fit, and what it states of readings that it has not seen."""
+
+    fit: Fit
+    knows: Predictive
+    root: Floats  # (P, K) R, root of κC
+    noise: float  # a, variance of the noise in units of the stated one
+    by_pose: float  # c, variance of the misfit that all readings of a pose share, likewise
+
+    @property
+    def mode(self) -> Mode:
+        """Kind of readings."""
+        return self.fit.mode
+
+
+def earlier_fit(fit: Fit) -> EarlierFit:
+    """Return what a fit, which must be gc-scaled, states of readings that it has not seen."""
+    if fit.scaling != "gc":
+        raise InputError(
+            f"the earlier fit has scaling {fit.scaling}; a comparison needs gc: run hilcal "
+            "identify again"
+        )
+    kept, w = fit.readings[~fit.outlier], fit.whitening
+    sigma = float(np.sqrt(np.sum(w.whiten(fit.left_out) ** 2) / w.rank))
+    knows = predictive(fit.model, fit.theta, fit.solution.prior, kept, fit.mode, sigma)
+    beyond = max(knows.factor * knows.scatter - 1.0, 0.0)
+    shared = beyond * _shared(fit, knows, kept)
+    root = _root(knows.factor * knows.covariance)
+    return EarlierFit(fit, knows, root, 1.0 + beyond - shared, shared)
+
+
+def _root(covariance: Floats) -> Floats:
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors[:, values > 0] * np.sqrt(values[values > 0]))
+
+
+def _shared(fit: Fit, knows: Predictive, kept: Readings) -> float:
+    """Share of the misfit on poses left out that all readings of a pose have in common.
+
+    With r_i (3,) the residual of measurement i, predicted without its pose, V_ij the stated
+    covariance of two measurements, J_i C J_jᵀ that of their predictions and τ_i² = tr V_ii, the
+    shares a and c of
+
+        r_iᵀ r_j = a tr V_ij + c τ_i τ_j + tr J_i C J_jᵀ
+
+    are fitted to all i ≠ j of a pose and to i = j; 1 of a is the stated noise. Without two readings
+    in a pose c is 0.
+    """
+    w, m, off = fit.whitening, fit.whitening.m, fit.left_out[:, :3]
+    if len(np.unique(fit.pose)) == len(fit.pose):
+        return 0.0
+    tau = np.sqrt(np.trace(w.covariance[:, :3, :3], axis1=1, axis2=2))
+    at = np.empty(len(kept), dtype=np.int64)
+    at[w.reading] = np.arange(len(off))
+    stated: dict[tuple[int, int], float] = {}
+    for bucket, block in zip(w.buckets, covariance_blocks(kept, w), strict=True):
+        count = bucket.loaded.shape[1]
+        parts = block.reshape(len(block), count, m, count, m)[:, :, :3, :, :3]
+        traces = np.einsum("gaibi->gab", parts)
+        a, b = np.triu_indices(count, 1)
+        for rows, trace in zip(at[bucket.loaded], traces, strict=True):
+            keys = zip(rows[a].tolist(), rows[b].tolist(), strict=True)
+            stated.update(zip(keys, trace[a, b].tolist(), strict=True))
+    jacobian = fit.model.jacobian(fit.solution.prediction, fit.theta, m)[:, :3]
+    spread = w.raw(jacobian @ _root(knows.covariance)).reshape(len(off), -1)
+    x = [np.stack([tau**2, tau**2], axis=1)]
+    y = [np.sum(off**2, axis=1) - np.sum(spread**2, axis=1)]
+    for rows in (np.flatnonzero(fit.pose == p) for p in np.unique(fit.pose)):
+        first, second = np.triu_indices(len(rows), 1)
+        i, j = rows[first], rows[second]
+        known = [stated.get((a, b), stated.get((b, a), 0.0)) for a, b in zip(i, j, strict=True)]
+        x.append(np.stack([np.array(known), tau[i] * tau[j]], axis=1).reshape(-1, 2))
+        y.append(np.sum(off[i] * off[j], axis=1) - (spread[rows] @ spread[rows].T)[first, second])
+    a, c = np.linalg.lstsq(np.concatenate(x), np.concatenate(y), rcond=None)[0]
+    scatter, shared = max(float(a) - 1.0, 0.0), max(float(c), 0.0)
+    return shared / (scatter + shared) if scatter + shared > 0.0 else 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Moving:
-    """A change of the arm: an effect that is added, with some directions of its parameters.
+    """A change of the arm: an effect that is added, with some directions of its parameters."""
 
-    Attributes:
-        effect: the effect, of another name than those of the model; several changes may be of one.
-        directions: (P, k) D, in units of the effect's parameters.
-    """
-
-    effect: Effect
-    directions: Floats
+    effect: Effect  # of another name than those of the model; several changes may be of one
+    directions: Floats  # (P, k) D, in units of the effect's parameters
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Setting:
-    """Later readings, and what is free to explain them without any change of the arm.
-
-    Attributes:
-        earlier: the earlier fit.
-        readings: the later readings.
-        w: their scaling, by the stated noise.
-        model: the earlier effects; the tracker's new place where it was set up anew.
-        mean: (P,) prior mean of its parameters.
-        lift: (P, K) directions that are free: R, and those of the frame.
-        ridge: (K,) 1 for those with a prior, 0 for flat ones.
-        poses: (R, L) rows of the misfit of each pose, in units of the noise √a.
-        anew: whether the tracker was set up anew.
-        frames: number of parameters of frames that are estimated anew, the last ones.
-    """
+    """Later readings, and what is free to explain them without any change of the arm."""
 
     earlier: EarlierFit
-    readings: Readings
-    w: Whitening
-    model: Model
-    mean: Floats
-    lift: Floats
-    ridge: Floats
-    poses: Floats
-    anew: bool
-    frames: int
+    readings: Readings  # the later ones
+    w: Whitening  # their scaling, by the stated noise
+    model: Model  # the earlier effects; the tracker's new place where it was set up anew
+    mean: Floats  # (P,) prior mean of its parameters
+    lift: Floats  # (P, K) directions that are free: R, and those of the frame
+    ridge: Floats  # (K,) 1 for those with a prior, 0 for flat ones
+    poses: Floats  # (R, L) rows of the misfit of each pose, in units of the noise √a
+    anew: bool  # whether the tracker was set up anew
+    frames: int  # number of parameters of frames that are estimated anew, the last ones
+
+    def scaled(self, white: Floats) -> Floats:
+        """Whitened rows (R, ...) in units of the noise."""
+        alone = len(np.unique(self.w.group)) == len(self.w)
+        a = self.earlier.noise + (self.earlier.by_pose if alone else 0.0)
+        return np.asarray(white / np.sqrt(a))
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,32 +166,19 @@ class Remeasured:
     """Later readings beside an earlier fit and some changes of the arm, at some coordinates.
 
     R whitened rows, K coordinates u, b and δ, L coordinates p, P parameters.
-
-    Attributes:
-        setting: what the readings are explained by.
-        changes: of the arm.
-        model: that of the setting, and the changes.
-        mean: (P,) prior mean of its parameters.
-        lift: (P, K) directions of u, b and δ.
-        ridge: (K + L,) of these and of p: 1 for those with a prior, 0 for flat ones.
-        coordinates: (K + L,) u, b, δ and p.
     """
 
-    setting: Setting
+    setting: Setting  # what the readings are explained by
     changes: tuple[Moving, ...]
-    model: Model
-    mean: Floats
-    lift: Floats
-    ridge: Floats
-    coordinates: Floats
+    model: Model  # that of the setting, and the changes
+    mean: Floats  # (P,) prior mean of its parameters
+    lift: Floats  # (P, K) directions of u, b and δ
+    ridge: Floats  # (K + L,) of these and of p: 1 for those with a prior, 0 for flat ones
+    coordinates: Floats  # (K + L,) u, b, δ and p
 
     @cached_property
     def theta(self) -> Floats:
-        """(P,) parameters.
-
-        Raises:
-            CannotAnswerError: they are beyond what has a static equilibrium.
-        """
+        """(P,) parameters; CannotAnswerError beyond what has a static equilibrium."""
         step = self.lift @ self.coordinates[: self.lift.shape[1]]
         if np.any(np.abs(step) > ABSURD * scales_of(self.model)):
             raise CannotAnswerError("a change of such a size has no static equilibrium")
@@ -147,14 +197,14 @@ class Remeasured:
     @cached_property
     def white(self) -> Floats:
         """(R,) residual in units of the noise √a."""
-        return _scaled(self.setting, self.setting.w.whiten(self.raw).reshape(-1))
+        return self.setting.scaled(self.setting.w.whiten(self.raw).reshape(-1))
 
     @cached_property
     def projection(self) -> Projection:
         """M, of rows in units of the noise √a."""
         w = self.setting.w
         jacobian = self.model.jacobian(self.prediction, self.theta, w.m)
-        moved = _scaled(self.setting, w.whiten(w.raw(jacobian @ self.lift)))
+        moved = self.setting.scaled(w.whiten(w.raw(jacobian @ self.lift)))
         return projection(np.hstack([moved, self.setting.poses]), self.ridge)
 
     @cached_property
@@ -194,15 +244,15 @@ class Remeasured:
     @property
     def inverse(self) -> Floats:
         """(k, k) covariance of δ in units of the noise a."""
-        own = self.projection.inverse_root[:, self.setting.lift.shape[1] : self.lift.shape[1]]
-        return np.asarray(own.T @ own)
+        root = self.projection.inverse_root[:, self.setting.lift.shape[1] : self.lift.shape[1]]
+        return np.asarray(root.T @ root)
 
     def columns(self, moving: Moving) -> tuple[Floats, Floats]:
         """Return rows (R, k) of a change, and the motion (D, 3, k) of the target it makes, m."""
         w = self.setting.w
         jacobian = self.model.jacobian_of((moving.effect,), self.prediction, self.theta, w.m)
         raw = w.raw(jacobian @ moving.directions)
-        return _scaled(self.setting, w.whiten(raw)), raw[:, :3]
+        return self.setting.scaled(w.whiten(raw)), raw[:, :3]
 
     def moved(self, step: Floats) -> "Remeasured":
         """Return them after a step (K + L,)."""
@@ -214,11 +264,8 @@ def setting(
 ) -> Setting:
     """Prepare the comparison of later readings with an earlier fit.
 
-    Args:
-        earlier: the earlier fit.
-        readings: later readings.
-        anew: whether the tracker was set up anew, so that its place is estimated.
-        cell: the later campaign's; its tool is used, and its target where that is another one.
+    The tracker was set up `anew` where its place is estimated; of the later campaign's cell the
+    tool is used, and its target where that is another one.
 
     Raises:
         InputError: an effect needs a column that the readings lack; or, for deflections, a loaded
@@ -226,12 +273,7 @@ def setting(
         CannotAnswerError: the readings do not determine the tracker's place.
     """
     fit = earlier.fit
-    for effect in fit.model.effects:
-        if effect.role not in FRAME_ROLES and not effect.computable(readings.states):
-            raise InputError(
-                f"effect {effect.name} needs {', '.join(effect.needs)}, which the later readings "
-                "do not have"
-            )
+    require_columns(fit.model, readings, "later")
     flat: list[Role] = ["registration"] if anew else []
     now = fit.model.cell
     if cell is not None:
@@ -244,20 +286,17 @@ def setting(
     if readings.states.observer is not None:  # they are set up anew for every campaign
         now = replace(now, observers=()).observed_by(readings.observers)
         flat = [*(role for role in flat if role != "registration" or now.tied), "observer"]
-    now, rms = _placed(fit, now, flat, readings)
+    now, rms = _placed(fit, now, flat, readings) if flat else (now, 0.0)
     scatter = fit.readings.arm_scatter
     if scatter is not None and readings.arm_scatter is None:
         readings = with_arm_scatter(now, readings, scatter)
     w = whitening(readings, fit.mode, "gc")
-    states, catalogue = fit.readings[~fit.outlier].states, fit.model.catalogue
-    parts = [
-        (e, s)
-        for e, s in zip(fit.model.effects, fit.model.slices(), strict=True)
-        if e.role not in flat
-    ]
+    states, slices = fit.readings[~fit.outlier].states, fit.model.slices()
+    parts = [p for p in zip(fit.model.effects, slices, strict=True) if p[0].role not in flat]
     if "target" in flat and now.target_known:
         flat.remove("target")
-    frames = [kind(now, states) for kind in catalogue.with_role(*flat)] if flat else []
+    kinds = fit.model.catalogue.with_role(*flat) if flat else ()
+    frames = [kind(now, states) for kind in kinds]
     effects = tuple(type(e)(now, states, e.options) for e, _ in parts)
     model = replace(fit.model, cell=now, effects=(*effects, *frames))
     count = sum(len(e.parameters) for e in effects)
@@ -265,76 +304,63 @@ def setting(
     if parts:
         mean[:count] = np.concatenate([fit.theta[s] for _, s in parts])
         lift[:count] = np.concatenate([earlier.root[s] for _, s in parts])
-    lift = lift @ _visible(model, mean, lift, readings, w).T
-    of_frames = np.eye(model.size)[:, count:] * scales_of(model)[count:]
-    free = np.zeros(of_frames.shape[1])
+    # Directions of the prior that the readings do not see stay at its mean.
+    _, values, vectors = np.linalg.svd(_rows(model, mean, lift, readings, w), full_matrices=False)
+    lift = lift @ vectors[values > LEAST * max(float(values.max(initial=0.0)), 1.0)].T
+    size = scales_of(model)[count:]
     if fit.mode == "deflection":  # deflections tell of frames only how they are turned
-        known = [rms if p.unit == "m" else rms / ARM for f in frames for p in f.parameters]
-        of_frames, free = np.eye(model.size)[:, count:] * np.array(known), free + 1.0
+        size = np.array([rms if p.unit == "m" else rms / ARM for f in frames for p in f.parameters])
+    free = np.full(len(size), 1.0 if fit.mode == "deflection" else 0.0)
     ridge = np.concatenate([np.ones(lift.shape[1]), free])
-    lift = np.hstack([lift, of_frames])
+    lift = np.hstack([lift, np.eye(model.size)[:, count:] * size])
     poses = _pose_rows(earlier, w)
     return Setting(earlier, readings, w, model, mean, lift, ridge, poses, anew, len(mean) - count)
 
 
 def frames_alone(at: Setting) -> Setting:
     """Return the setting in which the earlier parameters stay as they were; frames are free."""
-    known = len(at.mean) - at.frames
-    moves = np.any(at.lift[known:] != 0.0, axis=0)
-    none = at.poses[:, :0]
-    return replace(at, lift=at.lift[:, moves], ridge=at.ridge[moves], poses=none)
+    moves = np.any(at.lift[len(at.mean) - at.frames :] != 0.0, axis=0)
+    return replace(at, lift=at.lift[:, moves], ridge=at.ridge[moves], poses=at.poses[:, :0])
 
 
 def beside_frames(at: Setting) -> Floats:
     """(P, K) directions of the prior, each with the motion of the free frames that absorbs most."""
     frames = np.any(at.lift[len(at.mean) - at.frames :] != 0.0, axis=0)
-    own = at.lift[:, ~frames]
+    prior = at.lift[:, ~frames]
     if not frames.any():
-        return own
-    prediction = at.model.predict(at.readings.states, at.mean)
-    jacobian = at.model.jacobian(prediction, at.mean, at.w.m)
-    seen = at.w.whiten(at.w.raw(jacobian @ at.lift))
-    absorbed = np.linalg.lstsq(seen[:, frames], seen[:, ~frames], rcond=None)[0]
-    return np.asarray(own - at.lift[:, frames] @ absorbed)
+        return prior
+    rows = _rows(at.model, at.mean, at.lift, at.readings, at.w)
+    absorbed = np.linalg.lstsq(rows[:, frames], rows[:, ~frames], rcond=None)[0]
+    return np.asarray(prior - at.lift[:, frames] @ absorbed)
 
 
 def other_target(one: Cell, other: Cell) -> bool:
     """Whether another target is configured, or another place of it on the flange."""
-    if one.target_names != other.target_names:
-        return True
-    before, after = (c.config.tool if c.config else None for c in (one, other))
-    return _targets(before) != _targets(after)
 
+    def targets(tool: Tool | None) -> object:
+        return None if tool is None else (tool.target_m, tool.target_rotvec_rad, tool.targets)
 
-def _targets(tool: Tool | None) -> object:
-    return None if tool is None else (tool.target_m, tool.target_rotvec_rad, tool.targets)
+    before, after = (targets(c.config.tool if c.config else None) for c in (one, other))
+    return one.target_names != other.target_names or before != after
 
 
 def _placed(fit: Fit, now: Cell, flat: Sequence[Role], readings: Readings) -> tuple[Cell, float]:
     """Return the cell with frames as registered to the readings, and the rms error of that, m."""
-    if not flat:
-        return now, 0.0
-    targets, known = now.all_targets, now.known_targets
+    held = now
     if "target" not in flat:
-        known = (True,) * len(targets)
-        for e, mine in zip(fit.model.effects, fit.model.slices(), strict=True):
-            if isinstance(e, TargetOffset):
-                targets = e.displaced(fit.theta[mine])
-    held = now.with_targets(targets, known)
-    held = replace(held, registration_known="registration" not in flat)
-    found = register(held, readings)
-    placed = replace(now, registration=found.cell.registration, observers=found.cell.observers)
+        placed = targets_as_fitted(fit.model, fit.theta)
+        held = now.with_targets(placed, (True,) * len(placed))
+    found = register(replace(held, registration_known="registration" not in flat), readings)
+    moved = replace(now, registration=found.cell.registration, observers=found.cell.observers)
     if "target" in flat:
-        placed = placed.with_targets(found.cell.all_targets)
-    return placed, max(found.rms, 1e-6)
+        moved = moved.with_targets(found.cell.all_targets)
+    return moved, max(found.rms, 1e-6)
 
 
-def _visible(model: Model, mean: Floats, root: Floats, readings: Readings, w: Whitening) -> Floats:
-    """(K', K) directions of the prior that the readings see; the others stay at its mean."""
+def _rows(model: Model, mean: Floats, lift: Floats, readings: Readings, w: Whitening) -> Floats:
+    """Whitened rows (R, K) of the readings by directions (P, K) of the parameters."""
     prediction = model.predict(readings.states, mean)
-    seen = w.whiten(w.raw(model.jacobian(prediction, mean, w.m) @ root))
-    _, values, vectors = np.linalg.svd(seen, full_matrices=False)
-    return np.asarray(vectors[values > LEAST * max(float(values.max(initial=0.0)), 1.0)])
+    return w.whiten(w.raw(model.jacobian(prediction, mean, w.m) @ lift))
 
 
 def _pose_rows(earlier: EarlierFit, w: Whitening) -> Floats:
@@ -350,25 +376,13 @@ def _pose_rows(earlier: EarlierFit, w: Whitening) -> Floats:
     return w.whiten(out.reshape(len(w), w.m, -1))
 
 
-def _scaled(at: Setting, white: Floats) -> Floats:
-    """Whitened rows (R, ...) in units of the noise."""
-    alone = len(np.unique(at.w.group)) == len(at.w)
-    a = at.earlier.noise + (at.earlier.by_pose if alone else 0.0)
-    return np.asarray(white / np.sqrt(a))
-
-
 def remeasure(
     at: Setting, changes: Sequence[Moving] = (), start: Remeasured | None = None
 ) -> Remeasured:
-    """Find the minimum by Gauss-Newton on the exact chain.
+    """Find the minimum by Gauss-Newton on the exact chain, beside flat changes of the arm.
 
-    Args:
-        at: the later readings.
-        changes: of the arm, with flat parameters.
-        start: a minimum with the first of these changes.
-
-    Raises:
-        CannotAnswerError: no static equilibrium.
+    It may start from a minimum with the first of the changes. Without a static equilibrium it
+    raises CannotAnswerError.
     """
     k, sizes = at.lift.shape[1], [c.directions.shape[1] for c in changes]
     effects = tuple({id(c.effect): c.effect for c in changes}.values())

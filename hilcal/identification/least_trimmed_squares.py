@@ -1,48 +1,234 @@
-"""Least trimmed squares: the readings that agree best on one model.
+"""The linear model of single readings, and least trimmed squares on it.
+
+    r_k = W_k o_g + B_k δ + ε_k,    ε_k ~ N(0, I),    δ ~ N(−p/d, 1/d)
+
+r_k (m,) whitened residual of reading k at a linearisation, W_k V_k W_kᵀ = I with its covariance
+V_k, B_k (m, K) whitened columns, d precisions, zero without a prior. Readings of one group, those
+of deflections from the same unloaded readings, have an offset o_g in common, without a prior:
+eliminated, it leaves the least squares of their deflections. Absolute readings have none.
+
+Least trimmed squares (Rousseeuw and Van Driessen, Data Mining and Knowledge Discovery 12 (2006)
+29-45) finds the readings that agree best on one model:
 
     minimise Σ_{k ≤ h} d²_(k)(δ)
 
 d²_(k) ascending squared distances of the readings from the linear model with δ, h a little more
-than half of them, so that nearly half may be wrong, by any amount, and neither mask each other nor
-make good ones look wrong. A fit to the h readings that are nearest to a model has a lower sum
-(concentration); it is begun from many random subsets that just determine the model, and the lowest
-sum of all is taken.
-
-From the bulk of the distances follows the limit from which on a reading is a gross error (`limit`).
-
-Source: Rousseeuw and Van Driessen, *Computing LTS regression for large data sets*, Data Mining and
-Knowledge Discovery 12 (2006) 29-45.
+than half of them, so that nearly half may be wrong, by any amount. A fit to the h readings that are
+nearest to a model has a lower sum (concentration); it is begun from many random subsets that just
+determine the model, and the lowest sum of all is taken. From the bulk of the distances follows the
+limit of a gross error (`limit`).
 """
 
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Protocol, Self, TypeVar
 
 import numpy as np
 from scipy.stats import chi2
 
-from hilcal.identification.reading_model import ReadingModel
 from hilcal.identification.solver import shortened
+from hilcal.readings.whitening import inverse_root
 from hilcal.types import Bools, Floats, Ints
 
-MOST = 0.45
-"""Share of the readings that may be wrong. A choice: with few readings half of them agree on some
-model by chance; least trimmed squares does not allow more than that."""
-MISSED, STARTS = 1e-3, 300
-"""Probability that no random subset is without a wrong reading where `MOST` of all are wrong, and
-subsets at most; choices."""
-FEW, BEST, LAST = 300, 20, 20
-"""Readings that subsets are drawn from, the choice of the source; best subsets that are followed to
-the end, and steps at most; choices."""
-HALVINGS = 6
-"""Shorter steps that are tried; a choice."""
-ANEW = 6
-"""Most linearisations; a choice: gross errors may have led the first one far off."""
-FALSE_ALARMS = 1e-3
-"""Expected number of good readings set aside per campaign under the right model; a choice."""
-MISFIT_FACTOR = 6.25
-"""Factor of the limit with a misfit, 2.5 in distance: its tails are heavier. A choice, no study set
-it ..."""
-MISFIT = (1.25, 1.5)
-"""... reached gradually between these scales of the bulk, of noise alone and of a sure misfit."""
+# All of these are choices.
+MOST = 0.45  # share of the readings that may be wrong: half of few agree on some model by chance
+MISSED, STARTS = 1e-3, 300  # probability that every subset has a wrong reading; most subsets
+FEW, BEST, LAST = 300, 20, 20  # readings that subsets are of (source); best ones; steps at most
+HALVINGS = 6  # shorter steps that are tried
+ANEW = 6  # most linearisations: gross errors may have led the first one far off
+FALSE_ALARMS = 1e-3  # expected good readings set aside per campaign under the right model
+MISFIT_FACTOR = 6.25  # of the limit with a misfit, 2.5 in distance: its tails are heavier; reached
+MISFIT = (1.25, 1.5)  # gradually between these scales of the bulk, noise alone and a sure misfit
+SINGULAR = 1e-9  # ridge, as a share of a column's square: few readings determine few columns
+AT_A_TIME = 4096  # readings whose covariance is formed at a time
+FAR = 100.0  # χ² from which on its probability is not looked at
+LEVERAGE = 1e-6  # share of a reading's information that the others must leave for a test
+
+
+@dataclass(frozen=True, eq=False)
+class ReadingModel:
+    """The linear model of N readings of m elements."""
+
+    residual: Floats  # (N, m) r
+    columns: Floats  # (N, m, K) B
+    precision: Floats  # (K,) d
+    pull: Floats  # (K,) p, slope of the prior at the linearisation
+    root: Floats  # (N, m, m) W
+    members: Ints = field(default_factory=lambda: np.zeros((0, 0), dtype=np.int64))
+    """(G, S) rows of the readings of each group, unloaded ones first, −1 beyond the last."""
+
+    def __len__(self) -> int:
+        """Return the number of readings N."""
+        return len(self.residual)
+
+    @property
+    def m(self) -> int:
+        """Elements per reading."""
+        return int(self.residual.shape[1])
+
+    @cached_property
+    def enough(self) -> int:
+        """Number of readings whose elements are as many as the coordinates without a prior."""
+        elements = max(int(np.median(self.read)), 1)
+        return -(-int(np.count_nonzero(self.precision == 0)) // elements)
+
+    @cached_property
+    def read(self) -> Ints:
+        """(N,) elements of each reading that were read."""
+        return np.asarray(np.count_nonzero(np.any(self.root != 0, axis=2), axis=1))
+
+    @cached_property
+    def group(self) -> Ints:
+        """(N,) the group of each reading, −1 without one."""
+        out = np.full(len(self), -1)
+        g, s = np.nonzero(self.members >= 0)
+        out[self.members[g, s]] = g
+        return out
+
+    @cached_property
+    def tested(self) -> Bools:
+        """(N,) readings that the model is fitted to: of deflections, those with a group."""
+        return np.asarray((self.group >= 0) | (len(self.members) == 0))
+
+    def __getitem__(self, rows: Ints) -> "ReadingModel":
+        """Return the model of some readings, whole groups."""
+        place = np.full(len(self) + 1, -1)
+        place[rows] = np.arange(len(rows))
+        members = place[self.members]
+        members = members[(members >= 0).any(axis=1)]
+        r, columns, root = self.residual[rows], self.columns[rows], self.root[rows]
+        return ReadingModel(r, columns, self.precision, self.pull, root, members)
+
+    def with_columns(self, columns: Floats) -> "ReadingModel":
+        """Return the model with more whitened columns (N, m, P), of unit prior about zero."""
+        more = np.ones(columns.shape[2])
+        wide = np.concatenate([self.columns, columns], axis=2)
+        precision, pull = np.append(self.precision, more), np.append(self.pull, 0.0 * more)
+        return ReadingModel(self.residual, wide, precision, pull, self.root, self.members)
+
+    def fitted(self, used: Bools) -> tuple[Floats, Floats]:
+        """Return δ (K,) from some readings (N,), and its covariance (K, K)."""
+        return self._fitted(used)[:2]
+
+    def residuals(self, used: Bools) -> Floats:
+        """(N, m) whitened residual of all readings from the fit to the used ones (N,)."""
+        return self._fitted(used)[2]
+
+    def distances(self, used: Bools) -> Floats:
+        """(N,) squared distance t² of each reading from the fit to the used ones without it.
+
+        With r_k the residual, H_k = W_k C_o W_kᵀ + B_k C_δ B_kᵀ from the covariance of offset and
+        coordinates, t² = r_kᵀ (I − H_k)⁻ r_k of a used reading (Baarda's test of a shift of it),
+        and r_kᵀ (I + H_k)⁻ r_k of another one; χ²_m of a good reading, whatever its leverage.
+        """
+        _, covariance, r, b = self._fitted(used)
+        spread = np.empty((len(b), self.m, self.m))
+        for k in range(0, len(b), AT_A_TIME):
+            some = b[k : k + AT_A_TIME]
+            spread[k : k + AT_A_TIME] = (some @ covariance) @ some.swapaxes(1, 2)
+        if len(self.members):
+            grouped = self.group >= 0
+            root, offset = self.root[grouped], self._offset_covariance(used)[self.group[grouped]]
+            spread[grouped] += root @ offset @ root.swapaxes(1, 2)
+        a = np.eye(self.m) + np.where(used, -1.0, 1.0)[:, None, None] * spread
+        values, vectors = np.linalg.eigh(a)
+        c = np.einsum("nij,ni->nj", vectors, r)
+        kept = values > LEVERAGE
+        t2 = np.sum(np.where(kept, c**2 / np.where(kept, values, 1.0), 0.0), axis=1)
+        return self._comparable(np.asarray(t2))
+
+    def near(self, delta: Floats) -> tuple[Floats, Bools]:
+        """Squared distances (N,) from the model with δ (K,), and which readings are centres (N,).
+
+        Readings of a group are compared with one of them, its centre, at the distance zero: that
+        with the least Σ log(1 + d²), which is near most others wherever the rest are.
+        """
+        r = self.residual - self.columns @ delta
+        d2, centre = np.asarray(np.sum(r**2, axis=1)), np.zeros(len(self), dtype=np.bool_)
+        if len(self.members):
+            back, root = self._differences
+            x = (back @ r[:, :, None])[:, :, 0][self.members]
+            off = root @ (x[:, :, None] - x[:, None, :])[..., None]
+            apart, there = np.sum(off[..., 0] ** 2, axis=3), self.members >= 0
+            total = np.log1p(np.where(there[:, None, :], apart, 0.0)).sum(axis=2)
+            best = np.argmin(np.where(there, total, np.inf), axis=1)
+            each = np.arange(len(best))
+            g, s = np.nonzero(there)
+            d2[self.members[g, s]] = apart[each, best][g, s]
+            centre[self.members[each, best]] = True
+        return self._comparable(d2), centre
+
+    def with_lone_centres(self, used: Bools, centre: Bools) -> Bools:
+        """Return the used readings (N,), and the centre of each group that has none."""
+        if not len(self.members):
+            return used
+        has = np.append(np.any(used[self.members] & (self.members >= 0), axis=1), True)
+        return np.asarray(used | (centre & ~has[self.group]))
+
+    def _comparable(self, t2: Floats) -> Floats:
+        """(N,) squared distances as of readings of m elements.
+
+        Of a reading with fewer, as a distance has, χ² of the same probability; far beyond, where
+        that is rounding, as much more.
+        """
+        less = (self.read > 0) & (self.read < self.m)
+        if not less.any():
+            return t2
+        near, out = np.minimum(t2[less], FAR), t2.copy()
+        out[less] = chi2.isf(chi2.sf(near, self.read[less]), self.m) + t2[less] - near
+        return out
+
+    def _fitted(self, used: Bools) -> tuple[Floats, Floats, Floats, Floats]:
+        """δ, its covariance; residual and columns of all, from the offsets of the used ones."""
+        r, b = self.residual, self.columns
+        if len(self.members):
+            grouped = self.group >= 0
+            sums = self._summed(self._parts * used[:, None, None])
+            offset = self._offset_covariance(used) @ sums
+            both = self._both.copy()
+            both[grouped] -= self.root[grouped] @ offset[self.group[grouped]]
+            r, b = both[:, :, -1], both[:, :, :-1]
+        some = b if used.all() else b[used]
+        rows = some.reshape(self.m * len(some), b.shape[2])
+        h = rows.T @ rows
+        h[np.diag_indices_from(h)] += self.precision + self._guard
+        covariance = np.asarray(np.linalg.inv(h), dtype=float)
+        delta = covariance @ (rows.T @ r[used].reshape(-1) - self.pull)
+        return delta, covariance, r - b @ delta, b
+
+    @cached_property
+    def _both(self) -> Floats:
+        """(N, m, K + 1) columns and residual."""
+        return np.asarray(np.concatenate([self.columns, self.residual[:, :, None]], axis=2))
+
+    @cached_property
+    def _guard(self) -> Floats:
+        """(K,) ridge against singular equations."""
+        squares = np.einsum("nik,nik->k", self.columns, self.columns)
+        return np.asarray(SINGULAR * squares + 1e-300)
+
+    def _offset_covariance(self, used: Bools) -> Floats:
+        """(G, m, m) covariance of the offset of each group; zero without a used reading."""
+        information = self.root.swapaxes(1, 2) @ self.root
+        sums = self._summed(information * used[:, None, None])
+        return np.asarray(np.linalg.pinv(sums, hermitian=True), dtype=float)
+
+    @cached_property
+    def _parts(self) -> Floats:
+        """(N, m, K + 1) Wᵀ times columns and residual."""
+        return np.asarray(self.root.swapaxes(1, 2) @ self._both)
+
+    def _summed(self, x: Floats) -> Floats:
+        """(G, ...) sums of x (N, ...) over the readings of each group."""
+        beyond = np.concatenate([x, np.zeros_like(x[:1])])
+        return np.asarray(beyond[self.members].sum(axis=1))
+
+    @cached_property
+    def _differences(self) -> tuple[Floats, Floats]:
+        """(N, m, m) W⁻, and (G, S, S, m, m) roots of the precision of differences in a group."""
+        back = np.asarray(np.linalg.pinv(self.root), dtype=float)
+        v = (back @ back.swapaxes(1, 2))[self.members]
+        return back, inverse_root(v[:, :, None] + v[:, None, :])
 
 
 class Linearised(Protocol):
@@ -64,7 +250,7 @@ def robust_start(at: L, rng: np.random.Generator) -> tuple[L, Bools]:
     used, delta = _trimmed(at.linear, rng)
     for _ in range(ANEW):
         at = shortened(at.moved, delta, HALVINGS) or at
-        _, now, delta = _concentrated(at.linear, used, LAST)
+        _, now, delta = _concentrated(at.linear, used)
         if np.array_equal(now, used):
             break
         used = now
@@ -87,12 +273,6 @@ def limit(m: int, count: int, scale: float = 1.0) -> float:
     return far * float(MISFIT_FACTOR ** np.clip((scale - chance) / (sure - chance), 0.0, 1.0))
 
 
-def _trusted(of: ReadingModel, n: int) -> int:
-    """Return h, how many of n readings that are no centres."""
-    wrong = int(MOST * np.count_nonzero(of.tested))
-    return min(max(n - wrong, -(-n // 3), of.enough + 2), n)
-
-
 def variance(of: ReadingModel, d2: Floats, centre: Bools) -> float:
     """Variance of good readings by the median of the h least squared distances (N,)."""
     others = np.sort(d2[of.tested & ~centre])
@@ -110,28 +290,32 @@ def nearest(of: ReadingModel, d2: Floats, centre: Bools) -> tuple[Bools, float]:
     return used, float(d2[chosen].sum())
 
 
+def _trusted(of: ReadingModel, n: int) -> int:
+    """Return h, how many of n readings that are no centres."""
+    wrong = int(MOST * np.count_nonzero(of.tested))
+    return min(max(n - wrong, -(-n // 3), of.enough + 2), n)
+
+
 def _trimmed(of: ReadingModel, rng: np.random.Generator) -> tuple[Bools, Floats]:
     """Least trimmed squares: the readings (N,), and δ (K,) from them."""
     rows = _few(of, rng)
     part = of[rows] if len(rows) < len(of) else of
     size = (part.enough + 1) * (2 if len(part.members) else 1)
     starts = np.log(MISSED) / np.log1p(-((1.0 - MOST) ** size))
-    tried = []
-    for _ in range(int(min(np.ceil(starts), STARTS))):
-        near = part.near(_from_few(part, rng))
-        tried.append(nearest(part, *near))
+    count = int(min(np.ceil(starts), STARTS))
+    tried = [nearest(part, *part.near(_from_few(part, rng))) for _ in range(count)]
     tried.sort(key=lambda each: each[1])
-    best = [_concentrated(part, used, LAST) for used, _ in tried[:BEST]]
+    best = [_concentrated(part, used) for used, _ in tried[:BEST]]
     _, used, delta = min(best, key=lambda each: each[0])
     if part is not of:
-        _, used, delta = _concentrated(of, nearest(of, *of.near(delta))[0], LAST)
+        _, used, delta = _concentrated(of, nearest(of, *of.near(delta))[0])
     return used, delta
 
 
-def _concentrated(of: ReadingModel, used: Bools, steps: int) -> tuple[float, Bools, Floats]:
+def _concentrated(of: ReadingModel, used: Bools) -> tuple[float, Bools, Floats]:
     """Sum, readings (N,), and δ (K,) that led to them."""
     total = np.inf
-    for _ in range(steps):
+    for _ in range(LAST):
         delta = of.fitted(used)[0]
         used, now = nearest(of, *of.near(delta))
         if now >= total * (1 - 1e-9):

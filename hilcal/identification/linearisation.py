@@ -21,9 +21,8 @@ import numpy as np
 
 from hilcal.identification.effect_columns import EffectColumns
 from hilcal.identification.fit import Fit
-from hilcal.identification.folds import random_folds
+from hilcal.identification.folds import folds_of, random_folds
 from hilcal.identification.gauss_newton import columns_of
-from hilcal.identification.holdout import folds_of
 from hilcal.identification.priors import scales_of
 from hilcal.regression.evidence import FamilyScore, score_family
 from hilcal.regression.leave_out import (
@@ -39,33 +38,21 @@ from hilcal.regression.projection import Projection
 from hilcal.regression.spectrum import Spectrum
 from hilcal.types import Bools, Floats, Ints
 
-LEAST_MISFIT = 3.0
-"""A misfit counts as at least so many standard deviations of χ²; a choice."""
+LEAST_MISFIT = 3.0  # standard deviations of χ² that a misfit counts as at least; a choice
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReducedModel:
-    """A model without some of its columns, which are not copied: they can be many.
+    """A model without some of its columns, which are not copied: they can be many."""
 
-    Attributes:
-        columns: (R, P) all columns of the model.
-        out: (P,) the eliminated ones.
-        basis: coordinates of those that stay, flat ones first.
-        flat: (R, F) rows by the flat coordinates.
-        inverse_root: (K, K) T with Tᵀ T = H⁻¹.
-        gram: (P, P) of all columns.
-        residual: (R,) r₀.
-        dof: degrees of freedom of r₀.
-    """
-
-    columns: Floats
-    out: Bools
-    basis: Basis
-    flat: Floats
-    inverse_root: Floats
-    gram: Floats
-    residual: Floats
-    dof: float
+    columns: Floats  # (R, P) all columns of the model
+    out: Bools  # (P,) the eliminated ones
+    basis: Basis  # coordinates of those that stay, flat ones first
+    flat: Floats  # (R, F) rows by the flat coordinates
+    inverse_root: Floats  # (K, K) T with Tᵀ T = H⁻¹
+    gram: Floats  # (P, P) of all columns
+    residual: Floats  # (R,) r₀
+    dof: float  # degrees of freedom of r₀
 
     @property
     def rss(self) -> float:
@@ -75,10 +62,7 @@ class ReducedModel:
     def information(self, x: Floats, gram: Floats, products: Floats) -> Floats:
         """Return Xᵀ M X (Q, Q), M the projection off the columns that stay.
 
-        Args:
-            x: (R, Q) whitened columns.
-            gram: (Q, Q) XᵀX.
-            products: (P, Q) of all columns of the model with X.
+        Of whitened columns X (R, Q), with XᵀX (Q, Q) and products (P, Q) of the model's with X.
         """
         return self._information(self.flat.T @ x, gram, products)
 
@@ -101,30 +85,19 @@ class ReducedModel:
 
 @dataclass(frozen=True, slots=True)
 class HeldOut:
-    """Reduction of the held-out error by a family.
+    """Reduction of the held-out error by a family."""
 
-    Attributes:
-        share: of the misfit; negative where it makes predictions worse.
-        sure: whether the error falls by more than it scatters from pose to pose.
-    """
-
-    share: float
-    sure: bool
+    share: float  # of the misfit; negative where it makes predictions worse
+    sure: bool  # whether the error falls by more than it scatters from pose to pose
 
 
 @dataclass(frozen=True, eq=False)
 class Linearisation:
-    """A gc-scaled fit as a linear problem.
-
-    Attributes:
-        fit: the fit.
-        projection: M, off the columns of the fitted model.
-        residual: (R,) whitened residual r, after the remaining step of the model.
-    """
+    """A gc-scaled fit as a linear problem."""
 
     fit: Fit
-    projection: Projection
-    residual: Floats
+    projection: Projection  # M, off the columns of the fitted model
+    residual: Floats  # (R,) whitened residual r, after the remaining step of the model
 
     @property
     def rows(self) -> Floats:
@@ -184,11 +157,7 @@ class Linearisation:
         return score_family(s, g, self.rss, self.fit.dof, most=most)
 
     def families(self, columns: Sequence[EffectColumns]) -> list[tuple[Floats, Floats]]:
-        """Return S (P, P) and g = Xᵀ r (P,) of effects whose columns were computed together.
-
-        The model's columns and the residual are multiplied by all that were whitened together at
-        once.
-        """
+        """Return S (P, P) and g = Xᵀ r (P,) of effects whose columns were whitened together."""
         if not columns:
             return []
         own = np.column_stack([self.rows, self.residual])
@@ -210,11 +179,9 @@ class Linearisation:
         return float(np.clip(gain / self.misfit(), 0.0, 1.0))
 
     def held_out(self, families: Sequence[tuple[FamilyProducts, FamilyScore]]) -> list[HeldOut]:
-        """Return the reductions of the held-out error by families; see `regression.leave_out`.
+        """Return the reductions of the held-out error by families, each beside the model by itself.
 
-        Args:
-            families: products of each, which stands beside the model by itself, and its score,
-                for the ridge.
+        A family is its products and its score, for the ridge; see `regression.leave_out`.
         """
         seen = [(of, found.ridge) for of, found in families if found.rank]
         left = iter(left_out_of_families(self.folds, self.projection, self.fit.white, seen))
@@ -244,18 +211,12 @@ class ModelColumns:
     Parameters that are held at zero have no column, unless a test of their effect needs it
     (`Effect.for_scoring`). With a carried prior, columns are derivatives by the coordinates in
     which that prior is independent.
-
-    Attributes:
-        parameter: (L,) indices of the parameters, or coordinates, ascending.
-        scale: (L,) ordinary magnitudes, SI.
-        white: (R, L) whitened columns.
-        gram: (L, L) their products.
     """
 
-    parameter: Ints
-    scale: Floats
-    white: Floats
-    gram: Floats
+    parameter: Ints  # (L,) indices of the parameters, or coordinates, ascending
+    scale: Floats  # (L,) ordinary magnitudes, SI
+    white: Floats  # (R, L) whitened columns
+    gram: Floats  # (L, L) their products
 
 
 def model_columns(fit: Fit) -> ModelColumns:
@@ -275,17 +236,11 @@ def model_columns(fit: Fit) -> ModelColumns:
 
 
 def eliminate_effect(fit: Fit, columns: ModelColumns, effect: str) -> ReducedModel:
-    """Take an effect out of a fit, at the same linearisation.
-
-    Args:
-        fit: the fit.
-        columns: of its model.
-        effect: name of the effect, which is in its model.
-    """
-    mine = fit.model.slices()[fit.model.names.index(effect)]
+    """Take an effect of its model out of a fit, at the same linearisation."""
+    place = fit.model.slices()[fit.model.names.index(effect)]
     index, scale, s = columns.parameter, columns.scale, fit.solution
     theta, prior = s.y[index] / scale, s.prior[index] / scale
-    out = (index >= mine.start) & (index < mine.stop)
+    out = (index >= place.start) & (index < place.stop)
     return eliminate_columns(
         columns.white, columns.gram, fit.white, theta, prior, out, s.beta, fit.whitening.rank
     )
@@ -319,8 +274,7 @@ def eliminate_columns(
         gram: (P, P) AᵀA.
         white: (R,) whitened residual of the fit.
         theta: (P,) parameters of the fit.
-        prior: (P,) their prior standard deviations: infinite for flat ones, zero for those held
-            at zero.
+        prior: (P,) their prior standard deviations: infinite for flat ones, zero for held ones.
         out: (P,) which to take out.
         beta: noise variance factor that the priors are weighed against.
         rank: number of rows that carry information.

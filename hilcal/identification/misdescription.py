@@ -1,9 +1,8 @@
 """Whether the readings fit the description of the arm at all, and what is wrong where they do not.
 
 After registration the nominal arm misses readings by its geometric errors, some mm at most. What
-is far more is no effect but a wrong description. Single hypotheses (`hypotheses`) are tried on some
-of the readings, then the best of them in combination (beam search), until one explains the
-readings.
+is far more is no effect but a wrong description. Single hypotheses (`KINDS`) are tried on some of
+the readings, then the best of them in combination (beam search), until one explains the readings.
 
 Arms of one size differ by millimetres from one generation to the next, and registration hides part
 of that: readings of a UR10 leave some 4 mm with the description of a UR10e, which is not too much
@@ -15,126 +14,374 @@ described one leaves is named. For the described arm to be the right one then, |
 errors would be larger than 2/3 |d|, and lie along d.
 """
 
-from collections.abc import Iterator
+import json
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 
 from hilcal.cell import Cell
+from hilcal.config.sections import Conventions
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.hypotheses import (
-    TRIED,
-    Described,
-    Hypothesis,
-    hypotheses,
-    keys,
-    mended,
-    pairs,
-)
-from hilcal.identification.registration import Registration, register
-from hilcal.identification.residual import noise_floor
-from hilcal.identification.rigid_frames import (
+from hilcal.identification.registration import (
     FrameData,
     Frames,
     Placement,
+    Registration,
     angles,
     best_placement,
     free_parameters,
     given_and_free,
+    register,
 )
+from hilcal.identification.residual import noise_floor
 from hilcal.identification.solver import minimise
 from hilcal.numbers import length
 from hilcal.readings.readings import Readings
+from hilcal.robot import se3
 from hilcal.robot.arm import Arm
-from hilcal.robot.catalogue import other_arms
+from hilcal.robot.catalogue import load_arm, other_arms
 from hilcal.robot.chain import evaluate
-from hilcal.robot.conventions import as_counted
+from hilcal.robot.conventions import as_counted, may_follow, with_conventions
 from hilcal.types import Bools, Floats, Ints
 
-GATE_M = 0.010
-GATE_REACH = 0.01
-"""The gate: rms misfit in m, and as a share of the reach, whichever is more. Arms before
-calibration are 0.1 to 3 mm off, old or large ones up to 1 % of their reach."""
-LOOK = 0.3
-"""Share of the gate above which hypotheses are tried: a wrong description may hide behind the
-frames, or concern a joint that hardly turns. A choice."""
-GATE_EXTENT = 0.03
-"""Share of the extent of the positions that counts as a misfit where they lie close together; a
-choice: a joint that counts wrongly moves a target as far as the poses do."""
-LEVER = 0.3
-"""Lever by which attitude errors count as position errors, m: an ordinary tool; a choice."""
-ROWS = 40
-"""Readings that hypotheses are tried on, spread over all; a choice: seven times the unknowns."""
-DEPTH = 3
-"""Most hypotheses in combination; a choice."""
-BEAM = (6, 3)
-"""Best ones that a second and a third hypothesis is tried on; a choice."""
-FACTOR = 4.0
-"""How many times smaller a hypothesis must make the misfit; a choice."""
-CAREFUL = 10
-"""Best ones by a rough search that are searched with care; a choice."""
-ALIKE = 2.0
-"""Hypotheses that leave less than so many times the least misfit do equally well; a choice."""
-WRONG_ROWS = 0.2
-"""Largest share of rows that may be wrong by themselves; a choice."""
-FIRST = ("shift", "columns")
-"""Kinds that others are combined with where they help by themselves, for speed."""
-OFF_DEG = 0.2
-"""Zero of a single joint, degrees, from which on it is worth a word; a choice."""
-MOST_NAMED = 8
-"""Rows, or explanations, that are named; a choice."""
-HALF = 0.5
-"""Share of the described arm's misfit that another one may leave to be named. A choice: of 900
-simulated arms off by 1 and 3 mm and mrad none was named another one
-(`tests/unit/identification/test_other_arm.py` keeps a part of them)."""
-ZEROS = tuple(np.radians([0.0, 45.0, -45.0, 135.0, -135.0]).tolist())
-ZERO_WIDTH, ZERO_EXACT = np.pi / 4, 1e-7
-"""Zeros of a joint that the search begins at, how far it goes from them, and its end, rad."""
-BEYOND_NOISE = 3.0
-"""Misfit in standard deviations of the readings from which on other arms are tried; a choice."""
-ARM_ROWS, ARM_STEPS = 100, 10
-"""Readings that every arm is tried on, the best is registered to all; and Gauss-Newton steps of a
-registration from the frames of the described arm. Choices."""
+# All of these are choices.
+GATE_M, GATE_REACH = 0.010, 0.01  # the gate: rms misfit, m, or as a share of the reach if more;
+# arms before calibration are 0.1 to 3 mm off, old or large ones up to 1 % of their reach
+LOOK = 0.3  # share of the gate above which hypotheses are tried: frames may hide a part
+GATE_EXTENT = 0.03  # share of the positions' extent that counts as a misfit where they are close
+LEVER = 0.3  # m, by which attitude errors count as position errors: an ordinary tool
+ROWS = 40  # readings that hypotheses are tried on, spread over all: seven times the unknowns
+DEPTH, BEAM = 3, (6, 3)  # most hypotheses together; best ones that a 2nd and a 3rd are tried on
+FACTOR = 4.0  # how many times smaller a hypothesis must make the misfit
+CAREFUL = 10  # best ones by a rough search that are searched with care
+ALIKE = 2.0  # hypotheses that leave less than so many times the least misfit do equally well
+WRONG_ROWS = 0.2  # largest share of rows that may be wrong by themselves
+FIRST = ("shift", "columns")  # combined with others where they help by themselves, for speed
+OFF_DEG = 0.2  # zero of a single joint, degrees, that is worth a word
+MOST_NAMED = 8  # rows, or explanations, that are named
+ZEROS = tuple(np.radians([0.0, 45.0, -45.0, 135.0, -135.0]).tolist())  # where searches begin,
+ZERO_WIDTH, ZERO_EXACT = np.pi / 4, 1e-7  # how far they go from there, and their end, rad
+HALF = 0.5  # share of the described arm's misfit that another may leave to be named; of 900
+# simulated arms off by 1 and 3 mm and mrad none was named another one (test_other_arm keeps some)
+BEYOND_NOISE = 3.0  # misfit in standard deviations from which on other arms are tried
+ARM_ROWS, ARM_STEPS = 100, 10  # readings that every arm is tried on; steps of its registration
+SHIFTS = (1, -1, 2, -2)  # rows by which joints and positions are tried against each other
+TRIED = (
+    "signs, zeros, couplings and columns of the joints, units, shifted rows, mirrored axes, "
+    "inverse poses, other arms, alone and in combination"
+)
+MIRROR = np.array([1.0, -1.0, 1.0])
 
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Described:
+    """Arm and readings as they are described."""
+
+    arm: Arm
+    q: Floats  # (N, n) joint values, rad
+    value: Floats  # (N, 3) positions, m
+    turn: Floats | None  # (N, 3) rotation vectors of the attitudes, rad
+    base_unknown: bool
+    target_unknown: bool
+    shift: int = 0  # by how many rows the joint values come after their positions
+    conventions: Conventions | None = None  # how the controller counts any arm's joints
+
+    @property
+    def paired(self) -> Bools:
+        """(N,) rows that have joint values and a position under the shift."""
+        k = np.arange(len(self.q)) + self.shift
+        return (k >= 0) & (k < len(self.q))
+
+
+@dataclass(frozen=True, slots=True)
+class Hypothesis:
+    """One thing that may be otherwise than described."""
+
+    kind: str  # key of `KINDS`
+    joint: int = 0  # number from 1, where it is about one
+    sign: int = 1  # −1 where the joint turns the other way
+    offset: float = 0.0  # of its zero, rad: the chain turns by sign q + offset
+    follows: int = 0  # number of the joint that it follows, from 1; with `factor`
+    factor: float = 0.0  # of the coupling
+    arm: str = ""  # another arm of the catalogue
+    shift: int = 0  # as of `Described`
+    order: tuple[int, ...] = ()  # column, from 1, that holds the values of each joint
+
+    @property
+    def is_zero(self) -> bool:
+        """Whether it is the zero of a joint alone, by other than quarter turns."""
+        quarters = self.offset / (np.pi / 2)
+        return self.kind == "joint" and self.sign > 0 and abs(quarters - round(quarters)) > 0.02
+
+    @property
+    def cost(self) -> int:
+        """How much it changes: a joint that counts from elsewhere and the other way counts two."""
+        return 1 + (self.kind == "joint" and self.sign < 0 and self.offset != 0.0)
+
+    @property
+    def subject(self) -> tuple[str, int, int]:
+        """What it is about; two hypotheses about one thing are not combined."""
+        return self.kind, self.joint, self.follows
+
+    @property
+    def order_of_trial(self) -> tuple[object, ...]:
+        """Hypotheses about the arm come first, then those about joints, then couplings."""
+        rank = {"arm": 0, "joint": 1, "coupling": 2}.get(self.kind, 3)
+        return (rank, *self.subject, self.sign, self.offset)
+
+    def applied(self, d: Described) -> Described:
+        """Return arm and readings under this hypothesis."""
+        return KINDS[self.kind].applied(d, self)
+
+    @property
+    def words(self) -> str:
+        """What is wrong, in a phrase."""
+        words = KINDS[self.kind].words
+        return words if isinstance(words, str) else words(self)
+
+
+Applied = Callable[[Described, Hypothesis], Described]
 Way = tuple[Hypothesis, ...]
 """Hypotheses that are tried together."""
 
 
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """A row of the table."""
+
+    applied: Applied  # arm and readings under a hypothesis
+    words: str | Callable[[Hypothesis], str]  # what is wrong, in a phrase
+    mended: str | None = None  # a line of CELL.toml; '' where `keys` says it; None: in the table
+
+
+def _recounted(d: Described, h: Hypothesis) -> Described:
+    n, j = d.arm.n, h.joint - 1
+    sign, offset, coupling = np.ones(n), np.zeros(n), np.zeros((n, n))
+    sign[j], offset[j] = h.sign, h.offset
+    if h.follows:
+        coupling[j, h.follows - 1] = h.factor
+    return replace(d, arm=with_conventions(d.arm, sign, offset, coupling))
+
+
+def _another(d: Described, h: Hypothesis) -> Described:
+    arm = load_arm(h.arm)
+    return replace(d, arm=arm if d.conventions is None else as_counted(arm, d.conventions))
+
+
+def _mapped(name: str, by: Callable[[Any], Any]) -> Applied:
+    """Return what maps one attribute of the description, where there is one."""
+
+    def applied(d: Described, _: Hypothesis) -> Described:
+        given = getattr(d, name)
+        return d if given is None else replace(d, **{name: by(given)})
+
+    return applied
+
+
+def _angles_by(turning: Callable[[Floats], Floats], sliding: float = 1.0) -> Applied:
+    """Return what maps the values of joints that turn, and scales those of joints that slide."""
+    return lambda d, _: replace(d, q=np.where(d.arm.slides, sliding * d.q, turning(d.q)))
+
+
+def _mirrored(d: Described, _: Hypothesis) -> Described:
+    # D exp(w) D = exp(−D w) for a reflection D
+    turn = None if d.turn is None else -d.turn * MIRROR
+    return replace(d, value=d.value * MIRROR, turn=turn)
+
+
+def _inverse(d: Described, _: Hypothesis) -> Described:
+    if d.turn is None:
+        return d
+    back = np.asarray(-np.einsum("nji,nj->ni", se3.rotation(d.turn), d.value))
+    return replace(d, value=back, turn=-d.turn)
+
+
+def _joint_words(h: Hypothesis) -> str:
+    degrees = np.degrees(h.offset)
+    if h.sign > 0:
+        return f"joint {h.joint}'s zero is {degrees:.4g}° elsewhere in these data"
+    turned = f"joint {h.joint} turns the other way in these data"
+    return turned if not h.offset else f"{turned} and counts from {degrees:.4g}°"
+
+
+def _coupling_words(h: Hypothesis) -> str:
+    way = "with" if h.factor > 0 else "against"
+    return f"joint {h.joint} turns {way} joint {h.follows} (a coupling of {h.factor:+g})"
+
+
+def _shift_words(h: Hypothesis) -> str:
+    rows = "row" if abs(h.shift) == 1 else "rows"
+    way = "before" if h.shift > 0 else "after"
+    return f"each position stands {abs(h.shift)} {rows} {way} the joint values it belongs to"
+
+
+def _columns_words(h: Hypothesis) -> str:
+    moved = [(j, k) for j, k in enumerate(h.order, 1) if j != k]
+    if len(moved) == 2:
+        return f"the columns of joints {moved[0][0]} and {moved[1][0]} are exchanged"
+    each = ", ".join(f"joint {j}'s values are in the column of joint {k}" for j, k in moved)
+    return f"the columns of the joints are in another order: {each}"
+
+
+KINDS: dict[str, Kind] = {
+    "arm": Kind(_another, lambda h: f"the arm is another one, {h.arm}", ""),
+    "joint": Kind(_recounted, _joint_words, ""),
+    "coupling": Kind(_recounted, _coupling_words, ""),
+    "base_unknown": Kind(
+        _mapped("base_unknown", lambda _: True),
+        "the base stands elsewhere than [tracker] says",
+        "leave out [tracker] base_xyz_m and base_rotvec_rad",
+    ),
+    "target_unknown": Kind(
+        _mapped("target_unknown", lambda _: True),
+        "the target sits elsewhere than [tool] says",
+        "leave out [tool] target_m",
+    ),
+    "millimetres": Kind(
+        _mapped("value", lambda p: 1e-3 * p), "the positions are millimetres, not metres"
+    ),
+    "metres": Kind(
+        _mapped("value", lambda p: 1e3 * p),
+        "the positions are metres, and were taken for millimetres",
+    ),
+    "joint_degrees": Kind(_angles_by(np.radians), "the joint values are degrees, not radians"),
+    "joint_radians": Kind(
+        _angles_by(np.degrees), "the joint values are radians, and were taken for degrees"
+    ),
+    "travel_millimetres": Kind(
+        _angles_by(np.positive, 1e-3),
+        "the travels of the joints that slide are millimetres, not metres",
+    ),
+    "turn_degrees": Kind(_mapped("turn", np.radians), "the attitudes are degrees, not radians"),
+    "turn_radians": Kind(
+        _mapped("turn", np.degrees), "the attitudes are radians, and were taken for degrees"
+    ),
+    "mirrored": Kind(
+        _mirrored, "the axes of the readings are left-handed: one coordinate has the other sign"
+    ),
+    "mirrored_positions": Kind(
+        _mapped("value", lambda p: p * MIRROR), "one coordinate of the positions has the other sign"
+    ),
+    "inverse": Kind(
+        _inverse, "the poses are the inverse ones, of the tracker in the target's axes"
+    ),
+    "inverse_attitude": Kind(_mapped("turn", np.negative), "the attitudes are the inverse ones"),
+    "shift": Kind(
+        lambda d, h: replace(d, q=np.roll(d.q, -h.shift, axis=0), shift=d.shift + h.shift),
+        _shift_words,
+    ),
+    "columns": Kind(lambda d, h: replace(d, q=d.q[:, np.array(h.order) - 1]), _columns_words),
+}
+"""All kinds of hypotheses."""
+OF_ATTITUDES = ("mirrored_positions", "turn_degrees", "turn_radians", "inverse", "inverse_attitude")
+
+
+def hypotheses(d: Described) -> Iterator[Hypothesis]:
+    """Yield what is tried by itself."""
+    n, slides = d.arm.n, d.arm.slides
+    if not d.base_unknown:
+        yield Hypothesis("base_unknown")
+    if not d.target_unknown:
+        yield Hypothesis("target_unknown")
+    for j in range(1, n + 1):
+        for sign in (-1, 1):
+            for quarter in (0, 2, 1, -1):
+                if (sign < 0 or quarter) and not (quarter and slides[j - 1]):
+                    yield Hypothesis("joint", j, sign, quarter * np.pi / 2)
+    for joint, follows in may_follow(n):
+        for factor in (1.0, -1.0) if slides[joint - 1] == slides[follows - 1] else ():
+            yield Hypothesis("coupling", joint, follows=follows, factor=factor)
+    simple = ["millimetres", "metres", "joint_degrees", "joint_radians", "mirrored"]
+    simple += ["travel_millimetres"] * bool(slides.any())
+    yield from map(Hypothesis, simple if d.turn is None else [*simple, *OF_ATTITUDES])
+    yield from (Hypothesis("arm", arm=arm.name) for arm in other_arms(d.arm))
+    yield from (Hypothesis("shift", shift=k) for k in SHIFTS)
+    # Columns: two exchanged, or all in a turn.
+    straight, orders = tuple(range(1, n + 1)), []
+    for i, j in combinations(range(n), 2):
+        order = list(straight)
+        order[i], order[j] = order[j], order[i]
+        orders.append(tuple(order))
+    orders += [(*straight[k:], *straight[:k]) for k in range(1, n)]
+    orders.append(straight[::-1])
+    yield from (Hypothesis("columns", order=order) for order in dict.fromkeys(orders))
+
+
+def pairs(n: int) -> Iterator[Way]:
+    """Yield pairs that hide behind each other: two signs, and the zeros of two neighbours."""
+    for i, j in combinations(range(1, n + 1), 2):
+        yield Hypothesis("joint", i, -1), Hypothesis("joint", j, -1)
+    for j in range(1, n):
+        for a in (1, -1, 2):
+            for b in (1, -1, 2):
+                zeros = (a * np.pi / 2, b * np.pi / 2)
+                yield Hypothesis("joint", j, 1, zeros[0]), Hypothesis("joint", j + 1, 1, zeros[1])
+
+
+def mended(way: Way, cell: Cell) -> str:
+    """Return what to write into CELL.toml, or to change in the table; begins with '; '."""
+    lines = [f'[robot] model = "{h.arm}"' for h in way if h.arm][:1]
+    lines += [f"[robot] {key} = {value}" for key, value in keys(way, cell).items()]
+    where = [KINDS[h.kind].mended for h in way]
+    lines += [line for line in where if line]
+    said = f"; in CELL.toml: {', '.join(lines)}" if lines else ""
+    return f"{said}; correct it in the table" if None in where else said
+
+
+def keys(way: Way, cell: Cell) -> dict[str, str]:
+    """Return the keys of [robot] that describe the joints under some hypotheses, as TOML."""
+    n, robot = cell.arm.n, None if cell.config is None else cell.config.robot
+    sign = np.array((robot and robot.joint_sign) or (1,) * n)
+    zero = np.array((robot and robot.joint_offset_deg) or (0.0,) * n)
+    coupled = [
+        c.model_dump(exclude_defaults=True) | {"factor": c.factor}
+        for c in (robot.joint_coupling if robot else ())
+    ]
+    for h in way:
+        j = h.joint - 1
+        if h.offset:
+            zero[j] += sign[j] * np.degrees(h.offset)
+        if h.sign < 0:
+            sign[j] *= -1
+        if h.follows:
+            factor = float(sign[j] * h.factor)
+            coupled.append({"joint": h.joint, "follows": h.follows, "factor": factor})
+    entries = [", ".join(f"{k} = {json.dumps(v)}" for k, v in c.items()) for c in coupled]
+    values = (
+        (any(h.sign < 0 for h in way), json.dumps([int(s) for s in sign])),
+        (any(h.offset for h in way), json.dumps([round(float(z), 4) + 0.0 for z in zero])),
+        (any(h.follows for h in way), f"[{', '.join(f'{{ {entry} }}' for entry in entries)}]"),
+    )
+    return {
+        key: value
+        for key, (changed, value) in zip(Conventions.model_fields, values, strict=True)
+        if changed
+    }
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Explanation:
-    """Hypotheses that together explain the readings.
-
-    Attributes:
-        changes: what is otherwise than described.
-        rms: misfit with them, m; attitudes count with `LEVER`.
-    """
+    """Hypotheses that together explain the readings."""
 
     changes: Way
-    rms: float
+    rms: float  # misfit with them, m; attitudes count with `LEVER`
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DescriptionFinding:
-    """What is wrong with the description.
+    """What is wrong with the description."""
 
-    Attributes:
-        rms: misfit as described, m; attitudes count with `LEVER`.
-        gate: misfit above which nothing is fitted, m.
-        explanations: what explains the readings, best first; several do equally well.
-        rows: (N,) readings that do not fit, while most do.
-        swapped: pairs of them that fit each other's place.
-        tried: number of descriptions that were tried.
-    """
-
-    rms: float
-    gate: float
-    explanations: tuple[Explanation, ...]
-    rows: Bools
-    swapped: tuple[tuple[int, int], ...]
-    tried: int
+    rms: float  # misfit as described, m; attitudes count with `LEVER`
+    gate: float  # misfit above which nothing is fitted, m
+    explanations: tuple[Explanation, ...]  # best first; several do equally well
+    rows: Bools  # (N,) readings that do not fit, while most do
+    swapped: tuple[tuple[int, int], ...] = ()  # pairs of them that fit each other's place
+    tried: int = 0  # number of descriptions that were tried
 
     @property
     def refused(self) -> bool:
@@ -170,20 +417,20 @@ class DescriptionFinding:
 
     def _rows_named(self, readings: Readings) -> str:
         """Name the rows that do not fit while most do."""
-        which = np.flatnonzero(self.rows)
-        if not len(which):
-            return ""
+        which = np.flatnonzero(self.rows).tolist()
 
         def name(k: int) -> str:
             at = f"{readings.pose_names[readings.pose[k]]}/{readings.load_names[readings.load[k]]}"
             several = readings.states.target is not None
             return f"{at} {readings.target_names[readings.target[k]]}" if several else at
 
+        if not which:
+            return ""
         if self.swapped:
             crossed = [f"{name(i)} with {name(j)}" for i, j in self.swapped[:MOST_NAMED]]
             return f"rows are swapped ({', '.join(crossed)})"
-        named = ", ".join(name(int(k)) for k in which[:MOST_NAMED])
         more = f" and {len(which) - MOST_NAMED} more" if len(which) > MOST_NAMED else ""
+        named = ", ".join(map(name, which[:MOST_NAMED]))
         return f"{len(which)} of {len(readings)} rows do not fit: {named}{more}"
 
     def to_json(self, cell: Cell, readings: Readings) -> dict[str, object]:
@@ -206,39 +453,23 @@ class DescriptionFinding:
         }
 
 
-def gate_of(reach: float) -> float:
-    """Rms misfit above which nothing is fitted, m."""
-    return max(GATE_M, GATE_REACH * reach)
-
-
 def refuse_misdescribed(registered: Registration, readings: Readings) -> None:
-    """Refuse readings that do not fit the description of the arm, before anything is fitted.
-
-    Raises:
-        InputError: says what is wrong with the description, where that was found.
-    """
+    """Refuse readings that do not fit the description of the arm, and say what is wrong with it."""
     finding = examine(registered, readings)
     if finding is not None and finding.refused:
         raise InputError(finding.words(registered.cell, readings))
 
 
 def examine(registered: Registration, readings: Readings) -> DescriptionFinding | None:
-    """Return what is wrong with the description; None where the readings fit it.
-
-    Args:
-        registered: the registration of the nominal arm.
-        readings: the readings.
-    """
-    cell, gate = registered.cell, gate_of(registered.cell.arm.reach)
+    """Return what is wrong with the description, by the nominal arm's registration, if anything."""
+    cell, gate = registered.cell, max(GATE_M, GATE_REACH * registered.cell.arm.reach)
     # A base that is told shows the whole geometric error, however close the positions lie.
     extent = np.inf if cell.registration_known else _extent(readings.value[:, :3])
     far, rms, noise = registered.far, _size(registered.off), noise_floor(readings.covariance)
-    nothing = np.zeros_like(far)
+    nothing, others = np.zeros_like(far), _size(registered.off[~far])
     if cell.observers:  # what else the arm may be is told by positions in one frame
-        rest = _size(registered.off[~far])
-        return DescriptionFinding(rest, gate, (), far, (), 0) if far.any() or rest > gate else None
+        return DescriptionFinding(others, gate, (), far) if far.any() or others > gate else None
     if far.any():
-        others = _size(registered.off[~far])
         search = _DescriptionSearch(cell, readings, max(3.0 * noise, others))
         shifted = search.shifted()
         if shifted:
@@ -288,7 +519,7 @@ class _DescriptionSearch:
 
     def explain(self, gate: float, most: int) -> tuple[Explanation, ...]:
         """Return the shortest combination that explains the readings, and its likes."""
-        base = self.score(())
+        base, slides = self.score(()), self._cell.arm.slides
         singles = tuple(hypotheses(self._whole))
         beam: list[Way] = [()]
         tried: dict[Way, float] = {}
@@ -301,7 +532,6 @@ class _DescriptionSearch:
                 if h.subject not in [other.subject for other in begun]
             ]
             if depth == 1:
-                slides = self._cell.arm.slides
                 ways += [
                     way
                     for way in pairs(self._cell.arm.n)
@@ -324,7 +554,7 @@ class _DescriptionSearch:
 
         Where a pose has many readings, only its last one is wrong, and looks like a gross error.
         """
-        ways: list[Way] = [(h,) for h in hypotheses(self._whole) if h.kind == "shift"]
+        ways: list[Way] = [(Hypothesis("shift", shift=k),) for k in SHIFTS]
         tried = {way: self.score(way) for way in ways}
         return _explained(tried, min(self.enough, self.score(()) / FACTOR))
 
@@ -366,32 +596,28 @@ class _DescriptionSearch:
         def zeroed(zero: float) -> Way:
             return (*way, Hypothesis("joint", joint, 1, zero))
 
-        def placed(zero: float) -> Placement:
-            return self._best(*self._problem(zeroed(zero), self._few), rough=True)
+        def square(zero: float) -> float:
+            return self._best(*self._problem(zeroed(zero), self._few), rough=True).square
 
         begin = min(ZEROS, key=lambda zero: self.score(zeroed(zero), True))
+        bounds = (begin - ZERO_WIDTH, begin + ZERO_WIDTH)
         found = minimize_scalar(
-            lambda zero: placed(zero).square,
-            bounds=(begin - ZERO_WIDTH, begin + ZERO_WIDTH),
-            method="bounded",
-            options={"xatol": ZERO_EXACT},
+            square, bounds=bounds, method="bounded", options={"xatol": ZERO_EXACT}
         )
-        return _wrapped(found.x), _rms(placed(found.x))
+        count = int(np.count_nonzero(self._described(way).paired[self._few]))
+        rms = float(np.sqrt(found.fun / count))
+        return float(np.arctan2(np.sin(found.x), np.cos(found.x))), rms
 
     def _score(self, way: Way, rough: bool = False) -> float:
-        """Misfit of the nominal arm under some hypotheses, m; in units of the positions as given.
-
-        Args:
-            way: the hypotheses.
-            rough: in few steps from few starts.
-        """
+        """Misfit of the nominal arm under hypotheses, m; in units of the positions as given."""
         self.tried += 1
         at = self._best(*self._problem(way, self._few), rough)
-        return _rms(at) * max(1.0, self._extent / max(_extent(at.seen.value), 1e-12))
+        size = float(np.sqrt(at.square / len(at.data)))
+        return size * max(1.0, self._extent / max(_extent(at.data.value), 1e-12))
 
-    def _best(self, seen: FrameData, given: Frames, free: Bools, rough: bool = False) -> Placement:
+    def _best(self, data: FrameData, given: Frames, free: Bools, rough: bool = False) -> Placement:
         steps, rotated = (6, 0) if rough else (15, 2)
-        return best_placement(seen, given, free, self.enough, steps, rotated)
+        return best_placement(data, given, free, self.enough, steps, rotated)
 
     def _problem(self, way: Way, rows: Ints) -> tuple[FrameData, Frames, Bools]:
         """Flange poses and readings of some rows under some hypotheses, and what is estimated."""
@@ -399,17 +625,16 @@ class _DescriptionSearch:
         rows = rows[d.paired[rows]]
         turn, m = (None, 3) if d.turn is None else (d.turn[rows], 6)
         root = np.broadcast_to(np.diag(_levers(m)), (len(rows), m, m))
-        seen = FrameData.at(
-            d.arm, d.q[rows], d.value[rows], turn, root, self._readings.target[rows]
-        )
+        target = self._readings.target[rows]
+        data = FrameData.at(d.arm, d.q[rows], d.value[rows], turn, root, target)
         cell = self._cell
         # What was estimated with the wrong description is no start for another one.
         base = cell.registration if cell.registration_known else np.eye(4)
-        own = np.array(cell.known_targets)
-        given = Frames(base, np.where(own[:, None, None], cell.all_targets, np.eye(4)))
-        known = own & (not d.target_unknown)
+        stated = np.array(cell.known_targets)
+        given = Frames(base, np.where(stated[:, None, None], cell.all_targets, np.eye(4)))
+        known = stated & (not d.target_unknown)
         axes = m == 6 and (d.base_unknown or not known.all())
-        return seen, given, free_parameters(d.base_unknown, ~known, axes)
+        return data, given, free_parameters(d.base_unknown, ~known, axes)
 
     def _described(self, way: Way) -> Described:
         d = self._whole
@@ -420,19 +645,16 @@ class _DescriptionSearch:
     def _robust(self, way: Way) -> tuple[float, Bools, Placement]:
         """Registration by most of the rows: reweighted until the others do not matter.
 
-        Returns:
-            Rms of the rows that fit, m; (N,) those that do not; and the frames.
+        Rms of the rows that fit, m; (N,) those that do not; and the frames.
         """
-        seen, given, free = self._problem(way, np.arange(len(self._readings)))
-        at = self._best(seen, given, free)
-        scale = np.inf
+        data, given, free = self._problem(way, np.arange(len(self._readings)))
+        at, scale = self._best(data, given, free), np.inf
         for _ in range(12):
             distance = np.linalg.norm(at.white, axis=1)
             scale = min(scale, max(float(np.median(distance)), self.enough / 10))
             weights = 1.0 / (1.0 + (distance / (2.0 * scale)) ** 2)
-            weighted = replace(seen, root=seen.root * weights[:, None, None])
-            frames = minimise(Placement(weighted, at.frames, free), steps=5).frames
-            at = Placement(seen, frames, free)
+            weighted = replace(data, root=data.root * weights[:, None, None])
+            at = replace(at, frames=minimise(Placement(weighted, at.frames, free), steps=5).frames)
         distance = np.linalg.norm(at.white, axis=1)
         far = distance > 8.0 * max(float(np.median(distance)), self.enough / 10)
         everywhere = np.zeros(len(self._readings), dtype=bool)
@@ -444,7 +666,7 @@ class _DescriptionSearch:
         near, _, at = self.robust(())
         out = []
         for i, j in combinations(np.flatnonzero(far)[:30].tolist(), 2):
-            there, back = at.seen[np.array([i, j])], at.seen[np.array([j, i])]
+            there, back = at.data[np.array([i, j])], at.data[np.array([j, i])]
             crossed = replace(there, value=back.value, attitude=back.attitude)
             if _size(crossed.misfit(at.frames)) <= 3.0 * max(self.enough, near):
                 out.append((i, j))
@@ -465,10 +687,6 @@ def _sorted(way: Way) -> Way:
     return tuple(sorted(way, key=lambda h: h.order_of_trial))
 
 
-def _wrapped(angle: float) -> float:
-    return float(np.arctan2(np.sin(angle), np.cos(angle)))
-
-
 def _levers(m: int) -> Floats:
     return np.repeat([1.0, LEVER], 3)[:m]
 
@@ -478,29 +696,18 @@ def _size(off: Floats) -> float:
     return float(np.sqrt(np.mean(np.sum((off * _levers(off.shape[1])) ** 2, axis=1))))
 
 
-def _rms(at: Placement) -> float:
-    """The same of a placement whose whitened misfit has the levers."""
-    return float(np.sqrt(at.square / len(at.seen)))
-
-
 def _extent(positions: Floats) -> float:
     """Rms distance of positions (N, 3) from their mean, m."""
-    return float(np.sqrt(np.mean(np.sum((positions - positions.mean(axis=0)) ** 2, axis=1))))
+    return _size(positions - positions.mean(axis=0))
 
 
 @dataclass(frozen=True, slots=True)
 class OtherArm:
-    """An arm of the catalogue that fits better than the described one.
-
-    Attributes:
-        name: its name.
-        rms: what the described arm leaves after registration, m.
-        rms_with: what this one leaves, m.
-    """
+    """An arm of the catalogue that fits better than the described one."""
 
     name: str
-    rms: float
-    rms_with: float
+    rms: float  # what the described arm leaves after registration, m
+    rms_with: float  # what this one leaves, m
 
     def to_json(self) -> dict[str, object]:
         """Return its JSON."""
@@ -508,20 +715,15 @@ class OtherArm:
 
 
 def other_arm(registered: Registration, readings: Readings) -> OtherArm | None:
-    """Return the arm of the catalogue that these readings are of; None where none fits better.
-
-    Args:
-        registered: the registration of the described arm.
-        readings: the readings.
-    """
+    """Return the arm of the catalogue that readings are of rather than of the registered one."""
     cell = registered.cell
     if cell.observers or registered.rms <= BEYOND_NOISE * noise_floor(readings.covariance):
         return None
-    spread = np.unique(np.linspace(0, len(readings) - 1, ARM_ROWS).astype(int))
-    tried = [(_left(cell, arm, readings[spread]), arm) for arm in _others(cell)]
-    if not tried:
-        return None
-    least, arm = min(tried, key=lambda each: each[0])
+    robot = None if cell.config is None else cell.config.robot
+    arms = (arm if robot is None else as_counted(arm, robot) for arm in other_arms(cell.arm))
+    some = readings[np.unique(np.linspace(0, len(readings) - 1, ARM_ROWS).astype(int))]
+    tried = [(_left(cell, arm, some), arm) for arm in arms]
+    least, arm = min(tried, key=lambda each: each[0], default=(np.inf, cell.arm))
     if least > HALF * registered.rms:
         return None
     left = _left(cell, arm, readings)
@@ -536,15 +738,8 @@ def other_arm_of(cell: Cell, readings: Readings) -> OtherArm | None:
         return None
 
 
-def _others(cell: Cell) -> Iterator[Arm]:
-    """Yield the other arms of the catalogue with as many joints, as the controller counts them."""
-    robot = None if cell.config is None else cell.config.robot
-    for arm in other_arms(cell.arm):
-        yield arm if robot is None else as_counted(arm, robot)
-
-
 def _left(cell: Cell, arm: Arm, readings: Readings) -> float:
     """Rms misfit of the positions with another arm, from the frames of the described one, m."""
-    seen = FrameData.of(arm, readings)
-    off = minimise(Placement(seen, *given_and_free(cell, seen.m == 6)), ARM_STEPS).off
-    return float(np.sqrt(np.mean(np.sum(off[:, :3] ** 2, axis=1))))
+    data = FrameData.of(arm, readings)
+    off = minimise(Placement(data, *given_and_free(cell, data.m == 6)), ARM_STEPS).off
+    return _size(off[:, :3])

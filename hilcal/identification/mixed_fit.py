@@ -143,14 +143,19 @@ def with_all_effects(model: Model, states: States, harmonics: int = HARMONICS) -
 
 
 def with_all_harmonics(model: Model, states: States, harmonics: int = HARMONICS) -> Model:
-    """Return a model whose waves have at least so many harmonics."""
+    """Return a model whose waves have at least so many harmonics.
+
+    Standard deviations of an effect that gets finer are not kept.
+    """
     finer = tuple(
         e.with_options(states, harmonics=harmonics)
         if "harmonics" in e.options and len(getattr(e, "harmonics", ())) < harmonics
         else e
         for e in model.effects
     )
-    return replace(model, effects=finer)
+    kept = {e.name for e, old in zip(finer, model.effects, strict=True) if e is old}
+    random = {name: std for name, std in model.random.items() if name in kept}
+    return replace(model, effects=finer, random=random)
 
 
 def mixed_fit(model: Model, readings: Readings, mode: Mode) -> MixedFit:

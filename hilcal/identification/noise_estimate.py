@@ -54,52 +54,32 @@ from hilcal.readings.whitening import usual_mode
 from hilcal.tables.table import FROM_TRACKER, ImportResult
 from hilcal.types import Floats
 
-SPREAD = 3.0
-"""Of the log of a factor: 20 either way; a choice. The default is a laser tracker's, and cameras
-see by a hundred times less."""
-HARMONICS = 6
-"""Waves of a gear that take part; finer ones act as the arm's scatter. A choice, for speed."""
-MOST_ROWS = 900
-"""Elements of readings that are used, of poses chosen at random; a choice: of so many, a standard
-deviation is known to some per cent."""
-FEWEST_POSES = 10
-"""Poses below which frames and effects leave nothing to estimate a noise from; a choice."""
-ROUNDS = 3
-"""Most estimates, each after a new test for gross errors; a choice."""
-SEVERAL = 0.05
-"""Chance of finding several effects where there is one at most; a choice."""
-SEED = 20251125
-"""Of the poses that are chosen, and of simulated likelihood ratios."""
-NOISE = "noise"
-"""Key among the texts about an imported campaign, and kind of event of a measured one: the
-estimate; absent where the noise is stated, or as the samples show it."""
-CONTRADICTED = 3.0
-"""Standard errors of a factor's log from which on readings contradict their covariances."""
-LEAST_FACTOR = 1.3
-"""Smallest factor by which the noise of readings differs from that of their samples; a choice."""
+# Most of these are choices.
+SPREAD = 3.0  # of the log of a factor: 20 either way; cameras see by a hundred times less
+HARMONICS = 6  # waves of a gear that take part, for speed; finer ones act as the arm's scatter
+MOST_ROWS = 900  # elements of readings, of poses chosen at random: a σ is known to some per cent
+FEWEST_POSES = 10  # below which frames and effects leave nothing to estimate a noise from
+ROUNDS = 3  # most estimates, each after a new test for gross errors
+SEVERAL = 0.05  # chance of finding several effects where there is one at most
+SEED = 20251125  # of the poses that are chosen, and of simulated likelihood ratios
+NOISE = "noise"  # key among the texts about an imported campaign, and kind of event of a measured
+# one: the estimate; absent where the noise is stated, or as the samples show it
+CONTRADICTED = 3.0  # standard errors of a factor's log by which readings contradict covariances
+LEAST_FACTOR = 1.3  # by which the noise of readings differs from that of their samples
 ALONG, ACROSS, ORIENTATION, STATED = "along", "across", "orientation", "arm as stated"
 
 
 @dataclass(frozen=True, slots=True)
 class NoiseEstimate:
-    """The noise of readings, as they tell it.
+    """The noise of readings, as they tell it; standard deviations of the median reading."""
 
-    Attributes:
-        along_m: standard deviation along the beam, m; as the next two the median of the readings.
-        across_m: along each axis across it, m.
-        orientation_rad: of a rotation about any axis; None where positions were read.
-        distance_m: length of the beam.
-        joint_std_rad: the arm's scatter, of each joint; None where the cell states it.
-        factors: f of measured readings by component; None for an import, the covariances of which
-            are stored as estimated.
-    """
-
-    along_m: float
-    across_m: float
-    orientation_rad: float | None
-    distance_m: float
-    joint_std_rad: float | None
-    factors: Mapping[str, float] | None = None
+    along_m: float  # along the beam
+    across_m: float  # along each axis across it
+    orientation_rad: float | None  # of a rotation about any axis; None where positions were read
+    distance_m: float  # length of the beam
+    joint_std_rad: float | None  # the arm's scatter, of each joint; None where the cell states it
+    factors: Mapping[str, float] | None = None  # f of measured readings by component; None for an
+    # import, the covariances of which are stored as estimated
 
     def to_json(self) -> str:
         """Return it as a text of a campaign."""
@@ -120,20 +100,12 @@ class NoiseEstimate:
 def with_estimated_noise(
     found: ImportResult, cell: Cell, config: CellConfig
 ) -> tuple[ImportResult, NoiseEstimate | None]:
-    """Return an import with the noise that its readings tell, where nobody states it.
+    """Return an import with the noise that its readings tell, where nobody states it; the estimate.
 
     The covariance of readings of one target includes the arm's scatter then. Several targets share
-    it in one arrival, so that `diagnose` estimates it.
-
-    Args:
-        found: what was imported.
-        cell: the cell.
-        config: its configuration.
-
-    Returns:
-        The import, and the estimate: None where the noise is stated, where the readings are fewer
-        than `FEWEST_POSES` or show several effects, or where nothing can be fitted to them as they
-        are described.
+    it in one arrival, so that `diagnose` estimates it. None where the noise is stated, where the
+    readings are fewer than `FEWEST_POSES` or show several effects, or where nothing can be fitted
+    to them as they are described.
     """
     readings, station = found.readings, config.tracker.station_m
     told = None if found.noise_stated else _components(readings, cell, config)
@@ -142,23 +114,16 @@ def with_estimated_noise(
     factors, estimate = told.factors, told.estimate(readings, station)
     together = SCATTER in factors and readings.states.target is None
     used = factors if together else {k: f for k, f in factors.items() if k != SCATTER}
-    whole = _with(readings, station, told.model, used)
+    whole = _with(readings, station, used, told.model)
     covers = WHOLE if together else INSTRUMENT
     notes = tuple(n for n in found.notes if not n.startswith(FROM_TRACKER))
     return replace(found, readings=whole, covers=covers, notes=notes), estimate
 
 
 def measured_noise(readings: Readings, cell: Cell, config: CellConfig) -> NoiseEstimate | None:
-    """Return the noise of measured readings that contradict their samples.
+    """Return the noise of measured readings that contradict their samples, with its factors.
 
-    Args:
-        readings: with the covariances of their means.
-        cell: the cell.
-        config: its configuration.
-
-    Returns:
-        The estimate with its factors; None where the cell states the noise, where the samples show
-        it, or see `with_estimated_noise`.
+    None where the cell states it, where samples show it, or see `with_estimated_noise`.
     """
     if config.tracker.states_noise:
         return None
@@ -186,10 +151,7 @@ def with_noise_factors(
     readings: Readings, tracker: Tracker, factors: Mapping[str, float]
 ) -> Readings:
     """Return readings with the default noise of [tracker], its components times their factors."""
-    default = with_noise_of(tracker, readings)
-    parts = _instrument(default, tracker.station_m)
-    total = sum((factors[p.name] ** 2 * p.covariance for p in parts), np.zeros(()))
-    return replace(readings, covariance=total)
+    return _with(with_noise_of(tracker, readings), tracker.station_m, factors)
 
 
 def _sizes(readings: Readings, station: Sequence[float] | None) -> dict[str, float]:
@@ -202,18 +164,11 @@ def _sizes(readings: Readings, station: Sequence[float] | None) -> dict[str, flo
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Components:
-    """Components of the noise of readings, as these tell them.
+    """Components of the noise of readings, as these tell them."""
 
-    Attributes:
-        model: frames, at which the arm's scatter is evaluated.
-        factors: standard deviations of the components, in those of the default and of
-            `SCATTER_RAD`.
-        log_errors: standard errors of their logs.
-    """
-
-    model: Model
-    factors: Mapping[str, float]
-    log_errors: Mapping[str, float]
+    model: Model  # frames, at which the arm's scatter is evaluated
+    factors: Mapping[str, float]  # standard deviations, in those of the default and `SCATTER_RAD`
+    log_errors: Mapping[str, float]  # standard errors of their logs
 
     def estimate(self, readings: Readings, station: Sequence[float] | None) -> NoiseEstimate:
         """Return it in figures."""
@@ -233,13 +188,11 @@ def _components(readings: Readings, cell: Cell, config: CellConfig) -> _Componen
     """Return the components of the noise, estimated; None as of `with_estimated_noise`."""
     if len(np.unique(readings.pose)) < FEWEST_POSES or readings.scalar.any():
         return None
-    stated = config.repeatability.per_joint(cell.arm.n)
+    readings, mode = _some(readings), usual_mode(readings)
     try:
-        model = baseline(cell, _some(readings), usual_mode(readings))
-        found = _factors(model, _some(readings), config.tracker.station_m, stated)
+        return _estimated(baseline(cell, readings, mode), readings, config)
     except (HilcalError, np.linalg.LinAlgError):  # said where it is fitted
         return None
-    return None if found is None else _Components(model, *found)
 
 
 def _some(readings: Readings) -> Readings:
@@ -252,45 +205,40 @@ def _some(readings: Readings) -> Readings:
     return readings[np.isin(readings.pose, chosen)]
 
 
-def _factors(
-    model: Model, readings: Readings, station: Sequence[float] | None, joint_std: Floats
-) -> tuple[dict[str, float], dict[str, float]] | None:
-    """Factors and their logs' errors, see `_Components`.
-
-    None where the readings show effects beside the largest.
-    """
-    mode = usual_mode(readings)
+def _estimated(model: Model, readings: Readings, config: CellConfig) -> _Components | None:
+    """Return the components; None where the readings show effects beside the largest."""
+    mode, station = usual_mode(readings), config.tracker.station_m
+    joint_std = config.repeatability.per_joint(model.cell.arm.n)
     whole = with_all_effects(model, readings.states, HARMONICS)
     used = ~fit(model, readings, mode).outlier
     for _ in range(ROUNDS):
         kept = readings[used]
-        instrument = [*_instrument(kept, station)]
         if joint_std.any():
             known = with_joint_scatter(model.cell, kept, joint_std)
             more = known.covariance - kept.covariance
             arm = NoisePart(STATED, more, LogStdPrior(0.0, KNOWN), known.common)
         else:
             arm = scatter_part(model, kept)
-        found, theta = variances_with_noise(whole, kept, mode, instrument, arm)
+        parts = [*_instrument(kept, station), arm]
+        found, theta = variances_with_noise(whole, kept, mode, parts[:-1], arm)
         if _shows_several(found):
             return None
-        own = slice(-len(instrument) - 1, None)
-        names = (*(p.name for p in instrument), arm.name)
-        factors = dict(zip(names, np.exp(found.log_std[own]).tolist(), strict=True))
-        errors = np.sqrt(np.diagonal(found.covariance)[own])
-        scale = np.exp(found.log_std)
+        std, names = np.exp(found.log_std), [p.name for p in parts]
+        errors = np.sqrt(np.diagonal(found.covariance)[-len(parts) :])
+        factors = dict(zip(names, std[-len(parts) :].tolist(), strict=True))
         random = np.full(whole.size, np.inf)
-        for f, s in zip(found.equations.problem.families.random, scale, strict=False):
+        for f, s in zip(found.equations.problem.families.random, std, strict=False):
             random[f.parameters] = s * f.magnitude
-        of = replace(whole, random=_by_effect(whole, random))
-        noisy = _with(readings, station, model, factors)
+        effects = zip(whole.effects, whole.slices(), strict=True)
+        by_effect = {e.name: random[rows] for e, rows in effects if e.role not in FRAME_ROLES}
+        noisy = _with(readings, station, factors, model)
         if joint_std.any():
             noisy = with_joint_scatter(model.cell, noisy, joint_std)
-        now = ~fit(of, noisy, mode, start=theta).outlier
+        now = ~fit(replace(whole, random=by_effect), noisy, mode, start=theta).outlier
         if np.array_equal(now, used):
             break
         used = now
-    return factors, dict(zip(names, errors.tolist(), strict=True))
+    return _Components(model, factors, dict(zip(names, errors.tolist(), strict=True)))
 
 
 def _shows_several(found: Variances) -> bool:
@@ -308,18 +256,15 @@ def _shows_several(found: Variances) -> bool:
     return evidence(problem, others, rng, found.log_std).p_value < SEVERAL
 
 
-def _by_effect(model: Model, std: Floats) -> dict[str, Floats]:
-    """Standard deviations (P,) of the parameters by effect, without the frames."""
-    pairs = zip(model.effects, model.slices(), strict=True)
-    return {e.name: std[mine] for e, mine in pairs if e.role not in FRAME_ROLES}
-
-
 def _with(
-    readings: Readings, station: Sequence[float] | None, model: Model, factors: Mapping[str, float]
+    readings: Readings,
+    station: Sequence[float] | None,
+    factors: Mapping[str, float],
+    model: Model | None = None,
 ) -> Readings:
     """Return readings with the covariance that factors make of the default's."""
     parts = [*_instrument(readings, station)]
-    if SCATTER in factors:
+    if model is not None and SCATTER in factors:
         parts.append(scatter_part(model, readings))
     total = sum((factors[p.name] ** 2 * p.covariance for p in parts), np.zeros(()))
     return replace(readings, covariance=total)

@@ -1,6 +1,5 @@
 """The parameters of a fit with their covariance as one JSON document, and back."""
 
-import base64
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,10 +8,9 @@ from typing import Any
 import numpy as np
 
 from hilcal import __version__, limits
-from hilcal.errors import InputError
 from hilcal.identification.fit import Fit
-from hilcal.names import check_names
-from hilcal.toml import parse_json
+from hilcal.identification.fit_document import finite
+from hilcal.store.codec import encode, pack, read_document, read_file, unpack
 from hilcal.types import Bools, Floats
 
 FORMAT, VERSION = "hilcal-parameters", 1
@@ -22,25 +20,15 @@ MOST_LISTED = 200
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Parameters:
-    """What the document holds.
+    """What the document holds."""
 
-    Attributes:
-        names: (P,) "effect.parameter".
-        units: (P,) SI.
-        value: (P,) as fitted, the undetermined ones as they are in the model.
-        std: (P,) standard uncertainties, infinite where the readings do not determine it.
-        identifiable: (P,) whether they do.
-        covariance: (P, P), NaN in rows and columns of those that they do not determine.
-        about: the rest of the document.
-    """
-
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    value: Floats
-    std: Floats
-    identifiable: Bools
-    covariance: Floats
-    about: Mapping[str, Any]
+    names: tuple[str, ...]  # (P,) "effect.parameter"
+    units: tuple[str, ...]  # (P,) SI
+    value: Floats  # (P,) as fitted, the undetermined ones as they are in the model
+    std: Floats  # (P,) standard uncertainties, infinite where the readings do not determine it
+    identifiable: Bools  # (P,) whether they do
+    covariance: Floats  # (P, P), NaN in rows and columns of those that they do not determine
+    about: Mapping[str, Any]  # the rest of the document
 
 
 def covariance_of(fit: Fit) -> Floats:
@@ -62,12 +50,7 @@ def covariance_of(fit: Fit) -> Floats:
 
 
 def to_json(fit: Fit, source: Mapping[str, object]) -> dict[str, object]:
-    """Return the document, SI.
-
-    Args:
-        fit: the fit.
-        source: what it is from: campaign, revision, hash of the readings.
-    """
+    """Return the document, SI."""
     u, model = fit.uncertainty, fit.model
     every = [(e, p) for e in model.effects for p in e.parameters]
     used = np.flatnonzero(u.identifiable & np.isfinite(u.std))
@@ -76,10 +59,10 @@ def to_json(fit: Fit, source: Mapping[str, object]) -> dict[str, object]:
         {
             "name": f"{e.name}.{p.name}",
             "value": float(fit.theta[k]),
-            "std": float(u.std[k]) if np.isfinite(u.std[k]) and u.identifiable[k] else None,
+            "std": finite(u.std[k]) if u.identifiable[k] else None,
             "unit": p.unit,
             "identifiable": bool(u.identifiable[k]),
-            "prior_std": float(prior) if np.isfinite(prior := fit.solution.prior[k]) else None,
+            "prior_std": finite(fit.solution.prior[k]),
         }
         for k, (e, p) in enumerate(every)
     ]
@@ -93,7 +76,7 @@ def to_json(fit: Fit, source: Mapping[str, object]) -> dict[str, object]:
         "scaling": fit.scaling,
         "variance_factor": fit.variance_factor,
         "effects": [
-            {"name": e.name, "options": _plain(dict(e.options)), "role": e.role}
+            {"name": e.name, "options": encode(dict(e.options)), "role": e.role}
             for e in model.effects
         ],
         "parameters": rows,
@@ -104,20 +87,26 @@ def to_json(fit: Fit, source: Mapping[str, object]) -> dict[str, object]:
 
 
 def from_json(content: Mapping[str, Any]) -> Parameters:
-    """Return what `to_json` wrote, every bit of it.
+    """Return what `to_json` wrote, every bit of it."""
+    return read_document(content, "parameters", FORMAT, (VERSION,), _read)
 
-    Raises:
-        InputError: another kind of document.
-    """
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise InputError(f'no parameters; valid: a JSON document with "format": "{FORMAT}"')
-    check_names({k: v for k, v in content.items() if k != "source"}, "parameters")
-    rows = content["parameters"]
+
+def read(path: str | Path) -> Parameters:
+    """Read the document from a file."""
+    return read_file(Path(path), "parameters", from_json)
+
+
+def _read(content: Mapping[str, Any]) -> Parameters:
+    rows, stored = content["parameters"], content["covariance"]["lower_triangle"]
     limits.check_parameters(len(rows))
     names = tuple(row["name"] for row in rows)
     at = [names.index(name) for name in content["covariance_of"]]
+    known = np.zeros((len(at), len(at)))
+    i, j = np.tril_indices(len(at))
+    values = unpack(stored) if isinstance(stored, str) else np.array(stored, dtype=float)
+    known[i, j] = known[j, i] = values
     covariance = np.full((len(rows), len(rows)), np.nan)
-    covariance[np.ix_(at, at)] = _unpacked(content["covariance"], len(at))
+    covariance[np.ix_(at, at)] = known
     return Parameters(
         names=names,
         units=tuple(row["unit"] for row in rows),
@@ -129,44 +118,9 @@ def from_json(content: Mapping[str, Any]) -> Parameters:
     )
 
 
-@limits.bounded
-def read(path: str | Path) -> Parameters:
-    """Read the document from a file.
-
-    Raises:
-        InputError: no such file, or another kind of document.
-    """
-    try:
-        return from_json(parse_json(limits.read_text(Path(path), limits.DOCUMENT)))
-    except (OSError, LookupError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: no parameters: {error!r}") from None
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-
-
 def _packed(covariance: Floats) -> dict[str, object]:
     """Lower triangle, row by row: as numbers, or base64 of little-endian doubles where many."""
     values = covariance[np.tril_indices(len(covariance))]
     if len(covariance) <= MOST_LISTED:
         return {"encoding": "numbers", "lower_triangle": values.tolist()}
-    text = base64.b64encode(values.astype("<f8").tobytes()).decode("ascii")
-    return {"encoding": "base64 of little-endian doubles", "lower_triangle": text}
-
-
-def _unpacked(content: Mapping[str, Any], count: int) -> Floats:
-    given = content["lower_triangle"]
-    if isinstance(given, str):
-        given = np.frombuffer(base64.b64decode(given), dtype="<f8")
-    i, j = np.tril_indices(count)
-    covariance = np.zeros((count, count))
-    covariance[i, j] = covariance[j, i] = np.array(given, dtype=float)
-    return covariance
-
-
-def _plain(value: Any) -> Any:
-    """Return tuples and arrays as lists."""
-    if isinstance(value, dict):
-        return {k: _plain(v) for k, v in value.items()}
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    return [_plain(v) for v in value] if isinstance(value, tuple | list) else value
+    return {"encoding": "base64 of little-endian doubles", "lower_triangle": pack(values)}

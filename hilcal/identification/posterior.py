@@ -8,17 +8,30 @@ included,
 is the information: Λ the precision of the effects' own priors, σ² the noise factor, κ ≥ 1 by how
 much poses left out were farther off than the parameters explain. The strengths of shrunk families
 are those of `predictive.family_prior`: a harmonic that the readings did not need is not known to be
-zero where nobody measured. Parameters of the setup (frames, tool, instruments; `Effect.of_setup`),
-which another campaign does not have, are marginalised out, by the Schur complement of M.
+zero where nobody measured. Parameters of the setup (frames, tool, instruments; `Effect.of_setup`)
+are marginalised out, by the Schur complement of M. What the readings did not determine has no
+information: not a large variance, and not a zero one.
 
-What the readings did not determine has no information: not a large variance, and not a zero one.
+Two campaigns of one arm are compared in the same gauge (`parameter_differences`). Their likelihoods
+of the parameters that both have, without the effects' own priors and all others marginalised out,
+have the information I_A and I_B; that on d = θ_B − θ_A is the parallel sum (Anderson and Duffin,
+J. Math. Anal. Appl. 26 (1969) 576-594)
+
+    P = I_A (I_A + I_B)⁻ I_B
+
+singular along every direction that one of the campaigns did not determine: what a frame absorbs, or
+a joint that did not turn. There the two fits may stand anywhere. So each parameter, and each effect
+as a whole, is compared with all others free within f = `FREE` of their ordinary magnitudes: in
+these, S = ((P + 1/f²)⁻¹_mm)⁻¹ − 1/f² is the information on its difference. What is known less well
+than to one magnitude is not compared.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.stats import chi2
 
 from hilcal.readings.arm_scatter import ArmScatter
 from hilcal.readings.ranges import Range
@@ -32,23 +45,20 @@ if TYPE_CHECKING:
     from hilcal.identification.fit import Fit
 
 
+FREE = 10.0  # how far others may differ, in ordinary magnitudes, when one is compared; a choice
+LEAST = INFORMATION**2 / 2  # from which a direction is determined, in ordinary magnitudes
+LISTED = 60  # parameters of an effect from which it is compared as a whole only; a choice
+
+
 @dataclass(frozen=True, slots=True)
 class Source:
-    """Where a posterior is from.
+    """Where a posterior is from."""
 
-    Attributes:
-        campaign: name of the file; empty where it is from none.
-        revision: its revision; 0 for a fit that is not stored.
-        created: when that was fitted, ISO 8601, UTC.
-        readings_sha256: `content_hash` of the readings.
-        n_readings: how many were fitted.
-    """
-
-    campaign: str = ""
-    revision: int = 0
-    created: str = ""
-    readings_sha256: str = ""
-    n_readings: int = 0
+    campaign: str = ""  # name of the file; empty where it is from none
+    revision: int = 0  # 0 for a fit that is not stored
+    created: str = ""  # when that was fitted, ISO 8601, UTC
+    readings_sha256: str = ""  # `content_hash` of the readings
+    n_readings: int = 0  # how many were fitted
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +124,7 @@ class Posterior(Brief):
             InputError: a fit of another scaling than gc.
             CannotAnswerError: a model without any effect of the arm.
         """
-        from hilcal.identification.posterior_of_fit import posterior_of
+        from hilcal.identification.predictive import posterior_of
 
         return posterior_of(fit, source)
 
@@ -137,21 +147,20 @@ class Posterior(Brief):
 
     def index(self, effect: str) -> Ints:
         """Indices of the parameters of an effect; none where it is not among them."""
-        of = [name.split(".", 1)[0] == effect for name in self.names]
-        return np.flatnonzero(of)
+        return np.flatnonzero([name.split(".", 1)[0] == effect for name in self.names])
 
     def marginal(self, parameters: Ints) -> Floats:
         """Information (I, I) on some parameters, the others not known: the Schur complement."""
         scaled = self.information * (self.scale[:, None] * self.scale)
         some = schur_complement(scaled, parameters)
-        mine = self.scale[parameters]
-        return determined(some) / (mine[:, None] * mine)
+        scale = self.scale[parameters]
+        return determined(some) / (scale[:, None] * scale)
 
     @property
     def std(self) -> Floats:
         """(K,) standard deviations, SI; infinite where a direction without information enters."""
         values, vectors = np.linalg.eigh(self.information * (self.scale[:, None] * self.scale))
-        seen = values > INFORMATION**2 / 2
+        seen = values > LEAST
         std = np.sqrt(np.sum(vectors[:, seen] ** 2 / values[seen], axis=1))
         moved = np.linalg.norm(vectors[:, ~seen], axis=1)
         return np.where(moved <= NULL_SHARE * std, std * self.scale, np.inf)
@@ -168,3 +177,114 @@ def determined(information: Floats) -> Floats:
     root = vectors * np.sqrt(values)
     found = root @ root.T
     return np.asarray((found + found.T) / 2)
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterDifference:
+    """One parameter in both fits, SI."""
+
+    name: str  # effect and parameter
+    unit: str
+    before: float  # of the earlier fit
+    after: float  # of the later fit
+    difference: float
+    std: float | None  # None where frames absorb it or a campaign does not tell
+
+    @property
+    def z(self) -> float | None:
+        """Difference over its standard deviation."""
+        return None if self.std is None else self.difference / self.std
+
+
+@dataclass(frozen=True, slots=True)
+class EffectDifference:
+    """All parameters of an effect in both fits."""
+
+    effect: str
+    chi2: float  # dᵀ S d along the directions that can be compared
+    rank: int  # degrees of freedom
+    p_value: float
+
+
+@dataclass(frozen=True, slots=True)
+class Differences:
+    """Two fits of one arm."""
+
+    rows: tuple[ParameterDifference, ...]  # of effects that have few, as in the earlier model
+    effects: tuple[EffectDifference, ...]  # each effect that both have
+    apart: tuple[str, ...]  # effects that only one of them has, or with other parameters
+
+    def to_dict(self) -> dict[str, object]:
+        """Return them as JSON, SI."""
+        return {
+            "rows": [{**asdict(r), "z": r.z} for r in self.rows],
+            "effects": [asdict(e) for e in self.effects],
+            "not_in_both": list(self.apart),
+        }
+
+
+def parameter_differences(earlier: Posterior, later: Posterior) -> Differences:
+    """Compare the parameters that two fits have in common."""
+    common = [n for n in earlier.names if n in set(later.names)]
+    one, other = (
+        np.array([p.names.index(n) for n in common], dtype=np.int64) for p in (earlier, later)
+    )
+    of = [n.split(".", 1)[0] for n in common]
+    every = dict.fromkeys(n.split(".", 1)[0] for n in (*earlier.names, *later.names))
+    apart = tuple(e for e in every if {len(earlier.index(e)), len(later.index(e))} != {of.count(e)})
+    if not common:
+        return Differences((), (), apart)
+    scale = earlier.scale[one]
+    first, before = _likelihood(earlier, one, scale)
+    second, after = _likelihood(later, other, scale)
+    parallel = _parallel_sum(first, second)
+    covariance = np.asarray(np.linalg.inv(parallel + np.eye(len(common)) / FREE**2), dtype=float)
+    known = 1.0 / np.diag(covariance) - 1.0 / FREE**2
+    d, names = np.asarray(after - before, dtype=float), np.array(of)
+    effects = [_effect(e, covariance, d, np.flatnonzero(names == e)) for e in dict.fromkeys(of)]
+    rows = tuple(
+        ParameterDifference(
+            name=name,
+            unit=earlier.units[one[k]],
+            before=float(earlier.mean[one[k]]),
+            after=float(later.mean[other[k]]),
+            difference=float(scale[k] * d[k]),
+            std=float(scale[k] / np.sqrt(known[k])) if known[k] > 1.0 else None,
+        )
+        for k, name in enumerate(common)
+        if of.count(of[k]) < LISTED
+    )
+    return Differences(rows, tuple(effects), apart)
+
+
+def _likelihood(p: Posterior, chosen: Ints, scale: Floats) -> tuple[Floats, Floats]:
+    """Information (K, K) and mean (K,) by the readings alone, in ordinary magnitudes."""
+    whole = p.information * (p.scale[:, None] * p.scale)
+    values, vectors = np.linalg.eigh(whole - np.diag(p.own_precision * p.scale**2))
+    seen = values > LEAST
+    data = (vectors[:, seen] * values[seen]) @ vectors[:, seen].T
+    mean = (vectors[:, seen] / values[seen]) @ (vectors[:, seen].T @ (whole @ (p.mean / p.scale)))
+    by = p.scale[chosen] / scale
+    return schur_complement(data, chosen) / (by[:, None] * by), mean[chosen] * by
+
+
+def _parallel_sum(a: Floats, b: Floats) -> Floats:
+    """A (A + B)⁻ B (K, K) of two information matrices."""
+    values, vectors = np.linalg.eigh(a + b)
+    seen = values > LEAST
+    half = vectors[:, seen] / np.sqrt(values[seen])
+    p = (a @ half) @ (half.T @ b)
+    return np.asarray((p + p.T) / 2)
+
+
+def _effect(effect: str, covariance: Floats, d: Floats, rows: Ints) -> EffectDifference:
+    """Test the parameters (I,) of an effect at once, the others not known.
+
+    Of all, d (K,) is the difference, and its covariance (K, K) as far as campaigns and prior tell.
+    """
+    some = np.linalg.inv(covariance[np.ix_(rows, rows)]) - np.eye(len(rows)) / FREE**2
+    values, vectors = np.linalg.eigh((some + some.T) / 2)
+    seen = values > 1.0
+    total = float(np.sum(values[seen] * (vectors[:, seen].T @ d[rows]) ** 2))
+    rank = int(seen.sum())
+    return EffectDifference(effect, total, rank, float(chi2.sf(total, rank)) if rank else 1.0)

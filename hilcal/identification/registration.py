@@ -1,82 +1,75 @@
-"""The tracker's registration and the target's offset, before anything else is fitted.
+"""Base, targets and observers by whitened least squares, before anything else is fitted.
 
-Positions and attitudes register together, by whitened least squares over the frames of the nominal
-arm from several starts (`rigid_frames`); readings that are centimetres off are found from a robust
-start, and left out. What the poses cannot tell stays near the cell's target and is listed.
+With the nominal flange poses (R_i, p_i), readings y_i obey
+
+    y_i = R (p_i + R_i τ) + t,      M_i = R R_i R_τ  (attitude, where read)
+
+R, t: the base in the sensor's frame; τ, R_τ: the target k(i) on the flange. The 6 + 6 T parameters
+are a shift of the base at the centroid of the flange's positions and a turn, base axes; per target
+a shift and a turn, flange axes; all in ordinary sizes. Starts are closed forms (Kabsch; linear
+equations of a point, |p|² − d² being linear in it, and of a plane) and rotations of a cube.
+Readings centimetres off are found from a robust start, and left out. What the poses cannot tell
+stays near the cell's target and is listed.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
 import numpy as np
+from scipy.optimize import least_squares
 
-from hilcal.cell import Cell, Observer
+from hilcal.cell import Cell, Observer, plane_frame
+from hilcal.effects.target_offset import TargetOffset
 from hilcal.errors import CannotAnswerError
-from hilcal.identification.common_cause import off_alike
-from hilcal.identification.least_trimmed_squares import MOST, limit, robust_start, variance
-from hilcal.identification.observers import Sightings, placed
-from hilcal.identification.rigid_frames import (
-    FrameData,
-    Frames,
-    Placement,
-    angles,
-    best_placement,
-    given_and_free,
-    settled,
-    sizes,
+from hilcal.identification.data_snooping import off_alike
+from hilcal.identification.least_trimmed_squares import (
+    MOST,
+    ReadingModel,
+    limit,
+    robust_start,
+    variance,
 )
-from hilcal.identification.solver import minimise
+from hilcal.identification.solver import echelon, minimise
+from hilcal.model.model import Model
+from hilcal.model.observe import read_by
 from hilcal.readings.readings import Readings
+from hilcal.readings.whitening import inverse_root
 from hilcal.robot import se3
-from hilcal.types import Bools, Floats
+from hilcal.robot.arm import Arm
+from hilcal.robot.chain import evaluate
+from hilcal.types import Bools, Floats, Ints
 
+# All of these are choices.
+ROUGH = (1e-4, 1e-4)  # m and rad, added to the stated noise: nominal arms are 0.1 to 3 mm off
+TARGET_M, BASE_M = 0.3, 3.0  # ordinary distances of target and flange, of tracker and base
+TELL = 0.1  # share of an ordinary size to which readings must tell a direction to determine it
+ALTERNATIONS = 10  # between rotation and translations; least squares follow
+HOLD = 1e-6  # weight of an ordinary size in the linear starts, against an error of 1 m
+HOLD_SEVERAL = 1e-3  # the same in whitened rows of several observers
 MIN_POSES = 4
-NARROW = 1e-3
-"""Rms distance from a line, m, below which positions are collinear; a choice."""
-FEW = 100
-"""Readings that the starts are tried on, spread over all; a choice: 17 times the unknowns."""
-GOOD = 10.0
-"""Rms misfit, in units of noise with roughness, at which no other start is tried: about 1 mm and
-1 mrad. A choice: arms are so accurate before calibration."""
-STEPS, TRIED = 15, 5
-"""Steps from each start, and rotations of a cube that are tried; choices."""
-DISTURBED = 3e-3
-"""Rms misfit, m, from which on readings that are far off are looked for: nominal arms are off by
-less. A choice, a third of what is fitted at least (`misdescription.GATE_M`)."""
-BEYOND = 10.0
-"""Times the median misfit from which on a reading of several observers is far off; a choice."""
-LEAST_FAR = 1e-4
-"""Misfit that is never far off, m; a choice."""
-SEED = 0
-"""Of the random subsets, so that equal readings give equal frames."""
-ROUNDS = 5
-"""Most rounds in which readings join and leave; a choice."""
-TURNED = 1e-3
-"""Range of a joint's angle, rad, below which it counts as never turned; a choice."""
-TOLD = 0.05
-"""Component of an undetermined direction, in ordinary sizes, that is worth mentioning; a choice."""
+NARROW = 1e-3  # m rms from a line, below which positions are collinear
+FEW, FEW_EACH = 100, 50  # readings that starts are tried on: of all, and of each observer
+GOOD = 10.0  # rms misfit with roughness at which no other start is tried: 1 mm and 1 mrad
+STEPS, TRIED, FOLLOWED = 15, 5, 6  # steps of a start; rotations of a cube tried; starts followed
+DISTURBED = 3e-3  # m rms from which far readings are looked for: nominal arms are off by less
+BEYOND = 10.0  # times the median misfit from which on a reading of several observers is far off
+LEAST_FAR = 1e-4  # m, misfit that is never far off
+SEED, ROUNDS = 0, 5  # of random subsets; most rounds in which readings join and leave
+TURNED = 1e-3  # range of a joint's angle, rad, below which it counts as never turned
+TOLD = 0.05  # component of an undetermined direction that is worth mentioning
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Undetermined:
-    """Frame parameters that can move together without any reading telling it.
+    """Frame parameters that can move together without any reading telling it."""
 
-    Attributes:
-        target: index of the target that moves, or None where the base alone moves.
-        target_shift: (3,) its shift, flange axes, m.
-        target_turn: (3,) its turn, flange axes, rad.
-        base_shift: (3,) shift of the base that goes with it, base axes, m; at the middle of the
-            flange's positions.
-        base_turn: (3,) turn of the base, base axes, rad.
-        observers: what of several observers moves with it, as "point P" .
-    """
-
-    target: int | None
-    target_shift: Floats
-    target_turn: Floats
-    base_shift: Floats
-    base_turn: Floats
-    observers: tuple[str, ...] = ()
+    target: int | None  # index of the target that moves; None where the base alone moves
+    target_shift: Floats  # (3,) flange axes, m
+    target_turn: Floats  # (3,) rad
+    base_shift: Floats  # (3,) of the base with it, at the middle of the flange's positions, m
+    base_turn: Floats  # (3,) rad
+    observers: tuple[str, ...] = ()  # what of several observers moves with it, as "point P"
 
     def to_json(self) -> dict[str, object]:
         """Return its JSON."""
@@ -92,44 +85,28 @@ class Undetermined:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registration:
-    """Where base and target ended, and what the poses could not tell.
+    """Where base and target ended, and what the poses could not tell."""
 
-    Attributes:
-        cell: the cell with base and target in place.
-        off: (N, m) measured minus predicted by the nominal arm, sensor axes, m and rad.
-        rms: root mean square of the 3-D position error, m, of the readings that are not far off.
-        turn_rms: root mean square of the attitude's error, rad; None for positions alone.
-        far: (N,) readings far off while the others fit, which the frames are not fitted to.
-        undetermined: what the poses cannot tell.
-        still: (n,) joints that never turned.
-        estimated: whether anything was unknown.
-    """
-
-    cell: Cell
-    off: Floats
-    rms: float
-    turn_rms: float | None
-    far: Bools
+    cell: Cell  # with base and target in place
+    off: Floats  # (N, m) measured minus predicted by the nominal arm, sensor axes, m and rad
+    rms: float  # of the 3-D position error, m, of the readings that are not far off
+    turn_rms: float | None  # of the attitude's error, rad; None for positions alone
+    far: Bools  # (N,) far off while the others fit: the frames are not fitted to these
     undetermined: tuple[Undetermined, ...]
-    still: Bools
-    estimated: bool
+    still: Bools  # (n,) joints that never turned
+    estimated: bool  # whether anything was unknown
 
     def to_json(
         self, base: Floats | None = None, targets: Floats | None = None
     ) -> dict[str, object]:
-        """Return its JSON.
-
-        Args:
-            base: (4, 4) as a fit has it.
-            targets: (T, 4, 4) the same.
-        """
+        """Return its JSON; with base (4, 4) and targets (T, 4, 4) as a fit has them."""
         cell = self.cell
-        own = cell.all_targets if targets is None else targets
+        placed = cell.all_targets if targets is None else targets
         several = cell.target_names if cell.targets is not None else ()
-        each = {name: _pose(t) for name, t in zip(several, own, strict=False)}
+        each = {name: _pose(t) for name, t in zip(several, placed, strict=False)}
         return {
             "base": _pose(cell.registration if base is None else base),
-            "target": _pose(own[0]),
+            "target": _pose(placed[0]),
             **({"targets": each} if each else {}),
             "estimated": self.estimated,
             "rms_m": self.rms,
@@ -147,16 +124,16 @@ def register(cell: Cell, readings: Readings) -> Registration:
     """Estimate the registration and the target's offset where they are unknown.
 
     Raises:
-        CannotAnswerError: where the poses do not determine it (fewer than four distinct positions,
-            or all on one line).
+        CannotAnswerError: the poses do not determine it: fewer than four distinct positions, all on
+            one line, or fewer readings of an observer than what is unknown of it.
     """
     if readings.states.observer is not None:
         return _of_several(cell.observed_by(readings.observers), readings)
-    angle, seen = angles(readings), FrameData.of(cell.arm, readings)
-    given, free = given_and_free(cell, seen.m == 6)
+    angle, data = angles(readings), FrameData.of(cell.arm, readings)
+    given, free = given_and_free(cell, data.m == 6)
     known = cell.registration_known and cell.target_known
     if known:
-        at, null = Placement(seen, given, np.zeros_like(free)), np.zeros((len(free), 0))
+        at, null = Placement(data, given, np.zeros_like(free)), np.zeros((len(free), 0))
         far = _far(readings, at)
     else:
         distinct = len(np.unique(np.round(angle, 9), axis=0))
@@ -165,105 +142,62 @@ def register(cell: Cell, readings: Readings) -> Registration:
                 f"registration: {distinct} distinct poses; measure at least {MIN_POSES}, better "
                 "10, that turn the flange and do not lie on a line"
             )
-        at, null = _fitted(seen, given, free)
+        at, null = _fitted(data, given, free)
         far = _far(readings, at)
         if far.any():
-            at, null = _fitted(seen[~far], given, free)
-        if seen.m == 3 and not cell.registration_known:
-            _refuse_lines(seen, at.frames)
-        cell = replace(cell.with_targets(at.frames.targets), registration=at.frames.base)
-    off = seen.misfit(at.frames)
-    near = off[~far]
-    turn_rms = float(np.sqrt(np.mean(np.sum(near[:, 3:] ** 2, axis=1))))
-    return Registration(
-        cell=cell,
-        off=off,
-        rms=float(np.sqrt(np.mean(np.sum(near[:, :3] ** 2, axis=1)))),
-        turn_rms=turn_rms if seen.m == 6 else None,
-        far=far,
-        undetermined=_undetermined(null),
-        still=np.ptp(angle, axis=0) < TURNED,
-        estimated=not known,
-    )
-
-
-def _of_several(cell: Cell, readings: Readings) -> Registration:
-    """Register readings of several observers.
-
-    Raises:
-        CannotAnswerError: fewer readings of an observer than what is unknown of it.
-    """
-    angle = angles(readings)
-    for k, o in enumerate(cell.observers):
-        mine = readings.observer == k
-        count = len(np.unique(angle[mine], axis=0)) * (3 if o.name.kind == "station" else 1)
-        if 0 < count < len(o.free):
+            at, null = _fitted(data[~far], given, free)
+        x = data.points(at.frames)
+        spread = np.linalg.svd(x - x.mean(axis=0), compute_uv=False)
+        if data.m == 3 and not cell.registration_known and spread[1] < NARROW * np.sqrt(len(x)):
             raise CannotAnswerError(
-                f"registration: {o.name} has readings of {mine.sum()} poses, too few for the "
-                f"{len(o.free)} unknowns of its place; measure more, or state its place"
+                "registration: all positions lie in one point or on one line; measure poses "
+                "spread in space"
             )
-    found, off, null = placed(cell, readings)
-    size = np.linalg.norm(off[:, :3], axis=1)
-    far = size > max(LEAST_FAR, BEYOND * float(np.median(size)))
-    if 0 < far.mean() <= MOST:
-        found, _, null = placed(cell, readings[~far])
-        off = Sightings.of(cell, readings).off(found)
-        size = np.linalg.norm(off[:, :3], axis=1)
-        far = size > max(LEAST_FAR, BEYOND * float(np.median(size)))
-    near = off[~far]
-    targets = ~np.array(cell.known_targets)
-    count, base = len(targets), not cell.registration_known
-    whole = np.zeros((6 + 6 * count, null.shape[1]))
-    at = 6 * base
-    whole[:at] = null[:at]
-    for k in np.flatnonzero(targets).tolist():
-        whole[6 + 6 * k : 9 + 6 * k] = null[at : at + 3]
-        at += 3
-    moved = [tuple[str, ...](str(o.name) for o, v in _parts(cell, null[at:, u]) if v)
-             for u in range(null.shape[1])]  # fmt: skip
-    told = []
-    for u, names in enumerate(moved):
-        one = _direction(whole[:, u] / np.abs(whole[:, u]).max(initial=TOLD))
-        told.append(replace(one, observers=names))
-    turn = near[:, 3:]
-    return Registration(
-        cell=found,
-        off=off,
-        rms=float(np.sqrt(np.mean(np.sum(near[:, :3] ** 2, axis=1)))),
-        turn_rms=float(np.sqrt(np.mean(np.sum(turn**2, axis=1)))) if readings.m == 6 else None,
-        far=far if far.mean() <= MOST else np.zeros_like(far),
-        undetermined=tuple(told),
-        still=np.ptp(angle, axis=0) < TURNED,
-        estimated=base or bool(targets.any()) or any(o.free for o in cell.observers),
+        cell = replace(cell.with_targets(at.frames.targets), registration=at.frames.base)
+    off = data.misfit(at.frames)
+    return _registration(cell, readings, off, far, far, _undetermined(null), not known)
+
+
+def targets_as_fitted(model: Model, theta: Floats) -> Floats:
+    """(T, 4, 4) all targets of a model with parameters (P,)."""
+    for e, rows in zip(model.effects, model.slices(), strict=True):
+        if isinstance(e, TargetOffset):
+            return e.displaced(theta[rows])
+    return model.cell.all_targets
+
+
+def _registration(
+    cell: Cell,
+    readings: Readings,
+    off: Floats,
+    beyond: Bools,
+    far: Bools,
+    undetermined: tuple[Undetermined, ...],
+    estimated: bool,
+) -> Registration:
+    """Return a registration with the errors of the readings that are not `beyond` (N,)."""
+    rms, turn = (
+        float(np.sqrt(np.mean(np.sum(off[~beyond, part] ** 2, axis=1))))
+        for part in (slice(0, 3), slice(3, 6))
     )
+    still = np.ptp(angles(readings), axis=0) < TURNED
+    turn_rms = turn if readings.m == 6 else None
+    return Registration(cell, off, rms, turn_rms, far, undetermined, still, estimated)
 
 
-def _parts(cell: Cell, v: Floats) -> Iterator[tuple[Observer, bool]]:
-    """Yield each observer, and whether a direction (E,) of all moves it."""
-    at = 0
-    for o in cell.observers:
-        yield o, bool(np.any(np.abs(v[at : at + len(o.free)]) > TOLD))
-        at += len(o.free)
-
-
-def _fitted(seen: FrameData, given: Frames, free: Bools) -> tuple[Placement, Floats]:
+def _fitted(data: "FrameData", given: "Frames", free: Bools) -> tuple["Placement", Floats]:
     """Return the best frames by a part of the readings, then all, and what they do not determine.
 
     The undetermined directions (6 + 6 T, U) are of unit length, in ordinary sizes.
     """
-    part = seen[np.unique(np.linspace(0, len(seen) - 1, FEW).astype(int))]
+    part = data[np.unique(np.linspace(0, len(data) - 1, FEW).astype(int))]
     best = best_placement(part, given, free, GOOD * np.sqrt(part.m), STEPS, TRIED)
-    return settled(minimise(Placement(seen, best.frames, free)), given)
+    return settled(minimise(Placement(data, best.frames, free)), given)
 
 
-def _far(readings: Readings, at: Placement) -> Bools:
-    """(N,) readings far off while the others fit to within `DISTURBED`; none in other cases.
-
-    Args:
-        readings: N readings.
-        at: the frames of all of them.
-    """
-    seen, none = at.seen, np.zeros(len(readings), dtype=np.bool_)
+def _far(readings: Readings, at: "Placement") -> Bools:
+    """(N,) readings far off while the others fit to within `DISTURBED`; none in other cases."""
+    data, none = at.data, np.zeros(len(readings), dtype=np.bool_)
 
     def fits(off: Floats) -> bool:
         return bool(np.mean(np.sum(off[:, :3] ** 2, axis=1)) <= DISTURBED**2)
@@ -272,63 +206,547 @@ def _far(readings: Readings, at: Placement) -> Bools:
         return none
     at, used = robust_start(at, np.random.default_rng(SEED))
     for _ in range(ROUNDS):
-        of = at.linear
-        d2, _ = of.near(np.zeros(of.columns.shape[2]))
-        far = d2 > limit(seen.m, len(seen), variance(of, d2, none))
+        linear = at.linear
+        d2, _ = linear.near(np.zeros(linear.columns.shape[2]))
+        far = d2 > limit(data.m, len(data), variance(linear, d2, none))
         if far.mean() > MOST:
             return none
-        frames = minimise(Placement(seen[~far], at.frames, at.free)).frames
-        at = Placement(seen, frames, at.free)
+        at = replace(at, frames=minimise(replace(at, data=data[~far])).frames)
         if np.array_equal(far, ~used):
             break
         used = ~far
     rows, base = np.flatnonzero(far), at.frames.base[:3, :3]
-    axes = base @ seen.rotation[rows] @ at.frames.targets[seen.target[rows], :3, :3]
+    axes = base @ data.rotation[rows] @ at.frames.targets[data.target[rows], :3, :3]
     alike = off_alike(readings, ~none, rows, at.off[rows, :3], axes)
     return far if fits(at.off[~far]) and not len(alike) else none
 
 
 def _undetermined(null: Floats) -> tuple[Undetermined, ...]:
     """Return the undetermined directions, each with as few of a target's parameters as can be."""
-    if not null.size:
-        return ()
-    # Reduced echelon form: targets' shifts first, then turns of base and targets.
     size = len(null) // 6 - 1
     shifts = [6 + 6 * k + i for k in range(size) for i in range(3)]
     rest = [3, 4, 5, *(9 + 6 * k + i for k in range(size) for i in range(3)), 0, 1, 2]
-    rows, done = null.T.copy(), 0
-    for block in (shifts, rest):
-        while done < len(rows):
-            sub = np.abs(rows[done:][:, block])
-            i, j = np.unravel_index(int(np.argmax(sub)), sub.shape)
-            if sub[i, j] < TOLD:
-                break
-            pivot = block[int(j)]
-            rows[[done, done + int(i)]] = rows[[done + int(i), done]]
-            rows[done] /= rows[done, pivot]
-            others = np.arange(len(rows)) != done
-            rows[others] -= rows[others, pivot][:, None] * rows[done]
-            done += 1
+    rows = echelon(null.T, (shifts, rest), TOLD)
     return tuple(_direction(row / np.abs(row).max()) for row in rows)
 
 
-def _direction(row: Floats) -> Undetermined:
+def _direction(row: Floats, observers: tuple[str, ...] = ()) -> Undetermined:
     """Return one direction, in ordinary sizes, in m and rad."""
-    shifts = row * (np.abs(row) >= TOLD)
-    moved = shifts * sizes(len(row) // 6 - 1)
-    own = moved[6:].reshape(-1, 6)
-    active = np.flatnonzero(np.abs(own).any(axis=1))
+    moved = row * (np.abs(row) >= TOLD) * sizes(len(row) // 6 - 1)
+    each = moved[6:].reshape(-1, 6)
+    active = np.flatnonzero(np.abs(each).any(axis=1))
     target = int(active[0]) if len(active) else None
-    mine = own[target] if target is not None else np.zeros(6)
-    return Undetermined(target, mine[:3], mine[3:], moved[:3], moved[3:6])
+    six = each[target] if target is not None else np.zeros(6)
+    return Undetermined(target, six[:3], six[3:], moved[:3], moved[3:6], observers)
 
 
-def _refuse_lines(seen: FrameData, frames: Frames) -> None:
-    """Refuse positions that do not tell how the base is turned."""
-    x = seen.points(frames)
-    spread = np.linalg.svd(x - x.mean(axis=0), compute_uv=False)
-    if spread[1] < NARROW * np.sqrt(len(x)):
-        raise CannotAnswerError(
-            "registration: all positions lie in one point or on one line; measure poses "
-            "spread in space"
+def angles(readings: Readings) -> Floats:
+    """(N, n) joint values of the readings: as the encoders reported them, else as commanded."""
+    states = readings.states
+    return states.q if states.q_actual is None else states.q_actual
+
+
+def inverse_roots(covariance: Floats, partial: bool = False) -> Floats:
+    """(N, m, m) W with W V Wᵀ = I, V the covariance with the roughness added.
+
+    With `partial` elements without a variance were not read: they get no roughness either.
+    """
+    m = covariance.shape[-1]
+    rough = np.repeat(np.square(ROUGH), 3)[:m] * np.eye(m)
+    if partial:
+        rough = rough * (np.diagonal(covariance, axis1=1, axis2=2) > 0)[:, None, :]
+    return inverse_root(covariance + rough)
+
+
+def sizes(targets: int) -> Floats:
+    """(6 + 6 T,) ordinary sizes of the parameters, m and rad."""
+    return np.array([BASE_M] * 3 + [1.0] * 3 + ([TARGET_M] * 3 + [1.0] * 3) * targets)
+
+
+def free_parameters(base: bool, targets: Bools, attitudes: bool) -> Bools:
+    """(6 + 6 T,) what is estimated where base and targets (T,) are or are not unknown.
+
+    A target's axes show in attitudes alone, and are estimated from them even at a known offset.
+    """
+    return np.concatenate(
+        [np.full(6, base), *(np.repeat([bool(t), attitudes], 3) for t in targets)]
+    )
+
+
+def given_and_free(cell: Cell, attitudes: bool) -> tuple["Frames", Bools]:
+    """Return the frames of a cell, as given or as placed, and what is estimated of them."""
+    free = free_parameters(not cell.registration_known, ~np.array(cell.known_targets), attitudes)
+    return Frames(cell.registration, cell.all_targets), free
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frames:
+    """Base T_sensor_base (4, 4), and targets T_flange_target (T, 4, 4)."""
+
+    base: Floats
+    targets: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameData:
+    """What the frames are found from."""
+
+    rotation: Floats  # (N, 3, 3) nominal orientation of the flange, base axes
+    position: Floats  # (N, 3) nominal position of the flange, m
+    value: Floats  # (N, 3) positions read, sensor axes, m
+    attitude: Floats | None  # (N, 3, 3) attitudes read
+    root: Floats  # (N, m, m) inverse root of the covariance, roughness included
+    target: Ints  # (N,) index of the target that was read
+
+    @classmethod
+    def of(cls, arm: Arm, readings: Readings) -> "FrameData":
+        """Return the readings beside the flange poses of a nominal arm."""
+        value, turn = readings.value, readings.value[:, 3:] if readings.m == 6 else None
+        root = inverse_roots(readings.covariance)
+        return cls.at(arm, angles(readings), value[:, :3], turn, root, readings.target)
+
+    @classmethod
+    def at(
+        cls, arm: Arm, q: Floats, value: Floats, turn: Floats | None, root: Floats, target: Ints
+    ) -> "FrameData":
+        """Return what was read at joint values (N, n); `turn` (N, 3) the attitudes read, rad."""
+        chain = evaluate(arm, q)
+        rotation, position = (np.ascontiguousarray(x[-1]) for x in (chain.rotation, chain.position))
+        attitude = None if turn is None else se3.rotation(turn)
+        return cls(rotation, position, value, attitude, root, target)
+
+    @property
+    def m(self) -> int:
+        """Elements per reading: 3 or 6."""
+        return 3 if self.attitude is None else 6
+
+    def __len__(self) -> int:
+        """Return the number of readings."""
+        return len(self.value)
+
+    def __getitem__(self, rows: Ints | Bools | slice) -> "FrameData":
+        """Return the chosen readings."""
+        given = {f.name: a for f in fields(self) if (a := getattr(self, f.name)) is not None}
+        return replace(self, **{name: a[rows] for name, a in given.items()})
+
+    def points(self, frames: Frames) -> Floats:
+        """(N, 3) predicted positions of the targets, base axes, m."""
+        return self.position + se3.apply(self.rotation, frames.targets[self.target, :3, 3])
+
+    def misfit(self, frames: Frames) -> Floats:
+        """(N, m) measured minus predicted, sensor axes, m and rad."""
+        r, t = frames.base[:3, :3], frames.base[:3, 3]
+        off = self.value - self.points(frames) @ r.T - t
+        if self.attitude is None:
+            return np.asarray(off)
+        predicted = r @ self.rotation @ frames.targets[self.target, :3, :3]
+        turn = se3.rotation_vector(self.attitude @ np.swapaxes(predicted, 1, 2))
+        return np.concatenate([off, turn], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """Frames beside what was read: a point of `solver.minimise`."""
+
+    data: FrameData
+    frames: Frames
+    free: Bools  # (6 + 6 T,) the parameters that are estimated, K of them
+    held: Floats | None = None  # (T, 4, 4) targets with a prior of the ordinary sizes
+    weight: float = 1.0  # of a target an ordinary size off, in units of whitened misfit
+
+    @cached_property
+    def off(self) -> Floats:
+        """(N, m) misfit, m and rad."""
+        return self.data.misfit(self.frames)
+
+    @cached_property
+    def white(self) -> Floats:
+        """(N, m) whitened misfit."""
+        return np.asarray(np.einsum("nij,nj->ni", self.data.root, self.off))
+
+    @property
+    def square(self) -> float:
+        """Whitened sum of squares."""
+        return float(np.sum(self.white**2))
+
+    @property
+    def residual(self) -> Floats:
+        """(R,) whitened misfit, and that of the prior."""
+        if self.held is None:
+            return self.white.reshape(-1)
+        t = self.frames.targets
+        shift = (t[:, :3, 3] - self.held[:, :3, 3]) / TARGET_M
+        turn = se3.rotation_vector(t[:, :3, :3] @ np.swapaxes(self.held[:, :3, :3], 1, 2)) / np.pi
+        away = np.concatenate([np.zeros(6), np.concatenate([shift, turn], axis=1).reshape(-1)])
+        return np.concatenate([self.white.reshape(-1), -self.weight * away[self.free]])
+
+    def jacobian(self) -> Floats:
+        """(R, K) derivative of what is predicted."""
+        rows = self.columns().reshape(self.white.size, int(np.count_nonzero(self.free)))
+        if self.held is None:
+            return rows
+        slopes = np.tile(np.repeat([1.0, 1.0 / np.pi], 3), len(self.held))
+        away = np.concatenate([np.zeros(6), slopes])[self.free]
+        return np.concatenate([rows, self.weight * np.diag(away)])
+
+    def columns(self) -> Floats:
+        """(N, m, K) whitened derivative of the predicted readings."""
+        data, r = self.data, self.frames.base[:3, :3]
+        turned = r @ data.rotation
+        out = np.zeros((len(data), data.m, len(self.free)))
+        out[:, :3, :3] = r
+        out[:, :3, 3:6] = -r @ se3.skew(data.points(self.frames) - self._centre)
+        out[:, 3:, 3:6] = r[: data.m - 3]
+        for k in range(len(self.frames.targets)):
+            rows, at = data.target == k, 6 + 6 * k
+            out[rows, :3, at : at + 3] = turned[rows]
+            out[rows, 3:, at + 3 : at + 6] = turned[rows, : data.m - 3]
+        size = sizes(len(self.frames.targets))[self.free]
+        return np.asarray(data.root @ out[:, :, self.free] * size)
+
+    @property
+    def linear(self) -> ReadingModel:
+        """The linear model of the readings."""
+        none, columns = np.zeros(np.count_nonzero(self.free)), self.columns()
+        return ReadingModel(self.white, columns, none, none, self.data.root)
+
+    def moved(self, step: Floats) -> "Placement":
+        """Return the placement after a step (K,)."""
+        whole = np.zeros(len(self.free))
+        whole[self.free] = sizes(len(self.frames.targets))[self.free] * step
+        targets, each = self.frames.targets.copy(), whole[6:].reshape(-1, 6)
+        targets[:, :3, 3] += each[:, :3]
+        targets[:, :3, :3] = se3.rotation(each[:, 3:]) @ targets[:, :3, :3]
+        base = self.frames.base @ _moved_about(self._centre, whole[:6])
+        return replace(self, frames=Frames(base, targets))
+
+    def determined(self, spread: float) -> tuple[Floats, Floats]:
+        """Undetermined directions (6 + 6 T, U) by the misfit; the step (K,) along the others."""
+        a = self.jacobian()
+        # Squared singular values up to 1e12 leave rounding of 1e-2 in those that decide, about 10.
+        squares, vectors = np.linalg.eigh(a.T @ a)
+        told = squares > (spread / TELL) ** 2
+        null = np.zeros((len(self.free), np.count_nonzero(~told)))
+        null[self.free] = vectors[:, ~told]
+        part = vectors[:, told]
+        return null, part @ ((part.T @ (a.T @ self.residual)) / squares[told])
+
+    @cached_property
+    def _centre(self) -> Floats:
+        """(3,) the point of the base axes that the base turns about, m."""
+        return np.asarray(self.data.position.mean(axis=0))
+
+
+def _moved_about(centre: Floats, six: Floats) -> Floats:
+    """(4, 4) a shift and a turn (6,) about a point (3,)."""
+    about, back = np.eye(4), np.eye(4)
+    about[:3, 3], back[:3, 3] = centre, -centre
+    return about @ se3.matrix(se3.rotation(six[3:]), six[:3]) @ back
+
+
+def best_placement(
+    data: FrameData, given: Frames, free: Bools, good: float, steps: int, rotated: int
+) -> Placement:
+    """Return the best placement from several starts: closed forms, then rotations of a cube.
+
+    Args:
+        data: flange poses and readings.
+        given: base and targets as configured, or the nominal ones.
+        free: (6 + 6 T,) what is estimated.
+        good: whitened rms misfit per reading at which no other start is tried.
+        steps: most steps from each start.
+        rotated: of the rotations of a cube, the number of those that fit best and are tried.
+    """
+    found: list[Placement] = []
+    for start in _closed_forms(data, given, free):
+        found.append(minimise(Placement(data, start, free), steps))
+        if found[-1].square <= good**2 * len(data):
+            return min(found, key=lambda p: p.square)
+    if rotated and free[:6].any():
+        turns = (_with_translations(data, given, turn, free) for turn in cube())
+        begun = sorted((Placement(data, f, free) for f in turns), key=lambda p: p.square)
+        found += [minimise(placement, steps) for placement in begun[:rotated]]
+    return min(found, key=lambda p: p.square)
+
+
+def settled(at: Placement, given: Frames) -> tuple[Placement, Floats]:
+    """Return a minimum whose undetermined part is held near the given targets, and that part.
+
+    The prior has the ordinary sizes as standard deviations. It acts along the undetermined
+    directions (6 + 6 T, U) alone: along the others, the last steps go to the minimum without it.
+    """
+    dof = max(at.data.m * len(at.data) - int(np.count_nonzero(at.free)), 1)
+    spread = max(float(np.sqrt(at.square / dof)), 1.0)
+    null, _ = at.determined(spread)
+    if null.size:
+        at = replace(minimise(replace(at, held=given.targets, weight=spread)), held=None)
+    for _ in range(3):
+        null, step = at.determined(spread)
+        at = at.moved(step)
+    return at, null
+
+
+def nearest_rotation(m: Floats) -> Floats:
+    """Return the rotation (..., 3, 3) nearest to a matrix (Kabsch 1976)."""
+    u, _, vt = np.linalg.svd(m)
+    flip = np.ones(m.shape[:-1])
+    flip[..., 2] = np.sign(np.linalg.det(u @ vt))
+    return np.asarray((u * flip[..., None, :]) @ vt)
+
+
+def rotation_of_attitudes(attitude: Floats, flange: Floats) -> Floats:
+    """(3, 3) A of M_i Bᵀ = A R_i, attitudes M and flange orientations R (N, 3, 3)."""
+    # A linear system, vec by rows: (M_i ⊗ I) vec(Bᵀ) = (I ⊗ R_iᵀ) vec(A)
+    eye = np.eye(3)
+    left = np.einsum("nij,kl->nikjl", attitude, eye).reshape(-1, 9)
+    right = np.einsum("ij,nlk->nikjl", eye, flange).reshape(-1, 9)
+    gram = np.concatenate([left, -right], axis=1)
+    a = np.linalg.eigh(gram.T @ gram)[1][9:, 0].reshape(3, 3)
+    return nearest_rotation(a * (np.sign(np.linalg.det(a)) or 1.0))
+
+
+def cube() -> Floats:
+    """(24, 3, 3) the rotations that take a cube to itself."""
+    from scipy.spatial.transform import Rotation  # slow to import
+
+    return np.asarray(np.round(Rotation.create_group("O").as_matrix()))
+
+
+def _closed_forms(data: FrameData, given: Frames, free: Bools) -> Iterator[Frames]:
+    """Yield base and targets from attitudes and from positions."""
+    if not free[:6].any():
+        yield _with_translations(data, given, given.base[:3, :3], free)
+        return
+    if data.attitude is not None:
+        first = data.target == data.target[0]
+        base = rotation_of_attitudes(data.attitude[first], data.rotation[first])
+        yield _with_translations(data, given, base, free)
+    # Positions alone: Procrustes for R, then linear for τ and t, a few times.
+    out, y = given, data.value - data.value.mean(axis=0)
+    for _ in range(ALTERNATIONS):
+        x, before = data.points(out), out.targets
+        turn = nearest_rotation(y.T @ (x - x.mean(axis=0)))
+        out = _with_translations(data, given, turn, free)
+        if np.abs(out.targets - before).max() < 1e-6:
+            break
+    yield out
+
+
+def _with_translations(data: FrameData, given: Frames, rotation: Floats, free: Bools) -> Frames:
+    """Complete a rotation of the base by the best translations and the targets' axes."""
+    count, size = len(data), len(given.targets)
+    turned, of = rotation @ data.rotation, [data.target == k for k in range(size)]
+    a = np.zeros((count, 3, 3 + 3 * size))
+    a[:, :, :3] = np.eye(3)
+    for k, rows in enumerate(of):
+        a[rows, :, 3 + 3 * k : 6 + 3 * k] = turned[rows]
+    live = np.repeat(free[::6], 3)
+    x = np.concatenate([given.base[:3, 3], *given.targets[:, :3, 3]])
+    hold = np.repeat([HOLD / BASE_M] + [HOLD / TARGET_M] * size, 3)
+    flat = a.reshape(-1, len(x))
+    rest = (data.value - data.position @ rotation.T).reshape(-1) - flat @ x
+    if live.any():
+        system = np.concatenate([flat, np.diag(hold * np.sqrt(count))])[:, live]
+        x[live] += np.linalg.lstsq(system, np.append(rest, np.zeros(len(x))), rcond=None)[0]
+    targets = given.targets.copy()
+    targets[:, :3, 3] = x[3:].reshape(size, 3)
+    if data.attitude is not None:
+        means = [np.einsum("nji,njk->ik", turned[rows], data.attitude[rows]) for rows in of]
+        targets[:, :3, :3] = nearest_rotation(np.array(means))
+    return Frames(se3.matrix(rotation, x[:3]), targets)
+
+
+def _of_several(cell: Cell, readings: Readings) -> Registration:
+    """Register readings of several observers."""
+    angle = angles(readings)
+    for k, o in enumerate(cell.observers):
+        rows = readings.observer == k
+        count = len(np.unique(angle[rows], axis=0)) * (3 if o.name.kind == "station" else 1)
+        if 0 < count < len(o.free):
+            raise CannotAnswerError(
+                f"registration: {o.name} has readings of {rows.sum()} poses, too few for the "
+                f"{len(o.free)} unknowns of its place; measure more, or state its place"
+            )
+    found, off, null = _placed(cell, readings)
+    far = _far_of_several(off)
+    if 0 < far.mean() <= MOST:
+        found, _, null = _placed(cell, readings[~far])
+        off = Sightings.of(cell, readings).off(found)
+        far = _far_of_several(off)
+    targets, base = ~np.array(cell.known_targets), not cell.registration_known
+    place = [*range(6 * base), *(6 + 6 * k + i for k in np.flatnonzero(targets) for i in range(3))]
+    ends = np.cumsum([len(place), *(len(o.free) for o in cell.observers)]).tolist()
+    undetermined = []
+    for v in null.T:
+        whole = np.zeros(6 + 6 * len(targets))
+        whole[place] = v[: len(place)]
+        parts = zip(cell.observers, ends[:-1], ends[1:], strict=True)
+        moved = tuple(str(o.name) for o, a, b in parts if np.any(np.abs(v[a:b]) > TOLD))
+        undetermined.append(_direction(whole / np.abs(whole).max(initial=TOLD), moved))
+    said = far if far.mean() <= MOST else np.zeros_like(far)
+    estimated = base or bool(targets.any()) or any(o.free for o in cell.observers)
+    return _registration(found, readings, off, far, said, tuple(undetermined), estimated)
+
+
+def _far_of_several(off: Floats) -> Bools:
+    """(N,) readings that are off (N, m) by far more than most."""
+    size = np.linalg.norm(off[:, :3], axis=1)
+    return np.asarray(size > max(LEAST_FAR, BEYOND * float(np.median(size))))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sightings:
+    """Readings of several observers beside the flange poses of the nominal arm."""
+
+    cell: Cell  # with the observers of the readings
+    readings: Readings
+    data: FrameData  # whose root is zero in the rows of what is not read
+
+    @classmethod
+    def of(cls, cell: Cell, readings: Readings) -> "Sightings":
+        """Return readings beside the nominal arm."""
+        root = inverse_roots(readings.covariance, True)
+        return cls(cell, readings, replace(FrameData.of(cell.arm, readings), root=root))
+
+    @property
+    def targets(self) -> Bools:
+        """(T,) which of the targets are unknown."""
+        return ~np.array(self.cell.known_targets)
+
+    @property
+    def sizes(self) -> Floats:
+        """(K,) ordinary sizes of what is unknown: base, targets, observers."""
+        base = [] if self.cell.registration_known else [BASE_M] * 3 + [1.0] * 3
+        by = [BASE_M if e < 3 else 1.0 for o in self.cell.observers for e in o.free]
+        return np.array([*base, *[TARGET_M] * 3 * int(self.targets.sum()), *by])
+
+    def points(self, cell: Cell) -> Floats:
+        """(N, 3) predicted positions of the targets, sensor axes, m."""
+        base = self.data.points(Frames(cell.registration, cell.all_targets))
+        return np.asarray(base @ cell.registration[:3, :3].T + cell.registration[:3, 3])
+
+    def off(self, cell: Cell) -> Floats:
+        """(N, m) measured minus predicted, m and rad; zero in elements that are not read."""
+        r, attitude = self.readings, self.data.attitude
+        turn = cell.registration[:3, :3] @ self.data.rotation @ cell.all_targets[r.target, :3, :3]
+        position, turned = read_by(cell.observers, r.observer, self.points(cell), turn)
+        off = r.value[:, :3] - position
+        if attitude is None:
+            return np.asarray(off)
+        apart = se3.rotation_vector(attitude @ np.swapaxes(turned, 1, 2))
+        return np.concatenate([off, apart], axis=1)
+
+    def white(self, cell: Cell) -> Floats:
+        """(N·m,) whitened misfit."""
+        return se3.apply(self.data.root, self.off(cell)).reshape(-1)
+
+    def moved(self, cell: Cell, step: Floats) -> Cell:
+        """Return a cell moved by (K,), in ordinary sizes."""
+        x, at = step * self.sizes, 0
+        if not cell.registration_known:
+            by = _moved_about(self.data.position.mean(axis=0), x[:6])
+            cell, at = replace(cell, registration=cell.registration @ by), 6
+        poses = cell.all_targets.copy()
+        for k in np.flatnonzero(self.targets):
+            poses[k, :3, 3] += x[at : at + 3]
+            at += 3
+        observers = []
+        for o in cell.observers:
+            six = np.zeros(6)
+            six[list(o.free)] = x[at : at + len(o.free)]
+            at += len(o.free)
+            offset, six[3] = (six[3], 0.0) if o.name.kind == "point" else (0.0, six[3])
+            frame = se3.matrix(*se3.exp(six)) @ o.frame
+            observers.append(replace(o, frame=frame, offset=o.offset + offset))
+        return replace(cell.with_targets(poses), observers=tuple(observers))
+
+    def settled(self, begun: Cell, steps: int | None = None) -> tuple[Cell, float, Floats]:
+        """Return the minimum near a start, its sum of squares, and the Jacobian (R, K) there."""
+        count = len(self.sizes)
+        if not count:
+            return begun, float(np.sum(self.white(begun) ** 2)), np.zeros((0, 0))
+
+        def residual(x: Floats) -> Floats:
+            return np.concatenate([self.white(self.moved(begun, x)), HOLD_SEVERAL * x])
+
+        found = least_squares(residual, np.zeros(count), max_nfev=steps)
+        jacobian = np.asarray(found.jac, dtype=float)[: len(found.fun) - count]
+        return self.moved(begun, found.x), 2.0 * float(found.cost), jacobian
+
+    def begun(self, cell: Cell) -> Cell:
+        """Return a cell with each observer where its readings have it, by closed forms."""
+        p, r = self.points(cell), self.readings
+        rows = [r.observer == k for k in range(len(cell.observers))]
+        observers = (
+            _begun(o, p[k], r.value[k, :3]) if o.free and k.any() else o
+            for o, k in zip(cell.observers, rows, strict=True)
         )
+        return replace(cell, observers=tuple(observers))
+
+
+def _placed(cell: Cell, readings: Readings) -> tuple[Cell, Floats, Floats]:
+    """Place base, targets and the observers of the readings as far as they are unknown.
+
+    The cell with all in place; (N, m) measured minus predicted; directions (K, U) of unit length,
+    in ordinary sizes, that the readings do not determine.
+    """
+    data, part = Sightings.of(cell, readings), np.zeros(len(readings), dtype=bool)
+    for k in range(len(cell.observers)):
+        rows = np.flatnonzero(readings.observer == k)
+        if len(rows):
+            part[rows[np.linspace(0, len(rows) - 1, FEW_EACH).astype(int)]] = True
+    few = Sightings.of(cell, readings[part])
+    begun = [few.begun(start) for start in _starts(cell, readings)]
+    begun.sort(key=lambda c: float(np.sum(few.white(c) ** 2)))
+    tried = [few.settled(c, 50) for c in begun[:FOLLOWED]]
+    found, square, jacobian = data.settled(min(tried, key=lambda t: t[1])[0])
+    rank = int(np.count_nonzero(np.any(data.data.root != 0, axis=2)))
+    spread = max(np.sqrt(square / max(rank - jacobian.shape[1], 1)), 1.0)
+    squares, vectors = np.linalg.eigh(jacobian.T @ jacobian)
+    return found, data.off(found), vectors[:, squares <= (spread / TELL) ** 2]
+
+
+def _starts(cell: Cell, readings: Readings) -> Iterator[Cell]:
+    """Yield where base and targets may be: by the first station's readings, else all round."""
+    main = [k for k, o in enumerate(cell.observers) if o.name.kind == "station" and not o.free]
+    rows = np.isin(readings.observer, main)
+    if rows.any() and len(np.unique(readings.pose[rows])) >= MIN_POSES:
+        given, free = given_and_free(cell, readings.m == 6)
+        data = FrameData.of(cell.arm, readings[rows])
+        at = best_placement(data, given, free, GOOD * np.sqrt(data.m), STEPS, TRIED).frames
+        yield replace(cell.with_targets(at.targets), registration=at.base)
+    elif cell.registration_known:
+        yield cell
+    else:
+        known = [o.frame for o in cell.observers if o.tied]
+        centre = np.mean([-f[:3, :3].T @ f[:3, 3] for f in known], axis=0)
+        yield from (replace(cell, registration=se3.matrix(turn, centre)) for turn in cube())
+
+
+def _begun(o: Observer, p: Floats, value: Floats) -> Observer:
+    """Place an observer by what it read (N, 3) of positions (N, 3), sensor axes."""
+    middle, read = p.mean(axis=0), value.mean(axis=0)
+    x = p - middle
+    if o.name.kind == "station":
+        turn = nearest_rotation((value - read).T @ x)
+        return replace(o, frame=se3.matrix(turn, read - turn @ middle))
+    if o.name.kind == "point":
+        # |p|² − d² = 2 p·c − |c|², d the reading less its offset, which is linear in it, too.
+        if not set(o.free) & {0, 1, 2}:
+            return o
+        open_offset = 3 in o.free
+        d = value[:, 0] - (0.0 if open_offset else o.offset)
+        columns = [2 * x, np.ones((len(p), 1))] + ([-2 * d[:, None]] if open_offset else [])
+        found = np.linalg.lstsq(np.hstack(columns), np.sum(x**2, axis=1) - d**2, rcond=1e-6)[0]
+        frame = se3.matrix(np.eye(3), -(found[:3] + middle))
+        return replace(o, frame=frame, offset=-float(found[4]) if open_offset else o.offset)
+    if 4 not in o.free:  # of a gauge, the direction is known
+        frame = o.frame.copy()
+        frame[0, 3] = read[0] - frame[0, :3] @ middle
+        return replace(o, frame=frame)
+    # G = n·p − h: linear in n and h; where hardly anything but a plane is touched, its normal.
+    g = value[:, 0] - read[0]
+    axes, linear = np.linalg.svd(x, full_matrices=True)[2], np.linalg.lstsq(x, g, rcond=1e-6)[0]
+    tried = [n / np.linalg.norm(n) for n in (linear, axes[2], -axes[2]) if np.linalg.norm(n) > 1e-9]
+    best = min(tried, key=lambda n: float(np.sum((x @ n - g) ** 2)))
+    return replace(o, frame=plane_frame(best, middle - read[0] * best))

@@ -3,12 +3,16 @@
 from dataclasses import asdict, dataclass
 
 import numpy as np
+from scipy.stats import chi2
 
 from hilcal.model.model import Prediction
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Whitening, measured, relative_rotation
 from hilcal.robot import se3
+from hilcal.shown import Shown
 from hilcal.types import Floats
+
+CONFIDENCE = 0.95
 
 
 def residual(readings: Readings, prediction: Prediction, w: Whitening) -> Floats:
@@ -31,19 +35,12 @@ def residual(readings: Readings, prediction: Prediction, w: Whitening) -> Floats
 
 @dataclass(frozen=True, slots=True)
 class ErrorBlock:
-    """Position error per measurement, and the whitened residual.
+    """Position error per measurement, and the whitened residual."""
 
-    Attributes:
-        rms_m: root mean square of the 3-D position error, m.
-        mean_m: its mean, m.
-        max_m: its maximum, m.
-        rms_sigma: root mean square of the whitened elements, pure number.
-    """
-
-    rms_m: float
-    mean_m: float
-    max_m: float
-    rms_sigma: float
+    rms_m: float  # root mean square of the 3-D position error, m
+    mean_m: float  # its mean, m
+    max_m: float  # its maximum, m
+    rms_sigma: float  # root mean square of the whitened elements, pure number
 
     @classmethod
     def of(cls, raw: Floats, white: Floats, rank: int) -> "ErrorBlock":
@@ -69,3 +66,28 @@ def error_block(raw: Floats, w: Whitening) -> ErrorBlock:
 def noise_floor(covariance: Floats) -> float:
     """Root mean square of the 3-D position error under covariances (D, m, m) alone, m."""
     return float(np.sqrt(np.mean(np.trace(covariance[:, :3, :3], axis1=1, axis2=2))))
+
+
+class WithVarianceFactor(Shown):
+    """What has a whitened sum of squares and its degrees of freedom."""
+
+    __slots__ = ()
+
+    chi2: float
+    dof: float
+
+    @property
+    def variance_factor(self) -> float:
+        """χ²/dof of the gc-whitened residual; 1 where model and noise are right."""
+        return self.chi2 / self.dof
+
+    @property
+    def variance_factor_interval(self) -> tuple[float, float]:
+        """95 % confidence interval of the variance factor."""
+        return variance_interval(self.chi2, self.dof)
+
+
+def variance_interval(total: float, dof: float) -> tuple[float, float]:
+    """95 % confidence interval of χ²/dof."""
+    tail = (1 - CONFIDENCE) / 2
+    return float(total / chi2.isf(tail, dof)), float(total / chi2.ppf(tail, dof))

@@ -30,42 +30,26 @@ from hilcal.readings.readings import States
 from hilcal.robot import se3
 from hilcal.types import Bools, Floats
 
-TRIALS = 8
-"""Random states at which a deviation is asked whether it is constant; a choice."""
-SAME = 1e-15
-"""By how much a constant deviation may differ between states, m and rad: rounding."""
-SAME_ON = 1e-5
-"""m, and of a rotation's elements: by how much a prediction may differ; a choice, what a tracker
-hardly sees: a background has a coupling of joints that is smaller."""
+TRIALS = 8  # random states at which a deviation is asked whether it is constant; a choice
+SAME = 1e-15  # by how much a constant deviation may differ between states, m and rad: rounding
+SAME_ON = 1e-5  # m, and of a rotation's elements, that a prediction may differ by a whole turn on;
+# a choice, what a tracker hardly sees: a background has a coupling of joints that is smaller
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RobotFrames:
-    """Base, flange and targets of a fitted model.
+    """Base, flange and targets of a fitted model."""
 
-    Attributes:
-        base: (4, 4) T_sensor_base.
-        base_stated: whether the cell states it; mechanical otherwise.
-        registered: (4, 4) from the axes of the registration, where the fit began, to the base's.
-        chain: (4, 4) the same from those of the fitted chain, which the fitted frame moved.
-        flange: (4, 4) T_chainflange_flange.
-        targets: (T, 4, 4) T_flange_target as fitted.
-        declared: (T, 4, 4) the same as stated, where all of them are.
-        links: (n + 1, 4, 4) the arm with its constant effects, from base to flange.
-        within: effects that are constant, and so in `links`.
-        beyond: effects that are not.
-    """
-
-    base: Floats
-    base_stated: bool
-    chain: Floats
-    registered: Floats
-    flange: Floats
-    targets: Floats
-    declared: Floats
-    links: Floats
-    within: tuple[str, ...]
-    beyond: tuple[str, ...]
+    base: Floats  # (4, 4) T_sensor_base
+    base_stated: bool  # whether the cell states it; mechanical otherwise
+    chain: Floats  # (4, 4) from the axes of the fitted chain, which the frame moved, to the base's
+    registered: Floats  # (4, 4) the same from those of the registration, where the fit began
+    flange: Floats  # (4, 4) T_chainflange_flange
+    targets: Floats  # (T, 4, 4) T_flange_target as fitted
+    declared: Floats  # (T, 4, 4) the same as stated, where all of them are
+    links: Floats  # (n + 1, 4, 4) the arm with its constant effects, from base to flange
+    within: tuple[str, ...]  # effects that are constant, and so in `links`
+    beyond: tuple[str, ...]  # effects that are not
 
     @property
     def base_is(self) -> str:
@@ -74,12 +58,7 @@ class RobotFrames:
 
 
 def robot_frames(model: Model, theta: Floats) -> RobotFrames:
-    """Return base, flange and targets of a fitted model.
-
-    Args:
-        model: the model.
-        theta: (P,) its parameters.
-    """
+    """Return base, flange and targets of a model with parameters (P,)."""
     cell, nominal = model.cell, model.cell.arm.links
     moved, targets = _fitted(model, theta)
     stated = all(cell.known_targets)
@@ -88,8 +67,8 @@ def robot_frames(model: Model, theta: Floats) -> RobotFrames:
         base = cell.registration
         links[0] = moved @ links[0]
     else:
-        own, links[1] = _split(links[1], nominal[1])
-        base = cell.registration @ moved @ links[0] @ own @ se3.inverse(nominal[0])
+        first, links[1] = _split(links[1], nominal[1])
+        base = cell.registration @ moved @ links[0] @ first @ se3.inverse(nominal[0])
         links[0] = nominal[0]
     if stated:  # an offset that was fitted all the same is the flange's
         flange = targets[0] @ se3.inverse(cell.all_targets[0])
@@ -97,8 +76,8 @@ def robot_frames(model: Model, theta: Floats) -> RobotFrames:
     elif any(cell.known_targets):
         flange = np.eye(4)
     else:
-        own, before = _split(se3.inverse(links[-2]), se3.inverse(nominal[-2]))
-        flange = se3.inverse(links[-1]) @ own @ nominal[-1]
+        last, before = _split(se3.inverse(links[-2]), se3.inverse(nominal[-2]))
+        flange = se3.inverse(links[-1]) @ last @ nominal[-1]
         targets = se3.product(se3.inverse(flange)[None], targets)
         links[-2], links[-1] = se3.inverse(before), nominal[-1]
     registered = se3.inverse(base) @ cell.registration
@@ -122,10 +101,6 @@ def whole_turns(model: Model, theta: Floats) -> Bools:
     An arm is the same a whole turn of a joint on, and so are waves of whole turns. A law in the
     angle itself, as a coupling of joints, is not; nor are cables, which no effect of the catalogue
     has.
-
-    Args:
-        model: the model.
-        theta: (P,) its parameters.
     """
     states, n = random_states(model.cell), model.cell.arm.n
     before = model.predict(states, theta).observation
@@ -140,31 +115,29 @@ def whole_turns(model: Model, theta: Floats) -> Bools:
 
 def one_of_each(cell: Cell) -> States:
     """Return one state that has every column, for effects that are built without readings."""
-    n = cell.arm.n
-    one = np.zeros(1)
+    one, each = np.zeros(1), np.zeros((1, cell.arm.n))
     return States(
-        q=np.zeros((1, n)),
+        q=each,
         wrench=np.zeros((1, 6)),
         time=one,
         load_time=one,
         air_temperature=one,
-        joint_temperature=np.zeros((1, n)),
-        approach=np.ones((1, n)),
+        joint_temperature=each,
+        approach=each + 1,
     )
 
 
 def _fitted(model: Model, theta: Floats) -> tuple[Floats, Floats]:
     """Return how far the fitted base is from its registration (4, 4), and all targets (T, 4, 4)."""
     cell, targets = model.cell, model.cell.all_targets.copy()
-    rows = np.zeros(len(targets), dtype=np.int64)
-    states = one_of_each(cell)[rows]
+    states = one_of_each(cell)[np.zeros(len(targets), dtype=np.int64)]
     if cell.targets is not None:
         states = replace(states, target=np.arange(len(targets)))
     situation, base = model.predict(states, 0 * theta).situation, np.zeros(6)
-    for e, mine in zip(model.effects, model.slices(), strict=True):
+    for e, rows in zip(model.effects, model.slices(), strict=True):
         if e.role not in FRAME_ROLES:
             continue
-        d = e.deviation(theta[mine], situation)
+        d = e.deviation(theta[rows], situation)
         if e.role == "registration" and d.base is not None:
             base = base + d.base[0]
         if e.role == "target" and d.target is not None:
@@ -184,13 +157,13 @@ def _constant(model: Model, theta: Floats) -> tuple[Floats, tuple[str, ...], tup
     dq, twist = np.zeros(arm.n), np.zeros((arm.n + 1, 6))
     within, beyond = [], []
     situation = model.predict(random_states(model.cell), 0 * theta).situation
-    for e, mine in zip(model.effects, model.slices(), strict=True):
+    for e, rows in zip(model.effects, model.slices(), strict=True):
         if e.role in FRAME_ROLES:
             continue
-        d = e.deviation(theta[mine], situation)
-        fields = [d.base, d.station, d.target, d.scale, d.observer]
+        d = e.deviation(theta[rows], situation)
+        others = any(f is not None for f in (d.base, d.station, d.target, d.scale, d.observer))
         constant = not e.elastic and _same(d.dq) and _same(d.twist)
-        if not constant or any(f is not None for f in fields) or d.dq is d.twist:
+        if not constant or others or d.dq is d.twist:
             beyond.append(e.name)
             continue
         within.append(e.name)
@@ -199,8 +172,7 @@ def _constant(model: Model, theta: Floats) -> tuple[Floats, tuple[str, ...], tup
     moved = arm.driven(dq)
     turns, shifts = np.zeros((2, arm.n + 1, 3))
     turns[: arm.n, 2], shifts[: arm.n, 2] = moved * ~arm.slides, moved * arm.slides
-    links = arm.links @ se3.matrix(*se3.exp(twist))
-    links = links @ se3.matrix(se3.rotation(turns), shifts)
+    links = arm.links @ se3.matrix(*se3.exp(twist)) @ se3.matrix(se3.rotation(turns), shifts)
     return links, tuple(within), tuple(beyond)
 
 
@@ -226,6 +198,6 @@ def _split(link: Floats, nominal: Floats) -> tuple[Floats, Floats]:
     """Split a link into Rz Tz and a rest that has neither beyond what the nominal one has."""
     m = link @ se3.inverse(nominal)
     turn = np.arctan2(m[1, 0] - m[0, 1], m[0, 0] + m[1, 1])
-    own = se3.matrix(se3.rotation(np.array([0.0, 0.0, turn])), np.zeros(3))
-    own[2, 3] = link[2, 3] - nominal[2, 3]
-    return own, se3.inverse(own) @ link
+    along = np.array([0.0, 0.0, link[2, 3] - nominal[2, 3]])
+    first = se3.matrix(se3.rotation(np.array([0.0, 0.0, turn])), along)
+    return first, se3.inverse(first) @ link

@@ -5,7 +5,7 @@
 p ⊕ δ need be no sum: frames turn. A prior about zero is one more row of r.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol, Self, TypeVar
 
 import numpy as np
@@ -13,14 +13,11 @@ import numpy as np
 from hilcal.errors import CannotAnswerError
 from hilcal.types import Floats
 
-STEPS = 40
-"""Most steps; a choice."""
-DAMPING = 1e-3
-"""λ of the first step; a choice."""
-SETTLED = 1e-9
-"""Share of the sum of squares by which a last step lowers it; a choice."""
-SMALL = 1e-12
-"""A step below this in every coordinate ends the search: rounding."""
+# Choices, but for the last one, which is rounding.
+STEPS = 40  # at most
+DAMPING = 1e-3  # λ of the first step
+SETTLED = 1e-9  # share of the sum of squares by which a last step lowers it
+SMALL = 1e-12  # a step below this in every coordinate ends the search
 
 
 class SolverPoint(Protocol):
@@ -34,27 +31,16 @@ class SolverPoint(Protocol):
         """(R, K) J, derivative of what is predicted."""
 
     def moved(self, step: Floats) -> Self:
-        """Return p ⊕ δ (K,).
-
-        Raises:
-            CannotAnswerError: nothing can be predicted there.
-        """
+        """Return p ⊕ δ (K,)."""
 
 
 P = TypeVar("P", bound=SolverPoint)
 T = TypeVar("T")
 
 
-def minimise(at: P, steps: int = STEPS, damping: float = DAMPING, settled: float = SETTLED) -> P:
-    """Return the point of least squares that a start leads to.
-
-    Args:
-        at: the start.
-        steps: most steps.
-        damping: λ of the first step; near zero where the start is close.
-        settled: share of the sum of squares by which a last step lowers it.
-    """
-    square, normal = float(at.residual @ at.residual), None
+def minimise(at: P, steps: int = STEPS) -> P:
+    """Return the point of least squares that a start leads to."""
+    square, normal, damping = float(at.residual @ at.residual), None, DAMPING
     for _ in range(steps):
         if normal is None:
             a = at.jacobian()
@@ -66,13 +52,10 @@ def minimise(at: P, steps: int = STEPS, damping: float = DAMPING, settled: float
         largest = h.diagonal().max()
         guard = damping * (h.diagonal() + 1e-6 * largest) + 1e-12 * largest + 1e-300
         step: Floats = np.asarray(np.linalg.solve(h + np.diag(guard), gradient), dtype=float)
-        try:
-            trial = at.moved(step)
-            now = float(trial.residual @ trial.residual)
-        except CannotAnswerError:
-            now = np.inf
+        trial = at.moved(step)
+        now = float(trial.residual @ trial.residual)
         if now <= square:
-            done = square - now <= settled * square + 1e-12 * len(a) and damping <= DAMPING
+            done = square - now <= SETTLED * square + 1e-12 * len(a) and damping <= DAMPING
             at, square, normal = trial, now, None
             damping = max(0.1 * damping, 1e-9)
             if done or np.abs(step).max() < SMALL:
@@ -93,12 +76,7 @@ def shortened(
 ) -> T | None:
     """Return what the whole step, half of it, a quarter … first leads to; None for nothing good.
 
-    Args:
-        moved: where a step leads to; may raise CannotAnswerError, as `cost` may.
-        step: (K,) the whole one.
-        most: number of trials.
-        cost: what is not to grow.
-        limit: the most that it may be.
+    `moved` and `cost`, which must not exceed the limit, may raise CannotAnswerError.
     """
     for halving in range(most):
         try:
@@ -108,3 +86,24 @@ def shortened(
         except CannotAnswerError:
             continue
     return None
+
+
+def echelon(rows: Floats, blocks: Sequence[Sequence[int]], least: float = 0.0) -> Floats:
+    """Bring directions (U, P) to reduced echelon form, so that each involves few parameters.
+
+    Columns of a block are pivots before those of the next; elements up to `least` are none.
+    """
+    rows, done = rows.copy(), 0
+    for block in blocks:
+        while done < len(rows) and len(block):
+            sub = np.abs(rows[done:][:, block])
+            i, j = np.unravel_index(int(np.argmax(sub)), sub.shape)
+            if sub[i, j] <= least:
+                break
+            pivot = block[int(j)]
+            rows[[done, done + int(i)]] = rows[[done + int(i), done]]
+            rows[done] /= rows[done, pivot]
+            others = np.arange(len(rows)) != done
+            rows[others] -= rows[others, pivot][:, None] * rows[done]
+            done += 1
+    return rows

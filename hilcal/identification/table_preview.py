@@ -12,7 +12,7 @@ the axes' names turns one convention into another, and A and B take it up.
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +23,7 @@ from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.misdescription import examine
-from hilcal.identification.registration import register
-from hilcal.identification.rigid_frames import nearest_rotation, rotation_of_attitudes
+from hilcal.identification.registration import nearest_rotation, register, rotation_of_attitudes
 from hilcal.readings.readings import Readings
 from hilcal.robot.arm import Arm
 from hilcal.robot.chain import evaluate
@@ -44,36 +43,33 @@ from hilcal.tables.units import ANGLES, CONVENTIONS, LENGTHS, NUMBERS, rotations
 from hilcal.toml import check_section
 from hilcal.types import Floats
 
-CLOSE = 0.02
-"""Part of the reach that a nominal arm may be off; arms are better by ten times; a choice."""
-MOST_TRIED = 8
-"""Choices of columns that are tried; each takes a registration."""
-AGREES = 0.05
-"""rad; nominal arms are better by far (1 mrad), other conventions worse (1 rad); a choice."""
-CLEARER = 5.0
-"""How much worse the next choice must fit for the first to be certain; a choice."""
-FEWEST, MOST = 6, 300
-"""Readings below which two free rotations fit too easily, and readings that are tried; choices."""
+# All of these are choices.
+CLOSE = 0.02  # part of the reach that a nominal arm may be off; arms are better by ten times
+MOST_TRIED = 8  # choices of columns that are tried; each takes a registration
+AGREES = 0.05  # rad; nominal arms are better by far (1 mrad), other conventions worse (1 rad)
+CLEARER = 5.0  # how much worse the next choice must fit for the first to be certain
+FEWEST, MOST = 6, 300  # readings below which two rotations fit too easily; readings that are tried
+ROUNDS = 20  # steps between A and B
 _EXTERNAL = re.compile(r"e(xt)?_?[1-6]\b", re.IGNORECASE)
-ROUNDS = 20
-"""Steps between A and B; a choice."""
+_OWN = ("intrinsic-", "fixed-", "rotation-", "quaternion-")
+"""Beginnings of conventions that are no maker's."""
 
 
 @dataclass(frozen=True, slots=True)
 class Agreement:
-    """How well a convention agrees with the arm.
-
-    Attributes:
-        convention: its name.
-        angle: rms angle left, rad.
-        position: rms distance left, m.
-        rms: both together, distances as parts of the arm's reach.
-    """
+    """How well a convention agrees with the arm."""
 
     convention: str
-    angle: float
-    position: float
-    rms: float
+    angle: float  # rms angle left, rad
+    position: float  # rms distance left, m
+    rms: float  # both together, distances as parts of the arm's reach
+
+    @property
+    def words(self) -> str:
+        """What is left."""
+        angle, distance = float(np.rad2deg(self.angle)), 1e3 * self.position
+        degrees = f"{angle:.{0 if angle >= 10 else 2}f}°"
+        return f"{degrees} and {distance:.{0 if distance >= 10 else 2}f} mm"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,22 +110,22 @@ def preview_table(
     if cell is None:
         return Preview(len(found.grid.rows), found.proposal, None)
     settings = cell.configured()
-    _name_targets(found, [target.name for target in settings.tool.targets])
+    _name_targets(found.proposal, [target.name for target in settings.tool.targets])
     _decide_travels(found, cell.arm)
     outcome = _decide_columns(table, found, settings, cell)
     outcome += _decide_convention(found, cell.arm)
-    outcome += _try(table, found, settings, cell)
+    outcome += _try(table, found.proposal, settings, cell)
     return Preview(len(found.grid.rows), found.proposal, tuple(outcome))
 
 
-def _name_targets(found: Proposed, names: list[str]) -> None:
+def _name_targets(proposal: Proposal, names: list[str]) -> None:
     """Give targets that stand side by side the cell's names, in its order."""
-    section = found.proposal.sections.get("position", {})
+    section = proposal.sections.get("position", {})
     if names and len(names) == len(section.get("targets", ())):
         section["targets"] = names
         words = f"the targets are {', '.join(names)}, in the cell's order"
-        kept = [doubt for doubt in found.proposal.unsure if doubt != ("position", SIDE_BY_SIDE)]
-        found.proposal.unsure[:] = [*kept, ("position", words)]
+        kept = [doubt for doubt in proposal.unsure if doubt != ("position", SIDE_BY_SIDE)]
+        proposal.unsure[:] = [*kept, ("position", words)]
 
 
 def _decide_travels(found: Proposed, arm: Arm) -> None:
@@ -146,23 +142,18 @@ def _decide_travels(found: Proposed, arm: Arm) -> None:
     if len(names) + len(external) == arm.n and len(external) == len(slides):
         for j, name in zip(slides, external, strict=True):
             names.insert(j, name)
-        kept = [each for each in proposal.unused if each[0] not in external]
-        proposal.unused[:] = kept
-        doubts = [
-            d for d in proposal.unsure if not d[1].startswith(f"{len(names) - len(slides)} c")
-        ]
+        proposal.unused[:] = [each for each in proposal.unused if each[0] not in external]
+        counted = f"{len(names) - len(slides)} c"
+        doubts = [d for d in proposal.unsure if not d[1].startswith(counted)]
         proposal.unsure[:] = [*doubts, ("joints", f"{', '.join(external)} taken for what slides")]
     if len(names) != arm.n:
         return
     q = np.abs(np.stack([grid.numbers(name) for name in names], axis=1))
     far = np.nanmax(q, axis=0)
-    turning = far[~arm.slides]
-    unit = section["unit"]
-    if unit == "deg" and turning.max(initial=0.0) <= TURN and not any("deg" in n for n in names):
+    turning, unit = far[~arm.slides].max(initial=0.0), section["unit"]
+    if unit == "deg" and turning <= TURN and not any("deg" in n for n in names):
         unit = "rad"
-        proposal.unsure.append(
-            ("joints", f"rad, since none turns by more than {turning.max():.3g}")
-        )
+        proposal.unsure.append(("joints", f"rad, since none turns by more than {turning:.3g}"))
     mm = bool(np.any(far[slides] > 10 * arm.travels[slides]))
     section |= {"columns": names, "unit": unit, "slide_unit": "mm" if mm else "m"}
     if mm:
@@ -171,9 +162,8 @@ def _decide_travels(found: Proposed, arm: Arm) -> None:
     row = int(np.flatnonzero(np.isfinite(q).all(axis=1))[0])
     example = tuple(f"{grid.numbers(name)[row]:g}" for name in names)
     k = next(k for k, told in enumerate(proposal.understood) if told.what == "joints")
-    proposal.understood[k] = UnderstoodColumn(
-        "joints", tuple(names), f"{unit}, {section['slide_unit']}", example
-    )
+    meaning = f"{unit}, {section['slide_unit']}"
+    proposal.understood[k] = UnderstoodColumn("joints", tuple(names), meaning, example)
 
 
 def _decide_convention(found: Proposed, arm: Arm) -> list[str]:
@@ -190,11 +180,10 @@ def _decide_convention(found: Proposed, arm: Arm) -> list[str]:
     if blocks[0].shape[1] != arm.n or blocks[1].shape[1] != 3:
         return []
     whole = np.isfinite(np.hstack(blocks)).all(axis=1)
-    q, y, numbers = (block[whole] for block in blocks)
+    q, y, values = (block[whole] for block in blocks)
+    q, y = ANGLES[joints["unit"]] * q, LENGTHS[position["unit"]] * y
     unit = ANGLES[section.get("unit", "rad")]
-    ranked = rank_conventions(
-        arm, ANGLES[joints["unit"]] * q, LENGTHS[position["unit"]] * y, numbers, unit
-    )
+    ranked = rank_conventions(arm, q, y, values, unit)
     if not ranked:
         return []
     guess = ("orientation", GUESSED)
@@ -204,30 +193,22 @@ def _decide_convention(found: Proposed, arm: Arm) -> list[str]:
     if decided is None:
         words = (
             f"the nominal {arm.name} does not decide the convention: "
-            f"{best.convention} leaves {_left(best)}, {second.convention} {_left(second)}"
+            f"{best.convention} leaves {best.words}, {second.convention} {second.words}"
         )
         proposal.unsure.append(("orientation", words))
         return []
-    if not _same(section["convention"], decided, numbers, unit):
+    one, other = (rotations(name, values, unit) for name in (section["convention"], decided))
+    if not np.allclose(one, other):
         section["convention"] = decided
     proposal.open_convention = False
-    for k, u in enumerate(proposal.understood):
-        if u.what == "orientation":
-            meaning = ", ".join(str(v) for key, v in section.items() if key != "columns")
-            proposal.understood[k] = UnderstoodColumn(u.what, u.columns, meaning, u.example)
+    meaning = ", ".join(str(v) for key, v in section.items() if key != "columns")
+    proposal.understood[:] = [
+        replace(u, meaning=meaning) if u.what == "orientation" else u for u in proposal.understood
+    ]
     return [
         f"orientation: {section['convention']}, since the nominal {arm.name} fits best with it: "
-        f"{_left(best)} are left, with the next convention {_left(second)}"
+        f"{best.words} are left, with the next convention {second.words}"
     ]
-
-
-def _left(fit: Agreement) -> str:
-    angle, distance = float(np.rad2deg(fit.angle)), 1e3 * fit.position
-    return f"{angle:.{0 if angle >= 10 else 2}f}° and {distance:.{0 if distance >= 10 else 2}f} mm"
-
-
-def _same(one: str, other: str, numbers: Floats, unit: float) -> bool:
-    return bool(np.allclose(rotations(one, numbers, unit), rotations(other, numbers, unit)))
 
 
 def _decide_columns(table: Path, found: Proposed, settings: CellConfig, cell: Cell) -> list[str]:
@@ -280,16 +261,17 @@ def _left_by_the_arm(
         return None
 
 
-def _try(table: Path, found: Proposed, settings: CellConfig, cell: Cell) -> list[str]:
+def _try(table: Path, proposal: Proposal, settings: CellConfig, cell: Cell) -> list[str]:
     """Import with the proposed mapping; what comes of it, in sentences."""
-    if found.proposal.lacking:
+    if proposal.lacking:
         return []
     try:
-        result = import_readings(table, found.proposal.mapping(Mapping), settings, cell.arm)
+        result = import_readings(table, proposal.mapping(Mapping), settings, cell.arm)
     except InputError as error:
         return [f"refused: {error}"]
     readings = result.readings
-    told = [*result.notes]
+    count = f"{len(readings)} readings of {len(np.unique(readings.pose))} poses"
+    told = [f"{count}, {_kinds(readings)}", *result.notes]
     try:
         registered = register(cell, readings)
         told.append(f"the nominal {cell.arm.name} leaves {numbers.length(registered.rms)} rms")
@@ -297,10 +279,7 @@ def _try(table: Path, found: Proposed, settings: CellConfig, cell: Cell) -> list
             told.append(wrong.words(cell, readings))
     except CannotAnswerError as error:
         told.append(str(error))
-    return [
-        f"{len(readings)} readings of {len(np.unique(readings.pose))} poses, {_kinds(readings)}",
-        *told,
-    ]
+    return told
 
 
 def _kinds(readings: Readings) -> str:
@@ -311,32 +290,28 @@ def _kinds(readings: Readings) -> str:
 
 
 def rank_conventions(
-    arm: Arm, q: Floats, position: Floats, numbers: Floats, unit: float
+    arm: Arm, q: Floats, position: Floats, values: Floats, unit: float
 ) -> tuple[Agreement, ...]:
-    """Rank the conventions of orientations (N, k) by their agreement with the nominal arm.
+    """Rank the conventions of orientations by their agreement with the nominal arm, best first.
 
-    Args:
-        arm: the arm.
-        q: (N, n) joint angles, rad.
-        position: (N, 3) m, sensor axes.
-        numbers: (N, 3) angles or rotation vectors, or (N, 4) quaternions.
-        unit: radians in the unit of angles.
-
-    Returns:
-        Every convention of as many numbers, best first; none where the readings are too few.
+    At joint angles (N, n) and positions (N, 3), sensor axes, of as many numbers (N, k) in a unit of
+    angles; none where the readings are too few.
     """
     step = max(1, len(q) // MOST)
-    q, position, numbers = q[::step], position[::step], numbers[::step]
+    q, y, values = q[::step], position[::step], values[::step]
     if len(q) < FEWEST:
         return ()
     chain = evaluate(arm, q)
     flange, p = chain.rotation[-1], chain.position[-1]
-    found = []
+    eye, found = np.broadcast_to(np.eye(3), (len(p), 3, 3)), []
     for name, kind in CONVENTIONS.items():
-        own = name.startswith(("intrinsic-", "fixed-", "rotation-", "quaternion-"))  # no maker's
-        if own and NUMBERS.get(kind, 3) == numbers.shape[1]:
-            base, angle = _turned(rotations(name, numbers, unit), flange)
-            distance = _distance(base, flange, p, position)
+        if name.startswith(_OWN) and NUMBERS.get(kind, 3) == values.shape[1]:
+            base, angle = _turned(rotations(name, values, unit), flange)
+            # y_i − A p_i = A R_i τ + t with the best τ and t
+            rest = (y - p @ base.T).reshape(-1)
+            design = np.concatenate([base @ flange, eye], axis=2).reshape(-1, 6)
+            left = rest - design @ np.linalg.lstsq(design, rest, rcond=1e-9)[0]
+            distance = float(np.sqrt(3 * np.mean(left**2)))
             rms = float(np.hypot(angle, distance / arm.reach))
             found.append(Agreement(name, angle, distance, rms))
     return tuple(sorted(found, key=lambda a: a.rms))
@@ -358,12 +333,3 @@ def _turned(measured: Floats, flange: Floats) -> tuple[Floats, float]:
     trace = np.einsum("nij,nij->n", measured, a @ flange @ b)
     angle = np.arccos(np.clip((trace - 1) / 2, -1, 1))
     return a, float(np.sqrt(np.mean(angle**2)))
-
-
-def _distance(base: Floats, flange: Floats, p: Floats, y: Floats) -> float:
-    """Rms distance, m, of y_i − A p_i = A R_i τ + t with the best τ and t."""
-    rest = (y - p @ base.T).reshape(-1)
-    eye = np.broadcast_to(np.eye(3), (len(p), 3, 3))
-    design = np.concatenate([base @ flange, eye], axis=2).reshape(-1, 6)
-    left = rest - design @ np.linalg.lstsq(design, rest, rcond=1e-9)[0]
-    return float(np.sqrt(3 * np.mean(left**2)))

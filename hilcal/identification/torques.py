@@ -12,6 +12,7 @@ one pose, from which all that does not depend on the load cancels; b and c from 
 intervals.
 """
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -23,53 +24,37 @@ from hilcal.readings.readings import Readings, States
 from hilcal.robot.chain import evaluate
 from hilcal.robot.statics import Load, slot_wrenches
 from hilcal.store.plan import UNLOADED
-from hilcal.types import Floats
+from hilcal.types import Floats, Ints
 
 ARM, TOOL = "the arm's masses", "the tool's mass"
 LEVEL = 0.95
-SURE = 1e-3
-"""Two-sided p-value below which a factor differs from 1; a choice."""
-LEAST = 0.02
-"""Share by which a factor has to differ to be worth a word; a choice: motors' torque constants are
-known to a few per cent."""
-ROUNDS = 4
-"""Times that the noise of the drives is estimated anew; a choice."""
-TOLD = 1e-6
-"""Torques below this share of the largest tell nothing of their cause, rounding apart."""
+SURE = 1e-3  # two-sided p-value below which a factor differs from 1; a choice
+LEAST = 0.02  # share by which it has to differ: torque constants are known to some %; a choice
+ROUNDS = 4  # times that the noise of the drives is estimated anew; a choice
+TOLD = 1e-6  # torques below this share of the largest tell nothing of their cause: rounding
+
+_Factor = tuple[float, float, float, float]
+"""Estimate, lower and upper end of its interval, p-value of 1."""
 
 
 @dataclass(frozen=True, slots=True)
 class TorqueFactor:
-    """How large a cause of torques is, in units of its description.
+    """How large a cause of torques is, in units of its description."""
 
-    Attributes:
-        of: the load's name, `ARM` or `TOOL`.
-        factor: estimate; 1 where the description is right.
-        low: lower end of its 95 % interval.
-        high: upper end.
-        stated_kg: the mass as described; None where it is not one of a weight.
-        differs: whether it is another than described.
-    """
-
-    of: str
-    factor: float
-    low: float
-    high: float
-    stated_kg: float | None
-    differs: bool
+    of: str  # the load's name, `ARM` or `TOOL`
+    factor: float  # estimate; 1 where the description is right
+    low: float  # lower end of its 95 % interval
+    high: float  # upper end
+    stated_kg: float | None  # the mass as described; None where it is not one of a weight
+    differs: bool  # whether it is another than described
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TorqueCheck:
-    """Measured against modelled torques.
+    """Measured against modelled torques."""
 
-    Attributes:
-        factors: of loads, arm and tool, as far as the readings tell them.
-        std_Nm: (n,) standard deviation of what is left, of each drive, N·m.
-    """
-
-    factors: tuple[TorqueFactor, ...]
-    std_Nm: Floats
+    factors: tuple[TorqueFactor, ...]  # of loads, arm and tool, as far as the readings tell them
+    std_Nm: Floats  # (n,) standard deviation of what is left, of each drive, N·m
 
     def to_json(self) -> dict[str, object]:
         """Return its JSON."""
@@ -86,137 +71,109 @@ def modelled_torques(cell: Cell, states: States, wrench: Floats, arm: bool, tool
 
 
 def require_torques(cell: Cell, readings: Readings) -> None:
-    """Refuse a cell that asks for measured torques of readings that have none.
-
-    Raises:
-        InputError: says so.
-    """
-    if not cell.measured_torques:
-        return
+    """Refuse a cell that asks for measured torques of readings that have none."""
     torque = readings.states.torque
-    if torque is None:
-        raise InputError(
-            '[robot] torques = "measured", but the readings have no columns tau1_Nm, ...; valid: '
-            'readings with them, or torques = "modelled"'
-        )
-    if lost := int(np.isnan(torque).any(axis=1).sum()):
-        raise InputError(
-            f'[robot] torques = "measured", but {lost} of {len(readings)} readings have none; '
-            'valid: readings with them, or torques = "modelled"'
-        )
+    lost = 0 if torque is None else int(np.isnan(torque).any(axis=1).sum())
+    if not cell.measured_torques or (torque is not None and not lost):
+        return
+    what = "the readings have no columns tau1_Nm, ..."
+    if torque is not None:
+        what = f"{lost} of {len(readings)} readings have none"
+    raise InputError(
+        f'[robot] torques = "measured", but {what}; valid: readings with them, or torques = '
+        '"modelled"'
+    )
 
 
 def check_torques(cell: Cell, readings: Readings) -> TorqueCheck | None:
-    """Compare measured with modelled torques, of the readings that have some; None without.
-
-    Args:
-        cell: arm, tool and gravity as described.
-        readings: N readings.
-    """
+    """Compare measured with modelled torques, of the readings that have some; None without."""
     if readings.states.torque is None:
         return None
     readings = readings[np.flatnonzero(~np.isnan(readings.states.torque).any(axis=1))]
-    states = readings.states
-    if states.torque is None or not len(readings):
+    states, torque = readings.states, readings.states.torque
+    if torque is None or not len(readings):
         return None
     none = np.zeros_like(states.wrench)
-    own: dict[str, Floats] = {}
+    loads: dict[str, Floats] = {}
     for k in np.unique(readings.load):
-        mine = (readings.load == k)[:, None]
-        if (states.wrench * mine).any():
-            own[readings.load_names[k]] = -modelled_torques(
-                cell, states, states.wrench * mine, False, False
-            )
+        wrench = states.wrench * (readings.load == k)[:, None]
+        if wrench.any():
+            torques = modelled_torques(cell, states, wrench, False, False)
+            loads[readings.load_names[k]] = -torques
     body = {
         ARM: -modelled_torques(cell, states, none, True, False),
         TOOL: -modelled_torques(cell, states, none, False, True),
     }
-    visit = np.unique(
-        np.stack([readings.pose, readings.cycle], axis=1), axis=0, return_inverse=True
-    )
-    group = visit[1].reshape(-1)
-    paired = bool(np.any(np.bincount(group) > 1)) and _within(group, own)
-    side = [] if states.approach is None else [states.approach]
-    if paired:
-        loads, std = _fitted(
-            _centred(states.torque, group),
-            {name: _centred(x, group) for name, x in own.items()},
-            [_centred(s, group) for s in side],
-            len(np.unique(group)),
-        )
-        rest = states.torque - sum(
-            (loads[name][0] * x for name, x in own.items() if name in loads), np.zeros(())
-        )
-        bodies, _ = _fitted(_means(rest, group), {k: _means(x, group) for k, x in body.items()},
-                              [_means(s, group) for s in side], 0)  # fmt: skip
-        found = loads | bodies
+    visits = np.stack([readings.pose, readings.cycle], axis=1)
+    group = np.unique(visits, axis=0, return_inverse=True)[1].reshape(-1)
+    side = {} if states.approach is None else {"side": states.approach}
+
+    def centred(parts: Mapping[str, Floats]) -> dict[str, Floats]:
+        return {k: x - _means(x, group)[group] for k, x in parts.items()}
+
+    def means(parts: Mapping[str, Floats]) -> dict[str, Floats]:
+        return {k: _means(x, group) for k, x in parts.items()}
+
+    told = [
+        np.abs(x).max() > TOLD * max(np.abs(loads[k]).max(), 1e-12)
+        for k, x in centred(loads).items()
+    ]
+    if loads and all(told):  # every load by differences between the readings of one pose
+        lost = len(np.unique(group))
+        y = centred({"y": torque})["y"]
+        found, std = _fitted(y, centred(loads), centred(side), lost)
+        rest = torque - sum((found[k][0] * loads[k] for k in found), np.zeros(()))
+        found = found | _fitted(_means(rest, group), means(body), means(side), 0)[0]
     else:
-        found, std = _fitted(states.torque, own | body, side, 0)
-    factors = tuple(
-        _factor(cell, readings, name, *found[name]) for name in (*own, *body) if name in found
-    )
-    return TorqueCheck(factors, std)
+        found, std = _fitted(torque, loads | body, side, 0)
+    factors = [_factor(cell, readings, k, *found[k]) for k in (*loads, *body) if k in found]
+    return TorqueCheck(tuple(factors), std)
 
 
-def _within(group: np.ndarray, own: dict[str, Floats]) -> bool:
-    """Whether every load is told by differences between readings of one pose."""
-    return bool(own) and all(
-        np.abs(_centred(x, group)).max() > TOLD * max(np.abs(x).max(), 1e-12) for x in own.values()
-    )
-
-
-def _means(x: Floats, group: np.ndarray) -> Floats:
-    """(G, n) means of the groups."""
-    count = np.bincount(group)[:, None]
-    out = np.zeros((len(count), x.shape[1]))
+def _means(x: Floats, group: Ints) -> Floats:
+    """(G, n) means of the groups (N,)."""
+    out = np.zeros((int(group.max()) + 1, x.shape[1]))
     np.add.at(out, group, x)
-    return np.asarray(out / count)
-
-
-def _centred(x: Floats, group: np.ndarray) -> Floats:
-    """(N, n) what differs from the mean of the group."""
-    return np.asarray(x - _means(x, group)[group])
+    return np.asarray(out / np.bincount(group)[:, None])
 
 
 def _fitted(
-    y: Floats, causes: dict[str, Floats], side: list[Floats], lost: int
-) -> tuple[dict[str, tuple[float, float, float, float]], Floats]:
-    """Factors (estimate, low, high, p of 1) of causes (N, n), and the drives' noise (n,).
+    y: Floats, causes: Mapping[str, Floats], side: Mapping[str, Floats], lost: int
+) -> tuple[dict[str, _Factor], Floats]:
+    """Factors of causes (N, n), as far as they are told apart, and the drives' noise (n,).
 
-    Args:
-        y: (N, n) measured torques.
-        causes: torques of each at a factor of 1.
-        side: sides of the approach (N, n), where they are known.
-        lost: degrees of freedom that centring took from each drive.
+    Sides of the approach (N, n) are causes of no factor; centring took `lost` degrees of freedom
+    from each drive, which has an offset where that is zero.
     """
     count, n = y.shape
     largest = max([float(np.abs(x).max()) for x in causes.values()], default=0.0)
     names = [k for k, x in causes.items() if np.abs(x).max() > TOLD * largest]
     columns = [causes[k].T.reshape(-1) for k in names]
     one = np.eye(n)
-    own = [np.kron(one[j], np.ones(count)) for j in range(n)] if not lost else []
-    own += [np.kron(one[j], s[:, j]) for s in side for j in range(n) if np.ptp(s[:, j]) > 0]
-    a = np.stack([*columns, *own], axis=1) if columns or own else np.zeros((n * count, 0))
+    if not lost:
+        columns += [np.kron(one[j], np.ones(count)) for j in range(n)]
+    columns += [
+        np.kron(one[j], s[:, j]) for s in side.values() for j in range(n) if np.ptp(s[:, j]) > 0
+    ]
+    a = np.stack(columns, axis=1) if columns else np.zeros((n * count, 0))
     b, std = y.T.reshape(-1), np.ones(n)
-    own_dof = max(count - lost - a.shape[1] / n, 1.0)
-    x, cov = np.zeros(a.shape[1]), np.zeros((a.shape[1], a.shape[1]))
+    dof_of_each = max(count - lost - a.shape[1] / n, 1.0)
     for _ in range(ROUNDS):
         w = np.repeat(1.0 / std, count)
         u, s, vt = np.linalg.svd(a * w[:, None], full_matrices=False)
         kept = s > 1e-9 * max(float(s.max(initial=0.0)), 1e-300)
         back = vt[kept].T / s[kept]
         x, cov = back @ (u[:, kept].T @ (b * w)), back @ back.T
-        left = (b - a @ x).reshape(n, count)
-        std = np.maximum(np.sqrt(np.sum(left**2, axis=1) / own_dof), 1e-9 * (1 + np.abs(b).max()))
-    null = vt[~kept] if a.shape[1] else np.zeros((0, 0))
+        square = np.sum((b - a @ x).reshape(n, count) ** 2, axis=1)
+        std = np.maximum(np.sqrt(square / dof_of_each), 1e-9 * (1 + np.abs(b).max()))
+    null = np.abs(vt[~kept]).max(axis=0, initial=0.0)
     dof = max(n * (count - lost) - a.shape[1], 1)
     half, out = float(student.ppf(0.5 + LEVEL / 2, dof)), {}
     for k, name in enumerate(names):
-        if null.size and np.abs(null[:, k]).max() > 1e-6:
-            continue  # not told apart from others
-        size = float(np.sqrt(cov[k, k]))
-        p = 2 * float(student.sf(abs(x[k] - 1) / max(size, 1e-12), dof))
-        out[name] = (float(x[k]), float(x[k] - half * size), float(x[k] + half * size), p)
+        if null[k] <= 1e-6:
+            value, size = float(x[k]), float(np.sqrt(cov[k, k]))
+            p = 2 * float(student.sf(abs(value - 1) / max(size, 1e-12), dof))
+            out[name] = (value, value - half * size, value + half * size, p)
     return out, std
 
 

@@ -3,33 +3,25 @@
 While the residual is within the noise, Cov(θ) = T H⁻¹ Tᵀ. With a misfit, errors of neighbouring
 readings are correlated and that formula is far too optimistic. Then the standard uncertainty is
 the largest of three: the formal one times the root of the variance factor, and two delete-a-group
-jackknives, with groups of consecutive readings and with groups close in joint space:
+jackknives, with groups of consecutive readings and with groups close in joint space (Efron and
+Tibshirani, *An Introduction to the Bootstrap*, chapter 11):
 
     Var(θ_p) = (G − 1)/G Σ_g (θ_p without g − mean)²
 
-Source: Efron and Tibshirani, *An Introduction to the Bootstrap*, chapter 11.
-
-Uncertainty of the parameters of a shrunk family due to that of its prior variance.
-
-A group's prior N(0, τ²) is estimated from the data (`empirical_bayes`), from few parameters and
-therefore badly: intervals for that τ alone would be too short for weak groups. The uncertainty is
-that of the mixture over τ, around the estimate that is used:
+A shrunk group's prior N(0, τ²) is estimated from few parameters, and therefore badly. The
+uncertainty is that of the mixture over τ, around the estimate that is used (Kass and Steffey,
+J. Am. Stat. Assoc. 84 (1989) 717-726):
 
     E[(θ − θ̂)²] = Σ_τ w_τ [ V_τ + (m_τ − θ̂)² ],   w_τ ∝ p(τ) |I + τ² L|^(−1/2) exp(½ bᵀ V_τ b)
 
 with L and b the precision and the right-hand side of the group alone, V_τ = (L + I/τ²)⁻¹ and
-m_τ = V_τ b. p(τ) is half-Cauchy; its scale is the spread at which noise alone is as large as the
-group, so that a zero and a nonzero group are equally probable. Other groups keep their τ.
+m_τ = V_τ b. p(τ) is half-Cauchy (Polson and Scott, Bayesian Analysis 7 (2012) 887-902); its scale
+is the spread at which noise alone is as large as the group, so that a zero and a nonzero group are
+equally probable. Other groups keep their τ.
 
 Parameters of dropped groups may differ from zero by as much as the noise allows. They are
 integrated out with a prior of that size: with M the projection off their columns D with its ridge
-β Λ (`projection`), A the columns of the others and Λ_z the ridge of these,
-
-    Cov(z) = (Aᵀ M A + Λ_z)⁻¹
-
-Sources: Kass and Steffey, *Approximate Bayesian inference in conditionally independent
-hierarchical models*, J. Am. Stat. Assoc. 84 (1989) 717-726; Polson and Scott, *On the half-Cauchy
-prior for a global scale parameter*, Bayesian Analysis 7 (2012) 887-902.
+β Λ (`projection`), A the columns of the others and Λ_z their ridge, Cov(z) = (Aᵀ M A + Λ_z)⁻¹.
 """
 
 from dataclasses import dataclass
@@ -37,11 +29,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
-from hilcal.identification.coordinates import Coordinates
-from hilcal.identification.folds import block_folds, region_folds
+from hilcal.identification.carried import Coordinates
+from hilcal.identification.folds import block_folds, changes, region_folds
 from hilcal.identification.gauss_newton import Solution, whitened_jacobian
-from hilcal.identification.holdout import changes
-from hilcal.identification.priors import prior_of, scales_of
+from hilcal.identification.priors import names_of, prior_of, scales_of
+from hilcal.identification.solver import echelon
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Whitening
@@ -50,39 +42,24 @@ from hilcal.regression.projection import Projection
 from hilcal.regression.schur import inverse_root
 from hilcal.types import Bools, Floats, Ints
 
-LEARNT = 0.7
-"""Ratio of posterior to prior standard deviation below which a parameter with a prior is
-identifiable; a choice, no study set it."""
-MEANINGLESS = 10.0
-"""Standard uncertainty, in ordinary magnitudes, from which on a parameter is not identifiable; a
-choice, no study set it."""
-MISFIT_CHANCE = 0.01
-"""p-value of χ² below which the residual is a misfit; a choice, no study set it."""
-GRID = np.logspace(-2.0, 3.0, 101)
-"""Values of τ in units of the half-Cauchy's scale."""
+LEARNT = 0.7  # posterior over prior standard deviation below which one is identifiable; a choice
+MEANINGLESS = 10.0  # standard uncertainty, in ordinary magnitudes, from which none is; a choice
+MISFIT_CHANCE = 0.01  # p-value of χ² below which the residual is a misfit; a choice
+GRID = np.logspace(-2.0, 3.0, 101)  # values of τ in units of the half-Cauchy's scale
 ROUNDING = 1e-9
-HIDDEN = 2.0
-"""Variance that a dropped group may have, in units of that by noise alone:
-the mean over τ of a group at the limit of being dropped."""
+HIDDEN = 2.0  # variance that a dropped group may have, in units of that by noise alone:
+# the mean over τ of a group at the limit of being dropped
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Uncertainty:
-    """Uncertainty and identifiability of the parameters.
+    """Uncertainty and identifiability of the parameters."""
 
-    Attributes:
-        std: (P,) standard uncertainties; infinite where not identifiable.
-        formal: (P,) standard uncertainties under independent noise of the stated size alone.
-        identifiable: (P,) which parameters the data determine.
-        inflated: whether the residual is larger than noise, so that `std` is that of a misfit.
-        null: names of the unidentifiable directions.
-    """
-
-    std: Floats
-    formal: Floats
-    identifiable: Bools
-    inflated: bool
-    null: tuple[str, ...]
+    std: Floats  # (P,) standard uncertainties; infinite where not identifiable
+    formal: Floats  # (P,) under independent noise of the stated size alone
+    identifiable: Bools  # (P,) which parameters the data determine
+    inflated: bool  # whether the residual is larger than noise, so that `std` is that of a misfit
+    null: tuple[str, ...]  # names of the unidentifiable directions
 
 
 def uncertainty(
@@ -95,41 +72,29 @@ def uncertainty(
     dof: float,
 ) -> Uncertainty:
     """Uncertainties of a solution in the scaling `w`, with gc-whitened χ² `total` on `dof`."""
-    basis = solution.equations.basis
-    scale = scales_of(model)
+    basis, scale, space = solution.equations.basis, scales_of(model), solution.space
     spread = solution.equations.inverse(solution.beta)
     covariance = solution.transform @ spread @ solution.transform.T
     variance = np.diag(covariance).copy()
-    variance[solution.space.index] += solution.space.rest / solution.beta
+    variance[space.index] += space.rest / solution.beta
     noise = solution.beta if w.scaling == "none" else 1.0
     formal = np.sqrt(np.maximum(variance, 0.0) * noise)
-    misfit = w.scaling != "none" and bool(chi2.sf(total, dof) < MISFIT_CHANCE)
-    std = formal
+    misfit, std = w.scaling != "none" and bool(chi2.sf(total, dof) < MISFIT_CHANCE), formal
     if misfit:
         std = formal * np.sqrt(total / dof)
         angle = readings.states.q[w.reading]
         for fold in (block_folds(pose), region_folds(angle, pose)):
             change = changes(model, solution, fold, w)
-            count = len(change)
-            off = change - change.mean(axis=0)
-            jackknife = np.sqrt((count - 1) / count * np.sum(off**2, axis=0))
-            std = np.maximum(std, jackknife)
-    null = in_ordinary_magnitudes(solution.space, basis.null, scale)
-    carried = solution.space.carried(len(scale))
+            count, off = len(change), change - change.mean(axis=0)
+            std = np.maximum(std, np.sqrt((count - 1) / count * np.sum(off**2, axis=0)))
+    null = in_ordinary_magnitudes(space, basis.null, scale)
+    carried = space.carried(len(scale))
     identifiable = identifiable_parameters(basis, solution.prior, carried, scale, std, null)
-    std = std * _hyperparameter_factors(model, w, solution, covariance)
-    return Uncertainty(
-        np.where(identifiable, std, np.inf),
-        formal,
-        identifiable,
-        misfit,
-        name_directions(model, null),
-    )
+    std = np.where(identifiable, std * _wider(model, w, solution, covariance), np.inf)
+    return Uncertainty(std, formal, identifiable, misfit, name_directions(model, null))
 
 
-def _hyperparameter_factors(
-    model: Model, w: Whitening, solution: Solution, covariance: Floats
-) -> Floats:
+def _wider(model: Model, w: Whitening, solution: Solution, covariance: Floats) -> Floats:
     """Factors (P,) by which the unknown prior variances of shrunk families widen `std`."""
     groups, beta = prior_of(model)[1], solution.beta
     factor = hyperparameter_factors(beta * covariance, solution.theta, solution.prior, groups)
@@ -155,13 +120,8 @@ def identifiable_parameters(
 ) -> Bools:
     """(P,) parameters that unidentifiable directions hardly move, and that the data determine.
 
-    Args:
-        basis: identifiable coordinates of a fit.
-        prior: (P,) prior standard deviations of its y.
-        carried: (P,) parameters with a carried prior.
-        scale: (P,) ordinary magnitudes.
-        std: (P,) standard uncertainties.
-        null: (P, U) unidentifiable directions, in ordinary magnitudes.
+    Of a fit with some prior (P,) of its y and parameters with a carried one (P,); `scale`, `std`
+    (P,) and directions `null` (P, U) as of `uncertainty`.
     """
     moved = scale * np.linalg.norm(null, axis=1)
     flat = (moved <= NULL_SHARE * std) & (std < MEANINGLESS * scale)
@@ -175,30 +135,18 @@ def name_directions(model: Model, null: Floats, most: int = 3) -> tuple[str, ...
     The directions are brought to echelon form first, each pivoting on its largest element,
     so that every one involves few parameters. Factors are in ordinary magnitudes.
     """
-    names = [f"{e.name}.{p.name}" for e in model.effects for p in e.parameters]
-    rows = null.T.copy()
-    for i in range(len(rows)):
-        pivot = i + int(np.argmax(np.abs(rows[i:]).max(axis=1)))
-        rows[[i, pivot]] = rows[[pivot, i]]
-        column = int(np.argmax(np.abs(rows[i])))
-        rows[i] /= rows[i, column]
-        others = np.arange(len(rows)) != i
-        rows[others] -= np.outer(rows[others, column], rows[i])
-    out = []
-    for row in rows:
+    names, out = names_of(model), []
+    for row in echelon(null.T, (range(len(null)),)):
         order = np.argsort(-np.abs(row), kind="stable")
         strong = [k for k in order if abs(row[k]) > 0.05]
+        factors = [f"{abs(row[k]):.2g}" for k in strong[:most]]
         text = " ".join(
-            ("+ " if row[k] > 0 else "− ") + _times(abs(row[k])) + names[k] for k in strong[:most]
+            f"{'+' if row[k] > 0 else '−'} {'' if f == '1' else f'{f}·'}{names[k]}"
+            for k, f in zip(strong, factors, strict=False)
         )
         more = f" … ({len(strong) - most} more)" if len(strong) > most else ""
         out.append(text.removeprefix("+ ") + more)
     return tuple(out)
-
-
-def _times(factor: float) -> str:
-    text = f"{factor:.2g}"
-    return "" if text == "1" else f"{text}·"
 
 
 def hyperparameter_factors(
@@ -206,18 +154,14 @@ def hyperparameter_factors(
 ) -> Floats:
     """Return the factors (P,), at least 1, by which standard uncertainties grow.
 
-    Args:
-        covariance: (P, P) of the parameters at the chosen priors, in true units of noise.
-        theta: (P,) estimates.
-        prior: (P,) prior standard deviations, the same within a group; infinite or zero for
-            parameters that are not shrunk or held at zero.
-        groups: (P,) group of each parameter, −1 for those that are not shrunk.
+    Of the covariance at the chosen priors, in true units of noise; of priors, the same within a
+    group, infinite or zero for parameters that are not shrunk or held at zero; groups −1 for these.
     """
     out = np.ones(len(theta))
     shrunk = (groups >= 0) & np.isfinite(prior) & (prior > 0)
     for group in np.unique(groups[shrunk]):
-        mine = np.flatnonzero(shrunk & (groups == group))
-        out[mine] = _of_group(covariance[np.ix_(mine, mine)], theta[mine], float(prior[mine[0]]))
+        rows = np.flatnonzero(shrunk & (groups == group))
+        out[rows] = _of_group(covariance[np.ix_(rows, rows)], theta[rows], float(prior[rows[0]]))
     return out
 
 
@@ -248,12 +192,8 @@ def dropped_group_factors(
 ) -> Floats:
     """Return the factors (P,), at least 1, by which groups that were dropped widen all others.
 
-    Args:
-        transform: (P, K) parameters per coordinate z.
-        p: the model by its coordinates z.
-        columns: (R, Q) whitened derivatives D by the dropped parameters.
-        groups: (Q,) their groups.
-        beta: noise factor that priors are weighed against.
+    Of parameters per coordinate z (P, K), the model by z, whitened derivatives D (R, Q) by the
+    dropped parameters, and their groups (Q,).
     """
     cross, own_gram = p.rows.T @ columns, columns.T @ columns
     norm2 = np.diag(own_gram)

@@ -1,45 +1,51 @@
-"""Prediction of readings that a model was never fitted to."""
+"""Prediction of readings that a model was never fitted to, what lies outside, and what is passed.
 
-from dataclasses import dataclass, replace
+A model may be wrong wherever nothing was measured, however well it predicts poses left out among
+those that were. A variable is left where a reading is beyond the fitted ones' smallest or largest
+value by more than `MARGIN` of their range; an angle is where it is whole turns on, too, unless the
+model tells them apart (`whole_turns`). Joint angles inside of their ranges can be far from all
+fitted ones as well; then the leverage of a reading is large: the variance of its prediction over
+that of the noise, (J C Jᵀ) V⁻¹ σ⁻² with the largest eigenvalue, compared with h/(1 − h) of the
+fitted measurements, each predicted without itself.
+"""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
+from scipy.stats import chi2
 
 from hilcal.effects.protocol import FRAME_ROLES, Effect
-from hilcal.effects.target_offset import TargetOffset
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.registration import register
+from hilcal.identification.predictive import Predictive
+from hilcal.identification.registration import register, targets_as_fitted
 from hilcal.identification.residual import ErrorBlock, error_block, noise_floor, residual
+from hilcal.identification.robot_frames import whole_turns
 from hilcal.model.model import Model
+from hilcal.readings.ranges import ranges_of, turning_variables, variables
 from hilcal.readings.readings import Readings
-from hilcal.readings.whitening import Mode, Whitening, whitening
-from hilcal.types import Floats
+from hilcal.readings.whitening import Mode, Whitening, inverse_root, whitening
+from hilcal.shown import Shown
+from hilcal.types import Bools, Floats, Ints
 
-STEPS = 10
-"""Most Gauss-Newton steps of a registration; a choice, no study set it."""
-CONVERGED = 1e-6
-"""Step of a registration that ends it, in σ per whitened element; a choice, no study set it."""
+STEPS = 10  # most Gauss-Newton steps of a registration; a choice
+CONVERGED = 1e-6  # step of a registration that ends it, in σ per whitened element; a choice
+# leverage from which a reading is outside, in units of that which one in a hundred of the fitted
+# measurements exceeds; a choice
+FAR = 2.0
+BAND = 0.95  # probability of the band that is stated, as is usual (GUM)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Validation:
-    """Prediction errors of readings that a model was not fitted to.
-
-    Attributes:
-        readings: the other readings.
-        whitening: their gc-scaling.
-        raw: (D, m) residual.
-        error: error block.
-        variance_factor: whitened sum of squares by its rank; nothing was fitted but, where
-            asked for, the registration.
-        registered: whether the registration was estimated anew.
-    """
+    """Prediction errors of readings that a model was not fitted to."""
 
     readings: Readings
-    whitening: Whitening
-    raw: Floats
+    whitening: Whitening  # their gc-scaling
+    raw: Floats  # (D, m) residual
     error: ErrorBlock
-    variance_factor: float
-    registered: bool
+    variance_factor: float  # whitened sum of squares by its rank, less a registration's
+    registered: bool  # whether the registration was estimated anew
 
     @property
     def noise_floor(self) -> float:
@@ -77,53 +83,285 @@ def validate(
             "several observers: where they stand is told by the readings that were fitted; valid: "
             "readings by them, without a registration anew, or by one tracker"
         )
-    for effect in model.effects:
-        if effect.role not in FRAME_ROLES and not effect.computable(other.states):
-            raise InputError(
-                f"effect {effect.name} needs {', '.join(effect.needs)}, which the other readings "
-                "do not have"
-            )
+    require_columns(model, other, "other")
     w = whitening(other, mode, "gc")
     if registered:
         model, theta = _register(model, theta, fitted, other, w)
     raw = residual(other, model.predict(other.states, theta), w)
     white = w.whiten(raw).reshape(-1)
-    free = 6 if registered else 0
-    return Validation(
-        readings=other,
-        whitening=w,
-        raw=raw,
-        error=error_block(raw, w),
-        variance_factor=float(white @ white) / max(w.rank - free, 1),
-        registered=registered,
-    )
+    factor = float(white @ white) / max(w.rank - (6 if registered else 0), 1)
+    return Validation(other, w, raw, error_block(raw, w), factor, registered)
+
+
+def require_columns(model: Model, readings: Readings, which: str) -> None:
+    """Refuse readings ("other", "later") without a column that an effect of the model needs."""
+    for effect in model.effects:
+        if effect.role not in FRAME_ROLES and not effect.computable(readings.states):
+            raise InputError(
+                f"effect {effect.name} needs {', '.join(effect.needs)}, which the {which} readings "
+                "do not have"
+            )
 
 
 def _register(
     model: Model, theta: Floats, fitted: Readings, other: Readings, w: Whitening
 ) -> tuple[Model, Floats]:
     """Closed-form registration to the other readings, then Gauss-Newton on `base_frame`."""
-    parts = [(e, theta[s]) for e, s in zip(model.effects, model.slices(), strict=True)]
-    targets = model.cell.all_targets
-    for e, offset in parts:
-        if isinstance(e, TargetOffset):
-            targets = e.displaced(offset)
+    targets = targets_as_fitted(model, theta)
     held = model.cell.with_targets(targets, known=(True,) * len(targets))
-    unknown = replace(held, registration_known=False)
-    cell = replace(model.cell, registration=register(unknown, other).cell.registration)
-    kept = [(e, t) for e, t in parts if e.role != "registration"]
+    found = register(replace(held, registration_known=False), other)
+    cell = replace(model.cell, registration=found.cell.registration)
+    parts = zip(model.effects, model.slices(), strict=True)
+    kept = [(e, theta[s]) for e, s in parts if e.role != "registration"]
     effects: list[Effect] = [type(e)(cell, fitted.states, e.options) for e, _ in kept]
     frame = model.catalogue.with_role("registration")[0](cell, fitted.states)
     moved = replace(model, cell=cell, effects=(*effects, frame))
     values = np.concatenate([*(t for _, t in kept), np.zeros(6)])
     for _ in range(STEPS):
         prediction = moved.predict(other.states, values)
-        target_row = w.whiten(residual(other, prediction, w)).reshape(-1)
+        white = w.whiten(residual(other, prediction, w)).reshape(-1)
         columns = w.whiten(w.raw(moved.jacobian_of((frame,), prediction, values, w.m)))
-        step = np.linalg.lstsq(columns.reshape(-1, 6), target_row, rcond=1e-9)[0]
+        columns = columns.reshape(-1, 6)
+        step = np.linalg.lstsq(columns, white, rcond=1e-9)[0]
         values[-6:] += step
-        if float(np.linalg.norm(columns.reshape(-1, 6) @ step)) < CONVERGED * len(target_row):
+        if float(np.linalg.norm(columns @ step)) < CONVERGED * len(white):
             return moved, values
     raise CannotAnswerError(
         "registration: does not settle on these readings; measure poses spread in space"
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Beyond:
+    """Readings beyond the fitted range of one variable."""
+
+    variable: str  # e.g. "joint 2 angle", "force", "leverage"
+    unit: str  # SI
+    low: float  # smallest fitted value
+    high: float  # largest fitted value; of the leverage, the limit
+    count: int  # number of measurements beyond
+    most: float  # how far the farthest is beyond
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Extrapolation:
+    """What a fit states of readings that it has not seen, and which of them lie outside."""
+
+    outside: Bools  # (D,) measurements that lie outside in any variable
+    variables: tuple[Beyond, ...]  # those that are left, most measurements first
+    stated_m: Floats  # (D,) standard deviation that the fit states of the 3-D position error, m
+    z: Floats  # (D,) error over the stated standard deviation, rms of the elements
+    inside_error: ErrorBlock | None  # of the measurements inside; None where there are none
+    outside_error: ErrorBlock | None  # of those outside
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the keys of `validate --json` on extrapolation and stated standard deviations."""
+        z, errors = self.z, {"inside": self.inside_error, "outside": self.outside_error}
+        members = {"inside": ~self.outside, "outside": self.outside}
+        return {
+            "stated_rms_m": _rms(self.stated_m),
+            "z_rms": _rms(z),
+            "extrapolation": {
+                "n_outside": int(self.outside.sum()),
+                "variables": [
+                    {
+                        "variable": v.variable,
+                        "unit": v.unit,
+                        "measured": [v.low, v.high],
+                        "n_outside": v.count,
+                        "beyond": v.most,
+                    }
+                    for v in self.variables
+                ],
+                **{f"error_{k}": None if e is None else e.to_json() for k, e in errors.items()},
+                **{f"z_{k}": _rms(z[rows]) if rows.any() else None for k, rows in members.items()},
+            },
+        }
+
+
+def _rms(x: Floats) -> float:
+    return float(np.sqrt(np.mean(x**2)))
+
+
+def extrapolation(p: Predictive, fitted: Readings, found: Validation) -> Extrapolation:
+    """Compare other readings, predicted, with those that a model was fitted to."""
+    w, other, raw, units = found.whitening, found.readings, found.raw, p.model.cell.arm.units
+    prediction = p.model.predict(other.states, p.theta)
+    spread, noise = p.of_prediction(prediction, w), p.of_noise(w)
+    root = inverse_root(noise)
+    leverage = np.linalg.eigvalsh(root @ spread @ np.swapaxes(root, 1, 2))[:, -1]
+    beyond, outside = [], np.zeros(len(w.reading), dtype=np.bool_)
+    known = {r.variable: r for r in ranges_of(fitted.states, units)}
+    turning = turning_variables(whole_turns(p.model, p.theta))
+    for name, unit, values in variables(other.states, units):
+        if name not in known:
+            continue
+        r, after, turns = known[name], values[w.reading], name in turning
+        far = r.beyond(after, turning=turns)
+        if far.any():
+            most = float(r.over(after[far], turning=turns).max())
+            beyond.append(Beyond(name, unit, r.low, r.high, int(far.sum()), most))
+        outside |= far
+    limit = FAR * float(np.quantile(p.leverage / (1 - p.leverage), 0.99))
+    far = leverage > max(limit, 1e-12)
+    if far.any():
+        most = float(leverage.max() - limit)
+        beyond.append(Beyond("leverage", "1", 0.0, limit, int(far.sum()), most))
+    outside |= far
+    total = spread + noise
+    square, read = _squares(total, raw)
+
+    def error(rows: Bools) -> ErrorBlock | None:
+        """Errors of some measurements, each whitened by itself."""
+        if not rows.any():
+            return None
+        squares, elements = _squares(w.covariance[rows], raw[rows])
+        return ErrorBlock.of(raw[rows], np.sqrt(squares), int(elements.sum()))
+
+    return Extrapolation(
+        outside=outside,
+        variables=tuple(sorted(beyond, key=lambda v: -v.count)),
+        stated_m=np.sqrt(np.trace(total[:, :3, :3], axis1=1, axis2=2)),
+        z=np.sqrt(square / np.maximum(read, 1)),
+        inside_error=error(~outside),
+        outside_error=error(outside),
+    )
+
+
+def _squares(covariance: Floats, raw: Floats) -> tuple[Floats, Ints]:
+    """Squared Mahalanobis distances (D,) of residuals (D, m), and elements that were read (D,)."""
+    root = inverse_root(covariance)
+    square = np.sum(np.einsum("dij,dj->di", root, raw) ** 2, axis=1)
+    return square, np.asarray(np.count_nonzero(np.any(root != 0, axis=2), axis=1))
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """Which readings are judged."""
+
+    number: int | None  # of the revision; None for a baseline that is not kept
+    mode: Mode
+    readings: int  # all in the other campaign
+    fitted: int  # those of them that the revision was fitted to
+    spoilt: int  # further ones whose unloaded reading was fitted
+    unseen: bool  # whether those that are judged were never fitted; False where all were
+    scalar: bool = False  # whether some readings are one number, a distance or a height
+
+    @property
+    def model(self) -> str:
+        """The revision, in words."""
+        return "the baseline" if self.number is None else f"revision {self.number}"
+
+    @property
+    def what(self) -> str:
+        """The measurements, in words."""
+        if self.mode == "deflection":
+            return "deflections"
+        return "readings" if self.scalar else "positions"
+
+
+@dataclass(frozen=True, slots=True)
+class Share:
+    """The measurements of one load, or of one pose."""
+
+    name: str  # of the load or the pose
+    count: int
+    rms_m: float  # root mean square of their 3-D position error, m
+    max_m: float  # the largest, m
+    worst: str  # load (or pose) of the largest
+    stated_m: float  # rms of the standard deviation that the fit states for them, m
+    z: float  # rms of error over stated standard deviation, per element
+    within: float  # share inside of their 95 % region, rᵀ C⁻¹ r ≤ χ²(0.95, m), C as stated
+
+    def passes(self, limit_m: float) -> bool:
+        """Whether no error is larger than a limit, m."""
+        return self.max_m <= limit_m
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Acceptance:
+    """All measurements, by load and by pose."""
+
+    loads: tuple[Share, ...]  # in the order of the campaign's loads
+    poses: tuple[Share, ...]  # the largest error first
+    everything: Share
+    limit_m: float | None  # the largest error that is allowed, m; None where no limit is given
+    over: int  # number of measurements over the limit
+    noise_m: float  # rms that noise alone would leave, m
+
+    @property
+    def passed(self) -> bool | None:
+        """Whether the limit is kept by every measurement; None where none is given."""
+        return None if self.limit_m is None else self.over == 0
+
+    @property
+    def undecided(self) -> bool:
+        """Whether the limit is not kept, and the readings are too noisy to show that it could."""
+        return self.passed is False and self.limit_m is not None and self.limit_m < self.noise_m
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the keys of `validate --json` on loads, poses and the limit."""
+        limit = self.limit_m
+
+        def document(s: Share, kind: str, other: str) -> dict[str, object]:
+            d = {kind if k == "name" else k: v for k, v in asdict(s).items()}
+            d[f"worst_{other}"] = d.pop("worst")
+            return d if limit is None else {**d, "passed": s.passes(limit)}
+
+        return {
+            "within_95": self.everything.within,
+            "loads": [document(s, "load", "pose") for s in self.loads],
+            "poses": [document(s, "pose", "load") for s in self.poses],
+            "limit": None
+            if limit is None
+            else {"limit_m": limit, "passed": self.passed, "n_over": self.over},
+        }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CampaignValidation(Shown):
+    """Readings of another campaign against a revision."""
+
+    model: Model  # of the revision
+    judged: Judged  # which of the readings are judged
+    prediction: Validation  # of these
+    beyond: Extrapolation  # what the fit states of them, and which lie outside
+    shares: Acceptance  # errors by load and by pose, and against a limit
+
+
+def acceptance(
+    found: Validation, beyond: Extrapolation, limit_m: float | None = None
+) -> Acceptance:
+    """Divide prediction errors by load and by pose, against a largest one that is allowed, m."""
+    r, rows = found.readings, found.whitening.reading
+    error = np.linalg.norm(found.raw[:, :3], axis=1)
+    variance = np.diagonal(found.whitening.covariance, axis1=1, axis2=2)
+    read = np.maximum(np.count_nonzero(variance > 0, axis=1), 1)
+    inside = beyond.z**2 * read <= chi2.ppf(BAND, read)
+    load, pose = (r.load[rows], r.load_names), (r.pose[rows], r.pose_names)
+
+    def share(name: str, of: Bools, other: tuple[Ints, Sequence[str]]) -> Share:
+        worst = int(np.argmax(np.where(of, error, -1.0)))
+        return Share(
+            name=name,
+            count=int(of.sum()),
+            rms_m=_rms(error[of]),
+            max_m=float(error[worst]),
+            worst=other[1][other[0][worst]],
+            stated_m=_rms(beyond.stated_m[of]),
+            z=_rms(beyond.z[of]),
+            within=float(inside[of].mean()),
+        )
+
+    loads, poses = (
+        [share(by[1][k], by[0] == k, other) for k in np.unique(by[0]).tolist()]
+        for by, other in ((load, pose), (pose, load))
+    )
+    return Acceptance(
+        loads=tuple(loads),
+        poses=tuple(sorted(poses, key=lambda s: -s.max_m)),
+        everything=share("all", np.ones(len(rows), dtype=np.bool_), pose),
+        limit_m=limit_m,
+        over=0 if limit_m is None else int(np.sum(error > limit_m)),
+        noise_m=found.noise_floor,
     )

@@ -1,6 +1,7 @@
 """What is read in one arrival of the arm, and where the tracker roughly stands, to be aimed."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -21,22 +22,15 @@ from hilcal.robot.chain import drive_jacobian
 from hilcal.store.plan import Step
 from hilcal.types import Floats
 
-ENOUGH = 4
-"""Readings from which a registration is computed: three fix it, one more checks it."""
-WITNESSES = 2
-"""Readings by whose distances another one is judged, at least."""
-SPREAD_M = 0.05
-"""Second extent of a cloud of positions that fixes a rotation, m."""
-PLAUSIBLE_M = 0.1
-"""A reading so far from where the nominal arm holds the target is not believed, m."""
+ENOUGH = 4  # readings from which a registration is computed: three fix it, one more checks it
+WITNESSES = 2  # readings by whose distances another one is judged, at least
+SPREAD_M = 0.05  # second extent of a cloud of positions that fixes a rotation, m
+PLAUSIBLE_M = 0.1  # a reading so far from where the nominal arm holds the target is not believed, m
 FITS_M = 0.02
 """Largest residual of a reading that fits a registration, m; a nominal arm errs by less."""
-STRAYS = 3
-"""Readings that a registration leaves out at most; beyond that the nominal arm is wrong."""
-APART_M = 0.05
-"""Largest error of a distance between two readings, m."""
-STUCK_M = 1e-5
-"""Two readings so close to each other at poses that are not are one old reading, m."""
+STRAYS = 3  # readings that a registration leaves out at most; beyond that the nominal arm is wrong
+APART_M = 0.05  # largest error of a distance between two readings, m
+STUCK_M = 1e-5  # two readings so close to each other at poses that are not are one old reading, m
 STUCK_SHARE = 0.2
 """A target that moves by less than this share of what the arm moves it by is not on the arm."""
 MOVES_M = 0.005
@@ -51,7 +45,6 @@ class RoughRegistration:
     """
 
     def __init__(self, cell: Cell) -> None:
-        """Start with what is configured."""
         self._cell = cell
         self._held: list[Floats] = []
         self._seen: list[Floats] = []
@@ -61,10 +54,9 @@ class RoughRegistration:
         self._repeated: list[tuple[Step, str]] = []
 
     def add(self, q: Floats, position: Floats, target: int = 0, step: Step | None = None) -> None:
-        """Take note of a reading: joint angles (n,) and position (3,), sensor axes, m.
+        """Take note of a reading for a step: joint angles (n,) and position (3,), sensor axes, m.
 
-        One that repeats an earlier one is left out; older versions stored such. `step` is the one
-        that it was stored for, None at the positions of the start.
+        One that repeats an earlier one is left out; older versions stored such.
         """
         held = self._positions(q)[target]
         if self._stuck(held, position, target) is not None:
@@ -78,8 +70,7 @@ class RoughRegistration:
         """Return the stored readings that may not be of their target, each once, and why.
 
         They were stored while nothing told where the tracker stands: those that do not fit as soon
-        as that is known, and until then the one that the next reading repeated, which may be of
-        something at rest itself.
+        as that is known, and until then the one that the next reading repeated.
         """
         pose = self.pose()
         if pose is None:
@@ -98,10 +89,7 @@ class RoughRegistration:
         return out
 
     def doubt_repeated(self, q: Floats, position: Floats, target: int = 0) -> None:
-        """Doubt the reading that a refused one repeats, unless the tracker's place vouches for it.
-
-        The arguments are those of `add`.
-        """
+        """Doubt the reading that a refused one repeats, unless the tracker's place is known."""
         if self._stuck(self._positions(q)[target], position, target) is None or self.pose():
             return
         last = max(k for k, t in enumerate(self._target) if t == target)
@@ -166,10 +154,7 @@ class RoughRegistration:
         )
 
     def _stuck(self, held: Floats, position: Floats, target: int) -> str | None:
-        """Why a reading is the one before it or of something at rest, or None.
-
-        Distances between positions do not depend on where the tracker stands.
-        """
+        """Why a reading is the one before it, or of something at rest; or None."""
         same = np.flatnonzero(np.array(self._target) == target)
         if not len(same):
             return None
@@ -187,9 +172,9 @@ class RoughRegistration:
         )
 
     def _apart(self, held: Floats, position: Floats) -> float:
-        """By how much most distances from the other readings are not those of the arm, m.
+        """Median of how much distances from the other readings are not those of the arm, m.
 
-        The median; zero with fewer than two, of which one may be wrong itself.
+        Zero with fewer than two, of which one may be wrong itself.
         """
         if len(self._held) - len(self._doubted) < WITNESSES:
             return 0.0
@@ -203,8 +188,7 @@ class RoughRegistration:
     def repeatability(self, q: Floats, joint_std: Floats) -> Floats:
         """Return the (3, 3) covariance that the joints' scatter adds to a position, sensor axes.
 
-        J Σ_q Jᵀ at the target; while the tracker's axes are unknown its mean over all
-        directions, tr(J Σ_q Jᵀ)/3.
+        J Σ_q Jᵀ at the target; while the tracker's axes are unknown tr(J Σ_q Jᵀ)/3.
         """
         chain = chains.evaluate(self._cell.arm, np.asarray(q)[None])
         point = chain.point(self._cell.target[:3, 3])
@@ -261,11 +245,6 @@ class ArrivalReader:
         clock: Clock,
         watcher: Watcher,
     ) -> None:
-        """Use open devices.
-
-        Raises:
-            InputError: several targets, and a tracker that cannot be told which.
-        """
         self._cell, self._measurer, self._registration = cell, measurer, registration
         self._clock, self._watcher, self._said = clock, watcher, False
         self._tracker: PointingTracker | None = None
@@ -283,23 +262,18 @@ class ArrivalReader:
         self._radius = 0.5 * float(apart[apart > 0].min(initial=np.inf))
 
     def read(self, q: Floats, name: str) -> list[TargetReading]:
-        """Read at the present pose, called `name`; q (n,) are the commanded joint angles, rad.
-
-        Raises:
-            DeviceError: no target could be read, or a device failed.
-        """
+        """Read at the present pose, called `name`; q (n,) are the commanded joint angles, rad."""
         if self._tracker is None:
             return [TargetReading(None, self._measurer.measure(name), self._clock.now())]
         places = self._registration.expected(q)
         if places is None:
             if not self._said:
                 held, *others = self._cell.target_names
-                self._watcher.notify(
-                    Remark(
-                        f"only target {held} is read until the first positions have located "
-                        f"the tracker; {', '.join(others)} after that"
-                    )
+                text = (
+                    f"only target {held} is read until the first positions have located the "
+                    f"tracker; {', '.join(others)} after that"
                 )
+                self._watcher.notify(Remark(text))
                 self._said = True
             return [TargetReading(0, self._measurer.measure(name), self._clock.now())]
         found: list[TargetReading] = []
@@ -327,10 +301,7 @@ class ArrivalReader:
         name: str,
         force: WrenchSample | None,
     ) -> MeasuredStop:
-
-        def aim() -> None:
-            tracker.aim(places[k], self._radius)
-
+        aim = partial(tracker.aim, places[k], self._radius)
         try:
             aim()
         except TargetLostError:  # once more: somebody may have walked through the beam

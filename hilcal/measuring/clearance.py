@@ -14,8 +14,7 @@ from hilcal.types import Bools, Floats
 
 TOOL_RADIUS = 0.03
 """Radius of the ways from flange to target and load point, m: a plate or a reflector's nest."""
-CABLE_RADIUS = 0.01
-"""Radius that is kept for a cable, m."""
+CABLE_RADIUS = 0.01  # radius that is kept for a cable, m
 _NEAR = 0.02  # m, beyond touching
 _AT_TARGET, _AT_LOAD = "tool at the target", "tool at the load point"
 _TINY = 1e-18  # m², below which a segment is a point
@@ -51,10 +50,9 @@ class Clearance:
     def segments_at(self, at: Floats, load: str) -> tuple[Segment, ...]:
         """Return what hangs or pulls at the load point where that is (N, 3), base axes, m.
 
-        A weight takes an upright capsule of the length hang_m below the load point (along
-        gravity), a pull's cable goes in the pull's direction. What the flange carries, and the
-        last body, may touch them where they are so close to the load point that they always do:
-        the shape of the hook there is not known.
+        A weight takes an upright capsule below the load point (along gravity), a pull's cable goes
+        in the pull's direction. What is always that close to the load point may touch them: the
+        shape of the hook there is not known.
         """
         known = self.load(load)
         if known is None:
@@ -74,12 +72,7 @@ class Clearance:
         return tuple(out)
 
     def near(self, point: Floats, radius: float) -> frozenset[str]:
-        """Return what moves with the flange and is as good as touched at a point of it.
-
-        Args:
-            point: (3,) flange axes, m.
-            radius: of what is there, m.
-        """
+        """Return what moves with the flange and is as good as touched at a point (3,) of it, m."""
         arm = self.cell.arm
         at = on_flange(arm, point)
         return frozenset(
@@ -121,12 +114,10 @@ class LineOfSight:
     tracker: Floats  # (3,) where the tracker stands, base axes, m
 
     def free(self, q: Floats, load: str) -> Bools:
-        """Return (N,) in which states nothing is closer to a beam than [sight] clearance_m.
+        """Return (N,) in which states nothing is closer to any beam than [sight] clearance_m.
 
-        There is a beam to each target; all of them have to be free. A beam ends shortly before
-        its target. Not in its way are the way from the flange to the target and what else of the
-        tool is next to it, whose shape is not known, and obstacles that the tracker stands in or
-        on.
+        A beam ends shortly before its target. Not in its way are what of the tool is next to the
+        target, whose shape is not known, and obstacles that the tracker stands in or on.
         """
         targets = range(len(self.clearance.cell.all_targets))
         return np.asarray(np.all([self.sees(q, load, k) for k in targets], axis=0))
@@ -141,10 +132,7 @@ class LineOfSight:
         return np.asarray(out)
 
     def incidence(self, q: Floats) -> Floats | None:
-        """Return (N,) angles between the reflectors' normal and the beam, the largest, rad.
-
-        None where [sight] target_normal is not given.
-        """
+        """Return (N,) largest angles of a reflector's normal and its beam, rad; None without."""
         normal = self.clearance.config.sight.target_normal
         if normal is None:
             return None
@@ -218,9 +206,7 @@ def _holds(thing: Obstacle, point: Floats, margin: float) -> bool:
 def segment_distance(a: Floats, b: Floats, c: Floats, d: Floats) -> Floats:
     """Return (N,) least distances of the segments ab and cd, points (N, 3) or (3,), m.
 
-    |a + s u − c − t v| is least at the stationary s, kept within [0, 1], with the t that is
-    best for it, kept within [0, 1], and then the s that is best for that t (Ericson 2005,
-    Real-Time Collision Detection, section 5.1.9).
+    Ericson 2005, Real-Time Collision Detection, section 5.1.9.
     """
     u, v, r = b - a, d - c, a - c
     uu, vv, uv = _dot(u, u), _dot(v, v), _dot(u, v)

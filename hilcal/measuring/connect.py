@@ -1,11 +1,12 @@
-"""The open devices that a configuration names; all failures are reported together."""
+"""The devices that a configuration names, opened; the kinematics that an arm's controller tells."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
+from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.errors import HilcalError, InputError
 from hilcal.measuring import devices
@@ -15,6 +16,16 @@ from hilcal.measuring.devices import (
     OperatorDevice,
     Report,
     TrackerDevice,
+)
+from hilcal.robot.arm import Arm
+from hilcal.robot.catalogue import load_arm, robot_names
+from hilcal.robot.factory import (
+    FAR,
+    LINEARISED,
+    SAME,
+    FactoryKinematics,
+    flange_difference,
+    with_factory,
 )
 from hilcal.toml import suggest
 
@@ -58,35 +69,18 @@ class ConnectionResult:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class _Wanted:
-    """One device that the configuration names."""
-
-    device: str
-    group: str
-    driver: str | None
-    key: str
-
-
-def driver(group: str, name: str, key: str) -> Factory:
-    """Return the factory of a driver by name.
-
-    Args:
-        group: the group of entry points, see `devices`.
-        name: the driver's name, or its place as "module:function".
-        key: where the configuration gives it, for messages.
-
-    Raises:
-        InputError: unknown name (lists the valid ones), or the driver cannot be loaded.
-    """
+def driver(group: str, name: str | None, key: str) -> Factory:
+    """Return the factory of a driver by its name, or its place "module:function"."""
     found = {point.name: point for point in entry_points(group=group)}
+    valid = ", ".join(sorted(found)) or "none is installed"
+    if name is None:
+        part = group.removeprefix("hilcal.").removesuffix("s").replace("_", " ")
+        raise InputError(f"{key} is missing, so there is no {part}; valid: {valid}")
     if ":" in name:
         found[name] = EntryPoint(name, name, group)
     if name not in found:
-        valid = ", ".join(sorted(found)) or "none is installed"
-        raise InputError(
-            f'{key} = "{name}" is unknown{suggest(name, sorted(found))}; valid: {valid}'
-        )
+        hint = suggest(name, sorted(found))
+        raise InputError(f'{key} = "{name}" is unknown{hint}; valid: {valid}')
     try:
         factory: Factory = found[name].load()
     except Exception as error:  # a driver of somebody else's may fail in any way
@@ -100,21 +94,25 @@ def driver(group: str, name: str, key: str) -> Factory:
 def connect(config: CellConfig) -> tuple[Rig | None, tuple[ConnectionResult, ...]]:
     """Open every device at once; nothing moves.
 
-    Returns:
-        The rig, None where a device did not open (the others are closed again), and what
-        became of each device.
-
-    Raises:
-        InputError: the configuration names no driver for a part, or an unknown one.
+    Returns the rig, None where a device did not open (the others are closed again), and what
+    became of each. InputError: the configuration names no driver for a part, or an unknown one.
     """
-    wanted = _wanted(config)
-    factories = [_factory(one) for one in wanted]
-    with ThreadPoolExecutor(len(wanted)) as pool:
+    parts = [
+        ("arm", devices.ARMS, config.robot.driver, "[robot] driver"),
+        ("tracker", devices.TRACKERS, config.tracker.driver, "[tracker] driver"),
+        ("operator", devices.OPERATORS, config.operator.driver, "[operator] driver"),
+    ]
+    if config.force_sensor is not None:
+        sensor = config.force_sensor.driver
+        parts.append(("force sensor", devices.FORCE_SENSORS, sensor, "[force_sensor] driver"))
+    factories = [driver(group, name, key) for _, group, name, key in parts]
+    with ThreadPoolExecutor(len(parts)) as pool:
         opened = list(pool.map(lambda factory: _open(factory, config), factories))
+    made = dict(zip((part for part, *_ in parts), (device for device, _ in opened), strict=True))
     answers = tuple(
-        _answer(one, made, why) for one, (made, why) in zip(wanted, opened, strict=True)
+        _answer(part, name or "", device, why)
+        for (part, _, name, _), (device, why) in zip(parts, opened, strict=True)
     )
-    made = {one.device: device for one, (device, _) in zip(wanted, opened, strict=True)}
     wrong = [why for _, why in opened if isinstance(why, InputError)]
     if wrong or any(answer.failure for answer in answers):
         for device in made.values():
@@ -123,57 +121,85 @@ def connect(config: CellConfig) -> tuple[Rig | None, tuple[ConnectionResult, ...
         if wrong:
             raise wrong[0]
         return None, answers
-    rig = Rig(
-        arm=made["arm"],
-        tracker=made["tracker"],
-        force=made.get("force sensor"),
-        operator=made["operator"],
-    )
+    rig = Rig(made["arm"], made["tracker"], made.get("force sensor"), made["operator"])
     return rig, answers
 
 
-def _wanted(config: CellConfig) -> list[_Wanted]:
-    wanted = [
-        _Wanted("arm", devices.ARMS, config.robot.driver, "[robot] driver"),
-        _Wanted("tracker", devices.TRACKERS, config.tracker.driver, "[tracker] driver"),
-        _Wanted("operator", devices.OPERATORS, config.operator.driver, "[operator] driver"),
-    ]
-    if config.force_sensor is not None:
-        sensor = config.force_sensor.driver
-        wanted.append(
-            _Wanted("force sensor", devices.FORCE_SENSORS, sensor, "[force_sensor] driver")
-        )
-    return wanted
-
-
-def _factory(one: _Wanted) -> Factory:
-    if one.driver is None:
-        valid = ", ".join(sorted(point.name for point in entry_points(group=one.group)))
-        raise InputError(f"{one.key} is missing, so there is no {one.device}; valid: {valid}")
-    return driver(one.group, one.driver, one.key)
-
-
-def _open(factory: Factory, config: CellConfig) -> tuple[Any, str | HilcalError]:
+def _open(factory: Factory, config: CellConfig) -> tuple[Any, Exception | None]:
     try:
-        return factory(config), ""
+        return factory(config), None
     except Exception as error:  # a driver of somebody else's may fail in any way
-        return None, _why(error)
+        return None, error
 
 
-def _why(error: Exception) -> str | HilcalError:
-    """Return an error as one line, or itself where it is a HilcalError."""
-    if isinstance(error, HilcalError):
-        return error
-    return f"{type(error).__name__}: {' '.join(str(error).split())}"
-
-
-def _answer(one: _Wanted, made: Any, why: str | HilcalError) -> ConnectionResult:
-    name = one.driver or ""
+def _answer(device: str, driver: str, made: Any, why: Exception | None) -> ConnectionResult:
     try:
-        if made is not None:
-            return ConnectionResult(one.device, name, made.report())
+        if why is None:
+            return ConnectionResult(device, driver, made.report())
     except Exception as error:  # as above
-        why = _why(error)
+        why = error
     words = str(why)
-    told = words if words.startswith(one.device) else f"{one.device}: {words}"
-    return ConnectionResult(one.device, name, None, told)
+    if not isinstance(why, HilcalError):
+        words = f"{type(why).__name__}: {' '.join(words.split())}"
+    said = words if words.startswith(device) else f"{device}: {words}"
+    return ConnectionResult(device, driver, None, said)
+
+
+WHAT = "its kinematics"
+
+
+def told_by(answers: tuple[ConnectionResult, ...]) -> FactoryKinematics | None:
+    """Return the kinematics that the arm's controller tells; None where it does not."""
+    return next((a.report.kinematics for a in answers if a.report and a.report.kinematics), None)
+
+
+def with_kinematics(
+    answers: tuple[ConnectionResult, ...], cell: Cell
+) -> tuple[ConnectionResult, ...]:
+    """Return what the devices said, with how the arm's kinematics differ from the cell's."""
+    return tuple(
+        replace(a, report=_compared(a.report, a.report.kinematics, cell))
+        if a.report is not None and a.report.kinematics is not None
+        else a
+        for a in answers
+    )
+
+
+def nominal_arm(cell: Cell) -> Arm:
+    """Return the arm as its maker designed it, its joints not yet counted as the cell says."""
+    robot = cell.configured().robot
+    return load_arm(robot.model, cell.base_dir, base_link=robot.base_link, tip_link=robot.tip_link)
+
+
+def _compared(report: Report, told: FactoryKinematics, cell: Cell) -> Report:
+    robot = cell.configured().robot
+    problems = list(report.problems)
+    try:
+        nominal = nominal_arm(cell)
+        ours = with_factory(nominal, told)
+    except InputError as error:  # an arm with other joints, or a campaign without its file
+        return replace(report, facts=(*report.facts, (WHAT, str(error))))
+    rms, most = flange_difference(ours, nominal)
+    what = "measured by the factory" if told.status == LINEARISED else "not measured by the factory"
+    words = f"{what}: the flange is {1e3 * rms:.2f} mm (rms; most {1e3 * most:.2f} mm) from nominal"
+    off = 0.0
+    if cell.factory is not None:
+        off = flange_difference(ours, with_factory(nominal, cell.factory))[1]
+    if robot.model in robot_names() and most > FAR:
+        problems.append(
+            f"its kinematics are not those of a {robot.model}: the flange is up to "
+            f"{1e3 * most:.0f} mm elsewhere; check [robot] model"
+        )
+    elif off > SAME:
+        problems.append(
+            f"its kinematics are not those of [robot] calibration = {robot.calibration!r}: the "
+            f"flange is up to {1e3 * off:.3f} mm elsewhere; hilcal check CELL.toml "
+            "--save-calibration FILE.toml writes what the controller holds"
+        )
+    names = ("kinematics_from_nominal_rms_m", "kinematics_from_nominal_max_m")
+    return replace(
+        report,
+        facts=(*report.facts, (WHAT, words)),
+        problems=tuple(problems),
+        fields=(*report.fields, *zip(names, (rms, most), strict=True)),
+    )

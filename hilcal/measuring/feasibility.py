@@ -78,9 +78,6 @@ class Feasibility:
     body is from the axis of joint i at most (`Scene.rates`). A part of a motion is done where the
     gap in its middle is larger than that, and halved otherwise, until it is `BETWEEN_M` at most;
     torques and moments by their own rates likewise.
-
-    Attributes:
-        sight: the tracker's view; None where its place is not known.
     """
 
     def __init__(self, cell: Cell, config: CellConfig, margins: Margins | None = None) -> None:
@@ -152,13 +149,7 @@ class Feasibility:
     # motions
 
     def passable(self, start: Floats, ends: Floats, load: str) -> Bools:
-        """Return (M,) to which of `ends` (M, n) a straight motion in joint space is clear.
-
-        Args:
-            start: (n,) joint angles, rad.
-            ends: (M, n) joint angles, rad.
-            load: name of the load that hangs.
-        """
+        """Return (M,) to which of `ends` (M, n) a straight motion under a load is clear."""
         good = self._always(ends)
         for kind in WAY:
             left = np.flatnonzero(good)
@@ -176,10 +167,7 @@ class Feasibility:
                 )
 
     def _search(self, kind: str, start: Floats, ends: Floats, load: str) -> tuple[Bools, Floats]:
-        """Which motions (M,) keep a kind, and states (K, n) that show why others do not.
-
-        Breadth first: most motions that are not clear show it at a few points.
-        """
+        """Which motions (M,) keep a kind, and states (K, n) that show why others do not."""
         good = self._always(ends)
         turn = np.abs(self.cell.arm.chain_angles(ends - start))
         count = np.maximum(np.ceil((turn @ self._farthest) / _COARSE_M), 1).astype(np.int64)

@@ -1,4 +1,14 @@
-"""The force sensor as a campaign uses it: its zero, the tool it carries, what hangs."""
+"""The force sensor as a campaign uses it: its zero, the tool it carries, what hangs.
+
+The sensor reads what tool and load exert on it, in its own axes at its origin, plus its zero:
+
+    f = b_f + m u + f_load,   u = R_base_sensorᵀ g
+    M = b_M + m c × u + M_load
+
+Without a load this is linear in the ten parameters x = (b_f, b_M, m, m c). Turning the sensor
+in gravity tells them apart (J. Swevers et al., Dynamic model identification for industrial
+robots, IEEE Control Systems 27 (2007) 58, for payloads alike).
+"""
 
 from dataclasses import dataclass, replace
 
@@ -7,15 +17,185 @@ import numpy as np
 from hilcal.cell import Cell
 from hilcal.config import CellLoad, Operator
 from hilcal.config import ForceSensor as Settings
-from hilcal.errors import CannotAnswerError, DeviceError
+from hilcal.errors import CannotAnswerError, DeviceError, InputError
 from hilcal.measuring.devices import ForceSensorDevice, WrenchSample
-from hilcal.measuring.tool_load import PARAMETERS, ToolLoad, identify_tool_load, shift, tare
 from hilcal.robot import chain as chains
 from hilcal.robot import se3
 from hilcal.types import Floats
 
-MOMENT_LEVER_M = 0.1
-"""Lever by which a tolerance in N becomes one in N·m."""
+PARAMETERS = 10
+MIN_SPREAD = 0.02
+"""Root mean square by which directions of gravity have to differ, rad: about one degree."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ToolLoad:
+    """A sensor's zero and the tool it carries."""
+
+    bias: Floats  # (6,) what the sensor reads with nothing on it, N and N·m, sensor axes
+    mass: float  # of the tool beyond the sensor, kg
+    moment: Floats  # (3,) mass times centre of mass, kg·m, sensor axes from its origin
+    covariance: Floats  # (10, 10) of (bias, mass, moment); zero for what was not estimated
+    gravity: Floats  # (3,) base axes, m/s²
+    chi2: float  # sum of squared whitened residuals
+    dof: int  # its degrees of freedom; 0 after a tare
+    poses: int  # number of readings used
+
+    @property
+    def com(self) -> Floats:
+        """(3,) centre of mass, m, sensor axes; zero while the mass is not above 3 sigma."""
+        if self.mass <= 3.0 * np.sqrt(self.covariance[6, 6]) or self.mass <= 0.0:
+            return np.zeros(3)
+        return self.moment / self.mass
+
+    @property
+    def com_std(self) -> Floats:
+        """(3,) standard uncertainty of `com`, m, to first order; infinite where it is unknown."""
+        if not np.any(self.com) and self.mass <= 3.0 * np.sqrt(self.covariance[6, 6]):
+            return np.full(3, np.inf)
+        J = np.hstack([-self.com[:, None], np.eye(3)]) / self.mass
+        return np.asarray(np.sqrt(np.diagonal(J @ self.covariance[6:, 6:] @ J.T)))
+
+    @property
+    def variance_factor(self) -> float:
+        """chi2 / dof: 1 where the model and the stated noise explain the readings."""
+        return self.chi2 / self.dof if self.dof else float("nan")
+
+    def tool_wrench(self, rotation: Floats) -> Floats:
+        """Return what the sensor reads without a load, for R_base_sensor (..., 3, 3): (..., 6)."""
+        x = np.concatenate([self.bias, [self.mass], self.moment])
+        return np.asarray(design(np.asarray(rotation), self.gravity) @ x)
+
+    def load_wrench(self, wrench: Floats, rotation: Floats) -> Floats:
+        """Return the load's wrench (..., 6) at the sensor, base axes, of a reading."""
+        own = np.asarray(wrench) - self.tool_wrench(rotation)
+        parts = own.reshape(*own.shape[:-1], 2, 3)
+        return np.asarray((parts @ np.swapaxes(rotation, -1, -2)).reshape(own.shape))
+
+    def load_covariance(self, covariance: Floats, rotation: Floats) -> Floats:
+        """Return the covariance (6, 6) of `load_wrench`, from reading and parameters.
+
+        Cov = B (Cov_reading + D Cov_x Dᵀ) Bᵀ with B = diag(R, R), D the design matrix.
+        """
+        D = design(np.asarray(rotation), self.gravity)
+        B = np.kron(np.eye(2), rotation)
+        return np.asarray(B @ (covariance + D @ self.covariance @ D.T) @ B.T)
+
+
+def design(rotation: Floats, gravity: Floats) -> Floats:
+    """Return D (..., 6, 10): reading = D x, x = (b_f, b_M, m, m c), no load, in R_base_sensor."""
+    u = np.swapaxes(rotation, -1, -2) @ np.asarray(gravity, dtype=np.float64)
+    out = np.zeros((*u.shape[:-1], 6, PARAMETERS))
+    out[..., :6] = np.eye(6)
+    out[..., :3, 6] = u
+    out[..., 3:, 7:] = -se3.skew(u)  # m c × u = -u × m c
+    return out
+
+
+def identify_tool_load(
+    wrench: Floats, covariance: Floats, rotation: Floats, gravity: Floats
+) -> ToolLoad:
+    """Estimate zero, mass and centre of mass from K mean readings without a load, sensor axes.
+
+    Whitened least squares: x = argmin sum_k |S_k⁻¹ (w_k - D_k x)|² with S_k S_kᵀ = Cov_k.
+    """
+    _check_finite(wrench, covariance, rotation)
+    _check_orientations(rotation, gravity)
+    white = np.linalg.inv(_root(covariance))
+    A = (white @ design(rotation, gravity)).reshape(-1, PARAMETERS)
+    y = (white @ wrench[..., None]).reshape(-1)
+    scale = np.linalg.norm(A, axis=0)
+    Q, R = np.linalg.qr(A / scale)
+    x = np.linalg.solve(R, Q.T @ y) / scale
+    root = np.linalg.inv(R) / scale[:, None]
+    cov = root @ root.T
+    residual = y - A @ x
+    mass = float(x[6])
+    if mass < -5.0 * np.sqrt(cov[6, 6]):
+        raise CannotAnswerError(
+            f"force sensor: its readings give a tool of {mass:.3g} kg; its axes or its sign are "
+            "wrong: check rotvec_rad in [force_sensor]"
+        )
+    return ToolLoad(
+        bias=x[:6],
+        mass=mass,
+        moment=x[7:],
+        covariance=cov,
+        gravity=gravity,
+        chi2=float(residual @ residual),
+        dof=len(y) - PARAMETERS,
+        poses=len(wrench),
+    )
+
+
+def tare(
+    wrench: Floats, covariance: Floats, rotation: Floats, gravity: Floats, mass: float, com: Floats
+) -> ToolLoad:
+    """Return the sensor's zero from one mean reading (6,) without a load; the tool is known.
+
+    Its centre of mass (3,) is in sensor axes from the sensor's origin, m.
+    """
+    _check_finite(wrench, covariance, rotation)
+    moment = mass * com
+    tool = design(rotation, gravity)[:, 6:] @ np.concatenate([[mass], moment])
+    cov = np.zeros((PARAMETERS, PARAMETERS))
+    cov[:6, :6] = covariance
+    return ToolLoad(wrench - tool, float(mass), moment, cov, gravity, chi2=0.0, dof=0, poses=1)
+
+
+def shift(wrench: Floats, arm: Floats) -> Floats:
+    """Return a wrench (..., 6) at a point `arm` (..., 3) further: f' = f, M' = M - arm × f."""
+    force, moment = wrench[..., :3], wrench[..., 3:]
+    return np.concatenate([force, moment - np.cross(arm, force)], axis=-1)
+
+
+def _check_finite(*readings: Floats) -> None:
+    if not all(np.isfinite(values).all() for values in readings):
+        raise InputError("tool load: a reading has values that are no finite numbers")
+
+
+def _root(covariance: Floats) -> Floats:
+    """Cholesky factors (K, 6, 6), after units of one standard deviation each."""
+    std = np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 0.0))
+    try:
+        with np.errstate(divide="raise", invalid="raise"):
+            correlation = covariance / (std[..., :, None] * std[..., None, :])
+        return np.asarray(std[..., None] * np.linalg.cholesky(correlation))
+    except (np.linalg.LinAlgError, FloatingPointError):
+        raise InputError(
+            "tool load: the covariance of a mean wrench is not positive definite; average over "
+            "more frames (force_window_s in [acquire])"
+        ) from None
+
+
+def _check_orientations(rotation: Floats, gravity: Floats) -> None:
+    """Refuse orientations whose directions of gravity are too much alike.
+
+    Differences of u along one direction only: they tell the mass, and the centre of mass but
+    for its part along that direction.
+    """
+    size = float(np.linalg.norm(gravity))
+    K = len(rotation)
+    spread = np.zeros(2)
+    if size > 0.0 and K > 1:
+        u = np.swapaxes(rotation, -1, -2) @ (gravity / size)
+        values = np.linalg.svd(u - u.mean(axis=0), compute_uv=False) / np.sqrt(K)
+        spread[: len(values[:2])] = values[:2]
+    if spread[0] < MIN_SPREAD:
+        along, missing = "one direction", "mass and centre of mass"
+    elif spread[1] < MIN_SPREAD:
+        along, missing = "two directions", "centre of mass in one direction"
+    else:
+        return
+    raise CannotAnswerError(
+        f"force sensor: {K} unloaded reading{'s' * (K != 1)} with gravity along "
+        f"{along} of the sensor do not determine the tool's {missing}; measure "
+        "unloaded at 3 or more poses that turn the flange about two different horizontal axes, "
+        "30° or more"
+    )
+
+
+MOMENT_LEVER_M = 0.1  # lever by which a tolerance in N becomes one in N·m
 STANDARD_GRAVITY = np.array([0.0, 0.0, -9.80665])
 
 
@@ -31,15 +211,7 @@ def compare(
 
     It is, where |f - f_expected| <= max(tolerance_N, tolerance_share |f_expected|); three sigma
     of the measurement have to fit into that too. A load that is a moment alone is judged by its
-    moment, with tolerance_N acting at `MOMENT_LEVER_M`.
-
-    Args:
-        expected: (6,) wrench of the load asked for, N and N·m; zero where nothing may hang.
-        measured: (6,) wrench felt, same point, base axes.
-        std: (6,) its standard uncertainty.
-        tolerance_N: by how much the force may differ.
-        tolerance_share: the same as a share of the force.
-        gravity: (3,) base axes, m/s²; along it a load is given in kg.
+    moment, with tolerance_N acting at `MOMENT_LEVER_M`. Wrenches are at one point, base axes.
     """
     force, moment = (float(np.linalg.norm(part)) for part in (expected[:3], expected[3:]))
     if force == 0.0 and moment > 0.0:
@@ -98,22 +270,12 @@ def _mass(force: Floats, gravity: Floats) -> float | None:
     return along / size if along >= 0.9999 * np.linalg.norm(force) else None
 
 
-MIN_FRAMES = 20
-"""Frames that a mean wrench is made of at least."""
-ENOUGH_POSES = 4
-"""Unloaded readings from which the tool is identified at least."""
+MIN_FRAMES = 20  # frames that a mean wrench is made of at least
+ENOUGH_POSES = 4  # unloaded readings from which the tool is identified at least
 TOOL_OFF_M = 0.01
 """A tool whose centre of mass is so far from the configured one is remarked, m; a guess."""
 _FLOOR = np.diag([1e-3**2] * 3 + [1e-4**2] * 3)
 """Variance of a mean wrench at least, N² and N²·m²: a line that rounds shows no noise at all."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SensorFrame:
-    """Where the sensor is at one pose of the arm, base axes."""
-
-    rotation: Floats  # (3, 3) R_base_sensor
-    arm: Floats  # (3,) from the sensor's origin to the load point, m
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,11 +293,7 @@ class ForceMeter:
     The zero of a session is what the sensor reads at the reference pose with nothing on the
     hook, less the tool of the configuration. Wrenches of sessions are comparable after it,
     whatever the sensor's own zero did while it was off; how the real tool differs from the
-    configured one stays in them, the same in all sessions.
-
-    Attributes:
-        zero: (6,) what the sensor reads with nothing on it, N and N·m, sensor axes.
-        identified: whether the tool has been weighed, else it is that of the configuration.
+    configured one stays in them. Once `identified`, the tool is the one that was weighed.
     """
 
     def __init__(
@@ -155,19 +313,11 @@ class ForceMeter:
         self.tool = ToolLoad(np.zeros(6), cell.tool_mass, moment, nothing, cell.gravity, 0.0, 0, 0)
 
     def felt(self) -> Floats:
-        """Return the present wrench (6,) against the zero, sensor axes.
-
-        Raises:
-            DeviceError: the stream is dead or stale.
-        """
+        """Return the present wrench (6,) against the zero, sensor axes."""
         return np.asarray(self.sensor.latest().wrench - self.zero)
 
     def average(self) -> WrenchSample:
-        """Return a mean of at least `MIN_FRAMES` frames, as the sensor gives it.
-
-        Raises:
-            DeviceError: the stream is dead, gives too few frames, or stands still.
-        """
+        """Return a mean of at least `MIN_FRAMES` frames, as the sensor gives it."""
         sample = self.sensor.average(self._seconds)
         if sample.frames < MIN_FRAMES:  # a fast clock's window is too short for the real line
             self._seconds *= 1.2 * MIN_FRAMES / max(sample.frames, 1)
@@ -185,11 +335,11 @@ class ForceMeter:
         covariance = sample.covariance / max(sample.frames, 1) + _FLOOR
         return TaredWrench(sample.wrench - self.zero, covariance, np.asarray(q))
 
-    def frame(self, q: Floats) -> SensorFrame:
-        """Return where the sensor is at joint angles (n,)."""
+    def frame(self, q: Floats) -> tuple[Floats, Floats]:
+        """Return R_base_sensor and the way from the sensor to the load point (3,), base axes, m."""
         chain = chains.evaluate(self._cell.arm, np.asarray(q)[None])
         arm = chain.point(self._cell.load_point) - chain.point(self._origin)
-        return SensorFrame(chain.rotation[-1][0] @ self._axes, arm[0])
+        return chain.rotation[-1][0] @ self._axes, arm[0]
 
     def to_flange(self, point: Floats) -> Floats:
         """Return a point (3,) of the sensor's axes in flange axes, m."""
@@ -197,7 +347,7 @@ class ForceMeter:
 
     def set_zero(self, sample: WrenchSample, q: Floats) -> None:
         """Take a mean wrench without load, at joint angles (n,), as the zero."""
-        cell, rotation = self._cell, self.frame(q).rotation
+        cell, rotation = self._cell, self.frame(q)[0]
         self._tared_down = rotation.T @ cell.gravity
         covariance = sample.covariance / max(sample.frames, 1) + _FLOOR
         zero = tare(sample.wrench, covariance, rotation, cell.gravity, cell.tool_mass, self._com)
@@ -206,30 +356,26 @@ class ForceMeter:
             self.tool = replace(zero, bias=np.zeros(6))
 
     def turned(self, q: Floats) -> float:
-        """Return how far gravity has turned in the sensor's axes since the tare, m/s².
+        """Return how far gravity has turned in the sensor's axes since the tare, m/s², at q (n,).
 
-        At joint angles (n,); |R(q)ᵀ g - R_tareᵀ g|, by which each kg is felt that [tool] does not
-        say. Before any tare it is twice gravity, the most that it can be.
+        |R(q)ᵀ g - R_tareᵀ g|, by which each kg is felt that [tool] does not say; twice gravity, the
+        most that it can be, before any tare.
         """
         gravity = self._cell.gravity
         if self._tared_down is None:
             return 2.0 * float(np.linalg.norm(gravity))
-        return float(np.linalg.norm(self.frame(q).rotation.T @ gravity - self._tared_down))
+        return float(np.linalg.norm(self.frame(q)[0].T @ gravity - self._tared_down))
 
     def identify(self, unloaded: list[TaredWrench], tolerance_N: float) -> tuple[int, ...] | None:
-        """Find the real tool from unloaded readings.
+        """Find the real tool from unloaded readings; the numbers of those left out, None: too few.
 
         A reading whose force the tool does not explain to the tolerance was not unloaded, or
-        somebody leaned on the tool: the worst is left out until all are explained. Returned are the
-        numbers of those; None where the readings are too few.
-
-        Raises:
-            HilcalError: their poses do not determine it, or fewer than `ENOUGH_POSES` agree.
+        somebody leaned on the tool: the worst is left out until all are explained.
         """
         kept = list(range(len(unloaded)))
         while len(kept) >= ENOUGH_POSES:
             used = [unloaded[k] for k in kept]
-            rotation = np.array([self.frame(f.q).rotation for f in used])
+            rotation = np.array([self.frame(f.q)[0] for f in used])
             wrench = np.array([f.wrench for f in used])
             covariance = np.array([f.covariance for f in used])
             tool = identify_tool_load(wrench, covariance, rotation, self._cell.gravity)
@@ -247,30 +393,21 @@ class ForceMeter:
 
     def load_wrench(self, tared: TaredWrench) -> Floats:
         """Return the (6,) wrench of the load at the load point, base axes, N and N·m."""
-        frame = self.frame(tared.q)
-        return shift(self.tool.load_wrench(tared.wrench, frame.rotation), frame.arm)
+        rotation, arm = self.frame(tared.q)
+        return shift(self.tool.load_wrench(tared.wrench, rotation), arm)
 
     def verify(
         self, load: CellLoad | None, tared: TaredWrench, operator: Operator
     ) -> tuple[bool, str]:
-        """Whether a load is what hangs, within the operator's tolerance; and the finding.
-
-        Compared at the load point, where a dead weight and a pull have no moment.
-        """
-        gravity, frame = self._cell.gravity, self.frame(tared.q)
+        """Whether a load is what hangs, within the operator's tolerance; and the finding."""
+        gravity, (rotation, arm) = self._cell.gravity, self.frame(tared.q)
         expected = np.zeros(6) if load is None else load.wrench(gravity)
         moved = np.eye(6)
-        moved[3:, :3] = -se3.skew(frame.arm)
-        at_sensor = self.tool.load_covariance(tared.covariance, frame.rotation)
+        moved[3:, :3] = -se3.skew(arm)
+        at_sensor = self.tool.load_covariance(tared.covariance, rotation)
         std = np.sqrt(np.diagonal(moved @ at_sensor @ moved.T))
-        return compare(
-            expected,
-            self.load_wrench(tared),
-            std,
-            operator.tolerance_N,
-            operator.tolerance_share,
-            gravity,
-        )
+        limits = operator.tolerance_N, operator.tolerance_share
+        return compare(expected, self.load_wrench(tared), std, *limits, gravity)
 
     def tool_differs(self, tolerance_N: float) -> str | None:
         """Return in one line how the tool differs from [tool]; None where it does not.

@@ -22,18 +22,13 @@ from hilcal.measuring.progress import Answered, Phase, Question, Remark, Watcher
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Floats
 
-Wrong = Callable[[], str]
-"""Returns what is wrong, in one line; empty where nothing is."""
+Wrong = Callable[[], str]  # returns what is wrong, in one line; empty where nothing is
 TRIES = 3
-SWINGING_S = 2.0
-"""A load that seems wrong is weighed once more after so long, cell seconds."""
+SWINGING_S = 2.0  # a load that seems wrong is weighed once more after so long, cell seconds
 
 
 def payload(cell: Cell, load: CellLoad | None) -> tuple[float, Floats]:
-    """Return mass (kg) and centre of mass (3,) at the flange of the tool with a dead weight.
-
-    m = m_tool + m_load, c = (m_tool c_tool + m_load p_load) / m; pulls have no mass.
-    """
+    """Return mass (kg) and centre of mass (3,) at the flange of the tool with a dead weight."""
     hung = 0.0 if load is None else load.mass_kg
     mass = cell.tool_mass + hung
     if mass == 0.0:
@@ -43,11 +38,7 @@ def payload(cell: Cell, load: CellLoad | None) -> tuple[float, Floats]:
 
 
 class Hook:
-    """What hangs at the arm.
-
-    Every question raises DeviceError where the person gives up; WrongLoadError where what hangs is
-    wrong `TRIES` times.
-    """
+    """What hangs at the arm; WrongLoadError where what hangs is wrong `TRIES` times."""
 
     def __init__(
         self,
@@ -72,10 +63,7 @@ class Hook:
         return next((load for load in self._config.loads if load.name == name), None)
 
     def begin(self) -> None:
-        """Have every load taken off before anything moves, for what hangs is unknown.
-
-        The force sensor confirms it where its zero is known from an earlier session.
-        """
+        """Have every load taken off before anything moves, for what hangs is unknown."""
         self._ask(None, self._still_hangs)
         self.hanging, self.since = UNLOADED, self._clock.now()
 
@@ -111,10 +99,14 @@ class Hook:
         operator = self._operator
         if not isinstance(operator, ConfirmingOperator):
             raise DeviceError(f"arm: {question}: look at it, and start again")
-        if not (isinstance(operator, TerminalPerson) and operator.at_terminal):
+        if not self._at_terminal:
             self._watcher.notify(Remark(question))
         self._watcher.notify(Phase("waiting for the operator to look at the arm"))
         self._asked(partial(operator.confirm, question))
+
+    @property
+    def _at_terminal(self) -> bool:
+        return isinstance(self._operator, TerminalPerson) and self._operator.at_terminal
 
     def _carry(self, load: CellLoad | None) -> None:
         self._arm.set_payload(*payload(self._cell, load))
@@ -134,11 +126,10 @@ class Hook:
 
     def _asked(self, ask: Callable[[], None]) -> None:
         """Ask a person; one at the terminal gets it from the display."""
-        person = isinstance(self._operator, TerminalPerson) and self._operator.at_terminal
-        if person:
+        if self._at_terminal:
             self._watcher.notify(Question())
         ask()
-        if person:
+        if self._at_terminal:
             self._watcher.notify(Answered())
 
     def _ask(
@@ -150,11 +141,9 @@ class Hook:
     ) -> None:
         """Ask until nothing is wrong, `TRIES` times; an arm moved meanwhile is put back.
 
-        `why` tells why it is asked for, empty at the first time; `answered` is told what hangs
-        after each answer, before anything moves.
+        `answered` is told what hangs after each answer, before anything moves.
         """
         what = "take everything off" if load is None else f"hang {load.name}"
-        person = isinstance(self._operator, TerminalPerson) and self._operator.at_terminal
         for _ in range(TRIES):
             self._watcher.notify(Phase(f"waiting for the operator to {what}"))
             self._asked(partial(self._operator.hang, load, why))
@@ -166,7 +155,7 @@ class Hook:
             why = wrong()
             if not why:
                 return
-            if not person:  # a person is told with the next question
+            if not self._at_terminal:  # a person is told with the next question
                 self._watcher.notify(Remark(f"asked to {what}: {why}"))
         if load is None:
             why += ". If nothing does, the tool was touched while the sensor was tared"
@@ -189,9 +178,8 @@ class Hook:
     def _still_hangs(self) -> str:
         """What seems to hang still: a load that fits better than nothing does.
 
-        By the zero of an earlier session, since the sensor's own may have changed meanwhile.
-        Without one it is the sensor's own, which may be far off: then a second answer that nothing
-        hangs is believed, and said to be.
+        By the zero of an earlier session. Without one it is the sensor's own, which may be far off:
+        then a second answer that nothing hangs is believed, and said to be.
         """
         if self._meter is None:
             return ""

@@ -70,19 +70,11 @@ class Average:
 
 
 def average(samples: Sequence[TrackerSample], systematic_share: float = 0.0) -> Average:
-    """Average K samples of one target at rest; the law is that of the module.
+    """Average at least 2 samples of one target at rest; the law is that of the module.
 
     A gross outlier among them is left out: its squared distance from the median, whitened by
     Σ̄ and relative to what is usual in the window (never less than stated), is less probable
-    than `GROSS_SIGMA`.
-
-    Args:
-        samples: at least 2, of one target at rest.
-        systematic_share: s, 0 to 1.
-
-    Raises:
-        DeviceError: more than one in five samples (and more than one) are gross outliers, or
-            fewer than 2 remain.
+    than `GROSS_SIGMA`. DeviceError: they are more than one in five (and more than one).
     """
     values = np.array([sample.value for sample in samples])
     stated = np.array([sample.covariance for sample in samples])
@@ -132,10 +124,7 @@ def deviations(values: Floats) -> tuple[Floats, Floats]:
 
 
 def _trace_test(residuals: Floats, prior: Floats) -> tuple[float, float]:
-    """T / (m (K - 1)) and P(chi² >= T), with T = Σ_k r_kᵀ Σ̄⁻¹ r_k.
-
-    Under the stated noise T follows chi² with m (K - 1) degrees of freedom.
-    """
+    """T / (m (K - 1)), T = Σ_k r_kᵀ Σ̄⁻¹ r_k, and P(chi² >= T) with as many degrees of freedom."""
     count, m = residuals.shape
     white = residuals @ inverse_root(prior).T
     total, dof = float(np.sum(white**2)), m * (count - 1)
@@ -156,7 +145,7 @@ _LOG_GROSS = float(np.log(2) + stats.norm.logsf(GROSS_SIGMA))
 
 DRIFT_P = 0.04
 """False alarm rate of the drift test. The constants here are choices, traded by hand in
-tests/unit/measuring/test_settle.py: time lost at rest against the bias that a decay leaves."""
+tests/unit/measuring/test_measure.py: time lost at rest against the bias that a decay leaves."""
 AFTER_DRIFT_P = 0.3
 """The same after readings have drifted: the test is repeated at every sample, and none of the
 repeated tests may miss a drift that is there."""
@@ -164,10 +153,8 @@ SCATTER_P = 0.001
 SHRINKING_P = 0.05
 NEGLIGIBLE = 0.5
 """Drift over the window that does not matter, as a share of the standard deviation of a mean."""
-FEW = 12
-"""Fewer samples than this do not estimate a scatter."""
-LONGEST = 10
-"""The window grows to at most so many times K samples."""
+FEW = 12  # fewer samples than this do not estimate a scatter
+LONGEST = 10  # the window grows to at most so many times K samples
 
 
 class SettleWindow:
@@ -253,12 +240,9 @@ def _trend(samples: Sequence[TrackerSample]) -> _Trend:
     return _Trend(root @ slope, moment, span, scatter, p, dof)
 
 
-SEARCHES = 2
-"""How often a lost target is searched for in one reading."""
-AGAIN = 3
-"""How often a reading is tried that is void: the arm moved, or the samples disagree."""
-PATIENCE = 4
-"""Settling is given up after its time and at least so many windows of measurements."""
+SEARCHES = 2  # how often a lost target is searched for in one reading
+AGAIN = 3  # how often a reading is tried that is void: the arm moved, or the samples disagree
+PATIENCE = 4  # settling is given up after its time and at least so many windows of measurements
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -290,7 +274,6 @@ class Measurer:
         clock: Clock,
         watcher: Watcher,
     ) -> None:
-        """Use open devices."""
         self._mover, self._tracker, self._meter = mover, tracker, meter
         self._config, self._clock, self._watcher = config, clock, watcher
 
@@ -302,12 +285,7 @@ class Measurer:
     ) -> MeasuredStop:
         """Measure at the present pose, called `name`.
 
-        `find` finds a lost target again, the tracker's search where None; `force` is the wrench
-        where it was averaged at this stop already.
-
-        Raises:
-            TargetLostError: the target was not found again.
-            DeviceError: nothing settled in time, the arm did not stand still, or a device failed.
+        `find` finds a lost target again; `force` is the wrench where it was averaged already.
         """
         remarks: list[str] = []
         searches = repeats = 0

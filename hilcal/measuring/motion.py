@@ -1,29 +1,199 @@
-"""Moving the arm from pose to pose while every limit is checked."""
+"""Moving the arm from pose to pose while every limit, and that the load hangs, is checked."""
 
 from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
-from hilcal.config import CellConfig
+from hilcal.cell import Cell
+from hilcal.config import CellConfig, CellLoad
 from hilcal.errors import DeviceError
-from hilcal.measuring.devices import ArmDevice, ArmSample, Clock
-from hilcal.measuring.dry_run import on_route
-from hilcal.measuring.feasibility import Feasibility
-from hilcal.measuring.force import ForceMeter
-from hilcal.measuring.guard import HOW_ON, NORMAL, Guard, LoadWatch
-from hilcal.measuring.route import Stop, duration
+from hilcal.measuring.devices import ArmDevice, ArmSample, Clock, LoadChangedError
+from hilcal.measuring.feasibility import Feasibility, Margins
+from hilcal.measuring.force import MOMENT_LEVER_M, ForceMeter, TaredWrench
+from hilcal.measuring.progress import ArmAt, Watcher
+from hilcal.measuring.route import Stop, duration, on_route
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Floats
 
-POLL_S = 0.02
-"""Between two looks at the devices while the arm moves, real seconds."""
-GRACE_S = 15.0
-"""What a motion may take longer than three times its time, real seconds."""
-SLOWEST = 0.02
-"""The speed slider is not waited for below this share."""
-STILL_RAD = 1e-4
-"""Joints of an arm at rest vary by less, rad (some steps of an encoder)."""
+NORMAL = "normal"  # the safety state of an arm where all is well
+HOW_ON = "drive it by hand to a free place in the middle of its workspace"
+SLACK_M = 0.005  # an arm that sags at the edge of its workspace is not stopped for it, m
+SLACK = Margins(joint=-0.01, inside=-SLACK_M, clear=0.0, itself=0.0, bear=1.02)
+"""How much less is kept in motion than in a dry run: an arm sags and follows late, and a motion is
+checked at samples. Nothing may touch."""
+
+
+class Guard:
+    """The limits of a cell, checked against samples of its devices."""
+
+    def __init__(self, cell: Cell, config: CellConfig) -> None:
+        self.cell, self.config = cell, config
+        self._limits = Feasibility(cell, config, SLACK)
+
+    def check(
+        self, sample: ArmSample, felt: Floats | None = None, hanging: str = UNLOADED
+    ) -> str | None:
+        """Return in one line what is wrong, or None; `felt` is the wrench (6,) of the sensor."""
+        return (
+            self.state(sample)
+            or self._speed(sample)
+            or self._place(sample.q, hanging)
+            or self._pull(felt)
+        )
+
+    def state(self, sample: ArmSample) -> str | None:
+        """Return in one line why a sample is not one of this arm, ready to move; or None."""
+        if sample.safety != NORMAL:
+            return f"arm: its safety state is {sample.safety}; put that right on the pendant"
+        n = self.cell.arm.n
+        if sample.q.shape != (n,) or sample.qd.shape != (n,):
+            return f"arm: it reports {len(sample.q)} joints; {self.cell.arm.name} has {n}"
+        if not (np.isfinite(sample.q).all() and np.isfinite(sample.qd).all()):
+            return "arm: it reports joint angles that are not numbers"
+        return None
+
+    def _speed(self, sample: ArmSample) -> str | None:
+        speed, limit = np.abs(sample.qd), self.config.limits.joint_speed_rad_s
+        k = int(np.argmax(speed))
+        if speed[k] <= limit:
+            return None
+        name = self.cell.arm.joint_names[k]
+        return f"arm: {name} moves at {speed[k]:.3g} rad/s; joint_speed_rad_s is {limit:g}"
+
+    def _place(self, q: Floats, hanging: str) -> str | None:
+        found = next(self._limits.findings(q[None], hanging), None)
+        return None if found is None else f"{found.at('arm')}; {HOW_ON}"
+
+    def _pull(self, felt: Floats | None) -> str | None:
+        sensor = self.config.force_sensor
+        if felt is None or sensor is None:
+            return None
+        for part, unit, key, limit in (
+            (felt[:3], "N", "max_force_N", sensor.max_force_N),
+            (felt[3:], "N·m", "max_moment_Nm", sensor.max_moment_Nm),
+        ):
+            size = float(np.linalg.norm(part))
+            if not size <= limit:  # negated, so that what is not a number is refused
+                return (
+                    f"force sensor: {size:.4g} {unit}; {key} is {limit:g}. Look what the arm or "
+                    "its load touches"
+                )
+        return None
+
+
+# Choices, no study set them; tests/unit/measuring/test_run_watched.py shows what they find.
+ALLOWED = 2.0
+"""A hung load may differ by so many times what it may when it is hung: a sensor's zero drifts."""
+SWING = 0.3  # share of the load that it exerts to the side while it swings in motion: 17°
+PULL = 0.5
+"""Share by which a pull may differ: its rope turns with the arm, its weight is on a pulley."""
+UNKNOWN_KG = 1.0
+"""A tool that has not been weighed yet may differ from [tool] by so much, or by half of it, kg."""
+HOLD_S = 0.2  # in motion and between readings a difference has to last for so long, real seconds
+LOOKS = 3  # the same in looks
+
+
+class LoadWatch:
+    """Compares the force that the sensor feels with tool and load, at every look and reading.
+
+    d = |R (f - f_tool) - f_load| with f the force felt, sensor axes, f_tool that of the tool and R
+    the sensor's orientation. A load that is a moment alone is compared by its moment, acting at
+    `MOMENT_LEVER_M`. The limit is `ALLOWED` times the one of `[operator]` when a load is hung, and
+    more for a pull (`PULL`) and in motion for what swings to the side (`SWING`) and is accelerated.
+    A tool that is not weighed yet may differ from [tool] by `UNKNOWN_KG`: the tare holds that at
+    its pose, so the limit grows by how far the sensor has turned against gravity since.
+    """
+
+    def __init__(self, meter: ForceMeter, cell: Cell, config: CellConfig) -> None:
+        """Nothing is compared before `expect`."""
+        self._meter, self._cell, self._config = meter, cell, config
+        self._load: CellLoad | None = None
+        self.watching = False
+        self.differed = 0
+        self._since: tuple[int, int] | None = None
+
+    def expect(self, load: CellLoad | None) -> None:
+        """Compare with this load from now on; None: nothing hangs."""
+        self._load, self.watching, self._since = load, True, None
+
+    def suspend(self) -> None:
+        """Compare nothing: what hangs is being changed."""
+        self.watching = False
+
+    def look(self, sample: ArmSample, felt: Floats, *, moving: bool) -> None:
+        """Compare a frame of the sensor: a wrench (6,) against the zero, sensor axes, N and N·m."""
+        if not self.watching:
+            return
+        tared = TaredWrench(felt, np.zeros((6, 6)), sample.q)
+        difference, limit = self._compared(tared, moving=moving)
+        if difference <= limit:
+            self._since = None
+            return
+        self.differed += 1
+        first, count = self._since or (sample.host_ns, 0)
+        self._since = first, count + 1
+        if count + 1 >= LOOKS and sample.host_ns - first >= HOLD_S * 1e9:
+            raise LoadChangedError(self._words(tared))
+
+    def wrong(self, tared: TaredWrench) -> str:
+        """Return in one line why a mean wrench is not that of what should hang, or nothing."""
+        if not self.watching:
+            return ""
+        difference, limit = self._compared(tared, moving=False)
+        noise = 3.0 * float(np.sqrt(np.linalg.eigvalsh(tared.covariance[:3, :3]).max()))
+        return self._words(tared) if difference - noise > limit else ""
+
+    def _compared(self, tared: TaredWrench, *, moving: bool) -> tuple[float, float]:
+        """How far force (or moment) is from what should hang, and how far it may be, N.
+
+        A weight that swings pulls to the side; its vertical force is compared by itself in motion.
+        """
+        load, operator, cell = self._load, self._config.operator, self._cell
+        hung = np.zeros(6) if load is None else load.wrench(cell.gravity)
+        beyond = self._meter.load_wrench(tared) - hung
+        size, unlike = float(np.linalg.norm(hung[:3])), float(np.linalg.norm(beyond[:3]))
+        if size == 0.0 and hung[3:].any():
+            size = float(np.linalg.norm(hung[3:])) / MOMENT_LEVER_M
+            unlike = float(np.linalg.norm(beyond[3:])) / MOMENT_LEVER_M
+        pulled = load is not None and any((*load.force_N, *load.moment_Nm))
+        share = max(ALLOWED * operator.tolerance_share, PULL if pulled else 0.0)
+        limit = max(ALLOWED * operator.tolerance_N, share * size)
+        mass = cell.tool_mass + (0.0 if load is None else load.mass_kg)
+        if not self._meter.identified:
+            unweighed = max(UNKNOWN_KG, 0.5 * cell.tool_mass)
+            limit += unweighed * self._meter.turned(tared.q)
+        if moving:
+            motion = self._config.motion
+            brief = motion.speed_rad_s < HOLD_S * motion.acceleration_rad_s2
+            ramp = 0.0 if brief else motion.acceleration_rad_s2  # over before it has lasted enough
+            limit += mass * cell.arm.reach * (ramp + motion.speed_rad_s**2)
+            down = abs(float(beyond[:3] @ cell.gravity)) / float(np.linalg.norm(cell.gravity))
+            lifted = limit + SWING**2 / 2 * size
+            limit += SWING * size
+            if load is not None and not pulled and down / lifted > unlike / limit:
+                return down, lifted
+        return unlike, limit
+
+    def _words(self, tared: TaredWrench) -> str:
+        """What is felt and what should hang, in one line."""
+        hung = np.zeros(6) if self._load is None else self._load.wrench(self._cell.gravity)
+        felt = self._meter.load_wrench(tared)
+        moment = hung[3:].any() and not hung[:3].any()
+        part, unit = (slice(3, 6), "N·m") if moment else (slice(0, 3), "N")
+        what = "nothing" if self._load is None else self._load.name
+        words = (
+            f"the force sensor feels {np.linalg.norm(felt[part]):.1f} {unit} where {what} should "
+            f"hang ({np.linalg.norm(hung[part]):.1f} {unit}): has a load fallen off, or does "
+            "somebody touch the tool?"
+        )
+        return words if self._meter.identified else f"{words} Or is [tool] mass_kg or com_m wrong?"
+
+
+POLL_S = 0.02  # between two looks at the devices while the arm moves, real seconds
+GRACE_S = 15.0  # what a motion may take longer than three times its time, real seconds
+SLOWEST = 0.02  # the speed slider is not waited for below this share
+STILL_RAD = 1e-4  # joints of an arm at rest vary by less, rad (some steps of an encoder)
 MOVED_RAD = 0.005
 """A joint that stands farther from where hilcal left it has been moved, rad; brakes and sagging
 move it by less. A choice, no study set it: 7 mm at the end of an arm of 1.3 m."""
@@ -34,8 +204,7 @@ FOLLOW_S = 0.05
 """So long after its command a joint is where it was commanded to, at most, s. A choice."""
 FROZEN_S = 0.6
 """Joint angles or a clock that stand still for so long where they have to change, real seconds."""
-FROZEN_RAD = 1e-5
-"""Joint angles that change by less stand still, rad."""
+FROZEN_RAD = 1e-5  # joint angles that change by less stand still, rad
 
 
 class Mover:
@@ -43,11 +212,7 @@ class Mover:
 
     Every motion is checked from where the arm stands when it starts. Nothing here stops the arm:
     whatever is wrong is raised at once, and the run stops the arm before it does anything else.
-
-    Attributes:
-        goal: (n,) joint angles where the arm has been left, or goes; None while that is unknown.
-        side: (n,) from which each joint arrived, -1 or +1; 0 before its first motion.
-        watch: compares what the force sensor feels with what should hang; None without a sensor.
+    `goal` (n,) is where the arm has been left, or goes; None while that is unknown.
     """
 
     def __init__(
@@ -57,27 +222,21 @@ class Mover:
         guard: Guard,
         config: CellConfig,
         clock: Clock,
-        passed: Callable[[Floats], None] = lambda q: None,
+        watcher: Watcher,
     ) -> None:
-        """Use an open arm; `passed` is told where it is (n,) while it moves, and must not wait."""
+        """Use an open arm; the watcher is told where it is while it moves, and must not wait."""
         self.goal: Floats | None = None
         self.hanging: tuple[str, ...] = (UNLOADED,)
         self.side = np.zeros(guard.cell.arm.n)
         self.watch = None if meter is None else LoadWatch(meter, guard.cell, config)
         self._arm, self._meter, self._guard = arm, meter, guard
         self._limits = Feasibility(guard.cell, config)
-        self._motion, self._clock, self._passed = config.motion, clock, passed
+        self._motion, self._clock, self._watcher = config.motion, clock, watcher
         self._under_way = False
         self._ticked: tuple[float, int] = (-1.0, 0)
 
     def look(self) -> ArmSample:
-        """Return a sample of the arm after it and the force sensor have been checked.
-
-        Raises:
-            LoadChangedError: the force sensor does not feel what should hang.
-            DeviceError: a limit is exceeded, the arm is not where it was left, or a device failed;
-                the arm has to be stopped.
-        """
+        """Return a sample of the arm after it and the force sensor have been checked."""
         sample = self._arm.sample()
         felt = None if self._meter is None else self._meter.felt()
         checked = (self._guard.check(sample, felt, load) for load in self.hanging)
@@ -102,11 +261,9 @@ class Mover:
             (sample.q_target, "another program, or somebody at the pendant, has commanded"),
             (sample.q, "somebody has moved"),
         ):
-            off = np.abs(where - self.goal)
-            k = int(np.argmax(off))
-            if not off[k] <= MOVED_RAD:
-                name = self._guard.cell.arm.joint_names[k]
-                return f"{who} it since it came here: {name} by {off[k]:.3g} rad"
+            name, off = self._worst(where - self.goal)
+            if not off <= MOVED_RAD:
+                return f"{who} it since it came here: {name} by {off:.3g} rad"
         return None
 
     def wait(self, seconds: float) -> None:
@@ -123,11 +280,7 @@ class Mover:
     def agreed(self, goal: Floats, name: str, left: Floats, ask: Callable[[str], None]) -> Floats:
         """Return where the arm stands (n,), once its way to a goal is free and people have agreed.
 
-        Where it does not stand where it was `left` (n,), rad, that is asked first, and checked anew
-        after; `ask` raises DeviceError where that is refused.
-
-        Raises:
-            DeviceError: the way is not free, or the person gave up.
+        Where it does not stand where it was `left`, that is asked first, and checked anew after.
         """
         while True:
             sample = self._arm.sample()
@@ -136,13 +289,11 @@ class Mover:
                 raise DeviceError(unfit)
             q = sample.q
             self.check_way(q, goal, name)
-            off = np.abs(q - left)
-            k = int(np.argmax(off))
-            if off[k] <= MOVED_RAD:
+            joint, off = self._worst(q - left)
+            if off <= MOVED_RAD:
                 return q
-            joint = self._guard.cell.arm.joint_names[k]
             ask(
-                f"the arm does not stand where it was left: {joint} is {off[k]:.3g} rad off. Its "
+                f"the arm does not stand where it was left: {joint} is {off:.3g} rad off. Its "
                 f"way from there to {name} has been checked. It goes there next"
             )
             left = q
@@ -161,11 +312,7 @@ class Mover:
             self.goal = self._arm.sample().q
 
     def check_way(self, start: Floats, goal: Floats, name: str) -> None:
-        """Check the straight line in joint space between two states (n,), rad.
-
-        Raises:
-            DeviceError: it is not free.
-        """
+        """Check the straight line in joint space between two states (n,), rad."""
         for load in self.hanging:
             stops = Stop("where the arm stands", start, load), Stop(name, goal, load)
             problems = on_route(self._limits, stops)
@@ -175,15 +322,7 @@ class Mover:
                 )
 
     def move(self, q: Floats, name: str) -> None:
-        """Move to `q` (n,), rad, straight in joint space.
-
-        The way is checked from where the arm stands.
-
-        Raises:
-            LoadChangedError: the load is not what should hang any more.
-            DeviceError: the way is not free, the arm failed, a limit was exceeded, or it did not
-                arrive.
-        """
+        """Move straight to `q` (n,), rad; the way is checked from where the arm stands."""
         sample = self.look()
         start = sample.q
         if self.goal is not None and np.abs(start - self.goal).max() <= self._motion.arrival_rad:
@@ -208,7 +347,7 @@ class Mover:
         while self._arm.moving():
             sample = self.look()
             last = self._check_progress(start, q, sample, last, name)
-            self._passed(sample.q)
+            self._watcher.notify(ArmAt(tuple(sample.q.tolist())))
             slowest = min(slowest, max(sample.speed_scaling, SLOWEST))
             allowed = 3.0 * usual / slowest + GRACE_S * self._clock.scale
             if self._clock.now() - begun > allowed:
@@ -218,38 +357,35 @@ class Mover:
                 )
             self._clock.sleep(POLL_S * self._clock.scale)
         arrived = self.look().q
-        self._passed(arrived)
-        off = np.abs(arrived - q)
-        if not off.max() <= motion.arrival_rad:
-            k = int(np.argmax(off))
+        self._watcher.notify(ArmAt(tuple(arrived.tolist())))
+        joint, off = self._worst(arrived - q)
+        if not off <= motion.arrival_rad:
             raise DeviceError(
-                f"arm: {self._guard.cell.arm.joint_names[k]} stands {off[k]:.3g} rad off {name}; "
-                f"arrival_rad is {motion.arrival_rad:g}"
+                f"arm: {joint} stands {off:.3g} rad off {name}; arrival_rad is "
+                f"{motion.arrival_rad:g}"
             )
+
+    def _worst(self, off: Floats) -> tuple[str, float]:
+        """Name of the joint that is off the most, and by how much, rad."""
+        k = int(np.argmax(np.abs(off)))
+        return self._guard.cell.arm.joint_names[k], float(np.abs(off[k]))
 
     def _check_progress(
         self, start: Floats, goal: Floats, sample: ArmSample, last: ArmSample | None, name: str
     ) -> ArmSample:
-        """Check that a motion keeps its straight line and goes on.
-
-        `last` is the first sample with the joint angles of before; returned is that of now.
-        """
+        """Check that a motion keeps its line and goes on; the first sample that stood here."""
         way = goal - start
         share = np.clip((sample.q - start) @ way / max(float(way @ way), 1e-30), 0.0, 1.0)
-        off = np.abs(sample.q - start - share * way)
-        k = int(np.argmax(off))
-        joint = self._guard.cell.arm.joint_names[k]
-        if not off[k] <= OFF_WAY_RAD:
+        joint, off = self._worst(sample.q - start - share * way)
+        if not off <= OFF_WAY_RAD:
             raise DeviceError(
-                f"arm: {joint} has left the straight way to {name} by {off[k]:.3g} rad; does "
+                f"arm: {joint} has left the straight way to {name} by {off:.3g} rad; does "
                 "another program command the arm, or does somebody push it?"
             )
-        behind = np.abs(sample.q_target - sample.q)
-        k = int(np.argmax(behind))
-        joint = self._guard.cell.arm.joint_names[k]
-        if not behind[k] <= OFF_WAY_RAD + FOLLOW_S * self._motion.speed_rad_s:
+        joint, behind = self._worst(sample.q_target - sample.q)
+        if not behind <= OFF_WAY_RAD + FOLLOW_S * self._motion.speed_rad_s:
             raise DeviceError(
-                f"arm: {joint} is told to be {behind[k]:.3g} rad from where it is, on the way to "
+                f"arm: {joint} is told to be {behind:.3g} rad from where it is, on the way to "
                 f"{name}: its angle is old, or something holds the joint"
             )
         if last is None or np.abs(sample.q - last.q).max() > FROZEN_RAD:

@@ -10,11 +10,9 @@ from hilcal.config import CellConfig
 from hilcal.errors import DeviceError, HilcalError, InputError
 from hilcal.measuring.connect import Rig
 from hilcal.measuring.devices import ArmDevice, Clock
-from hilcal.measuring.dry_run import DryRun, dry_run
 from hilcal.measuring.progress import Phase, Remark, Watcher
-from hilcal.measuring.route import route
-from hilcal.measuring.session import LiveModel, Session
-from hilcal.measuring.stopping_rule import StoppingRule
+from hilcal.measuring.route import DryRun, dry_run, route
+from hilcal.measuring.session import LiveModel, Session, StoppingRule
 from hilcal.store.plan import Plan
 from hilcal.store.run_log import RunLog
 
@@ -69,11 +67,7 @@ def run(
 
 
 def refuse(checked: DryRun) -> None:
-    """Refuse a plan with problems.
-
-    Raises:
-        InputError: names the first problem, and how many more there are.
-    """
+    """Refuse a plan with problems: InputError names the first, and how many more there are."""
     if checked.problems:
         raise InputError(f"the plan is not safe to run, nothing has moved: {checked.first}")
 

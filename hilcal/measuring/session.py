@@ -16,16 +16,28 @@ from hilcal.measuring.arrival import ArrivalReader, RoughRegistration, TargetRea
 from hilcal.measuring.connect import Rig
 from hilcal.measuring.devices import Clock, LoadChangedError, TargetLostError, WrenchSample
 from hilcal.measuring.force import ForceMeter, TaredWrench
-from hilcal.measuring.guard import Guard
 from hilcal.measuring.loads import TRIES, Hook, payload
 from hilcal.measuring.measure import MeasuredStop, Measurer
-from hilcal.measuring.motion import Mover
-from hilcal.measuring.progress import ArmAt, LiveResidual, Phase, ReadingStored, Remark, Watcher
-from hilcal.measuring.reading_record import detail, reading_of, sample_json, stored_wrench
-from hilcal.measuring.route import Stop
-from hilcal.measuring.session_state import Eta, SessionState, Shift
-from hilcal.measuring.stopping_rule import GoalCheck, StoppingRule, way_home
-from hilcal.readings.readings import Readings
+from hilcal.measuring.motion import Guard, Mover
+from hilcal.measuring.progress import (
+    GoalMet,
+    GoalStatus,
+    LiveResidual,
+    Phase,
+    ReadingStored,
+    Remark,
+    Watcher,
+)
+from hilcal.measuring.route import Stop, way_home
+from hilcal.measuring.session_state import (
+    Eta,
+    SessionState,
+    Shift,
+    detail,
+    sample_json,
+    stored_wrench,
+)
+from hilcal.readings.readings import Readings, States
 from hilcal.store.plan import UNLOADED, Plan, Step
 from hilcal.store.run_log import RunLog
 from hilcal.types import Floats
@@ -33,6 +45,9 @@ from hilcal.types import Floats
 Done = TypeVar("Done")
 LiveModel = Callable[[Readings], LiveResidual]
 """Returns the last reading against a model fitted to those before it."""
+StoppingRule = Callable[[Readings, bool], GoalStatus]
+"""Tells from all readings so far how far the goal is. Unless it is told that the plan has no more,
+the answer may be that of a few readings before, so that judging does not delay the campaign."""
 
 
 class Session:
@@ -57,20 +72,14 @@ class Session:
         self._rig, self._cell, self._config, self._plan = rig, cell, config, plan
         self._store, self._clock, self._watcher, self._live = store, clock, watcher, live
         self._wall = wall
-        self._goal = GoalCheck(goal, plan, store, watcher, self._event)
+        self._rule = goal
+        self._goal: GoalStatus | None = None
         window = clock.real(config.acquire.force_window_s)
         self._meter: ForceMeter | None = None
         if rig.force is not None and config.force_sensor is not None:
             self._meter = ForceMeter(rig.force, config.force_sensor, cell, window)
         self._guard = Guard(cell, config)
-        self._mover = Mover(
-            rig.arm,
-            self._meter,
-            self._guard,
-            config,
-            clock,
-            lambda q: watcher.notify(ArmAt(tuple(q.tolist()))),
-        )
+        self._mover = Mover(rig.arm, self._meter, self._guard, config, clock, watcher)
         self._measurer = Measurer(self._mover, rig.tracker, self._meter, config, clock, watcher)
         self._hook = Hook(
             rig.arm, rig.operator, self._meter, self._mover, cell, config, clock, watcher
@@ -118,27 +127,23 @@ class Session:
     # the way
 
     def walk(self, stops: tuple[Stop, ...]) -> None:
-        """Go through all stops, or home as soon as the goal is met.
-
-        Raises:
-            HilcalError: something failed; the arm has to be stopped.
-        """
+        """Go through all stops, or home as soon as the goal is met."""
         total = len(self._plan.steps)
         self._event("start", {"missing": sum(s.step is not None for s in stops)})
         self._begin(stops[:2])
         pace = self._pace = Eta(self._clock)
         behind, ahead = list(stops[:2]), stops[2:]
-        if self._goal.newly_met(last=False):  # an earlier session was stopped on its way home
+        if self._goal_newly_met(last=False):  # an earlier session was stopped on its way home
             ahead = way_home(self._cell, self._config, self._plan, behind, self._store.done())
         while ahead:
             stop, *rest = ahead
             ahead = tuple(rest)
             behind.append(stop)
-            read = self._visit(stop)
+            read = self._watched(partial(self._visit, stop))
             if stop.step is not None and read is not None:
                 reading, settling = read
                 pace.read()
-                if self._goal.newly_met(last=all(s.step is None for s in ahead)):
+                if self._goal_newly_met(last=all(s.step is None for s in ahead)):
                     done = self._store.done()
                     ahead = way_home(self._cell, self._config, self._plan, behind, done)
                 left = pace.left(
@@ -148,21 +153,30 @@ class Session:
                 self._tell(stop.step, reading, total, left, settling)
         self._finish()
 
+    def _goal_newly_met(self, last: bool) -> bool:
+        """Apply the stopping rule; whether the goal has just been met, which is stored and told."""
+        readings = None if self._rule is None else self._store.readings()
+        if self._rule is None or readings is None or (self._goal is not None and self._goal.met):
+            return False
+        now = self._goal = self._rule(readings, last)
+        count, planned = len(readings), len(self._plan.steps)
+        if now.met or last:
+            self._event("goal", {**now.to_dict(), "readings": count, "planned": planned})
+        if now.met:
+            self._watcher.notify(GoalMet(now, count, planned))
+        return now.met
+
     def _visit(self, stop: Stop) -> tuple[Readings, float] | None:
-
-        def visit() -> tuple[Readings, float] | None:
-            self._move(stop)
-            change = None if stop.change_to == self._hook.hanging else stop.change_to
-            if change is not None:
-                self._pace.arrived()
-                self._change(change)
-            if not self._tared:
-                self._tare()
-            if change is not None:
-                self._pace.changed()
-            return None if stop.step is None else self._reading(stop, stop.step)
-
-        return self._watched(visit)
+        self._move(stop)
+        change = None if stop.change_to == self._hook.hanging else stop.change_to
+        if change is not None:
+            self._pace.arrived()
+            self._change(change)
+        if not self._tared:
+            self._tare()
+        if change is not None:
+            self._pace.changed()
+        return None if stop.step is None else self._reading(stop, stop.step)
 
     def _watched(self, do: Callable[[], Done]) -> Done:
         """Do something; again after what hangs was found wrong and has been put right."""
@@ -175,7 +189,7 @@ class Session:
                     raise
                 self._mover.left_here()
                 self._event("load", {"hanging": None, "why": str(error)})
-                self._watcher.notify(Remark(f"{error} The arm stands"))
+                self._remark(f"{error} The arm stands")
                 self._hook.restore(str(error))
                 self._event("load", {"hanging": self._hook.hanging})
         raise AssertionError("unreachable")
@@ -235,11 +249,7 @@ class Session:
             self._event("tare", {"force": sample_json(sample), "q": q.tolist()})
 
     def _zero(self) -> tuple[WrenchSample, Floats] | None:
-        """Set the force sensor's zero at the present pose, with nothing on the hook.
-
-        Returns:
-            the mean wrench and the joint angles (n,), rad; None without a sensor.
-        """
+        """Set the zero at the present pose, with nothing on the hook; mean wrench and joints."""
         meter, watch = self._meter, self._mover.watch
         if meter is None or watch is None:
             return None
@@ -269,17 +279,15 @@ class Session:
         try:
             left_out = self._meter.identify(self._state.tared_wrenches, tolerance)
         except HilcalError as error:
-            self._watcher.notify(Remark(f"the tool is not identified: {error}"))
+            self._remark(f"the tool is not identified: {error}")
             return
         if left_out is None:
             return
         tool = self._meter.tool
         if left_out:
-            self._watcher.notify(
-                Remark(
-                    f"{len(left_out)} of {self._identified} unloaded readings differ by more than "
-                    f"{tolerance:g} N from the tool that the others weigh: was the tool touched?"
-                )
+            self._remark(
+                f"{len(left_out)} of {self._identified} unloaded readings differ by more than "
+                f"{tolerance:g} N from the tool that the others weigh: was the tool touched?"
             )
         self._event(
             "tool",
@@ -294,7 +302,7 @@ class Session:
         )
         differs = self._meter.tool_differs(tolerance)
         if differs is not None:
-            self._watcher.notify(Remark(differs))
+            self._remark(differs)
 
     # one reading
 
@@ -302,17 +310,15 @@ class Session:
         """Measure and store all targets; the arm has arrived. Returns the first one's reading."""
         self._watcher.notify(Phase(f"measuring {step}"))
         found = self._reader.read(stop.q, stop.name)
-        pairs = [self._row(stop, step, one) for one in found]
-        rows, details = [reading for reading, _ in pairs], [told for _, told in pairs]
+        rows, details = map(list, zip(*(self._row(stop, step, one) for one in found), strict=True))
         self._check(found, details)
-        first = rows[0]
         self._store.record(Readings.joined(rows), step, details[0], *details[1:])
         self._done += 1
         for one in found:
             measured, mean = one.measured, one.measured.mean
             name = f"{step}" if one.target is None else f"{step}, {self._name(one.target)}"
             for text in measured.remarks:
-                self._watcher.notify(Remark(f"{name}: {text}"))
+                self._remark(f"{name}: {text}")
             tared = None if one.target else self._tared_wrench(measured)
             shift = self._state.add(
                 step, measured.q, mean.value, mean.covariance, tared, one.target or 0
@@ -320,30 +326,26 @@ class Session:
             if shift is not None:
                 self._tell_drift(step, shift)
         self._look_back()
-        return first, sum(one.measured.settling for one in found)
+        return rows[0], sum(one.measured.settling for one in found)
 
     def _check(self, found: Sequence[TargetReading], details: list[dict[str, Any]]) -> None:
-        """Refuse the readings of an arrival of another target or another load.
-
-        They are kept as doubted.
-        """
+        """Refuse the readings of an arrival of another target or load; they are doubted."""
         wrong = next(filter(None, map(self._doubt, found)), None)
-        if wrong is not None:
-            for told in details:
-                self._event("doubted", {"why": str(wrong), "reading": told})
-            for one in found:
-                position = one.measured.mean.value[:3]
-                self._state.registration.doubt_repeated(one.measured.q, position, one.target or 0)
-            self._look_back()
-            raise wrong
+        if wrong is None:
+            return
+        for raw in details:
+            self._event("doubted", {"why": str(wrong), "reading": raw})
+        for one in found:
+            position = one.measured.mean.value[:3]
+            self._state.registration.doubt_repeated(one.measured.q, position, one.target or 0)
+        self._look_back()
+        raise wrong
 
     def _look_back(self) -> None:
         """Tell of stored readings that are seen to be doubtful now."""
         for step, why in self._state.registration.late_doubts():
             self._event("doubted", {"why": why, "reading": asdict(step), "stored": True})
-            self._watcher.notify(
-                Remark(f"{step}, stored before: {why} A fit sets gross errors aside")
-            )
+            self._remark(f"{step}, stored before: {why} A fit sets gross errors aside")
 
     def _doubt(self, one: TargetReading) -> DeviceError | None:
         """Why a reading cannot be of its target under its load, or None."""
@@ -357,20 +359,32 @@ class Session:
         return LoadChangedError(wrong) if wrong else None
 
     def _row(self, stop: Stop, step: Step, one: TargetReading) -> tuple[Readings, dict[str, Any]]:
+        """One reading, whose covariance is the instrument's alone, and everything raw behind it."""
         measured, tared = one.measured, self._tared_wrench(one.measured)
         elapsed = self._elapsed + one.ended - self._begun
-        reading = reading_of(
-            step,
-            stop.q,
-            measured,
-            self._wrench(step, tared),
-            elapsed,
-            one.ended - self._hook.since,
-            self._mover.side,
-            self._temperature(measured),
-            self._torque(measured),
-            one.target,
-            self._cell.target_names,
+        temperature, torque = self._temperature(measured), self._torque(measured)
+        states = States(
+            q=stop.q[None].copy(),
+            wrench=self._wrench(step, tared)[None].copy(),
+            time=np.array([elapsed]),
+            load_time=np.array([one.ended - self._hook.since]),
+            joint_temperature=None if temperature is None else temperature[None],
+            approach=self._mover.side[None].copy(),
+            q_actual=measured.q[None].copy(),
+            torque=None if torque is None else torque[None].copy(),
+            target=None if one.target is None else np.array([one.target]),
+        )
+        number = np.zeros(1, dtype=np.int64)
+        reading = Readings(
+            states=states,
+            pose=number,
+            load=number,
+            cycle=np.array([step.cycle], dtype=np.int64),
+            value=measured.mean.value[None].copy(),
+            covariance=measured.mean.covariance[None].copy(),
+            load_names=(step.load,),
+            pose_names=(step.pose,),
+            target_names=() if one.target is None else self._cell.target_names,
         )
         session: dict[str, Any] = {
             "epoch_wall_s": self._epoch,
@@ -382,7 +396,7 @@ class Session:
         if one.target is not None:
             session["target"] = self._name(one.target)
         zero = None if self._meter is None else self._meter.zero
-        return reading, detail(step, measured, tared, zero, session)
+        return reading, detail(step, measured, tared, zero) | session
 
     def _name(self, target: int) -> str:
         return self._cell.target_names[target]
@@ -420,8 +434,8 @@ class Session:
         if not self._torques:
             return None
         if measured.torque is None and not self._torques_lost:
-            text = "arm: it no longer tells the torques of its joints; readings go on without them"
-            self._watcher.notify(Remark(text))
+            lost = "arm: it no longer tells the torques of its joints; readings go on without them"
+            self._remark(lost)
         self._torques_lost = measured.torque is None
         return np.full(self._cell.arm.n, np.nan) if measured.torque is None else measured.torque
 
@@ -430,7 +444,7 @@ class Session:
         content = {"shift_m": shift.metres.tolist(), "sigma": shift.sigma}
         self._event("drift", {"cycle": step.cycle, **content, "over": shift.sigma > limit})
         if shift.sigma > limit:
-            self._watcher.notify(Remark(shift.words(limit)))
+            self._remark(shift.words(limit))
 
     # people
 
@@ -450,7 +464,7 @@ class Session:
                 deflection,
                 live,
                 settling,
-                self._goal.status,
+                self._goal,
                 number,
                 tuple(others),
             )
@@ -473,9 +487,12 @@ class Session:
         found = self._state.repeatability()
         if found is not None:
             self._event("repeatability", asdict(found))
-            self._watcher.notify(Remark(found.words(self._joint_std)))
+            self._remark(found.words(self._joint_std))
         self._event("finished", {"readings": self._done})
         self._watcher.notify(Phase("finished"))
+
+    def _remark(self, text: str) -> None:
+        self._watcher.notify(Remark(text))
 
     def _event(self, kind: str, content: dict[str, Any]) -> None:
         self._store.event(kind, {"wall_s": self._wall(), **content})

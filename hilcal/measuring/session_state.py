@@ -1,18 +1,152 @@
-"""What is carried from reading to reading: registration, unloaded readings, drift, pace."""
+"""What is carried from reading to reading, and a reading as it is stored, with all behind it."""
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+from typing import Any
 
 import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.measuring.arrival import RoughRegistration
-from hilcal.measuring.devices import Clock
+from hilcal.measuring.devices import ArmSample, Clock, Losses, TrackerSample, WrenchSample
 from hilcal.measuring.force import TaredWrench
-from hilcal.measuring.repeatability import RepeatabilityEstimate, UnloadedVisit, repeatability
+from hilcal.measuring.measure import MeasuredStop
 from hilcal.robot import chain as chains
 from hilcal.robot.chain import drive_jacobian
 from hilcal.store.plan import REFERENCE, UNLOADED, Step
 from hilcal.types import Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class UnloadedVisit:
+    """One unloaded reading."""
+
+    pose: str
+    position: Floats  # (3,) m, sensor axes
+    tracker: Floats  # (3, 3) covariance of the instrument alone, m²
+    gain: float  # tr(J Jᵀ) of the target's translation, m²/rad²
+
+
+@dataclass(frozen=True, slots=True)
+class RepeatabilityEstimate:
+    """The scatter from one arrival to the next."""
+
+    poses: int  # poses with several readings
+    dof: int  # readings less poses
+    scatter: float  # rms distance of a reading from its pose's mean, m, unbiased
+    instrument: float  # the same as the instrument alone would make it, m
+    joint_std: float  # the scatter of every joint that explains the rest, rad; 0 where none is left
+    iso_9283: float = float("nan")
+    """The worst pose's RP = mean distance + 3 standard deviations of it, m (ISO 9283, 7.2.2), the
+    instrument's noise included; NaN in campaigns of older versions."""
+
+    @property
+    def shown(self) -> bool:
+        """Whether the arm scatters beyond what the instrument does by chance, about 1 in 100."""
+        total, noise = self.scatter**2, self.instrument**2
+        return bool(total - noise > 3.0 * noise * np.sqrt(2.0 / (3.0 * max(self.dof, 1))))
+
+    def words(self, configured: Floats) -> str:
+        """Return it for people, beside the configured standard deviations (n,), rad."""
+        told = float(np.sqrt(np.mean(configured**2)))
+        joints = f"is about {self.joint_std:.1g}" if self.shown else "does not show beside it"
+        return (
+            f"{self.dof} returns to {self.poses} poses scatter by {1e6 * self.scatter:.0f} µm, "
+            f"the instrument alone by {1e6 * self.instrument:.0f} µm: joint_std_rad {joints}, "
+            f"configured {told:.1g}"
+        )
+
+
+def repeatability(visits: Sequence[UnloadedVisit]) -> RepeatabilityEstimate | None:
+    """Estimate it from unloaded readings; None where no pose has two.
+
+    With S = Σ |x − x̄|² over the readings of a pose that was visited k times,
+
+        E S = (1 − 1/k) Σ (tr C + σ² tr(J Jᵀ))
+
+    which is solved for σ², one for all joints, over all poses together.
+    """
+    spread = instrument = gain = worst = 0.0
+    poses = dof = 0
+    for name in dict.fromkeys(v.pose for v in visits):
+        mine = [v for v in visits if v.pose == name]
+        k = len(mine)
+        if k < 2:
+            continue
+        at = np.array([v.position for v in mine])
+        away = np.linalg.norm(at - at.mean(axis=0), axis=1)
+        spread += float(np.sum(away**2))
+        instrument += (1 - 1 / k) * sum(float(np.trace(v.tracker)) for v in mine)
+        gain += (1 - 1 / k) * sum(v.gain for v in mine)
+        worst = max(worst, float(away.mean() + 3 * away.std(ddof=1)))
+        poses, dof = poses + 1, dof + k - 1
+    if not poses:
+        return None
+    left = max(spread - instrument, 0.0)
+    return RepeatabilityEstimate(
+        poses=poses,
+        dof=dof,
+        scatter=float(np.sqrt(spread / dof)),
+        instrument=float(np.sqrt(instrument / dof)),
+        joint_std=float(np.sqrt(left / gain)) if gain > 0 else 0.0,
+        iso_9283=worst,
+    )
+
+
+def detail(
+    step: Step, measured: MeasuredStop, tared: TaredWrench | None, zero: Floats | None
+) -> dict[str, Any]:
+    """Return everything raw behind a reading; `zero` (6,) is the force sensor's of the session."""
+    mean = measured.mean
+    out: dict[str, Any] = {
+        **asdict(step),
+        "value": mean.value.tolist(),
+        "tracker_covariance": mean.covariance.tolist(),
+        "scatter": mean.scatter,
+        "left_out": list(mean.left_out),
+        "q_actual": measured.q.tolist(),
+        "torque": None if measured.torque is None else measured.torque.tolist(),
+        "settling_s": measured.settling,
+        "remarks": list(measured.remarks),
+        "arm_before": sample_json(measured.before),
+        "arm_after": sample_json(measured.after),
+        "tracker": [sample_json(sample) for sample in measured.tracker],
+        "force": sample_json(measured.force),
+    }
+    if tared is not None and zero is not None:
+        felt = {"wrench": tared.wrench, "covariance": tared.covariance, "zero": zero}
+        out["felt"] = {name: array.tolist() for name, array in felt.items()}
+    return out
+
+
+def stored_wrench(stored: dict[str, Any]) -> TaredWrench | None:
+    """Return the mean wrench in a stored detail; None without one."""
+    felt = stored.get("felt")
+    if felt is None:
+        return None
+    return TaredWrench(
+        np.array(felt["wrench"]), np.array(felt["covariance"]), np.array(stored["q_actual"])
+    )
+
+
+def sample_json(sample: ArmSample | TrackerSample | WrenchSample | Losses | None) -> Any:
+    """Return a sample as a JSON object with the names of its fields; arrays as lists."""
+    if sample is None:
+        return None
+    return {f.name: _value(getattr(sample, f.name)) for f in fields(sample)}
+
+
+def _value(value: Any) -> Any:
+    """Return a JSON value; what is not a finite number becomes null."""
+    if isinstance(value, np.ndarray):
+        return [_value(x) for x in value.tolist()]
+    if isinstance(value, list):
+        return [_value(x) for x in value]
+    if isinstance(value, float | np.floating):
+        return float(value) if np.isfinite(value) else None
+    if isinstance(value, np.integer):
+        return int(value)
+    return value
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,27 +166,6 @@ class Shift:
         )
 
 
-@dataclass(slots=True)
-class Drift:
-    """Compares the unloaded readings at the reference pose with the first of them."""
-
-    _first: tuple[Floats, Floats] | None = field(default=None)
-
-    def add(self, step: Step, position: Floats, covariance: Floats) -> Shift | None:
-        """Add a position (3,), m; returns its shift where it is a return, else None.
-
-        Sensor axes; `covariance` (3, 3) is that of instrument and arm, m².
-        """
-        if step.pose != REFERENCE or step.load != UNLOADED:
-            return None
-        if self._first is None:
-            self._first = position, covariance
-            return None
-        d = np.asarray(position - self._first[0])
-        square = float(d @ np.linalg.solve(covariance + self._first[1], d))
-        return Shift(d, float(np.sqrt(max(square, 0.0))))
-
-
 LOADING_S = 60.0
 """How long a person is taken to need for a change of the load until one was seen, s."""
 
@@ -61,7 +174,6 @@ class Eta:
     """Measures readings with the motions to them, and changes of the load, in cell seconds."""
 
     def __init__(self, clock: Clock) -> None:
-        """Start now."""
         self._clock = clock
         self._mark = clock.now()
         self._moving = 0.0
@@ -93,12 +205,7 @@ class Eta:
 
 
 class SessionState:
-    """Everything that is carried from reading to reading, and from session to session.
-
-    Attributes:
-        tared_wrenches: the unloaded wrenches, from which the tool is identified.
-        last_q: (n,) actual joint angles of the last reading, rad; None before the first.
-    """
+    """Everything that is carried from reading to reading, and from session to session."""
 
     def __init__(self, cell: Cell, joint_std: Floats) -> None:
         """Start empty; `joint_std` (n,) is the arm's repeatability as configured, rad."""
@@ -108,7 +215,7 @@ class SessionState:
         self._cell, self._joint_std = cell, joint_std
         self._unloaded: dict[tuple[str, int, int], Floats] = {}
         self._visits: list[UnloadedVisit] = []
-        self._drift = Drift()
+        self._reference: tuple[Floats, Floats] | None = None
 
     def add(
         self,
@@ -121,8 +228,8 @@ class SessionState:
     ) -> Shift | None:
         """Add a reading; returns its shift where it is a return to the reference.
 
-        Joint angles `q` (n,) are the actual ones, rad; `value` (m,) is in sensor axes, `covariance`
-        (m, m) the instrument's alone. Drift, scatter and wrench are taken from the first target.
+        `q` (n,) are the actual joint angles; `covariance` (m, m) is the instrument's alone. Drift,
+        scatter and wrench are taken from the first target.
         """
         position = value[:3]
         self.last_q = q
@@ -139,7 +246,14 @@ class SessionState:
         jac = drive_jacobian(self._cell.arm, chain, chain.point(self._cell.target[:3, 3]))[0, :3]
         instrument = covariance[:3, :3]
         self._visits.append(UnloadedVisit(step.pose, position, instrument, float(np.sum(jac**2))))
-        return self._drift.add(step, position, instrument + scatter)
+        if step.pose != REFERENCE:
+            return None
+        if self._reference is None:
+            self._reference = position, instrument + scatter
+            return None
+        d = np.asarray(position - self._reference[0])
+        square = float(d @ np.linalg.solve(instrument + scatter + self._reference[1], d))
+        return Shift(d, float(np.sqrt(max(square, 0.0))))
 
     def deflection(self, step: Step, position: Floats, target: int = 0) -> float | None:
         """Return how far a loaded reading is from its unloaded one, m; None where that lacks."""

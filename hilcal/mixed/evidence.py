@@ -3,9 +3,11 @@
 With the others' standard deviations as estimated without it, Z_fᵀ P Z_f = U diag(μ) Uᵀ and
 w_i = (Uᵀ Z_fᵀ P y)_i / √μ_i, which are N(0, 1) where the family is not there,
 
-    T = max over λ ≥ 0 of  Σ_i [ w_i² λ μ_i / (1 + λ μ_i) − log(1 + λ μ_i) ],    λ = s_f²
+    T = max over λ of  Σ_i [ w_i² λ μ_i / (1 + λ μ_i) − log(1 + λ μ_i) ],    0 ≤ λ = s_f² ≤ most²
 
-T's distribution under s_f = 0 has a point mass at zero and is simulated from the μ_i.
+T's distribution under s_f = 0 has a point mass at zero and is simulated from the μ_i. Sizes beyond
+what is plausible are not asked for: a family far larger than it can be would stand in for what the
+zero mean of another one leaves, as a tracker's scale for gears that all give in one direction.
 Source: Crainiceanu and Ruppert, *Likelihood ratio tests in linear mixed models with one variance
 component*, J. R. Stat. Soc. B 66 (2004) 165.
 """
@@ -47,6 +49,7 @@ def evidence(
     families: int | Sequence[int],
     rng: np.random.Generator,
     start: Floats | None = None,
+    most: float = np.inf,
 ) -> FamilyEvidence:
     """Return the evidence for a family, or for several of one effect.
 
@@ -55,6 +58,7 @@ def evidence(
     Args:
         rng: draws the ratios.
         start: (F + N,) log s and η of the whole problem; without it the priors' means.
+        most: largest plausible s, in ordinary magnitudes.
     """
     numbers = [families] if isinstance(families, int) else list(families)
     without = problem.without(numbers)
@@ -69,14 +73,15 @@ def evidence(
         return FamilyEvidence(0.0, 1.0, 0)
     mu = mu[seen]
     w2 = (u[:, seen].T @ score) ** 2 / mu
-    ratio = float(_ratios(mu, w2[None])[0])
-    drawn = _ratios(mu, rng.standard_normal((DRAWS, len(mu))) ** 2)
+    bound = (most / ordinary[numbers].max()) ** 2
+    ratio = float(_ratios(mu, w2[None], bound)[0])
+    drawn = _ratios(mu, rng.standard_normal((DRAWS, len(mu))) ** 2, bound)
     p = (1 + int(np.count_nonzero(drawn >= ratio))) / (1 + DRAWS) if ratio > 0 else 1.0
     return FamilyEvidence(ratio, float(p), len(mu))
 
 
-def _ratios(mu: Floats, w2: Floats) -> Floats:
-    """(D,) T of squared w (D, r) with eigenvalues (r,)."""
-    lm = np.exp(GRID)[:, None] * (mu / mu.max())
+def _ratios(mu: Floats, w2: Floats, bound: float) -> Floats:
+    """(D,) T of squared w (D, r) with eigenvalues (r,), λ at most a bound."""
+    lm = np.minimum(np.exp(GRID), bound * mu.max())[:, None] * (mu / mu.max())
     shrink, cost = lm / (1 + lm), np.log1p(lm).sum(axis=1)
     return np.asarray(np.maximum((w2 @ shrink.T - cost).max(axis=1), 0.0))

@@ -13,48 +13,40 @@ rows as the reading, however many parameters there are.
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
-from hilcal.effects.protocol import Effect, Situation
+from hilcal.effects.protocol import Columns, Effect, Situation
 from hilcal.model.observe import ReadingDerivative, SlotFrames
 from hilcal.robot import se3
-from hilcal.robot.batch import zeros
+from hilcal.robot.batch import along_states, zeros
 from hilcal.robot.chain import Chain
-from hilcal.robot.geometric_stiffness import GeometricStiffness, MotionGradient, rows_times
-from hilcal.robot.statics import Load
-from hilcal.types import Floats
+from hilcal.robot.statics import (
+    GeometricStiffness,
+    Load,
+    MotionGradient,
+    rows_times,
+    rows_times_constant,
+)
+from hilcal.types import Floats, Ints
 
-TOLERANCE = 1e-8
-"""Part of the derivative, root mean square over the states, that may be missing; a choice, with
-room for states whose loads are several times the mean."""
+TOLERANCE = 1e-8  # part of the derivative (rms) that may be missing; a choice
 MAX_TERMS = 40
-TORQUE, ALONG = 5, 2
-"""Components of a slot's wrench about the axis of its joint, and along it."""
-FORCE, MOMENT = slice(0, 3), slice(3, 6)
-"""Components of a slot's wrench."""
+TORQUE, ALONG = 5, 2  # Components of a slot's wrench about the axis of its joint, and along it
+FORCE, MOMENT = slice(0, 3), slice(3, 6)  # Components of a slot's wrench
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlotResponse:
-    """Derivative of the deviation at one slot by the wrench through one slot.
+    """Derivative of the deviation at one slot by the wrench through one slot."""
 
-    Attributes:
-        slot: whose wrench.
-        to: which joint (index) or slot deviates.
-        joint: whether it is a joint displacement, else a twist.
-        components: range of the components of the wrench: of its force, or of its moment.
-        elements: range of the elements of the deviation.
-        values: (N, I, E) or (1, I, E).
-    """
-
-    slot: int
-    to: int
-    joint: bool
-    components: slice
-    elements: slice
-    values: Floats
+    slot: int  # whose wrench
+    to: int  # which joint (index) or slot deviates
+    joint: bool  # whether it is a joint displacement, else a twist
+    components: slice  # range of the components of the wrench: of its force, or of its moment
+    elements: slice  # range of the elements of the deviation
+    values: Floats  # (N, I, E) or (1, I, E)
 
 
 def compliance(parts: Sequence[tuple[Effect, Floats]], s: Situation) -> list[SlotResponse]:
@@ -70,7 +62,6 @@ def compliance(parts: Sequence[tuple[Effect, Floats]], s: Situation) -> list[Slo
 
 
 def _halves(b: SlotResponse) -> Iterator[SlotResponse]:
-    """Yield the parts of a block by the force and by the moment."""
     first, last = b.components.start, b.components.stop
     if first >= MOMENT.start or last <= FORCE.stop:
         yield b
@@ -83,8 +74,8 @@ def _halves(b: SlotResponse) -> Iterator[SlotResponse]:
 def _of_joints(b: SlotResponse, drive: Floats, borne: list[int]) -> Iterator[SlotResponse]:
     """Compliance of the chain's joints, from that of the drives: D C Dᵀ by torques.
 
-    Forces and moments across an axis are those of the slot itself. `borne`: the component that the
-    drive of each joint bears.
+    Forces and moments across an axis are those of the slot itself; drives bear the components
+    `borne`.
     """
     if not b.joint:
         yield b
@@ -106,12 +97,7 @@ def _of_joints(b: SlotResponse, drive: Floats, borne: list[int]) -> Iterator[Slo
 def at_equilibrium(
     moves: ReadingDerivative, stiffness: GeometricStiffness, blocks: list[SlotResponse]
 ) -> ReadingDerivative:
-    """Add to the motions of a reading how the arm yields to the change of the wrenches.
-
-    Args:
-        moves: derivatives of the reading with the wrenches held as they are.
-        stiffness: of the chain under its load.
-    """
+    """Add to the motions of a reading, wrenches held, how the arm yields to their change."""
     term = wrench_form(moves, blocks)
     form, whole = dict(term), _norm(term)
     before = whole
@@ -141,11 +127,7 @@ def wrench_form(
 
 
 def by_wrench_changes(form: Mapping[tuple[int, bool], Floats], change: Floats, m: int) -> Floats:
-    """Motion (N, m, P) of a reading by P changes (N, P, n + 1, 6) of the slot wrenches.
-
-    Args:
-        form: derivatives by the wrenches, see `wrench_form`.
-    """
+    """Motion (N, m, P) of a reading by changes (N, P, n + 1, 6) of the wrenches; `wrench_form`."""
     out = zeros(len(change), m, change.shape[1])
     for (slot, moment), rows in form.items():
         half = change[:, :, slot, MOMENT if moment else FORCE]
@@ -157,9 +139,6 @@ def by_load(form: Mapping[tuple[int, bool], Floats], chain: Chain, load: Load, m
     """Derivative (N, m, 6) of a reading by the load's wrench at the load point, base axes.
 
     A force f and a moment t there are R_kᵀ f and R_kᵀ (t + d_k × f) in slot k, d_k the lever.
-
-    Args:
-        form: derivatives by the slot wrenches, see `wrench_form`.
     """
     point = chain.point(load.point)
     out = zeros(len(point), m, 6)
@@ -174,17 +153,10 @@ def by_load(form: Mapping[tuple[int, bool], Floats], chain: Chain, load: Load, m
 
 def by_wrenches(
     blocks: list[SlotResponse],
-    by_joint: Callable[[int], Floats],
-    by_slot: Callable[[int, slice], Floats],
+    by_joint: Callable[[int], Floats],  # (N, m) by the displacement of a joint
+    by_slot: Callable[[int, slice], Floats],  # (N, m, E) by elements of a slot's twist
 ) -> dict[tuple[int, bool], Floats]:
-    """Derivatives (N, m, 3) by the force (False) and moment (True) of each slot.
-
-    From those by the deviation; those that are zero are left out.
-
-    Args:
-        by_joint: (N, m) by the displacement of a joint.
-        by_slot: (N, m, E) by a range of the elements of the twist of a slot.
-    """
+    """Derivatives (N, m, 3) by the force (False) and moment (True) of each slot, without zeros."""
     used: dict[int, slice] = {}
     for b in blocks:
         if not b.joint:
@@ -219,7 +191,6 @@ def _by_twist(gradient: MotionGradient, frames: SlotFrames, slot: int, elements:
 
 
 def _norm(form: Mapping[tuple[int, bool], Floats]) -> float:
-    """Root of the sum of squares of the coefficients of the wrenches, in SI units."""
     flat = (b.ravel(order="K") for b in form.values())
     return math.sqrt(sum(float(b @ b) for b in flat))
 
@@ -253,3 +224,100 @@ def _pruned(b: SlotResponse) -> SlotResponse | None:
     return replace(
         b, components=components, elements=elements, values=b.values[:, components, elements]
     )
+
+
+WIDE = 64  # Successive parameters of one joint that are written as they are; a choice by timing
+
+
+class ReadingColumns:
+    """The derivative (N, m, L) of a chunk of readings by L parameters, sensor axes.
+
+    What moves a reading, that is joints, slots, frames and wrenches, moves it by every effect that
+    acts there: its motion is computed once, then multiplied by each parameter's share of it.
+    """
+
+    def __init__(
+        self,
+        moves: ReadingDerivative,
+        blocks: list[SlotResponse],
+        load: Load,
+        out: Floats,  # (N, m, L), to be written
+        scale: Floats | None = None,  # (L,) units of the parameters, SI by default
+    ) -> None:
+        """Begin with zeros."""
+        self._moves, self._blocks, self._load, self._out = moves, blocks, load, out
+        self._scale = np.ones(out.shape[2]) if scale is None else scale
+        self._sums = zeros(*out.shape)
+        # which columns were added to, and which of them are written already
+        self._used, self._written = np.zeros((2, out.shape[2]), dtype=np.bool_)
+        self._known: dict[str | int, Floats] = {}
+
+    def add(self, c: Columns, place: Ints) -> None:
+        """Add columns of an effect; `place`: which of the L each parameter is, −1 for none."""
+        c = c.only(place[c.parameter] >= 0)
+        at = place[c.parameter]
+        if c.field == "dq":
+            for joint, mine in c.runs():
+                self._add_joint(self._moves.drives[:, :, joint, None], c.values[:, mine], at[mine])
+        elif c.field == "twist":
+            for slot, mine in c.runs():
+                moved = self._motion(slot, partial(self._moves.by_slot, slot))
+                self._add(_times(moved, c.values[:, mine]), at[mine])
+        else:
+            moved = self._motion(c.field, getattr(self._moves, f"by_{c.field}"))
+            values = c.values[..., None] if c.field == "scale" else c.values
+            self._add(_times(moved, values), at)
+
+    def add_wrench_changes(self, change: Floats, place: Ints) -> None:
+        """Add changes (N, P, n + 1, 6) of the slot wrenches by the P parameters of an effect."""
+        wanted = place >= 0
+        self._add(by_wrench_changes(self._form, change[:, wanted], self._moves.m), place[wanted])
+
+    def add_load_changes(self, change: Floats, place: Ints) -> None:
+        """Add changes (N, P, 6) of the load's wrench at the load point, base axes."""
+        wanted = place >= 0
+        moved = by_load(self._form, self._moves.chain, self._load, self._moves.m)
+        self._add(rows_times(moved, change[:, wanted], transposed=True), place[wanted])
+
+    def write(self) -> None:
+        """Write the derivative by all that was added."""
+        ends = np.flatnonzero(np.diff(np.concatenate([[True], self._written, [True]])))
+        for start, stop in ends.reshape(-1, 2).tolist():
+            part = (slice(None), slice(None), slice(start, stop))
+            np.multiply(self._sums[part], self._scale[start:stop], out=self._out[part])
+
+    @cached_property
+    def _form(self) -> dict[tuple[int, bool], Floats]:
+        return wrench_form(self._moves, self._blocks)
+
+    def _motion(self, key: str | int, find: Callable[[], Floats]) -> Floats:
+        if key not in self._known:
+            self._known[key] = find()
+        return self._known[key]
+
+    def _add_joint(self, moved: Floats, values: Floats, at: Ints) -> None:
+        """Add the motion (N, m, 1) by a joint, times (N or 1, P); many go where they belong."""
+        place = slice(int(at[0]), int(at[0]) + len(at))
+        if len(at) >= WIDE and np.all(np.diff(at) == 1) and not self._used[place].any():
+            np.multiply(moved, (values * self._scale[place])[:, None], out=self._out[:, :, place])
+            self._used[place] = self._written[place] = True
+        else:
+            self._add(moved * along_states(values)[:, None], at)
+
+    def _add(self, block: Floats, at: Ints) -> None:
+        """Add columns (N, m, P) at their places (P,), which may be the same."""
+        self._used[at] = True
+        for k, column in enumerate(at.tolist()):
+            if self._written[column]:
+                self._out[:, :, column] += self._scale[column] * block[:, :, k]
+            else:
+                self._sums[:, :, column] += block[:, :, k]
+
+
+def _times(moved: Floats, values: Floats) -> Floats:
+    """Motion (N, m, P) by P changes (N or 1, P, E), from the motion (N, m, E) per element."""
+    if len(values) == 1:
+        return rows_times_constant(moved, values[0].T)
+    used = np.flatnonzero(values.any(axis=(0, 1)))
+    part = slice(used[0], used[-1] + 1) if len(used) else slice(0, 1)
+    return rows_times(moved[..., part], along_states(values[..., part]), transposed=True)

@@ -1,6 +1,6 @@
 """A model is a cell and a tuple of effects; `model + effect` is a new model."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING
@@ -13,63 +13,57 @@ from hilcal.effects.options import typical_compliances
 from hilcal.effects.protocol import Columns, Effect, Situation, total
 from hilcal.effects.spec import EffectSpec
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.model.equilibrium import SlotResponse, at_equilibrium, compliance
+from hilcal.model.equilibrium import ReadingColumns, SlotResponse, at_equilibrium, compliance
 from hilcal.model.observe import Observation, ReadingDerivative, motion, observe
-from hilcal.model.reading_columns import ReadingColumns
 from hilcal.readings.readings import Readings, States
 from hilcal.robot import chain as chains
 from hilcal.robot import se3
-from hilcal.robot.batch import along_states, by_field, chunks, put, room, take, zeros
+from hilcal.robot.batch import along_states, by_field, chunks, take, zeros
 from hilcal.robot.chain import Chain, Deviation
-from hilcal.robot.geometric_stiffness import geometric_stiffness
-from hilcal.robot.statics import Load, slot_wrenches
+from hilcal.robot.statics import Load, geometric_stiffness, slot_wrenches
 from hilcal.shown import Brief
 from hilcal.types import Floats, Ints
 
 if TYPE_CHECKING:  # a value that a model only carries along; fits know what it means
     from hilcal.identification.carried import CarriedPrior
 
-EQUILIBRIUM_TOLERANCE = 1e-13
-"""Motion of the flange that may be missing from the converged equilibrium, m."""
+EQUILIBRIUM_TOLERANCE = 1e-13  # motion of the flange that may be missing, m
 MAX_EQUILIBRIUM_STEPS = 30
-FLANGE_STEP = 1e-4
-"""Step of a difference quotient, m or rad: rounding 1e-12, higher terms 1e-9 of the quotient."""
+FLANGE_STEP = 1e-4  # of a quotient, m or rad: rounding 1e-12, higher terms 1e-9 of it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction(Brief):
-    """What a model predicts of N states.
+    """What a model predicts of N states."""
 
-    Attributes:
-        situation: the states at their deflected configuration.
-        deviation: the summed deviation.
-        observation: what the sensor would read.
-    """
-
-    situation: Situation
-    deviation: Deviation
-    observation: Observation
+    situation: Situation  # the states at their deflected configuration
+    deviation: Deviation  # the summed deviation
+    observation: Observation  # what the sensor would read
 
     def __getitem__(self, rows: slice) -> "Prediction":
         """Return the prediction of the chosen states."""
         s = self.situation
         chosen = replace(
-            s,
-            states=s.states[rows],
-            angle=s.angle[rows],
-            chain=take(s.chain, rows, axis=1),
-            wrench=s.wrench[rows],
-            load=replace(s.load, wrench=s.load.wrench[rows]),
-        )
+            s, states=s.states[rows], angle=s.angle[rows], chain=take(s.chain, rows, axis=1),
+            wrench=s.wrench[rows], load=replace(s.load, wrench=s.load.wrench[rows]),
+        )  # fmt: skip
         return Prediction(chosen, take(self.deviation, rows), take(self.observation, rows))
 
-    def put(self, rows: slice, part: "Prediction") -> None:
-        """Write the prediction of the chosen states; the chain's twists are the deviation's."""
-        s, of = self.situation, part.situation
-        put(self.deviation, rows, part.deviation)
-        put(self.observation, rows, part.observation)
-        put(s.chain, rows, replace(of.chain, twist=None), axis=1)
-        s.angle[rows], s.wrench[rows], s.load.wrench[rows] = of.angle, of.wrench, of.load.wrench
+    @staticmethod
+    def joined(states: States, parts: "Sequence[Prediction]") -> "Prediction":
+        """Return the prediction of all states from those of chunks of them."""
+        of = [p.situation for p in parts]
+        join, s = np.concatenate, of[0]
+        situation = replace(
+            s,
+            states=states,
+            angle=join([x.angle for x in of]),
+            chain=by_field([x.chain for x in of], lambda given: join(given, axis=1)),
+            wrench=join([x.wrench for x in of]),
+            load=replace(s.load, wrench=join([x.load.wrench for x in of])),
+        )
+        deviation = by_field([p.deviation for p in parts], join)
+        return Prediction(situation, deviation, by_field([p.observation for p in parts], join))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,11 +122,7 @@ class Model(Brief):
         return self._slices
 
     def __add__(self, effect: Effect | EffectSpec | str | type[Effect]) -> "Model":
-        """Return the model with one more effect; one that is only named is built for it.
-
-        Raises:
-            InputError: an effect that is there already, or cannot be built.
-        """
+        """Return the model with one more effect; one that is only named is built for it."""
         if isinstance(effect, str | type):
             effect = EffectSpec(effect)
         if isinstance(effect, EffectSpec):
@@ -140,7 +130,6 @@ class Model(Brief):
         return replace(self, effects=(*self.effects, effect))
 
     def _with(self, spec: EffectSpec) -> "Model":
-        """Return the model with an effect that is built for its cell and readings."""
         if self.readings is None:
             raise InputError(
                 f"effect {spec.name}: this model was made without readings; add an effect that is "
@@ -163,19 +152,13 @@ class Model(Brief):
         Raises:
             CannotAnswerError: the deviations grow instead of settling.
         """
-        whole: Prediction | None = None
-        for rows in chunks(len(states)):
-            part = self._equilibrium(states[rows], theta, near[rows] if near else None)
-            if len(part.situation.angle) == len(states):
-                return part
-            # Written at once: chunks that are kept until the end take new memory each.
-            whole = _room(states, part) if whole is None else whole
-            whole.put(rows, part)
-        assert whole is not None  # noqa: S101 - there is always a chunk
-        return whole
+        parts = [
+            self._equilibrium(states[rows], theta, near[rows] if near else None)
+            for rows in chunks(len(states))
+        ]
+        return parts[0] if len(parts) == 1 else Prediction.joined(states, parts)
 
     def _equilibrium(self, states: States, theta: Floats, near: Prediction | None) -> Prediction:
-        """Return the equilibrium of a chunk of states."""
         cell = self.cell
         angle = states.q if states.q_actual is None else states.q_actual
         angle = along_states(angle)
@@ -215,11 +198,7 @@ class Model(Brief):
         )
 
     def jacobian(
-        self,
-        prediction: Prediction,
-        theta: Floats,
-        m: int,
-        live: Ints | None = None,
+        self, prediction: Prediction, theta: Floats, m: int, live: Ints | None = None
     ) -> Floats:
         """Derivative (N, m, P) of the readings by all parameters, sensor axes.
 
@@ -228,14 +207,9 @@ class Model(Brief):
         return self.jacobian_of(self.effects, prediction, theta, m, live)
 
     def jacobian_of(
-        self,
-        effects: tuple[Effect, ...],
-        prediction: Prediction,
-        theta: Floats,
-        m: int,
-        live: Ints | None = None,
-        scale: Floats | None = None,
-    ) -> Floats:
+        self, effects: tuple[Effect, ...], prediction: Prediction, theta: Floats, m: int,
+        live: Ints | None = None, scale: Floats | None = None,
+    ) -> Floats:  # fmt: skip
         """Derivative (N, m, P) of the readings by the parameters of `effects`.
 
         `effects` may or may not be in the model; one that is not is taken at zero. Analytic:
@@ -259,18 +233,13 @@ class Model(Brief):
         return out
 
     def _fill(
-        self,
-        out: Floats,
-        effects: tuple[Effect, ...],
-        places: list[Ints],
-        prediction: Prediction,
-        theta: Floats,
-        scale: Floats | None,
-    ) -> None:
+        self, out: Floats, effects: tuple[Effect, ...], places: list[Ints],
+        prediction: Prediction, theta: Floats, scale: Floats | None,
+    ) -> None:  # fmt: skip
         """Write the derivative of a chunk of states; `places`: columns of `out`, −1 for none."""
         s = prediction.situation
         moves, blocks = self._motion(prediction, theta, out.shape[1])
-        columns = ReadingColumns(moves, blocks, s.load, scale)
+        columns = ReadingColumns(moves, blocks, s.load, out, scale)
         mine = self._parts(theta)
         for e, place in zip(effects, places, strict=True):
             if not (place >= 0).any():
@@ -288,7 +257,7 @@ class Model(Brief):
                 columns.add_load_changes(change, place)
             elif (change := e.wrench_columns(at, s)) is not None:
                 columns.add_wrench_changes(change, place)
-        columns.write(out)
+        columns.write()
 
     def _motion(
         self, prediction: Prediction, theta: Floats, m: int
@@ -306,8 +275,7 @@ class Model(Brief):
     def _following(self, s: Situation, theta: Floats) -> Floats | None:
         """Derivative (N, 6, 6) of the acting wrench by displacement and turn of the flange.
 
-        By central differences, of the corrections alone: they are a small part of the wrench,
-        and it is their change with a small motion.
+        By central differences, of the corrections alone, which are a small part of the wrench.
         """
         parts = [(e, t) for e, t in self._parts(theta) if e.wrench_change(t, s) is not None]
         if not parts:
@@ -328,7 +296,6 @@ class Model(Brief):
         return out
 
     def _parts(self, theta: Floats) -> list[tuple[Effect, Floats]]:
-        """Each effect with its parameters."""
         return [(e, theta[s]) for e, s in zip(self.effects, self.slices(), strict=True)]
 
     def _compliance(self, theta: Floats) -> Floats:
@@ -337,7 +304,6 @@ class Model(Brief):
         return found[0] if found else typical_compliances(self.cell)
 
     def _load(self, states: States, theta: Floats) -> Load:
-        """Load as recorded, where it acts, and the weights."""
         cell, point = self.cell, self.cell.load_point
         moments: Floats | None = None
         for e, t in self._parts(theta):
@@ -378,22 +344,3 @@ def _flange_motion(a: Chain, b: Chain, reach: float) -> float:
     shift = np.abs(b.position[-1] - a.position[-1]).max(initial=0.0)
     turn = np.abs(b.rotation[-1] - a.rotation[-1]).max(initial=0.0)
     return float(max(shift, reach * turn))
-
-
-def _room(states: States, part: Prediction) -> Prediction:
-    """Return the prediction of all states, yet to be written, from that of a chunk of them."""
-    count, s = len(states), part.situation
-    deviation = by_field([part.deviation], lambda given: room(given[0], count))
-    observation = by_field([part.observation], lambda given: room(given[0], count))
-    chain = by_field([replace(s.chain, twist=None)], lambda given: room(given[0], count, axis=1))
-    if deviation.twist is not None:
-        chain = replace(chain, twist=np.swapaxes(deviation.twist, 0, 1))
-    situation = replace(
-        s,
-        states=states,
-        angle=room(s.angle, count),
-        chain=chain,
-        wrench=room(s.wrench, count),
-        load=replace(s.load, wrench=room(s.load.wrench, count)),
-    )
-    return Prediction(situation, deviation, observation)

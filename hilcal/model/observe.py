@@ -17,56 +17,38 @@ from hilcal.cell import Cell, Observer
 from hilcal.robot import se3
 from hilcal.robot.batch import empty, zeros
 from hilcal.robot.chain import Chain, Deviation, joint_jacobian, twist_jacobian
-from hilcal.robot.geometric_stiffness import MotionGradient, rows_times
+from hilcal.robot.statics import MotionGradient, rows_times
 from hilcal.shown import Brief
 from hilcal.types import Bools, Floats, Ints
 
-ALL = slice(0, 6)
-"""All elements of a twist."""
+ALL = slice(0, 6)  # All elements of a twist
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observation(Brief):
-    """What the sensor would read without noise.
+    """What the sensor would read without noise."""
 
-    Attributes:
-        position: (N, 3) what is read of the target: its position, sensor axes, m; or see above.
-        rotation: (N, 3, 3) target axes in sensor axes.
-        base_position: (N, 3) target position in the base axes of the chain, m.
-        axes: (N, 3, 3) orientation of the chain's base axes in sensor axes: the derivative of
-            `position` by displacements of the target, base axes.
-        sensor: (N, 3) target position, sensor axes, m; this and the rest only where there are
-            several observers.
-        own: (N, 3) the same in the axes of the observer.
-        read: (N, 3, 3) derivative of `position` by `own`.
-        by_sensor: (N, 3, 3) derivative of `position` by `sensor`.
-        distance: (N,) 1 where a distance is read, which has an offset; else 0.
-    """
-
-    position: Floats
-    rotation: Floats
-    base_position: Floats
+    position: Floats  # (N, 3) what is read of the target, sensor axes, m; or see above
+    rotation: Floats  # (N, 3, 3) target axes in sensor axes
+    base_position: Floats  # (N, 3) target position in the base axes of the chain, m
+    # (N, 3, 3) orientation of the chain's base axes in sensor axes: the derivative of `position` by
+    # displacements of the target, base axes
     axes: Floats
-    sensor: Floats | None = None
-    own: Floats | None = None
-    read: Floats | None = None
-    by_sensor: Floats | None = None
-    distance: Floats | None = None
+    sensor: Floats | None = None  # (N, 3) target, sensor axes, m; as below of several observers
+    own: Floats | None = None  # (N, 3) the same in the axes of the observer
+    read: Floats | None = None  # (N, 3, 3) derivative of `position` by `own`
+    by_sensor: Floats | None = None  # (N, 3, 3) derivative of `position` by `sensor`
+    distance: Floats | None = None  # (N,) 1 where a distance is read, which has an offset; else 0
 
 
 def observe(
     cell: Cell,
     chain: Chain,
     deviation: Deviation,
-    target: Ints | None = None,
-    observer: Ints | None = None,
+    target: Ints | None = None,  # (N,) number of the target, where there are several
+    observer: Ints | None = None,  # (N,) number of what observes it, where there are several
 ) -> Observation:
-    """Read the target of a deviated chain.
-
-    Args:
-        target: (N,) number of the target, where there are several.
-        observer: (N,) number of what observes it, where there are several.
-    """
+    """Read the target of a deviated chain."""
     pose = cell.target_of(target)
     offset, turn = pose[..., :3, 3], pose[..., :3, :3]
     axes, origin = cell.registration[:3, :3], cell.registration[:3, 3]
@@ -95,14 +77,9 @@ def observe(
 
 
 def _observed(
-    cell: Cell,
-    deviation: Deviation,
-    observer: Ints,
-    sensor: Floats,
-    rotation: Floats,
-    base_position: Floats,
-    axes: Floats,
-) -> Observation:
+    cell: Cell, deviation: Deviation, observer: Ints, sensor: Floats, rotation: Floats,
+    base_position: Floats, axes: Floats,
+) -> Observation:  # fmt: skip
     """Read what is seen in sensor axes by the observers (N,)."""
     turn, own, offset = _in_own_axes(cell.observers, observer, sensor)
     if deviation.observer is not None:
@@ -135,7 +112,6 @@ def _in_own_axes(
 
 
 def _distances(observers: Sequence[Observer], number: Ints) -> Bools:
-    """(N,) whether distances are read."""
     return np.array([o.name.kind == "point" for o in observers])[number]
 
 
@@ -163,15 +139,9 @@ def _sensed(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReadingDerivative:
-    """Derivative of the reading by each field of the deviation, sensor axes.
+    """Derivative of the reading by each field of the deviation, sensor axes; the first m rows.
 
-    Only the first m rows (position, or position and rotation) are kept. Without
-    `yielding` the wrenches stay as they are; with it the arm yields to their change where it moves
-    (see `equilibrium`).
-
-    Attributes:
-        dq: (N, m, n) derivative by displacements of the chain's joints.
-        yielding: derivative by motions of the chain of what the arm yields to them.
+    Without `yielding` the wrenches stay as they are; with it the arm yields to their change.
     """
 
     cell: Cell
@@ -180,8 +150,8 @@ class ReadingDerivative:
     deviation: Deviation
     m: int
     frames: "SlotFrames"
-    dq: Floats
-    yielding: MotionGradient | None = None
+    dq: Floats  # (N, m, n) derivative by displacements of the chain's joints
+    yielding: MotionGradient | None = None  # of what the arm yields to the motions
     _known: dict[int, tuple[Floats, Floats]] = field(default_factory=dict, repr=False)
 
     @property
@@ -280,22 +250,14 @@ class SlotFrames:
     """From motions of a frame to its twist ξ: v = R J dξ_v + R Q dξ_ω, ω = R J dξ_ω.
 
     J and Q are the blocks of the right Jacobian (`se3`), R the frame's orientation after ξ.
-
-    Attributes:
-        known: R J and R Q (None for zero) of the slots that were asked for.
     """
 
     chain: Chain
+    # R J and R Q (None for zero) of the slots that were asked for
     known: dict[int, tuple[Floats, Floats | None]] = field(default_factory=dict)
 
     def by_twist(self, slot: int, v: Floats | None, w: Floats, elements: slice = ALL) -> Floats:
-        """Rows (N, m, E) by the twist, from rows by v (None for zero) and ω (N, m, 3), base axes.
-
-        Args:
-            v: rows by the displacement.
-            w: rows by the turn.
-            elements: range of the elements of the twist.
-        """
+        """Rows (N, m, E) by elements of the twist, from rows by v (None for zero) and ω."""
         turned, shift = self._blocks(slot)
         start, stop = elements.start, elements.stop
         out = empty(*w.shape[:2], stop - start)

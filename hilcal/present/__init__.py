@@ -15,9 +15,9 @@ def html_of(value: object) -> str:
 
 def frame_of(value: object) -> "pd.DataFrame":
     """Return a result as a data frame."""
-    from hilcal.present import frames  # loads all kinds of results
+    from hilcal.present import notebook  # loads all kinds of results
 
-    return frames.frame_of(value)
+    return notebook.frame_of(value)
 
 
 def message(of: object) -> str:

@@ -1,6 +1,6 @@
-"""A calibration made and put to use: `calibrate`, step by step, and `compensate`."""
+"""A calibration made, tested and put to use: `calibrate`, `validate`, `bootstrap`, `compensate`."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -8,21 +8,33 @@ import numpy as np
 
 from hilcal import numbers
 from hilcal.calibration.calibration import Calibration
-from hilcal.calibration.compensated import BAND, Compensation
+from hilcal.calibration.compensation import BAND, Compensation
 from hilcal.calibration.improvement import Improved, Improvement
 from hilcal.calibration.measured import WORDS, Outside
 from hilcal.calibration.programs.program import ProgramPoint
 from hilcal.calibration.urscript import Waypoint
-from hilcal.identification.acceptance import Acceptance
-from hilcal.present.document import Block, heading, load_name, note, table
+from hilcal.identification.bootstrap import Bootstrap
+from hilcal.identification.priors import names_of
+from hilcal.identification.validation import BAND as REGION
+from hilcal.identification.validation import (
+    Acceptance,
+    Beyond,
+    Extrapolation,
+    Judged,
+    Share,
+    Validation,
+)
+from hilcal.numbers import length
+from hilcal.present.document import Block, Table, heading, load_name, note, table
+from hilcal.present.fit import error_words, kind, model_name
+from hilcal.present.progress import spoken
 from hilcal.present.registration import base_line
-from hilcal.present.running import spoken
 from hilcal.present.verdict import UNCALIBRATED, repeatability_source
 from hilcal.readings.whitening import Mode
 from hilcal.types import Floats
 
 if TYPE_CHECKING:
-    from hilcal.procedure.decision import Decision
+    from hilcal.procedure.next_plan import Decision
     from hilcal.procedure.state import ProcedureStep
 
 TITLES: Mapping[str, str] = {
@@ -52,14 +64,22 @@ DOES: Mapping[str, str] = {
     "seconds",
 }
 """Steps that compute, and how long they take for a campaign of some hundred readings."""
-MOST_LEFT = 6
-"""Points without a correction that are listed."""
+MOST_LEFT, LISTED = 6, 12
+"""Points without a correction, and points, that are listed."""
+MOST, WORST = 4, 6
+"""Variables, and poses, that are listed."""
+DOUBTED = 1.5
+"""Error over the stated standard deviation from which the statement is called too small."""
+WIDER = 1.5
+"""Ratio from which on the stated standard uncertainty is called too small; a choice. The standard
+deviation of 200 draws is known to 5 %, but that of few poses to much less."""
+CROWDED = 0.5
+"""Degrees of freedom that a fit spends, per pose, from which on draws are too wide; a choice."""
 
 
 def step_heading(step: "ProcedureStep", clock: float = 1.0) -> Iterator[Block]:
     """Yield what comes next, and how long it takes, of `clock` cell seconds per real second."""
-    yield ""
-    yield heading(TITLES[step.kind])
+    yield from ("", heading(TITLES[step.kind]))
     if not step.moves:
         yield f"{DOES[step.kind]}.\n"
         return
@@ -79,9 +99,8 @@ def standing(step: "ProcedureStep") -> str:
     """Say in a line where a calibration stands."""
     if step.kind == "done":
         return "it is complete"
-    where = TITLES[step.kind]
     left = f" ({step.missing} of {step.planned} readings are missing)" if step.moves else ""
-    return f'its next step is "{where}"{left}'
+    return f'its next step is "{TITLES[step.kind]}"{left}'
 
 
 def decision_report(
@@ -91,10 +110,9 @@ def decision_report(
 
     `goal_m` is in m, None without one; `clock` in cell seconds per real second.
     """
-    now = numbers.length(d.error.now_m)
+    now = length(d.error.now_m)
     yield f"Predicted after compensation: {100 * BAND:.0f} % of the points within {now}."
-    goal = "" if goal_m is None else numbers.length(goal_m)
-    then = "" if d.then_m is None else numbers.length(d.then_m)
+    goal, then = ("" if x is None else length(x) for x in (goal_m, d.then_m))
     cost = f"further readings ({lasting(d.seconds, clock)})"
     cost = "" if d.plan is None else f"{len(d.plan.steps)} {cost}"
     names = numbers.names(d.suspects)
@@ -110,7 +128,7 @@ def decision_report(
         "doubt": f"{names} are in doubt: {cost} will separate them, {power}.",
         "goal": f"The goal is {goal}: {cost} are predicted to lower this to {then}.",
         "floor": f"The goal of {goal} is out of reach: the arm's repeatability and what the model "
-        f"leaves alone are {numbers.length(d.error.floor_m)}. Nothing more is measured.",
+        f"leaves alone are {length(d.error.floor_m)}. Nothing more is measured.",
         "no_gain": f"The goal is {goal}, but further readings are predicted to change little"
         f"{f' ({then})' if then else ''}. Nothing more is measured.",
         "inseparable": f"{names} are in doubt, and no measurement in this cell separates them: any "
@@ -134,101 +152,77 @@ def validation_lines(found: Acceptance) -> Iterator[str]:
     e = found.everything
     yield (
         f"{e.count} measurements that nothing was fitted to are predicted to "
-        f"{numbers.length(e.rms_m)} rms, {numbers.length(e.max_m)} at most; the fit states "
-        f"{numbers.length(e.stated_m)}, noise alone would leave {numbers.length(found.noise_m)}. "
+        f"{length(e.rms_m)} rms, {length(e.max_m)} at most; the fit states "
+        f"{length(e.stated_m)}, noise alone would leave {length(found.noise_m)}. "
         f"{100 * e.within:.0f} % lie inside of their 95 % region.\n"
-    )
-
-
-def goal_words(mode: str) -> str:
-    """Say where a point was asked to be."""
-    if mode == "deflection":
-        return (
-            "A point is where the unloaded arm was measured at the same nominal joint values: the "
-            f"correction removes what the load does; {UNCALIBRATED}."
-        )
-    return (
-        "A point is where the nominal arm has the tool, in the tracker's frame by the fitted "
-        "registration."
     )
 
 
 def improvement_report(found: Improvement, limit_m: float | None) -> Iterator[Block]:
     """Yield the error before and after the correction, as measured, and whether a limit is kept."""
-    every = found.everything
     heads = ("load", "error", "mean", "rms", "max", "95 % within", "inside")
-    parts = (*found.by_load, *(() if len(found.by_load) == 1 else (every,)))
+    parts = (*found.by_load, *([found.everything] if len(found.by_load) > 1 else []))
     yield table(*heads, rows=(row for part in parts for row in _rows(part)), left=(0, 1))
+    goal = (
+        "A point is where the nominal arm has the tool, in the tracker's frame by the fitted "
+        "registration."
+    )
+    if found.mode == "deflection":
+        goal = (
+            "A point is where the unloaded arm was measured at the same nominal joint values: the "
+            f"correction removes what the load does; {UNCALIBRATED}."
+        )
     yield note(
-        f"{goal_words(found.mode)} noise alone: what the tracker's noise and the arm's "
+        f"{goal} noise alone: what the tracker's noise and the arm's "
         "repeatability would leave; 95 % within: the largest distance that was predicted for 95 % "
         "of such readings, noise included; inside: points within their own.\n"
     )
-    yield improvement_summary(found)
-    for name, why in found.left_out[:MOST_LEFT]:
-        yield f"left out: {name}: {why}"
-    if (more := len(found.left_out) - MOST_LEFT) > 0:
-        yield f"left out: {more} more"
-    if limit_m is not None:
-        yield _limit_words(found, limit_m)
-
-
-def improvement_summary(found: Improvement) -> str:
-    """Return the improvement in two sentences."""
-    e = found.everything
-    removed = ""
+    e, removed = found.everything, ""
     if e.removed is not None:
         removed = f"; of what exceeded the noise {100 * e.removed:.1f} % is gone"
     left = len(found.left_out)
     without = f" {left} points could not be corrected." if left else ""
-    return (
-        f"At the corrected joint targets the arm is off by {numbers.length(e.after.mean_m)} (mean) "
-        f"instead of {numbers.length(e.before.mean_m)}, measured by the tracker at {e.count} points"
+    yield (
+        f"At the corrected joint targets the arm is off by {length(e.after.mean_m)} (mean) "
+        f"instead of {length(e.before.mean_m)}, measured by the tracker at {e.count} points"
         f"{removed}. {e.inside} of {e.count} lie within their predicted 95 % band.{without}"
     )
+    for name, why in found.left_out[:MOST_LEFT]:
+        yield f"left out: {name}: {why}"
+    if left > MOST_LEFT:
+        yield f"left out: {left - MOST_LEFT} more"
+    if limit_m is not None:
+        over, size, largest = found.over(limit_m), length(limit_m), length(e.after.max_m)
+        of = " for deflections" if found.mode == "deflection" else ""
+        at = f"{'FAILED' if over else 'PASSED'}{of}: {over or 'no'}"
+        yield (
+            f"{at} of {e.count} errors at the corrected targets are over {size}; the largest is "
+            f"{largest}."
+            if over
+            else f"{at} error at the corrected targets is over {size}, the largest is {largest}."
+        )
 
 
 def _rows(part: Improved) -> Iterator[tuple[str, ...]]:
     """Yield before, after and noise of some points."""
-    name = load_name(part.name)
-    before, after = (
-        tuple(numbers.length(x) for x in (s.mean_m, s.rms_m, s.max_m))
-        for s in (part.before, part.after)
-    )
-    band, inside = numbers.length(part.band_m), f"{part.inside} of {part.count}"
-    yield (name, "before", *before, "", "")
+    before, after = (map(length, (s.mean_m, s.rms_m, s.max_m)) for s in (part.before, part.after))
+    band, inside = length(part.band_m), f"{part.inside} of {part.count}"
+    yield (load_name(part.name), "before", *before, "", "")
     yield ("", "after", *after, band, inside)
-    yield ("", "noise alone", "", numbers.length(part.noise_m), "", "", "")
-
-
-def _limit_words(found: Improvement, limit_m: float) -> str:
-    over, size = found.over(limit_m), numbers.length(limit_m)
-    largest = numbers.length(found.everything.after.max_m)
-    of = " for deflections" if found.mode == "deflection" else ""
-    if not over:
-        words = f"no error at the corrected targets is over {size}, the largest is {largest}."
-        return f"PASSED{of}: {words}"
-    return (
-        f"FAILED{of}: {over} of {found.everything.count} errors at the corrected targets are over "
-        f"{size}; the largest is {largest}."
-    )
+    yield ("", "noise alone", "", length(part.noise_m), "", "", "")
 
 
 def limit_failure(found: Improvement, limit_m: float) -> str:
     """Return the one line on a limit that is not kept."""
-    e, size = found.everything, numbers.length(limit_m)
+    e = found.everything
     line = (
         f"{found.over(limit_m)} of {e.count} errors at the corrected targets are over the limit of "
-        f"{size}, the largest is {numbers.length(e.after.max_m)}"
+        f"{length(limit_m)}, the largest is {length(e.after.max_m)}"
     )
     if limit_m < e.noise_m:
-        noise = numbers.length(e.noise_m)
+        noise = length(e.noise_m)
         return f"{line}; noise alone is {noise} rms, so that these readings cannot show it kept"
     return line
-
-
-LISTED = 12
-"""Points that are listed."""
 
 
 def refusals(c: Compensation, allowed_outside: bool) -> list[str]:
@@ -237,7 +231,7 @@ def refusals(c: Compensation, allowed_outside: bool) -> list[str]:
     for k in range(len(c.q)):
         why = []
         if not c.inverse.solved[k]:
-            left = numbers.length(float(c.inverse.residual_m[k]))
+            left = length(float(c.inverse.residual_m[k]))
             why.append(f"cannot be reached on its branch, {left} are left")
         if c.singular[k]:
             why.append("the pose is singular")
@@ -258,11 +252,11 @@ def _outside(o: Outside, k: int) -> str:
         return f"{r.variable} {at}, measured {low} to {high}"
     if r.unit == "m":
         return (
-            f"far from all that was measured (± {numbers.length(value)} by the parameters alone, "
-            f"{numbers.length(r.high)} there)"
+            f"far from all that was measured (± {length(value)} by the parameters alone, "
+            f"{length(r.high)} there)"
         )
-    low, high = numbers.digits(r.low), numbers.digits(r.high)
-    return f"{r.variable} {numbers.digits(value)} {r.unit}, measured {low} to {high}"
+    at, low, high = (numbers.digits(x) for x in (value, r.low, r.high))
+    return f"{r.variable} {at} {r.unit}, measured {low} to {high}"
 
 
 def compensation_report(
@@ -273,27 +267,24 @@ def compensation_report(
     `before` (N, n) are the joint values that were given for the points of these names.
     """
     now, later = c.before.error_m, c.after.band_m
-    expected = numbers.length(float(np.sqrt(np.mean(c.after.std_m**2))))
+    expected = length(float(np.sqrt(np.mean(c.after.std_m**2))))
     asked = "the unloaded arm" if calibration.mode == "deflection" else "the nominal arm"
     yield heading(f"{len(names)} points compensated")
     yield (
-        f"  error before   {numbers.length(float(now.mean()))} mean, "
-        f"{numbers.length(float(now.max()))} largest, from where {asked} has the tool\n"
+        f"  error before   {length(float(now.mean()))} mean, "
+        f"{length(float(now.max()))} largest, from where {asked} has the tool\n"
         f"  error after    {100 * BAND:.0f} % of the points within "
-        f"{numbers.length(float(later.max()))}; expected {expected} rms"
+        f"{length(float(later.max()))}; expected {expected} rms"
     )
     yield f"  the latter includes {', '.join(_parts(calibration, c.untold))}"
     yield f"  {base_line(calibration.model.cell, calibration.frames, calibration.mode)}"
     out = table("point", "before", "after, 95 %", "largest correction")
-    order = np.argsort(-now, kind="stable")[:LISTED]
-    for k in sorted(order):
+    for k in sorted(np.argsort(-now, kind="stable")[:LISTED]):
         turn = np.abs(c.q[k] - before[k])
         joint = int(np.argmax(turn))
         largest = f"joint {joint + 1}: {numbers.joint_value(turn[joint], c.units[joint], 3)}"
-        was, left = (numbers.length(float(x[k])) for x in (now, later))
-        out.add(names[k], was, f"± {left}", largest)
-    yield ""
-    yield out
+        out.add(names[k], length(float(now[k])), f"± {length(float(later[k]))}", largest)
+    yield from ("", out)
     for o in c.turned_on:
         yield (
             f"{o.of.variable}: in {int(o.points.sum())} of {len(names)} points whole turns from "
@@ -304,36 +295,29 @@ def compensation_report(
         yield f"The {LISTED} of {len(names)} points with the largest error before are listed."
 
 
-def _parts(calibration: Calibration, untold: Sequence[str]) -> list[str]:
-    """What the stated error after compensation consists of."""
-    parts = ["the parameters"]
+def _parts(calibration: Calibration, untold: Sequence[str]) -> Iterator[str]:
+    """Yield what the stated error after compensation consists of."""
+    yield "the parameters"
     for name in untold:
-        moved = numbers.length(float(np.sqrt(3 * calibration.conditions[name].variance_m2)))
-        parts.append(f"{WORDS[name]}, which the points do not tell ({moved} rms)")
+        moved = length(float(np.sqrt(3 * calibration.conditions[name].variance_m2)))
+        yield f"{WORDS[name]}, which the points do not tell ({moved} rms)"
     if calibration.misfit > 0:
-        left = numbers.length(float(np.sqrt(3 * calibration.misfit)))
-        parts.append(f"what the model leaves ({left} rms)")
+        yield f"what the model leaves ({length(float(np.sqrt(3 * calibration.misfit)))} rms)"
     source, arm = calibration.scatter.source, calibration.model.cell.arm
     if source == "unknown":
-        return [*parts, "no repeatability, which is not known"]
-    return [*parts, f"the arm's repeatability ({repeatability_source(source, arm)})"]
+        yield "no repeatability, which is not known"
+    else:
+        yield f"the arm's repeatability ({repeatability_source(source, arm)})"
 
 
 @dataclass(frozen=True, slots=True)
 class Fate:
-    """What became of a waypoint of a program.
+    """What became of a waypoint of a program."""
 
-    Attributes:
-        line: of the program.
-        done: "corrected", "left" (not understood) or "refused"; the latter two are as they were.
-        why: it is left or refused.
-        blend_m: radius within which the arm passes it without a stop, m.
-    """
-
-    line: int
-    done: str
-    why: str | None
-    blend_m: float
+    line: int  # of the program
+    done: str  # "corrected", "left" (not understood) or "refused"; these two are as they were
+    why: str | None  # it is left or refused
+    blend_m: float  # radius within which the arm passes it without a stop
 
 
 def fates(waypoints: Sequence[Waypoint | ProgramPoint], refused: Sequence[str]) -> list[Fate]:
@@ -352,8 +336,214 @@ def waypoints_table(found: Sequence[Fate]) -> Iterator[Block]:
         return
     out = table("line", "waypoint", "why")
     for f in found:
-        passed = f"the arm passes its place within {numbers.length(f.blend_m)} and does not stop"
+        passed = f"the arm passes its place within {length(f.blend_m)} and does not stop"
         out.add(str(f.line), f.done, f.why or (passed if f.blend_m > 0 else ""))
     yield from ("", out)
     if any(f.blend_m > 0 and f.done == "corrected" for f in found):
         yield "Of a blended waypoint the corner of the path is corrected; the radius stays."
+
+
+def opening(judged: Judged, found: Validation) -> Iterator[str]:
+    """Yield how many of the readings were fitted, and how far the others are off."""
+    error = f"{length(found.error.rms_m)} rms"
+    noise = f"noise alone would leave {length(found.noise_floor)}.\n"
+    count = f"{len(found.raw)} {judged.what}"
+    if not judged.unseen:
+        every = "All" if judged.fitted == judged.readings else f"{judged.fitted} of the"
+        yield (
+            f"{every} {judged.readings} readings were fitted by {judged.model}: these errors say "
+            f"how well it fits, not how well it predicts. {count} are off by {error}; {noise}"
+        )
+        return
+    if judged.fitted:
+        more = f", and {judged.spoilt} more share an unloaded reading" if judged.spoilt else ""
+        yield (
+            f"{judged.fitted} of the {judged.readings} readings were fitted by {judged.model}"
+            f"{more}; they are left out."
+        )
+    yield f"{count} that were never fitted are predicted to {error}; {noise}"
+
+
+def validation_report(judged: Judged, found: Validation, beyond: Extrapolation) -> Iterator[Block]:
+    """Yield the errors, inside and outside of what was measured, and where outside is."""
+    out = table(error_words(found.readings), "rms", "mean", "largest", "rms in σ", "stated", "z")
+    inside, outside = beyond.inside_error, beyond.outside_error
+    every = np.ones(len(beyond.z), dtype=np.bool_)
+    rows = [("never fitted" if judged.unseen else "fitted", found.error, every)]
+    if inside is not None and outside is not None:
+        rows.append(("inside", inside, ~beyond.outside))
+        rows.append(("outside", outside, beyond.outside))
+    for name, e, mine in rows:
+        sizes = map(length, (e.rms_m, e.mean_m, e.max_m))
+        stated, z = length(_rms(beyond.stated_m[mine])), f"{_rms(beyond.z[mine]):.2f}"
+        out.add(name, *sizes, f"{e.rms_sigma:.2f}", stated, z)
+    out.add("noise alone", length(found.noise_floor), "", "", "1.00", "", "")
+    yield out
+    yield note(
+        "stated: standard deviation that the fit states for these readings, what it does not know "
+        "where nothing was measured included; z: error over it.\n"
+    )
+    count, total = int(beyond.outside.sum()), len(beyond.outside)
+    if not count:
+        yield "All of them lie inside of what was measured.\n"
+    else:
+        yield f"Extrapolation: {count} of {total} lie outside of what was measured:"
+        yield from (f"  {_beyond(v)}" for v in beyond.variables[:MOST])
+        more = len(beyond.variables) - MOST
+        yield f"  and {more} more variables\n" if more > 0 else ""
+    if (z_all := _rms(beyond.z)) > DOUBTED:
+        yield f"These readings are {z_all:.2g} times as far off as the fit states.\n"
+
+
+def _beyond(v: Beyond) -> str:
+    if v.variable == "leverage":
+        return f"leverage: {v.count}, far from all fitted poses in several joints together"
+    if v.unit == "rad":
+        low, high, most = (f"{np.degrees(x):.0f}°" for x in (v.low, v.high, v.most))
+    else:
+        unit = "°C" if v.unit == "K" else v.unit  # the readings hold °C, differences are in K
+        low, high = (f"{numbers.digits(x)} {unit}" for x in (v.low, v.high))
+        most = f"{numbers.digits(v.most)} {v.unit}"
+    return f"{v.variable}: {v.count}, by up to {most} (measured: {low} to {high})"
+
+
+def shares_report(found: Acceptance) -> Iterator[Block]:
+    """Yield errors by load, the worst poses, and whether a limit is kept."""
+    yield from loads_report(found)
+    yield from (worst_table(found), "")
+    if found.limit_m is None:
+        return
+    size, a, worst = length(found.limit_m), found.everything, found.poses[0]
+    largest = f"the largest error is {length(a.max_m)}, at {_place(worst)}"
+    if found.passed:
+        yield f"PASSED: no error is over the limit of {size}; {largest}.\n"
+        return
+    poses = sum(not s.passes(found.limit_m) for s in found.poses)
+    yield (
+        f"FAILED: {found.over} of {a.count} errors are over the limit of {size}, at {poses} of "
+        f"{len(found.poses)} poses; {largest}.\n"
+    )
+
+
+def loads_report(found: Acceptance) -> Iterator[Block]:
+    """Yield errors by load."""
+    every = () if len(found.loads) == 1 else (found.everything,)
+    yield _shares_table("load", "at", (*found.loads, *every), found.limit_m)
+    yield note(
+        f"in 95 %: share of the readings inside of their stated {100 * REGION:.0f} % region.\n"
+    )
+
+
+def worst_table(found: Acceptance) -> Table:
+    """Return the errors of the worst poses."""
+    return _shares_table("worst poses", "load", found.poses[:WORST], found.limit_m)
+
+
+def _shares_table(of: str, at: str, shares: Iterable[Share], limit: float | None) -> Table:
+    heads = (of, "n", "rms", "largest", at, "stated", "z", "in 95 %")
+    out = table(*heads, *(() if limit is None else ("limit",)), left=(0, 4))
+    for s in shares:
+        rms, largest, stated = map(length, (s.rms_m, s.max_m, s.stated_m))
+        kept = () if limit is None else ("kept" if s.passes(limit) else "over",)
+        within = f"{100 * s.within:.0f} %"
+        out.add(s.name, str(s.count), rms, largest, s.worst, stated, f"{s.z:.2f}", within, *kept)
+    return out
+
+
+def _place(worst: Share) -> str:
+    """Return a pose and the load of its largest error."""
+    return f"{worst.name} {load_name(worst.worst, 'under ')}"
+
+
+def validation_failure(found: Acceptance, judged: Judged) -> str:
+    """Return the one line on a limit that is not kept."""
+    worst = found.poses[0]
+    head = (
+        f"the limit of {length(found.limit_m or 0.0)} is not kept: {found.over} of "
+        f"{found.everything.count} {judged.what} are further off, {_place(worst)} by "
+        f"{length(worst.max_m)}"
+    )
+    if not found.undecided:
+        return head
+    return (
+        f"{head}; but noise alone leaves {length(found.noise_m)} rms, so that these "
+        "readings cannot tell: measure with less noise, or give a limit above it"
+    )
+
+
+def _rms(x: Floats) -> float:
+    return float(np.sqrt(np.mean(x**2)))
+
+
+def bootstrap_report(found: Bootstrap) -> Iterator[Block]:
+    """Yield all that people want to know of a bootstrap."""
+    fit, ends = found.fit, found.interval()
+    yield heading(f"Model: {model_name(fit.model.named)}")
+    yield (
+        f"Fitted to {kind(fit)}; {len(found.theta)} times to {found.poses} poses drawn from its "
+        f"{found.poses}, with replacement.\n"
+    )
+    heads = ("parameter", "value", "± stated", "± drawn", "ratio", "95 % of the draws", "unit")
+    out = table(*heads, left=(0, 6))
+    units = [p.unit for e in fit.model.effects for p in e.parameters]
+    for k, name in enumerate(names_of(fit.model)):
+        if not found.compared[k]:
+            continue
+        theta, std = float(fit.theta[k]), float(fit.uncertainty.std[k])
+        unit, factor = numbers.unit_for(units[k], [theta])
+        value, stated = numbers.with_std(factor * theta, factor * std)
+        drawn = numbers.with_std(0.0, factor * float(found.std[k]))[1]
+        places = len(stated.partition(".")[2])
+        between = " to ".join(f"{factor * float(end[k]):.{places}f}" for end in ends)
+        out.add(name, value, stated, drawn, f"{found.ratio[k]:.2f}", between, unit)
+    if out.rows:
+        yield out
+        yield note(
+            "± stated: standard uncertainty of the fit. ± drawn: standard deviation over the draws."
+            "\n"
+        )
+    yield from bootstrap_remarks(found)
+
+
+def bootstrap_remarks(found: Bootstrap) -> Iterator[str]:
+    """Yield what the draws say of the stated standard uncertainties."""
+    known, solution = found.ratio[found.compared], found.fit.solution
+    if len(known):
+        yield (
+            f"Over the draws the parameters scatter {known.min():.2f} to {known.max():.2f} times "
+            f"as far as is stated (median {np.median(known):.2f})."
+        )
+    wide = sorted(np.flatnonzero(found.ratio > WIDER), key=lambda k: -found.ratio[k])
+    if wide:
+        of = names_of(found.fit.model)
+        listed = numbers.few([f"{of[k]} ({found.ratio[k]:.1f} times)" for k in wide], 5)
+        if solution.effective > CROWDED * found.poses:
+            yield (
+                f"Wider than stated: {listed}. This does not show that the stated ones are too "
+                f"small: the fit spends {solution.effective:.0f} degrees of freedom on "
+                f"{found.poses} poses, and draws, which have 63 % of the poses, scatter too much "
+                "then. More poses tell."
+            )
+        else:
+            yield (
+                f"Stated too small, or few poses carry it: {listed}. Take the drawn one, and "
+                "measure more poses that move these parameters."
+            )
+    elif found.fit.uncertainty.inflated:
+        yield (
+            "The residuals are larger than the noise. What neighbouring poses then have in common "
+            "is chance for draws of single poses; the stated ones, found by leaving out regions of "
+            "joint space, are the ones to use."
+        )
+    elif len(known):
+        yield f"None scatters more than {WIDER:g} times as far: the stated ones can be used."
+    if other := int((solution.estimated & ~found.compared).sum()):
+        yield (
+            f"{other} parameters are not compared: the readings do not determine them, or they "
+            "are of a family that shrinks its parameters towards zero."
+        )
+    if found.failed:
+        yield (
+            f"{found.failed} further draws are left out: their poses do not determine the "
+            "parameters. What is said of the others is too good by that."
+        )

@@ -1,60 +1,218 @@
-"""What a campaign holds, and two of its revisions side by side."""
+"""What prepares a campaign, what it holds, and two of its revisions side by side."""
 
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hilcal import numbers
 from hilcal.config.changes import Changes, write_value
+from hilcal.config.reference import NOT_SET, REQUIRED, KeyTable
+from hilcal.doctor.computer import Finding
 from hilcal.identification.fit import Fit
-from hilcal.measuring.repeatability import RepeatabilityEstimate
-from hilcal.present.document import Block, Table, heading, note, pairs, table
+from hilcal.measuring.session_state import RepeatabilityEstimate
+from hilcal.present.document import Block, Table, Words, heading, note, pairs, table
 from hilcal.present.fit import error_words, model_name
+from hilcal.present.progress import spoken
 from hilcal.present.registration import observed_words
 from hilcal.store.overview import Overview
 from hilcal.store.revision import RevisionRecord, change
+from hilcal.tables.proposal import Proposal
 
+if TYPE_CHECKING:
+    from hilcal.measuring.connect import ConnectionResult
+    from hilcal.measuring.route import DryRun
+    from hilcal.transfer.factory import FactoryCheck
+
+_HEAD = """\
+# Keys of CELL.toml
+
+Written by the program (`hilcal config SECTION` shows the same in the terminal); a test holds this
+page to the code. Every key that is not "required" may be left out. `hilcal init` writes a file to
+begin with.
+"""
+MARKS = {"ok": "✓", "warning": "!", "problem": "✗"}
+WIDEST, LISTED = 34, 12
+"""Characters of a cell before it is shortened; unused columns that are listed, not counted."""
 SHOWN = ("start", "load", "doubted", "goal", "interrupted", "failed", "finished")
 """Kinds of events that are listed; drift is where it is over its limit."""
 MOST_EVENTS = 30
+NONE, UNSEEN = "–", "not determined"
+
+
+def sections_overview(tables: Sequence[KeyTable]) -> Iterator[Block]:
+    """Yield the list of sections."""
+    yield heading("Sections of CELL.toml")
+    yield from (pairs((t.header, t.about) for t in tables), "")
+    yield "hilcal config SECTION explains the keys of one; hilcal init writes a file."
+
+
+def section_report(t: KeyTable) -> Iterator[Block]:
+    """Yield all keys of a section."""
+    yield from (heading(t.header), t.about)
+    for key in t.keys:
+        unit = f"unit: {key.unit}; " if key.unit else ""
+        default = REQUIRED if key.default == REQUIRED else f"default: {key.default}"
+        yield from ("", Words(key.name, "strong", indent=2))
+        for line in (key.valid, unit + default, f"example: {key.example}"):
+            yield Words(line, indent=6)
+
+
+def reference_page(tables: Sequence[KeyTable]) -> str:
+    """Return the page of the reference, in Markdown."""
+    lines = [_HEAD]
+    for t in tables:
+        lines += [f"## `{t.header}`", "", t.about, ""]
+        lines += ["| key | unit | default | what it must be | example |", "|---|---|---|---|---|"]
+        for key in t.keys:
+            default = key.default if key.default in (REQUIRED, NOT_SET) else f"`{key.default}`"
+            cells = (f"`{key.name}`", key.unit or "–", default, key.valid, f"`{key.example}`")
+            lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+        lines.append("")
+    return "\n".join(lines)
+
+
+def doctor_report(findings: Sequence[Finding]) -> Iterator[Block]:
+    """Yield everything that was looked at, by topic, and how it is mended."""
+    for topic, of in itertools.groupby(findings, lambda f: f.topic):
+        rows = pairs(())
+        for f in of:
+            rows.add(MARKS[f.state], f"{f.name}: {f.said}")
+            if f.mend:
+                rows.add("", f"→ {f.mend}")
+        yield from ("", Words(topic, "strong", indent=2), rows)
+    yield from ("", doctor_summary(findings))
+
+
+def doctor_summary(findings: Sequence[Finding]) -> str:
+    """Return the outcome in a line."""
+    problems = [f.name for f in findings if f.state == "problem"]
+    warnings = sum(f.state == "warning" for f in findings)
+    more = f"; {warnings} warning{'s' * (warnings != 1)}, marked !" if warnings else ""
+    if problems:
+        return f"{len(problems)} of {len(findings)} hinder a campaign: {', '.join(problems)}{more}"
+    return f"Nothing hinders a campaign{more}."
+
+
+def import_preview(proposal: Proposal, rows: int, source: str) -> Iterator[Block]:
+    """Yield what was understood, unsure and not used of a table of so many rows, from a file."""
+    yield heading(f"{source}: {rows} rows")
+    if file := proposal.sections.get("file", {}):
+        yield "  " + ", ".join(f"{key} = {value!r}" for key, value in file.items())
+    understood = [
+        (u.what, _short(u.columns), u.meaning, _short(u.example)) for u in proposal.understood
+    ]
+    if understood:
+        yield table("what", "columns", "meaning", "first row", rows=understood, left=(0, 1, 2, 3))
+    unused = [f"{name} ({why})" for name, why in proposal.unused]
+    if len(unused) > LISTED:
+        unused = [*unused[:LISTED], f"and {len(unused) - LISTED} more"]
+    for title, sentences in (
+        ("missing:", proposal.lacking),
+        ("unsure:", [f"{what}: {words}" for what, words in proposal.unsure]),
+        ("not used:", [", ".join(unused)] if unused else []),
+    ):
+        if sentences:
+            yield heading(title)
+        yield from (Words(sentence, indent=2) for sentence in sentences)
+
+
+def _short(cells: Sequence[str]) -> str:
+    """First and last of several names or values, cut to a width."""
+    words = ", ".join(cells) if len(cells) <= 3 else f"{cells[0]}, {cells[1]} … {cells[-1]}"
+    return words if len(words) <= WIDEST else words[: WIDEST - 1] + "…"
+
+
+def check_report(answers: "tuple[ConnectionResult, ...]", dry: "DryRun | None") -> Iterator[Block]:
+    """Yield who answered, in which state, and every problem."""
+    out = table("device", "driver", "", "who answers, and what it says", left=(0, 1, 2, 3))
+    for a in answers:
+        name, facts = ("no answer", ()) if a.report is None else (a.report.name, a.report.facts)
+        out.add(a.device, a.driver, "✗" if a.problems else "✓", name)
+        for what, value in facts:
+            out.add("", "", "", f"{what}: {value}")
+        for problem in a.problems:
+            out.add("", "", "!", problem)
+    if answers:
+        yield from ("", out, "")
+    count = sum(len(a.problems) for a in answers)
+    if not answers:
+        yield "The cell does not name all its devices: none was asked. Nothing was moved."
+    elif count:
+        yield f"{count} problem{'s' * (count > 1)}. Nothing was moved."
+    else:
+        yield "All devices are ready. Nothing was moved."
+    if dry is None:
+        return
+    if dry.problems:
+        yield f"The plan cannot be run ({len(dry.problems)}):"
+        yield from (f"  {problem}" for problem in dry.problems)
+    else:
+        yield (
+            f"The plan keeps every limit: {dry.motions} motions, {dry.load_changes} load changes, "
+            f"about {spoken(dry.duration)}."
+        )
+    yield from (f"note: {remark}" for remark in dry.remarks)
+
+
+def factory_words(found: "FactoryCheck") -> Iterator[Block]:
+    """Yield whether an arm is still what its factory measured, and how well that is known."""
+    moved, std = numbers.length(found.moved_m), numbers.length(found.moved_std_m)
+    yield ""
+    if found.changed:
+        yield (
+            "The arm is no longer what its factory measured: its geometry has changed "
+            f"(p = {found.p_value:.1g}), which moves the target by {moved} (rms, ± {std})."
+        )
+    else:
+        yield (
+            "The arm is what its factory measured, as far as these readings tell "
+            f"(p = {found.p_value:.2g}): what they leave of its geometry moves the target by "
+            f"{moved} (rms, ± {std})."
+        )
+    yield (
+        f"From the factory's kinematics {found.readings} readings are "
+        f"{numbers.length(found.factory_m)} off (rms, the arm's own weight in it), from the "
+        f"maker's nominal ones {numbers.length(found.nominal_m)}; "
+        f"their noise is {numbers.length(found.noise_m)}."
+    )
 
 
 def info_report(o: Overview, name: str, covariance: str) -> Iterator[Block]:
     """Yield what the campaign of a file name holds; `covariance` says what its covariances are."""
     count = 0 if o.readings is None else len(o.readings)
     yield heading(f"{name}: {count} readings of {o.poses} poses, {o.config.robot.model}")
-    yield pairs(_head(o, covariance))
-    yield ""
+    yield from (pairs(_head(o, covariance)), "")
     if o.planned is not None:
-        yield heading("Instruments")
-        yield pairs([(i.device, _instrument(i.name, i.serial_number)) for i in o.instruments])
-        yield ""
-        yield heading("Checks on the way")
-        yield pairs([*_checks(o)])
-        yield ""
-        yield heading("Events (UTC)")
-        yield from _events(o)
-        yield ""
+        instruments = [
+            (i.device, i.name if i.serial_number is None or i.serial_number in i.name
+             else f"{i.name}, serial number {i.serial_number}")
+            for i in o.instruments
+        ]  # fmt: skip
+        yield from (heading("Instruments"), pairs(instruments), "")
+        yield from (heading("Checks on the way"), pairs(_checks(o)), "")
+        yield from (heading("Events (UTC)"), *_events(o), "")
     yield heading("Revisions")
     if not o.revisions:
         yield "None yet: hilcal identify or refine makes one."
         return
-    yield from revisions_tables(o)
+    yield from _revisions_tables(o)
     what = "error" if o.readings is None else error_words(o.readings)
     yield note(
         f"fit, left out: rms of the {what}, of the fitted poses and of poses left out, "
         "there in σ of the noise as well; v.f.: variance factor."
     )
-    used = "→ used by every command: the latest one; hilcal accept RUN N chooses another."
-    if o.accepted is not None:
-        used = f"→ revision {o.accepted} is accepted: every command uses it."
-    yield used
+    yield (
+        "→ used by every command: the latest one; hilcal accept RUN N chooses another."
+        if o.accepted is None
+        else f"→ revision {o.accepted} is accepted: every command uses it."
+    )
 
 
 def _head(o: Overview, covariance: str) -> Iterator[tuple[str, str]]:
     by = f" by hilcal {o.program_version}" if o.program_version else ""
-    yield "made", f"{_time(o.created)} UTC{by}; {o.source}"
+    yield "made", f"{utc(o.created)} UTC{by}; {o.source}"
     if o.planned is not None:
         sessions = sum(e["kind"] == "start" for e in o.events)
         words = f"{sessions} session{'s' * (sessions != 1)}"
@@ -75,14 +233,10 @@ def _head(o: Overview, covariance: str) -> Iterator[tuple[str, str]]:
     yield "readings", f"{kind}; {covariance}"
 
 
-def _instrument(name: str, serial: str | None) -> str:
-    return name if serial is None or serial in name else f"{name}, serial number {serial}"
-
-
 def _checks(o: Overview) -> Iterator[tuple[str, str]]:
     if o.tares:
-        change = np.array([t.wrench for t in o.tares]) - o.tares[0].wrench
-        sizes = (np.linalg.norm(m, axis=1).max() for m in np.split(change, 2, axis=1))
+        moved = np.array([t.wrench for t in o.tares]) - o.tares[0].wrench
+        sizes = (np.linalg.norm(m, axis=1).max() for m in np.split(moved, 2, axis=1))
         force, moment = (numbers.digits(size, 2) for size in sizes)
         yield "tares", f"{len(o.tares)}; the zero moved by up to {force} N and {moment} N·m"
     else:
@@ -93,10 +247,10 @@ def _checks(o: Overview) -> Iterator[tuple[str, str]]:
         yield "tool", f"{o.tool['mass_kg']:.3f} kg, its centre at {com} mm in flange axes"
     if o.repeatability is not None:
         r = RepeatabilityEstimate(**o.repeatability)
-        scatter, alone = numbers.length(r.scatter), numbers.length(r.instrument)
         joints = "the joints do not show beside it"
         if r.shown:
             joints = f"joints {numbers.digits(1e6 * r.joint_std, 2)} µrad"
+        scatter, alone = numbers.length(r.scatter), numbers.length(r.instrument)
         returns = f"{r.dof} returns to {r.poses} poses scatter by {scatter}"
         yield "repeatability", f"{returns}, the instrument alone by {alone}; {joints}"
 
@@ -106,22 +260,22 @@ def _drift(o: Overview) -> str:
         return "no return to the reference pose"
     sizes = [float(np.linalg.norm(r.shift_m)) for r in o.returns]
     k, over = int(np.argmax(sizes)), sum(r.over for r in o.returns)
-    limit = f"{o.config.acquire.drift_limit_sigma:g} σ"
     several = f"{len(o.returns)} return{'s' * (len(o.returns) > 1)} to the reference pose"
     return (
         f"{several}: at most {numbers.length(sizes[k])} ({o.returns[k].sigma:.1f} σ), "
-        f"{numbers.length(sizes[-1])} at the last; {over or 'none'} over the limit of {limit}"
+        f"{numbers.length(sizes[-1])} at the last; {over or 'none'} over the limit of "
+        f"{o.config.acquire.drift_limit_sigma:g} σ"
     )
 
 
 def _events(o: Overview) -> Iterator[Block]:
-    told = [e for e in o.events if e["kind"] in SHOWN or (e["kind"] == "drift" and e["over"])]
-    if not told:
+    shown = [e for e in o.events if e["kind"] in SHOWN or (e["kind"] == "drift" and e["over"])]
+    if not shown:
         yield "None yet."
         return
-    if len(told) > MOST_EVENTS:
-        yield f"{len(told) - MOST_EVENTS} earlier ones, see --json"
-    yield pairs([(_time(e["utc"]), event_words(e)) for e in told[-MOST_EVENTS:]])
+    if len(shown) > MOST_EVENTS:
+        yield f"{len(shown) - MOST_EVENTS} earlier ones, see --json"
+    yield pairs([(utc(e["utc"]), event_words(e)) for e in shown[-MOST_EVENTS:]])
 
 
 def event_words(e: Mapping[str, Any]) -> str:
@@ -148,51 +302,49 @@ def event_words(e: Mapping[str, Any]) -> str:
     return kind if reason in ("", kind) else f"{kind}: {reason}"
 
 
-def revisions_tables(o: Overview) -> Iterator[Block]:
-    """Yield the revisions of each kind of readings, whose errors do not compare, as a table."""
+def _revisions_tables(o: Overview) -> Iterator[Block]:
+    """Yield the revisions of each kind of readings, whose errors do not compare, as a table.
+
+    An arrow marks the one in use.
+    """
     kinds = dict.fromkeys(str(r.options["readings"]) for r in o.revisions)
+    branched = any(r.made_from not in (None, r.number - 1) for r in o.revisions)
+    first = ("rev.", "from", "model") if branched else ("rev.", "model")
+    heads, left = (
+        (*first, "fit", "left out", "σ", "v.f.", "verdict"),
+        (len(first) - 1, len(first) + 4),
+    )
     for kind in kinds:
         if len(kinds) > 1:
             yield f"Of {'deflections' if kind == 'deflection' else 'absolute readings'}:"
-        yield _revisions_table(o, [r for r in o.revisions if r.options["readings"] == kind])
-
-
-def _revisions_table(o: Overview, revisions: Sequence[RevisionRecord]) -> Table:
-    """Return a table of revisions; an arrow marks the one in use."""
-    branched = any(r.made_from not in (None, r.number - 1) for r in o.revisions)
-    heads = ("fit", "left out", "σ", "v.f.", "verdict")
-    first = ("rev.", "from", "model") if branched else ("rev.", "model")
-    out = table(*first, *heads, left=(len(first) - 1, len(first) + 4))
-    for r in revisions:
-        fit = r.result_json["identify"]
-        left_out = fit["error"]["holdout"]
-        verdict = r.result_json.get("diagnose", {}).get("verdict", "")
-        out.add(
-            f"→ {r.number}" if r.number == o.in_use else str(r.number),
-            *(("" if r.made_from is None else str(r.made_from),) if branched else ()),
-            model_words(r),
-            numbers.length(float(fit["error"]["fit"]["rms_m"])),
-            numbers.length(float(left_out["rms_m"])),
-            f"{float(left_out['rms_sigma']):.2f}",
-            numbers.digits(float(fit["variance_factor"])),
-            str(verdict).replace("_", " "),
-        )
-    return out
+        out = table(*heads, left=left)
+        for r in (r for r in o.revisions if r.options["readings"] == kind):
+            fit = r.result_json["identify"]
+            held = fit["error"]["holdout"]
+            verdict = str(r.result_json.get("diagnose", {}).get("verdict", ""))
+            out.add(
+                f"→ {r.number}" if r.number == o.in_use else str(r.number),
+                *(("" if r.made_from is None else str(r.made_from),) if branched else ()),
+                model_words(r),
+                numbers.length(float(fit["error"]["fit"]["rms_m"])),
+                numbers.length(float(held["rms_m"])),
+                f"{float(held['rms_sigma']):.2f}",
+                numbers.digits(float(fit["variance_factor"])),
+                verdict.replace("_", " "),
+            )
+        yield out
 
 
 def model_words(r: RevisionRecord) -> str:
     """Return what a revision changed, or its whole model where it is a first one; and its cell."""
     scatter = r.parameters_json.get("arm_scatter") is not None and not r.cell
-    found = change(r.added, r.removed, scatter) or model_name(r.effects)
-    return f"{found}; {cell_words(r.cell)}" if r.cell else found
+    model = change(r.added, r.removed, scatter) or model_name(r.effects)
+    return f"{model}; {cell_words(r.cell)}" if r.cell else model
 
 
-def _time(utc: str) -> str:
-    """Return a time without what every time here has: T, seconds' zone."""
-    return utc[:19].replace("T", " ")
-
-
-NONE = "–"
+def utc(time: str) -> str:
+    """Return a time (ISO 8601, UTC) to the second, without what every time here has."""
+    return time[:19].replace("T", " ")
 
 
 def two_revisions(a: RevisionRecord, b: RevisionRecord) -> Table:
@@ -220,15 +372,28 @@ def two_revisions(a: RevisionRecord, b: RevisionRecord) -> Table:
         add(what, numbers.length(before), numbers.length(after), by)
     add("variance factor", *(numbers.digits(float(f["variance_factor"])) for f in fits))
     add("readings", *(str(f["n_readings"]) for f in fits))
-    for row in _parameters(*fits):
-        add(*row)
+    known: list[dict[str, Mapping[str, Any]]] = [
+        {p["name"]: p for p in f["parameters"]} for f in fits
+    ]
+    for name in dict.fromkeys([*known[0], *known[1]]):
+        both = [of.get(name) for of in known]
+        values = [0.0 if p is None or p["value"] is None else float(p["value"]) for p in both]
+        given = next(p for p in both if p is not None)
+        unit, factor = numbers.unit_for(str(given["unit"]), values)
+        first, second = (_value(p, factor) for p in both)
+        if {first, second} <= {NONE, UNSEEN}:
+            continue
+        moved = factor * (values[1] - values[0])
+        by = ("+" * (moved > 0) + numbers.digits(moved, 2)).replace("-", "−")
+        by *= not {first, second} & {NONE, UNSEEN}
+        add(f"{name} [{unit}]" if unit else name, first, second, by)
     return out
 
 
 def verdict_of(record: RevisionRecord) -> str:
     """Return the verdict as words; a line for none."""
-    found = record.result_json.get("diagnose", {}).get("verdict")
-    return NONE if found is None else str(found).replace("_", " ")
+    verdict = record.result_json.get("diagnose", {}).get("verdict")
+    return NONE if verdict is None else str(verdict).replace("_", " ")
 
 
 def left_out_m(record: RevisionRecord) -> float:
@@ -254,33 +419,10 @@ def refitted(before: Fit, after: Fit) -> str:
     )
 
 
-def _parameters(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[tuple[str, str, str, str]]:
-    known: list[dict[str, Mapping[str, Any]]] = [
-        {p["name"]: p for p in f["parameters"]} for f in (a, b)
-    ]
-    for name in dict.fromkeys([*known[0], *known[1]]):
-        found = [of.get(name) for of in known]
-        values = [0.0 if p is None or p["value"] is None else float(p["value"]) for p in found]
-        given = next(p for p in found if p is not None)
-        unit, factor = numbers.unit_for(str(given["unit"]), values)
-        first, second = (_value(p, factor) for p in found)
-        if {first, second} <= {NONE, UNSEEN}:
-            continue
-        by = factor * (values[1] - values[0])
-        difference = ("+" * (by > 0) + numbers.digits(by, 2)).replace("-", "−")
-        if {first, second} & {NONE, UNSEEN}:
-            difference = ""
-        yield f"{name} [{unit}]" if unit else name, first, second, difference
-
-
-UNSEEN = "not determined"
-
-
 def _value(p: Mapping[str, Any] | None, factor: float) -> str:
     if p is None:
         return NONE
     if p["value"] is None or not p["identifiable"]:
         return UNSEEN
     std = float("nan") if p["std"] is None else factor * float(p["std"])
-    value, error = numbers.with_std(factor * float(p["value"]), std)
-    return f"{value} ± {error}" if error else value
+    return " ± ".join(filter(None, numbers.with_std(factor * float(p["value"]), std)))

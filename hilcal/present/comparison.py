@@ -1,58 +1,65 @@
-"""What `compare A B` says: the error of the earlier calibration today, and what has changed."""
+"""What `compare A B` and `fleet` say: what has changed on an arm, arms unlike their type."""
 
 from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
 
 from hilcal import numbers
 from hilcal.diagnosis.change import LEVEL, POWER
 from hilcal.diagnosis.change_candidates import Candidate
 from hilcal.diagnosis.change_found import Change, Limit
 from hilcal.diagnosis.comparison import Comparison
-from hilcal.identification.parameter_differences import Differences
+from hilcal.identification.posterior import Differences
 from hilcal.names import quoted
-from hilcal.present.document import Block, Table, heading, table
+from hilcal.present.document import Block, Table, heading, note, table
 from hilcal.present.fit import error_words, measurements
 
-MOST_PARAMETERS = 6
-"""Parameters of a change that are listed."""
-MOST_ROWS = 12
-"""Parameters of both fits that are listed."""
+if TYPE_CHECKING:
+    from hilcal.transfer.fleet import Fleet
+    from hilcal.transfer.members import TypeSize
+    from hilcal.transfer.pooled import DiagnosedEffect, Odd, Pooled
+
+MOST_PARAMETERS, MOST_ROWS = 6, 12
+"""Parameters of a change, and of both fits, that are listed."""
 CLEAR = 2.0
 """Standard deviations from which one of several parameters of a change is listed."""
+FAR = 3.0
+"""Standard deviations between which most arms lie; a choice."""
+KNOWN = {
+    "list": "arms.csv",
+    "serial number": "the serial number that the arm told",
+    "folder": "the folder of the file, for want of a serial number",
+    "file": "the file's name, for want of anything better: each counts as an arm of its own",
+}
+KINDS = {"trait": ", a trait of the type", "defect": ", of single arms: a defect", "some": ""}
 
 
 def words_of(c: Candidate) -> str:
     """Return what may have changed, in words."""
+    words = c.change.words or c.effect
     if c.joint:
-        return f"joint {c.joint}'s {c.change.words or c.effect}"
-    if c.kind == "link":
-        return f"the {c.change.words or c.effect} of {c.part}"
-    return c.change.words or c.effect
+        return f"joint {c.joint}'s {words}"
+    return f"the {words} of {c.part}" if c.kind == "link" else words
 
 
 def comparison_report(c: Comparison, earlier: str, later: str) -> Iterator[Block]:
     """Yield everything that is said, with the names of the two files."""
-    yield from _setup(c, earlier, later)
-    yield ""
-    yield from _today(c, earlier)
-    yield ""
+    yield from (*_setup(c, earlier, later), "")
+    yield from (*_today(c, earlier), "")
     yield from _changes(c)
     yield from _parameters(c.differences)
-    yield ""
-    yield f"Next: {next_step(c, earlier)}"
+    yield from ("", f"Next: {next_step(c, earlier)}")
 
 
 def _setup(c: Comparison, earlier: str, later: str) -> Iterator[str]:
     what = measurements(c.mode, c.today.prediction.readings)
-    count = len(c.today.prediction.raw)
-    yield f"{count} {what} of {later}, measured later."
+    yield f"{len(c.today.prediction.raw)} {what} of {later}, measured later."
     if c.shared:
         model = "the baseline" if c.number is None else f"revision {c.number}"
         yield f"{c.shared} of its {c.readings} readings were fitted by {model}; they are left out."
     if c.later_mode not in (None, c.mode):
-        yield (
-            f"{later} was fitted to {_kind(c.later_mode)}, {earlier} to {_kind(c.mode)}: "
-            f"{_kind(c.mode)} are compared."
-        )
+        kinds = {"deflection": "deflections", "absolute": "absolute readings"}
+        was, used = kinds[str(c.later_mode)], kinds[c.mode]
+        yield f"{later} was fitted to {was}, {earlier} to {used}: {used} are compared."
     if c.lacked:
         yield (
             f"The model of {earlier} lacks {numbers.names(c.lacked)} by its own readings; added "
@@ -70,25 +77,19 @@ def _setup(c: Comparison, earlier: str, later: str) -> Iterator[str]:
         yield f"[tool] {numbers.names(c.tool)} of {later} differ; those of {later} are used."
 
 
-def _kind(mode: str | None) -> str:
-    return "deflections" if mode == "deflection" else "absolute readings"
-
-
 def _today(c: Comparison, earlier: str) -> Iterator[Block]:
     t, error = c.today, c.today.prediction.error
     drawing = "-" if t.drawing_m is None else numbers.length(t.drawing_m)
-    sizes = (error.rms_m, error.mean_m, error.max_m, t.stated_m)
-    row = (f"calibration of {earlier}", *map(numbers.length, sizes), drawing)
+    sizes = map(numbers.length, (error.rms_m, error.mean_m, error.max_m, t.stated_m))
     heads = (error_words(t.prediction.readings), "rms", "mean", "largest", "expected", "as drawn")
-    yield table(*heads, rows=[row])
+    yield table(*heads, rows=[(f"calibration of {earlier}", *sizes, drawing)])
     yield (
         f"The error is {numbers.digits(t.z, 2)} times what it states, all correlations counted "
         f"({numbers.p_equals(t.p_value)}): {'no ' * (t.p_value >= LEVEL)}more than its uncertainty."
     )
-    beyond = t.beyond
     # How far the poses are from the measured ones, the expected error counts.
-    ranges = [f"{v.variable} ({v.count})" for v in beyond.variables if v.variable != "leverage"]
-    if ranges:
+    variables = (v for v in t.beyond.variables if v.variable != "leverage")
+    if ranges := [f"{v.variable} ({v.count})" for v in variables]:
         yield (
             f"Outside of what {earlier} measured: {numbers.few(ranges, 3)}; an error there need "
             "not be a change."
@@ -128,10 +129,8 @@ def _changes(c: Comparison) -> Iterator[Block]:
         if change.same_as:
             others = numbers.names([words_of(o) for o in change.same_as], "or")
             yield f"  These readings do not tell it from {others}."
-    yield ""
-    yield _table(found.found)
-    if not all(change.candidate.of_arm for change in found.found):
-        named = dict.fromkeys(words_of(x.candidate) for x in found.found if not x.candidate.of_arm)
+    yield from ("", _table(found.found))
+    if named := dict.fromkeys(words_of(x.candidate) for x in found.found if not x.candidate.of_arm):
         yield f"Not of the arm: {numbers.names(list(named))}."
     yield _left(c)
     yield numbers.many_tests(found.tested, LEVEL, "candidates").replace("diagnoses", "comparisons")
@@ -140,9 +139,8 @@ def _changes(c: Comparison) -> Iterator[Block]:
 def sentence(change: Change) -> str:
     """Return a change in one sentence."""
     c, s = change.candidate, change.sizes[0]
-    what = words_of(c)
+    what, why = words_of(c), c.change.cause
     head = what[:1].upper() + what[1:]
-    why = c.change.cause
     if len(change.sizes) > 1:
         return (
             f"{head} has changed: it moves the target by {numbers.length(change.moved_m)} rms "
@@ -166,25 +164,22 @@ def _table(found: Sequence[Change]) -> Table:
         if not shown:
             out.add(change.candidate.name, *[""] * 4, *more)
         for k, s in enumerate(shown[:MOST_PARAMETERS]):
-            value, std, unit = numbers.measured(s.unit, s.value, s.std, [s.value, s.std])
+            measured = numbers.measured(s.unit, s.value, s.std, [s.value, s.std])
             name = change.candidate.name if alone else f"{change.candidate.effect}.{s.parameter}"
-            out.add(name, value, std, unit, f"{abs(s.z):.1f}", *(("", "") if k else more))
+            out.add(name, *measured, f"{abs(s.z):.1f}", *(("", "") if k else more))
         if len(shown) > MOST_PARAMETERS:
             out.add(f"  … {len(shown) - MOST_PARAMETERS} more", *[""] * 6)
     return out
 
 
 def _left(c: Comparison) -> str:
-    found = c.changes
+    found, scatter = c.changes, numbers.digits(c.changes.scatter, 2)
     if found.explained:
-        return (
-            f"What is left after that is scatter as stated ({numbers.digits(found.scatter, 2)} "
-            "times)."
-        )
+        return f"What is left after that is scatter as stated ({scatter} times)."
     outside = any(v.variable != "leverage" for v in c.today.beyond.variables)
     more = ", or the earlier model is wrong where it was not measured" if outside else ""
     return (
-        f"What is left is {numbers.digits(found.scatter, 2)} times the stated scatter "
+        f"What is left is {scatter} times the stated scatter "
         f"({numbers.p_equals(found.unexplained)}): more has changed than the candidates explain, "
         f"or these readings are noisier than stated{more}."
     )
@@ -211,42 +206,39 @@ def _limits(c: Comparison) -> Iterator[Block]:
         yield f"Not to be seen: the zero of {numbers.names(zeros)}; {frames} absorbs it."
 
 
-def _parameters(d: Differences | None) -> Iterator[Block]:
-    """Yield the parameters of both fits, those that differ most first."""
-    if d is None:
-        return
-    yield ""
-    yield heading("Both campaigns' own fits, as far as they can be compared")
-    told = sorted((r for r in d.rows if r.z is not None), key=lambda r: -abs(r.z or 0.0))
-    if told:
-        out = table("parameter", "before", "after", "by", "±", "unit", "σ", left=(0, 5))
-        for r in told[:MOST_ROWS]:
-            std = r.std or 0.0
-            unit, factor = numbers.unit_for(r.unit, [r.before, r.after, r.difference])
-            by, error = numbers.with_std(factor * r.difference, factor * std)
-            places = len(error.partition(".")[2])
-            sizes = (f"{factor * v:.{places}f}" for v in (r.before, r.after))
-            out.add(r.name, *sizes, by, error, unit, f"{abs(r.z or 0.0):.1f}")
-        yield out
-        if len(told) > MOST_ROWS:
-            yield f"{len(told) - MOST_ROWS} more differ less."
-    for e in d.effects:
-        chance = numbers.p_equals(e.p_value)
-        yield f"{e.effect}, as a whole: χ² {e.chi2:.0f} of {e.rank} ({chance})."
-    open_ = sum(r.z is None for r in d.rows)
-    if open_:
-        yield (
-            f"{open_} cannot be compared one by one: frames absorb them, or a campaign tells "
-            "nothing of them."
-        )
-    if d.apart:
-        yield f"Not in both, or with other options: {numbers.names(d.apart)}."
-
-
 def _least(limit: Limit | None) -> str:
     if limit is None or limit.size == float("inf"):
         return "-"
     return numbers.sizes([(limit.unit, limit.size)])
+
+
+def _parameters(d: Differences | None) -> Iterator[Block]:
+    """Yield the parameters of both fits, those that differ most first."""
+    if d is None:
+        return
+    yield from ("", heading("Both campaigns' own fits, as far as they can be compared"))
+    known = sorted(((r.z, r) for r in d.rows if r.z is not None), key=lambda zr: -abs(zr[0]))
+    if known:
+        out = table("parameter", "before", "after", "by", "±", "unit", "σ", left=(0, 5))
+        for z, r in known[:MOST_ROWS]:
+            unit, factor = numbers.unit_for(r.unit, [r.before, r.after, r.difference])
+            by, error = numbers.with_std(factor * r.difference, factor * (r.std or 0.0))
+            places = len(error.partition(".")[2])
+            sizes = (f"{factor * v:.{places}f}" for v in (r.before, r.after))
+            out.add(r.name, *sizes, by, error, unit, f"{abs(z):.1f}")
+        yield out
+        if len(known) > MOST_ROWS:
+            yield f"{len(known) - MOST_ROWS} more differ less."
+    for e in d.effects:
+        chance = numbers.p_equals(e.p_value)
+        yield f"{e.effect}, as a whole: χ² {e.chi2:.0f} of {e.rank} ({chance})."
+    if rest := len(d.rows) - len(known):
+        yield (
+            f"{rest} cannot be compared one by one: frames absorb them, or a campaign tells "
+            "nothing of them."
+        )
+    if d.apart:
+        yield f"Not in both, or with other options: {numbers.names(d.apart)}."
 
 
 def next_step(c: Comparison, earlier: str) -> str:
@@ -259,17 +251,16 @@ def next_step(c: Comparison, earlier: str) -> str:
     arm = [x for x in found.found if x.candidate.of_arm]
     if found.explained and found.found and not arm:
         return f"put the setup right, and compare again; the calibration of {earlier} holds."
-    parts = numbers.names(list(dict.fromkeys(x.candidate.part for x in arm)))
-    what = f"recalibrate {parts}" if parts else "recalibrate the arm"
-    return f"{what}, with what {earlier} knows as prior; more readings make it surer."
+    parts = numbers.names(list(dict.fromkeys(x.candidate.part for x in arm))) or "the arm"
+    return f"recalibrate {parts}, with what {earlier} knows as prior; more readings make it surer."
 
 
 def next_command(c: Comparison, earlier: str, later: str) -> str | None:
     """Return the command line for the next step; None where there is none."""
     if c.another_arm:
         return f"hilcal refine {quoted(later)}"
-    arm = [x for x in c.changes.found if x.candidate.of_arm]
-    changed = bool(arm) or not c.changes.explained
+    arm = any(x.candidate.of_arm for x in c.changes.found)
+    changed = arm or not c.changes.explained
     return f"hilcal refine {quoted(later)} --prior {quoted(earlier)}" if changed else None
 
 
@@ -278,3 +269,76 @@ def comparison_json(c: Comparison, earlier: str, later: str) -> dict[str, object
     changes = [{**x.to_dict(), "words": sentence(x)} for x in c.changes.found]
     after = {"next": next_step(c, earlier), "next_command": next_command(c, earlier, later)}
     return {**c.to_dict(), "changes": changes, **after}
+
+
+def fleet_report(fleet: "Fleet") -> Iterator[Block]:
+    """Yield all that people want to know of a fleet."""
+    for t in fleet.types:
+        yield from type_report(t)
+    yield from closing(fleet)
+
+
+def closing(fleet: "Fleet") -> Iterator[Block]:
+    """Yield how arms are known, and what was not used."""
+    known = {m.known for m in fleet.members}
+    yield f"Which arm a campaign is of: by {'; '.join(KNOWN[k] for k in KNOWN if k in known)}."
+    if fleet.failures:
+        yield from ("", heading(f"Not used: {len(fleet.failures)}"))
+        yield from (f"  {f.name}: {f.reason}" for f in fleet.failures)
+
+
+def type_report(t: "Pooled") -> Iterator[Block]:
+    """Yield what is known of one type."""
+    yield heading(f"{t.type}: {len(t.arms)} arms, {len(t.campaigns)} campaigns")
+    repeated = any(p.within is not None for p in t.parameters)
+    more = ["between campaigns"] * repeated
+    heads = ("parameter", "mean", "±", "between arms", "±", *more, "unit")
+    out = table(*heads, left=(0, len(heads) - 1))
+    for p in t.parameters:
+        unit, factor = numbers.unit_for(p.unit, [p.mean, p.between])
+        mean = numbers.with_std(factor * p.mean, factor * p.mean_std)
+        between = numbers.with_std(factor * p.between, factor * p.between_std)
+        within = [numbers.digits(factor * (p.within or 0.0))] * repeated
+        out.add(p.parameter, *mean, *between, *within, unit)
+    yield out
+    yield note(
+        "±: standard uncertainty; between arms, and campaigns of an arm: standard deviations.\n"
+    )
+    if not repeated:
+        yield "No arm was measured twice: what changes with time is part of the arms' spread.\n"
+    yield "Unlike the others:" if t.odd else "No arm is unlike the others."
+    yield from (f"  {unlike_words(o)}" for o in t.odd)
+    if t.wear:
+        drifts = {p.parameter: p for p in t.parameters}
+        yield "Common drift with time (wear):"
+        for name in t.wear:
+            p = drifts[name]
+            value, std, unit = numbers.measured(p.unit, p.per_year or 0.0, p.per_year_std or 0.0)
+            yield f"  {name}: {value} ± {std} {unit} a year"
+    if t.seen:
+        yield "Effects that the diagnoses added:"
+        yield from (f"  {_diagnosed(s)}" for s in t.seen)
+    yield from (*size_lines(t.sizes), "")
+
+
+def size_lines(sizes: Sequence["TypeSize"]) -> Iterator[str]:
+    """Yield the section of a cell for effects whose size differs from that on other arms."""
+    if other := [s for s in sizes if s.differs]:
+        yield "Effects whose size differs from that on other arms, for another arm of this type:"
+        yield "  [ordinary]"
+        for s in other:
+            factor, low, high = map(numbers.digits, (s.factor, s.low, s.high))
+            yield f"  {s.effect} = {factor} # 95 %: {low} to {high}"
+
+
+def unlike_words(o: "Odd") -> str:
+    """Say what is unlike, and by how much."""
+    unit, factor = numbers.unit_for(o.unit, [o.off])
+    off = f"{'+' if o.off > 0 else '−'}{numbers.digits(factor * abs(o.off))} {unit}"
+    who = f"{o.arm} has changed by {o.campaign}" if o.campaign else o.arm
+    return f"{who}: {o.parameter} {off} ({o.sigma:.1f} σ)"
+
+
+def _diagnosed(s: "DiagnosedEffect") -> str:
+    who = f": {', '.join(s.arms)}" if s.kind == "defect" else ""
+    return f"{s.effect}: on {len(s.arms)} of {s.of} arms{KINDS[s.kind]}{who}"

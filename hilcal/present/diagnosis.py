@@ -1,4 +1,4 @@
-"""Diagnoses and revisions in words and tables: suspects, what was not found, curves of a misfit."""
+"""Diagnoses, revisions and laws in words and tables: suspects, what was not found, curves."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -9,11 +9,17 @@ from hilcal import numbers
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.effect_ranking import FALSE_ALARM, LEAST_SHARE, Suspect
 from hilcal.diagnosis.live_model import LEAST
+from hilcal.diagnosis.misfit_breakdown import ROW_ORDER
 from hilcal.diagnosis.noise import PureError
 from hilcal.diagnosis.residual_regression import Dependence
 from hilcal.diagnosis.stepwise import predicts_better
+from hilcal.discovery.curve import Curve
+from hilcal.discovery.discovery import Discovery, LawSearch
+from hilcal.discovery.law import Coefficient, Law
+from hilcal.discovery.structures import Structure, pareto
 from hilcal.identification.fit import Fit
 from hilcal.identification.full_prediction import full_prediction
+from hilcal.numbers import length, percent
 from hilcal.present.document import Block, Table, Tone, Words, heading, note, table
 from hilcal.present.fit import CERTAIN, error_words, follows, misses, model_name, where_table
 from hilcal.present.verdict import broken, headline, implausible, message
@@ -26,6 +32,22 @@ REVISION_HEADS = (
     *("variance\nfactor", "verdict"),
 )
 """Of a table of revisions."""
+NEAR = 0.99
+"""Component from which a direction is called an axis; a choice."""
+BARS = "▁▂▃▄▅▆▇█"
+CURVES = 2
+COMPARED = 24
+"""Parameters that are compared with the true ones."""
+FEW, LEAST_BINS = 3, 3
+"""Effects that a law is said to resemble, and bins that make a curve; choices."""
+RARE = 0.01
+"""Probability below which no figure is written."""
+NOT_TRIED = "could not be tried in the exact model"
+NEWCOMER = f"""\
+The lines that follow are those of a real run: what the arm does, and each reading with its pose,
+load and cycle. It begins beside the reference pose, so that every joint arrives there from a known
+side. From {LEAST} poses on, a first model predicts each reading before it counts: the residual is
+how far it misses. While it is fitted to few poses, and lacks what is hidden, that is a lot."""
 
 
 def verdict_line(d: Diagnosis) -> Words:
@@ -40,7 +62,7 @@ def suspects_table(d: Diagnosis, most: int = SUSPECTS) -> Table:
     heads = ("missing effect?", "explains", "on poses left out", "p-value", "inseparable from")
     out = table(*heads, left=(0, 4))
     for s in shown_suspects(d)[:most]:
-        shares = (numbers.percent(s.share), numbers.percent(max(s.holdout_share, 0.0)))
+        shares = percent(s.share), percent(max(s.holdout_share, 0.0))
         same = numbers.few(s.same_as) if s.passes else ""
         out.add(s.effect, *shares, numbers.chance(s.score.p_value), same)
     return out
@@ -56,22 +78,19 @@ def addition_lines(s: Suspect) -> Iterator[str]:
     if not s.plausible:
         yield f"{s.effect} is implausible: it {implausible(s)}."
     if not s.keeps:
-        kept = numbers.percent(max(s.kept, 0.0))
+        kept = percent(max(s.kept, 0.0))
         yield (
-            f"The linearisation promised that {s.effect} explains {numbers.percent(s.share)} of "
+            f"The linearisation promised that {s.effect} explains {percent(s.share)} of "
             f"the misfit; the refit kept {kept} of that: remove it, hilcal remove RUN {s.effect}."
         )
 
 
 def diagnosis_report(d: Diagnosis) -> Iterator[Block]:
     """Yield the verdict, where the model fails and the suspects."""
-    yield heading(f"Model: {model_name(d.fit.model.named)}")
-    yield misses(d.fit)
+    yield from (heading(f"Model: {model_name(d.fit.model.named)}"), misses(d.fit))
     if d.verdict != "adequate" and not d.dependences:
         yield follows(d.misfit_breakdown)
-    yield ""
-    yield verdict_line(d)
-    yield ""
+    yield from ("", verdict_line(d), "")
     if d.significant:
         yield suspects_table(d)
         yield note(
@@ -85,7 +104,7 @@ def diagnosis_report(d: Diagnosis) -> Iterator[Block]:
         yield from (*where_table(d.misfit_breakdown), "")
     if d.verdict in ("unknown_effect", "noise_misjudged"):
         if d.verdict == "noise_misjudged" or d.predictable_share >= LEAST_SHARE:
-            predicted = numbers.percent(d.predictable_share)
+            predicted = percent(d.predictable_share)
             yield f"What is recorded predicts {predicted} of the misfit on poses left out."
         if d.insufficiency is not None:
             refitted = d.insufficiency.effects[: d.insufficiency.refitted]
@@ -97,7 +116,7 @@ def diagnosis_report(d: Diagnosis) -> Iterator[Block]:
             "--effects-from FILE.py tries it."
         )
     if d.pure_error is not None:
-        yield from repeats(d.pure_error)
+        yield from _repeats(d.pure_error)
     yield from redundant_line(d)
     yield from could_have_been_seen(d)
 
@@ -114,34 +133,25 @@ def finer(d: Diagnosis) -> Iterator[str]:
 
 def revisions_table(rows: Sequence[tuple[int, str, Fit, str]]) -> Table:
     """Return the table in which the error falls, from (number, change, fit, verdict)."""
-    out = table(*REVISION_HEADS, left=(0, 1, 7))
-    for row in rows:
-        out.add(*revision_cells(*row))
-    floor = numbers.length(full_prediction(rows[-1][2]).noise_floor)
+    out = table(*REVISION_HEADS, rows=(revision_cells(*row) for row in rows), left=(0, 1, 7))
+    floor = length(full_prediction(rows[-1][2]).noise_floor)
     out.add("", "noise alone", floor, "1.00", floor, "1.00", "1", "", tone="note")
     return out
 
 
 def revision_cells(number: int, change: str, fit: Fit, verdict: str) -> tuple[str, ...]:
     """Return the cells of a revision in `revisions_table`."""
-    return (
-        str(number),
-        change or model_name(fit.model.named),
-        numbers.length(fit.error.rms_m),
-        f"{fit.error.rms_sigma:.2f}",
-        numbers.length(fit.holdout.rms_m),
-        f"{fit.holdout.rms_sigma:.2f}",
-        numbers.digits(fit.variance_factor),
-        verdict.replace("_", " "),
-    )
+    errors = (x for e in (fit.error, fit.holdout) for x in (length(e.rms_m), f"{e.rms_sigma:.2f}"))
+    model = change or model_name(fit.model.named)
+    factor = numbers.digits(fit.variance_factor)
+    return str(number), model, *errors, factor, verdict.replace("_", " ")
 
 
 def key(readings: Readings) -> Words:
     """Return what the columns of `revisions_table` are."""
-    what = error_words(readings)
     return note(
-        f"Errors: rms of the {what}, and of all elements in σ, one standard deviation of the "
-        "noise.\n"
+        f"Errors: rms of the {error_words(readings)}, and of all elements in σ, one standard "
+        "deviation of the noise.\n"
     )
 
 
@@ -158,27 +168,23 @@ def fell(before: Fit, after: Fit, effect: str) -> str:
 
 def rose(before: Fit, after: Fit, effect: str) -> str:
     """Say what taking an effect out did to the error on poses left out."""
-    change = f"the error on poses left out {{}} {_from_to(before, after)}"
-    if predicts_better(after, before):
-        return f"Without {effect} {change.format('rises')}: it belongs there."
-    return f"Without {effect} {change.format('goes')}: it is not needed."
+    needed = predicts_better(after, before)
+    verb, end = ("rises", "it belongs there") if needed else ("goes", "it is not needed")
+    change = _from_to(before, after)
+    return f"Without {effect} the error on poses left out {verb} {change}: {end}."
 
 
 def _from_to(before: Fit, after: Fit) -> str:
-    a, b = (numbers.length(f.holdout.rms_m) for f in (before, after))
-    return f"from {a} to {b}"
+    return f"from {length(before.holdout.rms_m)} to {length(after.holdout.rms_m)}"
 
 
 def could_have_been_seen(d: Diagnosis) -> Iterator[Block]:
     """Yield the table of effects that were not found, the best visible first."""
     rest = [s for s in d.suspects if not s.passes]
-    seen = sorted((s for s in rest if s.shown), key=lambda s: s.least.displacement_m)
-    hidden = d.not_shown
-    if seen:
-        rows = [
-            (s.effect, numbers.length(s.least.displacement_m), numbers.sizes(s.least.parameters))
-            for s in seen
-        ]
+    visible = sorted((s for s in rest if s.shown), key=lambda s: s.least.displacement_m)
+    if visible:
+        least = [(s.effect, s.least) for s in visible]
+        rows = [(e, length(x.displacement_m), numbers.sizes(x.parameters)) for e, x in least]
         heads = ("not found", "would be seen from", "its parameters, rms")
         yield from ("", table(*heads, rows=rows, left=(0, 2)))
         yield note(
@@ -186,11 +192,10 @@ def could_have_been_seen(d: Diagnosis) -> Iterator[Block]:
             "one in ten would name the effect; rms of the parameters that make it.\n"
         )
     for s in rest:
-        if s.least.finest_m is not None:
-            much = numbers.length(s.least.finest_m)
-            when = f"from {much}" if np.isfinite(s.least.finest_m) else "at no size"
+        if (finest := s.least.finest_m) is not None:
+            when = f"from {length(finest)}" if np.isfinite(finest) else "at no size"
             yield f"A {s.effect} finer than these poses resolve would be seen {when}.\n"
-    if hidden:
+    if hidden := d.not_shown:
         yield f"At no plausible size would these readings show {numbers.names(hidden, 'or')}.\n"
 
 
@@ -206,21 +211,14 @@ def doubtful(d: Diagnosis) -> Iterator[str]:
 def redundant_line(d: Diagnosis) -> Iterator[str]:
     """Yield a sentence on effects of the model without which the readings are explained as well."""
     if d.redundant:
-        names = ", ".join(d.redundant)
         it = "it" if len(d.redundant) == 1 else "them"
         yield (
-            f"These readings are explained as well without {names}; to remove {it}: "
-            f"hilcal remove RUN {d.redundant[0]}."
+            f"These readings are explained as well without {', '.join(d.redundant)}; to remove "
+            f"{it}: hilcal remove RUN {d.redundant[0]}."
         )
 
 
-NEAR = 0.99
-"""Component from which a direction is called an axis; a choice."""
-BARS = "▁▂▃▄▅▆▇█"
-CURVES = 2
-
-
-def repeats(e: PureError) -> Iterator[str]:
+def _repeats(e: PureError) -> Iterator[str]:
     """Yield the scatter of repeated readings, and where it differs most from what is stated."""
     yield (
         f"Repeated readings scatter {e.factor**0.5:.2f} times as much as stated "
@@ -241,12 +239,13 @@ def curves(dependences: Sequence[Dependence], most: int = CURVES) -> Iterator[Bl
     """
     carrying = [d for d in dependences if d.share >= LEAST_SHARE][:most]
     for d in carrying:
-        told = f"{d.variable} carries {numbers.percent(d.share)}"
+        carries = f"{d.variable} carries {percent(d.share)}"
         if d.determined:
-            yield f"{told}; {moves(d)} errs by:"
-            yield from (curve_table(d), "")
+            yield f"{carries}; {moves(d)} errs by:"
+            head = f"{d.variable} [{d.unit}]" if d.unit else d.variable
+            yield from (_binned((head, "error"), d.y_unit, (d.x, d.y, d.error), d.labels), "")
         else:
-            yield f"{told}, but these readings do not determine its curve."
+            yield f"{carries}, but these readings do not determine its curve."
     if any(d.determined for d in carrying):
         yield note("±: standard uncertainty; the mean over the bins is taken as zero.")
 
@@ -262,20 +261,7 @@ def moves(d: Dependence) -> str:
     return f"the {d.moves} along ({along}) in base axes"
 
 
-def sparkline(values: Sequence[float]) -> str:
-    """Draw values as bars, the smallest the lowest."""
-    low, high = min(values), max(values)
-    size = (high - low) or 1.0
-    return "".join(BARS[round((v - low) / size * (len(BARS) - 1))] for v in values)
-
-
-def curve_table(d: Dependence) -> Table:
-    """Return the table of a dependence."""
-    head = f"{d.variable} [{d.unit}]" if d.unit else d.variable
-    return binned_table((head, "error"), d.y_unit, (d.x, d.y, d.error), d.labels)
-
-
-def binned_table(
+def _binned(
     heads: tuple[str, str],
     unit_of: str,
     bins: tuple[Floats, Floats, Floats],
@@ -293,7 +279,8 @@ def binned_table(
     """
     x, y, error = bins
     unit, factor = numbers.unit_for(unit_of, list(y))
-    bars = f"{heads[1]} [{unit}] {sparkline(list(y))}"
+    height = (y - y.min()) / ((y.max() - y.min()) or 1.0) * (len(BARS) - 1)
+    bars = f"{heads[1]} [{unit}] {''.join(BARS[round(h)] for h in height.tolist())}"
     out = table(heads[0], bars, "±", *(() if law is None else ("law",)))
     for k in range(len(x)):
         value, spread = numbers.with_std(factor * float(y[k]), factor * float(error[k]))
@@ -303,27 +290,15 @@ def binned_table(
     return out
 
 
-COMPARED = 24
-"""Parameters that are compared with the true ones."""
-NEWCOMER = f"""\
-The lines that follow are those of a real run: what the arm does, and each reading with its pose,
-load and cycle. It begins beside the reference pose, so that every joint arrives there from a known
-side. From {LEAST} poses on, a first model predicts each reading before it counts: the residual is
-how far it misses. While it is fitted to few poses, and lacks what is hidden, that is a lot."""
-
-
 def step_report(number: int, change: str, d: Diagnosis) -> Iterator[Block]:
     """Yield what one revision shows: how far off, where, and which effect would explain it."""
-    name = change or model_name(d.fit.model.named)
-    yield heading(f"Revision {number}: {name}")
+    yield heading(f"Revision {number}: {change or model_name(d.fit.model.named)}")
     yield misses(d.fit)
     if d.verdict != "adequate":
         yield follows(d.misfit_breakdown)
     if d.significant:
-        yield ""
-        yield suspects_table(d)
-    yield numbers.sentence(message(d), d.fit.model.catalogue.names)
-    yield ""
+        yield from ("", suspects_table(d))
+    yield from (numbers.sentence(message(d), d.fit.model.catalogue.names), "")
 
 
 @dataclass(frozen=True, slots=True)
@@ -338,16 +313,15 @@ class Compared:
 
 
 def compared(fit: Fit, truth: Mapping[str, float]) -> list[Compared]:
-    """Identifiable parameters that have a true value."""
+    """Identifiable parameters that have a true value, but for those that are shrunk on purpose."""
     rows = []
     for effect, s in zip(fit.model.effects, fit.model.slices(), strict=True):
-        if effect.groups() is not None:
-            continue  # shrunk on purpose
         for k, p in zip(range(s.start, s.stop), effect.parameters, strict=True):
-            true = truth.get(f"{effect.name}.{p.name}")
-            if true is not None and fit.uncertainty.identifiable[k]:
+            name = f"{effect.name}.{p.name}"
+            known = name in truth and effect.groups() is None
+            if known and fit.uncertainty.identifiable[k]:
                 value, std = float(fit.theta[k]), float(fit.uncertainty.std[k])
-                rows.append(Compared(f"{effect.name}.{p.name}", true, value, std, p.unit))
+                rows.append(Compared(name, truth[name], value, std, p.unit))
     return rows
 
 
@@ -356,11 +330,142 @@ def truth_table(rows: Sequence[Compared]) -> Iterator[Block]:
     out = table("parameter", "true", "found", "±", "unit", "off by", left=(0, 4))
     for r in rows[:COMPARED]:
         unit, factor = numbers.unit_for(r.unit, [r.true, r.value])
-        found, spread = numbers.with_std(factor * r.value, factor * r.std)
-        places = len(found.partition(".")[2])
+        value, spread = numbers.with_std(factor * r.value, factor * r.std)
+        places = len(value.partition(".")[2])
         off = f"{abs(r.value - r.true) / r.std:.1f} ±" if r.std > 0 else ""
-        out.add(r.name, f"{factor * r.true:.{places}f}", found, spread, unit, off)
+        out.add(r.name, f"{factor * r.true:.{places}f}", value, spread, unit, off)
     yield out
     if len(rows) > COMPARED:
         yield f"... and {len(rows) - COMPARED} more"
     yield note("±: standard uncertainty; off by: the error in units of it.\n")
+
+
+def discovery_report(d: Discovery) -> Iterator[Block]:
+    """Yield what was found, or why nothing is proposed."""
+    yield heading(f"Laws for what {model_name(d.fit.model.named)} leaves unexplained")
+    if not d.laws:
+        yield numbers.sentence(silence(d))
+        yield from curves(d.carried)
+        return
+    yield (
+        f"{d.candidates} candidates were tried. Searched for without them, laws explain "
+        f"{percent(d.searched_share)} of the misfit on poses left out."
+    )
+    for k, law in enumerate(d.laws):
+        yield ""
+        yield from _law(law, d, first=k == 0)
+        for c in d.curves if k == 0 else ():
+            yield from _drawn(c)
+    yield from ("", _structures(d.structures))
+    moved, std = map(length, d.average_m())
+    yield (
+        f"Averaged over them by their probability, laws move the readings by {moved} rms; what is "
+        f"then predicted has a standard uncertainty of {std}, the choice of the law included."
+    )
+    for what, why in (*d.refused, *d.unfitted):
+        yield f"{what} {NOT_TRIED} ({why})."
+
+
+def silence(d: Discovery) -> str:
+    """Say why no law is proposed, and what could not be tried."""
+    return _silence(d) + "".join(f"; {e} {NOT_TRIED} ({why})" for e, why in d.unfitted)
+
+
+def _silence(d: Discovery) -> str:
+    tried = f"{d.candidates} candidates were tried"
+    if d.reason == "adequate":
+        return (
+            f"no law: the stated noise explains the residual (variance factor "
+            f"{d.fit.variance_factor:.2f}), so there is nothing to explain"
+        )
+    if d.reason == "catalogue":
+        return (
+            f"no law: {tried}, and none explains the misfit better than effects of the catalogue "
+            f"do ({numbers.names(d.catalogue)}); hilcal refine adds them"
+        )
+    if d.refused:
+        law, why = d.refused[0]
+        return (
+            f"no law is proposed: {tried}; {law} predicts {percent(d.searched_share)} of "
+            f"the misfit on poses left out, but the exact model cannot be fitted with it ({why})"
+        )
+    if d.reason != "no_law":
+        return f"no law: {tried}, and nothing recorded predicts the misfit on poses left out"
+    helps = "measure more poses, or record what else may matter"
+    if any(c.variable == ROW_ORDER for c in d.carried[:1]):
+        helps = (
+            "it depends mostly on the order of the readings, whose times are missing: without "
+            "them no law of time can be searched, so add them"
+        )
+    return (
+        f"no law: {percent(d.attainable)} of the misfit is predictable on poses left out, but "
+        f"{tried}, and no law of this size predicts it; {helps}"
+    )
+
+
+def _law(law: Law, d: Discovery, first: bool) -> Iterator[Block]:
+    yield Words(law.formula, "good" if first else "strong")
+    yield f"  acts on      {', '.join(law.acts_on)}"
+    yield f"  depends on   {', '.join(law.variables) or 'nothing: a constant'}"
+    for c in law.parameters:
+        yield f"  {c.name:<12} {coefficient(c)}"
+    share = f"{percent(law.holdout_share)} of the misfit on poses left out"
+    if d.attainable > 0:
+        share += f", {percent(min(law.holdout_share / d.attainable, 1.0))} of what can be"
+    yield f"  explains     {share}"
+    yield f"  left         variance factor {law.left:.2f}, before {d.fit.variance_factor:.2f}"
+    yield f"  chance       {numbers.p_equals(law.p_value)}, the search paid for"
+    yield "  found again  in the searches without some poses:"
+    for a in law.again:
+        causes = f" by {', '.join(a.variables)}" if a.variables else ""
+        yield f"    {a.acts_on}{causes}: {percent(a.share)}"
+    if near := [f"{r.effect} (cosine {r.cosine:.2f})" for r in law.resembles[:FEW]]:
+        yield f"  resembles    {', '.join(near)}"
+    ranges = [
+        f"{symbol} {numbers.digits(low)} to {numbers.digits(high)}{'' if u == '1' else f' {u}'}"
+        for symbol, low, high, u in law.ranges
+    ]
+    if ranges:
+        yield f"  seen for     {', '.join(ranges)}; nothing is known outside"
+
+
+def _structures(of: Sequence[Structure]) -> Table:
+    """Return the likely laws: probability, complexity, share on poses left out."""
+    best = pareto(of)
+    rows = table("law", "probability", "complexity", "on poses left out", "")
+    for x in of:
+        remarks = [x.law or "", "best of its size" if x in best else ""]
+        chance = percent(x.probability) if x.probability >= RARE else f"< {100 * RARE:g} %"
+        sizes = chance, str(x.form.complexity), percent(x.holdout_share)
+        rows.add(x.form.text(), *sizes, ", ".join(filter(None, remarks)))
+    return rows
+
+
+def _drawn(c: Curve) -> Iterator[Block]:
+    """Yield the law over a quantity beside the mean of the readings there."""
+    x, y, std, _ = c.binned
+    if len(x) >= LEAST_BINS:
+        head = c.quantity if c.quantity_unit == "1" else f"{c.quantity} [{c.quantity_unit}]"
+        yield from ("", _binned((head, c.of), c.unit, (x, y, std), law=np.interp(x, *c.line)))
+
+
+def coefficient(c: Coefficient) -> str:
+    """Write a coefficient with its standard uncertainty, in a unit for people."""
+    value, std, unit = numbers.measured(c.unit, c.value, c.std)
+    return f"{value} ± {std} {'' if unit == '1' else unit}".rstrip()
+
+
+def refined_laws(s: LawSearch) -> Iterator[Block]:
+    """Yield what the searches of a refinement came to: laws that stayed, or why there is none."""
+    for d in s.found:
+        if not d.laws:
+            yield numbers.sentence(silence(d))
+        elif (law := d.laws[0]).name not in s.files:
+            yield f"{law.formula} was tried, and did not lower the error on poses left out."
+        else:
+            yield heading(f"{law.name}: a law that the catalogue does not have")
+            yield from _law(law, d, first=True)
+            yield (
+                f"It is the effect {law.name} in {s.files[law.name]}, to be edited; commands that "
+                "read these revisions take it by --effects-from.\n"
+            )

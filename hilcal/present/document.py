@@ -1,82 +1,82 @@
 """What a result says: words, tables and charts, made once; terminal, page and viewer render them.
 
 A builder yields blocks from the values of the library (`fit_report(fit)`); rich prints them,
-`html.page` and `viewer.style.markdown` write them down. A plain string is a paragraph, and its ends
-of lines are for the terminal.
+`html.fragment` and `viewer.style.markdown` write them down. A plain string is a paragraph, and its
+ends of lines are for the terminal.
 """
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal, Self
+from typing import TYPE_CHECKING, Literal
+
+from rich import box
+from rich.cells import cell_len
+from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
+from rich.padding import Padding
+from rich.table import Table as RichTable
+from rich.text import Text
 
 from hilcal.store.plan import UNLOADED
 
 if TYPE_CHECKING:
     import plotly.graph_objects as go
-    from rich.console import RenderableType
 
 Tone = Literal["text", "heading", "note", "strong", "code", "good", "doubt"]
-
-
-class Printable:
-    """What rich prints as it is."""
-
-    def __rich__(self) -> "RenderableType":
-        """Return it as rich prints it."""
-        from hilcal.present.terminal import rendered
-
-        return rendered(self)
+STYLES: dict[Tone, str] = {
+    "text": "",
+    "heading": "bold",
+    "note": "dim",
+    "strong": "bold",
+    "code": "",
+    "good": "bold green",
+    "doubt": "bold yellow",
+}
+GAPS = (3, 2)
+"""Blanks between two columns on a terminal: the wider where there is room."""
 
 
 @dataclass(frozen=True, slots=True)
-class Words(Printable):
-    """A paragraph.
-
-    Attributes:
-        text: it.
-        tone: "note" is small or dim; "good" and "doubt" are verdicts.
-        stressed: the part of the text that has the tone; all of it where empty.
-        indent: blanks in front of each of its lines.
-    """
+class Words:
+    """A paragraph; `stressed` is the part of the text that has the tone, all of it where empty."""
 
     text: str
     tone: Tone = "text"
     stressed: str = ""
-    indent: int = 0
+    indent: int = 0  # blanks in front of each of its lines
 
     def __str__(self) -> str:
         """Return the text."""
         return self.text
 
+    def __rich__(self) -> RenderableType:
+        """Return it as rich prints it."""
+        text, start = Text(self.text), self.text.find(self.stressed)
+        text.stylize(STYLES[self.tone], start, start + len(self.stressed or self.text))
+        return Padding(text, (0, 0, 0, self.indent)) if self.indent else text
+
 
 @dataclass(frozen=True, slots=True)
-class Items(Printable):
+class Items:
     """A list."""
 
     rows: tuple[str, ...]
 
+    def __rich__(self) -> RenderableType:
+        """Return it as rich prints it."""
+        return "\n".join(f"- {row}" for row in self.rows)
+
 
 @dataclass(frozen=True, slots=True)
-class Table(Printable):
-    """A table that is filled row by row; the first cell of each row is its header.
+class Table:
+    """A table that is filled row by row; the first cell of each row is its header."""
 
-    Attributes:
-        heads: of the columns; all empty for pairs of a name and what is said of it.
-        rows: cells as text.
-        left: columns of words, which stand to the left; numbers stand to the right.
-        caption: what it shows, where no heading above says it.
-        narrow: whether it stands beside another one where the page is wide.
-        tones: of rows that are not plain, by index.
-        ruled: indices of rows with a rule above.
-    """
-
-    heads: tuple[str, ...]
+    heads: tuple[str, ...]  # all empty for pairs of a name and what is said of it
     rows: list[tuple[str, ...]] = field(default_factory=list)
-    left: tuple[int, ...] = (0,)
-    caption: str = ""
-    narrow: bool = False
-    tones: dict[int, Tone] = field(default_factory=dict)
-    ruled: set[int] = field(default_factory=set)
+    left: tuple[int, ...] = (0,)  # columns of words, which stand to the left, numbers to the right
+    caption: str = ""  # what it shows, where no heading above says it
+    narrow: bool = False  # whether it stands beside another one where the page is wide
+    tones: dict[int, Tone] = field(default_factory=dict)  # of rows that are not plain
+    ruled: set[int] = field(default_factory=set)  # rows with a rule above
 
     def add(self, *cells: str, tone: Tone = "text") -> None:
         """Append a row."""
@@ -88,14 +88,20 @@ class Table(Printable):
         """Draw a rule below the rows so far."""
         self.ruled.add(len(self.rows))
 
-    def filled(self, rows: Iterable[Sequence[str]]) -> Self:
-        """Append rows, and return the table."""
-        self.rows.extend(tuple(row) for row in rows)
-        return self
+    def __rich__(self) -> RenderableType:
+        """Return it as rich prints it."""
+        if any(self.heads):
+            return WordTable(self)
+        out = RichTable.grid(padding=(0, 2), pad_edge=False)
+        out.add_column(no_wrap=True)
+        out.add_column(overflow="fold")
+        for what, said in self.rows:
+            out.add_row(Text(f"  {what}"), Text(said))
+        return out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Chart(Printable):
+class Chart:
     """A figure of plotly with its title; `wide`: it takes the whole width of a page.
 
     `height` is in CSS pixels, 0 for the figure's own: three rows of 230 are a printed page.
@@ -105,6 +111,10 @@ class Chart(Printable):
     figure: "go.Figure"
     wide: bool = False
     height: int = 230
+
+    def __rich__(self) -> RenderableType:
+        """Return the sentence that it shows."""
+        return says(self.figure)
 
 
 Block = str | Words | Items | Table | Chart
@@ -117,6 +127,11 @@ class PageSection:
     id: str
     title: str
     blocks: tuple[Block, ...]
+
+
+def says(figure: "go.Figure") -> str:
+    """Return the sentence that a chart shows, for those who do not see it."""
+    return str((figure.layout.meta or {}).get("says", ""))
 
 
 def load_name(name: str, under: str = "") -> str:
@@ -141,7 +156,7 @@ def table(
     caption: str = "",
 ) -> Table:
     """Return a table with some rows."""
-    return Table(heads, left=tuple(left), caption=caption).filled(rows)
+    return Table(heads, [tuple(row) for row in rows], tuple(left), caption)
 
 
 def pairs(rows: Iterable[Sequence[str]]) -> Table:
@@ -159,21 +174,83 @@ def captioned(blocks: Iterable[Block], caption: str = "") -> tuple[Block, ...]:
     used: set[str] = set()
     for block in blocks:
         if isinstance(block, str | Words):
-            of = block if isinstance(block, Words) else Words(block)
-            lines = (line.strip() for line in of.text.split("\n"))
-            out += [replace(of, text=line) for line in lines if line]
+            words = block if isinstance(block, Words) else Words(block)
+            lines = (line.strip() for line in words.text.split("\n"))
+            out += [replace(words, text=line) for line in lines if line]
             continue
         if isinstance(block, Table):
-            above, found = out[-1] if out else None, block.caption
-            titled = isinstance(above, Words) and above.tone == "heading"
-            if not found and isinstance(above, Words) and titled and not above.text.endswith("."):
-                out.pop()
-                found = above.text
-            found = found or caption or block.heads[0]
-            if found in used:
-                found = f"{found}: {block.heads[0]}"
-            used.add(found)
+            above, title = out[-1] if out else None, block.caption
+            headed = isinstance(above, Words) and above.tone == "heading"
+            if not title and headed and not str(above).endswith("."):
+                title = str(out.pop())
+            title = title or caption or block.heads[0]
+            if title in used:
+                title = f"{title}: {block.heads[0]}"
+            used.add(title)
             heads = tuple(" ".join(head.split()) for head in block.heads)
-            block = replace(block, caption=found, heads=heads)
+            block = replace(block, caption=title, heads=heads)
         out.append(block)
     return tuple(out)
+
+
+class WordTable(RichTable):
+    """Columns as wide as they want to be; where there is less room, lines break between words.
+
+    Columns of words (to the left) are narrowed down to their longest word, columns of numbers down
+    to their longest cell. Where even that does not fit, each row becomes a short list of its cells,
+    headed by the first one.
+    """
+
+    def __init__(self, of: Table) -> None:
+        """Take a table over."""
+        super().__init__(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
+        self._of = of
+        for k, name in enumerate(of.heads):
+            self.add_column(name, justify="left" if k in of.left else "right", overflow="fold")
+        for k, row in enumerate(of.rows):
+            if k in of.ruled and k:
+                self.add_section()
+            self.add_row(*row, style=STYLES[of.tones.get(k, "text")])
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Choose the widths for the room that there is."""
+        least, wanted = [], []
+        for k, (head, *cells) in enumerate(zip(self._of.heads, *self._of.rows, strict=True)):
+            words = [word for cell in cells for word in cell.split()]
+            whole = words if k in self._of.left else cells  # what must not be broken
+            least.append(_longest(*head.split(), *whole))
+            wanted.append(max(least[-1], _longest(head, *cells)))
+        for gap in GAPS:
+            room = options.max_width - gap * (len(wanted) - 1)
+            if sum(wanted) <= room or (gap == GAPS[-1] and sum(least) <= room):
+                self.padding = (0, 1, 0, gap - 2)  # one more blank is the column's edge
+                for column, width in zip(self.columns, shared(least, wanted, room), strict=True):
+                    column.width = width
+                yield from super().__rich_console__(console, options)
+                return
+        yield from self._lists()
+
+    def _lists(self) -> RenderResult:
+        heads = [" ".join(head.split()) for head in self._of.heads]
+        for row in self._of.rows:
+            cells = [" ".join(cell.split()) for cell in row]
+            first = next((k for k, cell in enumerate(cells) if cell), 0)
+            yield Text(f"{heads[first]} {cells[first]}".strip(), style="bold")
+            for head, cell in list(zip(heads, cells, strict=True))[first + 1 :]:
+                if cell:
+                    yield Padding(Text(f"{head}: {cell}" if head else cell), (0, 0, 0, 2))
+
+
+def shared(least: Sequence[int], wanted: Sequence[int], room: int) -> list[int]:
+    """Share a width, at least that of `least`: each column what it wants, or as much above that."""
+    level = max(t for t in range(room + 1) if sum(map(min, wanted, (x + t for x in least))) <= room)
+    out = [max(x, min(w, x + level)) for x, w in zip(least, wanted, strict=True)]
+    for k, most in enumerate(wanted):
+        if out[k] < most and sum(out) < room:
+            out[k] += 1
+    return out
+
+
+def _longest(*cells: str) -> int:
+    """Return the width of the longest line, at least 1."""
+    return max((cell_len(line) for cell in cells for line in cell.split("\n")), default=1)

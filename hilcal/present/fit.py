@@ -10,15 +10,19 @@ from hilcal.diagnosis.effect_ranking import FALSE_ALARM, LEAST_SHARE
 from hilcal.diagnosis.misfit_breakdown import Group, MisfitShare
 from hilcal.effects.protocol import FRAME_ROLES, Effect
 from hilcal.identification.background import background_of
-from hilcal.identification.carried import DriftGroup as CarriedGroup
+from hilcal.identification.baseline import masses_note
+from hilcal.identification.carried import DriftGroup
 from hilcal.identification.fit import Fit
 from hilcal.identification.fit_document import notes
-from hilcal.identification.full_prediction import FullPrediction, error_before, full_prediction
-from hilcal.identification.gross_errors import gross_errors
-from hilcal.identification.missing_masses import masses_note
-from hilcal.identification.posterior_of_fit import of_arm
+from hilcal.identification.full_prediction import (
+    FullPrediction,
+    error_before,
+    full_prediction,
+    gross_errors,
+)
+from hilcal.identification.predictive import of_arm
 from hilcal.identification.residual import ErrorBlock
-from hilcal.numbers import names
+from hilcal.numbers import length, percent
 from hilcal.present.document import Block, Table, heading, note, table
 from hilcal.present.registration import fitted_lines
 from hilcal.present.verdict import correlated, sigmas
@@ -31,9 +35,7 @@ ALL_ROWS = 60
 SCREEN = 6
 """Parameters on the first screen."""
 PARAMETER_COLUMNS = ("parameter", "value", "±", "unit", "meaning")
-STRONGEST = 5
-DIRECTIONS = 8
-GROSS = 8
+STRONGEST, DIRECTIONS, GROSS, MOST_LISTED = 5, 8, 8, 6
 POSE = "pose"
 GROUPS: dict[Group, str] = {
     "joints": "{}",
@@ -44,6 +46,9 @@ GROUPS: dict[Group, str] = {
 }
 """Groups of the table of variables in their order, and how a row of each is called."""
 CERTAIN = 0.005
+TELL_P = 1e-3
+"""p-value, times the number of groups that are looked at, below which a disagreement is told."""
+MOST_TOLD = 5
 
 
 def model_name(names: Sequence[str]) -> str:
@@ -64,36 +69,36 @@ def fit_report(fit: Fit, details: bool = True) -> Iterator[Block]:
     yield f"Fitted to {kind(fit)}; scaling {fit.scaling}."
     yield f"{before_and_after(fit)}\n"
     yield from parameters(fit, ALL_ROWS if details else SCREEN)
-    yield errors(fit)
-    yield ""
-    yield from remarks(fit) if details else _short(fit)
-
-
-def _short(fit: Fit) -> Iterator[str]:
-    """Yield the remarks of the first screen."""
+    yield from (errors(fit), "")
+    if details:
+        yield from remarks(fit)
+        return
     yield _variance_factor(fit)
     if null := [str(d) for d in fit.uncertainty.null]:
         several = f"{len(null)} directions" if len(null) > 1 else "1 direction"
         yield f"{several} cannot be seen in these readings: {numbers.few(null, 1)}."
     yield from set_aside(fit, details=False)
-    if (weight := masses_note(fit)) is not None:
-        yield numbers.sentence(weight)
+    if (masses := masses_note(fit)) is not None:
+        yield numbers.sentence(masses)
     yield from list(fitted_lines(fit))[:1]
 
 
 def set_aside(fit: Fit, details: bool) -> Iterator[str]:
     """Yield how many readings were set aside, which are in no error of a fit, or which."""
-    gross = gross_errors(fit)
-    if not gross:
+    if not (gross := gross_errors(fit)):
         return
     were = f"{len(gross)} readings are" if len(gross) > 1 else "1 reading is"
-    told = f"{were} set aside as gross error{'s' * (len(gross) > 1)}, and in none of these figures"
-    yield f"{told} (pose/load):" if details else f"{told}; --details lists them."
-    if not details:
-        return
-    yield from (f"  {g.pose}/{g.load}: {g.reason}" for g in gross[:GROSS])
-    if len(gross) > GROSS:
-        yield f"  ... and {len(gross) - GROSS} more; --json lists all"
+    words = f"{were} set aside as gross error{'s' * (len(gross) > 1)}, and in none of these figures"
+    yield f"{words} (pose/load):" if details else f"{words}; --details lists them."
+    if details:
+        yield from _listed([f"  {g.pose}/{g.load}: {g.reason}" for g in gross], GROSS)
+
+
+def _listed(lines: Sequence[str], most: int) -> Iterator[str]:
+    """Yield the first lines, and how many more there are."""
+    yield from lines[:most]
+    if len(lines) > most:
+        yield f"  ... and {len(lines) - most} more; --json lists all"
 
 
 def parameters(fit: Fit, most: int = ALL_ROWS, where: str = "--details") -> Iterator[Block]:
@@ -104,23 +109,32 @@ def parameters(fit: Fit, most: int = ALL_ROWS, where: str = "--details") -> Iter
     rows: list[tuple[str, ...]] = []
     frames: list[tuple[str, ...]] = []
     families, unseen = [], []
-    seen = fit.uncertainty.identifiable
     for effect, s in zip(fit.model.effects, fit.model.slices(), strict=True):
         if effect.name in fit.model.background:
             continue
         index = np.arange(s.start, s.stop)
         if effect.groups() is not None or len(index) > ALL_ROWS:
-            families.append(family(fit, effect, index))
-        else:
-            of = frames if effect.role in FRAME_ROLES else rows
-            of += _parameter_rows(fit, effect, index)
-            left = [p.name for k, p in zip(index, effect.parameters, strict=True) if not seen[k]]
-            if left:
-                unseen.append(f"{effect.name} {_which(left, len(index))}")
+            families.append(_family(fit, effect, index))
+            continue
+        of = frames if effect.role in FRAME_ROLES else rows
+        known, theta = fit.uncertainty.identifiable[index], fit.theta[index]
+        std = fit.uncertainty.std[index].tolist()
+        units = np.array([p.unit for p in effect.parameters])
+        for k, p in enumerate(effect.parameters):
+            if known[k]:
+                alike = theta[known & (units == p.unit)].tolist()
+                shown = numbers.measured(p.unit, float(theta[k]), std[k], alike)
+                of.append((f"{effect.name}.{p.name}", *shown, p.meaning))
+        left = [p.name for k, p in zip(known, effect.parameters, strict=True) if not k]
+        if left:
+            which = " ".join(left)
+            if len(left) > 6:
+                which = f"({f'{len(left)} of {len(index)}' if known.any() else 'none of it'})"
+            unseen.append(f"{effect.name} {which}")
     rest = len(frames) + len(rows) - most
     if frames or rows:
-        shown = [*frames, *rows] if rest <= 0 else [*rows, *frames][:most]
-        yield table(*PARAMETER_COLUMNS, rows=shown, left=(0, 3, 4))
+        shown_rows = [*frames, *rows] if rest <= 0 else [*rows, *frames][:most]
+        yield table(*PARAMETER_COLUMNS, rows=shown_rows, left=(0, 3, 4))
         more = f"{rest} more parameters: {where}. " if rest > 0 else ""
         yield note(f"{more}±: standard uncertainty.\n")
     yield from families
@@ -128,40 +142,23 @@ def parameters(fit: Fit, most: int = ALL_ROWS, where: str = "--details") -> Iter
         yield f"Not determined by these readings: {'; '.join(unseen)}.\n"
 
 
-def _which(names: Sequence[str], count: int) -> str:
-    if len(names) == count:
-        return "(none of it)" if count > 6 else " ".join(names)
-    return " ".join(names) if len(names) <= 6 else f"({len(names)} of {count})"
-
-
-def _parameter_rows(fit: Fit, effect: Effect, index: Ints) -> Iterator[tuple[str, ...]]:
-    seen, theta = fit.uncertainty.identifiable[index], fit.theta[index]
-    units = np.array([p.unit for p in effect.parameters])
-    for k, p in enumerate(effect.parameters):
-        if seen[k]:
-            alike = theta[seen & (units == p.unit)].tolist()
-            std = float(fit.uncertainty.std[index[k]])
-            shown = numbers.measured(p.unit, float(theta[k]), std, alike)
-            yield f"{effect.name}.{p.name}", *shown, p.meaning
-
-
-def family(fit: Fit, effect: Effect, index: Ints) -> str:
+def _family(fit: Fit, effect: Effect, index: Ints) -> str:
     """Summarise a family of hundreds of parameters."""
     theta, live = fit.theta[index], fit.solution.estimated[index]
     units = {p.unit for p in effect.parameters}
     unit, factor = numbers.unit_for(units.pop(), list(theta)) if len(units) == 1 else ("", 1.0)
-    rest = "." if live.all() else ", the rest are zero."
     joints: dict[str, float] = {}
     for value, p in zip(theta, effect.parameters, strict=True):
         head = p.name.split(".")[0]
         joints[head] = joints.get(head, 0.0) + float(value) ** 2 / 2
     rms = ", ".join(f"{j} {numbers.digits(factor * v**0.5)}" for j, v in joints.items())
-    strongest = np.argsort(-np.abs(theta), kind="stable")[:STRONGEST]
     named = ", ".join(
-        f"{effect.parameters[k].name} {numbers.digits(factor * float(theta[k]))}" for k in strongest
+        f"{effect.parameters[k].name} {numbers.digits(factor * float(theta[k]))}"
+        for k in np.argsort(-np.abs(theta), kind="stable")[:STRONGEST]
     )
     return (
-        f"{effect.name}: {int(live.sum())} of {len(index)} parameters kept{rest}\n"
+        f"{effect.name}: {int(live.sum())} of {len(index)} parameters kept"
+        f"{'.' if live.all() else ', the rest are zero.'}\n"
         f"  rms over a turn [{unit}]: {rms}\n  strongest [{unit}]: {named}\n"
     )
 
@@ -186,24 +183,20 @@ def _errors(
 ) -> Table:
     out = table(what, "rms", "mean", "largest", "rms in σ")
     for name, e in of.items():
-        lengths = (numbers.length(x) for x in (e.rms_m, e.mean_m, e.max_m))
-        out.add(name, *lengths, f"{e.rms_sigma:.2f}")
-    out.add("noise alone", numbers.length(floor_m), "", "", "1.00")
+        out.add(name, *map(length, (e.rms_m, e.mean_m, e.max_m)), f"{e.rms_sigma:.2f}")
+    out.add("noise alone", length(floor_m), "", "", "1.00")
     return out
 
 
 def before_and_after(fit: Fit) -> str:
     """Say in a sentence what was there before, and what the model leaves."""
-    before = numbers.length(error_before(fit).rms_m)
-    floor = numbers.length(full_prediction(fit).noise_floor)
-    was = (
-        f"Deflections of {before} rms were measured"
-        if fit.mode == "deflection"
-        else f"The rigid nominal arm, its frames fitted alone, is off by {before} rms"
-    )
-    left = f"the model leaves {numbers.length(fit.error.rms_m)}"
+    before, floor = length(error_before(fit).rms_m), length(full_prediction(fit).noise_floor)
+    was = f"The rigid nominal arm, its frames fitted alone, is off by {before} rms"
+    if fit.mode == "deflection":
+        was = f"Deflections of {before} rms were measured"
+    left = f"the model leaves {length(fit.error.rms_m)}"
     if fit.model.background:  # which follows the fitted poses more closely than others
-        left = f"at poses left out the model leaves {numbers.length(fit.holdout.rms_m)}"
+        left = f"at poses left out the model leaves {length(fit.holdout.rms_m)}"
     return f"{was}; {left} (noise alone: {floor})."
 
 
@@ -215,16 +208,13 @@ def remarks(fit: Fit) -> Iterator[Block]:
         yield f"The covariance has the arm's scatter as estimated: {sigmas(scatter)}."
     if (serial := fit.readings.serial) is not None:
         yield numbers.sentence(correlated(serial))
-    yield scaling_remark(fit)
+    yield _scaling_remark(fit)
     if null := fit.uncertainty.null:
         what = "directions, parameters that move together," if len(null) > 1 else "direction"
         yield f"{len(null)} {what} cannot be seen in these readings:"
-        yield from (f"  {d}" for d in null[:DIRECTIONS])
-        if len(null) > DIRECTIONS:
-            yield f"  ... and {len(null) - DIRECTIONS} more; --json lists all"
+        yield from _listed([f"  {d}" for d in null], DIRECTIONS)
     yield from fitted_lines(fit)
-    for remark in notes(fit):
-        yield remark[0].upper() + remark[1:] + "."
+    yield from (f"{remark[0].upper()}{remark[1:]}." for remark in notes(fit))
     yield from set_aside(fit, details=True)
 
 
@@ -234,7 +224,7 @@ def background_line(fit: Fit) -> Iterator[str]:
     if behind.effects:
         yield (
             f"Background: {len(behind.effects)} effects that are not named, together "
-            f"{numbers.length(behind.rms_m)} rms; all are predicted with."
+            f"{length(behind.rms_m)} rms; all are predicted with."
         )
 
 
@@ -246,27 +236,26 @@ def _variance_factor(fit: Fit | StreamFit) -> str:
     )
 
 
-def scaling_remark(fit: Fit) -> str:
+def _scaling_remark(fit: Fit) -> str:
     """Say whether parameter scaling was needed."""
     basis = fit.solution.equations.basis
     before, after = basis.condition_unscaled, basis.condition_scaled
     if not (np.isfinite(before) and np.isfinite(after)):
         return "Condition numbers: none, the model has no free parameter."
     needed = before > 1e3 and before > 10 * after
-    need = "was needed" if needed else "made no difference that matters"
     return (
         f"Condition number {numbers.condition(before)} in physical units, "
-        f"{numbers.condition(after)} after parameter scaling: parameter scaling {need}."
+        f"{numbers.condition(after)} after parameter scaling: parameter scaling "
+        f"{'was needed' if needed else 'made no difference that matters'}."
     )
 
 
 def misses(fit: Fit) -> str:
     """Say in a sentence how far the model is from the measurements."""
-    floor = full_prediction(fit).noise_floor
-    what = measurements(fit.mode, fit.readings)
     return (
-        f"On poses left out, predicted {what} are off by {numbers.length(fit.holdout.rms_m)} rms; "
-        f"noise alone would leave {numbers.length(floor)}."
+        f"On poses left out, predicted {measurements(fit.mode, fit.readings)} are off by "
+        f"{length(fit.holdout.rms_m)} rms; noise alone would leave "
+        f"{length(full_prediction(fit).noise_floor)}."
     )
 
 
@@ -279,22 +268,22 @@ def measurements(mode: str, readings: Readings) -> str:
 
 def follows(places: Sequence[MisfitShare]) -> str:
     """Say in a sentence what the misfit follows."""
-    found = [p for p in places if p.p_value < CERTAIN and p.share > 0.05]
-    sides = [p for p in found if p.variable.startswith("direction") and p.share > 0.5]
-    same = [p for p in found if p.variable == POSE and p.share > 0.5]
-    causes = [p for p in found if p.variable != POSE and not p.variable.startswith("direction")][:3]
+    clear = [p for p in places if p.p_value < CERTAIN and p.share > 0.05]
+    sides = [p for p in clear if p.variable.startswith("direction") and p.share > 0.5]
+    same = [p for p in clear if p.variable == POSE and p.share > 0.5]
+    causes = [p for p in clear if p.variable != POSE and not p.variable.startswith("direction")][:3]
     if not causes and not sides and not same:
         return (
             "The misfit follows none of the variables: neither joints nor load, time or direction."
         )
-    named = [f"{p.variable} ({numbers.percent(p.share)})" for p in causes]
-    told = f"The misfit follows {numbers.names(named) if named else 'none of the variables'}"
+    named = numbers.names([f"{p.variable} ({percent(p.share)})" for p in causes])
+    said = f"The misfit follows {named or 'none of the variables'}"
     if sides:
         side = sides[0].variable.removeprefix("direction ")
-        told += f"; {numbers.percent(sides[0].share)} of it is {side}"
+        said += f"; {percent(sides[0].share)} of it is {side}"
     if same:
-        told += f"; {numbers.percent(same[0].share)} of it is the same under every load of a pose"
-    return f"{told}."
+        said += f"; {percent(same[0].share)} of it is the same under every load of a pose"
+    return f"{said}."
 
 
 def where_table(places: Sequence[MisfitShare]) -> Iterator[Block]:
@@ -302,17 +291,16 @@ def where_table(places: Sequence[MisfitShare]) -> Iterator[Block]:
     out = table("where the model fails", "share", "p-value")
     shown = [p for p in places if p.share >= LEAST_SHARE]
     for group, words in GROUPS.items():
-        mine = [p for p in shown if p.group == group]
         out.rule()
-        for p in mine:
-            name = p.variable.removeprefix("direction ")
-            out.add(words.format(name), numbers.percent(p.share), numbers.chance(p.p_value))
+        for p in shown:
+            if p.group == group:
+                name = words.format(p.variable.removeprefix("direction "))
+                out.add(name, percent(p.share), numbers.chance(p.p_value))
     if shown:
         yield out
     tested = [p for p in places if p.group not in ("pose", "direction")]
     tests = numbers.many_tests(len(tested), FALSE_ALARM, "variables")
-    least = numbers.percent(LEAST_SHARE)
-    rest = len([p for p in places if p.share < LEAST_SHARE])
+    rest, least = len(places) - len(shown), percent(LEAST_SHARE)
     more = f"; {rest} more {'is' if rest == 1 else 'are'} below {least}" if rest else ""
     yield note(
         "share of the misfit: what a smooth law of the variable predicts on poses left out (these "
@@ -337,35 +325,30 @@ def target_words(name: str, n_readings: int, known: bool) -> str:
     return f"{name} ({n_readings} readings, its offset {offset})"
 
 
-def worst_poses(e: FullPrediction, most: int = 6) -> list[Worst]:
+def worst_poses(e: FullPrediction, most: int = MOST_LISTED) -> list[Worst]:
     """Measurements of the poses that err most in units of the noise, worst first."""
-    distance = np.sqrt(e.mahalanobis2)
-    found: dict[str, Worst] = {}
-    for k in np.argsort(-distance, kind="stable"):
-        pose, load = e.name(int(k))
-        of = e.target_name(int(k))
-        if pose not in found:
+    distance, out = np.sqrt(e.mahalanobis2), dict[str, Worst]()
+    for k in np.argsort(-distance, kind="stable").tolist():
+        (pose, load), of = e.name(k), e.target_name(k)
+        if pose not in out and len(out) < most:
             error = float(np.linalg.norm(e.raw[k, :3]))
-            found[pose] = Worst(f"{pose} {of}" if of else pose, load, error, float(distance[k]))
-        if len(found) == most:
-            break
-    return list(found.values())
+            out[pose] = Worst(f"{pose} {of}" if of else pose, load, error, float(distance[k]))
+    return list(out.values())
 
 
 def worst_table(worst: Sequence[Worst], left_out: bool = False) -> Table:
     """Return the table of the worst poses, as fitted or as predicted without themselves."""
     title = "worst poses, each left out" if left_out else "worst poses"
-    rows = ((w.pose, w.load, numbers.length(w.error_m), f"{w.sigma:.1f}") for w in worst)
+    rows = ((w.pose, w.load, length(w.error_m), f"{w.sigma:.1f}") for w in worst)
     return table(title, "load", "error", "in σ", rows=rows, left=(0, 1))
 
 
 def scalings_table(fits: Mapping[Scaling, Fit]) -> Iterator[Block]:
     """Yield a table: parameters with standard uncertainties, errors, condition numbers."""
     yield heading("The same readings with every scaling")
-    columns = list(fits.values())
+    columns, model = list(fits.values()), next(iter(fits.values())).model
     out = table("", *fits, "unit", left=(0, len(fits) + 1))
-    first = columns[0]
-    for effect, s in zip(first.model.effects, first.model.slices(), strict=True):
+    for effect, s in zip(model.effects, model.slices(), strict=True):
         if effect.groups() is not None or s.stop - s.start > ALL_ROWS:
             continue
         for k, p in zip(range(s.start, s.stop), effect.parameters, strict=True):
@@ -376,17 +359,11 @@ def scalings_table(fits: Mapping[Scaling, Fit]) -> Iterator[Block]:
     out.rule()
     bases = [f.solution.equations.basis for f in columns]
     for name, of in (
-        ("rms error, poses fitted", [numbers.length(f.error.rms_m) for f in columns]),
-        ("rms error, poses left out", [numbers.length(f.holdout.rms_m) for f in columns]),
+        ("rms error, poses fitted", [length(f.error.rms_m) for f in columns]),
+        ("rms error, poses left out", [length(f.holdout.rms_m) for f in columns]),
         ("variance factor (of gc)", [numbers.digits(f.variance_factor) for f in columns]),
-        (
-            "condition, physical units",
-            [numbers.condition(b.condition_unscaled) for b in bases],
-        ),
-        (
-            "condition, parameters scaled",
-            [numbers.condition(b.condition_scaled) for b in bases],
-        ),
+        ("condition, physical units", [numbers.condition(b.condition_unscaled) for b in bases]),
+        ("condition, parameters scaled", [numbers.condition(b.condition_scaled) for b in bases]),
     ):
         out.add(name, *of, "")
     yield out
@@ -399,10 +376,8 @@ def scalings_table(fits: Mapping[Scaling, Fit]) -> Iterator[Block]:
 def _entry(fit: Fit, k: int, factor: float) -> str:
     if not fit.uncertainty.identifiable[k]:
         return "-"
-    value, std = numbers.with_std(
-        factor * float(fit.theta[k]), factor * float(fit.uncertainty.std[k])
-    )
-    return f"{value} ± {std}" if std else value
+    sizes = factor * float(fit.theta[k]), factor * float(fit.uncertainty.std[k])
+    return " ± ".join(filter(None, numbers.with_std(*sizes)))
 
 
 def stream_report(fit: StreamFit) -> Iterator[Block]:
@@ -416,14 +391,11 @@ def stream_report(fit: StreamFit) -> Iterator[Block]:
             unseen.append(p.name)
         else:
             out.add(p.name, *numbers.measured(p.unit, p.value, p.std), meaning[p.name])
-    yield out
-    yield note("±: standard uncertainty.\n")
+    yield from (out, note("±: standard uncertainty.\n"))
     if unseen:
         yield f"Not determined by these readings: {', '.join(unseen)}.\n"
     named = {"readings fitted": fit.error, "tenths of the stream left out": fit.holdout}
-    yield _errors(named, fit.noise_floor)
-    yield ""
-    yield _variance_factor(fit)
+    yield from (_errors(named, fit.noise_floor), "", _variance_factor(fit))
     if fit.inflated:
         yield (
             "The residuals are larger than the noise: the standard uncertainties were widened to "
@@ -437,44 +409,40 @@ def stream_report(fit: StreamFit) -> Iterator[Block]:
         yield "Not converged: do not trust the parameters."
 
 
-TELL_P = 1e-3
-"""p-value, times the number of groups that are looked at, below which a disagreement is told."""
-MOST_TOLD = 5
-
-
-def prior_lines(found: Fit) -> list[str]:
+def prior_lines(fit: Fit) -> list[str]:
     """Return what people are told of the prior that a fit used; nothing without one."""
-    prior = found.model.prior
+    prior = fit.model.prior
     if prior is None:
         return []
     source = prior.posterior.source
     of = {"arm": " of this arm", "type": " of another arm of the type"}[prior.relation]
-    fleet = source.campaign and not source.revision  # it says itself of which arms
+    if source.campaign and not source.revision:  # a fleet, which says itself of which arms
+        of = ""
     name = source.campaign or "a posterior"
     name += f", revision {source.revision}" if source.revision else ""
-    lines = [f"Prior: {name} ({source.n_readings} readings{'' if fleet else of})."]
+    lines = [f"Prior: {name} ({source.n_readings} readings{of})."]
     # the groups about which prior and readings disagree beyond chance, worst first
-    told = [c for c in found.conflicts if c.p_value * len(found.conflicts) < TELL_P]
+    moved = [c for c in fit.conflicts if c.p_value * len(fit.conflicts) < TELL_P]
     lines += [
         f"  {_of(c.group)} has moved by {min(c.moved_sigma, 37):.1f} σ of what the prior allows: "
         "wear, a crash or a repair?"
-        for c in told[:MOST_TOLD]
+        for c in moved[:MOST_TOLD]
     ]
-    if len(told) > MOST_TOLD:
-        lines.append(f"  … and {len(told) - MOST_TOLD} more (--json lists them)")
+    if len(moved) > MOST_TOLD:
+        lines.append(f"  … and {len(moved) - MOST_TOLD} more (--json lists them)")
     known = {e.name for e in prior.posterior.effects}
-    new = [e.name for e in found.model.effects if of_arm(e) and e.name not in known]
+    new = [e.name for e in fit.model.effects if of_arm(e) and e.name not in known]
     ask = "hilcal compare EARLIER LATER says what has changed"
     if new:
-        lines.append(f"  Its model did not have {names(new)}; {ask}.")
-    elif found.variance_factor_interval[0] > 1:
+        lines.append(f"  Its model did not have {numbers.names(new)}; {ask}.")
+    elif fit.variance_factor_interval[0] > 1:
         lines.append(f"  With it the model leaves more than the noise; {ask}.")
-    elif not told:
+    elif not moved:
         lines.append("  The readings agree with it.")
     return lines
 
 
-def _of(group: CarriedGroup) -> str:
+def _of(group: DriftGroup) -> str:
     words = group.effect.replace("_", " ")
     if group.joint is not None:
         return f"joint {group.joint}'s {words}"

@@ -2,10 +2,10 @@
 
     command ─► bounded queue ─► thread ─► pipe ─► process: serves viewers, writes the recording
 
-Whatever becomes of viewer, recording or process, the command goes on: a full queue drops what is
-told, a dead process is reported once. The process ends when its pipe does, so that the recording
-is complete however the command ends. It is `python -m hilcal.present.live_viewer RECORD.rrd PORT`:
-it reads pickled messages from standard input and writes a JSON object per line to standard output,
+Whatever becomes of viewer, recording or process, the command goes on: a full queue drops messages,
+a dead process is reported once. The process ends when its pipe does, so that the recording is
+complete however the command ends. It is `python -m hilcal.present.live_viewer RECORD.rrd PORT`: it
+reads pickled messages from standard input and writes a JSON object per line to standard output,
 "url" once it serves, "problem" for people.
 """
 
@@ -36,23 +36,14 @@ from hilcal.types import Floats
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measuring:
-    """A campaign begins, or goes on, to be measured.
-
-    Attributes:
-        name: of the campaign.
-        arm: the arm.
-        targets: (T, 3) tracked targets, flange axes, m.
-        plan: the whole plan.
-        earlier: what earlier sessions stored, each with its time of day, s.
-        names: of the targets, where there are several.
-    """
+    """A campaign begins, or goes on, to be measured."""
 
     name: str
     arm: Arm
-    targets: Floats
+    targets: Floats  # (T, 3) tracked targets, flange axes, m
     plan: Plan
-    earlier: tuple[tuple[float, Step], ...] = ()
-    names: tuple[str, ...] = ()
+    earlier: tuple[tuple[float, Step], ...] = ()  # stored by earlier sessions, at times of day, s
+    names: tuple[str, ...] = ()  # of the targets, where there are several
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,7 +71,6 @@ class LiveViewer:
     """Tells the viewer's process what happens; no method waits for it but `start` and `close`.
 
     Attributes:
-        record: the recording.
         url: what a viewer opens; None where nothing is served.
         dropped: messages that were not passed on because the process did not keep up.
     """
@@ -99,8 +89,7 @@ class LiveViewer:
         self._queue: queue.Queue[tuple[float, object] | None] = queue.Queue(MOST)
         self._process: subprocess.Popen[bytes] | None = None
         self._threads: list[threading.Thread] = []
-        self._ready, self._closing = threading.Event(), False
-        self._arm_told = 0.0
+        self._ready, self._closing, self._arm_told = threading.Event(), False, 0.0
 
     @property
     def pid(self) -> int | None:
@@ -113,7 +102,7 @@ class LiveViewer:
         more = {"PYTHONPATH": os.pathsep.join(path), "OMP_NUM_THREADS": "1", "RUST_LOG": "off"}
         command = (sys.executable, "-P", "-m", "hilcal.present.live_viewer")
         try:
-            self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
+            self._process = process = subprocess.Popen(  # noqa: S603 - our interpreter and module
                 [*command, str(self.record.absolute()), str(self._port)],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
@@ -126,10 +115,7 @@ class LiveViewer:
             self._say(f"no live viewer: {error}; it goes on without")
             self._closing = True
             return
-        for work, pipe in (
-            (self._write, self._process.stdin),
-            (self._listen, self._process.stdout),
-        ):
+        for work, pipe in ((self._write, process.stdin), (self._listen, process.stdout)):
             thread = threading.Thread(target=work, args=(pipe,), name="live viewer", daemon=True)
             thread.start()
             self._threads.append(thread)
@@ -150,9 +136,8 @@ class LiveViewer:
         """Tell that a campaign is measured, and what it holds already."""
         known = (d for d in log.details() if "wall_s" in d)
         earlier = tuple((float(d["wall_s"]), Step(**d["step"])) for d in known)
-        targets = cell.all_targets[:, :3, 3]
-        told = Measuring(name, cell.arm, targets, log.plan, earlier, cell.target_names)
-        self._tell(time.time(), told)
+        of = cell.arm, cell.all_targets[:, :3, 3], log.plan
+        self._tell(time.time(), Measuring(name, *of, earlier, cell.target_names))
 
     def revised(self, chapter: Chapter) -> None:
         """Tell a revision; what cannot be drawn is said, and nothing is raised."""
@@ -200,12 +185,12 @@ class LiveViewer:
         """Thread: pass on what the process says; its end is the last word."""
         with pipe:
             for line in pipe:
-                told: dict[str, Any] = json.loads(line)
-                if "url" in told:
-                    self.url = told["url"]
+                reply: dict[str, Any] = json.loads(line)
+                if "url" in reply:
+                    self.url = reply["url"]
                     self._ready.set()
-                if "problem" in told:
-                    self._say(told["problem"])
+                if "problem" in reply:
+                    self._say(reply["problem"])
         if not self._closing:
             self._say("the live viewer has ended; everything else goes on")
         self._ready.set()
@@ -234,8 +219,8 @@ def main() -> None:
     replies = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # what a library prints is no reply
 
-    def reply(**told: object) -> None:
-        print(json.dumps(told), file=replies, flush=True)
+    def reply(**what: object) -> None:
+        print(json.dumps(what), file=replies, flush=True)
 
     from hilcal.present.viewer.live import follow  # loads the viewer's library
 

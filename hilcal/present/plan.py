@@ -5,10 +5,11 @@ from collections.abc import Iterator, Sequence
 
 from hilcal import numbers
 from hilcal.design.next import SURE, Next, PairPower
+from hilcal.design.run_order import Confounding
 from hilcal.design.summary import CurvePoint, PlanSummary, PredictedParameter
-from hilcal.design.timing import Confounding
+from hilcal.numbers import digits, length
 from hilcal.present.document import Block, Table, heading, load_name, note, pairs, table
-from hilcal.present.running import spoken
+from hilcal.present.progress import spoken
 from hilcal.store.plan import UNLOADED
 
 CRITERIA = {
@@ -27,14 +28,15 @@ UNCERTAIN = 1e-3
 LIKE = 1.1
 """A number of poses is enough where the end of the curve is not better by more than this factor.
 A choice."""
+_STRETCHED, _MOST_LOADS, _LEAST_SHARE = 1.15, 2, 0.1
 
 
 def plan_facts(s: PlanSummary) -> Iterator[Block]:
     """Yield what a plan costs and reaches, and what more poses would give."""
     yield from (heading("Plan"), pairs(cost_rows(s)), "")
     if larger := [c for c in s.curve if c.poses > s.poses]:
-        told = [f"{c.poses} poses ± {numbers.length(c.position_std_m)}" for c in larger[::2]]
-        yield f"More would give, predicted for the {s.quantity}: {', '.join(told)}."
+        more = [f"{c.poses} poses ± {length(c.position_std_m)}" for c in larger[::2]]
+        yield f"More would give, predicted for the {s.quantity}: {', '.join(more)}."
 
 
 def plan_screen(s: PlanSummary) -> Iterator[Block]:
@@ -42,35 +44,33 @@ def plan_screen(s: PlanSummary) -> Iterator[Block]:
     yield from plan_facts(s)
     heads = ("predicted for", "parameters", "±", "unit", "± in %, worst")
     if s.parameters:
-        yield from (table(*heads, rows=effect_rows(s.parameters), left=(0, 3)), "")
-    if seen := detectable(s):
-        (first, least), (last, most) = seen[0], seen[-1]
+        yield from (table(*heads, rows=_effect_rows(s.parameters), left=(0, 3)), "")
+    if visible := _detectable(s):
+        (first, least), (last, most) = visible[0], visible[-1]
         yield f"Outside of the model: {first} is seen from {least}, ..., {last} from {most}."
-    if words := undetectable(s):
-        yield words
+    yield from _undetectable(s)
     yield from (f"note: {remark}" for remark in s.remarks[:SCREEN])
     rest = len(s.remarks) - SCREEN
     more = f"{rest} more notes, every parameter" if rest > 0 else "every parameter"
     yield f"--details: {more}, criteria, numbers of poses, effects outside of the model."
 
 
-def effect_rows(parameters: Sequence[PredictedParameter]) -> Iterator[tuple[str, ...]]:
+def _effect_rows(parameters: Sequence[PredictedParameter]) -> Iterator[tuple[str, ...]]:
     """Yield a row for the parameters of an effect that have one unit."""
     groups: dict[tuple[str, str], list[PredictedParameter]] = {}
     for p in parameters:
-        groups.setdefault((_effect(p.name), p.unit), []).append(p)
-    for (effect, si), all_of in groups.items():
-        known = [p for p in all_of if math.isfinite(p.std)]
-        some = f"{len(known)} of " if len(known) < len(all_of) else ""
-        count = f"{some}{len(all_of)}"
+        groups.setdefault((_effect(p), p.unit), []).append(p)
+    for (effect, si), every in groups.items():
+        known = [p for p in every if math.isfinite(p.std)]
+        count = f"{f'{len(known)} of ' * (len(known) < len(every))}{len(every)}"
         if not known:
             yield effect, count, "not determined", "", ""
             continue
         stds = [p.std for p in known]
         unit, factor = numbers.unit_for(si, stds)
-        least, most = (numbers.digits(factor * x, 2) for x in (min(stds), max(stds)))
+        least, most = (digits(factor * x, 2) for x in (min(stds), max(stds)))
         shares = [p.std / abs(p.value) for p in known if p.value]
-        worst = f"{numbers.digits(100 * max(shares), 2)} %" if shares else ""
+        worst = f"{digits(100 * max(shares), 2)} %" if shares else ""
         yield effect, count, least if least == most else f"{least} to {most}", unit, worst
 
 
@@ -86,22 +86,19 @@ def plan_report(s: PlanSummary) -> Iterator[Block]:
         yield note("magnitude: estimated so far, else the effect's ordinary magnitude.\n")
     if s.criteria:
         yield heading("Comparison of criteria, for the same number of readings")
-        yield from criteria_table(s)
+        yield from _criteria_table(s)
     if s.curve:
         yield heading("Sample-size curve: how many poses are enough")
-        yield _curve(s)
-        yield f"{enough(s.curve)}\n"
+        yield from (_curve(s), f"{enough(s.curve)}\n")
     if s.detectable:
         yield heading("Minimum detectable effects outside of the model")
-        if found := detectable(s):
-            yield table("effect", "from", rows=found)
+        if visible := _detectable(s):
+            yield table("effect", "from", rows=visible)
             yield note(
                 "from: rms displacement of the target that is one sigma of these readings.\n"
             )
-        if words := undetectable(s):
-            yield f"{words}\n"
-    for remark in s.remarks:
-        yield f"note: {remark}"
+        yield from (f"{words}\n" for words in _undetectable(s))
+    yield from (f"note: {remark}" for remark in s.remarks)
 
 
 def certified(efficiency: float) -> str:
@@ -117,7 +114,10 @@ def _floor(efficiency: float) -> str:
 
 def cost_rows(s: PlanSummary) -> Iterator[tuple[str, str]]:
     """Yield names and values of what a plan costs and reaches."""
-    yield "poses", f"{s.poses} and the reference{_asked(s)}"
+    fewer = ""
+    if s.asked_poses not in (None, s.poses):
+        fewer = f": the cell leaves no more of {s.asked_poses}, so that some are read again"
+    yield "poses", f"{s.poses} and the reference{fewer}"
     loads = ", ".join(f"{load_name(name)} {count}" for name, count in s.loads.items())
     yield "readings", f"{s.readings}: {loads}"
     time = s.duration
@@ -130,39 +130,31 @@ def cost_rows(s: PlanSummary) -> Iterator[tuple[str, str]]:
     if s.efficiency is not None:
         yield "efficiency", certified(s.efficiency)
     if s.position_std_m is not None:
-        yield s.quantity, f"± {numbers.length(s.position_std_m)}, predicted for the {s.position}"
+        yield s.quantity, f"± {length(s.position_std_m)}, predicted for the {s.position}"
         yield "", s.position_note
-
-
-def _asked(s: PlanSummary) -> str:
-    """Say why there are other poses than were asked for; nothing where there are as many."""
-    if s.asked_poses in (None, s.poses):
-        return ""
-    return f": the cell leaves no more of {s.asked_poses}, so that some are read again"
 
 
 def order_remark(s: PlanSummary) -> str:
     """Return in sentences what the order costs and how a linear drift acts."""
-    own, randomised = s.confounding, s.longer >= 5e-4
-    if own is None:
+    c, randomised = s.confounding, s.longer >= 5e-4
+    if c is None:
         return ""
-    out = (
-        "The order is randomised, so that drift is little correlated with joints and loads, and "
-        f"takes {100 * s.longer:.1f} % longer than the shortest one. "
-        if randomised
-        else "The order is the shortest one. "
-    )
-    out += f"Estimating a drift as well costs up to about {_lost(own)} of a parameter's information"
+    out = "The order is the shortest one. "
+    if randomised:
+        out = (
+            "The order is randomised, so that drift is little correlated with joints and loads, "
+            f"and takes {100 * s.longer:.1f} % longer than the shortest one. "
+        )
+    out += f"Estimating a drift as well costs up to about {_lost(c)} of a parameter's information"
     if randomised and s.shortest is not None:
         out += f" ({_lost(s.shortest)} in the shortest order)"
-    mean = abs(own.bias_m)
+    mean = length(abs(c.bias_m)) if abs(c.bias_m) >= 1e-7 else "less than 0.1 µm"
     out += (
-        f". Without it in the fit, a drift of {numbers.digits(3.6e9 * own.drift, 2)} µm/h shifts "
-        f"deflections by {numbers.length(own.error_m)} rms and "
-        f"{numbers.length(mean) if mean >= 1e-7 else 'less than 0.1 µm'} on average"
+        f". Without it in the fit, a drift of {digits(3.6e9 * c.drift, 2)} µm/h shifts "
+        f"deflections by {length(c.error_m)} rms and {mean} on average"
     )
-    if own.drift_std is not None:
-        rate = numbers.digits(3.6e9 * own.drift_std, 2)
+    if c.drift_std is not None:
+        rate = digits(3.6e9 * c.drift_std, 2)
         out += f"; the returns to the reference pose determine it to ± {rate} µm/h"
     return f"{out}."
 
@@ -175,33 +167,32 @@ def _lost(c: Confounding) -> str:
 def _parameter_rows(parameters: Sequence[PredictedParameter]) -> Iterator[tuple[str, ...]]:
     """Yield rows; parameters of one effect and unit share a prefix."""
     for p in parameters:
-        alike = [o for o in parameters if o.unit == p.unit and _effect(o.name) == _effect(p.name)]
+        alike = [o for o in parameters if (o.unit, _effect(o)) == (p.unit, _effect(p))]
         sizes = [o.std if o.value is None else o.value for o in alike]
         unit, factor = numbers.unit_for(p.unit, sizes)
-        magnitude = "" if p.value is None else numbers.digits(factor * p.value)
-        if not math.isfinite(p.std):
-            yield p.name, "not determined", magnitude, unit, ""
-            continue
-        share = f"{numbers.digits(100 * p.std / abs(p.value), 2)} %" if p.value else ""
-        yield p.name, numbers.digits(factor * p.std, 2), magnitude, unit, share
+        magnitude = "" if p.value is None else digits(factor * p.value)
+        std, share = "not determined", ""
+        if math.isfinite(p.std):
+            std = digits(factor * p.std, 2)
+            share = f"{digits(100 * p.std / abs(p.value), 2)} %" if p.value else ""
+        yield p.name, std, magnitude, unit, share
 
 
-def _effect(name: str) -> str:
-    return name.split(".")[0]
+def _effect(p: PredictedParameter) -> str:
+    return p.name.split(".")[0]
 
 
-def criteria_table(s: PlanSummary) -> Iterator[Block]:
+def _criteria_table(s: PlanSummary) -> Iterator[Block]:
     """Yield what plans by other criteria would reach with as many readings."""
     heads = ("criterion", "predicted ±", "open ±", "joint ±", "O1 (D)", "O2 (K)", "O3 (E)")
     out = table(*heads, "certified")
     for c in s.criteria:
         this = c.criterion == s.criterion
-        sizes = (c.position_std_m, c.position_open_m)
         out.add(
             f"{c.criterion} (this)" if this else c.criterion,
-            *("-" if x is None else numbers.length(x) for x in sizes),
-            "-" if c.joint_share is None else f"{numbers.digits(100 * c.joint_share, 2)} %",
-            *(numbers.digits(c.o1), numbers.digits(c.o2, 2), numbers.digits(c.o3)),
+            *("-" if x is None else length(x) for x in (c.position_std_m, c.position_open_m)),
+            "-" if c.joint_share is None else f"{digits(100 * c.joint_share, 2)} %",
+            *(digits(c.o1), digits(c.o2, 2), digits(c.o3)),
             "-" if c.efficiency is None else _floor(c.efficiency),
             tone="strong" if this else "text",
         )
@@ -221,8 +212,8 @@ def _curve(s: PlanSummary) -> Table:
     for point in s.curve:
         size = max(1, round(BAR * point.position_std_m / top)) if top > 0 else 1
         this = point.poses == s.poses
-        bar, length = "█" * size + "  this plan" * this, numbers.length(point.position_std_m)
-        out.add(str(point.poses), length, bar, tone="strong" if this else "text")
+        bar, std = "█" * size + "  this plan" * this, length(point.position_std_m)
+        out.add(str(point.poses), std, bar, tone="strong" if this else "text")
     return out
 
 
@@ -232,54 +223,23 @@ def enough(curve: Sequence[CurvePoint]) -> str:
     first = next(p for p in curve if p.position_std_m <= LIKE * last.position_std_m)
     if first is last:
         return f"More than {last.poses} poses still improve the prediction."
-    gain = 1.0 - last.position_std_m / first.position_std_m
+    gain = 100 * (1.0 - last.position_std_m / first.position_std_m)
     return (
         f"From {first.poses} to {last.poses} poses the prediction's uncertainty falls by "
-        f"{100 * gain:.0f} % only."
+        f"{gain:.0f} % only."
     )
 
 
-def detectable(s: PlanSummary) -> list[tuple[str, str]]:
+def _detectable(s: PlanSummary) -> list[tuple[str, str]]:
     """Return effects with their minimum detectable displacement, smallest first."""
-    found = [(d.least_m, d.effect) for d in s.detectable if d.least_m is not None]
-    return [(effect, numbers.length(least)) for least, effect in sorted(found)]
+    least = sorted((d.least_m, d.effect) for d in s.detectable if d.least_m is not None)
+    return [(effect, length(metres)) for metres, effect in least]
 
 
-def undetectable(s: PlanSummary) -> str:
-    """Return in words which effects the readings cannot detect; empty where there are none."""
-    names = [d.effect for d in s.detectable if d.least_m is None]
-    return f"These readings cannot detect {numbers.names(names, 'or')}." if names else ""
-
-
-_STRETCHED = 1.15
-_MOST_LOADS = 2
-_LEAST_SHARE = 0.1
-
-
-def next_report(found: Next, poses: int, readings: int, details: bool = True) -> Iterator[Block]:
-    """Yield the powers of the pairs, now and then, and what makes the difference.
-
-    `poses` beside the reference and `readings` are the plan's; without `details` of each suspect
-    only the pair that is separated least.
-    """
-    yield heading("Telling the suspects apart")
-    yield power_table(found.powers if details else weakest(found.powers))
-    yield note(
-        "now, then: where the first effect is there, the chance that the readings so far, and with "
-        "those planned as well, reject a fit with the second in its place (test at 1 %).\n"
-    )
-    yield f"{powers_summary(found.powers, poses, readings)} {_difference(found)}\n"
-    for remark in found.notes:
-        yield f"note: {remark}"
-
-
-def weakest(powers: Sequence[PairPower]) -> tuple[PairPower, ...]:
-    """Return of each effect that may be there the pair that is separated least."""
-    least: dict[str, PairPower] = {}
-    for t in powers:
-        if t.effect not in least or t.then < least[t.effect].then:
-            least[t.effect] = t
-    return tuple(least.values())
+def _undetectable(s: PlanSummary) -> Iterator[str]:
+    """Yield which effects the readings cannot detect, where there are some."""
+    if names := [d.effect for d in s.detectable if d.least_m is None]:
+        yield f"These readings cannot detect {numbers.names(names, 'or')}."
 
 
 def brief_plan(s: PlanSummary) -> str:
@@ -292,6 +252,22 @@ def brief_plan(s: PlanSummary) -> str:
     )
 
 
+def next_report(found: Next, poses: int, readings: int, details: bool = True) -> Iterator[Block]:
+    """Yield the powers of the pairs, now and then, and what makes the difference.
+
+    `poses` beside the reference and `readings` are the plan's; without `details` of each suspect
+    only the pair that is separated least.
+    """
+    yield heading("Telling the suspects apart")
+    yield power_table(found.powers if details else _weakest(found.powers))
+    yield note(
+        "now, then: where the first effect is there, the chance that the readings so far, and with "
+        "those planned as well, reject a fit with the second in its place (test at 1 %).\n"
+    )
+    yield f"{powers_summary(found.powers, poses, readings)} {_difference(found)}\n"
+    yield from (f"note: {remark}" for remark in found.notes)
+
+
 def poses_report(found: Next, poses: int, readings: int, details: bool = True) -> Iterator[Block]:
     """Yield what further poses tell of a misfit of the pose alone; arguments of `next_report`."""
     yield heading("Poses where nothing was read yet")
@@ -300,12 +276,21 @@ def poses_report(found: Next, poses: int, readings: int, details: bool = True) -
         f"{readings} unloaded readings at {poses} poses, spread over the joints' range.\n"
     )
     if found.powers:
-        some = found.powers if details else weakest(found.powers)
+        some = found.powers if details else _weakest(found.powers)
         yield power_table(some, "and this is fitted")
         yield note(
             "now, then: chance that it passes every test of a missing effect, poses left out "
             "included, with the readings so far and with those planned as well.\n"
         )
+
+
+def _weakest(powers: Sequence[PairPower]) -> tuple[PairPower, ...]:
+    """Return of each effect that may be there the pair that is separated least."""
+    least: dict[str, PairPower] = {}
+    for t in powers:
+        if t.effect not in least or t.then < least[t.effect].then:
+            least[t.effect] = t
+    return tuple(least.values())
 
 
 def power_table(powers: Sequence[PairPower], rival: str = "this is ruled out") -> Table:
@@ -316,18 +301,13 @@ def power_table(powers: Sequence[PairPower], rival: str = "this is ruled out") -
 def power_rows(powers: Sequence[PairPower]) -> Iterator[tuple[str, str, str, str]]:
     """Yield effect, rival, and the powers now and with the plan."""
     for t in powers:
-        then = "not in this cell" if t.not_separable else chance(t.then)
-        yield t.effect, t.rival, chance(t.now), then
+        then = "not in this cell" if t.not_separable else _chance(t.then)
+        yield t.effect, t.rival, _chance(t.now), then
 
 
-def chance(power: float) -> str:
+def _chance(power: float) -> str:
     """Write a chance; no test is certain."""
     return "> 99 %" if power > 0.995 else numbers.percent(power)
-
-
-def _at_least(power: float) -> str:
-    """Write a lower bound of a chance, rounded down."""
-    return f"{min(int(100 * power + 1e-9), 99)} %"
 
 
 def powers_summary(powers: Sequence[PairPower], poses: int, readings: int) -> str:
@@ -340,17 +320,18 @@ def powers_summary(powers: Sequence[PairPower], poses: int, readings: int) -> st
     if least.then < SURE:
         return (
             f"{head}: the weakest pair is {least.effect}, where it is there, and {least.rival}, "
-            f"which they rule out with a chance of {chance(least.then)} ({chance(least.now)} now); "
-            "more poses raise it."
+            f"which they rule out with a chance of {_chance(least.then)} ({_chance(least.now)} "
+            "now); more poses raise it."
         )
+    at_least = f"at least {min(int(100 * least.then + 1e-9), 99)} %"  # rounded down
     if len(able) == len(powers):
         return (
             f"{head} separate the suspects: whichever is there, each of the others is ruled out "
-            f"with a chance of at least {_at_least(least.then)}."
+            f"with a chance of {at_least}."
         )
     return (
         f"{head} separate what can be separated in this cell: each of these pairs with a chance of "
-        f"at least {_at_least(least.then)}."
+        f"{at_least}."
     )
 
 

@@ -23,6 +23,22 @@ PLACES = 5, 4
 """Decimals of a position in m and of an angle in degrees. A choice."""
 ALONG = 0.98
 """Share of its length that one element must have for a direction to be named after that axis."""
+WORDS: dict[CovarianceParts, str] = {
+    "instrument": (
+        "the instrument alone; the arm's own scatter is not in it ([repeatability] "
+        "joint_std_rad states it)"
+    ),
+    "instrument and repeatability": (
+        "the instrument, and the arm's scatter as [repeatability] states it"
+    ),
+    "instrument and arm as stated": (
+        "instrument and arm's scatter together; [repeatability] is not added again"
+    ),
+    "as imported": (
+        "as an older version of hilcal imported it; [repeatability] is not added (import the "
+        "table again for that)"
+    ),
+}
 
 
 def registration_lines(found: Registration) -> Iterator[str]:
@@ -86,12 +102,11 @@ def base_line(cell: Cell, found: RobotFrames, mode: Mode = "absolute") -> str:
     """
     if np.array_equal(found.base, np.eye(4)) and found.base_stated:
         return "The robot's base: the axes that the positions are given in."
-    if found.base_stated:
-        return f"The robot's base: {_at(found.base)}; as the cell states it."
-    why = "the nominal arm on it has the axis of joint 1 where the readings have it"
-    if mode == "deflection":
-        why += "; deflections tell it no better"
-    places = (3, 2) if mode == "deflection" else PLACES
+    why, places = "as the cell states it", PLACES
+    if not found.base_stated:
+        why = "the nominal arm on it has the axis of joint 1 where the readings have it"
+        if mode == "deflection":
+            why, places = f"{why}; deflections tell it no better", (3, 2)
     return f"The robot's base: {_at(found.base, places)}; {why}."
 
 
@@ -99,19 +114,19 @@ def undetermined_lines(found: Registration) -> Iterator[str]:
     """Yield a sentence for each direction of the frames that the poses do not determine."""
     names = found.cell.target_names if found.cell.targets is not None else ()
     for u in found.undetermined:
-        why, what = _why(found.still), _told(u, names)
+        what = _undetermined(u, names)
         verb = "separate" if " from " in what else "determine"
-        yield f"The poses cannot {verb} {what}{why}; it stays near the start."
+        yield f"The poses cannot {verb} {what}{_why(found.still)}; it stays near the start."
 
 
-def _told(u: Undetermined, names: tuple[str, ...]) -> str:
-    own = "" if u.target is None or not names else f" {names[u.target]}"
+def _undetermined(u: Undetermined, names: tuple[str, ...]) -> str:
+    name = "" if u.target is None or not names else f" {names[u.target]}"
     if u.observers:
         place = f"the place of {' and '.join(u.observers)}"
         if not np.any(u.base_shift) and not np.any(u.base_turn) and u.target is None:
             return place
-        return f"{place} from {_told(replace(u, observers=()), names)}"
-    moved = _moves(u.target_shift, u.target_turn, f"the target{own}'s", "the flange's")
+        return f"{place} from {_undetermined(replace(u, observers=()), names)}"
+    moved = _moves(u.target_shift, u.target_turn, f"the target{name}'s", "the flange's")
     base = _moves(u.base_shift, u.base_turn, "the base's", "its")
     return " from ".join(filter(None, (moved, base))) or "a combination of base and target"
 
@@ -119,27 +134,23 @@ def _told(u: Undetermined, names: tuple[str, ...]) -> str:
 def _moves(shift: Floats, turn: Floats, whose: str, axes: str) -> str:
     parts = []
     if np.any(shift):
-        height = whose.startswith("the base") and _axis(shift) == "z"
-        offset = f"{whose} offset along {_axis_words(shift, axes)}"
-        parts.append("the height of the base" if height else offset)
+        along = _axis_words(shift, axes)
+        height = whose == "the base's" and along == f"{axes} z"
+        parts.append("the height of the base" if height else f"{whose} offset along {along}")
     if np.any(turn):
         parts.append(f"{whose} turn about {_axis_words(turn, axes)}")
     return " with ".join(parts)
 
 
 def _axis_words(v: Floats, axes: str) -> str:
-    if name := _axis(v):
-        return f"{axes} {name}"
-    return f"{axes} direction ({', '.join(f'{x:.2f}' for x in v / np.linalg.norm(v))})"
-
-
-def _axis(v: Floats) -> str | None:
-    k = int(np.argmax(np.abs(v)))
-    return "xyz"[k] if abs(v[k]) > ALONG * np.linalg.norm(v) else None
+    k, unit = int(np.argmax(np.abs(v))), v / np.linalg.norm(v)
+    if abs(unit[k]) > ALONG:
+        return f"{axes} {'xyz'[k]}"
+    return f"{axes} direction ({', '.join(f'{x:.2f}' for x in unit)})"
 
 
 def _why(still: Bools) -> str:
-    """Joints that never turned, 1-based."""
+    """Say which joints never turned, where some did not."""
     which = [int(k) + 1 for k in np.flatnonzero(still)]
     if not which:
         return ": the tool hardly changed its orientation, or turned about one axis only"
@@ -147,7 +158,7 @@ def _why(still: Bools) -> str:
         return f": joint {which[0]} never turned"
     if which == list(range(which[0], which[-1] + 1)):
         return f": joints {which[0]} to {which[-1]} never turned"
-    return f": joints {', '.join(map(str, which[:-1]))} and {which[-1]} never turned"
+    return f": joints {numbers.names(list(map(str, which)))} never turned"
 
 
 def _at(t: Floats, places: tuple[int, int] = PLACES) -> str:
@@ -170,45 +181,25 @@ def _place(t: Floats, places: tuple[int, int] = PLACES) -> str:
     return f"({place}) m, turned by the rotation vector ({words})°"
 
 
-WORDS: dict[CovarianceParts, str] = {
-    "instrument": (
-        "the instrument alone; the arm's own scatter is not in it ([repeatability] "
-        "joint_std_rad states it)"
-    ),
-    "instrument and repeatability": (
-        "the instrument, and the arm's scatter as [repeatability] states it"
-    ),
-    "instrument and arm as stated": (
-        "instrument and arm's scatter together; [repeatability] is not added again"
-    ),
-    "as imported": (
-        "as an older version of hilcal imported it; [repeatability] is not added (import the "
-        "table again for that)"
-    ),
-}
-
-
 def covariance_words(parts: CovarianceParts, noise: NoiseEstimate | None = None) -> str:
     """Return a sentence without its full stop; `noise` is the estimate, where nothing states it."""
-    if noise is not None:
-        return _estimated(noise)
-    return f"each covariance is that of {WORDS[parts]}"
-
-
-def _estimated(n: NoiseEstimate) -> str:
-    turn = "" if n.orientation_rad is None else f", orientations {1e6 * n.orientation_rad:.2g} µrad"
-    arm = ""
-    if n.joint_std_rad is not None:
-        arm = f"; each joint scatters by {1e6 * n.joint_std_rad:.2g} µrad from arrival to arrival"
+    if noise is None:
+        return f"each covariance is that of {WORDS[parts]}"
+    turn = arm = ""
+    if noise.orientation_rad is not None:
+        turn = f", orientations {1e6 * noise.orientation_rad:.2g} µrad"
+    if noise.joint_std_rad is not None:
+        scatter = f"{1e6 * noise.joint_std_rad:.2g} µrad"
+        arm = f"; each joint scatters by {scatter} from arrival to arrival"
     why = "neither the table nor [tracker] states the noise"
-    if n.factors is not None:
+    if noise.factors is not None:
         why = (
             "[tracker] does not state the noise, and the samples of each pose do not show all of it"
         )
     return (
         f"{why}; it was estimated from the readings, together with all effects: "
-        f"{numbers.length(n.along_m)} along the beam, "
-        f"{numbers.length(n.across_m)} across it at {n.distance_m:.2g} m{turn}{arm}"
+        f"{numbers.length(noise.along_m)} along the beam, "
+        f"{numbers.length(noise.across_m)} across it at {noise.distance_m:.2g} m{turn}{arm}"
     )
 
 
@@ -216,15 +207,14 @@ def torque_lines(found: TorqueCheck | None) -> Iterator[str]:
     """Yield a sentence for each described mass that the torques contradict, else one for all."""
     if found is None:
         return
-    left = ", ".join(numbers.digits(x, 2) for x in found.std_Nm)
     if not found.factors:
         yield "Measured joint torques: the poses tell neither a load nor a mass by them."
     for f in found.factors:
         if f.differs:
             yield f"Measured joint torques: {_differs(f)}."
-    right = [_size(f) for f in found.factors if not f.differs]
-    if right:
+    if right := [_size(f) for f in found.factors if not f.differs]:
         yield f"Measured joint torques agree with the description: {'; '.join(right)}."
+    left = ", ".join(numbers.digits(x, 2) for x in found.std_Nm)
     yield f"Measured joint torques scatter about that by {left} N·m, joint by joint (friction)."
 
 
@@ -247,6 +237,5 @@ def _size(f: TorqueFactor) -> str:
 
 
 def _band(f: TorqueFactor) -> str:
-    unit = 1.0 if f.stated_kg is None else f.stated_kg
-    low, high = numbers.digits(unit * f.low), numbers.digits(unit * f.high)
+    low, high = (numbers.digits((f.stated_kg or 1.0) * x) for x in (f.low, f.high))
     return f" (95 %: {low} to {high}{'' if f.stated_kg is None else ' kg'})"

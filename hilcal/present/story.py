@@ -15,7 +15,7 @@ from hilcal.diagnosis.added_variable import added_variable
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.effect_ranking import Suspect
 from hilcal.diagnosis.residual_regression import Dependence
-from hilcal.discovery.drawn_law import drawn_laws
+from hilcal.discovery.curve import drawn_laws
 from hilcal.discovery.law import Coefficient
 from hilcal.errors import InputError
 from hilcal.identification.fit import Fit, all_left_out, mahalanobis2
@@ -23,13 +23,13 @@ from hilcal.identification.full_prediction import FullPrediction, full_predictio
 from hilcal.identification.residual import ErrorBlock
 from hilcal.model.model import Model
 from hilcal.present.diagnosis import (
+    coefficient,
     diagnosis_report,
     moves,
     revision_cells,
     shown_suspects,
     suspects_table,
 )
-from hilcal.present.discovery import coefficient
 from hilcal.present.document import Block
 from hilcal.present.fit import errors, misses, model_name, parameters
 from hilcal.present.verdict import message
@@ -43,6 +43,14 @@ LEVEL_NAMES = ("inside the noise", "doubtful", "outside the noise")
 LIMITS = (0.99, 0.9999)
 """Quantiles of χ²(3) from which a reading is doubtful, and outside: noise does that once in 100,
 and in 10,000 readings."""
+MOST_NUMBER = 10**9
+UNDIAGNOSED = "not diagnosed"
+LITTLE = 0.2
+"""Share of the predictable misfit that the first suspect must explain for its own chart to be
+shown, not those of the variables; a guess."""
+LEAST_CARRIED = 0.02
+"""Share of the misfit below which a variable is not shown; a guess."""
+MOST_SUSPECTS, MOST_PARAMETERS = 3, 40
 
 
 def levels(norm2: Floats) -> Ints:
@@ -62,64 +70,37 @@ def worst_and_even(badness: Floats, most: int) -> Ints:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DependenceCurve:
-    """Something over a variable that it may follow; units as the labels name them.
+    """Something over a variable that it may follow; units as the labels name them."""
 
-    Attributes:
-        title: the variable, the suspect or the law.
-        says: a sentence on it.
-        x: (K,) of the variable: of single readings, or centres of bins.
-        y: (K,) residual, or its mean in the bin.
-        x_label: the variable with its unit.
-        y_label: what errs or moves, with its unit.
-        error: (K,) standard uncertainty of the means; None of single readings.
-        names: (K,) of the bins, where x only counts them; else empty.
-        line: (2, L) the variable, and the law; None without one.
-        facts: what a law is, in names and words.
-    """
-
-    title: str
+    title: str  # the variable, the suspect or the law
     says: str
-    x: Floats
-    y: Floats
-    x_label: str
-    y_label: str
-    error: Floats | None = None
-    names: tuple[str, ...] = ()
-    line: Floats | None = None
-    facts: tuple[tuple[str, str], ...] = ()
+    x: Floats  # (K,) the variable: of single readings, or centres of bins
+    y: Floats  # (K,) residual, or its mean in the bin
+    x_label: str  # the variable with its unit
+    y_label: str  # what errs or moves, with its unit
+    error: Floats | None = None  # (K,) standard uncertainty of the means; None of single readings
+    names: tuple[str, ...] = ()  # (K,) of the bins, where x only counts them; else empty
+    line: Floats | None = None  # (2, L) the variable, and the law
+    facts: tuple[tuple[str, str], ...] = ()  # what a law is, in names and words
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StoryRevision:
-    """One fitted model revision of N readings.
+    """One fitted model revision of N readings."""
 
-    Attributes:
-        revision: its number, growing along the story.
-        change: what it changed, e.g. "+ hysteresis"; empty for the first.
-        verdict: one of the verdicts of `diagnose`, or `UNDIAGNOSED`.
-        residual: (N, 3) measured - predicted, base axes, m.
-        predicted: (N, 3) position in absolute mode, deflection vector in deflection mode, m.
-        whitened_norm2: (N,) squared Mahalanobis distance of each reading, 3 degrees of freedom.
-        error: of the fitted readings.
-        holdout: of whole poses left out.
-        cells: of its row in a table of revisions.
-        panels: "verdict", "details" and "parameters" in words and tables.
-        follows: what the residual follows; None where nothing is found.
-        laws: of the model, which the catalogue does not have; one entry per curve.
-    """
-
-    revision: int
-    change: str
-    verdict: str
-    residual: Floats
-    predicted: Floats
-    whitened_norm2: Floats
-    error: ErrorBlock
-    holdout: ErrorBlock
-    cells: tuple[str, ...] = ()
+    revision: int  # its number, growing along the story
+    change: str  # what it changed, e.g. "+ hysteresis"; empty for the first
+    verdict: str  # one of the verdicts of `diagnose`, or `UNDIAGNOSED`
+    residual: Floats  # (N, 3) measured - predicted, base axes, m
+    predicted: Floats  # (N, 3) position, or deflection vector in deflection mode, m
+    whitened_norm2: Floats  # (N,) squared Mahalanobis distances, 3 degrees of freedom
+    error: ErrorBlock  # of the fitted readings
+    holdout: ErrorBlock  # of whole poses left out
+    cells: tuple[str, ...] = ()  # of its row in a table of revisions
     panels: Mapping[str, tuple[Block, ...]] = field(default_factory=dict)
-    follows: DependenceCurve | None = None
-    laws: tuple[DependenceCurve, ...] = ()
+    """"verdict", "details" and "parameters" in words and tables."""
+    follows: DependenceCurve | None = None  # what the residual follows
+    laws: tuple[DependenceCurve, ...] = ()  # that the catalogue does not have, one per curve
 
     @property
     def size_m(self) -> Floats:
@@ -144,41 +125,23 @@ class StoryRevision:
 
 @dataclass(frozen=True, eq=False)
 class Story:
-    """N readings and the revisions of the model that was fitted to them; SI, base axes.
-
-    Attributes:
-        arm: the arm.
-        mode: what the readings are.
-        q: (N, n) joint angles, rad.
-        pose: (N,) index of the commanded pose.
-        load_names: (N,) name of each reading's load.
-        anchor: (N, 3) nominal position of the target, where arrows start, m.
-        measured: (N, 3) deflection vector, or position in absolute mode, m.
-        covariance: (N, 3, 3) covariance of the residual, m².
-        noise_floor_m: rms 3-D error that noise alone would leave, m.
-        revisions: the revisions, in growing order.
-        target: (N,) number of the target that was read, into `target_names`; None for one.
-        target_names: names of several targets.
-        pose_names: (N,) name of each reading's pose; empty where its number is its name.
-        time_s: (N,) time of each reading, s; None where the readings do not state it.
-        growing: whether further revisions may follow.
-    """
+    """N readings and the revisions of the model that was fitted to them; SI, base axes."""
 
     arm: Arm
     mode: Mode
-    q: Floats
-    pose: Ints
-    load_names: tuple[str, ...]
-    anchor: Floats
-    measured: Floats
-    covariance: Floats
-    noise_floor_m: float
+    q: Floats  # (N, n) joint angles, rad
+    pose: Ints  # (N,) number of the commanded pose
+    load_names: tuple[str, ...]  # (N,) of each reading
+    anchor: Floats  # (N, 3) nominal position of the target, where arrows start, m
+    measured: Floats  # (N, 3) deflection vector, or position in absolute mode, m
+    covariance: Floats  # (N, 3, 3) of the residual, m²
+    noise_floor_m: float  # rms 3-D error that noise alone would leave
     revisions: tuple[StoryRevision, ...]
-    target: Ints | None = None
+    target: Ints | None = None  # (N,) of the target that was read, into `target_names`
     target_names: tuple[str, ...] = ()
-    pose_names: tuple[str, ...] = ()
-    time_s: Floats | None = None
-    growing: bool = False
+    pose_names: tuple[str, ...] = ()  # (N,) of each reading; empty where the number is the name
+    time_s: Floats | None = None  # (N,) None where the readings do not state it
+    growing: bool = False  # whether further revisions may follow
 
     @cached_property
     def poses(self) -> Ints:
@@ -226,27 +189,9 @@ class Story:
         return len(self.pose)
 
 
-MOST_NUMBER = 10**9
-UNDIAGNOSED = "not diagnosed"
-LITTLE = 0.2
-"""Share of the predictable misfit that the first suspect must explain for its own chart to be
-shown, not those of the variables; a guess."""
-LEAST_CARRIED = 0.02
-"""Share of the misfit below which a variable is not shown; a guess."""
-MOST_SUSPECTS, MOST_PARAMETERS = 3, 40
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Chapter:
-    """One revision.
-
-    Attributes:
-        number: of the revision.
-        added: the effect that it added.
-        fit: the fit.
-        diagnosis: of it, or None where it was not diagnosed.
-        removed: the effect that it took out.
-    """
+    """One revision: its number, the effect that it added, the fit, and its diagnosis, if any."""
 
     number: int
     added: str | None
@@ -267,42 +212,38 @@ def build_story(chapters: Sequence[Chapter]) -> Story:
     if not chapters:
         raise InputError("no revision to show; run hilcal identify first")
     parts = [full_prediction(c.fit) for c in chapters]
-    last = parts[-1]
-    mode: Mode = chapters[-1].fit.mode
+    last, fit = parts[-1], chapters[-1].fit
     for c, part in zip(chapters, parts, strict=True):
-        if c.fit.mode != mode or not np.array_equal(part.whitening.reading, last.whitening.reading):
+        same = np.array_equal(part.whitening.reading, last.whitening.reading)
+        if c.fit.mode != fit.mode or not same:
             raise InputError(
                 f"revision {c.number} was fitted to other readings; nothing to compare"
             )
-    readings, rows = last.readings, last.whitening.reading
-    frames = chapters[-1].fit.frames
-    axes = np.broadcast_to(frames.base[:3, :3].T, (len(rows), 3, 3))
-    cell = chapters[-1].fit.model.cell.with_targets(frames.declared)
-    rigid = Model(cell, ()).predict(readings.states, np.zeros(0))
-    nominal = rigid.observation.base_position
-    if mode == "absolute":
+    readings, rows, frames = last.readings, last.whitening.reading, fit.frames
+    to_base, states = frames.base[:3, :3], readings.states  # a vector v is v @ to_base there
+    rigid = Model(fit.model.cell.with_targets(frames.declared), ()).predict(states, np.zeros(0))
+    if fit.mode == "absolute":
         chain, predicted = frames.chain, last.prediction.observation.base_position
-        measured = chain[:3, 3] + predicted @ chain[:3, :3].T + _turn(axes, last.raw[:, :3])
+        measured = chain[:3, 3] + predicted @ chain[:3, :3].T + last.raw[:, :3] @ to_base
     else:
-        measured = _turn(axes, last.whitening.raw(readings.value[:, :3]))
-    covariance = axes @ last.whitening.covariance[:, :3, :3] @ np.swapaxes(axes, 1, 2)
+        measured = last.whitening.raw(readings.value[:, :3]) @ to_base
+    covariance = to_base.T @ last.whitening.covariance[:, :3, :3] @ to_base
+    pairs = zip(chapters, parts, strict=True)
     return Story(
-        arm=chapters[-1].fit.model.cell.arm,
-        mode=mode,
-        q=readings.states.q[rows],
+        arm=fit.model.cell.arm,
+        mode=fit.mode,
+        q=states.q[rows],
         pose=pose_numbers(readings.pose_names)[readings.pose[rows]],
         load_names=tuple(readings.load_names[k] for k in readings.load[rows]),
-        anchor=nominal[rows],
+        anchor=rigid.observation.base_position[rows],
         measured=measured,
         covariance=0.5 * (covariance + np.swapaxes(covariance, 1, 2)),
         noise_floor_m=last.noise_floor,
-        revisions=tuple(
-            _revision(c, part, axes, measured) for c, part in zip(chapters, parts, strict=True)
-        ),
-        target=None if readings.states.target is None else readings.target[rows],
+        revisions=tuple(_revision(c, p, p.raw[:, :3] @ to_base, measured) for c, p in pairs),
+        target=None if states.target is None else readings.target[rows],
         target_names=readings.target_names,
         pose_names=tuple(readings.pose_names[k] for k in readings.pose[rows]),
-        time_s=None if readings.states.time is None else readings.states.time[rows],
+        time_s=None if states.time is None else states.time[rows],
     )
 
 
@@ -310,12 +251,9 @@ def of_left_out(revision: StoryRevision, fit: Fit) -> StoryRevision:
     """Return a revision with the errors of poses left out in place of those of its fit."""
     raw, w = all_left_out(fit)
     residual = raw[:, :3] @ fit.frames.base[:3, :3]
-    return replace(
-        revision,
-        residual=residual,
-        predicted=revision.predicted + revision.residual - residual,
-        whitened_norm2=mahalanobis2(raw[:, :3], w.covariance[:, :3, :3]),
-    )
+    predicted = revision.predicted + revision.residual - residual
+    norm2 = mahalanobis2(raw[:, :3], w.covariance[:, :3, :3])
+    return replace(revision, residual=residual, predicted=predicted, whitened_norm2=norm2)
 
 
 def pose_numbers(names: Sequence[str]) -> Ints:
@@ -333,46 +271,37 @@ def pose_numbers(names: Sequence[str]) -> Ints:
     return np.array(numbers, dtype=np.int64)
 
 
-def _turn(axes: Floats, vectors: Floats) -> Floats:
-    return np.asarray(np.einsum("dij,dj->di", axes, vectors))
-
-
-def _revision(c: Chapter, e: FullPrediction, axes: Floats, measured: Floats) -> StoryRevision:
-    residual, d = _turn(axes, e.raw[:, :3]), c.diagnosis
+def _revision(c: Chapter, e: FullPrediction, residual: Floats, measured: Floats) -> StoryRevision:
+    d, named = c.diagnosis, f"Model: {model_name(c.fit.model.named)}."
     changed = change(c.added, c.removed, c.fit.readings.arm_scatter is not None)
-    verdict = UNDIAGNOSED if d is None else d.verdict
+    told = UNDIAGNOSED if d is None else d.verdict
+    drawn = None if d is None else follows(d)
+    verdict: list[Block] = [f"{UNDIAGNOSED.capitalize()}: run hilcal diagnose for a verdict."]
+    details: list[Block] = [misses(c.fit)]
+    if d is not None:
+        verdict = [numbers.sentence(message(d), d.fit.model.catalogue.names)]
+        verdict += [suspects_table(d, MOST_SUSPECTS)] if d.significant else []
+        details = list(diagnosis_report(d))
+        if drawn is not None:
+            details.append(f"Drawn: {drawn.y_label} against {drawn.x_label}. {drawn.says}")
     return StoryRevision(
         revision=c.number,
         change=changed,
-        verdict=verdict,
+        verdict=told,
         residual=residual,
         predicted=measured - residual,
         whitened_norm2=mahalanobis2(e.raw[:, :3], e.whitening.covariance[:, :3, :3]),
         error=c.fit.error,
         holdout=c.fit.holdout,
-        cells=revision_cells(c.number, changed, c.fit, verdict),
-        panels=_panels(c),
-        follows=None if d is None else follows(d),
+        cells=revision_cells(c.number, changed, c.fit, told),
+        panels={
+            "verdict": (*verdict, named),
+            "details": (*details, errors(c.fit)),
+            "parameters": tuple(parameters(c.fit, MOST_PARAMETERS)),
+        },
+        follows=drawn,
         laws=laws(c.fit),
     )
-
-
-def _panels(c: Chapter) -> dict[str, tuple[Block, ...]]:
-    d = c.diagnosis
-    verdict: list[Block] = [f"{UNDIAGNOSED.capitalize()}: run hilcal diagnose for a verdict."]
-    details: list[Block] = [misses(c.fit)]
-    if d is not None:
-        verdict = [numbers.sentence(message(d), d.fit.model.catalogue.names)]
-        if d.significant:
-            verdict.append(suspects_table(d, MOST_SUSPECTS))
-        details = list(diagnosis_report(d))
-        if (drawn := follows(d)) is not None:
-            details.append(f"Drawn: {drawn.y_label} against {drawn.x_label}. {drawn.says}")
-    return {
-        "verdict": (*verdict, f"Model: {model_name(c.fit.model.named)}."),
-        "details": (*details, errors(c.fit)),
-        "parameters": tuple(parameters(c.fit, MOST_PARAMETERS)),
-    }
 
 
 def follows(d: Diagnosis) -> DependenceCurve | None:
@@ -393,14 +322,14 @@ def laws(fit: Fit) -> tuple[DependenceCurve, ...]:
     """Return the curves of laws from files, in units for people; see `drawn_laws`."""
     out = []
     for law in drawn_laws(fit):
-        told = [
+        values = ", ".join(
             f"{p.name.partition('.')[2]} = "
-            + coefficient(Coefficient(p.name, p.value or 0.0, p.std or 0.0, p.unit))
+            + coefficient(Coefficient(p.name, p.value, p.std or 0.0, p.unit))
             for p in fit.parameters
             if p.name.startswith(f"{law.name}.") and p.value is not None
-        ]
-        acts, coefficients = ", ".join(law.acts_on), ", ".join(told)
-        facts = (("law", law.formula), ("acts on", acts), ("coefficients", coefficients))
+        )
+        acts = ", ".join(law.acts_on)
+        facts = (("law", law.formula), ("acts on", acts), ("coefficients", values))
         says = f"{law.formula}: where it is right, the readings lie on it."
         for c in law.curves:
             x, y, error, _ = c.binned
@@ -415,22 +344,14 @@ def laws(fit: Fit) -> tuple[DependenceCurve, ...]:
 
 def curve(d: Dependence) -> DependenceCurve:
     """Return a dependence in units for people."""
-    x_unit, x_factor = d.unit, 1.0
-    if d.unit in ("rad", "m"):
-        x_unit, x_factor = numbers.of_joint(d.unit)
-    elif d.unit == "s" and (span := float(np.ptp(d.x))) > 120:
+    x_unit, x_factor = numbers.of_joint(d.unit) if d.unit in ("rad", "m") else (d.unit, 1.0)
+    if d.unit == "s" and (span := float(np.ptp(d.x))) > 120:
         x_unit, x_factor = ("h", 1 / 3600) if span > 7200 else ("min", 1 / 60)
     y_unit, y_factor = numbers.unit_for(d.y_unit, list(d.y))
-    return DependenceCurve(
-        d.variable,
-        f"{numbers.percent(d.share)} of the misfit on poses left out follows {d.variable}.",
-        x_factor * d.x,
-        y_factor * d.y,
-        f"{d.variable} [{x_unit}]" if x_unit else d.variable,
-        f"error of {moves(d)} [{y_unit}]",
-        y_factor * d.error,
-        d.labels,
-    )
+    says = f"{numbers.percent(d.share)} of the misfit on poses left out follows {d.variable}."
+    over = f"{d.variable} [{x_unit}]" if x_unit else d.variable
+    of, x, y = f"error of {moves(d)} [{y_unit}]", x_factor * d.x, y_factor * d.y
+    return DependenceCurve(d.variable, says, x, y, over, of, y_factor * d.error, d.labels)
 
 
 def regressor(fit: Fit, suspect: Suspect) -> DependenceCurve | None:

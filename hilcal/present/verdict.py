@@ -14,16 +14,14 @@ from hilcal.diagnosis.pose_alone import PoseAlone
 from hilcal.diagnosis.separability import Separability
 from hilcal.diagnosis.stepwise_alternatives import Alternative
 from hilcal.diagnosis.wrong_figures import WrongFigure
-from hilcal.identification.gross_errors import disagreement_words
+from hilcal.identification.full_prediction import disagreement_words
 from hilcal.numbers import few, length, p_equals, sizes
 from hilcal.readings.arm_scatter import ArmScatter
 from hilcal.readings.serial_noise import SerialNoise
 from hilcal.robot.arm import Arm
 
-MOST_LIKELY = 4
-"""Effects of a background that the sentence names."""
-MOST_HIDDEN = 4
-"""Effects that the readings cannot show of which the sentence names so many."""
+MOST_LIKELY, MOST_HIDDEN = 4, 4
+"""Effects of a background, and effects that the readings cannot show, that the sentence names."""
 HEADLINES: Mapping[Verdict, str] = {
     "adequate": "adequate: the residual is noise",
     "missing_effect": "an effect is missing",
@@ -52,36 +50,44 @@ def message(d: Diagnosis) -> str:
 
 def _verdict(d: Diagnosis) -> str:
     if d.wrong_figures:  # any one of several explains the misfit
-        told = "; or, as well: ".join(_figure(f) for f in d.wrong_figures)
-        return f"{told}. Until that is settled no effect is looked for"
+        figures = "; or, as well: ".join(map(_figure, d.wrong_figures))
+        return f"{figures}. Until that is settled no effect is looked for"
     if d.reason == "one_suspect":
-        return _missing(d.suspects[0])
-    if d.reason == "inseparable_suspects":
-        return _inseparable(d)
+        s = d.suspects[0]
+        if not s.coarse:
+            return f"{s.effect} is missing: it {_explains(s)}"
+        return (
+            f"let joints differ: {s.effect} {_explains(s)}; the model has one {s.coarse} for "
+            "several joints"
+        )
     if d.reason == "readings_disagree":
         return disagreement_words(d.fit)
-    if d.reason == "insufficient_catalogue":
-        return _insufficient(d)
-    if d.reason == "no_suspect":
-        return _no_suspect(d)
-    if d.reason == "misjudged_noise":
-        return _misjudged(d)
-    if d.reason == "background":
-        return _background(d)
-    if d.reason == "arm_scatter":
-        return left_to_the_arm(d, nothing_missing(d))
+    others = {
+        "inseparable_suspects": _inseparable,
+        "insufficient_catalogue": _insufficient,
+        "no_suspect": _no_suspect,
+        "misjudged_noise": _misjudged,
+        "background": _background,
+        "arm_scatter": _left_to_the_arm,
+    }
+    if d.reason in others:
+        return others[d.reason](d)
     if d.pose_alone is not None:
         return _pose_alone(d, d.pose_alone)
     adequate = (
         f"Residuals are what the noise explains: variance factor {d.fit.variance_factor:.2f}; "
-        f"{nothing_missing(d)}{noise_place(d.pure_error)}"
+        f"{_nothing_missing(d)}{_noise_place(d.pure_error)}"
     )
     if d.scatter is not None:
-        adequate = left_to_the_arm(d, nothing_missing(d))
+        adequate = _left_to_the_arm(d)
     if d.reason in ("residual_is_noise", "serial_or_effect"):
         return adequate
     doubts = "; ".join(_alternative(a) for a in d.alternatives if a.inseparable)
     return f"{adequate}; but {doubts}: measure what separates them"
+
+
+def _share(share: float) -> str:
+    return f"{100 * share:.0f} %"
 
 
 def _figure(f: WrongFigure) -> str:
@@ -106,7 +112,7 @@ def _figure(f: WrongFigure) -> str:
     )
 
 
-def nothing_missing(d: Diagnosis) -> str:
+def _nothing_missing(d: Diagnosis) -> str:
     """Say that no effect is missing, of those that such readings show at a plausible size."""
     if d.fit.mode == "deflection":
         return (
@@ -120,37 +126,23 @@ def nothing_missing(d: Diagnosis) -> str:
 
 def _background(d: Diagnosis) -> str:
     """Say which effects of the background are likely, and what to measure."""
-    of = d.background
-    likely = [b for b in of if b.p_value < LIKELY][:MOST_LIKELY]
+    likely = [b for b in d.background if b.p_value < LIKELY][:MOST_LIKELY]
     names = ", ".join(f"{b.effect} ({p_equals(b.p_value)})" for b in likely)
-    told = f"likeliest: {names}" if likely else "none stands out"
+    noise = ""
+    if d.noise is not None and d.noise.misjudged:
+        times = d.fit.variance_factor**0.5
+        noise = f"; what they leave is {times:.1f} times the stated noise: repeat some readings"
     return (
-        f"{len(of)} effects of the catalogue together predict what the named ones leave, and these "
-        f"readings prove none of them by itself; {told}: all are predicted with; more poses, "
-        f"spread over all joints, tell which are there{_noise_beside(d)}"
-    )
-
-
-def _noise_beside(d: Diagnosis) -> str:
-    """Say how large the noise is that a background leaves, where it is not the stated one."""
-    if d.noise is None or not d.noise.misjudged:
-        return ""
-    times = d.fit.variance_factor**0.5
-    return f"; what they leave is {times:.1f} times the stated noise: repeat some readings"
-
-
-def _missing(s: Suspect) -> str:
-    if not s.coarse:
-        return f"{s.effect} is missing: it {_explains(s)}"
-    return (
-        f"let joints differ: {s.effect} {_explains(s)}; the model has one {s.coarse} for several "
-        "joints"
+        f"{len(d.background)} effects of the catalogue together predict what the named ones leave, "
+        "and these readings prove none of them by itself; "
+        f"{f'likeliest: {names}' if likely else 'none stands out'}: all are predicted with; more "
+        f"poses, spread over all joints, tell which are there{noise}"
     )
 
 
 def _explains(s: Suspect) -> str:
     return (
-        f"explains {100 * s.share:.0f} % of the misfit, {100 * max(s.holdout_share, 0):.0f} % on "
+        f"explains {_share(s.share)} of the misfit, {_share(max(s.holdout_share, 0))} on "
         f"poses left out ({p_equals(s.score.p_value)})"
     )
 
@@ -164,9 +156,7 @@ def implausible(s: Suspect) -> str:
 
 def broken(s: Suspect) -> str:
     """Say how much the exact model keeps of what the linearisation promised."""
-    return (
-        f"the exact model keeps {100 * max(s.kept, 0.0):.0f} % of what its linearisation promises"
-    )
+    return f"the exact model keeps {_share(max(s.kept, 0.0))} of what its linearisation promises"
 
 
 def _inseparable(d: Diagnosis) -> str:
@@ -174,14 +164,13 @@ def _inseparable(d: Diagnosis) -> str:
     advice = "hilcal next plans what separates them, or add one and judge on new poses"
     if not any(r.possible for r in rivals):
         advice = "add one; readings of this kind are predicted as well with any of them"
-    others = ", ".join(separable(r) for r in rivals)
     return (
-        f"{lead.effect} {_explains(lead)}, but these readings do not separate it from {others}; "
-        f"{advice}"
+        f"{lead.effect} {_explains(lead)}, but these readings do not separate it from "
+        f"{', '.join(map(_separable, rivals))}; {advice}"
     )
 
 
-def separable(r: Separability) -> str:
+def _separable(r: Separability) -> str:
     """Name a rival, with the readings that would separate it."""
     if not r.possible:
         return f"{r.effect} (no readings of this kind can)"
@@ -192,9 +181,8 @@ def separable(r: Separability) -> str:
 
 def _alternative(a: Alternative) -> str:
     """Name the effects that could replace one of the model."""
-    several = len(a.others) > 1 and a.as_good
-    others = (*a.same_as, *([" and ".join(a.others)] if several else []))
-    return f"{a.effect} could as well be {' or '.join(others)}"
+    several = [" and ".join(a.others)] if len(a.others) > 1 and a.as_good else []
+    return f"{a.effect} could as well be {' or '.join((*a.same_as, *several))}"
 
 
 def _insufficient(d: Diagnosis) -> str:
@@ -203,15 +191,15 @@ def _insufficient(d: Diagnosis) -> str:
         raise ValueError("a diagnosis of an insufficient catalogue without what it leaves")
     follows = f", which follows {' and '.join(d.follows)}" if d.follows else ""
     return (
-        f"{lead.effect} explains {100 * lead.share:.0f} % of the misfit, but all effects of the "
-        f"catalogue together leave {100 * i.share:.0f} % of it, "
+        f"{lead.effect} explains {_share(lead.share)} of the misfit, but all effects of the "
+        f"catalogue together leave {_share(i.share)} of it, "
         f"{i.variance_factor**0.5:.2g} times the stated noise{follows}: {lead.effect} may only "
         f"resemble the missing effect{_repeats_scatter_less(i.noise, d.pure_error)}"
     )
 
 
 def _no_suspect(d: Diagnosis) -> str:
-    none = f"no effect of the catalogue explains {100 * LEAST_SHARE:.0f} % of it or more"
+    none = f"no effect of the catalogue explains {_share(LEAST_SHARE)} of it or more"
     if d.suspects and d.suspects[0].explains:
         best = d.suspects[0]
         tried = best.effect in d.history.rejected
@@ -221,21 +209,20 @@ def _no_suspect(d: Diagnosis) -> str:
         elif not best.keeps:
             but = broken(best)
         none = (
-            f"the best effect of the catalogue, {best.effect}, explains {100 * best.share:.0f} % "
+            f"the best effect of the catalogue, {best.effect}, explains {_share(best.share)} "
             f"of it, but {but}"
         )
-    follows = f"; it follows {' and '.join(d.follows)}" if d.follows else ""
-    repeats = _repeats_scatter_less(d.noise, d.pure_error)
-    if d.predictable_share < LEAST_SHARE and repeats:
+    repeats, share = _repeats_scatter_less(d.noise, d.pure_error), d.predictable_share
+    if share < LEAST_SHARE and repeats:
         return (
             f"Residuals are {_spread(d)} and follow nothing recorded, but "
-            f"{100 * d.repeated_share:.0f} % of the misfit is the same when a pose is repeated: "
+            f"{_share(d.repeated_share)} of the misfit is the same when a pose is repeated: "
             f"the pose itself predicts it{repeats}; {none}"
         )
     if repeats:
-        repeats = f"{repeats}: {100 * d.repeated_share:.0f} % of the misfit is the same in them"
-    share = d.predictable_share
-    percent = f"{100 * share:.0f} %" if share >= 0.005 else f"{100 * share:.1g} %"
+        repeats = f"{repeats}: {_share(d.repeated_share)} of the misfit is the same in them"
+    percent = _share(share) if share >= 0.005 else f"{100 * share:.1g} %"
+    follows = f"; it follows {' and '.join(d.follows)}" if d.follows else ""
     return (
         f"Residuals are {_spread(d)}, {percent} of the misfit is predicted on poses left out, and "
         f"{none}{follows}{repeats}"
@@ -244,10 +231,10 @@ def _no_suspect(d: Diagnosis) -> str:
 
 def _pose_alone(d: Diagnosis, a: PoseAlone) -> str:
     first, *rest = a.effects
-    chance = "" if a.chance is None else f" with a chance of {100 * a.chance:.0f} %"
+    chance = "" if a.chance is None else f" with a chance of {_share(a.chance)}"
     others = f", or {' or '.join(rest[:2])}," if rest else ""
     return (
-        f"Residuals are {_spread(d)}, and {100 * a.share:.0f} % of the misfit is the same under "
+        f"Residuals are {_spread(d)}, and {_share(a.share)} of the misfit is the same under "
         f"every load of a pose: it depends on the pose alone. {first} finer than {a.poses} poses "
         f"can resolve{others} would do that, and so would an arm that repeats worse than stated, "
         f"where each pose was arrived at once; {a.more} more poses tell{chance}"
@@ -259,19 +246,18 @@ def _misjudged(d: Diagnosis) -> str:
         raise ValueError("a diagnosis of misjudged noise without a judgement of the noise")
     repeats = d.pure_error
     if d.scatter is not None and d.fit.readings.arm_scatter is None:
-        return f"Residuals are {_spread(d)} and nothing predicts them; {no_repeatability(d)}"
+        why = _no_repeatability(d.scatter, d.fit.model.cell.arm)
+        return f"Residuals are {_spread(d)} and nothing predicts them; {why}"
     if d.noise.reason == "repeats" and repeats is not None:
         compared = "less" if d.fit.variance_factor < 1 else "more"
         return (
             f"Repeated readings scatter {repeats.factor**0.5:.2g} times as much as stated, and "
             f"the residuals no {compared} than the repeats: scale the covariance by "
-            f"{repeats.factor:.2g}; no effect is missing{noise_place(repeats)}"
+            f"{repeats.factor:.2g}; no effect is missing{_noise_place(repeats)}"
         )
     if d.noise.reason == "too_large":
-        return (
-            f"Residuals are only {_spread(d)}: the stated covariance is too large"
-            f"{noise_place(repeats)}"
-        )
+        place = _noise_place(repeats)
+        return f"Residuals are only {_spread(d)}: the stated covariance is too large{place}"
     few = "without repeated readings" if repeats is None else "with so few repeated readings"
     return (
         f"Residuals are {_spread(d)} and nothing predicts them; {few} it cannot be known whether "
@@ -288,70 +274,59 @@ def _repeats_scatter_less(noise: NoiseVerdict | None, repeats: PureError | None)
     """Return the end of a sentence on repeats that scatter less than the residuals."""
     if noise is None or noise.reason != "lack_of_fit" or repeats is None:
         return ""
-    factor = repeats.factor**0.5
-    return f"; repeated readings scatter only {factor:.2g} times what is stated"
+    return f"; repeated readings scatter only {repeats.factor**0.5:.2g} times what is stated"
 
 
-def noise_place(repeats: PureError | None) -> str:
+def _noise_place(repeats: PureError | None) -> str:
     """Return the end of a sentence on where the noise differs most from what is stated."""
     if repeats is None or repeats.where is None:
         return ""
     w = repeats.where
-    readings = "unloaded readings" if w.name == "unloaded" else w.name
-    place = {"axis": w.name, "joint": f"along the motion of {w.name}"}.get(
-        w.kind, f"{'of' if w.name == 'unloaded' else 'under'} {readings}"
-    )
+    of = "of unloaded readings" if w.name == "unloaded" else f"under {w.name}"
+    place = {"axis": w.name, "joint": f"along the motion of {w.name}"}.get(w.kind, of)
     return (
         f"; it differs most {place}, where the repeats scatter {w.factor**0.5:.2g} times as much "
         "as stated"
     )
 
 
-def left_to_the_arm(d: Diagnosis, nothing_missing: str) -> str:
+def _left_to_the_arm(d: Diagnosis) -> str:
     """Say that what is left is the arm's repeatability, and that no effect is missing."""
-    s = _scatter(d)
-    doubt = ""
+    s = d.scatter
+    if s is None:
+        raise ValueError("a diagnosis of the arm's scatter without an estimate of it")
+    alone, predicted = "is predictable by nothing recorded (0 % on poses left out) and ", ""
+    if s.predicted_share >= 0.005:
+        by = " and ".join(s.predicted_by) or "what was recorded"
+        size = length(s.predicted_share**0.5 * s.size_m)
+        alone, predicted = (
+            "",
+            (
+                f"; {_share(s.predicted_share)} of it, {size} rms, follows {by} on poses left out, "
+                "which is negligible beside the rest"
+            ),
+        )
+    doubt = large = ""
     if not separated(s):
         doubt = (
             "; these readings cannot separate it from an instrument "
             f"{s.instrument_factor:.2g} times as noisy as stated"
         )
-    alone = predicted = ""
-    if s.predicted_share < 0.005:
-        alone = "is predictable by nothing recorded (0 % on poses left out) and "
-    else:
-        predicted = f"; {_predicted(s)}"
+    estimated = d.fit.readings.arm_scatter is not None
+    if estimated and d.noise is not None and d.noise.reason == "too_large":
+        large = (
+            f"; with it the residuals are {d.fit.variance_factor**0.5:.2g} times the noise, so the "
+            "instrument's is stated too large in some of its elements"
+        )
     return (
-        f"What is left, {numbers.length(s.size_m)} rms, {alone}is of the size of the arm's "
+        f"What is left, {length(s.size_m)} rms, {alone}is of the size of the arm's "
         f"repeatability: {sigmas(s)}{_maker(s, d.fit.model.cell.arm)}{predicted}; "
-        f"{nothing_missing}{doubt}{_too_large(d)}"
+        f"{_nothing_missing(d)}{doubt}{large}"
     )
 
 
-def _predicted(s: ArmScatter) -> str:
-    """Say how much of what is left something recorded predicts, and that it is negligible."""
-    by = " and ".join(s.predicted_by) if s.predicted_by else "what was recorded"
-    size = numbers.length(s.predicted_share**0.5 * s.size_m)
-    return (
-        f"{100 * s.predicted_share:.0f} % of it, {size} rms, follows {by} on poses left out, which "
-        "is negligible beside the rest"
-    )
-
-
-def _too_large(d: Diagnosis) -> str:
-    """Say that the stated noise is too large beside the scatter, where it is."""
-    if d.fit.readings.arm_scatter is None or d.noise is None or d.noise.reason != "too_large":
-        return ""
-    factor = d.fit.variance_factor**0.5
-    return (
-        f"; with it the residuals are {factor:.2g} times the noise, so the instrument's is stated "
-        "too large in some of its elements"
-    )
-
-
-def no_repeatability(d: Diagnosis) -> str:
+def _no_repeatability(s: ArmScatter, arm: Arm) -> str:
     """Say why what is left is not the arm's repeatability; the start of it is said already."""
-    s, arm = _scatter(d), d.fit.model.cell.arm
     if instrument_instead(s):
         return (
             f"they are as if the instrument were {s.instrument_factor:.2g} times as noisy as "
@@ -359,7 +334,7 @@ def no_repeatability(d: Diagnosis) -> str:
             "readings to be sure"
         )
     return (
-        f"the arm would have to scatter by {numbers.length(s.size_m)} rms{_maker(s, arm)}, more "
+        f"the arm would have to scatter by {length(s.size_m)} rms{_maker(s, arm)}, more "
         "than an arm's repeatability: the instrument is noisier than stated, or the arm or the "
         "target was loose"
     )
@@ -367,61 +342,51 @@ def no_repeatability(d: Diagnosis) -> str:
 
 def sigmas(s: ArmScatter) -> str:
     """Write the standard deviations with their uncertainties."""
-    if s.kind == "isotropic":
-        value, error = numbers.with_std(1e6 * s.std[0], 1e6 * s.std_error[0])
-        return f"the target scatters by σ = {value} ± {error} µm along each axis"
     pairs = [numbers.with_std(1e6 * v, 1e6 * e) for v, e in zip(s.std, s.std_error, strict=True)]
+    if s.kind == "isotropic":
+        return f"the target scatters by σ = {' ± '.join(pairs[0])} µm along each axis"
     if s.kind == "joints":
-        return f"each joint scatters by σ_q = {pairs[0][0]} ± {pairs[0][1]} µrad"
-    told = ", ".join(
-        f"joint {j + 1} {value} ± {error}"
-        for j, (value, error) in enumerate(pairs)
+        return f"each joint scatters by σ_q = {' ± '.join(pairs[0])} µrad"
+    clear = ", ".join(
+        f"joint {j + 1} {' ± '.join(pair)}"
+        for j, pair in enumerate(pairs)
         if s.std[j] > s.std_error[j]
     )
-    return f"the joints scatter by σ_q [µrad] = {told}, the others by less than can be told"
+    return f"the joints scatter by σ_q [µrad] = {clear}, the others by less than can be told"
 
 
 def _maker(s: ArmScatter, arm: Arm) -> str:
     """Compare with ISO 9283's figure."""
-    own = f" (RP of ISO 9283 about {numbers.length(RP_PER_RMS * s.size_m)}"
-    if arm.repeatability is None:
-        return f"{own}; arms of industry have 0.02 to 0.1 mm)"
-    return f"{own}; the maker states {numbers.digits(1e3 * arm.repeatability, 2)} mm)"
+    states = "arms of industry have 0.02 to 0.1 mm"
+    if arm.repeatability is not None:
+        states = f"the maker states {numbers.digits(1e3 * arm.repeatability, 2)} mm"
+    return f" (RP of ISO 9283 about {length(RP_PER_RMS * s.size_m)}; {states})"
 
 
 def repeatability_source(source: ScatterSource, arm: Arm) -> str:
     """Say what an arm's repeatability is from, as an uncertainty budget does."""
-    if source == "estimated":
-        return "type A: estimated with the model"
-    if source == "stated":
-        return "type B: as [repeatability] states it"
-    if source == "repeats":
-        return "type A: scatter of the repeated readings"
     if source == "maker" and arm.repeatability is not None:
-        return f"type B: the maker states RP {numbers.length(arm.repeatability)} (ISO 9283)"
-    if source == "industry":
-        return f"type B: not known; RP of arms of industry is up to {numbers.length(INDUSTRIAL)}"
-    return "not known"
-
-
-def _scatter(d: Diagnosis) -> ArmScatter:
-    if d.scatter is None:
-        raise ValueError("a diagnosis of the arm's scatter without an estimate of it")
-    return d.scatter
+        return f"type B: the maker states RP {length(arm.repeatability)} (ISO 9283)"
+    return {
+        "estimated": "type A: estimated with the model",
+        "stated": "type B: as [repeatability] states it",
+        "repeats": "type A: scatter of the repeated readings",
+        "industry": f"type B: not known; RP of arms of industry is up to {length(INDUSTRIAL)}",
+    }.get(source, "not known")
 
 
 def correlated(n: SerialNoise) -> str:
     """Say that the readings are correlated along their order, and what it does."""
-    rho, error = numbers.with_std(n.rho, n.rho_error)
     unit = "s" if n.clock == "time" else "readings"
-    share = "" if n.share > 0.95 else f" in {100 * n.share:.0f} % of their variance"
+    share = "" if n.share > 0.95 else f" in {_share(n.share)} of their variance"
     doubt = ""
     if not n.proved:
         others = " and ".join(n.instead) or "effects of the catalogue"
         doubt = f"; or not, since {others} would explain the readings as well: repeat them"
     low, high = n.wider
     return (
-        f"readings are correlated along their order{share}: ρ = {rho} ± {error} from one to the "
+        f"readings are correlated along their order{share}: "
+        f"ρ = {' ± '.join(numbers.with_std(n.rho, n.rho_error))} from one to the "
         f"next, half-time {n.half:.2g} {unit}; standard uncertainties are {low:.2g} to {high:.2g} "
         f"times as large for it{doubt}"
     )

@@ -1,15 +1,19 @@
-"""What a diagnosis leaves open, the measurements that would settle it, and why there are none."""
+"""Whether more is to be measured: what is in doubt, and what a further plan would tell."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hilcal.calibration.calibration import Calibration
+from hilcal.calibration.compensation import band
+from hilcal.calibration.tool import tool_of
 from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.design.checked_plan import CheckedPlan, checked
 from hilcal.design.next import Next, PairPower, measure_next, measure_poses
-from hilcal.design.planner import Request
+from hilcal.design.planner import Request, make
+from hilcal.design.predicted import predicted
 from hilcal.design.summary import about, summarise
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.doubt import in_doubt
@@ -17,11 +21,14 @@ from hilcal.diagnosis.effect_ranking import Suspect
 from hilcal.diagnosis.more_poses import pose_powers
 from hilcal.diagnosis.pose_alone import PoseAlone
 from hilcal.diagnosis.stepwise import remove
-from hilcal.errors import CannotAnswerError
+from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.fit import Fit
 from hilcal.names import quoted
 from hilcal.present.progress import Say
-from hilcal.procedure.state import reference_in
+from hilcal.procedure.state import Settings, duration_of, reference_in
+from hilcal.procedure.validation_plan import RECORDED
+from hilcal.readings.readings import States
+from hilcal.robot.chain import evaluate
 from hilcal.store.plan import Plan
 from hilcal.types import Floats
 
@@ -68,14 +75,10 @@ def separating(
     reference: Floats | None = None,
     usual: int = 20,
 ) -> Next:
-    """Plan the measurements that separate the suspects of a doubt.
+    """Plan the measurements that separate the suspects of a doubt, or raise a CannotAnswerError.
 
     As many readings as so many poses take, as many as the doubt needs, or `usual` where neither is
     known. `reference` (n,) are the joints of the campaign's reference pose, rad.
-
-    Raises:
-        InputError: suspects that cannot be.
-        CannotAnswerError: no measurement separates any two of them, or no plan can be made.
     """
     before, effects = doubt.fit, doubt.suspects
     if doubt.alone is None:
@@ -118,10 +121,7 @@ def next_plan(
 
     As many readings as so many poses take; what the doubt needs where None. `cell` is given where
     it is not the campaign's any more. To `compare` criteria and numbers of poses takes longer.
-
-    Raises:
-        InputError: suspects that cannot be, or a plan that may not be run.
-        CannotAnswerError: no measurement separates any two of them, or no plan can be made.
+    Raises as `separating` does.
     """
     config, numbers = (o.config, o.cell) if cell is None else cell
     found = separating(numbers, config, doubt, poses, rng, say, reference_in(o.file), POSES)
@@ -135,8 +135,7 @@ def next_plan(
 def doubt_to_settle(o: Campaign, d: Diagnosis, say: Say) -> Doubt:
     """Return what a diagnosis leaves open, and a fit whose model does not hold the suspects.
 
-    Raises:
-        CannotAnswerError: nothing is in doubt; says what else to do.
+    Raises a CannotAnswerError where nothing is in doubt; it says what else to do.
     """
     found = doubt_of(d, say)
     if found is not None:
@@ -196,3 +195,186 @@ def _differ(o: Campaign, s: Suspect) -> str:
         f"the model has one {s.coarse} for several joints; let them differ, and diagnose again: "
         f"hilcal add {quoted(o.path)} {quoted(s.effect)}"
     )
+
+
+WORTH = 0.05
+"""Share by which a further plan must lower the predicted error to be worth its time; a choice."""
+TOLD = 0.1
+"""Power that a further plan must add for a pair of suspects to be worth its time; a choice."""
+MOST_PLANS = 6
+"""Plans of a campaign at most; a choice: what five further plans have not settled, a sixth of the
+same size will not."""
+MOST = 200
+"""Points at which the error is predicted at most; a choice."""
+
+
+@dataclass(frozen=True, slots=True)
+class PredictedError:
+    """Distances within which 95 % of points are after compensation, as the fit states them."""
+
+    now_m: float  # all of it
+    floor_m: float
+    """What no further reading lowers: the arm's repeatability, and what the model leaves."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Decision:
+    """What to do after a refinement."""
+
+    reason: str
+    """"adequate", "goal_met"; "doubt" or "goal" where a further plan is to be measured; "floor",
+    "no_gain", "inseparable", "time" or "plans" where more cannot be told or costs too much; the
+    verdict where no measurement would help."""
+    verdict: str
+    error: PredictedError
+    then_m: float | None = None  # the same after the further plan; None where it is about a doubt
+    suspects: tuple[str, ...] = ()  # effects in doubt
+    power: float | None = None  # least chance of separating two of them after the further plan
+    plan: Plan | None = None
+    """The further plan, that is measured unless the reason is "time"; None without one."""
+    seconds: float = 0.0  # how long it takes, cell s
+
+    @property
+    def measures(self) -> bool:
+        """Whether the further plan is to be measured."""
+        return self.reason in ("doubt", "goal")
+
+    def to_json(self) -> dict[str, object]:
+        """Return it as an entry of the log holds it."""
+        return {
+            "reason": self.reason,
+            "verdict": self.verdict,
+            "predicted_m": self.error.now_m,
+            "floor_m": self.error.floor_m,
+            "then_m": self.then_m,
+            "suspects": list(self.suspects),
+            "power": self.power,
+            "readings": 0 if self.plan is None else len(self.plan.steps),
+            "seconds": self.seconds,
+        }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Question:
+    """Whether to measure more, after a diagnosis."""
+
+    cell: Cell
+    config: CellConfig
+    settings: Settings
+    d: Diagnosis  # of the last fit
+    error: PredictedError
+    reference: Floats | None  # (n,) joints of the reference pose of the plans so far, rad
+    rng: np.random.Generator
+    say: Say
+
+    def separating(self) -> Decision | None:
+        """Return what would settle a doubt; None where there is none."""
+        doubt = doubt_of(self.d, self.say)
+        if doubt is None:
+            return None
+        nothing = Decision("inseparable", self.d.verdict, self.error, suspects=doubt.suspects)
+        poses, site = self.settings.poses, (self.cell, self.config)
+        try:
+            found = separating(*site, doubt, None, self.rng, self.say, self.reference, poses)
+        except (CannotAnswerError, InputError):
+            return nothing
+        separable = [p for p in found.powers if not p.not_separable]
+        if max((p.then - p.now for p in separable), default=0.0) < TOLD:
+            return nothing
+        plan, power = plan_of(found, doubt.suspects), min(p.then for p in separable)
+        seconds = duration_of(plan)
+        return replace(nothing, reason="doubt", power=power, plan=plan, seconds=seconds)
+
+    def sharpening(self) -> Decision | None:
+        """Return what would lower the predicted error; None where it is as wanted."""
+        goal, error = self.settings.goal_m, self.error
+        if goal is None or error.now_m <= goal:
+            return None
+        decision = Decision("no_gain", self.d.verdict, error)
+        if error.floor_m >= goal:
+            return replace(decision, reason="floor")
+        self.say("planning what would lower the predicted error")
+        planning = self.config.planning.model_copy(update={"readings": self.d.fit.mode})
+        config, asked = self.config.model_copy(update={"planning": planning}), self.settings.poses
+        try:
+            planned = make(
+                *(self.cell, config, Request(asked), self.rng, self.d.fit, self.say),
+                reference=self.reference,
+            )
+        except (CannotAnswerError, InputError):
+            return decision
+        before = predicted(planned.problem, work=planned.work).position
+        after, share = planned.predicted.position, 1.0
+        if before is not None and after is not None and np.isfinite(after):
+            share = (after / before) ** 2 if np.isfinite(before) and before > 0 else 0.0
+        of_parameters = max(error.now_m**2 - error.floor_m**2, 0.0)
+        then = float(np.sqrt(error.floor_m**2 + share * of_parameters))
+        if then > (1.0 - WORTH) * error.now_m:
+            return replace(decision, then_m=then)
+        plan = replace(planned.ordered.plan, about=about(planned))
+        seconds = duration_of(plan)
+        return replace(decision, reason="goal", then_m=then, plan=plan, seconds=seconds)
+
+
+def decide(
+    cell: Cell,
+    config: CellConfig,
+    settings: Settings,
+    d: Diagnosis,
+    plans: tuple[Plan, ...],
+    reference: Floats | None,
+    rng: np.random.Generator,
+    say: Say = lambda words: None,
+) -> Decision:
+    """Decide whether to measure more, and what.
+
+    A doubt between effects comes first; then a predicted error above the goal. A further plan is
+    measured where it would tell more and the time allows it. `d` is the diagnosis of the last fit,
+    `plans` are those so far, `reference` (n,) the joints of their reference pose, rad.
+    """
+    error = predicted_error(Calibration.of(d.fit), d.fit.readings.states, config)
+    question = _Question(cell, config, settings, d, error, reference, rng, say)
+    further = question.separating()
+    if further is None or not further.measures:
+        sharper = question.sharpening()
+        if sharper is not None and (further is None or sharper.measures):
+            further = sharper
+    if further is None:
+        reached = settings.goal_m is not None and d.verdict == "adequate"
+        return Decision("goal_met" if reached else d.verdict, d.verdict, error)
+    if not further.measures:
+        return further
+    if sum(map(duration_of, plans)) + further.seconds > settings.max_time_s:
+        return replace(further, reason="time")
+    return replace(further, reason="plans") if len(plans) >= MOST_PLANS else further
+
+
+def predicted_error(calibration: Calibration, fitted: States, config: CellConfig) -> PredictedError:
+    """Predict the error after compensation where the robot will work.
+
+    At `[planning] work_q_rad` where it is given, else half-way between measured poses, under the
+    loads of the readings: the distance that 95 % of all these points are within.
+    """
+    states = _work(fitted, config)
+    columns = {k: v for k in RECORDED if (v := getattr(states, k)) is not None}
+    told = calibration.predict(states.q, states.wrench, recorded=columns)
+    assert told.covariance is not None  # noqa: S101  (asked for by default)
+    of = tool_of(calibration.model, calibration.theta, None)
+    chain = evaluate(calibration.model.cell.arm, states.q)
+    floor = calibration.scatter.covariance(of.model.cell, chain, told.position)
+    floor = floor + calibration.misfit * np.eye(3)
+    pooled = np.stack([told.covariance.mean(axis=0), floor.mean(axis=0)])
+    now, least = band(pooled)
+    return PredictedError(float(now), float(least))
+
+
+def _work(fitted: States, config: CellConfig) -> States:
+    loaded = np.flatnonzero(np.any(fitted.wrench != 0, axis=1))
+    rows = loaded if len(loaded) else np.arange(len(fitted))
+    rows = rows[np.linspace(0, len(rows) - 1, min(MOST, len(rows))).astype(np.int64)]
+    q = fitted.q[rows]
+    between = 0.5 * (q + np.roll(q, -max(len(q) // 3, 1), axis=0))
+    if config.planning.work_q_rad:
+        work = np.array(config.planning.work_q_rad, dtype=float)
+        between = work[np.arange(len(rows)) % len(work)]
+    return replace(fitted[rows], q=between, q_actual=None, target=None)

@@ -32,15 +32,13 @@ from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import InputError
 from hilcal.identification import validation
-from hilcal.identification.acceptance import Acceptance, acceptance
 from hilcal.identification.arm_scatter import with_arm_scatter
 from hilcal.identification.baseline import baseline
 from hilcal.identification.carried import CarriedPrior
-from hilcal.identification.extrapolation import extrapolation
 from hilcal.identification.full_covariance import full_readings
+from hilcal.identification.validation import Acceptance, acceptance, extrapolation
 from hilcal.present.progress import Say
-from hilcal.procedure.corrected import corrected_plan, expected_of, paired
-from hilcal.procedure.decision import Decision, PredictedError, decide, predicted_error
+from hilcal.procedure.next_plan import Decision, PredictedError, decide, predicted_error
 from hilcal.procedure.state import (
     BEGUN,
     DECIDED,
@@ -60,7 +58,7 @@ from hilcal.procedure.state import (
     reference_of,
     settings_of,
 )
-from hilcal.procedure.validation_plan import validation_plan
+from hilcal.procedure.validation_plan import corrected_plan, expected_of, paired, validation_plan
 from hilcal.readings.arm_scatter import ArmScatter
 from hilcal.readings.covariance import COVERS, INSTRUMENT
 from hilcal.readings.readings import Readings
@@ -70,10 +68,17 @@ from hilcal.refinement import Refinement, refine
 from hilcal.refinement import RefinementStep as RefinementStep
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan, read_plan
-from hilcal.store.procedure_log import ENTRY, ProcedureLog, entry
-from hilcal.store.purpose import CALIBRATION, CORRECTED, PURPOSE, VALIDATION
-from hilcal.store.records import content_hash
+from hilcal.store.procedure_log import (
+    CALIBRATION,
+    CORRECTED,
+    ENTRY,
+    PURPOSE,
+    VALIDATION,
+    ProcedureLog,
+    entry,
+)
 from hilcal.store.revision import RevisionRecord
+from hilcal.store.rows import content_hash
 from hilcal.store.run_log import PLAN, RunLog, check_same_cell, create_run
 
 Measure = Callable[[CampaignFile, float | None], None]
@@ -122,9 +127,6 @@ class Procedure:
             cell: from `Cell.load`.
             catalogue: the effects that a model can have; the installed ones unless given.
             **asked: what is asked for, see `Settings`; of a calibration that is there, what it was.
-
-        Raises:
-            InputError: the campaign is of another cell, or not of a calibration.
         """
         path, config, known = Path(run), cell.configured(), catalogue or installed()
         if path.exists():
@@ -140,11 +142,7 @@ class Procedure:
         return Files(self.run)
 
     def record(self) -> RevisionRecord:
-        """Return the revision that the last refinement ended with.
-
-        Raises:
-            InputError: there is none.
-        """
+        """Return the revision that the last refinement ended with."""
         with Campaign.open(self.run, self.catalogue, read_only=True) as o:
             return self._record(o)
 
@@ -155,19 +153,11 @@ class Procedure:
     # the first plan
 
     def plan(self, say: Say = lambda words: None) -> CheckedPlan:
-        """Choose the first plan; nothing is stored yet.
-
-        Raises:
-            InputError: numbers or names that cannot be.
-            CannotAnswerError: the cell leaves too few poses.
-        """
-        rng, config = self._rng(_FIRST), self._planned()
-        chosen = make(
-            self.cell, config, Request(self.settings.poses), rng, None, say, self.catalogue
-        )
-        plan = replace(
-            chosen.ordered.plan, about={**about(chosen), "remarks": list(remarks(chosen))}
-        )
+        """Choose the first plan; nothing is stored yet. A cell may leave too few poses."""
+        rng, config, asked = self._rng(_FIRST), self._planned(), Request(self.settings.poses)
+        chosen = make(self.cell, config, asked, rng, None, say, self.catalogue)
+        known = {**about(chosen), "remarks": list(remarks(chosen))}
+        plan = replace(chosen.ordered.plan, about=known)
         summary = summarise(chosen, config, rng, say, compare=False)
         say("checking every motion in a dry run")
         return checked(self.cell, config, plan, summary)
@@ -177,9 +167,6 @@ class Procedure:
 
         `config` is what the file holds, with the devices that are used; `covers` what the
         covariance of the readings will cover.
-
-        Raises:
-            InputError: it cannot be written, or is there already.
         """
         self.check_files()
         first = entry(BEGUN, {"settings": self.settings.to_json()})
@@ -187,11 +174,7 @@ class Procedure:
         create_run(self.run, config, self.base_dir, plan, source=self._source(), more=more).close()
 
     def check_files(self) -> None:
-        """Refuse files of another calibration where those of this one will be.
-
-        Raises:
-            InputError: one is there.
-        """
+        """Refuse files of another calibration where those of this one will be."""
         for path in (self.files.validation, self.files.corrected):
             if path.exists():
                 raise InputError(
@@ -199,17 +182,12 @@ class Procedure:
                 )
 
     def resume(self, campaign: CampaignFile) -> None:
-        """Keep what is asked for in the log of the campaign.
-
-        Raises:
-            InputError: the campaign is of another cell.
-        """
+        """Keep what is asked for in the log of the campaign."""
         check_same_cell(campaign, self.config, self.base_dir)
-        log = ProcedureLog(campaign)
-        told = self.settings.to_json()
+        log, settings = ProcedureLog(campaign), self.settings.to_json()
         before = log.last(BEGUN)
-        if before is None or before["settings"] != told:
-            log.append(BEGUN, {"settings": told})
+        if before is None or before["settings"] != settings:
+            log.append(BEGUN, {"settings": settings})
 
     # measuring
 
@@ -260,14 +238,8 @@ class Procedure:
         return found
 
     def keep(self, o: Campaign, found: Refinement) -> tuple[int, ...]:
-        """Store the revisions of a refinement; returns their numbers.
-
-        Raises:
-            InputError: it is of other readings than those of the campaign.
-        """
-        records = [
-            o.record(step.fit, step.diagnosis, step.added, step.removed) for step in found.steps
-        ]
+        """Store the revisions of a refinement; returns their numbers."""
+        records = [o.record(s.fit, s.diagnosis, s.added, s.removed) for s in found.steps]
         content = {"readings_sha256": o.data_hash, "verdict": found.verdict}
         self._found[:] = [found]
         return ProcedureLog(o.file).append(REFINED, content, revisions=records)
@@ -287,12 +259,11 @@ class Procedure:
             found = decide(
                 self.cell, self._planned(), self.settings, d, run.plans, reference, rng, say
             )
-            content = found.to_json()
-            if found.measures and found.plan is not None:
-                plan = run.with_new_names(found.plan)  # `run` checks every motion of it
-                log.append(DECIDED, {"action": MEASURE, **content}, plan=plan)
-            else:
-                log.append(DECIDED, {"action": STOP, **content})
+            plan = found.plan if found.measures else None
+            if plan is not None:
+                plan = run.with_new_names(plan)  # `run` checks every motion of it
+            action = STOP if plan is None else MEASURE
+            log.append(DECIDED, {"action": action, **found.to_json()}, plan=plan)
         return found
 
     def stop(self) -> None:
@@ -321,11 +292,7 @@ class Procedure:
     # testing what is never fitted
 
     def plan_validation(self, say: Say = lambda words: None) -> Plan:
-        """Choose poses and loads of the validation campaign, and make its file.
-
-        Raises:
-            CannotAnswerError: no pose is left.
-        """
+        """Choose poses and loads of the validation campaign, and make its file."""
         with Campaign.open(self.run, self.catalogue, read_only=True) as o:
             say("restoring the model")
             calibration, record = self._calibration(o)
@@ -344,11 +311,7 @@ class Procedure:
         return plan
 
     def validate(self, say: Say = lambda words: None) -> Acceptance:
-        """Freeze the validation campaign, and predict its readings.
-
-        Raises:
-            InputError: readings of it were fitted, or it has changed since it was frozen.
-        """
+        """Freeze the validation campaign, and predict its readings."""
         with (
             Campaign.open(self.run, self.catalogue) as o,
             opened(self.files.validation, VALIDATION, self.run) as unseen,
@@ -370,16 +333,9 @@ class Procedure:
             beyond = extrapolation(o.predictive(record, model, theta), fitted, found)
             shares = acceptance(found, beyond)
             every = shares.everything
-            log.append(
-                VALIDATED,
-                {
-                    "revision": record.number,
-                    "error": found.error.to_json(),
-                    "noise_floor_m": found.noise_floor,
-                    "stated_m": every.stated_m,
-                    "within": every.within,
-                },
-            )
+            content = {"revision": record.number, "error": found.error.to_json()}
+            content |= {"noise_floor_m": found.noise_floor, "stated_m": every.stated_m}
+            log.append(VALIDATED, {**content, "within": every.within})
         return shares
 
     def _freeze(self, log: ProcedureLog, unseen: CampaignFile) -> None:
@@ -396,11 +352,7 @@ class Procedure:
             )
 
     def correct(self, say: Say = lambda words: None) -> Plan:
-        """Correct the joint targets of the validation poses, and make the file of their run.
-
-        Raises:
-            CannotAnswerError: no point can be corrected.
-        """
+        """Correct the joint targets of the validation poses, and make the file of their run."""
         with (
             Campaign.open(self.run, self.catalogue) as o,
             opened(self.files.validation, VALIDATION, self.run) as unseen,
@@ -426,11 +378,7 @@ class Procedure:
         return plan
 
     def compare(self, say: Say = lambda words: None) -> Improvement:
-        """Compare the errors at uncorrected and at corrected joint targets, as measured.
-
-        Raises:
-            InputError: the validation campaign has changed since it was frozen.
-        """
+        """Compare the errors at uncorrected and at corrected joint targets, as measured."""
         with (
             Campaign.open(self.run, self.catalogue) as o,
             opened(self.files.validation, VALIDATION, self.run) as unseen,
@@ -443,15 +391,8 @@ class Procedure:
             first, last = (self._readings(o, record, file) for file in (unseen, moved))
             before, after = paired(first, last, calibration.mode)
             _, left_out = expected_of(read_plan(moved.about(PLAN) or "", f"{moved.path}, its plan"))
-            model, theta = o.restore_model(record)
-            found = improvement(
-                calibration,
-                o.predictive(record, model, theta),
-                before,
-                after,
-                before.states,
-                left_out,
-            )
+            p = o.predictive(record, *o.restore_model(record))
+            found = improvement(calibration, p, before, after, before.states, left_out)
             if log.last(IMPROVED) is None:
                 content = {"revision": record.number, "readings_sha256": moved.data_hash()}
                 log.append(IMPROVED, {**content, **found.to_dict()})
@@ -509,11 +450,7 @@ class Procedure:
 
 
 def continued(run: Path, cell: Cell, config: CellConfig, catalogue: Catalogue) -> Procedure:
-    """Return a calibration as its campaign file has it.
-
-    Raises:
-        InputError: the campaign is of another cell, or not of a calibration.
-    """
+    """Return a calibration as its campaign file has it."""
     with CampaignFile.open(run, read_only=True) as campaign:
         settings, base_dir = settings_of(campaign), cell.base_dir.absolute()
         check_same_cell(campaign, config, base_dir)

@@ -1,16 +1,16 @@
 """Where a calibration stands: the next step, by what its files hold and nothing else."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Literal
 
 from hilcal.errors import InputError
 from hilcal.names import quoted
 from hilcal.readings.whitening import Mode
 from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.codec import decode, encode
 from hilcal.store.plan import REFERENCE, Plan, read_plan
-from hilcal.store.procedure_log import ProcedureLog
-from hilcal.store.purpose import CALIBRATION, CORRECTED, PURPOSE, VALIDATION
+from hilcal.store.procedure_log import CALIBRATION, CORRECTED, PURPOSE, VALIDATION, ProcedureLog
 from hilcal.store.run_log import PLAN, RunLog
 from hilcal.types import Floats
 
@@ -29,15 +29,10 @@ Kind = Literal[
 ]
 MOVING: tuple[Kind, ...] = ("measure", "measure_validation", "measure_corrected")
 """Steps in which the arm moves."""
-BEGUN, REFINED, DECIDED, FROZEN, VALIDATED, IMPROVED, WORLD = (
-    "begun",
-    "refined",
-    "decided",
-    "frozen",
-    "validated",
-    "improved",
-    "world",
-)
+_VALIDATING: tuple[Kind, Kind, Kind] = ("plan_validation", "measure_validation", "validate")
+_CORRECTING: tuple[Kind, Kind, Kind] = ("correct", "measure_corrected", "compare")
+BEGUN, REFINED, DECIDED, FROZEN = "begun", "refined", "decided", "frozen"
+VALIDATED, IMPROVED, WORLD = "validated", "improved", "world"
 """Kinds of entries in the log."""
 MEASURE, STOP = "measure", "stop"
 """What was decided: to measure a further plan, or that the model is as good as it gets."""
@@ -64,14 +59,9 @@ class Settings:
     prior: str | None = None
     """File of the campaign or the posterior that is the prior of every fit; None without."""
 
-    def to_json(self) -> dict[str, Any]:
-        """Return it as JSON."""
-        return asdict(self)
-
-    @classmethod
-    def from_json(cls, content: dict[str, Any]) -> Self:
-        """Return what `to_json` wrote."""
-        return cls(**content)
+    def to_json(self) -> dict[str, object]:
+        """Return it as JSON; `settings_of` reads it."""
+        return dict(encode(self))
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,11 +102,7 @@ class ProcedureStep:
 
 
 def next_step(run: Path) -> ProcedureStep:
-    """Return the next step of a calibration.
-
-    Raises:
-        InputError: the campaign is not one of a calibration, or a file is damaged.
-    """
+    """Return the next step of a calibration."""
     files = Files(run)
     if not run.exists():
         return ProcedureStep("plan", run)
@@ -136,21 +122,18 @@ def next_step(run: Path) -> ProcedureStep:
                 return ProcedureStep("refine", run)
             return ProcedureStep("decide", run)
         looked, improved = log.last(VALIDATED) is not None, log.last(IMPROVED) is not None
-    if not files.validation.exists():
-        return ProcedureStep("plan_validation", files.validation)
-    with opened(files.validation, VALIDATION, run) as campaign:
-        missing = _missing("measure_validation", campaign)
-    if missing is not None:
-        return missing
-    if not looked:
-        return ProcedureStep("validate", files.validation)
-    if not files.corrected.exists():
-        return ProcedureStep("correct", files.corrected)
-    with opened(files.corrected, CORRECTED, run) as campaign:
-        missing = _missing("measure_corrected", campaign)
-    if missing is not None:
-        return missing
-    return ProcedureStep("done" if improved else "compare", run)
+    tests: list[tuple[Path, str, Kind, Kind, Kind, bool, Path]] = [
+        (files.validation, VALIDATION, *_VALIDATING, looked, files.validation),
+        (files.corrected, CORRECTED, *_CORRECTING, improved, run),
+    ]
+    for path, purpose, plan, measure, judge, judged, of in tests:
+        if not path.exists():
+            return ProcedureStep(plan, path)
+        with opened(path, purpose, run) as campaign:
+            missing = _missing(measure, campaign)
+        if missing is not None or not judged:
+            return missing or ProcedureStep(judge, of)
+    return ProcedureStep("done", run)
 
 
 def _asked_anew(log: ProcedureLog) -> bool:
@@ -161,11 +144,7 @@ def _asked_anew(log: ProcedureLog) -> bool:
 
 
 def opened(path: Path, purpose: str, run: Path, *, read_only: bool = True) -> CampaignFile:
-    """Open a file of a calibration.
-
-    Raises:
-        InputError: it is another one.
-    """
+    """Open a file of a calibration."""
     campaign = CampaignFile.open(path, read_only=read_only)
     if campaign.about(PURPOSE) != purpose or campaign.about(CALIBRATION) != identity(run):
         campaign.close()
@@ -180,15 +159,12 @@ def identity(run: Path) -> str:
 
 
 def settings_of(campaign: CampaignFile) -> Settings:
-    """Return what a calibration was asked for, as it was last.
-
-    Raises:
-        InputError: the campaign is not one of a calibration.
-    """
+    """Return what a calibration was asked for, as it was last."""
     begun = ProcedureLog(campaign).last(BEGUN)
     if begun is None:
         raise _another(campaign.path)
-    return Settings.from_json(begun["settings"])
+    settings: Settings = decode(Settings, begun["settings"])
+    return settings
 
 
 def _another(run: Path) -> InputError:

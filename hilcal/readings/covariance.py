@@ -35,45 +35,27 @@ from hilcal.robot.arm import Arm
 from hilcal.robot.chain import drive_jacobian, evaluate
 from hilcal.types import Bools, Floats, Ints
 
-COVERS = "covariance"
-"""Key among the texts about a campaign: what the stored covariances cover."""
-FROM = "covariance from"
-"""Key of `TRACKER` where they were made from the noise in [tracker]; absent elsewhere."""
+COVERS = "covariance"  # Key among the texts about a campaign: what the stored covariances cover
+FROM = "covariance from"  # key of `TRACKER` where they were made from [tracker]
 TRACKER = "tracker"
-INSTRUMENT = "instrument"
-"""They cover the instrument alone, not the arm's repeatability."""
-WHOLE = "instrument+arm"
-"""They include the arm's repeatability."""
-ROUNDING = "+rounding"
-"""End of either word in a table, where the covariances also include the rounding of positions."""
-PRIOR_REPEATS = 20.0
-"""ν0: how many repeats the stated covariance is worth as a prior; a guess, no study set it."""
+INSTRUMENT = "instrument"  # They cover the instrument alone, not the arm's repeatability
+WHOLE = "instrument+arm"  # They include the arm's repeatability
+ROUNDING = "+rounding"  # end of either word in a table, where rounding is included
+PRIOR_REPEATS = 20.0  # ν0, the repeats that the stated covariance is worth; a guess
 
 
 @dataclass(frozen=True, slots=True)
 class TrackerNoise:
-    """A specification: standard deviations a + b d of a spherical instrument at distance d.
+    """A specification: standard deviations a + b d of a spherical instrument at distance d."""
 
-    Attributes:
-        range_std: along the beam at zero distance, m.
-        range_std_per_m: its growth with distance, m/m.
-        transverse_std: across the beam at zero distance, m.
-        transverse_std_per_m: its growth with distance (an angle), m/m.
-        orientation_std: of a small rotation about any axis, rad; 0 where only positions are read.
-    """
-
-    range_std: float
-    range_std_per_m: float
-    transverse_std: float
-    transverse_std_per_m: float
-    orientation_std: float = 0.0
+    range_std: float  # along the beam at zero distance, m
+    range_std_per_m: float  # its growth with distance, m/m
+    transverse_std: float  # across the beam at zero distance, m
+    transverse_std_per_m: float  # its growth with distance (an angle), m/m
+    orientation_std: float = 0.0  # of a small rotation about any axis, rad; 0 if not read
 
     def __post_init__(self) -> None:
-        """Refuse what no instrument can have.
-
-        Raises:
-            InputError: a figure is negative or not finite, or a position has no noise at all.
-        """
+        """Refuse what no instrument can have."""
         for f in fields(self):
             value = getattr(self, f.name)
             if not np.isfinite(value) or value < 0:
@@ -96,31 +78,19 @@ def tracker_noise(section: Tracker) -> TrackerNoise:
 
 
 def tracker_covariance(
-    position: Floats,
+    position: Floats,  # (N, 3) positions in the frame of `station`, m
     noise: TrackerNoise,
-    station: Floats | Sequence[float] = (0.0, 0.0, 0.0),
-    m: int = 3,
+    station: Floats | Sequence[float] = (0.0, 0.0, 0.0),  # (3,) where the beam starts, m
+    m: int = 3,  # 3 for positions, 6 for poses
 ) -> Floats:
-    """Instrument covariance of one sample: an ellipsoid that turns with the line of sight.
+    """Instrument covariance (N, m, m) of one sample: an ellipsoid that turns with the beam.
 
     With d the distance from the station and u the beam's direction,
 
         Cov = J diag(σ_az², σ_el², (a + b d)²) Jᵀ = (c + e d)² (I - u uᵀ) + (a + b d)² u uᵀ
 
-    where the angles' errors are equal across the beam: d σ_el = d cos(el) σ_az = c + e d.
-    The rotation of a pose (m = 6) has the covariance σ_o² I, independent of the position.
-
-    Args:
-        position: (N, 3) positions in the frame of `station`, m.
-        station: (3,) where the beam starts, m.
-        m: 3 for positions, 6 for poses.
-
-    Returns:
-        (N, m, m) covariances, m² and rad², exactly symmetric.
-
-    Raises:
-        InputError: a position lies at the station, where the beam has no direction; m = 6 with
-            `orientation_std` 0.
+    where the angles' errors are equal across the beam: d σ_el = d cos(el) σ_az = c + e d. The
+    rotation of a pose (m = 6) has the covariance σ_o² I.
     """
     beam = np.asarray(position, dtype=float) - np.asarray(station, dtype=float)
     distance = np.linalg.norm(beam, axis=1)
@@ -142,21 +112,13 @@ def tracker_covariance(
 def covariance_of_mean(
     stated: Floats, deviations: Floats, systematic_share: float = 0.0, factor: float = 1.0
 ) -> Floats:
-    """Covariance (m, m) of the mean of K samples of one target at rest.
+    """Covariance (m, m) of the mean of K samples of one target at rest, r_k from their mean (K, m).
 
         R = (ν0 (1 - s) τ Σ̄ + Σ_k r_k r_kᵀ) / (ν0 + K - 1)        Cov = s Σ̄ + R / K
 
-    The share s of Σ̄ is the same in all samples: it does not show in their scatter, and averaging
-    does not reduce it. R is the posterior mean of the random covariance with the stated one as an
-    inverse Wishart prior worth ν0 = `PRIOR_REPEATS` repeats (Gelman et al., *Bayesian Data
-    Analysis*, section 3.6): a few repeats are a poor estimate of six or more variances, but a
-    specification describes a kind of instrument, not the air of the day.
-
-    Args:
-        stated: (m, m) Σ̄, the instrument's covariance of one sample.
-        deviations: (K, m) r_k of the samples from their mean.
-        systematic_share: s, 0 to 1.
-        factor: τ, by which the stated random variance is multiplied; 1 unless it is disproved.
+    The share s of Σ̄ is the same in all samples: averaging does not reduce it. R is the posterior
+    mean of the random covariance with the stated one, times τ, as an inverse Wishart prior worth ν0
+    = `PRIOR_REPEATS` repeats (Gelman et al., *Bayesian Data Analysis*, section 3.6).
     """
     count = len(deviations)
     prior = PRIOR_REPEATS * (1 - systematic_share) * factor * stated
@@ -177,15 +139,9 @@ def joint_scatter(jacobian: Floats, joint_std: Floats, rotation: Floats, m: int)
 
 
 def scatter_factor(jacobian: Floats, joint_std: Floats, rotation: Floats, m: int) -> Floats:
-    """Factor F = R J Σ_q^½ (..., m, n) of the scatter of the joints.
+    """Factor F = R J Σ_q^½ (..., m, n) of the scatter of the joints, σ_q (n,); J (..., 6, n).
 
     F_i F_jᵀ is the covariance of two readings i, j of one arrival of the arm.
-
-    Args:
-        jacobian: (..., 6, n) of the target, translation then rotation, base axes.
-        joint_std: (n,) standard deviations σ_q from one arrival to the next, rad.
-        rotation: (..., 3, 3) R_sensor_base.
-        m: 3 for positions, 6 for poses.
     """
     moved = jacobian * joint_std
     turned = np.concatenate([rotation @ moved[..., :3, :], rotation @ moved[..., 3:, :]], axis=-2)
@@ -195,24 +151,14 @@ def scatter_factor(jacobian: Floats, joint_std: Floats, rotation: Floats, m: int
 def arrival_factors(
     arm: Arm, readings: Readings, offset: Floats, rotation: Floats, joint_std: Floats
 ) -> Floats:
-    """Factors F (N, m, n) of the scatter of the joints at the nominal poses of the readings.
-
-    Args:
-        readings: N readings.
-        offset: (3,) or (N, 3) the target in flange axes, m.
-        rotation: (3, 3) R_sensor_base.
-        joint_std: (n,) standard deviations from one arrival to the next, rad.
-    """
+    """Factors F (N, m, n) of the scatter of the joints at the nominal poses of the readings."""
     chain = evaluate(arm, readings.states.q)
     jac = drive_jacobian(arm, chain, chain.point(offset))
     return scatter_factor(jac, joint_std, rotation, readings.m)
 
 
 def with_scatter(readings: Readings, factor: Floats) -> Readings:
-    """Return the readings with a scatter of the arm added: V + F Fᵀ, F (N, m, k).
-
-    Targets that were read in one arrival have it in common (`Readings.common`).
-    """
+    """Return the readings with a scatter of the arm, F (N, m, k), added: V + F Fᵀ."""
     total = readings.covariance + factor @ np.swapaxes(factor, 1, 2)
     return replace(readings, covariance=total, common=_of_arrival(readings, factor))
 
@@ -238,10 +184,7 @@ def symmetric_root(covariance: Floats) -> Floats:
 
 
 def instrument_root(readings: Readings, m: int | None = None) -> Floats:
-    """(N, m, m) S of `serial_noise`: root of the covariance that is not known as the arm's.
-
-    Of the first m elements; of all where that is None.
-    """
+    """(N, m, m) S of `serial_noise`, of the first m elements: root of all but the arm's scatter."""
     v = readings.covariance if readings.stated is None else readings.stated
     if readings.stated is None and readings.common is not None:
         v = v - readings.common @ np.swapaxes(readings.common, 1, 2)
@@ -254,13 +197,8 @@ def measurement_covariance(
     """(G, L·m, L·m) covariance D C Dᵀ of the measurements of each group, D = [I, −weights].
 
     C, of all its readings, has the blocks V_i, and F_i F_jᵀ for two readings of one arrival; where
-    their noise is correlated, φ S_i C_ij S_jᵀ more, see `serial_noise`.
-
-    Args:
-        readings: N readings.
-        loaded: (G, L) rows of the measured readings of each group.
-        reference: (G, U) rows of the unloaded readings that they share.
-        weights: (L, U) of these in the mean that each measurement is taken from.
+    their noise is correlated, φ S_i C_ij S_jᵀ more, see `serial_noise`. Of groups (G, L) of loaded
+    and (G, U) of unloaded rows.
     """
     rows = np.concatenate([loaded, reference], axis=1)
     groups, count = rows.shape
@@ -292,8 +230,7 @@ def single_covariance(v: Floats, loaded: Ints, reference: Ints, weights: Floats)
 def smallest_correlation(covariance: Floats) -> Floats:
     """Return the smallest eigenvalue (N,) of the correlation matrices of covariances (N, m, m).
 
-    −∞ where a variable without variance has a covariance with another, a variance is negative, or a
-    correlation is beyond ±1 (its eigenvalues need not be computable).
+    −∞ where these are none: a covariance without variance, a negative one, or beyond ±1.
     """
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     scale = 1.0 / np.sqrt(np.where(variance > 0, variance, 1.0))

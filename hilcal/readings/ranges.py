@@ -8,9 +8,7 @@ import numpy as np
 from hilcal.readings.readings import States
 from hilcal.types import Bools, Floats
 
-MARGIN = 0.02
-"""Share of the fitted range by which a reading is beyond it; a choice: of two random halves, few
-readings are."""
+MARGIN = 0.02  # share of the fitted range by which a reading is beyond it; a choice
 FULL_TURN = 2.0 * np.pi
 
 
@@ -24,12 +22,7 @@ class Range:
     high: float
 
     def over(self, values: Floats, *, turning: bool = False) -> Floats:
-        """Return by how much values are outside; zero or less inside.
-
-        Args:
-            values: (N,) SI.
-            turning: angles that mean the same whole turns on.
-        """
+        """Return by how much values (N,) are outside; zero or less inside."""
         if not turning:
             return np.asarray(np.maximum(values - self.high, self.low - values))
         above = np.mod(values - self.low, FULL_TURN)
@@ -57,10 +50,7 @@ def turning_variables(turns: Bools) -> frozenset[str]:
 
 
 def variables(s: States, units: Sequence[str]) -> Iterator[tuple[str, str, Floats]]:
-    """Yield name, unit, and the values (N,) of what a prediction may extrapolate in.
-
-    `units` (n,): "rad", or "m" of joints that slide.
-    """
+    """Yield name, unit, and the values (N,) of what a prediction may extrapolate in."""
     for j, unit in enumerate(units):
         yield (travel_name if unit == "m" else angle_name)(j), unit, s.q[:, j]
     for name, unit, part in (("force", "N", slice(0, 3)), ("moment", "N·m", slice(3, 6))):

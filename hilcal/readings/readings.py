@@ -13,8 +13,7 @@ from hilcal.shown import Brief, Tabular
 from hilcal.types import Bools, Floats, Ints
 
 ObserverKind = Literal["station", "point", "gauge"]
-SAME_POSE = 1e-6
-"""Commanded joints of one pose agree to this, rad."""
+SAME_POSE = 1e-6  # Commanded joints of one pose agree to this, rad
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,14 +70,9 @@ class States(Brief):
 
 @dataclass(frozen=True, slots=True)
 class ObserverName:
-    """What observes the target.
+    """What observes the target."""
 
-    Attributes:
-        kind: "station" reads positions or poses, "point" the distance from a point, "gauge" the
-            height over a plane.
-    """
-
-    kind: ObserverKind
+    kind: ObserverKind  # of positions or poses, of distances, or of heights over a plane
     name: str
 
     def __str__(self) -> str:
@@ -143,17 +137,12 @@ class Readings(Tabular):
     def __getitem__(self, rows: Ints | Bools | slice) -> "Readings":
         """Return the chosen readings; names are kept."""
         return replace(
-            self,
-            states=self.states[rows],
-            pose=self.pose[rows],
-            load=self.load[rows],
-            cycle=self.cycle[rows],
-            value=self.value[rows],
-            covariance=self.covariance[rows],
+            self, states=self.states[rows], pose=self.pose[rows], load=self.load[rows],
+            cycle=self.cycle[rows], value=self.value[rows], covariance=self.covariance[rows],
             common=None if self.common is None else self.common[rows],
             stated=None if self.stated is None else self.stated[rows],
             along=None if self.along is None else self.along[rows],
-        )
+        )  # fmt: skip
 
     @staticmethod
     def joined(parts: Sequence["Readings"]) -> "Readings":

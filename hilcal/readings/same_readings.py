@@ -18,35 +18,21 @@ import numpy as np
 from hilcal.readings.readings import Readings
 from hilcal.types import Bools, Floats
 
-LENGTH_M = 1e-7
-"""A table in mm with four decimals is off by half of that; a choice."""
-ANGLE_RAD = 1e-5
-"""A table in degrees with three decimals is off by 0.9e-5; a choice."""
-ATTITUDE_RAD = 2e-5
-"""Three such angles together make an attitude; a choice."""
-SHARED = 0.1
-"""Share of a campaign's readings that are another's, from which both are of one measurement; a
-choice: where a table's last digit is as coarse as the scatter, some hundredths agree by chance."""
-_APART = 10.0
-"""Distance of loaded from unloaded readings, in units of the tolerance."""
+LENGTH_M = 1e-7  # A table in mm with four decimals is off by half of that; a choice
+ANGLE_RAD = 1e-5  # A table in degrees with three decimals is off by 0.9e-5; a choice
+ATTITUDE_RAD = 2e-5  # Three such angles together make an attitude; a choice
+SHARED = 0.1  # share of the readings that makes two campaigns of one measurement; a choice
+_APART = 10.0  # Distance of loaded from unloaded readings, in units of the tolerance
 
 
 def already(readings: Readings, others: Readings) -> Bools:
-    """(N,) which readings are among others.
-
-    Args:
-        readings: N readings; where one of both has positions alone, these are compared.
-        others: any number of readings.
-    """
+    """(N,) which readings are among others; by positions where one of both has these alone."""
     attitude = readings.m == others.m == 6
     return _near(_coordinates(readings, attitude), _coordinates(others, attitude))
 
 
 def prints(readings: Readings) -> Floats:
-    """(N, n + 4) what a reading is known by without its attitude: joints, position, whether loaded.
-
-    To be kept where the readings themselves are not; see `among`.
-    """
+    """(N, n + 4) what a reading is known by, to be kept: joints, position, whether loaded."""
     return _coordinates(readings, attitude=False)
 
 
@@ -66,11 +52,7 @@ def _near(own: Floats, others: Floats) -> Bools:
 
 
 def shared(campaigns: Sequence[Floats]) -> tuple[int, int] | None:
-    """Return the numbers of two campaigns that share readings; None where all are their own.
-
-    Args:
-        campaigns: (N, n + 4) `prints` of each; of another number of joints are other arms.
-    """
+    """Return the numbers of two campaigns, by their `prints`, that share readings; else None."""
     from scipy.spatial import cKDTree  # slow to import
 
     for width in sorted({of.shape[1] for of in campaigns}):
@@ -99,11 +81,6 @@ def never_fitted(readings: Readings, fitted: Readings, deflections: bool) -> tup
     """Return (N,) which readings were fitted, and (N,) which can be predicted as unseen ones.
 
     A deflection is unseen if neither its loaded nor an unloaded reading of it was fitted.
-
-    Args:
-        readings: N readings.
-        fitted: those that a model was fitted to.
-        deflections: whether deflections are to be predicted.
     """
     known = already(readings, fitted)
     if not deflections:

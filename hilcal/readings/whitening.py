@@ -16,34 +16,144 @@ Cholesky's factor: the whitened rows of a measurement are what earlier ones do n
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg import block_diag, solve_triangular
 
 from hilcal import limits
 from hilcal.errors import InputError
 from hilcal.readings.covariance import measurement_covariance, single_covariance
-from hilcal.readings.reading_groups import arrival_groups, deflection_groups, has_unloaded, runs
 from hilcal.readings.readings import Readings
 from hilcal.robot import se3
-from hilcal.types import Floats, Ints
+from hilcal.types import Bools, Floats, Ints
+
+Group = tuple[Ints, Ints, Floats]  # measured (G, L), unloaded (G, U), weights (L, U)
+
+
+def arrival_groups(readings: Readings) -> list[Group]:
+    """Group the readings that share the scatter of an arrival; else each is alone."""
+    count = len(readings)
+    arrival = np.arange(count) if readings.common is None else readings.arrivals
+    order = np.argsort(arrival, kind="stable")
+    starts = np.flatnonzero(np.diff(arrival[order], prepend=-1))
+    sizes = np.diff(np.append(starts, count))
+    if len(starts) == count:
+        order = np.arange(count)
+    found = []
+    for size in np.unique(sizes):
+        rows = order[starts[sizes == size][:, None] + np.arange(size)]
+        limits.check_shared(int(size), readings.m, len(rows))
+        none = np.empty((len(rows), 0), dtype=np.int64)
+        found.append((rows, none, np.zeros((size, 0))))
+    return found
+
+
+def deflection_groups(readings: Readings) -> list[Group]:
+    """Group loaded readings with the unloaded ones of their pose, cycle, target and observer.
+
+    Targets that share the scatter of an arrival are in one group. A loaded reading whose target was
+    not read unloaded in its pose and cycle makes no deflection.
+    """
+    if len(readings) and readings.unloaded.all():
+        raise InputError("readings = deflection: there is no loaded reading; use absolute")
+    _refuse_without_unloaded(readings)
+    keys = [readings.pose, readings.cycle]
+    rows = np.flatnonzero(_has_unloaded(readings, [*keys, readings.line]))
+    unloaded, target = readings.unloaded[rows], readings.line[rows]
+    if readings.common is None:
+        keys.append(readings.line)
+    group = _numbered([k[rows] for k in keys])
+    order = np.lexsort((target, ~unloaded, group))
+    starts = np.flatnonzero(np.diff(group[order], prepend=-1))
+    sizes = np.diff(np.append(starts, len(rows)))
+    count = np.add.reduceat(unloaded[order].astype(np.int64), starts)
+    alike = np.zeros_like(starts)
+    if readings.common is not None:
+        kinds: dict[bytes, int] = {}
+        for k, mine in enumerate(np.split(target[order], starts[1:])):
+            alike[k] = kinds.setdefault(mine.tobytes(), len(kinds))
+    shapes = np.stack([sizes, count, alike], axis=1)
+    found = []
+    for shape in np.unique(shapes, axis=0):
+        size, u = int(shape[0]), int(shape[1])
+        if size == u:
+            continue
+        at = order[starts[np.all(shapes == shape, axis=1)][:, None] + np.arange(size)]
+        limits.check_shared(size - u, readings.m, len(at))
+        limits.check_numbers(f"{size - u} loaded times {u} unloaded readings", (size - u) * u)
+        same = target[at[0, u:], None] == target[at[0, :u]]
+        found.append((rows[at[:, u:]], rows[at[:, :u]], same / same.sum(axis=1, keepdims=True)))
+    if not found:
+        raise InputError(
+            "readings = deflection: no target was read both loaded and unloaded in one pose and "
+            "cycle; use absolute"
+        )
+    return found
+
+
+def runs(readings: Readings, groups: Sequence[Group], most: int) -> list[Group]:
+    """Join groups to runs of about so many measurements along `Readings.along`; none is divided."""
+    each = [
+        (loaded, reference, weights)
+        for of_shape, references, weights in groups
+        for loaded, reference in zip(of_shape, references, strict=True)
+    ]
+    t = np.arange(len(readings)) if readings.along is None else readings.along
+    first = np.argsort([t[loaded].min() for loaded, _, _ in each], kind="stable")
+    sizes = np.cumsum([len(each[k][0]) for k in first])
+    count = -(-int(sizes[-1]) // most)
+    of = (sizes - 1) * count // int(sizes[-1])
+    found = []
+    for run in range(count):
+        parts = [each[k] for k in first[of == run]]
+        if not parts:
+            continue
+        loaded = np.concatenate([p[0] for p in parts])
+        order = np.argsort(t[loaded], kind="stable")
+        weights = block_diag(*(p[2] for p in parts))[order]
+        reference = np.concatenate([p[1] for p in parts])
+        found.append((loaded[order][None], reference[None], weights))
+    return found
+
+
+def _numbered(keys: Sequence[Ints]) -> Ints:
+    return np.unique(np.stack(keys, axis=1), axis=0, return_inverse=True)[1].reshape(-1)
+
+
+def has_unloaded(readings: Readings) -> Bools:
+    """Return (N,) which readings have an unloaded one, or are one, in their pose and cycle."""
+    return _has_unloaded(readings, [readings.pose, readings.cycle])
+
+
+def _has_unloaded(readings: Readings, keys: Sequence[Ints]) -> Bools:
+    group = _numbered(keys)
+    has = np.zeros(int(group.max()) + 1, dtype=bool)
+    has[group[readings.unloaded]] = True
+    return np.asarray(has[group])
+
+
+def _refuse_without_unloaded(readings: Readings) -> None:
+    has = has_unloaded(readings)
+    if not has.all():
+        row = int(np.argmin(has))
+        name = readings.pose_names[readings.pose[row]]
+        raise InputError(
+            f"pose {name}, cycle {readings.cycle[row]}: no unloaded reading (load = none), which "
+            "a deflection needs; measure it, or use --readings absolute"
+        )
+
 
 Scaling = Literal["none", "gu", "gc"]
 Mode = Literal["deflection", "absolute"]
 SCALINGS: tuple[Scaling, ...] = ("none", "gu", "gc")
 MODES: tuple[Mode, ...] = ("deflection", "absolute")
 RANK_TOLERANCE = 1e-10
-MANY = 1000
-"""Blocks from which on Cholesky's factor takes the place of eigenvectors where the rule for
-rank-deficient blocks does not come into play: a fifth of the time for 100,000 blocks; a choice by
-timing."""
-TOGETHER = 1_000_000
-"""Numbers that are whitened at a time; a choice by memory."""
-RUN = 200
-"""Measurements in a run of correlated noise; a choice: a campaign of up to so many is exact, and of
-larger ones the whitening costs as much as predicting."""
+MANY = 1000  # blocks from which on Cholesky's factor is tried; a choice by timing
+TOGETHER = 1_000_000  # Numbers that are whitened at a time; a choice by memory
+RUN = 200  # measurements in a run of correlated noise; a choice: of fewer all is exact
 
 
 def inverse_root(covariance: Floats, scaling: Scaling = "gc") -> Floats:
@@ -85,8 +195,7 @@ def _triangular_roots(covariance: Floats, per_std: Floats) -> Floats:
     """S⁻¹ (N, k, k) by Cholesky's factor; by eigenvalues where the rule may leave something out.
 
     The correlation matrix has trace k, so that λ_max ≤ k, and the product of the k − 1 largest
-    eigenvalues is at most (k/(k − 1))^(k − 1) < e: λ_min > det/e. Blocks with
-    det > e k `RANK_TOLERANCE` have no eigenvalue that the rule leaves out.
+    eigenvalues is below e: with det > e k `RANK_TOLERANCE` the rule leaves nothing out.
     """
     k = covariance.shape[-1]
     correlation = covariance * per_std[:, :, None] * per_std[:, None, :]
@@ -100,59 +209,37 @@ def _triangular_roots(covariance: Floats, per_std: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bucket:
-    """G groups of one shape: L measurements each, and the U unloaded readings they share.
+    """G groups of one shape: L measurements each, and the U unloaded readings they share."""
 
-    Attributes:
-        loaded: (G, L) rows of the readings.
-        reference: (G, U) rows of the unloaded readings; U = 0 for absolute readings.
-        factor: (G, L·m, L·m) scaling matrices.
-        weights: (L, U) of the unloaded readings in the mean that each deflection is taken from:
-            those of its target.
-    """
-
-    loaded: Ints
-    reference: Ints
-    factor: Floats
-    weights: Floats
+    loaded: Ints  # (G, L) rows of the readings
+    reference: Ints  # (G, U) rows of the unloaded readings; U = 0 for absolute readings
+    factor: Floats  # (G, L·m, L·m) scaling matrices
+    weights: Floats  # (L, U) of the unloaded in the mean that each is taken from
 
     def difference(self, x: Floats) -> Floats:
         """(G·L, ...) loaded minus the mean of the unloaded of x (N, ...)."""
         loaded = x[self.loaded]
         if self.reference.shape[1]:
-            loaded -= self._reference_mean(x)
+            unloaded = x[self.reference]
+            if np.all(self.weights == self.weights[:1]):  # all from the same ones
+                loaded -= unloaded.mean(axis=1)[:, None]
+            else:
+                loaded -= np.einsum("lu,gu...->gl...", self.weights, unloaded)
         return loaded.reshape(self.loaded.size, *x.shape[1:])
-
-    def _reference_mean(self, x: Floats) -> Floats:
-        """(G, L or 1, ...) means of the unloaded of x (N, ...)."""
-        unloaded = x[self.reference]
-        if np.all(self.weights == self.weights[:1]):  # all from the same ones
-            return np.asarray(unloaded.mean(axis=1)[:, None])
-        return np.asarray(np.einsum("lu,gu...->gl...", self.weights, unloaded))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Whitening:
-    """The scaled regression: from readings to stacked whitened rows.
+    """The scaled regression: from readings to stacked whitened rows."""
 
-    Attributes:
-        mode: "absolute" or "deflection".
-        scaling: "none", "gu" or "gc".
-        m: elements per reading.
-        buckets: groups by shape.
-        reading: (D,) row of the reading behind each measurement, in the stacked order.
-        covariance: (D, m, m) covariance of each measurement by itself.
-        group: (D,) pose of each measurement.
-        rank: number of whitened rows that carry information.
-    """
-
-    mode: Mode
-    scaling: Scaling
-    m: int
-    buckets: tuple[Bucket, ...]
-    reading: Ints
-    covariance: Floats
-    group: Ints
-    rank: int
+    mode: Mode  # "absolute" or "deflection"
+    scaling: Scaling  # "none", "gu" or "gc"
+    m: int  # elements per reading
+    buckets: tuple[Bucket, ...]  # groups by shape
+    reading: Ints  # (D,) row of the reading behind each measurement, in the stacked order
+    covariance: Floats  # (D, m, m) covariance of each measurement by itself
+    group: Ints  # (D,) pose of each measurement
+    rank: int  # number of whitened rows that carry information
 
     def __len__(self) -> int:
         """Return the number of measurements D (readings or deflections)."""
@@ -161,7 +248,8 @@ class Whitening:
     def raw(self, x: Floats) -> Floats:
         """Measurements (D, m, ...) from values at the readings (N, m, ...)."""
         if self.mode == "absolute":
-            return x if _each_alone(self.buckets) else x[self.reading]
+            alone = len(self.buckets) == 1 and self.buckets[0].loaded.shape[1] == 1
+            return x if alone else x[self.reading]  # in their own order where none share an error
         return np.concatenate([b.difference(x) for b in self.buckets])
 
     def whiten(self, raw: Floats, overwrite: bool = False) -> Floats:
@@ -190,12 +278,7 @@ class Whitening:
 
 
 def whitening(readings: Readings, mode: Mode, scaling: Scaling = "gc") -> Whitening:
-    """Prepare the scaling of the readings in one mode.
-
-    Raises:
-        InputError: where there are no readings; in deflection mode, where a pose has no
-            unloaded reading or there is no loaded reading at all.
-    """
+    """Prepare the scaling of the readings in one mode."""
     if not len(readings):
         raise InputError("there are no readings to fit; measure or import some")
     v, m = readings.covariance, readings.m
@@ -220,11 +303,7 @@ def whitening(readings: Readings, mode: Mode, scaling: Scaling = "gc") -> Whiten
 
 
 def _innovations(covariance: Floats) -> Floats:
-    """S⁻¹ (1, k, k) of a run, S = D L with C = L Lᵀ; a small share of C's diagonal for the rule.
-
-    The rule for rank-deficient V is kept for elements without variance; for directions without,
-    C has `RANK_TOLERANCE` more on its diagonal, in place of leaving out what has no row of its own.
-    """
+    """S⁻¹ (1, k, k) of a run, S = D L with C = L Lᵀ; a small share of C's diagonal for the rule."""
     std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     seen = std > 0
     per = np.where(seen, 1.0, 0.0) / np.where(seen, std, 1.0)
@@ -259,26 +338,13 @@ def relative_rotation(r: Floats, w: Whitening) -> Floats:
     return np.concatenate(out)
 
 
-def _each_alone(buckets: tuple[Bucket, ...]) -> bool:
-    """Whether no absolute readings share an error, so that they are in their own order."""
-    return len(buckets) == 1 and buckets[0].loaded.shape[1] == 1
-
-
 def covariance_blocks(readings: Readings, w: Whitening) -> list[Floats]:
-    """Return the covariance (G, L·m, L·m) of the measurements of each bucket of a scaling.
-
-    Args:
-        readings: those of the scaling, with any covariance.
-    """
+    """Return the covariance (G, L·m, L·m) of the measurements of each bucket of a scaling."""
     return [measurement_covariance(readings, b.loaded, b.reference, b.weights) for b in w.buckets]
 
 
 def usual_mode(readings: Readings, planned: Mode = "deflection") -> Mode:
-    """Deflections where every loaded reading has an unloaded one in its pose and cycle.
-
-    Args:
-        planned: `[planning] readings` of the cell; where it is "absolute", so is what is fitted.
-    """
+    """Deflections, unless planned otherwise, where every loaded reading has an unloaded one."""
     if planned == "absolute" or readings.unloaded.all():
         return "absolute"
     return "deflection" if has_unloaded(readings).all() else "absolute"

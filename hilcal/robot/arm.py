@@ -23,15 +23,10 @@ def missing(
     file: str,
     weighed: bool,
     unlimited: Sequence[str],
-    weak: Sequence[str],
-    forceless: Sequence[str] = (),
+    weak: Sequence[str],  # joints without a torque or effort
+    forceless: Sequence[str] = (),  # prismatic ones without a force or effort
 ) -> tuple[str, ...]:
-    """Return what a description lacks, and what that means, a sentence each.
-
-    Args:
-        weak: joints without a torque or effort.
-        forceless: prismatic ones without a force or effort.
-    """
+    """Return what a description lacks, and what that means, a sentence each."""
     out = [] if weighed else [NO_MASSES.format(file)]
     if unlimited:
         out.append(f"no limits in {file} for {', '.join(unlimited)}: ±360° is assumed")
@@ -52,61 +47,41 @@ def missing(
 class Arm(Brief):
     """A serial arm of n joints, revolute or prismatic (rails, columns, gantries).
 
-    The chain from base to flange is
-
         T_base_flange(q) = L_0 M_1(q_1) L_1 M_2(q_2) ... M_n(q_n) L_n,   M = Rz or Tz
 
-    with constant rigid transforms L_k; coupled joints move by `chain_angles`. *Slot* k
-    (k = 0..n) is the frame right after L_k: for k < n its origin is a point of the axis of joint
-    k + 1 and its z is that axis; slot n is the flange. Body i (i = 1..n) is what joint i moves;
-    its frame is slot i - 1 moved by joint i.
+    with constant rigid transforms L_k; coupled joints move by `chain_angles`. *Slot* k (k = 0..n)
+    is the frame right after L_k: for k < n its origin is a point of the axis of joint k + 1 and its
+    z is that axis; slot n is the flange. Body i (i = 1..n) is what joint i moves; its frame is slot
+    i - 1 moved by joint i.
 
-    What is an angle of a revolute joint (rad) is a displacement of a prismatic one (m), and what is
-    a torque (N·m) is a force along its axis (N); speeds and tolerances in the configuration are the
-    same number in m for a prismatic joint as in rad for a revolute one.
-
-    Attributes:
-        name: catalogue name or file stem.
-        links: (n + 1, 4, 4) transforms L_k, lengths in m.
-        masses: (n,) masses of the bodies, kg.
-        coms: (n, 3) centres of mass in the body frames (after the joint's rotation), m.
-        q_min: (n,) lower joint limits, rad.
-        q_max: (n,) upper joint limits, rad.
-        torque_max: (n,) joint torque limits, N·m.
-        payload: rated payload, kg.
-        joint_names: (n,) names.
-        source: where the figures come from.
-        coupling: (n, n) C with θ = C q: the angles of the chain from the controller's values, where
-            joints follow others (see `conventions`); None where each turns by itself.
-        drive: (n, n) D with dθ = D dδ: displacements of the chain's joints from those of the
-            drives, where drives turn several joints; None where each turns its own.
-        mimic: (n, n + 1) [F, f] with q = F q + f for the controller's values, where joints have no
-            value of their own (`<mimic>` of a URDF): their rows say what it would be, those of the
-            others are of the identity; None where every joint has one.
-        sign: (n,) −1 where the axis is the drawn one turned round (`with_conventions`), else 1;
-            None for 1 everywhere.
-        notes: what its description lacks, and what that means, a sentence each.
-        repeatability: pose repeatability RP of ISO 9283 as the maker states it, m; None if unknown.
-        prismatic: (n,) which joints slide; None where all turn.
+    Of a prismatic joint, angles (rad) are displacements (m), and torques (N·m) forces along its
+    axis (N); speeds and tolerances in the configuration are the same number in m as in rad.
     """
 
-    name: str
-    links: Floats
-    masses: Floats
-    coms: Floats
-    q_min: Floats
-    q_max: Floats
-    torque_max: Floats
-    payload: float
-    joint_names: tuple[str, ...]
-    source: str
+    name: str  # catalogue name or file stem
+    links: Floats  # (n + 1, 4, 4) transforms L_k, lengths in m
+    masses: Floats  # (n,) masses of the bodies, kg
+    coms: Floats  # (n, 3) centres of mass in the body frames (after the joint's rotation), m
+    q_min: Floats  # (n,) lower joint limits, rad
+    q_max: Floats  # (n,) upper joint limits, rad
+    torque_max: Floats  # (n,) joint torque limits, N·m
+    payload: float  # rated payload, kg
+    joint_names: tuple[str, ...]  # (n,) names
+    source: str  # where the figures come from
+    # (n, n) C with θ = C q: the angles of the chain from the controller's values, where joints
+    # follow others (see `conventions`); None where each turns by itself
     coupling: Floats | None = None
+    # (n, n) D with dθ = D dδ: displacements of the chain's joints from those of the drives, where
+    # drives turn several joints; None where each turns its own
     drive: Floats | None = None
+    # (n, n + 1) [F, f] with q = F q + f for the controller's values, where joints have no value of
+    # their own (`<mimic>` of a URDF): their rows say what it would be, those of the others are of
+    # the identity; None where every joint has one
     mimic: Floats | None = None
-    sign: Floats | None = None
-    notes: tuple[str, ...] = ()
-    repeatability: float | None = None
-    prismatic: Bools | None = None
+    sign: Floats | None = None  # (n,) −1 where the axis is the drawn one turned round
+    notes: tuple[str, ...] = ()  # what its description lacks, and what that means, a sentence each
+    repeatability: float | None = None  # pose repeatability RP of ISO 9283, m, as stated
+    prismatic: Bools | None = None  # (n,) which joints slide; None where all turn
 
     @property
     def slides(self) -> Bools:
@@ -135,29 +110,20 @@ class Arm(Brief):
 
     @property
     def ratings(self) -> Floats:
-        """(n,) rated torques or forces; where unknown those of a joint of middle size.
-
-        150 N·m and 1500 N: guesses.
-        """
+        """(n,) rated torques or forces; where unknown 150 N·m and 1500 N, a middle size."""
         rated = np.asarray(self.torque_max, dtype=float)
         known = np.isfinite(rated) & (rated > 0)
         return np.where(known, rated, np.where(self.slides, UNKNOWN_FORCE, UNKNOWN_TORQUE))
 
     def along(self, wrench: Floats) -> Floats:
-        """Loads (..., n) along the joints, of wrenches (..., n + 1, 6) through the slots.
-
-        The torque about the axis, of a prismatic joint the force along it.
-        """
+        """Torques or forces (..., n) along the joints, of wrenches (..., n + 1, 6)."""
         torque = wrench[..., :-1, 5]
         if self.prismatic is None:
             return torque
         return np.where(self.prismatic, wrench[..., :-1, 2], torque)
 
     def phases(self, q: Floats) -> Floats:
-        """Phases (..., n) that periodic laws depend on, rad, from the controller's values.
-
-        The angle of the drive; of a prismatic joint one turn over its whole travel.
-        """
+        """Phases (..., n) that periodic laws depend on, rad; of a slide a turn over its travel."""
         angle = self.drive_angles(q)
         if self.prismatic is None:
             return angle
@@ -169,10 +135,7 @@ class Arm(Brief):
         return q if self.coupling is None else q @ self.coupling.T
 
     def drive_angles(self, q: Floats) -> Floats:
-        """Angles (..., n) that the drives have turned by, from the controller's values.
-
-        φ with D φ = C q; the controller's values themselves where all couplings are mechanical.
-        """
+        """Angles (..., n) φ of the drives: D φ = C q; q where all couplings are mechanical."""
         if self.drive is None:
             return self.chain_angles(q)
         if self.coupling is not None and np.array_equal(self.drive, self.coupling):
@@ -184,10 +147,7 @@ class Arm(Brief):
         return dq if self.drive is None else np.asarray(dq @ self.drive.T)
 
     def drive_torques(self, torque: Floats) -> Floats:
-        """Torques (..., n) that the drives carry, Dᵀ τ, from those about the joints' axes.
-
-        By virtual work: τ · D dδ = (Dᵀ τ) · dδ.
-        """
+        """Torques (..., n) that the drives carry, Dᵀ τ, from those about the joints' axes."""
         return torque if self.drive is None else np.asarray(torque @ self.drive)
 
     @property
@@ -198,21 +158,14 @@ class Arm(Brief):
         return np.asarray(np.diag(self.mimic) != 0)
 
     def complete(self, q: Floats) -> Floats:
-        """Return joint values (..., n) with those of mimic joints as they follow from the others.
-
-        What stands in their place is not used, it may be NaN.
-        """
+        """Return joint values (..., n) with those of mimic joints from the others."""
         if self.mimic is None:
             return q
         given = np.where(self.own, q, 0.0)
         return np.asarray(given @ self.mimic[:, :-1].T + self.mimic[:, -1])
 
     def __post_init__(self) -> None:
-        """Refuse an arm of more joints than any has, or a slide without an end.
-
-        Raises:
-            InputError: says what would be valid.
-        """
+        """Refuse an arm of more joints than any has, or a slide without an end."""
         if self.prismatic is not None:
             travel = (self.q_max - self.q_min)[self.prismatic]
             if not np.all(np.isfinite(travel) & (travel > 0.0)):

@@ -15,14 +15,9 @@ import numpy as np
 
 from hilcal.types import Floats
 
-CHUNK = 8200
-"""States of a chunk, at most; a choice by timing. No power of two: the components of an array would
-all fall into the same few lines of the processor's cache, and what is turned over in memory take
-four times as long."""
-BUDGET = 1 << 20
-"""Numbers of a chunk's largest array, 8 MB; a choice by timing."""
-LEAST_CHUNK = 256
-"""States of a chunk, at least: Python's share of the time grows with the number of chunks."""
+CHUNK = 8200  # states, by timing; no power of two, which would all fall in few cache lines
+BUDGET = 1 << 20  # Numbers of a chunk's largest array, 8 MB; a choice by timing
+LEAST_CHUNK = 256  # states of a chunk, at least: Python's share grows with their number
 
 
 class Record(Protocol):
@@ -50,11 +45,7 @@ def along_states(x: Floats) -> Floats:
 
 
 def chunks(count: int, numbers: int = 0) -> Iterator[slice]:
-    """Yield slices that cover `count` states; one empty slice where there is none.
-
-    Args:
-        numbers: that are computed for each state, where they are many: chunks are smaller then.
-    """
+    """Yield slices that cover `count` states, at least one; smaller for many numbers each."""
     size = CHUNK if numbers == 0 else max(LEAST_CHUNK, min(CHUNK, BUDGET // numbers))
     for start in range(0, max(count, 1), size):
         yield slice(start, min(start + size, count))
@@ -64,20 +55,6 @@ def take(record: R, rows: slice, axis: int = 0) -> R:
     """Return the chosen states of a record whose arrays have the states on `axis`."""
     index = (*(slice(None),) * axis, rows)
     return by_field([record], lambda given: given[0][index])
-
-
-def room(part: Floats, count: int, axis: int = 0) -> Floats:
-    """Return an empty array for `count` states, otherwise like that of a chunk of them."""
-    shape = (*part.shape[:axis], count, *part.shape[axis + 1 :])
-    return np.empty_like(part, shape=shape)
-
-
-def put(whole: R, rows: slice, part: R, axis: int = 0) -> None:
-    """Write a record of the chosen states into one of all states."""
-    for f in fields(whole):
-        values = getattr(part, f.name)
-        if isinstance(values, np.ndarray):
-            getattr(whole, f.name)[(*(slice(None),) * axis, rows)] = values
 
 
 def by_field(records: Sequence[R], combine: Callable[[Sequence[Floats]], Floats]) -> R:

@@ -18,44 +18,28 @@ _JOINTS = 6
 _RIM = 0.5  # of the radius: a housing's rounded end; so much shorter is the capsule's segment
 _THICK, _THIN = 0.047, 0.03  # radii of an unknown arm at base and flange, shares of its reach
 _SHORT = 1e-6  # m
-TURNED = np.array([1.0, -1.0, -1.0])
-"""Coordinates of a point in a frame that was turned round x by 180°."""
+TURNED = np.array([1.0, -1.0, -1.0])  # of a point in a frame turned round x
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Capsule:
-    """A capsule that moves with a body.
+    """A capsule that moves with a body."""
 
-    Attributes:
-        name: what it is, for people.
-        body: 0 the base, i what joint i moves.
-        start: (3,) one end of the segment in the body's frame, m.
-        end: (3,) the other end, m.
-        radius: m.
-    """
-
-    name: str
-    body: int
-    start: Floats
-    end: Floats
-    radius: float
+    name: str  # what it is, for people
+    body: int  # 0 the base, i what joint i moves
+    start: Floats  # (3,) one end of the segment in the body's frame, m
+    end: Floats  # (3,) the other end, m
+    radius: float  # m
 
 
 @dataclass(frozen=True, slots=True)
 class Figures:
-    """Sizes of an arm of Universal Robots' build, m.
+    """Sizes of an arm of Universal Robots' build, m."""
 
-    Attributes:
-        shoulder: offset of the upper arm's tube along the shoulder's axis.
-        elbow: offset of the forearm's tube along the same direction.
-        housings: radii of the housings on joints 1, 2, 3 and on the wrists.
-        tubes: radii of the tubes of upper arm and forearm.
-    """
-
-    shoulder: float
-    elbow: float
-    housings: tuple[float, float, float, float]
-    tubes: tuple[float, float]
+    shoulder: float  # offset of the upper arm's tube along the shoulder's axis
+    elbow: float  # offset of the forearm's tube along the same direction
+    housings: tuple[float, float, float, float]  # radii on joints 1, 2, 3 and the wrists
+    tubes: tuple[float, float]  # radii of the tubes of upper arm and forearm
 
 
 # Offsets: the manufacturer's ROS 2 description package, config/*/physical_parameters.yaml,
@@ -74,21 +58,14 @@ _UR3 = ((0.049, 0.049, 0.041, 0.033), (0.040, 0.030))
 _UR20 = ((0.099, 0.099, 0.084, 0.060), (0.078, 0.062))
 _UR15 = ((0.084, 0.084, 0.069, 0.051), (0.066, 0.050))
 _FIGURES = {
-    "ur3": Figures(0.1198, 0.0275, *_UR3),
-    "ur3e": Figures(0.120, 0.027, *_UR3),
-    "ur5": Figures(0.13585, 0.0165, *_UR5),
-    "ur5e": Figures(0.138, 0.007, *_UR5),
-    "ur7e": Figures(0.138, 0.007, *_UR5),
-    "ur8long": Figures(0.227, 0.046, *_UR15),
-    "ur10": Figures(0.220941, 0.049042, *_UR10),
-    "ur10e": Figures(0.1762, 0.0393, *_UR10),
-    "ur12e": Figures(0.1762, 0.0393, *_UR10),
-    "ur15": Figures(0.227, 0.046, *_UR15),
-    "ur16e": Figures(0.1762, 0.0393, *_UR10),
-    "ur18": Figures(0.227, 0.046, *_UR15),
-    "ur20": Figures(0.260, 0.043, *_UR20),
-    "ur30": Figures(0.260, 0.043, *_UR20),
-}
+    "ur3": Figures(0.1198, 0.0275, *_UR3), "ur3e": Figures(0.120, 0.027, *_UR3),
+    "ur5": Figures(0.13585, 0.0165, *_UR5), "ur5e": Figures(0.138, 0.007, *_UR5),
+    "ur7e": Figures(0.138, 0.007, *_UR5), "ur8long": Figures(0.227, 0.046, *_UR15),
+    "ur10": Figures(0.220941, 0.049042, *_UR10), "ur10e": Figures(0.1762, 0.0393, *_UR10),
+    "ur12e": Figures(0.1762, 0.0393, *_UR10), "ur15": Figures(0.227, 0.046, *_UR15),
+    "ur16e": Figures(0.1762, 0.0393, *_UR10), "ur18": Figures(0.227, 0.046, *_UR15),
+    "ur20": Figures(0.260, 0.043, *_UR20), "ur30": Figures(0.260, 0.043, *_UR20),
+}  # fmt: skip
 _GUESSED = frozenset({"ur8long", "ur15", "ur18"})
 
 
@@ -107,8 +84,8 @@ def _has_figures(arm: Arm) -> bool:
 def capsules(arm: Arm) -> tuple[Capsule, ...]:
     """Return the capsules of base and bodies, those of one body side by side.
 
-    Real housings are cylinders with rounded ends; the capsules hold them but for a rim of at
-    most an eighth of the radius, which the margins of collision checks cover.
+    They hold the real housings but for a rim of at most an eighth of the radius, which the margins
+    of collision checks cover.
     """
     if arm.sign is None:
         return _of_ur(arm, _FIGURES[arm.name]) if _has_figures(arm) else _of_any(arm)
@@ -121,16 +98,9 @@ def capsules(arm: Arm) -> tuple[Capsule, ...]:
 
 
 def body_poses(arm: Arm, q: Floats, chain: Chain | None = None) -> Floats:
-    """Poses T_base_body of base and bodies, and of the flange.
+    """Poses T_base_body (N, n + 2, 4, 4) of base, bodies and flange at joint values (N, n).
 
     T_base_body0 = 1, T_base_bodyi = L_0 M_1(θ_1) ... L_{i-1} M_i(θ_i).
-
-    Args:
-        q: (N, n) the controller's joint values, rad.
-        chain: the chain at q where it is evaluated already.
-
-    Returns:
-        (N, n + 2, 4, 4): base, the n bodies, flange.
     """
     chain = evaluate(arm, q) if chain is None else chain
     out = np.tile(np.eye(4), (len(q), arm.n + 2, 1, 1))
@@ -150,19 +120,12 @@ def body_poses(arm: Arm, q: Floats, chain: Chain | None = None) -> Floats:
 
 
 def flange_capsule(arm: Arm, name: str, start: Floats, end: Floats, radius: float) -> Capsule:
-    """Return a capsule that the flange carries.
-
-    Args:
-        start: (3,) one end, flange axes, m.
-        end: (3,) the other end, flange axes, m.
-        radius: m.
-    """
+    """Return a capsule that the flange carries, between two ends (3,) in its axes, m."""
     axes, origin = arm.links[arm.n][:3, :3], arm.links[arm.n][:3, 3]
     return Capsule(name, arm.n, origin + axes @ start, origin + axes @ end, radius)
 
 
 def _of_ur(arm: Arm, figures: Figures) -> tuple[Capsule, ...]:
-    """Housings about the joint axes and tubes between them."""
     r1, r2, r3, r4 = figures.housings
     upper, fore = figures.tubes
     d1, d4 = (float(arm.links[k][2, 3]) for k in (1, 4))

@@ -21,26 +21,18 @@ from hilcal.types import Bools, Floats
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Deviation:
-    """Departure of N states from the nominal chain; None stands for zero.
+    """Departure of N states from the nominal chain; None stands for zero."""
 
-    Attributes:
-        dq: (N, n) joint displacements, rad: of the drives where joints are coupled (`Arm.drive`).
-        twist: (N, n + 1, 6) small rigid displacement of everything beyond slot k, in the axes
-            of slot k, m and rad.
-        base: (N, 6) twist of the base relative to its registration, base axes.
-        station: (N, 6) twist of the readings about the sensor's origin, sensor axes.
-        target: (N, 6) displacement of the tracked target, flange axes.
-        scale: (N,) relative scale error of the sensor's ranges.
-        observer: (N, 6) twist of the position in the axes of what observes it, where there are
-            several; of a distance, which no turn changes, element 3 is the offset, m.
-    """
-
-    dq: Floats | None = None
+    dq: Floats | None = None  # (N, n) of the drives' joints, rad, where coupled `Arm.drive`
+    # (N, n + 1, 6) small rigid displacement of everything beyond slot k, in the axes of slot k, m
+    # and rad
     twist: Floats | None = None
-    base: Floats | None = None
-    station: Floats | None = None
-    target: Floats | None = None
-    scale: Floats | None = None
+    base: Floats | None = None  # (N, 6) twist of the base relative to its registration, base axes
+    station: Floats | None = None  # (N, 6) twist of the readings about the sensor's origin
+    target: Floats | None = None  # (N, 6) displacement of the tracked target, flange axes
+    scale: Floats | None = None  # (N,) relative scale error of the sensor's ranges
+    # (N, 6) twist of the position in the axes of what observes it, where there are several; of a
+    # distance, which no turn changes, element 3 is the offset, m
     observer: Floats | None = None
 
     def __add__(self, other: "Deviation") -> "Deviation":
@@ -50,29 +42,20 @@ class Deviation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chain:
-    """Frames of the deviated chain in base axes.
+    """Frames of the deviated chain in base axes."""
 
-    Attributes:
-        rotation: (n + 1, N, 3, 3) orientation of slot k, after its twist.
-        position: (n + 1, N, 3) origin of slot k, after its twist, m.
-        com: (n, N, 3) centre of mass of body i + 1, m.
-        twist: (n + 1, N, 6) the twists that were applied, or None.
-        slides: which joints are prismatic, counted from 0.
-    """
-
-    rotation: Floats
-    position: Floats
-    com: Floats
-    twist: Floats | None
-    slides: tuple[int, ...] = ()
+    rotation: Floats  # (n + 1, N, 3, 3) orientation of slot k, after its twist
+    position: Floats  # (n + 1, N, 3) origin of slot k, after its twist, m
+    com: Floats  # (n, N, 3) centre of mass of body i + 1, m
+    twist: Floats | None  # (n + 1, N, 6) the twists that were applied, or None
+    slides: tuple[int, ...] = ()  # which joints are prismatic, counted from 0
 
     def point(self, offset: Floats) -> Floats:
         """Position of a point fixed in flange axes, offset (3,) or (N, 3) -> (N, 3)."""
         return np.asarray(self.position[-1] + se3.apply(self.rotation[-1], offset))
 
 
-Turns = tuple[Floats, Floats, Floats | None]
-"""Cosines and sines (N, n) of the angles of the chain, and displacements (N, n) of its slides."""
+Turns = tuple[Floats, Floats, Floats | None]  # cos, sin (N, n); travel (N, n) of slides
 
 
 def turns(arm: Arm, q: Floats) -> Turns:
@@ -98,10 +81,7 @@ def _turned(nominal: Turns, dq: Floats, prismatic: Bools | None) -> Turns:
 def evaluate(
     arm: Arm, q: Floats, deviation: Deviation | None = None, nominal: Turns | None = None
 ) -> Chain:
-    """Evaluate the deviated chain at the controller's values q (N, n); exact, batched.
-
-    `nominal`: `turns` at q where they are known.
-    """
+    """Evaluate the deviated chain at the controller's values q (N, n), `turns` there if known."""
     deviation = deviation or Deviation()
     moved = turns(arm, q) if nominal is None else nominal
     if deviation.dq is not None:
@@ -147,10 +127,7 @@ def evaluate(
 
 
 def _combine(axes: Floats, weights: Sequence[float], out: Floats) -> None:
-    """Write Σ_j w_j axes_j of axes (N, 3, 3), in their columns, and weights (3,), to (N, 3).
-
-    Links turn by quarter turns mostly: most weights are zero.
-    """
+    """Write Σ_j w_j axes_j of axes (N, 3, 3), in their columns, to (N, 3); most w are zero."""
     first, *others = [j for j in range(3) if weights[j]] or [0]
     np.multiply(axes[..., first], weights[first], out=out)
     for j in others:
@@ -166,11 +143,9 @@ def _offset(p: Floats, axes: Floats, offset: Sequence[float]) -> Floats:
 
 
 def joint_jacobian(chain: Chain, x: Floats) -> Floats:
-    """Geometric Jacobian (N, 6, n) of a flange-fixed point now at x (N, 3), base axes.
+    """Geometric Jacobian (N, 6, n) of a flange-fixed point now at x (N, 3), by the chain's angles.
 
-    By the angles of the chain; `drive_jacobian` is that by the drives.
-
-    Column j is (z_j × (x − p_j), z_j), of a prismatic joint (z_j, 0); rows are m/rad and rad/rad.
+    Column j is (z_j × (x − p_j), z_j), of a prismatic joint (z_j, 0); base axes, m/rad and rad/rad.
     """
     n = len(chain.com)
     z = np.swapaxes(chain.rotation[:n, :, :, 2], 0, 1)
@@ -194,9 +169,8 @@ def twist_jacobian(r: Floats, lever: Floats, twist: Floats | None) -> Floats:
 
         (v, ω) = [R, −[l]× R; 0, R] [J(ξ), Q(ξ); 0, J(ξ)] dξ
 
-    with R (N, 3, 3) the frame's orientation after its twist ξ (N, 6), l (N, 3) the lever from
-    its origin to the point, and the blocks J, Q of the right Jacobian (`se3`). v, ω and l are
-    in the axes that R leads to.
+    with R (N, 3, 3) the frame's orientation after its twist ξ (N, 6), l (N, 3) the lever from its
+    origin to the point, and J, Q of the right Jacobian (`se3`), in the axes that R leads to.
     """
     out = empty(len(lever), 6, 6)
     shift: Floats | float = 0.0

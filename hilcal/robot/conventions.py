@@ -23,16 +23,11 @@ from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.types import Floats
 
-_HALF_TURN = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Rx(π): Rz(−θ) = Rx(π) Rz(θ) Rx(π)."""
+_HALF_TURN = np.diag([1.0, -1.0, -1.0, 1.0])  # Rx(π): Rz(−θ) = Rx(π) Rz(θ) Rx(π)
 
 
 def as_counted(arm: Arm, by: Conventions) -> Arm:
-    """Return the arm as the controller counts its joints.
-
-    Raises:
-        InputError: another number of values than the arm has joints, or no such joint.
-    """
+    """Return the arm as the controller counts its joints."""
     for key in ("joint_sign", "joint_offset_deg"):
         given = getattr(by, key)
         if given is not None and len(given) != arm.n:
@@ -67,21 +62,15 @@ def as_counted(arm: Arm, by: Conventions) -> Arm:
 def with_conventions(
     arm: Arm, sign: Floats, offset: Floats, coupling: Floats, counted: Floats | float = 0.0
 ) -> Arm:
-    """Return the arm whose joint values are the controller's.
+    """Return the arm whose joint values are the controller's: (n,) s and o, (n, n) k.
 
     Signs and zeros go into the constant links:
 
         M(s q + o) = M(o) X M(q) X⁻¹,  X = Rx(π) for s = −1, else 1;  M = Rz or Tz
 
-    Limits are those of the controller's values and stay.
-
-    Couplings C that the arm has already are applied to the converted values: θ = C (S q + o + K q).
-
-    Args:
-        sign: (n,) s.
-        offset: (n,) o, rad; m where a joint slides.
-        coupling: (n, n) k, zero on the diagonal.
-        counted: (n, n) the part of it that is not mechanical.
+    Limits are those of the controller's values and stay. Couplings C that the arm has already are
+    applied to the converted values: θ = C (S q + o + K q). `counted` is the part of K that is not
+    mechanical.
     """
     links, coms = arm.links.copy(), arm.coms.copy()
     own = np.eye(arm.n) if arm.coupling is None else arm.coupling
@@ -104,14 +93,9 @@ def with_conventions(
         moved = sign * (by @ offset + rest - offset)
         mimic = np.where(arm.own[:, None], mimic, np.column_stack([turned, moved]))
     return replace(
-        arm,
-        links=links,
-        coms=coms,
-        coupling=_unless_one(follows),
-        drive=_unless_one(drives),
-        mimic=mimic,
-        sign=signs if np.any(signs < 0) else None,
-    )
+        arm, links=links, coms=coms, coupling=_unless_one(follows), drive=_unless_one(drives),
+        mimic=mimic, sign=signs if np.any(signs < 0) else None,
+    )  # fmt: skip
 
 
 def as_drawn(arm: Arm) -> Arm:

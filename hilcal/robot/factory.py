@@ -34,12 +34,9 @@ from hilcal.types import Floats
 
 N = 6
 KINDS = "a calibration.conf, a .yaml of ur_calibration, or a .toml of check --save-calibration"
-SAME = 1e-6
-"""m; flanges that are nearer are of the same kinematics: files keep 12 digits and more."""
-LINEARISED = 2
-"""Calibration status of an arm that the factory has measured."""
-FAR = 0.05
-"""m; a factory's figures move the flange by some millimetres, those of another arm by more."""
+SAME = 1e-6  # m; flanges that are nearer are of the same kinematics: files keep 12 digits and more
+LINEARISED = 2  # Calibration status of an arm that the factory has measured
+FAR = 0.05  # m, of another arm; a factory's figures move the flange by some millimetres
 _KEYS = ("theta_rad", "a_m", "d_m", "alpha_rad")
 _DELTAS = ("delta_theta", "delta_a", "delta_d", "delta_alpha")
 _BODIES = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
@@ -50,21 +47,13 @@ _LARGEST = 1e5  # m or rad
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FactoryKinematics:
-    """The kinematics of one arm.
+    """The kinematics of one arm."""
 
-    Attributes:
-        links: (7, 4, 4) constant transforms L_k, see `Arm`; their frames may be far away.
-        rows: (4, 6) θ, a, d, α of classic rows, rad and m; None where transforms are given.
-        status: of the calibration, 2 where the factory has measured the arm.
-        checksum: of the joints, as the controller tells it; empty where it is not known.
-        source: where they come from.
-    """
-
-    links: Floats
-    rows: Floats | None
-    status: int
-    checksum: tuple[int, ...]
-    source: str
+    links: Floats  # (7, 4, 4) constant transforms L_k, see `Arm`; their frames may be far away
+    rows: Floats | None  # (4, 6) θ, a, d, α of classic rows, rad and m; None if not given
+    status: int  # of the calibration, 2 where the factory has measured the arm
+    checksum: tuple[int, ...]  # of the joints by the controller; empty where not known
+    source: str  # where they come from
 
     def to_dict(self) -> dict[str, object]:
         """Return the numbers as a file and a campaign keep them; there have to be rows."""
@@ -84,11 +73,7 @@ class FactoryKinematics:
 def of_rows(
     rows: Floats, source: str, status: int = LINEARISED, checksum: tuple[int, ...] = ()
 ) -> FactoryKinematics:
-    """Return the kinematics of classic rows (4, 6): θ, a, d, α.
-
-    Raises:
-        InputError: numbers that no arm has.
-    """
+    """Return the kinematics of classic rows (4, 6): θ, a, d, α."""
     if rows.shape != (4, N) or not (np.abs(rows) < _LARGEST).all():
         raise InputError(f"{source}: not four times {N} lengths in m and angles in rad")
     theta, a, d, alpha = rows
@@ -100,11 +85,7 @@ def of_rows(
 
 
 def of_dict(told: Any, source: str) -> FactoryKinematics:
-    """Return the kinematics that `FactoryKinematics.to_dict` has written.
-
-    Raises:
-        InputError: it is something else.
-    """
+    """Return the kinematics that `FactoryKinematics.to_dict` has written."""
     try:
         rows = np.array([told[key] for key in _KEYS], dtype=float)
         checksum = tuple(map(int, told["joint_checksum"]))
@@ -115,16 +96,7 @@ def of_dict(told: Any, source: str) -> FactoryKinematics:
 
 
 def read_factory(path: Path, nominal: Arm, text: str | None = None) -> FactoryKinematics:
-    """Read a file of one arm's kinematics.
-
-    Args:
-        path: the file; its ending says of which kind it is.
-        nominal: the arm as its maker designed it, to which a calibration.conf adds.
-        text: what the file holds, as a campaign keeps it; then none is read.
-
-    Raises:
-        InputError: unreadable, of no known kind, or of another arm.
-    """
+    """Read a file of one arm's kinematics; a calibration.conf adds to the nominal arm."""
     kind = path.suffix.lower()
     reader = {".conf": _of_conf, ".yaml": _of_yaml, ".yml": _of_yaml, ".toml": _of_toml}.get(kind)
     if reader is None:
@@ -146,11 +118,7 @@ def read_factory(path: Path, nominal: Arm, text: str | None = None) -> FactoryKi
 
 
 def check_of(factory: FactoryKinematics, nominal: Arm) -> None:
-    """Refuse the kinematics of another arm.
-
-    Raises:
-        InputError: says how far it is off.
-    """
+    """Refuse the kinematics of another arm."""
     off = flange_difference(with_factory(nominal, factory), nominal)[1]
     if not off < FAR:
         raise InputError(
@@ -160,11 +128,7 @@ def check_of(factory: FactoryKinematics, nominal: Arm) -> None:
 
 
 def with_factory(nominal: Arm, factory: FactoryKinematics) -> Arm:
-    """Return an arm with measured kinematics, its frames as near to the nominal ones as can be.
-
-    Raises:
-        InputError: the arm has another number of joints, or coupled ones.
-    """
+    """Return an arm with measured kinematics, its frames as near to the nominal ones as can be."""
     if nominal.n != N or nominal.coupling is not None or nominal.drive is not None:
         raise InputError(
             f"{factory.source}: kinematics of an arm of {N} joints that turn each by itself; "
@@ -192,11 +156,7 @@ def flange_difference(one: Arm, other: Arm, states: int = 400) -> tuple[float, f
 
 
 def nominal_rows(arm: Arm) -> Floats:
-    """(4, 6) θ, a, d, α of an arm of classic rows without offsets.
-
-    Raises:
-        ValueError: it is not such an arm.
-    """
+    """(4, 6) θ, a, d, α of an arm of classic rows without offsets."""
     rows = np.zeros((4, arm.n))
     for k, link in enumerate(arm.links[1:]):
         rows[1:, k] = link[0, 3], link[2, 3], np.arctan2(link[2, 1], link[1, 1])

@@ -2,17 +2,45 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pinocchio as pin
 
 from hilcal.config import Obstacle
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.robot.body import Capsule, capsules, is_known
-from hilcal.robot.pinocchio_model import pinocchio_model
 from hilcal.types import Bools, Floats
+
+if TYPE_CHECKING:
+    import pinocchio as pin
+
+FLANGE = "flange"
+
+
+def pinocchio_model(arm: Arm) -> "pin.Model":
+    """Build a Pinocchio model with the same chain, masses and limits.
+
+    Joint i turns about z or slides along it, with the placement L_{i-1} in body i - 1; bodies are
+    point masses at their centres of mass; the frame "flange" has the placement L_n in the last
+    body.
+    """
+    import pinocchio as pin
+
+    model = pin.Model()
+    model.name = arm.name
+    joint = 0
+    for i in range(arm.n):
+        joint = model.addJoint(
+            joint, pin.JointModelPZ() if arm.slides[i] else pin.JointModelRZ(),
+            pin.SE3(arm.links[i]), arm.joint_names[i], arm.torque_max[i : i + 1],
+            np.array([np.inf]), arm.q_min[i : i + 1], arm.q_max[i : i + 1],
+        )  # fmt: skip
+        body = pin.Inertia(float(arm.masses[i]), arm.coms[i], np.zeros((3, 3)))
+        model.appendBodyToJoint(joint, body, pin.SE3.Identity())
+    model.addFrame(pin.Frame(FLANGE, joint, 0, pin.SE3(arm.links[arm.n]), pin.FrameType.OP_FRAME))
+    return model
+
 
 _SAMPLES = 256  # states that tell which pairs touch by their crude shape alone
 _SHORT = 1e-12  # m, of a segment without a direction
@@ -22,35 +50,26 @@ _NEAR = 0.03  # m; guessed shapes that are so near in every state are neighbours
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Segment:
-    """What does not move with a body, as a capsule in every one of N states, base axes.
+    """What does not move with a body, as a capsule in every one of N states, base axes."""
 
-    Attributes:
-        name: what it is, for people.
-        start: (N, 3) or (3,) one end, m.
-        end: (N, 3) or (3,) the other end, m.
-        radius: m.
-        ignored: names of parts that it may touch.
-    """
-
-    name: str
-    start: Floats
-    end: Floats
-    radius: float
-    ignored: frozenset[str] = frozenset()
+    name: str  # what it is, for people
+    start: Floats  # (N, 3) or (3,) one end, m
+    end: Floats  # (N, 3) or (3,) the other end, m
+    radius: float  # m
+    ignored: frozenset[str] = frozenset()  # names of parts that it may touch
 
 
 class Scene:
     """Parts of the arm, what it carries, and obstacles, as Coal's shapes on a Pinocchio model.
 
-    Pairs within one body and of neighbouring bodies are not checked, nor are pairs of which
-    the crude shapes touch in a large share of all states, as those about a spherical wrist.
+    Pairs within one body and of neighbouring bodies are not checked, nor are pairs of which the
+    crude shapes touch in a large share of all states, as those about a spherical wrist.
 
     Attributes:
         parts: capsules of the arm, then what the flange carries.
-        rates: (P, n) by part and joint: no point of the part goes farther than this per radian, m.
+        rates: (P, n) no point of a part goes farther than this per radian of a joint, m.
         itself: pairs of parts.
-        around: parts and obstacles; base and shoulder stand where the arm is mounted, and are not
-            checked.
+        around: parts and obstacles; base and shoulder stand where the arm is mounted.
         free: parts and obstacles against a segment that is given with the states.
     """
 
@@ -62,7 +81,9 @@ class Scene:
         self._arm, self._model = arm, pinocchio_model(arm)
         self._data = self._model.createData()
         self._things = [(thing.name, *_obstacle(thing)) for thing in obstacles]
-        far = np.array([_farthest(arm, part) for part in self.parts])
+        joints = range(1, arm.n + 1)  # bounds on how far parts are from their axes
+        ends = [(part.body, np.array([part.start, part.end])) for part in self.parts]
+        far = np.array([[from_axis(arm, body, end, i) for i in joints] for body, end in ends])
         bodies = np.array([part.body for part in self.parts])
         self.rates = np.where(np.arange(1, arm.n + 1) <= bodies[:, None], far, 0.0)
         count = len(self.parts)
@@ -82,16 +103,10 @@ class Scene:
         self.free = self._pairs([(a, last) for a in range(last)])
 
     def towards(self, point: Floats) -> Floats:
-        """Return how fast parts and obstacles near what hangs from a point of the flange, m/rad.
+        """Return (P + obstacles, n) how fast all near what hangs from a point of the flange, m/rad.
 
         It moves with the point and does not turn. A joint that turns a part turns the point with
         it, so that they near each other by no more than their distance per radian.
-
-        Args:
-            point: (3,) flange axes, m.
-
-        Returns:
-            (P + obstacles, n), by joint.
         """
         arm, fixed = self._arm, len(self._things)
         at = on_flange(arm, point)
@@ -107,16 +122,15 @@ class Scene:
         return out
 
     def _apart(self, a: int, b: int, far: Floats) -> Floats:
-        """(n,) how fast two parts near each other by a joint between them, m/rad.
-
-        Their distance is the same whichever of them stands still: the slower one counts.
-        """
+        """(n,) how fast two parts near each other by a joint between them, m/rad."""
         low, high = sorted((self.parts[a].body, self.parts[b].body))
         joint = np.arange(1, self._arm.n + 1)
         between = (joint > low) & (joint <= high)
         return np.where(between, np.minimum(far[a], far[b]), 0.0)
 
     def _pairs(self, pairs: Sequence[tuple[int, int]], rates: Sequence[Floats] = ()) -> "Pairs":
+        import pinocchio as pin
+
         geometry = pin.GeometryModel()
         names = []
         for part in self.parts:
@@ -154,15 +168,9 @@ class Pairs:
     """Pairs of shapes that are checked together; `rates` (K, n): how fast they near, m/rad."""
 
     def __init__(
-        self,
-        arm: Arm,
-        model: Any,
-        data: Any,
-        geometry: Any,
-        names: tuple[str, ...],
-        pairs: tuple[tuple[int, int], ...],
-        rates: Floats,
-    ) -> None:
+        self, arm: Arm, model: Any, data: Any, geometry: Any, names: tuple[str, ...],
+        pairs: tuple[tuple[int, int], ...], rates: Floats,
+    ) -> None:  # fmt: skip
         """Take shapes and pairs from `Scene`, which makes these."""
         self.rates = rates
         self._arm, self._model, self._data, self._geometry = arm, model, data, geometry
@@ -174,13 +182,9 @@ class Pairs:
     def touching(
         self, q: Floats, margin: float | Floats = 0.0, segment: Segment | None = None
     ) -> Bools:
-        """Return (N,) in which states (N, n) any pair is closer than its margin, m.
+        """Return (N,) in which states (N, n) any pair is closer than its margin, m."""
+        import pinocchio as pin
 
-        Args:
-            q: (N, n) joint angles, rad.
-            margin: of all pairs, or (K,) of each; negative where shapes may overlap.
-            segment: what is given with the states, of `Scene.free`.
-        """
         out = np.zeros(len(q), dtype=np.bool_)
         if not self._pairs:
             return out
@@ -194,10 +198,9 @@ class Pairs:
     def named(
         self, q: Floats, margin: float = 0.0, segment: Segment | None = None
     ) -> dict[tuple[str, str], float]:
-        """Return the pairs closer than a margin in any state (N, n), and their least distance, m.
+        """Return the pairs closer than a margin in any state (N, n), and their distance, m."""
+        import pinocchio as pin
 
-        It is negative where they overlap.
-        """
         out: dict[tuple[str, str], float] = {}
         hit = np.flatnonzero(self.touching(q, margin, segment))
         if not len(hit):
@@ -214,6 +217,8 @@ class Pairs:
 
     def how_often(self, q: Floats, margin: float = 0.0) -> Floats:
         """(K,) share of the states in which each pair is closer than a margin, m."""
+        import pinocchio as pin
+
         count = np.zeros(len(self._pairs))
         self._prepare(margin, None)
         for turned in self._arm.chain_angles(q):
@@ -232,6 +237,8 @@ class Pairs:
         )
 
     def _gap(self, k: int) -> float:
+        import pinocchio as pin
+
         return float(pin.computeDistance(self._geometry, self._state, k).min_distance)
 
     def _prepare(self, margin: float | Floats, segment: Segment | None) -> None:
@@ -247,7 +254,8 @@ class Pairs:
                 self._state.activeCollisionPairs[k] = self._names[a] not in segment.ignored
 
     def _place(self, turned: Floats, lies: "_Lies | None" = None, i: int = 0) -> None:
-        """Put all shapes where they are at angles of the chain (n,); a segment as in state i."""
+        import pinocchio as pin
+
         pin.updateGeometryPlacements(self._model, self._data, self._geometry, self._state, turned)
         if lies is not None:
             half, turn, middle = lies
@@ -256,17 +264,11 @@ class Pairs:
 
 
 def from_axis(arm: Arm, body: int, points: Floats, joint: int) -> float:
-    """Return a bound on how far points of a body are from the axis of a joint, m, in every state.
+    """Return a bound on how far points (K, 3) of a body are from the axis of a joint, m.
 
-    So far they go at most per radian of the joint, or it per radian seen from them; 1 of a joint
-    that slides. It is the
-    length of the way along the links, |L_k| each; exact for a body that the joint carries, or
-    that carries the joint.
-
-    Args:
-        body: 0 the base, i what joint i moves.
-        points: (K, 3) points in the body's frame, m.
-        joint: 1 to n.
+    So far they go at most per radian of the joint; 1 of a joint that slides. It is the length of
+    the way along the links, |L_k| each; exact for a body that the joint carries, or that carries
+    it. Bodies count from 0, the base; joints from 1.
     """
     if arm.slides[joint - 1]:
         return 1.0
@@ -290,12 +292,6 @@ def on_flange(arm: Arm, point: Floats) -> Floats:
     return np.asarray(flange[:3, :3] @ point + flange[:3, 3])
 
 
-def _farthest(arm: Arm, part: Capsule) -> Floats:
-    """(n,) bound on how far a part's segment is from each axis, m."""
-    ends = np.array([part.start, part.end])
-    return np.array([from_axis(arm, part.body, ends, i) for i in range(1, arm.n + 1)])
-
-
 def _along(arm: Arm, body: int, points: Floats, last: int) -> float:
     """The longest way from points of a body along the links to the frame of a later body, m."""
     lengths = np.linalg.norm(arm.links[body + 1 : last, :3, 3], axis=1).sum()
@@ -306,8 +302,7 @@ def _along(arm: Arm, body: int, points: Floats, last: int) -> float:
 def _spread(count: int, n: int) -> Floats:
     """(count, n) points that fill the unit cube evenly: frac(1/2 + k φ^-i), φ^(n+1) = φ + 1.
 
-    Source: Roberts (2018), The unreasonable effectiveness of quasirandom sequences. SciPy has
-    others, which take half a second to load.
+    Source: Roberts (2018), The unreasonable effectiveness of quasirandom sequences.
     """
     phi = 2.0
     for _ in range(60):
@@ -315,12 +310,10 @@ def _spread(count: int, n: int) -> Floats:
     return np.asarray((0.5 + np.outer(np.arange(count), phi ** -np.arange(1.0, n + 1))) % 1.0)
 
 
-_Lies = tuple[Floats, Floats, Floats]
-"""Half lengths (N,), axes (N, 3, 3) and middles (N, 3) of a segment in N states."""
+_Lies = tuple[Floats, Floats, Floats]  # half lengths (N,), axes (N, 3, 3), middles (N, 3)
 
 
 def _lies(segment: Segment, count: int) -> _Lies:
-    """How a segment lies in every state."""
     shape = (count, 3)
     start, end = np.broadcast_to(segment.start, shape), np.broadcast_to(segment.end, shape)
     way = end - start
@@ -329,6 +322,8 @@ def _lies(segment: Segment, count: int) -> _Lies:
 
 def _capsule(start: Floats, end: Floats, radius: float) -> tuple[Any, Any]:
     """Coal's capsule, which lies along z about its middle, and where it is."""
+    import pinocchio as pin
+
     way = end - start
     shape = pin.coal.Capsule(radius, float(np.linalg.norm(way)))
     return shape, pin.SE3(_turn(way[None])[0], 0.5 * (start + end))
@@ -336,6 +331,8 @@ def _capsule(start: Floats, end: Floats, radius: float) -> tuple[Any, Any]:
 
 def _obstacle(thing: Obstacle) -> tuple[Any, Any]:
     """Coal's shape of an obstacle, and where its middle is."""
+    import pinocchio as pin
+
     if thing.center_m is not None and thing.size_m is not None:
         return pin.coal.Box(*thing.size_m), pin.SE3(np.eye(3), np.array(thing.center_m))
     if thing.bottom_m is None or thing.radius_m is None or thing.height_m is None:

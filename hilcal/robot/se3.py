@@ -19,8 +19,7 @@ import numpy as np
 from hilcal.robot.batch import empty, zeros
 from hilcal.types import Floats
 
-_NEAR = 0.25
-"""θ² below which b and c are summed as series: the closed forms cancel near zero."""
+_NEAR = 0.25  # θ² below which b and c are summed as series: the closed forms cancel near zero
 _TERMS = 8
 _B = [(-1) ** k / factorial(2 * k + 2) for k in range(_TERMS)]
 _C = [(-1) ** k / factorial(2 * k + 3) for k in range(_TERMS)]
@@ -72,9 +71,8 @@ def rotation(w: Floats) -> Floats:
 def rotation_vector(r: Floats) -> Floats:
     """Rotation vector of a rotation matrix, angle in [0, π]; (..., 3, 3) -> (..., 3).
 
-    By the unit quaternion (v, w): of 4 (v, w)(v, w)ᵀ, whose elements are sums of those of R, the
-    row with the largest diagonal element is taken, so that nothing cancels at any angle
-    (Shepperd 1978, J. Guidance and Control 1); θ = 2 atan2(|v|, w).
+    By the unit quaternion (v, w): of 4 (v, w)(v, w)ᵀ the row with the largest diagonal element is
+    taken, so that nothing cancels (Shepperd 1978, J. Guidance and Control 1); θ = 2 atan2(|v|, w).
     """
     m = r.reshape(-1, 3, 3)
     square = np.empty((len(m), 4, 4))
@@ -180,8 +178,7 @@ def right_jacobian_blocks(twist: Floats) -> tuple[Floats, Floats]:
         Q = dJ(ω + ε v)/dε = −b [v]× + c (v ωᵀ + ω vᵀ) − 2 c d I
                              + 2 d (−b' [ω]× + c' (ω ωᵀ − θ² I)),   d = ω · v
 
-    with b', c' the slopes of b and c over θ². Q is the slope of J along v because a twist is
-    the dual number ω + ε v and J an analytic function of it.
+    with b', c' the slopes of b and c over θ²: a twist is the dual number ω + ε v.
     """
     v, w = twist[..., :3], twist[..., 3:]
     t2 = _square(w)
@@ -200,12 +197,10 @@ def right_jacobian_blocks(twist: Floats) -> tuple[Floats, Floats]:
 
 
 def _shape(a: tuple[int, ...], b: tuple[int, ...]) -> tuple[int, ...]:
-    """Shape of the result; where they are the same, at once."""
     return a if a == b else np.broadcast_shapes(a, b)
 
 
 def _square(w: Floats) -> Floats:
-    """Squared length over the last axis."""
     x, y, z = w[..., 0], w[..., 1], w[..., 2]
     return np.asarray(x * x + y * y + z * z)
 
@@ -237,7 +232,6 @@ def coefficients(t2: Floats) -> tuple[Floats, Floats]:
 
 
 def _slopes(t2: Floats, b: Floats, c: Floats) -> tuple[Floats, Floats]:
-    """Return db/dθ² and dc/dθ²."""
     near = t2 < _NEAR
     far = np.where(near, 1.0, 2 * t2)
     b_slope, c_slope = (1 - c * t2 - 2 * b) / far, (b - 3 * c) / far

@@ -1,6 +1,23 @@
-"""Static wrenches that load and weight transmit through each slot of the deviated arm."""
+"""Static wrenches through each slot of the deviated arm, and how they change where it moves.
 
+Geometric stiffness: everything beyond slot j is displaced by v, at p_j, and turned by ω; forces,
+weights and the load's moment m keep their directions in base axes. With f_k the force through slot
+k and D_k = Σ l fᵀ − (Σ l · f) I over all that is beyond slot k (l: lever from p_k), the components
+in slot axes change as
+
+    k < j:  δf_k = 0,             δt_k = v × f_j + D_j ω         (slot k stands still)
+    k ≥ j:  δf_k = −ω × f_k,      δt_k = D_kᵀ ω − ω × m          (slot k moves along)
+
+The displacement of joint j + 1 is a turn about z_j, of a prismatic joint a shift along z_j, that
+leaves slot j standing still. What is computed is the transpose: the gradient by the motions of a
+linear form of the slot wrenches. Source: Chen and Kao, *Conservative congruence transformation for
+joint and Cartesian stiffness matrices of robotic hands and fingers*, Int. J. Robotics Research 19
+(2000) 835-847.
+"""
+
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 
@@ -13,24 +30,14 @@ from hilcal.types import Floats
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Load:
-    """What pulls at the arm beside its own weight.
+    """What pulls at the arm beside its own weight."""
 
-    Attributes:
-        wrench: (N, 6) force and moment on the tool at the load point, base axes, N, N·m.
-        point: (3,) or (N, 3) load point, flange axes, m.
-        tool_mass: mass carried permanently, kg.
-        tool_com: (3,) its centre of mass, flange axes, m.
-        gravity: (3,) acceleration, base axes, m/s².
-        first_moment: (n, 3) what the bodies' mass × centre of mass is beyond that of the arm,
-            body axes, kg·m; None for nothing.
-    """
-
-    wrench: Floats
-    point: Floats
-    tool_mass: float
-    tool_com: Floats
-    gravity: Floats
-    first_moment: Floats | None = None
+    wrench: Floats  # (N, 6) force and moment on the tool at the load point, base axes, N, N·m
+    point: Floats  # (3,) or (N, 3) load point, flange axes, m
+    tool_mass: float  # mass carried permanently, kg
+    tool_com: Floats  # (3,) its centre of mass, flange axes, m
+    gravity: Floats  # (3,) acceleration, base axes, m/s²
+    first_moment: Floats | None = None  # (n, 3) of the bodies beyond the arm's, kg·m
 
 
 def slot_wrenches(arm: Arm, chain: Chain, load: Load) -> Floats:
@@ -75,12 +82,7 @@ def _add_moment(t: Floats, lever: Floats, force: Floats) -> None:
 
 
 def slot_wrench_change(chain: Chain, force: Floats, moment: Floats) -> Floats:
-    """Change (N, P, n + 1, 6) of the slot wrenches by changes of the wrench at the flange.
-
-    Args:
-        force: (N, P, 3) change of the force, base axes, N.
-        moment: (N, P, 3) change of the moment about the flange's origin, base axes, N·m.
-    """
+    """Change (N, P, n + 1, 6) of slot wrenches by forces and moments (N, P, 3) at the flange."""
     slots, count = chain.position.shape[:2]
     out = empty(count, force.shape[1], slots, 6)
     for k in range(slots):
@@ -92,10 +94,7 @@ def slot_wrench_change(chain: Chain, force: Floats, moment: Floats) -> Floats:
 
 
 def load_wrench_change(chain: Chain, load: Load, change: Floats) -> Floats:
-    """Change (N, P, n + 1, 6) of the slot wrenches by changes (N, P, 6) of the load's wrench.
-
-    The changes are at the load point, in base axes, N and N·m.
-    """
+    """Change (N, P, n + 1, 6) of slot wrenches by changes (N, P, 6) of the load's, base axes."""
     lever = (chain.point(load.point) - chain.position[-1])[:, None, :]
     force = change[..., :3]
     return slot_wrench_change(chain, force, change[..., 3:] + se3.cross(lever, force))
@@ -121,3 +120,166 @@ def body_axes(arm: Arm, chain: Chain, k: int) -> Floats:
     if chain.twist is not None and np.any(chain.twist[k + 1]):
         r = se3.product(r, se3.rotation(-chain.twist[k + 1, :, 3:]))
     return np.asarray(se3.product(r, arm.links[k + 1][:3, :3].T))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GeometricStiffness:
+    """The load of a chain as its motions see it; base axes."""
+
+    chain: Chain
+    force: list[Floats]  # (n + 1,) list of (N, 3) f_k, N
+    dyad: list[Floats]  # (n + 1,) list of (N, 3, 3) D_k, N·m
+    carried: list[Floats]  # (n + 1,) list of (N, 3, 3) D_k − [m]×, N·m, m the load's moment
+    spun: list[Floats]  # (n,) list of (N, 3) D_j z_j, N·m
+    load_point: Floats  # (N, 3) where the load acts, m
+    following: Floats | None = None  # (N, 6, 6) of the load's wrench by the flange's motion
+
+    def gradient(self, form: Mapping[tuple[int, bool], Floats]) -> "MotionGradient":
+        """Gradient by the motions of a linear form (N, m, 3) of slots' force and moment."""
+        chain, slots = self.chain, len(self.force)
+        still: list[Floats | None] = [None]
+        along: list[Floats | None] = [None] * (slots + 1)
+        load: Floats | None = None
+        for k in range(slots):
+            by_force, by_moment = (
+                None if b is None else rows_times(b, chain.rotation[k], transposed=True)
+                for b in (form.get((k, False)), form.get((k, True)))
+            )
+            still.append(_sum(still[-1], by_moment))
+            if by_moment is not None:
+                along[k] = rows_times(by_moment, self.carried[k], transposed=True)
+                if self.following is not None:
+                    lever = self.load_point - chain.position[k]
+                    load = _sum(load, se3.cross(by_moment, lever[:, None]))
+            if by_force is not None:
+                along[k] = _sum(along[k], se3.cross(by_force, self.force[k][:, None]))
+                load = _sum(load, by_force) if self.following is not None else None
+        for k in range(slots - 1, -1, -1):
+            mine, beyond = along[k], along[k + 1]
+            if mine is None or beyond is None:
+                along[k] = _sum(mine, beyond)
+            else:
+                mine += beyond
+        flange = None
+        if self.following is not None and load is not None and still[-1] is not None:
+            flange = rows_times(np.concatenate([load, still[-1]], axis=2), self.following)
+        rows = next(iter(form.values())).shape[:2]
+        return MotionGradient(self, rows, still, along, flange)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MotionGradient:
+    """Gradient of a linear form of the slot wrenches by motions of the chain."""
+
+    stiffness: GeometricStiffness
+    rows: tuple[int, ...]  # N and m
+    # (n + 2,) sums (N, m, 3) over the slots i < k of the moments' coefficients, base axes; None for
+    # zero, here and below
+    still: list[Floats | None]
+    along: list[Floats | None]  # (n + 2,) gradients (N, m, 3) by a turn with slots i ≥ k
+    flange: Floats | None  # (N, m, 6) of the load's wrench by the flange's motion
+
+    def joint(self, j: int) -> Floats:
+        """(N, m) gradient by the displacement of joint j + 1."""
+        z, arm = self.stiffness.chain.rotation[j, :, :, 2], self.stiffness
+        if j in arm.chain.slides:
+            # Slot j stands still, and the force through it is shifted along z against p_j.
+            still = self.still[j + 1]
+            found = None if still is None else _rows_dot(still, se3.cross(z, arm.force[j]))
+            if self.flange is not None:
+                found = _sum(found, _rows_dot(self.flange[..., :3], z))
+            return zeros(*self.rows) if found is None else found
+        parts = [(self.along[j + 1], z), (self.still[j + 1], arm.spun[j])]
+        if self.flange is not None:
+            lever = arm.chain.position[-1] - arm.chain.position[j]
+            parts += [(self.flange[..., 3:], z), (self.flange[..., :3], se3.cross(z, lever))]
+        out = reduce(_sum, (None if a is None else _rows_dot(a, by) for a, by in parts))
+        return zeros(*self.rows) if out is None else out
+
+    def displacement(self, j: int) -> Floats | None:
+        """(N, m, 3) gradient by the displacement of all beyond slot j, base axes."""
+        out = None if self.flange is None else self.flange[..., :3]
+        still = self.still[j]
+        if still is not None:
+            out = _sum(out, se3.cross(self.stiffness.force[j][:, None], still))
+        return out
+
+    def turn(self, j: int) -> Floats:
+        """(N, m, 3) gradient by the turn of all beyond slot j about p_j, base axes."""
+        out, still = self.along[j], self.still[j]
+        chain, flange = self.stiffness.chain, self.flange
+        if still is not None:
+            out = _sum(out, rows_times(still, self.stiffness.dyad[j]))
+        if flange is not None:
+            lever = (chain.position[-1] - chain.position[j])[:, None]
+            out = _sum(out, flange[..., 3:] + se3.cross(lever, flange[..., :3]))
+        return zeros(*self.rows, 3) if out is None else out
+
+
+def geometric_stiffness(
+    arm: Arm, chain: Chain, load: Load, following: Floats | None = None
+) -> GeometricStiffness:
+    """Prepare the geometric stiffness of a chain under a load."""
+    n, p = arm.n, chain.position
+    point, weight = chain.point(load.point), load.tool_mass * load.gravity
+    force = load.wrench[:, :3] + weight
+    dyad = _outer(point - p[n], load.wrench[:, :3])
+    _add_weight(dyad, chain.point(load.tool_com) - p[n], weight)
+    forces, dyads = [force], [dyad]
+    for k in range(n - 1, -1, -1):
+        dyad = dyad + _outer(p[k + 1] - p[k], force)
+        weight = arm.masses[k] * load.gravity
+        _add_weight(dyad, chain.com[k] - p[k], weight)
+        if load.first_moment is not None:
+            moment = se3.apply(body_axes(arm, chain, k), load.first_moment[k])
+            _add_weight(dyad, moment, load.gravity)
+        force = force + weight
+        forces.insert(0, force)
+        dyads.insert(0, dyad)
+    for dyad in dyads:
+        trace = dyad[:, 0, 0] + dyad[:, 1, 1] + dyad[:, 2, 2]
+        for axis in range(3):
+            dyad[:, axis, axis] -= trace
+    moment = load.wrench[:, 3:]
+    turned = se3.skew(moment) if moment.any() else None
+    carried = dyads if turned is None else [dyad - turned for dyad in dyads]
+    spun = [se3.apply(dyads[j], chain.rotation[j, :, :, 2]) for j in range(n)]
+    return GeometricStiffness(chain, forces, dyads, carried, spun, point, following)
+
+
+def rows_times(rows: Floats, matrix: Floats, *, transposed: bool = False) -> Floats:
+    """Rows (N, m, i) times matrices (N, i, j), or their transposes."""
+    out = empty(*rows.shape[:2], matrix.shape[1 if transposed else 2])
+    by = "nmi,nji->nmj" if transposed else "nmi,nij->nmj"
+    return np.asarray(np.einsum(by, rows, matrix, out=out))
+
+
+def rows_times_constant(rows: Floats, matrix: Floats) -> Floats:
+    """Rows (N, m, i) times one matrix (i, j), which is zero for the most part."""
+    if np.array_equal(matrix, np.eye(len(matrix))):
+        return rows
+    out = zeros(*rows.shape[:2], matrix.shape[1])
+    for i, j in zip(*np.nonzero(matrix), strict=True):
+        out[..., j] += rows[..., i] * matrix[i, j]
+    return out
+
+
+def _rows_dot(rows: Floats, vector: Floats) -> Floats:
+    """Rows (N, m, i) times vectors (N, i)."""
+    return np.einsum("nmi,ni->nm", rows, vector, out=empty(*rows.shape[:2]))
+
+
+def _sum(a: Floats | None, b: Floats | None) -> Floats | None:
+    if a is None or b is None:
+        return b if a is None else a
+    return np.asarray(a + b)
+
+
+def _outer(a: Floats, b: Floats) -> Floats:
+    return np.einsum("ni,nj->nij", a, b, out=empty(len(a), 3, 3))
+
+
+def _add_weight(dyad: Floats, lever: Floats, weight: Floats) -> None:
+    """Add l wᵀ of a weight w (3,) that is the same in all states."""
+    for axis in np.flatnonzero(weight):
+        dyad[:, :, axis] += lever * weight[axis]

@@ -31,26 +31,15 @@ DEFAULTS = (("multiplier", "1"), ("offset", "0"))
 
 
 def arm_from_urdf(path: Path, base_link: str | None = None, tip_link: str | None = None) -> Arm:
-    """Read the arm between two links of a URDF.
+    """Read the arm between two links of a URDF; by default the root and the only leaf.
 
-    With M_k the placement of joint k in its predecessor and R_k a rotation that takes z to
-    the joint's axis, the constant transforms are L_0 = T_base_root M_1 R_1,
-    L_k = R_kᵀ M_{k+1} R_{k+1} and L_n = R_nᵀ M_tip. Masses rigidly attached to a moving link
-    are merged into it; joints outside the chain (fingers of a gripper) are held at zero.
-    A continuous joint gets the range ±2π, also one whose limits are both 0; an effort of 0 means
-    unknown (infinite); a URDF names no payload (infinite). What is missing is said in `Arm.notes`.
-    A joint outside of the chain that mimics another is held at zero as well. One of the chain turns
-    by multiplier · q_i + offset of the joint i of the chain that it follows: that is a coupling of
-    the arm (`Arm.coupling`, `Arm.drive`), and the joint has no value of its own (`Arm.mimic`).
-
-    Args:
-        base_link: link whose frame is the base; the root link if None.
-        tip_link: link whose frame is the flange; the only leaf link if None.
-
-    Raises:
-        InputError: no file, not a URDF, unknown link, a branching chain without `tip_link`
-            (lists the leaf links), a joint of more than one degree of freedom, or one that mimics
-            no joint with a value of its own within the chain.
+    With M_k the placement of joint k in its predecessor and R_k a rotation that takes z to the
+    joint's axis, the constant transforms are L_0 = T_base_root M_1 R_1, L_k = R_kᵀ M_{k+1} R_{k+1}
+    and L_n = R_nᵀ M_tip. Masses rigidly attached to a moving link are merged into it; joints
+    outside the chain are held at zero. A continuous joint gets the range ±2π, also one whose limits
+    are both 0; an effort of 0 means unknown (infinite). What is missing is said in `Arm.notes`. A
+    joint of the chain that mimics another turns by multiplier · q_i + offset: that is a coupling of
+    the arm, and the joint has no value of its own (`Arm.mimic`).
     """
     model = _read(path)
     names = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
@@ -73,7 +62,10 @@ def _arm(model: pin.Model, base: pin.SE3, tip: pin.SE3, path: Path) -> Arm:
     joints = range(1, model.njoints)
     axes = _axes(model)
     slides = np.array([bool(np.any(axis[:3])) for axis in axes])
-    turns = [_z_to(axis[:3] if s else axis[3:]) for axis, s in zip(axes, slides, strict=True)]
+    turns = np.tile(np.eye(4), (len(axes), 1, 1))  # the smallest that take z to the axes
+    for turn, axis, s in zip(turns, axes, slides, strict=True):
+        to = axis[:3] if s else axis[3:]
+        turn[:3, :3] = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), to).matrix()
     coms = [
         turn[:3, :3].T @ model.inertias[joint].lever
         for turn, joint in zip(turns, joints, strict=True)
@@ -87,17 +79,11 @@ def _arm(model: pin.Model, base: pin.SE3, tip: pin.SE3, path: Path) -> Arm:
     return Arm(
         name=path.stem,
         links=np.array([b @ m @ a for b, m, a in zip(before, placements, after, strict=True)]),
-        masses=masses,
-        coms=np.array(coms),
-        q_min=np.array(lower),
-        q_max=np.array(upper),
-        torque_max=np.array(effort),
-        payload=math.inf,
-        joint_names=names,
-        source=f"URDF {path.name}",
-        notes=_missing(model, masses, slides),
+        masses=masses, coms=np.array(coms), q_min=np.array(lower), q_max=np.array(upper),
+        torque_max=np.array(effort), payload=math.inf, joint_names=names,
+        source=f"URDF {path.name}", notes=_missing(model, masses, slides),
         prismatic=slides if slides.any() else None,
-    )
+    )  # fmt: skip
 
 
 def _missing(model: pin.Model, masses: Floats, slides: Bools) -> tuple[str, ...]:
@@ -116,7 +102,6 @@ def _no_limits(model: pin.Model, joint: int) -> bool:
 
 
 def _limits(model: pin.Model, joint: int) -> tuple[float, float, float]:
-    """Lower and upper limit in rad or m, and effort in N·m or N."""
     kind = model.joints[joint]
     effort = float(model.upperEffortLimit[kind.idx_v]) or math.inf
     if kind.nq != 1 or _no_limits(model, joint):  # continuous: Pinocchio keeps cosine and sine
@@ -137,15 +122,7 @@ def _axes(model: pin.Model) -> list[Floats]:
     ]
 
 
-def _z_to(axis: Floats) -> Floats:
-    """(4, 4) the smallest rotation that takes z to a unit axis."""
-    turn = np.eye(4)
-    turn[:3, :3] = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), axis).matrix()
-    return turn
-
-
 def _chain(model: pin.Model, base: str, tip: str, path: Path) -> list[int]:
-    """Joints between two links, each revolute or prismatic."""
     start, joint = _link(model, base).parentJoint, _link(model, tip).parentJoint
     chain: list[int] = []
     while joint not in (start, 0):
@@ -177,7 +154,6 @@ def _link(model: pin.Model, name: str) -> pin.Frame:
 
 
 def _only_leaf(model: pin.Model, path: Path) -> str:
-    """Name of the only moving link that nothing is attached to."""
     parents = {frame.parentFrame for frame in model.frames}
     leaves = [
         str(frame.name)
@@ -245,17 +221,11 @@ def _captured_stderr() -> Iterator[IO[str]]:
 
 @dataclass(frozen=True, slots=True)
 class Mimic:
-    """What a joint follows: q = multiplier · q of `joint` + offset.
+    """What a joint follows: q = multiplier · q of `joint` + offset."""
 
-    Attributes:
-        joint: name of the joint that it follows.
-        multiplier: 1 where it is not written.
-        offset: 0 where it is not written, rad or m.
-    """
-
-    joint: str
-    multiplier: float
-    offset: float
+    joint: str  # name of the joint that it follows
+    multiplier: float  # 1 where it is not written
+    offset: float  # 0 where it is not written, rad or m
 
 
 def mimics(path: Path) -> dict[str, Mimic]:
@@ -281,17 +251,7 @@ def mimics(path: Path) -> dict[str, Mimic]:
 
 
 def with_mimics(arm: Arm, given: Mapping[str, Mimic], where: str) -> Arm:
-    """Return the arm whose joints follow others as a URDF says.
-
-    The motor of joint i turns the joint along, so that the coupling is mechanical.
-
-    Args:
-        arm: the arm with every joint by itself.
-        given: what joints of the file follow; those that the arm does not have do not count.
-
-    Raises:
-        InputError: what is followed is no joint of the arm, or follows another one itself.
-    """
+    """Return the arm whose joints follow others as a URDF says, turned along by their motors."""
     names, n = list(arm.joint_names), arm.n
     follows = {names.index(name): m for name, m in given.items() if name in names}
     if not follows:

@@ -3,6 +3,7 @@
 A file that is not the one of its name any more while it is open is found again, or rescued.
 """
 
+import itertools
 import json
 import os
 import sqlite3
@@ -11,8 +12,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from types import TracebackType
-from typing import Self, get_args
+from typing import Any, Self
 
 import numpy as np
 
@@ -21,8 +21,8 @@ from hilcal.errors import HilcalError, InputError, MovedFileError
 from hilcal.names import quoted
 from hilcal.readings.readings import ObserverKind, ObserverName, Readings
 from hilcal.store import rows, schema
-from hilcal.store.command_line import typed_now
-from hilcal.store.records import Layout, content_hash, layout_of, read_layout
+from hilcal.store.codec import decode
+from hilcal.store.kept_texts import robot_file_of, typed_now
 from hilcal.store.revision import (
     RevisionRecord,
     fitted_to,
@@ -32,7 +32,7 @@ from hilcal.store.revision import (
     to_text,
     utc_now,
 )
-from hilcal.store.robot_file import robot_file_of
+from hilcal.store.rows import Layout, content_hash, layout_of, read_layout
 from hilcal.whole_file import replacing
 
 _TARGETS, _OBSERVERS = "targets", "observers"
@@ -59,12 +59,13 @@ class CampaignFile:
 
     def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
         """Take over an open connection; use `create` or `open`."""
-        self.path = path
-        self._connection = connection
+        self.path, self.connection = path, connection
         self._identity = identity(path)
         self._now: Path | None = None
         self._written = False
         self._meta = self._read_meta()
+        self.config_json, self.base_dir = self._meta["config"], self._meta["base_dir"]
+        self.source, self.created = self._meta["source"], self._meta["created"]
 
     @classmethod
     def create(
@@ -80,22 +81,12 @@ class CampaignFile:
     ) -> Self:
         """Make a campaign; the file appears only when it is complete.
 
-        Args:
-            base_dir: the directory to which its relative paths refer.
-            source: where the readings come from, in words.
-            overwrite: replace an existing campaign (never a file of another kind).
-            more: further texts about it, see `about`.
-            readings: the first ones; none unless given.
-
-        Raises:
-            InputError: the file exists, or cannot be written; see `append_readings`.
-            DeviceError: the disk is full or failed.
+        It may `overwrite` an existing campaign, never a file of another kind.
         """
         path = Path(path)
-        meta = dict(
-            zip(_META, (config_json, base_dir, source, utc_now(), __version__), strict=True)
-        )
-        meta |= {**typed_now(), **robot_file_of(config_json, base_dir), **(more or {})}
+        meta = {"config": config_json, "base_dir": base_dir, "source": source}
+        meta |= {"created": utc_now(), "program_version": __version__, **typed_now()}
+        meta |= {**robot_file_of(config_json, base_dir), **(more or {})}
         with new_campaign(path, meta, overwrite) as connection:
             if readings is not None:
                 cls(path, connection).insert(readings)
@@ -107,13 +98,7 @@ class CampaignFile:
     ) -> Self:
         """Open a campaign and check that it is whole.
 
-        Args:
-            read_only: write nothing, see `schema.connect`.
-            check_revisions: refuse bad ones (`bad_revision`); what needs the readings alone, as to
-                measure on, does not.
-
-        Raises:
-            InputError: no such file, another format, a newer version, damaged or truncated.
+        Bad revisions (`bad_revision`) are refused, unless the readings alone are needed.
         """
         path = Path(path)
         if path.exists() and not (path.is_file() or path.is_dir()):
@@ -142,18 +127,13 @@ class CampaignFile:
 
     def close(self) -> None:
         """Close the file."""
-        self._connection.close()
+        self.connection.close()
 
     def __enter__(self) -> Self:
         """Return the campaign."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close the file; what was written is not left in one that is not in its place."""
         try:
             if self._written and self._now is None:
@@ -165,80 +145,38 @@ class CampaignFile:
     def n_readings(self) -> int:
         """Number of readings."""
         with schema.sqlite_errors(self.path):
-            (count,) = self._connection.execute("SELECT count(*) FROM readings").fetchone()
+            (count,) = self.connection.execute("SELECT count(*) FROM readings").fetchone()
         return int(count)
-
-    @property
-    def config_json(self) -> str:
-        """The cell's configuration."""
-        return self._meta["config"]
-
-    @property
-    def base_dir(self) -> str:
-        """The directory to which the configuration's relative paths refer."""
-        return self._meta["base_dir"]
-
-    @property
-    def source(self) -> str:
-        """Where the readings come from."""
-        return self._meta["source"]
-
-    @property
-    def created(self) -> str:
-        """When the campaign was made, ISO 8601, UTC."""
-        return self._meta["created"]
 
     def about(self, key: str) -> str | None:
         """A further text about the campaign, as given to `create`; None where there is none."""
         return self._meta.get(key)
 
-    @property
-    def connection(self) -> sqlite3.Connection:
-        """The open file, for the other modules of this package."""
-        return self._connection
-
     @contextmanager
     def transaction(self) -> Iterator[sqlite3.Connection]:
-        """Store everything of a block, or nothing.
-
-        Raises:
-            InputError: it cannot be stored.
-            DeviceError: the disk is full or failed, or see `check_place`.
-        """
+        """Store everything of a block, or nothing; raises as `check_place` does, too."""
         self._written = True
         try:
-            with schema.sqlite_errors(self.path), schema.transaction(self._connection) as found:
-                yield found
+            with schema.sqlite_errors(self.path), schema.transaction(self.connection) as open_file:
+                yield open_file
         except HilcalError:
             self.check_place()  # which is why
             raise
         self.check_place()
 
     def check_place(self) -> None:
-        """Refuse to go on where the open file is not the one of its name any more.
-
-        Raises:
-            MovedFileError: it was deleted, replaced or moved; says where its readings are.
-        """
+        """Raise a MovedFileError where the open file is not the one of its name any more."""
         if identity(self.path) == self._identity:
             return
         if self._now is None:
-            self._now = moved_to(self._identity) or rescued(self._connection, self.path)
+            self._now = moved_to(self._identity) or rescued(self.connection, self.path)
         raise MovedFileError(
             f"{self.path}: deleted, replaced or moved while it was open; all {self.n_readings} "
             f"readings stored so far are in {self._now}: move that back to {self.path} first"
         )
 
     def append_readings(self, readings: Readings) -> int:
-        """Append readings in one transaction; names already known keep their numbers.
-
-        Returns:
-            The number of readings in the campaign.
-
-        Raises:
-            InputError: other quantities, joints or elements than the readings before; a known
-                pose with other commanded joints; not finite; the file cannot be written.
-        """
+        """Append readings in one transaction; names already known keep their numbers."""
         with self.transaction():
             return self.insert(readings)
 
@@ -254,76 +192,58 @@ class CampaignFile:
             readings = self._numbered_targets(readings)
             self._claim_observers(readings)
             limits.check_fitted(self.n_readings + len(readings), readings.m, f"{self.path}: ")
-        rows.check_poses(self._connection, self.path, readings)
-        return rows.insert_readings(self._connection, readings)
+        rows.check_poses(self.connection, self.path, readings)
+        return rows.insert_readings(self.connection, readings)
 
     def readings(self) -> Readings:
-        """All readings in the order in which they were appended.
-
-        Raises:
-            InputError: there are none yet, or they are damaged.
-        """
+        """All readings in the order in which they were appended."""
         layout = self._layout()
         if layout is None:
             raise InputError(f"{self.path}: the campaign holds no readings yet")
         with schema.sqlite_errors(self.path):
-            names, by = self._names_in(self._read_meta().get(_TARGETS, "[]")), self._observers()
-            return rows.fetch_readings(self._connection, self.path, layout, names, by)
+            names, by = self._stored(_TARGETS, tuple[str, ...]), self._observers()
+            return rows.fetch_readings(self.connection, self.path, layout, names, by)
 
     def data_hash(self, count: int | None = None) -> str:
         """SHA-256 of the readings, or of the first ones; see `content_hash`."""
         return content_hash(self.readings()[:count])
 
     def append_revision(self, record: RevisionRecord) -> int:
-        """Append a model revision.
-
-        Returns:
-            Its number, 1, 2, ...; `record.number` is not looked at.
-
-        Raises:
-            InputError: the file cannot be written.
-            ValueError: a number in it is not finite.
-        """
+        """Append a model revision; returns its number, 1, 2, ..., whatever the record has."""
         with self.transaction():
             return self.insert_revision(record)
 
     def insert_revision(self, record: RevisionRecord) -> int:
         """Do the same inside a transaction that the caller has begun."""
-        (last,) = self._connection.execute("SELECT ifnull(max(id), 0) FROM revisions").fetchone()
-        number = int(last) + 1
-        if record.parent == last and replace(record, parent=None).follows:
+        number = rows.last_id(self.connection, "revisions") + 1
+        if record.parent == number - 1 and replace(record, parent=None).follows:
             record = replace(record, parent=None)
         record, key, posterior = split(record)
         text = to_text(record)
-        if record.parent is not None:
-            schema.require(self._connection, schema.CHOSEN_REVISION)
-        if key is not None:
-            if key not in self._read_meta():
-                rows.insert_meta(self._connection, key, posterior)
-            schema.require(self._connection, schema.CARRIED_PRIOR)
-        if record.cell:
-            schema.require(self._connection, schema.CHANGED_CELL)
+        if key is not None and key not in self._read_meta():
+            rows.insert_meta(self.connection, key, posterior)
+        schema.require(
+            self.connection,
+            schema.CHANGED_CELL * bool(record.cell),
+            schema.CARRIED_PRIOR * (key is not None),
+            schema.CHOSEN_REVISION * (record.parent is not None),
+        )
         row = (number, text, rows.text_crc(str(number), text))
-        rows.insert(self._connection, "revisions", [row])
+        rows.insert(self.connection, "revisions", [row])
         return number
 
     def accepted(self) -> int | None:
         """Number of the accepted revision; None where the latest one is used."""
-        found = self.acceptances()
-        return found[-1] if found else None
+        return next(reversed(self.acceptances()), None)
 
     def accept(self, number: int | None) -> None:
-        """Make a revision the one that is used; None lets the latest one be used again.
-
-        Raises:
-            InputError: no such revision, or the file cannot be written.
-        """
+        """Make a revision the one that is used; None lets the latest one be used again."""
         if number is not None:
             self.revision(number)
         with self.transaction():
             key = ACCEPTED.format(len(self.acceptances()) + 1)
-            rows.insert_meta(self._connection, key, json.dumps(number))
-            schema.require(self._connection, schema.CHOSEN_REVISION)
+            rows.insert_meta(self.connection, key, json.dumps(number))
+            schema.require(self.connection, schema.CHOSEN_REVISION)
 
     def acceptances(self) -> list[int | None]:
         """All that was accepted, in order."""
@@ -333,16 +253,12 @@ class CampaignFile:
         while (text := meta.get(ACCEPTED.format(len(found) + 1))) is not None:
             number = rows.stored_json(self.path, text)
             if number is not None and not isinstance(number, int):
-                raise InputError(f"{self.path}: the campaign file is damaged (an acceptance)")
+                raise self._damaged("an acceptance")
             found.append(number)
         return found
 
     def revisions(self) -> tuple[RevisionRecord, ...]:
-        """All revisions, oldest first.
-
-        Raises:
-            InputError: they are damaged.
-        """
+        """All revisions, oldest first."""
         records, damaged = self._sound_revisions()
         if damaged is not None:
             raise InputError(f"{self.path}: {damaged[1]}; {_mend(self.path)}")
@@ -352,7 +268,7 @@ class CampaignFile:
         """Return the revisions before the first damaged one; and its number, and what it is."""
         records: list[RevisionRecord] = []
         with schema.sqlite_errors(self.path), limits.memory(str(self.path)):
-            stored = self._connection.execute("SELECT id, content, crc FROM revisions ORDER BY id")
+            stored = self.connection.execute("SELECT id, content, crc FROM revisions ORDER BY id")
             meta = self._read_meta()
             for expected, (number, text, crc) in enumerate(stored.fetchall(), start=1):
                 try:
@@ -368,11 +284,7 @@ class CampaignFile:
         return tuple(records), None
 
     def revision(self, number: int) -> RevisionRecord:
-        """One revision.
-
-        Raises:
-            InputError: there is none of this number; names the valid ones.
-        """
+        """One revision."""
         records = self.revisions()
         if not 1 <= number <= len(records):
             valid = f"there are 1 to {len(records)}" if records else "there are none yet"
@@ -382,16 +294,16 @@ class CampaignFile:
     def bad_revision(self) -> tuple[int, str] | None:
         """Return the first revision that is damaged, or was fitted to other readings, and why.
 
-        The hash of a revision is that of the first readings: of those that it was fitted to, or, as
-        programs before stored it, of some more, which were appended while it was fitted. Either
-        proves that the readings which it was fitted to are as they were.
+        Its hash is that of the first readings: of those that it was fitted to, or, as programs
+        before stored it, of some more, which were appended while it was fitted. Either proves that
+        they are as they were.
         """
         records, damaged = self._sound_revisions()
-        fitted = [(r.number, *told) for r in records if (told := fitted_to(r)) is not None]
-        readings = self.readings() if fitted else None
-        hashes: dict[int, str] = {}
+        fitted = [(r.number, *of) for r in records if (of := fitted_to(r)) is not None]
+        if not fitted:
+            return damaged
+        readings, hashes = self.readings(), dict[int, str]()
         for number, count, stored in fitted:
-            assert readings is not None  # noqa: S101
             for n in range(count, min(len(readings), count + _MEANWHILE) + 1):
                 if n > count and sum(hashes) > _HASHED:
                     return number, _OTHER_READINGS.format(number)
@@ -404,10 +316,13 @@ class CampaignFile:
         return damaged
 
     def _read_meta(self) -> dict[str, str]:
-        meta = rows.fetch_meta(self._connection, self.path)
+        meta = rows.fetch_meta(self.connection, self.path)
         if missing := sorted(set(_META) - set(meta)):
-            raise InputError(f"{self.path}: the campaign file is damaged (no {missing[0]})")
+            raise self._damaged(f"no {missing[0]}")
         return meta
+
+    def _damaged(self, what: object) -> InputError:
+        return InputError(f"{self.path}: the campaign file is damaged ({what})")
 
     def _layout(self) -> Layout | None:
         with schema.sqlite_errors(self.path):
@@ -415,19 +330,21 @@ class CampaignFile:
         try:
             return None if text is None else read_layout(text)
         except ValueError as e:
-            raise InputError(f"{self.path}: the campaign file is damaged ({e})") from e
+            raise self._damaged(e) from e
 
-    def _names_in(self, text: str) -> list[str]:
-        names = rows.stored_json(self.path, text)
-        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-            raise InputError(f"{self.path}: the campaign file is damaged (its targets)")
-        return names
+    def _stored(self, key: str, kind: Any) -> Any:
+        """A list about the campaign, of some type; empty where there is none."""
+        content = rows.stored_json(self.path, self._read_meta().get(key, "[]"))
+        try:
+            return decode(kind, content)
+        except (TypeError, ValueError):
+            raise self._damaged(f"its {key}") from None
 
     def _claim_layout(self, layout: Layout) -> None:
         """Fix the quantities of a reading with the first ones; refuse others later."""
         known = self._layout()
         if known is None:
-            rows.insert_meta(self._connection, "layout", json.dumps(layout))
+            rows.insert_meta(self.connection, "layout", json.dumps(layout))
         elif known != layout:
             differ = sorted({name for name, _ in set(known) ^ set(layout)})
             raise InputError(
@@ -435,39 +352,32 @@ class CampaignFile:
                 f"a campaign holds one kind of reading, start another for these"
             )
 
-    def _observers(self) -> list[ObserverName]:
-        found = rows.stored_json(self.path, self._read_meta().get(_OBSERVERS, "[]"))
-        kinds = get_args(ObserverKind)
-        try:
-            by = [ObserverName(kind, str(name)) for kind, name in found]
-        except (TypeError, ValueError):
-            by = [ObserverName("station", "")]
-        if not all(o.kind in kinds and o.name for o in by):
-            raise InputError(f"{self.path}: the campaign file is damaged (its observers)")
-        return by
+    def _observers(self) -> tuple[ObserverName, ...]:
+        stored = self._stored(_OBSERVERS, tuple[tuple[ObserverKind, str], ...])
+        if not all(name for _, name in stored):
+            raise self._damaged("its observers")
+        return tuple(ObserverName(kind, name) for kind, name in stored)
 
     def _claim_observers(self, readings: Readings) -> None:
         """Name the observers with the first readings; refuse others later."""
         if readings.states.torque is not None or readings.states.observer is not None:
-            schema.require(self._connection, schema.MORE_COLUMNS)
+            schema.require(self.connection, schema.MORE_COLUMNS)
         if readings.states.observer is None:
             return
         if self._read_meta().get(_OBSERVERS) is None:
             text = json.dumps([[o.kind, o.name] for o in readings.observers])
-            rows.insert_meta(self._connection, _OBSERVERS, text)
-        if tuple(self._observers()) != readings.observers:
+            rows.insert_meta(self.connection, _OBSERVERS, text)
+        if self._observers() != readings.observers:
             raise InputError(f"{self.path}: the readings are by other observers than those before")
 
     def _numbered_targets(self, readings: Readings) -> Readings:
         """Return the readings with targets numbered as in the file; the first ones name them."""
         if readings.states.target is None:
             return readings
-        text = self._read_meta().get(_TARGETS)
-        if text is None:
-            text = json.dumps(readings.target_names)
-            rows.insert_meta(self._connection, _TARGETS, text)
-            schema.require(self._connection, schema.SEVERAL_TARGETS)
-        names = self._names_in(text)
+        if self._read_meta().get(_TARGETS) is None:
+            rows.insert_meta(self.connection, _TARGETS, json.dumps(readings.target_names))
+            schema.require(self.connection, schema.SEVERAL_TARGETS)
+        names: tuple[str, ...] = self._stored(_TARGETS, tuple[str, ...])
         new = [name for name in readings.target_names if name not in names]
         if new:
             raise InputError(
@@ -475,7 +385,7 @@ class CampaignFile:
             )
         number = np.array([names.index(name) for name in readings.target_names])
         states = replace(readings.states, target=number[readings.target])
-        return replace(readings, states=states, target_names=tuple(names))
+        return replace(readings, states=states, target_names=names)
 
 
 def _mend(path: Path) -> str:
@@ -503,34 +413,26 @@ def moved_to(known: Identity | None) -> Path | None:
 
 
 def rescued(connection: sqlite3.Connection, path: Path) -> Path:
-    """Write a copy of an open file that has no name any more, beside where it was.
-
-    Raises:
-        InputError: it cannot be written.
-    """
+    """Write a copy of an open file that has no name any more, beside where it was."""
     home = path.absolute().parent
     folder = home if home.is_dir() else Path(tempfile.gettempdir())
-    place, k = folder / f"{path.stem}.rescued{path.suffix}", 2
-    while place.exists():
-        place, k = folder / f"{path.stem}.rescued-{k}{path.suffix}", k + 1
+    place = free_place(folder, f"{path.stem}.rescued", path.suffix)
     with replacing(place, must_be_new=True) as new, closing(sqlite3.connect(new)) as copy:
         connection.backup(copy)
     return place
+
+
+def free_place(folder: Path, name: str, end: str = "") -> Path:
+    """Return a path that no file has: name and end, with -2, -3, ... between them where needed."""
+    places = (folder / f"{name}{f'-{k}' * (k > 1)}{end}" for k in itertools.count(1))
+    return next(place for place in places if not place.exists())
 
 
 @contextmanager
 def new_campaign(
     path: Path, about: Mapping[str, str], overwrite: bool
 ) -> Iterator[sqlite3.Connection]:
-    """Give an empty campaign to the block; the file appears when the block has filled it.
-
-    Args:
-        about: texts about the campaign, by name.
-
-    Raises:
-        InputError: as for `may_write`, or it cannot be written.
-        DeviceError: the disk is full or failed.
-    """
+    """Give an empty campaign to the block; the file appears when the block has filled it."""
     may_write(path, overwrite)
     with replacing(path) as new:
         try:
@@ -553,11 +455,7 @@ def new_campaign(
 
 
 def may_write(path: Path, overwrite: bool) -> None:
-    """Refuse to replace a file that is no campaign, or any without `overwrite`.
-
-    Raises:
-        InputError: names the file and the reason.
-    """
+    """Refuse to replace a file that is no campaign, or any without `overwrite`."""
     if not path.exists():
         return
     if not overwrite:

@@ -11,7 +11,7 @@ import numpy as np
 from hilcal.config import CellConfig
 from hilcal.readings.readings import Readings
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.command_line import COMMAND
+from hilcal.store.kept_texts import COMMAND
 from hilcal.store.revision import RevisionRecord
 from hilcal.store.run_log import PLAN, RunLog
 from hilcal.types import Floats
@@ -21,98 +21,59 @@ _SERIAL = re.compile(r"serial(?: number)?:? (\S+)", re.IGNORECASE)
 
 @dataclass(frozen=True, slots=True)
 class MeasuringDevice:
-    """A device that measured, as it answered when a session began.
+    """A device that measured, as it answered when a session began."""
 
-    Attributes:
-        device: part of the cell, e.g. "tracker".
-        name: as it told it.
-        serial_number: None where it told none.
-        facts: what else it told, by name.
-        utc: when it answered first, ISO 8601.
-    """
-
-    device: str
+    device: str  # part of the cell, e.g. "tracker"
     driver: str
-    name: str
-    serial_number: str | None
-    facts: Mapping[str, str]
-    utc: str
+    name: str  # as it told it
+    serial_number: str | None  # None where it told none
+    facts: Mapping[str, str]  # what else it told, by name
+    utc: str  # when it answered first, ISO 8601
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tare:
-    """A zero of the force sensor.
+    """A zero of the force sensor."""
 
-    Attributes:
-        utc: when, ISO 8601.
-        wrench: (6,) what it read with nothing on the hook, sensor axes, N and N·m.
-    """
-
-    utc: str
-    wrench: Floats
+    utc: str  # when, ISO 8601
+    wrench: Floats  # (6,) what it read with nothing on the hook, sensor axes, N and N·m
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Return:
-    """A return to the reference pose.
+    """A return to the reference pose."""
 
-    Attributes:
-        utc: when, ISO 8601.
-        shift_m: (3,) shift since the first reading there, sensor axes, m.
-        sigma: its size in standard deviations.
-        over: whether it was over the limit of [acquire] drift_limit_sigma.
-    """
-
-    utc: str
-    shift_m: Floats
-    sigma: float
-    over: bool
+    utc: str  # when, ISO 8601
+    shift_m: Floats  # (3,) shift since the first reading there, sensor axes, m
+    sigma: float  # its size in standard deviations
+    over: bool  # whether it was over the limit of [acquire] drift_limit_sigma
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Overview:
-    """A campaign at a glance.
+    """A campaign at a glance."""
 
-    Attributes:
-        created: when the file was made, ISO 8601, UTC.
-        program_version: of the program that made it.
-        source: where the readings come from.
-        command: that made the file, as it was typed; empty where it is not kept.
-        readings: all of them, with the covariances as stored; None before the first.
-        loads: number of readings by load.
-        targets: number of readings by target, where there are several.
-        planned: number of planned steps; None for an imported campaign.
-        measured: of them those that were measured.
-        instruments: that were connected, each once.
-        tares: of the force sensor, in order.
-        returns: to the reference pose, in order.
-        tool: as the force sensor found it last: mass_kg, com_m, ...; None where it did not.
-        repeatability: as the last session found it; None where it did not.
-        events: all that happened, in order: "kind", "utc" and more.
-        accepted: number of the accepted revision, if any.
-        in_use: number of the revision that commands use, if there is any.
-    """
-
-    created: str
-    program_version: str
-    source: str
-    command: str
+    created: str  # when the file was made, ISO 8601, UTC
+    program_version: str  # of the program that made it
+    source: str  # where the readings come from
+    command: str  # that made the file, as it was typed; empty where it is not kept
     config: CellConfig
-    readings: Readings | None
-    loads: Mapping[str, int]
-    targets: Mapping[str, int]
-    planned: int | None
-    measured: int
+    readings: Readings | None  # all of them, with the covariances as stored; None before the first
+    loads: Mapping[str, int]  # number of readings by load
+    targets: Mapping[str, int]  # number of readings by target, where there are several
+    planned: int | None  # number of planned steps; None for an imported campaign
+    measured: int  # of them those that were measured
     plans: int
-    instruments: tuple[MeasuringDevice, ...]
-    tares: tuple[Tare, ...]
-    returns: tuple[Return, ...]
+    instruments: tuple[MeasuringDevice, ...]  # that were connected, each once
+    tares: tuple[Tare, ...]  # of the force sensor, in order
+    returns: tuple[Return, ...]  # to the reference pose, in order
     tool: Mapping[str, Any] | None
-    repeatability: Mapping[str, Any] | None
-    events: tuple[Mapping[str, Any], ...]
+    """As the force sensor found it last: mass_kg, com_m, ...; None where it did not."""
+    repeatability: Mapping[str, Any] | None  # as the last session found it; None where it did not
+    events: tuple[Mapping[str, Any], ...]  # all that happened, in order: "kind", "utc" and more
     revisions: tuple[RevisionRecord, ...]
-    accepted: int | None
-    in_use: int | None
+    accepted: int | None  # number of the accepted revision, if any
+    in_use: int | None  # number of the revision that commands use, if there is any
 
     @property
     def poses(self) -> int:
@@ -121,11 +82,7 @@ class Overview:
 
 
 def overview(file: CampaignFile) -> Overview:
-    """Return what a campaign file holds.
-
-    Raises:
-        InputError: it is damaged.
-    """
+    """Return what a campaign file holds."""
     log = None if file.about(PLAN) is None else RunLog(file)
     events = () if log is None else tuple(log.events())
     readings = file.readings() if file.n_readings else None
@@ -173,16 +130,12 @@ def _count(index: Sequence[int], names: Sequence[str]) -> dict[str, int]:
 def _instruments(events: Sequence[Mapping[str, Any]]) -> tuple[MeasuringDevice, ...]:
     found: dict[tuple[str, str], MeasuringDevice] = {}
     for event in events:
-        for answer in event["answers"] if event["kind"] == "devices" else ():
-            facts, name = dict(answer["facts"]), str(answer["name"])
-            told = _SERIAL.search(name)
-            serial = facts.get("serial number") or (told and told[1].rstrip(",;"))
-            found.setdefault(
-                (answer["device"], name),
-                MeasuringDevice(
-                    answer["device"], answer["driver"], name, serial, facts, event["utc"]
-                ),
-            )
+        for a in event["answers"] if event["kind"] == "devices" else ():
+            facts, name = dict(a["facts"]), str(a["name"])
+            m = _SERIAL.search(name)
+            serial = facts.get("serial number") or (m and m[1].rstrip(",;"))
+            device = MeasuringDevice(a["device"], a["driver"], name, serial, facts, event["utc"])
+            found.setdefault((device.device, name), device)
     return tuple(found.values())
 
 
@@ -195,11 +148,7 @@ def _last(events: Sequence[Mapping[str, Any]], kind: str) -> Mapping[str, Any] |
 
 
 def to_json(o: Overview, path: str, covariance: str) -> dict[str, object]:
-    """Return the document of `info --json`.
-
-    Args:
-        covariance: what the covariances consist of, in words.
-    """
+    """Return the document of `info --json`."""
     return {
         "campaign": path,
         "created": o.created,

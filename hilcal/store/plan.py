@@ -1,5 +1,6 @@
 """A plan: which states to measure, in which order. Data that a person can edit."""
 
+import itertools
 import json
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -26,16 +27,11 @@ REFERENCE = "reference"
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One reading to take; (pose, load, cycle) names it in the whole campaign.
-
-    Attributes:
-        load: name of the load, "none" for unloaded.
-        cycle: readings of one pose and one cycle share their unloaded reading.
-    """
+    """One reading to take; (pose, load, cycle) names it in the whole campaign."""
 
     pose: str
-    load: str
-    cycle: int = 0
+    load: str  # name of the load, "none" for unloaded
+    cycle: int = 0  # readings of one pose and one cycle share their unloaded reading
 
     def __str__(self) -> str:
         """Return the step for people."""
@@ -44,19 +40,13 @@ class Step:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plan(Brief):
-    """Poses, and steps in the order in which they are taken.
+    """Poses, and steps in the order in which they are taken."""
 
-    Attributes:
-        pose_names: P distinct names.
-        q: (P, n) commanded joint angles, rad.
-        steps: distinct steps.
-        about: further keys of the file: how the plan was made, what it promises.
-    """
-
-    pose_names: tuple[str, ...]
-    q: Floats
-    steps: tuple[Step, ...]
+    pose_names: tuple[str, ...]  # P distinct names
+    q: Floats  # (P, n) commanded joint angles, rad
+    steps: tuple[Step, ...]  # distinct steps
     about: dict[str, Any] = field(default_factory=dict)
+    """Further keys of the file: how the plan was made, what it promises."""
 
     def joints(self, pose: str) -> Floats:
         """Return the (n,) joint angles of a pose by name, rad."""
@@ -84,11 +74,7 @@ class Plan(Brief):
 
 @limits.bounded
 def load_plan(path: Path) -> Plan:
-    """Read a plan file.
-
-    Raises:
-        InputError: unreadable, not a plan, or something in it that cannot be.
-    """
+    """Read a plan file."""
     try:
         text = limits.read_text(path, limits.DOCUMENT)
     except FileNotFoundError:
@@ -99,11 +85,7 @@ def load_plan(path: Path) -> Plan:
 
 
 def read_plan(text: str, where: str) -> Plan:
-    """Return the plan in a JSON document; `where` names it in messages.
-
-    Raises:
-        InputError: not a plan, or something in it that cannot be.
-    """
+    """Return the plan in a JSON document; `where` names it in messages."""
     data = read_json(text, where)
     if not isinstance(data, dict) or data.get("format") != FORMAT:
         raise InputError(f'{where}: not a plan; a plan has "format": "{FORMAT}"')
@@ -112,56 +94,51 @@ def read_plan(text: str, where: str) -> Plan:
     check_names(data, where)
     names, q = _poses(data.get("poses"), where)
     steps = _steps(data.get("steps"), names, where)
-    known = {"format", "version", "poses", "steps"}
-    about = {key: value for key, value in data.items() if key not in known}
-    return Plan(names, q, steps, about)
+    known = ("format", "version", "poses", "steps")
+    return Plan(names, q, steps, {key: x for key, x in data.items() if key not in known})
+
+
+def _entries(data: object, what: str, where: str) -> list[Any]:
+    """A list of poses or steps that is not empty."""
+    if not isinstance(data, list) or not data:
+        raise InputError(f'{where}: "{what}s" must be a list of at least one {what}')
+    limits.check_planned(where, f"{what}s", len(data))
+    return data
 
 
 def _poses(data: object, where: str) -> tuple[tuple[str, ...], Floats]:
     """Names and joint angles of the poses."""
-    if not isinstance(data, list) or not data:
-        raise InputError(f'{where}: "poses" must be a list of at least one pose')
-    limits.check_planned(where, "poses", len(data))
-    names: dict[str, None] = {}
-    rows: list[list[float]] = []
-    for k, pose in enumerate(data, start=1):
+    rows: dict[str, list[float]] = {}
+    for k, pose in enumerate(_entries(data, "pose", where), start=1):
         if not isinstance(pose, dict) or set(pose) != {"name", "q_rad"}:
             raise InputError(f'{where}: pose {k} must have exactly the keys "name" and "q_rad"')
         name, q = pose["name"], pose["q_rad"]
         if not isinstance(name, str) or not name:
             raise InputError(f"{where}: pose {k}: name {name!r} must be a text that is not empty")
-        if name in names:
+        if name in rows:
             raise InputError(f"{where}: two poses have the name {name!r}; names must differ")
+        count = len(next(iter(rows.values()), ()))
         numbers = isinstance(q, list) and all(
             isinstance(x, int | float) and not isinstance(x, bool) and abs(x) < LARGEST for x in q
         )
-        if not numbers or not q or (rows and len(q) != len(rows[0])):
-            count = f"{len(rows[0])} " if rows else ""
+        if not numbers or not q or (count and len(q) != count):
             raise InputError(
-                f"{where}: pose {name!r}: q_rad must be a list of {count}finite numbers, rad, "
-                f"below {LARGEST:g}"
+                f"{where}: pose {name!r}: q_rad must be a list of {count or ''} finite numbers, "
+                f"rad, below {LARGEST:g}"
             )
-        names[name] = None
-        rows.append([float(x) for x in q])
-    return tuple(names), np.array(rows)
+        rows[name] = [float(x) for x in q]
+    return tuple(rows), np.array(list(rows.values()))
 
 
 def _steps(data: object, names: tuple[str, ...], where: str) -> tuple[Step, ...]:
     """Steps in order."""
-    if not isinstance(data, list) or not data:
-        raise InputError(f'{where}: "steps" must be a list of at least one step')
-    limits.check_planned(where, "steps", len(data))
     steps: dict[Step, int] = {}
-    known = frozenset(names)
-    for k, step in enumerate(data, start=1):
-        if not isinstance(step, dict) or not {"pose", "load"} <= set(step) <= {
-            "pose",
-            "load",
-            "cycle",
-        }:
+    for k, step in enumerate(_entries(data, "step", where), start=1):
+        keys = set(step) if isinstance(step, dict) else set()
+        if not {"pose", "load"} <= keys <= {"pose", "load", "cycle"}:
             raise InputError(f'{where}: step {k} must have "pose" and "load", and may have "cycle"')
         pose, load, cycle = step["pose"], step["load"], step.get("cycle", 0)
-        if not isinstance(pose, str) or pose not in known:
+        if not isinstance(pose, str) or pose not in names:
             hint = suggest(str(pose), names)
             raise InputError(f"{where}: step {k}: there is no pose {pose!r}{hint}")
         if not isinstance(load, str) or not load:
@@ -181,13 +158,6 @@ def with_new_names(plan: Plan, before: Plan, number: int) -> Plan:
     The reference pose becomes that of the campaign, so that the drift is measured over all of it. A
     pose of a known name at other joints gets another name; one at the same joints is the same
     pose, and its readings get new cycles, with unloaded readings of their own.
-
-    Args:
-        before: all that was planned before.
-        number: of the plan in the campaign, 2 or more.
-
-    Raises:
-        InputError: another number of joints, or only one of the two has a reference pose.
     """
     if plan.q.shape[1] != before.q.shape[1]:
         raise InputError(
@@ -204,7 +174,8 @@ def with_new_names(plan: Plan, before: Plan, number: int) -> Plan:
         if name == REFERENCE:
             joints = known[name]
         elif name in known and np.abs(joints - known[name]).max() > SAME_POSE:
-            name = _free(f"{name}-{number}", taken)
+            free = (f"{name}-{number}{f'-{k}' * (k > 1)}" for k in itertools.count(1))
+            name = next(new for new in free if new not in taken)
             taken.add(name)
         elif name in known:
             joints = known[name]
@@ -227,22 +198,10 @@ def joined(before: Plan, done: frozenset[Step], further: Plan) -> Plan:
     """
     kept = tuple(s for s in before.steps if s in done)
     used = {s.pose for s in kept} | {REFERENCE}
-    more = [
-        k
-        for k, name in enumerate(before.pose_names)
-        if name in used and name not in further.pose_names
-    ]
+    more = [k for k, p in enumerate(before.pose_names) if p in used and p not in further.pose_names]
     return Plan(
         (*further.pose_names, *(before.pose_names[k] for k in more)),
         np.vstack([further.q, before.q[more]]),
         (*kept, *further.steps),
         further.about,
     )
-
-
-def _free(name: str, taken: set[str]) -> str:
-    """Return a name that is not taken."""
-    out, k = name, 2
-    while out in taken:
-        out, k = f"{name}-{k}", k + 1
-    return out

@@ -8,37 +8,26 @@ from hilcal.config import CellConfig
 from hilcal.errors import InputError
 from hilcal.robot.catalogue import load_arm
 from hilcal.store import schema
-from hilcal.store.campaign_file import ACCEPTED, CampaignFile
+from hilcal.store.campaign_file import ACCEPTED, CampaignFile, free_place
+from hilcal.store.kept_texts import ROBOT_FILE, text_of
 from hilcal.store.procedure_log import ENTRY, ProcedureLog
-from hilcal.store.robot_file import ROBOT_FILE, text_of
 from hilcal.store.rows import insert_meta
 from hilcal.whole_file import replace_file
 
 
 @dataclass(frozen=True, slots=True)
 class Repaired:
-    """What was set aside.
+    """What was set aside."""
 
-    Attributes:
-        why: what is wrong with the first of them.
-        original: the file as it was.
-    """
-
-    why: str
+    why: str  # what is wrong with the first of them
     revisions: tuple[int, ...]
-    original: Path
+    original: Path  # the file as it was
 
 
 def repair(path: Path) -> Repaired | None:
     """Set aside the first bad revision, all after it, and what names one of them.
 
     Later revisions may have been made from it. The readings have to be sound.
-
-    Returns:
-        What was done; None where no revision is bad.
-
-    Raises:
-        InputError: not a campaign, a damaged reading, or a file that cannot be written.
     """
     with CampaignFile.open(path, check_revisions=False) as file:
         if file.n_readings:
@@ -48,7 +37,7 @@ def repair(path: Path) -> Repaired | None:
             return None
         first, why = bad
         with file.transaction() as connection:
-            original = _free(path)
+            original = free_place(path.parent, f"{path.name}.original")
             replace_file(original, connection.serialize(), must_be_new=True)
             found = connection.execute(
                 "SELECT id FROM revisions WHERE id >= ? OR id < 1 ORDER BY id", (first,)
@@ -60,11 +49,7 @@ def repair(path: Path) -> Repaired | None:
 
 
 def put_robot(path: Path, file: Path) -> None:
-    """Put the file of its robot into a campaign that does not hold it.
-
-    Raises:
-        InputError: it holds one, needs none, or that file is not one of such an arm.
-    """
+    """Put the file of its robot into a campaign that does not hold it."""
     with CampaignFile.open(path) as campaign:
         robot = CellConfig.from_json(campaign.config_json).robot
         if campaign.about(ROBOT_FILE) is not None or not Path(robot.model).suffix:
@@ -102,11 +87,3 @@ def _delete(
     delete = f"DELETE FROM {table} WHERE {key} = ?"  # noqa: S608
     connection.executemany(delete, [(value,) for value in values])
     connection.execute(made)
-
-
-def _free(path: Path) -> Path:
-    """Return a name for the file as it was."""
-    found, k = path.with_name(f"{path.name}.original"), 2
-    while found.exists():
-        found, k = path.with_name(f"{path.name}.original-{k}"), k + 1
-    return found

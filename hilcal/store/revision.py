@@ -10,7 +10,7 @@ from typing import Any
 from hilcal.config.changes import Changes
 from hilcal.errors import InputError
 from hilcal.names import check_names
-from hilcal.store.stored_schema import Result, StoredOptions, check
+from hilcal.store.stored_schema import REVISION, check
 from hilcal.toml import parse_json
 
 STORED = "stored_sha256"
@@ -29,11 +29,7 @@ def utc_now() -> str:
 
 
 def seconds_of(date: str, where: str = "date") -> float:
-    """Return seconds since 1970 of a date in ISO 8601, UTC unless it says otherwise.
-
-    Raises:
-        InputError: no date.
-    """
+    """Return seconds since 1970 of a date in ISO 8601, UTC unless it says otherwise."""
     try:
         found = datetime.fromisoformat(date)
     except ValueError:
@@ -43,34 +39,22 @@ def seconds_of(date: str, where: str = "date") -> float:
 
 @dataclass(frozen=True, slots=True)
 class RevisionRecord:
-    """One fit, as a campaign file keeps it; all mappings are JSON.
+    """One fit, as a campaign file keeps it; all mappings are JSON."""
 
-    Attributes:
-        effects: canonical names of the model's effects, in order.
-        added: the effect that this revision added to the one before; None for a first model.
-        options: what was chosen: scaling, kind of readings, options of the effects.
-        data_hash: `content_hash` of the readings that were fitted.
-        program_version: version of the program that fitted.
-        parameters_json: the parameters, enough to predict with the model again.
-        result_json: what `identify --json` or `diagnose --json` reported.
-        created: ISO 8601, UTC.
-        number: 1, 2, ... in one campaign; the campaign gives it.
-        removed: the effect that this revision took out of the one before.
-        parent: number of the revision that it was made from; None where that is the one before, or
-            where it was made from none.
-    """
-
-    effects: tuple[str, ...]
+    effects: tuple[str, ...]  # canonical names of the model's effects, in order
     added: str | None
-    options: Mapping[str, Any]
-    data_hash: str
-    program_version: str
-    parameters_json: Mapping[str, Any]
-    result_json: Mapping[str, Any]
-    created: str = field(default_factory=utc_now)
-    number: int = 0
-    removed: str | None = None
+    """The effect that this revision added to the one before; None for a first model."""
+    options: Mapping[str, Any]  # what was chosen: scaling, kind of readings, options of the effects
+    data_hash: str  # `content_hash` of the readings that were fitted
+    program_version: str  # version of the program that fitted
+    parameters_json: Mapping[str, Any]  # the parameters, enough to predict with the model again
+    result_json: Mapping[str, Any]  # what `identify --json` or `diagnose --json` reported
+    created: str = field(default_factory=utc_now)  # ISO 8601, UTC
+    number: int = 0  # 1, 2, ... in one campaign; the campaign gives it
+    removed: str | None = None  # the effect that this revision took out of the one before
     parent: int | None = None
+    """Number of the revision that it was made from; None where that is the one before, or where it
+    was made from none."""
 
     @property
     def cell(self) -> Changes:
@@ -99,11 +83,7 @@ class RevisionRecord:
 
 
 def change(added: str | None, removed: str | None, scatter: bool = False) -> str:
-    """Return what a revision changed, as "+ a", "− b" or "+ a − b"; empty for a first model.
-
-    Args:
-        scatter: whether the arm's estimated scatter is in its covariance.
-    """
+    """Return what a revision changed, as "+ a", "− b" or "+ a − b"; empty for a first model."""
     if scatter and added is None and removed is None:
         return "arm's scatter"
     parts = [f"+ {added}"] if added else []
@@ -111,12 +91,7 @@ def change(added: str | None, removed: str | None, scatter: bool = False) -> str
 
 
 def to_text(record: RevisionRecord) -> str:
-    """JSON text of a record without its number; floats keep their exact value.
-
-    Raises:
-        ValueError: a number is NaN or infinite, which JSON cannot hold (use null).
-        TypeError: a value is not of JSON.
-    """
+    """JSON text of a record without its number; floats keep their exact value, and are finite."""
     content = {f.name: getattr(record, f.name) for f in fields(record) if f.name != "number"}
     if record.parent is None:
         del content["parent"]
@@ -124,42 +99,20 @@ def to_text(record: RevisionRecord) -> str:
 
 
 def from_text(text: str, number: int) -> RevisionRecord:
-    """Record from its JSON text.
-
-    Raises:
-        ValueError: not such a text.
-        InputError: a name in it is none.
-    """
+    """Record from its JSON text."""
     try:
         content = parse_json(text)
-        content["effects"] = tuple(content["effects"])
-        record = RevisionRecord(**content, number=number)
-        _check(record)
-        return record
+        r = RevisionRecord(**{**content, "effects": tuple(content["effects"])}, number=number)
+        names = [*r.effects, r.data_hash, r.program_version, r.created, r.added, r.removed]
+        check_names([name for name in names if name is not None], f"revision {number}, name")
+        check(REVISION, content)
+        return r
     except (LookupError, TypeError, AttributeError) as e:
         raise ValueError(str(e)) from e
 
 
-def _check(record: RevisionRecord) -> None:
-    """Refuse a record whose entries are of other kinds."""
-    if not isinstance(record.parameters_json, dict):
-        raise TypeError("parameters_json is no document")
-    texts = (*record.effects, record.data_hash, record.program_version, record.created)
-    named = (t for t in (record.added, record.removed) if t is not None)
-    if not all(isinstance(text, str) for text in (*texts, *named)):
-        raise TypeError("a name is no text")
-    check_names([*texts, *named], f"revision {record.number}, name")
-    check(StoredOptions, record.options)
-    check(Result, record.result_json)
-    if record.parent is not None and not isinstance(record.parent, int):
-        raise TypeError("parent is no number")
-
-
 def fitted_to(record: RevisionRecord) -> tuple[int, str] | None:
-    """Return how many readings a revision was fitted to, the first ones, and their stored hash.
-
-    None where the record does not say.
-    """
+    """Return how many readings a revision was fitted to, the first ones, and their stored hash."""
     identified = record.result_json.get("identify")
     count = identified.get("n_readings") if isinstance(identified, dict) else None
     stored = record.options.get(STORED)
@@ -171,11 +124,8 @@ def fitted_to(record: RevisionRecord) -> tuple[int, str] | None:
 CARRIED = "carried_prior"
 """Key among the parameters of a revision: the prior that it was fitted with, as JSON."""
 _POSTERIOR, _HASH = "posterior", "posterior_sha256"
-
-
-def key_of(sha256: str) -> str:
-    """Key of a posterior in the file."""
-    return f"posterior {sha256}"
+_KEY = "posterior {}"
+"""Key of a posterior in the file, by its hash."""
 
 
 def split(record: RevisionRecord) -> tuple[RevisionRecord, str | None, str]:
@@ -187,21 +137,17 @@ def split(record: RevisionRecord) -> tuple[RevisionRecord, str | None, str]:
     sha256 = hashlib.sha256(text.encode()).hexdigest()
     named = {k: v for k, v in carried.items() if k != _POSTERIOR} | {_HASH: sha256}
     parameters = {**record.parameters_json, CARRIED: named}
-    return replace(record, parameters_json=parameters), key_of(sha256), text
+    return replace(record, parameters_json=parameters), _KEY.format(sha256), text
 
 
 def join(record: RevisionRecord, stored: Mapping[str, str]) -> RevisionRecord:
-    """Return a record with the posterior that it names.
-
-    Raises:
-        ValueError: the posterior is not among them.
-    """
+    """Return a record with the posterior that it names; a ValueError where that is not there."""
     carried: Any = record.parameters_json.get(CARRIED)
     if carried is None:
         return record
     if not isinstance(carried, Mapping):
         raise ValueError("a prior is no document")
-    text = stored.get(key_of(str(carried.get(_HASH))))
+    text = stored.get(_KEY.format(carried.get(_HASH)))
     if text is None:
         raise ValueError("a prior is missing")
     whole = {k: v for k, v in carried.items() if k != _HASH} | {_POSTERIOR: parse_json(text)}

@@ -1,8 +1,11 @@
-"""Rows of a campaign file: readings and texts in and out, each under a checksum."""
+"""Rows of a campaign file: readings as records of little-endian doubles, texts, checksums."""
 
+import hashlib
+import json
 import sqlite3
 import zlib
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +15,142 @@ from hilcal import limits
 from hilcal.errors import InputError
 from hilcal.names import check_name, check_names
 from hilcal.readings.covariance import is_covariance
-from hilcal.readings.readings import SAME_POSE, ObserverName, Readings
-from hilcal.store.records import Layout, lacking, pack, unpack
+from hilcal.readings.readings import SAME_POSE, ObserverName, Readings, States
 from hilcal.toml import parse_json
-from hilcal.types import Ints
+from hilcal.types import Bools, Floats, Ints
 
+Layout = tuple[tuple[str, int], ...]
+"""Fields of a record in order, and how many doubles each takes; absent quantities take none."""
 LARGEST = 1e12
 """No quantity of a reading is as large, in SI units: times in s are below 1e11."""
-_NAMES = {
-    "poses": "SELECT name FROM poses ORDER BY id",
-    "loads": "SELECT name FROM loads ORDER BY id",
-}
+MAY_LACK = "torque"
+"""Quantity of a state that single readings may lack, all of its numbers NaN then."""
+_PER_JOINT = ("q", "joint_temperature", "approach", "q_actual", "torque")
+_STATE = (
+    *("q", "wrench", "time", "load_time", "air_temperature", "joint_temperature", "approach"),
+    *("q_actual", "torque", "target", "observer"),
+)
+
+
+def _widths(n: int, m: int) -> dict[str, int]:
+    """Doubles of each field, in order, of n joints and m measured elements."""
+    state = {name: n if name in _PER_JOINT else 1 for name in _STATE} | {"wrench": 6}
+    return state | {"value": m, "covariance": m * m}
+
+
+def layout_of(readings: Readings) -> Layout:
+    """Layout of the records of some readings."""
+    absent = {name for name in _STATE if getattr(readings.states, name) is None}
+    widths = _widths(readings.states.q.shape[1], readings.m)
+    return tuple((name, width) for name, width in widths.items() if name not in absent)
+
+
+def read_layout(text: str) -> Layout:
+    """Return a layout from its JSON text; raises a ValueError where no reading has it."""
+    try:
+        found = tuple((str(name), int(width)) for name, width in parse_json(text))
+    except (TypeError, OverflowError) as error:
+        raise ValueError(str(error)) from error
+    given = dict(found)
+    n, m = given.get("q", 0), given.get("value", 0)
+    wanted = tuple((k, w) for k, w in _widths(n, m).items() if k in given)
+    if not {"q", "wrench", "value", "covariance"} <= set(given) or m not in (3, 6):
+        raise ValueError("fields that no reading has")
+    if n < 1 or found != wanted:
+        raise ValueError("fields of a wrong order or width")
+    return found
+
+
+def pack(readings: Readings) -> Floats:
+    """(N, K) records; refuses arrays of a wrong shape, and numbers that are not finite."""
+    count, parts = len(readings), []
+    for name, width in layout_of(readings):
+        owner = readings.states if name in _STATE else readings
+        part = np.asarray(getattr(owner, name), dtype="<f8")
+        if part.size != count * width or len(part) != count:
+            raise InputError(f"readings: {name} has shape {part.shape} for {count} readings")
+        part = part.reshape(count, width)
+        known = np.isfinite(part).all(axis=1)
+        if name == MAY_LACK:
+            known |= np.isnan(part).all(axis=1)
+        if not known.all():
+            i = int(np.argmin(known))
+            raise InputError(f"readings: {name} of reading {i + 1} is not finite")
+        parts.append(part)
+    return np.ascontiguousarray(np.hstack(parts), dtype="<f8")
+
+
+def _lacking(records: Floats, layout: Layout) -> Bools:
+    """(N, K) numbers that are NaN since a reading lacks the whole quantity, and may."""
+    out, at = np.zeros(records.shape, dtype=np.bool_), 0
+    for name, width in layout:
+        if name == MAY_LACK:
+            none = np.isnan(records[:, at : at + width])
+            out[:, at : at + width] = none.all(axis=1, keepdims=True)
+        at += width
+    return out
+
+
+def _unpacked(
+    records: Floats,
+    layout: Layout,
+    index: Ints,
+    names: Sequence[Sequence[str]],
+    observers: Sequence[ObserverName],
+) -> Readings:
+    """Readings of (N, K) records, (N, 3) pose, load and cycle, names of poses, loads, targets."""
+    fields: dict[str, Any] = {}
+    at, one = 0, _widths(0, 0)
+    for name, width in layout:
+        block = np.array(records[:, at : at + width], dtype=np.float64)
+        fields[name] = block[:, 0] if one[name] == 1 else block
+        at += width
+    for name in ("target", "observer"):
+        if name in fields:
+            fields[name] = fields[name].astype(np.int64)
+    value, covariance = fields.pop("value"), fields.pop("covariance")
+    m = value.shape[1]
+    pose_names, load_names, target_names = map(tuple, names)
+    return Readings(
+        states=States(**fields),
+        pose=index[:, 0].copy(),
+        load=index[:, 1].copy(),
+        cycle=index[:, 2].copy(),
+        value=value,
+        covariance=covariance.reshape(len(records), m, m),
+        load_names=load_names,
+        pose_names=pose_names,
+        target_names=target_names if "target" in fields else (),
+        observers=tuple(observers) if "observer" in fields else (),
+    )
+
+
+def content_hash(readings: Readings) -> str:
+    """SHA-256 (hex) of what was measured, in order.
+
+    Depends on every number and on the names of poses, loads and targets, but not on how names are
+    numbered, on names without readings, or on how the readings were appended; nor on a scatter of
+    the arm that was estimated from them.
+    """
+    readings = readings.as_stated()
+    sha = hashlib.sha256()
+    columns = []
+    named = [(readings.pose, readings.pose_names), (readings.load, readings.load_names)]
+    if readings.states.target is not None:
+        named.append((readings.target, readings.target_names))
+    if readings.states.observer is not None:
+        named.append((readings.observer, tuple(map(str, readings.observers))))
+    readings = replace(readings, states=replace(readings.states, target=None, observer=None))
+    for index, names in named:
+        used = list(dict.fromkeys(index.tolist()))
+        order = {k: i for i, k in enumerate(dict.fromkeys(names[k] for k in used))}
+        sha.update(json.dumps(list(order)).encode() + b"\n")
+        columns.append([order[names[k]] for k in index.tolist()])
+    columns.append(readings.cycle.tolist())
+    sha.update(json.dumps([len(readings), layout_of(readings)]).encode() + b"\n")
+    sha.update(np.array(columns, dtype="<i8").T.tobytes())
+    sha.update((pack(readings) + 0.0).astype("<f8").tobytes())
+    return sha.hexdigest()
 
 
 def text_crc(key: str, text: str) -> int:
@@ -35,11 +163,7 @@ def _reading_crc(number: int, where: Sequence[int], record: bytes) -> int:
 
 
 def insert(connection: sqlite3.Connection, table: str, rows: Sequence[Sequence[object]]) -> None:
-    """Append rows to a table.
-
-    Raises:
-        sqlite3.DatabaseError: not all of them are in it.
-    """
+    """Append rows to a table; raises a DatabaseError where not all of them are in it."""
     if not rows:
         return
     marks = ", ".join("?" * len(rows[0]))
@@ -48,17 +172,19 @@ def insert(connection: sqlite3.Connection, table: str, rows: Sequence[Sequence[o
         raise sqlite3.DatabaseError(f"{len(rows) - done.rowcount} rows of {table} were not stored")
 
 
+def last_id(connection: sqlite3.Connection, table: str) -> int:
+    """Number of the last row of a table; 0 where it is empty."""
+    (last,) = connection.execute(f"SELECT ifnull(max(id), 0) FROM {table}").fetchone()  # noqa: S608
+    return int(last)
+
+
 def insert_meta(connection: sqlite3.Connection, key: str, value: str) -> None:
     """Store a text about the campaign; it cannot be changed later."""
     insert(connection, "meta", [(key, value, text_crc(key, value))])
 
 
 def fetch_meta(connection: sqlite3.Connection, path: Path) -> dict[str, str]:
-    """All texts about the campaign.
-
-    Raises:
-        InputError: one is damaged.
-    """
+    """All texts about the campaign; refuses damaged ones."""
     with limits.memory(str(path)):
         rows = connection.execute("SELECT key, value, crc FROM meta").fetchall()
     meta = {str(key): str(value) for key, value, _ in rows}
@@ -67,20 +193,17 @@ def fetch_meta(connection: sqlite3.Connection, path: Path) -> dict[str, str]:
     return meta
 
 
-def fetch_names(connection: sqlite3.Connection, table: str) -> tuple[str, ...]:
+def _fetch_names(connection: sqlite3.Connection, table: str) -> tuple[str, ...]:
     """Names of the poses or loads by number."""
-    return tuple(str(name) for (name,) in connection.execute(_NAMES[table]))
+    found = connection.execute(f"SELECT name FROM {table} ORDER BY id")  # noqa: S608
+    return tuple(str(name) for (name,) in found)
 
 
-def insert_names(connection: sqlite3.Connection, table: str, names: Sequence[str]) -> Ints:
-    """Numbers of names; new ones are appended in order.
-
-    Raises:
-        InputError: a name stands for two of them, or is none.
-    """
+def _insert_names(connection: sqlite3.Connection, table: str, names: Sequence[str]) -> Ints:
+    """Numbers of names, of which new ones are appended in order."""
     if len(set(names)) != len(names):
         raise InputError(f"readings: two {table} have the same name")
-    known = {name: k for k, name in enumerate(fetch_names(connection, table))}
+    known = {name: k for k, name in enumerate(_fetch_names(connection, table))}
     for name in names:
         if name not in known:
             check_name(name, table)
@@ -92,18 +215,17 @@ def insert_names(connection: sqlite3.Connection, table: str, names: Sequence[str
 def insert_readings(connection: sqlite3.Connection, readings: Readings) -> int:
     """Append readings after those that are there; returns how many there are then."""
     records = pack(readings)
-    pose = insert_names(connection, "poses", readings.pose_names)[readings.pose]
-    load = insert_names(connection, "loads", readings.load_names)[readings.load]
-    (last,) = connection.execute("SELECT ifnull(max(id), 0) FROM readings").fetchone()
+    pose = _insert_names(connection, "poses", readings.pose_names)[readings.pose]
+    load = _insert_names(connection, "loads", readings.load_names)[readings.load]
+    last = last_id(connection, "readings")
     index = np.stack([pose, load, readings.cycle], axis=1).tolist()
+    pairs = zip(index, map(bytes, records), strict=True)
     stored = [
         (number, *where, record, _reading_crc(number, where, record))
-        for number, (where, record) in enumerate(
-            zip(index, map(bytes, records), strict=True), start=int(last) + 1
-        )
+        for number, (where, record) in enumerate(pairs, start=last + 1)
     ]
     insert(connection, "readings", stored)
-    return int(last) + len(readings)
+    return last + len(readings)
 
 
 def fetch_readings(
@@ -113,72 +235,52 @@ def fetch_readings(
     target_names: Sequence[str] = (),
     observers: Sequence[ObserverName] = (),
 ) -> Readings:
-    """All readings, in order.
-
-    Raises:
-        InputError: one is missing or damaged, or a name of a pose, load or target is none.
-    """
+    """All readings, in order; refuses missing or damaged ones, and names that are none."""
     (count,) = connection.execute("SELECT count(*) FROM readings").fetchone()
+
+    def damaged(what: str) -> InputError:
+        return InputError(f"{path}: the campaign file is damaged{what}")
+
     if not count:
-        raise InputError(f"{path}: the campaign file is damaged (its readings are gone)")
-    width = sum(width for _, width in layout)
+        raise damaged(" (its readings are gone)")
     limits.check_fitted(count, dict(layout)["value"], f"{path}: ")
+    width = sum(width for _, width in layout)
     with limits.memory(str(path)):
-        return _fetched(connection, path, layout, target_names, observers, count, width)
-
-
-def _fetched(
-    connection: sqlite3.Connection,
-    path: Path,
-    layout: Layout,
-    target_names: Sequence[str],
-    observers: Sequence[ObserverName],
-    count: int,
-    width: int,
-) -> Readings:
-    """Return the first `count` readings of records of `width` numbers."""
-    names = [fetch_names(connection, table) for table in ("poses", "loads")]
-    check_names([*names, target_names, [o.name for o in observers]], f"{path}: name")
-    rows = connection.execute(
-        "SELECT id, pose, load, cycle, record, crc FROM readings ORDER BY id LIMIT ?", (count,)
-    )
-    records, index = np.empty((count, width)), np.empty((count, 3), dtype=np.int64)
-    for number, (key, *where, record, crc) in enumerate(rows, start=1):
-        try:
-            whole = key == number and len(record) == 8 * width
-            whole = whole and _reading_crc(key, where, record) == crc
-        except (TypeError, ValueError, OverflowError):
-            whole = False
-        if not whole:
-            raise InputError(f"{path}: the campaign file is damaged at reading {number}")
-        records[number - 1] = np.frombuffer(record, "<f8")
-        index[number - 1] = where
-    sound = (np.abs(records) < LARGEST) | lacking(records, layout)
-    if bad := np.flatnonzero(~sound.all(axis=1))[:1].tolist():
-        raise InputError(f"{path}: the campaign file is damaged at reading {bad[0] + 1}")
-    if index[:, :2].min() < 0 or np.any(index[:, :2].max(axis=0) >= [len(n) for n in names]):
-        raise InputError(f"{path}: the campaign file is damaged (names are missing)")
-    readings = unpack(records, layout, index, names[0], names[1], target_names, observers)
-    if bad := np.flatnonzero(~is_covariance(readings.covariance))[:1].tolist():
-        raise InputError(
-            f"{path}: the campaign file is damaged at reading {bad[0] + 1}: its covariance is not "
-            "positive semi-definite"
+        names = [*(_fetch_names(connection, t) for t in ("poses", "loads")), target_names]
+        check_names([*names, [o.name for o in observers]], f"{path}: name")
+        rows = connection.execute(
+            "SELECT id, pose, load, cycle, record, crc FROM readings ORDER BY id LIMIT ?", (count,)
         )
-    target = readings.states.target
-    if target is not None and not 0 <= target.min() <= target.max() < len(target_names):
-        raise InputError(f"{path}: the campaign file is damaged (targets are missing)")
-    by = readings.states.observer
-    if by is not None and not 0 <= by.min() <= by.max() < len(observers):
-        raise InputError(f"{path}: the campaign file is damaged (observers are missing)")
+        records, index = np.empty((count, width)), np.empty((count, 3), dtype=np.int64)
+        for number, (key, *where, record, crc) in enumerate(rows, start=1):
+            try:
+                whole = key == number and len(record) == 8 * width
+                whole = whole and _reading_crc(key, where, record) == crc
+            except (TypeError, ValueError, OverflowError):
+                whole = False
+            if not whole:
+                raise damaged(f" at reading {number}")
+            records[number - 1] = np.frombuffer(record, "<f8")
+            index[number - 1] = where
+        sound = (np.abs(records) < LARGEST) | _lacking(records, layout)
+        if bad := np.flatnonzero(~sound.all(axis=1))[:1].tolist():
+            raise damaged(f" at reading {bad[0] + 1}")
+        counts = [len(names[0]), len(names[1])]
+        if index[:, :2].min() < 0 or np.any(index[:, :2].max(axis=0) >= counts):
+            raise damaged(" (names are missing)")
+        readings = _unpacked(records, layout, index, names, observers)
+        if bad := np.flatnonzero(~is_covariance(readings.covariance))[:1].tolist():
+            why = "its covariance is not positive semi-definite"
+            raise damaged(f" at reading {bad[0] + 1}: {why}")
+    for what, known in (("target", target_names), ("observer", observers)):
+        of = getattr(readings.states, what)
+        if of is not None and not 0 <= of.min() <= of.max() < len(known):
+            raise damaged(f" ({what}s are missing)")
     return readings
 
 
 def stored_json(path: Path, text: str, check: Callable[[object], None] | None = None) -> Any:
-    """Return what a stored JSON text holds, which `check` may refuse by a ValueError.
-
-    Raises:
-        InputError: it is none.
-    """
+    """Return what a stored JSON text holds, which `check` may refuse by a ValueError."""
     try:
         with limits.memory(str(path)):
             content = parse_json(text)
@@ -190,11 +292,7 @@ def stored_json(path: Path, text: str, check: Callable[[object], None] | None = 
 
 
 def check_poses(connection: sqlite3.Connection, path: Path, readings: Readings) -> None:
-    """Refuse a pose that is commanded to other joints than in earlier readings.
-
-    Raises:
-        InputError: names the pose.
-    """
+    """Refuse a pose that is commanded to other joints than in earlier readings."""
     if len(readings) == 0:
         return
     q = readings.states.q

@@ -3,7 +3,7 @@
 import json
 import sqlite3
 from collections.abc import Mapping
-from functools import partial
+from functools import partial, reduce
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +16,10 @@ from hilcal.readings.covariance import COVERS, INSTRUMENT
 from hilcal.readings.readings import Readings
 from hilcal.store import rows, schema
 from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.kept_texts import KEYS, robot_file_of
 from hilcal.store.plan import Plan, Step, joined, read_plan, with_new_names
 from hilcal.store.revision import utc_now
-from hilcal.store.robot_file import KEYS, robot_file_of
-from hilcal.store.stored_schema import Detail, check, check_event
+from hilcal.store.stored_schema import DETAIL, check, check_event
 
 PLAN = "plan"
 """Key of the plan among the texts about a campaign; further ones are "plan 2" and so on."""
@@ -41,17 +41,7 @@ def create_run(
     source: str = "measured by hilcal run",
     more: Mapping[str, str] | None = None,
 ) -> CampaignFile:
-    """Make the empty campaign of a run, its plan inside.
-
-    Args:
-        base_dir: the directory to which its relative paths refer.
-        source: where the readings come from, in words.
-        more: further texts about it; that of the key `COVERS` where readings are stored with
-            another covariance than the instrument's.
-
-    Raises:
-        InputError: it cannot be written, or is there already.
-    """
+    """Make the empty campaign of a run, its plan inside; `more` are further texts about it."""
     texts = {PLAN: plan.to_json(), COVERS: INSTRUMENT, **(more or {})}
     return CampaignFile.create(
         path, config.to_json(), str(base_dir), source, overwrite=overwrite, more=texts
@@ -59,15 +49,7 @@ def create_run(
 
 
 def check_same_cell(campaign: CampaignFile, config: CellConfig, base_dir: Path) -> None:
-    """Refuse to continue a campaign in another cell.
-
-    Args:
-        config: the cell as it is told now.
-        base_dir: directory to which relative paths in it refer.
-
-    Raises:
-        InputError: names the section, or the robot's file, that differs.
-    """
+    """Refuse to continue a campaign in another cell."""
     for key, now in robot_file_of(config.to_json(), str(base_dir)).items():
         kept = campaign.about(key)
         if kept is not None and kept != now:
@@ -94,11 +76,7 @@ class RunLog:
     """
 
     def __init__(self, campaign: CampaignFile) -> None:
-        """Write to an open campaign.
-
-        Raises:
-            InputError: the campaign was not measured by a run (it has no plan).
-        """
+        """Write to an open campaign."""
         text = campaign.about(PLAN)
         if text is None:
             raise InputError(
@@ -116,19 +94,11 @@ class RunLog:
     @property
     def plan(self) -> Plan:
         """All plans in one; of those before the last one only what was measured."""
-        if len(self.plans) == 1:
-            return self.plans[0]
-        done, whole = self.done(), self.plans[0]
-        for further in self.plans[1:]:
-            whole = joined(whole, done, further)
-        return whole
+        done = self.done() if len(self.plans) > 1 else frozenset()
+        return reduce(lambda whole, further: joined(whole, done, further), self.plans)
 
     def with_new_names(self, plan: Plan) -> Plan:
-        """Return a further plan with names and cycles that the campaign does not have yet.
-
-        Raises:
-            InputError: it does not go with the campaign, or is the last one and not done yet.
-        """
+        """Return a further plan with names and cycles that the campaign does not have yet."""
         last, whole = self.plans[-1], self.plan
         missing = len(last.without(self.done()).steps)
         made = with_new_names(plan, whole, len(self.plans) + 1)
@@ -142,21 +112,12 @@ class RunLog:
 
     def _before_last(self) -> Plan:
         """Return what was planned before the last plan, as far as that matters for names."""
-        if len(self.plans) == 1:
-            first = self.plans[0]
-            return Plan(first.pose_names, first.q, ())
-        done, whole = self.done(), self.plans[0]
-        for further in self.plans[1:-1]:
-            whole = joined(whole, done, further)
-        kept = tuple(s for s in whole.steps if s in done)
-        return Plan(whole.pose_names, whole.q, kept)
+        done = self.done() if len(self.plans) > 1 else frozenset()
+        whole = reduce(lambda a, b: joined(a, done, b), self.plans[1:-1], self.plans[0])
+        return Plan(whole.pose_names, whole.q, tuple(s for s in whole.steps if s in done))
 
     def append(self, plan: Plan) -> None:
-        """Append a further plan, see `with_new_names`; what is missing of those before is given up.
-
-        Raises:
-            DeviceError: the disk is full or failed.
-        """
+        """Append a further plan, see `with_new_names`; what is missing of others is given up."""
         with self._campaign.transaction() as connection:
             rows.insert_meta(connection, f"{PLAN} {len(self.plans) + 1}", plan.to_json())
         self.plans = (*self.plans, plan)
@@ -166,12 +127,8 @@ class RunLog:
     ) -> None:
         """Append the reading of a step, with everything raw that belongs to it.
 
-        Of several targets all readings of the arrival, one detail for each, or none of them: a
-        step that is measured again is another arrival.
-
-        Raises:
-            InputError: the step is there already, or other quantities than before.
-            DeviceError: the disk is full or failed; the file is as before.
+        Of several targets all readings of the arrival, one detail for each, or none of them: a step
+        that is measured again is another arrival. Where the disk fails, the file is as before.
         """
         details = (detail, *more)
         if len(reading) != len(details):
@@ -190,15 +147,10 @@ class RunLog:
                     ) from None
 
     def event(self, kind: str, content: dict[str, Any]) -> None:
-        """Append what happened, with the time (UTC).
-
-        Raises:
-            DeviceError: the disk is full or failed.
-        """
+        """Append what happened, with the time (UTC)."""
         text = json.dumps({"kind": kind, "utc": utc_now(), **content}, allow_nan=False)
         with self._campaign.transaction() as connection:
-            (last,) = connection.execute("SELECT ifnull(max(id), 0) FROM events").fetchone()
-            number = int(last) + 1
+            number = rows.last_id(connection, "events") + 1
             row = (number, text, rows.text_crc(str(number), text))
             rows.insert(connection, "events", [row])
 
@@ -208,11 +160,7 @@ class RunLog:
         return frozenset(Step(*self._step(key)) for (key,) in stored)
 
     def details(self) -> list[dict[str, Any]]:
-        """Return the raw details of all readings, in order, each with its "step".
-
-        Raises:
-            InputError: they are damaged.
-        """
+        """Return the raw details of all readings, in order, each with its "step"."""
         out = []
         for number, key, text, crc in self._select("SELECT * FROM details ORDER BY id"):
             if rows.text_crc(f"{number}{key}", text) != crc:
@@ -221,25 +169,19 @@ class RunLog:
                     f"reading {number}"
                 )
             pose, load, cycle = self._step(key)
-            found = rows.stored_json(self._campaign.path, text, partial(check, Detail))
+            found = rows.stored_json(self._campaign.path, text, partial(check, DETAIL))
             out.append({**found, "step": {"pose": pose, "load": load, "cycle": cycle}})
         return out
 
     def events(self) -> list[dict[str, Any]]:
-        """Return what happened, in order: "kind", "utc" and more.
-
-        Raises:
-            InputError: it is damaged.
-        """
+        """Return what happened, in order: "kind", "utc" and more."""
         return self._events("SELECT * FROM events ORDER BY id")
 
     def last(self, kind: str) -> dict[str, Any] | None:
         """Return the last event of a kind, see `events`; None where there is none."""
         of_kind = f'{{"kind": "{kind}", %'
-        found = self._events(
-            "SELECT * FROM events WHERE content LIKE ? ORDER BY id DESC LIMIT 1", of_kind
-        )
-        return found[0] if found else None
+        last = "SELECT * FROM events WHERE content LIKE ? ORDER BY id DESC LIMIT 1"
+        return next(iter(self._events(last, of_kind)), None)
 
     def _events(self, statement: str, *values: str) -> list[dict[str, Any]]:
         out = []

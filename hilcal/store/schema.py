@@ -17,25 +17,16 @@ from functools import cache
 from pathlib import Path
 
 from hilcal import limits
-from hilcal.errors import DeviceError, InputError
+from hilcal.errors import DeviceError, HilcalError, InputError
 
 APPLICATION_ID = 0x68696C63  # "hilc"
-VERSION = 7
-MORE_COLUMNS = 7
-"""Version of a file whose readings have joint torques, or are of several observers (stations,
-distances, gauges): programs that do not know these would take the file for damaged."""
-CHANGED_CELL = 6
-"""Version of a file with a revision that was fitted in a cell that was changed since its readings
-were taken: programs that do not know it would take the cell as it was."""
-CARRIED_PRIOR = 5
-"""Version of a file with a revision that was fitted with a prior of another campaign: programs that
-do not know it would fit without."""
-CHOSEN_REVISION = 4
-"""Version of a file with an accepted revision, or one made from another than the one before:
-programs that know neither would go on from the latest one."""
-SEVERAL_TARGETS = 3
-"""Version of a file whose readings are of several targets; all others stay at `ONE_TARGET`."""
-ONE_TARGET = 2
+ONE_TARGET, SEVERAL_TARGETS, CHOSEN_REVISION = 2, 3, 4
+CARRIED_PRIOR, CHANGED_CELL, MORE_COLUMNS = 5, 6, 7
+"""Versions of a file: readings of one target, or of several; an accepted revision, or one made from
+another than the one before; a revision fitted with a prior of another campaign, or in a cell that
+was changed since its readings were taken; readings with joint torques, or of several observers.
+Programs that do not know one would take the file for damaged, or for another."""
+VERSION = MORE_COLUMNS
 HEADER = b"SQLite format 3\x00"
 _JOURNAL = bytes.fromhex("d9d505f920a163d7")  # begins a journal, and ends one that ends in a name
 
@@ -65,6 +56,24 @@ _KEYS = {"meta": "key"} | dict.fromkeys(
     ("poses", "loads", "readings", "revisions", "details", "events"), "id"
 )
 _SINCE = {"details": 2, "events": 2}
+_SAID: dict[str, tuple[type[HilcalError], str]] = {
+    "malformed|not a database": (InputError, "the campaign file is damaged or truncated ({})"),
+    "full|I/O error": (
+        DeviceError,
+        "cannot be written ({}); nothing that was stored is lost: make room on the disk",
+    ),
+    "too big": (
+        InputError,
+        f"a record is larger than {limits.DOCUMENT / 1e6:.0f} MB, which no campaign has",
+    ),
+    "locked|busy": (InputError, "another program is writing to the campaign"),
+    "readonly|unable to open": (
+        InputError,
+        "cannot be written ({}): the file or its folder is read-only; valid: a copy in a folder "
+        "that can be written",
+    ),
+}
+"""What is said of an error of SQLite, by the words that its message has."""
 _LONGEST_S = 60.0
 """No check of a file that is opened takes as long; a choice."""
 
@@ -73,19 +82,18 @@ def statements() -> list[str]:
     """All statements that make an empty campaign, triggers against change included."""
     made = [s for s in _TABLES.split(";") if s.strip()]
     for table, key in _KEYS.items():
-        refuse = f"SELECT RAISE(ABORT, '{table} are immutable: append only')"
-        for event in ("UPDATE", "DELETE"):
-            made.append(
-                f"CREATE TRIGGER {table}_no_{event.lower()} BEFORE {event} ON {table} "
-                f"BEGIN {refuse}; END"
+        refuse = f"BEGIN SELECT RAISE(ABORT, '{table} are immutable: append only'); END"
+        there = f"WHEN EXISTS (SELECT 1 FROM {table} WHERE {key} = NEW.{key}) "  # noqa: S608
+        made += [
+            f"CREATE TRIGGER {table}_no_{what} BEFORE {event} ON {table} {when}{refuse}"
+            for what, event, when in (
+                ("update", "UPDATE", ""),
+                ("delete", "DELETE", ""),
+                ("replace", "INSERT", there),
             )
-        made.append(
-            f"CREATE TRIGGER {table}_no_replace BEFORE INSERT ON {table} "  # noqa: S608
-            f"WHEN EXISTS (SELECT 1 FROM {table} WHERE {key} = NEW.{key}) BEGIN {refuse}; END"
-        )
-    made.append(f"PRAGMA application_id = {APPLICATION_ID}")
-    made.append(f"PRAGMA user_version = {ONE_TARGET}")
-    return made
+        ]
+    versions = f"PRAGMA application_id = {APPLICATION_ID}", f"PRAGMA user_version = {ONE_TARGET}"
+    return [*made, *versions]
 
 
 def is_campaign(path: Path) -> bool:
@@ -97,12 +105,7 @@ def is_campaign(path: Path) -> bool:
 
 @contextmanager
 def sqlite_errors(path: Path) -> Iterator[None]:
-    """Turn SQLite's errors into one line.
-
-    Raises:
-        InputError: names what is wrong with the file.
-        DeviceError: the disk is full or failed.
-    """
+    """Turn SQLite's errors into one line."""
     try:
         yield
     except UnicodeEncodeError as e:
@@ -111,26 +114,9 @@ def sqlite_errors(path: Path) -> Iterator[None]:
         raise InputError(f"{path}: the campaign file is damaged") from e
     except sqlite3.DatabaseError as e:
         text = str(e)
-        if "malformed" in text or "not a database" in text:
-            raise InputError(f"{path}: the campaign file is damaged or truncated ({text})") from e
-        if "full" in text or "I/O error" in text:
-            raise DeviceError(
-                f"{path}: cannot be written ({text}); nothing that was stored is lost: "
-                "make room on the disk"
-            ) from e
-        if "too big" in text:
-            most = limits.DOCUMENT / 1e6
-            raise InputError(
-                f"{path}: a record is larger than {most:.0f} MB, which no campaign has"
-            ) from e
-        if "locked" in text or "busy" in text:
-            raise InputError(f"{path}: another program is writing to the campaign") from e
-        if "readonly" in text or "unable to open" in text:
-            raise InputError(
-                f"{path}: cannot be written ({text}): the file or its folder is read-only; valid: "
-                "a copy in a folder that can be written"
-            ) from e
-        raise InputError(f"{path}: the campaign file cannot be used ({text})") from e
+        kinds = (kind for words, kind in _SAID.items() if any(w in text for w in words.split("|")))
+        error, what = next(kinds, (InputError, "the campaign file cannot be used ({})"))
+        raise error(f"{path}: {what.format(text)}") from e
 
 
 def connect(path: Path, read_only: bool = False) -> sqlite3.Connection:
@@ -138,11 +124,8 @@ def connect(path: Path, read_only: bool = False) -> sqlite3.Connection:
 
     Args:
         read_only: write nothing, neither to the file nor beside it. A journal beside the file is
-            what a killed program left unfinished; SQLite has to undo that before anybody can
-            read, and then the file is opened for writing all the same.
-
-    Raises:
-        InputError: it has a journal that no hilcal made, or a write-ahead log.
+            what a killed program left unfinished; SQLite has to undo that before anybody can read,
+            and then the file is opened for writing all the same.
     """
     _refuse_log(path)
     unfinished = _journal(path)
@@ -173,7 +156,11 @@ def _journal(path: Path) -> bool:
     """
     journal = Path(f"{os.path.realpath(path)}-journal")  # beside a link's file
     try:
-        ours = stat.S_ISREG(journal.lstat().st_mode) and not _ends_in_name(journal)
+        ours = stat.S_ISREG(journal.lstat().st_mode)
+        if ours:
+            with journal.open("rb") as stream:
+                stream.seek(-min(len(_JOURNAL), journal.stat().st_size), os.SEEK_END)
+                ours = stream.read() != _JOURNAL
     except FileNotFoundError:
         return False
     if not ours:
@@ -182,12 +169,6 @@ def _journal(path: Path) -> bool:
             "files; delete it, or take the campaign without it"
         )
     return True
-
-
-def _ends_in_name(journal: Path) -> bool:
-    with journal.open("rb") as stream:
-        stream.seek(-min(len(_JOURNAL), journal.stat().st_size), os.SEEK_END)
-        return stream.read() == _JOURNAL
 
 
 def _refuse_log(path: Path) -> None:
@@ -220,26 +201,17 @@ def transaction(connection: sqlite3.Connection) -> Iterator[sqlite3.Connection]:
         raise
 
 
-def require(connection: sqlite3.Connection, version: int) -> None:
+def require(connection: sqlite3.Connection, *versions: int) -> None:
     """Raise the version of the schema where it is lower; older programs refuse the file then."""
     (now,) = connection.execute("PRAGMA user_version").fetchone()
-    if now < version:
-        connection.execute(f"PRAGMA user_version = {version}")
+    if now < max(versions):
+        connection.execute(f"PRAGMA user_version = {max(versions)}")
 
 
 def check_file(connection: sqlite3.Connection, path: Path) -> None:
-    """Refuse what is not a sound campaign of a known version, and of exactly its schema.
-
-    Raises:
-        InputError: names it.
-    """
+    """Refuse what is not a sound campaign of a known version, and of exactly its schema."""
     end = time.monotonic() + _LONGEST_S
     connection.set_progress_handler(lambda: time.monotonic() > end, 100_000)
-    _check_file(connection, path)
-    connection.set_progress_handler(None, 0)
-
-
-def _check_file(connection: sqlite3.Connection, path: Path) -> None:
     (application,) = connection.execute("PRAGMA application_id").fetchone()
     if application != APPLICATION_ID:
         raise InputError(f"{path}: an SQLite file, but not a hilcal campaign")
@@ -257,6 +229,7 @@ def _check_file(connection: sqlite3.Connection, path: Path) -> None:
     (sound,) = connection.execute("PRAGMA quick_check(1)").fetchone()
     if sound != "ok":
         raise InputError(f"{path}: the campaign file is damaged ({' '.join(sound.split())})")
+    connection.set_progress_handler(None, 0)
 
 
 def _check_schema(connection: sqlite3.Connection, path: Path, version: int) -> None:

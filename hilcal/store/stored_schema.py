@@ -4,15 +4,19 @@ Each is checked where it comes out of the file. Keys beside those named here are
 """
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError, create_model
 
 from hilcal.toml import Number
 
+Schema = type[BaseModel]
 Text = Annotated[str, Strict()]
 Count = Annotated[int, Strict(), Field(ge=0)]
+Whole = Annotated[int, Strict()]
 Axes = tuple[Number, Number, Number]
+Wrench = tuple[Number, Number, Number, Number, Number, Number]
 Matrix = Annotated[list[tuple[float, ...]], Field(min_length=1)]
 
 
@@ -22,202 +26,112 @@ class _Document(BaseModel):
     model_config = ConfigDict(extra="allow", allow_inf_nan=False)
 
 
-class _Errors(_Document):
-    mean_m: Number
-    rms_m: Number
-    max_m: Number
-    rms_sigma: Number
-
-
-class _Error(_Document):
-    fit: _Errors
-    holdout: _Errors
-
-
-class _Parameter(_Document):
-    name: Text
-    unit: Text
-    value: Number | None
-    std: Number | None
-    identifiable: bool
-
-
-class _Identified(_Document):
-    n_readings: Count
-    variance_factor: Number
-    error: _Error
-    parameters: list[_Parameter]
-
-
-class _Diagnosed(_Document):
-    verdict: Text
-    rejected: list[Text] = []
-
-
-class Result(_Document):
-    """What `identify` and `diagnose` reported of a revision."""
-
-    identify: _Identified
-    diagnose: _Diagnosed | None = None
-
-
-class StoredOptions(_Document):
-    """What was chosen for a revision."""
-
-    readings: Literal["deflection", "absolute"]
-    scaling: Literal["none", "gu", "gc"]
-    effects: dict[str, dict[str, Any]]
-    effects_from: dict[str, dict[str, str]] = {}
-    cell: dict[str, dict[str, Any]] = {}
-
-
-class Detail(_Document):
-    """What is kept with a reading."""
-
-    epoch_wall_s: Number | None = None
-    q_actual: tuple[Number, ...] | None = None
-    tracker_covariance: Matrix | None = None
-
-
-class _Doubtful(Detail):
-    """A reading that was measured and cannot be of its target under its load."""
-
-    pose: Text
-    load: Text
-    target: Text | None = None
-
-
-class _Happened(_Document):
-    kind: Text
-    utc: Text
-
-
-class _Answer(_Document):
-    device: Text
-    driver: Text
-    name: Text
-    facts: dict[str, Text]
-
-
-class _Devices(_Happened):
-    answers: list[_Answer]
-
-
-class _Force(_Document):
-    wrench: tuple[Number, Number, Number, Number, Number, Number]
-
-
-class _Tare(_Happened):
-    force: _Force
-
-
-class _Drift(_Happened):
-    shift_m: Axes
-    sigma: Number
-    over: bool
-
-
-class _Tool(_Happened):
-    mass_kg: Number
-    com_m: Axes
-
-
-class _Repeatability(_Happened):
-    dof: Count
-    poses: Count
-    scatter: Number
-    instrument: Number
-    joint_std: Number
-
-
-class _Load(_Happened):
-    hanging: Text | None  # None while that is being put right
-    why: Text = ""
-
-
-class _Doubted(_Happened):
-    why: Text
-    reading: _Doubtful
-    stored: bool = False  # among the readings: it was seen too late to be doubtful
-
-
-class _Start(_Happened):
-    missing: Count
-
-
-class _Finished(_Happened):
-    readings: Count
-
-
-class _Noise(_Happened):
-    factors: dict[Text, Number] | None  # None where the covariances stay as measured
-    along_m: Number = 0.0
-    across_m: Number = 0.0
-    orientation_rad: Number | None = None
-    distance_m: Number = 0.0
-    joint_std_rad: Number | None = None
-
-
-_EVENTS: Mapping[str, type[_Happened]] = {
-    "devices": _Devices,
-    "tare": _Tare,
-    "drift": _Drift,
-    "tool": _Tool,
-    "repeatability": _Repeatability,
-    "load": _Load,
-    "doubted": _Doubted,
-    "start": _Start,
-    "finished": _Finished,
-    "noise": _Noise,
-}
-
-
-class _Settings(_Document):
-    poses: Count
-    validation: Count
-    max_time_s: Number
-    goal_m: Number | None
-    limit_m: Number | None
-    seed: Annotated[int, Strict()]
-    readings: Literal["deflection", "absolute"]
-    hide: Text | None
-    prior: Text | None = None
-    under_load: bool = False
-
+class _Strict(_Document):
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
-class _Begun(_Happened):
-    settings: _Settings
+def _of(base: Schema = _Document, /, **keys: Any) -> Any:
+    """Return a document with keys of types, or of pairs of a type and a default."""
+    given: dict[str, Any] = {
+        k: of if isinstance(of, tuple) else (of, ...) for k, of in keys.items()
+    }
+    return create_model("document", __base__=base, **given)
 
 
-class _Refined(_Happened):
-    readings_sha256: Text
-    revisions: Annotated[list[Count], Field(min_length=1)]
+def _list(of: Any) -> Any:
+    return list.__class_getitem__(of)
 
 
-class _Decided(_Happened):
-    action: Text
-
-
-class _Frozen(_Happened):
-    readings_sha256: Text
-
-
-_ENTRIES: Mapping[str, type[_Happened]] = {
-    "begun": _Begun,
-    "refined": _Refined,
-    "decided": _Decided,
-    "frozen": _Frozen,
+_ERRORS = _of(mean_m=Number, rms_m=Number, max_m=Number, rms_sigma=Number)
+_PARAMETER = _of(name=Text, unit=Text, value=Number | None, std=Number | None, identifiable=bool)
+_IDENTIFIED = _of(
+    n_readings=Count,
+    variance_factor=Number,
+    error=_of(fit=_ERRORS, holdout=_ERRORS),
+    parameters=_list(_PARAMETER),
+)
+_DIAGNOSED = _of(verdict=Text, rejected=(list[Text], []))
+_OPTIONS = _of(
+    readings=Literal["deflection", "absolute"],
+    scaling=Literal["none", "gu", "gc"],
+    effects=dict[str, dict[str, Any]],
+    effects_from=(dict[str, dict[str, str]], {}),
+    cell=(dict[str, dict[str, Any]], {}),
+)
+REVISION: Schema = _of(
+    effects=list[Text],
+    added=Text | None,
+    removed=(Text | None, None),
+    parent=(Whole | None, None),
+    data_hash=Text,
+    program_version=Text,
+    created=(Text, ""),
+    options=_OPTIONS,
+    parameters_json=dict[str, Any],
+    result_json=_of(identify=_IDENTIFIED, diagnose=(_DIAGNOSED | None, None)),
+)
+"""A revision, see `store.revision`."""
+DETAIL: Schema = _of(
+    epoch_wall_s=(Number | None, None),
+    q_actual=(tuple[Number, ...] | None, None),
+    tracker_covariance=(Matrix | None, None),
+)
+"""What is kept with a reading."""
+_DOUBTFUL = _of(DETAIL, pose=Text, load=Text, target=(Text | None, None))
+"""A reading that was measured and cannot be of its target under its load."""
+_HAPPENED: Schema = _of(kind=Text, utc=Text)
+_happened = partial(_of, _HAPPENED)
+EVENTS: Mapping[str, Schema] = {
+    "devices": _happened(
+        answers=_list(_of(device=Text, driver=Text, name=Text, facts=dict[str, Text]))
+    ),
+    "tare": _happened(force=_of(wrench=Wrench)),
+    "drift": _happened(shift_m=Axes, sigma=Number, over=bool),
+    "tool": _happened(mass_kg=Number, com_m=Axes),
+    "repeatability": _happened(
+        dof=Count, poses=Count, scatter=Number, instrument=Number, joint_std=Number
+    ),
+    "load": _happened(hanging=Text | None, why=(Text, "")),  # None while that is being put right
+    # stored: among the readings, since it was seen too late to be doubtful
+    "doubted": _happened(why=Text, reading=_DOUBTFUL, stored=(bool, False)),
+    "start": _happened(missing=Count),
+    "finished": _happened(readings=Count),
+    "noise": _happened(
+        factors=dict[Text, Number] | None,  # None where the covariances stay as measured
+        along_m=(Number, 0.0),
+        across_m=(Number, 0.0),
+        orientation_rad=(Number | None, None),
+        distance_m=(Number, 0.0),
+        joint_std_rad=(Number | None, None),
+    ),
 }
+"""Of a session, by kind."""
+_SETTINGS = _of(
+    _Strict,
+    poses=Count,
+    validation=Count,
+    max_time_s=Number,
+    goal_m=Number | None,
+    limit_m=Number | None,
+    seed=Whole,
+    readings=Literal["deflection", "absolute"],
+    hide=Text | None,
+    prior=(Text | None, None),
+    under_load=(bool, False),
+)
+ENTRIES: Mapping[str, Schema] = {
+    "begun": _happened(settings=_SETTINGS),
+    "refined": _happened(
+        readings_sha256=Text, revisions=Annotated[list[Count], Field(min_length=1)]
+    ),
+    "decided": _happened(action=Text),
+    "frozen": _happened(readings_sha256=Text),
+}
+"""Of a calibration's log, by kind."""
 
 
-def check(schema: type[BaseModel], content: object) -> None:
-    """Refuse a document that is not as it should be.
-
-    Raises:
-        ValueError: says where, in a line.
-    """
+def check(schema: Schema, content: object) -> None:
+    """Refuse, by a ValueError of a line, a document that is not as it should be."""
     try:
         schema.model_validate(content)
     except ValidationError as error:
@@ -226,16 +140,10 @@ def check(schema: type[BaseModel], content: object) -> None:
         raise ValueError(f"{where}: {first['msg']}") from None
 
 
-def check_event(content: object) -> None:
-    """Refuse what is no event of a session; raises as `check` does."""
-    _check_happened(content, _EVENTS)
-
-
-def check_entry(content: object) -> None:
-    """Refuse what is no entry of a calibration's log; raises as `check` does."""
-    _check_happened(content, _ENTRIES)
-
-
-def _check_happened(content: object, known: Mapping[str, type[_Happened]]) -> None:
+def check_event(content: object, known: Mapping[str, Schema] = EVENTS) -> None:
+    """Refuse what is no event of a session, or no entry of a log; raises as `check` does."""
     kind = content.get("kind") if isinstance(content, dict) else None
-    check(known.get(kind, _Happened) if isinstance(kind, str) else _Happened, content)
+    check(known.get(kind, _HAPPENED) if isinstance(kind, str) else _HAPPENED, content)
+
+
+check_entry = partial(check_event, known=ENTRIES)

@@ -25,35 +25,32 @@ from hilcal.effects.options import Options
 from hilcal.engine.engine import Advance, Engine
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.baseline import baseline, with_effects
-from hilcal.identification.carried import CarriedPrior
-from hilcal.identification.coordinates import coordinates_of
-from hilcal.identification.estimates import Estimates
-from hilcal.identification.fit import Fit, fit
+from hilcal.identification.carried import CarriedPrior, coordinates_of
+from hilcal.identification.fit import Estimates, Fit, fit
 from hilcal.identification.fit_document import finite
 from hilcal.identification.folds import FOLDS
 from hilcal.identification.full_covariance import joint_factors, with_joint_scatter
 from hilcal.identification.gauss_newton import (
-    over_all_parameters,
-    prior_coordinates,
-    whitened_jacobian,
-)
-from hilcal.identification.gauss_newton_steps import (
+    LinearProblem,
     NewtonPoint,
     NewtonProblem,
+    Regularisation,
     linear_problem,
     minimum,
+    over_all_parameters,
+    prior_coordinates,
+    spent_parameters,
+    whitened_jacobian,
 )
 from hilcal.identification.least_trimmed_squares import bulk, limit
 from hilcal.identification.priors import prior_of, scales_of
-from hilcal.identification.regularisation import LinearProblem, Regularisation, spent_parameters
-from hilcal.identification.residual import ErrorBlock, residual
+from hilcal.identification.residual import ErrorBlock, WithVarianceFactor, residual
 from hilcal.identification.uncertainty import (
     MISFIT_CHANCE,
     identifiable_parameters,
     in_ordinary_magnitudes,
     name_directions,
 )
-from hilcal.identification.variance_factor import WithVarianceFactor
 from hilcal.model.model import Model, Prediction
 from hilcal.readings.covariance import WHOLE, with_scatter
 from hilcal.readings.readings import Readings

@@ -7,18 +7,15 @@ import numpy as np
 
 from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.revisions import mode_of
-from hilcal.config import CellConfig
 from hilcal.diagnosis.change import find_changes
 from hilcal.diagnosis.change_candidates import changing
 from hilcal.diagnosis.comparison import Comparison, error_today
 from hilcal.diagnosis.completed import completed
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.earlier_fit import earlier_fit
 from hilcal.identification.fit import Fit
-from hilcal.identification.later_readings import setting
+from hilcal.identification.later_readings import earlier_fit, setting
 from hilcal.identification.misdescription import refuse_misdescribed
-from hilcal.identification.parameter_differences import Differences, parameter_differences
-from hilcal.identification.posterior import Posterior
+from hilcal.identification.posterior import Differences, Posterior, parameter_differences
 from hilcal.identification.registration import register
 from hilcal.names import quoted
 from hilcal.readings.readings import Readings
@@ -64,15 +61,22 @@ def compare(
     number, fit = run.fit_in_use(say, revision)
     chosen, shared = _unseen(run, later, fit, number)
     drawing = _drawn(later, chosen)
-    anew = not (_same_place(run, later) if same_setup is None else same_setup)
+    one, other = run.cell, later.cell
+    if same_setup is None:
+        stated = one.registration_known and other.registration_known
+        anew = not (stated and np.allclose(one.registration, other.registration, atol=1e-9))
+    else:
+        anew = not same_setup
     say("predicting what the earlier calibration leaves")
+    before = run.in_use(revision)
+    judged: Mapping[str, Any] = {} if before is None else before.result_json.get("diagnose", {})
     # A model that a diagnosis found to lack nothing that it can name is taken as it is.
-    whole, lacked = completed(
-        fit, () if _judged(run.in_use(revision)) else changing(run.catalogue), say
-    )
+    lacks = judged.get("verdict", "missing_effect") == "missing_effect"
+    whole, lacked = completed(fit, changing(run.catalogue) if lacks else (), say)
     at = setting(earlier_fit(whole), chosen, anew=anew, cell=later.cell)
     changes = find_changes(at, say)
-    record = later.in_use()
+    record, tool = later.in_use(), run.config.tool
+    keys = type(tool).model_fields
     return Comparison(
         number=number,
         fit=fit,
@@ -83,7 +87,7 @@ def compare(
         shared=shared,
         anew=anew,
         told=same_setup is not None,
-        tool=_other_keys(run.config, later.config),
+        tool=tuple(k for k in keys if getattr(tool, k) != getattr(later.config.tool, k)),
         today=error_today(at, changes, drawing),
         changes=changes,
         differences=None if record is None else _differences(fit, later, record, say),
@@ -101,12 +105,6 @@ def _differences(
         return parameter_differences(Posterior.of(fit), Posterior.of(later.restore(record)))
     except (CannotAnswerError, InputError):
         return None
-
-
-def _judged(record: RevisionRecord | None) -> bool:
-    """Whether a stored diagnosis names no effect that the model lacks."""
-    found: Mapping[str, Any] = {} if record is None else record.result_json.get("diagnose", {})
-    return bool(found.get("verdict", "missing_effect") != "missing_effect")
 
 
 def _unseen(run: Campaign, later: Campaign, fit: Fit, number: int | None) -> tuple[Readings, int]:
@@ -139,15 +137,3 @@ def _drawn(later: Campaign, readings: Readings) -> float | None:
     except InputError as error:
         raise InputError(f"{later.path}: {error}") from None
     return registered.rms
-
-
-def _same_place(run: Campaign, later: Campaign) -> bool:
-    """Whether both cells configure the same place of the tracker."""
-    one, other = run.cell, later.cell
-    known = one.registration_known and other.registration_known
-    return known and bool(np.allclose(one.registration, other.registration, atol=1e-9))
-
-
-def _other_keys(one: CellConfig, other: CellConfig) -> tuple[str, ...]:
-    before, after = one.tool, other.tool
-    return tuple(k for k in type(before).model_fields if getattr(before, k) != getattr(after, k))

@@ -37,25 +37,15 @@ LEAST = 8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FactoryCheck(Shown):
-    """The answer.
+    """The answer."""
 
-    Attributes:
-        changed: whether the geometry is another one than the factory measured.
-        p_value: of what of it is left, where nothing has changed.
-        moved_m: rms displacement of the target by what is left, as estimated, m.
-        moved_std_m: its standard deviation.
-        factory_m: rms misfit of the positions with the factory's kinematics alone, m.
-        nominal_m: the same with the maker's nominal ones.
-        noise_m: rms of the noise that is stated for the readings, m.
-    """
-
-    changed: bool
-    p_value: float
-    moved_m: float
-    moved_std_m: float
-    factory_m: float
-    nominal_m: float
-    noise_m: float
+    changed: bool  # whether the geometry is another one than the factory measured
+    p_value: float  # of what of it is left, where nothing has changed
+    moved_m: float  # rms displacement of the target by what is left, as estimated, m
+    moved_std_m: float  # its standard deviation
+    factory_m: float  # rms misfit of the positions with the factory's kinematics alone, m
+    nominal_m: float  # the same with the maker's nominal ones
+    noise_m: float  # rms of the noise that is stated for the readings, m
     readings: int
 
 
@@ -66,16 +56,10 @@ def check_factory(
     readings: Readings,
     catalogue: Catalogue | None = None,
 ) -> FactoryCheck:
-    """Judge readings by the kinematics that the factory measured.
+    """Judge readings of a few poses by the kinematics that the factory measured.
 
-    Args:
-        nominal: the arm as its maker designed it, its joints not yet counted as the cell says.
-        readings: of a few poses all over the workspace.
-        catalogue: the effects; the installed ones where None.
-
-    Raises:
-        InputError: kinematics of an arm of another kind.
-        CannotAnswerError: too few readings, or they do not determine the frames.
+    `nominal` is the arm as its maker designed it, its joints not yet counted as the cell says.
+    Raises a CannotAnswerError for too few readings, or where they do not determine the frames.
     """
     if len(readings) < LEAST:
         raise CannotAnswerError(f"{len(readings)} readings; {LEAST} or more can answer")

@@ -18,7 +18,6 @@ from hilcal.transfer.members import (
     Member,
     entries,
     member_of,
-    member_with,
     prints_of,
 )
 from hilcal.transfer.pooled import Pooled, effects_seen, pooled
@@ -33,21 +32,15 @@ def _unseen(what: str, total: int) -> AbstractContextManager[Advance]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fleet:
-    """What is known of a fleet.
+    """What is known of a fleet."""
 
-    Attributes:
-        types: by type of arm; those that were pooled.
-        members: the campaigns that were used.
-        failures: those that were not, and types that could not be pooled.
-    """
-
-    types: tuple[Pooled, ...]
-    members: tuple[Member, ...]
-    failures: tuple[Failure, ...]
+    types: tuple[Pooled, ...]  # by type of arm; those that were pooled
+    members: tuple[Member, ...]  # the campaigns that were used
+    failures: tuple[Failure, ...]  # those that were not, and types that could not be pooled
 
     def _repr_html_(self) -> str:
-        from hilcal.present.fleet import fleet_report  # notebooks alone need them
-        from hilcal.present.html.page import fragment
+        from hilcal.present.comparison import fleet_report  # notebooks alone need them
+        from hilcal.present.html import fragment
 
         return fragment(fleet_report(self))
 
@@ -56,16 +49,9 @@ def fleet(directory: Path, engine: Engine, counting: Counting = _unseen) -> Flee
     """Fit and diagnose the campaigns in a directory and below it, and pool them by type of arm.
 
     Nothing is stored in them. A campaign that fails is listed with its reason; so is one whose arm
-    is described otherwise than the first of its type.
-
-    Args:
-        directory: with campaign files.
-        counting: shows how far it is, as `present.progress.counting` does.
-
-    Raises:
-        InputError: no directory, no campaigns, or two of the same readings, which would count
-            twice: copies, or one and its extension.
-        CannotAnswerError: no type of which anything can be said.
+    is described otherwise than the first of its type. Two of the same readings, copies, or one and
+    its extension, are refused: they would count twice. Raises a CannotAnswerError where nothing can
+    be said of any type. `counting` shows how far it is, as `present.progress.counting` does.
     """
     listed = entries(directory)
     if same := shared(engine.map(prints_of, listed)):
@@ -82,11 +68,12 @@ def fleet(directory: Path, engine: Engine, counting: Counting = _unseen) -> Flee
         if isinstance(result, Failure):
             continue
         of = kinds.setdefault(result.type, [])
-        if of and not _alike(of[0][1], result):
+        links, others = result.posterior.links, (of[0][1] if of else result).posterior.links
+        if links.shape == others.shape and np.abs(links - others).max() <= SAME_M:
+            of.append((entry, result))
+        else:
             why = f"its {result.type} has other nominal links than that of {of[0][1].name}"
             failures.append(Failure(result.name, why))
-            continue
-        of.append((entry, result))
     types, members = [], []
     for kind, of in kinds.items():
         try:
@@ -100,16 +87,10 @@ def fleet(directory: Path, engine: Engine, counting: Counting = _unseen) -> Flee
         failures += lost
     if not types:
         first = failures[0]
+        what = f"{first.name}: {first.reason}"
         more = f" ({len(failures) - 1} more)" if len(failures) > 1 else ""
-        raise CannotAnswerError(
-            f"{directory}: nothing can be pooled: {first.name}: {first.reason}{more}"
-        )
+        raise CannotAnswerError(f"{directory}: nothing can be pooled: {what}{more}")
     return Fleet(tuple(types), tuple(members), tuple(failures))
-
-
-def _alike(a: Member, b: Member) -> bool:
-    one, other = a.posterior.links, b.posterior.links
-    return one.shape == other.shape and bool(np.abs(one - other).max() <= SAME_M)
 
 
 def _type(
@@ -122,7 +103,7 @@ def _type(
     lacking = [k for k, m in enumerate(members) if not set(traits) <= set(m.added)]
     lost: list[Failure] = []
     if traits and lacking:
-        run = partial(member_with, effects=traits)
+        run = partial(member_of, effects=traits)
         with counting(f"campaigns again, with {', '.join(traits)}", len(lacking)) as advance:
             again = engine.map(run, [of[k][0] for k in lacking], advance=advance)
         for k, result in zip(lacking, again, strict=True):
@@ -134,11 +115,7 @@ def _type(
 
 
 def to_json(fleet: Fleet, priors: Mapping[str, str]) -> dict[str, object]:
-    """Return a fleet as JSON, SI.
-
-    Args:
-        priors: file of the prior by type.
-    """
+    """Return a fleet as JSON, SI."""
     return {
         "types": [{**_type_json(t), "prior": priors.get(t.type)} for t in fleet.types],
         "campaigns": [

@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from scipy.stats import norm
@@ -27,8 +28,7 @@ from hilcal.regression.hierarchy import (
 )
 from hilcal.regression.schur import schur_complement
 from hilcal.store.revision import seconds_of, utc_now
-from hilcal.transfer.members import Member
-from hilcal.transfer.type_sizes import TypeSize, type_sizes
+from hilcal.transfer.members import Member, TypeSize, type_sizes
 from hilcal.types import Floats
 
 COMMON = 0.5
@@ -43,92 +43,60 @@ YEAR_S = 365.25 * 86400.0
 
 @dataclass(frozen=True, slots=True)
 class Odd:
-    """A parameter of one arm that is unlike those of the others of its type.
-
-    Attributes:
-        campaign: in which campaign, where it is a change of the arm; empty where it is the arm.
-        parameter: "effect.parameter".
-        off: by how much, SI.
-        sigma: the same in standard deviations of what the other arms let expect.
-        p_value: of that among all that were looked at.
-    """
+    """A parameter of one arm that is unlike those of the others of its type."""
 
     arm: str
-    campaign: str
-    parameter: str
-    off: float
+    campaign: str  # in which campaign, where it is a change of the arm; empty where it is the arm
+    parameter: str  # "effect.parameter"
+    off: float  # by how much, SI
     unit: str
-    sigma: float
-    p_value: float
+    sigma: float  # the same in standard deviations of what the other arms let expect
+    p_value: float  # of that among all that were looked at
 
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """One parameter of a type, SI.
+    """One parameter of a type, SI."""
 
-    Attributes:
-        parameter: "effect.parameter".
-        mean: μ of the type.
-        mean_std: its standard uncertainty.
-        between: standard deviation from arm to arm.
-        between_std: its standard error.
-        within: standard deviation from campaign to campaign of an arm; None where none was
-            measured twice.
-        per_year: β, common drift; None where no arm was measured at two times.
-        per_year_std: its standard uncertainty.
-    """
-
-    parameter: str
+    parameter: str  # "effect.parameter"
     unit: str
-    mean: float
-    mean_std: float
-    between: float
-    between_std: float
+    mean: float  # μ of the type
+    mean_std: float  # its standard uncertainty
+    between: float  # standard deviation from arm to arm
+    between_std: float  # its standard error
     within: float | None
-    per_year: float | None
-    per_year_std: float | None
+    """Standard deviation from campaign to campaign of an arm; None where none was measured
+    twice."""
+    per_year: float | None  # β, common drift; None where no arm was measured at two times
+    per_year_std: float | None  # its standard uncertainty
 
 
 @dataclass(frozen=True, slots=True)
 class DiagnosedEffect:
-    """An effect that diagnoses added.
-
-    Attributes:
-        arms: the arms that have it.
-        kind: "trait" of the type, "defect" of single arms, or "some".
-    """
+    """An effect that diagnoses added."""
 
     effect: str
-    arms: tuple[str, ...]
+    arms: tuple[str, ...]  # the arms that have it
     of: int
-    kind: str
+    kind: str  # "trait" of the type, "defect" of single arms, or "some"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pooled:
-    """What is known of arms of one type.
-
-    Attributes:
-        odd: what is unlike, the arms' first, most certain first.
-        seen: effects that diagnoses added, most frequent first.
-        wear: parameters whose common drift is certain.
-        prior: what to expect of another arm.
-        off: (A, K) each arm's parameters minus the mean of the type, SI.
-        off_std: (A, K) their standard uncertainties; infinite where an arm did not determine one.
-        sizes: of the effects of the type, by their names.
-    """
+    """What is known of arms of one type."""
 
     type: str
     arms: tuple[str, ...]
     campaigns: tuple[str, ...]
     parameters: tuple[Spread, ...]
-    odd: tuple[Odd, ...]
-    seen: tuple[DiagnosedEffect, ...]
-    wear: tuple[str, ...]
-    prior: Posterior
-    off: Floats
+    odd: tuple[Odd, ...]  # what is unlike, the arms' first, most certain first
+    seen: tuple[DiagnosedEffect, ...]  # effects that diagnoses added, most frequent first
+    wear: tuple[str, ...]  # parameters whose common drift is certain
+    prior: Posterior  # what to expect of another arm
+    off: Floats  # (A, K) each arm's parameters minus the mean of the type, SI
     off_std: Floats
-    sizes: tuple[TypeSize, ...]
+    """(A, K) their standard uncertainties; infinite where an arm did not determine one."""
+    sizes: tuple[TypeSize, ...]  # of the effects of the type, by their names
 
     @property
     def distance(self) -> Floats:
@@ -159,15 +127,7 @@ def effects_seen(members: Sequence[Member]) -> tuple[DiagnosedEffect, ...]:
 
 
 def pooled(members: Sequence[Member], seen: Sequence[DiagnosedEffect]) -> Pooled:
-    """Pool the campaigns of arms of one type.
-
-    Args:
-        members: of one type; effects that are traits are in all their models.
-        seen: effects that diagnoses added.
-
-    Raises:
-        CannotAnswerError: fewer than three arms, or no parameter that two arms determine.
-    """
+    """Pool the campaigns of arms of one type; two arms have no spread: a CannotAnswerError."""
     first = members[0].posterior
     arms = tuple(dict.fromkeys(m.arm for m in members))
     if len(arms) < FEWEST_ARMS:
@@ -180,15 +140,20 @@ def pooled(members: Sequence[Member], seen: Sequence[DiagnosedEffect]) -> Pooled
         raise CannotAnswerError(
             f"no parameter of an arm of the type {first.arm} is determined by campaigns of two arms"
         )
-    scale = _per_name(members, names, "scale")
+    scales, units = _by_name(members, "scale"), _by_name(members, "units")
+    scale = np.array([scales[name] for name in names])
     found = _found(members, arms, names, scale)
     h, unlike_arms = hierarchy(found)
-    odd = [_odd(o, arms[o.unit], "", names, scale, members) for o in unlike_arms]
-    odd += _changed(members, found, arms, h, names, scale)
+    late, changed = _changed(found, h)
+    of_arms = [(o, arms[o.unit], "") for o in unlike_arms]
+    of_campaigns = [(o, members[late[o.unit]].arm, members[late[o.unit]].name) for o in changed]
+    odd = []
+    for o, arm, campaign in (*of_arms, *of_campaigns):
+        name, off = names[o.parameter], float(o.off * scale[o.parameter])
+        odd.append(Odd(arm, campaign, name, off, units[name], o.sigma, o.p_value))
     years = np.sqrt(np.diag(h.covariance)[len(names) :])
     certain = 2 * norm.sf(np.abs(h.slope) / np.where(years > 0, years, np.inf)) * len(names)
     timed = bool(np.any(h.slope != 0))
-    units = _units(members)
     spreads = [
         Spread(
             parameter=name,
@@ -239,17 +204,11 @@ def _common(members: Sequence[Member]) -> tuple[tuple[PosteriorEffect, ...], tup
     return tuple(e for e in effects if e.name in used), names
 
 
-def _per_name(members: Sequence[Member], names: Sequence[str], field: str) -> Floats:
-    values: dict[str, float] = {}
+def _by_name(members: Sequence[Member], field: str) -> dict[str, Any]:
+    """Values of a field of the posteriors, by the names of the parameters."""
+    found: dict[str, Any] = {}
     for m in members:
-        values |= dict(zip(m.posterior.names, getattr(m.posterior, field), strict=True))
-    return np.array([values[name] for name in names], dtype=float)
-
-
-def _units(members: Sequence[Member]) -> dict[str, str]:
-    found: dict[str, str] = {}
-    for m in members:
-        found |= dict(zip(m.posterior.names, m.posterior.units, strict=True))
+        found |= dict(zip(m.posterior.names, getattr(m.posterior, field), strict=True))
     return found
 
 
@@ -274,19 +233,12 @@ def _found(
     return FleetEstimates(mean, information, arm, (seconds - begun[arm]) / YEAR_S)
 
 
-def _changed(
-    members: Sequence[Member],
-    found: FleetEstimates,
-    arms: Sequence[str],
-    h: Hierarchy,
-    names: Sequence[str],
-    scale: Floats,
-) -> list[Odd]:
-    """Campaigns in which an arm has changed since its campaign before, unlike other arms."""
-    covariance = np.linalg.inv(found.information + 1e-8 * np.eye(len(names)))
+def _changed(found: FleetEstimates, h: Hierarchy) -> tuple[list[int], Sequence[Unlike]]:
+    """Later campaigns of arms, and those in which one has changed since before, unlike others."""
+    covariance = np.linalg.inv(found.information + 1e-8 * np.eye(found.mean.shape[1]))
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     after, change, spread = [], [], []
-    for a in range(len(arms)):
+    for a in range(int(found.arm.max()) + 1):
         mine = np.flatnonzero(found.arm == a)
         mine = mine[np.argsort(found.time[mine], kind="stable")]
         for before, now in pairwise(mine):
@@ -294,33 +246,7 @@ def _changed(
             after.append(int(now))
             change.append(found.mean[now] - found.mean[before] - years * h.slope)
             spread.append(variance[now] + variance[before])
-    if not after:
-        return []
-    worst = unlike(np.array(change), np.array(spread))
-    return [
-        _odd(
-            o,
-            members[after[o.unit]].arm,
-            members[after[o.unit]].name,
-            names,
-            scale,
-            members,
-        )
-        for o in worst
-    ]
-
-
-def _odd(
-    o: Unlike,
-    arm: str,
-    campaign: str,
-    names: Sequence[str],
-    scale: Floats,
-    members: Sequence[Member],
-) -> Odd:
-    name = names[o.parameter]
-    off = float(o.off * scale[o.parameter])
-    return Odd(arm, campaign, name, off, _units(members)[name], o.sigma, o.p_value)
+    return after, unlike(np.array(change), np.array(spread)) if after else []
 
 
 def _prior(

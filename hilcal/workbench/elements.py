@@ -11,8 +11,8 @@ from nicegui import ui
 from nicegui.events import GenericEventArguments
 
 from hilcal.names import escaped
-from hilcal.present.charts import style
-from hilcal.present.document import Table
+from hilcal.present import chart_style as style
+from hilcal.present.document import Table, says
 from hilcal.workbench.work import Work
 
 if TYPE_CHECKING:
@@ -25,18 +25,18 @@ class Status:
     def __init__(self, view: View) -> None:
         """Make it, empty."""
         with ui.column().classes("strip").style("gap: 0"):
-            with ui.row().classes("bench items-center no-wrap").style("gap: 12px") as self.busy:
-                ui.spinner(size="1.3em")
-                self.doing = ui.label().classes("soft").props("aria-live=polite")
-            with ui.row().classes("bench items-center").style("gap: 12px") as self.answered:
-                self.told = ui.label().classes("answer").props("role=alert data-answer=file")
-                self.refit = button(
-                    view, "Fit anew to all readings", view.fit_anew, "outline dense"
-                )
-            with ui.row().classes("bench items-center").style("gap: 12px") as self.stale:
-                ui.label("Another command has changed the file.").classes("bad")
-                button(view, "Read it again", view.again, "outline dense")
-        for row in (self.busy, self.answered, self.stale):
+            rows = [ui.row().classes("bench items-center").style("gap: 12px") for _ in range(3)]
+        self.busy, self.answered, self.stale = rows
+        with self.busy.classes("no-wrap"):
+            ui.spinner(size="1.3em")
+            self.doing = ui.label().classes("soft").props("aria-live=polite")
+        with self.answered:
+            self.told = ui.label().classes("answer").props("role=alert data-answer=file")
+            self.refit = button(view, "Fit anew to all readings", view.fit_anew, "outline dense")
+        with self.stale:
+            ui.label("Another command has changed the file.").classes("bad")
+            button(view, "Read it again", view.again, "outline dense")
+        for row in rows:
             row.set_visibility(False)
 
     def show(self, work: Work) -> None:
@@ -70,13 +70,17 @@ def soft(words: str) -> ui.label:
 
 def drawn(of: Table, selection: Literal["single"] | None = None) -> ui.table:
     """Draw a table of a document; a row has its cells by the number of the column."""
-    sides = {k: "left" if k in of.left else "right" for k in range(len(of.heads))}
     columns = [
-        {"name": str(k), "label": head, "field": str(k), "align": sides[k]}
+        {
+            "name": str(k),
+            "label": head,
+            "field": str(k),
+            "align": "left" if k in of.left else "right",
+        }
         for k, head in enumerate(of.heads)
     ]
     rows = [
-        {"at": i, **{str(k): cell for k, cell in enumerate(row)}} for i, row in enumerate(of.rows)
+        {"at": i} | {str(k): cell for k, cell in enumerate(row)} for i, row in enumerate(of.rows)
     ]
     made = ui.table(columns=columns, rows=rows, row_key="at", selection=selection)
     return made.props("flat dense").style("width: 100%")
@@ -93,14 +97,13 @@ def chart(view: View, figure: go.Figure) -> ui.plotly:
     """Draw a chart in the page's scheme, with its sentence for those who do not see it."""
     dressed = style.in_scheme(figure, view.tab.dark).to_plotly_json()
     shown = ui.plotly({**dressed, "config": style.CONFIG}).classes("chart")
-    shown.props["role"], shown.props["aria-label"] = "img", style.says(figure)
+    shown.props["role"], shown.props["aria-label"] = "img", says(figure)
     return shown
 
 
 def point(e: GenericEventArguments) -> dict[str, Any]:
     """Return the point of a chart that was clicked, as plotly.js describes it."""
-    points = e.args.get("points") or [{}]
-    return dict(points[0])
+    return dict((e.args.get("points") or [{}])[0])
 
 
 def plain(words: str) -> str:

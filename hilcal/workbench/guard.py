@@ -45,13 +45,7 @@ class AccessGuard:
     """An ASGI application that passes on only what the operator's browser asks for."""
 
     def __init__(self, app: App, port: int, token: str) -> None:
-        """Guard an application.
-
-        Args:
-            app: it.
-            port: of the server.
-            token: the secret of its address.
-        """
+        """Guard an application at a port; `token` is the secret of its address."""
         self.app, self._token = app, token
         self._secret = secrets.token_urlsafe(32)
         self._until = time.monotonic() + UNUSED_S
@@ -83,11 +77,10 @@ class AccessGuard:
         if scope["type"] not in ("http", "websocket"):
             await self.app(scope, receive, send)
             return
-        heads = _Heads(scope)
-        why = self._stranger(scope, heads)
+        why = self._stranger(scope)
         if why is not None:
             await _refuse(scope, send, 403, why)
-        elif self._has_cookie(heads):
+        elif self._has_cookie(scope):
             if scope["path"] != "/" and not scope["path"].startswith(PATHS):
                 await _refuse(scope, send, 404, "nothing here")
             elif scope["path"] == "/" and scope["query_string"]:
@@ -110,27 +103,27 @@ class AccessGuard:
         """Whether nobody has used the token in its time, and so nobody ever will."""
         return not self.entered and time.monotonic() > self._until
 
-    def _stranger(self, scope: Scope, heads: "_Heads") -> str | None:
+    def _stranger(self, scope: Scope) -> str | None:
         """Say why a request is not of this server's own page on this machine; None where it is."""
         if (scope.get("client") or LOOPBACK)[0] not in LOOPBACK:
             return "only this machine may ask"
-        if heads.all(b"host") not in [[host] for host in self._hosts]:
+        if _heads(scope, b"host") not in [[host] for host in self._hosts]:
             return "not the name of this server"
-        origins = heads.all(b"origin")
+        origins = _heads(scope, b"origin")
         if scope["type"] == "websocket" and len(origins) != 1:
             return "a socket of no page"
         if any(origin not in self.origins for origin in origins):
             return "not a page of this server"
-        site = heads.all(b"sec-fetch-site")
-        visited = heads.all(b"sec-fetch-mode") == ["navigate"] and scope["path"] == "/"
+        site = _heads(scope, b"sec-fetch-site")
+        visited = _heads(scope, b"sec-fetch-mode") == ["navigate"] and scope["path"] == "/"
         if any(s not in ("same-origin", "none") for s in site) and not visited:
             return "not a page of this server"
         return None
 
-    def _has_cookie(self, heads: "_Heads") -> bool:
+    def _has_cookie(self, scope: Scope) -> bool:
         jar = SimpleCookie()
         try:
-            jar.load("; ".join(heads.all(b"cookie")))
+            jar.load("; ".join(_heads(scope, b"cookie")))
         except CookieError:
             return False
         found = jar.get(self._cookie)
@@ -159,14 +152,9 @@ class AccessGuard:
         return marked
 
 
-class _Heads:
-    """The headers of a request, several of one name included."""
-
-    def __init__(self, scope: Scope) -> None:
-        self._given: list[tuple[bytes, bytes]] = list(scope["headers"])
-
-    def all(self, name: bytes) -> list[str]:
-        return [value.decode("latin-1") for key, value in self._given if key.lower() == name]
+def _heads(scope: Scope, name: bytes) -> list[str]:
+    """Return the headers of a name, of which there may be several."""
+    return [value.decode("latin-1") for key, value in scope["headers"] if key.lower() == name]
 
 
 def _same(a: str, b: str) -> bool:

@@ -11,20 +11,16 @@ from nicegui import app as bench
 from nicegui import ui
 
 from hilcal import numbers
-from hilcal.campaign.changes import Changed
 from hilcal.present.campaign import refitted
 from hilcal.present.diagnosis import addition_lines, fell, rose
-from hilcal.workbench import cards, next_card
+from hilcal.workbench import cards
 from hilcal.workbench.elements import Status
-from hilcal.workbench.session import Say, WorkbenchSession
-from hilcal.workbench.snapshot import Snapshot
+from hilcal.workbench.session import Snapshot, WorkbenchSession
 from hilcal.workbench.viewer import WebViewer
-from hilcal.workbench.work import Answer, Work
+from hilcal.workbench.work import Answer, Say, Work
 
-TICK = 0.2
-"""How often a tab looks whether something has changed, s."""
-LOOK = 2.0
-"""How often it looks at the file, s."""
+TICK, LOOK = 0.2, 2.0
+"""How often a tab looks whether something has changed, and at the file, s."""
 CSS = Path(__file__).with_name("page.css")
 SCRIPT = Path(__file__).with_name("page.js")
 DARK = "matchMedia('(prefers-color-scheme: dark)').matches"
@@ -32,31 +28,19 @@ DARK = "matchMedia('(prefers-color-scheme: dark)').matches"
 
 @dataclass
 class Tab:
-    """What one tab looks at; nothing of it is stored.
+    """What one tab looks at; nothing of it is stored."""
 
-    Attributes:
-        snapshot: the snapshot that the rest belongs to.
-        suspect: the missing effect whose evidence is shown.
-        variable: the variable over which residuals are drawn; None for the pose.
-        picked: measurements of the story that were clicked; None before.
-        told: what they are, in words.
-        dark: whether the browser asks for a dark page.
-        texts: values of the cell by section and key, as they were typed and not used yet.
-        pair: the two revisions that are shown side by side.
-        looks: whether the 3-D view was asked for.
-        viewer: address of the 3-D view; empty before it was opened.
-    """
-
-    snapshot: Snapshot | None = None
-    suspect: str | None = None
-    variable: str | None = None
-    picked: list[int] | None = None
-    told: str = ""
-    dark: bool = False
+    snapshot: Snapshot | None = None  # that the rest belongs to
+    suspect: str | None = None  # the missing effect whose evidence is shown
+    variable: str | None = None  # over which residuals are drawn; None for the pose
+    picked: list[int] | None = None  # measurements of the story that were clicked
+    told: str = ""  # what they are, in words
+    dark: bool = False  # whether the browser asks for a dark page
     texts: dict[tuple[str, str], str] = field(default_factory=dict)
-    pair: tuple[int, int] | None = None
-    looks: bool = False
-    viewer: str = ""
+    """Values of the cell by section and key, as they were typed and not used yet."""
+    pair: tuple[int, int] | None = None  # the two revisions that are shown side by side
+    looks: bool = False  # whether the 3-D view was asked for
+    viewer: str = ""  # address of the 3-D view; empty before it was opened
 
 
 @dataclass
@@ -75,10 +59,10 @@ def install(app: FastAPI, session: WorkbenchSession) -> None:
 
     @app.get("/viewer/{name:path}")
     def viewer(name: str) -> Response:
-        found = shared.viewer.file(name)
-        if found is None:
+        file = shared.viewer.file(name)
+        if file is None:
             return PlainTextResponse("nothing here\n", status_code=404)
-        content, kind = found
+        content, kind = file
         return Response(content, media_type=kind, headers={"rerun-final-length": str(len(content))})
 
     @ui.page("/")
@@ -88,39 +72,25 @@ def install(app: FastAPI, session: WorkbenchSession) -> None:
         await ui.context.client.connected()
         view.begin(dark=bool(await ui.run_javascript(DARK, timeout=5.0)))
 
-    bench.on_startup(lambda: shared.work.start(f"Reading {session.path.name}", read(session)))
+    bench.on_startup(lambda: _read(shared))
 
 
-def read(session: WorkbenchSession, revision: int | None = None) -> Callable[[Say], str]:
-    """Return what reads the file and shows a revision."""
+def _read(shared: TabsShared) -> None:
+    """Begin to read the file."""
 
-    def do(say: Say) -> str:
-        known = session.snapshot is not None
-        found = session.load(say, revision)
-        return f"{found.name} was read again." if known else ""
+    def read(say: Say) -> str:
+        again = shared.session.snapshot is not None
+        name = shared.session.load(say).name
+        return f"{name} was read again." if again else ""
 
-    return do
-
-
-def told(c: Changed | None) -> str:
-    """Return what adding or removing an effect did."""
-    if c is None:
-        return ""
-    say = fell if c.added else rose
-    lines = [say(c.before, c.fit, c.added or c.removed or ""), f"It is revision {c.number}."]
-    return " ".join(lines + ([] if c.expected is None else [*addition_lines(c.expected)]))
+    shared.work.start(f"Reading {shared.session.path.name}", read)
 
 
 class View:
     """One tab of the page."""
 
     def __init__(self, shared: TabsShared, address: str) -> None:
-        """Begin with what is there.
-
-        Args:
-            shared: what all tabs share.
-            address: of this server, as the browser calls it.
-        """
+        """Begin with what is there; `address` is this server's, as the browser calls it."""
         self.shared, self.address, self.tab = shared, address, Tab()
         self.readings: ui.column | None = None
         self.evidence: ui.column | None = None
@@ -148,8 +118,7 @@ class View:
         ui.add_css(CSS)
         ui.add_body_html(f"<script>{SCRIPT.read_text(encoding='utf-8')}</script>")
         self.status = Status(self)
-        self.body = ui.column().classes("bench")
-        self.below = ui.column().classes("bench")
+        self.body, self.below = (ui.column().classes("bench") for _ in range(2))
         ui.timer(TICK, self.tick)
         ui.timer(LOOK, self.look)
 
@@ -186,10 +155,10 @@ class View:
         """Show at each place what is being done there, or what came of it."""
         for place, label in self.answers.items():
             busy = self.work.line if self.work.place == place else ""
-            found = self.work.answers.get(place)
-            label.set_text(f"{busy} …" if busy else numbers.sentence(found.words if found else ""))
-            label.set_visibility(bool(busy or found))
-            done = found is not None and found.done
+            came = self.work.answers.get(place)
+            label.set_text(f"{busy} …" if busy else numbers.sentence(came.words if came else ""))
+            label.set_visibility(bool(busy or came))
+            done = came is not None and came.done
             label.props(f"data-came={'busy' if busy else 'done' if done else 'failed'}")
 
     def look(self) -> None:
@@ -201,14 +170,9 @@ class View:
         self._drawn = self.session.count, self.work.what is not None
         snapshot, before = self.session.snapshot, self.tab
         if snapshot is not before.snapshot:
-            named = snapshot.diagnosis.significant if snapshot else ()
-            self.tab = Tab(
-                snapshot,
-                named[0] if named else None,
-                dark=before.dark,
-                texts=before.texts,
-                pair=before.pair,
-            )
+            suspect = next(iter(snapshot.diagnosis.significant), None) if snapshot else None
+            kept = {"dark": before.dark, "texts": before.texts, "pair": before.pair}
+            self.tab = Tab(snapshot, suspect, **kept)  # type: ignore[arg-type]
         self.answers = {"file": self.status.told}
         self.body.clear()
         with self.body:
@@ -219,16 +183,32 @@ class View:
         self.draw_below()
         self.show_answers()
 
+    def _redraw(self, place: ui.column | None, card: Callable[["View", Snapshot], None]) -> None:
+        """Draw a part alone, where it is there."""
+        if place is not None:
+            place.clear()
+            with place:
+                if self.tab.snapshot is not None:
+                    card(self, self.tab.snapshot)
+
     def draw_below(self) -> None:
         """Draw the 3-D view alone."""
-        self.below.clear()
-        with self.below:
-            if self.tab.snapshot is not None:
-                cards.viewer(self)
+        self._redraw(self.below, lambda view, d: cards.viewer(view))
 
-    # what can be clicked
+    def draw_readings(self) -> None:
+        """Draw the readings that were picked."""
+        self._redraw(self.readings, cards.readings)
 
-    def do(self, place: str, what: str, act: Callable[[Snapshot, Say], object]) -> None:
+    def draw_evidence(self) -> None:
+        """Draw the evidence of the chosen suspect."""
+        self._redraw(self.evidence, cards.evidence)
+
+    def draw_plan(self) -> None:
+        """Draw the next measurements, where they are planned."""
+        self._planned = self.session.planned
+        self._redraw(self.planned, lambda view, d: cards.planned(view.session))
+
+    def _do(self, place: str, what: str, act: Callable[[Snapshot, Say], object]) -> None:
         """Begin something on the snapshot of this tab; only one thing is done at a time.
 
         Args:
@@ -242,24 +222,29 @@ class View:
         ):
             self.work.answers[place] = Answer("Something else was being done; nothing was begun.")
 
+    def _change(
+        self, place: str, what: str, effect: str, act: Callable[[Snapshot, str, Say], Snapshot]
+    ) -> None:
+        """Begin to add or remove an effect, and say what that did."""
+
+        def do(snapshot: Snapshot, say: Say) -> str:
+            act(snapshot, effect, say)
+            if (c := self.session.changed) is None:
+                return ""
+            did = fell if c.added else rose
+            lines = [did(c.before, c.fit, c.added or c.removed or "")]
+            lines.append(f"It is revision {c.number}.")
+            return " ".join(lines + ([] if c.expected is None else [*addition_lines(c.expected)]))
+
+        self._do(place, f"{what} {effect}", do)
+
     def add(self) -> None:
         """Add the chosen effect."""
-        effect = self.tab.suspect or ""
-
-        def act(snapshot: Snapshot, say: Say) -> str:
-            self.session.add(snapshot, effect, say)
-            return told(self.session.changed)
-
-        self.do("missing", f"Adding {effect}", act)
+        self._change("missing", "Adding", self.tab.suspect or "", self.session.add)
 
     def remove(self, effect: str) -> None:
         """Take an effect out."""
-
-        def act(snapshot: Snapshot, say: Say) -> str:
-            self.session.remove(snapshot, effect, say)
-            return told(self.session.changed)
-
-        self.do("model", f"Removing {effect}", act)
+        self._change("model", "Removing", effect, self.session.remove)
 
     def go_back(self, number: int) -> None:
         """Show a revision and let every command use it."""
@@ -268,7 +253,7 @@ class View:
             self.session.go_back(snapshot, number, say)
             return f"Revision {number} is shown, and every command uses it."
 
-        self.do("revisions", f"Going to revision {number}", act)
+        self._do("revisions", f"Going to revision {number}", act)
 
     def show(self, number: int) -> None:
         """Show a revision; nothing is written."""
@@ -277,19 +262,19 @@ class View:
             self.session.load(say, number)
             return f"Revision {number} is shown; what commands use is as it was."
 
-        self.do("revisions", f"Reading revision {number}", act)
+        self._do("revisions", f"Reading revision {number}", act)
 
     def again(self) -> None:
         """Read the file again."""
-        self.work.start(f"Reading {self.session.path.name}", read(self.session))
+        _read(self.shared)
 
     def fit_anew(self) -> None:
         """Fit the model of the revision in use to all readings."""
         snapshot = self.session.snapshot
 
         def act(say: Say) -> str:
-            found = self.session.fit_anew(snapshot, say)
-            return f"Fitted to all {found.n_readings} readings: revision {found.number}."
+            anew = self.session.fit_anew(snapshot, say)
+            return f"Fitted to all {anew.n_readings} readings: revision {anew.number}."
 
         self.work.start("Fitting anew", act)
 
@@ -298,13 +283,12 @@ class View:
         texts = dict(self.tab.texts)
 
         def act(snapshot: Snapshot, say: Say) -> str:
-            before = snapshot.fit
-            found = self.session.change_cell(snapshot, texts, say)
+            anew = self.session.change_cell(snapshot, texts, say)
             for key in texts:
                 self.tab.texts.pop(key, None)
-            return f"{refitted(before, found.fit)} It is revision {found.number}."
+            return f"{refitted(snapshot.fit, anew.fit)} It is revision {anew.number}."
 
-        self.do("cell", "Fitting in the changed cell", act)
+        self._do("cell", "Fitting in the changed cell", act)
 
     def download(self, kind: str) -> None:
         """Make a file about the shown revision, and give it to the browser."""
@@ -314,13 +298,13 @@ class View:
             size = f"{len(content) / 1e6:.1f} MB" if len(content) > 1e5 else f"{len(content)} bytes"
             return f"Your browser has {name} now ({size})."
 
-        self.do("download", f"Making the {kind}", act)
+        self._do("download", f"Making the {kind}", act)
 
     def plan(self, poses: float | None, file: str, *, quick: bool) -> None:
         """Plan the next measurements."""
         output = self.session.path.parent / Path(file).name
         count = None if poses is None else int(poses)
-        self.do(
+        self._do(
             "next",
             "Planning the next measurements",
             lambda snapshot, say: self.session.plan(snapshot, count, output, say, quick=quick),
@@ -336,7 +320,7 @@ class View:
             names = self.shared.viewer.prepare(snapshot.story, self.session.count, say)
             self.shared.drawing = snapshot, names
 
-        self.do("viewer", "Opening the 3-D view", act)
+        self._do("viewer", "Opening the 3-D view", act)
 
     def choose(self, effect: str) -> None:
         """Show the evidence of a suspect."""
@@ -351,45 +335,17 @@ class View:
         """Show the residuals over a variable, and its readings that are furthest off."""
         self.tab.variable = name
         worst = cards.furthest(self.tab.snapshot) if self.tab.snapshot else []
-        self.pick(worst, "The readings that are furthest off")
-
-    def pick(self, measurements: list[int], told: str) -> None:
-        """Show some readings, and what distinguishes them."""
-        self.tab.picked, self.tab.told = measurements, told
-        self.draw_readings()
+        self._pick(worst, "The readings that are furthest off")
 
     def pick_pose(self, measurement: int) -> None:
         """Show the readings of the pose of one."""
         snapshot = self.tab.snapshot
         if snapshot is not None and 0 <= measurement < len(snapshot.story):
-            mine = np.flatnonzero(snapshot.story.pose == snapshot.story.pose[measurement])
-            self.pick(
-                mine.tolist(), f"The readings of pose {snapshot.story.pose_name(measurement)}"
-            )
+            story = snapshot.story
+            mine = np.flatnonzero(story.pose == story.pose[measurement]).tolist()
+            self._pick(mine, f"The readings of pose {story.pose_name(measurement)}")
 
-    def draw_readings(self) -> None:
-        """Draw the readings that were picked."""
-        if self.readings is None:
-            return
-        self.readings.clear()
-        with self.readings:
-            if self.tab.snapshot is not None:
-                cards.readings(self, self.tab.snapshot)
-
-    def draw_plan(self) -> None:
-        """Draw the next measurements, where they are planned."""
-        self._planned = self.session.planned
-        if self.planned is None:
-            return
-        self.planned.clear()
-        with self.planned:
-            next_card.planned(self.session)
-
-    def draw_evidence(self) -> None:
-        """Draw the evidence of the chosen suspect."""
-        if self.evidence is None:
-            return
-        self.evidence.clear()
-        with self.evidence:
-            if self.tab.snapshot is not None:
-                cards.evidence(self, self.tab.snapshot)
+    def _pick(self, measurements: list[int], told: str) -> None:
+        """Show some readings, and what distinguishes them."""
+        self.tab.picked, self.tab.told = measurements, told
+        self.draw_readings()

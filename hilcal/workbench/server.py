@@ -33,15 +33,8 @@ def require_nicegui() -> None:
         import nicegui  # noqa: F401
 
 
-def listening(port: int | None) -> socket.socket:
-    """Return a socket that listens on the loopback address.
-
-    Args:
-        port: its port; where None, the usual one or, where that is taken, any.
-
-    Raises:
-        InputError: the port cannot be had.
-    """
+def _listening(port: int | None) -> socket.socket:
+    """Listen at a loopback port; where None, at the usual one or, where that is taken, any."""
     wanted = (PORT, 0) if port is None else (port,)
     for one in wanted:
         made = socket.socket()
@@ -57,7 +50,7 @@ def listening(port: int | None) -> socket.socket:
     raise InputError(f"--port {port}: {why}; choose a free port of this machine")
 
 
-def quiet_environment() -> None:
+def _quiet_environment() -> None:
     """Let NiceGUI neither read nor write storage of its own, nor speak to another machine."""
     folder = Path(tempfile.gettempdir()) / f"hilcal-no-storage-{secrets.token_hex(8)}"
     os.environ["NICEGUI_STORAGE_PATH"] = str(folder)
@@ -66,7 +59,7 @@ def quiet_environment() -> None:
 
 
 @contextlib.contextmanager
-def leading_to(url: str) -> Iterator[Path]:
+def _leading_to(url: str) -> Iterator[Path]:
     """Yield a file that leads a browser to an address, and that its user alone can read.
 
     Every user of the machine reads the arguments of every process: a browser that is started with
@@ -87,19 +80,14 @@ def serve(
 ) -> bool:
     """Serve the workbench of a campaign until Ctrl-C; whether somebody opened it.
 
-    It ends by itself where nobody has in the time of its token: nobody could any more.
-
-    Args:
-        session: of the campaign.
-        port: on this machine; a free one where None.
-        told: is called with the address once it is served.
-        browser: open the address in the default browser.
+    It ends by itself where nobody has in the time of its token: nobody could any more. `told` is
+    called with the address once it is served; `browser` opens it in the default browser.
 
     Raises:
         InputError: NiceGUI is not installed, or the port cannot be had.
     """
     require_nicegui()
-    quiet_environment()
+    _quiet_environment()
     import logging
 
     import uvicorn
@@ -111,7 +99,7 @@ def serve(
 
     # What a click fails by is told on the page; the library's own remarks are for its developers.
     logging.getLogger("nicegui").setLevel(logging.CRITICAL)
-    with listening(port) as sock:
+    with _listening(port) as sock:
         number, token = int(sock.getsockname()[1]), secrets.token_urlsafe(32)
         app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
         install(app, session)
@@ -145,7 +133,7 @@ def serve(
                 await super().startup(sockets)
                 told(url)
                 if browser:
-                    lead = opening.enter_context(leading_to(url)).as_uri()
+                    lead = opening.enter_context(_leading_to(url)).as_uri()
                     threading.Thread(target=webbrowser.open, args=(lead,), daemon=True).start()
 
             async def on_tick(self, counter: int) -> bool:

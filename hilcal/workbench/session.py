@@ -6,8 +6,8 @@ tab or a second click, it is refused and nothing is appended.
 """
 
 import tempfile
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,25 +16,121 @@ import numpy as np
 from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.changes import Changed, add_effect, change_cell, refit, remove_effect
 from hilcal.campaign.revisions import chain_in_cell
-from hilcal.config.changes import Changes, read_value
+from hilcal.config import Target
+from hilcal.config.changes import (
+    CHANGEABLE,
+    INSTRUMENT_NOISE,
+    Changes,
+    described,
+    read_value,
+    write_value,
+)
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.distinguish import Difference, Recorded, distinguish, recorded_values
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.written import read_effects_text
 from hilcal.errors import InputError
+from hilcal.identification.fit import Fit
 from hilcal.identification.full_prediction import full_prediction
 from hilcal.names import quoted
 from hilcal.present.registration import covariance_words
-from hilcal.present.story import Chapter, DependenceCurve, build_story, regressor
+from hilcal.present.story import (
+    Chapter,
+    DependenceCurve,
+    Story,
+    StoryRevision,
+    build_story,
+    regressor,
+)
 from hilcal.procedure.next_plan import NextPlan, doubt_to_settle, next_plan
-from hilcal.store.purpose import refuse_fitting
+from hilcal.store.procedure_log import refuse_fitting
 from hilcal.store.revision import RevisionRecord
 from hilcal.types import Ints
-from hilcal.workbench.snapshot import Snapshot, Stamp, figures_of, require_judged
+from hilcal.workbench.work import Say
 from hilcal.write_report import Asked, write_report
 
-Say = Callable[[str], None]
+Stamp = tuple[int, int, int]
+"""Size (bytes), time of the last change (ns) and inode of a file, by which a change is noticed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """A value of the cell that can be changed."""
+
+    section: str  # of CELL.toml
+    key: str
+    text: str  # as CELL.toml has it; empty where it is not given, or was estimated
+    valid: str  # what is valid, in words
+    fixed: str  # why these readings do not let it change; empty where they do
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Snapshot:
+    """A campaign with one of its revisions, and the way to it; made anew after every change."""
+
+    name: str  # of the file
+    arm: str
+    n_readings: int  # all of them
+    records: tuple[RevisionRecord, ...]  # all revisions, oldest first
+    accepted: int | None  # the revision that every command uses; None where it is the latest
+    number: int | None  # the revision that is shown; None for the baseline, which is not kept
+    chapters: tuple[Chapter, ...]  # the shown revision and those before it, oldest first
+    story: Story  # the same as it is drawn
+    stamp: Stamp  # of the file as it was read
+    source: str  # where the readings come from
+    covariance: str  # what their covariance consists of, in words
+    changes: Changes  # of the cell since they were taken
+    figures: tuple[Figure, ...]  # of the cell as it is for the shown revision
+
+    @property
+    def fit(self) -> Fit:
+        """The fit that is shown."""
+        return self.chapters[-1].fit
+
+    @property
+    def diagnosis(self) -> Diagnosis:
+        """The judgement of it."""
+        judged = self.chapters[-1].diagnosis
+        if judged is None:
+            raise ValueError("a snapshot without a diagnosis")
+        return judged
+
+    @property
+    def revision(self) -> StoryRevision:
+        """The shown revision as it is drawn."""
+        return self.story.revisions[-1]
+
+    @property
+    def in_use(self) -> int | None:
+        """The revision that every command uses; None where there is none yet."""
+        latest = self.records[-1].number if self.records else None
+        return latest if self.accepted is None else self.accepted
+
+    @property
+    def removable(self) -> tuple[str, ...]:
+        """Effects of the shown model that may be taken out: all but frames that are unknown."""
+        frames = self.fit.model.catalogue.unknown_frames(self.fit.model.cell)
+        return tuple(name for name in self.fit.model.named if name not in frames)
+
+
+def _figures(o: Campaign) -> tuple[Figure, ...]:
+    """Return what can be changed in the cell of a campaign."""
+    together = {"tracker": dict.fromkeys(INSTRUMENT_NOISE)}  # what needs a stated noise is shown
+    fixed, out = o.unchangeable(together), []
+    for section, keys in CHANGEABLE.items():
+        of = getattr(o.config, section)
+        for key in keys:
+            value = getattr(of, key)
+            if isinstance(value, tuple) and value and isinstance(value[0], Target):
+                value = [target.model_dump(exclude_none=True) for target in value]
+            elif key == "targets" or (o.config.tool.targets and key.startswith("target_")):
+                continue  # the tool has one target, or several
+            estimated = o.noise is not None and key in INSTRUMENT_NOISE
+            text = "" if value is None or estimated else write_value(value)
+            why = fixed.get((section, key), "")
+            out.append(Figure(section, key, text, described(section, key), why))
+    return tuple(out)
 
 
 def silent(words: str) -> None:
@@ -44,8 +140,10 @@ def silent(words: str) -> None:
 class WorkbenchSession:
     """A campaign file at the workbench.
 
+    Every method that takes a snapshot raises InputError where that is outdated; `say` takes
+    progress, one line each.
+
     Attributes:
-        path: the file.
         snapshot: what is shown; None before `load`.
         changed: what the last change did; None before any, and after another revision was chosen.
         planned: the next measurements that were planned last, and their file.
@@ -65,11 +163,7 @@ class WorkbenchSession:
     def load(self, say: Say = silent, revision: int | None = None) -> Snapshot:
         """Read the file, judge a revision and those that it was made from, and show it.
 
-        Nothing is written to the file, nor beside it.
-
-        Args:
-            say: takes progress, one line each.
-            revision: its number; the one in use where None.
+        Nothing is written to the file, nor beside it. `revision` is the one in use where None.
 
         Raises:
             InputError: no sound campaign, no such revision, or one that cannot be restored.
@@ -78,17 +172,16 @@ class WorkbenchSession:
         stamp = self._stamp()
         with self._open(read_only=True) as o:
             self._forget_others(o)
-            chapters = self._chapters(o, revision, say)
-            record = o.in_use(revision)
-            number = None if record is None else record.number
-            snapshot = self._snapshot(o.at(cell_of(record)), number, chapters, stamp)
-        return self._show(snapshot)
+            chapters, record = self._chapters(o, revision, say), o.in_use(revision)
+            if record is None:
+                return self._show(o.at({}), None, chapters, stamp=stamp)
+            return self._show(o.at(record.cell), record.number, chapters, stamp=stamp)
 
     def add(self, snapshot: Snapshot, effect: str, say: Say = silent) -> Snapshot:
         """Add an effect, written as for `hilcal add`, to the shown model; see `changes`.
 
         Raises:
-            InputError: not one effect, one that cannot be added, or an outdated snapshot.
+            InputError: not one effect, or one that cannot be added.
             CannotAnswerError: the readings do not determine it.
         """
         with self._writing(snapshot) as o:
@@ -110,14 +203,12 @@ class WorkbenchSession:
         """Show a revision, and let every command use it; nothing is taken away.
 
         Raises:
-            InputError: no such revision, one that cannot be restored, or an outdated snapshot.
+            InputError: no such revision, or one that cannot be restored.
         """
         with self._writing(snapshot) as o:
             chapters = self._chapters(o, number, say)
             o.accept(None if number == len(o.file.revisions()) else number)
-            there = o.at(o.file.revision(number).cell)
-            found = self._snapshot(there, number, chapters, self._stamp())
-        return self._show(found)
+            return self._show(o.at(o.file.revision(number).cell), number, chapters)
 
     def fit_anew(self, snapshot: Snapshot | None, say: Say = silent) -> Snapshot:
         """Fit the model of the revision in use to all readings, those appended later included.
@@ -125,33 +216,28 @@ class WorkbenchSession:
         A prior that the revision was fitted with is kept.
 
         Raises:
-            InputError: no revision, or an outdated snapshot.
+            InputError: no revision.
             CannotAnswerError: the readings do not determine it.
         """
         with self._writing(snapshot, changed=True) as o:
             record = o.in_use()
             if record is None:
                 raise InputError(f"{o.path}: no revision yet")
-            found = refit(o, record, say)
-            number = self._store(o, found)
+            number = self._store(o, refit(o, record, say))
             if o.file.accepted() is not None:
                 o.accept(None)  # it cannot be used any more
-            snapshot = self._snapshot(o, number, (self._known[number],), self._stamp())
-        return self._show(snapshot)
+            return self._show(o, number, (self._known[number],))
 
     def change_cell(
         self, snapshot: Snapshot, texts: Mapping[tuple[str, str], str], say: Say = silent
     ) -> Snapshot:
         """Fit the shown model in a changed cell, and show that revision; see `changes`.
 
-        Args:
-            snapshot: what is shown.
-            texts: values by section and key, written as in CELL.toml; those that are shown change
-                nothing, and an empty one leaves the key out.
-            say: takes progress, one line each.
+        `texts` are values by section and key, written as in CELL.toml; those that are shown change
+        nothing, and an empty one leaves the key out.
 
         Raises:
-            InputError: nothing is changed, a value that is not valid, or an outdated snapshot.
+            InputError: nothing is changed, or a value that is not valid.
             CannotAnswerError: the readings do not determine the model.
         """
         changes: dict[str, dict[str, Any]] = {}
@@ -165,40 +251,29 @@ class WorkbenchSession:
             of = snapshot.number, snapshot.fit
             there, number, found = change_cell(o, *of, changes, say, snapshot.diagnosis)
             self._known[number] = Chapter(number, None, found.fit, found)
-            chapters = self._chapters(there, number, silent)
-            return self._show(self._snapshot(there, number, chapters, self._stamp()))
+            return self._show(there, number, self._chapters(there, number, silent))
 
     def document(self, snapshot: Snapshot, kind: str, say: Say = silent) -> tuple[str, bytes]:
         """Return name and content of a file about the shown revision.
 
-        Args:
-            snapshot: what is shown.
-            kind: "report" (HTML), "calibration" (JSON), which keeps a baseline that is not kept,
-                or "table" (the exchange table).
-            say: takes progress, one line each.
-
-        Raises:
-            InputError: an outdated snapshot, or what cannot be written.
+        `kind` is "report" (HTML), "calibration" (JSON), which keeps a baseline that is not kept,
+        or "table" (the exchange table).
         """
         self._require(snapshot)
-        stem, number = self.path.stem, snapshot.number
-        with tempfile.TemporaryDirectory() as folder:
-            if kind == "calibration" and number is None:
-                with self._writing(snapshot) as o:
-                    number = self._store(o, snapshot.diagnosis)
-                    chapters = (self._known[number],)
-                    self._show(self._snapshot(o, number, chapters, self._stamp()))
-            with self._open(read_only=True) as opened:
-                o = opened.at(snapshot.changes)
-                if kind == "report":
-                    path = Path(folder) / f"{stem}.html"
-                    write_report(o, path, Asked(revision=number), say)
-                elif kind == "calibration":
-                    path = Path(folder) / f"{stem}-calibration.json"
-                    o.calibration(number).save(path)
-                else:
-                    path = Path(folder) / f"{stem}-readings.csv"
-                    o.save_table(path)
+        number = snapshot.number
+        if kind == "calibration" and number is None:
+            with self._writing(snapshot) as o:
+                number = self._store(o, snapshot.diagnosis)
+                self._show(o, number, (self._known[number],))
+        ends = {"report": ".html", "calibration": "-calibration.json", "table": "-readings.csv"}
+        with tempfile.TemporaryDirectory() as folder, self._open(read_only=True) as opened:
+            o, path = opened.at(snapshot.changes), Path(folder) / f"{self.path.stem}{ends[kind]}"
+            if kind == "report":
+                write_report(o, path, Asked(revision=number), say)
+            elif kind == "calibration":
+                o.calibration(number).save(path)
+            else:
+                o.save_table(path)
             return path.name, path.read_bytes()
 
     def plan(
@@ -216,7 +291,7 @@ class WorkbenchSession:
             snapshot: what is shown.
             poses: as many readings as so many poses take; what the doubt needs where None.
             output: the plan's file; it must not exist.
-            say: takes progress, one line each.
+            say: takes progress.
             quick: without comparing criteria and numbers of poses, as `hilcal next` does.
 
         Raises:
@@ -228,8 +303,7 @@ class WorkbenchSession:
         self._require(snapshot)
         with self._open(read_only=True) as opened:
             o = opened.at(snapshot.changes)
-            doubt = doubt_to_settle(o, snapshot.diagnosis, say)
-            rng = np.random.default_rng(0)
+            doubt, rng = doubt_to_settle(o, snapshot.diagnosis, say), np.random.default_rng(0)
             found = next_plan(o, doubt, poses, rng, say, compare=not quick)
         found.made.save(output)
         self.planned = found, output
@@ -259,8 +333,7 @@ class WorkbenchSession:
     def recorded(self, snapshot: Snapshot) -> dict[str, Recorded]:
         """Return what was recorded of each measurement of the story (D,), by name."""
         rows = full_prediction(snapshot.fit).whitening.reading
-        found = recorded_values(snapshot.fit)
-        return {v.name: replace(v, values=v.values[rows]) for v in found}
+        return {v.name: replace(v, values=v.values[rows]) for v in recorded_values(snapshot.fit)}
 
     def differences(self, snapshot: Snapshot, measurements: Ints) -> tuple[Difference, ...]:
         """Return what sets some measurements of the story apart, the clearest first."""
@@ -272,15 +345,7 @@ class WorkbenchSession:
         return Campaign.open(self.path, self._catalogue, read_only=read_only)
 
     def _writing(self, snapshot: Snapshot | None, *, changed: bool = False) -> Campaign:
-        """Open the file for a change that was asked for on a snapshot.
-
-        Args:
-            snapshot: it.
-            changed: whether another command may have changed the file since.
-
-        Raises:
-            InputError: the session, or the file, has gone on since.
-        """
+        """Open the file for a change; `changed`: another command may have changed it since."""
         self._require(snapshot, changed=changed)
         o = self._open(read_only=False)
         try:
@@ -304,30 +369,30 @@ class WorkbenchSession:
         if record is None:
             refuse_fitting(o.file)
             if 0 not in self._known:
-                _, found = o.fit_in_use(say)
+                _, baseline = o.fit_in_use(say)
                 say("diagnosing the baseline")
-                self._known[0] = Chapter(1, None, found, diagnose(found, say=say))
+                self._known[0] = Chapter(1, None, baseline, diagnose(baseline, say=say))
             return (self._known[0],)
         o = o.at(record.cell)
         out = [self._chapter(o, r, say) for r in chain_in_cell(o.file.revisions(), record.number)]
-        require_judged(o, out[-1])
+        if out[-1].diagnosis is None:
+            o.require_gc(out[-1].number, out[-1].fit.scaling, "judging")
         return tuple(out)
 
     def _chapter(self, o: Campaign, record: RevisionRecord, say: Say) -> Chapter:
         number = record.number
         if number not in self._known:
             say(f"restoring revision {number}")
-            found, judged = o.restore(record), None
-            if found.scaling == "gc":
+            fit, judged = o.restore(record), None
+            if fit.scaling == "gc":
                 say(f"diagnosing revision {number}")
-                judged = diagnose(found, o.history(number), say)
-            self._known[number] = Chapter(number, record.added, found, judged, record.removed)
+                judged = diagnose(fit, o.history(number), say)
+            self._known[number] = Chapter(number, record.added, fit, judged, record.removed)
         return self._known[number]
 
     def _forget_others(self, o: Campaign) -> None:
         """Forget what was fitted to other readings than the file has now."""
-        stored = o.data_hash
-        if stored != self._hash:
+        if (stored := o.data_hash) != self._hash:
             self._known, self._hash = {}, stored
 
     def _store(self, o: Campaign, found: Diagnosis) -> int:
@@ -339,13 +404,19 @@ class WorkbenchSession:
         if c.before_number not in self._known:  # the baseline, kept now
             self._known[c.before_number] = self._known[0]
         self._known[c.number] = Chapter(c.number, c.added, c.fit, c.diagnosis, c.removed)
-        chapters = self._chapters(o, c.number, silent)
-        return self._show(self._snapshot(o, c.number, chapters, self._stamp()), c)
+        return self._show(o, c.number, self._chapters(o, c.number, silent), changed=c)
 
-    def _snapshot(
-        self, o: Campaign, number: int | None, chapters: tuple[Chapter, ...], stamp: Stamp
+    def _show(
+        self,
+        o: Campaign,
+        number: int | None,
+        chapters: tuple[Chapter, ...],
+        *,
+        stamp: Stamp | None = None,
+        changed: Changed | None = None,
     ) -> Snapshot:
-        return Snapshot(
+        """Show a revision of a file that is as it is now, or as it was at a stamp."""
+        self.snapshot = Snapshot(
             name=self.path.name,
             arm=o.cell.arm.name,
             n_readings=len(o.readings),
@@ -354,17 +425,15 @@ class WorkbenchSession:
             number=number,
             chapters=chapters,
             story=build_story(chapters),
-            stamp=stamp,
+            stamp=stamp or self._stamp(),
             source=o.file.source,
             covariance=covariance_words(o.covariance_parts, o.noise),
             changes=o.changes,
-            figures=figures_of(o),
+            figures=_figures(o),
         )
-
-    def _show(self, snapshot: Snapshot, changed: Changed | None = None) -> Snapshot:
-        self.snapshot, self.changed = snapshot, changed
+        self.changed = changed
         self.count += 1
-        return snapshot
+        return self.snapshot
 
     def _stamp(self) -> Stamp:
         """Return what tells whether the file was changed.
@@ -377,8 +446,3 @@ class WorkbenchSession:
         except OSError as error:
             raise InputError(f"{self.path}: cannot be read ({error.strerror})") from None
         return found.st_size, found.st_mtime_ns, found.st_ino
-
-
-def cell_of(record: RevisionRecord | None) -> Changes:
-    """Return what was changed in the cell before a revision was fitted."""
-    return {} if record is None else record.cell

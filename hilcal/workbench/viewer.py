@@ -11,12 +11,12 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from http.client import HTTPConnection, HTTPException
 from pathlib import Path
 
 from hilcal.errors import HilcalError
 from hilcal.present.story import Story
+from hilcal.workbench.work import Say
 
 FILES = {
     "index.html": "text/html; charset=utf-8",
@@ -47,8 +47,6 @@ sys.exit(subprocess.call(sys.argv[1:], stdin=subprocess.DEVNULL))
 _NOBODY = "rerun+http://127.0.0.1:9/proxy"
 """What the viewer would show: given something, rerun opens no port for recordings."""
 
-Say = Callable[[str], None]
-
 
 class WebViewer:
     """The viewer's files and the recordings that it shows, in memory."""
@@ -62,11 +60,7 @@ class WebViewer:
         """Record a story, and return the names of the files by which the viewer shows it.
 
         The layout is a file of its own: a web viewer takes the one in a recording for a proposal.
-
-        Args:
-            story: it.
-            count: makes its name differ from those before.
-            say: takes progress.
+        `count` makes the names differ from those before.
 
         Raises:
             HilcalError: the viewer cannot be had, or the story not be recorded.

@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from hilcal.effects.failure import failure_of
+from hilcal.effects.from_file import failure_of
 from hilcal.errors import HilcalError
 
 Say = Callable[[str], None]
@@ -21,19 +21,12 @@ class Answer:
 
 @dataclass(slots=True)
 class Work:
-    """What is being done.
+    """What is being done."""
 
-    Attributes:
-        what: it, in words; None where nothing is.
-        place: the part of the page where it was asked for.
-        said: the last line of its progress.
-        answers: the last answer at each place; it stays until the next one there.
-    """
-
-    what: str | None = None
-    place: str = ""
-    said: str = ""
-    answers: dict[str, Answer] = field(default_factory=dict)
+    what: str | None = None  # in words; None where nothing is
+    place: str = ""  # the part of the page where it was asked for
+    said: str = ""  # the last line of its progress
+    answers: dict[str, Answer] = field(default_factory=dict)  # the last at each place
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def start(self, what: str, do: Callable[[Say], object], place: str = "file") -> bool:
@@ -55,8 +48,8 @@ class Work:
 
     def _run(self, do: Callable[[Say], object]) -> None:
         try:
-            told = do(self._say)
-            answer = Answer(told) if isinstance(told, str) and told else None
+            result = do(lambda words: setattr(self, "said", words))
+            answer = Answer(result) if isinstance(result, str) and result else None
         except HilcalError as error:
             answer = Answer(str(error), done=False)
         except Exception as error:
@@ -68,9 +61,6 @@ class Work:
                 self.answers[self.place] = answer
             self.what, self.said = None, ""
 
-    def _say(self, words: str) -> None:
-        self.said = words
-
     @property
     def line(self) -> str:
         """What is being done, in one line; empty where nothing is."""
@@ -81,8 +71,8 @@ class Work:
 
     def failure(self, place: str = "file") -> str:
         """Why the last piece of work that was asked for at a place failed; empty otherwise."""
-        found = self.answers.get(place)
-        return "" if found is None or found.done else found.words
+        answer = self.answers.get(place)
+        return "" if answer is None or answer.done else answer.words
 
     def wait(self, timeout: float) -> bool:
         """Wait until nothing is being done; whether that came in time, s."""

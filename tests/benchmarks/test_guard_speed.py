@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from hilcal.config import Obstacle
-from hilcal.measuring.guard import Guard
-from hilcal.measuring.motion import POLL_S
+from hilcal.measuring.motion import POLL_S, Guard
 from tests.benchmarks.conftest import Claim
 from tests.support.fake_bench import POSES, Bench
 from tests.support.space_cases import TABLE

@@ -22,8 +22,8 @@ import scipy.optimize as so
 from hilcal.calibration.handover import urdf
 from hilcal.cell import Cell
 from hilcal.design.approximate_design import relax
-from hilcal.design.candidate_set import CandidateSet
 from hilcal.design.criteria import D
+from hilcal.design.criterion import CandidateSet
 from hilcal.design.optimum import best
 from hilcal.drivers.simulated.injected_effects import Draw
 from hilcal.identification.baseline import baseline, with_effects

@@ -14,8 +14,8 @@ import pytest
 import scipy.linalg as sl
 
 from hilcal.design.approximate_design import relax
-from hilcal.design.candidate_set import CandidateSet
 from hilcal.design.criteria import D
+from hilcal.design.criterion import CandidateSet
 from hilcal.design.optimum import best
 from hilcal.effects.joint_compliance import JointCompliance
 from hilcal.effects.link_geometry import LinkGeometry

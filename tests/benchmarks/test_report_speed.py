@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 from playwright.sync_api import CDPSession
 
-from hilcal.present.charts.readings import MOST
-from hilcal.present.html.certificate import ReportContent
-from hilcal.present.html.sections import page as page_of
+from hilcal.present.charts import MOST
+from hilcal.present.html.report import ReportContent
+from hilcal.present.html.report import page as page_of
 from tests.benchmarks.conftest import Claim
 from tests.support.browser import DESKTOP, needs_chromium, open_browser
 from tests.support.report_pages import opened, small_content

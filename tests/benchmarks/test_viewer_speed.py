@@ -18,7 +18,7 @@ import rerun as rr
 from hilcal.measuring.progress import ArmAt
 from hilcal.present.live_viewer import Measuring
 from hilcal.present.viewer import live, save
-from hilcal.present.viewer.live_scene import LiveScene
+from hilcal.present.viewer.live import LiveScene
 from tests.benchmarks.conftest import Claim
 from tests.support.live_story import events, measuring, plan
 from tests.support.picture import opened, vulkan_available

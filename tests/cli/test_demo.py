@@ -17,7 +17,7 @@ from hilcal.effects.catalogue import installed
 from hilcal.errors import DeviceError, InputError
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan
-from hilcal.store.purpose import purpose_of
+from hilcal.store.procedure_log import purpose_of
 from studies.random_campaigns import rehearse
 from tests.support.cli_cases import CELL, ok, quickly_planned, refused, rehearsal, run
 from tests.support.screen import AtTerminal

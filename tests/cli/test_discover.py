@@ -11,18 +11,15 @@ from hilcal.cell import cell_from_config
 from hilcal.config import load_config
 from hilcal.config.reference import to_toml
 from hilcal.discovery import shapes
-from hilcal.discovery.amplitudes import Amplitude, Factor
+from hilcal.discovery.amplitudes import Amplitude, Factor, variables
 from hilcal.discovery.discovery import Discovery
-from hilcal.discovery.law import Coefficient, Form, LawPart
+from hilcal.discovery.law import Coefficient, Form, LawPart, source_of_form
 from hilcal.discovery.law import Law as FoundLaw
 from hilcal.discovery.sites import sites
 from hilcal.discovery.structures import Structure
-from hilcal.discovery.variables import variables
-from hilcal.discovery.write_effect import source_of_form
 from hilcal.drivers.simulated.injected_effects import nothing_hidden
 from hilcal.drivers.simulated.rehearsal import measurement_noise, simulate
-from hilcal.effects.check import check_effect
-from hilcal.effects.example import example_cell, example_situation, example_states
+from hilcal.effects.check import check_effect, example_cell, example_situation, example_states
 from hilcal.effects.from_file import read_effects
 from hilcal.readings.covariance import WHOLE
 from hilcal.store.campaign_file import CampaignFile

@@ -17,7 +17,7 @@ from hilcal.readings.covariance import COVERS, INSTRUMENT, WHOLE
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.records import content_hash
+from hilcal.store.rows import content_hash
 from hilcal.tables.table import import_table, with_what_rounding_does, write_table
 from tests.support.cli_cases import CELL, ok, refused, rehearsal
 from tests.support.readings_cases import make_arm, simple

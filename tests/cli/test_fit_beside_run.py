@@ -15,8 +15,8 @@ from hilcal.errors import InputError
 from hilcal.readings.covariance import COVERS, WHOLE
 from hilcal.store import rows, schema
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.records import content_hash
 from hilcal.store.revision import STORED, fitted_to, from_text, to_text
+from hilcal.store.rows import content_hash
 from tests.support.appending import again, appending
 from tests.support.cli_cases import CELL, ok, refused, rehearsal
 from tests.support.unguarded import unguarded

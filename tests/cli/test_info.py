@@ -16,14 +16,13 @@ from hilcal.cell import cell_from_config
 from hilcal.cli import main
 from hilcal.config import load_config
 from hilcal.errors import InputError
-from hilcal.present.html.sections import page
+from hilcal.present.html.report import page
 from hilcal.readings.covariance import COVERS, INSTRUMENT
 from hilcal.robot.catalogue import configs_dir, load_arm
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.command_line import COMMAND, typed, typed_now
+from hilcal.store.kept_texts import COMMAND, ROBOT_FILE, typed, typed_now
 from hilcal.store.overview import overview
 from hilcal.store.plan import Plan, Step
-from hilcal.store.robot_file import ROBOT_FILE
 from hilcal.store.run_log import RunLog, check_same_cell, create_run
 from hilcal.write_report import Asked, content_of
 from tests.support.campaigns import campaign, configuration

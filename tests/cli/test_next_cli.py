@@ -35,7 +35,7 @@ from tests.support.campaigns import configuration
 from tests.support.cli_cases import CELL, ok, refused, table
 from tests.support.next_cases import SMALL, doubtful
 from tests.unit.data.test_run_log import MADE, STEPS, _campaign, _reading
-from tests.unit.design.test_many_poses import fine_error
+from tests.unit.design.test_next import fine_error
 
 TILT, LINK, BASE = "joint_tilt_compliance", "link_compliance", "base_compliance"
 CELLS = str(configs_dir() / "cells")

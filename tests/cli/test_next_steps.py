@@ -231,7 +231,7 @@ HERE, RARE = "tests/cli/test_next_steps.py::test_", "tests/cli/test_rare_next_st
 PAGE, CALIBRATE = "tests/cli/test_workbench_page.py::test_", "tests/cli/test_calibrate.py::test_"
 DISCOVER, IMPORT = "tests/cli/test_discover.py::test_", "tests/cli/test_import_tables.py::test_"
 KINEMATICS = (
-    "tests/wire/test_polyscope_x_cell.py"
+    "tests/wire/test_network_cell.py"
     "::test_the_controllers_kinematics_are_checked_written_stored_and_judged"
 )
 TAKEN: dict[str, dict[str, str]] = {
@@ -277,38 +277,38 @@ TAKEN: dict[str, dict[str, str]] = {
     "config/cell": {"check CELL.toml --save-calibration": KINEMATICS},
     "config/reference": {"hilcal config SECTION": f"{RARE}sections_of_a_cell"},
     "effects/from_file": {"hilcal effects new NAME": f"{HERE}an_effect_of_ones_own"},
-    "identification/earlier_fit": {
+    "identification/later_readings": {
         "hilcal identify again": f"{HERE}another_scaling_or_parameters_of_another_version"
     },
-    "identification/posterior_of_fit": {"run hilcal refine first": f"{HERE}nothing_to_carry_over"},
-    "identification/missing_masses": {"hilcal add RUN": f"{RARE}masses_that_a_description_lacks"},
-    "measuring/kinematics": {"check CELL.toml --save-calibration": KINEMATICS},
-    "measuring/dry_run": {"hilcal check --plan": f"{HERE}files_that_are_not_there_yet"},
+    "identification/predictive": {"run hilcal refine first": f"{HERE}nothing_to_carry_over"},
+    "identification/baseline": {"hilcal add RUN": f"{RARE}masses_that_a_description_lacks"},
+    "measuring/connect": {"check CELL.toml --save-calibration": KINEMATICS},
+    "measuring/route": {"hilcal check --plan": f"{HERE}files_that_are_not_there_yet"},
     "present/campaign": {"hilcal accept RUN N": f"{HERE}what_a_report_names",
-        "None yet: hilcal identify": f"{HERE}without_a_revision"},
+        "None yet: hilcal identify": f"{HERE}without_a_revision",
+        "(`hilcal config SECTION`": f"{RARE}sections_of_a_cell",
+        "hilcal init writes a file.": f"{RARE}sections_of_a_cell"},
     "present/comparison": {"hilcal refine {}": f"{HERE}another_arm_is_calibrated_by_itself",
         "hilcal refine {} --prior": f"{HERE}what_a_comparison_says",
         "hilcal refine EARLIER": f"{RARE}an_effect_that_an_earlier_model_lacks"},
     "present/diagnosis": {"remove it, hilcal remove": f"{RARE}an_addition_that_breaks_its_promise",
         "to remove {}: hilcal remove": f"{HERE}what_a_diagnosis_says",
         "hilcal effects new NAME": f"{HERE}an_effect_of_ones_own",
-        "its own: hilcal add RUN": f"{RARE}joints_that_differ"},
-    "present/discovery": {"hilcal refine adds": f"{RARE}a_law_that_effects_explain_as_well"},
+        "its own: hilcal add RUN": f"{RARE}joints_that_differ",
+        "hilcal refine adds": f"{RARE}a_law_that_effects_explain_as_well"},
     "present/fit": {"hilcal compare EARLIER LATER": f"{HERE}what_a_comparison_says"},
-    "present/html/certificate": {"report --limit": f"{RARE}the_page_says_how_to_be_judged",
-        "--scaling gc": f"{RARE}the_page_says_how_to_be_judged"},
     "present/html/other_pages": {"hilcal compare {} {}": f"{HERE}what_a_report_names"},
-    "present/html/sections": {"hilcal report --appendix": f"{HERE}what_a_report_names",
+    "present/html/report": {"report --limit": f"{RARE}the_page_says_how_to_be_judged",
+        "--scaling gc": f"{RARE}the_page_says_how_to_be_judged",
+        "hilcal report --appendix": f"{HERE}what_a_report_names",
         "hilcal refine finds": f"{HERE}what_a_report_names"},
-    "present/preparing": {"(`hilcal config SECTION`": f"{RARE}sections_of_a_cell",
-        "hilcal init writes a file.": f"{RARE}sections_of_a_cell"},
     "present/story": {"run hilcal diagnose for a verdict": f"{RARE}what_a_recording_names",
         "run hilcal identify first": f"{RARE}what_a_recording_names"},
     "present/verdict": {
         "hilcal next plans": "tests/cli/test_next_cli.py::test_next_in_json_and_in_words",
         "hilcal refine --readings absolute": f"{HERE}deflections_lack_the_unloaded_arm",
     },
-    "present/viewer/live_scene": {"`hilcal refine` does": f"{RARE}what_a_recording_names",
+    "present/viewer/live": {"`hilcal refine` does": f"{RARE}what_a_recording_names",
         "hilcal refine says what": f"{RARE}what_a_recording_names"},
     "procedure/state": {"hilcal info": f"{HERE}a_campaign_that_calibrate_did_not_make"},
     "procedure/next_plan": {
@@ -322,8 +322,10 @@ TAKEN: dict[str, dict[str, str]] = {
     },
     "store/campaign_file": {"hilcal repair": f"{RARE}a_bad_revision_is_set_aside_and_fitted_again"},
     "store/plan": {"hilcal plan": f"{HERE}files_that_are_not_there_yet"},
-    "store/purpose": {"--fit-validation": f"{CALIBRATE}what_fits_refuses_a_validation_campaign"},
-    "store/robot_file": {
+    "store/procedure_log": {
+        "--fit-validation": f"{CALIBRATE}what_fits_refuses_a_validation_campaign"
+    },
+    "store/kept_texts": {
         "hilcal repair {} --robot": "tests/unit/security/test_received_campaign.py"
         "::test_the_user_gives_the_robot_of_an_old_campaign"
     },
@@ -347,7 +349,7 @@ TAKEN: dict[str, dict[str, str]] = {
 """By module, what tells each sentence that names a command from the others, and the test that takes
 the step."""
 NO_STEP = {
-    "discovery/write_effect",
+    "discovery/law",
     "present/viewer/fleet",
     "present/viewer/plan",
     "procedure/procedure",

@@ -14,11 +14,10 @@ from hilcal.diagnosis.verdict import diagnose
 from hilcal.diagnosis.wrong_figures import WrongFigure
 from hilcal.discovery.discovery import Discovery
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.present.diagnosis import addition_lines
-from hilcal.present.discovery import silence
+from hilcal.present.diagnosis import addition_lines, silence
 from hilcal.present.story import build_story
-from hilcal.present.viewer import live_scene
-from hilcal.present.viewer.live_scene import GUIDE
+from hilcal.present.viewer import live
+from hilcal.present.viewer.live import GUIDE
 from hilcal.procedure.next_plan import doubt_to_settle
 from hilcal.readings.covariance import WHOLE
 from hilcal.robot.catalogue import configs_dir, load_arm
@@ -176,7 +175,7 @@ def test_a_law_that_effects_explain_as_well(run, capsys):
 @pytest.mark.long
 def test_what_a_recording_names(run, tmp_path, capsys):
     assert "`hilcal refine` does, afterwards" in GUIDE
-    assert "hilcal refine says what" in inspect.getsource(live_scene)
+    assert "hilcal refine says what" in inspect.getsource(live)
     with pytest.raises(InputError, match="run hilcal identify first"):
         build_story([])
     ok(capsys, "identify", run, "--scaling", "gu")

@@ -12,14 +12,14 @@ import hilcal.cli.running as running
 from hilcal.cli.terminal import terminal
 from hilcal.config import Repeatability
 from hilcal.config.reference import to_toml
-from hilcal.design import goal_rule
-from hilcal.design.goal_rule import GoalRule
+from hilcal.design import goal as goal_rule
+from hilcal.design.goal import GoalRule
 from hilcal.design.nominal_model import nominal_states
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.measuring.connect import ConnectionResult
-from hilcal.present.running import full_words, status_words
+from hilcal.present.progress import full_words, status_words
 from hilcal.robot import chain as chains
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan, Step

@@ -19,8 +19,7 @@ from hilcal.calibration.programs.languages import understood
 from hilcal.campaign.campaign import Campaign
 from hilcal.config import CellConfig, load_config
 from hilcal.identification import parameters_document
-from hilcal.robot.catalogue import configs_dir, load_arm
-from hilcal.robot.dh import arm_from_dh
+from hilcal.robot.catalogue import arm_from_dh, configs_dir, load_arm
 from hilcal.robot.factory import nominal_rows, read_factory, with_factory
 from hilcal.robot.urdf import arm_from_urdf
 from hilcal.store.plan import load_plan

@@ -23,8 +23,7 @@ from random import Random
 
 from hilcal.errors import CannotAnswerError, DeviceError, InputError
 
-BATCH = 200
-"""Inputs of one random stream; a choice."""
+BATCH = 200  # inputs of one random stream; a choice
 MEMORY = 3 << 30
 """Address space beyond what the process has, bytes; a choice: a table of readings needs little."""
 
@@ -47,55 +46,33 @@ class Hung(BaseException):
 
 @dataclass(frozen=True, slots=True)
 class Parser:
-    """What is tried.
+    """What is tried."""
 
-    Attributes:
-        name: on the command line.
-        make: returns a damaged input.
-        parse: takes it; returns whether it was read, and raises what the parser raises.
-        limit_s: processor time that one input may take.
-        refusals: errors that its caller turns into one of the project's.
-    """
-
-    name: str
-    make: Callable[[Random], bytes]
+    name: str  # on the command line
+    make: Callable[[Random], bytes]  # returns a damaged input
     parse: Callable[[bytes], bool]
-    limit_s: float = 2.0
+    limit_s: float = 2.0  # processor time that one input may take
     refusals: tuple[type[Exception], ...] = ()
 
 
 @dataclass(slots=True)
 class Outcome:
-    """What became of the inputs.
+    """What became of the inputs."""
 
-    Attributes:
-        inputs: how many were given.
-        read: those that were read as sound.
-        refused: those that were refused, by the name of the error.
-        findings: one line for each kind of finding, with how often it was seen.
-        collisions: damaged readings that a sound checksum let pass, see `Collision`.
-        kept: a file with an input for each.
-        slowest_s: processor time of the slowest input.
-        stopped: whether it was told to end before.
-    """
-
-    inputs: int = 0
-    read: int = 0
+    inputs: int = 0  # how many were given
+    read: int = 0  # those that were read as sound
     refused: Counter[str] = field(default_factory=Counter)
     findings: Counter[str] = field(default_factory=Counter)
-    collisions: int = 0
-    kept: dict[str, str] = field(default_factory=dict)
-    slowest_s: float = 0.0
-    stopped: bool = False
+    collisions: int = 0  # damaged readings that a sound checksum let pass, see `Collision`
+    kept: dict[str, str] = field(default_factory=dict)  # a file with an input for each
+    slowest_s: float = 0.0  # processor time of the slowest input
+    stopped: bool = False  # whether it was told to end before
 
 
 def fuzz(
     parser: Parser, inputs: int, seed: int, keep: Path | None = None, seconds: float = float("inf")
 ) -> Outcome:
-    """Give a parser so many damaged inputs, or as many as there is processor time for.
-
-    Ctrl-C ends it between two inputs and keeps the counts.
-    """
+    """Give a parser so many damaged inputs, or as many as there is processor time for."""
     out = Outcome()
     end = time.process_time() + seconds
 
@@ -145,11 +122,7 @@ def _one(parser: Parser, data: bytes, out: Outcome, keep: Path | None) -> None:
 
 
 def passed(what: str, data: bytes, sound: Iterable[bytes]) -> Accepted:
-    """What it is that `data`, which is none of the sound ones, was accepted.
-
-    A CRC of 16 bits sees every error within 16 bits that follow each other (Peterson and Brown,
-    Cyclic codes for error detection, Proc. IRE 49, 1961), so that this must not pass.
-    """
+    """What it is that `data`, which is none of the sound ones, was accepted."""
     for one in sound:
         if len(one) == len(data):
             differ = int.from_bytes(one, "big") ^ int.from_bytes(data, "big")

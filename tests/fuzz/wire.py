@@ -8,8 +8,9 @@ reached and only what is physically possible may be accepted.
 import math
 import struct
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from random import Random
+from types import SimpleNamespace
 from typing import Any
 
 import minimalmodbus
@@ -18,16 +19,262 @@ from geocompy import geo
 from geocompy.geo import GeoCom
 
 from hilcal.config.cell import Tracker
-from hilcal.drivers import bota, ft300, geocom_line, onrobot_hex
+from hilcal.drivers import bota, emscon, ft300, geocom, netft, onrobot_hex
+from hilcal.drivers import emscon_packets as es
+from hilcal.drivers import natnet_frames as nn
+from hilcal.drivers.emscon import EmsconConnection, EmsconTracker
 from hilcal.drivers.force_stream import RING, ForceStream, SensorFormat
-from hilcal.drivers.geocom import GeoComOptions, GeoComTracker
-from hilcal.drivers.geocom_line import Link
+from hilcal.drivers.geocom import GeoComOptions, GeoComTracker, Link
+from hilcal.drivers.natnet import NatNetTracker
+from hilcal.drivers.simulated.natnet_server import BODY, Cameras
+from hilcal.drivers.ur_link import lines, probe, reading, supervision
+from hilcal.drivers.ur_link.lines import LinkError
 from hilcal.measuring.devices import Clock
-from tests.fuzz import controller, network
 from tests.fuzz.damage import NUMBERS, bytes_damaged
 from tests.fuzz.harness import Accepted, Parser, passed
-from tests.fuzz.stand_ins import Port, Time, finite, instead
+from tests.fuzz.stand_ins import Port, Socket, Time, finite, instead
 from tests.support.geocom_cases import crc16_arc, line
+
+
+def _rtde_frame(kind: str, body: bytes) -> bytes:
+    return struct.pack(">HB", (3 + len(body)) % 65536, ord(kind)) + body
+
+
+def rtde() -> Parser:
+    names = reading.OUTPUTS
+    kinds = ",".join("VECTOR6D" for _ in names).encode()
+    version = _rtde_frame("V", b"\1")
+    asked: list[tuple[bytes, Callable[[], object]]] = [
+        (
+            version
+            + _rtde_frame("v", struct.pack(">4I", 5, 11, 6, 0))
+            + _rtde_frame("O", b"\1" + kinds),
+            lambda: probe.controller("fuzz", names, 1.0),
+        ),
+        (
+            version
+            + _rtde_frame("M", b"\5hello\3foo\1")
+            + _rtde_frame("O", b"\1DOUBLE")
+            + _rtde_frame("S", b"\1")
+            + _rtde_frame("U", b"\1" + struct.pack(">d", 1.0)),
+            lambda: probe.check_stream("fuzz", 1.0),
+        ),
+        (
+            version + _rtde_frame("I", b"\1IN_USE,DOUBLE"),
+            lambda: probe.in_use("fuzz", ("a", "b"), 1.0),
+        ),
+    ]
+    corpus = [data for data, _ in asked]
+
+    def make(by: Random) -> bytes:
+        k = by.randrange(len(asked))
+        if by.random() < 0.2:
+            frames = [
+                _rtde_frame(by.choice("VvOSUIPM?"), by.randbytes(by.choice((0, 1, 2, 16, 17, 300))))
+                for _ in range(by.randint(1, 5))
+            ]
+            return bytes([k]) + by.choice((version, b"")) + b"".join(frames)
+        return bytes([k]) + bytes_damaged(corpus[k], by, corpus)
+
+    def parse(data: bytes) -> bool:
+        with instead(lines, _network(data[1:])):
+            asked[data[0] % len(asked)][1]()
+        return True
+
+    return Parser("rtde", make, parse, refusals=(LinkError,))
+
+
+def dashboard_server() -> Parser:
+    said = (
+        b"Connected: Universal Robots Dashboard Server\n", b"UR10\n", b"20235500001\n",
+        b"URSoftware 5.11.6.1010327 (Jan 01 2023)\n", b"Robotmode: RUNNING\n",
+        b"Safetystatus: NORMAL\n", b"true\n", b"STOPPED <unnamed>\n",
+    )  # fmt: skip
+    corpus = [b"".join(said), said[0] + b"Stopped\n", said[0] + b"true\n",
+              said[0] + b"could not understand: 'is in remote control'\n"]  # fmt: skip
+    asked: list[Callable[[], object]] = [
+        lambda: supervision.Dashboard("fuzz").describe(1.0),
+        lambda: supervision.Dashboard("fuzz").stop(1.0),
+        lambda: supervision.Dashboard("fuzz").in_remote_control(1.0),
+    ]
+
+    def make(by: Random) -> bytes:
+        data = bytes_damaged(by.choice(corpus), by, corpus)
+        if by.random() < 0.001:
+            data *= 1 + 200_000 // max(1, len(data))
+        return bytes([by.randrange(len(asked))]) + data
+
+    def parse(data: bytes) -> bool:
+        with instead(lines, _network(data[1:])):
+            asked[data[0] % len(asked)]()
+        return True
+
+    return Parser("dashboard", make, parse, refusals=(LinkError,))
+
+
+def primary_port() -> Parser:
+    def package(kind: int, body: bytes) -> bytes:
+        return struct.pack(">iB", 5 + len(body), kind) + body
+
+    part = package(5, struct.pack(">6I24dI", *range(6), *(0.1 * k for k in range(24)), 2))
+    state = package(16, package(0, bytes(47)) + part)
+    corpus = [package(20, b"version") + state, state, package(16, package(0, bytes(47))) + state]
+
+    def make(by: Random) -> bytes:
+        return bytes_damaged(by.choice(corpus), by, corpus)
+
+    def parse(data: bytes) -> bool:
+        with instead(lines, _network(data)):
+            found = reading.read_kinematics("fuzz", 1.0)
+        if not np.isfinite(found.links).all():
+            raise Accepted("primary: transforms that are no numbers")
+        return True
+
+    return Parser("primary", make, parse, refusals=(LinkError,))
+
+
+def packet() -> Parser:
+    """What the receive worker passes on: a packet whose numbers the network may have changed."""
+    width = {"payload_cog": 3}
+    single = {"timestamp", "robot_mode", "runtime_state", "safety_status_bits", "speed_scaling",
+              "target_speed_fraction", "payload"}  # fmt: skip
+    size = {name: 1 if name in single else width.get(name, 6) for name in reading.OUTPUTS}
+    layout = struct.Struct(f">{sum(size.values())}d")
+    usual = [0.5] * sum(size.values())
+
+    def make(by: Random) -> bytes:
+        values = list(usual)
+        for _ in range(by.randint(1, 4)):
+            values[by.randrange(len(values))] = finite(by)
+        data = layout.pack(*values)
+        return bytes_damaged(data, by) if by.random() < 0.5 else data
+
+    def parse(data: bytes) -> bool:
+        values = list(struct.unpack(f">{len(data) // 8}d", data[: len(data) // 8 * 8]))
+        fields: dict[str, Any] = {}
+        for name, count in size.items():
+            taken, values = values[:count], values[count:]
+            whole = name in ("robot_mode", "runtime_state", "safety_status_bits")
+            one: Any = taken[0] if taken else 0.0
+            if whole:
+                one = int(one) if math.isfinite(one) else 0
+            fields[name] = one if name in single else taken
+        got = reading.read({"host_ns": 1, "fields": fields}).sample
+        if np.abs(got.q).max() > 100.0 or np.abs(got.joint_temperature).max() > 200.0:
+            raise Accepted("packet: joints or temperatures that cannot be")
+        return True
+
+    return Parser("packet", make, parse, refusals=(reading.ReadingError,))
+
+
+def _network(data: bytes) -> dict[str, Any]:
+    import socket
+
+    fake = SimpleNamespace(
+        create_connection=lambda *_, **__: Socket(data),
+        gaierror=socket.gaierror,
+        SHUT_WR=socket.SHUT_WR,
+    )
+    return {"socket": fake}
+
+
+TARGET = np.array([0.5, 2.8, 0.4])
+
+
+class _Line(Socket):
+    def settimeout(self, seconds: float) -> None: ...
+    def close(self) -> None: ...
+
+
+def _emscon() -> Parser:
+    sound = []
+    for turn in (None, np.array([0.5, 0.5, 0.5, 0.5])):
+        cov = 1e-10 * np.eye(3)
+        m = es.Measurement(
+            TARGET, cov, turn, np.array([0.0, 1.57, 1.57]), cov, (20.0, 1013.0, 40.0)
+        )
+        kind, packed = es.pack_measurement(m, es.STATIONARY if turn is None else es.STATIONARY_6D)
+        body = es.OK.to_bytes(4, "little") + packed
+        change = es.HEADER.pack(12, es.CHANGE) + (7).to_bytes(4, "little")
+        sound.append(change + es.HEADER.pack(8 + len(body), kind) + body)
+
+    def make(by: Random) -> bytes:
+        k = by.randrange(2)
+        return bytes([k]) + (sound[k] if by.random() < 0.1 else bytes_damaged(sound[k], by, sound))
+
+    def parse(data: bytes) -> bool:
+        line = EmsconConnection.__new__(EmsconConnection)
+        line.where, line.changes, line.open = "fuzz", [], True
+        line._came, line._socket = bytearray(), _Line(data[1:])  # type: ignore[assignment]
+        tracker = EmsconTracker.__new__(EmsconTracker)
+        target = "pose" if data[0] else "position"
+        tracker._options = emscon.EmsconOptions(target=target)  # type: ignore[arg-type]
+        tracker._config, tracker._remarks, tracker._line = Tracker(), [], line
+        tracker._ready = lambda seconds=0.0: np.inf  # type: ignore[method-assign]
+        tracker._clock = None  # type: ignore[assignment]
+        tracker._soon = tracker._ready  # type: ignore[method-assign]
+        kind, status, body = line.result(until=np.inf)
+        tracker._measure = lambda: tracker._sound(kind, status, body)  # type: ignore[method-assign]
+        sample = tracker.measure()
+        if not (np.isfinite(sample.value).all() and np.linalg.eigvalsh(sample.covariance)[0] > 0.0):
+            raise Accepted("emscon: a reading that cannot be")
+        return True
+
+    return Parser("emscon", make, parse)
+
+
+def _natnet() -> Parser:
+    rng = np.random.default_rng(1)
+    cameras = Cameras(None, rng, None, (4, 1), 0.0, np.zeros((6, 4)), 0.0)  # type: ignore[arg-type]
+    cameras.paused, cameras.seen, cameras.others = True, (TARGET, np.array([0, 0, 0, 1.0])), 2
+    cameras.board = type("Board", (), {"time": 1.0})()  # type: ignore[assignment]
+    versions: tuple[nn.Version, ...] = ((3, 0), (4, 0), (4, 1), (4, 2))
+    sound = [nn.message(nn.FRAME, cameras.frame(v)) for v in versions]
+    sound += [nn.message(nn.DESCRIPTIONS, cameras.descriptions(v)) for v in versions]
+
+    def make(by: Random) -> bytes:
+        k = by.randrange(8)
+        return bytes([k]) + (sound[k] if by.random() < 0.1 else bytes_damaged(sound[k], by, sound))
+
+    def parse(data: bytes) -> bool:
+        tracker = NatNetTracker.__new__(NatNetTracker)
+        tracker.where, tracker._newest = "fuzz", -1
+        version = versions[data[0] % 4]
+        tracker._server = nn.NatNetServer("fuzz", "1", version)
+        if data[0] < 4:
+            bodies = tracker._next(_Line(data[1:]))  # type: ignore[arg-type]
+            for body in bodies or ():
+                if not np.isfinite([*body.position, *body.quaternion]).all():
+                    raise Accepted("natnet: a pose that cannot be")
+            return any(b.number == BODY for b in bodies or ())
+        tracker._options = type("Options", (), {"rigid_body": "tool"})()  # type: ignore[assignment]
+        tracker._ask = lambda request, answer: data[5:]  # type: ignore[method-assign]
+        return tracker._found()[1] == "tool"
+
+    return Parser("natnet", make, parse)
+
+
+def _page() -> Parser:
+    words = b"<netft><prodname>x</prodname><cfgcpf>1000000</cfgcpf><cfgcpt>1000</cfgcpt>"
+    words += b"<scfgfu>N</scfgfu><scfgtu>Nmm</scfgtu><comrdtrate>7000</comrdtrate></netft>"
+
+    def make(by: Random) -> bytes:
+        return words if by.random() < 0.1 else bytes_damaged(words, by)
+
+    def parse(data: bytes) -> bool:
+        sensor = netft.sensor_format(data.decode("utf-8", "replace"), netft.NetFtOptions(), "fuzz")
+        counter = sensor.losses()
+        if not (np.isfinite(sensor.unit).all() and (sensor.unit > 0).all() and counter.rate >= 0):
+            raise Accepted("netft: units that cannot be")
+        return True
+
+    return Parser("netft_page", make, parse)
+
+
+def network_parsers() -> list[Parser]:
+    """All of them."""
+    return [_emscon(), _natnet(), _page()]
+
 
 # --- frames of force sensors ---
 
@@ -136,10 +383,10 @@ def _geocom() -> Parser:
     port = Port()
     link = Link.__new__(Link)
     link._path, link._baud, link._port = "fuzz", 115200, port  # type: ignore[assignment]
-    link._connection = geocom_line._Connection(port)  # type: ignore[arg-type]
+    link._connection = geocom._Connection(port)  # type: ignore[arg-type]
     link._instrument = GeoCom.__new__(GeoCom)
     port.held = b"".join(line(f"%R1P,0,{k}", body) for k, body in enumerate(("0", "0,15", "0")))
-    with instead(geocom_line, quiet), instead(geo, {"sleep": lambda _: None}):
+    with instead(geocom, quiet), instead(geo, {"sleep": lambda _: None}):
         GeoCom.__init__(link._instrument, link._connection, attempts=1, checksum=True)
     config = Tracker(driver="geocom", port="fuzz")
     tracker = GeoComTracker(link, config, GeoComOptions(), Clock(1.0))
@@ -188,7 +435,7 @@ def _geocom() -> Parser:
         port.held = data[1:]
         link._instrument.transaction_counter = 0
         tracker._full_known, tracker._last_ms = True, 0.0
-        with instead(geocom_line, quiet):
+        with instead(geocom, quiet):
             sample = tracker.measure()
         distance = float(np.linalg.norm(sample.value))
         if not np.all(np.isfinite(sample.covariance)) or not 0.1 < distance < 101.0:
@@ -257,9 +504,9 @@ def parsers() -> list[Parser]:
         *(_force(name) for name in ("ft300", "bota", "hex")),
         _geocom(),
         _modbus(),
-        controller.rtde(),
-        controller.dashboard_server(),
-        controller.primary_port(),
-        controller.packet(),
-        *network.parsers(),
+        rtde(),
+        dashboard_server(),
+        primary_port(),
+        packet(),
+        *network_parsers(),
     ]

@@ -17,10 +17,7 @@ ARMS = (*robot_names(), ODD, RAILS)
 
 
 def arm_of(name: str) -> Arm:
-    """An arm of the catalogue, drawn; or one of seven joints with axes in odd directions.
-
-    That of rails slides in its first, fourth and last joint.
-    """
+    """An arm of the catalogue, drawn; or one of seven joints with axes in odd directions."""
     if name not in (ODD, RAILS):
         return replace(load_arm(name), coupling=None, drive=None)
     rng = np.random.default_rng(7)

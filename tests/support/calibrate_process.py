@@ -47,8 +47,7 @@ clock = 40.0
 """
 """A tiny cell without a force sensor; its world goes forty times faster than a clock."""
 SIZE = ("--poses", "4", "--validation", "3")
-LONGEST = 120.0
-"""A calibration that is not killed takes a fifth of this, s."""
+LONGEST = 120.0  # a calibration that is not killed takes a fifth of this, s
 STARTING = 15.0
 """A device process that starts on a busy computer sees only then that its parent is gone, s."""
 

@@ -18,8 +18,7 @@ from hilcal.types import Floats
 from tests.support.campaign_run import EndedError, Run
 from tests.support.campaign_site import Site, site
 
-LONG = 900.0
-"""A whole campaign may take so long, s."""
+LONG = 900.0  # a whole campaign may take so long, s
 STARVED = re.compile(
     r"no new data over RTDE|no answer within|by its watchdog|too busy|nothing came for|"
     r"nobody watched its motion"
@@ -35,11 +34,7 @@ Act = Callable[[Site], object]
 def cell(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Site]:
-    """One simulated cell for a file, with a plan that is long enough for all of its runs.
-
-    Each of them stores a reading or two before it meets its fault; how many more some of them
-    store, a file says in MORE_READINGS.
-    """
+    """One simulated cell for a file, with a plan that is long enough for all of its runs."""
     runs = sum(
         item.path == request.path and "path" in getattr(item, "fixturenames", ())
         for item in request.session.items
@@ -66,23 +61,14 @@ def path(cell: Site) -> Path:
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """What happens in the middle of a run, what is said, and how it is put right.
+    """What happens in the middle of a run, what is said, and how it is put right."""
 
-    Attributes:
-        name: of the test.
-        do: makes it happen.
-        undo: puts it right, as the operator would.
-        says: patterns that the one line has to contain.
-        stops: whether the arm has to be stopped for it (else it stands already).
-        fast: whether it is one of the few that are long, not slow.
-    """
-
-    name: str
-    do: Act
-    undo: Act
-    says: tuple[str, ...]
-    stops: bool = True
-    fast: bool = False
+    name: str  # of the test
+    do: Act  # makes it happen
+    undo: Act  # puts it right, as the operator would
+    says: tuple[str, ...]  # patterns that the one line has to contain
+    stops: bool = True  # whether the arm has to be stopped for it (else it stands already)
+    fast: bool = False  # whether it is one of the few that are long, not slow
 
 
 def act(device: str, op: str, **arguments: object) -> Act:
@@ -102,11 +88,7 @@ def each(faults: tuple[Fault, ...]) -> pytest.MarkDecorator:
 
 
 def begin(cell: Site, path: Path, then: Callable[[Run], Then]) -> tuple[Run, Then]:
-    """Start a run, wait for its first reading and for what comes then; returns both.
-
-    The devices' deadlines are real time: on a computer that is too busy a run may be stopped
-    before it has met its fault. Then it is begun again, as an operator does.
-    """
+    """Start a run, wait for its first reading and for what comes then; returns both."""
     for left in reversed(range(TRIES)):
         run = Run(cell, path)
         try:
@@ -120,10 +102,7 @@ def begin(cell: Site, path: Path, then: Callable[[Run], Then]) -> tuple[Run, The
 
 
 def meets(fault: Fault, cell: Site, path: Path, *, moving: bool) -> None:
-    """Let a run meet a fault after its first reading, and check what the operator sees.
-
-    Again, see `begin`, where this computer has stopped the run before the fault was noticed.
-    """
+    """Let a run meet a fault after its first reading, and check what the operator sees."""
     for left in reversed(range(TRIES)):
         run, goal = begin(cell, path, Run.moving if moving else Run.measuring)
         since = cell.now()
@@ -180,11 +159,7 @@ def whole(site: Site, path: Path) -> None:
 
 
 def right(site: Site, path: Path) -> None:
-    """Check that every stored reading is what a tracker may read of the state it is stored with.
-
-    But for those that the runs themselves doubted, each at most one: as soon as it knew where the
-    tracker stands, or as its next reading repeated it.
-    """
+    """Check that every stored reading is what a tracker may read of the state it is stored with."""
     with CampaignFile.open(path) as campaign:
         log = RunLog(campaign)
         steps = [str(Step(**d["step"])) for d in log.details()]

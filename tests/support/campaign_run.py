@@ -20,8 +20,7 @@ ROOT = Path(__file__).resolve().parents[2]
 BEGUN = "waiting for the operator to take everything off"
 """What a run says as soon as every device is there and ready."""
 TAKEN = re.compile(r"\d+/\d+ ")
-SLOW = 0.1
-"""Position of the speed slider while an arm is to be stopped on its way."""
+SLOW = 0.1  # position of the speed slider while an arm is to be stopped on its way
 LOOK_S = 0.25
 """Time between two looks at the processes that a run has started; each reads those of the whole
 machine."""
@@ -44,10 +43,7 @@ class Run:
         limit: int | None = None,
         how: tuple[str, ...] = (),
     ) -> None:
-        """Start it; unless `how` says otherwise, `--resume` where the campaign is there already.
-
-        With `limit`, no file of the program can grow beyond so many bytes.
-        """
+        """Start it; unless `how` says otherwise, `--resume` where the campaign is there already."""
         self.site, self.path = site, path
         self.log = path.with_suffix(f".{time.monotonic_ns()}.log")
         usual = ("--resume",) if path.exists() else ("--plan", str(site.plan_file))
@@ -73,11 +69,7 @@ class Run:
         return self.log.read_text(encoding="utf-8", errors="replace")
 
     def wait_until(self, what: Callable[[], bool], words: str) -> None:
-        """Wait until something holds.
-
-        Raises:
-            EndedError: the run has ended before that.
-        """
+        """Wait until something holds."""
         end = time.monotonic() + DEADLINE
         while not what():
             self._look()
@@ -91,11 +83,7 @@ class Run:
         self.wait_until(lambda: bool(TAKEN.search(self.words)), "a reading")
 
     def moving(self) -> Floats:
-        """Wait until the arm moves, so slowly and so far that it will not arrive soon.
-
-        Without that it would stand within half a second whether it is stopped or not. Returns
-        the joint angles (6,) that it goes to, rad.
-        """
+        """Wait until the arm moves, so slowly and so far that it will not arrive soon."""
         self.site.slider(SLOW)
         plan = self.site.plan
         goal = np.zeros(6)

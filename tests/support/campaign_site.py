@@ -16,7 +16,7 @@ from hilcal.config.reference import to_toml
 from hilcal.drivers.simulated.cell_processes import SimulatedCell
 from hilcal.drivers.simulated.rehearsal import case_of_plan, simulated_cell
 from hilcal.drivers.simulated.world import World
-from hilcal.measuring.dry_run import dry_run
+from hilcal.measuring.route import dry_run
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.plan import Plan
 from tests.support.spread_plan import spread_plan
@@ -24,8 +24,7 @@ from tests.support.spread_plan import spread_plan
 if TYPE_CHECKING:
     from tests.support.campaign_run import Run
 
-DEADLINE = 60.0
-"""Nothing here may take longer, s; far above what it takes."""
+DEADLINE = 60.0  # nothing here may take longer, s; far above what it takes
 HAND_S = 2.0
 """The simulated person is quick, s of cell time: nothing here depends on how long it takes."""
 

@@ -96,11 +96,7 @@ def campaign(
     plan_seed: int | None = None,
     harmonics: int = 6,
 ) -> Campaign:
-    """Measure a campaign in a world that hides one effect at `strength` σ.
-
-    With `plan_seed` equal plans share their states; otherwise poses are drawn for each seed.
-    Equal arguments give the same object; its readings cannot be written to.
-    """
+    """Measure a campaign in a world that hides one effect at `strength` σ."""
     cell = cell_of(registration_known=registration_known, target_known=target_known)
     p = plan(poses, 1000 + seed if plan_seed is None else plan_seed, cycles)
     rng = np.random.default_rng(seed)
@@ -152,10 +148,7 @@ def true_parameters(world: World, effect: str, *, m: int = 3) -> Floats:
 
 
 def followed(arm: Arm) -> Ints:
-    """Where among n x n factors, row by row, those of joints behind one another are.
-
-    Of one kind both: that turn, or that slide.
-    """
+    """Where among n x n factors, row by row, those of joints behind one another are."""
     n = arm.n
     pairs = np.eye(n, k=-1)
     pairs[n - 1, n - 3] = 1.0

@@ -118,8 +118,7 @@ def numeric_jacobian(model, states, theta, scale, m):
     return numeric_slopes(model, states, theta, np.diag(scale), m)
 
 
-SOFT = 2e-5
-"""Compliance of every joint in what follows, rad/(N·m)."""
+SOFT = 2e-5  # compliance of every joint in what follows, rad/(N·m)
 
 
 def soft(cell: Cell, states: States, name: str, options=None) -> Model:

@@ -61,10 +61,7 @@ kinematics:
 
 
 def measured_arm(name: str, seed: int = 3) -> Arm:
-    """An arm whose axes are off by tenths of a millimetre and some 0.5 mrad, as factories find.
-
-    The first axis is the base's z and the last one the flange's, as in every table of rows.
-    """
+    """An arm whose axes are off by tenths of a millimetre and some 0.5 mrad, as factories find."""
     arm, rng = load_arm(name), np.random.default_rng(seed)
     links = arm.links.copy()
     for k in range(1, arm.n):

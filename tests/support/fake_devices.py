@@ -18,8 +18,7 @@ from hilcal.types import Floats
 from tests.support.fake_world import World
 
 STD = 1e-5  # m, of one measurement
-TORQUE = np.array([3.0, -40.0, 20.0, 5.0, 1.0, -0.5])
-"""N·m, of every pose."""
+TORQUE = np.array([3.0, -40.0, 20.0, 5.0, 1.0, -0.5])  # N·m, of every pose
 
 
 @dataclass

@@ -9,7 +9,8 @@ import numpy as np
 from hilcal.errors import DeviceError
 from hilcal.readings.readings import Readings
 from hilcal.store.plan import Step
-from hilcal.store.stored_schema import Detail, check, check_event
+from hilcal.store.stored_schema import DETAIL as Detail
+from hilcal.store.stored_schema import check, check_event
 from tests.support.fake_world import World
 
 

@@ -1,15 +1,26 @@
 """What the tests of fits share."""
 
+from collections.abc import Collection
 from dataclasses import replace
 
 import numpy as np
 
-from hilcal.identification.fit import Fit
+from hilcal.cell import Cell
+from hilcal.identification.baseline import baseline, with_effects
+from hilcal.identification.fit import Fit, fit
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
+from hilcal.readings.whitening import Mode
 from hilcal.robot import se3
 
 MODES = ("absolute", "deflection")
+
+
+def based(cell: Cell, readings: Readings, mode: Mode, names: Collection[str] | None = None) -> Fit:
+    """The baseline, or the named effects beside unknown frames, fitted to readings."""
+    if names is None:
+        return fit(baseline(cell, readings, mode), readings, mode)
+    return fit(with_effects(cell, readings, mode, names), readings, mode)
 
 
 def named(found: Fit) -> dict[str, tuple[float, float]]:

@@ -110,10 +110,7 @@ def steady(sensor, seconds):
 
 
 def settled(sensor, right, seconds=15.0):
-    """The losses as soon as they are right; on a busy machine frames are held up for a while.
-
-    What is held up counts as lost until it comes.
-    """
+    """The losses as soon as they are right; on a busy machine frames are held up for a while."""
     end = time.monotonic() + seconds
     while not right(count := sensor.losses()) and time.monotonic() < end:
         time.sleep(0.05)

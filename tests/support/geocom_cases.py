@@ -42,10 +42,9 @@ UNKNOWN = "3081"
 
 @contextmanager
 def table_instrument(table: Table) -> Iterator[tuple[str, list[int]]]:
-    """Serve a table: request number -> body of the reply, or a function(transaction, arguments)
-    of its bytes; requests that are not in it are unknown. The table may change meanwhile; yields
-    the port and the numbers of the requests.
-    """
+    """Serve a table: request number -> body of the reply, or a function(transaction, arguments) of
+    its bytes; requests that are not in it are unknown. The table may change meanwhile; yields
+    the port and the numbers of the requests."""
     asked: list[int] = []
     master, slave = os.openpty()
     tty.setraw(slave)

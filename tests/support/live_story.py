@@ -9,10 +9,8 @@ from hilcal.present.live_viewer import Measuring
 from hilcal.store.plan import Plan, Step
 from tests.support.viewer_story import ur10e
 
-BEGUN = 1_800_000_000.0
-"""The time of day at which it begins, s."""
-BLIND = 8
-"""Readings before there is a model."""
+BEGUN = 1_800_000_000.0  # the time of day at which it begins, s
+BLIND = 8  # readings before there is a model
 
 
 def plan(poses: int = 24, loads: tuple[str, ...] = ("none", "10kg"), seed: int = 3) -> Plan:

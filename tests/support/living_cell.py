@@ -13,7 +13,7 @@ from hilcal.drivers.simulated.blackboard import Blackboard
 from hilcal.drivers.simulated.injected_effects import nothing_hidden
 from hilcal.drivers.simulated.truth import Truth
 from hilcal.drivers.simulated.world import World
-from hilcal.drivers.simulated.world_state import WorldState
+from hilcal.drivers.simulated.world_server import WorldState
 from hilcal.readings.readings import States
 from hilcal.types import Floats
 from tests.support.arm_cases import arm_of

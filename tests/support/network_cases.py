@@ -55,8 +55,8 @@ def netft(*options: str) -> Iterator[tuple[Instrument, str]]:
     with tempfile.TemporaryDirectory() as directory:
         world = Blackboard.create(Path(directory) / "world.bin", 1.0)
         world.write("truth", time=world.time, sensor_wrench=WRENCH)
-        place = ("--host", host, "--seed", "1", "--on", "1e6")
-        sensor = start("netft_server", "force", Path(directory), 1.0, *place, *options)
+        place = ("--kind", "netft", "--host", host, "--seed", "1", "--on", "1e6")
+        sensor = start("force_server", "force", Path(directory), 1.0, *place, *options)
         try:
             yield sensor, host
         finally:

@@ -53,18 +53,7 @@ def observed(
     base: bool = False,
     alternate: bool = False,
 ) -> Observed:
-    """Measure every state of a plan by observers: "S1", "S2" stations, "A" to "D" points, "G".
-
-    Args:
-        who: observers.
-        seed: of plan, world and noise.
-        poses: number.
-        cell: as it is told; the demo's unless given.
-        effect: that is hidden in the world.
-        strength: of it, in σ.
-        base: whether the sensor's axes are those of the base.
-        alternate: whether one pose is read by one observer, the next by the next.
-    """
+    """Measure every state of a plan by observers: "S1", "S2" stations, "A" to "D" points, "G"."""
     cell, rng, p = cell or cell_of(), np.random.default_rng(seed), plan(poses, seed)
     world = world_of(cell, rng)
     if effect is not None:

@@ -87,21 +87,7 @@ def pictures(
     size: tuple[int, int] = (1920, 1080),
     longest: int | None = None,
 ) -> tuple[ViewReport, ...]:
-    """Draw a recording into PNG files, one per shot, with one start of the viewer.
-
-    Args:
-        rrd: the recording.
-        shots: what to draw.
-        size: width and height of the window, points; the picture may have twice the pixels.
-        longest: longest side of the pictures, pixels; None for all pixels.
-
-    Returns:
-        The views, with what they reported; no problems in a sound recording.
-
-    Raises:
-        InputError: no such recording, timeline or view.
-        HilcalError: no Vulkan driver, or the viewer failed.
-    """
+    """Draw a recording into PNG files, one per shot, with one start of the viewer."""
     if not Path(rrd).is_file():
         raise InputError(f"recording {rrd}: no such file")
     if not vulkan_available():

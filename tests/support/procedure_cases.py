@@ -35,19 +35,12 @@ def small(loads: int = 2, **planning: object) -> CellConfig:
 
 @dataclass
 class Drawn:
-    """A calibration whose readings are drawn in one simulated world.
+    """A calibration whose readings are drawn in one simulated world."""
 
-    Attributes:
-        procedure: the calibration.
-        hidden: what is hidden in the world.
-        dies_after: readings after which measuring is killed; None for never.
-        kinds: of the steps that were done.
-    """
-
-    procedure: Procedure
-    hidden: str
-    dies_after: int | None = None
-    kinds: list[str] = field(default_factory=list)
+    procedure: Procedure  # the calibration
+    hidden: str  # what is hidden in the world
+    dies_after: int | None = None  # readings after which measuring is killed; None for never
+    kinds: list[str] = field(default_factory=list)  # of the steps that were done
 
     def case(self) -> SimulationCase:
         """The world, made again from the first plan."""

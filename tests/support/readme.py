@@ -27,11 +27,7 @@ def cell() -> str:
 
 
 def commands(*, options: bool = False) -> list[list[str]]:
-    """Commands of the section as words without "hilcal": of the blocks, then of the sentences.
-
-    Args:
-        options: with those that are in brackets.
-    """
+    """Commands of the section as words without "hilcal": of the blocks, then of the sentences."""
     typed, mentioned = [], []
     for line in campaign().splitlines():
         code = _CODE.match(line)

@@ -10,19 +10,12 @@ from hilcal.types import Floats
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem:
-    """A model with and without priors, fitted to y, and a family beside it.
+    """A model with and without priors, fitted to y, and a family beside it."""
 
-    Attributes:
-        rows: (R, K) columns of the model.
-        ridge: (K,) of their priors.
-        x: (R, P) columns of the family.
-        y: (R,) the data.
-    """
-
-    rows: Floats
-    ridge: Floats
-    x: Floats
-    y: Floats
+    rows: Floats  # (R, K) columns of the model
+    ridge: Floats  # (K,) of their priors
+    x: Floats  # (R, P) columns of the family
+    y: Floats  # (R,) the data
 
     @property
     def projection(self) -> Projection:
@@ -44,11 +37,7 @@ class Problem:
 def problem(
     kind: str = "priors", rows: int = 60, family: int = 4, noise: float = 1.0, seed: int = 0
 ) -> Problem:
-    """Return a random problem; kinds: "flat", "priors", "no columns", "rank deficient".
-
-    The family of the last kind has two columns that are linear combinations of others and of
-    the model's.
-    """
+    """Return a random problem; kinds: "flat", "priors", "no columns", "rank deficient"."""
     rng = np.random.default_rng(seed)
     size = 0 if kind == "no columns" else 7
     b = rng.standard_normal((rows, size))

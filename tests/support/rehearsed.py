@@ -17,21 +17,13 @@ from studies.random_campaigns import dead_weights, rehearsal_states
 
 @dataclass(frozen=True, eq=False)
 class Rehearsed:
-    """What was simulated.
+    """What was simulated."""
 
-    Attributes:
-        cell: the cell.
-        world: its truth.
-        readings: (D,) deflections with their noise.
-        pose: (D,) number of each reading's pose.
-        cycle: (D,) number of its load cycle.
-    """
-
-    cell: Cell
-    world: World
-    readings: Readings
-    pose: Ints
-    cycle: Ints
+    cell: Cell  # the cell
+    world: World  # its truth
+    readings: Readings  # (D,) deflections with their noise
+    pose: Ints  # (D,) number of each reading's pose
+    cycle: Ints  # (D,) number of its load cycle
 
 
 def rehearsed(poses: int, seed: int) -> Rehearsed:

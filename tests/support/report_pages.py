@@ -9,7 +9,7 @@ from pathlib import Path
 from playwright.sync_api import Browser, Page, Route
 
 from hilcal.campaign.campaign import Campaign
-from hilcal.present.html.certificate import ReportContent
+from hilcal.present.html.report import ReportContent
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.write_report import Asked, content_of

@@ -18,20 +18,14 @@ from typing import Self
 import pyte
 
 ROOT = Path(__file__).resolve().parents[2]
-HISTORY = 2000
-"""Lines that have scrolled off the top and can still be read."""
-DEADLINE = 120.0
-"""Nothing that is waited for may take longer, s; far above what it takes."""
+HISTORY = 2000  # lines that have scrolled off the top and can still be read
+DEADLINE = 120.0  # nothing that is waited for may take longer, s; far above what it takes
 STANDING_S = 0.5
 """A question that stands so long is not wiped away; a live bar refreshes ten times a second."""
 
 
 class AtTerminal:
-    """One command of hilcal in a pseudo-terminal of its own, and what stands on its screen.
-
-    Attributes:
-        gaps: (seconds, line that stood last) of every silence so far, longest first.
-    """
+    """One command of hilcal in a pseudo-terminal of its own, and what stands on its screen."""
 
     def __init__(
         self,

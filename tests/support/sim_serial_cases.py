@@ -24,19 +24,12 @@ TRACKER_NOISE = (
 
 @dataclass(eq=False)
 class Instrument:
-    """A running simulated instrument.
+    """A running simulated instrument."""
 
-    Attributes:
-        port: the name to open.
-        socket: its admin socket.
-        board: the shared world; the test is its writer.
-        process: the server.
-    """
-
-    port: Path
-    socket: Path
-    board: Blackboard
-    process: subprocess.Popen[bytes]
+    port: Path  # the name to open
+    socket: Path  # its admin socket
+    board: Blackboard  # the shared world; the test is its writer
+    process: subprocess.Popen[bytes]  # the server
 
     def admin(self, op: str, **arguments: Any) -> Any:
         """Switch a fault, or ask for the state."""
@@ -62,7 +55,7 @@ class Instrument:
 def start(module: str, name: str, directory: Path, scale: float, *options: str) -> Instrument:
     """Start `python -m hilcal.drivers.simulated.<module>` and wait until it is ready."""
     world = directory / "world.bin"
-    board = Blackboard.attach(world) if world.exists() else Blackboard.create(world, scale)
+    board = Blackboard(world) if world.exists() else Blackboard.create(world, scale)
     process = subprocess.Popen(
         [
             sys.executable,

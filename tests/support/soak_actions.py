@@ -15,7 +15,7 @@ from random import Random
 
 import numpy as np
 
-from hilcal.measuring.dry_run import dry_run
+from hilcal.measuring.route import dry_run
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.run_log import RunLog
 from tests.support.calibrate_process import Calibration
@@ -27,16 +27,13 @@ from tests.wire import test_fault_matrix_person as person
 from tests.wire.test_fault_matrix_arm import MOTION, REST
 from tests.wire.test_fault_matrix_serial import FORCE, OVERCOME, TRACKER
 
-PATIENCE = 25.0
-"""So long a program may go on with a fault before it counts as overcome, s."""
+PATIENCE = 25.0  # so long a program may go on with a fault before it counts as overcome, s
 STANDS = 1.0
 """So long after its program was killed an arm may move, s: half of it to be noticed, and a ramp."""
-IN_MOTION = 1.0
-"""So long an arm in motion may go on after what it has to be stopped for, s."""
+IN_MOTION = 1.0  # so long an arm in motion may go on after what it has to be stopped for, s
 NOTICED = re.compile(r"touch the tool|does not stand|asked \d times")
 """What is said of a load that fell."""
-DONE = "readings are in"
-"""What a run says at its end."""
+DONE = "readings are in"  # what a run says at its end
 STOP_MOVING = (*MOTION, *person.MOTION)
 """Faults for which an arm in motion has to be stopped and the run ended."""
 STOP_MEASURING = (*REST, *TRACKER, *FORCE, *person.REST)
@@ -49,28 +46,18 @@ BESIDE = (
     ("report", "-o", "/dev/null"),
 )
 """Commands that are run on a campaign while it is measured."""
-CODES = (0, 3, 130, -signal.SIGKILL)
-"""Exit codes: done, a device failed, interrupted, killed."""
+CODES = (0, 3, 130, -signal.SIGKILL)  # exit codes: done, a device failed, interrupted, killed
 
 
 @dataclass
 class Soak:
-    """What is done, and what was found.
+    """What is done, and what was found."""
 
-    Attributes:
-        rng: draws everything.
-        folder: for the files.
-        counts: how often each thing was done, by name.
-        findings: what was wrong: what was being done, and the failed check.
-        starved: runs that ended because this computer gave a process no turn.
-        slowest: by fault, the longest time from it until an arm in motion stood, s.
-    """
-
-    rng: Random
-    folder: Path
-    counts: Counter[str] = field(default_factory=Counter)
+    rng: Random  # draws everything
+    folder: Path  # for the files
+    counts: Counter[str] = field(default_factory=Counter)  # how often each thing was done, by name
     findings: list[str] = field(default_factory=list)
-    starved: int = 0
+    starved: int = 0  # runs that ended because this computer gave a process no turn
     slowest: dict[str, float] = field(default_factory=dict)
     _stack: ExitStack = field(default_factory=ExitStack)
     _site: Site | None = None
@@ -202,11 +189,7 @@ class Soak:
         return "load falls"
 
     def wrong_weights(self) -> str:
-        """The person hangs another weight than asked for, once or every time.
-
-        Once where no reading is stored yet: by the sensor's own zero a load that nobody took off
-        cannot be told, and the second answer is believed until gravity turns in the sensor.
-        """
+        """The person hangs another weight than asked for, once or every time."""
         before = self.path
         measured = self._count_stored() > 0
         run = self._run()  # may begin another campaign

@@ -42,10 +42,7 @@ def placed(part: Capsule, at: list[Floats]) -> Floats:
 
 
 def reached(cell: Cell, parts: tuple[Capsule, ...], q: Floats) -> tuple[Floats, Floats]:
-    """(3,) what all that is held to a workspace reaches in states (N, n): lowest and highest, m.
-
-    Forearm, wrists and tool; the upper arm to the sides that the shoulder keeps as it turns.
-    """
+    """(3,) what all that is held to a workspace reaches in states (N, n): lowest and highest, m."""
     turns = np.zeros((25, cell.arm.n))
     turns[:, 0] = np.linspace(-np.pi, np.pi, 25)
     low, high = extent([p for p in parts if p.body > 2], cell, q)

@@ -58,10 +58,7 @@ def write(
     gross: int = 0,
     damage: Callable[[pa.Table], pa.Table] = lambda table: table,
 ) -> Floats:
-    """Write a stream; the true parameters of `EFFECTS`.
-
-    `gross`: readings from row 8 on that are 5 mm off; `damage`: done to each row group.
-    """
+    """Write a stream; the true parameters of `EFFECTS`."""
     rng = np.random.default_rng(seed)
     model, theta = truth(cell(), rng)
     q = motion(count, rng)

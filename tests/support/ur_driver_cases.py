@@ -12,17 +12,13 @@ import pytest
 from hilcal.config import CellConfig
 from hilcal.drivers.simulated.ur_server import API
 from hilcal.drivers.ur import UrArm, open_arm
-from hilcal.drivers.ur_link import dashboard
-from hilcal.drivers.ur_link.dashboard import Dashboard
-from hilcal.drivers.ur_link.robot_api import RobotApi
-from hilcal.drivers.ur_link.supervision import Supervision
+from hilcal.drivers.ur_link.supervision import Dashboard, RobotApi, Supervision, ask
 from hilcal.errors import DeviceError
 from tests.support import sim_ur_cases
 
 MASS, COM = 2.5, np.array([0.01, -0.02, 0.08])
 SPEED, ACCELERATION = 0.5, 4.0
-STOP_NS = 500_000_000
-"""In this time the arm has to stand after a fault (the requirement)."""
+STOP_NS = 500_000_000  # in this time the arm has to stand after a fault (the requirement)
 
 Sim = sim_ur_cases.SimulatedUr
 
@@ -96,10 +92,7 @@ def api(sim: Sim) -> RobotApi:
 
 
 def children() -> list[psutil.Process]:
-    """Child processes of the driver (the simulated controllers are children, too).
-
-    A relay to PolyScope X ends by itself with the process that commands, a moment later.
-    """
+    """Child processes of the driver (the simulated controllers are children, too)."""
     end = time.monotonic() + 2.0
     while True:
         mine = psutil.Process().children(recursive=True)
@@ -131,7 +124,7 @@ def put_right(sim: Sim) -> None:
             for action in ("POWER_ON", "BRAKE_RELEASE"):
                 api(sim).order("/robotstate/v1/state", action, 2.0)
         else:
-            dashboard.ask(sim.host, ("power on", "brake release"), 2.0)
+            ask(sim.host, ("power on", "brake release"), 2.0)
         sim.wait("robot_mode", 7)
     sim.wait("moving", False)
 

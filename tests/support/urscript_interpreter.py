@@ -45,11 +45,7 @@ class Told:
 
 
 class Machine:
-    """A controller; digital inputs read the same for the same seed.
-
-    Lists are shared by assignments and arguments with `by_reference`, else copied. A thread runs
-    between any two statements of the others, at once to its end.
-    """
+    """A controller; digital inputs read the same for the same seed."""
 
     def __init__(self, seed: int, by_reference: bool) -> None:
         self.inputs = random.Random(seed)

@@ -9,6 +9,7 @@ import rerun as rr
 
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig, load_config
+from hilcal.design.run_order import Confounding, Duration
 from hilcal.design.summary import (
     CriterionResult,
     CurvePoint,
@@ -16,7 +17,6 @@ from hilcal.design.summary import (
     PlanSummary,
     PredictedParameter,
 )
-from hilcal.design.timing import Confounding, Duration
 from hilcal.present.viewer.plan import record_plan
 from hilcal.robot.chain import evaluate
 from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step

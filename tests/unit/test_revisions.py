@@ -16,8 +16,8 @@ from hilcal.identification.fit import Fit, fit
 from hilcal.identification.fit_document import plain, to_json
 from hilcal.readings.whitening import usual_mode
 from hilcal.refinement import add
-from hilcal.store.records import content_hash
 from hilcal.store.revision import RevisionRecord, from_text, to_text
+from hilcal.store.rows import content_hash
 from tests.support.cli_cases import rehearsal
 
 

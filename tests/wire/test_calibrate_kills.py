@@ -14,10 +14,8 @@ from hilcal.store.procedure_log import ProcedureLog
 from tests.support.calibrate_process import Calibration
 
 MOMENTS = int(os.environ.get("HILCAL_KILLS", "50"))
-EACH = 10
-"""Kills of one calibration."""
-LONGEST = 14.0
-"""A moment is drawn up to here, s: so long a start, its devices and some steps take."""
+EACH = 10  # kills of one calibration
+LONGEST = 14.0  # a moment is drawn up to here, s: so long a start, its devices and some steps take
 
 
 def finished(c: Calibration) -> None:

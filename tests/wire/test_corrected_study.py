@@ -19,8 +19,7 @@ from tests.support.paths import ROOT
 
 ARMS, EFFECT = ("ur3e", "ur10e"), "encoder_offset"
 SIZE = ("--poses", "4", "--points", "2", "--arms", ",".join(ARMS), "--effects", EFFECT, "--json")
-DEVICES = 4
-"""Processes of a cell: world, arm, tracker, force sensor."""
+DEVICES = 4  # processes of a cell: world, arm, tracker, force sensor
 MEASURING_S, CASES_S, END_S = 240.0, 600.0, 15.0
 """Longest until both cells measure, until both are done, and until a process is gone."""
 

@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hilcal.drivers import bota, ft300, onrobot_hex
-from hilcal.drivers.frame_losses import ByArrival, ByDeviceClock
-from hilcal.drivers.frames import Deframer, crc_x25
+from hilcal.drivers.force_stream import ByArrival, ByDeviceClock, Deframer, crc_x25
 
 FORMATS = {
     "ft300": ft300.SENSOR.frame,

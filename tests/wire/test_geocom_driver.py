@@ -1,4 +1,4 @@
-"""The GeoCOM driver against the simulated station: readings, the target, and the line."""
+"""The GeoCOM driver against a simulated station: readings, reports, and what goes wrong."""
 
 import contextlib
 import time
@@ -6,12 +6,18 @@ import time
 import numpy as np
 import pytest
 
-from hilcal.drivers.geocom import DEADLINE_S, open_tracker
-from hilcal.drivers.geocom_line import ANSWER_S
-from hilcal.errors import DeviceError
-from hilcal.measuring.devices import TargetLostError
+from hilcal.drivers.geocom import (
+    ANSWER_S,
+    DEADLINE_S,
+    GeoComOptions,
+    GeoComTracker,
+    Link,
+    open_tracker,
+)
+from hilcal.errors import DeviceError, InputError
+from hilcal.measuring.devices import Clock, TargetLostError
 from tests.support import sim_serial_cases as simulated
-from tests.support.geocom_cases import cell
+from tests.support.geocom_cases import GREETING, cell, line, table_instrument
 
 TARGET = (0.5, 2.8, 0.4)
 MUTE_S = DEADLINE_S + ANSWER_S + 1.0
@@ -211,3 +217,273 @@ def test_mute_instrument_is_given_up_in_time_and_heard_again(device, station):
     assert seconds < MUTE_S
     station.admin("mute", on=False)
     assert device.measure().value == pytest.approx(TARGET, abs=1e-3)
+
+
+OPEN_S = 6.0  # 5 s are promised; the machine may be busy
+HZ, V, D = 0.3, 1.4, 3.0
+POINT = D * np.array([np.sin(V) * np.sin(HZ), np.sin(V) * np.cos(HZ), np.cos(V)])
+FULL = f"0,{HZ},{V},1e-6,1e-5,2e-5,1e-6,{D},"
+
+
+def full(code=0, ms=4000):
+    """Replies to full measurements, each with a time of its own."""
+    count = iter(range(ms, ms + 1000))
+    return lambda transaction, _: line(f"%R1P,0,{transaction}", f"{code}{FULL[1:]}{next(count)}")
+
+
+@pytest.fixture(scope="module")
+def instrument():
+    """An instrument of a table that tests change, and a link to it (opening takes a second)."""
+    table = {}
+    with table_instrument(table) as (port, asked):
+        link = Link(port, 115200)
+        yield table, asked, link
+        link.close()
+
+
+@pytest.fixture
+def opened(instrument):
+    """Return a driver on an instrument of a table, and the list of what it is asked."""
+    table, asked, link = instrument
+
+    def start(answers, **tracker):
+        table.clear()
+        table.update(answers)
+        asked.clear()
+        config = cell("unused", **tracker)
+        return GeoComTracker(link, config.tracker, GeoComOptions(), Clock(20.0)), asked
+
+    return start
+
+
+def refused(error, config):
+    """One line, in time."""
+    begin = time.monotonic()
+    with pytest.raises(error) as caught:
+        open_tracker(config)
+    assert time.monotonic() - begin < OPEN_S
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+# configuration
+
+
+def test_readings_in_base_axes_are_no_readings_of_an_instrument():
+    assert 'must be "tracker"' in refused(InputError, cell("/dev/x", frame="base"))
+
+
+def test_port_is_needed():
+    config = cell("x")
+    lacking = config.model_copy(
+        update={"tracker": config.tracker.model_copy(update={"port": None})}
+    )
+    assert "port" in refused(InputError, lacking)
+
+
+def test_unknown_option_lists_the_valid_ones():
+    text = refused(InputError, cell("/dev/x", options={"search": 1.0}))
+    assert "search_rad" in text
+    assert "max_distance_m" in text
+
+
+# opening
+
+
+def test_port_that_is_not_there(tmp_path):
+    assert "no port" in refused(DeviceError, cell(tmp_path / "absent"))
+
+
+@pytest.mark.long
+def test_mute_instrument_and_wrong_rate_say_what_to_check():
+    with simulated.tracker() as station:
+        text = refused(DeviceError, cell(station.port, baud=57600))
+        assert "57600 Bd" in text
+        station.admin("mute", on=True)
+        text = refused(DeviceError, cell(station.port))
+        assert "115200 Bd" in text
+        assert "switched on" in text
+        station.admin("mute", on=False)
+        open_tracker(cell(station.port)).close()
+
+
+def test_force_sensor_at_the_port_is_no_instrument():
+    with simulated.force_sensor("bota") as sensor:
+        text = refused(DeviceError, cell(sensor.port, baud=460800))
+    assert "nobody asked for" in text
+
+
+def test_other_instrument_that_answers_something_else():
+    with table_instrument({0: lambda *_: b"*11....+00000000\r\n"}) as (port, _):
+        assert "no GeoCOM" in refused(DeviceError, cell(port))
+
+
+def test_replies_without_checksum_are_refused():
+    table = {
+        n: lambda t, _, body=body: f"%R1P,0,{t}:{body}\r\n".encode() for n, body in GREETING.items()
+    }
+    table[2167] = lambda t, _: f"%R1P,0,{t}:{FULL}4000\r\n".encode()
+    with table_instrument(table) as (port, _):
+        device = open_tracker(cell(port))
+        with pytest.raises(DeviceError, match="without checksum"):
+            device.measure()
+        device.close()
+
+
+# the line breaks
+
+
+def test_unplugged_adapter_is_named_and_a_new_opening_works():
+    with simulated.tracker() as station:
+        device = open_tracker(cell(station.port))
+        device.measure()
+        station.admin("unplug")
+        for call in (device.measure, device.find_target, device.report, device.measure):
+            begin = time.monotonic()
+            with pytest.raises(DeviceError, match="unplugged") as caught:
+                call()
+            assert not isinstance(caught.value, TargetLostError)
+            assert time.monotonic() - begin < 1.0
+        station.admin("replug")
+        with pytest.raises(DeviceError):
+            device.measure()
+        device.close()
+        device.close()
+        again = open_tracker(cell(station.port))
+        again.measure()
+        again.close()
+
+
+def test_instrument_that_dies_is_noticed():
+    with simulated.tracker() as station:
+        device = open_tracker(cell(station.port))
+        station.admin("die")
+        time.sleep(0.1)
+        with pytest.raises(DeviceError):
+            device.measure()
+        device.close()
+
+
+# odd instruments
+
+
+def test_cartesian_axes_of_an_instrument(opened):
+    device, _ = opened({2167: full()})
+    assert device.measure().value == pytest.approx(POINT, abs=1e-15)
+
+
+def test_second_face_gives_the_same_point(opened):
+    turned = f"0,{HZ + np.pi},{2 * np.pi - V},1e-6,0,0,0,{D},77"
+    device, _ = opened({2167: turned})
+    assert device.measure().value == pytest.approx(POINT, abs=1e-14)
+
+
+def test_covariance_is_that_of_the_angles_and_the_distance(opened):
+    """Against numerical derivatives of the point and the law of the angles' errors."""
+    std = 40e-6
+    device, _ = opened({2167: f"0,{HZ},{V},{std},0,0,0,{D},77"}, range_std_m=3e-5)
+    covariance = device.measure().covariance
+
+    def point(x):
+        return x[2] * np.array(
+            [np.sin(x[1]) * np.sin(x[0]), np.sin(x[1]) * np.cos(x[0]), np.cos(x[1])]
+        )
+
+    at, step = np.array([HZ, V, D]), 1e-6
+    jac = np.array([(point(at + d) - point(at - d)) / (2 * step) for d in step * np.eye(3)]).T
+    spread = np.diag([(std / np.sin(V)) ** 2, std**2, (3e-5 + 0.15e-6 * D) ** 2])
+    assert covariance == pytest.approx(jac @ spread @ jac.T, rel=1e-6, abs=1e-18)
+
+
+def test_older_instrument_without_full_measurement(opened):
+    device, asked = opened({17017: f"0,{HZ},{V},{D},2"})
+    for _ in range(2):
+        sample = device.measure()
+        assert sample.value == pytest.approx(POINT, abs=1e-15)
+    assert asked.count(2167) == 1
+    assert asked.count(17017) == 2
+
+
+def test_report_without_what_the_instrument_does_not_know(opened):
+    device, _ = opened({17017: f"0,{HZ},{V},{D},2", 9021: "5"})
+    report = device.report()
+    assert report.name == "TABLE, serial 77"
+    assert report.problems == ()
+    assert "battery" not in dict(report.facts)
+
+
+def test_report_of_an_empty_battery_and_no_lock(opened):
+    device, _ = opened({2167: full(), 5039: "0,4,2,2", 9021: "0,0"})
+    problems = " / ".join(device.report().problems)
+    assert "4 %" in problems
+    assert "not locked" in problems
+
+
+@pytest.mark.parametrize("code", [1285, 1288, 1289, 1292, 1294, 8710, 8711, 8725])
+def test_codes_without_a_distance_are_lost_targets(opened, code):
+    device, _ = opened({2167: f"{code},{HZ},{V},1e-6,0,0,0,0.0,0"})
+    with pytest.raises(TargetLostError, match=str(code)):
+        device.measure()
+
+
+@pytest.mark.parametrize("code", [0, 1283, 1284])
+def test_distance_zero_is_never_a_reading_whatever_the_code(opened, code):
+    device, _ = opened({2167: f"{code},{HZ},{V},1e-6,0,0,0,0.0,0"})
+    with pytest.raises(TargetLostError, match=r"0\.0 m"):
+        device.measure()
+
+
+@pytest.mark.parametrize(
+    ("code", "words"), [(1291, "atmospheric"), (1290, "level"), (99999, "99999")]
+)
+def test_other_codes_are_failures_of_the_instrument(opened, code, words):
+    device, _ = opened({2167: f"{code},{HZ},{V},1e-6,0,0,0,0.0,0"})
+    with pytest.raises(DeviceError, match=words) as caught:
+        device.measure()
+    assert not isinstance(caught.value, TargetLostError)
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        f"0,{HZ},{V},1e-6,0,0,0,nan,77",
+        f"0,inf,{V},1e-6,0,0,0,{D},77",
+        f"0,{HZ},{V},1e-6,0,0,0,{D}",
+        f"0,{HZ},{V},1e-6,0,0,0,{D},77,1",
+        f"0,{HZ},{V},1e-6,0,0,0,three,77",
+        "0",
+    ],
+)
+def test_reply_of_another_form_is_no_reading(opened, body):
+    device, _ = opened({2167: body})
+    with pytest.raises(DeviceError, match="measuring: the instrument gives") as caught:
+        device.measure()
+    assert not isinstance(caught.value, TargetLostError)
+
+
+def test_distance_of_the_measurement_before_is_no_new_reading(opened):
+    device, _ = opened({2167: f"{FULL}77"})
+    device.measure()
+    with pytest.raises(DeviceError, match="not a new one"):
+        device.measure()
+
+
+def test_no_damaged_reply_gives_a_reading(opened):
+    """One to three flipped bits: what is read is the reading of a repeat, to the last bit."""
+    rng = np.random.default_rng(5)
+    damaged = 0
+
+    def spoilt(transaction, _):
+        nonlocal damaged
+        text = bytearray(line(f"%R1P,0,{transaction}", f"{FULL}0"))
+        if rng.random() < 0.5:
+            damaged += 1
+            for bit in rng.choice(8 * (len(text) - 2), rng.integers(1, 4), replace=False):
+                text[bit // 8] ^= 1 << int(bit % 8)
+        return bytes(text)
+
+    device, asked = opened({2167: spoilt})
+    for _ in range(100):
+        assert device.measure().value == pytest.approx(POINT, abs=1e-15)
+    assert damaged > 60
+    assert asked.count(2167) == 100 + damaged

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilcal.drivers.frames import crc_modbus, crc_x25
+from hilcal.drivers.force_stream import crc_modbus, crc_x25
 from hilcal.drivers.simulated.force_server import Ft300
 from hilcal.drivers.simulated.pty_port import crc16
 from tests.support.sim_ur_cases import ClientError, SimulatedUr, Wire, client, start

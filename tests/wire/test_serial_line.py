@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from hilcal.drivers.serial_line import close_port, drain, line_failures, open_port
+from hilcal.drivers.links import close_port, drain, line_failures, open_port
 from hilcal.errors import DeviceError, InputError
 
 HOLD = """
 import sys
-from hilcal.drivers.serial_line import open_port
+from hilcal.drivers.links import open_port
 port = open_port("tracker", sys.argv[1], 19200)
 print("held", flush=True)
 sys.stdin.read()

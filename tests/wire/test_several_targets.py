@@ -1,5 +1,6 @@
-"""Several reflectors over real bytes: the station is pointed to each; a whole run."""
+"""Several targets, and instruments that agree about where they are."""
 
+import time
 from pathlib import Path
 
 import numpy as np
@@ -7,12 +8,17 @@ import pytest
 
 from hilcal.campaign.campaign import Campaign
 from hilcal.drivers import emscon, geocom
+from hilcal.drivers.ft300 import open_force_sensor
+from hilcal.drivers.geocom import open_tracker
 from hilcal.drivers.simulated.cell_processes import SimulatedCell
+from hilcal.drivers.simulated.operator import open_operator
+from hilcal.drivers.ur import open_arm
 from hilcal.measuring.devices import PointingTracker, TargetLostError
+from hilcal.readings.readings import States
 from hilcal.robot.catalogue import configs_dir
 from tests.support.cli_cases import Capsys
 from tests.support.cli_cases import run as command
-from tests.support.living_cell import config, world_of
+from tests.support.living_cell import WEIGHT, Q, config, world_of
 from tests.support.reflector_cases import NAMES, OFFSETS
 
 RADIUS = 0.05
@@ -86,3 +92,104 @@ def test_a_whole_run_with_three_reflectors(tmp_path: Path, capsys: Capsys) -> No
     found = hilcal("refine", str(run))
     assert found["revisions"][-1]["model"].count("base_compliance") == 1
     assert 0.6 < found["revisions"][-1]["variance_factor"] < 1.5
+
+
+MOUNT = {"origin_m": [0.0, 0.0, 0.04], "rotvec_rad": [0.0, 0.0, 0.7]}
+MEASUREMENTS = 8
+TURN = np.array([0.1, -0.1, 0.1, -0.2, 0.2, -0.1])
+
+
+def made_cell():
+    return config(
+        force_sensor={"driver": "ft300", "port": "x", **MOUNT},
+        operator={"driver": "simulated", "options": {"hand_s": 1.0}},
+    )
+
+
+@pytest.fixture(scope="module")
+def cell(tmp_path_factory):
+    world = world_of(made_cell(), hysteresis=np.full(6, 5e-5))
+    with SimulatedCell.start(world, made_cell(), tmp_path_factory.mktemp("c"), 3) as cell:
+        yield cell
+
+
+def measured(tracker):
+    samples = [tracker.measure() for _ in range(MEASUREMENTS)]
+    mean = np.mean([s.value for s in samples], axis=0)
+    return mean, np.mean([s.covariance for s in samples], axis=0) / MEASUREMENTS
+
+
+def closed_after(test, *devices):
+    try:
+        return test(*devices)
+    finally:
+        for device in devices:
+            device.close()
+
+
+def chi_square(difference, covariance):
+    return float(difference @ np.linalg.solve(covariance, difference))
+
+
+def test_the_tracker_sees_the_sag_under_the_load_that_the_force_sensor_feels(cell):
+    tracker, force = open_tracker(cell.config), open_force_sensor(cell.config)
+    person = open_operator(cell.config)
+    load = cell.config.loads[0]
+
+    def readings(tracker, force, person):
+        out = []
+        for hung in (None, load):
+            person.hang(hung, "")
+            state = cell.ask("world", "state")
+            out.append((*measured(tracker), force.average(0.5), np.array(state["sensor_wrench"])))
+        person.hang(None, "")
+        return out
+
+    empty, loaded = closed_after(readings, tracker, force, person)
+    arm = cell._board.read("arm")
+    both = States(
+        q=np.tile(arm["q"], (2, 1)),
+        wrench=np.array([np.zeros(6), WEIGHT]),
+        approach=np.tile(arm["side"], (2, 1)),
+    )
+    slip = np.tile(cell.ask("world", "state")["slip"], (2, 1))
+    position = world_of(made_cell(), hysteresis=np.full(6, 5e-5)).sight(both, slip).position
+    sag = position[1] - position[0]
+    spread = empty[1] + loaded[1]
+    assert chi_square(sag, spread) > 1e3  # there is something to see
+    # chi-square of 3 degrees exceeds 28 in 4 of a million
+    assert chi_square(loaded[0] - empty[0] - sag, spread) < 28.0
+    felt = loaded[2].wrench - empty[2].wrench
+    frames = [r[2].covariance / r[2].frames for r in (empty, loaded)]
+    bound = 5.0 * np.sqrt(np.diag(frames[0] + frames[1])) + np.repeat([0.01, 0.001], 3)
+    assert np.all(np.abs(felt - (loaded[3] - empty[3])) < bound)
+    assert np.linalg.norm(felt[:3]) == pytest.approx(5.0 * 9.80665, abs=0.3)
+
+
+def test_the_tracker_sees_the_arm_arrive_where_it_was_sent(cell):
+    world = world_of(made_cell(), hysteresis=np.full(6, 5e-5))
+    arm, tracker = open_arm(cell.config), open_tracker(cell.config)
+
+    def visit(arm, tracker):
+        seen = []
+        arm.take_control(0.8, np.array([0.01, 0.02, 0.06]))
+        for goal in (Q, Q + TURN):
+            arm.start_move(goal, 0.5, 0.5)
+            end = time.monotonic() + 15.0
+            while arm.moving():
+                assert time.monotonic() < end
+                time.sleep(0.02)
+            time.sleep(0.1)
+            np.testing.assert_allclose(arm.sample().q, goal, atol=1e-4)
+            seen.append((goal, *measured(tracker), cell.ask("world", "state")))
+        return seen
+
+    (goal_a, *_), (goal_b, value, covariance, state) = closed_after(visit, arm, tracker)
+    last = States(
+        q=goal_b[None],
+        wrench=np.zeros((1, 6)),
+        approach=np.sign(goal_b - goal_a)[None],  # the side from which it arrived
+    )
+    want = world.sight(last, np.array([state["slip"]])).position[0]
+    assert chi_square(value - want, covariance) < 28.0
+    np.testing.assert_allclose(state["encoder"], goal_b, atol=2e-5)

@@ -16,7 +16,7 @@ from geocompy.geo.gctypes import GeoComCode
 from scipy import stats
 
 from hilcal.drivers.simulated.admin import Operations
-from hilcal.drivers.simulated.geocom_station import Beam, PolarPoint
+from hilcal.drivers.simulated.geocom_server import Beam, PolarPoint
 from hilcal.drivers.simulated.pty_port import PtyPort
 from tests.support.sim_serial_cases import Instrument, tracker
 

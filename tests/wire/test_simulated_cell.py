@@ -1,11 +1,13 @@
-"""The whole simulated cell: started, killed and ended, with nothing left behind."""
+"""The processes of a simulated cell: they start, agree, answer, and end."""
 
 import os
 import signal
 import socket
+import stat
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +16,7 @@ import psutil
 import pytest
 
 from hilcal.drivers.simulated import cell_processes
+from hilcal.drivers.simulated.admin import ask
 from hilcal.drivers.simulated.blackboard import Blackboard
 from hilcal.drivers.simulated.cell_processes import (
     UR_PORTS,
@@ -23,11 +26,14 @@ from hilcal.drivers.simulated.cell_processes import (
 )
 from hilcal.drivers.simulated.truth import Truth
 from hilcal.drivers.simulated.world import World
+from hilcal.drivers.simulated.world_server import write_world
 from hilcal.errors import DeviceError, InputError
 from tests.support.arm_cases import ODD, arm_of
 from tests.support.living_cell import WEIGHT, config, same, states, world_of
 from tests.support.paths import ROOT
 from tests.support.rows import first
+from tests.support.sim_ur_cases import SimulatedUr
+from tests.support.sim_ur_cases import start as start_server
 
 DEVICES = ("world", "arm", "tracker", "force")
 SENSOR = {"driver": "ft300", "port": "to be filled in", "origin_m": [0.0, 0.0, 0.04]}
@@ -148,7 +154,7 @@ def test_a_killed_device_comes_back_at_the_same_place(cell, device):
 
 def test_the_truth_goes_on_with_the_arm_after_a_restart_of_the_world(cell):
     cell.restart("world")
-    board = Blackboard.attach(cell.directory / "world.bin")
+    board = Blackboard(cell.directory / "world.bin")
     cell.ask("world", "hang", name="5kg")
     truth, state = board.read("truth"), cell.ask("world", "state")
     arm = board.read("arm")
@@ -278,3 +284,96 @@ def test_what_cannot_be_simulated_is_refused_before_anything_starts(tmp_path):
     (tmp_path / "force").mkdir()
     refused("cannot be used")
     assert not list(tmp_path.glob("*.log"))
+
+
+def wait_until(condition, seconds=10.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "never came true"
+        time.sleep(0.005)
+
+
+@pytest.fixture
+def process(tmp_path):
+    made = config()
+    write_world(tmp_path / "world.json", world_of(made), made)
+    arguments = ("--seed", "5")
+    process = DeviceProcess("world", "hilcal.drivers.simulated.world_server", tmp_path, arguments)
+    process.start()
+    wait_until(lambda: process.socket.exists() or process.ended)
+    process.check()
+    yield process
+    process.end()
+
+
+def test_a_world_that_died_goes_on_where_it_was(process, tmp_path):
+    board = Blackboard(tmp_path / "world.bin")
+    ask(process.socket, "hang", name="pull")
+    since, begun = board.read("truth")["load_since"], board.time
+    ask(process.socket, "die")
+    wait_until(lambda: process.ended)
+    with pytest.raises(DeviceError, match="ended with exit code 70"):
+        process.check()
+    with pytest.raises(DeviceError, match=r"simulated device at world\.sock"):
+        ask(process.socket, "state")
+    process.start()
+    wait_until(lambda: process.socket.exists() or process.ended)
+    state = ask(process.socket, "state")
+    assert (state["load"], state["load_since"]) == ("pull", since)
+    assert state["time"] > begun
+
+
+def test_requests_that_cannot_be_are_answered_with_what_is_valid(process):
+    with pytest.raises(DeviceError, match=r"no load '7kg'.*valid: none, 5kg, pull"):
+        ask(process.socket, "hang", name="7kg")
+    with pytest.raises(DeviceError, match="unknown op 'heng'; valid: hang, mistake"):
+        ask(process.socket, "heng")
+    with pytest.raises(DeviceError, match="six numbers"):
+        ask(process.socket, "push", wrench=[1.0])
+    ask(process.socket, "swing", wrench=[1.0] * 6, period=1.0, decay=1.0)
+    assert ask(process.socket, "log") == []
+
+
+def test_a_process_without_a_world_says_so_in_one_line(tmp_path):
+    process = DeviceProcess(
+        "world", "hilcal.drivers.simulated.world_server", tmp_path, ("--seed", "5")
+    )
+    process.start()
+    wait_until(lambda: process.ended)
+    with pytest.raises(DeviceError, match=r"world: ended with exit code 2: .*world\.json"):
+        process.check()
+    process.end()
+    assert len((tmp_path / "world.log").read_text().splitlines()) == 1
+
+
+@pytest.fixture
+def arm(tmp_path: Path) -> Iterator[SimulatedUr]:
+    running = start_server(tmp_path)
+    yield running
+    running.close()
+
+
+def listening(pid: int) -> list[str]:
+    """Addresses on which a process listens on TCP, by the kernel."""
+    files = Path(f"/proc/{pid}/fd")
+    held = {os.readlink(link) for link in files.iterdir() if link.is_symlink()}
+    out = []
+    for table in ("tcp", "tcp6"):
+        for line in Path(f"/proc/{pid}/net/{table}").read_text().splitlines()[1:]:
+            words = line.split()
+            if words[3] == "0A" and f"socket:[{words[9]}]" in held:
+                raw = bytes.fromhex(words[1].split(":")[0])
+                out.append(socket.inet_ntoa(raw[::-1]) if len(raw) == 4 else "IPv6")
+    return out
+
+
+def test_the_simulated_arm_listens_on_loopback_alone(arm: SimulatedUr) -> None:
+    found = listening(arm.process.pid)
+    assert len(found) == 4  # RTDE, dashboard, primary, script
+    assert all(address.startswith("127.") for address in found)
+
+
+def test_admin_lines_are_of_the_user_who_started_them(arm: SimulatedUr) -> None:
+    line = arm.directory / "arm.sock"
+    assert stat.S_IMODE(line.stat().st_mode) == 0o600
+    assert line.stat().st_uid == os.getuid()

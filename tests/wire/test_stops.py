@@ -32,10 +32,8 @@ from tests.support.campaign_site import Site
 
 __all__ = ["cell", "nothing_goes_on", "path"]  # fixtures
 
-LONGEST = 5.0
-"""The moment of a kill is drawn up to here, s; a run takes longer."""
-SLOW = 0.3
-"""Position of the speed slider meanwhile: the arm moves for about half of the time."""
+LONGEST = 5.0  # the moment of a kill is drawn up to here, s; a run takes longer
+SLOW = 0.3  # position of the speed slider meanwhile: the arm moves for about half of the time
 
 
 @pytest.mark.parametrize(
@@ -78,11 +76,7 @@ def test_ctrl_c_twice_in_a_row_stops_it_too(cell: Site, path: Path) -> None:
 
 
 def _kill_at_random(cell: Site, path: Path, kills: int, seed: int) -> int:
-    """Kill one run after the other; returns in how many of them the arm moved.
-
-    The moment of every second one counts from when all devices are ready: whatever the kill
-    before has left behind, it must not be refused. None may end before it is killed.
-    """
+    """Kill one run after the other; returns in how many of them the arm moved."""
     rng = np.random.default_rng(seed)
     killed = moved = starved = 0
     cell.slider(SLOW)

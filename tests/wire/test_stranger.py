@@ -23,8 +23,7 @@ from tests.support.screen import AtTerminal
 
 pytestmark = pytest.mark.slow
 
-COMMANDS = 15
-"""A stranger may need so many."""
+COMMANDS = 15  # a stranger may need so many
 ASKED = "Enter = done, q = give up:"
 HIDDEN = "joint_tilt_compliance"
 ANSWERS = (

@@ -275,8 +275,7 @@ def test_versions_of_polyscope_x(tmp_path, version, says):
         running.close()
 
 
-CONNECT_S = 8.0
-"""Deadline of opening (the requirement)."""
+CONNECT_S = 8.0  # deadline of opening (the requirement)
 
 
 def test_local_mode_is_refused_before_anything_is_uploaded(sim):

@@ -11,7 +11,7 @@ import numpy as np
 import psutil
 import pytest
 
-from hilcal.drivers.ur_link import dashboard
+from hilcal.drivers.ur_link import supervision
 from hilcal.errors import DeviceError
 from tests.support import sim_ur_cases
 from tests.support import ur_driver_cases as cases
@@ -109,7 +109,7 @@ def test_program_that_a_protective_stop_left_paused_is_ended(tmp_path):
         os.kill(other.workers[0], signal.SIGSTOP)
         running.wait("runtime", 4)
         time.sleep(5.2)  # the robot takes an unlock no sooner
-        dashboard.ask(running.host, ("unlock protective stop",), 2.0)
+        supervision.ask(running.host, ("unlock protective stop",), 2.0)
         os.kill(other.workers[1], signal.SIGKILL)
         assert running.wait("safety", 1)["runtime"] == 4
         arm = cases.controlled(running)

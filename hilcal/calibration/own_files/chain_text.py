@@ -1,4 +1,4 @@
-"""A chain as somebody's description file draws it, and the same chain with a corrected arm.
+"""A description file with the places of its numbers, and its chain with a corrected arm.
 
 A file has steps from its base link to its tip link: a place, and behind it a joint or none. Its
 frames are not those of the arm (a mesh wants its own), but where it is the same arm, they lie on
@@ -14,11 +14,16 @@ of G and H, so that N' is exact. Each N'_k is made by one place: that of its joi
 joint that of the first step there.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import reduce
+from pathlib import Path
+from xml.parsers import expat
 
 import numpy as np
 
+from hilcal import limits
 from hilcal.calibration.programs.program import Span
 from hilcal.errors import InputError
 from hilcal.names import escaped
@@ -36,54 +41,146 @@ millimetres, others are corrected already. A choice; what is written is exact in
 LEFT = 1e-9
 """m, rad; a place that moves less is left as it is."""
 Edits = list[tuple[Span, str]]
+LARGEST, SMALLEST = 1e6, 1e-6
+"""Of numbers, and of the length of a direction; choices."""
+_TAG = re.compile(r"<(?:\"[^\"]*\"|'[^']*'|[^<>\"'])*>")
+
+
+@dataclass(slots=True, eq=False)
+class Node:
+    """An element."""
+
+    tag: str
+    attributes: dict[str, str]  # by name, as written
+    line: int  # from 1
+    begin: int  # where its start tag begins
+    end: int  # where its start tag ends
+    close: int = 0  # where its end tag begins
+    parent: "Node | None" = None  # None for the root
+    children: list["Node"] = field(default_factory=list)  # in the order of the text
+
+    def first(self, tag: str) -> "Node | None":
+        """Return the first child of a name."""
+        return next((c for c in self.children if c.tag == tag), None)
+
+    def every(self, *tags: str) -> Iterator["Node"]:
+        """Yield elements of some names below it, in the order of the text."""
+        for child in self.children:
+            if child.tag in tags:
+                yield child
+            yield from child.every(*tags)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Document:
+    """A file."""
+
+    name: str
+    text: str  # with one character per byte
+    root: Node
+
+    def refused(self, node: Node, what: str) -> InputError:
+        """Return the error of an element."""
+        return InputError(f"{self.name}: line {node.line}: {what}")
+
+    def attribute(self, node: Node, name: str) -> Span | None:
+        """Where the value of an attribute stands."""
+        tag = self.text[node.begin : node.end]
+        m = re.search(rf"\s{re.escape(name)}\s*=\s*(\"([^\"]*)\"|'([^']*)')", tag)
+        if m is None:
+            return None
+        return Span(0, node.begin + m.start(1) + 1, node.begin + m.end(1) - 1)
+
+    def put(self, node: Node, name: str, value: str) -> tuple[Span, str]:
+        """Return the edit that gives an attribute a value, where there is none a new one."""
+        at = self.attribute(node, name)
+        if at is not None:
+            return at, value
+        begin = node.begin + 1 + len(node.tag)
+        return Span(0, begin, begin), f' {name}="{value}"'
+
+    def numbers(self, node: Node, text: str, count: int) -> Floats:
+        """Return the numbers of an attribute or a text."""
+        try:
+            values = np.array([float(word) for word in text.split()])
+        except ValueError:
+            values = np.empty(0)
+        if len(values) != count or not (np.abs(values) <= LARGEST).all():
+            what = f"<{escaped(node.tag)}> has '{escaped(text[:40])}'; valid: {count} numbers"
+            raise self.refused(node, what)
+        return values
+
+    def direction(self, node: Node, values: Floats) -> Floats:
+        """Return a vector of length 1."""
+        size = float(np.linalg.norm(values))
+        if size < SMALLEST:
+            raise self.refused(node, f"<{escaped(node.tag)}> has a direction of length 0")
+        return np.asarray(values / size)
+
+
+def read_xml(path: Path) -> Document:
+    """Read a file."""
+    try:
+        raw = limits.read_bytes(path, limits.PROGRAM)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    text = raw.decode("latin-1")
+    top = Node("", {}, 0, 0, 0)
+    open_ = [top]
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        begin, above = parser.CurrentByteIndex, open_[-1]
+        m = _TAG.match(text, begin)
+        node = Node(tag, attributes, parser.CurrentLineNumber, begin, m.end() if m else begin)
+        node.parent = None if above is top else above
+        above.children.append(node)
+        open_.append(node)
+        if len(open_) > limits.NESTED + 1:
+            raise InputError(f"{path}: nested too deeply; valid: a robot's description")
+
+    def end(tag: str) -> None:
+        open_.pop().close = parser.CurrentByteIndex
+
+    def entity(*_: object) -> None:
+        raise InputError(f"{path}: it has entities of its own; valid: XML without <!ENTITY>")
+
+    parser = expat.ParserCreate()
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    parser.EntityDeclHandler = entity
+    try:
+        parser.Parse(raw, True)
+    except expat.ExpatError as error:
+        raise InputError(f"{path}: line {error.lineno}: no XML: {error}") from None
+    if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        raise InputError(f"{path}: UTF-16; valid: UTF-8")
+    return Document(path.name, text, top.children[0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChainPlace:
-    """One place of a chain.
+    """One place of a chain."""
 
-    Attributes:
-        name: of the element, for people.
-        line: of it, from 1.
-        place: (4, 4) in the frame before it.
-        joint: (4, 4) where the axis is behind it, z along the axis; None where nothing turns.
-        write: edits that give it another place; raises `InputError` where it cannot have one.
-    """
-
-    name: str
-    line: int
-    place: Floats
+    name: str  # of the element, for people
+    line: int  # of it, from 1
+    place: Floats  # (4, 4) in the frame before it
     joint: Floats | None
+    """(4, 4) where the axis is behind it, z along the axis; None where nothing turns."""
     write: Callable[[Floats], Edits]
+    """Edits that give it another place; raises `InputError` where it cannot have one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Redrawn:
-    """A chain with a corrected arm.
+    """A chain with a corrected arm."""
 
-    Attributes:
-        places: (4, 4) the new place of each step.
-        tip: (4, 4) from the flange of the arm to the tip of the file.
-        lost: (4, 4) what the file has no place for, behind its last joint.
-        rough: by how much its axes lay elsewhere than those of the nominal arm, m.
-    """
-
-    places: tuple[Floats, ...]
-    tip: Floats
-    lost: Floats
-    rough: float
+    places: tuple[Floats, ...]  # (4, 4) the new place of each step
+    tip: Floats  # (4, 4) from the flange of the arm to the tip of the file
+    lost: Floats  # (4, 4) what the file has no place for, behind its last joint
+    rough: float  # by how much its axes lay elsewhere than those of the nominal arm, m
 
 
 def redrawn(steps: Sequence[ChainPlace], nominal: Arm, arm: Arm, file: str) -> Redrawn:
-    """Return the places that a corrected arm has in a file.
-
-    Args:
-        steps: of the file, base to tip.
-        nominal: the arm that the campaign began with.
-
-    Raises:
-        InputError: the file is of another arm; says which axis lies elsewhere.
-    """
+    """Return the places that a corrected arm has in a file."""
     turning = [k for k, s in enumerate(steps) if s.joint is not None]
     if len(turning) != arm.n:
         names = ", ".join(escaped(steps[k].name) for k in turning)
@@ -95,11 +192,11 @@ def redrawn(steps: Sequence[ChainPlace], nominal: Arm, arm: Arm, file: str) -> R
     drawn, before, after = [], [], []
     last, joint = 0, np.eye(4)
     for k in (*turning, len(steps)):
-        end = steps[k].joint if k < len(steps) else np.eye(4)
-        fixed = _product([s.place for s in steps[last:k]])
-        own = steps[k].place if k < len(steps) else np.eye(4)
-        assert end is not None  # noqa: S101 - `turning` has joints alone
-        drawn.append(se3.inverse(joint) @ fixed @ own @ end)
+        place, end = np.eye(4), np.eye(4)
+        if k < len(steps):
+            place, end = steps[k].place, np.asarray(steps[k].joint)
+        fixed = _product(steps[last:k])
+        drawn.append(se3.inverse(joint) @ fixed @ place @ end)
         before.append((joint, fixed))
         after.append(end)
         last, joint = k + 1, end
@@ -111,7 +208,7 @@ def redrawn(steps: Sequence[ChainPlace], nominal: Arm, arm: Arm, file: str) -> R
         if k < len(turning):
             places[turning[k]] = se3.inverse(fixed) @ joint @ wanted @ se3.inverse(after[k])
         elif len(steps) > turning[-1] + 1:
-            rest = _product([s.place for s in steps[turning[-1] + 2 :]])
+            rest = _product(steps[turning[-1] + 2 :])
             places[turning[-1] + 1] = joint @ wanted @ se3.inverse(rest)
         else:
             lost = joint @ wanted
@@ -172,27 +269,17 @@ def _off(g: Floats) -> tuple[float, float]:
 def _other_zero(link: Floats, before: Floats, drawn: Floats) -> Floats:
     """H with the turn about z by which the next axis of the file lies on that of the arm."""
     seen = before @ drawn
-    column = (
-        2 if np.hypot(link[0, 2], link[1, 2]) > NEAR_RAD else 3
-    )  # parallel axes: by where they are
+    parallel = np.hypot(link[0, 2], link[1, 2]) <= NEAR_RAD
+    column = 3 if parallel else 2  # parallel axes: by where they are
     turn = np.arctan2(link[1, column], link[0, column])
     turn -= np.arctan2(seen[1, column], seen[0, column])
     return se3.screw(2, float(turn)) @ before
 
 
 def edits_of(steps: Sequence[ChainPlace], places: Sequence[Floats]) -> tuple[Edits, list[str]]:
-    """Edits of all steps that move, and the names of these.
-
-    Raises:
-        InputError: a place cannot be written; names the line.
-    """
-    out: Edits = []
-    names = []
-    for step, place in zip(steps, places, strict=True):
-        if moved(step.place, place) > LEFT:
-            out += step.write(place)
-            names.append(step.name)
-    return out, names
+    """Edits of all steps that move, and the names of these."""
+    pairs = [(s, p) for s, p in zip(steps, places, strict=True) if moved(s.place, p) > LEFT]
+    return [edit for s, place in pairs for edit in s.write(place)], [s.name for s, _ in pairs]
 
 
 def moved(a: Floats, b: Floats) -> float:
@@ -210,13 +297,16 @@ def z_to(axis: Floats) -> Floats:
     return se3.matrix(se3.rotation(np.arctan2(size, axis[2]) * about / size), np.zeros(3))
 
 
+def not_between(name: str, kind: str) -> str:
+    """Say that a joint may not stand between base and tip."""
+    what = f"joint '{escaped(name)}' is {escaped(kind) or 'nothing'}"
+    return f"{what}; valid between base and tip: revolute, continuous, fixed"
+
+
 def numbers(values: Floats) -> str:
     """Numbers as a description has them, to a nanometre and better."""
     return " ".join(f"{0.0 if abs(v) < 1e-13 else v:.12g}" for v in values.tolist())
 
 
-def _product(places: Sequence[Floats]) -> Floats:
-    out = np.eye(4)
-    for place in places:
-        out = out @ place
-    return out
+def _product(steps: Sequence[ChainPlace]) -> Floats:
+    return reduce(np.matmul, (s.place for s in steps), np.eye(4))

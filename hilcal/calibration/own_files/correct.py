@@ -9,64 +9,46 @@ import numpy as np
 from hilcal import limits
 from hilcal.calibration.dh_table import dh_rows
 from hilcal.calibration.handover import Corrected
-from hilcal.calibration.own_files.chain_text import LEFT, SAME, edits_of, moved, redrawn
+from hilcal.calibration.own_files.chain_text import LEFT, SAME, edits_of, moved, read_xml, redrawn
 from hilcal.calibration.own_files.mjcf_text import mjcf_steps
 from hilcal.calibration.own_files.sdf_text import sdf_chain
 from hilcal.calibration.own_files.urdf_text import urdf_steps
-from hilcal.calibration.own_files.xml_text import read_xml
 from hilcal.calibration.programs.program import Span, edited
 from hilcal.errors import InputError
 from hilcal.numbers import length
 from hilcal.robot.arm import Arm
-from hilcal.types import Floats
 
 KINDS = "a URDF, a xacro, an MJCF, an SDF, or UR's calibration.conf"
+_STEPS = {"mujoco": mjcf_steps, "robot": urdf_steps}
 _DELTA = re.compile(r"^(\s*delta_(theta|a|d|alpha)\s*=\s*\[)([^\]\n]*)(\].*)$", re.MULTILINE)
 
 
 @dataclass(frozen=True, slots=True)
 class Correction:
-    """A file with another arm in it.
-
-    Attributes:
-        said: what was changed, and what the file has no place for.
-    """
+    """A file with another arm in it."""
 
     content: bytes
-    said: str
+    said: str  # what was changed, and what the file has no place for
 
 
 def correct_file(
     path: Path, nominal: Arm, found: Corrected, base: str | None = None, tip: str | None = None
 ) -> Correction:
-    """Return a file with the corrected geometry in the place of its own.
-
-    Args:
-        path: a file of `KINDS`.
-        nominal: the arm that the campaign began with.
-        base: name of the link or body that the arm begins at.
-        tip: name of the link, body or site that is its flange.
-
-    Raises:
-        InputError: it cannot be read, is of another arm, or a place in it cannot be written.
-    """
+    """Return a file with the corrected geometry in the place of its own."""
     if path.suffix == ".conf":
         return _ur_conf(path, nominal, found.arm)
     document = read_xml(path)
     kind = document.root.tag
-    if kind == "mujoco":
-        steps = mjcf_steps(document, base, tip)
-    elif kind == "robot":
-        steps = urdf_steps(document, base, tip)
-    elif kind == "sdf":
+    if kind == "sdf":
         chain = sdf_chain(document, base, tip)
         new = redrawn(chain.steps, nominal, found.arm, document.name)
         edits, names = chain.edits(list(new.places))
-    else:
-        raise InputError(f"{path}: an XML file of <{kind[:40]}>; valid: {KINDS}")
-    if kind != "sdf":
+    elif kind in _STEPS:
+        steps = _STEPS[kind](document, base, tip)
         new = redrawn(steps, nominal, found.arm, document.name)
         edits, names = edits_of(steps, new.places)
+    else:
+        raise InputError(f"{path}: an XML file of <{kind[:40]}>; valid: {KINDS}")
     said = f"{path}: {len(names)} places changed ({', '.join(names)}), all else as it was"
     if new.rough > SAME:
         said += f"; its axes lay up to {length(new.rough)} from those of the nominal {nominal.name}"
@@ -102,14 +84,9 @@ def _ur_conf(path: Path, nominal: Arm, arm: Arm) -> Correction:
     if not nominal.name.startswith("ur"):
         raise InputError(f"{path}: is for UR arms, the campaign has {nominal.name}")
     old, new = dh_rows(nominal), dh_rows(arm)
-    turn = (new.offset - old.offset + np.pi) % (2 * np.pi) - np.pi
-    bend = (new.alpha - old.alpha + np.pi) % (2 * np.pi) - np.pi
-    values: dict[str, Floats] = {
-        "theta": turn,
-        "a": new.a - old.a,
-        "d": new.d - old.d,
-        "alpha": bend,
-    }
+    values = {"a": new.a - old.a, "d": new.d - old.d}
+    for key, turn in (("theta", new.offset - old.offset), ("alpha", new.alpha - old.alpha)):
+        values[key] = (turn + np.pi) % (2 * np.pi) - np.pi
     edits = [
         (Span(0, m.start(3), m.end(3)), f" {', '.join(f'{v:.17g}' for v in values[key])}")
         for key, m in found.items()

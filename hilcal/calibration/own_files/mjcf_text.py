@@ -11,8 +11,7 @@ import re
 
 import numpy as np
 
-from hilcal.calibration.own_files.chain_text import ChainPlace, Edits, numbers, z_to
-from hilcal.calibration.own_files.xml_text import Document, Node
+from hilcal.calibration.own_files.chain_text import ChainPlace, Document, Edits, Node, numbers, z_to
 from hilcal.calibration.programs.program import Span
 from hilcal.errors import InputError
 from hilcal.names import escaped
@@ -23,27 +22,15 @@ _TURNS = {"quat": 4, "axisangle": 4, "euler": 3, "xyaxes": 6, "zaxis": 3}
 
 
 def mjcf_steps(document: Document, base: str | None, tip: str | None) -> list[ChainPlace]:
-    """Return the steps from a base body to a tip, a body or a site.
-
-    Args:
-        base: name of the body; the one that carries the first hinge where None.
-        tip: name of a body or a site; the last body with a hinge where None.
-
-    Raises:
-        InputError: no such chain, or one that cannot be read.
-    """
+    """Return the steps from a base body to a tip, a body or a site."""
     world = document.root.first("worldbody")
     if world is None:
         raise InputError(f"{document.name}: no <worldbody>; valid: an MJCF with the arm in it")
     for node in document.root.every("include", "attach", "replicate"):
-        raise InputError(
-            f"{document.name}: line {node.line}: <{node.tag}>; valid: the arm in the file itself"
-        )
+        raise document.refused(node, f"<{node.tag}>; valid: the arm in the file itself")
     hinged = [b for b in world.every("body") if b.first("joint") is not None]
     if not hinged:
-        raise InputError(
-            f"{document.name}: no body with a joint; valid: an MJCF with the arm in it"
-        )
+        raise InputError(f"{document.name}: no body with a joint; valid: an MJCF with the arm")
     if tip is None:
         ends = [b for b in hinged if not any(o is not b and b in _up(o) for o in hinged)]
         if len(ends) != 1:
@@ -85,10 +72,8 @@ def _step(document: Document, node: Node) -> ChainPlace:
     """Return the step of a body or a site; raises as `mjcf_steps` does."""
     joints = [c for c in node.children if c.tag in ("joint", "freejoint")]
     if node.tag == "frame" or len(joints) > 1:
-        raise InputError(
-            f"{document.name}: line {node.line}: {_name(node)} is a frame or has several joints; "
-            "valid: one hinge in a body"
-        )
+        what = f"{_name(node)} is a frame or has several joints; valid: one hinge in a body"
+        raise document.refused(node, what)
     pos = document.numbers(node, node.attributes.get("pos", "0 0 0"), 3)
     place = se3.matrix(_rotation(document, node), pos)
     turn = None
@@ -96,10 +81,8 @@ def _step(document: Document, node: Node) -> ChainPlace:
         (joint,) = joints
         kind = _default(document, joint, "type") or "hinge"
         if joint.tag != "joint" or kind != "hinge":
-            raise InputError(
-                f"{document.name}: line {joint.line}: joint '{_name(joint)}' is no hinge; valid: "
-                "hinges between base and tip"
-            )
+            what = f"joint '{_name(joint)}' is no hinge; valid: hinges between base and tip"
+            raise document.refused(joint, what)
         axis = document.numbers(joint, _default(document, joint, "axis") or "0 0 1", 3)
         at = document.numbers(joint, _default(document, joint, "pos") or "0 0 0", 3)
         turn = se3.matrix(np.eye(3), at) @ z_to(document.direction(joint, axis))
@@ -134,9 +117,8 @@ def _rotation(document: Document, node: Node) -> Floats:
         return np.eye(3)
     key = keys[0]
     v = document.numbers(node, node.attributes[key], _TURNS[key])
-    compiler = [c for c in document.root.every("compiler") if "angle" in c.attributes]
-    radian = bool(compiler) and compiler[-1].attributes["angle"] == "radian"
-    unit = 1.0 if radian else np.pi / 180
+    compiler = {k: v for c in document.root.every("compiler") for k, v in c.attributes.items()}
+    unit = 1.0 if compiler.get("angle") == "radian" else np.pi / 180
     if key == "quat":
         return se3.of_quaternion(document.direction(node, v))
     if key == "axisangle":
@@ -147,12 +129,7 @@ def _rotation(document: Document, node: Node) -> Floats:
         x = document.direction(node, v[:3])
         y = document.direction(node, v[3:] - (x @ v[3:]) * x)
         return np.stack([x, y, np.cross(x, y)], axis=1)
-    order = [
-        c.attributes["eulerseq"]
-        for c in document.root.every("compiler")
-        if "eulerseq" in c.attributes
-    ]
-    sequence = order[-1] if order else "xyz"
+    sequence = compiler.get("eulerseq", "xyz")
     if not re.fullmatch(r"[xyzXYZ]{3}", sequence):
         raise InputError(f"{document.name}: eulerseq '{escaped(sequence)}'; valid: such as xyz")
     out = np.eye(3)

@@ -7,13 +7,20 @@ than its child has its pose changed, of every other one the pose of the child li
 Source: *SDFormat Specification* 1.7 and later, "Pose frame semantics".
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from hilcal.calibration.handover import origin_of
-from hilcal.calibration.own_files.chain_text import LEFT, ChainPlace, Edits, moved, numbers, z_to
-from hilcal.calibration.own_files.xml_text import Document, Node
+from hilcal.calibration.own_files.chain_text import (
+    LEFT,
+    ChainPlace,
+    Document,
+    Edits,
+    Node,
+    moved,
+    not_between,
+    numbers,
+    z_to,
+)
 from hilcal.calibration.programs.program import Span
 from hilcal.errors import InputError
 from hilcal.names import escaped
@@ -24,72 +31,26 @@ MODEL = "__model__"
 """The model's own frame."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SdfChain:
-    """A chain of an SDF, and how it is written.
-
-    Attributes:
-        steps: from the base link to the tip link; their `write` is that of `edits`.
-    """
-
-    steps: list[ChainPlace]
-    document: Document
-    joints: list[Node]
-    model: "_Model"
-
-    def edits(self, places: list[Floats]) -> tuple[Edits, list[str]]:
-        """Edits that give the steps other places, and the names of what moves."""
-        new: dict[str, Floats] = {}
-        given = dict(zip(self.joints, places, strict=True))
-        for joint in self.model.ordered():
-            parent, child = self.model.ends(joint)
-            place = given.get(joint)
-            if place is None:
-                if parent not in new:
-                    continue
-                place = se3.inverse(self.model.place(parent)) @ self.model.place(child)
-            from_ = new[parent] if parent in new else self.model.place(parent)
-            name = joint.attributes.get("name", "")
-            behind = se3.inverse(self.model.place(child)) @ self.model.place(name)
-            new[child] = from_ @ place
-            new[name] = new[child] @ behind
-        out: Edits = []
-        names = []
-        for name, at in new.items():
-            node, reference = self.model.nodes[name], self.model.reference(name)
-            pose = se3.inverse(self.model.place(reference, new)) @ at
-            if moved(self.model.own(name), pose) > LEFT:
-                xyz, rpy = origin_of(pose)
-                out.append(_pose_edit(node, f"{numbers(xyz)} {numbers(rpy)}"))
-                names.append(name)
-            along, other = self.model.axis(node)
-            if along is not None and other:  # an axis in another frame turns with its joint
-                was = self.model.document.numbers(along, self.model.text(along), 3)
-                local = self.model.place(name)[:3, :3].T @ self.model.place(other)[:3, :3] @ was
-                now = self.model.place(other, new)[:3, :3].T @ at[:3, :3] @ local
-                if np.abs(now - was).max() > LEFT:
-                    out.append((Span(0, along.end, along.close), numbers(now)))
-        return out, names
-
-
-class _Model:
-    """Frames of a model: links, joints, frames."""
+class SdfModel:
+    """Frames of a model: links, joints, frames; and its chain from a base link to a tip link."""
 
     def __init__(self, document: Document, node: Node):
+        """Take the frames of a model; the chain is found by `sdf_chain`."""
         self.document = document
+        self.steps: list[ChainPlace] = []
+        self.chain: list[Node] = []
         self.nodes: dict[str, Node] = {}
         for child in node.children:
             if child.tag in ("model", "include"):
-                raise self._refused(child, "a model in a model; valid: one model with the arm")
+                raise document.refused(child, "a model in a model; valid: one with the arm")
             if child.tag in ("link", "joint", "frame"):
                 name = child.attributes.get("name", "")
                 if name in self.nodes:
-                    raise self._refused(child, f"a second '{escaped(name)}'; valid: names of one")
+                    raise document.refused(
+                        child, f"a second '{escaped(name)}'; valid: names of one"
+                    )
                 self.nodes[name] = child
         self.joints = [n for n in self.nodes.values() if n.tag == "joint"]
-
-    def _refused(self, node: Node, what: str) -> InputError:
-        return InputError(f"{self.document.name}: line {node.line}: {what}")
 
     def text(self, node: Node | None) -> str:
         """Text of an element; empty where it is none."""
@@ -107,7 +68,8 @@ class _Model:
         if pose is None or not self.text(pose):
             return np.eye(4)
         if pose.attributes.get("degrees") == "true" or "rotation_format" in pose.attributes:
-            raise self._refused(pose, "a <pose> in degrees or quaternions; valid: x y z r p y, rad")
+            what = "a <pose> in degrees or quaternions; valid: x y z r p y, rad"
+            raise self.document.refused(pose, what)
         v = self.document.numbers(pose, self.text(pose), 6)
         return se3.matrix(se3.of_rpy(v[3:]), v[:3])
 
@@ -154,21 +116,46 @@ class _Model:
             left = [j for j in left if j not in ready]
         return out
 
+    def edits(self, places: list[Floats]) -> tuple[Edits, list[str]]:
+        """Edits that give the steps other places, and the names of what moves."""
+        new: dict[str, Floats] = {}
+        given = dict(zip(self.chain, places, strict=True))
+        for joint in self.ordered():
+            parent, child = self.ends(joint)
+            place = given.get(joint)
+            if place is None:
+                if parent not in new:
+                    continue
+                place = se3.inverse(self.place(parent)) @ self.place(child)
+            name = joint.attributes.get("name", "")
+            behind = se3.inverse(self.place(child)) @ self.place(name)
+            new[child] = (new[parent] if parent in new else self.place(parent)) @ place
+            new[name] = new[child] @ behind
+        out: Edits = []
+        names = []
+        for name, at in new.items():
+            node = self.nodes[name]
+            pose = se3.inverse(self.place(self.reference(name), new)) @ at
+            if moved(self.own(name), pose) > LEFT:
+                xyz, rpy = origin_of(pose)
+                out.append(_pose_edit(node, f"{numbers(xyz)} {numbers(rpy)}"))
+                names.append(name)
+            along, other = self.axis(node)
+            if along is not None and other:  # an axis in another frame turns with its joint
+                was = self.document.numbers(along, self.text(along), 3)
+                local = self.place(name)[:3, :3].T @ self.place(other)[:3, :3] @ was
+                now = self.place(other, new)[:3, :3].T @ at[:3, :3] @ local
+                if np.abs(now - was).max() > LEFT:
+                    out.append((Span(0, along.end, along.close), numbers(now)))
+        return out, names
 
-def sdf_chain(document: Document, base: str | None, tip: str | None) -> SdfChain:
-    """Return the chain from a base link to a tip link.
 
-    Args:
-        base: name of the link; the first one where None.
-        tip: name of the link; the only one behind the turning joints where None.
-
-    Raises:
-        InputError: no such chain, or one that cannot be read.
-    """
+def sdf_chain(document: Document, base: str | None, tip: str | None) -> SdfModel:
+    """Return the chain from a base link to a tip link."""
     models = list(document.root.every("model"))
     if not models:
         raise InputError(f"{document.name}: no <model>; valid: an SDF with the arm")
-    model = _Model(document, models[0])
+    model = SdfModel(document, models[0])
     leads = {model.ends(j)[1]: j for j in model.ordered() if model.ends(j)[0] != "world"}
     turning = [j for j in leads.values() if j.attributes.get("type") in ("revolute", "continuous")]
     if not turning:
@@ -197,8 +184,9 @@ def sdf_chain(document: Document, base: str | None, tip: str | None) -> SdfChain
         if base not in names:
             raise InputError(f"{document.name}: no chain from '{base}' to '{tip or ends[0]}'")
         joints = joints[: names.index(base) + 1]
-    joints.reverse()
-    return SdfChain([_step(model, j) for j in joints], document, joints, model)
+    model.chain = joints[::-1]
+    model.steps = [_step(model, j) for j in model.chain]
+    return model
 
 
 def _pose_edit(node: Node, text: str) -> tuple[Span, str]:
@@ -210,7 +198,7 @@ def _pose_edit(node: Node, text: str) -> tuple[Span, str]:
     return Span(0, pose.end, pose.close), text
 
 
-def _step(model: _Model, joint: Node) -> ChainPlace:
+def _step(model: SdfModel, joint: Node) -> ChainPlace:
     """Return the step of a joint; raises as `sdf_chain` does."""
     kind, name = joint.attributes.get("type", ""), joint.attributes.get("name", "")
     parent, child = model.ends(joint)
@@ -224,8 +212,5 @@ def _step(model: _Model, joint: Node) -> ChainPlace:
             along = at[:3, :3].T @ model.place(other)[:3, :3] @ along
         turn = se3.inverse(model.place(child)) @ at @ z_to(along)
     elif kind != "fixed":
-        raise InputError(
-            f"{model.document.name}: line {joint.line}: joint '{escaped(name)}' is {escaped(kind)};"
-            " valid between base and tip: revolute, continuous, fixed"
-        )
+        raise model.document.refused(joint, not_between(name, kind))
     return ChainPlace(name, joint.line, place, turn, lambda _: [])

@@ -6,13 +6,22 @@ read, and refused by its line where it would have to change.
 
 import ast
 import math
+import operator
 import re
+from collections.abc import Callable
 
 import numpy as np
 
 from hilcal.calibration.handover import origin_of
-from hilcal.calibration.own_files.chain_text import ChainPlace, Edits, numbers, z_to
-from hilcal.calibration.own_files.xml_text import Document, Node
+from hilcal.calibration.own_files.chain_text import (
+    ChainPlace,
+    Document,
+    Edits,
+    Node,
+    not_between,
+    numbers,
+    z_to,
+)
 from hilcal.calibration.programs.program import Span
 from hilcal.errors import InputError
 from hilcal.names import escaped
@@ -20,19 +29,15 @@ from hilcal.robot import se3
 from hilcal.types import Floats
 
 _EXPRESSION = re.compile(r"\$\{([^{}]*)\}")
+_ARITHMETIC: dict[type[ast.operator], Callable[[float, float], float]] = {
+    **{ast.Add: operator.add, ast.Sub: operator.sub},
+    **{ast.Mult: operator.mul, ast.Div: operator.truediv},
+}
 _TURNING, _FIXED = ("revolute", "continuous"), "fixed"
 
 
 def urdf_steps(document: Document, base: str | None, tip: str | None) -> list[ChainPlace]:
-    """Return the steps from a base link to a tip link.
-
-    Args:
-        base: name of the link, without what a xacro puts before it; the root link where None.
-        tip: the same of the last one; the only leaf behind the last joint where None.
-
-    Raises:
-        InputError: no such chain.
-    """
+    """Return the steps from a base link to a tip link."""
     parents: dict[str, tuple[str, Node]] = {}
     for joint in document.root.every("joint"):
         ends = [joint.first(tag) for tag in ("parent", "child")]
@@ -41,16 +46,14 @@ def urdf_steps(document: Document, base: str | None, tip: str | None) -> list[Ch
             continue
         parent, child = (str(n) for n in names)
         if child in parents:
-            raise InputError(
-                f"{document.name}: line {joint.line}: a second joint leads to link "
-                f"'{escaped(child)}'; valid: a tree"
-            )
+            what = f"a second joint leads to link '{escaped(child)}'; valid: a tree"
+            raise document.refused(joint, what)
         parents[child] = (parent, joint)
     links = {*parents, *(p for p, _ in parents.values())}
     if not links:
         raise InputError(f"{document.name}: no joints; valid: a URDF or a xacro with them")
     end = _link(document, links, tip) if tip is not None else _leaf(document, parents, links)
-    up = _path(end, parents, document)
+    up, back = _path(end, parents, document), []
     if base is not None:
         start = _link(document, links, base)
         down = _path(start, parents, document)
@@ -59,9 +62,8 @@ def urdf_steps(document: Document, base: str | None, tip: str | None) -> list[Ch
             raise InputError(f"{document.name}: no chain from '{base}' to '{tip}'")
         up = up[: [n for n, _ in up].index(common)]
         back = down[: [n for n, _ in down].index(common)]
-        inverse = [_step(document, j, turned=True) for _, j in back if j is not None]
-        return [*inverse, *(_step(document, j) for _, j in reversed(up) if j is not None)]
-    return [_step(document, j) for _, j in reversed(up) if j is not None]
+    inverse = [_step(document, j, turned=True) for _, j in back if j is not None]
+    return [*inverse, *(_step(document, j) for _, j in reversed(up) if j is not None)]
 
 
 def _path(
@@ -115,10 +117,7 @@ def _step(document: Document, joint: Node, *, turned: bool = False) -> ChainPlac
     kind, name = joint.attributes.get("type", ""), joint.attributes.get("name", "")
     axis = joint.first("axis")
     if kind not in (*_TURNING, _FIXED) or (turned and kind != _FIXED):
-        raise InputError(
-            f"{document.name}: line {joint.line}: joint '{escaped(name)}' is {kind or 'nothing'}; "
-            "valid between base and tip: revolute, continuous, fixed"
-        )
+        raise document.refused(joint, not_between(name, kind))
     along = "1 0 0" if axis is None else axis.attributes.get("xyz", "1 0 0")
     origin = joint.first("origin")
     given = {} if origin is None else origin.attributes
@@ -138,14 +137,14 @@ def _step(document: Document, joint: Node, *, turned: bool = False) -> ChainPlac
             return [(Span(0, joint.end, joint.end), f"<origin {text}/>")]
         out: Edits = []
         for key, old in (("xyz", xyz), ("rpy", rpy)):
-            same = np.abs(old - values[key]).max() < 1e-12
-            if same:
+            if np.abs(old - values[key]).max() < 1e-12:
                 continue
             if "$" in given.get(key, ""):
-                raise InputError(
-                    f"{document.name}: line {origin.line}: the place of joint '{escaped(name)}' is "
-                    f"'{escaped(given[key][:60])}', and becomes '{numbers(values[key])}'; write "
-                    "numbers there, or correct what xacro makes of it: xacro F.xacro > F.urdf"
+                raise document.refused(
+                    origin,
+                    f"the place of joint '{escaped(name)}' is '{escaped(given[key][:60])}', and "
+                    f"becomes '{numbers(values[key])}'; write numbers there, or correct what "
+                    "xacro makes of it: xacro F.xacro > F.urdf",
                 )
             out.append(document.put(origin, key, numbers(values[key])))
         return out
@@ -160,9 +159,10 @@ def _values(document: Document, node: Node, text: str) -> Floats:
         try:
             return repr(_constant(ast.parse(m[1].strip(), mode="eval").body))
         except (ValueError, SyntaxError, ZeroDivisionError, OverflowError, RecursionError):
-            raise InputError(
-                f"{document.name}: line {node.line}: '{escaped(m[0][:60])}' is not of numbers; "
-                "correct what xacro makes of the file: xacro F.xacro > F.urdf"
+            raise document.refused(
+                node,
+                f"'{escaped(m[0][:60])}' is not of numbers; correct what xacro makes of the file: "
+                "xacro F.xacro > F.urdf",
             ) from None
 
     return document.numbers(node, _EXPRESSION.sub(computed, text), 3)
@@ -177,17 +177,8 @@ def _constant(node: ast.expr) -> float:
             return math.pi
         case ast.UnaryOp(op=ast.USub(), operand=inner):
             return -_constant(inner)
-        case ast.BinOp(left=a, op=op, right=b):
-            x, y = _constant(a), _constant(b)
-            match op:
-                case ast.Add():
-                    return x + y
-                case ast.Sub():
-                    return x - y
-                case ast.Mult():
-                    return x * y
-                case ast.Div():
-                    return x / y
+        case ast.BinOp(left=a, op=op, right=b) if type(op) in _ARITHMETIC:
+            return _ARITHMETIC[type(op)](_constant(a), _constant(b))
         case ast.Call(func=ast.Name("radians"), args=[inner], keywords=[]):
             return math.radians(_constant(inner))
     raise ValueError

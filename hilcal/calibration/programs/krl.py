@@ -28,15 +28,14 @@ from hilcal.calibration.programs.program import (
     Language,
     Program,
     ProgramPoint,
+    ProgramReader,
     Span,
     arguments_of,
     controller_frames,
     of_euler,
     read_text,
     to_euler,
-    used_again,
 )
-from hilcal.errors import InputError
 from hilcal.types import Floats, Ints
 
 POSE, AXES, TURN = ("X", "Y", "Z", "A", "B", "C"), tuple(f"A{k}" for k in range(1, 7)), "T"
@@ -78,6 +77,7 @@ _FORBIDDEN = re.compile(
 )
 _INERT = re.compile(r"^\s*(\$H_POS|\$POS_RET)\s*=\s*\w+\s*$", re.IGNORECASE)
 """Statements that read a point and move nothing."""
+_BEFORE = "before it in the same subprogram"
 
 
 def flags(q: Floats, shape: Ints) -> Ints:
@@ -89,8 +89,7 @@ def _written(new: Ints, texts: Sequence[str]) -> list[str]:
     """T with the bits of the flags."""
     (text,) = texts
     turn = int(_value(text)) & ~0b111111
-    turn |= sum(1 << k for k, bit in enumerate(new[2:]) if bit == 1)
-    return [str(turn)]
+    return [str(turn | sum(1 << k for k, bit in enumerate(new[2:]) if bit == 1))]
 
 
 KRL = Language(
@@ -101,51 +100,29 @@ KRL = Language(
     axes=((0, 0, -1), (0, 1, 0), (0, 1, 0), (-1, 0, 0), (0, 1, 0), (-1, 0, 0)),
     flags=flags,
     of_shape=(True, True, *(False,) * JOINTS),
+    moves="PTP, LIN, CIRC and their S…",
     written=_written,
+    frames="a copy of $config.dat, or TOML",
 )
 
 
 def read_krl(path: Path, frames_file: Path | None, tool: Floats | None) -> Program:
-    """Read a `.src` file with the `.dat` file beside it.
-
-    Args:
-        path: of the `.src` file.
-        frames_file: TOML, or the controller's `$config.dat`; None where there is none.
-        tool: (4, 4) T_flange_tool of tools that no file has; None without it.
-
-    Raises:
-        InputError: it cannot be read, or something could change what its points mean.
-    """
-    beside = next(
-        (
-            p
-            for p in sorted(path.parent.glob("*"))
-            if p.stem == path.stem and p.suffix.lower() == ".dat"
-        ),
-        None,
-    )
-    paths = [path, *([] if beside is None else [beside])]
+    """Read a `.src` file with the `.dat` file beside it."""
+    beside = (p for p in sorted(path.parent.glob("*")) if p.stem == path.stem)
+    paths = [path, *[p for p in beside if p.suffix.lower() == ".dat"][:1]]
     texts, encodings = zip(*(read_text(p) for p in paths), strict=True)
-    if encodings.count("latin-1") and len(set(encodings)) > 1:
-        texts = tuple(p.read_bytes().decode("latin-1") for p in paths)
-    data: dict[str, list[_Value]] = {}
-    suffix = "" if frames_file is None else frames_file.suffix.lower()
-    if frames_file is not None and suffix not in (".toml", ".dat"):
-        raise InputError(f"{frames_file}: valid: a .toml file, or the controller's $config.dat")
-    if frames_file is not None and suffix == ".dat":
-        _collect(read_text(frames_file)[0], -1, data)
-    known = controller_frames(frames_file if suffix == ".toml" else None, KRL, tool)
+    encoding = "latin-1" if "latin-1" in encodings else "utf-8"
+    if len(set(encodings)) > 1:
+        texts = tuple(p.read_bytes().decode(encoding) for p in paths)
+    config = frames_file is not None and frames_file.suffix.lower() == ".dat"
+    known = controller_frames(None if config else frames_file, KRL, tool)
+    reader = _KrlReader(path, known, texts[0], encoding)
+    reader.files = [p.name for p in paths]
     for k, text in enumerate(texts):
-        _collect(text, k, data)
-    names = [p.name for p in paths]
-    points = _KrlReader(names, data, known).points(texts[0])
-    return Program(
-        KRL,
-        tuple(p.suffix for p in paths),
-        texts,
-        points,
-        "latin-1" if "latin-1" in encodings else "utf-8",
-    )
+        reader.collect(text, k)
+    if frames_file is not None and config:
+        reader.collect(read_text(frames_file)[0], -1)
+    return reader.read(texts, [p.suffix for p in paths])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,6 +134,14 @@ class _Value:
     kind: str
     fields: Mapping[str, tuple[str, int, int]]
 
+    @classmethod
+    def of(cls, code: str, at: int, file: int, line: int, kind: str = "") -> "_Value":
+        """Return the aggregate that begins a text; `at` is its place in the file."""
+        body = code[: code.index("}") + 1] if "}" in code else code
+        found = _FIELD.finditer(body)
+        fields = {m[1].upper(): (m[2], at + m.start(2), at + m.end(2)) for m in found}
+        return cls(file, line, kind.upper(), fields)
+
     def numbers(self, keys: Sequence[str]) -> Floats | None:
         """Values of some fields; None where one is missing."""
         try:
@@ -164,9 +149,9 @@ class _Value:
         except (KeyError, ValueError):
             return None
 
-    def span(self, key: str) -> Span:
-        """Where the number of a field stands."""
-        return Span(self.file, *self.fields[key][1:])
+    def spans(self, keys: Sequence[str]) -> tuple[Span, ...]:
+        """Where the numbers of some fields stand."""
+        return tuple(Span(self.file, *self.fields[k][1:]) for k in keys)
 
 
 def _code(text: str) -> Iterator[tuple[int, int, str]]:
@@ -179,21 +164,6 @@ def _code(text: str) -> Iterator[tuple[int, int, str]]:
         at += len(line) + 1
 
 
-def _aggregate(code: str, at: int, file: int, line: int, kind: str) -> _Value:
-    """Fields of an aggregate that begins a text; `at` is its place in the file."""
-    body = code[: code.index("}") + 1] if "}" in code else code
-    fields = {m[1].upper(): (m[2], at + m.start(2), at + m.end(2)) for m in _FIELD.finditer(body)}
-    return _Value(file, line, kind.upper(), fields)
-
-
-def _collect(text: str, file: int, into: dict[str, list[_Value]]) -> None:
-    """Add all aggregates that names are given."""
-    for line, at, code in _code(text):
-        if m := _DATA.match(code):
-            value = _aggregate(m[3], at + m.start(3), file, line, m[1] or "")
-            into.setdefault(_key(m[2]), []).append(value)
-
-
 def _key(name: str) -> str:
     return re.sub(r"\s", "", name).upper()
 
@@ -202,8 +172,8 @@ def _key(name: str) -> str:
 class _State:
     """Tool and base that are set: a pose, or why it is not known."""
 
-    tool: Floats | str
-    base: Floats | str
+    tool: Floats | str = f"the program does not set $TOOL {_BEFORE}"
+    base: Floats | str = f"the program does not set $BASE {_BEFORE}"
 
     def same(self, other: "_State") -> bool:
         """Whether both are known and the same as elsewhere, or unknown there, too."""
@@ -214,9 +184,6 @@ class _State:
         )
 
 
-_NOT_SET = "the program does not set {} before it in the same subprogram"
-
-
 @dataclass(slots=True, eq=False)
 class _Block:
     """A block that is open: the state at its beginning, and at the ends of its branches."""
@@ -225,28 +192,32 @@ class _Block:
     ends: list[_State] = field(default_factory=list)
 
 
-class _KrlReader:
+class _KrlReader(ProgramReader):
     """Goes through the statements of a `.src` file in the order of its text."""
 
-    def __init__(
-        self, files: Sequence[str], data: Mapping[str, list[_Value]], known: ControllerFrames
-    ):
-        self.files, self.data, self.known = files, data, known
-        self.found: dict[str, ProgramPoint] = {}
-        self.at_name: dict[str, str] = {}
-        self.state = _State(*(_NOT_SET.format(n) for n in ("$TOOL", "$BASE")))
+    def __init__(self, path: Path, known: ControllerFrames, text: str, encoding: str):
+        super().__init__(path, known, text, encoding)
+        self.files: list[str] = []
+        self.data: dict[str, list[_Value]] = {}
+        self.state = _State()
         self.form: str | None = None
 
-    def points(self, text: str) -> tuple[ProgramPoint, ...]:
-        """All points; raises as `read_krl` does."""
-        lines = list(_code(text))
-        used = self._used_otherwise(lines)
+    def collect(self, text: str, file: int) -> None:
+        """Take all aggregates that names are given in a file; −1 for that of --frames."""
+        for line, at, code in _code(text):
+            if m := _DATA.match(code):
+                value = _Value.of(m[3], at + m.start(3), file, line, m[1] or "")
+                self.data.setdefault(_key(m[2]), []).append(value)
+
+    def read(self, texts: Sequence[str], suffixes: Sequence[str]) -> Program:
+        """Read the statements of the first text."""
+        lines = list(_code(texts[0]))
+        self.used = self._used_otherwise(lines)
         blocks: list[_Block] = []
         for k, (line, at, code) in enumerate(lines):
-            m = _NAME.match(code.strip())
-            word = m[0].upper() if m else ""
+            word = _word(code)
             if word in ("DEF", "DEFFCT", "GLOBAL") and re.search(r"\bDEF(FCT)?\b", code, re.I):
-                self.state, blocks = _State(*(_NOT_SET.format(n) for n in ("$TOOL", "$BASE"))), []
+                self.state, blocks = _State(), []
             elif word in _ELSE and blocks:
                 blocks[-1].ends.append(self.state)
                 self.state = blocks[-1].begin
@@ -261,19 +232,17 @@ class _KrlReader:
             elif word and re.fullmatch(r"\s*\w+\s*:\s*", code):
                 self._forget(f"line {line} is a label, which may be reached from elsewhere")
             else:
-                self._statement(line, at, code, used)
-        if not self.found:
-            raise InputError(f"{self.files[0]}: no motions; valid: PTP, LIN, CIRC and their S…")
-        return tuple(self.found.values())
+                self._statement(line, at, code)
+        return self.program(texts, suffixes)
 
     def _forget(self, because: str) -> None:
         why = f"its tool and base are not known: {because}"
         self.state = _State(why, why)
 
-    def _statement(self, line: int, at: int, code: str, used: Mapping[str, int]) -> None:
-        """Take note of one statement; raises as `read_krl` does."""
+    def _statement(self, line: int, at: int, code: str) -> None:
+        """Take note of one statement."""
         if m := _MOTION.match(code):
-            self._motion(line, at, code, m, used)
+            self._motion(line, at, code, m)
         elif m := _SET.match(code):
             self._set(m[1].upper(), m[2].strip(), line, at + m.start(2))
         elif m := _FDAT.match(code):
@@ -287,10 +256,8 @@ class _KrlReader:
             elif what == "INITMOV":
                 self._forget(f"BAS(#INITMOV) of line {line} sets them to what $config.dat has")
         elif m := _FORBIDDEN.search(code):
-            raise InputError(
-                f"{self.files[0]}: line {line}: '{m[0].strip()}' changes what points mean; valid: "
-                "$TOOL and $BASE as a whole, a tool on the flange"
-            )
+            what = f"'{m[0].strip()}' changes what points mean"
+            raise self.refused(line, what, "$TOOL and $BASE as a whole, a tool on the flange")
         elif (m := _CALL.match(code)) and m[1].upper() not in _NO_CALLS:
             self._forget(f"{m[1][:40]} of line {line} may set them")
 
@@ -303,10 +270,8 @@ class _KrlReader:
             return
         fields = values[0].fields
         if fields.get("IPO_FRAME", ("#BASE",))[0].upper() != "#BASE":
-            raise InputError(
-                f"{self.files[0]}: line {line}: {name} has its tool outside of the arm "
-                "(IPO_FRAME #TCP); valid: a tool on the flange"
-            )
+            what = f"{name} has its tool outside of the arm (IPO_FRAME #TCP)"
+            raise self.refused(line, what, "a tool on the flange")
         for what in ("TOOL", "BASE"):
             if only in ("", what):
                 number = fields.get(f"{what}_NO", ("0",))[0]
@@ -314,52 +279,38 @@ class _KrlReader:
 
     def _set(self, what: str, value: str, line: int, at: int) -> None:
         """Set `$TOOL` or `$BASE`."""
-        key, out = what.lower(), self._frame(what, value, line, at)
-        self.state = replace(self.state, **{key: out})
+        out = self._frame(what, value, line, at)
+        self.state = replace(self.state, **{what.lower(): out})
+
+    def _numbers(self, name: str) -> Floats | None:
+        """Numbers of a pose that a name has; None where it has none, or several."""
+        values = self.data.get(_key(name), [])
+        return values[0].numbers(POSE) if len(values) == 1 else None
 
     def _frame(self, what: str, value: str, line: int, at: int) -> Floats | str:
         """Pose of a value, or why it is not known."""
         if value.upper() == "$NULLFRAME":
             return np.eye(4)
         if value.startswith("{"):
-            numbers = _aggregate(value, at, 0, line, "FRAME").numbers(POSE)
+            numbers = _Value.of(value, at, 0, line).numbers(POSE)
             return f"${what} of line {line} is not whole" if numbers is None else of_euler(numbers)
         m = _INDEX.match(value)
         if m is None or m[1].upper() != what:
-            values = self.data.get(_key(value), [])
-            numbers = values[0].numbers(POSE) if len(values) == 1 else None
-            if numbers is None:
-                return f"${what} of line {line} is computed"
+            numbers = self._numbers(value)
+            return f"${what} of line {line} is computed" if numbers is None else of_euler(numbers)
+        group, name = ("tools", "bases")[what == "BASE"], f"{what}_DATA[{m[2]}]"
+        if self.known.given(group, m[2]) is None and (numbers := self._numbers(name)) is not None:
             return of_euler(numbers)
-        number = m[2]
-        table = self.known.tools if what == "TOOL" else self.known.bases
-        if number in table:
-            return table[number]
-        values = self.data.get(f"{what}_DATA[{number}]", [])
-        numbers = values[0].numbers(POSE) if len(values) == 1 else None
-        if numbers is not None:
-            return of_euler(numbers)
-        if number == "0":
-            return np.eye(4)
-        if what == "TOOL" and self.known.tool is not None:
-            return self.known.tool
-        other = " or --tool" if what == "TOOL" else ""
-        return (
-            f"{what}_DATA[{number}] is not in the program; give it by --frames (a copy of "
-            f"$config.dat, or TOML){other}"
-        )
+        return self.known.pose(group, m[2], name)
 
-    def _motion(
-        self, line: int, at: int, code: str, m: re.Match[str], used: Mapping[str, int]
-    ) -> None:
+    def _motion(self, line: int, at: int, code: str, m: re.Match[str]) -> None:
         """Take the targets of a motion."""
         word = m[1].upper()
-        rest, begin = code[m.end() :], at + m.end()
-        head, _, with_ = re.split(r"(\bWITH\b)", f"{rest} WITH ", maxsplit=1, flags=re.I)
-        with_ = with_.rpartition("WITH")[0] if "WITH" in rest.upper() else ""
+        head, *with_ = re.split(r"\bWITH\b", code[m.end() :], maxsplit=1, flags=re.I)
         before = self.state
         for what in ("TOOL", "BASE"):
-            if given := re.search(rf"\${what}\s*=\s*(.+?)(?=,\s*\$|$)", with_, re.I):
+            given = re.search(rf"\${what}\s*=\s*(.+?)(?=,\s*\$|$)", "".join(with_), re.I)
+            if given:
                 text = given[1].strip()
                 form = re.match(r"\w+\s*\(.*?\b(\w+)(?:\.\w+)?\s*\)", text)
                 if form and _key(form[1]) in self.data:
@@ -375,77 +326,50 @@ class _KrlReader:
             (b, t) for b, t in arguments_of(head) if not re.match(r"\s*(CA|C_\w+)\b", t, re.I)
         ]
         for offset, target in targets[: 2 if "CIRC" in word else 1]:
-            self._target(line, begin + offset, target, word in ("PTP", "SPTP"), left, used)
+            self._target(line, at + m.end() + offset, target, word in ("PTP", "SPTP"), left)
         self.state = before
 
-    def _target(
-        self, line: int, at: int, text: str, obeyed: bool, left: str, used: Mapping[str, int]
-    ) -> None:
+    def _target(self, line: int, at: int, text: str, obeyed: bool, left: str) -> None:
         """Take one target."""
         body = re.sub(r"\s+C_(PTP|DIS|VEL|ORI|SPL)\b.*", "", text, flags=re.I).strip()
         at += len(text) - len(text.lstrip())
+        key, name, value = _key(body), f"line {line}", _Value(0, line, "", {})
         if body.startswith("{"):
-            value, key = _aggregate(text.strip(), at, 0, line, ""), f"line {line}, {at}"
-            name = f"line {line}"
+            value, key = _Value.of(text.strip(), at, 0, line), f"line {line}, {at}"
         else:
-            values, key = self.data.get(_key(body), []), _key(body)
-            name = f"line {line}"
+            values = self.data.get(key, [])
             if not _NAME.fullmatch(body):
                 left = left or f"the point '{body[:40]}' is computed while the program runs"
             elif len(values) != 1 or values[0].file < 0:
                 what = "is not in this program" if not values else "has several values"
                 left = left or f"the point '{body[:40]}' {what}"
-            elif key in used:
-                left = left or f"line {used[key]} uses or changes '{body[:40]}' otherwise"
+            elif key in self.used:
+                left = left or f"line {self.used[key]} uses or changes '{body[:40]}' otherwise"
             if len(values) == 1 and values[0].file >= 0:
                 value = values[0]
                 name = f"{body} ({self.files[value.file]} line {value.line})"
-            else:
-                value = _Value(0, line, "", {})
-        new = self._point(value, name, line, obeyed, left)
-        self.found[key] = used_again(self.found.get(key), new, line, "base", obeyed)
+        bare = ProgramPoint(value.line if value.fields else line, name, left=left)
+        self.take(key, bare if left else self._point(bare, value, obeyed), line, obeyed)
 
-    def _point(self, value: _Value, name: str, line: int, obeyed: bool, left: str) -> ProgramPoint:
+    def _point(self, bare: ProgramPoint, value: _Value, obeyed: bool) -> ProgramPoint:
         """Return a point of an aggregate."""
-        bare = ProgramPoint(value.line if value.fields else line, name)
-        if left:
-            return replace(bare, left=left)
         moved = [k for k, f in value.fields.items() if re.fullmatch(r"E[1-6]", k) and _moves(f[0])]
         if moved:
             return replace(bare, left=f"{moved[0]} moves, and it is not known what that carries")
-        if AXES[0] in value.fields:
-            numbers = value.numbers(AXES)
-            if numbers is None:
-                return replace(bare, left="not all of A1 to A6 are written")
-            spans = tuple(value.span(k) for k in AXES)
-            return replace(
-                bare,
-                numbers=spans,
-                values=numbers,
-                joints=True,
-                tool=np.eye(4) if isinstance(self.state.tool, str) else self.state.tool,
-            )
-        numbers = value.numbers(POSE)
+        keys = AXES if AXES[0] in value.fields else POSE
+        numbers = value.numbers(keys)
         if numbers is None:
-            return replace(bare, left="not all of X, Y, Z, A, B, C are written")
-        for state in (self.state.tool, self.state.base):
-            if isinstance(state, str):
-                return replace(bare, left=state)
+            what = "A1 to A6" if keys is AXES else "X, Y, Z, A, B, C"
+            return replace(bare, left=f"not all of {what} are written")
+        tool, spans = self.state.tool, value.spans(keys)
+        if keys is AXES:
+            return bare.at_joints(spans, numbers, tool)
         s, t = (value.numbers([k]) for k in ("S", TURN))
         status = [UNSTATED] * 2 if s is None else [int(s[0]) & OVERHEAD, int(s[0]) // ELBOW & 1]
         turn = [UNSTATED] * JOINTS if t is None else [int(t[0]) >> k & 1 for k in range(JOINTS)]
-        assert isinstance(self.state.tool, np.ndarray)  # noqa: S101 - no text, see above
-        assert isinstance(self.state.base, np.ndarray)  # noqa: S101 - no text, see above
-        return replace(
-            bare,
-            numbers=tuple(value.span(k) for k in POSE),
-            values=numbers,
-            frame=self.state.base,
-            tool=self.state.tool,
-            flags=(*status, *turn),
-            config=() if t is None else (value.span(TURN),),
-            obeyed=obeyed,
-        )
+        config = () if t is None else value.spans([TURN])
+        stated = {"flags": (*status, *turn), "config": config, "obeyed": obeyed}
+        return bare.at_pose(spans, numbers, tool, self.state.base, **stated)
 
     def _used_otherwise(self, lines: Sequence[tuple[int, int, str]]) -> dict[str, int]:
         """Names of points that statements use which are no motions to them, with their lines."""
@@ -481,12 +405,17 @@ def _moves(text: str) -> bool:
         return True
 
 
+def _word(code: str) -> str:
+    """First word of a statement, in capital letters."""
+    m = _NAME.match(code.strip())
+    return m[0].upper() if m else ""
+
+
 def _sets(lines: Sequence[tuple[int, int, str]]) -> bool:
     """Whether a loop, whose statements these begin with, may set tool or base."""
     depth = 0
     for _, _, code in lines:
-        m = _NAME.match(code.strip())
-        word = m[0].upper() if m else ""
+        word = _word(code)
         depth += (word in _OPENS) - (word in _CLOSES)
         if depth < 0:
             return False

@@ -19,13 +19,7 @@ from hilcal.calibration.points import Points, solutions
 from hilcal.calibration.programs.fanuc import read_ls
 from hilcal.calibration.programs.inform import read_jbi
 from hilcal.calibration.programs.krl import read_krl
-from hilcal.calibration.programs.program import (
-    JOINTS,
-    UNSTATED,
-    Language,
-    Program,
-    ProgramPoint,
-)
+from hilcal.calibration.programs.program import JOINTS, UNSTATED, Language, Program, ProgramPoint
 from hilcal.calibration.programs.rapid import read_rapid
 from hilcal.errors import InputError
 from hilcal.names import escaped
@@ -49,20 +43,13 @@ READERS: Mapping[str, Callable[[Path, Path | None, Floats | None], Program]] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UnderstoodProgram:
-    """A program with N points that are understood.
+    """A program with N points that are understood."""
 
-    Attributes:
-        program: the program; what is not understood of it is left.
-        q: (N, 6) joint values at which it is at them, rad.
-        tool: (4, 4) T_flange_tool that errors are stated for.
-        said: what is to be said of their branches.
-    """
-
-    program: Program
+    program: Program  # the program; what is not understood of it is left
     arm: Arm
-    q: Floats
-    tool: Floats
-    said: tuple[str, ...]
+    q: Floats  # (N, 6) joint values at which it is at them, rad
+    tool: Floats  # (4, 4) T_flange_tool that errors are stated for
+    said: tuple[str, ...]  # what is to be said of their branches
 
     @property
     def points(self) -> Points:
@@ -77,11 +64,7 @@ class UnderstoodProgram:
         return replace(self, program=replace(self.program, points=points), q=self.q[kept])
 
     def corrected(self, q: Floats) -> dict[str, bytes]:
-        """Return the files by suffix, with joint values (N, 6) in place of `q`.
-
-        Raises:
-            InputError: see `Program.corrected`.
-        """
+        """Return the files by suffix, with joint values (N, 6) in place of `q`."""
         points, language = self.program.understood, self.program.language
         none = (UNSTATED,) * len(language.of_shape)
         stated = np.array([p.flags or none for p in points])
@@ -102,37 +85,26 @@ def understood(
 ) -> UnderstoodProgram:
     """Read a program.
 
-    Args:
-        path: the program; the end of its name says of which maker.
-        frames: file with what the controller keeps apart from programs.
-        tool: (4, 4) T_flange_tool of tools that neither has.
-        near: (6,) joint values that the first pose is near to, rad.
-        leave: keep what is not understood as it is.
-
-    Raises:
-        InputError: it cannot be read, or a point is not understood; names the line.
+    `tool` (4, 4) T_flange_tool is that of tools that neither it nor `frames` has; `near` (6,) are
+    joint values that the first pose is near to, rad.
     """
     try:
         program = READERS[path.suffix.lower()](path, frames, tool)
     except InputError as error:
         raise InputError(escaped(str(error))) from None
-    points = tuple(
-        p if _usable(p) else replace(p, left="numbers that are none, in it, its tool or its base")
-        for p in program.points
-    )
-    program = replace(program, points=points)
+    points = []
+    for p in program.points:
+        every = np.concatenate([p.values, p.frame.ravel(), p.tool.ravel()])
+        usable = (np.abs(every) < LARGEST).all()
+        left = p.left if usable else "numbers that are none, in it, its tool or its base"
+        points.append(replace(p, left=left))
+    program = replace(program, points=tuple(points))
     _refuse(path, program.points, leave)
     q, doubts, said = resolve(program, arm, near)
     longest, more = longest_tool(program.understood)
     found = UnderstoodProgram(program, arm, q, longest, said + more).without(doubts)
     _refuse(path, found.program.points, leave)
     return found
-
-
-def _usable(p: ProgramPoint) -> bool:
-    """Whether its numbers are such that an arm has."""
-    every = np.concatenate([p.values, p.frame.ravel(), p.tool.ravel()])
-    return bool((np.abs(every) < LARGEST).all())
 
 
 def _refuse(path: Path, points: tuple[ProgramPoint, ...], leave: bool) -> None:
@@ -155,7 +127,7 @@ BORDER = 1e-4
 """rad; joint values as near to where a flag changes have both; a choice, above what numbers of four
 decimals leave open."""
 AS_NEAR = 0.05
-"""rad, see `calibration.branches.AS_NEAR`."""
+"""rad, see `calibration.urscript.AS_NEAR`."""
 
 
 def unlike(arm: Arm, language: Language) -> str:
@@ -171,16 +143,10 @@ def unlike(arm: Arm, language: Language) -> str:
         )
         return f"axis {k + 1} with all joint values zero is {is_}, not {should}"
     p = chain.position[:JOINTS, 0]
-    gaps = [_gap(p[k], axes[k], p[4], axes[4]) for k in (3, 5)]
-    if max(gaps) > MEET:
-        return f"axes 4 to 6 miss each other by {1e3 * max(gaps):.3g} mm"
-    return ""
-
-
-def _gap(p: Floats, a: Floats, other: Floats, b: Floats) -> float:
-    """Distance of two lines, m."""
-    n = np.cross(a, b)
-    return float(abs((p - other) @ n) / np.linalg.norm(n))
+    normals = {k: np.cross(axes[k], axes[4]) for k in (3, 5)}
+    gaps = [abs((p[k] - p[4]) @ n) / np.linalg.norm(n) for k, n in normals.items()]
+    missed = max(gaps)
+    return f"axes 4 to 6 miss each other by {1e3 * missed:.3g} mm" if missed > MEET else ""
 
 
 def shape(arm: Arm, q: Floats) -> Ints:
@@ -210,17 +176,10 @@ def flags_of(arm: Arm, language: Language, q: Floats) -> Ints:
 def resolve(
     program: Program, arm: Arm, near: Floats | None
 ) -> tuple[Floats, list[str], tuple[str, ...]]:
-    """Return the joint values (N, 6) at which the nominal arm is at the points.
+    """Return joint values (N, 6) at which the nominal arm is at the points, doubts, and remarks.
 
-    Args:
-        program: N points of which are understood.
-        near: (6,) joint values that the first pose is near to, rad; None where none are given.
-
-    Returns:
-        joint values; why those of a point are not certain, "" where they are; what is to be said.
-
-    Raises:
-        InputError: the arm has other joints, or does not reach a pose.
+    A doubt says why the values of a point are not certain, "" where they are. `near` (6,) are joint
+    values that the first pose is near to, rad; None where none are given.
     """
     language = program.language
     if arm.n != JOINTS or arm.mimic is not None:
@@ -265,12 +224,7 @@ def resolve(
 
 
 def _one(
-    arm: Arm,
-    language: Language,
-    p: ProgramPoint,
-    before: Floats | None,
-    stated: Ints,
-    asked: Bools,
+    arm: Arm, language: Language, p: ProgramPoint, before: Floats | None, stated: Ints, asked: Bools
 ) -> tuple[Floats, str]:
     """Joint values of a pose, and why they are not certain; raises as `resolve` does."""
     goal = p.frame @ language.pose(p.values)
@@ -312,10 +266,7 @@ def _one(
 def kept_flags(arm: Arm, language: Language, given: Floats, q: Floats, stated: Ints) -> Ints:
     """(N, F) configuration to be stated after a correction: others where those were left alone.
 
-    Args:
-        given: (N, 6) joint values before, rad.
-        q: (N, 6) joint values after.
-        stated: (N, F) as stated.
+    `given` and `q` are joint values (N, 6) before and after, rad; `stated` (N, F) is as it was.
     """
     left = _agree(arm, language, given, stated) & ~_agree(arm, language, q, stated)
     if unlike(arm, language):
@@ -345,11 +296,7 @@ def _turned(arm: Arm, q: Floats) -> Floats:
 
 
 def longest_tool(points: Sequence[ProgramPoint]) -> tuple[Floats, tuple[str, ...]]:
-    """(4, 4) T_flange_tool of the points, of several the longest, and what is to be said.
-
-    Joint values that put the flange where it should be put every tool there; what is stated of the
-    remaining errors holds for one of them.
-    """
+    """(4, 4) T_flange_tool of the points, of several the longest, and what is to be said."""
     poses = [p for p in points if not p.joints] or list(points)
     first = max(poses, key=lambda p: float(np.linalg.norm(p.tool[:3, 3])))
     if all(np.allclose(p.tool, first.tool, atol=1e-9) for p in poses):

@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pydantic import Field
@@ -29,6 +30,8 @@ from hilcal.toml import Number, Section, load_section
 from hilcal.types import Floats, Ints
 
 JOINTS = 6
+UNSTATED = -99
+"""A flag of a configuration that is not stated."""
 SAME_M, SAME_RAD = 2e-9, 2e-9
 """m, rad; a point that moved less keeps its text: above what the inverse leaves, see
 `calibration.compensation.TOLERANCE`, and below what any controller resolves."""
@@ -47,104 +50,86 @@ class Span:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ProgramPoint:
-    """One point of a program, in the order of its first use.
+    """One point of a program, in the order of its first use."""
 
-    Attributes:
-        line: of its numbers, from 1.
-        name: for people, with its line.
-        numbers: where its numbers stand: joint values, or those of a pose.
-        values: (k,) these as written.
-        joints: whether they are joint values.
-        scale: (6,) what the language counts joint values in, per rad.
-        frame: (4, 4) T_base_frame that a pose counts from.
-        tool: (4, 4) T_flange_tool.
-        flags: the configuration as `Language.flags` has it; −99 where it is not stated.
-        config: where what of it may change stands; empty where it cannot.
-        obeyed: whether the controller takes the configuration that is stated; it goes on from the
-            point before otherwise.
-        made: text of the whole span `numbers[0]`, with places for the numbers and the changeable
-            configuration, where the point is computed in the program (`Offs(p, …)`); else "".
-        left: why it is left as it is; empty where it is understood.
-        blend_m: 0, since only URScript states it at the point.
-    """
-
-    line: int
-    name: str
-    numbers: tuple[Span, ...] = ()
-    values: Floats = field(default_factory=lambda: np.empty(0))
-    joints: bool = False
+    line: int  # of its numbers, from 1
+    name: str  # for people, with its line
+    numbers: tuple[Span, ...] = ()  # where its numbers stand: joint values, or those of a pose
+    values: Floats = field(default_factory=lambda: np.empty(0))  # (k,) these as written
+    joints: bool = False  # whether they are joint values
     scale: Floats = field(default_factory=lambda: np.full(JOINTS, np.degrees(1.0)))
-    frame: Floats = field(default_factory=lambda: np.eye(4))
-    tool: Floats = field(default_factory=lambda: np.eye(4))
-    flags: tuple[int, ...] = ()
-    config: tuple[Span, ...] = ()
+    """(6,) what the language counts joint values in, per rad."""
+    frame: Floats = field(default_factory=lambda: np.eye(4))  # (4, 4) T_base_frame of a pose
+    tool: Floats = field(default_factory=lambda: np.eye(4))  # (4, 4) T_flange_tool
+    flags: tuple[int, ...] = ()  # the configuration as `Language.flags` has it
+    config: tuple[Span, ...] = ()  # where what of it may change stands; empty where it cannot
     obeyed: bool = True
+    """Whether the controller takes the configuration that is stated; it goes on from the point
+    before otherwise."""
     made: str = ""
-    left: str = ""
-    blend_m: float = 0.0
+    """Text of the whole span `numbers[0]`, with places for the numbers and the changeable
+    configuration, where the point is computed in the program (`Offs(p, …)`); else ""."""
+    left: str = ""  # why it is left as it is; empty where it is understood
+    blend_m: float = 0.0  # 0, since only URScript states it at the point
+
+    def at_joints(
+        self, numbers: Sequence[Span], values: Floats, tool: Floats | str
+    ) -> "ProgramPoint":
+        """Return the point of joint values: they hold with any tool, one that is not known, too."""
+        held = np.eye(4) if isinstance(tool, str) else tool
+        return replace(self, numbers=tuple(numbers), values=values, joints=True, tool=held)
+
+    def at_pose(
+        self,
+        numbers: Sequence[Span],
+        values: Floats,
+        tool: Floats | str,
+        frame: Floats | str,
+        **more: Any,
+    ) -> "ProgramPoint":
+        """Return the point of a pose; it is left where tool or frame is a text, which says why."""
+        if isinstance(tool, str) or isinstance(frame, str):
+            return replace(self, left=tool if isinstance(tool, str) else str(frame))
+        return replace(self, numbers=tuple(numbers), values=values, tool=tool, frame=frame, **more)
 
 
-UNSTATED = -99
-
-
-def used_again(
-    old: ProgramPoint | None, new: ProgramPoint, line: int, what: str, obeyed: bool = False
-) -> ProgramPoint:
-    """Return a point that a further motion, in a line, moves to: left where its frames differ.
-
-    Args:
-        what: the maker's word for the frame that it counts from.
-        obeyed: whether this motion takes the configuration that is stated.
-    """
-    if old is None or new.left:
-        return new if old is None or not old.left else old
-    if old.left:
-        return old
-    if not np.array_equal(old.tool, new.tool) or not np.array_equal(old.frame, new.frame):
-        return replace(old, left=f"line {line} has it with another tool or {what}")
-    return replace(old, obeyed=old.obeyed or obeyed)
+def _as_written(_: Ints, texts: Sequence[str]) -> list[str]:
+    return list(texts)
 
 
 @dataclass(frozen=True, slots=True)
 class Language:
-    """How a maker writes points.
-
-    Attributes:
-        pose: T (4, 4) of the numbers of a pose.
-        numbers: the numbers of T (4, 4), near to those that were there.
-        decimals: of a position in mm, of the orientation, of joint values; at least these.
-        axes: (6, 3) directions of the axes of the maker's arms with spherical wrist, all joint
-            values zero, in axes of the controller's base.
-        flags: (K, F) configuration at joint values (K, 6), by the `languages.shape` (K, 2) there.
-        of_shape: (F,) which of these the shape of the arm tells, and not the joint values alone.
-        written: what stands at `ProgramPoint.config`, from the flags and the texts that are there.
-        padded: whether numbers stand in columns.
-    """
+    """How a maker writes points."""
 
     name: str
-    pose: Callable[[Floats], Floats]
+    pose: Callable[[Floats], Floats]  # T (4, 4) of the numbers of a pose
     numbers: Callable[[Floats, Floats], Floats]
+    """The numbers of T (4, 4), near to those that were there."""
     decimals: tuple[int, int, int]
+    """Of a position in mm, of the orientation, of joint values; at least these."""
     axes: tuple[tuple[int, int, int], ...]
+    """(6, 3) directions of the axes of the maker's arms with spherical wrist, all joint values
+    zero, in axes of the controller's base."""
     flags: Callable[[Floats, Ints], Ints]
+    """(K, F) configuration at joint values (K, 6), by the `languages.shape` (K, 2) there."""
     of_shape: tuple[bool, ...]
-    written: Callable[[Ints, Sequence[str]], list[str]]
-    padded: bool = False
+    """(F,) which of these the shape of the arm tells, and not the joint values alone."""
+    moves: str  # its motions, for people
+    written: Callable[[Ints, Sequence[str]], list[str]] = _as_written
+    """What stands at `ProgramPoint.config`, from the flags and the texts that are there."""
+    padded: bool = False  # whether numbers stand in columns
+    count: int = JOINTS  # numbers of a pose
+    frames: str = "F.toml"  # what --frames takes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Program:
-    """A program.
-
-    Attributes:
-        texts: of its files, as they are.
-        points: in the order of their first use.
-    """
+    """A program."""
 
     language: Language
     suffixes: tuple[str, ...]
-    texts: tuple[str, ...]
-    points: tuple[ProgramPoint, ...]
+    texts: tuple[str, ...]  # of its files, as they are
+    points: tuple[ProgramPoint, ...]  # in the order of their first use
     encoding: str = "utf-8"
 
     @property
@@ -155,78 +140,71 @@ class Program:
     def corrected(
         self, arm: Arm, found: Sequence[ProgramPoint], given: Floats, q: Floats, flags: Ints
     ) -> dict[str, bytes]:
-        """Return the files, by suffix, with other points.
+        """Return the files, by suffix, with N other points.
 
-        Args:
-            found: N points of it.
-            given: (N, 6) joint values of them as they were, rad.
-            q: (N, 6) joint values that they get.
-            flags: (N, F) configuration that they get.
-
-        Raises:
-            InputError: the configuration changes where it cannot be written; names the line.
+        They had joint values `given` (N, 6), rad, and get q and the configuration `flags` (N, F).
         """
         edits: list[tuple[Span, str]] = []
         poses = evaluate(arm, q)
         for k, p in enumerate(found):
             flange = se3.matrix(poses.rotation[-1][k], poses.position[-1][k])
-            edits += _edits(self, p, flange, given[k], q[k], flags[k])
-        return {
-            suffix: edited(text, [(s, new) for s, new in edits if s.file == k]).encode(
-                self.encoding
+            edits += self._edits(p, flange, given[k], q[k], flags[k])
+        out = {}
+        for k, (suffix, text) in enumerate(zip(self.suffixes, self.texts, strict=True)):
+            new = edited(text, [(s, words) for s, words in edits if s.file == k])
+            out[suffix] = new.encode(self.encoding)
+        return out
+
+    def _edits(
+        self, p: ProgramPoint, flange: Floats, given: Floats, q: Floats, flags: Ints
+    ) -> list[tuple[Span, str]]:
+        """Texts that change at one point."""
+        language = self.language
+        if np.abs(q - given).max() < SAME_RAD:
+            return []
+        if p.joints:
+            degrees = np.allclose(p.scale, np.degrees(1.0))  # others are pulses, which are whole
+            return self._numbers(p, q * p.scale, [language.decimals[2] * degrees] * JOINTS)
+        goal = se3.inverse(p.frame) @ flange @ p.tool
+        was = language.pose(p.values)
+        turned = se3.rotation_vector(goal[:3, :3] @ was[:3, :3].T)
+        moved = np.linalg.norm(goal[:3, 3] - was[:3, 3])
+        if moved < SAME_M and np.linalg.norm(turned) < SAME_RAD:
+            return []
+        new = language.numbers(goal, p.values)
+        decimals = [language.decimals[0]] * 3 + [language.decimals[1]] * (len(new) - 3)
+        old = [self._text(s) for s in p.config]
+        words = language.written(flags, old) if p.config or p.made else []
+        if not words and np.any(flags != np.array(p.flags)):
+            raise InputError(
+                f"{p.name}: the correction takes a joint into another configuration, which is "
+                "stated for several points at once; valid: joint values in its place"
             )
-            for k, (suffix, text) in enumerate(zip(self.suffixes, self.texts, strict=True))
-        }
+        if p.made:
+            texts = [f"{v:.{d}f}" for v, d in zip(new, decimals, strict=True)]
+            return [(p.numbers[0], p.made.format(*texts, *words))]
+        changed = [(s, w) for s, w, o in zip(p.config, words, old, strict=True) if w != o]
+        return self._numbers(p, new, decimals) + changed
 
+    def _text(self, span: Span) -> str:
+        return self.texts[span.file][span.begin : span.end]
 
-def _edits(
-    program: Program, p: ProgramPoint, flange: Floats, given: Floats, q: Floats, flags: Ints
-) -> list[tuple[Span, str]]:
-    """Texts that change at one point; raises as `Program.corrected` does."""
-    language = program.language
-    if np.abs(q - given).max() < SAME_RAD:
-        return []
-    if p.joints:
-        degrees = np.allclose(p.scale, np.degrees(1.0))  # others are pulses, which are whole
-        return _numbers(program, p, q * p.scale, [language.decimals[2] if degrees else 0] * JOINTS)
-    goal = se3.inverse(p.frame) @ flange @ p.tool
-    was = language.pose(p.values)
-    turned = se3.rotation_vector(goal[:3, :3] @ was[:3, :3].T)
-    moved = np.linalg.norm(goal[:3, 3] - was[:3, 3])
-    if moved < SAME_M and np.linalg.norm(turned) < SAME_RAD:
-        return []
-    new = language.numbers(goal, p.values)
-    decimals = [language.decimals[0]] * 3 + [language.decimals[1]] * (len(new) - 3)
-    old = [program.texts[s.file][s.begin : s.end] for s in p.config]
-    words = language.written(flags, old) if p.config or p.made else []
-    if not words and np.any(flags != np.array(p.flags)):
-        raise InputError(
-            f"{p.name}: the correction takes a joint into another configuration, which is stated "
-            "for several points at once; valid: joint values in its place"
-        )
-    if p.made:
-        texts = [f"{v:.{d}f}" for v, d in zip(new, decimals, strict=True)]
-        return [(p.numbers[0], p.made.format(*texts, *words))]
-    changed = [(s, w) for s, w, o in zip(p.config, words, old, strict=True) if w != o]
-    return _numbers(program, p, new, decimals) + changed
-
-
-def _numbers(
-    program: Program, p: ProgramPoint, new: Floats, decimals: Sequence[int]
-) -> list[tuple[Span, str]]:
-    """Numbers in the place of those that were there, with as many decimals at least."""
-    out = []
-    for span, value, least in zip(p.numbers, new.tolist(), decimals, strict=True):
-        old = program.texts[span.file][span.begin : span.end]
-        digits = old.lower().partition("e")[0].partition(".")[2]
-        text = f"{value:.{max(least, len(digits.strip())) if least else 0}f}"
-        if text.strip("-0.") == "":
-            text = text.lstrip("-")
-        if program.language.padded:
-            text = text.rjust(len(old))
-            text = text if text.startswith(" ") or not old.startswith(" ") else f" {text}"
-        out.append((span, text))
-    return out
+    def _numbers(
+        self, p: ProgramPoint, new: Floats, decimals: Sequence[int]
+    ) -> list[tuple[Span, str]]:
+        """Numbers in the place of those that were there, with as many decimals at least."""
+        out = []
+        for span, value, least in zip(p.numbers, new.tolist(), decimals, strict=True):
+            old = self._text(span)
+            digits = old.lower().partition("e")[0].partition(".")[2]
+            text = f"{value:.{max(least, len(digits.strip())) if least else 0}f}"
+            if text.strip("-0.") == "":
+                text = text.lstrip("-")
+            if self.language.padded:
+                text = text.rjust(len(old))
+                text = text if text.startswith(" ") or not old.startswith(" ") else f" {text}"
+            out.append((span, text))
+        return out
 
 
 def edited(text: str, edits: Sequence[tuple[Span, str]]) -> str:
@@ -239,11 +217,7 @@ def edited(text: str, edits: Sequence[tuple[Span, str]]) -> str:
 
 
 def read_text(path: Path) -> tuple[str, str]:
-    """Text of a file with its line ends as they are, and its encoding.
-
-    Raises:
-        InputError: it cannot be read.
-    """
+    """Text of a file with its line ends as they are, and its encoding."""
     try:
         raw = limits.read_bytes(path, limits.SCRIPT)
     except OSError as error:
@@ -289,42 +263,46 @@ class _FramesFile(Section):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ControllerFrames:
-    """What the controller keeps apart from programs.
+    """What the controller keeps apart from programs."""
 
-    Attributes:
-        tools: (4, 4) T_flange_tool by number or name.
-        bases: (4, 4) T_base_frame by number or name.
-        pulses: (6,) pulses per rad; None where they are not given.
-        turn_axes: axes that the three turn numbers of a Fanuc are of, `$SCR_GRP[1].$TURN_AXIS`.
-        tool: (4, 4) of tools that are not in `tools`, from --tool; None without it.
-    """
-
-    tools: Mapping[str, Floats] = field(default_factory=dict)
-    bases: Mapping[str, Floats] = field(default_factory=dict)
-    pulses: Floats | None = None
+    language: Language
+    poses: Mapping[str, Mapping[str, Floats]]
+    """(4, 4) T_flange_tool by number or name under "tools", T_base_frame under "bases"."""
+    pulses: Floats | None = None  # (6,) pulses per rad; None where they are not given
     turn_axes: tuple[int, ...] | None = None
-    tool: Floats | None = None
+    """Axes that the three turn numbers of a Fanuc are of, `$SCR_GRP[1].$TURN_AXIS`."""
+    tool: Floats | None = None  # (4, 4) of tools that have none here, from --tool; None without it
+
+    def given(self, what: str, name: str) -> Floats | None:
+        """Pose (4, 4) of one of the "tools" or "bases" in the file of --frames."""
+        named = (pose for key, pose in self.poses[what].items() if key.upper() == name.upper())
+        return next(named, None)
+
+    def pose(self, what: str, name: str, words: str, none: str = "0") -> Floats | str:
+        """Pose (4, 4) of a tool or base, or why it is not known; `words` is what it is called.
+
+        `none` is the name of that which is no tool, or the base itself.
+        """
+        given = self.given(what, name)
+        if given is not None or name.upper() == none:
+            return np.eye(4) if given is None else given
+        if what == "tools" and self.tool is not None:
+            return self.tool
+        other = " or --tool" if what == "tools" else ""
+        return f"{words} is not in the program; give it by --frames ({self.language.frames}){other}"
 
 
 def controller_frames(
-    path: Path | None, language: Language, tool: Floats | None, count: int = JOINTS
+    path: Path | None, language: Language, tool: Floats | None
 ) -> ControllerFrames:
-    """Read `--frames F.toml`, where there is one.
-
-    Args:
-        tool: (4, 4) T_flange_tool of tools that no file has; None without it.
-        count: how many numbers a pose of the maker has.
-
-    Raises:
-        InputError: it is no TOML file, or cannot be used.
-    """
+    """Read `--frames F.toml`, where there is one; `tool` (4, 4) is of tools that no file has."""
     if path is None:
-        return ControllerFrames(tool=tool)
+        return ControllerFrames(language, {"tools": {}, "bases": {}}, tool=tool)
     if path.suffix.lower() != ".toml":
-        raise InputError(f"{path}: frames of {language.name} programs; valid: a .toml file")
-    found = load_section(path, _FramesFile)
-    groups = []
-    for key, group in (("tools", found.tools), ("bases", found.bases)):
+        raise InputError(f"{path}: frames of {language.name} programs; valid: {language.frames}")
+    found, count = load_section(path, _FramesFile), language.count
+    groups = {"tools": found.tools, "bases": found.bases}
+    for key, group in groups.items():
         for name, numbers in group.items():
             if len(numbers) != count:
                 raise InputError(
@@ -332,28 +310,68 @@ def controller_frames(
                     f"{count}, as the controller shows them: mm and degrees"
                     + (", x y z q1 q2 q3 q4" if count > JOINTS else "")
                 )
-        groups.append({name: language.pose(np.array(given)) for name, given in group.items()})
     pulses = found.pulses_per_degree
     if pulses is not None and (len(pulses) != JOINTS or not all(pulses)):
         raise InputError(f"{path.name}: pulses_per_degree; valid: {JOINTS} numbers other than 0")
     axes = found.turn_axes
     if axes is not None and (len(axes) != 3 or not set(axes) <= set(range(1, JOINTS + 1))):
         raise InputError(f"{path.name}: turn_axes; valid: three axes, such as [1, 4, 6]")
-    per_rad = None if pulses is None else np.degrees(1.0) * np.array(pulses)
-    return ControllerFrames(groups[0], groups[1], per_rad, axes, tool)
+    return ControllerFrames(
+        language,
+        {
+            key: {name: language.pose(np.array(numbers)) for name, numbers in group.items()}
+            for key, group in groups.items()
+        },
+        None if pulses is None else np.degrees(1.0) * np.array(pulses),
+        axes,
+        tool,
+    )
 
 
-def frame_of(known: ControllerFrames, what: str, number: str) -> Floats | str:
-    """Pose of a tool ("tool") or frame ("frame") by its number, or why it is not known."""
-    table = known.tools if what == "tool" else known.bases
-    if number in table:
-        return table[number]
-    if number == "0":
-        return np.eye(4)
-    if what == "tool" and known.tool is not None:
-        return known.tool
-    key, other = ("tools", " or --tool") if what == "tool" else ("bases", "")
-    return f"{what} {number} is not in the program; give it by --frames F.toml, [{key}]{other}"
+class ProgramReader:
+    """What the readers of all makers do alike: they go through the text and take its points."""
+
+    def __init__(self, path: Path, known: ControllerFrames, text: str, encoding: str):
+        """Begin without points."""
+        self.path, self.known, self.text, self.encoding = path, known, text, encoding
+        self.found: dict[str, ProgramPoint] = {}
+        self.otherwise: dict[str, int] = {}
+        """Points that statements use which are no motions to them, with the line."""
+
+    def leave(self, line: int, why: str) -> None:
+        """Take a motion that is left as it is."""
+        self.found[f"line {line}"] = ProgramPoint(line, f"line {line}", left=why)
+
+    def refused(self, line: int, what: str, valid: str) -> InputError:
+        """Return the error of a statement that changes what points mean."""
+        return InputError(f"{self.path.name}: line {line}: {what}; valid: {valid}")
+
+    def take(self, key: str, new: ProgramPoint, line: int, obeyed: bool = False) -> None:
+        """Take the point of a motion; one that is there already is left where its frames differ."""
+        old = self.found.get(key)
+        if old is None or (new.left and not old.left):
+            self.found[key] = new
+        elif not old.left:
+            same = np.array_equal(old.tool, new.tool) and np.array_equal(old.frame, new.frame)
+            left = "" if same else f"line {line} has it with another tool or base"
+            self.found[key] = replace(old, left=left, obeyed=old.obeyed or obeyed)
+
+    def program(self, texts: Sequence[str] = (), suffixes: Sequence[str] = ()) -> Program:
+        """Return the program with all points that were taken."""
+        for name, line in self.otherwise.items():
+            if name in self.found and not self.found[name].left:
+                left = f"line {line} uses or changes it otherwise"
+                self.found[name] = replace(self.found[name], left=left)
+        language = self.known.language
+        if not self.found:
+            raise InputError(f"{self.path.name}: no motions; valid: {language.moves}")
+        return Program(
+            language,
+            tuple(suffixes) or (self.path.suffix,),
+            tuple(texts) or (self.text,),
+            tuple(self.found.values()),
+            self.encoding,
+        )
 
 
 def of_euler(values: Floats) -> Floats:

@@ -14,8 +14,8 @@ confdata, tooldata, wobjdata, MoveL, Offs, RelTool; *RAPID Overview*.
 """
 
 import re
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,19 +23,18 @@ import numpy as np
 from hilcal.calibration.programs.program import (
     JOINTS,
     UNSTATED,
-    ControllerFrames,
     Language,
     Program,
     ProgramPoint,
+    ProgramReader,
     Span,
     arguments_of,
     controller_frames,
+    edited,
     line_of,
     of_euler,
     read_text,
-    used_again,
 )
-from hilcal.errors import InputError
 from hilcal.robot import se3
 from hilcal.types import Floats, Ints
 
@@ -70,6 +69,7 @@ _NO_ASSIGNMENT = re.compile(r"(\b(CONST|PERS|VAR)\s[^;]*|\\\s*)$", re.IGNORECASE
 _MADE = re.compile(r"^(Offs|RelTool)\s*\((.*)\)$", re.IGNORECASE | re.DOTALL)
 _NAME = re.compile(r"[A-Za-z]\w*")
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+_COMPUTED = "the point '{}' is computed while the program runs"
 
 
 def of_quaternion(values: Floats) -> Floats:
@@ -101,47 +101,32 @@ RAPID = Language(
     axes=((0, 0, 1), (0, 1, 0), (0, 1, 0), (1, 0, 0), (0, 1, 0), (1, 0, 0)),
     flags=flags,
     of_shape=(False, False, False, True),
+    moves="MoveJ, MoveL, MoveC, MoveAbsJ",
     written=lambda new, texts: [str(v) for v in new[:3]],
+    count=POSE,
+    frames="a module with its tooldata and wobjdata, or TOML",
 )
 
 
-@dataclass(frozen=True, slots=True)
-class _Number:
-    """A number and where it stands."""
-
-    value: float
-    begin: int
-    end: int
-
-
 def read_rapid(path: Path, frames_file: Path | None, tool: Floats | None) -> Program:
-    """Read a module.
-
-    Args:
-        frames_file: TOML, or a module with tooldata and wobjdata; None where there is none.
-        tool: (4, 4) T_flange_tool of tools that no file has; None without it.
-
-    Raises:
-        InputError: it cannot be read, or something could change what its points mean.
-    """
-    text, encoding = read_text(path)
+    """Read a module."""
     module = frames_file is not None and frames_file.suffix.lower() != ".toml"
-    known = controller_frames(None if module else frames_file, RAPID, tool, POSE)
+    known = controller_frames(None if module else frames_file, RAPID, tool)
     more = read_text(frames_file)[0] if frames_file is not None and module else ""
-    reader = _RapidReader(path.name, text, more, known)
-    return Program(RAPID, (path.suffix,), (text,), reader.points(), encoding)
+    return _RapidReader(path, known, *read_text(path)).read(more)
 
 
-def _statements(text: str) -> Iterator[tuple[int, str]]:
-    """Yield place and code of each statement: comments and texts blanked, of the same length."""
+def _statements(text: str) -> list[tuple[int, str]]:
+    """Place and code of each statement: comments and texts blanked, of the same length."""
     code = _BLANK.sub(lambda m: " " * len(m[0]), text)
-    for m in _STATEMENT.finditer(code):
-        yield m.start(), m[0]
+    return [(m.start(), m[0]) for m in _STATEMENT.finditer(code)]
 
 
-def _numbers(text: str, at: int) -> list[_Number]:
-    """All numbers of an aggregate; `at` is its place in the file."""
-    return [_Number(float(m[0]), at + m.start(), at + m.end()) for m in _NUMBER.finditer(text)]
+def _numbers(text: str, at: int = 0) -> tuple[Floats, list[Span]]:
+    """All numbers of an aggregate, and where they stand; `at` is its place in the file."""
+    found = list(_NUMBER.finditer(text))
+    values = np.array([float(m[0]) for m in found])
+    return values, [Span(0, at + m.start(), at + m.end()) for m in found]
 
 
 def _form(text: str) -> str:
@@ -151,119 +136,96 @@ def _form(text: str) -> str:
 
 _ROBTARGET = "[[0,0,0],[0,0,0,0],[0,0,0,0],[0,0,0,0,0,0]]"
 _JOINTTARGET = "[[0,0,0,0,0,0],[0,0,0,0,0,0]]"
+_FRAMES = {"tooldata": "tool", "wobjdata": "work object"}
+_Data = dict[str, list[tuple[str, str, int]]]
+"""Declarations by name: type, text of the value, its place."""
 
 
-class _RapidReader:
+class _RapidReader(ProgramReader):
     """Goes through the statements of a module in the order of its text."""
 
-    def __init__(self, name: str, text: str, more: str, known: ControllerFrames):
-        self.name, self.text, self.known = name, text, known
-        self.statements = list(_statements(text))
-        self.data: dict[str, list[tuple[str, str, int]]] = {}
-        self.frames: dict[str, list[tuple[str, str, int]]] = {}
-        for at, code in self.statements:
-            self._collect(at, code, self.data)
-        for at, code in _statements(more):
-            self._collect(at, code, self.frames)
-        self.assigned = dict(self._assignments())
-        self.found: dict[str, ProgramPoint] = {}
-
-    def _collect(self, at: int, code: str, into: dict[str, list[tuple[str, str, int]]]) -> None:
-        """Take the last declaration of a statement: before it a header without `;` may stand."""
-        for m in re.finditer(r"\b(?:LOCAL\s+|TASK\s+)?(?:CONST|PERS|VAR)\s", code, re.I):
-            if d := _DATA.match(code[m.start() :]):
-                value = d[4] if d[4] is not None and d[3] is None else ""
-                place = at + m.start() + (d.start(4) if d[4] is not None else 0)
-                into.setdefault(d[2].upper(), []).append((d[1].lower(), value, place))
-                return
-
-    def _assignments(self) -> Iterator[tuple[str, int]]:
-        """Yield names that get another value, wholly or in part, with the line."""
-        for at, code in self.statements:
-            for m in _ASSIGNED.finditer(code):
-                if not _NO_ASSIGNMENT.search(code[: m.start()]):
-                    yield m[1].upper(), line_of(self.text, at + m.start())
-
-    def points(self) -> tuple[ProgramPoint, ...]:
-        """All points; raises as `read_rapid` does."""
-        used, obeyed = self._used_otherwise(), True
+    def read(self, more: str) -> Program:
+        """Read the module; `more` is the text of one with tools and work objects."""
+        self.statements = _statements(self.text)
+        self.data = self._collected(self.statements)
+        self.frames = self._collected(_statements(more))
+        self.assigned = {
+            m[1].upper(): line_of(self.text, at + m.start())
+            for at, code in self.statements
+            for m in _ASSIGNED.finditer(code)
+            if not _NO_ASSIGNMENT.search(code[: m.start()])
+        }
+        self.used, obeyed = self._used_otherwise(), True
         for at, code in self.statements:
             if m := _REFUSED.search(code):
-                raise InputError(
-                    f"{self.name}: line {line_of(self.text, at + m.start())}: {m[1]} changes what "
-                    "points mean; valid: a program without it"
-                )
+                line = line_of(self.text, at + m.start())
+                raise self.refused(line, f"{m[1]} changes what points mean", "a program without it")
             if m := _CONF.search(code):
                 obeyed = m[2].upper() == "ON"
             elif m := _MOTION.search(code):
-                self._motion(at, code, m, obeyed, used)
+                self._motion(at, code, m, obeyed)
             elif (m := _OTHER_MOTION.search(code)) and m[1].upper() not in _MOVES_NOTHING:
-                line = line_of(self.text, at + m.start())
-                left = f"{m[1]} is not corrected"
-                self.found[f"line {line}"] = ProgramPoint(line, f"line {line}", left=left)
-        if not self.found:
-            raise InputError(f"{self.name}: no motions; valid: MoveJ, MoveL, MoveC, MoveAbsJ")
-        return tuple(self.found.values())
+                self.leave(line_of(self.text, at + m.start()), f"{m[1]} is not corrected")
+        return self.program()
 
-    def _arguments(self, code: str, m: re.Match[str]) -> tuple[list[tuple[int, str]], str]:
-        """Positional arguments of a motion with their places in the code, and its options."""
-        parts, options, positional = arguments_of(code[m.end() : code.rindex(";")]), "", []
-        for begin, part in parts:
+    def _collected(self, statements: Sequence[tuple[int, str]]) -> _Data:
+        """Last declaration of each statement: before it a header without `;` may stand."""
+        out: _Data = {}
+        for at, code in statements:
+            for m in re.finditer(r"\b(?:LOCAL\s+|TASK\s+)?(?:CONST|PERS|VAR)\s", code, re.I):
+                if d := _DATA.match(code[m.start() :]):
+                    value = d[4] if d[4] is not None and d[3] is None else ""
+                    place = at + m.start() + (d.start(4) if d[4] is not None else 0)
+                    out.setdefault(d[2].upper(), []).append((d[1].lower(), value, place))
+                    break
+        return out
+
+    def _targets(self, code: str, m: re.Match[str]) -> tuple[list[tuple[int, str]], str, str]:
+        """Targets of a motion with their places in the code, its tool, its options."""
+        options, given = "", []
+        for begin, part in arguments_of(code[m.end() : code.rindex(";")]):
             outer = re.sub(r"\([^()]*\)", lambda m: "(" + "." * (len(m[0]) - 2) + ")", part)
             cut = outer.find("\\") if "\\" in outer else len(part)
             plain, options = part[:cut], options + part[cut:]
             if plain.strip():
                 lead = len(plain) - len(plain.lstrip())
-                positional.append((m.end() + begin + lead, plain.strip()))
-        return positional, options
+                given.append((m.end() + begin + lead, plain.strip()))
+        count = 2 if m[1].upper().endswith("C") else 1
+        return given[:count], given[-1][1] if len(given) >= LEAST else "", options
 
-    def _motion(
-        self, at: int, code: str, m: re.Match[str], obeyed: bool, used: Mapping[str, int]
-    ) -> None:
+    def _motion(self, at: int, code: str, m: re.Match[str], obeyed: bool) -> None:
         """Take the targets of a motion."""
-        word, line = m[1].upper(), line_of(self.text, at + m.start())
-        given, options = self._arguments(code, m)
-        if len(given) < LEAST:
-            left = f"{m[1]} without its arguments"
-            self.found[f"line {line}"] = ProgramPoint(line, f"line {line}", left=left)
+        line = line_of(self.text, at + m.start())
+        targets, held, options = self._targets(code, m)
+        if not held:
+            self.leave(line, f"{m[1]} without its arguments")
             return
-        targets = given[: 2 if word.endswith("C") else 1]
-        tool = self._frame("tooldata", given[-1][1], line)
         named = re.search(r"\\\s*WObj\s*:=\s*(\w+)", options, re.I)
-        frame = self._frame("wobjdata", named[1] if named else "wobj0", line)
+        frames = (
+            self._frame("tooldata", held),
+            self._frame("wobjdata", named[1] if named else "wobj0"),
+        )
         for place, text in targets:
-            self._target(line, at + place, text, word == "MOVEABSJ", tool, frame, obeyed, used)
+            self._target(line, at + place, text, m[1].upper() == "MOVEABSJ", frames, obeyed)
 
-    def _frame(self, kind: str, name: str, line: int) -> Floats | str:
+    def _frame(self, kind: str, name: str) -> Floats | str:
         """Pose of a tool or of an object frame, or why it is not known."""
-        what, plain = ("tool", "TOOL0") if kind == "tooldata" else ("work object", "WOBJ0")
-        key = name.upper()
-        table = self.known.tools if kind == "tooldata" else self.known.bases
-        for given, pose in table.items():
-            if given.upper() == key:
-                return pose
+        key, tool = name.upper(), kind == "tooldata"
+        group, words = "tools" if tool else "bases", f"the {_FRAMES[kind]} '{name[:40]}'"
         values = self.data.get(key) or self.frames.get(key) or []
-        if key == plain and not values:
-            return np.eye(4)
+        if not values or self.known.given(group, name) is not None:
+            return self.known.pose(group, name, words, "TOOL0" if tool else "WOBJ0")
         if len(values) != 1 or values[0][0] != kind:
-            if kind == "tooldata" and self.known.tool is not None and not values:
-                return self.known.tool
-            other = " or --tool" if kind == "tooldata" else ""
-            return (
-                f"the {what} '{name[:40]}' is not in the module; give it by --frames (a module "
-                f"with its {kind}, or TOML){other}"
-            )
+            return f"{words} is not one {kind} of the program"
         if key in self.assigned:
-            return f"line {self.assigned[key]} changes the {what} '{name[:40]}'"
-        text = values[0][1]
-        numbers = np.array([n.value for n in _numbers(text, 0)])
-        start = re.sub(r"\s", "", text).upper()
-        if kind == "tooldata":
+            return f"line {self.assigned[key]} changes {words}"
+        numbers, start = _numbers(values[0][1])[0], re.sub(r"\s", "", values[0][1]).upper()
+        if tool:
             if not start.startswith("[TRUE,[[") or len(numbers) < POSE:
-                return f"the tool '{name[:40]}' is not one on the flange with numbers"
+                return f"{words} is not one on the flange with numbers"
             return of_quaternion(numbers[:POSE])
         if not start.startswith("[FALSE,TRUE,") or len(numbers) != 2 * POSE:
-            return f"the work object '{name[:40]}' is not fixed, or not of numbers"
+            return f"{words} is not fixed, or not of numbers"
         return of_quaternion(numbers[:POSE]) @ of_quaternion(numbers[POSE:])
 
     def _target(
@@ -272,140 +234,105 @@ class _RapidReader:
         at: int,
         text: str,
         joints: bool,
-        tool: Floats | str,
-        frame: Floats | str,
+        frames: tuple[Floats | str, Floats | str],
         obeyed: bool,
-        used: Mapping[str, int],
     ) -> None:
-        """Take one target."""
-        left = next((x for x in (tool, frame) if isinstance(x, str) and not joints), "")
-        made = _MADE.match(text)
+        """Take one target; `frames` are its tool and what it counts from."""
+        made, key, here = _MADE.match(text), f"line {line}, {at}", f"line {line}"
         if text.startswith("["):
-            new = self._value(text, at, f"line {line}", joints)
-            key = f"line {line}, {at}"
+            new = self._value(text, at, here, joints)
         elif made and not joints:
-            new, key = self._made(text, made, at, line), f"line {line}, {at}"
+            new = self._made(text, made, at, line)
         else:
-            key, new = text.upper(), ProgramPoint(line, f"line {line}")
+            key, new = text.upper(), ProgramPoint(line, here)
             values = self.data.get(key, [])
             if not _NAME.fullmatch(text):
-                left = left or f"the point '{text[:40]}' is computed while the program runs"
+                new = replace(new, left=_COMPUTED.format(text[:40]))
             elif len(values) != 1 or not values[0][1]:
                 what = "has several values" if values else "is not in this module"
-                left = left or f"the point '{text[:40]}' {what}"
-            elif key in used:
-                left = left or f"line {used[key]} uses or changes '{text[:40]}' otherwise"
+                new = replace(new, left=f"the point '{text[:40]}' {what}")
+            elif key in self.used:
+                left = f"line {self.used[key]} uses or changes '{text[:40]}' otherwise"
+                new = replace(new, left=left)
             else:
                 kind, value, place = values[0]
                 name = f"{text} (line {line_of(self.text, place)})"
                 new = self._value(value, place, name, kind == "jointtarget")
-        if left and not new.left:
-            new = replace(new, left=left)
         if not new.left and not joints:
-            assert isinstance(tool, np.ndarray)  # noqa: S101 - see `left`
-            assert isinstance(frame, np.ndarray)  # noqa: S101 - see `left`
-            new = replace(new, tool=tool, frame=frame, obeyed=obeyed)
-            if made:
-                new = self._moved(new, made)
-        self.found[key] = used_again(self.found.get(key), new, line, "frame")
+            new = new.at_pose(new.numbers, new.values, *frames, obeyed=obeyed)
+        self.take(key, new, line)
 
     def _value(self, text: str, at: int, name: str, joints: bool) -> ProgramPoint:
         """Return a point of an aggregate."""
-        numbers, bare = _numbers(text, at), ProgramPoint(line_of(self.text, at), name)
+        (values, spans), bare = _numbers(text, at), ProgramPoint(line_of(self.text, at), name)
         if _form(text) != (_JOINTTARGET if joints else _ROBTARGET):
             kind = "jointtarget" if joints else "robtarget"
             return replace(bare, left=f"it is no {kind} of numbers")
-        if any(n.value < UNUSED and n.value != 0 for n in numbers[-JOINTS:]):
+        external = values[-JOINTS:]
+        if np.any((external < UNUSED) & (external != 0)):
             return replace(bare, left="an external axis moves, and it is not known what it carries")
-        count = JOINTS if joints else POSE
-        spans = [Span(0, n.begin, n.end) for n in numbers]
-        values = np.array([n.value for n in numbers[:count]])
-        if not joints and not np.isclose(np.linalg.norm(values[3:]), 1.0, atol=1e-3):
+        if joints:
+            return bare.at_joints(spans[:JOINTS], values[:JOINTS], np.eye(4))
+        if not np.isclose(np.linalg.norm(values[3:POSE]), 1.0, atol=1e-3):
             return replace(bare, left="its quaternion is not of length 1")
         return replace(
             bare,
-            numbers=tuple(spans[:count]),
-            values=values,
-            joints=joints,
-            flags=() if joints else tuple(int(n.value) for n in numbers[count : count + 4]),
-            config=() if joints else tuple(spans[count : count + 3]),
+            numbers=tuple(spans[:POSE]),
+            values=values[:POSE],
+            flags=tuple(int(v) for v in values[POSE : POSE + 4]),
+            config=tuple(spans[POSE : POSE + 3]),
         )
 
     def _made(self, text: str, made: re.Match[str], at: int, line: int) -> ProgramPoint:
-        """Return the point that `Offs` or `RelTool` moves, to be written in its place."""
+        """Return the point that `Offs` or `RelTool` makes, to be written in its place."""
         bare = ProgramPoint(line, f"line {line}")
         base, *moves = [part.strip() for _, part in arguments_of(re.sub(r"\\", ",\\\\", made[2]))]
-        values = self.data.get(base.upper(), [])
-        turn = rf"\\\s*R[xyz]\s*:=\s*{_NUMBER.pattern}" if made[1].upper() == "RELTOOL" else "-"
+        values, relative = self.data.get(base.upper(), []), made[1].upper() == "RELTOOL"
+        turn = rf"\\\s*R[xyz]\s*:=\s*{_NUMBER.pattern}" if relative else "-"
         shift = [m for m in moves if _NUMBER.fullmatch(m)]
-        plain = len(shift) == 3 and all(
-            re.fullmatch(turn, m, re.I) for m in moves if m and m not in shift
-        )
+        turns = [m for m in moves if m and m not in shift]
+        plain = len(shift) == 3 and all(re.fullmatch(turn, m, re.I) for m in turns)
         if len(values) != 1 or not values[0][1] or not plain or base.upper() in self.assigned:
-            return replace(bare, left=f"the point '{text[:40]}' is computed while the program runs")
-        point = self._value(values[0][1], values[0][2], f"line {line}", False)
+            return replace(bare, left=_COMPUTED.format(text[:40]))
+        _, value, begin = values[0]
+        point = self._value(value, begin, bare.name, False)
         if point.left:
             return replace(bare, left=point.left)
-        value = values[0][1]
-        spans = [
-            (s.begin - values[0][2], s.end - values[0][2]) for s in (*point.numbers, *point.config)
-        ]
-        pieces, last = [], 0
-        for begin, end in spans:
-            pieces += [value[last:begin], "{}"]
-            last = end
-        written = re.sub(r"\s", "", "".join([*pieces, value[last:]]))
+        places = [Span(0, s.begin - begin, s.end - begin) for s in (*point.numbers, *point.config)]
+        t, by = of_quaternion(point.values), np.array([float(m) for m in shift])
+        if relative:
+            angle = {m[1:].strip()[:2].lower(): float(m.partition(":=")[2]) for m in turns}
+            t = t @ of_euler(np.array([*by, 0.0, 0.0, 0.0]))
+            for k, key in enumerate(("rx", "ry", "rz")):  # about x, then the new y, then the new z
+                t = t @ of_euler(angle.get(key, 0.0) * np.eye(6)[5 - k])
+        else:
+            t[:3, 3] += 1e-3 * by
         return replace(
             point,
             line=line,
-            name=f"line {line}",
+            name=bare.name,
             numbers=(Span(0, at, at + len(text)),),
+            values=to_quaternion(t, point.values),
             config=(),
             flags=(UNSTATED,) * 3 + point.flags[3:],  # quadrants follow from where it moves to
-            made=written,
+            made=re.sub(r"\s", "", edited(value, [(place, "{}") for place in places])),
         )
-
-    def _moved(self, p: ProgramPoint, made: re.Match[str]) -> ProgramPoint:
-        """Return the point where `Offs` or `RelTool` has it."""
-        moves = [part.strip() for _, part in arguments_of(re.sub(r"\\", ",\\\\", made[2]))][1:]
-        shift = np.array([float(m) for m in moves if m and not m.startswith("\\")])
-        turns = {
-            m[1:].strip()[:2].lower(): float(m.partition(":=")[2])
-            for m in moves
-            if m.startswith("\\")
-        }
-        t = of_quaternion(p.values)
-        if made[1].lower() == "offs":
-            t[:3, 3] += 1e-3 * shift
-        else:
-            for k, key in enumerate(("rx", "ry", "rz")):  # about x, then the new y, then the new z
-                one = np.zeros(6)
-                one[:3] = shift if k == 0 else 0.0
-                one[5 - k] = turns.get(key, 0.0)
-                t = t @ of_euler(one)
-        return replace(p, values=to_quaternion(t, p.values))
 
     def _used_otherwise(self) -> dict[str, int]:
         """Names of points that statements use which are no motions to them, with their lines."""
         out: dict[str, int] = {}
         points = {k for k, v in self.data.items() if v[0][0] in ("robtarget", "jointtarget")}
         for at, code in self.statements:
-            skipped: list[tuple[int, int]] = []
+            skipped = [
+                d.span(1) for d in re.finditer(r"\b(?:robtarget|jointtarget)\s+(\w+)", code, re.I)
+            ]
             if m := _MOTION.search(code):
-                for place, text in self._arguments(code, m)[0][
-                    : 2 if m[1].upper().endswith("C") else 1
-                ]:
-                    if _NAME.fullmatch(text) or self._plainly_made(text):
+                for place, text in self._targets(code, m)[0]:
+                    made = _MADE.match(text)  # of a point and numbers, it becomes one by itself
+                    if _NAME.fullmatch(text) or (made and not self._made(text, made, 0, 1).left):
                         skipped.append((place, place + len(text)))
-            for d in re.finditer(r"\b(?:robtarget|jointtarget)\s+(\w+)", code, re.I):
-                skipped.append(d.span(1))
             for n in _NAME.finditer(code):
                 inside = any(a <= n.start() < b for a, b in skipped)
                 if n[0].upper() in points and not inside:
                     out.setdefault(n[0].upper(), line_of(self.text, at + n.start()))
         return out
-
-    def _plainly_made(self, text: str) -> bool:
-        """Whether it is Offs or RelTool of a point and numbers, which become a point by itself."""
-        made = _MADE.match(text)
-        return made is not None and not self._made(text, made, 0, 1).left

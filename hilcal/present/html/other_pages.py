@@ -6,17 +6,26 @@ from hilcal import numbers
 from hilcal.diagnosis.change import LEVEL
 from hilcal.diagnosis.comparison import Comparison
 from hilcal.names import quoted
-from hilcal.present.charts.comparisons import arms_chart, changes_chart, error_by_pose
-from hilcal.present.comparison import comparison_report, headline, next_step, sentence
+from hilcal.present.campaign import utc
+from hilcal.present.charts import arms_chart, changes_chart, error_by_pose
+from hilcal.present.comparison import (
+    closing,
+    comparison_report,
+    headline,
+    next_step,
+    sentence,
+    type_report,
+    unlike_words,
+)
 from hilcal.present.document import Block, Chart, PageSection, Words, captioned, heading, table
-from hilcal.present.fleet import closing, type_report, unlike_words
-from hilcal.present.html.certificate import identity, utc
-from hilcal.present.html.page import Card, FirstScreen, render
+from hilcal.present.html import Card, FirstScreen, render
+from hilcal.present.html.report import identity
 
 if TYPE_CHECKING:
     from hilcal.transfer.fleet import Fleet
 
 Named = tuple[str, str]
+"""Name and SHA-256 of a campaign's file."""
 
 
 def comparison_page(
@@ -26,14 +35,13 @@ def comparison_page(
 
     Args:
         c: the comparison.
-        files: name and SHA-256 of the earlier campaign's file and of the later one's.
+        files: of the earlier campaign and of the later one.
         operator: who answers for the measurement; empty where nobody is named.
         made: when the report was made, ISO 8601, UTC.
         version: of the program.
     """
     (earlier, _), (later, _) = files
     arm = c.fit.model.cell.arm.name
-    told = tuple(comparison_report(c, earlier, later))
     charts: list[Block] = [Chart("Error today, by pose", error_by_pose(c), wide=True, height=0)]
     if c.changes.found:
         charts.append(Chart("What each change moves", changes_chart(c), wide=True, height=0))
@@ -49,7 +57,7 @@ def comparison_page(
         Words(f"hilcal compare {quoted(earlier)} {quoted(later)}", "code"),
     )
     sections = (
-        PageSection("changes", "What has changed", told),
+        PageSection("changes", "What has changed", tuple(comparison_report(c, earlier, later))),
         PageSection("today", "The earlier calibration today", tuple(charts)),
         PageSection("provenance", "Provenance", provenance),
     )
@@ -59,14 +67,12 @@ def comparison_page(
 
 def comparison_screen(c: Comparison, earlier: str) -> FirstScreen:
     """Return what the first screen says."""
-    found, t, told = c.changes, c.today, headline(c)
-    error = t.prediction.error
+    found, t, error = c.changes, c.today, c.today.prediction.error
     beyond = "more" if t.p_value < LEVEL else "no more"
     good = (
         f"The calibration of {earlier} is off by {numbers.length(error.rms_m)} rms today, "
         f"{numbers.digits(t.z, 2)} times what it states: {beyond} than its uncertainty."
     )
-    what = " ".join(sentence(x) for x in found.found) or f"{told}."
     largest = f"rms; largest {numbers.length(error.max_m)}"
     cards = [
         Card("Error today", numbers.length(error.rms_m), largest),
@@ -76,27 +82,20 @@ def comparison_screen(c: Comparison, earlier: str) -> FirstScreen:
         cards.append(Card("Uncalibrated", numbers.length(t.drawing_m), "rms of the arm as drawn"))
     answers = (
         ("Is the calibration still good?", good),
-        ("What has changed?", what),
+        ("What has changed?", " ".join(map(sentence, found.found)) or f"{headline(c)}."),
         ("What to do?", numbers.sentence(next_step(c, earlier))),
     )
     tone = "good" if not found.found and found.explained else "bad"
-    return FirstScreen(told, tone, answers, tuple(cards), "", None)
+    return FirstScreen(headline(c), tone, answers, tuple(cards))
 
 
 def fleet_page(fleet: "Fleet", directory: str, made: str, version: str) -> str:
-    """Return a fleet as HTML.
-
-    Args:
-        fleet: the fleet.
-        directory: that its campaigns are in.
-        made: when the page was made, ISO 8601, UTC.
-        version: of the program.
-    """
+    """Return a fleet of campaigns in a directory as HTML; `made` is an ISO 8601 time, UTC."""
     sections = []
     for k, t in enumerate(fleet.types):
         drawn: tuple[Block, ...] = (Chart("Arms of the type", arms_chart(t), wide=True, height=0),)
-        told = captioned(list(type_report(t))[1:], f"Parameters of the {t.type}")
-        sections.append(PageSection(f"type{k}", f"{t.type}: {len(t.arms)} arms", drawn + told))
+        report = captioned(list(type_report(t))[1:], f"Parameters of the {t.type}")
+        sections.append(PageSection(f"type{k}", f"{t.type}: {len(t.arms)} arms", drawn + report))
     rows = [(m.name, m.arm, m.date[:10], m.verdict, numbers.length(m.rms_m)) for m in fleet.members]
     heads = ("campaign", "arm", "date", "verdict", "rms on poses left out")
     campaigns = table(*heads, rows=rows, caption="Campaigns")
@@ -108,18 +107,18 @@ def fleet_page(fleet: "Fleet", directory: str, made: str, version: str) -> str:
 def _fleet_screen(fleet: "Fleet") -> FirstScreen:
     odd = [o for t in fleet.types for o in t.odd]
     arms = list(dict.fromkeys(o.arm for o in odd))
-    wear = [name for t in fleet.types for name in t.wear]
-    headline = f"Unlike their type: {numbers.names(arms)}" if arms else "No arm is unlike its type"
+    wear = ", ".join(name for t in fleet.types for name in t.wear)
+    headline, todo = "No arm is unlike its type", "Nothing; the prior serves the next arm."
+    if arms:
+        headline = f"Unlike their type: {numbers.names(arms)}"
+        todo = "Measure these arms again, and look at these joints."
     cards = (
         Card("Arms", str(sum(len(t.arms) for t in fleet.types)), "that were pooled"),
         Card("Campaigns", str(len(fleet.members)), f"used; not used: {len(fleet.failures)}"),
     )
-    todo = "Nothing; the prior serves the next arm."
-    if arms:
-        todo = "Measure these arms again, and look at these joints."
     answers = (
         ("Which arms are unlike, and by how much?", "; ".join(map(unlike_words, odd)) or "None."),
-        ("What wears?", ", ".join(wear) or "No drift that the arms have in common."),
+        ("What wears?", wear or "No drift that the arms have in common."),
         ("What to do?", todo),
     )
-    return FirstScreen(headline, "bad" if arms else "good", answers, cards, "", None)
+    return FirstScreen(headline, "bad" if arms else "good", answers, cards)

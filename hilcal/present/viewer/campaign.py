@@ -23,10 +23,58 @@ from hilcal.present.story import (
     levels,
     worst_and_even,
 )
-from hilcal.present.viewer import arm_shapes, recording, style
+from hilcal.present.viewer import recording, style
 from hilcal.present.viewer.recording import along, fixed
 from hilcal.robot.body import capsules
 from hilcal.types import Floats, Ints
+
+FOLLOWS = "What the residual follows (axes: Details)"
+LAW = "Law beyond the catalogue: blue readings, green law"
+ERRORS = "Error of each revision [µm]: blue fitted, pink left out, red largest, green noise"
+SERIES = {
+    "fit": style.MEASURED,
+    "holdout": style.HOLDOUT,
+    "largest": style.RED,
+    "noise": style.NOISE,
+}
+"""Of the errors of revisions: entity and colour, see `ERRORS`."""
+BARS = 150
+"""Bars of poses at most."""
+_BINS = 12
+"""Of single readings over what they may follow, for their mean."""
+SIGMA_LENGTH, ARROW_CAP = 0.02, 0.40
+"""One σ is drawn this long, and no arrow longer, m."""
+DEFLECTION_LENGTH, DEFLECTION_CAP = 0.25, 0.6
+"""The same of a large measured deflection, m."""
+ARROWS, BALLS, PAIRS = 150, 60, 150
+"""How much is drawn at most, so that a picture stays legible and a file small."""
+_LABEL_ABOVE = np.array([0.0, 0.0, 0.3])
+_DOT = 0.012  # m, half the distance of two dots of a leader
+_MARKS = {"adequate": "✓ ", "missing_effect": "✗ ", "unknown_effect": "✗ "}
+_POSE_LOADS = 12
+GUIDE = """### How to read this
+**Timelines** (bottom left): *revision* goes through the models, the first one first: drag the
+slider, or press Space to play. *pose* moves the arm through all poses, with the last model; the
+bright ball is the present pose.
+
+**Residuals** (3-D): each green ball is where noise alone would leave 99 % of the readings.
+An arrow that leaves its ball = the model is wrong there. Grey: noise. Amber: beyond 99 %.
+Red: beyond 99.99 %. The arm stands in the pose of the worst reading; a dotted line leads from it
+to its label and is no residual.
+
+**Deflection** (3-D): blue is measured, white is predicted, both enlarged; one pair per pose, of
+its largest deflection. The line between their tips is what the model misses. Where only blue is
+seen, the model is right.
+
+**Worst reading of each pose**: the length of its residual in σ of its own noise. The tallest bar
+is the worst reading; the order in µm can be another, where some readings are noisier.
+
+**Error of each revision**: rms over fitted poses, over poses left out, and the longest residual
+in µm, against the noise. Left-out error far above the fitted one = too many parameters.
+
+**What the residual follows**: its mean over the leading suspect, or, where that explains little of
+it, over the recorded variable that carries most of it; *Details* names both axes.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,10 +108,8 @@ def save(story: Story, path: Path) -> None:
         InputError: the folder is missing.
         HilcalError: the file cannot be written.
     """
-    path = Path(path)
-    recording.require_folder(path)
     rec = _opened(story)
-    recording.write(rec, blueprint(story), lambda: tell(rec, story), path)
+    recording.write(rec, blueprint(story), lambda: tell(rec, story), Path(path))
 
 
 @contextlib.contextmanager
@@ -113,23 +159,33 @@ def tell(rec: rr.RecordingStream, story: Story) -> None:
 
 
 def begin(rec: rr.RecordingStream, story: Story) -> None:
-    """Log what is the same in every revision."""
-    static_scene(rec, story)
+    """Log what is the same in every revision: shapes of the arm, axes of the world, the guide."""
+    fixed(rec, "world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+    parts = style.shapes(capsules(story.arm))
+    style.log_shapes(rec, [*parts, *style.target_shapes(story.arm, story.targets)])
+    if story.target is not None:
+        names = [story.target_names[k] for k in np.unique(story.target)]
+        at = f"world/arm/body{story.arm.n + 1}/names"
+        fixed(rec, at, style.labels(story.targets, names))
     fixed(rec, "words/guide", style.document(GUIDE))
 
 
 def tell_revision(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
     """Log one revision at the recording's current time."""
-    revision_scene(rec, story, r)
-    error_bars(rec, story)
-    pose_bars(rec, story, r)
-    curve_bars(rec, "follows", r.follows)
-    if any(one.laws for one in story.revisions):
-        curve_bars(rec, "law", r.laws[0] if r.laws else None)
-    rec.log("words/verdict", style.document(verdict(story, r)))
-    rec.log("words/parameters", style.document(style.markdown(r.panels.get("parameters", ()))))
-    rec.log("words/revisions", style.document(revisions(story, r.revision)))
-    rec.log("words/details", style.document(details(story, r)))
+    _scene(rec, story, r)
+    _error_bars(rec, story)
+    _pose_bars(rec, story, r)
+    _curve_bars(rec, "follows", r.follows)
+    if any(of.laws for of in story.revisions):
+        _curve_bars(rec, "law", r.laws[0] if r.laws else None)
+    parameters = style.markdown(r.panels.get("parameters", ()))
+    for name, text in (
+        ("verdict", verdict(story, r)),
+        ("parameters", parameters),
+        ("revisions", revisions(story, r.revision)),
+        ("details", details(story, r)),
+    ):
+        rec.log(f"words/{name}", style.document(text))
     rec.log("log", rr.TextLog(log_line(story, r), level="INFO"))
 
 
@@ -138,7 +194,7 @@ def _poses(rec: rr.RecordingStream, story: Story) -> None:
     rec.set_time("pose", sequence=int(story.poses[0]))
     tell_revision(rec, story, story.revisions[-1])
     rec.reset_time()
-    pose_scene(rec, story)
+    _pose_scene(rec, story)
     time = rr.TimeColumn("pose", sequence=story.poses)
     along(rec, "words/verdict", time, style.documents(pose_cards(story)))
     # the bar of the current pose; its name puts it in front of the others
@@ -147,11 +203,6 @@ def _poses(rec: rr.RecordingStream, story: Story) -> None:
         bar = rr.BarChart([height], abscissa=[left], widths=[width], color=style.MEASURED)
         rec.log("bars/zcurrent", bar)
     rec.reset_time()
-
-
-FOLLOWS = "What the residual follows (axes: Details)"
-LAW = "Law beyond the catalogue: blue readings, green law"
-ERRORS = "Error of each revision [µm]: blue fitted, pink left out, red largest, green noise"
 
 
 def blueprint(story: Story) -> rrb.Blueprint:
@@ -199,8 +250,12 @@ def titles(story: Story) -> tuple[str, str, str]:
 
 
 def _view3d(story: Story, name: str, without: str) -> rrb.Spatial3DView:
+    """Return a view of the targets, the arm in its worst poses and the labels."""
+    far = [worst(r) for r in story.revisions]
+    stands = story.bodies[story.row[far], :, :3, 3].reshape(-1, 3)
+    points = np.vstack([story.anchor, stands, story.anchor[far] + _LABEL_ABOVE])
     middle, size = style.center(story.anchor, story.arm.reach)
-    place = style.near(middle, style.EYE * size, seen(story))
+    place = style.near(middle, style.EYE * size, points)
     contents = ["+ $origin/**", f"- $origin/{without}/**", "- $origin/live/**"]
     return style.view3d("world", name, place, middle, contents)
 
@@ -209,31 +264,18 @@ def _bars(origin: str, name: str) -> rrb.BarChartView:
     return rrb.BarChartView(origin=origin, name=name, plot_legend=rrb.PlotLegend(visible=False))
 
 
-SERIES = {
-    "fit": style.MEASURED,
-    "holdout": style.HOLDOUT,
-    "largest": style.RED,
-    "noise": style.NOISE,
-}
-"""Of the errors of revisions: entity and colour, see `ERRORS`."""
-BARS = 150
-"""Bars of poses at most."""
-_BINS = 12
-"""Of single readings over what they may follow, for their mean."""
-
-
-def error_bars(rec: rr.RecordingStream, story: Story) -> None:
+def _error_bars(rec: rr.RecordingStream, story: Story) -> None:
     """Log the errors of all revisions, µm: four bars beside each other for each."""
-    told, floor = story.revisions, story.noise_floor_m
-    sizes = np.array([(r.error.rms_m, r.holdout.rms_m, r.error.max_m, floor) for r in told])
-    at, wide = np.array([float(r.revision) for r in told]), 0.8 / len(SERIES)
+    of, floor = story.revisions, story.noise_floor_m
+    sizes = np.array([(r.error.rms_m, r.holdout.rms_m, r.error.max_m, floor) for r in of])
+    at, wide = np.array([float(r.revision) for r in of]), 0.8 / len(SERIES)
     for k, (name, color) in enumerate(SERIES.items()):
         left, widths = at - 0.4 + k * wide, np.full(len(at), wide)
         bars = rr.BarChart(1e6 * sizes[:, k], abscissa=left, widths=widths, color=color)
         rec.log(f"errors/{name}", bars)
 
 
-def curve_bars(rec: rr.RecordingStream, entity: str, c: DependenceCurve | None) -> None:
+def _curve_bars(rec: rr.RecordingStream, entity: str, c: DependenceCurve | None) -> None:
     """Log a curve as bars over its variable, and beside each that of the law, where it has one.
 
     Single readings are drawn by their mean in bins of equal count.
@@ -241,36 +283,30 @@ def curve_bars(rec: rr.RecordingStream, entity: str, c: DependenceCurve | None) 
     bars: dict[str, Floats] = {}
     edges = np.zeros(0)
     if c is not None and len(c.x):
-        x, y = (c.x, c.y) if c.error is not None else _means(c)
+        x, y = c.x, c.y
+        if c.error is None:
+            order = np.argsort(x, kind="stable")
+            bins = np.array_split(order, min(_BINS, max(1, len(order) // 4)))
+            x, y = (np.array([v[b].mean() for b in bins]) for v in (x, y))
         order = np.arange(len(x)) if c.names else np.argsort(x, kind="stable")
         bars["mean"] = y[order]
         if c.line is not None:
             bars["law"] = np.interp(x[order], *c.line)
-        edges = _edges(order.astype(float) if c.names else x[order])
+        at = order.astype(float) if c.names else x[order]
+        gaps = np.diff(at) if len(at) > 1 else np.ones(1)
+        wide = np.concatenate([at[:1] - gaps[:1], at, at[-1:] + gaps[-1:]])
+        edges = 0.5 * (wide[1:] + wide[:-1])
     for k, (part, color) in enumerate((("mean", style.MEASURED), ("law", style.NOISE))):
         if part not in bars:
             rec.log(f"{entity}/{part}", rr.Clear(recursive=False))
             continue
         width = np.diff(edges) / len(bars)
-        at = edges[:-1] + k * width
-        rec.log(f"{entity}/{part}", rr.BarChart(bars[part], abscissa=at, widths=width, color=color))
+        left = edges[:-1] + k * width
+        bar = rr.BarChart(bars[part], abscissa=left, widths=width, color=color)
+        rec.log(f"{entity}/{part}", bar)
 
 
-def _edges(x: Floats) -> Floats:
-    """(K + 1,) of bins about growing centres (K,): half-way between them."""
-    if len(x) == 1:
-        return np.array([x[0] - 0.5, x[0] + 0.5])
-    middle = 0.5 * (x[1:] + x[:-1])
-    return np.concatenate([[2 * x[0] - middle[0]], middle, [2 * x[-1] - middle[-1]]])
-
-
-def _means(c: DependenceCurve) -> tuple[Floats, Floats]:
-    order = np.argsort(c.x, kind="stable")
-    bins = np.array_split(order, min(_BINS, max(1, len(order) // 4)))
-    return np.array([c.x[b].mean() for b in bins]), np.array([c.y[b].mean() for b in bins])
-
-
-def pose_bars(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
+def _pose_bars(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
     """Log the worst reading of each pose in σ, its Mahalanobis distance, one series per level.
 
     The tallest bar is the worst reading of all. A bar of several poses is that of the worst.
@@ -293,37 +329,24 @@ def _bar_places(story: Story, r: StoryRevision) -> tuple[Ints, Floats, Floats, F
     """First pose (its number), left edge, width and height, σ, of every bar."""
     starts = np.arange(0, len(story.poses), poses_per_bar(story))
     edges = np.append(story.poses[starts], story.poses[-1] + 1) - 0.5
-    worst_of_poses = r.sigma[story.last_of_poses(r.whitened_norm2)]
-    height = np.maximum.reduceat(worst_of_poses, starts)
+    height = np.maximum.reduceat(r.sigma[story.last_of_poses(r.whitened_norm2)], starts)
     return story.poses[starts], edges[:-1], np.diff(edges), height
-
-
-_MARKS = {"adequate": "✓ ", "missing_effect": "✗ ", "unknown_effect": "✗ "}
-_POSE_LOADS = 12
 
 
 def verdict(story: Story, r: StoryRevision) -> str:
     """Return the verdict of a revision with its suspects; short, since a small window cuts it."""
-    mark = _MARKS.get(r.verdict, "")
-    head = heading(f"{place(story, r)}: {mark}{r.verdict.replace('_', ' ')}")
+    numbers_of = [o.revision for o in story.revisions]
+    k, count = numbers_of.index(r.revision) + 1, len(numbers_of)
+    where = f" of {count}" if numbers_of == list(range(1, count + 1)) else f" ({k} of {count})"
+    place = "" if story.growing else f"{where}{', the last' * (k == count > 1)}"
+    says = f"{_MARKS.get(r.verdict, '')}{r.verdict.replace('_', ' ')}"
+    head = heading(f"Revision {r.revision}{place}: {says}")
     return style.markdown([head, *r.panels.get("verdict", ())])
-
-
-def place(story: Story, r: StoryRevision) -> str:
-    """Return where in the story a revision stands, e.g. "Revision 2 of 2, the last"."""
-    if story.growing:
-        return f"Revision {r.revision}"
-    told = [o.revision for o in story.revisions]
-    k, count = told.index(r.revision) + 1, len(told)
-    plain = told == list(range(1, count + 1))
-    where = f"of {count}" if plain else f"({k} of {count})"
-    return f"Revision {r.revision} {where}{', the last' * (k == count > 1)}"
 
 
 def details(story: Story, r: StoryRevision) -> str:
     """Return what the verdict rests on, as the terminal has it, and the worst reading."""
-    outside = float(np.mean(r.level > 0))
-    i = worst(r)
+    outside, i = float(np.mean(r.level > 0)), worst(r)
     told = (
         f"{numbers.percent(outside)} of readings are outside their 99 % noise ball (noise alone: "
         f"1 %). Worst: pose {story.pose_name(i)}, load {story.load_names[i]}, "
@@ -336,20 +359,18 @@ def details(story: Story, r: StoryRevision) -> str:
 def pose_cards(story: Story) -> list[str]:
     """Return each pose of the last revision in words: residual of each load, and joints."""
     r, size = story.revisions[-1], story.revisions[-1].size_m
-    sigma, level = r.sigma, r.level
-    rms = np.sqrt(np.bincount(story.row, size**2) / np.bincount(story.row))
+    sigma, level, out = r.sigma, r.level, []
     order = np.argsort(story.row, kind="stable")
     ends = np.cumsum(np.bincount(story.row, minlength=len(story.poses)))
-    out = []
     for k, rows in enumerate(np.split(order, ends[:-1])):
-        cells = (
-            (story.load_names[i], numbers.length(float(size[i])), f"{sigma[i]:.1f}",
-             LEVEL_NAMES[level[i]])
+        rms = numbers.length(float(np.sqrt(np.mean(size[rows] ** 2))))
+        cells = [
+            (story.load_names[i], numbers.length(size[i]), f"{sigma[i]:.1f}", LEVEL_NAMES[level[i]])
             for i in rows[:_POSE_LOADS].tolist()
-        )  # fmt: skip
+        ]
         joints = map(numbers.joint_value, story.q[story.first[k]].tolist(), story.arm.units)
         card: list[Block] = [
-            heading(f"Pose {story.pose_name(int(rows[0]))}: {numbers.length(float(rms[k]))} rms"),
+            heading(f"Pose {story.pose_name(int(rows[0]))}: {rms} rms"),
             f"With the model of revision {r.revision}: {r.name}.",
             table("load", "residual", "in σ", "", rows=cells, left=(0, 3)),
             f"Joints {', '.join(joints)}.",
@@ -374,41 +395,6 @@ def log_line(story: Story, r: StoryRevision) -> str:
     )
 
 
-GUIDE = """### How to read this
-**Timelines** (bottom left): *revision* goes through the models, the first one first: drag the
-slider, or press Space to play. *pose* moves the arm through all poses, with the last model; the
-bright ball is the present pose.
-
-**Residuals** (3-D): each green ball is where noise alone would leave 99 % of the readings.
-An arrow that leaves its ball = the model is wrong there. Grey: noise. Amber: beyond 99 %.
-Red: beyond 99.99 %. The arm stands in the pose of the worst reading; a dotted line leads from it
-to its label and is no residual.
-
-**Deflection** (3-D): blue is measured, white is predicted, both enlarged; one pair per pose, of
-its largest deflection. The line between their tips is what the model misses. Where only blue is
-seen, the model is right.
-
-**Worst reading of each pose**: the length of its residual in σ of its own noise. The tallest bar
-is the worst reading; the order in µm can be another, where some readings are noisier.
-
-**Error of each revision**: rms over fitted poses, over poses left out, and the longest residual
-in µm, against the noise. Left-out error far above the fitted one = too many parameters.
-
-**What the residual follows**: its mean over the leading suspect, or, where that explains little of
-it, over the recorded variable that carries most of it; *Details* names both axes.
-"""
-
-
-SIGMA_LENGTH, ARROW_CAP = 0.02, 0.40
-"""One σ is drawn this long, and no arrow longer, m."""
-DEFLECTION_LENGTH, DEFLECTION_CAP = 0.25, 0.6
-"""The same of a large measured deflection, m."""
-ARROWS, BALLS, PAIRS = 150, 60, 150
-"""How much is drawn at most, so that a picture stays legible and a file small."""
-_LABEL_ABOVE = np.array([0.0, 0.0, 0.3])
-_DOT = 0.012  # m, half the distance of two dots of a leader
-
-
 def residual_scale(story: Story) -> float:
     """Return the m that are drawn per m of residual."""
     sigma = float(np.sqrt(np.median(np.trace(story.covariance, axis1=1, axis2=2)) / 3))
@@ -430,7 +416,7 @@ def noise_balls(story: Story, rows: Ints) -> tuple[Floats, Floats]:
     w, v = np.linalg.eigh(story.covariance[rows])
     v[:, :, 0] *= np.sign(np.linalg.det(v))[:, None]
     half = style.BALL_SIGMAS * residual_scale(story) * np.sqrt(np.maximum(w, 0.0))
-    return np.maximum(half, 1e-3), arm_shapes.quaternions_of(v)
+    return np.maximum(half, 1e-3), style.quaternions_of(v)
 
 
 def worst(r: StoryRevision) -> int:
@@ -449,27 +435,18 @@ def shown(story: Story, r: StoryRevision) -> Ints:
     return np.union1d(worst_and_even(r.whitened_norm2, ARROWS), balled(story, r))
 
 
-def static_scene(rec: rr.RecordingStream, story: Story) -> None:
-    """Log what never changes: the arm's shapes and the axes of the world."""
-    fixed(rec, "world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
-    arm_shapes.log_bodies(rec, capsules(story.arm))
-    several = () if story.target is None else np.unique(story.target)
-    names = [style.safe(story.target_names[k]) for k in several]
-    arm_shapes.log_targets(rec, story.arm, story.targets, names)
-
-
-def revision_scene(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
+def _scene(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
     """Log one revision at the recording's current time: arrows, balls, the arm at its worst."""
     far, drawn, balls = worst(r), shown(story, r), balled(story, r)
-    arm_shapes.stand(rec, story.bodies[story.row[far]])
+    style.stand(rec, story.bodies[story.row[far]])
     level = r.level[drawn]
-    found = rr.Arrows3D(
+    arrows_ = rr.Arrows3D(
         origins=story.anchor[drawn],
         vectors=arrows(story, r, drawn),
         colors=style.LEVEL_COLORS[level],
         radii=np.where(level > 0, 0.0055, 0.0035),
     )
-    rec.log("world/residual/arrows", found)
+    rec.log("world/residual/arrows", arrows_)
     half, quaternions = noise_balls(story, balls)
     noise = rr.Ellipsoids3D(
         centers=story.anchor[balls],
@@ -480,17 +457,31 @@ def revision_scene(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> N
     )
     rec.log("world/residual/noise", noise)
     at, words = story.anchor[far], f"worst: pose {story.pose_name(far)}, {_words(story, r, far)}"
-    rec.log("world/residual/worst", arm_shapes.labels([at + _LABEL_ABOVE], [words]))
+    rec.log("world/residual/worst", style.labels([at + _LABEL_ABOVE], [words]))
     dots = list(leader(at, noise_balls(story, np.array([far]))[0]))
     lines = rr.LineStrips3D(dots, colors=[style.LEADER], radii=rr.Radius.ui_points(0.5))
     rec.log("world/residual/leader", lines)
-    _deflections(rec, story, r)
+    # a pair of arrows per chosen pose, of its largest deflection, and what is missed
+    of_pose = story.last_of_poses(np.linalg.norm(story.deviation(story.measured), axis=1))
+    some = of_pose[worst_and_even(r.whitened_norm2[of_pose], PAIRS)]
+    feet, scale, tips = story.anchor[some], deflection_scale(story), []
+    for name, value, color, radius in (
+        ("measured", story.measured, style.MEASURED, 0.0055),
+        ("predicted", r.predicted, style.PREDICTED, 0.0045),
+    ):
+        moved = capped(story.deviation(value)[some] * scale, DEFLECTION_CAP)
+        tips.append(feet + moved)
+        pair = rr.Arrows3D(origins=feet, vectors=moved, colors=[color], radii=[radius])
+        rec.log(f"world/deflection/{name}", pair)
+    colors, thin = style.LEVEL_COLORS[r.level[some]], rr.Radius.ui_points(1.6)
+    missed = rr.LineStrips3D(np.stack(tips, 1), colors=colors, radii=thin)
+    rec.log("world/deflection/missed", missed)
 
 
-def pose_scene(rec: rr.RecordingStream, story: Story) -> None:
+def _pose_scene(rec: rr.RecordingStream, story: Story) -> None:
     """Send the arm and the highlighted arrow of every pose, as columns on `pose`."""
     r, time = story.revisions[-1], rr.TimeColumn("pose", sequence=story.poses)
-    arm_shapes.send_stands(rec, time, story.bodies)
+    style.send_stands(rec, time, story.bodies)
     far = story.last_of_poses(r.whitened_norm2)
     at, (half, quaternions) = story.anchor[far], noise_balls(story, far)
     now = rr.Arrows3D.columns(
@@ -509,36 +500,24 @@ def pose_scene(rec: rr.RecordingStream, story: Story) -> None:
     strips = rr.LineStrips3D.columns(strips=np.concatenate(dots))
     along(rec, "world/residual/leader", time, strips.partition([len(x) for x in dots]))
     words = [f"pose {story.pose_name(i)}: {_words(story, r, i)}" for i in far.tolist()]
-    along(rec, "world/residual/worst", time, arm_shapes.label_columns(at + _LABEL_ABOVE, words))
+    along(rec, "world/residual/worst", time, style.label_columns(at + _LABEL_ABOVE, words))
 
 
 def _words(story: Story, r: StoryRevision, i: int) -> str:
-    name = ""
-    if story.target is not None:
-        name = f"{style.safe(story.target_names[story.target[i]])} "
+    name = "" if story.target is None else f"{story.target_names[story.target[i]]} "
     return f"{name}{numbers.length(float(r.size_m[i]))} ({r.sigma[i]:.1f} σ)"
 
 
 def leader(at: Floats, ball: Floats) -> Floats:
     """(K, 2, 3) dots from above a noise ball to the label of its reading, m.
 
-    Thin, dotted and grey, so that nobody takes them for a residual, which is a solid arrow.
-
-    Args:
-        at: (3,) the ball's middle.
-        ball: its half axes.
+    Thin, dotted and grey, so that nobody takes them for a residual, which is a solid arrow. `at`
+    (3,) is the ball's middle, `ball` has its half axes.
     """
     top = float(_LABEL_ABOVE[2])
     z = np.arange(min(1.1 * float(ball.max()), top - _DOT), top, 2.0 * _DOT)
     ends = np.stack([z, np.minimum(z + 0.5 * _DOT, top)], 1)
     return np.asarray(at + ends[:, :, None] * np.array([0.0, 0.0, 1.0]))
-
-
-def seen(story: Story) -> Floats:
-    """(K, 3) what is to be in the picture: targets, the arm in its worst poses, labels, m."""
-    far = [worst(r) for r in story.revisions]
-    stands = story.bodies[story.row[far], :, :3, 3].reshape(-1, 3)
-    return np.vstack([story.anchor, stands, story.anchor[far] + _LABEL_ABOVE])
 
 
 def arrows(story: Story, r: StoryRevision, rows: Ints) -> Floats:
@@ -550,21 +529,3 @@ def capped(vectors: Floats, length: float) -> Floats:
     """(K, 3) vectors, those longer than `length` shortened to it."""
     norm = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.asarray(vectors * np.minimum(1.0, length / np.maximum(norm, 1e-300)))
-
-
-def _deflections(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
-    """Log a pair of arrows per chosen pose, of its largest deflection, and what is missed."""
-    of_pose = story.last_of_poses(np.linalg.norm(story.deviation(story.measured), axis=1))
-    some = of_pose[worst_and_even(r.whitened_norm2[of_pose], PAIRS)]
-    at, scale, tips = story.anchor[some], deflection_scale(story), []
-    for name, value, color, radius in (
-        ("measured", story.measured, style.MEASURED, 0.0055),
-        ("predicted", r.predicted, style.PREDICTED, 0.0045),
-    ):
-        moved = capped(story.deviation(value)[some] * scale, DEFLECTION_CAP)
-        tips.append(at + moved)
-        drawn = rr.Arrows3D(origins=at, vectors=moved, colors=[color], radii=[radius])
-        rec.log(f"world/deflection/{name}", drawn)
-    colors, thin = style.LEVEL_COLORS[r.level[some]], rr.Radius.ui_points(1.6)
-    missed = rr.LineStrips3D(np.stack(tips, 1), colors=colors, radii=thin)
-    rec.log("world/deflection/missed", missed)

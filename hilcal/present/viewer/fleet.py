@@ -11,9 +11,9 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from hilcal import numbers
+from hilcal.present.comparison import FAR, type_report, unlike_words
 from hilcal.present.document import heading
-from hilcal.present.fleet import FAR, type_report, unlike_words
-from hilcal.present.viewer import arm_shapes, recording, style
+from hilcal.present.viewer import recording, style
 from hilcal.present.viewer.recording import along, fixed
 from hilcal.robot.arm import Arm
 from hilcal.robot.body import body_poses, capsules
@@ -30,10 +30,8 @@ _STANDS = (0.0, -1.4, 1.0, -1.2, -1.57, 0.0)
 """Joint values of the drawn arms, rad: upright, so that many stand side by side; a choice."""
 _APART = (0.62, 0.95)
 """Distances of arms and of their rows, shares of the reach; a choice."""
-_NAMED = 40
-"""Arms up to which each has its name beside it; a choice."""
-_ROWS = 12
-"""Parameters that are drawn at most; a choice."""
+_NAMED, _ROWS = 40, 12
+"""Arms up to which each has its name beside it, and parameters that are drawn; choices."""
 _LEAST_RANGE_S = 86400.0
 GUIDE = """### How to read this
 - **Arms**: one of each, side by side. A red joint is unlike the others of the type; its arm stands
@@ -46,24 +44,16 @@ GUIDE = """### How to read this
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DrawnType:
-    """One type of a fleet; A arms, K pooled parameters, C campaigns.
-
-    Attributes:
-        pooled: what is known of the type.
-        arm: its links, for drawing.
-        odd: (A, K) what is unlike the type.
-        owner: (C,) arm of each campaign.
-        seconds: (C,) when it was measured, since 1970.
-        campaigns: (C, K) distance of each campaign from the mean of the type, in σ: the root of
-            the spread from arm to arm and its own uncertainty; NaN where it tells nothing.
-    """
+    """One type of a fleet; A arms, K pooled parameters, C campaigns."""
 
     pooled: "Pooled"
-    arm: Arm
-    odd: Bools
-    owner: tuple[int, ...]
-    seconds: Floats
+    arm: Arm  # its links, for drawing
+    odd: Bools  # (A, K) what is unlike the type
+    owner: tuple[int, ...]  # (C,) arm of each campaign
+    seconds: Floats  # (C,) when it was measured, since 1970
     campaigns: Floats
+    """(C, K) distance of each campaign from the mean of the type, in σ: the root of the spread from
+    arm to arm and its own uncertainty; NaN where it tells nothing."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -108,27 +98,25 @@ def places(d: DrawnType) -> Floats:
     count = len(d.pooled.arms)
     wide = max(math.ceil(math.sqrt(2.0 * count)), 1)
     index = np.arange(count)
-    at = np.zeros((count, 3))
-    at[:, 0] = -_APART[1] * d.reach * (index // wide)
-    at[:, 1] = _APART[0] * d.reach * (index % wide - (min(wide, count) - 1) / 2)
-    return at
+    across = index % wide - (min(wide, count) - 1) / 2
+    return np.stack([-_APART[1] * (index // wide), _APART[0] * across, 0 * index], 1) * d.reach
 
 
-def arms(rec: rr.RecordingStream, path: str, d: DrawnType) -> None:
+def _arms(rec: rr.RecordingStream, path: str, d: DrawnType) -> None:
     """Log the arms; a joint that is unlike the type is red, one beyond `FAR` σ amber."""
     fixed(rec, path, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
-    shapes = capsules(d.arm)
+    parts = capsules(d.arm)
     poses = body_poses(d.arm, np.resize(np.array(_STANDS), d.arm.n)[None])[0]
-    body, radius = (np.array([getattr(s, k) for s in shapes]) for k in ("body", "radius"))
+    body, radius = (np.array([getattr(s, k) for s in parts]) for k in ("body", "radius"))
     start, end = (
         np.einsum("kij,kj->ki", poses[body, :3, :3], x) + poses[body, :3, 3]
-        for x in (np.array([s.start for s in shapes]), np.array([s.end for s in shapes]))
+        for x in (np.array([s.start for s in parts]), np.array([s.end for s in parts]))
     )
     top = np.array([0.0, 0.0, 1.06 * float((np.maximum(start, end)[:, 2] + radius).max())])
     at, marked = places(d), np.asarray(d.odd.any(axis=1))
     low, high = (np.concatenate([x + p for p in at]) for x in (start, end))
     colors = np.concatenate([_colors(d, a)[body] for a in range(len(at))])
-    fixed(rec, f"{path}/arms", arm_shapes.capsules(low, high, np.tile(radius, len(at)), colors))
+    fixed(rec, f"{path}/arms", style.drawn_capsules(low, high, np.tile(radius, len(at)), colors))
     named = np.flatnonzero(marked | (len(at) <= _NAMED))
     # Long words stand above the names of the neighbours, each arm's on a line of its own.
     step = np.cumsum(marked)[named] * marked[named]
@@ -137,8 +125,10 @@ def arms(rec: rr.RecordingStream, path: str, d: DrawnType) -> None:
     thin = rr.Radius.ui_points(1.0)
     leaders = rr.LineStrips3D(np.stack([feet, feet + above], 1), colors=[style.RED], radii=thin)
     fixed(rec, f"{path}/names/leader", leaders)
-    words = [_label(d, int(a)) for a in named]
-    fixed(rec, f"{path}/names", arm_shapes.labels(feet + above, words))
+    arms = [d.pooled.arms[a] for a in named]
+    unlike = [[unlike_words(o) for o in d.pooled.odd if o.arm == arm] for arm in arms]
+    words = ["\n".join(lines[:3]) or arm for arm, lines in zip(arms, unlike, strict=True)]
+    fixed(rec, f"{path}/names", style.labels(feet + above, words))
     if marked.any():
         frames = rr.Boxes3D(
             centers=at[marked] + 0.5 * top,
@@ -152,7 +142,7 @@ def arms(rec: rr.RecordingStream, path: str, d: DrawnType) -> None:
 
 def _colors(d: DrawnType, a: int) -> "np.ndarray[tuple[int, ...], np.dtype[np.uint8]]":
     """(n + 1, 3) colours of the bodies of an arm."""
-    out = np.array([arm_shapes.shade(i) for i in range(d.arm.n + 1)], dtype=np.uint8)
+    out = np.array([style.shade(i) for i in range(d.arm.n + 1)], dtype=np.uint8)
     far = np.abs(np.nan_to_num(d.pooled.distance[a])) > FAR
     for chosen, color in ((far, style.AMBER), (d.odd[a], style.RED)):
         for k in np.flatnonzero(chosen):
@@ -160,22 +150,16 @@ def _colors(d: DrawnType, a: int) -> "np.ndarray[tuple[int, ...], np.dtype[np.ui
     return out
 
 
-def _label(d: DrawnType, a: int) -> str:
-    name = d.pooled.arms[a]
-    lines = [unlike_words(o) for o in d.pooled.odd if o.arm == name]
-    return "\n".join(lines[:3]) or name
-
-
-def rows(d: DrawnType) -> list[int]:
+def _rows(d: DrawnType) -> list[int]:
     """Return the parameters that are drawn: those with the farthest arms, in their order."""
     far = np.nan_to_num(np.abs(d.pooled.distance), posinf=0.0).max(axis=0)
     return sorted(np.argsort(-far, kind="stable")[:_ROWS].tolist())
 
 
-def drift(rec: rr.RecordingStream, path: str, d: DrawnType) -> None:
+def _drift(rec: rr.RecordingStream, path: str, d: DrawnType) -> None:
     """Send each arm's campaigns along `date`, a view per parameter."""
     owner = np.array(d.owner)
-    for k in rows(d):
+    for k in _rows(d):
         for a, arm in enumerate(d.pooled.arms):
             mine = (owner == a) & np.isfinite(d.campaigns[:, k])
             if not mine.any():
@@ -195,31 +179,26 @@ def record_fleet(fleet: "Fleet", path: Path) -> None:
         InputError: the folder is missing.
         HilcalError: the file cannot be written.
     """
-    path = Path(path)
-    recording.require_folder(path)
     types = [drawn_type(t, fleet.members) for t in fleet.types]
-    told = [(d.pooled.type, d.pooled.arms, d.pooled.odd, d.names) for d in types]
+    names = [(d.pooled.type, d.pooled.arms, d.pooled.odd, d.names) for d in types]
     content = (a for d in types for a in (d.pooled.distance, d.seconds, d.campaigns))
-    rec = recording.opened(told, *content)
-    recording.write(rec, _blueprint(types), lambda: _log(rec, types), path)
+    rec = recording.opened(names, *content)
+    recording.write(rec, _blueprint(types), lambda: _log(rec, types), Path(path))
 
 
 def _log(rec: rr.RecordingStream, types: list[DrawnType]) -> None:
     rec.send_recording_name(f"hilcal fleet: {sum(len(d.pooled.arms) for d in types)} arms")
     for i, d in enumerate(types):
-        arms(rec, f"arms{i}", d)
-        drift(rec, f"date{i}", d)
-        fixed(rec, f"words/type{i}", style.document(_words(d)))
+        _arms(rec, f"arms{i}", d)
+        _drift(rec, f"date{i}", d)
+        odd = list(dict.fromkeys(o.arm for o in d.pooled.odd))
+        verb = "is" if len(odd) == 1 else "are"
+        title = f"{numbers.names(odd)} {verb} unlike the others" if odd else "No arm is unlike"
+        name, table, note, *lines = type_report(d.pooled)
+        words = style.markdown([heading(title), name, *lines, table, note])
+        fixed(rec, f"words/type{i}", style.document(words))
     fixed(rec, "words/guide", style.document(GUIDE))
     recording.flush(rec)
-
-
-def _words(d: DrawnType) -> str:
-    odd = list(dict.fromkeys(o.arm for o in d.pooled.odd))
-    verb = "is" if len(odd) == 1 else "are"
-    title = f"{numbers.names(odd)} {verb} unlike the others" if odd else "No arm is unlike"
-    name, table, note, *lines = type_report(d.pooled)
-    return style.markdown([heading(title), name, *lines, table, note])
 
 
 def _blueprint(types: list[DrawnType]) -> rrb.Blueprint:
@@ -235,13 +214,11 @@ def _blueprint(types: list[DrawnType]) -> rrb.Blueprint:
         low, high = float(d.seconds.min()), float(d.seconds.max())
         wide = max(0.05 * (high - low), _LEAST_RANGE_S)
         ends = [rrb.TimeRangeBoundary.absolute(seconds=t) for t in (low - wide, high + wide)]
-        whole = rrb.TimeAxis(view_range=rrb.TimeRange(*ends))
-        quiet = rrb.PlotLegend(visible=False)
-        for k in sorted(rows(d), key=lambda k: (not d.odd[:, k].any(), k)):
+        axis, quiet = rrb.TimeAxis(view_range=rrb.TimeRange(*ends)), rrb.PlotLegend(visible=False)
+        for k in sorted(_rows(d), key=lambda k: (not d.odd[:, k].any(), k)):
             at_k, name = f"date{i}/{k}", f"{of}{d.names[k]} by date [σ]"
-            dates.append(
-                rrb.TimeSeriesView(origin=at_k, name=name, plot_legend=quiet, axis_x=whole)
-            )
+            view = rrb.TimeSeriesView(origin=at_k, name=name, plot_legend=quiet, axis_x=axis)
+            dates.append(view)
         words.append(style.text(f"type{i}", f"{of}Unlike the type"))
     left = rrb.Vertical(rrb.Tabs(*scenes), rrb.Tabs(*dates), row_shares=[3, 2])
     right = rrb.Tabs(*words, style.text("guide", "How to read this"))

@@ -1,23 +1,34 @@
-"""Follows a command while it works: serves viewers that come and go, and records."""
+"""A command drawn while it works, for viewers that come and go, and into a recording."""
 
 import contextlib
+import math
 import pickle
 import threading
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from datetime import timedelta
-from functools import partial
 from pathlib import Path
-from typing import BinaryIO, Protocol
+from typing import Any, BinaryIO
 
+import numpy as np
 import rerun as rr
+import rerun.blueprint as rrb
+from rerun.blueprint import archetypes
+from scipy import stats
 
+from hilcal import numbers
 from hilcal.errors import HilcalError, InputError
-from hilcal.measuring.progress import ArmAt
+from hilcal.measuring.progress import ArmAt, GoalMet, LiveResidual, Phase, ReadingStored, Remark
+from hilcal.present.document import Block, Items, heading, table
 from hilcal.present.live_viewer import Measuring, Revised
-from hilcal.present.viewer import recording
-from hilcal.present.viewer.live_scene import LiveScene
-from hilcal.present.viewer.recording import Sink
+from hilcal.present.progress import figures, met_words, spoken, status_words
+from hilcal.present.story import LIMITS, Story, levels
+from hilcal.present.viewer import campaign, recording, style
+from hilcal.present.viewer.recording import along, fixed
+from hilcal.robot.body import body_poses
+from hilcal.store.plan import Step
+from hilcal.types import Floats
 
 PORTS = 20
 """Ports that are tried, from the wanted one; a choice."""
@@ -26,49 +37,440 @@ MEMORY = "256MiB"
 SHARE = 0.02
 """A file is written whenever it has grown by this share, so that it consists of few, large pieces;
 what a killed process loses of it. A choice."""
-_FLUSH_S = 5.0
-_NEVER = timedelta(days=1)
-_END_S = 8.0
+_FLUSH_S, _END_S = 5.0, 8.0
+SIGMA_LENGTH, ARROW_CAP = 0.02, 0.4
+"""One σ of a residual is drawn this long, and no arrow longer than that, m; choices."""
+BALL = SIGMA_LENGTH * style.BALL_SIGMAS
+"""Radius of the ball that holds 99 % of the readings where the model is right, m."""
+LIMIT = style.BALL_SIGMAS / 3**0.5
+"""The same in the σ of a reading."""
+ALARM = 0.001
+"""Chance that noise alone leaves as many readings outside their balls as is called wrong."""
+WORST, REMARKS = 3, 3
+"""Readings, and remarks, that are listed."""
+BALLS, MANY = 60, 300
+"""Readings from which a ball, and an arrow, is drawn only where the arrow leaves its ball; choices,
+for legibility."""
+FLUENT = 1000
+"""Residuals that a viewer draws one by one. Of 10,000 each of its pictures took 3.5 times the
+processor time of 100 (tests/benchmarks/test_viewer_speed.py); of this many some 1.2 times."""
+GROUPS = 150
+"""Groups that more of them are divided into: as many as a finished recording has bars."""
+TIMELINE = "time"
+RESIDUALS = "in σ: an arrow that leaves its noise ball = model wrong"
+IN_TIME = "in σ: grey noise, amber doubtful, red model wrong"
+_ABOVE = np.array([0.0, 0.0, 1.3 * BALL])
+GUIDE = """### How to read this
+Each reading is compared with a simple model, that of frames and joint compliance, fitted to the
+readings **before** it.
+
+**Residuals** (3-D): a small grey dot is a pose of the plan. A green ball is where noise and what
+the model does not know yet would leave 99 % of the readings; an arrow that leaves its ball = the
+model is wrong there. All arrows are in units of that noise. Grey: noise. Amber: beyond 99 %.
+Red: beyond 99.99 %. Blue dots were measured before there was a model, or in an earlier session.
+After 300 readings only arrows that leave their balls are drawn; below stand all.
+
+A campaign of more than 1000 readings is divided into 150 groups, one after the other. The last
+reading is always drawn; of the earlier ones only those stay that were the worst of their group so
+far, here and below. The words count all readings, and the log lists them.
+
+**Residual of each reading** (below): the same along the time of day, in σ as on the
+terminal (rms of the three axes): 1 is noise, the green line 99 %.
+
+What is missing in the model is not asked while measuring: `hilcal refine` does, afterwards.
+"""
 
 
-class ViewerReply(Protocol):
-    """Tells the command something: `url`, or a `problem` in one line."""
+@dataclass(frozen=True, slots=True)
+class LiveJudgement:
+    """A reading against the model."""
 
-    def __call__(self, **told: object) -> None:
-        """Tell it."""
-        ...
+    step: Step
+    target: str  # its name; empty where there is one
+    length: float  # of the residual r, m
+    norm2: float  # rᵀ V⁻¹ r, V the covariance of reading and prediction; 3 degrees of freedom
+    stands_out: bool = True  # whether it is the worst of its group so far, see `LiveTally.group`
+
+    @property
+    def sigma(self) -> float:
+        """sqrt(rᵀ V⁻¹ r / 3), as the terminal has it: 1 where the model is right."""
+        return float(np.sqrt(self.norm2 / 3))
+
+    @property
+    def level(self) -> int:
+        """0 inside the noise, 1 beyond 99 %, 2 beyond 99.99 %."""
+        return int(levels(np.array([self.norm2]))[0])
+
+    def __str__(self) -> str:
+        """Return the residual for people, with its size in σ."""
+        return f"{numbers.length(self.length)} ({self.sigma:.1f} σ)"
 
 
-def follow(messages: BinaryIO, reply: ViewerReply, record: Path, port: int) -> None:
+def judged(step: Step, live: LiveResidual, target: str = "") -> LiveJudgement | None:
+    """Return a reading as `LiveJudgement`; None where it was not compared."""
+    if live.vector is None or live.covariance is None:
+        return None
+    r, v = np.array(live.vector), np.array(live.covariance).reshape(3, 3)
+    return LiveJudgement(step, target, float(np.linalg.norm(r)), float(r @ np.linalg.solve(v, r)))
+
+
+@dataclass(slots=True, eq=False)
+class LiveTally:
+    """A campaign that is being measured."""
+
+    told: Measuring
+    bodies: Floats  # (P, n + 2, 4, 4) poses of the arm's bodies at each pose of the plan
+    anchor: dict[str, Floats]  # (T, 3) nominal positions of the targets by pose, base axes, m
+    done: int = 0  # readings that are stored
+    left: float = 0.0  # real seconds that the rest takes
+    phase: str = ""
+    last: ReadingStored | None = None
+    judged: int = 0  # how many readings were compared with a model
+    outside: int = 0  # of these how many are outside their ball
+    loads: dict[str, list[int]] = field(default_factory=dict)  # both by load
+    worst: list[LiveJudgement] = field(default_factory=list)  # farthest from the model
+    remarks: list[str] = field(default_factory=list)  # newest last
+    group_worst: float = 0.0  # largest `LiveJudgement.norm2` of the group that is being measured
+
+    @classmethod
+    def of(cls, told: Measuring) -> "LiveTally":
+        """Return that of a campaign that begins, or goes on."""
+        bodies = body_poses(told.arm, told.plan.q)
+        flange = bodies[:, -1]
+        at = flange[:, None, :3, 3] + np.einsum("pij,tj->pti", flange[:, :3, :3], told.targets)
+        anchor = dict(zip(told.plan.pose_names, at, strict=True))
+        return cls(told, bodies, anchor, len({step for _, step in told.earlier}))
+
+    @property
+    def total(self) -> int:
+        """Readings that are planned."""
+        return len(self.told.plan.steps)
+
+    @property
+    def group(self) -> int:
+        """Residuals, one after the other, of which a viewer keeps those that stand out; 1: all."""
+        planned = self.total * len(self.told.targets)
+        return 1 if planned <= FLUENT else math.ceil(planned / GROUPS)
+
+    @property
+    def targets(self) -> Floats:
+        """(K, 3) nominal positions of the targets in all poses, m."""
+        return np.concatenate(list(self.anchor.values()))
+
+    def place(self, step: Step, target: int = 0) -> Floats:
+        """(3,) where the nominal arm holds a target, m."""
+        return np.asarray(self.anchor[step.pose][target])
+
+    def add(self, event: ReadingStored) -> list[tuple[int, LiveResidual, LiveJudgement | None]]:
+        """Take note of a reading.
+
+        Returns:
+            Each target that was read, with its residual; judged, or None without a model yet.
+        """
+        self.last, self.done, self.left = event, event.done, event.left_real
+        read = ((event.target, event.live), *event.others)
+        return [(k, live, self._judge(event.step, k, live)) for k, live in read]
+
+    def _judge(self, step: Step, target: int, live: LiveResidual) -> LiveJudgement | None:
+        j = judged(step, live, self.told.names[target] if self.told.names else "")
+        if j is None:
+            return None
+        begins, outside = self.judged % self.group == 0, int(j.level > 0)
+        self.judged, self.outside = self.judged + 1, self.outside + outside
+        compared, beyond = self.loads.get(step.load, (0, 0))
+        self.loads[step.load] = [compared + 1, beyond + outside]
+        self.worst = sorted([*self.worst, j], key=lambda other: -other.norm2)[:WORST]
+        j = replace(j, stands_out=begins or j.norm2 > self.group_worst)
+        self.group_worst = max(j.norm2, 0.0 if begins else self.group_worst)
+        return j
+
+    @property
+    def wrong(self) -> bool:
+        """Whether more readings are outside than noise leaves there, see `ALARM`."""
+        chance = stats.binom.sf(self.outside - 1, self.judged, 1.0 - LIMITS[0])
+        return self.outside > 0 and bool(chance < ALARM)
+
+    def words(self) -> Iterator[Block]:
+        """Yield how far the campaign is, and what the readings say so far."""
+        if self.judged == 0:
+            yield heading("Measuring: no judgement yet")
+            yield "The first readings tell where tracker and target are; then each one is compared."
+        else:
+            title, more = "✓ So far noise explains the readings", ""
+            if self.wrong:
+                title = "✗ The simple model fails: look at the red arrows"
+                more = " Something is missing in it: hilcal refine says what, after measuring."
+            yield heading(title)
+            yield (
+                f"{self.outside} of {self.judged} ({numbers.percent(self.outside / self.judged)}) "
+                "compared readings are outside their 99 % noise ball (noise alone: 1 %)." + more
+            )
+        left = f", {spoken(self.left)} left" if self.left > 0 else ""
+        yield f"{self.done} of {self.total} readings{left}. {self.phase}"
+        goal = None if self.last is None else self.last.goal
+        if goal is not None and (now := status_words(goal)):
+            yield f"Goal: {now}."
+        if len(self.loads) > 1 and self.outside:
+            rows = [(n, str(a), str(b), numbers.percent(b / a)) for n, (a, b) in self.loads.items()]
+            yield table("load", "compared", "outside", "", rows=rows)
+        if worst := [j for j in self.worst if j.level > 0]:
+            names = (f"{j.step.pose} {j.target}".rstrip() for j in worst)
+            sizes = ((j.step.load, numbers.length(j.length), f"{j.sigma:.1f}") for j in worst)
+            rows = [(name, *size) for name, size in zip(names, sizes, strict=True)]
+            yield table("worst so far", "load", "residual", "in σ", rows=rows, left=(0, 1))
+        yield Items(tuple(f"note: {text}" for text in self.remarks[-REMARKS:]))
+
+
+def live_blueprint(d: LiveTally, world: str, series: str) -> rrb.Blueprint:
+    """Return the blueprint, of readings below `world` and residuals in time below `series`."""
+    ever, now = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()
+    every = archetypes.VisibleTimeRanges(timeline=TIMELINE, start=ever, end=now)
+    of = "Residual of each reading," if d.group == 1 else f"Worst of every {d.group} residuals,"
+    middle, size = style.center(d.targets, d.told.arm.reach)
+    points = np.vstack([d.targets, d.bodies[0, :, :3, 3]])
+    scene = style.view3d(
+        "world",
+        f"{of} {RESIDUALS}",
+        style.near(middle, style.EYE * size, points),
+        middle,
+        [f"+ {world}/**"],
+        overrides={f"{world}/{name}": every for name in ("arrows", "balls", "dots")},
+    )
+    in_time = rrb.TimeSeriesView(
+        origin=series,
+        name=f"{of} {IN_TIME}",
+        plot_legend=rrb.PlotLegend(visible=False),
+        axis_x=archetypes.TimeAxis(view_range=rr.TimeRange(start=ever, end=ever)),
+    )
+    kinds = (rrb.encodings.TextLogColumnKind.LogLevel, rrb.encodings.TextLogColumnKind.Body)
+    columns = archetypes.TextLogColumns(
+        timeline_columns=[rrb.encodings.TimelineColumn(timeline=TIMELINE, visible=False)],
+        text_log_columns=[rrb.encodings.TextLogColumn(kind=kind, visible=True) for kind in kinds],
+    )
+    log = rrb.TextLogView(origin="log", name="Log", columns=columns)
+    words = (("measuring", "So far"), ("live_guide", "How to read this"))
+    left = rrb.Vertical(scene, in_time, row_shares=[11, 4])
+    right = rrb.Vertical(rrb.Tabs(*(style.text(*w) for w in words)), log, row_shares=[3, 2])
+    return style.whole(rrb.Horizontal(left, right, column_shares=[3, 2]), TIMELINE, "following")
+
+
+class LiveScene:
+    """What has been told so far, drawn into one recording along the time of day."""
+
+    def __init__(self, rec: rr.RecordingStream, batches: bool = False) -> None:
+        """Draw into an open recording; in `batches` the arm, and words, wait for `settle`."""
+        self._rec, self._batches = rec, batches
+        self._arm: style.MovingArm | None = None
+        self._passed: list[tuple[float, tuple[float, ...]]] = []
+        self._since = 0  # those of them that came before the last reading
+        self._now: LiveTally | None = None
+        self._acts = 0
+        self._story: Story | None = None
+        self._titles: tuple[str, ...] = ()
+
+    def tell(self, wall: float, what: object) -> None:
+        """Draw what happened at a time of day, s."""
+        self._rec.set_time(TIMELINE, timestamp=wall)
+        if isinstance(what, ArmAt):
+            self._passed.append((wall, what.q))
+        if not self._batches:
+            self._move()
+        if isinstance(what, Measuring):
+            self.settle()
+            self._measuring(wall, what)
+        elif isinstance(what, Revised):
+            self._revised(what.story)
+        elif self._now is not None:
+            self._event(self._now, what)
+
+    def settle(self) -> None:
+        """Tell what waits for a batch to be handed on: where the arm has been, words, the limit."""
+        self._move()
+        if self._batches and self._now is not None and self._now.last is not None:
+            self._words(self._now)
+            self._rec.log(f"{self._series}/limit", rr.Scalars(LIMIT))
+
+    def end(self, to_open: bool) -> None:
+        """Tell the story once more, whole: its words know now which revision is the last.
+
+        `to_open`: let it open at the first revision, as a file does; else it stays at the last one.
+        """
+        self.settle()
+        self._now = None
+        if self._story is None:
+            return
+        self._rec.reset_time()
+        story = replace(self._story, growing=False)
+        campaign.tell(self._rec, story)
+        self._rec.reset_time()
+        self._show(campaign.blueprint(story if to_open else self._story))
+
+    def _show(self, views: rrb.Blueprint) -> None:
+        self._rec.send_blueprint(views, make_active=True, make_default=True)
+
+    @property
+    def _world(self) -> str:
+        return f"world/live/{self._acts}"
+
+    @property
+    def _series(self) -> str:
+        return f"live/{self._acts}"
+
+    def _measuring(self, wall: float, told: Measuring) -> None:
+        rec, d = self._rec, LiveTally.of(told)
+        self._acts, self._now = self._acts + 1, d
+        rec.send_recording_name(f"hilcal: {style.safe(told.name)}")
+        fixed(rec, "world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+        self._arm = style.MovingArm(rec, f"{self._world}/arm", told.arm, told.targets)
+        fixed(rec, "words/live_guide", style.document(GUIDE))
+        planned = rr.Points3D(d.targets, colors=[style.GREY], radii=[0.006])
+        fixed(rec, f"{self._world}/planned", planned)
+        for name, color in zip(style.LEVEL_NAMES, style.LEVEL_COLORS, strict=True):
+            fixed(rec, f"{self._series}/{name}", style.series(name, color, 0.0, 4.0)[1])
+        line = rr.SeriesLines(colors=[style.NOISE], widths=[1.5], names=["99 %"])
+        fixed(rec, f"{self._series}/limit", line)
+        if told.earlier:  # what earlier sessions measured, as one batch
+            walls, steps = zip(*told.earlier, strict=True)
+            dots = rr.Points3D.columns(
+                positions=[d.place(step) for step in steps],
+                colors=np.tile(np.array(style.MEASURED, dtype=np.uint8), (len(steps), 1)),
+                radii=np.full(len(steps), 0.01),
+            )
+            time = rr.TimeColumn(TIMELINE, timestamp=list(walls))
+            along(rec, f"{self._world}/dots", time, dots)
+        self._passed.append((wall, tuple(told.plan.q[0].tolist())))
+        self._move()
+        self._words(d)
+        self._show(live_blueprint(d, self._world, self._series))
+
+    def _move(self) -> None:
+        """Send where the arm has been since the last time."""
+        passed, self._passed, self._since = self._passed, [], 0
+        if passed and self._arm is not None and self._now is not None:
+            bodies = body_poses(self._now.told.arm, np.array([q for _, q in passed]))
+            self._arm.send(TIMELINE, [wall for wall, _ in passed], bodies)
+
+    def _event(self, d: LiveTally, what: object) -> None:
+        if isinstance(what, ReadingStored):
+            if self._batches and d.done > MANY:
+                # the arm stands at each reading, and skips its ways
+                del self._passed[self._since : -1]
+            self._since = len(self._passed)
+            self._reading(d, what)
+            self._log(f"{what.done}/{what.total} {what.step}{figures(what)}")
+        elif isinstance(what, Phase):
+            d.phase = what.text
+        elif isinstance(what, Remark | GoalMet):
+            text = what.text if isinstance(what, Remark) else met_words(what)
+            d.remarks.append(text)
+            self._log(text, "WARN" if isinstance(what, Remark) else "INFO")
+        else:
+            return
+        if not self._batches:
+            self._words(d)
+
+    def _reading(self, d: LiveTally, event: ReadingStored) -> None:
+        """Draw a reading: each target's arrow in its ball and place in time, and a label."""
+        rec, before = self._rec, d.judged
+        dots, arrows, balls, now = [], [], [], []
+        read = d.add(event)
+        for target, live, j in read:
+            at = d.place(event.step, target)
+            if j is None:
+                dots.append(at)
+                continue
+            # its direction, and as long as sqrt(rᵀ V⁻¹ r) says
+            length = min(SIGMA_LENGTH * float(np.sqrt(j.norm2)), ARROW_CAP)
+            drawn = (at, length / (j.length or 1.0) * np.array(live.vector), j.level)
+            now.append(drawn)
+            if not j.stands_out:
+                continue
+            if j.level or d.judged <= MANY:
+                arrows.append(drawn)
+            if d.judged <= (MANY if j.level else BALLS):
+                balls.append(at)
+            rec.log(f"{self._series}/{style.LEVEL_NAMES[j.level]}", rr.Scalars(j.sigma))
+        if dots:
+            dot = rr.Points3D(dots, colors=[style.MEASURED], radii=[0.01])
+            rec.log(f"{self._world}/dots", dot)
+        if arrows:
+            rec.log(f"{self._world}/arrows", _arrows(arrows))
+        if balls:
+            rec.log(f"{self._world}/balls", _balls(balls))
+        if now and d.group > 1:  # the last reading, drawn until the next one comes
+            rec.log(f"{self._world}/now/arrow", _arrows(now))
+            rec.log(f"{self._world}/now/ball", _balls([at for at, *_ in now]))
+        if d.judged > before and not (self._batches and before):
+            rec.log(f"{self._series}/limit", rr.Scalars(LIMIT))
+        target, _, worst = max(read, key=lambda r: -1.0 if r[2] is None else r[2].norm2)
+        words = f"{event.step.pose}, {event.step.load}"
+        if worst is not None:
+            words += f"{', ' * bool(worst.target)}{worst.target}: {worst}"
+        at = d.place(event.step, target) + _ABOVE
+        rec.log(f"{self._world}/last", style.labels([at], [words]))
+
+    def _words(self, d: LiveTally) -> None:
+        self._rec.log("words/measuring", style.document(style.markdown(d.words())))
+
+    def _log(self, text: str, level: str = "INFO") -> None:
+        self._rec.log("log", rr.TextLog(style.safe(text), level=level))
+
+    def _revised(self, story: Story) -> None:
+        """Draw a revision with those before it, of the same readings."""
+        rec, before, new = self._rec, self._story, story.revisions[0]
+        same = before is not None and len(before) == len(story)
+        known = before.revisions if before is not None and same else ()
+        earlier = tuple(r for r in known if r.revision < new.revision)
+        self._story = story = replace(story, revisions=(*earlier, *story.revisions), growing=True)
+        if not earlier:
+            campaign.begin(rec, story)
+        rec.set_time("revision", sequence=new.revision)
+        campaign.tell_revision(rec, story, new)
+        rec.disable_timeline("revision")
+        titles = campaign.titles(story)
+        if titles != self._titles or not earlier:
+            self._show(campaign.blueprint(story))
+            self._titles = titles
+
+
+def _arrows(of: Sequence[tuple[Floats, Floats, int]]) -> rr.Arrows3D:
+    """Return arrows that begin at places, m, with their levels."""
+    starts, vectors, levels = zip(*of, strict=True)
+    colors = [style.LEVEL_COLORS[level] for level in levels]
+    radii = [0.0055 if level else 0.0035 for level in levels]
+    return rr.Arrows3D(origins=starts, vectors=vectors, colors=colors, radii=radii)
+
+
+def _balls(at: Sequence[Floats]) -> rr.Ellipsoids3D:
+    size, color = [(BALL, BALL, BALL)] * len(at), [(*style.NOISE, 46)]
+    return rr.Ellipsoids3D(centers=at, half_sizes=size, colors=color, fill_mode="solid")
+
+
+def follow(messages: BinaryIO, reply: Callable[..., None], record: Path, port: int) -> None:
     """Show what messages tell, until they end.
 
     Args:
         messages: pickled pairs of a time of day, s, and what happened; see `LiveScene`.
-        reply: told `url` when viewers can be served (None: they cannot), and problems.
+        reply: told `url` when viewers can be served (None: they cannot), and each `problem`.
         record: the recording; a file that is there is replaced.
         port: the first to be tried, on the loopback interface only.
     """
     identifier = str(uuid.uuid4())
-    name = f"recording {record}"
-    outlets = [_Outlet(identifier, reply, name, lambda: rr.FileSink(str(record)), record)]
+    outlets = [_Outlet(identifier, reply, f"recording {record}", file=record)]
     with contextlib.suppress(OSError):
         recording.disable_analytics()
-    found = next((p for p in range(port, port + PORTS) if recording.free("127.0.0.1", p)), None)
-    if found is None:
+    free = next((p for p in range(port, port + PORTS) if recording.free("127.0.0.1", p)), None)
+    if free is None:
         reply(problem=f"no free port from {port} to {port + PORTS - 1}: no live viewer is served")
         reply(url=None)
     else:
-        sink = rr.GrpcServerSink(bind_ip="127.0.0.1", port=found, server_memory_limit=MEMORY)
-        name = f"live viewer at port {found}"
-        outlets.append(_Outlet(identifier, reply, name, lambda: sink))
-        reply(url=f"rerun+http://127.0.0.1:{found}/proxy")
+        outlets.append(_Outlet(identifier, reply, f"live viewer at port {free}", port=free))
+        reply(url=f"rerun+http://127.0.0.1:{free}/proxy")
     with contextlib.suppress(EOFError, pickle.UnpicklingError):
         while True:
             wall, what = pickle.load(messages)  # noqa: S301 - of the command that started us
             for outlet in outlets:
-                whole = not isinstance(what, ArmAt)  # places of the arm go on in batches
-                now = isinstance(what, Measuring | Revised)
-                outlet.tell(partial(LiveScene.tell, wall=wall, what=what), whole, now=now)
+                outlet.tell(wall, what)
     guard = threading.Thread(target=lambda: list(map(_Outlet.end, outlets)), daemon=True)
     guard.start()
     guard.join(_END_S)
@@ -80,34 +482,42 @@ class _Outlet:
     def __init__(
         self,
         identifier: str,
-        reply: ViewerReply,
+        reply: Callable[..., None],
         name: str,
-        sink: Callable[[], Sink],
         file: Path | None = None,
+        port: int = 0,
     ) -> None:
-        """Open it; `file`: where it is one that is read later."""
+        """Open it: a file that is read later, or a port."""
         self._reply, self._name, self._file = reply, name, file
         self._scene: LiveScene | None = None
         self._told, self._written = 0, 0
-        config = rr.ChunkBatcherConfig(flush_tick=_NEVER) if file else None
+        config = rr.ChunkBatcherConfig(flush_tick=timedelta(days=1)) if file else None
         self._rec = recording.stream(identifier, config)
         try:
-            self._rec.set_sinks(sink())
-            self._scene = LiveScene(self._rec, batches=file is not None)
+            served: dict[str, Any] = {
+                "bind_ip": "127.0.0.1",
+                "port": port,
+                "server_memory_limit": MEMORY,
+            }
+            self._rec.set_sinks(rr.FileSink(str(file)) if file else rr.GrpcServerSink(**served))
+            self._scene = LiveScene(self._rec, batches=self._file is not None)
         except (OSError, RuntimeError, ValueError) as error:
             self._fail(error)
 
-    def tell(
-        self, told: Callable[[LiveScene], None], flush: bool = True, *, now: bool = False
-    ) -> None:
-        """Draw something, and hand it on: now, or with what comes next."""
+    def tell(self, wall: float, what: object) -> None:
+        """Draw what happened, and hand it on: now, or with what comes next."""
+        whole = not isinstance(what, ArmAt)  # places of the arm go on in batches
+        now = isinstance(what, Measuring | Revised)
+        self._draw(lambda scene: scene.tell(wall, what), whole, now)
+
+    def _draw(self, draw: Callable[[LiveScene], None], whole: bool, now: bool) -> None:
         if self._scene is None:
             return
         try:
-            told(self._scene)
-            self._told += flush
+            draw(self._scene)
+            self._told += whole
             little = self._told - self._written < max(1.0, SHARE * self._told)
-            if not flush or (self._file and little and not now):
+            if not whole or (self._file and little and not now):
                 return
             self._written = self._told
             self._scene.settle()
@@ -125,7 +535,7 @@ class _Outlet:
 
     def end(self) -> None:
         """End it, whole."""
-        self.tell(lambda scene: scene.end(self._file is not None), now=True)
+        self._draw(lambda scene: scene.end(self._file is not None), whole=True, now=True)
         if self._scene is not None:  # else it would wait for what cannot be written
             self._rec.disconnect()
 

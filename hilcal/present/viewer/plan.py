@@ -13,16 +13,16 @@ from hilcal import numbers
 from hilcal.cell import Cell
 from hilcal.config import CellConfig, Obstacle
 from hilcal.design.next import PairPower
+from hilcal.design.run_order import pace, timeline
 from hilcal.design.summary import PlanSummary
-from hilcal.design.timing import pace, timeline
 from hilcal.errors import InputError
 from hilcal.measuring.clearance import TRACKER_UNKNOWN as NO_TRACKER
 from hilcal.measuring.clearance import Clearance, LineOfSight, clearance_of, sight_of
 from hilcal.measuring.route import route
 from hilcal.present import plan as plan_blocks
 from hilcal.present.document import Block, Words, heading, load_name, pairs, table
-from hilcal.present.running import spoken
-from hilcal.present.viewer import arm_shapes, recording, style
+from hilcal.present.progress import spoken
+from hilcal.present.viewer import recording, style
 from hilcal.present.viewer.recording import along, fixed
 from hilcal.robot import body
 from hilcal.robot import chain as chains
@@ -33,29 +33,68 @@ from hilcal.types import Bools, Floats, Ints
 SEEN, TURNED, HIDDEN, UNKNOWN = range(4)
 """Does the tracker see the target: yes; it is turned too far away; something is between; not
 known, as the tracker's place is not."""
+SIGHT_COLORS = np.array([style.NOISE, style.AMBER, style.RED, style.GREY], dtype=np.uint8)
+SIGHT_WORDS = ("seen", "turned too far away", "hidden", "sight not checked")
+NOT_FIRST = ("", "takes about")
+"""Rows of what a plan costs that stand with the details."""
+STEPS = "Plan step by step: a bead per pose and load, beam green = seen"
+TRACKER = "From the tracker"
+SCHEDULE = "Schedule: minute of each reading by step, colour by load"
+BEAD, BEAD_GAP = 0.0075, 0.016
+"""Radius of a bead and distance of two in a stack, shares of the reach."""
+# Labels stand on a plate in the theme's colour: these have a contrast of about 3 on both.
+_UNLOADED: style.Color = (225, 226, 230)
+# After Okabe & Ito's set for colour-blind readers, without the green, amber and red of the sight.
+_LOADS = np.array(
+    [
+        *((86, 180, 233), (240, 228, 66), (204, 121, 167), (70, 110, 235)),
+        *((205, 150, 110), (120, 220, 215), (165, 120, 245)),
+    ]
+)
+_FADED = 0.62
+_OBSTACLE, _BOX, _TRACKER = (122, 112, 104), (64, 82, 108), (235, 235, 240)
+_SOLID = 90  # of 255: what stands behind an obstacle shows through
+_HEAD = 0.07  # m, of the drawn tracker
+_FORCE_LENGTH = 0.35  # the strongest pull is drawn this long, m
+_LABEL_ABOVE = 0.24  # m
+_DIM = 0.42  # of a colour: lines have no transparency
+_UP = np.array([0.0, 0.0, 1.0])
 _WAY_STEP_RAD = 0.08  # distance of the drawn points of a motion, of the leading joint
+_DOT, _FPS = 3.5, 2.0
+_LOOKED_AT = 20  # steps whose arm is to be seen from the eye
+GUIDE = """### How to read this
+**Plan step by step** (3-D): the arm stands in the pose of the step, as the capsules that are kept
+clear of everything. *Step* (bottom left) goes through the readings in the order in which they are
+taken; the bright line is the target's last motion, the faint one its whole way under this load.
+
+**Beads** stand where the target is read: the lowest of a stack is the target itself, each further
+one is the same place under another load. Their colours are those of the schedule below.
+
+**The beam** is green where the tracker sees the target, amber where the reflector is turned too
+far away, red where something is between; such readings have a cage about their bead and a cross
+in the schedule. *From the tracker*: what the tracker sees, from where it stands.
+
+**What hangs** below the load point is drawn with the room that is kept for it, a pull as an arrow.
+Thin blue lines bound the workspace.
+
+**Schedule**: one dot per reading, its minute over its step, in the colour of its load; jumps are
+load changes by hand.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class PlanView:
     """A plan in its cell: where everything is at each of its S steps, base axes, SI.
 
-    Attributes:
-        cell: the cell.
-        config: its loads, obstacles, limits and sight.
-        plan: poses and steps.
-        summary: cost, predicted precision and efficiency.
-        powers: of the suspects that the plan separates, pair by pair; else empty.
-
     Raises:
         InputError: the plan's poses do not have as many joints as the arm.
     """
 
     cell: Cell
-    config: CellConfig
+    config: CellConfig  # its loads, obstacles, limits and sight
     plan: Plan
     summary: PlanSummary
-    powers: tuple[PairPower, ...] = ()
+    powers: tuple[PairPower, ...] = ()  # of the suspects that the plan separates, pair by pair
 
     def __post_init__(self) -> None:
         """Refuse a plan of another arm."""
@@ -131,6 +170,11 @@ class PlanView:
         turned = np.zeros(len(self), dtype=np.bool_) if angle is None else angle > most
         return np.where(~free, HIDDEN, np.where(turned, TURNED, SEEN)).astype(np.int64)
 
+    @property
+    def unseen(self) -> Bools:
+        """(S,) steps whose target the tracker does not see."""
+        return np.asarray((self.sight == TURNED) | (self.sight == HIDDEN))
+
     def why(self, step: int) -> str:
         """Return why the target is not seen at a step; empty where it is."""
         if self._view is None or self.sight[step] == SEEN:
@@ -183,63 +227,34 @@ class PlanView:
         """(S,) numbers of the steps on the timeline, from 1."""
         return rr.TimeColumn("step", sequence=np.arange(1, len(self) + 1))
 
-    @property
-    def unseen(self) -> Bools:
-        """(S,) steps whose target the tracker does not see."""
-        return np.asarray((self.sight == TURNED) | (self.sight == HIDDEN))
+    @cached_property
+    def colors(self) -> "np.ndarray[tuple[int, ...], np.dtype[np.uint8]]":
+        """(L, 3) a colour of each load; beyond seven, the same again and darker."""
+        hung = [name for name in self.loads if name != UNLOADED]
+        rgb = {n: _LOADS[k % 7] * _FADED ** (k // 7) for k, n in enumerate(hung)}
+        each = [rgb.get(n, np.array(_UNLOADED)) for n in self.loads]
+        return np.array(each).round().astype(np.uint8)
 
 
-# In the order of SEEN, TURNED, HIDDEN, UNKNOWN.
-SIGHT_COLORS = np.array([style.NOISE, style.AMBER, style.RED, style.GREY], dtype=np.uint8)
-SIGHT_WORDS = ("seen", "turned too far away", "hidden", "sight not checked")
-# Labels stand on a plate in the theme's colour: these have a contrast of about 3 on both.
-_UNLOADED: style.Color = (225, 226, 230)
-# After Okabe & Ito's set for colour-blind readers, without the green, amber and red of the sight.
-_LOADS = np.array(
-    [
-        *((86, 180, 233), (240, 228, 66), (204, 121, 167), (70, 110, 235)),
-        *((205, 150, 110), (120, 220, 215), (165, 120, 245)),
-    ]
-)
-_FADED = 0.62
-BEAD, BEAD_GAP = 0.0075, 0.016
-"""Radius of a bead and distance of two in a stack, shares of the reach."""
-_OBSTACLE, _BOX, _TRACKER = (122, 112, 104), (64, 82, 108), (235, 235, 240)
-_SOLID = 90  # of 255: what stands behind an obstacle shows through
-_HEAD = 0.07  # m, of the drawn tracker
-_FORCE_LENGTH = 0.35  # the strongest pull is drawn this long, m
-_LABEL_ABOVE = 0.24  # m
-_DIM = 0.42  # of a colour: lines have no transparency
-_UP = np.array([0.0, 0.0, 1.0])
-
-
-def load_colors(names: tuple[str, ...]) -> "np.ndarray[tuple[int, ...], np.dtype[np.uint8]]":
-    """(L, 3) a colour of each load; beyond seven, the same again and darker."""
-    hung = [name for name in names if name != UNLOADED]
-    rgb = {n: _LOADS[k % 7] * _FADED ** (k // 7) for k, n in enumerate(hung)}
-    return np.array([rgb.get(n, np.array(_UNLOADED)) for n in names]).round().astype(np.uint8)
-
-
-def static_scene(rec: rr.RecordingStream, d: PlanView) -> None:
+def _static_scene(rec: rr.RecordingStream, d: PlanView) -> None:
     """Log what never changes: shapes of the arm, what stands around, and a bead per reading."""
     fixed(rec, "world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
-    own = len(body.capsules(d.cell.arm))
-    arm_shapes.log_bodies(rec, d.shapes.scene.parts[:own], d.shapes.scene.parts[own:])
+    own, parts = len(body.capsules(d.cell.arm)), d.shapes.scene.parts
+    style.log_shapes(rec, style.shapes(parts[:own], parts[own:]))
     _obstacles(rec, d.config.obstacles)
     _workspace(rec, d)
     _beads(rec, d)
     if d.tracker is not None:
-        at = d.tracker
-        low, high = ((at + k * _HEAD * _UP)[None] for k in (-1.2, 0.2))
-        fixed(rec, "world/tracker", arm_shapes.capsules(low, high, np.array([_HEAD]), [_TRACKER]))
-        name = arm_shapes.labels([at + 2.2 * _HEAD * _UP], ["tracker"])
+        low, high = ((d.tracker + k * _HEAD * _UP)[None] for k in (-1.2, 0.2))
+        head = style.drawn_capsules(low, high, np.array([_HEAD]), [_TRACKER])
+        fixed(rec, "world/tracker", head)
+        name = style.labels([d.tracker + 2.2 * _HEAD * _UP], ["tracker"])
         fixed(rec, "world/tracker/name", name)
 
 
 def _obstacles(rec: rr.RecordingStream, things: tuple[Obstacle, ...]) -> None:
-    boxes = [x for x in things if x.center_m is not None]
-    for part, mode, alpha in (("body", "solid", _SOLID), ("edge", "majorwireframe", 255)):
-        if boxes:
+    if boxes := [x for x in things if x.center_m is not None]:
+        for part, mode, alpha in (("body", "solid", _SOLID), ("edge", "majorwireframe", 255)):
             drawn = rr.Boxes3D(
                 centers=[x.center_m or () for x in boxes],
                 sizes=[x.size_m or () for x in boxes],
@@ -249,9 +264,8 @@ def _obstacles(rec: rr.RecordingStream, things: tuple[Obstacle, ...]) -> None:
             fixed(rec, f"world/obstacles/box/{part}", drawn)
     if stood := [x for x in things if x.bottom_m is not None]:
         height = np.array([x.height_m for x in stood], dtype=float)
-        middle = np.array([x.bottom_m for x in stood]) + 0.5 * height[:, None] * _UP
         cylinders = rr.Cylinders3D(
-            centers=middle,
+            centers=np.array([x.bottom_m for x in stood]) + 0.5 * height[:, None] * _UP,
             lengths=height,
             radii=[x.radius_m or 0.0 for x in stood],
             colors=[(*_OBSTACLE, _SOLID)],
@@ -259,7 +273,7 @@ def _obstacles(rec: rr.RecordingStream, things: tuple[Obstacle, ...]) -> None:
         )
         fixed(rec, "world/obstacles/cylinder", cylinders)
     if things:
-        names = arm_shapes.labels([_named_at(x) for x in things], [x.name for x in things])
+        names = style.labels([_named_at(x) for x in things], [x.name for x in things])
         fixed(rec, "world/obstacles/names", names)
 
 
@@ -275,9 +289,14 @@ def _named_at(thing: Obstacle) -> Floats:
 def _workspace(rec: rr.RecordingStream, d: PlanView) -> None:
     """Log the outline of every side of the workspace that is given."""
     limits, reach = d.config.limits, 1.1 * d.reach
-    low = np.array(limits.workspace_min_m or (-reach, -reach, 0.0), dtype=float)
-    high = np.array(limits.workspace_max_m or (reach, reach, reach), dtype=float)
-    low, high = np.minimum(low, high), np.maximum(low, high)
+    ends = np.array(
+        [
+            limits.workspace_min_m or (-reach, -reach, 0.0),
+            limits.workspace_max_m or (reach, reach, reach),
+        ],
+        dtype=float,
+    )
+    low, high = ends.min(0), ends.max(0)
     sides = []
     for given, at in ((limits.workspace_min_m, low), (limits.workspace_max_m, high)):
         for axis in range(3) if given is not None else ():
@@ -296,8 +315,8 @@ def _beads(rec: rr.RecordingStream, d: PlanView) -> None:
     pairs = np.stack([d.pose, d.load], 1)
     steps = np.sort(np.unique(pairs, axis=0, return_index=True)[1])
     at = d.target[steps] + d.rank[steps, None] * BEAD_GAP * d.reach * _UP
-    colors = load_colors(d.loads)[d.load[steps]]
-    fixed(rec, "world/target/beads", rr.Points3D(at, colors=colors, radii=BEAD * d.reach))
+    beads = rr.Points3D(at, colors=d.colors[d.load[steps]], radii=BEAD * d.reach)
+    fixed(rec, "world/target/beads", beads)
     lost = d.unseen[steps]
     if lost.any():
         cages = rr.Ellipsoids3D(
@@ -310,10 +329,10 @@ def _beads(rec: rr.RecordingStream, d: PlanView) -> None:
         fixed(rec, "world/target/unseen", cages)
 
 
-def step_scene(rec: rr.RecordingStream, d: PlanView) -> None:
+def _step_scene(rec: rr.RecordingStream, d: PlanView) -> None:
     """Send what changes with every step, as columns on `step`."""
-    arm_shapes.send_stands(rec, d.steps, d.bodies[:, :-1])
-    colors, beams = load_colors(d.loads)[d.load], SIGHT_COLORS[d.sight]
+    style.send_stands(rec, d.steps, d.bodies[:, :-1])
+    colors, beams = d.colors[d.load], SIGHT_COLORS[d.sight]
 
     def lines(path: str, strips: object, of: object, radius: float) -> None:
         radii = np.full(len(d), radius * d.reach)
@@ -325,10 +344,11 @@ def step_scene(rec: rr.RecordingStream, d: PlanView) -> None:
     along(rec, "world/target/now", d.steps, points)
     above = d.target + (_LABEL_ABOVE + d.rank.max(initial=0) * BEAD_GAP * d.reach) * _UP
     words = [
-        f"{k}: {s.pose}, {load_name(s.load)}{_sight_words(d, k - 1)}"
-        for k, s in enumerate(d.plan.steps, start=1)
+        f"{k + 1}: {s.pose}, {load_name(s.load)}"
+        + f": {SIGHT_WORDS[d.sight[k]]}" * bool(d.sight[k] != UNKNOWN)
+        for k, s in enumerate(d.plan.steps)
     ]
-    labels = arm_shapes.label_columns(above + 0.25 * _LABEL_ABOVE * _UP, words)
+    labels = style.label_columns(above + 0.25 * _LABEL_ABOVE * _UP, words)
     along(rec, "world/label", d.steps, labels)
     lines("world/label/leader", np.stack([d.target, above], 1), beams, 0.0012)
     if d.tracker is not None:
@@ -336,22 +356,15 @@ def step_scene(rec: rr.RecordingStream, d: PlanView) -> None:
         lines("world/beam", np.stack([start, d.target], 1), beams, 0.004)
     lines("world/way/last", list(d.ways), colors, 0.0022)
     _loads(rec, d)
-    _whole_ways(rec, d)
-
-
-def framed(d: PlanView) -> tuple[Floats, float]:
-    """Middle of what should be in the picture and its half size, m; a far tracker counts less."""
-    points = [np.zeros((1, 3)), d.target]
-    if d.tracker is not None:
-        far = float(np.linalg.norm(d.tracker))
-        points.append((d.tracker * min(1.0, 1.6 * d.reach / max(far, 1e-9)))[None])
-    lo, hi = np.vstack(points).min(0), np.vstack(points).max(0)
-    return (lo + hi) / 2, max(float(np.linalg.norm(hi - lo)) / 2, 0.35 * d.reach)
-
-
-def _sight_words(d: PlanView, step: int) -> str:
-    sight = int(d.sight[step])
-    return f": {SIGHT_WORDS[sight]}" if d.unseen[step] or sight == SEEN else ""
+    # the target's whole way under the load of the step
+    starts = [0, *(np.flatnonzero(np.diff(d.load)) + 1).tolist(), len(d)]
+    for begin, end in pairwise(starts):
+        rec.set_time("step", sequence=begin + 1)
+        way, color = [np.vstack(d.ways[begin:end])], (_DIM * d.colors[d.load[begin]])
+        thin = rr.Radius.ui_points(0.6)
+        drawn = rr.LineStrips3D(way, colors=[color.astype(np.uint8)], radii=thin)
+        rec.log("world/way/whole", drawn)
+    rec.reset_time()
 
 
 def _loads(rec: rr.RecordingStream, d: PlanView) -> None:
@@ -359,38 +372,26 @@ def _loads(rec: rr.RecordingStream, d: PlanView) -> None:
     forces = {x.name: np.array(x.force_N) for x in d.config.loads}
     most = max((float(np.linalg.norm(f)) for f in forces.values()), default=0.0)
     hook = chains.evaluate(d.cell.arm, d.q).point(d.cell.load_point)
-    for name, color in zip(d.loads, load_colors(d.loads), strict=True):
-        steps = np.flatnonzero(d.load == d.loads.index(name))
+    for k, (name, color) in enumerate(zip(d.loads, d.colors, strict=True)):
+        steps = np.flatnonzero(d.load == k)
         hung = d.shapes.segments(d.q[steps], name)
         force = forces.get(name, np.zeros(3))
         for i, step in enumerate(steps.tolist()):
             rec.set_time("step", sequence=step + 1)
-            parts: dict[str, rr.AsComponents] = dict.fromkeys(
-                ("capsules", "arrow"), rr.Clear(recursive=False)
-            )
+            load: rr.AsComponents = rr.Clear(recursive=False)
+            pull: rr.AsComponents = rr.Clear(recursive=False)
             if hung:
-                start, end = (np.array([getattr(x, k)[i] for x in hung]) for k in ("start", "end"))
-                radius = np.array([x.radius for x in hung])
-                parts["capsules"] = arm_shapes.capsules(start, end, radius, [color])
+                start, end = (
+                    np.array([getattr(x, at)[i] for x in hung]) for at in ("start", "end")
+                )
+                load = style.drawn_capsules(start, end, np.array([x.radius for x in hung]), [color])
             if force.any():
                 way = [_FORCE_LENGTH * force / most]
-                parts["arrow"] = rr.Arrows3D(
+                pull = rr.Arrows3D(
                     origins=[hook[step]], vectors=way, colors=[color], radii=[0.006 * d.reach]
                 )
-            for part, drawn in parts.items():
-                rec.log(f"world/load/{part}", drawn)
-    rec.reset_time()
-
-
-def _whole_ways(rec: rr.RecordingStream, d: PlanView) -> None:
-    """Log the target's whole way under the load of the step."""
-    colors = (_DIM * load_colors(d.loads)).astype(np.uint8)
-    starts = [0, *(np.flatnonzero(np.diff(d.load)) + 1).tolist(), len(d)]
-    for start, end in pairwise(starts):
-        rec.set_time("step", sequence=start + 1)
-        way, color = [np.vstack(d.ways[start:end])], [colors[d.load[start]]]
-        drawn = rr.LineStrips3D(way, colors=color, radii=rr.Radius.ui_points(0.6))
-        rec.log("world/way/whole", drawn)
+            rec.log("world/load/capsules", load)
+            rec.log("world/load/arrow", pull)
     rec.reset_time()
 
 
@@ -406,67 +407,48 @@ def record_plan(
 
     The timeline `step` goes through the readings in order, from 1: the arm in its pose, what
     hangs, and the beam of the tracker, coloured by whether it sees the target. Equal plans give
-    equal recordings.
-
-    Args:
-        cell: the cell.
-        config: its loads, obstacles, limits and sight.
-        plan: poses and steps.
-        summary: cost, predicted precision and efficiency.
-        path: of the recording, ".rrd".
-        powers: of the suspects that the plan separates; these are shown first.
+    equal recordings. `powers` of the suspects that the plan separates are shown first.
 
     Raises:
         InputError: the folder is missing, or the plan's poses do not fit the arm.
         HilcalError: the file cannot be written.
     """
-    path = Path(path)
-    recording.require_folder(path)
     d = PlanView(cell, config, plan, summary, powers)
     rec = recording.opened(d.config.to_json(), d.plan.to_json(), d.summary, d.powers)
-    recording.write(rec, blueprint(d), lambda: _log(rec, d), path)
+    recording.write(rec, blueprint(d), lambda: _log(rec, d), Path(path))
 
 
 def _log(rec: rr.RecordingStream, d: PlanView) -> None:
     rec.send_recording_name(f"hilcal plan: {style.safe(d.cell.arm.name)}, {len(d)} readings")
-    static_scene(rec, d)
+    _static_scene(rec, d)
     _, _, *tables = plan_blocks.plan_report(d.summary)
     times = pairs(row for row in plan_blocks.cost_rows(d.summary) if row[0] in NOT_FIRST)
     details = style.markdown([times, *tables])
     for name, text in (("plan", overview(d)), ("guide", GUIDE), ("details", details)):
         fixed(rec, f"words/{name}", style.document(text))
     recording.flush(rec)
-    step_scene(rec, d)
-    schedule(rec, d)
+    _step_scene(rec, d)
+    _schedule(rec, d)
     along(rec, "words/step", d.steps, style.documents([step_card(d, k) for k in range(len(d))]))
     recording.flush(rec)
 
 
-NOT_FIRST = ("", "takes about")
-"""Rows of what a plan costs that stand with the details."""
-
-
 def overview(d: PlanView) -> str:
     """Return what a plan is for, its cost and efficiency; short, since a small window cuts it."""
-    s = d.summary
-    told = f"Plan: {s.poses} poses, {s.readings} readings, {spoken(s.duration.total)}"
+    s, tracker = d.summary, NO_TRACKER
+    title = f"Plan: {s.poses} poses, {s.readings} readings, {spoken(s.duration.total)}"
+    if d.tracker is not None:
+        lost = int(d.unseen.sum())
+        tracker = f"✓ sees the target in all {len(d)} readings"
+        if lost:
+            tracker = f"✗ does not see the target in {lost} of {len(d)} readings"
     rows = [row for row in plan_blocks.cost_rows(s) if row[0] not in NOT_FIRST]
     asked: list[Block] = []
     if d.powers:
         names = list(dict.fromkeys(t.effect for t in d.powers))
         question = heading(f"Which is it: {numbers.names(names, 'or')}?")
         asked = [question, plan_blocks.power_table(d.powers)]
-    return style.markdown([*asked, heading(told), pairs([*rows, ("tracker", sight(d))])])
-
-
-def sight(d: PlanView) -> str:
-    """Return how many of the readings the tracker sees."""
-    if d.tracker is None:
-        return NO_TRACKER
-    lost = int(d.unseen.sum())
-    if not lost:
-        return f"✓ sees the target in all {len(d)} readings"
-    return f"✗ does not see the target in {lost} of {len(d)} readings"
+    return style.markdown([*asked, heading(title), pairs([*rows, ("tracker", tracker)])])
 
 
 def step_card(d: PlanView, k: int) -> str:
@@ -482,15 +464,15 @@ def step_card(d: PlanView, k: int) -> str:
     x, y, z = d.target[k]
     what = "Target" if d.cell.target_known else "Flange (the target's place is not known)"
     place = f"{what} at {x:.3f}, {y:.3f}, {z:.3f} m, base axes."
-    joints = table("joint", "deg", rows=rows)
-    return style.markdown([head, when, *before, _sight(d, k), joints, place])
+    return style.markdown(
+        [head, when, *before, _sight(d, k), table("joint", "deg", rows=rows), place]
+    )
 
 
 def _sight(d: PlanView, k: int) -> Words:
     if d.tracker is None:
         return Words(numbers.sentence(NO_TRACKER))
-    far = float(np.linalg.norm(d.tracker - d.target[k]))
-    way = f"at {far:.2f} m"
+    way = f"at {float(np.linalg.norm(d.tracker - d.target[k])):.2f} m"
     if d.incidence is not None:
         way += f", {np.rad2deg(d.incidence[k]):.0f}° off the reflector's normal"
     if d.sight[k] == SEEN:
@@ -498,39 +480,15 @@ def _sight(d: PlanView, k: int) -> Words:
     return Words(f"✗ The tracker does not see the target {way}: {d.why(k)}.", "strong")
 
 
-GUIDE = """### How to read this
-**Plan step by step** (3-D): the arm stands in the pose of the step, as the capsules that are kept
-clear of everything. *Step* (bottom left) goes through the readings in the order in which they are
-taken; the bright line is the target's last motion, the faint one its whole way under this load.
-
-**Beads** stand where the target is read: the lowest of a stack is the target itself, each further
-one is the same place under another load. Their colours are those of the schedule below.
-
-**The beam** is green where the tracker sees the target, amber where the reflector is turned too
-far away, red where something is between; such readings have a cage about their bead and a cross
-in the schedule. *From the tracker*: what the tracker sees, from where it stands.
-
-**What hangs** below the load point is drawn with the room that is kept for it, a pull as an arrow.
-Thin blue lines bound the workspace.
-
-**Schedule**: one dot per reading, its minute over its step, in the colour of its load; jumps are
-load changes by hand.
-"""
-
-
-_DOT = 3.5
-
-
-def schedule(rec: rr.RecordingStream, d: PlanView) -> None:
+def _schedule(rec: rr.RecordingStream, d: PlanView) -> None:
     """Send the minute of each reading along `step`, one series per load; load changes are jumps."""
-    colors = load_colors(d.loads)
     series = [
-        (f"load{k}", load_name(name), d.load == k, tuple(colors[k]), "circle", _DOT)
+        (f"load{k}", load_name(name), d.load == k, tuple(d.colors[k]), "circle", _DOT)
         for k, name in enumerate(d.loads)
     ]
     if d.unseen.any():
-        told = "not seen by the tracker"
-        series.append(("unseen", told, d.unseen, style.RED, "cross", 2 * _DOT))
+        name = "not seen by the tracker"
+        series.append(("unseen", name, d.unseen, style.RED, "cross", 2 * _DOT))
     for entity, name, of, color, marker, size in series:
         points = rr.SeriesPoints(
             names=[f"{style.safe(name)}: {int(of.sum())}"],
@@ -544,46 +502,32 @@ def schedule(rec: rr.RecordingStream, d: PlanView) -> None:
         along(rec, f"schedule/{entity}", time, minutes)
 
 
-_FPS = 2.0
-_LOOKED_AT = 20
-"""Steps whose arm is to be seen from the eye."""
-STEPS = "Plan step by step: a bead per pose and load, beam green = seen"
-TRACKER = "From the tracker"
-SCHEDULE = "Schedule: minute of each reading by step, colour by load"
-
-
 def blueprint(d: PlanView) -> rrb.Blueprint:
     """Left: 3-D over the schedule. Right: the plan in words over its tables."""
-    middle, size = framed(d)
-    scenes = [style.view3d("world", STEPS, middle + size * _eye(d, middle, size), middle)]
+    points, turn = [np.zeros((1, 3)), d.target], float(np.deg2rad(-52.0))
+    if d.tracker is not None:  # a far one counts less
+        far = float(np.linalg.norm(d.tracker))
+        points.append((d.tracker * min(1.0, 1.6 * d.reach / max(far, 1e-9)))[None])
+    lo, hi = np.vstack(points).min(0), np.vstack(points).max(0)
+    middle, size = (lo + hi) / 2, max(float(np.linalg.norm(hi - lo)) / 2, 0.35 * d.reach)
+    if d.tracker is not None:  # look across the beam
+        beam = d.tracker - middle
+        turn = float(np.arctan2(beam[1], beam[0]) - np.deg2rad(62.0))
+    # and from where no obstacle hides the arm
+    some = np.unique(np.linspace(0, len(d) - 1, _LOOKED_AT).round().astype(np.int64))
+    arm = np.vstack([d.bodies[some, 1:, :3, 3].reshape(-1, 3), d.target[some]])
+    eye = style.direction(turn, middle, size, arm, d.config.obstacles)
+    scenes = [style.view3d("world", STEPS, middle + size * eye, middle)]
     if d.tracker is not None:
-        scenes.append(_from_tracker(d, d.tracker))
+        hidden = [f"- $origin/{x}/**" for x in ("tracker", "beam", "workspace", "way")]
+        at = d.target.mean(axis=0)
+        name = f"{TRACKER}, {numbers.length(float(np.linalg.norm(d.tracker - at)))} away"
+        view = style.view3d("world", name, d.tracker, at, ["+ $origin/**", *hidden])
+        scenes.append(view)
     legend = rrb.PlotLegend(rrb.Corner2D.RightBottom)
     times = rrb.TimeSeriesView(origin="schedule", name=SCHEDULE, plot_legend=legend)
     words = (("plan", "Plan"), ("step", "This step"), ("guide", "How to read this"))
     left = rrb.Vertical(rrb.Tabs(*scenes), times, row_shares=[7, 2])
-    right = rrb.Vertical(
-        rrb.Tabs(*(style.text(*w) for w in words)),
-        style.text("details", "Details"),
-        row_shares=[5, 4],
-    )
+    tabs = rrb.Tabs(*(style.text(*w) for w in words))
+    right = rrb.Vertical(tabs, style.text("details", "Details"), row_shares=[5, 4])
     return style.whole(rrb.Horizontal(left, right, column_shares=[3, 2]), "step", fps=_FPS)
-
-
-def _from_tracker(d: PlanView, place: Floats) -> rrb.Spatial3DView:
-    contents = ["+ $origin/**"]
-    contents += [f"- $origin/{x}/**" for x in ("tracker", "beam", "workspace", "way")]
-    at = d.target.mean(axis=0)
-    far = float(np.linalg.norm(place - at))
-    return style.view3d("world", f"{TRACKER}, {numbers.length(far)} away", place, at, contents)
-
-
-def _eye(d: PlanView, middle: Floats, size: float) -> Floats:
-    """Direction to the eye: across the beam where there is one, and where no obstacle hides."""
-    turn = float(np.deg2rad(-52.0))
-    if d.tracker is not None:
-        beam = d.tracker - middle
-        turn = float(np.arctan2(beam[1], beam[0]) - np.deg2rad(62.0))
-    some = np.unique(np.linspace(0, len(d) - 1, _LOOKED_AT).round().astype(np.int64))
-    points = np.vstack([d.bodies[some, 1:, :3, 3].reshape(-1, 3), d.target[some]])
-    return style.direction(turn, middle, size, points, d.config.obstacles)

@@ -82,16 +82,6 @@ def along(
     rec.send_columns(path, indexes=[time], columns=columns)
 
 
-def require_folder(path: Path) -> None:
-    """Refuse a file in a folder that is not there.
-
-    Raises:
-        InputError: names the folder.
-    """
-    if not path.parent.is_dir():
-        raise InputError(f"recording {path}: no folder {path.parent}; make it first")
-
-
 def write(
     rec: rr.RecordingStream, blueprint: rrb.Blueprint, tell: Callable[[], None], path: Path
 ) -> None:
@@ -100,8 +90,10 @@ def write(
     The recording is encoded in memory: rerun's own file sink can wait forever on a full disk.
 
     Raises:
-        InputError: the file cannot be written.
+        InputError: the folder is missing, or the file cannot be written.
     """
+    if not path.parent.is_dir():
+        raise InputError(f"recording {path}: no folder {path.parent}; make it first")
     memory = rec.memory_recording()
     rec.send_blueprint(blueprint, make_active=True, make_default=True)
     tell()
@@ -120,21 +112,16 @@ def flush(rec: rr.RecordingStream) -> None:
     try:
         rec.flush(timeout_sec=_FLUSH_TIMEOUT)
     except (ValueError, RuntimeError, OSError) as error:
-        if slow(error):
-            _LOG.warning("recording: a viewer is slow: %s", error)
-            return
-        raise HilcalError(f"the recording's sink failed: {error}") from error
+        if not slow(error):
+            raise HilcalError(f"the recording's sink failed: {error}") from error
+        _LOG.warning("recording: a viewer is slow: %s", error)
 
 
 def disable_analytics() -> None:
     """Switch the viewer's usage statistics off for this user; they are on by default."""
     with contextlib.suppress(OSError, subprocess.SubprocessError, HilcalError):
-        subprocess.run(  # noqa: S603 (our own arguments)
-            [executable(), "analytics", "disable"],
-            check=False,
-            capture_output=True,
-            timeout=10,
-        )
+        command = [executable(), "analytics", "disable"]
+        subprocess.run(command, check=False, capture_output=True, timeout=10)  # noqa: S603
 
 
 def executable() -> str:
@@ -142,8 +129,8 @@ def executable() -> str:
     try:
         import rerun_cli  # type: ignore[import-untyped, unused-ignore]
     except ImportError:
-        found = shutil.which("rerun")
-        if found is None:
+        path = shutil.which("rerun")
+        if path is None:
             raise HilcalError("no rerun viewer: install rerun-sdk") from None
-        return found
+        return path
     return str(Path(str(rerun_cli.__file__)).parent / "rerun")

@@ -1,19 +1,17 @@
 """One base: what is asked for in the axes of any export is where the tracker finds the tool."""
 
 import json
-import re
 from dataclasses import replace
 from functools import cache
+from itertools import product
 from pathlib import Path
 
 import numpy as np
-import pinocchio as pin
 import pytest
-from scipy.spatial.transform import Rotation
 
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.dh_table import dh_rows, to_toml
-from hilcal.calibration.handover import UR_JOINTS, corrected, frames, ur_kinematics, urdf
+from hilcal.calibration.handover import corrected, frames, ur_kinematics, urdf
 from hilcal.calibration.own_files.correct import correct_file
 from hilcal.drivers.simulated.world import World
 from hilcal.identification.baseline import with_effects
@@ -22,17 +20,13 @@ from hilcal.identification.fit_document import frames_to_json
 from hilcal.readings.readings import States
 from hilcal.robot import se3
 from hilcal.robot.catalogue import load_arm
-from hilcal.robot.chain import evaluate
 from hilcal.types import Floats
 from tests.support.campaigns import Campaign, campaign, measured, plan
+from tests.unit.calibration.other_eyes import by_pinocchio, by_ur, flanges, urdf_model
 
 POSES = 24
-CASES = [
-    (effect, registration, target)
-    for effect in ("none", "link_geometry")
-    for registration in (False, True)
-    for target in (True, False)
-]
+CASES = list(product(("none", "link_geometry"), (False, True), (True, False)))
+"""Effect, whether the place of the base is known, whether the target is."""
 OTHER = se3.matrix(se3.rotation(np.array([0.2, 0.0, -0.4])), np.array([0.0, 0.1, 0.2]))
 
 
@@ -77,8 +71,7 @@ def test_a_request_is_where_the_tracker_finds_the_tool(
     """Request, corrected joints, tracker, request; and with another tool."""
     c, world = fitted(effect, registration, target), site(effect, registration, target).world
     states, told = fresh(1), document(c)
-    chain = evaluate(c.model.cell.arm, states.q)
-    at_flange = se3.matrix(chain.rotation[-1], chain.position[-1])
+    at_flange = flanges(c.model.cell.arm, states.q)
     for key in ("base_in_tracker", "controller"):
         base = told[key]["base_in_tracker_m_rad"] if key == "controller" else told[key]
         asked = at_flange @ pose(told["tool_on_flange"])
@@ -144,41 +137,16 @@ def test_every_export_puts_the_tool_where_the_tracker_finds_it(
     (tmp_path / "a.toml").write_text(to_toml(dh_rows(arm), arm, "made"), encoding="utf-8")
     text, _ = ur_kinematics(cal.model.cell.arm, arm)
     exported = {
-        "URDF": by_pinocchio(urdf(arm), states.q) @ tool,
+        "URDF": by_pinocchio(urdf_model(urdf(arm)), states.q) @ tool,
         "DH": flanges(load_arm(str(tmp_path / "a.toml")), states.q) @ tool,
         "UR yaml": by_ur(text, states.q) @ pose(told["tcp_for_ur_kinematics"]),
     }
     own, nominal = tmp_path / "own.urdf", cal.model.cell.arm
     own.write_text(urdf(nominal), encoding="utf-8")
     into = correct_file(own, nominal, corrected(cal)).content.decode()
-    exported["into a URDF"] = by_pinocchio(into, states.q) @ tool
+    exported["into a URDF"] = by_pinocchio(urdf_model(into), states.q) @ tool
     for name, poses in exported.items():
         off = np.linalg.norm(poses[:, :3, 3] - wanted, axis=1)
         assert np.mean(off <= band) > 0.9, name
     fitted_frames = frames_to_json(found)["base"]
     np.testing.assert_allclose(fitted_frames["xyz_m"], base[:3, 3], atol=1e-9)
-
-
-def flanges(arm, q: Floats) -> Floats:
-    chain = evaluate(arm, q)
-    return se3.matrix(chain.rotation[-1], chain.position[-1])
-
-
-def by_pinocchio(text: str, q: Floats) -> Floats:
-    model = pin.buildModelFromXML(text.partition("\n")[2])
-    data, frame, out = model.createData(), model.getFrameId("tool0"), []
-    for row in q:
-        pin.framesForwardKinematics(model, data, row)
-        out.append(data.oMf[frame].homogeneous.copy())
-    return np.stack(out)
-
-
-def by_ur(text: str, q: Floats) -> Floats:
-    place = np.broadcast_to(np.eye(4), (len(q), 4, 4))
-    for k, joint in enumerate(UR_JOINTS):
-        block = text.split(f"  {joint}:\n")[1]
-        six = np.array(re.findall(r"^ {4}\w+: (\S+)$", block, re.MULTILINE)[:6], dtype=float)
-        turn = Rotation.from_euler("xyz", six[3:]).as_matrix()
-        spun = Rotation.from_euler("z", q[:, k, None]).as_matrix()
-        place = place @ se3.matrix(turn, six[:3]) @ se3.matrix(spun, np.zeros((len(q), 3)))
-    return np.asarray(place)

@@ -2,10 +2,9 @@
 
 import numpy as np
 
-from hilcal.calibration.branches import NEAREST, STRAIGHT, UNKNOWN, doubts
 from hilcal.calibration.compensation import invert
 from hilcal.calibration.points import Points, on_branch
-from hilcal.calibration.urscript import waypoints
+from hilcal.calibration.urscript import NEAREST, NOT_STRAIGHT, UNKNOWN, doubts, waypoints
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate
 from hilcal.robot.se3 import rotation_vector
@@ -64,7 +63,7 @@ def test_waypoints_as_programs_have_them_are_certain() -> None:
 def test_joint_values_of_another_branch_are_not_where_a_straight_motion_ends() -> None:
     assert told(f"movej({joints(A)})", f"movel({joints(FLIPPED)})", f"movel({pose(A)})")[0] == [
         "",
-        STRAIGHT,
+        NOT_STRAIGHT,
         UNKNOWN,
     ]
     assert told(f"movel({joints(FLIPPED)})")[0] == [""]  # as they are, where nothing is known

@@ -10,7 +10,7 @@ import pytest
 
 import hilcal as hc
 from hilcal.calibration.calibration import Calibration
-from hilcal.calibration.compensated import band
+from hilcal.calibration.compensation import band
 from hilcal.calibration.covariance_source import CovarianceSource
 from hilcal.calibration.measured import Measured
 from hilcal.calibration.scatter import Scatter
@@ -136,16 +136,8 @@ def nominal(c: Calibration, q: Floats) -> tuple[Floats, Floats]:
 @pytest.mark.parametrize("effect", ["target_offset", "thermal_growth", "creep", "backlash"])
 def test_a_calibration_comes_back_from_its_file(effect: str, tmp_path: Path) -> None:
     c = campaign("joint_tilt_compliance", "absolute", 0, poses=POSES)
-    states = replace(
-        c.readings.states,
-        **{
-            name: np.broadcast_to(20.0, np.shape(value)).copy()
-            for name, value in {
-                "air_temperature": c.readings.states.time,
-                "joint_temperature": c.readings.states.q,
-            }.items()
-        },
-    )
+    warm = np.full(c.readings.states.q.shape, 20.0)
+    states = replace(c.readings.states, air_temperature=warm[:, 0], joint_temperature=warm)
     readings = replace(c.readings, states=states)
     cell = replace(c.cell, target_known=False) if effect == "target_offset" else c.cell
     model = baseline(cell, readings, "absolute")

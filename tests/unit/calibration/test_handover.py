@@ -1,23 +1,17 @@
 """Corrected geometry as others read it, against the model's own kinematics and Pinocchio."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
-from hilcal.calibration.handover import UR_JOINTS, corrected, ur_kinematics
+from hilcal.calibration.handover import corrected, ur_kinematics
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.robot import se3
 from hilcal.robot.catalogue import load_arm, robot_names
-from hilcal.robot.chain import Deviation, evaluate
-from hilcal.types import Floats
+from hilcal.robot.chain import Deviation
+from tests.unit.calibration.other_eyes import flanges, ur_origins
 from tests.unit.calibration.test_calibration import calibrated, fresh
-
-
-def flanges(arm, q: Floats, deviation: Deviation | None = None) -> Floats:
-    chain = evaluate(arm, q, deviation)
-    return se3.matrix(chain.rotation[-1], chain.position[-1])
 
 
 @pytest.mark.parametrize("effect", ["link_geometry", "encoder_offset"])
@@ -47,31 +41,16 @@ def test_what_is_not_constant_is_named_and_left_out(effect: str) -> None:
     np.testing.assert_allclose(found.arm.links, c.model.cell.arm.links, atol=1e-12)
 
 
-def kinematics(text: str) -> Floats:
-    """Origins (6, 4, 4) of UR's file, by its own words."""
-    out = []
-    for name in UR_JOINTS:
-        block = text.split(f"  {name}:\n")[1]
-        six = [float(re.search(rf" {key}: (\S+)", block)[1]) for key in ("x", "y", "z")]
-        rpy = [float(re.search(rf" {key}: (\S+)", block)[1]) for key in ("roll", "pitch", "yaw")]
-        out.append(se3.matrix(Rotation.from_euler("xyz", rpy).as_matrix(), np.array(six)))
-    return np.stack(out)
-
-
 @pytest.mark.parametrize("name", [n for n in robot_names() if n.startswith("ur")])
 def test_the_nominal_arms_have_the_origins_of_ur_description(name: str) -> None:
     arm = load_arm(name)
     text, rest = ur_kinematics(arm, arm)
-    origins = kinematics(text)
     np.testing.assert_allclose(rest, np.eye(4), atol=1e-12)
-    d = [np.linalg.norm(arm.links[k][:3, 3]) for k in range(7)]
+    d = np.linalg.norm(arm.links[:, :3, 3], axis=1)
     # shoulder up, forearm and wrist 1 along −x, wrist 2 along −y, wrist 3 along +y
-    np.testing.assert_allclose(origins[0][:3, 3], [0, 0, d[1]], atol=1e-9)
-    np.testing.assert_allclose(origins[1][:3, 3], 0, atol=1e-9)
-    np.testing.assert_allclose(origins[2][:3, 3], [-d[2], 0, 0], atol=1e-9)
-    np.testing.assert_allclose(origins[3][:3, 3], [-d[3], 0, d[4]], atol=1e-9)
-    np.testing.assert_allclose(origins[4][:3, 3], [0, -d[5], 0], atol=1e-9)
-    np.testing.assert_allclose(origins[5][:3, 3], [0, d[6], 0], atol=1e-9)
+    first, last = [[0, 0, d[1]], [0, 0, 0], [-d[2], 0, 0]], [[0, -d[5], 0], [0, d[6], 0]]
+    expected = [*first, [-d[3], 0, d[4]], *last]
+    np.testing.assert_allclose(ur_origins(text)[:, :3, 3], expected, atol=1e-9)
     assert re.search(r"hash: calib_\d+", text)
 
 
@@ -79,6 +58,6 @@ def test_deflections_and_foreign_arms_are_refused_in_words() -> None:
     with pytest.raises(CannotAnswerError, match="--readings absolute"):
         corrected(calibrated("none", "deflection"))
     arm = load_arm("ur10e")
-    foreign = type(arm)(**{**{k: getattr(arm, k) for k in arm.__slots__}, "name": "kr6"})
+    foreign = replace(arm, name="kr6")
     with pytest.raises(InputError, match="kr6: UR's kinematics file is for UR arms"):
         ur_kinematics(foreign, foreign)

@@ -17,11 +17,11 @@ from hilcal.errors import InputError
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm
-from hilcal.robot.chain import evaluate
 from hilcal.robot.conventions import with_conventions
 from hilcal.types import Floats
 from tests.support.description_files import MJCF, SDF
 from tests.support.maker_arms import maker_arm, urdf_of
+from tests.unit.calibration.other_eyes import by_pinocchio, flanges, turned
 
 Q = np.random.default_rng(1).uniform(-2, 2, (12, 6))
 NM = 1e-9
@@ -39,22 +39,12 @@ def changed(arm: Arm, where: slice = slice(None), seed: int = 0) -> Arm:
     return replace(arm, links=links)
 
 
-def flanges(arm: Arm, q: Floats = Q) -> Floats:
-    chain = evaluate(arm, q)
-    return se3.matrix(chain.rotation[-1], chain.position[-1])
+def poses(arm: Arm) -> Floats:
+    return flanges(arm, Q)
 
 
 def correct(path: Path, nominal: Arm, new: Arm, *ends: str | None) -> Correction:
     return correct_file(path, nominal, Corrected(new, (), ()), *ends)
-
-
-def by_pinocchio(model: pin.Model, base: str, tip: str) -> Floats:
-    data, out = model.createData(), []
-    for row in Q:
-        pin.framesForwardKinematics(model, data, row)
-        a, b = (data.oMf[model.getFrameId(name)] for name in (base, tip))
-        out.append((a.inverse() * b).homogeneous.copy())
-    return np.stack(out)
 
 
 def lines_changed(before: str, after: str) -> list[str]:
@@ -76,8 +66,8 @@ def test_a_urdf_keeps_all_but_the_origins_of_its_joints(arm: Arm, tmp_path: Path
     found = correct(path, arm, new)
     after = found.content.decode()
     path.write_bytes(found.content)
-    made = by_pinocchio(pin.buildModelFromUrdf(str(path)), "base_link", "tool0")
-    np.testing.assert_allclose(made, flanges(new), atol=NM)
+    made = by_pinocchio(pin.buildModelFromUrdf(str(path)), Q, "tool0", "base_link")
+    np.testing.assert_allclose(made, poses(new), atol=NM)
     assert len(lines_changed(text, after)) == 7
     joint_origin = re.compile(r"(<joint[^>]*>)(<origin[^>]*/>)?")
     assert joint_origin.sub(r"\1", after) == joint_origin.sub(r"\1", text)
@@ -102,12 +92,8 @@ def test_a_urdf_with_a_base_beside_and_zeros_of_its_own(tmp_path: Path) -> None:
     arm = with_conventions(replace(drawn, links=links), sign, zero, np.zeros((6, 6)))
     new = changed(arm)
     path.write_bytes(correct(path, arm, new, "base", "tool0").content)
-    model = pin.buildModelFromUrdf(str(path))
-    data = model.createData()
-    for row, expected in zip(Q, flanges(new), strict=True):
-        pin.framesForwardKinematics(model, data, sign * row + zero)
-        a, b = (data.oMf[model.getFrameId(name)] for name in ("base", "tool0"))
-        np.testing.assert_allclose((a.inverse() * b).homogeneous, expected, atol=NM)
+    made = by_pinocchio(pin.buildModelFromUrdf(str(path)), sign * Q + zero, "tool0", "base")
+    np.testing.assert_allclose(made, poses(new), atol=NM)
 
 
 def test_a_xacro_is_corrected_where_it_has_numbers(arm: Arm, tmp_path: Path) -> None:
@@ -131,12 +117,14 @@ def test_a_xacro_is_corrected_where_it_has_numbers(arm: Arm, tmp_path: Path) -> 
 def test_an_mjcf_is_the_corrected_arm_to_pinocchio(arm: Arm, tmp_path: Path) -> None:
     path, new = tmp_path / "lab.xml", changed(arm)
     path.write_text(MJCF)
-    before = by_pinocchio(pin.buildModelFromMJCF(str(path)), "base", "flange")
-    np.testing.assert_allclose(before, flanges(arm), atol=NM)
+
+    def seen() -> Floats:
+        return by_pinocchio(pin.buildModelFromMJCF(str(path)), Q, "flange", "base")
+
+    np.testing.assert_allclose(seen(), poses(arm), atol=NM)
     found = correct(path, arm, new, "base", "flange")
     path.write_bytes(found.content)
-    made = by_pinocchio(pin.buildModelFromMJCF(str(path)), "base", "flange")
-    np.testing.assert_allclose(made, flanges(new), atol=NM)
+    np.testing.assert_allclose(seen(), poses(new), atol=NM)
     after = found.content.decode()
     assert len(lines_changed(MJCF, after)) == 7
     assert "<!-- the arm of bay 3 -->" in after
@@ -146,8 +134,7 @@ def test_an_mjcf_is_the_corrected_arm_to_pinocchio(arm: Arm, tmp_path: Path) -> 
     found = correct(path, arm, new, "base", "flange")
     assert "its axes lay up to 3.00 mm from those of the nominal krl" in found.said
     path.write_bytes(found.content)
-    again = by_pinocchio(pin.buildModelFromMJCF(str(path)), "base", "flange")
-    np.testing.assert_allclose(again, flanges(new), atol=NM)
+    np.testing.assert_allclose(seen(), poses(new), atol=NM)
     lost = correct(path, new, changed(new), "base")
     assert "no place for the flange's own shift" in lost.said
 
@@ -190,13 +177,13 @@ def sdf_flanges(text: str) -> Floats:
 def test_an_sdf_is_the_corrected_arm_and_carries_what_hangs_on_it(arm: Arm, tmp_path: Path) -> None:
     path, new = tmp_path / "lab.sdf", changed(arm)
     path.write_text(SDF)
-    np.testing.assert_allclose(sdf_flanges(SDF), flanges(arm), atol=NM)
+    np.testing.assert_allclose(sdf_flanges(SDF), poses(arm), atol=NM)
     found = correct(path, arm, new, "base", "tool0")
     after = found.content.decode()
-    np.testing.assert_allclose(sdf_flanges(after), flanges(new), atol=1e-8)
+    np.testing.assert_allclose(sdf_flanges(after), poses(new), atol=1e-8)
     assert "<!-- by hand -->" in after
-    poses = re.compile(r"(<pose[^>]*>|<xyz[^>]*>)[^<]*")
-    assert poses.sub(r"\1", after) == poses.sub(r"\1", SDF)
+    places = re.compile(r"(<pose[^>]*>|<xyz[^>]*>)[^<]*")
+    assert places.sub(r"\1", after) == places.sub(r"\1", SDF)
     assert '<pose relative_to="a2">0 0 0 -0.3 0 0</pose>' in after  # follows its joint
     (grip,) = re.findall(r'gripper"><pose>([^<]*)', after)
     assert grip != "1.6 0 0.47 0 0 0"
@@ -224,14 +211,12 @@ def test_ur_s_calibration_conf_makes_the_controller_s_rows_the_arm(tmp_path: Pat
     a = np.array([0, -0.6127, -0.57155, 0, 0, 0]) + deltas["a"]
     d = np.array([0.1807, 0, 0, 0.17415, 0.11985, 0.11655]) + deltas["d"]
     alpha = np.array([np.pi / 2, 0, 0, np.pi / 2, -np.pi / 2, 0]) + deltas["alpha"]
-    for row, expected in zip(Q, flanges(new), strict=True):
-        place = np.eye(4)
-        for k in range(6):
-            turn = Rotation.from_euler("z", row[k] + deltas["theta"][k]).as_matrix()
-            bend = Rotation.from_euler("x", alpha[k]).as_matrix()
-            place = place @ se3.matrix(turn, np.array([0, 0, d[k]]))
-            place = place @ se3.matrix(bend, np.array([a[k], 0, 0]))
-        np.testing.assert_allclose(place, expected, atol=1e-8)  # d of hundreds of metres cancel
+    place = np.broadcast_to(np.eye(4), (len(Q), 4, 4))
+    for k in range(6):
+        turn, bend = turned("z", (Q[:, k] + deltas["theta"][k])[:, None]), turned("x", alpha[k])
+        moved = se3.matrix(np.eye(3), np.array([a[k], 0, d[k]]))
+        place = place @ turn @ moved @ bend
+    np.testing.assert_allclose(place, poses(new), atol=1e-8)  # d of hundreds of metres cancel
     other = replace(nominal, name="kr10")
     with pytest.raises(InputError, match="is for UR arms, the campaign has kr10"):
         correct(path, other, new)
@@ -247,13 +232,10 @@ def test_a_matlab_function_builds_the_arm(arm: Arm) -> None:
     ]
     parents = re.findall(r"addBody\(robot, body, '(\w+)'\)", text)
     assert parents == ["base", *(f"link_{k}" for k in range(1, 7))]
-    for row, expected in zip(Q, flanges(changed(arm)), strict=True):
-        place = np.eye(4)
-        for k, t in enumerate(fixed):
-            angle = row[k] if k < 6 else 0.0
-            turn = Rotation.from_euler("z", angle).as_matrix()
-            place = place @ t @ se3.matrix(turn, np.zeros(3))
-        np.testing.assert_allclose(place, expected, atol=1e-12)
+    place = np.broadcast_to(np.eye(4), (len(Q), 4, 4))
+    for t, angle in zip(fixed, [*Q.T, np.zeros(len(Q))], strict=True):
+        place = place @ t @ turned("z", angle[:, None])
+    np.testing.assert_allclose(place, poses(changed(arm)), atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -1,13 +1,11 @@
 """What is handed over says the same at the other end: random arms, models, loads and branches."""
 
 import json
-import re
 import warnings
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -17,7 +15,7 @@ import hilcal as hc
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.compiled import Compiled, compiled
 from hilcal.calibration.dh_table import CONVENTIONS, dh_rows, flange_poses, to_toml
-from hilcal.calibration.handover import UR_JOINTS, ur_kinematics, urdf
+from hilcal.calibration.handover import ur_kinematics, urdf
 from hilcal.calibration.measured import Measured
 from hilcal.calibration.scatter import Scatter
 from hilcal.calibration.storage import from_json, to_json
@@ -30,6 +28,7 @@ from hilcal.robot.catalogue import load_arm, robot_names
 from hilcal.robot.chain import evaluate, joint_jacobian
 from hilcal.types import Floats
 from tests.support.campaigns import cell_of
+from tests.unit.calibration.other_eyes import by_pinocchio, by_ur, flanges, urdf_model
 
 ROUND = settings(max_examples=10, deadline=None, derandomize=True)
 SEEDS = st.integers(0, 2**32 - 1)
@@ -45,11 +44,6 @@ def moved_arm(name: str, seed: int, size: float) -> Arm:
     return replace(arm, links=arm.links @ moved)
 
 
-def flanges(arm: Arm, q: Floats) -> Floats:
-    chain = evaluate(arm, q)
-    return se3.matrix(chain.rotation[-1], chain.position[-1])
-
-
 def joints(seed: int, count: int = 10) -> Floats:
     return np.random.default_rng(seed).uniform(-3, 3, (count, 6))
 
@@ -58,11 +52,8 @@ def joints(seed: int, count: int = 10) -> Floats:
 @given(ARMS, SEEDS, st.sampled_from([0.0, 1e-6, 1e-3, 0.3]))
 def test_pinocchio_has_the_urdf_s_flange_to_a_nanometre(name: str, seed: int, size: float) -> None:
     arm, q = moved_arm(name, seed, size), joints(seed)
-    model = pin.buildModelFromXML(urdf(arm).partition("\n")[2])
-    data, frame = model.createData(), model.getFrameId("tool0")
-    for row, expected in zip(q, flanges(arm, q), strict=True):
-        pin.framesForwardKinematics(model, data, row)
-        np.testing.assert_allclose(data.oMf[frame].homogeneous, expected, atol=NM)
+    made = by_pinocchio(urdf_model(urdf(arm)), q)
+    np.testing.assert_allclose(made, flanges(arm, q), atol=NM)
 
 
 @pytest.mark.parametrize("pitch", [np.pi / 2, -np.pi / 2, np.pi / 2 - 1e-8, np.pi / 2 - 1e-5])
@@ -72,11 +63,8 @@ def test_a_urdf_is_exact_where_roll_and_yaw_are_one(pitch: float) -> None:
     links[2, :3, :3] = Rotation.from_euler("xyz", [0.4, pitch, -1.1]).as_matrix()
     arm, q = replace(arm, links=links), joints(1)
     with warnings.catch_warnings(action="error"):
-        model = pin.buildModelFromXML(urdf(arm).partition("\n")[2])
-    data, frame = model.createData(), model.getFrameId("tool0")
-    for row, expected in zip(q, flanges(arm, q), strict=True):
-        pin.framesForwardKinematics(model, data, row)
-        np.testing.assert_allclose(data.oMf[frame].homogeneous, expected, atol=NM)
+        model = urdf_model(urdf(arm))
+    np.testing.assert_allclose(by_pinocchio(model, q), flanges(arm, q), atol=NM)
 
 
 @ROUND
@@ -86,17 +74,7 @@ def test_ur_s_file_and_its_tool_are_the_arm_to_a_nanometre(
 ) -> None:
     arm, q = moved_arm(name, seed, size), joints(seed)
     text, rest = ur_kinematics(load_arm(name), arm, "by a test")
-    place = np.broadcast_to(np.eye(4), (len(q), 4, 4))
-    for k, joint in enumerate(UR_JOINTS):
-        block = text.split(f"  {joint}:\n")[1]
-        found = re.findall(r"^ {4}\w+: (\S+)$", block, re.MULTILINE)[:6]
-        # YAML 1.1 takes a number without a point for text, where it has an exponent
-        assert all(re.fullmatch(r"-?\d+(\.\d+(e[-+]\d+)?)?", number) for number in found)
-        six = np.array(found, dtype=float)
-        turn = Rotation.from_euler("xyz", six[3:]).as_matrix()
-        spun = Rotation.from_euler("z", q[:, k, None]).as_matrix()
-        place = place @ se3.matrix(turn, six[:3]) @ se3.matrix(spun, np.zeros((len(q), 3)))
-    np.testing.assert_allclose(place @ rest, flanges(arm, q), atol=NM)
+    np.testing.assert_allclose(by_ur(text, q) @ rest, flanges(arm, q), atol=NM)
     assert abs(rest[2, 3]) < 1e-15  # what can be moved before the last joint is there
     assert abs(rest[1, 0] - rest[0, 1]) < 1e-12
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilcal.calibration.budget import budget
 from hilcal.calibration.calibration import Calibration
+from hilcal.calibration.scatter import budget
 from hilcal.config import Repeatability
 from hilcal.diagnosis.arm_repeatability import RP_PER_RMS
 from hilcal.identification.baseline import baseline

@@ -125,13 +125,13 @@ def test_the_demo_cell_stays_within_the_payload():
 
 number = st.floats(-4.0, 4.0)
 vector = st.tuples(number, number, number)
-LOAD = st.text(min_size=1).filter(lambda name: escaped(name) == name)
+LOAD_NAME = st.text(min_size=1).filter(lambda name: escaped(name) == name)
 
 
 @given(
     target=st.none() | vector,
     mass=st.floats(0, 20),
-    loads=st.lists(st.tuples(LOAD, st.floats(0.1, 20), vector), max_size=4),
+    loads=st.lists(st.tuples(LOAD_NAME, st.floats(0.1, 20), vector), max_size=4),
     joint_std=st.floats(0, 1e-3) | st.tuples(*[st.floats(0, 1e-3)] * 6),
     base=st.none() | st.tuples(vector, vector),
 )

@@ -9,7 +9,7 @@ from pydantic import TypeAdapter
 from hilcal.cli.looking_up import DRIVERS_OWN
 from hilcal.config import CellConfig
 from hilcal.config.reference import NOT_SET, REQUIRED, tables
-from hilcal.present.preparing import reference_page
+from hilcal.present.campaign import reference_page
 from hilcal.toml import section_of
 from tests.support.cli_cases import ok, refused
 from tests.support.paths import ROOT

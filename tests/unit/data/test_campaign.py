@@ -23,9 +23,8 @@ from hilcal.cli import main
 from hilcal.errors import HilcalError, InputError, MovedFileError
 from hilcal.store import schema
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.records import content_hash
 from hilcal.store.revision import STORED, RevisionRecord
-from hilcal.store.rows import _reading_crc
+from hilcal.store.rows import _reading_crc, content_hash
 from hilcal.store.run_log import RunLog
 from hilcal.store.schema import sqlite_errors
 from tests.support import power_loss
@@ -479,7 +478,7 @@ def test_a_folder_made_read_only_is_said(tmp_path):
         assert file.n_readings == 1
 
 
-WRITER = """
+POWER_WRITER = """
 import os, sys
 from pathlib import Path
 from hilcal.store.campaign_file import CampaignFile
@@ -499,7 +498,7 @@ with CampaignFile.create(folder / "run.hilcal", "{}", "", "a test") as run:
 """Readings go in one by one; a revision comes after the second, is accepted, and is not counted."""
 
 
-def _lost(tmp_path, batches, tries, writer=WRITER, syncs=4):
+def _lost(tmp_path, batches, tries, writer=POWER_WRITER, syncs=4):
     folder = tmp_path / "disk"
     folder.mkdir()
     recorder = power_loss.compiled(tmp_path)
@@ -567,7 +566,9 @@ def test_the_model_loses_what_was_never_synced(tmp_path):
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="the recorder needs gcc")
 def test_a_program_that_does_not_sync_is_found_out(tmp_path):
-    careless = WRITER.replace("    x = simple", "    run.connection.execute(OFF)\n    x = simple")
+    careless = POWER_WRITER.replace(
+        "    x = simple", "    run.connection.execute(OFF)\n    x = simple"
+    )
     careless = 'OFF = "PRAGMA synchronous = OFF"\n' + careless
     with pytest.raises((AssertionError, InputError)):
         _lost(tmp_path, 3, tries=3, writer=careless, syncs=0)

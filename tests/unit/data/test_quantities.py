@@ -16,7 +16,7 @@ from hilcal.readings.ranges import Range
 from hilcal.readings.readings import Readings, States
 from hilcal.readings.same_readings import already, never_fitted
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.records import content_hash
+from hilcal.store.rows import content_hash
 from hilcal.tables.table import read_table, write_table
 from hilcal.tables.units import parse_duration, parse_length
 from tests.support.campaigns import cell_of

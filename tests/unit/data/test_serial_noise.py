@@ -7,9 +7,8 @@ import pytest
 
 from hilcal.readings import whitening as scaling_module
 from hilcal.readings.covariance import symmetric_root
-from hilcal.readings.reading_groups import has_unloaded
 from hilcal.readings.serial_noise import SerialNoise
-from hilcal.readings.whitening import MODES, whitening
+from hilcal.readings.whitening import MODES, has_unloaded, whitening
 from tests.unit.data.test_whitening import make_readings, random_readings, spd
 
 NOISE = SerialNoise("order", 0.8, 0.05, 7.0, float(np.exp(-1 / 7)), 0.02, 30.0)

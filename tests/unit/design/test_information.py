@@ -1,36 +1,62 @@
 """What a plan predicts is what identification then states, and what the parameters scatter by."""
 
+import json
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hilcal.design.candidates import reading_covariance
-from hilcal.design.information import problem
+from hilcal.cell import cell_from_config
+from hilcal.config import load_config
+from hilcal.config.cell import Target
+from hilcal.config.sections import Gauge, Point
+from hilcal.design.discriminated_pairs import discriminated_pairs
+from hilcal.design.information import (
+    MOST_ORDINARY,
+    MOST_PARAMETERS,
+    DesignProblem,
+    problem,
+    reading_covariance,
+)
 from hilcal.design.nominal_model import after, nominal_model, nominal_states
-from hilcal.design.predicted import predicted
-from hilcal.design.prediction_poses import prediction_poses
+from hilcal.design.predicted import predicted, prediction_poses
+from hilcal.effects.catalogue import installed
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.baseline import baseline, with_effects
+from hilcal.identification.carried import CarriedPrior, carried_prior
 from hilcal.identification.fit import fit
+from hilcal.identification.full_covariance import with_joint_scatter
+from hilcal.identification.posterior import Posterior
+from hilcal.measuring.clearance import LineOfSight, clearance_of
 from hilcal.measuring.devices import TrackerSample
 from hilcal.measuring.measure import average
+from hilcal.measuring.route import seconds_at_rest
+from hilcal.readings.whitening import MODES, Mode
+from hilcal.robot.chain import evaluate
 from tests.support.arm_cases import ARMS, arm_of
 from tests.support.arm_cases import cell_of as odd_cell
 from tests.support.campaigns import (
     campaign,
     cell_of,
+    configuration,
     measured,
     noiseless,
     plan,
     with_noise,
     world_of,
 )
+from tests.support.cli_cases import CELL as DEMO
+from tests.support.cli_cases import Capsys, ok
+from tests.support.fit_cases import named
 from tests.support.fit_cases import predicted as read
+from tests.support.observer_cases import NORMAL, POINTS, STD, observed
 from tests.support.plan_cases import config_of, everything_once, poses_in, poses_of
+from tests.support.reflector_cases import NAMES, OFFSETS, reflectors
 from tests.support.rows import first
-
-MODES = ("deflection", "absolute")
 
 
 def joints(std):
@@ -244,3 +270,292 @@ def test_what_cannot_be_seen_has_no_uncertainty():
     assert np.isinf(mine.std).any()  # three numbers measured, six compliances
     assert np.isinf(mine.position)
     assert np.isfinite(predicted(p, everything_once(p) * 0 + 1.0).std).any()
+
+
+CELL = cell_of(registration_known=True)
+
+
+def made(mode="deflection", against="catalogue", poses=40, **planning):
+    config = config_of(mode, against=against, **planning)
+    return problem(nominal_model(CELL, config), config, poses_of(poses))
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_potential_terms_are_one_sigma_strong(mode):
+    p = made(mode)
+    rng = np.random.default_rng(0)
+    single = np.array([len(loads) == 1 for _, loads in p.what])
+    rows = p.units.rows[single][:, :3]
+    assert p.families
+    for e in p.families:
+        where = p.of_effect(e.name)
+        ordinary = np.array([q.scale for q in e.parameters])
+        drawn = rng.standard_normal((4000, len(where)))
+        shift = rows[:, :, where].reshape(-1, len(where)) @ drawn.T
+        assert np.sqrt(np.mean(shift**2)) == pytest.approx(1.0, rel=0.05), e.name
+        tau = p.scale[where] / ordinary
+        assert tau == pytest.approx(np.full(len(tau), tau[0]))
+        assert tau[0] <= MOST_ORDINARY
+        assert p.prior[np.ix_(where, where)] == pytest.approx(np.eye(len(where)))
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_the_catalogue_is_planned_for_or_said_not_to_be(mode):
+    p = made(mode)
+    assert len(p.terms) <= MOST_PARAMETERS
+    for kind in installed().effects:
+        name = kind.name
+        planned = name in {t.effect for t in p.terms}
+        if kind.name == "guide_error" or kind.role == "observer":
+            assert not planned  # the arm has no slide, the cell one tracker
+        elif not kind.needs:
+            assert planned != any(note.startswith(f"{name}: not planned for") for note in p.notes)
+        else:
+            assert not planned  # only the order of a plan tells them
+
+
+def test_deflections_do_not_plan_for_what_cancels_in_them():
+    assert "transmission_error" not in {t.effect for t in made("deflection").terms}
+    assert "transmission_error" in {t.effect for t in made("absolute").terms}
+
+
+def test_a_load_that_no_pose_bears_is_as_good_as_none():
+    """As two weights of the demo at an arm of a smaller payload."""
+    config = config_of("deflection", against="catalogue")
+    q, loads = poses_of(30), len(config.loads)
+    allowed = np.ones((30, 1 + loads), dtype=bool)
+    allowed[:, -1] = False
+    borne = problem(nominal_model(CELL, config), config, q, allowed)
+    less = config.model_copy(update={"loads": config.loads[:-1]})
+    without = problem(nominal_model(CELL, less), less, q)
+    assert borne.what == without.what
+    assert borne.terms == without.terms
+    np.testing.assert_allclose(
+        borne.information(np.ones(len(borne.what))), without.information(np.ones(len(without.what)))
+    )
+
+
+def test_potential_terms_only_add_uncertainty():
+    p, alone = made(), made(against=())
+    mine, bare = predicted(p, everything_once(p)), predicted(alone, everything_once(alone))
+    assert mine.std == pytest.approx(bare.std, rel=1e-9)
+    assert bare.std_open == pytest.approx(bare.std, rel=1e-9)
+    assert np.all(mine.std_open > mine.std)
+
+
+def test_asked_for_effects_that_the_order_tells_are_taken_at_random():
+    p = made(against=("hysteresis",), poses=10)
+    assert len(p.of_effect("hysteresis")) == 6
+    assert any("approach of the readings taken at random" in note for note in p.notes)
+
+
+def test_derivatives_where_the_robot_works():
+    for mode, load in (("absolute", "none"), ("absolute", "10kg"), ("deflection", "10kg")):
+        config = config_of(mode, work_load=load)
+        a = nominal_model(CELL, config)
+        q = poses_of(3)
+        work = prediction_poses(a, config, q)
+        wrench = next((x.wrench(CELL.gravity) for x in config.loads if x.name == load), np.zeros(6))
+
+        def at(theta, a=a, work=work, wrench=wrench, mode=mode):
+            out = 0.0
+            signs = ((1, wrench), (-1, 0 * wrench)) if mode == "deflection" else ((1, wrench),)
+            for sign, w in signs:
+                states = nominal_states(work.q, np.tile(w, (len(work.q), 1)))
+                out = out + sign * a.model.predict(states, theta).observation.position
+            return out
+
+        for k, scale in enumerate(p.scale for e in a.model.effects for p in e.parameters):
+            step = np.zeros(a.model.size)
+            step[k] = 1e-2 * scale
+            slope = (at(a.theta + step) - at(a.theta - step)) / 2e-2
+            # The Jacobian leaves out what is smaller by deflection over reach.
+            assert work.derivative[:, :, k] == pytest.approx(
+                slope, abs=2e-2 * np.abs(slope).max() + 1e-12
+            )
+
+
+def test_unloaded_work_with_deflections_is_under_each_load():
+    config = config_of("deflection")
+    a = nominal_model(CELL, config)
+    work = prediction_poses(a, config, poses_of(3))
+    assert work.what == "deflection under each load at 3 feasible poses"
+    assert len(work.q) == 12
+    assert np.all(np.abs(work.derivative).max(axis=(1, 2)) > 0)
+
+
+def test_named_work_and_a_box():
+    q = poses_of(2)
+    named = config_of("absolute", work_q_rad=tuple(tuple(x) for x in q))
+    a = nominal_model(CELL, named)
+    assert prediction_poses(a, named, poses_of(9, 3)).q == pytest.approx(q)
+    short = config_of("absolute", work_q_rad=((0.0, 1.0),))
+    with pytest.raises(InputError, match="2 values; ur10e has 6 joints"):
+        prediction_poses(a, short, q)
+    low, high = (0.3, -0.6, 0.2), (1.0, 0.6, 0.9)
+    box = config_of("absolute", work_min_m=low, work_max_m=high)
+    work = prediction_poses(a, box, np.empty((0, 6)), lambda x: x[:, 0] > 0.1)
+    at = evaluate(CELL.arm, work.q).point(CELL.target[:3, 3])
+    assert len(work.q) >= 50
+    assert np.all((at >= low) & (at <= high))
+    assert np.all(work.q[:, 0] > 0.1)
+    away = config_of("absolute", work_min_m=(5.0, 5.0, 5.0), work_max_m=(6.0, 6.0, 6.0))
+    with pytest.raises(CannotAnswerError, match="widen the box"):
+        prediction_poses(a, away, q, lambda x: x[:, 0] > 0.1)
+
+
+def test_one_suspect_is_none_to_tell_apart():
+    with pytest.raises(InputError, match="1 effects to tell apart"):
+        discriminated_pairs(made(against=("joint_stiffening",), poses=8))
+
+
+CARRIED = ("joint_compliance", "joint_tilt_compliance")
+
+
+@cache
+def learnt() -> Posterior:
+    c = campaign("joint_tilt_compliance", "absolute", 1, poses=30, registration_known=True)
+    found = fit(with_effects(c.cell, c.readings, "absolute", CARRIED), c.readings, "absolute")
+    return Posterior.of(found)
+
+
+def problem_with(prior: CarriedPrior | None, names: tuple[str, ...] = CARRIED) -> DesignProblem:
+    config = configuration()
+    planning = config.planning.model_copy(update={"model": names, "against": ()})
+    config = config.model_copy(update={"planning": planning})
+    nominal = nominal_model(cell_from_config(config), config, 3, prior=prior)
+    return problem(nominal, config, np.unique(plan(4, 5).states.q, axis=0))
+
+
+def std(of: DesignProblem) -> dict[str, float]:
+    return predicted(of, np.ones(len(of.units))).by_name()
+
+
+def test_what_is_known_is_in_the_prediction() -> None:
+    alone, known = std(problem_with(None)), std(problem_with(carried_prior(learnt())))
+    assert known.keys() == alone.keys()
+    own = dict(zip(learnt().names, learnt().std, strict=True))
+    for name in learnt().names:
+        assert known[name] < min(alone[name], own[name])
+
+
+def test_effects_that_only_the_prior_knows_are_planned_for() -> None:
+    found = problem_with(carried_prior(learnt()), CARRIED[:1])
+    assert "joint_tilt_compliance" in found.nominal.model.names
+
+
+def test_a_prior_that_knows_nothing_changes_no_prediction() -> None:
+    p = learnt()
+    nothing = carried_prior(replace(p, information=np.zeros_like(p.information)))
+    alone, known = std(problem_with(None)), std(problem_with(nothing))
+    np.testing.assert_allclose(list(known.values()), list(alone.values()), rtol=1e-9)
+
+
+def test_of_another_arm_is_refused() -> None:
+    p = learnt()
+    with pytest.raises(InputError, match="nominal links"):
+        problem_with(carried_prior(replace(p, links=1.01 * p.links)))
+
+
+CASES = {
+    "distance": (["A", "B"], {k: Point(position_m=POINTS[k], std_m=STD) for k in "AB"}, {}),
+    "height": (["G"], {}, {"G": Gauge(direction=tuple(NORMAL), std_m=STD)}),
+}
+
+
+@pytest.mark.parametrize("what", CASES)
+def test_predicted_uncertainties_are_those_of_a_fit(what: str) -> None:
+    who, points, gauges = CASES[what]
+    config = configuration()
+    tracker = config.tracker.model_copy(update={"frame": "base", "observes": what})
+    planning = config.planning.model_copy(update={"readings": "absolute", "against": ()})
+    config = config.model_copy(
+        update={"tracker": tracker, "planning": planning, "points": points, "gauges": gauges}
+    )
+    acquire = config.acquire.model_copy(update={"samples": 1})
+    config = config.model_copy(update={"acquire": acquire})
+    cell = replace(cell_of(), config=config, registration_known=True)
+    c = observed(who, 7, cell=cell, base=True)
+    joint_std = config.repeatability.per_joint(6)
+    readings = with_joint_scatter(cell, c.readings, joint_std)
+    f = fit(baseline(cell, readings, "absolute"), readings, "absolute")
+
+    _, first = np.unique(readings.pose, return_index=True)
+    of = problem(nominal_model(cell, config), config, readings.states.q[first])
+    assert len(of.what) == len(first) * 5
+    information = of.information(np.ones(len(of.what))) - of.prior + of.measured
+    names = [t.name for t in of.terms]
+    own = [k for k, name in enumerate(names) if name.startswith("joint_compliance")]
+    frames = [k for k, name in enumerate(names) if name.startswith("observer_frame")]
+    kept = np.array([*own, *frames])
+    covariance = np.linalg.pinv(information[np.ix_(kept, kept)], rcond=1e-12)
+    std = np.sqrt(np.diagonal(covariance))[: len(own)] * of.scale[own]
+    fitted = named(f)
+    for name, planned in zip((names[k] for k in own), std, strict=True):
+        if np.isfinite(fitted[name][1]):
+            assert planned == pytest.approx(fitted[name][1], rel=0.25), name
+
+
+@pytest.mark.long
+def test_a_cell_of_distances_is_planned(tmp_path: Path, capsys: Capsys) -> None:
+    text = DEMO.read_text().replace("candidates = 250", "candidates = 60\nagainst = []")
+    text = text.replace('frame = "tracker"', 'frame = "base"\nobserves = "distance"')
+    (tmp_path / "cell.toml").write_text(text + "\n[points.A]\nstd_m = 1e-5\n[points.B]\n")
+    out = tmp_path / "plan.json"
+    ok(capsys, "plan", tmp_path / "cell.toml", "--poses", "8", "-o", out)
+    assert len({step["pose"] for step in json.loads(out.read_text())["steps"]}) >= 8
+
+
+def test_devices_read_positions(tmp_path: Path) -> None:
+    text = DEMO.read_text().replace(
+        'frame = "tracker"', 'driver = "geocom"\nport = "x"\nobserves = "distance"'
+    )
+    (tmp_path / "cell.toml").write_text(text)
+    with pytest.raises(InputError, match=r'observes = "distance" together with driver'):
+        load_config(tmp_path / "cell.toml")
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_prediction_is_what_identification_states_of_several_targets(mode: Mode) -> None:
+    config = config_of(mode)
+    scatter = config.repeatability.model_copy(update={"joint_std_rad": 5e-5})
+    config = config.model_copy(update={"repeatability": scatter})
+    c = reflectors(poses=14, joint_std=5e-5, known=(True, False, True), registration_known=True)
+    found = fit(baseline(c.cell, c.readings, mode), c.readings, mode)
+    p = problem(nominal_model(c.cell, config), config, poses_in(c.readings))
+    foreseen = predicted(p, everything_once(p)).by_name()
+    names = [t.name for t in p.terms if not t.potential]
+    stated = dict(zip(names, found.uncertainty.formal, strict=True))
+    if mode == "absolute":  # in deflections a prior of another size holds the offset
+        assert foreseen["target_offset.R2.x"] == pytest.approx(
+            stated["target_offset.R2.x"], rel=0.05
+        )
+    for j in range(1, 7):
+        name = f"joint_compliance.j{j}"
+        assert foreseen[name] == pytest.approx(stated[name], rel=0.05), name
+
+
+def test_sight_and_time_of_each_target() -> None:
+    config = config_of()
+    tool = config.tool.model_copy(
+        update={
+            "target_m": None,
+            "targets": tuple(
+                Target(name=n, target_m=tuple(at))
+                for n, at in zip(NAMES, OFFSETS.tolist(), strict=True)
+            ),
+        }
+    )
+    several = config.model_copy(update={"tool": tool})
+    assert seconds_at_rest(several) > 2 * seconds_at_rest(config)
+    c = reflectors(poses=6)
+    cell = replace(c.cell, registration_known=True)
+    q = poses_in(c.readings)
+    view = LineOfSight(clearance_of(cell, several), np.array([3.0, 0.5, 0.4]))
+    seen = np.array([view.sees(q, "none", k) for k in range(3)])
+    np.testing.assert_array_equal(view.free(q, "none"), seen.all(axis=0))
+    for k in range(len(q)):
+        hidden = view.hidden(q[k : k + 1], "none")
+        assert hidden == tuple(np.flatnonzero(~seen[:, k]))
+        told = [key for key in view.problems(q[k : k + 1], "none", "here") if key[0] == "sight"]
+        assert bool(told) == (len(hidden) == 3)

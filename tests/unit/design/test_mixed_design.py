@@ -8,17 +8,19 @@ import pytest
 from hilcal.config import CellConfig
 from hilcal.design import mixed_design as condensing
 from hilcal.design.approximate_design import relax
-from hilcal.design.candidates import absolute_rows, deflection_rows, reading_derivatives
 from hilcal.design.choice import choose, objective_of
 from hilcal.design.criteria import MeanVariance
-from hilcal.design.information import DesignProblem, information_of, problem
+from hilcal.design.information import (
+    DesignProblem,
+    absolute_rows,
+    deflection_rows,
+    information_of,
+    problem,
+    reading_derivatives,
+)
 from hilcal.design.mixed_design import MixedDesign, balanced, mixed_design, other_effects
 from hilcal.design.nominal_model import after, nominal_model
-from hilcal.design.prediction_poses import (
-    PredictionPoses,
-    position_derivative,
-    prediction_poses,
-)
+from hilcal.design.predicted import PredictionPoses, position_derivative, prediction_poses
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.readings.whitening import Mode

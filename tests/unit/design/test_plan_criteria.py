@@ -1,15 +1,18 @@
 """Criteria of plans: derivatives, concavity, bounds, and what they mean."""
 
 from collections.abc import Callable
+from functools import cache
+from itertools import product
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hilcal.design.criteria import D, E, K, MeanVariance
-from hilcal.design.criterion import Criterion, require_determined
-from hilcal.design.t_optimality import Pair, Separate
+from hilcal.design.approximate_design import ApproximateDesign, relax
+from hilcal.design.criteria import D, E, K, MeanVariance, Pair, Separate
+from hilcal.design.criterion import CandidateSet, Criterion, require_determined
+from hilcal.design.optimum import best
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.types import Floats
 
@@ -39,17 +42,12 @@ def compound_variance() -> MeanVariance:
 
 
 CRITERIA: dict[str, Callable[[], Criterion]] = {
-    "D": D,
-    "A": lambda: MeanVariance(np.eye(P) / P, "A"),
+    "D": D, "A": lambda: MeanVariance(np.eye(P) / P, "A"),
     "A of some": lambda: MeanVariance(np.diag([1.0, 0.0, 1.0, 0.0, 0.0, 1.0]) / 3, "A"),
-    "I": lambda: MeanVariance(few_poses()),
-    "E": E,
-    "K": K,
-    "E of some": lambda: E(np.array([0, 2, 5])),
-    "separate": lambda: Separate(pairs()),
-    "compound variance": compound_variance,
-    "compound determinant": lambda: D(4),
-}
+    "I": lambda: MeanVariance(few_poses()), "E": E, "K": K,
+    "E of some": lambda: E(np.array([0, 2, 5])), "separate": lambda: Separate(pairs()),
+    "compound variance": compound_variance, "compound determinant": lambda: D(4),
+}  # fmt: skip
 seeds = st.integers(0, 10**6)
 every = pytest.mark.parametrize("name", CRITERIA)
 
@@ -175,3 +173,292 @@ def test_says_which_parameters_nothing_determines() -> None:
 def test_refusals(make: Callable[[], object], words: str) -> None:
     with pytest.raises(InputError, match=words):
         make()
+
+
+def compound_of_three() -> MeanVariance:
+    """Of two parameters, with a third that may be there."""
+    c = np.array([[2.0, 0.5, 0.0], [0.5, 1.0, 0.0], [0.0, 0.0, 0.0]])
+    return MeanVariance(c, "A", 2.0 * c[:2, :2])
+
+
+OF_THREE: dict[str, Callable[[], Criterion]] = {
+    "D": D,
+    "A": lambda: MeanVariance(np.eye(3) / 3, "A"),
+    "A of some": lambda: MeanVariance(np.diag([0.5, 0.5, 0.0]), "A"),
+    "I": lambda: MeanVariance(np.outer([1.0, 2.0, -1.0], [1.0, 2.0, -1.0])),
+    "compound variance": compound_of_three,
+    "compound determinant": lambda: D(2),
+    "E": E,
+    "K": K,
+    "E of some": lambda: E(np.array([0, 1])),
+    "separate": lambda: Separate(
+        (
+            Pair(np.array([0]), np.ones(1), np.array([1])),
+            Pair(np.array([1]), np.ones(1), np.array([2])),
+            Pair(np.array([2]), np.full(1, 2.0), np.array([0, 1])),
+        )
+    ),
+}
+QUICK = {"D of some", "I", "compound determinant", "E"}
+"""One of each kind; the others are long."""
+every_of_three = pytest.mark.parametrize(
+    "name",
+    [pytest.param(c, marks=() if c in QUICK else pytest.mark.long) for c in OF_THREE],
+)
+
+
+def polynomial(degree: int, points: Floats) -> CandidateSet:
+    """Readings of a polynomial at points, one row each."""
+    return CandidateSet(
+        np.vander(points, degree + 1, increasing=True)[:, None, :], np.ones(len(points))
+    )
+
+
+def random_units(seed: int, count: int, size: int = 3, costs: bool = False) -> CandidateSet:
+    rng = np.random.default_rng(seed)
+    rows = rng.normal(size=(count, 2, size))
+    rows[rng.random(count) < 0.3, 1] = 0.0  # units of fewer rows
+    return CandidateSet(rows, rng.integers(1, 4, count).astype(float) if costs else np.ones(count))
+
+
+def at(points: Floats, found: ApproximateDesign) -> dict[float, float]:
+    """Shares of the weight by point, without what is near 0."""
+    total = found.weight.sum()
+    shares = {float(points[k]): w / total for k, w in zip(found.index, found.weight, strict=True)}
+    return {x: w for x, w in shares.items() if w > 1e-3}
+
+
+def prior_of(seed: int, size: int = 3) -> Floats:
+    root = np.random.default_rng(seed + 1).normal(size=(2, size))
+    return root.T @ root
+
+
+def largest(criterion: Criterion, units: CandidateSet, weights: Floats, prior: Floats) -> float:
+    """The best of many plans (N, K)."""
+    each = np.swapaxes(units.rows, 1, 2) @ units.rows
+    return float(criterion.value(prior + np.tensordot(weights, each, axes=1)).max())
+
+
+GRID = np.linspace(-1, 1, 201)
+LEGENDRE = np.sort(np.concatenate([GRID, [-np.sqrt(0.2), np.sqrt(0.2)]]))
+
+
+@pytest.mark.parametrize(
+    ("criterion", "degree", "expected"),
+    [
+        (D(), 2, {-1: 1 / 3, 0: 1 / 3, 1: 1 / 3}),
+        (D(), 3, {-1: 1 / 4, -np.sqrt(0.2): 1 / 4, np.sqrt(0.2): 1 / 4, 1: 1 / 4}),
+        (MeanVariance(np.eye(3) / 3), 2, {-1: 1 / 4, 0: 1 / 2, 1: 1 / 4}),
+        (E(), 2, {-1: 1 / 5, 0: 3 / 5, 1: 1 / 5}),
+        # the highest coefficient: Chebyshev points (Kiefer & Wolfowitz 1959)
+        (MeanVariance(np.diag([0.0, 0.0, 1.0])), 2, {-1: 1 / 4, 0: 1 / 2, 1: 1 / 4}),
+        # the value at 2: Chebyshev points, in proportion to Lagrange's polynomials there
+        (
+            MeanVariance(np.outer([1.0, 2.0, 4.0], [1.0, 2.0, 4.0])),
+            2,
+            {-1: 1 / 7, 0: 3 / 7, 1: 3 / 7},
+        ),
+        # a parabola beyond a straight line: the highest coefficient again
+        (
+            Separate((Pair(np.array([2]), np.ones(1), np.array([0, 1])),)),
+            2,
+            {-1: 1 / 4, 0: 1 / 2, 1: 1 / 4},
+        ),
+    ],
+)
+def test_known_optima(criterion: Criterion, degree: int, expected: dict[float, float]) -> None:
+    """Pukelsheim (1993), ch. 9; Fedorov (1972)."""
+    found = relax(polynomial(degree, LEGENDRE), criterion, 10.0, tolerance=1e-8)
+    shares = at(LEGENDRE, found)
+    assert sorted(shares) == pytest.approx(sorted(expected), abs=1e-9)
+    for x, share in expected.items():
+        near = min(shares, key=lambda y, x=x: abs(y - x))  # type: ignore[misc]
+        assert shares[near] == pytest.approx(share, abs=2e-3)
+    exact_value = float(
+        criterion.value(
+            10.0
+            * polynomial(degree, np.array(list(expected))).information(
+                np.array(list(expected.values()))
+            )
+        )
+    )
+    assert found.value == pytest.approx(exact_value, rel=1e-6)
+    assert found.value * (1 - 1e-9) <= found.bound <= found.value * (1 + 1e-6)
+
+
+@every_of_three
+def test_small_problems_against_all_shares(name: str) -> None:
+    """Four units of three parameters: all shares in steps of 1/16, with a prior and without."""
+    criterion = OF_THREE[name]()
+    steps = 16
+    n = np.array(list(product(range(steps + 1), repeat=3)))
+    n = n[n.sum(axis=1) <= steps]
+    shares = np.column_stack([n, steps - n.sum(axis=1)]) / steps
+    for seed in range(3):
+        units = random_units(seed, 4, costs=True)
+        units = CandidateSet(units.rows + 0.2, units.cost)
+        for prior in (np.zeros((3, 3)), prior_of(seed)):
+            most = largest(criterion, units, 6.0 * shares / units.cost, prior)
+            found = relax(units, criterion, 6.0, prior)
+            assert found.gap <= (1e-3 if criterion.kinked else 1e-6)
+            assert found.bound >= most * (1 - 1e-9)
+            assert found.value >= most * (1 - 1e-3)
+            # what is found can be had: shares of the budget that give this value
+            assert found.weight.min() >= 0
+            assert found.weight @ units.cost[found.index] <= 6.0 * (1 + 1e-9)
+            weight = np.zeros(len(units))
+            np.add.at(weight, found.index, found.weight)
+            own = float(criterion.value(prior + units.information(weight)))
+            assert found.value == pytest.approx(own, rel=1e-9)
+
+
+@every_of_three
+@settings(max_examples=15)
+@given(
+    seed=st.integers(0, 10**6),
+    costs=st.booleans(),
+    known=st.booleans(),
+    most=st.sampled_from([None, 1, 2]),
+)
+def test_no_plan_exceeds_the_bound(
+    name: str, seed: int, costs: bool, known: bool, most: int | None
+) -> None:
+    """Random plans, and the planner's own."""
+    criterion = OF_THREE[name]()
+    units = random_units(seed, 15, costs=costs)
+    prior = prior_of(seed) if known else None
+    base = np.zeros((3, 3)) if prior is None else prior
+    design = best(units, criterion, 9.0, prior, np.random.default_rng(0), most=most, effort=40)
+    rng = np.random.default_rng(seed)
+    for _ in range(20):
+        counts = np.zeros(len(units))
+        for k in rng.permutation(np.repeat(np.arange(len(units)), 3)):
+            fits = (counts @ units.cost) + units.cost[k] <= 9.0
+            if fits and (most is None or counts[k] < most):
+                counts[k] += 1
+        value = float(criterion.value(base + units.information(counts)))
+        assert value <= design.bound * (1 + 1e-9)
+    assert design.cost == pytest.approx(design.counts @ units.cost)
+    assert design.cost <= 9.0 + 1e-9
+    assert design.counts.min() >= 0
+    assert most is None or design.counts.max() <= most
+    assert 0 < design.efficiency <= 1
+    own = base + units.information(design.counts.astype(float))
+    assert design.value == pytest.approx(float(criterion.value(own)), rel=1e-9)
+    assert design.efficiency == pytest.approx(min(1, design.value / design.bound))
+    relaxed = design.relaxed
+    assert relaxed.weight @ units.cost[relaxed.index] <= 9.0 * (1 + 1e-9)
+    assert relaxed.weight.min() >= 0
+    assert most is None or relaxed.weight.max() <= most * (1 + 1e-9)
+
+
+@cache
+def all_plans(most: int, units: int, total: int) -> Floats:
+    """(N, units) plans of at most `most` of each unit and `total` of all (a unit costs 1)."""
+    plans = np.indices((most + 1,) * units).reshape(units, -1).T
+    return plans[plans.sum(axis=1) <= total].astype(float)
+
+
+@every_of_three
+def test_tiny_plans_against_all_plans(name: str) -> None:
+    """The exchange finds the best of all plans of whole numbers, or nearly."""
+    criterion = OF_THREE[name]()
+    shares = []
+    for seed in range(8):
+        units = random_units(seed, 7, costs=seed % 2 == 1)
+        prior = prior_of(seed) if seed % 4 > 1 else None
+        most = 1 if seed % 3 == 0 else None
+        budget = 5.0
+        plans = all_plans(1 if most else 5, 7, 5)
+        plans = plans[plans @ units.cost <= budget]
+        top = largest(criterion, units, plans, np.zeros((3, 3)) if prior is None else prior)
+        design = best(
+            units, criterion, budget, prior, np.random.default_rng(0), most=most, effort=150
+        )
+        assert design.bound >= top * (1 - 1e-9)
+        assert design.value <= top * (1 + 1e-9)
+        shares.append(design.value / top)
+    assert min(shares) > 0.95
+    assert np.median(shares) > 1 - 1e-9
+
+
+@pytest.mark.parametrize("most", [None, 1])
+def test_many_units(most: int | None) -> None:
+    """Columns are generated until the equivalence theorem holds for all units."""
+    units = random_units(3, 20_000, 8)
+    found = relax(units, D(), 40.0, most=most)
+    assert found.gap <= 1e-6
+    inverse = np.linalg.inv(units.information(found.weight, found.index))
+    leverage = np.einsum("krp,pq,krq->k", units.rows, inverse, units.rows)
+    if most is None:
+        assert leverage.max() <= 8 / 40.0 * (1 + 1e-5)
+    else:
+        assert found.weight.max() <= 1 + 1e-9
+        top = np.sort(leverage)[-40:].sum()  # the 40 best once each
+        assert found.value * top / 8 <= found.value * (1 + 1e-5)
+
+
+def test_the_plan_depends_on_the_generator_alone() -> None:
+    units = random_units(5, 300, 6)
+    one, two = (best(units, D(), 9.0, None, np.random.default_rng(3)).counts for _ in range(2))
+    np.testing.assert_array_equal(one, two)
+
+
+def test_scale_of_a_parameter_does_not_matter_to_d() -> None:
+    units = random_units(5, 100, 6)
+    factor = 10.0 ** np.arange(-6, 6, 2)
+    scaled = CandidateSet(units.rows * factor, units.cost)
+    one = best(units, D(), 12.0, None, np.random.default_rng(3), tolerance=1e-7)
+    two = best(scaled, D(), 12.0, None, np.random.default_rng(3), tolerance=1e-7)
+    assert two.efficiency == pytest.approx(one.efficiency, abs=0.01)
+    assert two.bound == pytest.approx(one.bound * np.prod(factor) ** (2 / 6), rel=1e-5)
+
+
+def test_budget_too_small_for_the_parameters() -> None:
+    units = random_units(9, 50, 6)
+    with pytest.raises(CannotAnswerError, match="budget of 2 takes 2 units, too few"):
+        best(units, D(), 2.0)
+    for name in ("A", "E", "K"):
+        with pytest.raises(CannotAnswerError, match="raise the budget"):
+            best(units, OF_THREE[name](), 2.0, effort=50)
+
+
+def test_names_what_no_candidate_determines() -> None:
+    units = random_units(9, 50, 4)
+    units.rows[:, :, 2] = 0.0
+    with pytest.raises(CannotAnswerError, match="changes with wrist"):
+        best(units, D(), 9.0, names=("base", "elbow", "wrist", "tool"))
+    prior = np.diag([0.0, 0.0, 1.0, 0.0])
+    assert best(units, D(), 9.0, prior).efficiency > 0.9  # known from elsewhere
+    units.rows[:, :, 2] = units.rows[:, :, 0] - units.rows[:, :, 1]
+    with pytest.raises(CannotAnswerError, match="parameter 1") as caught:
+        relax(units, E(), 9.0)
+    assert "parameter 4" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"budget": 0.5}, "least cost"),
+        ({"budget": np.nan}, "budget"),
+        ({"budget": np.inf}, "budget"),
+        ({"prior": np.eye(4)}, r"\(3, 3\)"),
+        ({"prior": -np.eye(3)}, "semidefinite"),
+        ({"prior": np.full((3, 3), np.nan)}, "finite"),
+        ({"most": 0}, "at most 0 times"),
+        ({"units": CandidateSet(np.zeros((2, 1, 3)), np.array([1.0, 0.0]))}, "over 0"),
+        ({"units": CandidateSet(np.full((2, 1, 3), np.inf), np.ones(2))}, "not finite"),
+        ({"units": CandidateSet(np.zeros((2, 1, 3)), np.ones(3))}, "shape"),
+        ({"units": CandidateSet(np.zeros((0, 1, 3)), np.ones(0))}, "shape"),
+    ],
+)
+def test_refusals_of_plans(change: dict[str, object], words: str) -> None:
+    asked: dict[str, object] = {
+        "units": random_units(1, 10),
+        "criterion": D(),
+        "budget": 5.0,
+        "prior": None,
+        "most": None,
+    }
+    with pytest.raises(InputError, match=words):
+        best(**(asked | change))  # type: ignore[arg-type]

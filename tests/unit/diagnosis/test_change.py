@@ -19,8 +19,7 @@ from hilcal.drivers.simulated.world import stand
 from hilcal.effects.spec import effect
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.baseline import with_effects
-from hilcal.identification.earlier_fit import earlier_fit
-from hilcal.identification.later_readings import setting
+from hilcal.identification.later_readings import earlier_fit, setting
 from hilcal.robot.catalogue import configs_dir
 from studies.change import StudiedArm, measured, remeasured, studied_arm
 from tests.support.rows import first

@@ -8,7 +8,7 @@ import pytest
 from hilcal.config import CellConfig
 from hilcal.diagnosis.live_model import LiveModel
 from hilcal.measuring.progress import LiveResidual, ReadingStored
-from hilcal.present.running import figures
+from hilcal.present.progress import figures
 from hilcal.readings.readings import Readings
 from hilcal.store.plan import Step
 from tests.support.campaigns import campaign, cell_of, configuration

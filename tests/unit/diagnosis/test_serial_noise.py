@@ -22,7 +22,7 @@ from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import MODES, Mode
 from hilcal.refinement import refine
 from hilcal.robot.catalogue import configs_dir
-from hilcal.store.records import content_hash
+from hilcal.store.rows import content_hash
 from studies.serial_noise import serial_readings
 from studies.study_cases import study_case
 from tests.support.rows import first

@@ -10,7 +10,7 @@ from scipy.stats import multivariate_normal
 from hilcal.diagnosis.evidence import spoken_against
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.carried import CarriedPrior, carried_prior
-from hilcal.identification.carried_evidence import carried_effects, evidence_of_carried
+from hilcal.identification.drift import carried_effects, evidence_of_carried
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.gauss_newton import whitened_jacobian
 from hilcal.identification.posterior import Posterior

@@ -7,18 +7,16 @@ from functools import cache
 import numpy as np
 import pytest
 
-from hilcal.discovery.discovery import Discovery
-from hilcal.discovery.document import discovery_json
+from hilcal.discovery.discovery import Discovery, discovery_json
 from hilcal.discovery.known_effects import Instead, instead_of_law, known_effects, tells_more
 from hilcal.discovery.problem import SearchProblem
-from hilcal.discovery.screen import screen
+from hilcal.discovery.screen import LawTerm, screen
 from hilcal.discovery.search import LEAST, Selection
-from hilcal.discovery.terms import LawTerm
 from hilcal.effects.spec import EffectSpec
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.linearisation import linearise
-from hilcal.present.discovery import silence
+from hilcal.present.diagnosis import silence
 from tests.unit.discovery.test_discover import campaign
 
 

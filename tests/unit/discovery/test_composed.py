@@ -7,18 +7,15 @@ import numpy as np
 import pytest
 
 from hilcal.discovery import shapes
-from hilcal.discovery.amplitudes import Amplitude, Composed, Factor, composed
+from hilcal.discovery.amplitudes import Amplitude, Composed, Factor, Variable, composed, variables
 from hilcal.discovery.curve import curves
 from hilcal.discovery.discovery import Discovery, agreement, discover
-from hilcal.discovery.law import Form, LawPart
+from hilcal.discovery.law import Form, LawPart, effect_class, source_of_form
 from hilcal.discovery.refit import exact, left_by, refine
 from hilcal.discovery.screen import screen
 from hilcal.discovery.shapes import Shape
 from hilcal.discovery.sites import sites
-from hilcal.discovery.variables import Variable, variables
-from hilcal.discovery.write_effect import effect_class, source_of_form
-from hilcal.effects.check import check_effect
-from hilcal.effects.example import example_cell, example_situation, example_states
+from hilcal.effects.check import check_effect, example_cell, example_situation, example_states
 from hilcal.effects.protocol import Situation
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit

@@ -10,19 +10,14 @@ import pytest
 
 import hilcal as hc
 from hilcal.discovery import shapes
-from hilcal.discovery.amplitudes import Amplitude, Factor
-from hilcal.discovery.discovery import Discovery, discover
-from hilcal.discovery.document import discovery_json, laws_json
-from hilcal.discovery.law import Form, LawPart
+from hilcal.discovery.amplitudes import Amplitude, Factor, variables
+from hilcal.discovery.discovery import Discovery, LawSearch, discover, discovery_json, laws_json
+from hilcal.discovery.law import Form, LawPart, effect_class, source_of_form
 from hilcal.discovery.problem import SearchProblem
-from hilcal.discovery.proposal import LawSearch
 from hilcal.discovery.refit import exact
-from hilcal.discovery.screen import Screen, screen
+from hilcal.discovery.screen import LawTerm, Screen, screen
 from hilcal.discovery.search import Selection, search, worth_their_length
 from hilcal.discovery.sites import ORDINARY
-from hilcal.discovery.terms import LawTerm
-from hilcal.discovery.variables import variables
-from hilcal.discovery.write_effect import effect_class, source_of_form
 from hilcal.effects.catalogue import installed
 from hilcal.effects.check import check_effect
 from hilcal.errors import CannotAnswerError, InputError
@@ -30,11 +25,7 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.effect_columns import effect_columns
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.linearisation import linearise
-from hilcal.present.discovery import (
-    discovery_report,
-    refined_laws,
-    silence,
-)
+from hilcal.present.diagnosis import discovery_report, refined_laws, silence
 from hilcal.refinement import refine
 from studies.unmodelled_laws import law_named, shift
 from tests.support.rehearsed import rehearsed

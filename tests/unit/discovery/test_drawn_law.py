@@ -8,19 +8,17 @@ import numpy as np
 import pytest
 
 from hilcal.discovery import shapes
-from hilcal.discovery.amplitudes import Amplitude, Factor
-from hilcal.discovery.drawn_law import drawn_laws
-from hilcal.discovery.law import Form, LawPart
+from hilcal.discovery.amplitudes import Amplitude, Factor, variables
+from hilcal.discovery.curve import drawn_laws
+from hilcal.discovery.law import Form, LawPart, source_of_form
 from hilcal.discovery.sites import sites
-from hilcal.discovery.variables import variables
-from hilcal.discovery.write_effect import source_of_form
 from hilcal.effects.catalogue import installed
-from hilcal.effects.example import example_cell, example_situation, example_states
+from hilcal.effects.check import example_cell, example_situation, example_states
 from hilcal.effects.from_file import effects_of
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.fit import Fit, fit
-from hilcal.present.charts import style
-from hilcal.present.charts.evidence import curve_chart
+from hilcal.present.charts import curve_chart
+from hilcal.present.document import says
 from hilcal.present.story import Chapter, build_story
 from hilcal.present.viewer import save
 from tests.support.campaigns import NOTHING, campaign
@@ -77,7 +75,7 @@ def test_a_law_is_seen_on_the_page_and_in_the_viewer(tmp_path: Path) -> None:
     assert one.x_label == "q_5 [°]"
     assert one.y_label == "dq_3/τ_3 of joint 3 [µrad/(N·m)]"
     assert dict(one.facts)["coefficients"].startswith("a = ")
-    assert "dq_3 = a·cos(q_5)·τ_3" in style.says(curve_chart(one))
+    assert "dq_3 = a·cos(q_5)·τ_3" in says(curve_chart(one))
     save(story, tmp_path / "x.rrd")
     law = rows(tmp_path / "x.rrd", "/law/law", "BarChart:values", "revision")
     assert set(law) == {2}

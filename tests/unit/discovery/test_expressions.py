@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 from hilcal.discovery import shapes
-from hilcal.discovery.amplitudes import Amplitude, Factor, composed
+from hilcal.discovery.amplitudes import Amplitude, Factor, Variable, composed, variables
 from hilcal.discovery.law import Coefficient, Form, Law, LawPart
 from hilcal.discovery.sites import Site, sites
-from hilcal.discovery.variables import Variable, variables
-from hilcal.effects.example import example_cell, example_situation, example_states
+from hilcal.effects.check import example_cell, example_situation, example_states
 from hilcal.effects.protocol import Situation
 from studies.benchmark.formula import Formula
 

@@ -7,13 +7,11 @@ import numpy as np
 import pytest
 
 from hilcal.discovery import shapes
-from hilcal.discovery.amplitudes import Amplitude, Factor
+from hilcal.discovery.amplitudes import Amplitude, Factor, variables
 from hilcal.discovery.curve import curves
 from hilcal.discovery.discovery import Discovery, discover
-from hilcal.discovery.law import Form, LawPart
+from hilcal.discovery.law import Form, LawPart, effect_class
 from hilcal.discovery.sites import sites
-from hilcal.discovery.variables import variables
-from hilcal.discovery.write_effect import effect_class
 from hilcal.effects.check import check_effect
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit

@@ -4,9 +4,8 @@ import numpy as np
 
 from hilcal.discovery.amplitudes import Amplitude
 from hilcal.discovery.problem import SearchProblem
-from hilcal.discovery.screen import Screen
+from hilcal.discovery.screen import LawTerm, Screen
 from hilcal.discovery.search import search
-from hilcal.discovery.terms import LawTerm
 from tests.unit.discovery.test_discover import screened
 
 

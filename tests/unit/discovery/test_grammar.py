@@ -5,14 +5,11 @@ import pytest
 
 from hilcal.discovery import grammar as products
 from hilcal.discovery import shapes
-from hilcal.discovery.amplitudes import Amplitude, Factor
+from hilcal.discovery.amplitudes import Amplitude, Factor, variables
 from hilcal.discovery.grammar import grammar
-from hilcal.discovery.law import Form, LawPart
+from hilcal.discovery.law import Form, LawPart, effect_class, source_of_form
 from hilcal.discovery.sites import sites
-from hilcal.discovery.variables import variables
-from hilcal.discovery.write_effect import effect_class, source_of_form
-from hilcal.effects.check import check_effect
-from hilcal.effects.example import example_cell, example_situation, example_states
+from hilcal.effects.check import check_effect, example_cell, example_situation, example_states
 from hilcal.effects.force_sensor import recorded
 
 

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hilcal.discovery.discovery import Discovery, alternatives
-from hilcal.discovery.document import discovery_json
+from hilcal.discovery.discovery import Discovery, alternatives, discovery_json
 from hilcal.discovery.structures import Structure, averaged, pareto, posterior
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.residual import residual

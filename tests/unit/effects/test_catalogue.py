@@ -9,7 +9,7 @@ import pytest
 import hilcal
 from hilcal.diagnosis.effect_ranking import candidates
 from hilcal.effects.catalogue import installed
-from hilcal.effects.failure import failure_of
+from hilcal.effects.from_file import failure_of
 from hilcal.effects.protocol import Columns, Effect, Parameter, Role
 from hilcal.effects.spec import effect
 from hilcal.errors import InputError

@@ -10,8 +10,8 @@ from hilcal.errors import InputError
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.fit import fit
 from hilcal.model.model import Model
-from hilcal.store.records import content_hash
 from hilcal.store.revision import from_text, to_text
+from hilcal.store.rows import content_hash
 from tests.support.campaigns import campaign
 from tests.support.effect_cases import (
     CELLS,

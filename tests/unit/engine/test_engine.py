@@ -80,7 +80,8 @@ def test_workers_of_this_machine_give_the_same_bits_and_can_be_reached_by_nobody
 def workers():
     """Every process below this one but that which Python keeps for its semaphores."""
     every = psutil.Process().children(recursive=True)
-    return [p for p in every if "resource_tracker" not in " ".join(p.cmdline())]
+    alive = [p for p in every if p.status() != psutil.STATUS_ZOMBIE]
+    return [p for p in alive if "resource_tracker" not in " ".join(p.cmdline())]
 
 
 def sockets():

@@ -13,7 +13,7 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.carried import carried_prior
 from hilcal.identification.fit import fit
 from hilcal.identification.posterior import Posterior
-from hilcal.present.charts.comparisons import arms_chart
+from hilcal.present.charts import arms_chart
 from hilcal.present.html.other_pages import fleet_page
 from hilcal.readings.readings import Readings
 from hilcal.robot.catalogue import configs_dir
@@ -23,14 +23,7 @@ from hilcal.transfer.members import Failure, Member, entries, member_of
 from hilcal.transfer.pooled import effects_seen, pooled
 from hilcal.types import Floats
 from tests.support.calibrate_process import CELL
-from tests.support.campaigns import (
-    cell_of,
-    configuration,
-    noiseless,
-    plan,
-    with_noise,
-    world_of,
-)
+from tests.support.campaigns import cell_of, configuration, noiseless, plan, with_noise, world_of
 from tests.support.cli_cases import Capsys, ok, refused
 
 SPREAD = 0.15
@@ -186,15 +179,19 @@ def test_a_calibration_takes_the_prior_of_a_fleet(
     assert revision["verdict"] == "adequate"
 
 
+def store(path: Path, *readings: Readings) -> None:
+    base = str(configs_dir() / "cells")
+    with CampaignFile.create(path, configuration().to_json(), base, "a test") as file:
+        for some in readings:
+            file.append_readings(some)
+
+
 def write(folder: Path, names: Sequence[str]) -> None:
     """Campaign files of arms, not fitted yet."""
     rng = np.random.default_rng(5)
     for k, name in enumerate(names):
-        path = folder / name
-        path.parent.mkdir(exist_ok=True)
-        content, base = configuration().to_json(), str(configs_dir() / "cells")
-        with CampaignFile.create(path, content, base, "a test") as file:
-            file.append_readings(readings_of(compliances(rng), k))
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        store(folder / name, readings_of(compliances(rng), k))
 
 
 @pytest.mark.slow
@@ -202,7 +199,6 @@ def test_a_directory_of_campaigns_gives_a_prior_that_identify_takes(
     capsys: Capsys, tmp_path: Path
 ) -> None:
     folder = tmp_path / "fleet"
-    folder.mkdir()
     write(folder, ("a/1.hilcal", "b/1.hilcal", "c/1.hilcal", "c/2.hilcal"))
     (folder / "broken.hilcal").write_bytes(b"no campaign")
     prior, shown = tmp_path / "prior.json", tmp_path / "fleet.html"
@@ -217,11 +213,8 @@ def test_a_directory_of_campaigns_gives_a_prior_that_identify_takes(
     assert {c["arm_known_by"] for c in told.document["campaigns"]} == {"folder"}
     assert [f["name"] for f in told.document["failed"]] == ["broken.hilcal"]
     assert "broken.hilcal: " in told.err
-    readings = readings_of(np.ones(6), 77, poses=4)
     new = tmp_path / "fresh.hilcal"
-    content, base = configuration().to_json(), str(configs_dir() / "cells")
-    with CampaignFile.create(new, content, base, "a test") as file:
-        file.append_readings(readings)
+    store(new, readings_of(np.ones(6), 77, poses=4))
     fitted = ok(capsys, "identify", new, "--prior", prior, "--json").document
     assert fitted["prior"]["source"]["campaign"].startswith("4 campaigns of 3 arms")
     assert ok(capsys, "refine", new, "--prior", prior, "--json").document["verdict"]
@@ -259,19 +252,17 @@ def test_campaigns_of_the_same_readings_are_refused(
 ) -> None:
     """They would make an arm look like several, and its spread like none."""
     folder, names = tmp_path / "fleet", ("a.hilcal", "b.hilcal", "c.hilcal")
-    folder.mkdir()
     write(folder, names)
     rng, other = np.random.default_rng(3), folder / "d.hilcal"
     with CampaignFile.open(folder / "b.hilcal", read_only=True) as file:
-        x, config = file.readings(), file.config_json
+        x = file.readings()
     again = replace(x, value=x.value + rng.normal(0, 1e-5, x.value.shape), cycle=x.cycle + 1)
 
-    def extended(path: Path, more: Readings) -> None:
-        with CampaignFile.create(path, config, "", "extended") as file:
-            file.append_readings(x)
-            for k in range(4):
-                moved = more.value + rng.normal(0, 1e-5, more.value.shape)
-                file.append_readings(replace(more, value=moved, cycle=more.cycle + k))
+    def extended(path: Path) -> None:
+        moved = (again.value + rng.normal(0, 1e-5, x.value.shape) for _ in range(4))
+        store(
+            path, x, *(replace(again, value=v, cycle=again.cycle + k) for k, v in enumerate(moved))
+        )
 
     if how == "a copy":
         other.write_bytes((folder / "b.hilcal").read_bytes())
@@ -280,14 +271,13 @@ def test_campaigns_of_the_same_readings_are_refused(
     elif how == "imported again":  # other names, another order, six decimals
         poses = tuple(f"P {k}" for k in range(len(x.pose_names)))
         renamed = replace(x, value=x.value.round(8), pose_names=poses)
-        with CampaignFile.create(other, config, "", "again") as file:
-            file.append_readings(renamed[np.random.default_rng(1).permutation(len(x))])
+        store(other, renamed[np.random.default_rng(1).permutation(len(x))])
     elif how == "extended":
-        extended(other, again)
+        extended(other)
     elif how == "two extensions":
         (folder / "b.hilcal").unlink()
-        extended(other, again)
-        extended(folder / "e.hilcal", again)
+        extended(other)
+        extended(folder / "e.hilcal")
     else:
         for k in range(25):
             (folder / f"d{k:02d}.hilcal").write_bytes((folder / "b.hilcal").read_bytes())

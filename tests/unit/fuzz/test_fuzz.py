@@ -11,7 +11,7 @@ from hilcal.calibration.urscript import program_points
 from hilcal.config import CellConfig
 from hilcal.errors import HilcalError, InputError
 from hilcal.identification import parameters_document, posterior_document
-from hilcal.identification.rigid_frames import inverse_roots
+from hilcal.identification.registration import inverse_roots
 from hilcal.readings.covariance import is_covariance
 from hilcal.store.plan import read_plan
 from hilcal.tables.mapping import Mapping, load_mapping

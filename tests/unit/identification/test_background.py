@@ -1,4 +1,4 @@
-"""Thirty poses of a real arm: a background predicts, and only what is proved is named."""
+"""All effects at once: a background of a real and of simulated arms, and the mixed model of it."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -7,23 +7,33 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from hilcal.calibration.scatter import budget
 from hilcal.campaign.revisions import restore, to_record
 from hilcal.cell import Cell
+from hilcal.config import load_config
 from hilcal.diagnosis.stepwise import add, remove
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.errors import InputError
-from hilcal.identification.background import background_of
+from hilcal.identification.background import background_of, with_pooled_lines
 from hilcal.identification.baseline import baseline
 from hilcal.identification.family_sizes import family_sizes
-from hilcal.identification.fit import Fit
+from hilcal.identification.fit import Fit, fit
+from hilcal.identification.mixed_fit import mixed_fit
 from hilcal.identification.predictive import predictive
 from hilcal.library import read_table
+from hilcal.mixed.evidence import evidence
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import whitening
 from hilcal.refinement import BACKGROUND, Refinement, refine
 from hilcal.robot.catalogue import configs_dir
-from hilcal.store.records import content_hash
 from hilcal.store.revision import from_text, to_text
+from hilcal.store.rows import content_hash
+from studies.diagnosis import Asked
+from studies.diagnosis_command import simulate
+from studies.random_campaigns import rehearsal_states
+from studies.study_cases import study_case, with_study_loads
+from tests.support.cli_cases import CELL
+from tests.support.fit_cases import based
 
 
 @pytest.fixture(scope="module")
@@ -145,3 +155,136 @@ def test_bands_do_not_depend_on_how_large_the_noise_is_stated(series: Readings) 
         assert 0.85 < inside.mean() <= 1.0
         sizes.append(np.sqrt(np.trace(total, axis1=1, axis2=2).mean()))
     assert sizes[1] == pytest.approx(sizes[0], rel=0.2)
+
+
+HIDDEN = (
+    "link_geometry", "transmission_error", "encoder_offset", "joint_tilt_compliance",
+    "joint_coupling", "hysteresis", "tool_compliance",
+)  # fmt: skip
+
+
+@pytest.mark.long
+def test_an_arm_that_errs_in_many_ways_is_predicted_from_few_poses() -> None:
+    config = load_config(CELL)
+    case = study_case(config, "ur10e", "absolute", HIDDEN, 20.0, 1, n_poses=25)
+    some = case.readings[case.readings.load == 0]
+    assert len(some) == 25
+    found = refine(baseline(case.cell, some, "absolute"), some, "absolute")
+    added = [step.added for step in found.steps]
+    alone = found.steps[added.index(BACKGROUND) - 1]
+    _, loads = with_study_loads(config, "ur10e")
+    fresh, *_ = rehearsal_states(case.cell, 20, loads, np.random.default_rng(2))
+    true = case.world.sight(fresh).position
+    error = np.linalg.norm(found.fit.predict(fresh).position - true, axis=1).mean()
+    before = np.linalg.norm(alone.fit.predict(fresh).position - true, axis=1).mean()
+    assert error < 0.6 * before
+    stated = budget(found.fit)  # fitted poses are far nearer than any other is
+    assert stated.combined >= found.fit.holdout.rms_m > 3 * found.fit.error.rms_m
+    unloaded = replace(fresh, wrench=np.zeros_like(fresh.wrench))  # as what was fitted
+    off = found.fit.predict(unloaded).position - case.world.sight(unloaded).position
+    assert np.mean(np.linalg.norm(off, axis=1) <= stated.expanded) >= 0.9
+    assert found.verdict in ("missing_effect", "ambiguous")
+    assert set(found.fit.model.named) - {"base_frame"} <= set(HIDDEN)
+
+
+@pytest.mark.long
+def test_effects_of_implausible_size_do_not_stand_in_for_an_unknown_law() -> None:
+    law = "compliance by another joint"  # link lengths of 14 mm would predict it
+    asked = Asked("outside", "ur3e", "deflection", (law,), 3.0, 0)
+    case = simulate(asked)
+    found = refine(baseline(case.cell, case.readings, asked.mode), case.readings, asked.mode)
+    assert found.verdict == "unknown_effect"
+    assert not found.fit.model.background
+
+
+@pytest.mark.long
+def test_noise_that_is_stated_too_small_is_no_background() -> None:
+    asked = Asked("noise", "ur3e", "absolute", (), 0.0, 0, 0.5, cycles=2)
+    case = simulate(asked)
+    found = refine(baseline(case.cell, case.readings, asked.mode), case.readings, asked.mode)
+    assert found.verdict == "noise_misjudged"
+    assert not found.fit.model.background
+
+
+def test_waves_of_gears_in_pools_predict_better_than_line_by_line() -> None:
+    config, ratios = load_config(CELL), []
+    for seed in (1, 2, 3):
+        case = study_case(
+            config, "ur10e", "absolute", ("transmission_error",), 3.0, seed, n_poses=30
+        )
+        some = case.readings
+        start = baseline(case.cell, some, "absolute")
+        found = refine(start, some, "absolute")
+        by_lines = replace(found.fit.model, random={})
+        lines = fit(by_lines, some, "absolute", start=found.fit.theta)
+        assert "transmission_error" in found.fit.model.random
+        assert not found.fit.model.background
+        fresh, *_ = rehearsal_states(case.cell, 40, [], np.random.default_rng(seed))
+        true = case.world.sight(fresh).position
+        errors = [
+            np.linalg.norm(x.predict(fresh).position - true, axis=1).mean()
+            for x in (found.fit, lines)
+        ]
+        ratios.append(errors[0] / errors[1])
+        assert found.verdict == "adequate"
+        # what a diagnosis of the stored revision would say
+        assert diagnose(found.fit, found.diagnosis.history).verdict == found.verdict
+    assert np.exp(np.mean(np.log(ratios))) < 0.9
+
+
+def test_without_shrunk_effects_there_are_no_lines() -> None:
+    case = study_case(load_config(CELL), "ur10e", "absolute", (), 0.0, 1, n_poses=12)
+    plain = based(case.cell, case.readings, "absolute")
+    assert with_pooled_lines(plain) is None
+
+
+CONFIG = load_config(CELL)
+TILT = "joint_tilt_compliance"
+
+
+def test_a_hidden_effect_is_predicted_at_fresh_poses_and_has_the_evidence() -> None:
+    case = study_case(CONFIG, "ur10e", "absolute", (TILT,), 3.0, 1, n_poses=10)
+    start = baseline(case.cell, case.readings, "absolute")
+    found = mixed_fit(start, case.readings, "absolute")
+    without = fit(start, case.readings, "absolute")
+    _, loads = with_study_loads(CONFIG, "ur10e")
+    fresh, *_ = rehearsal_states(case.cell, 20, loads, np.random.default_rng(2))
+    true = case.world.sight(fresh).position
+    position, spread = found.predict(fresh, 3)
+    error = np.linalg.norm(true - position, axis=1).mean()
+    assert error < 0.5 * np.linalg.norm(true - without.predict(fresh).position, axis=1).mean()
+    std = np.sqrt(np.diagonal(spread, axis1=1, axis2=2))
+    assert 0.85 < np.mean(np.abs(true - position) < 1.96 * std) <= 1.0
+    k = found.problem.families.names.index(TILT)
+    rng, log_std = np.random.default_rng(0), found.variances.log_std
+    assert evidence(found.problem, k, rng, log_std).p_value < 0.01
+
+
+def test_a_cell_says_how_large_an_effect_is_expected_to_be() -> None:
+    """It moves where a size begins, and what the readings do not tell stays there."""
+    sizes = {}
+    for factor in (1.0, 0.1):
+        config = CONFIG.model_copy(update={"ordinary": {"tracker_scale": factor}})
+        case = study_case(config, "ur10e", "absolute", (TILT,), 3.0, 1, n_poses=8)
+        cell = replace(case.cell, config=config)
+        found = mixed_fit(baseline(cell, case.readings, "absolute"), case.readings, "absolute")
+        (f,) = (f for f in found.problem.families.random if f.effect == "tracker_scale")
+        assert f.prior.mean == pytest.approx(np.log(0.5 * factor), abs=0.01)
+        sizes[factor] = found.std("tracker_scale")
+    assert sizes[0.1] < 0.3 * sizes[1.0]
+
+
+def test_a_hidden_effect_of_deflections_has_the_evidence() -> None:
+    case = study_case(CONFIG, "ur10e", "deflection", (TILT,), 3.0, 1, n_poses=10)
+    start = baseline(case.cell, case.readings, "deflection")
+    found = mixed_fit(start, case.readings, "deflection")
+    names, log_std = found.problem.families.names, found.variances.log_std
+    p = {
+        name: evidence(found.problem, k, np.random.default_rng(0), log_std).p_value
+        for k, name in enumerate(names)
+        if name in (TILT, "base_compliance", "link_compliance", "backlash", "creep")
+    }
+    assert p.pop(TILT) < 0.001
+    assert min(p.values()) > 0.01
+    # the registration is known by its prior, and nothing else is of its size
+    assert found.std("base_frame") == pytest.approx(1.0, abs=0.01)

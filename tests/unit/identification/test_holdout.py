@@ -7,23 +7,25 @@ import pytest
 
 from hilcal.config import load_config
 from hilcal.diagnosis.stepwise import add, predicts_better
-from hilcal.identification.baseline import baseline, with_effects
+from hilcal.identification.baseline import with_effects
 from hilcal.identification.fit import Fit, fit
-from hilcal.identification.folds import block_folds, distinct_poses, random_folds, region_folds
+from hilcal.identification.folds import (
+    block_folds,
+    changes,
+    distinct_poses,
+    leave_out,
+    ordinary,
+    random_folds,
+    region_folds,
+)
 from hilcal.identification.gauss_newton import solve
-from hilcal.identification.holdout import changes, leave_out, ordinary
 from hilcal.identification.residual import residual
 from hilcal.readings.readings import Readings
-from hilcal.readings.whitening import Mode, whitening
+from hilcal.readings.whitening import MODES, Mode, whitening
 from hilcal.robot.catalogue import configs_dir
 from studies.study_cases import study_case
 from tests.support.campaigns import campaign
-
-MODES = ("absolute", "deflection")
-
-
-FURTHER = (("absolute", 3), ("deflection", 6))
-"""Positions and poses of both modes; each is in a fast case."""
+from tests.support.fit_cases import based
 
 
 def fitted(mode: Mode, m: int = 3, effect: str = "none", **options) -> Fit:
@@ -37,37 +39,34 @@ def fitted(mode: Mode, m: int = 3, effect: str = "none", **options) -> Fit:
     [
         ("absolute", 6),
         ("deflection", 3),
-        *(pytest.param(*other, marks=pytest.mark.slow) for other in FURTHER),
+        pytest.param("absolute", 3, marks=pytest.mark.slow),
+        pytest.param("deflection", 6, marks=pytest.mark.slow),
     ],
 )
 def test_leaving_out_is_refitting_without(mode, m):
     found = fitted(mode, m)
-    readings, w = found.readings, found.whitening
+    readings, w, model = found.readings, found.whitening, found.model
     assert not found.outlier.any()
-    fold = random_folds(found.pose)
-    solution = solve(found.model, readings, w, found.theta)
-    left_out = leave_out(found.model, solution, fold, w)
-    changed = changes(found.model, solution, fold, w)
+    fold, of_reading = random_folds(found.pose), random_folds(distinct_poses(readings))
+    solution = solve(model, readings, w, found.theta)
+    left_out = leave_out(model, solution, fold, w)
     np.testing.assert_allclose(left_out, found.left_out, rtol=0, atol=1e-9)
-    noise = found.uncertainty.formal
-    of_reading = random_folds(distinct_poses(readings))
+    changed = changes(model, solution, fold, w)
     assert len(changed) == 10
-    known = ordinary(found.model, found.theta)
+    noise, sigma = found.uncertainty.formal, np.sqrt(np.einsum("dii->di", w.covariance))
+    known = ordinary(model, found.theta)
     prior = np.where(np.isinf(solution.prior), known, solution.prior)
     moved = []
-    for f in range(len(changed)):
+    for f, change in enumerate(changed):
         rest = readings[of_reading != f]
-        refit = fit(found.model, rest, mode, start=found.theta, prior=prior)
-        change = (refit.theta - found.theta) / noise
+        refit = fit(model, rest, mode, start=found.theta, prior=prior)
         # One linear step: right to a few per cent of a standard uncertainty, where leaving out
         # moves parameters by one.
-        np.testing.assert_allclose(changed[f] / noise, change, rtol=0, atol=0.06)
-        prediction = found.model.predict(readings.states, refit.theta)
-        off = residual(readings, prediction, w)
-        sigma = np.sqrt(np.einsum("dii->di", w.covariance))
-        mine = fold == f
-        np.testing.assert_allclose((left_out - off)[mine] / sigma[mine], 0, atol=0.02)
-        moved.append((found.raw - off)[mine] / sigma[mine])
+        np.testing.assert_allclose(change / noise, (refit.theta - found.theta) / noise, atol=0.06)
+        off = residual(readings, model.predict(readings.states, refit.theta), w)
+        out = fold == f
+        np.testing.assert_allclose((left_out - off)[out] / sigma[out], 0, atol=0.02)
+        moved.append((found.raw - off)[out] / sigma[out])
     assert np.abs(np.concatenate(moved)).max() > 0.3
 
 
@@ -91,16 +90,13 @@ def test_every_measurement_is_predicted_without_its_own_pose(mode):
 
 def test_the_error_on_poses_left_out_exceeds_that_of_the_fit_by_what_parameters_cost():
     """Expected squares: 1 − P/R fitted, about 1 + P/R left out."""
-    inside, outside, share = [], [], []
+    gain, share = [], []
     for seed in range(8):
         c = campaign(seed=seed, plan_seed=0, registration_known=True)
-        model = with_effects(c.cell, c.readings, "absolute", ("joint_compliance", "hysteresis"))
-        found = fit(model, c.readings, "absolute")
-        inside.append(found.error.rms_sigma**2)
-        outside.append(found.holdout.rms_sigma**2)
+        found = based(c.cell, c.readings, "absolute", ("joint_compliance", "hysteresis"))
+        gain.append(found.holdout.rms_sigma**2 - found.error.rms_sigma**2)
         share.append(12 / (3 * len(c.readings)))
-    gain = np.mean(outside) - np.mean(inside)
-    assert gain == pytest.approx(2 * np.mean(share), rel=0.6)
+    assert np.mean(gain) == pytest.approx(2 * np.mean(share), rel=0.6)
 
 
 # --- which readings belong together ---------------------------------------------------------
@@ -128,11 +124,7 @@ def test_repetitions_of_a_pose_stay_together_whatever_their_names():
     pose = distinct_poses(twice)
     np.testing.assert_array_equal(pose[:n], pose[n:])
     assert pose.max() + 1 == len(c.readings.pose_names)
-    for fold in (
-        random_folds(pose),
-        block_folds(pose),
-        region_folds(twice.states.q, pose),
-    ):
+    for fold in (random_folds(pose), block_folds(pose), region_folds(twice.states.q, pose)):
         np.testing.assert_array_equal(fold[:n], fold[n:])
 
 
@@ -153,15 +145,13 @@ def test_poses_are_numbered_by_first_appearance_and_order_does_not_matter():
 def test_folds_are_of_equal_size_and_whole_poses(poses):
     pose = np.repeat(np.arange(poses), 3)
     angle = np.random.default_rng(0).normal(size=(poses, 6))[pose]
-    for fold in (random_folds(pose), block_folds(pose), region_folds(angle, pose)):
-        members = [np.unique(pose[fold == f]) for f in range(fold.max() + 1)]
-        sizes = [len(m) for m in members]
-        assert sum(sizes) == poses
-        assert fold.max() + 1 == min(10, poses)
-        assert min(sizes) >= 1
-    for fold in (random_folds(pose), block_folds(pose)):
-        sizes = [len(np.unique(pose[fold == f])) for f in range(fold.max() + 1)]
-        assert max(sizes) - min(sizes) <= 1
+    folds = (random_folds(pose), block_folds(pose), region_folds(angle, pose))
+    sizes = [[len(np.unique(pose[fold == f])) for f in range(fold.max() + 1)] for fold in folds]
+    for each in sizes:
+        assert sum(each) == poses
+        assert len(each) == min(10, poses)
+        assert min(each) >= 1
+    assert all(max(each) - min(each) <= 1 for each in sizes[:2])
     np.testing.assert_array_equal(random_folds(pose), random_folds(pose))
     assert np.all(np.diff(block_folds(pose)) >= 0)
 
@@ -178,7 +168,7 @@ def test_what_one_pose_alone_shows_of_an_effect_does_not_spoil_the_others() -> N
     """Without pose 19 nothing tells a combination of the backlashes; flat, it erred by 42 σ."""
     config = load_config(configs_dir() / "cells" / "demo_ur10e.toml")
     c = study_case(config, "ur5e", "deflection", ("backlash",), 2.0, 901)
-    before = fit(baseline(c.cell, c.readings, "deflection"), c.readings, "deflection")
+    before = based(c.cell, c.readings, "deflection")
     found = add(before, "backlash")
     assert found.variance_factor == pytest.approx(1.0, abs=0.15)
     assert found.holdout.rms_sigma < 1.1 < 1.5 < before.holdout.rms_sigma

@@ -1,5 +1,6 @@
 """A noise that nobody states is estimated: it is no effect, and no effect is noise."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,9 +8,21 @@ import pytest
 
 import hilcal as hc
 from hilcal.cell import Cell
+from hilcal.cli.running import estimate_noise
+from hilcal.cli.terminal import terminal
+from hilcal.config import Tracker
+from hilcal.errors import DeviceError
+from hilcal.measuring.devices import TrackerSample
+from hilcal.measuring.measure import average
+from hilcal.readings.covariance import tracker_covariance, tracker_noise
 from hilcal.readings.readings import Readings
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.plan import Plan, Step
+from hilcal.store.run_log import create_run
+from hilcal.types import Floats
 from tests.support.cli_cases import ok
-from tests.unit.identification.test_other_arm import measured
+from tests.support.rows import first
+from tests.unit.identification.test_misdescription import measured
 
 OFF = 0.3
 """mm and mrad of each link: an ordinary arm."""
@@ -88,3 +101,104 @@ def test_import_and_info_say_it(tmp_path: Path, capsys: pytest.CaptureFixture[st
     for args in (["import", str(table), "--config", str(cell), "-o", run], ["info", run]):
         said = " ".join(ok(capsys, *args).out.split())
         assert "neither the table nor [tracker] states the noise; it was estimated" in said
+
+
+Capsys = pytest.CaptureFixture[str]
+SAMPLES = 5
+STATED = "range_std_m = 5e-6\ntransverse_std_m = 7.5e-6\n"
+
+
+def sampled(seed: int, sigma: float | None, between: float) -> Readings:
+    """Readings of an ordinary arm, each the mean of samples with the default's covariance.
+
+    Args:
+        seed: of arm, poses and noise.
+        sigma: of a sample, each axis; the default's noise where None.
+        between: of what the instrument errs by from pose to pose.
+    """
+    r, rng = measured("ur5", seed, OFF, 60, 1e-9), np.random.default_rng(seed)
+    means = []
+    for x, v in zip(r.value, tracker_covariance(r.value, tracker_noise(Tracker())), strict=True):
+        root = np.linalg.cholesky(v) if sigma is None else sigma * np.eye(3)
+        means.append(of_samples(x + between * rng.standard_normal(3), v, root, rng))
+    value, covariance = (np.array(part) for part in zip(*means, strict=True))
+    return replace(r, value=value, covariance=covariance)
+
+
+def of_samples(
+    x: Floats, v: Floats, root: Floats, rng: np.random.Generator
+) -> tuple[Floats, Floats]:
+    """The mean of samples and its covariance; samples that scatter too much are taken again."""
+    while True:
+        drawn = x + rng.standard_normal((SAMPLES, 3)) @ root.T
+        try:
+            mean = average([TrackerSample(k, value, v) for k, value in enumerate(drawn)])
+        except DeviceError:
+            continue
+        return mean.value, mean.covariance
+
+
+def run_of(readings: Readings, path: Path, tracker: str = "", arm: str = "") -> Path:
+    """A campaign as `run` leaves it."""
+    text = f'[robot]\nmodel = "ur5"\n[tracker]\n{tracker}{arm}'
+    (path / "CELL.toml").write_text(text)
+    config = hc.Cell.load(path / "CELL.toml").configured()
+    names = readings.pose_names
+    plan = Plan(names, readings.states.q, tuple(Step(name, "none") for name in names))
+    with create_run(path / "r.hilcal", config, path, plan) as file:
+        file.append_readings(readings)
+        estimate_noise(terminal(False), config, hc.Cell.load(path / "CELL.toml"), file)
+    return path / "r.hilcal"
+
+
+@pytest.mark.parametrize(
+    ("sigma", "between", "arm"),
+    first(
+        2,
+        [
+            (2e-5, 0.0, ""),
+            (5e-6, 1e-4, ""),
+            (2e-4, 0.0, ""),
+            (5e-6, 2e-5, ""),
+            (5e-6, 1e-4, "[repeatability]\njoint_std_rad = 1e-7\n"),
+        ],
+    ),
+)
+def test_another_instrument_is_noise(
+    tmp_path: Path, capsys: Capsys, sigma: float, between: float, arm: str
+) -> None:
+    readings = sampled(3, sigma, between)
+    path = run_of(readings, tmp_path, arm=arm)
+    assert "[tracker] does not state the noise" in " ".join(capsys.readouterr().err.split())
+    with hc.Campaign.open(path) as run:
+        assert not run.readings.noise_stated
+        truth = np.sqrt(sigma**2 / SAMPLES + between**2)
+        assert size(run.readings) == pytest.approx(truth, rel=0.3)
+        assert judged(run.cell, run.readings).verdict == "adequate"
+    assert "[tracker] does not state the noise" in " ".join(ok(capsys, "info", path).out.split())
+
+
+@pytest.mark.parametrize("tracker", ["", STATED])
+def test_what_the_samples_show_or_the_cell_states_stays(tmp_path: Path, tracker: str) -> None:
+    """The default's own noise; or a stated one that the readings contradict."""
+    readings = sampled(3, 5e-6, 2e-5) if tracker else sampled(3, None, 0.0)
+    with hc.Campaign.open(run_of(readings, tmp_path, tracker)) as run:
+        assert run.readings.noise_stated
+        np.testing.assert_array_equal(run.readings.covariance, readings.covariance)
+        if not tracker:
+            assert judged(run.cell, run.readings).verdict == "adequate"
+
+
+def test_an_estimate_does_not_outlive_the_readings_that_it_is_of(
+    tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = run_of(sampled(3, 5e-6, 1e-4), tmp_path)
+    cell = hc.Cell.load(tmp_path / "CELL.toml")
+    monkeypatch.setattr("hilcal.cli.running.measured_noise", lambda *_: None)
+    with CampaignFile.open(path) as file:
+        estimate_noise(terminal(False), cell.configured(), cell, file)
+        stored = file.readings()
+    with hc.Campaign.open(path) as run:
+        assert run.readings.noise_stated
+        np.testing.assert_array_equal(run.readings.covariance, stored.covariance)
+    assert "does not state the noise" not in ok(capsys, "info", path).out

@@ -14,8 +14,7 @@ from hilcal.config.sections import Gauge, Point
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.catalogue import installed
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.baseline import baseline
-from hilcal.identification.fit import Fit, fit
+from hilcal.identification.fit import Fit
 from hilcal.identification.full_covariance import with_joint_scatter
 from hilcal.identification.registration import register
 from hilcal.identification.validation import validate
@@ -25,12 +24,12 @@ from hilcal.readings.readings import ObserverName, Readings
 from hilcal.readings.whitening import Mode
 from hilcal.robot import se3
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.records import content_hash
+from hilcal.store.rows import content_hash
 from hilcal.tables.table import read_table, write_table
 from tests.support.campaigns import campaign, cell_of, configuration, true_parameters
 from tests.support.cli_cases import CELL, Capsys, ok
 from tests.support.effect_cases import numeric_slopes, random_theta, some_states
-from tests.support.fit_cases import named
+from tests.support.fit_cases import based, named
 from tests.support.observer_cases import NORMAL, POINTS, Observed, base_cell, observed, stated
 from tests.support.rows import first
 
@@ -48,7 +47,7 @@ CASES: dict[str, Case] = {
 def fitted(c: Observed, mode: Mode = "absolute") -> Fit:
     joint_std = configuration().repeatability.per_joint(6)
     readings = with_joint_scatter(c.cell, c.readings, joint_std)
-    return fit(baseline(c.cell, readings, mode), readings, mode)
+    return based(c.cell, readings, mode)
 
 
 def apart(c: Observed, found: Fit) -> np.ndarray:
@@ -259,7 +258,7 @@ Q = "p1,none,0,-1,0,0,0,0"
     ("more", "cells", "message"),
     [
         ("distance_m,from", "1.0,A", r"row 2: nothing states the noise of point A; .*'cov_d_d'"),
-        ("distance_m,cov_d_d", "1.0,1e-10", r"column 'from' is missing; it names what"),
+        ("distance_m,cov_d_d", "1.0,1e-10", r"without column 'from'; give both"),
         ("distance_m,from,cov_d_d", "1.0,,1e-10", r"row 2, column 'from': the cell is empty"),
         ("distance_m,from,cov_d_d", "-1.0,A,1e-10", r"'distance_m': -1 m cannot be right"),
         ("distance_m,from,cov_d_d", "1.0,A,0", r"'cov_d_d': a variance of 0 m² cannot be right"),
@@ -306,7 +305,7 @@ def test_stations_of_poses() -> None:
     cov = 0.5 * (cov + np.swapaxes(cov, 1, 2))
     readings = replace(whole, states=states, value=value, covariance=cov, observers=names)
     cell = cell_of(target_known=False)
-    found, one = (fit(baseline(cell, r, "absolute"), r, "absolute") for r in (readings, whole))
+    found, one = (based(cell, r, "absolute") for r in (readings, whole))
     assert found.dof == one.dof - 6
     assert abs(one.variance_factor - 1.0) < 0.3
     assert abs(found.variance_factor - 1.0) < 0.3

@@ -1,4 +1,4 @@
-"""What is stated of poses left out is the mean square of their errors."""
+"""What a fit states of readings that it has not seen, and which of them lie outside."""
 
 from dataclasses import replace
 
@@ -7,18 +7,25 @@ import pytest
 
 from hilcal.effects.catalogue import installed
 from hilcal.identification.baseline import with_effects
-from hilcal.identification.excess import Excess
-from hilcal.identification.fit import fit
+from hilcal.identification.fit import Fit, fit
 from hilcal.identification.predictive import (
+    Excess,
     Predictive,
     _left_out,
+    excess,
     parameter_factor,
     position_factor,
     predictive,
 )
+from hilcal.identification.robot_frames import whole_turns
+from hilcal.identification.validation import Extrapolation, Validation, extrapolation, validate
+from hilcal.readings.readings import Readings, States
+from hilcal.readings.whitening import whitening
+from hilcal.types import Floats
 from tests.support.campaigns import campaign
+from tests.support.fit_cases import based
 
-NOISE, FOLDS, EACH = 1.7, 10, 12
+NOISE_FACTOR, FOLDS, EACH = 1.7, 10, 12
 
 
 @pytest.mark.parametrize("size", [60, 300])
@@ -32,12 +39,12 @@ def test_left_out_folds_are_as_far_off_as_dense_algebra_has_it(size: int) -> Non
     rows = other_rows = 0.0
     for f in range(FOLDS):
         rest = a[fold != f]
-        c = np.linalg.inv(np.eye(size) + rest.T @ rest / NOISE)
+        c = np.linalg.inv(np.eye(size) + rest.T @ rest / NOISE_FACTOR)
         rows += np.trace(a[fold == f] @ c @ a[fold == f].T)
         other_rows += np.trace(other[points == f] @ c @ other[points == f].T)
     values, vectors = np.linalg.eigh(a.T @ a)
-    root = vectors * np.sqrt(NOISE / (np.maximum(values, 0.0) + NOISE))
-    found = _left_out(a, fold, ((a, fold), (other, points)), root, NOISE)
+    root = vectors * np.sqrt(NOISE_FACTOR / (np.maximum(values, 0.0) + NOISE_FACTOR))
+    found = _left_out(a, fold, ((a, fold), (other, points)), root, NOISE_FACTOR)
     assert found == pytest.approx([rows / count, other_rows / len(other)], rel=1e-3)
 
 
@@ -82,3 +89,156 @@ def test_scatter_beyond_the_stated_noise_is_told_from_what_many_parameters_take(
     assert p.excess.attitude == 1.0
     assert scatter / 2 < np.sqrt(p.excess.position) < scatter * 2
     assert p.noise < 1.2
+
+
+COUNT, M = 400, 6
+NOISE = np.array([5e-6, 20e-6, 20e-6, 9e-5, 9e-5, 9e-5])
+
+
+def readings(rng: np.random.Generator) -> Readings:
+    axes = np.linalg.qr(rng.normal(size=(COUNT, 3, 3)))[0]
+    turn = np.zeros((COUNT, M, M))
+    turn[:, :3, :3], turn[:, 3:, 3:] = axes, np.eye(3)
+    covariance = turn * NOISE**2 @ np.swapaxes(turn, 1, 2)
+    each = np.arange(COUNT)
+    return Readings(
+        states=States(q=rng.normal(size=(COUNT, 6)), wrench=np.zeros((COUNT, 6))),
+        pose=each,
+        load=np.zeros(COUNT, dtype=int),
+        cycle=np.zeros(COUNT, dtype=int),
+        value=np.zeros((COUNT, M)),
+        covariance=covariance,
+        load_names=("none",),
+        pose_names=tuple(f"p{k}" for k in each),
+    )
+
+
+def drawn(extra_m: float, factor: float, parameters: int = 0) -> tuple[Excess, Readings]:
+    """Draw residuals, with some directions fitted away, and return what is found of them."""
+    rng = np.random.default_rng(3)
+    r = readings(rng)
+    w = whitening(r, "absolute", "gc")
+    true = Excess(extra_m**2, factor)
+    raw = np.einsum(
+        "dij,dj->di", np.linalg.cholesky(true.widened(r.covariance)), rng.normal(size=(COUNT, M))
+    )
+    wide = whitening(true.of_readings(r, "absolute"), "absolute", "gc")
+    jacobian = rng.normal(size=(COUNT, M, parameters)) * NOISE[:, None]
+    rows = wide.whiten(jacobian) if parameters else np.zeros((COUNT * M, 1))
+    root: Floats = np.zeros((1, 1))
+    if parameters:
+        root = np.linalg.cholesky(np.linalg.inv(rows.T @ rows))
+        step = np.linalg.lstsq(rows, wide.whiten(raw).reshape(-1), rcond=None)[0]
+        raw = raw - jacobian @ step
+    return excess(raw, w, wide, rows, root), r
+
+
+def test_stated_noise_has_no_excess() -> None:
+    assert drawn(0.0, 1.0)[0].none
+
+
+@pytest.mark.parametrize("parameters", [0, 300])
+def test_both_are_found_in_their_size_beside_fitted_parameters(parameters: int) -> None:
+    found, _ = drawn(30e-6, 2.0, parameters)
+    # 1200 elements: good to 1/sqrt(600).
+    assert np.sqrt(found.position) == pytest.approx(30e-6, rel=0.08)
+    assert found.attitude == pytest.approx(2.0, rel=0.15)
+
+
+def test_one_does_not_make_the_other() -> None:
+    found, _ = drawn(30e-6, 1.0)
+    assert found.position > 0
+    assert found.attitude == 1.0
+    found, _ = drawn(0.0, 3.0)
+    assert found.position == 0.0
+    assert found.attitude > 2.5
+
+
+def test_a_deflection_has_it_once() -> None:
+    _, r = drawn(0.0, 1.0)
+    more = Excess(1e-10, 4.0)
+    wide = more.of_readings(r, "deflection")
+    np.testing.assert_allclose(
+        np.trace(wide.covariance[:, :3, :3] - r.covariance[:, :3, :3], axis1=1, axis2=2), 1.5e-10
+    )
+    np.testing.assert_allclose(wide.covariance[:, 3:, 3:], 4 * r.covariance[:, 3:, 3:])
+    assert replace(more, position=1.01e-10).near(more)
+    assert not Excess().near(more)
+
+
+def split(seed: int, joint: int | None) -> tuple[Fit, Validation, Extrapolation]:
+    """A fit to half of the unloaded readings, by joint angle or at random, and the other half."""
+    c = campaign(
+        "transmission_error", "absolute", seed, plan_seed=5, poses=100, harmonics=8, strength=3.0
+    )
+    r = c.readings[c.readings.load == 0]
+    first = np.random.default_rng(seed).permutation(len(r)) < len(r) // 2
+    if joint is not None:
+        first = r.states.q[:, joint] < np.median(r.states.q[:, joint])
+    names = ("joint_compliance", "transmission_error")
+    model = with_effects(c.cell, r[first], "absolute", names, {}, installed())
+    found = fit(model, r[first], "absolute")
+    other = validate(model, found.theta, found.readings, r[~first], "absolute")
+    used = found.readings[~found.outlier]
+    p = predictive(
+        model, found.theta, found.solution.prior, used, "absolute", found.holdout.rms_sigma
+    )
+    return found, other, extrapolation(p, found.readings, other)
+
+
+def rms(z: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(z**2)))
+
+
+@pytest.mark.parametrize("joint", [0, 1])
+def test_half_against_half_of_a_joint_is_outside_and_its_error_is_stated(joint: int) -> None:
+    z = []
+    for seed in range(2):
+        found, other, x = split(seed, joint)
+        assert x.outside.mean() > 0.9
+        lead = x.variables[0]
+        assert (lead.variable, lead.unit) == (f"joint {joint + 1} angle", "rad")
+        q = other.readings.states.q[:, joint]
+        either_way = np.minimum(q - lead.high, lead.low + 2 * np.pi - q)  # whole turns are the same
+        assert lead.most == pytest.approx(either_way.max())
+        assert x.outside_error is not None
+        assert rms(x.stated_m[x.outside]) > 1.2 * found.holdout.rms_m
+        z.append(rms(x.z))
+    assert 0.5 < rms(np.array(z)) < 1.15
+
+
+def test_of_two_random_halves_few_are_outside() -> None:
+    z = []
+    for seed in range(2):
+        found, other, x = split(seed, None)
+        assert x.outside.mean() < 0.1
+        assert x.inside_error is not None
+        assert x.inside_error.rms_m == pytest.approx(other.error.rms_m, rel=0.1)
+        assert other.error.rms_sigma < 1.2 * found.holdout.rms_sigma
+        z.append(rms(x.z))
+    assert 0.6 < rms(np.array(z)) < 1.1
+
+
+@pytest.mark.parametrize(
+    ("effect", "same"), [("transmission_error", True), ("joint_coupling", False)]
+)
+def test_waves_of_whole_turns_are_the_same_and_couplings_are_not(effect: str, same: bool) -> None:
+    c = campaign()
+    model = with_effects(c.cell, c.readings, "absolute", ["joint_compliance", effect])
+    theta = 1e-4 * np.ones(model.size)
+    assert bool(whole_turns(model, theta)[1]) is same
+
+
+def test_a_joint_that_turned_on_is_validated_as_inside() -> None:
+    c = campaign(poses=16)
+    found = based(c.cell, c.readings, "absolute")
+    q = c.readings.states.q.copy()
+    q[:, 5] += 2 * np.pi
+    on = replace(c.readings, states=replace(c.readings.states, q=q))
+    p = predictive(
+        found.model, found.theta, found.solution.prior, c.readings, "absolute",
+        found.holdout.rms_sigma,
+    )  # fmt: skip
+    seen = validate(found.model, found.theta, c.readings, on, "absolute")
+    told = extrapolation(p, c.readings, seen)
+    assert [v.variable for v in told.variables if "angle" in v.variable] == []

@@ -1,7 +1,4 @@
-"""Where the tracker stands and where its target sits; what the poses cannot tell of them.
-
-That stays near the start, is listed, and costs nothing.
-"""
+"""Where the tracker stands and where targets sit; what the poses cannot tell, and costs nothing."""
 
 from dataclasses import replace
 
@@ -12,14 +9,21 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from hilcal.cell import Cell
+from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.fit import fit
+from hilcal.identification.full_prediction import gross_errors
+from hilcal.identification.linearisation import linearise
 from hilcal.identification.registration import register
 from hilcal.present.registration import registration_lines
 from hilcal.readings.readings import Readings, States
+from hilcal.readings.whitening import MODES, Mode
+from hilcal.robot.se3 import rotation_vector
 from tests.support.arm_cases import slots_of
 from tests.support.campaigns import cell_of, plan
+from tests.support.fit_cases import based
+from tests.support.reflector_cases import OFFSETS, reflectors
 from tests.support.rows import first
 
 CELL = replace(cell_of(), target_known=False)
@@ -259,7 +263,7 @@ def test_an_undetermined_target_costs_no_accuracy(m):
     first, second = readings[:40], readings[40:]
     error = []
     for cell in (known, unknown):
-        found = fit(with_effects(cell, first, "absolute", []), first, "absolute")
+        found = based(cell, first, "absolute", [])
         off = found.predict(second.states).position - second.value[:, :3]
         error.append(np.sqrt(np.mean(np.sum(off**2, axis=1))))
     assert error[1] < 1.15 * error[0]
@@ -273,3 +277,89 @@ def test_a_known_frame_is_left_alone():
     assert not found.estimated
     moved = register(replace(cell, registration=np.eye(4)), readings)
     assert moved.rms > 1.0
+
+
+OF_THREE = [(True, True, True), (False, True, False), (False, False, False)]
+
+
+@pytest.mark.parametrize("m", [3, 6])
+@pytest.mark.parametrize("known", OF_THREE)
+def test_base_and_targets_are_registered_together(known: tuple[bool, ...], m: int) -> None:
+    c = reflectors(known=known, joint_std=0.0, m=m)
+    cell = register(c.cell, c.readings).cell
+    assert c.world.offsets is not None
+    true = OFFSETS + c.world.offsets
+    off = cell.all_targets[:, :3, 3] - true
+    # The nominal arm is rigid: its loads move the targets by up to 1 mm.
+    assert np.abs(off).max() < 5e-4
+    assert np.all(off[list(known)] == 0.0)
+    turn = cell.registration[:3, :3] @ c.world.registration[:3, :3].T
+    assert np.linalg.norm(rotation_vector(turn)) < 1e-3
+
+
+@pytest.mark.parametrize("m", [3, 6])
+def test_derivatives_agree_with_differences(m: int) -> None:
+    c = reflectors(known=(False, True, False), m=m, poses=4)
+    names = ("joint_compliance", "encoder_offset")
+    model = with_effects(c.cell, c.readings, "absolute", names)
+    assert [p.name for p in model.effects[1].parameters][::m] == ["R1.x", "R3.x"]
+    rng = np.random.default_rng(1)
+    scale = np.array([p.scale for e in model.effects for p in e.parameters])
+    theta = 0.3 * scale * rng.standard_normal(model.size)
+    states = c.readings.states
+    exact = model.jacobian(model.predict(states, theta), theta, 3)
+    for k in range(model.size):
+        step = np.zeros(model.size)
+        step[k] = 1e-2 * scale[k]
+        ahead, back = (model.predict(states, theta + s).observation for s in (step, -step))
+        quotient = (ahead.position - back.position) / (2 * step[k])
+        np.testing.assert_allclose(exact[:, :, k], quotient, atol=2e-6 * np.abs(quotient).max())
+
+
+def test_one_offset_moves_one_target() -> None:
+    c = reflectors(known=(False, True, False), poses=4)
+    model = with_effects(c.cell, c.readings, "absolute", ())
+    theta = np.zeros(model.size)
+    before = model.predict(c.readings.states, theta).observation.position
+    theta[-3:] = 1e-3  # target_offset.R3
+    moved = model.predict(c.readings.states, theta).observation.position - before
+    distance = np.linalg.norm(moved, axis=1)
+    np.testing.assert_allclose(distance, np.where(c.readings.target == 2, np.sqrt(3) * 1e-3, 0.0))
+
+
+@pytest.mark.parametrize(("mode", "known"), [(MODES[0], OF_THREE[0]), (MODES[1], OF_THREE[-1])])
+def test_swapped_names_and_a_displaced_reading_are_named(
+    mode: Mode, known: tuple[bool, ...]
+) -> None:
+    c = reflectors("base_compliance", known=known, seed=1, joint_std=1e-5, poses=14, strength=4.0)
+    r = c.readings
+    first, second, third = np.flatnonzero((r.pose == 4) & (r.load == 2))
+    lone = np.flatnonzero((r.pose == 7) & (r.load == 1))[2]
+    number, value = r.target.copy(), r.value.copy()
+    number[[first, second]] = number[[second, first]]
+    value[lone] += [1e-3, 0.0, 0.0]
+    wrong = replace(r, states=replace(r.states, target=number), value=value)
+    named = {g.row: g.reason for g in gross_errors(based(c.cell, wrong, mode))}
+    assert set(named) == {first, second, lone}
+    assert named[first] == "target R2: lies where R1 is: were they swapped?"
+    assert named[second] == "target R1: lies where R2 is: were they swapped?"
+    assert named[lone].startswith("target R3: ")
+    assert third not in named
+
+
+def test_the_misfit_of_a_displaced_reflector_follows_the_target() -> None:
+    c = reflectors(seed=2, joint_std=1e-5)
+    moved = c.cell.all_targets.copy()
+    moved[1, :3, 3] += [2e-4, -1e-4, 1e-4]
+    cell = c.cell.with_targets(moved)
+    found = based(cell, c.readings, "absolute")
+    shares = misfit_breakdown(linearise(found))
+    assert shares[0].variable == "target"
+    assert shares[0].share > 0.9
+    model = with_effects(cell, c.readings, "absolute", ["joint_compliance", "target_offset"])
+    offset = model.slices()[model.names.index("target_offset")]
+    theta = fit(model, c.readings, "absolute").theta[offset].reshape(3, 3)
+    # A common displacement of all targets is hardly told from one of the base; a single one is.
+    np.testing.assert_allclose(
+        theta[1] - theta[[0, 2]].mean(axis=0), [-2e-4, 1e-4, -1e-4], atol=1.5e-5
+    )

@@ -11,16 +11,15 @@ import pytest
 from hilcal.config import load_config
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
-from hilcal.identification.fit import fit
 from hilcal.identification.torques import check_torques
 from hilcal.readings.covariance import WHOLE
 from hilcal.readings.readings import Readings
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.records import content_hash
+from hilcal.store.rows import content_hash
 from hilcal.tables.table import read_table, write_table
 from tests.support.campaigns import cell_of, measured, plan, true_parameters, world_of
 from tests.support.cli_cases import CELL, Capsys, ok
-from tests.support.fit_cases import compliances
+from tests.support.fit_cases import based, compliances
 
 SEEDS = range(4)
 
@@ -73,7 +72,7 @@ def test_compliances_by_measured_torques_do_not_need_the_loads() -> None:
     truth = true_parameters(world_of(cell_of(), np.random.default_rng(3)), "joint_compliance")
     found = {}
     for name, cell in (("modelled", by_model), ("measured", by_torque)):
-        fitted = fit(baseline(cell, told, "deflection"), told, "deflection")
+        fitted = based(cell, told, "deflection")
         found[name] = compliances(fitted)[:3] / truth[:3]
         if name == "measured":
             off = (compliances(fitted) - truth) / fitted.uncertainty.std[-6:]

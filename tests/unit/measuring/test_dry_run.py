@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 
 from hilcal.config import CellLoad, ForceSensor, Limits, Motion, Tool
 from hilcal.measuring.clearance import clearance_of
-from hilcal.measuring.dry_run import dry_run
 from hilcal.measuring.feasibility import BETWEEN_M
-from hilcal.measuring.route import APPROACH_RAD, duration, home, route
+from hilcal.measuring.route import APPROACH_RAD, dry_run, duration, home, route
 from hilcal.robot.catalogue import load_arm
 from hilcal.store.plan import Plan, Step
 from tests.support.fake_bench import POSES, Bench, plan_of, usual_plan

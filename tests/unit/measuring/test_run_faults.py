@@ -1,23 +1,28 @@
-"""A campaign under a fault at any call of any device: each reading exactly once, arm stopped."""
+"""What goes wrong in a campaign: the arm stops first, and what is stored stays."""
 
+import json
 from collections import Counter
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
 
 from hilcal.cell import Cell
-from hilcal.config import Limits
+from hilcal.config import Acquire, CellLoad, ForceSensor, Limits
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.arrival import RoughRegistration
+from hilcal.measuring.progress import ReadingStored
 from hilcal.measuring.run import HOW_ON, run
 from hilcal.robot import chain as chains
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.plan import Plan, Step
-from tests.support.fake_bench import Bench, plan_of
+from tests.support.fake_bench import POSES, Bench, plan_of, usual_plan
+from tests.support.fake_devices import STD, FakeClock
 from tests.support.fake_world import Killed
 from tests.support.rows import first
+from tests.support.run_cases import measure
 
 FAULTS = (
     DeviceError("arm: the line is dead"),
@@ -42,7 +47,7 @@ def bench() -> Bench:
     return Bench(limits=Limits())
 
 
-def measure(b: Bench, plan: Plan) -> None:
+def run_once(b: Bench, plan: Plan) -> None:
     run(b.rig, b.cell, b.config, plan, b.store, b.clock, b.notes)
 
 
@@ -53,7 +58,7 @@ def each_once(b: Bench, plan: Plan) -> bool:
 @cache
 def calls_of_a_whole_run() -> int:
     b = bench()
-    measure(b, small_plan())
+    run_once(b, small_plan())
     assert each_once(b, small_plan())
     return len(b.world.calls)
 
@@ -85,7 +90,7 @@ def check_fault(fault: BaseException, k: int) -> None:
         b.world.fail[k] = fault
     expected = DeviceError if isinstance(fault, OSError) else type(fault)
     with pytest.raises(expected) as raised:
-        measure(b, plan)
+        run_once(b, plan)
     if isinstance(raised.value, DeviceError):
         said = str(raised.value)
         assert said.endswith(HOW_ON), (k, said)
@@ -93,7 +98,7 @@ def check_fault(fault: BaseException, k: int) -> None:
     check_stopped(b, k)
     before = [step for step, _, _ in b.store.rows]
     b.world.again()
-    measure(b, plan)
+    run_once(b, plan)
     assert [step for step, _, _ in b.store.rows][: len(before)] == before
     assert each_once(b, plan), k
     readings = b.store.readings()
@@ -119,12 +124,12 @@ def test_disk_full_stops_the_arm_and_says_what_to_do() -> None:
     b, plan = bench(), small_plan()
     b.store.full_at = 2
     with pytest.raises(DeviceError, match=r"disk is full.*--resume$"):
-        measure(b, plan)
+        run_once(b, plan)
     assert b.world.calls[-2:] == ["arm.stop", "store.event"]
     assert len(b.store.rows) == 2
     b.store.full_at = None
     b.world.again()
-    measure(b, plan)
+    run_once(b, plan)
     assert each_once(b, plan)
 
 
@@ -137,7 +142,7 @@ def test_a_refused_row_keeps_its_kind_of_error(monkeypatch: pytest.MonkeyPatch) 
 
     monkeypatch.setattr(b.store, "record", refuse)
     with pytest.raises(InputError, match=r"differ from those before\. .*--resume$"):
-        measure(b, small_plan())
+        run_once(b, small_plan())
     assert b.world.calls[-2] == "arm.stop"
 
 
@@ -150,7 +155,7 @@ def test_an_arm_that_does_not_stop_is_told_loudly(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(b.rig.arm, "stop", stop)
     b.world.fail[120] = KeyboardInterrupt()
     with pytest.raises(DeviceError, match=r"THE ARM MAY STILL MOVE.*no answer.*emergency stop"):
-        measure(b, small_plan())
+        run_once(b, small_plan())
     assert b.store.last("interrupted")["arm_not_stopped"] == "arm: no answer to stop"
 
 
@@ -165,7 +170,7 @@ def test_an_error_that_asks_for_the_emergency_stop_asks_once(
     monkeypatch.setattr(b.rig.arm, "stop", stop)
     b.world.fail[120] = DeviceError("arm: its link broke; press the emergency stop. Unplugged?")
     with pytest.raises(DeviceError) as raised:
-        measure(b, small_plan())
+        run_once(b, small_plan())
     said = str(raised.value)
     assert said.count("emergency stop") == 1
     assert said.endswith(f"Unplugged? {HOW_ON}")
@@ -186,7 +191,7 @@ def test_impatience_does_not_keep_the_arm_from_stopping(monkeypatch: pytest.Monk
     monkeypatch.setattr(b.rig.arm, "stop", stop)
     b.world.fail[120] = DeviceError("tracker: silent")
     with pytest.raises(DeviceError, match=r"tracker: silent.*--resume$"):
-        measure(b, small_plan())
+        run_once(b, small_plan())
     assert len(stops) == 2
     assert not b.world.is_moving
 
@@ -195,7 +200,7 @@ def test_unexpected_errors_are_one_line_and_their_trace_is_stored() -> None:
     b = bench()
     b.world.fail[150] = ZeroDivisionError("of a driver of somebody else's")
     with pytest.raises(DeviceError, match=r"unexpected ZeroDivisionError: of a driver.*--resume"):
-        measure(b, small_plan())
+        run_once(b, small_plan())
     assert "Traceback" in b.store.last("failed")["trace"]
 
 
@@ -204,7 +209,7 @@ def test_nothing_is_stopped_before_the_arm_is_ours() -> None:
     b = bench()
     b.world.fail[2] = DeviceError("force sensor: silent")
     with pytest.raises(DeviceError, match="silent"):
-        measure(b, small_plan())
+        run_once(b, small_plan())
     assert "arm.take_control" not in b.world.calls
     assert "arm.stop" not in b.world.calls
 
@@ -272,3 +277,287 @@ def test_a_target_that_is_not_where_it_is_said_refuses_no_reading(
         rough.add(q, x, step=Step(f"p{k}", "none"))
         assert rough.late_doubts() == []
     assert rough.pose() is not None
+
+
+LIMIT = ForceSensor(driver="fake", port="nowhere", max_force_N=120.0)
+
+
+# order and safety
+
+
+def test_order_of_the_start() -> None:
+    """The hook is cleared before anything moves, the tare comes before the first reading."""
+    b = Bench()
+    measure(b)
+    first = {name: b.world.calls.index(name) for name in set(b.world.calls)}
+    assert first["operator.hang"] < first["arm.take_control"] < first["arm.start_move"]
+    tare = b.world.calls.index("force.average", first["arm.start_move"])
+    assert first["force.average"] < first["arm.take_control"]  # does something still hang?
+    assert tare < first["store.record"]
+    assert b.operator.asked[0] == ("none", "")
+    assert b.store.kinds()[:2] == ["start", "tare"]
+
+
+def test_payload_is_set_before_a_weight_is_hung_and_after_it_is_off() -> None:
+    b = Bench()
+    told: list[tuple[str, float, str]] = []
+
+    def payload(mass: float, com: Any) -> None:
+        told.append((b.world.load, mass, str(np.round(com, 6).tolist())))
+
+    b.rig.arm.set_payload = payload  # type: ignore[method-assign]
+    plan = plan_of(
+        ("p1", "none", 0), ("p1", "3kg", 0), ("p1", "6kg", 0), ("p1", "3kg", 1), ("p1", "pull", 0)
+    )
+    measure(b, plan)
+    com = {m: np.round((0.8 * b.cell.tool_com + (m - 0.8) * b.cell.load_point) / m, 6).tolist()
+           for m in (3.8, 6.8)}  # fmt: skip
+    assert told == [
+        ("none", 3.8, str(com[3.8])),
+        ("3kg", 6.8, str(com[6.8])),
+        ("3kg", 3.8, str(com[3.8])),  # the 6 kg are off
+        ("pull", 0.8, str(np.round(b.cell.tool_com, 6).tolist())),
+    ]
+
+
+def test_loads_change_only_at_the_reference_and_motions_carry_them() -> None:
+    b = Bench()
+    where: list[tuple[str, Any]] = []
+    hang = b.operator.hang
+
+    def noted(load: CellLoad | None, why: str) -> None:
+        where.append(("none" if load is None else load.name, b.world.q.copy()))
+        hang(load, why)
+
+    b.operator.hang = noted  # type: ignore[method-assign]
+    measure(b)
+    assert [name for name, _ in where] == ["none", "3kg", "none", "pull", "none"]
+    for _, q in where[1:]:
+        assert np.allclose(q, POSES["reference"])
+    assert {load for _, load in b.world.at_start} == {"none", "3kg", "pull"}
+
+
+def test_an_unsafe_plan_is_refused_before_any_device_is_asked() -> None:
+    b = Bench(limits=Limits(workspace_min_m=(-3, -3, 0.9)))
+    plan = plan_of(("p1", "none", 0), ("p1", "brick", 0))
+    with pytest.raises(InputError, match="not safe") as raised:
+        measure(b, plan)
+    words = str(raised.value)
+    assert "\n" not in words  # one line says the first problem, and how to see the others
+    assert "brick" in words
+    assert "more: hilcal check --plan" in words
+    assert b.world.calls == []
+    assert b.store.events == []
+
+
+def test_an_arm_that_stands_outside_its_workspace_is_not_moved() -> None:
+    b = Bench(limits=Limits(workspace_min_m=(-1.2, -0.5, 0.05), workspace_max_m=(1.2, 1.2, 1.5)))
+    b.world.q = np.array([1.5, -1.3, 1.6, -1.4, -1.4, 0.1])  # beyond y = -0.5
+    plan = plan_of(("reference", "none", 0), poses={"reference": POSES["reference"]})
+    with pytest.raises(DeviceError, match=r"outside the workspace.*drive it by hand"):
+        measure(b, plan)
+    assert "arm.start_move" not in b.world.calls
+    assert "arm.take_control" not in b.world.calls
+
+
+@pytest.mark.parametrize(
+    ("what", "change", "said"),
+    [
+        ("force", {"extra": np.array([130.0, 0, 0, 0, 0, 0])}, "max_force_N is 120"),
+        ("speed", {"extra_speed": 2.5}, "joint_speed_rad_s is 2"),
+        ("safety", {"safety": "protective stop"}, "protective stop"),
+    ],
+)
+def test_limits_are_enforced_in_motion(what: str, change: dict[str, Any], said: str) -> None:
+    """The limit is exceeded in the middle of the fourth motion: the arm stops within a look."""
+    b = Bench(force_sensor=LIMIT)
+    moving = b.rig.arm.moving
+    seen: list[float] = []
+
+    def noted() -> bool:
+        still = moving()
+        if b.world.calls.count("arm.start_move") == 4 and still:
+            for name, value in change.items():
+                setattr(b.world, name, value)
+            seen.append(b.world.time)
+        return still
+
+    b.rig.arm.moving = noted  # type: ignore[method-assign]
+    with pytest.raises(DeviceError, match=said):
+        measure(b)
+    assert b.world.calls[-2:] == ["arm.stop", "store.event"]
+    assert not b.world.is_moving
+    assert b.world.time - seen[0] <= 0.05
+    assert said in b.store.last("failed")["reason"]
+
+
+def test_limits_are_enforced_at_rest() -> None:
+    b = Bench(force_sensor=LIMIT)
+    take = b.rig.tracker.measure
+
+    def noted() -> Any:
+        if len(b.store.rows) == 2:
+            b.world.extra = np.array([0, 130.0, 0, 0, 0, 0])
+        return take()
+
+    b.rig.tracker.measure = noted  # type: ignore[method-assign]
+    with pytest.raises(DeviceError, match="max_force_N"):
+        measure(b)
+    assert len(b.store.rows) == 2
+    assert b.world.calls[-2] == "arm.stop"
+
+
+def test_an_arm_that_does_not_arrive() -> None:
+    b = Bench()
+    real = b.rig.arm.start_move
+
+    def short(q: Any, speed: float, acceleration: float) -> None:
+        real(q - 0.002, speed, acceleration)
+
+    b.rig.arm.start_move = short  # type: ignore[method-assign]
+    with pytest.raises(DeviceError, match=r"stands 0\.002 rad off"):
+        measure(b)
+
+
+@pytest.mark.long
+def test_a_motion_that_never_ends_is_given_up() -> None:
+    b = Bench()
+    b.rig.arm.moving = lambda: True  # type: ignore[method-assign]
+    with pytest.raises(DeviceError, match="not finished after"):
+        measure(b)
+    assert b.world.calls[-2] == "arm.stop"
+
+
+# the target
+
+
+def test_a_lost_target_is_found_again() -> None:
+    b = Bench()
+    b.world.lost = 3  # at both stops of the approach, where nothing is read, and at the reading
+    readings = measure(b)
+    assert len(readings) == len(usual_plan().steps)
+    assert b.world.calls.count("tracker.find_target") == 1
+    assert any("found again" in x for x in json.loads(b.store.rows[0][2])["remarks"])
+
+
+@pytest.mark.parametrize("lost", [5, 1000])
+def test_a_target_that_stays_lost_ends_the_run(lost: int) -> None:
+    b = Bench()
+    b.world.lost, b.world.not_found = lost, 0 if lost == 5 else 1000
+    with pytest.raises(DeviceError, match=r"line of sight.*--resume$"):
+        measure(b)
+    assert b.store.rows == []
+    assert b.world.calls.count("tracker.find_target") == 2
+    assert b.world.calls[-2] == "arm.stop"
+
+
+def test_another_reflector_is_not_believed() -> None:
+    b = Bench()
+
+    def other() -> None:
+        if len(b.store.rows) == 5:
+            b.world.shift = np.array([0.0, 0.3, 0.0])
+
+    before = b.store.event
+    b.store.event = lambda kind, content: (other(), before(kind, content))[1]  # type: ignore
+    with pytest.raises(DeviceError, match="another reflector"):
+        measure(b)
+    assert len(b.store.rows) == 5
+
+
+# settling
+
+
+def test_readings_that_drift_are_waited_for_and_given_up() -> None:
+    b = Bench(acquire=Acquire(samples=3, settle_s=0.2, settle_timeout_s=20.0))
+    b.world.creep = 1e-3
+    begun = b.world.time
+    with pytest.raises(DeviceError, match="not settled within 20 s: the readings drift"):
+        measure(b)
+    assert b.store.rows == []
+    assert b.world.time - begun < 120.0
+
+
+@pytest.mark.long
+def test_drift_that_ends_is_waited_for() -> None:
+    b, few = Bench(), plan_of(("p1", "none", 0), ("p2", "none", 0), ("p2", "3kg", 0))
+    real = b.world.position
+    arrived: dict[tuple[float, ...], float] = {}
+
+    def position() -> Any:
+        """The target comes to rest with a time constant of 0.5 s after each arrival."""
+        since = arrived.setdefault((*b.world.joints(), len(b.world.at_start)), b.world.time)
+        return real() + 1e-3 * np.exp(-(b.world.time - since) / 0.5)
+
+    b.world.position = position  # type: ignore[method-assign]
+    measure(b, few)
+    taken = b.notes.of(ReadingStored)
+    assert min(t.settling for t in taken) > 1.0
+    quiet = Bench()
+    measure(quiet, few)
+    assert max(t.settling for t in quiet.notes.of(ReadingStored)) < 1.0
+    away = b.store.readings().value - quiet.store.readings().value  # type: ignore[union-attr]
+    assert np.abs(away).max() < 6 * STD
+
+
+def test_an_arm_that_trembles_is_measured_again_and_given_up() -> None:
+    b = Bench()
+    b.world.jitter = 1e-4
+    with pytest.raises(DeviceError, match=r"measured 3 times in vain: arm: it moved by"):
+        measure(b)
+    assert b.store.rows == []
+
+
+@pytest.mark.long
+def test_somebody_who_jogs_the_arm_meanwhile_spoils_the_reading() -> None:
+    b = Bench()
+    real = b.rig.force
+    assert real is not None
+    average = real.average
+    jogged: list[int] = []
+
+    def jog(seconds: float) -> Any:
+        if len(b.world.at_start) == 3 and not jogged:
+            jogged.append(1)
+            b.world.q = b.world.q + 3e-4
+        return average(seconds)
+
+    real.average = jog  # type: ignore[method-assign]
+    measure(b)
+    assert "measured again: arm: it moved by 0.0003" in b.store.rows[1][2]
+    assert len(b.store.rows) == len(usual_plan().steps)
+
+
+def test_at_least_twenty_frames_whatever_the_clock() -> None:
+    """The window of a fast clock is too short for a real line of 100 Hz."""
+    b = Bench(acquire=Acquire(samples=3, settle_s=0.2, force_window_s=0.05))
+    measure(b, plan_of(("p1", "none", 0), ("p2", "none", 0)))
+    assert all(json.loads(text)["force"]["frames"] >= 20 for _, _, text in b.store.rows)
+    assert b.world.calls.count("force.average") == 2 + 4  # the first one was too short
+
+
+@pytest.mark.parametrize("scale", [1.0, 20.0])
+def test_everything_is_looked_at_twenty_times_a_second_in_motion(scale: float) -> None:
+    """Real seconds: a fast world's motions are short, and looked at as often as others."""
+    b = Bench()
+    b.world.hurry = 1.0
+    b.clock = FakeClock(scale=scale, world=b.world)
+    call, gaps = b.world.call, {"arm.moving": 0.0, "arm.sample": 0.0, "force.latest": 0.0}
+    last: dict[str, float] = {}
+    looks = 0
+
+    def noted(name: str) -> None:
+        nonlocal looks
+        if name in gaps and b.world.is_moving:
+            looks += 1
+            since = last.get(name, b.world.begun)
+            gaps[name] = max(gaps[name], (b.world.time - since) / scale)
+            last[name] = b.world.time
+        elif name == "arm.start_move":
+            last.clear()
+        call(name)
+
+    b.world.call = noted  # type: ignore[method-assign]
+    measure(b, plan_of(("p1", "none", 0), ("p1", "3kg", 0)))
+    assert looks > 30
+    assert max(gaps.values()) <= 0.05, gaps

@@ -8,11 +8,9 @@ import pytest
 
 from hilcal.config import Limits, Obstacle
 from hilcal.errors import DeviceError
-from hilcal.measuring.dry_run import route_problems
 from hilcal.measuring.progress import GoalMet, GoalStatus, ReadingStored, Remark
-from hilcal.measuring.route import Stop
-from hilcal.measuring.stopping_rule import way_home
-from hilcal.present.running import met_words
+from hilcal.measuring.route import Stop, route_problems, way_home
+from hilcal.present.progress import met_words
 from hilcal.readings.readings import Readings
 from hilcal.robot.chain import evaluate
 from hilcal.store.plan import Plan, Step

@@ -12,27 +12,28 @@ from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification.baseline import baseline
 from hilcal.identification.family_sizes import FamilySize
 from hilcal.identification.fit import Fit, fit
-from hilcal.present.charts import style
-from hilcal.present.charts.comparisons import MOST, error_per_revision, made_of
-from hilcal.present.charts.evidence import (
+from hilcal.present import chart_style as style
+from hilcal.present.charts import (
+    LONGEST,
+    MOST_FAMILIES,
     added_variable,
     correlations,
     curve_chart,
+    drawn,
+    error_per_revision,
+    made_of,
+    magnification,
+    measured_predicted,
     misfit_shares,
     noise_check,
     parameter_correlations,
-)
-from hilcal.present.charts.readings import (
-    LONGEST,
-    drawn,
-    magnification,
-    measured_predicted,
     residual_by_joint,
     residual_by_load,
     residual_by_pose,
     residual_by_time,
     workspace,
 )
+from hilcal.present.document import says
 from hilcal.present.story import LEVEL_NAMES, Chapter, build_story, of_left_out, regressor
 from tests.support.campaigns import campaign
 from tests.support.viewer_story import ANGLE, LOAD, story
@@ -62,7 +63,7 @@ def test_each_revision_has_a_bar_for_both_errors_and_the_noise_is_shown():
         assert list(trace.text) == [numbers.digits(v) for v in rms]
     (floor,) = figure.layout.shapes
     assert floor.x0 == pytest.approx(1e6 * told.noise_floor_m)
-    assert style.says(figure).startswith("The rms error fell from")
+    assert says(figure).startswith("The rms error fell from")
 
 
 @pytest.mark.parametrize("mode", ["deflection", "absolute"])
@@ -88,7 +89,7 @@ def test_residuals_are_mahalanobis_distances_with_their_names():
         residual_by_time(replace(told, time_s=60.0 * np.arange(len(told))), r),
     ):
         np.testing.assert_allclose(np.sort(points(figure, "y")), sigma, rtol=1e-6)
-        assert style.says(figure)
+        assert says(figure)
     by_joint = residual_by_joint(told, r, 1)
     np.testing.assert_allclose(
         np.sort(points(by_joint, "x")), np.sort(np.degrees(told.q[:, 1])), rtol=1e-6
@@ -105,7 +106,7 @@ def test_residuals_are_mahalanobis_distances_with_their_names():
 def test_levels_have_a_colour_and_a_mark():
     told = story()
     figure = residual_by_pose(told, told.revisions[0])
-    limits = (0.0, *style.sigma_limits(), np.inf)
+    limits = (0.0, *style.SIGMA_LIMITS, np.inf)
     for trace in figure.data:
         k = LEVEL_NAMES.index(trace.name)
         assert (trace.marker.color, trace.marker.symbol) == (style.LEVELS[k], style.SYMBOLS[k])
@@ -167,7 +168,7 @@ def test_an_added_variable_plot_shows_its_slope():
     figure = added_variable(found, "joint_tilt_compliance")
     slope = float(np.polyfit(found.x, found.y, 1)[0])
     assert slope == pytest.approx(1.0, abs=0.2)
-    assert f"slope {float(found.x @ found.y / (found.x @ found.x)):.2f}" in style.says(figure)
+    assert f"slope {float(found.x @ found.y / (found.x @ found.x)):.2f}" in says(figure)
     np.testing.assert_allclose(np.asarray(figure.data[0].y, float), found.y, atol=1e-3)
 
 
@@ -214,7 +215,7 @@ def test_the_noise_check_counts_every_element():
     assert int(np.sum(bar.y)) == len(f.white)
     step, width = float(normal.x[1] - normal.x[0]), float(bar.x[1] - bar.x[0])
     assert np.sum(normal.y) * step == pytest.approx(width * len(f.white), rel=1e-3)
-    assert "larger than the stated noise" in style.says(noise_check(f))
+    assert "larger than the stated noise" in says(noise_check(f))
 
 
 def luminance(color: str) -> float:
@@ -236,22 +237,22 @@ def test_a_scheme_changes_the_look_and_nothing_else():
     dark = style.in_scheme(figure, dark=True)
     assert dark.layout.template.layout.font.color != figure.layout.template.layout.font.color
     assert dark.data == figure.data
-    assert style.says(dark) == style.says(figure)
+    assert says(dark) == says(figure)
 
 
 def test_the_sizes_of_families_are_drawn_by_those_of_an_ordinary_arm_with_their_intervals():
     sizes = [
         FamilySize(f"f{k}", f"f{k}", k == 0, 2.0, 1.0, 6.0, 4.0, "rad", 1e-3 / (k + 1))
-        for k in range(MOST + 3)
+        for k in range(MOST_FAMILIES + 3)
     ]
     figure = made_of(sizes)
     named, other = figure.data
     assert list(named.y) == ["f0"]
-    assert list(other.y) == [s.name for s in sizes[1:MOST]]
+    assert list(other.y) == [s.name for s in sizes[1:MOST_FAMILIES]]
     for trace in figure.data:
         np.testing.assert_allclose(trace.x, 0.5)
         np.testing.assert_allclose(trace.x + trace.error_x.array, 1.5)
         np.testing.assert_allclose(trace.x - trace.error_x.arrayminus, 0.25)
     assert figure.layout.yaxis.categoryarray[-1] == "f0"  # on top
-    assert "f0 moves the target most, by 1.00 mm rms" in style.says(figure)
-    assert f"The {MOST} of {MOST + 3} families" in style.says(figure)
+    assert "f0 moves the target most, by 1.00 mm rms" in says(figure)
+    assert f"The {MOST_FAMILIES} of {MOST_FAMILIES + 3} families" in says(figure)

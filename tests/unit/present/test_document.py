@@ -1,16 +1,24 @@
-"""Blocks of a document: how rich prints them, and what a page makes of them."""
+"""Blocks of a document: how rich prints them, at any width, and what a page makes of them."""
 
-import io
+from hypothesis import given
+from hypothesis import strategies as st
 
-from rich.console import Console
+from hilcal.present.document import (
+    Block,
+    Table,
+    Words,
+    captioned,
+    heading,
+    note,
+    pairs,
+    shared,
+    table,
+)
 
-from hilcal.present.document import Block, Table, Words, captioned, heading, note, pairs, table
-
-
-def printed(block: Block, *, color: bool = False) -> str:
-    stream = io.StringIO()
-    Console(file=stream, width=60, force_terminal=color).print(block, markup=False)
-    return stream.getvalue()
+WORD = st.text("abcdefghij_", min_size=1, max_size=26)
+WORDS = st.lists(WORD, min_size=1, max_size=6).map(" ".join)
+NUMBER = st.floats(-1e4, 1e4).map(lambda x: f"{x:.3g} µm")
+ROW = st.tuples(WORD, WORDS, NUMBER, NUMBER, WORDS)
 
 
 def captions(*blocks: Block, caption: str = "") -> list[str]:
@@ -30,22 +38,59 @@ def test_a_page_has_a_paragraph_for_each_line() -> None:
     assert found == (Words("first"), Words("second"), Words("small", "note"))
 
 
-def test_the_stressed_part_of_words_has_their_tone() -> None:
+def test_the_stressed_part_of_words_has_their_tone(printed) -> None:
     shown = printed(Words("Verdict: adequate.\nNoise.", "good", "adequate"), color=True)
     assert shown.startswith("Verdict: \x1b[1;32madequate\x1b[0m.")
     assert printed(Words("told", indent=4)).startswith("    told")
 
 
-def test_pairs_stand_in_two_columns_without_heads() -> None:
-    assert printed(pairs([("poses", "8"), ("", "and the reference")])).split("\n")[:2] == [
-        "  poses  8                ".rstrip().ljust(len("         and the reference")),
-        "         and the reference",
-    ]
-
-
-def test_a_rule_parts_groups_of_rows() -> None:
+def test_pairs_stand_in_two_columns_and_a_rule_parts_groups_of_rows(printed) -> None:
+    of = printed(pairs([("poses", "8"), ("", "and the reference")]), width=60)
+    lines = [line.rstrip() for line in of.split("\n")]
+    assert lines[:2] == ["  poses  8", "         and the reference"]
     made = table("a", "b", rows=[("row 0", "0")])
     made.rule()
     made.add("row 1", "1")
     lines = [line.strip() for line in printed(made).split("\n")]
     assert lines[lines.index("row 0   0") + 1 :][:2] == ["", "row 1   1"]
+
+
+@given(rows=st.lists(ROW, min_size=1, max_size=4), width=st.integers(30, 120))
+def test_no_word_is_broken_and_no_line_is_too_long(printed, rows, width: int) -> None:
+    heads = ("effect", "what it is", "poses\nfitted", "σ", "verdict")
+    lines = printed(table(*heads, rows=rows, left=(0, 1, 4)), width=width).splitlines()
+    assert max(map(len, lines)) <= width
+    cells = {word for row in rows for cell in row for word in cell.split()}
+    rule = {word for line in lines for word in line.split() if set(word) == {"─"}}
+    shown = {word.rstrip(":") for line in lines for word in line.split()}
+    assert cells <= shown
+    assert shown - rule <= cells | {word for head in heads for word in head.split()}
+    if rule:  # a table: a number and its unit stand on one line
+        assert all(any(row[2] in line for line in lines) for row in rows)
+
+
+def test_a_table_that_has_room_is_as_it_was_and_a_narrow_terminal_gets_lists(printed) -> None:
+    wide = printed(table("effect", "share", rows=[("creep", "10 %")]), width=40).splitlines()
+    assert wide == ["effect   share", "──────────────", "creep     10 %"]
+    rows = [("1", "16.7 µm", "missing effect"), ("", "18.9 µm", "")]
+    made = table("rev.", "poses\nfitted", "verdict", rows=rows, left=(0, 2))
+    assert [line.rstrip() for line in printed(made, width=18).splitlines()] == [
+        "rev. 1",
+        "  poses fitted:",
+        "  16.7 µm",
+        "  verdict: missing",
+        "  effect",
+        "poses fitted 18.9",
+        "µm",
+    ]
+
+
+@given(
+    st.lists(st.tuples(st.integers(1, 20), st.integers(0, 20)), min_size=1, max_size=6),
+    st.integers(0, 40),
+)
+def test_widths_share_the_room(columns: list[tuple[int, int]], more: int) -> None:
+    least, wanted = [a for a, _ in columns], [a + b for a, b in columns]
+    widths = shared(least, wanted, sum(least) + more)
+    assert sum(widths) == min(sum(least) + more, sum(wanted))
+    assert all(a <= w <= b for a, w, b in zip(least, widths, wanted, strict=True))

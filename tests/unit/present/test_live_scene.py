@@ -1,7 +1,6 @@
 """What a live viewer draws of a campaign while it is measured, and of revisions as they come."""
 
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -9,43 +8,43 @@ import pytest
 import rerun as rr
 
 from hilcal.measuring.progress import ArmAt, LiveResidual, ReadingStored, Remark
-from hilcal.present.live_viewer import Measuring, Revised
-from hilcal.present.viewer import live, live_scene, style
-from hilcal.present.viewer.live_scene import (
-    BALL,
-    FLUENT,
-    GROUPS,
-    LIMIT,
-    MANY,
-    LiveScene,
-    LiveTally,
-    judged,
-)
+from hilcal.present.live_viewer import Revised
+from hilcal.present.viewer import live, style
+from hilcal.present.viewer.live import BALL, FLUENT, GROUPS, LIMIT, MANY, LiveTally, judged
 from tests.support.live_story import BLIND, events, measuring, plan, residual
 from tests.support.picture import Shot, pictures, vulkan_available
 from tests.support.recordings import chunks, values
 from tests.support.viewer_story import story
 
+pytestmark = pytest.mark.usefixtures("strict")
+
 
 def recorded(path: Path, told, end: bool = True) -> Path:
     """Draw what is told into a file."""
-    rr.set_strict_mode(True)
     rec = rr.RecordingStream("hilcal", recording_id="test", send_properties=False)
     rec.set_sinks(rr.FileSink(str(path)))
-    scene = LiveScene(rec, batches=True)
+    scene = live.LiveScene(rec, batches=True)
     for wall, what in told:
         scene.tell(wall, what)
     if end:
         scene.end(to_open=True)
     rec.disconnect()
-    rr.set_strict_mode(False)
     return path
 
 
-def revisions(begun: float = 0.0):
+def revisions():
     told = story()
     for k, r in enumerate(told.revisions):
-        yield begun + k, Revised(replace(told, revisions=(r,)))
+        yield float(k), Revised(replace(told, revisions=(r,)))
+
+
+def stored(told, wrong: float = 6.0) -> list[ReadingStored]:
+    return [e for _, e in events(told, wrong) if isinstance(e, ReadingStored)]
+
+
+def of_levels(path: Path) -> list[np.ndarray]:
+    """The residuals in time, σ, of each level."""
+    return [np.ravel(values(path, f"/live/1/{n}", "Scalars:scalars")) for n in style.LEVEL_NAMES]
 
 
 @pytest.fixture(scope="module")
@@ -59,49 +58,42 @@ def refined(tmp_path_factory) -> Path:
 
 
 def test_each_reading_has_its_arrow_and_leaves_its_ball_where_the_model_is_wrong(measured):
-    stored = [e for _, e in events(measuring()) if isinstance(e, ReadingStored)]
-    found = [judged(e.step, e.live) for e in stored[BLIND:]]
+    read = stored(measuring())
+    found = [judged(e.step, e.live) for e in read[BLIND:]]
+    levels = np.array([j.level for j in found])
     arrows = np.array(values(measured, "/world/live/1/arrows", "Arrows3D:vectors"))[:, 0]
-    assert len(arrows) == len(found) == len(stored) - BLIND
     assert len(values(measured, "/world/live/1/dots", "Points3D:positions")) == BLIND
     outside = np.linalg.norm(arrows, axis=1) > BALL
-    assert outside.tolist() == [j.level > 0 for j in found]
+    assert outside.tolist() == (levels > 0).tolist()
     assert 5 < outside.sum() < len(found) / 2
     red = (style.LEVEL_COLORS[2].astype(int) * [1 << 24, 1 << 16, 1 << 8]).sum() + 255
     colors = np.array(values(measured, "/world/live/1/arrows", "Arrows3D:colors"))[:, 0]
-    assert ((colors == red) == [j.level == 2 for j in found]).all()
-    sigma = values(measured, "/live/1/outside", "Scalars:scalars")
-    assert len(sigma) == sum(j.level == 2 for j in found)
-    assert np.ravel(sigma) == pytest.approx([j.sigma for j in found if j.level == 2])
+    assert ((colors == red) == (levels == 2)).all()
+    assert of_levels(measured)[2] == pytest.approx([j.sigma for j in found if j.level == 2])
 
 
 def test_of_many_readings_only_those_outside_are_drawn_in_space(tmp_path):
     told = measuring(plan(200))
     path = recorded(tmp_path / "many.rrd", events(told))
-    stored = [e for _, e in events(told) if isinstance(e, ReadingStored)][BLIND:]
-    outside = [judged(e.step, e.live).level > 0 for e in stored]
+    outside = [judged(e.step, e.live).level > 0 for e in stored(told)[BLIND:]]
     arrows = values(path, "/world/live/1/arrows", "Arrows3D:vectors")
-    assert len(arrows) == MANY + sum(outside[MANY:]) < len(stored)
-    shown = [values(path, f"/live/1/{name}", "Scalars:scalars") for name in style.LEVEL_NAMES]
-    assert sum(map(len, shown)) == len(stored)
+    assert len(arrows) == MANY + sum(outside[MANY:]) < len(outside)
+    assert sum(map(len, of_levels(path))) == len(outside)
 
 
 @pytest.mark.long
 def test_of_a_thousand_readings_and_more_the_worst_of_each_group_stay(tmp_path):
     told = measuring(plan(FLUENT // 2 + 100))
     path = recorded(tmp_path / "thousands.rrd", events(told, wrong=2.0))
-    stored = [e for _, e in events(told, wrong=2.0) if isinstance(e, ReadingStored)][BLIND:]
-    sigma = np.array([judged(e.step, e.live).sigma for e in stored])
+    sigma = np.array([judged(e.step, e.live).sigma for e in stored(told, 2.0)[BLIND:]])
     group = -(-len(told.plan.steps) // GROUPS)
-    shown = np.sort(np.concatenate(
-        [np.ravel(values(path, f"/live/1/{n}", "Scalars:scalars")) for n in style.LEVEL_NAMES]
-    ))  # fmt: skip
+    shown = np.sort(np.concatenate(of_levels(path)))
     assert LiveTally.of(told).group == group == 8
     assert len(shown) < 0.45 * len(sigma)
     worst = [sigma[k : k + group].max() for k in range(0, len(sigma), group)]
     assert all(np.abs(shown - w).min() < 1e-9 for w in worst)
     last = values(path, "/world/live/1/now/arrow", "Arrows3D:vectors")
-    assert len(last) == len(stored)  # each reading is drawn while it is the last
+    assert len(last) == len(sigma)  # each reading is drawn while it is the last
     kept = values(path, "/world/live/1/arrows", "Arrows3D:vectors")
     assert len(kept) <= len(shown)
     outside = [w for w in worst if w > LIMIT]
@@ -112,72 +104,64 @@ def test_every_target_of_an_arrival_is_drawn_where_it_is(tmp_path):
     one = measuring()
     targets = np.vstack([one.targets, [[-0.1, 0.05, 0.02]]])
     told = replace(one, targets=targets, names=("left", "right"))
-    shown, rng = [], np.random.default_rng(2)
+    shown, rng, d = [], np.random.default_rng(2), LiveTally.of(told)
     for wall, e in events(told, wrong=0.0):
         if isinstance(e, ReadingStored):
             right = residual(rng, 9.0) if e.done > BLIND else LiveResidual()
             e = replace(e, others=((1, right),))
+            d.add(e)
         shown.append((wall, e))
     path = recorded(tmp_path / "two.rrd", shown)
     starts = values(path, "/world/live/1/arrows", "Arrows3D:origins")
-    last = [e for _, e in shown if isinstance(e, ReadingStored)][-1]
-    d = LiveTally.of(told)
-    assert np.allclose(starts[-1], [d.place(last.step, 0), d.place(last.step, 1)], atol=1e-6)
-    assert np.linalg.norm(d.place(last.step, 1) - d.place(last.step, 0)) == pytest.approx(
-        float(np.linalg.norm(targets[1] - targets[0]))
-    )
-    label = values(path, "/world/live/1/last", "Points3D:labels")[-1][0]
-    assert "right" in label
-    for _, e in shown:
-        if isinstance(e, ReadingStored):
-            d.add(e)
+    both = [d.place(d.last.step, k) for k in (0, 1)]
+    assert np.allclose(starts[-1], both, atol=1e-6)
+    apart = np.linalg.norm(targets[1] - targets[0])
+    assert np.linalg.norm(both[1] - both[0]) == pytest.approx(apart)
+    assert "right" in values(path, "/world/live/1/last", "Points3D:labels")[-1][0]
     assert d.judged == 2 * (len(told.plan.steps) - BLIND)
     assert {j.target for j in d.worst} == {"right"}
-    assert " right |" in live_scene.status(d)
+    assert " right |" in style.markdown(d.words())
 
 
 def test_a_long_campaign_is_a_small_file(tmp_path):
     path = tmp_path / "long.rrd"
-    outlet = live._Outlet("long", print, "file", lambda: rr.FileSink(str(path)), path)
-    told = measuring(plan(250))
-    for wall, what in events(told):
-        tell = partial(LiveScene.tell, wall=wall, what=what)
-        outlet.tell(tell, not isinstance(what, ArmAt), now=isinstance(what, Measuring))
+    outlet = live._Outlet("long", print, "file", file=path)
+    for wall, what in events(measuring(plan(250))):
+        outlet.tell(wall, what)
     outlet.end()
     assert path.stat().st_size < 2.5e6  # 5.5 MB, when each reading was handed on by itself
-    levels = [values(path, f"/live/1/{name}", "Scalars:scalars") for name in style.LEVEL_NAMES]
-    assert sum(map(len, levels)) == 500 - BLIND
+    assert sum(map(len, of_levels(path))) == 500 - BLIND
 
 
 def test_the_arm_moves_through_every_place_that_is_told(measured):
-    told = [e for _, e in events(measuring()) if type(e).__name__ == "ArmAt"]
+    told = [e for _, e in events(measuring()) if isinstance(e, ArmAt)]
     places = np.array(values(measured, "/world/live/1/arm", "Capsules3D:translations"))
     assert len(places) == len(told) + 1  # and where it begins
-    assert np.abs(np.diff(places, axis=0)).max(axis=(1, 2)).max() > 0.05
+    assert np.abs(np.diff(places, axis=0)).max() > 0.05
 
 
 def test_words_say_whether_the_model_fails_and_under_which_load():
     def status(wrong: float) -> str:
         d = LiveTally.of(measuring())
+        assert "no judgement yet" in style.markdown(d.words())
         for _, e in events(measuring(), wrong):
             if isinstance(e, ReadingStored):
                 d.add(e)
             elif isinstance(e, Remark):
                 d.remarks.append(e.text)
-        return live_scene.status(d)
+        return style.markdown(d.words())
 
     bad, good = status(6.0), status(0.0)
-    assert "✗ The simple model fails" in bad
-    assert "12 of 40 (30 %)" in bad
-    assert "| none | 16 | 0 |" in bad
-    assert "| 10kg | 24 | 12 |" in bad
-    assert "note: the reference pose has drifted" in bad
+    for words in (
+        "✗ The simple model fails",
+        "12 of 40 (30 %)",
+        "| none | 16 | 0 |",
+        "| 10kg | 24 | 12 |",
+        "note: the reference pose has drifted",
+    ):
+        assert words in bad
     assert "✓ So far noise explains the readings" in good
     assert style.safe(bad) == bad
-
-
-def test_without_a_model_there_is_no_judgement():
-    assert "no judgement yet" in live_scene.status(LiveTally.of(measuring()))
 
 
 def test_what_earlier_sessions_stored_is_there_at_its_own_time(tmp_path):
@@ -197,10 +181,8 @@ def test_the_errors_of_revisions_grow_one_by_one_and_end_as_the_whole_story(refi
     assert all(" of " not in text.splitlines()[0] for text in said)  # nobody knows the last yet
     said = [row[0] for row in values(refined, "/words/verdict", "TextDocument:text")]
     assert any(text.startswith("### Revision 0 (1 of 4)") for text in said)
-    norms = [
-        np.linalg.norm(np.array(row), axis=1).max()
-        for row in values(growing, "/world/residual/arrows", "Arrows3D:vectors")
-    ]
+    arrows = values(growing, "/world/residual/arrows", "Arrows3D:vectors")
+    norms = [np.linalg.norm(np.array(row), axis=1).max() for row in arrows]
     assert norms[-1] < 0.5 * norms[0]
 
 
@@ -215,20 +197,17 @@ def test_other_readings_begin_another_story(tmp_path):
 
 def contrast(a, b) -> float:
     """Ratio of relative luminances, as WCAG 2 defines it."""
-    linear = [
-        np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
-        for c in (np.array(a) / 255.0, np.array(b) / 255.0)
-    ]
-    y = sorted(float(c @ [0.2126, 0.7152, 0.0722]) + 0.05 for c in linear)
-    return y[1] / y[0]
+    c = np.array([a, b]) / 255.0
+    linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+    low, high = sorted(linear @ [0.2126, 0.7152, 0.0722] + 0.05)
+    return float(high / low)
 
 
 def test_words_in_pictures_are_legible_in_both_themes(refined):
     boxes = (36, 38, 43), (123, 124, 126)  # of the viewer, measured in pictures of both themes
     assert min(contrast(style.LABEL, box) for box in boxes) > 4.0
-    white = 0xFFFFFFFF
     for row in values(refined, "/world/residual/worst", "Points3D:colors"):
-        assert set(row) == {white}
+        assert set(row) == {0xFFFFFFFF}
 
 
 @pytest.mark.vulkan

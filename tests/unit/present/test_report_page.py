@@ -16,18 +16,18 @@ import pytest
 from playwright.sync_api import Browser
 
 from hilcal import numbers
-from hilcal.calibration.budget import budget
+from hilcal.calibration.scatter import budget
 from hilcal.campaign.campaign import Campaign
 from hilcal.present.document import Chart, Table
-from hilcal.present.html.certificate import (
+from hilcal.present.html.report import (
     ReportContent,
     first_screen,
     left_out_errors,
     limit_words,
+    sections,
     where_wrong,
 )
-from hilcal.present.html.sections import page as page_of
-from hilcal.present.html.sections import sections
+from hilcal.present.html.report import page as page_of
 from hilcal.present.story import Chapter
 from hilcal.refinement import Refinement, RefinementStep
 from hilcal.store.overview import MeasuringDevice

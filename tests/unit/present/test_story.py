@@ -15,7 +15,7 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.identification.full_prediction import full_prediction
 from hilcal.identification.linearisation import HeldOut
-from hilcal.present.html.certificate import left_out_errors
+from hilcal.present.html.report import left_out_errors
 from hilcal.present.story import (
     Chapter,
     Story,

@@ -1,31 +1,41 @@
-"""The recording, read back: what the story says is what the viewer gets."""
+"""The recording, read back: what the story says is what the viewer gets, also drawn, and late."""
 
+import os
 import re
+import socket
+import subprocess
+import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-import rerun as rr
 from rerun.chunk import RrdReader
 from scipy.spatial.transform import Rotation
 
+from hilcal.errors import HilcalError, InputError
 from hilcal.present.document import table
 from hilcal.present.story import levels, worst_and_even
-from hilcal.present.viewer import campaign, save, style
+from hilcal.present.viewer import campaign, save, serve, style
+from hilcal.present.viewer.recording import executable
 from hilcal.robot.body import body_poses, capsules
+from tests.support import picture
+from tests.support.paths import ROOT
+from tests.support.picture import Shot, pictures, pixels, vulkan_available
 from tests.support.recordings import rows, same, texts
 from tests.support.viewer_story import ANGLE, LOAD, doubtful, story, ur10e
 
+pytestmark = pytest.mark.usefixtures("strict")
 FORBIDDEN = "█▏░─│⟂∥∈∝ᵀ✘漢"
-READINGS = 90
-
-
-@pytest.fixture(autouse=True)
-def _strict():
-    rr.set_strict_mode(True)
-    yield
-    rr.set_strict_mode(False)
+SIZE, LONGEST = (960, 540), 480
+LONG = (
+    "base_compliance explains 100 % of the misfit, 96 % on poses left out (p = 5e-08), but these "
+    "readings do not separate it from joint_tilt_compliance (24 times as many readings like these "
+    "would), link_compliance (2.1 times as many readings like these would); hilcal next plans what "
+    "separates them, or add one and judge on new poses."
+)
+needs_vulkan = pytest.mark.skipif(not vulkan_available(), reason="no Vulkan driver installed")
 
 
 @pytest.fixture(scope="module")
@@ -40,30 +50,36 @@ def recording(told, tmp_path_factory) -> Path:
     return path
 
 
-def test_every_revision_has_its_errors_in_micrometres(told, recording):
-    expected = {
-        "fit": [r.error.rms_m for r in told.revisions],
-        "holdout": [r.holdout.rms_m for r in told.revisions],
-        "largest": [r.error.max_m for r in told.revisions],
-        "noise": [told.noise_floor_m] * len(told.revisions),
-    }
-    numbers = [r.revision for r in told.revisions]
-    for name, sizes in expected.items():
-        for shown in numbers:
-            left, right, height = bars(recording, f"/errors/{name}", shown)
-            np.testing.assert_allclose(height, 1e6 * np.array(sizes))
-            assert ((np.array(numbers) - 0.5 < left) & (right < np.array(numbers) + 0.5)).all()
+@pytest.fixture(scope="module")
+def by_revision(recording):
+    """What an entity has at each revision."""
+    return lambda entity, name: rows(recording, entity, name, "revision")
 
 
 def bars(path: Path, entity: str, revision: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return left and right edges and heights of the bars of a revision."""
+    """Left and right edges and heights of the bars of a revision."""
     left, width, height = (
-        np.array(rows(path, entity, f"BarChart:{name}", "revision")[revision][0]["buffer"])
-        if name != "widths"
-        else np.array(rows(path, entity, f"BarChart:{name}", "revision")[revision])
+        np.array(rows(path, entity, f"BarChart:{name}", "revision")[revision])
+        if name == "widths"
+        else np.array(rows(path, entity, f"BarChart:{name}", "revision")[revision][0]["buffer"])
         for name in ("abscissa", "widths", "values")
     )
     return left, left + width, height
+
+
+def test_every_revision_has_its_errors_in_micrometres(told, recording):
+    of = told.revisions
+    numbers = np.array([r.revision for r in of])
+    for name, sizes in {
+        "fit": [r.error.rms_m for r in of],
+        "holdout": [r.holdout.rms_m for r in of],
+        "largest": [r.error.max_m for r in of],
+        "noise": [told.noise_floor_m] * len(of),
+    }.items():
+        for shown in numbers:
+            left, right, height = bars(recording, f"/errors/{name}", shown)
+            np.testing.assert_allclose(height, 1e6 * np.array(sizes))
+            assert ((numbers - 0.5 < left) & (right < numbers + 0.5)).all()
 
 
 def test_a_curve_is_drawn_by_bars_about_its_values(tmp_path):
@@ -76,12 +92,15 @@ def test_a_curve_is_drawn_by_bars_about_its_values(tmp_path):
     assert 3 not in rows(path, "/follows/mean", "BarChart:values", "revision")  # nothing follows
 
 
-def test_loads_stand_beside_each_other_in_their_order(tmp_path):
+@pytest.mark.parametrize(
+    ("curve", "height"),
+    [(LOAD, LOAD.y), (replace(ANGLE, x=np.ones(1), y=np.zeros(1), error=np.zeros(1)), [0.0])],
+)
+def test_loads_and_a_single_bin_have_bars_of_width_one(tmp_path, curve, height):
     told, path = doubtful(), tmp_path / "load.rrd"
-    third = replace(told.revisions[2], follows=LOAD)
-    save(replace(told, revisions=(third,)), path)
-    left, right, height = bars(path, "/follows/mean", 2)
-    np.testing.assert_allclose(height, LOAD.y)
+    save(replace(told, revisions=(replace(told.revisions[2], follows=curve),)), path)
+    left, right, drawn = bars(path, "/follows/mean", 2)
+    np.testing.assert_allclose(drawn, height)
     np.testing.assert_allclose(right - left, 1.0)
 
 
@@ -93,18 +112,15 @@ def test_readings_over_a_suspect_are_drawn_by_their_mean(told, recording):
     assert follows.y.min() <= height.min() <= height.max() <= follows.y.max()
 
 
-def test_a_curve_of_one_bin_or_no_height_is_drawn(tmp_path):
-    one = replace(ANGLE, x=np.ones(1), y=np.zeros(1), error=np.zeros(1))
-    told = doubtful()
-    save(replace(told, revisions=(replace(told.revisions[2], follows=one),)), tmp_path / "one.rrd")
-    assert bars(tmp_path / "one.rrd", "/follows/mean", 2)[2].tolist() == [0.0]
-
-
-def test_it_opens_at_the_first_revision_and_the_end_says_that_it_is_the_end(told, recording):
-    read = rows(recording, "/words/verdict", "TextDocument:text", "revision")
+def test_it_opens_at_the_first_revision_and_the_end_says_that_it_is_the_end(recording, by_revision):
+    read = by_revision("/words/verdict", "TextDocument:text")
     heads = [read[k][0].splitlines()[0] for k in range(4)]
     assert [("the last" in head) for head in heads] == [False, False, False, True]
     assert [f"({k + 1} of 4)" in head for k, head in enumerate(heads)] == [True] * 4
+    first = read[0][0].replace("\\", "")
+    assert all(words in first for words in ("base_compliance", "86 %", "84 %"))
+    assert "adequate" in read[3][0]
+    assert "86 %" not in read[3][0]
     reader = RrdReader(recording)
     (blueprint,) = reader.blueprints()
     panel: dict[str, object] = {}
@@ -112,10 +128,14 @@ def test_it_opens_at_the_first_revision_and_the_end_says_that_it_is_the_end(told
         panel |= chunk.to_record_batch().to_pydict()
     assert panel["TimePanelBlueprint:timeline"] == [["revision"]]
     assert panel["TimePanelBlueprint:play_state"] == [[1]]  # paused: else it opens at the end
+    assert {n for c in reader.stream().to_chunks() for n in c.timeline_names} == {
+        "revision",
+        "pose",
+    }
 
 
-def test_the_leader_of_the_worst_reading_is_no_arrow(told, recording):
-    strips = rows(recording, "/world/residual/leader", "LineStrips3D:strips", "revision")
+def test_the_leader_of_the_worst_reading_is_no_arrow(told, by_revision):
+    strips = by_revision("/world/residual/leader", "LineStrips3D:strips")
     balls, _ = campaign.noise_balls(told, np.arange(len(told)))
     for r in told.revisions:
         worst = int(np.argmax(r.whitened_norm2))
@@ -123,27 +143,23 @@ def test_the_leader_of_the_worst_reading_is_no_arrow(told, recording):
         assert len(dots) >= 5  # dotted
         np.testing.assert_allclose(dots[:, :, :2], 0.0, atol=1e-6)
         assert dots[:, :, 2].min() > min(balls[worst].max(), 0.25)  # begins outside of the ball
-        lengths = np.ptp(dots[:, :, 2], axis=1)
         gaps = dots[1:, 0, 2] - dots[:-1, 1, 2]
-        assert (gaps > lengths[:-1]).all()
+        assert (gaps > np.ptp(dots[:, :, 2], axis=1)[:-1]).all()
     assert tuple(style.LEADER) not in {tuple(c) for c in style.LEVEL_COLORS.tolist()}
 
 
-def test_the_tallest_bar_is_the_worst_reading_of_the_label(told, recording):
-    labels = rows(recording, "/world/residual/worst", "Points3D:labels", "revision")
+def test_bars_hold_every_pose_once_and_the_tallest_is_the_worst_reading(told, by_revision):
+    labels = by_revision("/world/residual/worst", "Points3D:labels")
+    drawn = [by_revision(f"/bars/{name}", "BarChart:values") for name in style.LEVEL_NAMES]
     for r in told.revisions:
-        bars = [
-            rows(recording, f"/bars/{name}", "BarChart:values", "revision")[r.revision][0]
-            for name in style.LEVEL_NAMES
-        ]
-        tallest = max(max(b["buffer"]) for b in bars)
-        assert f"({tallest:.1f} σ)" in labels[r.revision][0]
+        heights = np.concatenate([of[r.revision][0]["buffer"] for of in drawn])
+        assert (heights > 0).sum() == 30
+        assert f"({heights.max():.1f} σ)" in labels[r.revision][0]
 
 
 def test_a_pose_has_its_own_name_in_every_label_and_text(told, tmp_path):
-    named = replace(told, pose_names=tuple(f"p{k + 40}a" for k in told.pose))
     path = tmp_path / "named.rrd"
-    save(named, path)
+    save(replace(told, pose_names=tuple(f"p{k + 40}a" for k in told.pose)), path)
     name = f"p{told.pose[np.argmax(told.revisions[-1].whitened_norm2)] + 40}a"
     worst = rows(path, "/world/residual/worst", "Points3D:labels", "revision")
     assert f"pose {name}," in worst[3][0]
@@ -153,63 +169,29 @@ def test_a_pose_has_its_own_name_in_every_label_and_text(told, tmp_path):
     assert cards[7][0].startswith("### Pose p47a:")
 
 
-def test_timelines_are_revision_and_pose(recording):
-    names = {
-        name for chunk in RrdReader(recording).stream().to_chunks() for name in chunk.timeline_names
-    }
-    assert names == {"revision", "pose"}
-
-
-def test_every_reading_has_its_arrow(told, recording):
-    drawn = rows(recording, "/world/residual/arrows", "Arrows3D:vectors", "revision")
-    scale = campaign.residual_scale(told)
+def test_every_reading_has_its_arrow_and_every_pose_a_ball(told, by_revision):
+    drawn = by_revision("/world/residual/arrows", "Arrows3D:vectors")
     for r in told.revisions:
         vectors = np.array(drawn[r.revision])
-        assert vectors.shape == (READINGS, 3)
-        length = np.linalg.norm(r.residual, axis=1) * scale
-        np.testing.assert_allclose(
-            np.linalg.norm(vectors, axis=1),
-            np.minimum(length, campaign.ARROW_CAP),
-            rtol=1e-5,
-        )
-
-
-def test_one_ball_per_pose_and_arm_moves_through_poses(told, recording):
-    balls = rows(recording, "/world/residual/noise", "Ellipsoids3D:half_sizes", "revision")
+        assert vectors.shape == (90, 3)
+        length = np.linalg.norm(r.residual, axis=1) * campaign.residual_scale(told)
+        expected = np.minimum(length, campaign.ARROW_CAP)
+        np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), expected, rtol=1e-5)
+    balls = by_revision("/world/residual/noise", "Ellipsoids3D:half_sizes")
     assert {len(b) for b in balls.values()} == {30}
+
+
+def test_the_arm_moves_through_poses_and_stands_in_the_worst_one(told, recording, by_revision):
     moves = rows(recording, "/world/arm/body6", "Transform3D:translation", "pose")
-    bodies = body_poses(told.arm, told.q[::3])
     assert sorted(moves) == list(range(30))
     read = np.array([moves[k][0] for k in range(30)])
+    bodies = body_poses(told.arm, told.q[::3])
     np.testing.assert_allclose(read, bodies[:, 6, :3, 3], atol=1e-6)
-
-
-def test_arm_stands_in_the_worst_pose(told, recording):
-    stands = rows(recording, "/world/arm/body7", "Transform3D:translation", "revision")
+    stands = by_revision("/world/arm/body7", "Transform3D:translation")
     for r in told.revisions:
         i = int(np.argmax(r.whitened_norm2))
         expected = body_poses(told.arm, told.q[i : i + 1])[0, -1, :3, 3]
         np.testing.assert_allclose(stands[r.revision][0], expected, atol=1e-6)
-
-
-def test_bars_hold_every_pose_once_under_its_level(told, recording):
-    for r in told.revisions:
-        total = 0
-        for name in style.LEVEL_NAMES:
-            bars = rows(recording, f"/bars/{name}", "BarChart:values", "revision")
-            values = np.array(bars[r.revision][0]["buffer"], dtype=float)
-            total += int((values > 0).sum())
-        assert total == 30
-
-
-def test_verdict_names_suspects_with_their_figures(told, recording):
-    read = rows(recording, "/words/verdict", "TextDocument:text", "revision")
-    first = read[0][0]
-    assert "base_compliance" in first.replace("\\", "")
-    assert "86 %" in first
-    assert "84 %" in first
-    assert "adequate" in read[3][0]
-    assert "86 %" not in read[3][0]
 
 
 def test_saving_twice_gives_equal_recordings(told, recording, tmp_path):
@@ -231,8 +213,7 @@ def test_no_character_without_a_glyph_reaches_the_viewer(tmp_path):
 
 def test_user_names_cannot_break_a_table():
     made = style.markdown([table("effect", "share", rows=[("a|b\nc", "50 %")])]).splitlines()
-    assert len(made) == 3
-    assert {len(re.findall(r"(?<!\\)\|", line)) for line in made} == {3}
+    assert [len(re.findall(r"(?<!\\)\|", line)) for line in made] == [3, 3, 3]
 
 
 def test_thousands_of_readings_stay_small_and_say_what_they_show(tmp_path):
@@ -241,8 +222,7 @@ def test_thousands_of_readings_stay_small_and_say_what_they_show(tmp_path):
     assert path.stat().st_size < 20e6
     arrows = rows(path, "/world/residual/arrows", "Arrows3D:vectors", "revision")
     assert all(100 < len(a) < 300 for a in arrows.values())
-    title = campaign.titles(big)[0]
-    assert f"about {len(arrows[0])} of 3000" in title
+    assert f"about {len(arrows[0])} of 3000" in campaign.titles(big)[0]
     balls = rows(path, "/world/residual/noise", "Ellipsoids3D:centers", "revision")
     origins = rows(path, "/world/residual/arrows", "Arrows3D:origins", "revision")
     for k in range(4):
@@ -259,8 +239,7 @@ def test_subsample_keeps_the_worst():
 
 
 def test_noise_balls_give_the_covariance_back():
-    rng = np.random.default_rng(3)
-    a = 1e-5 * rng.standard_normal((12, 3, 3))
+    a = 1e-5 * np.random.default_rng(3).standard_normal((12, 3, 3))
     told = replace(story(poses=4, loads=3), covariance=a @ a.transpose(0, 2, 1) + 1e-10 * np.eye(3))
     half, quaternion = campaign.noise_balls(told, np.arange(12))
     half = half / (style.BALL_SIGMAS * campaign.residual_scale(told))
@@ -272,39 +251,171 @@ def test_noise_balls_give_the_covariance_back():
 def test_levels_hold_the_share_of_noise_they_name():
     norm2 = np.random.default_rng(4).chisquare(3, 200_000)
     share = np.bincount(levels(norm2), minlength=3) / len(norm2)
-    assert share[1] == pytest.approx(0.0099, abs=0.001)
-    assert share[2] == pytest.approx(0.0001, abs=0.0001)
+    assert share[1:] == pytest.approx([0.0099, 0.0001], abs=0.001)
 
 
 def test_the_arm_is_drawn_as_its_capsules(told, recording):
     for i in range(told.arm.n + 1):
         own = [c for c in capsules(told.arm) if c.body == i]
-        entity = f"/world/arm/body{i}"
-        (start,), (radius,), (length,), (turn,) = (
-            [x for chunk in RrdReader(recording).stream().filter(content=entity).to_chunks()
-             if name in (batch := chunk.to_record_batch()).schema.names
-             for x in batch.column(name).to_pylist()]
-            for name in ("Capsules3D:translations", "Capsules3D:radii", "Capsules3D:lengths",
-                         "Capsules3D:quaternions")
-        )  # fmt: skip
+        start, radius, length, turn = (
+            np.array(rows(recording, f"/world/arm/body{i}", f"Capsules3D:{name}")[0])
+            for name in ("translations", "radii", "lengths", "quaternions")
+        )
         assert len(own) >= 1
         np.testing.assert_allclose(start, [c.start for c in own], atol=1e-6)
         np.testing.assert_allclose(radius, [c.radius for c in own], atol=1e-6)
-        axis = Rotation.from_quat(turn).apply([0.0, 0.0, 1.0])
-        end = np.array(start) + np.array(length)[:, None] * axis
+        end = start + length[:, None] * Rotation.from_quat(turn).apply([0.0, 0.0, 1.0])
         np.testing.assert_allclose(end, [c.end for c in own], atol=1e-6)
 
 
 def test_arm_of_another_shape_is_drawn(tmp_path):
-    six = ur10e()
-    four = replace(
-        six,
-        links=six.links[:5],
-        masses=six.masses[:4],
-        coms=six.coms[:4],
-        joint_names=six.joint_names[:4],
-    )
-    told = story(poses=3)
-    path = tmp_path / "four.rrd"
+    six, told, path = ur10e(), story(poses=3), tmp_path / "four.rrd"
+    cut = {k: getattr(six, k)[:4] for k in ("masses", "coms", "joint_names")}
+    four = replace(six, links=six.links[:5], **cut)
     save(replace(told, arm=four, q=told.q[:, :4]), path)
     assert len(rows(path, "/world/arm/body5", "Transform3D:translation", "pose")) == 3
+
+
+# pictures
+
+
+def share_of_red(png: np.ndarray) -> float:
+    """Share of pixels in the colour of a reading that the model fails."""
+    return float((np.abs(png[..., :3].astype(int) - style.RED).max(axis=2) < 40).mean())
+
+
+def colors(png: np.ndarray) -> int:
+    return len(np.unique(png.reshape(-1, png.shape[2]), axis=0))
+
+
+@pytest.mark.vulkan
+@needs_vulkan
+def test_the_picture_shows_the_red_vanish(told, recording, tmp_path):
+    reached = [levels(r.whitened_norm2).max() for r in told.revisions]
+    assert (reached[0], reached[3] < 2) == (2, True)  # red at first, none in the end
+    view = campaign.titles(told)[0]
+    shots = [Shot(tmp_path / f"{k}.png", "revision", k, view) for k in (0, 3)]
+    reports = pictures(recording, shots, SIZE, LONGEST)
+    assert len(reports) >= 10
+    assert [v for v in reports if v.problems] == []
+    first, last = (pixels(s.png) for s in shots)
+    assert colors(first) > 500
+    assert share_of_red(first) > 0 == share_of_red(last)
+
+
+@pytest.mark.long
+@pytest.mark.vulkan
+@needs_vulkan
+def test_in_a_small_window_the_verdict_ends_above_its_edge(tmp_path):
+    path, told = tmp_path / "doubt.rrd", doubtful()
+    long = replace(told.revisions[1], panels={"verdict": (LONG,)})
+    save(replace(told, revisions=(told.revisions[0], long, *told.revisions[2:])), path)
+    shots = [Shot(tmp_path / f"{k}.png", "revision", k, "Verdict") for k in range(4)]
+    pictures(path, shots, (1280, 720))
+    for shot in shots:
+        drawn = pixels(shot.png)[..., :3].astype(int)
+        lines = np.flatnonzero((np.abs(drawn - drawn[-1, 2]).max(axis=2) > 40).any(axis=1))
+        assert len(lines) > 25
+        assert lines.max() < 0.97 * len(drawn), shot  # the last line is whole
+
+
+@pytest.mark.vulkan
+@pytest.mark.slow
+@needs_vulkan
+def test_every_view_is_drawn_without_a_report(told, recording, tmp_path):
+    words = ("Verdict", "Details", "How to read this", "Table", "Log", "Parameters ± σ")
+    names = [*campaign.titles(told), campaign.ERRORS, campaign.FOLLOWS, *words]
+    shots = [Shot(tmp_path / f"{i}.png", "revision", 1, n) for i, n in enumerate(names)]
+    shots.append(Shot(tmp_path / "pose.png", "pose", 7))
+    reports = pictures(recording, shots, SIZE, LONGEST)
+    assert set(names) <= {v.name for v in reports}
+    assert [v for v in reports if v.problems] == []
+    for shot in shots:
+        assert colors(pixels(shot.png)) > 20, shot
+
+
+@pytest.mark.long
+@pytest.mark.vulkan
+@needs_vulkan
+def test_unknown_timeline_and_view_are_named(recording, tmp_path):
+    with pytest.raises(InputError, match=r"no timeline 'frame'; the recording has .*revision"):
+        picture.picture(recording, tmp_path / "a.png", "frame", 0, size=(320, 200))
+    with pytest.raises(InputError, match=r"no view 'Nothing'; the recording has .*Verdict"):
+        picture.picture(recording, tmp_path / "a.png", view="Nothing", size=(320, 200))
+
+
+def test_missing_recording_or_driver_is_refused(recording, tmp_path, monkeypatch):
+    with pytest.raises(InputError, match=r"no such file"):
+        picture.picture(tmp_path / "none.rrd", tmp_path / "a.png")
+    monkeypatch.setenv("VK_DRIVER_FILES", str(tmp_path / "none.json"))
+    assert not vulkan_available()
+    with pytest.raises(HilcalError, match="mesa-vulkan-drivers"):
+        picture.picture(recording, tmp_path / "a.png")
+
+
+# where a recording goes
+
+
+def test_missing_folder_is_refused(told, tmp_path):
+    with pytest.raises(InputError, match="no folder"):
+        save(told, tmp_path / "none" / "x.rrd")
+
+
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")
+def test_a_viewer_that_joins_late_gets_the_whole_story(told, tmp_path, monkeypatch, free_port):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    late = tmp_path / "late.rrd"
+    with serve(told, port=free_port) as served:
+        assert served.url == f"rerun+http://127.0.0.1:{free_port}/proxy"
+        client = subprocess.Popen(
+            [executable(), "--port", "auto", "--save", str(late), served.url],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        try:
+            end = time.monotonic() + 30
+            while not {"/errors/fit", "/bars/zcurrent"} <= entities(late):
+                assert time.monotonic() < end, "the late viewer did not receive the story"
+                time.sleep(0.1)
+        finally:
+            client.terminate()
+            client.wait(10)
+
+
+def entities(path: Path) -> set[str]:
+    """Entities that a file holds so far; it may still be growing."""
+    if not path.exists() or path.stat().st_size == 0:
+        return set()
+    try:
+        return {str(c.entity_path) for c in RrdReader(path).stream().to_chunks()}
+    except (ValueError, RuntimeError):  # nothing in it yet; a part of a message
+        return set()
+
+
+def test_a_port_in_use_is_refused(told, free_port):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", free_port))
+        taken.listen()
+        with pytest.raises(InputError, match=f"{free_port}.*free port"):
+            serve(told, port=free_port).__enter__()
+
+
+@pytest.mark.long
+@pytest.mark.skipif(sys.platform == "win32", reason="no file size limits on Windows")
+def test_a_file_that_cannot_grow_leaves_what_was_there(tmp_path):
+    path = tmp_path / "x.rrd"
+    path.write_text("before")
+    code = (
+        "import resource, signal, sys; from pathlib import Path\n"
+        "from tests.support.viewer_story import story; from hilcal.present.viewer import save\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, resource.RLIM_INFINITY))\n"
+        "save(story(), Path(sys.argv[1]))\n"
+    )
+    command, env = [sys.executable, "-c", code, str(path)], os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, env=env, capture_output=True, text=True, check=False, timeout=60)
+    assert done.stderr.strip().splitlines()[-1].startswith("hilcal.errors.InputError: ")
+    assert "cannot be written" in done.stderr
+    assert path.read_text() == "before"
+    assert list(tmp_path.iterdir()) == [path]

@@ -16,8 +16,7 @@ from hilcal.procedure.state import DECIDED, FROZEN
 from hilcal.readings.same_readings import already
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import REFERENCE
-from hilcal.store.procedure_log import ProcedureLog
-from hilcal.store.purpose import purpose_of, release
+from hilcal.store.procedure_log import ProcedureLog, purpose_of, release
 from hilcal.store.run_log import RunLog
 from tests.support.paths import ROOT
 from tests.support.procedure_cases import Drawn, KilledError, again, drawn, small
@@ -154,20 +153,28 @@ def test_another_validation_campaign_is_refused(done: tuple[Drawn, Improvement])
         files.validation.write_bytes(kept)
 
 
-@pytest.mark.long
-def test_a_goal_below_the_repeatability_is_not_measured_for_but_another_is_decided(
-    tmp_path,
-) -> None:
-    d = drawn(tmp_path / "run.hilcal", goal_m=5e-6)
-    kinds = []
+def until_decided(d: Drawn) -> tuple[list[str], object]:
+    """Do the steps before the validation; returns their kinds, and what the last one gave."""
+    kinds, found = [], None
     while (step := d.procedure.next()).kind != "plan_validation":
         found = d.do(step)
         kinds.append(step.kind)
+    return kinds, found
+
+
+def with_goal(d: Drawn, goal_m: float) -> Drawn:
+    settings = replace(d.procedure.settings, goal_m=goal_m)
+    return replace(d, procedure=replace(d.procedure, settings=settings))
+
+
+@pytest.mark.long
+def test_a_goal_below_the_repeatability_is_not_measured_for_but_another_is(tmp_path) -> None:
+    d = drawn(tmp_path / "run.hilcal", goal_m=5e-6)
+    kinds, found = until_decided(d)
     assert kinds == ALL[:4]
     assert found.reason == "floor"
     assert found.error.floor_m > 5e-6
-    settings = replace(d.procedure.settings, goal_m=1.0)
-    d = replace(d, procedure=replace(d.procedure, settings=settings))
+    d = with_goal(d, 1.0)
     with CampaignFile.open(d.procedure.run) as run:
         d.procedure.resume(run)
     assert d.procedure.next().kind == "decide"
@@ -193,16 +200,11 @@ def test_a_goal_within_reach_is_measured_for(tmp_path) -> None:
     for _ in range(3):
         d.do(d.procedure.next())
     first = d.procedure.predicted()
-    goal = 0.5 * (first.now_m + first.floor_m)
-    settings = replace(d.procedure.settings, goal_m=goal)
-    d = replace(d, procedure=replace(d.procedure, settings=settings))
+    d = with_goal(d, 0.5 * (first.now_m + first.floor_m))
     found = d.do(d.procedure.next())
     assert found.reason == "goal"
     assert found.then_m < first.now_m
-    kinds = []
-    while (step := d.procedure.next()).kind != "plan_validation":
-        found = d.do(step)
-        kinds.append(step.kind)
+    kinds, found = until_decided(d)
     assert kinds[:3] == ["measure", "refine", "decide"]
     assert found.error.now_m < first.now_m
     with CampaignFile.open(d.procedure.run) as run:

@@ -5,7 +5,7 @@ import pytest
 
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import Fit, fit
-from hilcal.identification.regularisation import effective_parameters
+from hilcal.identification.gauss_newton import effective_parameters
 from hilcal.identification.validation import validate
 from hilcal.regression.empirical_bayes import EmpiricalPrior, maximise_evidence, spent_by_groups
 from hilcal.regression.schur import eliminate

@@ -13,7 +13,7 @@ from hilcal.errors import InputError
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import UNPUBLISHED, configs_dir, load_arm, robot_names
 from hilcal.robot.chain import evaluate
-from hilcal.robot.pinocchio_model import pinocchio_model
+from hilcal.robot.scene import pinocchio_model
 from hilcal.robot.statics import Load, slot_wrenches
 from hilcal.robot.urdf import arm_from_urdf
 from hilcal.types import Floats

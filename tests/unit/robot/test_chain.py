@@ -8,7 +8,7 @@ from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.robot.body import body_poses
 from hilcal.robot.chain import Deviation, evaluate, joint_jacobian, twist_jacobian
-from hilcal.robot.pinocchio_model import FLANGE, pinocchio_model
+from hilcal.robot.scene import FLANGE, pinocchio_model
 from hilcal.types import Floats
 from tests.support.arm_cases import ARMS, ODD, arm_of, displacement, slope, twisted
 

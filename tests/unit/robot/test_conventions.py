@@ -9,7 +9,7 @@ from hilcal.config import CellConfig
 from hilcal.errors import InputError
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import drive_jacobian, evaluate
-from hilcal.robot.pinocchio_model import pinocchio_model
+from hilcal.robot.scene import pinocchio_model
 from hilcal.robot.urdf import arm_from_urdf
 
 SIGN = [1, -1, 1, 1, -1, 1]

@@ -8,7 +8,7 @@ from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig
 from hilcal.drivers.simulated.mechanics import rotation_vector
 from hilcal.drivers.simulated.truth import Truth
-from hilcal.drivers.simulated.ur.state import GRAVITY, Kinematics
+from hilcal.drivers.simulated.ur_state import GRAVITY, Kinematics
 from hilcal.drivers.simulated.world import SimulatedNoise, World
 from hilcal.effects.protocol import Situation
 from hilcal.identification.full_covariance import joint_factors
@@ -17,8 +17,7 @@ from hilcal.readings.readings import Readings
 from hilcal.robot.body import body_poses, capsules, is_known
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate
-from hilcal.robot.pinocchio_model import pinocchio_model
-from hilcal.robot.scene import Scene
+from hilcal.robot.scene import Scene, pinocchio_model
 from tests.support.campaigns import true_parameters
 from tests.support.effect_cases import make, numeric_jacobian, some_states
 

@@ -10,9 +10,8 @@ import pytest
 from hilcal.robot import chain as chains
 from hilcal.robot.arm import Arm
 from hilcal.robot.chain import Deviation, evaluate, twist_jacobian
-from hilcal.robot.geometric_stiffness import geometric_stiffness
-from hilcal.robot.pinocchio_model import FLANGE, pinocchio_model
-from hilcal.robot.statics import Load, slot_wrench_change, slot_wrenches
+from hilcal.robot.scene import FLANGE, pinocchio_model
+from hilcal.robot.statics import Load, geometric_stiffness, slot_wrench_change, slot_wrenches
 from hilcal.types import Floats
 from tests.support.arm_cases import ARMS, ODD, arm_of, displacement, twisted
 from tests.support.effect_cases import CELLS, situation
@@ -26,8 +25,7 @@ def case(arm: Arm, gravity: tuple[float, ...]) -> tuple[Floats, Deviation, Load]
     rng = np.random.default_rng(5)
     q = rng.uniform(-np.pi, np.pi, (COUNT, arm.n))
     d = Deviation(
-        dq=0.1 * rng.normal(size=(COUNT, arm.n)),
-        twist=0.1 * rng.normal(size=(COUNT, arm.n + 1, 6)),
+        dq=0.1 * rng.normal(size=(COUNT, arm.n)), twist=0.1 * rng.normal(size=(COUNT, arm.n + 1, 6))
     )
     load = Load(
         wrench=rng.normal(size=(COUNT, 6)) * [80, 80, 80, 9, 9, 9],
@@ -72,17 +70,11 @@ def test_torques_are_those_that_pinocchio_holds_against(name: str, gravity: str)
 def test_a_weight_on_a_lever_turns_it_down() -> None:
     # One joint about −y, a lever of 0.5 m along x with 3 kg at its end: it falls by +τ.
     arm = Arm(
-        name="lever",
-        links=np.array([displacement([0, 0, 0, np.pi / 2, 0, 0]), np.eye(4)]),
-        masses=np.array([3.0]),
-        coms=np.array([[0.5, 0.0, 0.0]]),
-        q_min=np.array([-np.pi]),
-        q_max=np.array([np.pi]),
-        torque_max=np.array([100.0]),
-        payload=1.0,
-        joint_names=("j1",),
+        name="lever", links=np.array([displacement([0, 0, 0, np.pi / 2, 0, 0]), np.eye(4)]),
+        masses=np.array([3.0]), coms=np.array([[0.5, 0.0, 0.0]]), q_min=np.array([-np.pi]),
+        q_max=np.array([np.pi]), torque_max=np.array([100.0]), payload=1.0, joint_names=("j1",),
         source="made up",
-    )
+    )  # fmt: skip
     load = Load(np.zeros((1, 6)), np.zeros(3), 0.0, np.zeros(3), np.array([0, 0, -10.0]))
     wrench = slot_wrenches(arm, evaluate(arm, np.zeros((1, 1))), load)
     np.testing.assert_allclose(wrench[0, 0], [0, -30, 0, 0, 0, -15], rtol=0, atol=1e-13)

@@ -47,16 +47,16 @@ from hilcal.cli.exporting import _write_parameters
 from hilcal.cli.terminal import Terminal
 from hilcal.config import load_config
 from hilcal.config.reference import cell_text
-from hilcal.discovery.write_effect import source_of_form
+from hilcal.discovery.law import source_of_form
 from hilcal.drivers.terminal_operator import TerminalOperator
 from hilcal.errors import InputError
 from hilcal.identification import posterior_document
 from hilcal.names import check_name, check_names, csv_text, escaped, from_csv, quoted
-from hilcal.present.charts import style as chart_style
-from hilcal.present.charts.style import label as in_chart
+from hilcal.present import chart_style
+from hilcal.present import html as page
+from hilcal.present.chart_style import label as in_chart
 from hilcal.present.document import Chart, Items, PageSection, Words, table
-from hilcal.present.html import page
-from hilcal.present.html.page import FirstScreen
+from hilcal.present.html import FirstScreen
 from hilcal.present.progress import SafeConsole, counting, working
 from hilcal.present.viewer import style as viewer_style
 from hilcal.robot.catalogue import load_arm

@@ -1,5 +1,6 @@
-"""The living world: what it publishes is what the arm's statics say."""
+"""The world as time goes by, its effects there, and its file."""
 
+import json
 import time
 from dataclasses import replace
 
@@ -10,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from hilcal.drivers.simulated.blackboard import Blackboard
 from hilcal.drivers.simulated.truth import Truth
 from hilcal.drivers.simulated.world import World
-from hilcal.drivers.simulated.world_state import WorldState
+from hilcal.drivers.simulated.world_server import WorldState, read_world, write_world
 from hilcal.errors import InputError
 from tests.support.arm_cases import ODD, arm_of
 from tests.support.living_cell import (
@@ -25,6 +26,7 @@ from tests.support.living_cell import (
     states,
     world_of,
 )
+from tests.support.world_cases import further
 
 
 @pytest.mark.parametrize(("load", "wrench"), [(None, np.zeros(6)), ("5kg", WEIGHT), ("pull", PULL)])
@@ -282,3 +284,144 @@ def test_an_arm_of_seven_joints_is_refused(tmp_path):
     board = Blackboard.create(tmp_path / "world.bin", 1.0)
     with pytest.raises(InputError, match="arm odd has 7 joints, the shared world one of 6"):
         WorldState(odd, made, board, 1)
+
+
+MOUNTED = {
+    "force_sensor": {
+        "driver": "ft300",
+        "port": "x",
+        "origin_m": [0.01, -0.02, 0.045],
+        "rotvec_rad": [0.3, -0.9, 2.1],
+    }
+}
+
+
+def state_of(cell, truth, wrench):
+    """The state that a truth belongs to."""
+    state = states(Q, wrench, float(truth["time"]))
+    return replace(
+        state,
+        load_time=truth["time"][None] - truth["load_since"],
+        joint_temperature=truth["joint_temperature"][None],
+    )
+
+
+def slip_at(cell):
+    return cell.living.slip(cell.arrivals)[None]
+
+
+def test_every_effect_shows_in_the_truth(tmp_path):
+    cell = life(tmp_path, sections=MOUNTED, **everything(np.random.default_rng(2)), **further(3))
+    cell.living.hang("pull")
+    truth = cell.rest_at(Q)
+    want = cell.world.sight(state_of(cell, truth, PULL), slip_at(cell))
+    assert same(truth["target"], want.position[0])
+    for effect in further(3):
+        gone = np.zeros_like(getattr(cell.world.physics, effect))
+        less = replace(cell.world, physics=cell.world.physics.with_effect(effect, gone))
+        seen = less.sight(state_of(cell, truth, PULL), slip_at(cell)).position[0]
+        # Creep has only begun; equilibria are exact to 1e-12 rad.
+        assert np.linalg.norm(seen - truth["target"]) > 1e-9, effect
+
+
+@pytest.mark.parametrize("effect", ["creep", "thermal_growth", "thermal_joint_drift"])
+def test_what_goes_on_with_time_or_warmth_moves_a_resting_arm(tmp_path, effect):
+    cell = life(tmp_path, **{effect: 100.0 * further(3)[effect]})
+    cell.living.hang("5kg")
+    first = cell.rest_at(Q)
+    time.sleep(0.02)
+    second = cell.look()
+    assert second["time"] - first["time"] >= 0.02 * 20.0
+    want = cell.world.sight(state_of(cell, second, WEIGHT), slip_at(cell))
+    assert same(second["target"], want.position[0])
+    assert not same(second["target"], first["target"])
+
+
+def test_the_joints_are_as_warm_as_the_world_takes_them_to_be(tmp_path):
+    cell = life(tmp_path, thermal_joint_drift=np.full(6, 1e-4))
+    truth = cell.rest_at(Q)
+    told = replace(
+        states(Q, np.zeros(6), float(truth["time"])),
+        joint_temperature=truth["joint_temperature"][None],
+    )
+    assert same(truth["target"], cell.world.sight(told, slip_at(cell)).position[0])
+
+
+def test_a_sensor_that_misreads_says_what_hangs_while_the_arm_bears_another_load(tmp_path):
+    bias = np.array([5.0, -4.0, 6.0, 0.5, 0.3, -0.2])
+    wrong = life(tmp_path, sections=MOUNTED, wrench_bias=bias)
+    (tmp_path / "right").mkdir()
+    right = life(tmp_path / "right", sections=MOUNTED)
+    for cell in (wrong, right):
+        cell.rest_at(Q)
+        cell.living.hang("5kg")
+    a, b = (cell.board.read("truth") for cell in (wrong, right))
+    turned = a["flange"][:3, :3]
+    seen = Rotation.from_matrix(turned.T @ b["flange"][:3, :3]).magnitude()
+    assert 1e-6 < seen < 1e-3
+    np.testing.assert_allclose(a["sensor_wrench"], b["sensor_wrench"], atol=60.0 * seen)
+    lean = np.abs(a["drive_torque"] - b["drive_torque"])
+    assert lean[1] > 1.0
+    assert wrong.living.hang(None) is None
+    right.living.hang(None)
+    assert same(wrong.board.read("truth")["flange"], right.board.read("truth")["flange"])
+
+
+def test_world_comes_back_from_its_file_to_the_last_bit(tmp_path):
+    made = config(force_sensor={"driver": "ft300", "port": "x", "origin_m": [0, 0, 0.1]})
+    world = world_of(made, **everything(np.random.default_rng(3)), **further(4))
+    world = replace(world, joint_reference=23.4)
+    write_world(tmp_path / "world.json", world, made)
+    back, told = read_world(tmp_path / "world.json")
+    assert told == made
+    assert back.truth == world.truth
+    assert back.noise == world.noise
+    for name in ("registration", "station", "joint_std"):
+        assert same(getattr(back, name), getattr(world, name))
+    assert back.joint_reference == 23.4
+    state = replace(states(Q, WEIGHT, 12.3), joint_temperature=np.full((1, 6), 25.0))
+    assert same(back.sight(state).position, world.sight(state).position)
+
+
+def test_a_configuration_of_another_cell_is_refused(tmp_path):
+    world = world_of(config())
+    other = config(tool={"mass_kg": 0.9, "load_point_m": [0.1, -0.03, 0.15]})
+    with pytest.raises(InputError, match="differ in targets, tool_mass, tool_com;"):
+        write_world(tmp_path / "world.json", world, other)
+    assert not (tmp_path / "world.json").exists()
+
+
+@pytest.mark.parametrize("text", ["", "[1]", '{"format": "hilcal-plan"}', "{"])
+def test_another_file_is_no_world(tmp_path, text):
+    (tmp_path / "world.json").write_text(text)
+    with pytest.raises(InputError, match="not a world file"):
+        read_world(tmp_path / "world.json")
+
+
+def test_a_world_written_before_an_effect_was_known_has_none_of_it(tmp_path):
+    path = tmp_path / "world.json"
+    world = world_of(config(), **everything(np.random.default_rng(3)))
+    write_world(path, world, config())
+    content = json.loads(path.read_text())
+    del content["physics"]["joint_coupling"]
+    path.write_text(json.dumps(content))
+    back = read_world(path)[0]
+    assert back.truth == {
+        k: v for k, v in world.truth.items() if not k.startswith("joint_coupling")
+    }
+
+
+def test_a_damaged_world_says_so(tmp_path):
+    path = tmp_path / "world.json"
+    write_world(path, world_of(config()), config())
+    content = json.loads(path.read_text())
+    del content["physics"]["base_frame"]
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match="damaged: KeyError 'base_frame'"):
+        read_world(path)
+    write_world(path, world_of(config()), config())
+    path.write_text(path.read_text().replace('"version": 2', '"version": 1'))
+    with pytest.raises(InputError, match="version 1; this hilcal reads 2"):
+        read_world(path)
+    with pytest.raises(InputError, match="cannot be read"):
+        read_world(tmp_path / "none.json")

@@ -11,7 +11,7 @@ import scipy.linalg as sl
 from hilcal.calibration.calibration import Calibration
 from hilcal.engine.engine import open_engine
 from hilcal.errors import InputError
-from hilcal.identification import gauss_newton_steps
+from hilcal.identification import gauss_newton as gauss_newton_steps
 from hilcal.identification.fit import fit
 from hilcal.readings.readings import Readings
 from hilcal.regression import normal_equations

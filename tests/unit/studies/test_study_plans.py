@@ -7,7 +7,7 @@ import pytest
 
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig, load_config
-from hilcal.design.candidates import reading_covariance
+from hilcal.design.information import reading_covariance
 from hilcal.engine.engine import open_engine
 from hilcal.types import Floats
 from studies.plans import DOUBLE, GRID, PARAMETERS, RANDOM, TEST, PlansStudy, plans_study

@@ -13,9 +13,9 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.mixed_fit import mixed_fit, with_all_effects
 from hilcal.mixed.families import families_of
 from hilcal.model.model import Model
-from hilcal.present.fleet import size_lines
+from hilcal.present.comparison import size_lines
 from hilcal.readings.readings import Readings
-from hilcal.transfer.type_sizes import TypeSize, evidence_of, type_sizes
+from hilcal.transfer.members import TypeSize, evidence_of, type_sizes
 from studies.random_descriptions import readings_of
 
 TRUTH = {"transmission_error": 0.1, "link_geometry": 0.3}

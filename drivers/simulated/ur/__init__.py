@@ -1,1 +1,0 @@
-"""A simulated Universal Robots controller, as it is seen from the network."""

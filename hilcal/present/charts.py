@@ -1,0 +1,532 @@
+"""Charts of fits, diagnoses, comparisons and stories; each a pure function of such values."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import plotly.graph_objects as go
+from scipy.stats import norm
+
+from hilcal import numbers
+from hilcal.diagnosis.comparison import Comparison
+from hilcal.diagnosis.diagnosis import Diagnosis
+from hilcal.diagnosis.effect_ranking import LEAST_SHARE
+from hilcal.identification.family_sizes import FamilySize
+from hilcal.identification.fit import Fit
+from hilcal.present import chart_style as style
+from hilcal.present.comparison import FAR, words_of
+from hilcal.present.document import load_name
+from hilcal.present.fit import CERTAIN, follows
+from hilcal.present.story import LEVEL_NAMES, DependenceCurve, Story, StoryRevision, worst_and_even
+from hilcal.store.plan import UNLOADED
+from hilcal.types import Bools, Floats, Ints
+
+if TYPE_CHECKING:
+    from hilcal.transfer.pooled import Pooled
+
+MOST = 1500
+"""Points that a chart draws; a choice by the size of the page, 8 MB."""
+MOST_POSES, LONGEST_NAME = 16, 12
+"""Poses up to which all their names stand at the axis, and characters of such a name; choices."""
+LONGEST, MOST_ARROWS = 0.25, 300
+"""Length of the largest residual as drawn, m, and arrows of a level at most; choices."""
+MOST_VARIABLES, MOST_CORRELATED, MOST_FAMILIES = 12, 30, 16
+RANGE, WIDEST, BINS = 5.0, 50.0, 40
+"""Least and largest range of the histogram, σ; what lies beyond is counted in its last bins."""
+_NICE = (1.0, 2.0, 5.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ChartReadings:
+    """The readings that a chart draws of a revision of a story: `index` (K,), growing."""
+
+    story: Story
+    revision: StoryRevision
+    index: Ints
+
+    @property
+    def sigma(self) -> Floats:
+        """(K,) Mahalanobis distance, σ."""
+        return self.revision.sigma[self.index]
+
+    @property
+    def note(self) -> str:
+        """What is said where not all readings are drawn; else empty."""
+        if len(self.index) == len(self.story):
+            return ""
+        worst = max(1, len(self.index) // 5)
+        return (
+            f" Of {len(self.story)} readings {len(self.index)} are drawn: the {worst} furthest off "
+            "and an even choice of the others."
+        )
+
+    def by_level(self) -> Iterator[tuple[int, Bools]]:
+        """Yield each level that occurs with its members (K,)."""
+        level = self.revision.level[self.index]
+        yield from ((int(k), level == k) for k in np.unique(level))
+
+    def named(self, mine: Bools | slice = slice(None)) -> list[str]:
+        """Return some, or all, in words: pose, load, target where there are several, distance."""
+        story, size, sigma = self.story, self.revision.size_m, self.revision.sigma
+        out = []
+        for i in self.index[mine].tolist():
+            words = f"{story.pose_name(i)}, {load_name(story.load_names[i])}"
+            if story.target is not None and len(story.target_names) > 1:
+                words += f", {story.target_names[int(story.target[i])]}"
+            distance = f"{numbers.length(float(size[i]))}, {sigma[i]:.1f} σ"
+            out.append(f"{style.label(words)}: {distance}")
+        return out
+
+    def marks(self, x: Floats, y: Floats, level: int, mine: Bools, **more: Any) -> go.Scatter:
+        """Return some (K,) as points of a level at x, y (K,)."""
+        at = x[mine], y[mine], style.LEVELS[level], style.SYMBOLS[level]
+        more |= {"name": LEVEL_NAMES[level], "text": self.named(mine)}
+        return style.marks(*at, **more, hovertemplate="%{text}<extra></extra>")
+
+
+def drawn(story: Story, revision: StoryRevision, most: int = MOST) -> ChartReadings:
+    """Choose at most `most` readings."""
+    return ChartReadings(story, revision, worst_and_even(revision.whitened_norm2, most))
+
+
+def residual_by_pose(story: Story, revision: StoryRevision) -> go.Figure:
+    """Draw the residual of each reading in σ over its pose, poses in the order of their numbers."""
+    d, full = drawn(story, revision), [story.pose_name(int(i)) for i in story.first]
+    out = _residuals(d, story.row[d.index].astype(float), "", _by(story, revision, "pose"))
+    short = [n if len(n) <= LONGEST_NAME else f"…{n[1 - LONGEST_NAME :]}" for n in full]
+    names, step = [style.label(n) for n in short], -(-len(full) // MOST_POSES)
+    return out.update_xaxes(tickvals=list(range(0, len(names), step)), ticktext=names[::step])
+
+
+def residual_by_load(story: Story, revision: StoryRevision) -> go.Figure:
+    """Draw the residual of each reading in σ over its load."""
+    d = drawn(story, revision)
+    loads = list(dict.fromkeys(story.load_names))
+    of = np.array([loads.index(name) for name in story.load_names], dtype=float)
+    # beside each other within a load, so that points do not hide each other
+    beside = np.random.default_rng(0).uniform(-0.3, 0.3, len(of))
+    out = _residuals(d, (of + beside)[d.index], "load", _by(story, revision, "load"))
+    names = [style.label(load_name(name)) for name in loads]
+    return out.update_xaxes(tickvals=list(range(len(names))), ticktext=names)
+
+
+def residual_over(
+    story: Story, revision: StoryRevision, values: Floats, name: str, unit: str
+) -> go.Figure:
+    """Draw the residual of each reading in σ over a variable.
+
+    `values` (N,) are in units for people, NaN where not known; `unit` is "" for a pure number.
+    """
+    d = drawn(story, revision)
+    known = np.isfinite(values)
+    x = np.where(known, values, np.median(values[known]) if known.any() else 0.0)
+    high = x > np.median(x)
+    says = f"{name} is the same for all readings."
+    if high.any():
+        low, beyond = (_rms(revision.sigma[mine] / 3**0.5) for mine in (~high, high))
+        at = f"{np.median(x):.0f}{unit if unit == '°' else f' {unit}'}".strip()
+        says = (
+            f"Residual over {name}: {low:.2g} times the noise rms up to {at}, "
+            f"{beyond:.2g} times beyond."
+        )
+    return _residuals(d, values[d.index], f"{name} [{unit}]" if unit else name, says)
+
+
+def residual_by_joint(story: Story, revision: StoryRevision, joint: int) -> go.Figure:
+    """Draw the residual of each reading in σ over the angle, or travel, of a joint (from 0)."""
+    unit, factor = numbers.of_joint(story.arm.unit(joint))
+    name = f"joint {joint + 1} {story.arm.kind(joint)}"
+    return residual_over(story, revision, factor * story.q[:, joint], name, unit)
+
+
+def residual_by_time(story: Story, revision: StoryRevision) -> go.Figure:
+    """Draw the residual of each reading in σ over the time; over its row where none is known."""
+    if story.time_s is None:
+        rows = np.arange(len(story), dtype=float)
+        return residual_over(story, revision, rows, "row, in the order of the file", "")
+    minutes = (story.time_s - story.time_s.min()) / 60
+    return residual_over(story, revision, minutes, "time since the first reading", "min")
+
+
+def _rms(x: Floats) -> float:
+    return float(np.sqrt(np.mean(x**2)))
+
+
+def _by(story: Story, revision: StoryRevision, what: str) -> str:
+    """Say which pose or load is worst, and how good the best one is."""
+    names: Sequence[str] = story.load_names
+    if what == "pose":
+        names = [story.pose_name(i) for i in range(len(story))]
+    each, which = np.unique(names, return_inverse=True)
+    rms = np.sqrt(np.bincount(which, revision.sigma**2 / 3) / np.bincount(which))
+    worst = int(np.argmax(rms))
+    name = "the unloaded readings" if each[worst] == UNLOADED else f"{what} {each[worst]}"
+    if len(each) == 1:
+        return f"All readings are of {name}: {rms[0]:.2g} times the noise rms."
+    return (
+        f"Worst is {name} with {rms[worst]:.2g} times the noise rms; best, {rms.min():.2g} times."
+    )
+
+
+def _residuals(d: ChartReadings, x: Floats, title: str, words: str) -> go.Figure:
+    """Draw residuals over x (K,); each point carries the number of its reading."""
+    traces = [d.marks(x, d.sigma, k, mine, customdata=d.index[mine]) for k, mine in d.by_level()]
+    out = style.figure(words + d.note, x=title, y="residual [σ]", traces=traces, height=320)
+    for limit, color in zip(style.SIGMA_LIMITS, (style.AMBER, style.RED), strict=True):
+        out.add_hline(limit, line={"color": color, "dash": "dot", "width": 1})
+    return out.update_yaxes(rangemode="tozero")
+
+
+def measured_predicted(story: Story, revision: StoryRevision) -> go.Figure:
+    """Draw what was measured over what is predicted, along the three base axes.
+
+    Deflections are drawn as they are; of absolute readings the deviation from the nominal arm.
+    Points on the diagonal are predicted exactly.
+    """
+    d = drawn(story, revision, most=500)  # three points each
+    x, y = (1e6 * story.deviation(v) for v in (revision.predicted, story.measured))
+    ends = np.array([min(x.min(), y.min()), max(x.max(), y.max())])
+    traces: list[object] = [style.line(ends, ends, "exact", dash="dash")]
+    colors = (style.MEASURED, style.HOLDOUT, style.AMBER)
+    for k, (axis, color) in enumerate(zip("xyz", colors, strict=True)):
+        values = "measured %{y:.1f} µm, predicted %{x:.1f} µm<extra></extra>"
+        more: dict[str, Any] = {
+            "text": d.named(),
+            "hovertemplate": f"%{{text}}<br>{axis}: {values}",
+        }
+        at = (x[d.index, k], y[d.index, k], color, style.SYMBOLS[k])
+        traces.append(style.marks(*at, name=f"base {axis}", **more))
+    what = "deflection" if story.mode == "deflection" else "deviation from the nominal arm"
+    total = np.sum((y - y.mean(axis=0)) ** 2)
+    share = 100 * (1 - np.sum((y - x) ** 2) / total) if total > 0 else 0.0
+    says = (
+        f"Measured against predicted {what}: the model accounts for {share:.1f} % of what was "
+        f"measured.{d.note}"
+    )
+    titles = {k: f"{v} {what.split()[0]} [µm]" for k, v in (("x", "predicted"), ("y", "measured"))}
+    return style.figure(says, **titles, traces=traces, height=420)
+
+
+def workspace(
+    story: Story, revision: StoryRevision, plane: Literal["xy", "xz"] = "xy"
+) -> go.Figure:
+    """Draw the target of each reading in base axes, marked by its level, with its residual.
+
+    `plane` is of the base's axes; "xy" is seen from above.
+    """
+    d = drawn(story, revision, most=1000)
+    axes = ["xyz".index(a) for a in plane]
+    at, residual = story.anchor[d.index][:, axes], revision.residual[d.index][:, axes]
+    largest = float(revision.size_m.max(initial=0.0))
+    times = magnification(largest)
+    traces: list[object] = []
+    for k, mine in d.by_level():
+        worst = np.flatnonzero(mine)[np.argsort(-d.sigma[mine])][:MOST_ARROWS]
+        start, end = at[worst], at[worst] + times * residual[worst]
+        gap = np.full_like(start, np.nan)  # between one line and the next
+        lines = np.stack([start, end, gap], axis=1).reshape(-1, 2)
+        traces.append(style.line(lines[:, 0], lines[:, 1], color=style.LEVELS[k]))
+        traces.append(d.marks(at[:, 0], at[:, 1], k, mine, size=5, showlegend=False))
+    outside = int((revision.level == len(style.LEVELS) - 1).sum())
+    says = (
+        f"Targets with their errors, {times:g} times enlarged: {outside} of {len(story)} readings "
+        f"are outside the noise (crosses, red); the largest error is "
+        f"{numbers.length(largest)}.{d.note}"
+    )
+    says = "The same from the side." if plane == "xz" else says
+    x, y = (f"base {a} [m]" for a in plane)
+    out = style.figure(says, x=x, y=y, traces=traces, height=280)
+    out.update_yaxes(scaleanchor="x", constrain="domain")
+    return out.update_xaxes(constrain="domain")
+
+
+def magnification(largest_m: float) -> float:
+    """Return the factor, 1, 2 or 5 times a power of ten, by which residuals are drawn longer."""
+    if largest_m <= 0:
+        return 1.0
+    wanted = LONGEST / largest_m
+    power = 10.0 ** np.floor(np.log10(wanted))
+    return float(max(f for f in _NICE if f * power <= wanted * (1 + 1e-9)) * power)
+
+
+def added_variable(r: DependenceCurve, effect: str) -> go.Figure:
+    """Draw residual over regressor, both freed of what the model can do.
+
+    Where the suspect is right the points lie on the line of slope 1, where it explains nothing
+    around zero.
+    """
+    at = worst_and_even(np.abs(r.y), MOST)
+    ends = np.array([r.x.min(), r.x.max()])
+    slope = float(r.x @ r.y / max(float(r.x @ r.x), 1e-300))
+    hover = "would explain %{x:.1f}, residual %{y:.1f}<extra></extra>"
+    traces = [
+        style.marks(r.x[at], r.y[at], name="readings", size=5, hovertemplate=hover),
+        style.line(ends, ends, "if it is right: slope 1", dash="dash"),
+        style.line(ends, slope * ends, f"found: slope {slope:.2f}", style.RED),
+    ]
+    note = "" if len(at) == len(r.x) else f" Of {len(r.x)} points {len(at)} are drawn."
+    says = (
+        f"Residual against what {effect} would explain: slope {slope:.2f}, where 1 means that it "
+        f"is right and 0 that it explains nothing.{note}"
+    )
+    return style.figure(says, x="it would explain [µm]", y=r.y_label, traces=traces, height=340)
+
+
+def misfit_shares(d: Diagnosis) -> go.Figure:
+    """Draw the share of the misfit that follows each recorded variable, the largest on top."""
+    rows = [v for v in d.misfit_breakdown if v.share >= LEAST_SHARE][:MOST_VARIABLES]
+    if not rows:
+        return style.empty("The misfit follows no recorded variable.")
+    shares, names = [100 * v.share for v in rows], [v.variable for v in rows]
+    hover = [f"{v.variable}: {100 * v.share:.0f} %, {numbers.p_equals(v.p_value)}" for v in rows]
+    colors = [style.MEASURED if v.p_value < CERTAIN else style.GREY for v in rows]
+    says = f"{follows(d.misfit_breakdown)} Grey bars are within chance."
+    return style.bars(names, shares, hover, says, "share of the misfit [%]", colors)
+
+
+def curve_chart(c: DependenceCurve) -> go.Figure:
+    """Draw means over a variable with standard uncertainties, and the law, where there is one."""
+    points = style.marks(
+        [style.label(n) for n in c.names] if c.names else c.x,
+        c.y,
+        size=8,
+        error_y={"type": "data", "array": c.error, "color": style.GREY},
+        mode="markers" if c.names or c.line is not None else "lines+markers",
+        line={"color": style.MEASURED},
+        name="readings, mean ± standard uncertainty",
+        hovertemplate="%{x}: %{y:.3g} ± %{error_y.array:.2g}<extra></extra>",
+        showlegend=c.line is not None,
+    )
+    says = f"{c.y_label} over {c.x_label}, from {c.y.min():.3g} to {c.y.max():.3g}; {c.says}"
+    traces = [points] if c.line is None else [style.line(c.line[0], c.line[1], "law"), points]
+    x, y = style.label(c.x_label), style.label(c.y_label)
+    return style.figure(says, x=x, y=y, traces=traces, height=320)
+
+
+def parameter_correlations(fit: Fit) -> tuple[list[str], Floats]:
+    """Return names and correlations (K, K) of the identifiable parameters, formal ones.
+
+    Cov(θ) = T H⁻¹ Tᵀ, as in `identification.uncertainty`.
+    """
+    s = fit.solution
+    covariance = s.transform @ s.equations.inverse(s.beta) @ s.transform.T
+    names = [f"{e.name}.{p.name}" for e in fit.model.effects for p in e.parameters]
+    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    keep = np.flatnonzero(fit.uncertainty.identifiable & s.estimated & (std > 0))
+    of = covariance[np.ix_(keep, keep)] / np.outer(std[keep], std[keep])
+    return [names[k] for k in keep], np.clip(of, -1.0, 1.0)
+
+
+def correlations(fit: Fit) -> go.Figure:
+    """Draw the correlations of the identifiable parameters; of many, those of the strongest."""
+    names, of = parameter_correlations(fit)
+    if len(names) < 2:
+        return style.empty("Fewer than two parameters are identifiable: nothing is correlated.")
+    away = np.abs(of - np.diag(np.diag(of)))
+    i, j = np.unravel_index(int(np.argmax(away)), away.shape)
+    says = (
+        f"The strongest correlation is {of[i, j]:+.2f}, of {names[i]} and {names[j]}; columns are "
+        "in the order of the rows."
+    )
+    some: Ints = np.sort(np.argsort(-away.max(axis=1), kind="stable")[:MOST_CORRELATED])
+    if len(some) < len(names):
+        says += f" The {len(some)} most correlated of {len(names)} parameters are drawn."
+    shown = [style.label(names[k]) for k in some]
+    trace = go.Heatmap(
+        z=style.drawn(of[np.ix_(some, some)]),
+        y=shown,
+        hovertext=[[f"{a}<br>{b}" for a in shown] for b in shown],
+        zmin=-1,
+        zmax=1,
+        colorscale=[[0, style.RED], [0.5, "rgba(136,139,148,0.08)"], [1, style.MEASURED]],
+        hovertemplate="%{hovertext}<br>%{z:+.2f}<extra></extra>",
+        colorbar={"title": {"text": "correlation"}, "thickness": 12},
+    )
+    out = style.figure(says, traces=[trace], height=100 + 16 * len(some))
+    out.update_yaxes(autorange="reversed", tickfont={"size": 10})
+    return out.update_xaxes(showticklabels=False)
+
+
+def noise_check(fit: Fit) -> go.Figure:
+    """Draw the histogram of the whitened residual with the standard normal density.
+
+    With n elements and p effective parameters the rms of the residual is sqrt(1 − p/n) where model
+    and noise are right; the density is that of this standard deviation.
+    """
+    white = fit.white[np.isfinite(fit.white)]
+    reach = float(np.clip(np.ceil(np.quantile(np.abs(white), 0.995)), RANGE, WIDEST))
+    edges, width = np.linspace(-reach, reach, BINS + 1, retstep=True)
+    counts, _ = np.histogram(np.clip(white, -reach + 1e-9, reach - 1e-9), edges)
+    expected = np.sqrt(min(fit.dof / max(len(white), 1), 1.0))
+    fine = np.linspace(-reach, reach, 401)
+    density = len(white) * width * norm.pdf(fine, scale=max(expected, 1e-9))
+    look = {"width": 0.9 * width, "name": "measured", "marker": {"color": style.MEASURED}}
+    hover = "%{x:.2f} σ: %{y} elements<extra></extra>"
+    traces = [
+        go.Bar(x=0.5 * (edges[1:] + edges[:-1]), y=counts, hovertemplate=hover, **look),
+        style.line(fine, density, "the stated noise"),
+    ]
+    factor, (low, high) = fit.variance_factor, fit.variance_factor_interval
+    fits = f"the residual is {'larger' if factor > 1 else 'smaller'} than the stated noise"
+    if low <= 1 <= high:
+        fits = "the stated noise explains the residual"
+    beyond = int(np.sum(np.abs(white) > RANGE))
+    says = (
+        f"Variance factor {factor:.2f}, 95 % interval {low:.2f} to {high:.2f}: {fits}. "
+        f"{beyond} of {len(white)} elements are beyond {RANGE:.0f} σ."
+    )
+    titles = {"x": "whitened residual [σ]", "y": "number of elements"}
+    return style.figure(says, **titles, traces=traces, height=320)
+
+
+def error_per_revision(story: Story) -> go.Figure:
+    """Draw the rms error of each revision, the first on top, and what noise alone would leave."""
+    of = story.revisions
+    changes = [(r.change if k else "") or "start" for k, r in enumerate(of)]
+    names = [style.label(f"{r.revision}: {c}") for r, c in zip(of, changes, strict=True)]
+    traces: list[object] = []
+    for errors, name, color in (
+        ([r.error for r in of], "fitted poses", style.MEASURED),
+        ([r.holdout for r in of], "poses left out", style.HOLDOUT),
+    ):
+        rms = [1e6 * e.rms_m for e in errors]
+        template = "%{y}: %{text} µm, " + name + "<extra></extra>"
+        text = [numbers.digits(v) for v in rms]
+        traces.append(style.bar(rms, names, color, text, name=name, hovertemplate=template))
+    floor, noise = 1e6 * story.noise_floor_m, numbers.length(story.noise_floor_m)
+    left, fitted = (
+        [numbers.length(e.rms_m) for e in errors]
+        for errors in ((of[0].holdout, of[-1].holdout), (of[0].error, of[-1].error))
+    )
+    says = f"One revision: {left[0]} rms error on poses left out; noise alone would leave {noise}."
+    if len(of) > 1:
+        went = "fell" if of[-1].holdout.rms_m < of[0].holdout.rms_m else "went"
+        says = (
+            f"The rms error {went} from {left[0]} to {left[1]} on poses left out, and from "
+            f"{' to '.join(fitted)} on the fitted ones, over {len(of)} revisions; noise alone "
+            f"would leave {noise}."
+        )
+    out = style.figure(says, x="error, rms [µm]", traces=traces, height=130 + 26 * len(names))
+    line = {"color": style.NOISE, "dash": "dash", "width": 2}
+    out.add_vline(floor, line=line, layer="below")
+    # for the legend alone: a shape has no entry there
+    named = {"name": f"noise alone, {numbers.digits(floor)} µm", "mode": "lines", "line": line}
+    out.add_trace(go.Scatter(x=[None], y=[names[0]], hoverinfo="skip", **named))
+    out.update_yaxes(autorange="reversed")
+    return out.update_xaxes(rangemode="tozero")
+
+
+def error_by_pose(c: Comparison) -> go.Figure:
+    """Draw the error of the earlier calibration at each later reading, and what it states."""
+    of = c.today.prediction
+    r, rows = of.readings, of.whitening.reading
+    error, stated = 1e6 * np.linalg.norm(of.raw[:, :3], axis=1), 1e6 * c.today.beyond.stated_m
+    names = [r.pose_names[k] for k in r.pose[rows]]
+    loads = [load_name(r.load_names[k]) for k in r.load[rows]]
+    hover = [
+        style.label(f"{n}, {load}: {e:.0f} µm, stated {s:.0f} µm")
+        for n, load, e, s in zip(names, loads, error, stated, strict=True)
+    ]
+    poses, more = [style.label(n) for n in names], {"hovertext": hover, "hoverinfo": "text"}
+    states = "standard deviation that the calibration states"
+    traces = [
+        style.marks(poses, error, style.MEASURED, "circle", 7, name="error today", **more),
+        style.marks(poses, stated, style.NOISE, "line-ew-open", 7, name=states, **more),
+    ]
+    worst = int(np.argmax(error))
+    says = (
+        f"The error today is {error[worst]:.0f} µm at most, at {names[worst]} ({loads[worst]}); "
+        f"{numbers.length(of.error.rms_m)} rms, where the calibration states "
+        f"{numbers.length(c.today.stated_m)}."
+    )
+    kind = "error" if r.scalar.any() else "3-D error"
+    return style.figure(says, x="pose", y=f"{kind} [µm]", traces=traces)
+
+
+def changes_chart(c: Comparison) -> go.Figure:
+    """Draw how far each change moves the target in the later readings."""
+    moved = [1e6 * x.moved_m for x in c.changes.found]
+    names = [words_of(x.candidate) for x in c.changes.found]
+    hover = [f"{n}: {m:.0f} µm rms" for n, m in zip(names, moved, strict=True)]
+    says = f"{names[0]} moves the target most: {moved[0]:.0f} µm rms." if names else "No change."
+    return style.bars(names, moved, hover, says, "moves the target by, rms [µm]")
+
+
+def arms_chart(t: "Pooled") -> go.Figure:
+    """Draw each arm's parameters by their distance from the type, over what most arms have."""
+    names, off = [p.parameter for p in t.parameters], t.distance
+    odd = {(o.arm, o.parameter) for o in t.odd if not o.campaign}
+    traces = []
+    for unlike, words, color, symbol in (
+        (False, "like its type", style.MEASURED, "circle"),
+        (True, "unlike its type", style.RED, "x"),
+    ):
+        chosen = [
+            (off[a, k], name, f"{arm}, {name}: {off[a, k]:+.1f} σ")
+            for k, name in enumerate(names)
+            for a, arm in enumerate(t.arms)
+            if np.isfinite(off[a, k]) and ((arm, name) in odd) == unlike
+        ]
+        if chosen:
+            x, y, hover = zip(*chosen, strict=True)
+            more: dict[str, Any] = {"hovertext": list(map(style.label, hover)), "hoverinfo": "text"}
+            at = (np.array(x), list(map(style.label, y)), color, symbol, 9)
+            traces.append(style.marks(*at, name=words, opacity=0.8, **more))
+    arms = sorted({arm for arm, _ in odd})
+    says = f"The {len(t.arms)} arms of the type are alike within what they scatter by."
+    if arms:
+        verb = "is" if len(arms) == 1 else "are"
+        says = f"{', '.join(arms)} {verb} unlike the others of the type."
+    band = {"type": "rect", "x0": -FAR, "x1": FAR, "y0": 0, "y1": 1, "yref": "paper"}
+    look = {"fillcolor": style.NOISE, "opacity": 0.12, "line": {"width": 0}, "layer": "below"}
+    return style.figure(
+        says,
+        x="distance from the mean of the type [σ]",
+        height=140 + 24 * len(names),
+        traces=traces,
+        yaxis={"autorange": "reversed", "title": {"text": ""}},
+        shapes=[{**band, **look}],
+    )
+
+
+def made_of(sizes: Sequence[FamilySize]) -> go.Figure:
+    """Draw the size of each family by that of an ordinary arm, over its 95 % interval."""
+    shown, first = sizes[:MOST_FAMILIES], sizes[0]
+    traces = []
+    for named, words, color, symbol in (
+        (True, "named", style.MEASURED, "circle"),
+        (False, "predicted with, not named", style.GREY, "diamond"),
+    ):
+        if not (of := [s for s in shown if s.named == named]):
+            continue
+        low, at, high = np.array([(s.low, s.std, s.high) for s in of]).T / [s.ordinary for s in of]
+        error = {"type": "data", "symmetric": False, "array": high - at, "arrayminus": at - low}
+        hover = {"hovertext": [style.label(_size(s)) for s in of], "hoverinfo": "text"}
+        names, error_x = [style.label(s.name) for s in of], {**error, "color": color}
+        traces.append(
+            style.marks(at, names, color, symbol, 9, name=words, error_x=error_x, **hover)
+        )
+    says = (
+        f"{first.name} moves the target most, by {numbers.length(first.moves_m)} rms. Sizes are "
+        "standard deviations of the parameters, with 95 % intervals; 1 is an ordinary arm, and "
+        "[k] of waves are those from 2^k times a turn on."
+    )
+    if len(shown) < len(sizes):
+        says += f" The {len(shown)} of {len(sizes)} families are drawn that move the target most."
+    ordinary = {"type": "line", "x0": 1, "x1": 1, "y0": 0, "y1": 1, "yref": "paper"}
+    order = [style.label(s.name) for s in reversed(shown)]
+    return style.figure(
+        says,
+        height=130 + 22 * len(shown),
+        traces=traces,
+        # 1, 2 and 5 of each decade
+        xaxis={"type": "log", "dtick": "D2", "title": {"text": "size, by that of an ordinary arm"}},
+        yaxis={"categoryorder": "array", "categoryarray": order, "title": {"text": ""}},
+        shapes=[{**ordinary, "line": {"color": style.NOISE, "width": 1, "dash": "dash"}}],
+    )
+
+
+def _size(s: FamilySize) -> str:
+    low, std, high = (numbers.sizes([(s.unit, v)]) for v in (s.low, s.std, s.high))
+    return f"{s.name}: {std} ({low} to {high}), moves the target by {numbers.length(s.moves_m)} rms"

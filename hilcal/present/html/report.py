@@ -1,0 +1,627 @@
+"""The report of one campaign: first screen, certificate, sections, and an appendix for experts."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2
+
+from hilcal import numbers
+from hilcal.calibration.scatter import COVERAGE, budget
+from hilcal.diagnosis.diagnosis import Diagnosis
+from hilcal.diagnosis.effect_ranking import LEAST_SHARE, Suspect
+from hilcal.diagnosis.repeats import classes
+from hilcal.identification.family_sizes import family_sizes
+from hilcal.identification.fit import Fit
+from hilcal.identification.full_covariance import CovarianceParts
+from hilcal.identification.full_prediction import error_before, names
+from hilcal.identification.residual import CONFIDENCE
+from hilcal.identification.validation import CampaignValidation
+from hilcal.numbers import length, percent
+from hilcal.present import charts
+from hilcal.present.calibration import loads_report, opening, validation_report, worst_table
+from hilcal.present.campaign import info_report, utc
+from hilcal.present.diagnosis import REVISION_HEADS, could_have_been_seen, doubtful, redundant_line
+from hilcal.present.document import (
+    Block,
+    Chart,
+    Items,
+    PageSection,
+    Table,
+    Words,
+    captioned,
+    heading,
+    load_name,
+    note,
+    table,
+)
+from hilcal.present.fit import (
+    background_line,
+    errors,
+    follows,
+    misses,
+    parameters,
+    prior_lines,
+    remarks,
+    scalings_table,
+    where_table,
+)
+from hilcal.present.html import Card, FirstScreen, render
+from hilcal.present.registration import base_line, covariance_words
+from hilcal.present.story import Chapter, Story, StoryRevision, curve, laws, regressor
+from hilcal.present.verdict import headline, message, repeatability_source
+from hilcal.readings.whitening import Scaling
+from hilcal.store.kept_texts import COMMAND
+from hilcal.store.overview import Overview
+from hilcal.store.plan import Plan
+from hilcal.types import Floats
+
+MOST_CURVES, MOST_LISTED, MOST_PARAMETERS, MOST_LAWS = 2, 6, 48, 4
+"""Curves, suspects, parameters and curves of laws that stand on the page; choices."""
+NOT_KEPT = "not kept: made by a program of one's own, at the workbench, or before hilcal kept it"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tested:
+    """A model against readings of another campaign: its file's name and hash, what was found."""
+
+    name: str
+    sha256: str
+    found: CampaignValidation
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReportContent:
+    """Everything that a report says."""
+
+    name: str  # of the campaign's file
+    sha256: str  # of that file
+    made: str  # when the report was made, ISO 8601, UTC
+    version: str  # of the program
+    overview: Overview
+    covariance: CovarianceParts
+    chapters: tuple[Chapter, ...]  # the revisions, oldest first; the report is about the last
+    stored: bool  # whether they are in the file; else the baseline was fitted for this alone
+    story: Story  # of the same revisions
+    left_out: StoryRevision  # the last of them with the errors of poses left out
+    scalings: Mapping[Scaling, Fit]  # the last model with each; empty without an appendix
+    plan: Plan | None
+    tested: Tested | None  # on readings that were never fitted
+    corrected: Mapping[str, Any] | None
+    """Error at uncorrected and at corrected joint targets, as `calibrate` measured it with this
+    revision and the file keeps it: a document of `Improvement`."""
+    limit_m: float | None  # the largest 3-D position error that is allowed
+    operator: str  # who answers for the measurement; empty where nobody is named
+    commands: tuple[str, ...]  # that lead to the same result
+    appendix: bool  # whether the page has one
+
+    @property
+    def fit(self) -> Fit:
+        """The fit that the report is about."""
+        return self.chapters[-1].fit
+
+    @property
+    def diagnosis(self) -> Diagnosis | None:
+        """Its diagnosis; None where it is not scaled by gc."""
+        return self.chapters[-1].diagnosis
+
+
+def page(m: ReportContent) -> str:
+    """Return the report of one campaign as HTML."""
+    about = f"{m.overview.config.robot.model}, {m.name}, {m.made[:10]}"
+    parts = (_certificate(m), *sections(m), *(_appendix(m) if m.appendix else ()))
+    return render("Calibration report", about, first_screen(m), parts)
+
+
+def sections(m: ReportContent) -> tuple[PageSection, ...]:
+    """Return all sections after the certificate."""
+    return (_revisions(m), _where(m), _evidence(m), *_laws(m), _parameters(m))
+
+
+def first_screen(m: ReportContent) -> FirstScreen:
+    """Return what the first screen says."""
+    answers = (
+        ("Is the model good?", _how_good(m)),
+        ("Where is it wrong?", where_wrong(m)),
+        ("What is missing?", _missing(m.diagnosis)),
+    )
+    return FirstScreen(*_headline(m.diagnosis), answers, tuple(_cards(m)), *limit_words(m))
+
+
+def _headline(d: Diagnosis | None) -> tuple[str, str]:
+    """Return the verdict in a few words, and its tone."""
+    if d is None:
+        return "Not judged: only a model fitted with scaling gc can be", "doubt"
+    words = headline(d)
+    if d.verdict == "missing_effect" and d.lead is not None:
+        words = f"{words}: {d.lead.effect}"
+    good, doubt = d.verdict == "adequate", d.verdict in ("ambiguous", "noise_misjudged")
+    tone = "good" if good else "doubt" if doubt and not d.wrong_figures else "bad"
+    return f"{words[0].upper()}{words[1:]}", tone
+
+
+def _how_good(m: ReportContent) -> str:
+    """Say in a sentence how well the model predicts."""
+    d, prior, words = m.diagnosis, m.fit.model.prior, misses(m.fit)
+    if prior is not None:
+        words += f" It also rests on a prior: {prior.posterior.source.campaign or 'a posterior'}."
+    if d is None:
+        return words
+    if d.verdict == "noise_misjudged":
+        return f"It cannot be told, for the stated noise is wrong. {words}"
+    good = d.verdict == "adequate" or d.reason == "inseparable_addition"
+    return f"{'Yes' if good else 'Not yet'}. {words}"
+
+
+def where_wrong(m: ReportContent) -> str:
+    """Say in a sentence where it is worst, and what the misfit follows."""
+    d, fit, error = m.diagnosis, m.fit, left_out_errors(m.fit)
+    furthest = int(fit.whitening.reading[np.argmax(error)])
+    pose, load = names(fit.readings[~fit.outlier], furthest)
+    at = f"{pose} {load_name(load, 'under ')}"
+    words = f"Of the poses left out, {at} is furthest off: {length(error.max())}."
+    if d is None:
+        return words
+    if not d.residual_is_noise:
+        return f"{words} {follows(d.misfit_breakdown)}"
+    # With R whitened elements of standard deviation 1 their sum of squares is χ²(R).
+    count = fit.whitening.rank
+    if fit.holdout.rms_sigma**2 * count <= chi2.isf((1 - CONFIDENCE) / 2, count):
+        return "Nowhere beyond the noise: all poses and loads are predicted within it."
+    return (
+        "Nowhere in particular: what is left of the fitted poses is noise. Poses left out are off "
+        f"by {fit.holdout.rms_sigma:.2f} times the noise, more than by chance; more poses would "
+        f"lower that. {words}"
+    )
+
+
+def _missing(d: Diagnosis | None) -> str:
+    """Say what is missing, and what that effect is."""
+    if d is None:
+        return "Not judged; hilcal identify --scaling gc, then hilcal diagnose, say it."
+    if d.verdict == "adequate":
+        return "Nothing that these readings could show."
+    words = numbers.sentence(message(d), d.significant)
+    if d.lead is None or d.wrong_figures:
+        return words
+    name = d.lead.coarse or d.lead.effect
+    return f"{words} {name} is: {d.fit.model.catalogue[name].summary}."
+
+
+def _cards(m: ReportContent) -> Iterator[Card]:
+    def card(label: str, rms_m: float, max_m: float, more: str = "") -> Card:
+        return Card(label, length(rms_m), f"rms; largest {length(max_m)}{more}")
+
+    before, held = error_before(m.fit), m.fit.holdout
+    what = "nominal arm, only its frames fitted"
+    if m.fit.mode == "deflection":
+        what = "deflection under load; a rigid arm has none"
+    yield card("Before", before.rms_m, before.max_m, f"; {what}")
+    if m.tested is not None:
+        e, unseen = m.tested.found.prediction.error, m.tested.found.judged.unseen
+        kind = "never fitted" if unseen else "fitted, so no test"
+        yield card("After, validation", e.rms_m, e.max_m, f"; {kind}")
+    if m.corrected is not None:
+        of = m.corrected["error"]
+        was, now = (length(float(of[k]["rms_m"])) for k in ("before", "after"))
+        words = f"rms; {was} without correction; {of['count']} points"
+        yield Card("Measured at corrected targets", now, words)
+    yield card("After, poses left out", held.rms_m, held.max_m)
+    noise = "rms that the stated noise would leave"
+    yield Card("Noise alone", length(m.story.noise_floor_m), noise)
+
+
+def limit_words(m: ReportContent) -> tuple[str, bool | None]:
+    """Say whether the limit is kept, and by what that was judged."""
+    if m.limit_m is None:
+        return "", None
+    if m.tested is not None:
+        a = m.tested.found.shares
+        count, over, passed, most = a.everything.count, a.over, bool(a.passed), a.everything.max_m
+        end = f" (campaign {m.tested.name}, never fitted; largest {length(most)})."
+        if a.undecided:
+            end += " Noise alone exceeds the limit, so that these readings cannot tell."
+    else:
+        error = left_out_errors(m.fit)
+        count, over = len(error), int(np.sum(error > m.limit_m))
+        passed, most = over == 0, float(error.max())
+        end = (
+            f", each pose predicted without itself (largest {length(most)}). No validation "
+            "campaign was given: an independent test is missing."
+        )
+    head = f"{'PASSED' if passed else 'FAILED'}: {count - over} of {count} errors are within"
+    return f"{head} {length(m.limit_m)}{end}", passed
+
+
+def left_out_errors(fit: Fit) -> Floats:
+    """Return the 3-D errors (D,) of fitted measurements predicted without their pose, m."""
+    return np.asarray(np.linalg.norm(fit.left_out[:, :3], axis=1))
+
+
+def _certificate(m: ReportContent) -> PageSection:
+    """Return the certificate for a quality manager."""
+    parts: list[Block] = [replace(errors(m.fit), caption="Error before and after")]
+    if m.corrected is not None:
+        parts.append(_corrected(m.corrected))
+    for title, blocks in (
+        ("Uncertainty", _uncertainty(m.fit)),
+        ("Limit", _limit(m)),
+        ("Poses and loads", _conditions(m)),
+        ("What was not tested", [Items(tuple(_not_tested(m)))]),
+        ("Measured with", _instruments(m)),
+    ):
+        parts += [heading(title), *blocks]
+    return PageSection("certificate", "Certificate", tuple(parts))
+
+
+def _corrected(found: Mapping[str, Any]) -> Table:
+    """Errors where the arm was moved to corrected joint targets and measured again."""
+    heads = ("load", "n", "before, rms", "largest", "corrected, rms", "largest", "in 95 % band")
+    out = table(*heads, caption="Measured at uncorrected and at corrected joint targets")
+    for part in (*found["loads"], found["error"]):
+        sizes = [part[when][k] for when in ("before", "after") for k in ("rms_m", "max_m")]
+        name, within = load_name(str(part["name"])), f"{part['inside']} of {part['count']}"
+        out.add(name, str(part["count"]), *(length(float(x)) for x in sizes), within)
+    return out
+
+
+def _uncertainty(fit: Fit) -> Iterator[Block]:
+    if fit.scaling != "gc":
+        yield "No uncertainty is stated: the fit is not weighted by the full covariance."
+        return
+    b = budget(fit)
+    whole = ~fit.readings[~fit.outlier].scalar[fit.whitening.reading]
+    error = left_out_errors(fit)[whole]
+    inside = int(np.sum(error <= b.expanded))
+    what = "deflection" if fit.mode == "deflection" else "position"
+    within = f"; {inside} of {len(error)} {what}s of poses left out are within it"
+    yield Words(
+        f"Expected accuracy of a predicted {what} at a pose that was not fitted: expanded "
+        f"uncertainty U = {length(b.expanded)} (3-D, k = {COVERAGE:.0f})"
+        f"{within * bool(len(error))}.",
+        "strong",
+    )
+    repeats = repeatability_source(b.scatter_source, fit.model.cell.arm)
+    parts = (
+        ("estimated parameters", "type A: errors of poses left out", b.parameters),
+        ("misfit at fitted poses", "type A: residuals beyond the noise", b.misfit),
+        ("repeatability of the arm", repeats, b.scatter),
+        ("noise of the instrument", "type B: as stated", b.instrument),
+        ("combined, u", "", b.combined),
+    )
+    rows = [(*x, length(u), percent((u / b.combined) ** 2)) for *x, u in parts]
+    caption = "Contributions (GUM): standard uncertainties"
+    yield table("contribution", "evaluated by", "3-D", "share of u²", rows=rows, caption=caption)
+    yield note(
+        "This holds for poses and loads among those below. It does not contain what no reading "
+        "here can show: an error of scale or alignment of the instrument beyond its stated "
+        "covariance, temperatures and loads that were not measured, and changes of the arm since."
+    )
+
+
+def _limit(m: ReportContent) -> Iterator[Block]:
+    words, passed = limit_words(m)
+    if passed is None:
+        yield "No limit was given (hilcal report --limit LENGTH), so nothing is passed or failed."
+    else:
+        yield Words(words, "strong")
+    if m.tested is not None:
+        t = m.tested.found
+        yield f"Validation campaign {m.tested.name}"
+        yield from opening(t.judged, t.prediction)
+        report = validation_report(t.judged, t.prediction, t.beyond)
+        yield from captioned(report, "Validation")
+        yield from captioned(loads_report(t.shares), "Errors of the validation campaign")
+
+
+def _conditions(m: ReportContent) -> Iterator[Block]:
+    o, r = m.overview, m.fit.readings
+    loads = ", ".join(f"{load_name(name)} ({n})" for name, n in o.loads.items())
+    outliers = int(m.fit.outlier.sum())
+    gross = f"; {outliers} set aside as gross errors" if outliers else ""
+    poses = len(np.unique(r.pose))
+    yield f"{len(r)} readings of {poses} poses{gross}. Loads (readings): {loads}."
+    yield from prior_lines(m.fit)
+    about = {} if m.plan is None else m.plan.about
+    efficiency, criterion = about.get("efficiency"), about.get("criterion")
+    if m.plan is None:
+        yield ("The readings were imported; the file holds no plan, so nothing proves the choice.")
+    elif not isinstance(efficiency, int | float):
+        yield "They were planned."
+    else:
+        yield (
+            f"This choice is at least {100 * efficiency:.1f} % as informative as the best possible "
+            f"one, by criterion {criterion}: a bound that the general equivalence theorem proves."
+        )
+    q, units = r.states.q, m.fit.model.cell.arm.units
+    rows = [
+        (name, *(numbers.joint_value(x, unit, 0) for x, unit in zip(ends, units, strict=True)))
+        for name, ends in (("from", q.min(axis=0)), ("to", q.max(axis=0)))
+    ]
+    heads = ("joint", *(str(j + 1) for j in range(q.shape[1])))
+    yield table(*heads, caption="Joint angles that were measured", rows=rows)
+    if m.tested is None:
+        yield _by_load(m)
+
+
+def _by_load(m: ReportContent) -> Table:
+    """Errors of poses left out by load."""
+    fit, error = m.fit, left_out_errors(m.fit)
+    kept = fit.readings[~fit.outlier][fit.whitening.reading]
+    limit = () if m.limit_m is None else ("limit",)
+    heads = ("load", "n", "rms", "largest", "at pose", *limit)
+    out = table(*heads, caption="Error of poses left out, by load")
+    for k in np.unique(kept.load):
+        mine = np.flatnonzero(kept.load == k)
+        worst = mine[int(np.argmax(error[mine]))]
+        rms, most = (length(float(x)) for x in (np.sqrt(np.mean(error[mine] ** 2)), error[worst]))
+        row = [load_name(fit.readings.load_names[k]), str(len(mine)), rms, most]
+        row.append(fit.readings.pose_names[kept.pose[worst]])
+        if m.limit_m is not None:
+            row.append("kept" if error[worst] <= m.limit_m else "over")
+        out.add(*row)
+    return out
+
+
+def _not_tested(m: ReportContent) -> Iterator[str]:
+    """Yield what these readings say nothing of."""
+    s, fit, d = m.fit.readings.states, m.fit, m.diagnosis
+    if m.tested is None:
+        yield "No validation campaign: the errors are those of poses left out in turn."
+    elif not m.tested.found.judged.unseen:
+        yield f"{m.tested.name} was fitted itself: it tests nothing."
+    yield "Joint angles outside of the ranges above, and loads other than those above."
+    if not np.any(s.wrench):
+        yield "Any load: all readings are unloaded."
+    for values, name in (
+        (s.air_temperature, "temperature of the air"),
+        (s.joint_temperature, "temperature of the joints"),
+        (s.approach, "side from which joints arrive"),
+        (s.load_time, "time under load (creep)"),
+    ):
+        if values is None:
+            yield f"Not recorded: {name}."
+        elif np.ptp(values) == 0:
+            yield f"Always the same: {name}."
+    if fit.readings.m == 3:
+        yield "Orientation of the tool: positions alone were measured."
+    yield "The arm in motion: all readings were taken at rest."
+    if fit.mode == "deflection":
+        yield "Geometry: deflections were fitted, in which it cancels."
+    if d is not None and d.not_shown:
+        yield f"At no plausible size would these readings show {numbers.names(d.not_shown, 'or')}."
+
+
+def _instruments(m: ReportContent) -> Iterator[Block]:
+    o = m.overview
+    if o.instruments:
+        heads = ("part", "instrument", "serial number", "answered first (UTC)", "further")
+        out = table(*heads, caption="Instruments")
+        for i in o.instruments:
+            more = "; ".join(f"{k}: {v}" for k, v in i.facts.items() if k != "serial number")
+            out.add(i.device, i.name, i.serial_number or "not told", utc(i.utc), more)
+        yield out
+    else:
+        imported = ": the readings were imported from a table" if o.planned is None else ""
+        yield f"The file names no instrument{imported}."
+    yield note(f"Noise of the readings: {covariance_words(m.covariance)}.")
+    revision = str(m.chapters[-1].number) if m.stored else "none stored: the baseline"
+    yield identity(
+        ("Robot", o.config.robot.model),
+        ("Base", base_line(m.fit.model.cell, m.fit.frames, m.fit.mode)),
+        ("Operator", m.operator or "not stated"),
+        ("Campaign", f"{m.name}, made {utc(o.created)} UTC"),
+        ("SHA-256", m.sha256),
+        *([("Validation SHA-256", m.tested.sha256)] if m.tested else []),
+        ("Revision", revision),
+        ("Report made", f"{utc(m.made)} UTC by hilcal {m.version}"),
+    )
+
+
+def identity(*facts: tuple[str, str]) -> Table:
+    """Return what a report is of, and who made it."""
+    return table("", "", caption="Identity of this report", rows=facts)
+
+
+def _revisions(m: ReportContent) -> PageSection:
+    parts: list[Block] = [
+        Chart("Error per revision", charts.error_per_revision(m.story), wide=True, height=0),
+        table(*REVISION_HEADS, rows=(r.cells for r in m.story.revisions), caption="Revisions"),
+    ]
+    if not m.stored:
+        parts.append(
+            "No revision is stored in the campaign: the baseline was fitted for this report "
+            "and is not kept. hilcal refine finds the effects that are missing."
+        )
+    return PageSection("revisions", "How the error fell", tuple(parts))
+
+
+def _where(m: ReportContent) -> PageSection:
+    of, d = (m.story, m.left_out), m.diagnosis
+    parts: list[Block] = [
+        "Errors are those of poses left out: each is predicted by a fit to the others."
+        + (" Readings set aside as gross errors are drawn, too." * bool(m.fit.outlier.any())),
+        Chart("By pose", charts.residual_by_pose(*of), wide=True),
+        Chart("Measured against predicted", charts.measured_predicted(*of)),
+    ]
+    if len(set(m.story.load_names)) > 1:
+        parts.append(Chart("By load", charts.residual_by_load(*of)))
+    if m.story.time_s is not None:
+        parts.append(Chart("Over time", charts.residual_by_time(*of)))
+    parts += [
+        Chart("From above", charts.workspace(*of, "xy")),
+        Chart("From the side", charts.workspace(*of, "xz")),
+        Chart("Noise check: fitted poses", charts.noise_check(m.fit)),
+    ]
+    if d is not None:
+        if d.verdict != "adequate":
+            curves = [curve(v) for v in d.dependences if v.determined][:MOST_CURVES]
+            parts += [Chart(c.title, charts.curve_chart(c)) for c in curves]
+        blocks = captioned(where_table(d.misfit_breakdown), "What the error follows")
+        parts += [replace(p, narrow=True) if isinstance(p, Table) else p for p in blocks]
+    return PageSection("where", "Where it fails", (*parts, _noise(m)))
+
+
+def _noise(m: ReportContent) -> str:
+    """Say what the repeats tell of the noise."""
+    e = None if m.diagnosis is None else m.diagnosis.pure_error
+    if e is not None:
+        low, high = e.interval
+        return (
+            f"Repeated readings scatter {e.factor**0.5:.2f} times as much as stated (variance "
+            f"factor {e.factor:.2f}, 95 % interval {low:.2f} to {high:.2f}, {e.dof:.0f} degrees of "
+            "freedom)."
+        )
+    kept = m.fit.readings[~m.fit.outlier]
+    again = len(kept) - len(np.unique(classes(kept)))
+    if not again:
+        return "No reading was repeated: the noise is judged by the model alone."
+    what = "deflection" if m.fit.mode == "deflection" else "reading"
+    return (
+        f"{again} of {len(kept)} readings repeat an earlier one, too few to judge the noise of a "
+        f"{what} by them: the model alone does."
+    )
+
+
+def _evidence(m: ReportContent) -> PageSection:
+    d, title = m.diagnosis, "What is missing, with its evidence"
+    if d is None:
+        words = "Not diagnosed: only a model fitted with scaling gc can be."
+        return PageSection("evidence", title, (words,))
+    parts: list[Block] = []
+    if d.verdict == "adequate":  # else the first screen has it
+        parts.append(numbers.sentence(message(d)))
+    parts.append(_suspects_table(d.suspects[:MOST_LISTED], "Suspects, best first"))
+    parts += [*doubtful(d), *redundant_line(d)]
+    parts += _added_variables(d, [s for s in d.suspects if s.passes][:MOST_CURVES])
+    return PageSection("evidence", title, tuple(parts))
+
+
+def _added_variables(d: Diagnosis, of: Sequence[Suspect]) -> Iterator[Chart]:
+    """Yield the added-variable plot of each suspect that has one."""
+    for s in of:
+        if (found := regressor(d.fit, s)) is not None:
+            yield Chart(f"Added variable: {s.effect}", charts.added_variable(found, s.effect))
+
+
+def _suspects_table(rows: Sequence[Suspect], caption: str) -> Table:
+    """Return a table of suspects."""
+    heads = ("effect", "explains", "on poses left out", "log evidence", "p-value", "passes")
+    out = table(*heads, "not separable from", caption=caption)
+    for s in rows:
+        shares = percent(s.share), percent(max(s.holdout_share, 0.0))
+        scores = f"{s.score.log_evidence:z.1f}", numbers.chance(s.score.p_value)
+        passes = "yes" if s.passes else "no"
+        out.add(s.effect, *shares, *scores, passes, ", ".join(s.same_as) or "-")
+    return out
+
+
+def _laws(m: ReportContent) -> Iterator[PageSection]:
+    found = laws(m.fit)
+    if not found:
+        return
+    parts: list[Block] = []
+    for name, facts in {law.title: law.facts for law in found}.items():
+        parts.append(table("", "", rows=facts, caption=f"{name}, an effect of a file"))
+    for law in found[:MOST_LAWS]:
+        parts.append(Chart(f"{law.title}: {law.y_label}", charts.curve_chart(law)))
+    parts.append(
+        note(
+            "Each point is the mean over readings of the law's value plus what it leaves of them. "
+            "Nothing is known outside of the range that is drawn, nor within its gaps."
+        )
+    )
+    yield PageSection("laws", "Laws beyond the catalogue", tuple(parts))
+
+
+def _parameters(m: ReportContent) -> PageSection:
+    fit, catalogue = m.fit, m.fit.model.catalogue
+    known = [name for name in fit.model.named if name in catalogue.names]
+    parts: list[Block] = [note(f"{name}: {catalogue[name].summary}.") for name in known]
+    more = "hilcal report --appendix"
+    for part in captioned(parameters(fit, MOST_PARAMETERS, more), "Parameters"):
+        parts += _halves(part) if isinstance(part, Table) else (part,)
+    parts += background_line(fit)
+    if sizes := family_sizes(fit):
+        parts.append(Chart("What this arm is made of", charts.made_of(sizes), wide=True, height=0))
+    return PageSection("parameters", "Parameters", tuple(parts))
+
+
+def _halves(t: Table) -> Iterator[Table]:
+    """Yield the two halves of a table of parameters, without what they mean."""
+    middle = -(-len(t.rows) // 2)
+    for rows, more in ((t.rows[:middle], ""), (t.rows[middle:], ", continued")):
+        if rows:
+            cut, caption = [row[:-1] for row in rows], f"{t.caption}{more}"
+            yield replace(t, caption=caption, heads=t.heads[:-1], rows=cut, narrow=True)
+
+
+def _appendix(m: ReportContent) -> Iterator[PageSection]:
+    """Yield the sections of the appendix."""
+    for name, title, parts in (
+        ("joints", "Over each joint", _joints(m)),
+        ("rejected", "Rejected suspects", _rejected(m)),
+        ("all", "Parameters and what they mean", _all_parameters(m)),
+        ("scalings", "Scaling none, gu and gc", _scalings(m)),
+        ("planned", "As planned and as reached", _planned(m)),
+        ("provenance", "Provenance", _provenance(m)),
+    ):
+        if blocks := tuple(parts):
+            yield PageSection(name, f"Appendix: {title}", blocks)
+
+
+def _joints(m: ReportContent) -> Iterator[Block]:
+    for j in range(m.story.arm.n):
+        yield Chart(f"Over joint {j + 1}", charts.residual_by_joint(m.story, m.left_out, j))
+    if m.tested is not None:
+        yield replace(worst_table(m.tested.found.shares), caption="Worst poses")
+
+
+def _rejected(m: ReportContent) -> Iterator[Block]:
+    d = m.diagnosis
+    if d is None:
+        return
+    if len(d.suspects) > MOST_LISTED:
+        yield _suspects_table(d.suspects[MOST_LISTED:], "Other suspects")
+    rejected = [s for s in d.suspects if not s.passes and s.plausible and s.share >= LEAST_SHARE]
+    yield from _added_variables(d, rejected)
+    yield from captioned(could_have_been_seen(d), "What could have been seen")
+
+
+def _all_parameters(m: ReportContent) -> Iterator[Block]:
+    yield from captioned(parameters(m.fit), "Parameters with standard uncertainties")
+    yield from captioned(remarks(m.fit))
+    yield Chart("Correlations", charts.correlations(m.fit), wide=True, height=0)
+
+
+def _scalings(m: ReportContent) -> Iterator[Block]:
+    if len(m.scalings) > 1:
+        yield from captioned(scalings_table(m.scalings), "The same model with each scaling")
+
+
+def _planned(m: ReportContent) -> Iterator[Block]:
+    predicted = None if m.plan is None else m.plan.about.get("predicted_std")
+    if not isinstance(predicted, dict):
+        return
+    out = table("parameter", "planned", "reached", caption="Standard uncertainties")
+    for p in m.fit.parameters:
+        planned = predicted.get(p.name)
+        if p.std is not None and isinstance(planned, int | float):
+            out.add(p.name, *(numbers.sizes([(p.unit, float(s))]) for s in (planned, p.std)))
+    if out.rows:
+        yield out
+
+
+def _provenance(m: ReportContent) -> Iterator[Block]:
+    o = m.overview
+    heads = ("revision", "made (UTC)", "hilcal", "SHA-256 of its readings")
+    rows = [(str(r.number), utc(r.created), r.program_version, r.data_hash) for r in o.revisions]
+    yield table(*heads, rows=rows, caption="Revisions by time and program")
+    made = [("the campaign", o.command or NOT_KEPT)]
+    made += [(f"revision {r.number}", str(r.options.get(COMMAND, NOT_KEPT))) for r in o.revisions]
+    yield table("made", "by", rows=made, caption="Commands as they were typed")
+    yield heading("Commands that show the same")
+    yield from (Words(c, "code") for c in m.commands)
+    info = info_report(o, m.name, covariance_words(m.covariance))
+    yield from captioned(info, "The campaign file")

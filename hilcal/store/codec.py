@@ -1,0 +1,122 @@
+"""The one codec of what is stored: values as JSON by their fields, and back by their types.
+
+A dataclass becomes an object of its fields, arrays and tuples lists, infinite numbers, which JSON
+lacks, the texts "inf" and "-inf". Back, a field that is missing has its default, and further ones
+are passed over: so what earlier programs wrote is read.
+"""
+
+import base64
+import json
+import types
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, Field, fields, is_dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+from hilcal import limits
+from hilcal.errors import InputError
+from hilcal.names import check_names
+from hilcal.toml import parse_json
+from hilcal.types import Floats
+from hilcal.whole_file import replace_file
+
+T = TypeVar("T")
+
+
+def encode(value: Any) -> Any:
+    """Return a value as JSON."""
+    if is_dataclass(value):
+        return {f.name: encode(getattr(value, f.name)) for f in fields(value) if f.init}
+    if isinstance(value, np.ndarray):
+        return encode(value.tolist())
+    if isinstance(value, float) and np.isinf(value):
+        return str(value)
+    if isinstance(value, Mapping):
+        return {str(k): encode(v) for k, v in value.items()}
+    return [encode(v) for v in value] if isinstance(value, tuple | list) else value
+
+
+def decode(kind: Any, content: Any) -> Any:
+    """Return the value of a type that `encode` made JSON of; others raise as conversions do."""
+    origin, of = get_origin(kind), get_args(kind)
+    if origin in (Union, types.UnionType):  # of a type and None
+        return None if content is None else decode(of[0], content)
+    if origin is Literal:
+        if content not in of:
+            raise ValueError(f"{content!r} is none of {of}")
+        return content
+    if origin is np.ndarray:
+        return np.array(content, dtype=get_args(of[1])[0])
+    if origin is tuple:
+        kinds = of[:1] * len(content) if of[1:] == (...,) else of
+        return tuple(decode(k, v) for k, v in zip(kinds, content, strict=True))
+    if origin is not None and issubclass(origin, Mapping):
+        return {str(k): decode(of[1], v) for k, v in content.items()}
+    if isinstance(kind, type) and is_dataclass(kind):
+        hints = _hints(kind)
+        given = [f for f in fields(kind) if f.init and (f.name in content or _required(f))]
+        return kind(**{f.name: decode(hints[f.name], content[f.name]) for f in given})
+    if kind is float:
+        return float(content)
+    if kind in (str, int, bool) and type(content) is not kind:
+        raise TypeError(f"{content!r} is no {kind.__name__}")
+    return content
+
+
+@cache
+def _hints(kind: Any) -> Mapping[str, Any]:
+    return get_type_hints(kind)
+
+
+def _required(f: Field[Any]) -> bool:
+    return f.default is MISSING and f.default_factory is MISSING
+
+
+def pack(values: Floats) -> str:
+    """Return numbers as base64 of their little-endian doubles, so that none is rounded."""
+    return base64.b64encode(np.ascontiguousarray(values, dtype="<f8").tobytes()).decode("ascii")
+
+
+def unpack(text: str) -> Floats:
+    """Return the numbers (N,) that `pack` wrote."""
+    return np.frombuffer(base64.b64decode(text), dtype="<f8").astype(float)
+
+
+def write_document(path: Path, content: Mapping[str, object], indent: int | None = None) -> None:
+    """Write a document to a JSON file."""
+    replace_file(path, json.dumps(content, indent=indent, allow_nan=False) + "\n")
+
+
+def read_document(
+    content: object, what: str, form: str, versions: tuple[int, ...], read: Callable[[Any], T]
+) -> T:
+    """Return what a document holds; refuses another kind of it, a newer version, a damaged one."""
+    if not isinstance(content, dict) or content.get("format") != form:
+        raise InputError(f'no {what}; valid: a JSON document with "format": "{form}"')
+    if content.get("version") not in versions:
+        known = "version" + "s" * (len(versions) > 1) + " " + " and ".join(map(str, versions))
+        raise InputError(
+            f"a {what} of version {content.get('version')}, written by hilcal "
+            f"{content.get('hilcal')}; this program reads {known}"
+        )
+    check_names({k: v for k, v in content.items() if k != "source"}, what)
+    try:
+        return read(content)
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
+        raise InputError(f"a damaged {what}: {error!r}") from None
+
+
+@limits.bounded
+def read_file(path: Path, what: str, read: Callable[[Any], T]) -> T:
+    """Return what a JSON file holds; `read` makes the value of its content."""
+    try:
+        content = parse_json(limits.read_text(path, limits.DOCUMENT))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: no {what}: {error}") from None
+    try:
+        return read(content)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None

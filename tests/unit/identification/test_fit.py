@@ -1,0 +1,460 @@
+"""Fits: exact without noise, free of units, honest about what the data cannot see; as values."""
+
+import re
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hilcal.cell import Cell
+from hilcal.effects.joint_compliance import JointCompliance
+from hilcal.effects.protocol import Effect
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.identification.baseline import baseline, loads_differ, masses_note, with_effects
+from hilcal.identification.fit import Fit, fit
+from hilcal.identification.fit_document import notes, to_json
+from hilcal.model.model import Model
+from hilcal.readings.readings import Readings, States
+from hilcal.readings.whitening import SCALINGS
+from hilcal.robot import se3
+from tests.support.campaigns import campaign, cell_of, noiseless, plan, true_parameters, with_noise
+from tests.support.effect_cases import make
+from tests.support.fit_cases import MODES, based, compliances, named, predicted
+
+FRAMES = ("base_frame", "target_offset", "encoder_offset")
+WAVES = ("joint_compliance", "transmission_error")
+GEOMETRY = ("joint_compliance", "link_geometry")
+
+
+# --- recovery -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("m", [3, 6])
+@pytest.mark.parametrize("mode", MODES)
+def test_parameters_are_recovered_exactly_without_noise(mode, m):
+    c = campaign(plan_seed=0, registration_known=True, m=m)
+    model = baseline(c.cell, c.readings, mode)
+    truth = c.world.physics.joint_compliance
+    found = fit(model, predicted(model, c.readings, truth), mode)
+    assert found.solution.converged
+    # Steps end below 1e-5 σ and shrink at least tenfold each.
+    np.testing.assert_array_less(np.abs(found.theta - truth), 1e-6 * found.uncertainty.formal)
+    np.testing.assert_allclose(found.theta, truth, rtol=1e-8)
+    assert found.chi2 < 1e-8
+    if m == 3:  # and by mechanics of its own: equilibria there hold to 1e-12 rad of 1e-3
+        found = fit(model, noiseless(c.world, plan()), mode)
+        np.testing.assert_allclose(found.theta, truth, rtol=1e-8)
+
+
+@pytest.mark.parametrize("m", [3, 6])
+def test_unknown_frames_are_recovered_with_the_compliances(m):
+    c = campaign(plan_seed=0, target_known=False, m=m)
+    found = based(c.cell, noiseless(c.world, plan(), m), "absolute")
+    assert found.model.names == ("base_frame", "target_offset", "joint_compliance")
+    np.testing.assert_allclose(compliances(found), c.world.physics.joint_compliance, rtol=1e-7)
+    assert found.error.max_m < 1e-10
+
+
+def far_off(rng: np.random.Generator) -> np.ndarray:
+    """A base turned by degrees, a target off by centimetres, zeros off by degrees.
+
+    The first zero is the base's turn about z, the last one the target's.
+    """
+    base, target = rng.uniform(-0.1, 0.1, 6), rng.uniform(-0.05, 0.05, 6)
+    return np.concatenate([base, target, [0.0], rng.uniform(-0.08, 0.08, 4), [0.0]])
+
+
+def of_names(names: tuple[str, ...], cell: Cell, states: States, m: int) -> Model:
+    return Model(cell, tuple(make(n, cell, states, m=m) for n in names))
+
+
+@pytest.mark.parametrize("m", [3, 6])
+@pytest.mark.parametrize("seed", range(3))
+def test_geometry_converges_from_large_errors(m, seed):
+    c = campaign(plan_seed=0, registration_known=True, m=m)
+    bare = c.readings[c.readings.unloaded]
+    model = of_names(FRAMES, replace(c.cell, gravity=np.zeros(3)), bare.states, m)
+    truth = far_off(np.random.default_rng(seed))
+    truth = truth if m == 6 else np.delete(truth, [9, 10, 11])
+    found = fit(model, predicted(model, bare, truth), "absolute")
+    assert found.solution.converged
+    assert found.solution.iterations <= 8
+    assert found.error.max_m < 1e-10
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_counts_as_seen_does_not_depend_on_how_far_off_the_start_was(seed):
+    c = campaign(plan_seed=0, registration_known=True, m=6)
+    model = of_names((*FRAMES, "joint_compliance"), c.cell, c.readings.states, 6)
+    truth = np.append(far_off(np.random.default_rng(seed)), c.world.physics.joint_compliance)
+    noisy = with_noise(predicted(model, c.readings, truth), np.random.default_rng(seed))
+    near, far = (fit(model, noisy, "absolute", start=start) for start in (truth, None))
+    assert far.rank == near.rank
+    assert not (far.outlier ^ near.outlier).any()
+    assert far.uncertainty.identifiable.sum() == near.uncertainty.identifiable.sum()
+
+
+def test_the_same_data_give_the_same_numbers_and_a_fit_is_found_again_from_its_own():
+    c = campaign("transmission_error", plan_seed=0)
+    model = with_effects(c.cell, c.readings, "absolute", WAVES)
+    a, b = (fit(model, c.readings, "absolute") for _ in range(2))
+    np.testing.assert_array_equal(a.theta, b.theta)
+    np.testing.assert_array_equal(a.uncertainty.std, b.uncertainty.std)
+    assert to_json(a) == to_json(b)
+    again = fit(model, c.readings, "absolute", start=a.theta, prior=a.solution.prior)
+    # Steps below 1e-5 σ count as none; seen along the least determined direction.
+    assert np.nanmax(np.abs(again.theta - a.theta) / a.uncertainty.std) < 1e-3
+    assert again.chi2 == pytest.approx(a.chi2, rel=1e-6)
+
+
+def test_the_order_of_readings_and_of_effects_does_not_matter():
+    c = campaign(plan_seed=0, target_known=False)
+    found = based(c.cell, c.readings, "absolute", ("joint_compliance", "hysteresis"))
+    shuffled = c.readings[np.random.default_rng(1).permutation(len(c.readings))]
+    turned = replace(found.model, effects=found.model.effects[::-1])
+    other = named(fit(turned, shuffled, "absolute"))
+    for name, (value, std) in named(found).items():
+        assert other[name][0] == pytest.approx(value, abs=1e-4 * std), name
+        assert other[name][1] == pytest.approx(std, rel=1e-6), name
+
+
+# --- identifiability ------------------------------------------------------------------------
+
+
+def seen_directions(model: Model, readings: Readings, m: int) -> int:
+    """Numeric rank of the scaled Jacobian, by differences of the prediction."""
+    scale = np.array([p.scale for e in model.effects for p in e.parameters])
+    base = model.predict(readings.states, np.zeros(model.size)).observation.rotation
+    columns = []
+    for p in range(model.size):
+        both = []
+        for h in (1.0, -1.0):
+            step = h * scale[p] * np.eye(model.size)[p]
+            o = model.predict(readings.states, step).observation
+            turn = o.rotation @ np.swapaxes(base, 1, 2)
+            w = [turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0]]
+            w.append(turn[:, 1, 0] - turn[:, 0, 1])
+            both.append(np.hstack([o.position, 0.5 * np.stack(w, axis=1)])[:, :m].ravel())
+        columns.append(both[0] - both[1])
+    values = np.linalg.svd(np.array(columns).T, compute_uv=False)
+    # Differences over a milliradian are right to 1e-6; nothing lies between that and what is seen.
+    seen = values > 1e-5 * values[0]
+    assert not np.any((values > 1e-6 * values[0]) & ~seen)
+    return int(seen.sum())
+
+
+@pytest.mark.parametrize(("m", "expected"), [(3, 27), (6, 30)])
+def test_an_over_complete_model_has_the_rank_that_the_arm_has(m, expected):
+    """Six axes are lines (4 each); the target at rest adds a position (3) or a pose (6)."""
+    c = campaign("link_geometry", plan_seed=0, poses=30, target_known=False, m=m)
+    r = c.readings[c.readings.unloaded]
+    r = replace(r, states=replace(r.states, wrench=0 * r.states.wrench))
+    found = based(replace(c.cell, gravity=np.zeros(3)), r, "absolute", ("link_geometry",))
+    assert seen_directions(found.model, r, m) == found.rank == expected
+    assert len(found.uncertainty.null) == found.model.size - expected
+
+
+def test_what_cannot_be_seen_is_named_and_has_no_number():
+    c = campaign("link_geometry", plan_seed=0, poses=30)
+    found = based(c.cell, c.readings, "absolute", GEOMETRY)
+    u, model, document = found.uncertainty, found.model, to_json(found)
+    compliance, links = (model.slices()[model.names.index(name)] for name in GEOMETRY)
+    assert found.rank < model.size
+    np.testing.assert_array_equal(np.isinf(u.std), ~u.identifiable)
+    # A shift along a joint's axis can be made before or after the joint.
+    assert not u.identifiable[links][2:38:6].any()
+    assert u.identifiable[compliance].all()
+    for p, seen in zip(document["parameters"], u.identifiable, strict=True):
+        assert (p["value"] is None) == (p["std"] is None) == (not seen)
+        assert p["identifiable"] == bool(seen)
+    assert len(document["unidentifiable"]) == model.size - found.rank
+    assert all("link_geometry" in name for name in document["unidentifiable"])
+
+
+def test_an_over_complete_model_predicts_what_the_world_shows_elsewhere():
+    c, other = campaign("link_geometry", plan_seed=0, poses=30), plan(12, 77).states
+    clean = noiseless(c.world, plan(30))
+    told = based(c.cell, clean, "absolute", GEOMETRY).predict(other).position
+    off = np.linalg.norm(told - c.world.sight(other).position, axis=1)
+    # Parts of a direction too weak to be estimated stay: 0.05 σ over all data together.
+    sigma = np.sqrt(np.trace(clean.covariance, axis1=1, axis2=2).mean())
+    assert off.max() < 0.05 * sigma
+
+
+def test_redundant_effects_share_one_direction():
+    """The first zero is the base's turn about z; both cannot be told."""
+    c = campaign(plan_seed=0)
+    found = based(c.cell, c.readings, "absolute", ("joint_compliance", "encoder_offset"))
+    (null,) = found.uncertainty.null
+    unseen = {n for n, (_, std) in named(found).items() if np.isinf(std)}
+    assert unseen == {"base_frame.rz", "encoder_offset.j1"}
+    assert all(name in null for name in unseen)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.parametrize("mode", MODES)
+def test_no_more_elements_than_parameters_cannot_answer(mode, count):
+    c = campaign(plan_seed=0, registration_known=True)
+    if mode == "deflection":
+        few = c.readings[(c.readings.pose < count) & np.isin(c.readings.load, [0, 3])]
+    else:
+        few = c.readings[np.flatnonzero(c.readings.load == 3)[:count]]
+    told = rf"{3 * count} measured elements for \d parameters.*measure at least (\d+)"
+    with pytest.raises(CannotAnswerError, match=told) as caught:
+        based(c.cell, few, mode)
+    assert 3 * int(re.search(told, str(caught.value))[1]) > 6
+    assert caught.value.exit_code == 4
+    assert "\n" not in str(caught.value)
+
+
+def test_true_parameters_lie_within_their_uncertainty():
+    """A check of the whole way on one campaign of the world, at 5 σ of 12 parameters."""
+    c = campaign(plan_seed=0, target_known=False, poses=20)
+    found = based(c.cell, c.readings, "absolute")
+    rows = found.model.slices()[2]
+    off = found.theta[rows] - true_parameters(c.world, "joint_compliance")
+    assert np.abs(off / found.uncertainty.std[rows]).max() < 5
+    assert found.variance_factor == pytest.approx(1, abs=5 * np.sqrt(2 / found.dof))
+
+
+def test_noise_of_a_known_factor_shows_in_the_variance_factor():
+    c = campaign(plan_seed=0, registration_known=True)
+    noisy = with_noise(noiseless(c.world, plan()), np.random.default_rng(5), 2.0)
+    found = based(cell_of(registration_known=True), noisy, "absolute")
+    assert found.variance_factor == pytest.approx(4, abs=4 * 5 * np.sqrt(2 / found.dof))
+
+
+# --- as a value for scripts -----------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def found() -> Fit:
+    c = campaign(poses=8, mode="absolute")
+    return based(c.cell, c.readings, "absolute")
+
+
+def test_parameters_are_those_of_the_document_and_of_the_data_frame(found: Fit) -> None:
+    assert found.parameters.to_dicts() == to_json(found)["parameters"]
+    second = found.parameters["joint_compliance.j2"]
+    k = [row.name for row in found.parameters].index("joint_compliance.j2")
+    assert second == found.parameters[k]
+    assert second.value == pytest.approx(found.theta[k])
+    assert second.unit == "rad/(N·m)"
+    frame = found.parameters.to_frame()
+    assert frame.index[0] == found.parameters[0].name
+    assert frame.loc["joint_compliance.j2", "std"] == second.std
+    with pytest.raises(InputError, match=r"did you mean .*joint_compliance.j2"):
+        found.parameters["joint_complience.j2"]
+
+
+def test_without_pandas_the_data_frame_names_it(
+    found: Fit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(InputError, match="the package pandas is not installed: pip install pandas"):
+        found.parameters.to_frame()
+
+
+def test_the_summary_has_every_parameter_and_both_errors(found: Fit) -> None:
+    text = found.summary()
+    assert all(f"{row.name} " in text for row in found.parameters)
+    for error in (found.error, found.holdout):
+        assert f"{1e6 * error.rms_m:.1f} µm rms" in text
+
+
+def test_residuals_in_base_axes_are_those_of_the_sensor_turned_back(found: Fit) -> None:
+    registered = se3.matrix(*se3.exp(found.theta[found.model.slices()[0]]))
+    assert found.model.names[0] == "base_frame"
+    turn = (found.model.cell.registration @ registered)[:3, :3]
+    np.testing.assert_allclose(found.residuals("base"), found.residuals() @ turn, atol=1e-15)
+    with pytest.raises(InputError, match="valid: sensor, base"):
+        found.residuals("tool")  # type: ignore[arg-type]
+    rows, r = found.whitening.reading, found.readings
+    added = found.predict(r.states).position[rows] + found.residuals()[:, :3]
+    np.testing.assert_allclose(added, r.value[rows, :3], atol=1e-12)
+
+
+# --- units and scaling ----------------------------------------------------------------------
+
+
+def in_other_lengths(cell: Cell, readings: Readings, k: float) -> tuple[Cell, Readings]:
+    """The same cell and readings where lengths are in 1/k m; forces stay in N."""
+
+    def moved(poses):
+        out = poses.copy()
+        out[..., :3, 3] *= k
+        return out
+
+    arm, states = cell.arm, readings.states
+    other = replace(
+        cell,
+        arm=replace(arm, links=moved(arm.links), coms=k * arm.coms, torque_max=k * arm.torque_max),
+        target=moved(cell.target),
+        load_point=k * cell.load_point,
+        tool_com=k * cell.tool_com,
+        registration=moved(cell.registration),
+    )
+    unit = np.repeat([k, 1.0], 3)[: readings.m]
+    return other, replace(
+        readings,
+        states=replace(states, wrench=states.wrench * np.repeat([1.0, k], 3)),
+        value=readings.value * unit,
+        covariance=readings.covariance * unit[:, None] * unit,
+    )
+
+
+POWER = {"m": 1, "m/s": 1, "rad": 0, "rad/s": 0, "rad/(N·m)": -1, "rad/(N·m)³": -3}
+
+
+def effect_in_other_lengths(effect: Effect, cell: Cell, k: float) -> Effect:
+    """The same effect of the other cell, its ordinary magnitudes in the other unit."""
+    given = effect.parameters
+
+    class Other(type(effect)):
+        @property
+        def parameters(self):
+            return tuple(replace(p, scale=p.scale * k ** POWER[p.unit]) for p in given)
+
+    options = dict(effect.options)
+    if "prior_m" in options:
+        options["prior_m"] *= k
+    none = States(q=np.zeros((1, 6)), wrench=np.zeros((1, 6)))
+    return Other(cell, replace(none, time=np.zeros(1), approach=np.ones((1, 6))), options)
+
+
+@pytest.mark.parametrize("k", [1e3, 1 / 0.0254])
+@pytest.mark.parametrize("m", [3, 6])
+@pytest.mark.parametrize("mode", MODES)
+def test_units_do_not_matter(mode, m, k):
+    c = campaign("base_compliance", mode, plan_seed=0, target_known=False, m=m)
+    cell, readings = in_other_lengths(c.cell, c.readings, k)
+    a = based(c.cell, c.readings, mode, (*WAVES, "joint_stiffening"))
+    registered, _ = in_other_lengths(a.model.cell, readings, k)
+    effects = tuple(effect_in_other_lengths(e, registered, k) for e in a.model.effects)
+    parameters = [p for e in a.model.effects for p in e.parameters]
+    unit = np.array([k ** POWER[p.unit] for p in parameters])
+    b = fit(Model(registered, effects), readings, mode)
+    assert cell.arm.reach == pytest.approx(k * c.cell.arm.reach)
+    formal = a.uncertainty.formal  # ordinary magnitudes where there are none
+    noise = np.where(formal > 0, formal, [p.scale for p in parameters])
+    assert np.abs((b.theta / unit - a.theta) / noise).max() < 1e-5
+    seen = a.uncertainty.identifiable
+    np.testing.assert_array_equal(b.uncertainty.identifiable, seen)
+    np.testing.assert_allclose((b.uncertainty.std / unit)[seen], a.uncertainty.std[seen], rtol=1e-5)
+    assert b.rank == a.rank
+    assert b.chi2 == pytest.approx(a.chi2, rel=1e-6)
+    assert b.dof == pytest.approx(a.dof, rel=1e-6)
+    assert b.holdout.rms_sigma == pytest.approx(a.holdout.rms_sigma, rel=1e-5)
+    assert b.holdout.rms_m == pytest.approx(k * a.holdout.rms_m, rel=1e-5)
+
+
+def test_without_scaling_the_unit_of_length_decides_where_rotations_are_read():
+    """What `none` is kept for: to show that it is wrong."""
+    c = campaign(plan_seed=0, registration_known=True, m=6)
+    both = ((c.cell, c.readings), in_other_lengths(c.cell, c.readings, 1e3))
+    off = {}
+    for scaling in SCALINGS:
+        a, b = (fit(baseline(cell, r, "absolute"), r, "absolute", scaling) for cell, r in both)
+        off[scaling] = float(np.abs((1e3 * b.theta - a.theta) / a.uncertainty.std).max())
+    assert off["gc"] < 1e-3
+    assert off["gu"] < 1e-3
+    assert off["none"] > 0.1
+
+
+def test_scalings_agree_where_they_must_and_differ_where_errors_correlate():
+    c = campaign(plan_seed=0, registration_known=True)
+    n, model = len(c.readings), baseline(c.cell, c.readings, "absolute")
+    spread = np.random.default_rng(0).uniform(1e-5, 5e-5, (n, 3))
+
+    def all_three(covariance):
+        given = replace(c.readings, covariance=covariance)
+        return {s: fit(model, given, "absolute", s).theta for s in SCALINGS}
+
+    equal = all_three(np.tile(4e-10 * np.eye(3), (n, 1, 1)))
+    for other in ("none", "gu"):
+        np.testing.assert_allclose(equal[other], equal["gc"], rtol=1e-8)
+    diagonal = all_three(spread[:, :, None] ** 2 * np.eye(3))
+    np.testing.assert_allclose(diagonal["gu"], diagonal["gc"], rtol=1e-8)
+    assert np.all(diagonal["none"] != diagonal["gc"])
+    correlated = all_three(c.readings.covariance)
+    assert np.all(np.abs(correlated["gu"] / correlated["gc"] - 1) > 1e-6)
+
+
+class Rescaled(JointCompliance):
+    """The same effect with other ordinary magnitudes."""
+
+    @property
+    def parameters(self):
+        factors = zip(super().parameters, [30.0, 0.1, 3.0, 0.3, 10.0, 2.0], strict=True)
+        return tuple(replace(p, scale=f * p.scale) for p, f in factors)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_parameter_scaling_conditions_the_problem_but_not_the_answer(mode):
+    c = campaign(plan_seed=0, registration_known=True)
+    plain = based(c.cell, c.readings, mode)
+    scaled = fit(Model(c.cell, (Rescaled(c.cell, c.readings.states),)), c.readings, mode)
+    off = np.abs(scaled.theta - plain.theta)
+    assert off.max() < 1e-4 * plain.uncertainty.std.min()
+    np.testing.assert_allclose(scaled.uncertainty.std, plain.uncertainty.std, rtol=1e-6)
+
+
+def test_scaling_parameters_of_different_units_lowers_the_condition():
+    c = campaign(plan_seed=0, target_known=False)
+    found = based(c.cell, c.readings, "absolute")
+    basis, cell = found.solution.equations.basis, found.model.cell
+    assert basis.condition_scaled < 0.1 * basis.condition_unscaled
+    # Both are properties of the data, not of the magnitudes that someone thought ordinary.
+    other = Model(cell, found.model.effects[:2]) + Rescaled(cell, c.readings.states)
+    again = fit(other, c.readings, "absolute").solution.equations.basis
+    assert again.condition_scaled == pytest.approx(basis.condition_scaled, rel=1e-3)
+    assert again.condition_unscaled == pytest.approx(basis.condition_unscaled, rel=1e-3)
+
+
+# --- an arm that is described without masses, under its weight and loads ----------------------
+
+C = campaign("none", "absolute", 0, poses=12)
+BARE = replace(C.cell, arm=replace(C.cell.arm, masses=np.zeros(6), coms=np.zeros((6, 3))))
+
+
+def ratios(f: Fit) -> np.ndarray:
+    """Compliances by the true ones, of joints 2 and 3, which carry the weight."""
+    true, by_name = C.world.physics.joint_compliance, {p.name: p.value for p in f.parameters}
+    return np.array([by_name[f"joint_compliance.j{j}"] / true[j - 1] for j in (2, 3)])
+
+
+def under(*loads: str) -> Readings:
+    return C.readings[np.isin(np.array(C.readings.load_names)[C.readings.load], loads)]
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_where_loads_differ_the_compliances_are_right(mode: str) -> None:
+    f, absolute = based(BARE, C.readings, mode), mode == "absolute"
+    assert ("link_mass" in f.model.names) == absolute
+    assert ratios(f) == pytest.approx(1.0, abs=0.03)
+    assert f.variance_factor == pytest.approx(1.0, abs=0.3)
+    note = masses_note(f)
+    assert (note is None) == (not absolute)
+    if absolute:
+        assert "link_mass estimates what its weight does" in note
+        assert sum("masses" in n for n in notes(f)) == 1
+
+
+def test_without_the_weight_they_are_too_soft_and_that_is_said() -> None:
+    bare, told = (
+        based(cell, C.readings, "absolute", ("joint_compliance",)) for cell in (BARE, C.cell)
+    )
+    assert ratios(bare).max() > 1.3
+    assert "hilcal add RUN link_mass" in masses_note(bare)
+    assert ratios(told) == pytest.approx(1.0, abs=0.03)
+    assert masses_note(told) is None
+
+
+def test_under_one_load_nothing_tells_them_apart_and_that_is_said() -> None:
+    light = under("5kg")
+    f = based(BARE, light, "absolute")
+    assert "link_mass" not in f.model.names
+    assert ratios(f)[0] > 2.0
+    assert "no pose was read under two loads" in masses_note(f)
+    assert [loads_differ(r) for r in (light, under("none", "5kg"))] == [False, True]

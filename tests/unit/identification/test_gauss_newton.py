@@ -1,0 +1,225 @@
+"""Gauss-Newton reaches the minimum in few steps, as scipy and LAPACK find it."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import scipy.linalg as sl
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from hilcal.errors import CannotAnswerError
+from hilcal.identification.fit import Fit, fit
+from hilcal.identification.gauss_newton import Acceleration, NewtonPoint, linear_problem, regularise
+from hilcal.identification.priors import scales_of
+from hilcal.identification.residual import residual
+from hilcal.identification.solver import minimise, shortened
+from hilcal.model.model import Model
+from hilcal.readings.readings import Readings, States
+from hilcal.readings.whitening import whitening
+from hilcal.regression.normal_equations import TALL
+from hilcal.types import Floats
+from tests.support.campaigns import cell_of
+from tests.support.effect_cases import make
+from tests.support.rows import first
+
+SIGMA = 2e-5
+POSES, LOADS = 30, 6
+STEPS = 8
+
+
+def case(seed: int, names: tuple[str, ...], soft: float = 5.0) -> tuple[Model, Readings]:
+    """Absolute readings of a soft UR10e, off by 2 σ in a way of its own at each pose."""
+    rng = np.random.default_rng(seed)
+    cell = cell_of(registration_known=True)
+    q = np.repeat(rng.uniform(-2.5, 2.5, (POSES, 6)), LOADS, axis=0)
+    wrench = rng.normal(size=(LOADS, 6)) * [60, 60, 60, 5, 5, 5]
+    wrench[0] = 0.0
+    states = States(q=q, wrench=np.tile(wrench, (POSES, 1)))
+    model = Model(cell, tuple(make(name, cell, states) for name in names))
+    theta = scales_of(model) * rng.normal(size=model.size)
+    for e, at in zip(model.effects, model.slices(), strict=True):
+        if e.elastic:
+            theta[at] = soft * np.abs(theta[at])
+    value = model.predict(states, theta).observation.position
+    value = value + 2 * SIGMA * np.repeat(rng.normal(size=(POSES, 3)), LOADS, axis=0)
+    value = value + SIGMA * rng.normal(size=value.shape)
+    count = len(value)
+    return model, Readings(
+        states=states,
+        pose=np.repeat(np.arange(POSES), LOADS),
+        load=np.tile(np.arange(LOADS), POSES),
+        cycle=np.zeros(count, dtype=np.int64),
+        value=value,
+        covariance=np.tile(SIGMA**2 * np.eye(3), (count, 1, 1)),
+        load_names=("none", *(f"pull {k}" for k in range(1, LOADS))),
+        pose_names=tuple(str(k) for k in range(POSES)),
+    )
+
+
+def slope(found: Fit) -> np.ndarray:
+    """Difference quotient of ½ ‖r‖² by each z, where a unit of z moves all data by 1 σ."""
+    w = whitening(found.readings, "absolute")
+    steps = found.solution.equations.basis.transform
+
+    def cost(theta: np.ndarray) -> float:
+        p = found.model.predict(found.readings.states, theta)
+        return 0.5 * float(np.sum(w.whiten(residual(found.readings, p, w)) ** 2))
+
+    h = 0.05
+    return np.array(
+        [(cost(found.theta + h * z) - cost(found.theta - h * z)) / (2 * h) for z in steps.T]
+    )
+
+
+@pytest.mark.parametrize("seed", first(1, range(3)))
+@pytest.mark.parametrize(
+    "more", [(), ("joint_tilt_compliance",), ("link_compliance", "target_offset")]
+)
+def test_a_misfit_does_not_hinder(seed: int, more: tuple[str, ...]) -> None:
+    model, readings = case(seed, ("joint_compliance", "encoder_offset", *more))
+    found = fit(model, readings, "absolute")
+    assert found.solution.converged
+    assert found.solution.iterations <= STEPS
+    assert found.variance_factor > 3
+    np.testing.assert_allclose(slope(found), 0.0, atol=2e-3)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_sideways_pulls_separate_the_first_joints_offset_from_the_registration(seed: int) -> None:
+    """Turned with the arm or not, a sideways pull deflects otherwise: both are determined.
+
+    Under weights alone, along the axis of the first joint, they are one gauge freedom.
+    """
+    model, readings = case(seed, ("base_frame", "joint_compliance", "encoder_offset"))
+    found = fit(model, readings, "absolute")
+    names = [f"{e.name}.{p.name}" for e in model.effects for p in e.parameters]
+    pair = [names.index("base_frame.rz"), names.index("encoder_offset.j1")]
+    assert found.solution.converged
+    assert found.solution.iterations <= STEPS
+    assert found.uncertainty.identifiable[pair].all()
+    wrench = readings.states.wrench * [0, 0, 1, 0, 0, 0]
+    states = replace(readings.states, wrench=wrench)
+    shift = (
+        model.predict(states, found.theta).observation.position
+        - model.predict(readings.states, found.theta).observation.position
+    )
+    down = fit(model, replace(readings, states=states, value=readings.value + shift), "absolute")
+    assert not down.uncertainty.identifiable[pair].any()
+
+
+def test_steps_that_shrink_by_constant_factors_lead_to_their_limit() -> None:
+    """Anderson's combination of steps x → x* + D (x − x*), D diagonal with two factors."""
+    rng = np.random.default_rng(0)
+    limit, factor = rng.normal(size=8), np.where(np.arange(8) < 4, -0.55, 0.6)
+    path, x = Acceleration(), np.zeros(8)
+    for _ in range(4):
+        aim = limit + factor * (x - limit)
+        shortcut = path.accelerated(aim, aim - x)
+        x = aim if shortcut is None else shortcut
+    np.testing.assert_allclose(x, limit, rtol=0, atol=1e-10)
+
+
+@dataclass(frozen=True)
+class Valley:
+    """Rosenbrock's function, and a third row so that a residual is left."""
+
+    x: float
+    y: float
+
+    @property
+    def residual(self) -> Floats:
+        return np.array([1 - self.x, 10 * (self.y - self.x**2), 0.3 + self.y])
+
+    def jacobian(self) -> Floats:
+        return np.array([[1.0, 0.0], [20 * self.x, -10.0], [0.0, -1.0]])
+
+    def moved(self, step: Floats) -> "Valley":
+        return Valley(self.x + step[0], self.y + step[1])
+
+
+@pytest.mark.parametrize("start", [(-1.2, 1.0), (0.5, -3.0)])
+def test_the_minimum_is_that_of_scipy(start: tuple[float, float]) -> None:
+    found = minimise(Valley(*start), steps=100)
+    expected = least_squares(lambda x: Valley(*x).residual, start, xtol=1e-14, ftol=1e-14).x
+    np.testing.assert_allclose([found.x, found.y], expected, atol=1e-5)
+
+
+@dataclass(frozen=True)
+class Turned:
+    """A rotation that takes vectors (N, 3) to others, in steps about the turned axes."""
+
+    vectors: Floats
+    others: Floats
+    turn: Rotation
+
+    @property
+    def residual(self) -> Floats:
+        return (self.others - self.turn.apply(self.vectors)).reshape(-1)
+
+    def jacobian(self) -> Floats:
+        each = [np.cross(axis, self.turn.apply(self.vectors)) for axis in np.eye(3)]
+        return np.stack(each, axis=2).reshape(-1, 3)
+
+    def moved(self, step: Floats) -> "Turned":
+        return replace(self, turn=Rotation.from_rotvec(step) * self.turn)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_rotations_are_found_from_far_off(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    vectors, true = rng.normal(size=(10, 3)), Rotation.from_rotvec(rng.uniform(-1.2, 1.2, 3))
+    others = true.apply(vectors) + 1e-3 * rng.normal(size=(10, 3))
+    found = minimise(Turned(vectors, others, Rotation.identity())).turn
+    expected = Rotation.align_vectors(others, vectors)[0]
+    assert (found * expected.inv()).magnitude() < 1e-7
+
+
+def test_a_step_is_shortened_until_it_can_be_taken() -> None:
+    def moved(step: Floats) -> float:
+        if step[0] > 1.0:
+            raise CannotAnswerError("too far")
+        return float(step[0])
+
+    step = np.array([3.0])
+    assert shortened(moved, step, 3) == 0.75
+    assert shortened(moved, step, 4, cost=lambda x: x, limit=0.5) == 0.375
+    assert shortened(moved, step, 2) is None
+
+
+def nearly_dependent(condition: float, columns: int) -> Floats:
+    """Rows (2 TALL, P) of that condition number, whose columns have units over eight decades."""
+    rng = np.random.default_rng(5)
+    q = np.linalg.qr(rng.standard_normal((2 * TALL, columns)))[0]
+    turn = np.linalg.qr(rng.standard_normal((columns, columns)))[0]
+    return np.asarray(q * np.geomspace(1e8, 1e8 / condition, columns) @ turn)
+
+
+def solved(a: Floats, white: Floats, scale: Floats) -> Floats:
+    """Step of Gauss-Newton from zero, all parameters without a prior."""
+    columns = a.shape[1]
+    start, prior = np.zeros(columns), np.full(columns, np.inf)
+    point = NewtonPoint(start, start, float(white @ white), white.size)
+    linear = linear_problem(point, prior, a, white, len(a), 1.0, whitened=True)
+    assert len(linear.a) == columns + 1
+    assert linear.rows is a
+    by = regularise(linear, scale, prior, np.full(columns, -1), choose=False)
+    return np.asarray(by.basis.transform @ linear.equations(by.basis).solve(by.beta))
+
+
+@pytest.mark.parametrize("condition", [1e2, 1e5, 1e8])
+def test_errors_are_those_of_lapacks_qr(condition: float) -> None:
+    """At 1e8 the normal equations AᵀA have no correct digit."""
+    rng = np.random.default_rng(6)
+    columns = 8
+    a, units = nearly_dependent(condition, columns), np.geomspace(1e-4, 1e4, columns)
+    truth = rng.standard_normal(columns)
+    noise = rng.standard_normal(len(a))
+    exact = np.linalg.lstsq(a, noise, rcond=None)[0]
+    white = a @ truth + 1e-6 * (noise - a @ exact)
+    error = np.abs(units * solved(a * units, white, 1 / units) - truth).max()
+    lapack = np.abs(sl.lstsq(a, white, lapack_driver="gelsy")[0] - truth).max()
+    assert error < 10 * max(lapack, 1e-14 * condition)
+    if condition == 1e8:
+        squared = np.abs(np.linalg.solve(a.T @ a, a.T @ white) - truth).max()
+        assert squared > 1e3 * error

@@ -1,0 +1,268 @@
+"""The guard in motion, and that planner, dry run and guard judge by one rule."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hilcal.cell import cell_from_config
+from hilcal.config import CellConfig, CellLoad, ForceSensor, Limits
+from hilcal.design.feasible import Space
+from hilcal.measuring.clearance import clearance_of
+from hilcal.measuring.devices import ArmSample
+from hilcal.measuring.motion import SLACK_M, Guard
+from hilcal.measuring.route import dry_run
+from hilcal.store.plan import UNLOADED, Plan, Step
+from tests.support.arm_cases import ODD, arm_of
+from tests.support.cli_cases import Capsys, refused, run
+from tests.support.fake_bench import POSES, Bench
+from tests.support.space_cases import cell, reached
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return Bench(
+        limits=Limits(
+            joint_speed_rad_s=1.0, workspace_min_m=(-2, -2, 0.0), workspace_max_m=(2, 2, 2)
+        ),
+        force_sensor=ForceSensor(
+            driver="fake", port="nowhere", max_force_N=100.0, max_moment_Nm=10.0
+        ),
+    )
+
+
+def sample(bench: Bench, **changes: object) -> ArmSample:
+    bench.world.q = np.array(POSES["p1"])
+    return replace(bench.rig.arm.sample(), **changes)  # type: ignore[arg-type]
+
+
+def test_all_is_well(bench: Bench) -> None:
+    assert Guard(bench.cell, bench.config).check(sample(bench), np.zeros(6)) is None
+
+
+def test_without_a_force_sensor_no_wrench_is_asked(bench: Bench) -> None:
+    assert Guard(bench.cell, bench.config).check(sample(bench)) is None
+
+
+def test_safety_state_is_told_in_the_makers_words(bench: Bench) -> None:
+    said = Guard(bench.cell, bench.config).check(sample(bench, safety="protective stop"))
+    assert said is not None
+    assert "protective stop" in said
+
+
+@pytest.mark.parametrize("joint", range(6))
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_speed_of_every_joint(bench: Bench, joint: int, sign: float) -> None:
+    guard = Guard(bench.cell, bench.config)
+    qd = np.zeros(6)
+    qd[joint] = sign * 0.999
+    assert guard.check(sample(bench, qd=qd)) is None
+    qd[joint] = sign * 1.001
+    said = guard.check(sample(bench, qd=qd))
+    assert said is not None
+    assert bench.cell.arm.joint_names[joint] in said
+
+
+@pytest.mark.parametrize("axis", range(6))
+def test_force_and_moment(bench: Bench, axis: int) -> None:
+    guard = Guard(bench.cell, bench.config)
+    limit = 100.0 if axis < 3 else 10.0
+    felt = np.zeros(6)
+    felt[axis] = -0.999 * limit
+    assert guard.check(sample(bench), felt) is None
+    felt[axis] = -1.001 * limit
+    said = guard.check(sample(bench), felt)
+    assert said is not None
+    assert ("max_force_N" if axis < 3 else "max_moment_Nm") in said
+
+
+@pytest.mark.parametrize(("part", "key"), [(0, "max_force_N"), (3, "max_moment_Nm")])
+def test_force_and_moment_are_the_lengths_of_their_vectors(
+    bench: Bench, part: int, key: str
+) -> None:
+    felt = np.zeros(6)
+    felt[part : part + 3] = 70.0 if part == 0 else 7.0  # the limits are 100 N and 10 N·m
+    said = Guard(bench.cell, bench.config).check(sample(bench), felt)
+    assert said is not None
+    assert key in said
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_what_is_not_a_number_is_never_well(bench: Bench, bad: float) -> None:
+    guard = Guard(bench.cell, bench.config)
+    q = np.array(POSES["p1"])
+    q[2] = bad
+    assert guard.check(sample(bench, q=q)) is not None
+    assert guard.check(sample(bench, qd=np.full(6, bad))) is not None
+    for axis in range(6):
+        felt = np.zeros(6)
+        felt[axis] = bad
+        assert guard.check(sample(bench), felt) is not None, axis
+
+
+def test_wrong_number_of_joints(bench: Bench) -> None:
+    said = Guard(bench.cell, bench.config).check(sample(bench, q=np.zeros(7)))
+    assert said is not None
+    assert "7 joints" in said
+
+
+@pytest.mark.parametrize("side", ["min", "max"])
+@pytest.mark.parametrize("axis", range(3))
+def test_workspace_of_the_actual_pose(bench: Bench, side: str, axis: int) -> None:
+    """A box that ends where forearm, wrists and tool do, less and more than the slack."""
+    parts = clearance_of(bench.cell, bench.config).scene.parts
+    low, high = reached(bench.cell, parts, np.array([POSES["p1"]]))
+    edge = (low if side == "min" else high)[axis]
+    inwards = 1.0 if side == "min" else -1.0
+    for over, wrong in ((0.5 * SLACK_M, False), (2 * SLACK_M, True)):
+        box = {"min": [-3.0] * 3, "max": [3.0] * 3}
+        box[side][axis] = edge + inwards * over
+        limits = Limits(workspace_min_m=tuple(box["min"]), workspace_max_m=tuple(box["max"]))
+        config = bench.config.model_copy(update={"limits": limits})
+        said = Guard(bench.cell, config).check(sample(bench))
+        assert (said is not None) is wrong
+        if said is not None:
+            assert f"is {2 * SLACK_M:.3g} m outside the workspace, whose {'xyz'[axis]}" in said
+
+
+def test_what_hangs_stops_the_arm_when_it_is_told() -> None:
+    """At 0.45 m a weight that hangs 0.5 m low is through the floor, and nothing else is."""
+    load = CellLoad(name="long", mass_kg=2.0, hang_m=0.5)
+    bench = Bench(loads=(load,), limits=Limits(), force_sensor=None)
+    guard, here = Guard(bench.cell, bench.config), sample(bench, q=np.array(POSES["reference"]))
+    assert guard.check(here) is None
+    said = guard.check(here, hanging="long")
+    assert said is not None
+    assert "what hangs (long)" in said
+    assert "mounting plane" in said
+
+
+def test_arm_and_obstacles_that_touch_stop_the_arm() -> None:
+    folded = (0.0, -1.5, 3.0, -1.5, -1.5, 0.0)
+    bench = Bench(limits=Limits(workspace_min_m=(-2, -2, -2)))
+    said = Guard(bench.cell, bench.config).check(sample(bench, q=np.array(folded)))
+    assert said is not None
+    assert "shoulder and forearm collide" in said
+
+
+HOME = (0.0, -1.2, 1.5, -1.5, -1.5, 0.0)
+BELOW = (0.0, 0.5, 0.9, -1.5, -1.5, 0.0)
+"""The tool of a UR10e is 0.86 m below the plane that it is mounted on."""
+
+
+def refused_lines(config: CellConfig, *states: Any, load: str = UNLOADED) -> tuple[str, ...]:
+    names = ("reference", *(f"p{k}" for k in range(1, len(states))))
+    plan = Plan(names, np.array(states, dtype=float), (Step(names[-1], load),))
+    return dry_run(cell_from_config(config), config, plan).problems
+
+
+def stopped(config: CellConfig, q: Any) -> str | None:
+    joints = np.array(q, dtype=float)
+    here = replace(Bench().rig.arm.sample(), q=joints, qd=np.zeros(len(joints)))
+    return Guard(cell_from_config(config), config).check(here)
+
+
+def planned(config: CellConfig, q: Any) -> bool:
+    space = Space(cell_from_config(config), config)
+    return bool(space.allowed(np.array([q], dtype=float), UNLOADED, GEOMETRY).all())
+
+
+GEOMETRY = ("joint limits", "workspace", "self-collision", "obstacle")
+
+
+def elbow(height: float) -> tuple[float, ...]:
+    """The elbow's joint of a UR10e at a height above the mounting plane, m."""
+    lift = float(np.arcsin((0.1807 - height) / 0.6127))
+    return (0.0, lift, -lift - 1.0, -1.0, -1.5, 0.0)
+
+
+def with_targets(*more: Any, **limits: Any) -> CellConfig:
+    targets = [
+        {"name": f"t{k}", "target_m": at} for k, at in enumerate(([0.0, 0.0, 0.1], *more), start=1)
+    ]
+    return cell(tool={"targets": targets}, limits=limits)
+
+
+CASES = {
+    "the tool 0.86 m below the mounting plane, no workspace given": (
+        cell(), BELOW, "mounting plane",
+    ),
+    "the elbow 17 mm above a floor at 0": (
+        cell(limits={"workspace_min_m": [-3.0, -3.0, 0.0]}), elbow(0.017), "forearm",
+    ),
+    "a second target 0.39 m outside": (
+        with_targets([0.0, 0.0, 0.7], workspace_min_m=[-3.0, -3.0, 0.17]), HOME, "t2",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("config", "q", "word"), CASES.values(), ids=CASES.keys())
+def test_what_the_planner_refuses_is_refused_and_stops_the_arm(
+    config: CellConfig, q: tuple[float, ...], word: str
+) -> None:
+    assert not planned(config, q)
+    found = refused_lines(config, q)
+    assert any(word in line for line in found), found
+    said = stopped(config, q)
+    assert said is not None
+    assert word in said
+
+
+def test_run_and_check_refuse_it_before_anything_moves(tmp_path: Path, capsys: Capsys) -> None:
+    toml, plan = tmp_path / "cell.toml", tmp_path / "plan.json"
+    arm, tracker = 'driver = "ur"\nhost = "127.0.0.1"', 'driver = "geocom"\nport = "/dev/null"'
+    toml.write_text(f'[robot]\nmodel = "ur10e"\n{arm}\n[tracker]\n{tracker}\n', encoding="utf-8")
+    poses = [{"name": name, "q_rad": q} for name, q in (("reference", HOME), ("low", BELOW))]
+    steps = [{"pose": "low", "load": "none", "cycle": 0}]
+    told = {"format": "hilcal-plan", "version": 1, "poses": poses, "steps": steps}
+    plan.write_text(json.dumps(told), encoding="utf-8")
+    line = refused(capsys, 2, "run", toml, "--plan", plan, "-o", tmp_path / "x.hilcal")
+    assert "pose low: forearm is 0.726 m below the mounting plane z = 0" in line
+    assert "workspace_min_m" in line
+    checked = run(capsys, "check", toml, "--plan", plan, "--json").document["plan"]
+    assert any("pose low: wrist 3 is" in problem for problem in checked["problems"])
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_the_upper_arm_keeps_the_sides_that_leave_the_shoulder_room(axis: int) -> None:
+    """A side 0.45 m from the axis: lying towards it, the upper arm alone is outside."""
+    most = [3.0, 3.0, 3.0]
+    most[axis] = 0.45
+    lift, turn = (-1.57, 0.0) if axis == 2 else (0.0, np.pi if axis == 0 else -np.pi / 2)
+    q = (turn, lift, 2.6 if axis == 2 else -2.6, 0.0, -1.5, 0.0)
+    limits = {"workspace_min_m": [-3.0, -3.0, -3.0], "workspace_max_m": most}
+    found = refused_lines(cell(limits=limits), HOME, q)
+    assert any("pose p1: upper arm is" in line and "outside" in line for line in found), found
+
+
+def test_the_shape_of_an_unknown_arm_is_said_to_be_guessed() -> None:
+    config = cell()
+    unknown = replace(cell_from_config(config), arm=arm_of(ODD))
+    q = np.zeros((1, unknown.arm.n))
+    dry = dry_run(unknown, config, Plan(("reference",), q, (Step("reference", UNLOADED),)))
+    said = "the shape of odd is not known: its links are guessed"
+    assert said in dry.remarks
+    assert said in Space(unknown, config).remarks
+
+
+def test_guessed_links_are_held_to_each_other_by_planner_dry_run_and_guard() -> None:
+    """States of an arm of unknown shape in which it touches nothing but itself."""
+    config = cell(limits={"workspace_min_m": [-9.0, -9.0, -9.0]}, loads=[])
+    unknown = replace(cell_from_config(config), arm=arm_of(ODD))
+    space, guard = Space(unknown, config), Guard(unknown, config)
+    drawn = np.random.default_rng(0).uniform(-2.0, 2.0, (200, unknown.arm.n))
+    overlap = [q for q in drawn if space.shapes.scene.itself.distance(q) < 0.0]
+    assert len(overlap) > 20
+    for q in overlap[:20]:
+        assert not space.allowed(q[None], UNLOADED, ("self-collision",)).all()
+        plan = Plan(("reference",), q[None], (Step("reference", UNLOADED),))
+        found = [x for x in dry_run(unknown, config, plan).problems if "collide" in x]
+        assert found
+        assert all("its links are guessed" in x for x in found)
+        here = replace(Bench().rig.arm.sample(), q=q, qd=np.zeros(len(q)))
+        said = guard.check(here)
+        assert said is not None
+        assert "collide" in said

@@ -1,0 +1,233 @@
+"""What people read of a plan and of `next`: words that follow from numbers; a table."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilcal.design.discriminated_pairs import not_ruled_out
+from hilcal.design.next import PairPower
+from hilcal.design.run_order import Confounding, Duration
+from hilcal.design.summary import (
+    CriterionResult,
+    CurvePoint,
+    DetectableEffect,
+    PlanSummary,
+    PredictedParameter,
+)
+from hilcal.present.plan import (
+    certified,
+    enough,
+    order_remark,
+    plan_report,
+    power_rows,
+    powers_summary,
+)
+from hilcal.robot.catalogue import load_arm
+from hilcal.robot.chain import evaluate
+from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step
+from hilcal.tables.table import read_table
+from hilcal.tables.write import plan_csv
+
+ORDER = Confounding(60, 0.0251**0.5, "fz", -3.6, 1000.0, 20e-6 / 3600, 5.7e-6, -2e-8, 17e-6 / 3600)
+SUMMARY = PlanSummary(
+    poses=18,
+    readings=93,
+    loads={UNLOADED: 33, "mass-5kg": 20, "mass-10kg": 20, "pull-x-50N": 20},
+    duration=Duration(842.0, 1111.5, 240.0),
+    criterion="D",
+    efficiency=0.98768,
+    parameters=(
+        PredictedParameter("joint_compliance.j1", 4e-8, 4.2e-6, "rad/(N·m)"),
+        PredictedParameter("joint_compliance.j6", 6e-7, 1.6e-5, "rad/(N·m)"),
+        PredictedParameter("base_frame.x", 1.2e-5, None, "m"),
+        PredictedParameter("target_offset.x", 2.2e-5, 0.0, "m"),
+    ),
+    position_std_m=11.4e-6,
+    position="deflection under mass-5kg at 100 poses",
+    criteria=(
+        CriterionResult("D", 11.4e-6, 15.1e-6, 0.038, 132.0, 0.021, 4.1, 0.98768),
+        CriterionResult("I", 9.1e-6, None, None, 110.0, 0.016, 3.3, None),
+    ),
+    curve=tuple(CurvePoint(*p) for p in ((6, 31e-6), (12, 12e-6), (18, 11.4e-6), (36, 11.2e-6))),
+    detectable=(
+        DetectableEffect("hysteresis", 6e-6),
+        DetectableEffect("joint_tilt", 3e-6),
+        DetectableEffect("tracker_drift", None),
+    ),
+    longer=0.032,
+    confounding=ORDER,
+    shortest=replace(ORDER, correlation=0.41**0.5),
+    remarks=("only 3 candidates are left of load mass-10kg.",),
+)
+
+
+@pytest.fixture
+def shown(printed):
+    return lambda summary=SUMMARY, width=80: printed(*plan_report(summary), width=width)
+
+
+@pytest.mark.parametrize("width", [80, 110])
+def test_everything_is_told_and_fits(shown, width: int) -> None:
+    text = shown(width=width)
+    assert max(map(len, text.splitlines())) <= width
+    assert "…" not in text  # nothing is cut off
+    words = " ".join(text.split())
+    for told in (
+        "18 and the reference",
+        "93: unloaded 33, mass-5kg 20, mass-10kg 20, pull-x-50N 20",
+        "37 min",
+        "motion 14 min, readings 19 min, 4 load changes by hand 4 min",
+        "efficiency of the plan: at least 98.7 % (certified lower bound); not accuracy",
+        "deflection ± 11.4 µm, predicted for the deflection under mass-5kg at 100 poses",
+        "it is not the accuracy of the robot: geometry, registration, repeatability and effects "
+        "outside of the model are not in it",
+        "joint_compliance.j6 0.60 16.0 µrad/(N·m) 3.8 %",
+        "base_frame.x 12 µm",
+        "D (this) 11.4 µm 15.1 µm 3.8 % 132 0.021 4.10 98.7 %",
+        "I 9.10 µm - - 110 0.016 3.30 -",
+        "These readings cannot detect tracker_drift.",
+        "note: only 3 candidates are left of load mass-10kg.",
+    ):
+        assert told in words
+    assert text.index("joint_tilt") < text.index("hysteresis  ")  # the best seen comes first
+
+
+def test_what_is_absent_is_not_told(shown) -> None:
+    bare = PlanSummary(1, 2, {UNLOADED: 2}, Duration(1.0, 2.0, 0.0), "made by hand", None, (), None)
+    text = shown(bare)
+    assert "made by hand" in text
+    assert "0 load changes" in text
+    absent = ["efficiency", "certified", "position", "Comparison", "enough", "drift", "nan", "None"]
+    assert [word for word in absent if word in text] == []
+
+
+def test_other_poses_than_asked_for_and_parameters_left_open_are_explained(shown) -> None:
+    words = " ".join(shown(replace(SUMMARY, asked_poses=24)).split())
+    fewer = "18 and the reference: the cell leaves no more of 24, so that some are read again"
+    assert fewer in words
+    assert "the cell leaves" not in shown(replace(SUMMARY, asked_poses=18))
+    lost = PredictedParameter("joint_compliance.j1", np.inf, 4.2e-6, "rad/(N·m)")
+    summary = replace(SUMMARY, parameters=(lost,))
+    assert "joint_compliance.j1 not determined 4.20 µrad" in " ".join(shown(summary).split())
+    assert "accuracy of the robot" in str(summary.to_dict()["position_note"])
+
+
+@pytest.mark.parametrize(
+    ("efficiency", "words"),
+    [
+        (0.98768, "98.7 %"),
+        (0.9999, "99.9 %"),
+        (1.0, "100.0 %"),
+        (1 + 1e-12, "100.0 %"),
+        (0, "not certified"),
+    ],
+)
+def test_a_certificate_is_never_rounded_up(efficiency: float, words: str) -> None:
+    assert words in certified(efficiency)
+
+
+def test_bars_are_as_long_as_what_they_show_and_the_plan_is_marked(shown) -> None:
+    lines = [line for line in shown().splitlines() if "█" in line]
+    sizes = np.array([line.count("█") for line in lines])
+    values = np.array([point.position_std_m for point in SUMMARY.curve])
+    np.testing.assert_allclose(sizes / sizes[0], values / values[0], atol=0.02)
+    assert ["this plan" in line for line in lines] == [False, False, True, False]
+    from_12 = "From 12 to 36 poses the prediction's uncertainty falls by 7 % only."
+    assert enough(SUMMARY.curve) == from_12
+    assert enough(SUMMARY.curve[:2]) == "More than 12 poses still improve the prediction."
+
+
+def test_the_order_is_stated_with_its_cost_and_what_it_saves() -> None:
+    words = order_remark(SUMMARY)
+    for told in (
+        "3.2 % longer",
+        "up to about 3 % of a parameter's information (41 % in the shortest order)",
+        "a drift of 20 µm/h shifts deflections by 5.70 µm rms",
+        "and less than 0.1 µm on average",
+        "determine it to ± 17 µm/h",
+    ):
+        assert told in words
+    order = replace(ORDER, bias_m=5e-6, drift_std=None)
+    plain = order_remark(replace(SUMMARY, longer=0.0, confounding=order))
+    assert plain.startswith("The order is the shortest one. ")
+    assert "5.00 µm on average." in plain
+    assert "in the shortest order" not in plain
+    assert "returns" not in plain
+
+
+# what `next` says of pairs
+
+A, B = "base_compliance", "link_compliance"
+SURE, WEAK = PairPower(A, B, 0.2, 0.9999, False), PairPower(B, A, 0.1, 0.45, False)
+NEVER = PairPower(B, A, 0.02, 0.05, True)
+
+
+@pytest.mark.parametrize(
+    ("powers", "words"),
+    [
+        ((SURE, SURE), "separate the suspects: whichever is there, each of the others is ruled"),
+        ((SURE, WEAK), f"the weakest pair is {B}, where it is there, and {A}, which they rule out"),
+        ((SURE, NEVER), "separate what can be separated in this cell: each of these pairs"),
+        ((NEVER, NEVER), "rule out none of the suspects"),
+    ],
+)
+def test_the_sentence_follows_from_the_table(powers: tuple[PairPower, ...], words: str) -> None:
+    said = powers_summary(powers, 12, 40)
+    assert said.startswith("40 readings at 12 poses")
+    assert words in said
+    assert "100 %" not in said
+    assert ("more poses raise it" in said) == (WEAK in powers)
+
+
+def test_no_chance_is_certain_and_none_is_given_where_nothing_would_do() -> None:
+    assert list(power_rows((SURE, WEAK, NEVER))) == [
+        (A, B, "20 %", "> 99 %"),
+        (B, A, "10 %", "45 %"),
+        (B, A, "2 %", "not in this cell"),
+    ]
+    assert not_ruled_out([(B, A)]) == (
+        f"no measurement in this cell rules out {A} where {B} is there: 100 of the best readings "
+        "would do so with a chance of less than 20 %"
+    )
+
+
+# the table
+
+STEPS = (
+    Step(REFERENCE, UNLOADED),
+    Step("p, 1", UNLOADED),
+    Step("p, 1", "mass-5kg"),
+    Step("p, 1", UNLOADED, 1),
+)
+Q = np.array([[0.1, -1.2, 1.4, -0.5, 0.7, 1 / 3], [0.2, -1.1, 1.3, -0.4, 0.6, 0.1]])
+PLAN = Plan((REFERENCE, "p, 1"), Q, STEPS)
+PULL = np.array([0.0, 0.0, -49.0, 0.0, 0.0, 1.5])
+
+
+def test_a_plan_as_a_table_has_every_step_in_order() -> None:
+    lines = plan_csv(PLAN).splitlines()
+    assert lines[0] == "x_order,pose,load,cycle,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad"
+    assert lines[1] == f"1,reference,none,0,0.1,-1.2,1.4,-0.5,0.7,{1 / 3!r}"
+    assert lines[3] == '3,"p, 1",mass-5kg,0,0.2,-1.1,1.3,-0.4,0.6,0.1'
+    assert len(lines) == 1 + len(PLAN.steps)
+
+
+def test_with_positions_it_is_an_exchange_table(tmp_path: Path) -> None:
+    arm, q = load_arm("ur10e"), np.array([PLAN.joints(s.pose) for s in STEPS])
+    head, *rows = plan_csv(PLAN, {"mass-5kg": PULL}).splitlines()
+    cov = ",".join(f"cov_{a}" for a in ("x_x", "x_y", "x_z", "y_y", "y_z", "z_z"))
+    text = [f"{head},x_m,y_m,z_m,{cov}"]
+    for row, p in zip(rows, evaluate(arm, q).point(np.zeros(3)), strict=True):
+        text.append(f"{row},{','.join(map(repr, p.tolist()))},1e-10,0,0,1e-10,0,1e-10")
+    path = tmp_path / "measured.csv"
+    path.write_text("\n".join(text) + "\n", encoding="utf-8")
+    read = read_table(path, arm, None)
+    taken = [
+        Step(read.pose_names[p], read.load_names[load], int(c))
+        for p, load, c in zip(read.pose, read.load, read.cycle, strict=True)
+    ]
+    assert tuple(taken) == STEPS
+    np.testing.assert_array_equal(read.states.q, q)
+    np.testing.assert_array_equal(read.states.wrench[2:4], [PULL, np.zeros(6)])

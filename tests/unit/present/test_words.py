@@ -1,0 +1,282 @@
+"""Numbers, fits, misfits and diagnoses as people read them, written in one way everywhere."""
+
+import math
+import re
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hilcal import numbers
+from hilcal.diagnosis.diagnosis import Diagnosis
+from hilcal.diagnosis.document import to_json as diagnosis_json
+from hilcal.diagnosis.effect_ranking import FALSE_ALARM
+from hilcal.diagnosis.misfit_breakdown import ROW_ORDER, MisfitShare, misfit_breakdown
+from hilcal.diagnosis.residual_regression import Dependence
+from hilcal.diagnosis.verdict import diagnose
+from hilcal.effects.options import typical_compliances
+from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import Fit, fit
+from hilcal.identification.fit_document import to_json
+from hilcal.identification.full_prediction import error_before, full_prediction
+from hilcal.identification.linearisation import linearise
+from hilcal.present.diagnosis import curves, diagnosis_report, suspects_table
+from hilcal.present.fit import before_and_after, errors, fit_report, where_table, worst_poses
+from hilcal.present.story import Chapter, build_story
+from hilcal.present.verdict import message
+from hilcal.present.viewer import campaign as viewer
+from tests.support.campaigns import campaign, cell_of, noiseless, plan, with_noise, world_of
+
+# numbers
+
+
+@pytest.mark.parametrize(
+    ("metres", "words"),
+    [
+        (0.0, "0 µm"),
+        (28.13e-6, "28.1 µm"),
+        (999e-6, "999 µm"),
+        (1.04e-3, "1.04 mm"),
+        (0.327, "327 mm"),
+        (2.5, "2.50 m"),
+        (4.59e-16, "< 0.001 µm"),
+        (-4.59e-16, "< 0.001 µm"),
+        (1.04e-9, "0.00104 µm"),
+    ],
+)
+def test_lengths(metres: float, words: str) -> None:
+    assert numbers.length(metres) == words
+
+
+@given(st.floats(1e-3, 1e6), st.integers(1, 5))
+def test_digits_keep_the_value(value: float, count: int) -> None:
+    rel = 0.5 * 10.0 ** (1 - count)
+    assert float(numbers.digits(value, count)) == pytest.approx(value, rel=rel)
+
+
+@given(st.floats(-1e4, 1e4), st.floats(1e-4, 1e2))
+def test_a_value_is_written_to_the_digits_of_its_uncertainty(value: float, std: float) -> None:
+    written, spread = numbers.with_std(value, std)
+    # from 9.95 on there are no decimals left to drop
+    assert abs(float(written) - value) <= (0.5 if std >= 9.95 else 0.06 * std)
+    assert float(spread) == pytest.approx(std, rel=0.06, abs=0.5 if std >= 9.95 else 0)
+    assert len(written.partition(".")[2]) == len(spread.partition(".")[2])
+
+
+@given(st.sampled_from(["m", "rad"]), st.floats(-1, 1), st.floats(0, 1))
+def test_no_length_nor_angle_has_an_exponent(unit: str, value: float, std: float) -> None:
+    assert "e" not in "".join(numbers.measured(unit, value, std)[:2])
+
+
+def test_what_rounding_leaves_is_no_number() -> None:
+    assert numbers.measured("m", 3e-4, 4.59e-16) == ("300.0000", "< 0.001", "µm")
+    assert numbers.measured("m", 2e-2, 4.59e-16) == ("20.0000000", "< 0.000001", "mm")
+    assert numbers.measured("rad", 4.59e-16) == ("< 0.001", "", "µrad")
+    assert numbers.measured("m", 0.0, 0.0) == ("0", "", "µm")
+    assert numbers.sizes([("m", 4.59e-16), ("rad/K", 4e-9)]) == "< 0.001 µm, 0.0040 µrad/K"
+    assert numbers.with_std(1.234, math.inf) == ("1.23", "")
+
+
+@pytest.mark.parametrize(
+    ("unit", "values", "expected"),
+    [
+        ("m", [2e-6, -5e-4], ("µm", 1e6)),
+        ("m", [2e-6, -5e-3], ("mm", 1e3)),
+        ("rad/(N·m)", [1e-5], ("µrad/(N·m)", 1e6)),
+        ("furlong", [1.0], ("furlong", 1.0)),
+        ("m", [], ("µm", 1e6)),
+    ],
+)
+def test_units_follow_the_largest_value(unit: str, values: list[float], expected: object) -> None:
+    assert numbers.unit_for(unit, values) == expected
+
+
+def test_sentences_keep_the_spelling_of_effects() -> None:
+    assert numbers.sentence("residuals are noise") == "Residuals are noise."
+    kept = numbers.sentence("hysteresis is missing: it", {"hysteresis"})
+    assert kept == "hysteresis is missing: it."
+    assert numbers.names(["a"]) == "a"
+    assert numbers.names(["a", "b", "c"]) == "a, b and c"
+    assert numbers.few(["a", "b", "c", "d"]) == "a, b and 2 more"
+
+
+@pytest.mark.parametrize(
+    ("p", "written"),
+    [(5e-26, "p < 1e-16"), (0.0, "p < 1e-16"), (3.2e-9, "p = 3e-09"), (0.0123, "p = 0.012")],
+)
+def test_a_small_p_value_is_written_in_one_way(p, written):
+    assert numbers.p_equals(p) == written
+    assert numbers.chance(p) == written.removeprefix("p = ").removeprefix("p ")
+
+
+# fits
+
+
+@cache
+def fitted(mode: str, effect: str = "transmission_error") -> Fit:
+    c = campaign(effect, mode, 1, poses=12, strength=3.0)
+    return fit(baseline(c.cell, c.readings, c.mode), c.readings, c.mode)
+
+
+@pytest.fixture(scope="module")
+def absolute() -> Fit:
+    return fitted("absolute")
+
+
+@pytest.fixture(scope="module")
+def judged(absolute) -> Diagnosis:
+    return diagnose(absolute)
+
+
+@pytest.fixture
+def shown(printed):
+    return lambda *blocks: " ".join(printed(*blocks).split())
+
+
+def test_before_a_deflection_is_what_was_measured():
+    f = fitted("deflection", "base_compliance")
+    measured = np.linalg.norm(f.whitening.raw(f.readings.value[:, :3]), axis=1)
+    before = error_before(f)
+    assert before.rms_m == pytest.approx(float(np.sqrt(np.mean(measured**2))), rel=1e-9)
+    assert before.max_m == pytest.approx(float(measured.max()), rel=1e-9)
+    said = before_and_after(f)
+    assert said.startswith(f"Deflections of {numbers.length(before.rms_m)} rms were measured;")
+    assert f"the model leaves {numbers.length(f.error.rms_m)} (noise" in said
+
+
+def test_before_of_positions_is_the_rigid_arm_in_frames_of_its_own(absolute, shown):
+    """Compliances alone are put to zero; they sag by about torque times compliance."""
+    before, torque = error_before(absolute), absolute.solution.prediction.situation.torque
+    turned = torque * typical_compliances(absolute.model.cell)
+    assert absolute.error.rms_m < 0.2 * before.rms_m
+    assert 0.1 * np.abs(turned).max() < before.rms_m < 3.0 * np.abs(turned).sum(axis=1).max()
+    report = shown(*fit_report(absolute))
+    assert "The rigid nominal arm, its frames fitted alone, is off by" in report
+    row = f"before: rigid nominal arm {numbers.length(before.rms_m)}"
+    assert row in shown(errors(absolute))
+    assert to_json(absolute)["error"]["before"] == before.to_json()
+
+
+def test_a_p_value_reads_the_same_wherever_it_stands(absolute, judged, shown):
+    lead = judged.suspects[0]
+    value, equals = (f(lead.score.p_value) for f in (numbers.chance, numbers.p_equals))
+    assert equals in message(judged)
+    assert re.search(rf"{lead.effect} .*{re.escape(value)}", shown(suspects_table(judged)))
+    story = build_story([Chapter(1, None, absolute, judged)])
+    revision = story.revisions[0]
+    escaped = value.replace("<", "\\<")
+    assert f"| {escaped} |" in viewer.verdict(story, revision)
+    assert equals in str(revision.panels["verdict"][0])
+    assert all(s.score.p_value * judged.tested < FALSE_ALARM for s in judged.suspects if s.passes)
+
+
+def test_how_many_were_tested_stands_where_p_values_do(absolute, judged, shown):
+    tests = diagnosis_json(judged)["tests"]
+    assert tests["count"] == sum(s.score.rank > 0 for s in judged.suspects)
+    assert tests["each"] == pytest.approx(FALSE_ALARM / tests["count"])
+    report = shown(*diagnosis_report(judged))
+    assert f"{tests['count']} effects were tested: one counts from p < " in report
+    assert f"which is 0.001 / {tests['count']}" in report
+    kinds = [v for v in judged.misfit_breakdown if v.group not in ("pose", "direction")]
+    assert f"{len(kinds)} variables were tested" in report
+    story = build_story([Chapter(1, None, absolute, judged)])
+    details = viewer.details(story, story.revisions[0])
+    assert f"{tests['count']} effects were tested" in details
+
+
+def test_terminal_and_viewer_call_the_worst_pose_by_its_name(absolute):
+    worst = worst_poses(full_prediction(absolute))[0]
+    story = build_story([Chapter(1, None, absolute, None)])
+    assert worst.pose in absolute.readings.pose_names
+    assert story.pose_name(viewer.worst(story.revisions[0])) == worst.pose
+    details = viewer.details(story, story.revisions[0])
+    assert f"Worst: pose {worst.pose}, load {worst.load}," in details
+
+
+# where the model fails
+
+PLACES = (
+    MisfitShare("direction vertical", 0.7, 1e-30),
+    MisfitShare("pose", 0.95, 1e-9),
+    MisfitShare("time", 0.2, 1e-4),
+    MisfitShare("joint 4 angle", 0.4, 1e-12),
+    MisfitShare("load", 0.02, 1e-3),
+    MisfitShare("joint 1 angle", 0.0, 1e-20),
+    MisfitShare("air temperature", 0.004, 0.3),
+)
+
+
+def test_variables_stand_in_groups_and_those_without_a_share_are_counted(shown) -> None:
+    told = shown(*where_table(PLACES))
+    order = ["joint 4 angle", "load", "time", "same in all readings of a pose", "points vertical"]
+    places = [told.index(name) for name in order]
+    assert places == sorted(places)
+    assert "joint 1 angle" not in told
+    assert not re.search(r"(?<!\d)0 %", told)
+    assert "2 more are below 1 %" in told
+
+
+def test_a_curve_is_shown_only_where_it_is_determined_and_carries_something(shown) -> None:
+    def told(error: float, share: float = 0.3) -> str:
+        x, y = np.arange(5.0), 1e-5 * np.arange(-2.0, 3.0)
+        std = np.full(5, error)
+        of = Dependence("time", "s", share, "joint 2", np.zeros(3), x, y, std, "rad")
+        return shown(*curves([of]))
+
+    assert "joint 2 errs by" in told(2e-6)
+    assert "do not determine its curve" in told(5e-2)
+    assert "±" not in told(5e-2)
+    assert told(2e-6, share=0.004) == ""
+
+
+def drifting(strength: float) -> Diagnosis:
+    """Judge a drift of the tracker where nothing states the time."""
+    cell, p = cell_of(registration_known=True), plan(16, 3)
+    rng = np.random.default_rng(4)
+    r = with_noise(noiseless(world_of(cell, rng), p), rng)
+    along = np.linspace(-1, 1, len(r))[:, None] * np.array([0.0, 0.0, strength])
+    states = replace(r.states, time=None, load_time=None)
+    r = replace(r, value=r.value + along, states=states)
+    return diagnose(fit(baseline(cell, r, "absolute"), r, "absolute"))
+
+
+def test_row_order_stands_for_the_time_where_there_is_none() -> None:
+    by_name = {v.variable: v for v in drifting(1e-4).misfit_breakdown}
+    assert "time" not in by_name
+    order = by_name[ROW_ORDER]
+    assert order.p_value < 1e-6
+    assert order.share > 0.5
+    assert order.group == "time and air"
+    c = campaign(plan_seed=0)
+    timed = fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute")
+    assert ROW_ORDER not in {v.variable for v in misfit_breakdown(linearise(timed))}
+
+
+@pytest.mark.parametrize("strength", [2e-5, 4e-5, 1e-4])
+def test_an_unknown_effect_never_stands_beside_nothing_predicted(strength: float) -> None:
+    d = drifting(strength)
+    if d.verdict == "unknown_effect":
+        assert d.predictable_share >= 0.01
+        assert " 0 % of the misfit" not in message(d)
+
+
+def test_what_the_pose_alone_predicts_is_said_so(shown) -> None:
+    """Each pose is off by its own random amount; its repeats are off by the same."""
+    cell, p = cell_of(registration_known=True), plan(16, 3, 2)
+    rng = np.random.default_rng(4)
+    r = with_noise(noiseless(world_of(cell, rng), p), rng)
+    kind = r.pose * 10 + r.load  # so that only repeats have the error in common
+    off = 1e-4 * rng.standard_normal((int(kind.max()) + 1, 3))[kind]
+    r = replace(r, value=r.value + off)
+    d = diagnose(fit(baseline(cell, r, "absolute"), r, "absolute"))
+    assert d.verdict == "unknown_effect"
+    assert d.repeated_share > 0.9
+    same = f"{100 * d.repeated_share:.0f} % of the misfit is the same"
+    assert f"{same} in them" in message(d)
+    # Had nothing recorded been significant:
+    alone = replace(d, predictable_share=0.0, follows=())
+    assert f"{same} when a pose is repeated: the pose itself predicts it" in message(alone)
+    assert "predicts 0 %" not in shown(*diagnosis_report(alone))
