@@ -38,19 +38,11 @@ def import_campaign(
     overwrite: bool = False,
     say: Say = lambda text: None,
 ) -> Imported:
-    """Make a campaign file from a table of readings.
+    """Make a campaign file from a table of readings, measured in a cell.
 
     Args:
-        table: what was measured.
-        config: CELL.toml of the cell that it was measured in.
-        output: the file to make.
         kind: "table", "ipa-ur10", the name of a mapping, or the path of one.
         second: the second file of a mapping that is for two.
-        overwrite: replace a campaign that is there.
-        say: takes progress, one line each.
-
-    Raises:
-        InputError: anything in table or cell that cannot be right, or the file exists.
     """
     settings = load_config(config)
     base_dir = config.absolute().parent

@@ -218,11 +218,10 @@ def fit(
     else:
         std = prior
     data = with_prior_scatter(model, data)
-    for known in SCALINGS:
-        if scaling == known:
-            found = fits.fit(model, data, _mode(readings, data, model.cell), known, prior=std)
-            return with_serial_noise(found, std)
-    raise InputError(f"scaling {scaling!r} is unknown; valid: {', '.join(SCALINGS)}")
+    if scaling not in SCALINGS:
+        raise InputError(f"scaling {scaling!r} is unknown; valid: {', '.join(SCALINGS)}")
+    found = fits.fit(model, data, _mode(readings, data, model.cell), scaling, prior=std)
+    return with_serial_noise(found, std)
 
 
 def load_posterior(path: str | Path, catalogue: Catalogue | None = None) -> Posterior:
@@ -401,7 +400,6 @@ def _mode(asked: str | None, data: Readings, cell: Cell) -> Mode:
     if asked is None:
         config = cell.config
         return usual_mode(data) if config is None else usual_mode(data, config.planning.readings)
-    for known in MODES:
-        if asked == known:
-            return known
-    raise InputError(f"readings {asked!r} is unknown; valid: {', '.join(MODES)}")
+    if asked not in MODES:
+        raise InputError(f"readings {asked!r} is unknown; valid: {', '.join(MODES)}")
+    return asked

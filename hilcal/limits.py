@@ -150,12 +150,7 @@ def check_shared(shared: int, elements: int, groups: int) -> None:
 
 
 def read_bytes(path: Path, most: int) -> bytes:
-    """Read a file of at most so many bytes.
-
-    Raises:
-        InputError: it is larger.
-        OSError: it cannot be read.
-    """
+    """Read a file; InputError where it has more than so many bytes."""
     with path.open("rb") as stream:
         data = stream.read(most + 1)
         if len(data) > most:

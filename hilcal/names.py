@@ -35,11 +35,7 @@ def _code(sign: str) -> str:
 
 
 def check_name(text: str, where: str) -> str:
-    r"""Return a text if it is of one line, without control characters; `where` names its origin.
-
-    Raises:
-        InputError: it holds another character; names it as `\u….`.
-    """
+    r"""Return a text if it is of one line, without control characters; `where` names its origin."""
     if found := _REFUSED.search(text):
         begin = max(found.start() - 20, 0)
         shown = ("…" if begin else "") + escaped(text[begin : found.start() + 20])
@@ -51,11 +47,7 @@ def check_name(text: str, where: str) -> str:
 
 
 def check_names(value: object, where: str) -> None:
-    """Check all texts in lists and dictionaries, keys too.
-
-    Raises:
-        InputError: see `check_name`.
-    """
+    """Check all texts in lists and dictionaries, keys too."""
     pending = [(value, where)]  # documents of others are nested deeper than Python calls itself
     while pending:
         inner, at = pending.pop()

@@ -58,16 +58,10 @@ def sizes(of: Iterable[tuple[str, float]]) -> str:
 def measured(
     unit: str, value: float, std: float = math.nan, alike: Sequence[float] = (), count: int = 3
 ) -> tuple[str, str, str]:
-    """Write a value, its standard uncertainty and their unit for people.
+    """Write a value, its standard uncertainty and their unit for people; all given in SI.
 
-    What is below `LEAST` is said to be less than that.
-
-    Args:
-        unit: SI.
-        value: in it.
-        std: in it; not finite or 0 where there is none, which is written "".
-        alike: values whose column has one unit; the value alone where empty.
-        count: significant digits of a value without an uncertainty.
+    What is below `LEAST` is said to be less than that; "" is no uncertainty. `alike` are values
+    whose column has one unit; `count` are the digits of a value without an uncertainty.
     """
     name, factor = unit_for(unit, alike or [value])
     least = LEAST.get(unit, 0.0)

@@ -34,14 +34,7 @@ REQUIRED = {
 
 @contextmanager
 def needed_by(what: str) -> Iterator[None]:
-    """Import packages that may be missing.
-
-    Args:
-        what: needs them; begins the message.
-
-    Raises:
-        MissingPackageError: one is not installed, or does not load.
-    """
+    """Import packages that may be missing: MissingPackageError, which `what` needs them begins."""
     try:
         yield
     except ImportError as error:
@@ -49,14 +42,7 @@ def needed_by(what: str) -> Iterator[None]:
 
 
 def lacking(error: BaseException) -> str:
-    """Say which package an import did not find, and the line that installs it.
-
-    Args:
-        error: what the import raised.
-
-    Returns:
-        One line; empty where it is another error, or the package is none of those named above.
-    """
+    """Say which package an import lacks, and the line that installs it; "" for other errors."""
     name = (error.name or "") if isinstance(error, ModuleNotFoundError) else ""
     package = name.split(".")[0]
     if package not in EXTRAS and package not in REQUIRED:

@@ -105,12 +105,7 @@ def _check_whole(data: dict[str, Any], where: str) -> None:
 
 
 def check_section(data: object, section: type[S], where: str) -> S:
-    """Check a dictionary against `section`; `where` names its origin in messages.
-
-    Raises:
-        InputError: unknown key (lists the valid ones), missing key, bad value, or a text with a
-            character that no name may hold.
-    """
+    """Check a dictionary against `section`; `where` names its origin in InputErrors of one line."""
     check_names(data, where)
     try:
         return section.model_validate(data)
@@ -142,12 +137,7 @@ def read_json(text: str, where: str) -> Any:
 
 
 def parse_json(text: str) -> Any:
-    """Return what a JSON document holds.
-
-    Raises:
-        ValueError: not JSON, nested too deeply, more than `limits.VALUES` values, or a whole number
-            of so many digits that it is no float.
-    """
+    """Return what a JSON document holds; ValueError where it is none, too deep, or too large."""
     if sum(map(text.count, ",:[{")) > limits.VALUES:
         raise ValueError(f"more than {limits.VALUES / 1e6:.0f} million values")
     try:

@@ -89,8 +89,7 @@ class CalibrationOptions:
 AS_USUAL = CalibrationOptions()
 
 
-@command(
-    f"""
+@command(f"""
     output | -o --output RUN.hilcal | The campaign file; RUN.validation.hilcal and
         RUN.corrected.hilcal go beside it.
     resume | --resume | Go on with what RUN.hilcal holds, after any stop.
@@ -105,19 +104,12 @@ AS_USUAL = CalibrationOptions()
     validation | --validation | Poses of the validation campaign, {VALIDATION} unless given.
     rehearse | --rehearse | In one simulated cell, from the first to the last.
     yes | --yes -y | Do not ask before the arm moves; for scripts.
-    """
-)
+    """)
 def calibrate(
-    cell: Path,
-    output: Path,
-    resume: bool = False,
-    asked: CalibrationOptions = AS_USUAL,
-    rehearse: bool = False,
-    yes: bool = False,
-    view: bool = False,
-    effects_from: list[Path] | None = None,
-    as_json: bool = False,
-) -> None:
+    cell: Path, output: Path, resume: bool = False, asked: CalibrationOptions = AS_USUAL,
+    rehearse: bool = False, yes: bool = False, view: bool = False,
+    effects_from: list[Path] | None = None, as_json: bool = False,
+) -> None:  # fmt: skip
     """Plan, measure, fit, measure what is in doubt, validate, correct, and measure the gain."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     config, numbers = read_cell(cell)

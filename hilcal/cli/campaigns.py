@@ -1,5 +1,6 @@
 """`import`, `info`, `accept`, `repair`, `fleet`: campaign files, and which revision is used."""
 
+from contextlib import suppress
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -14,7 +15,7 @@ from hilcal.cli.terminal import Terminal, terminal
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.full_covariance import covariance_parts
 from hilcal.identification.misdescription import examine, other_arm
-from hilcal.identification.registration import Registration, register
+from hilcal.identification.registration import register
 from hilcal.identification.table_preview import preview_table
 from hilcal.identification.torques import check_torques
 from hilcal.import_campaign import import_campaign
@@ -38,12 +39,10 @@ from hilcal.store.overview import overview, to_json
 from hilcal.store.repair import put_robot
 from hilcal.store.repair import repair as repaired
 from hilcal.store.revision import RevisionRecord
-from hilcal.tables.proposal import Proposal
 from hilcal.whole_file import replace_file
 
 
-@command(
-    """
+@command("""
     table | TABLE | What was measured.
     config | --config CELL.toml | The cell it was measured in.
     output | -o --output RUN.hilcal | The campaign file to make; with --preview, the mapping file.
@@ -51,18 +50,11 @@ from hilcal.whole_file import replace_file
         file.
     second | --second TABLE | The second file, e.g. of the joints.
     preview | --preview | Show how the table could be read; make no campaign.
-    """
-)
+    """)
 def import_(
-    table: Path,
-    config: Path | None = None,
-    output: Path | None = None,
-    kind: str = "table",
-    second: Path | None = None,
-    preview: bool = False,
-    force: bool = False,
-    as_json: bool = False,
-) -> None:
+    table: Path, config: Path | None = None, output: Path | None = None, kind: str = "table",
+    second: Path | None = None, preview: bool = False, force: bool = False, as_json: bool = False,
+) -> None:  # fmt: skip
     """Make a campaign file from a table of readings."""
     t = terminal(as_json)
     if preview:
@@ -79,59 +71,45 @@ def import_(
     notes = (*found.notes, covariance_words(found.parts, noise), *cell.arm.notes)
     loads = [readings.load_names[k] for k in np.unique(readings.load)]
     poses = len(np.unique(readings.pose))
+    kind = f"each reading is a position{'' if readings.m == 3 else ' and an orientation'}"
+    kind = observed_words(readings) if readings.observers else kind
     t.show(heading(f"{len(readings)} readings of {poses} poses"))
-    t.show(f"  robot {settings.robot.model}; {_kind(readings)}\n  loads: {', '.join(loads)}")
+    t.show(f"  robot {settings.robot.model}; {kind}\n  loads: {', '.join(loads)}")
     targets = _targets(cell, readings)
     if targets:
         t.show("  targets: " + "; ".join(target_words(**x) for x in targets))
-    t.show(Words(note, indent=2) for note in notes)
-    torques = check_torques(cell, readings)
-    t.show(Words(line, indent=2) for line in torque_lines(torques))
-    registered = _registered(cell, readings)
-    wrong = None if registered is None else examine(registered, readings)
-    if registered is not None and not (wrong is not None and wrong.refused):
-        t.show(Words(line, indent=2) for line in registration_lines(registered))
-    refused = wrong is not None and wrong.refused
-    other = None if registered is None or refused else other_arm(registered, readings)
+    torques, registered, wrong, other = check_torques(cell, readings), None, None, None
+    lines = [*notes, *torque_lines(torques)]
+    with suppress(CannotAnswerError):  # the readings do not determine the registration
+        registered = register(cell, readings)
+    if registered is not None:
+        wrong = examine(registered, readings)
+        if wrong is None or not wrong.refused:
+            lines += registration_lines(registered)
+            other = other_arm(registered, readings)
     if other is not None:
-        t.show(Words(f"Note: {other_arm_line(other)}", indent=2))
+        lines.append(f"Note: {other_arm_line(other)}")
     if wrong is not None:
-        said = wrong.words(cell, readings)
         begin = "Nothing can be fitted yet" if wrong.refused else "Note"
-        t.show(Words(f"{begin}: {said}.", indent=2))
+        lines.append(f"{begin}: {wrong.words(cell, readings)}.")
+    t.show(Words(line, indent=2) for line in lines)
     t.document(
-        {
-            "campaign": str(output),
-            "robot": settings.robot.model,
-            "n_readings": len(readings),
-            "n_poses": poses,
-            "elements": readings.m,
-            "loads": loads,
-            "targets": targets,
-            "observers": [str(name) for name in readings.observers],
-            "covariance": found.parts,
-            "noise": None if noise is None else asdict(noise),
-            "notes": list(notes),
-            "description": None if wrong is None else wrong.to_json(cell, readings),
-            "other_arm": None if other is None else other.to_json(),
-            "torques": None if torques is None else torques.to_json(),
-            "frames": None if registered is None else registered.to_json(),
-        }
+        campaign=str(output),
+        robot=settings.robot.model,
+        n_readings=len(readings),
+        n_poses=poses,
+        elements=readings.m,
+        loads=loads,
+        targets=targets,
+        observers=[str(name) for name in readings.observers],
+        covariance=found.parts,
+        noise=None if noise is None else asdict(noise),
+        notes=list(notes),
+        description=None if wrong is None else wrong.to_json(cell, readings),
+        other_arm=None if other is None else other.to_json(),
+        torques=None if torques is None else torques.to_json(),
+        frames=None if registered is None else registered.to_json(),
     )
-
-
-def _kind(readings: Readings) -> str:
-    if readings.observers:
-        return observed_words(readings)
-    return f"each reading is a position{'' if readings.m == 3 else ' and an orientation'}"
-
-
-def _registered(cell: Cell, readings: Readings) -> Registration | None:
-    """Return the registration; None where the readings do not determine it."""
-    try:
-        return register(cell, readings)
-    except CannotAnswerError:
-        return None
 
 
 def _targets(cell: Cell, readings: Readings) -> list[dict[str, Any]]:
@@ -162,35 +140,26 @@ def show_preview(
         t.show(heading("with this mapping:"))
         t.show(Words(words, indent=2) for words in outcome)
     if output is not None:
-        if second is not None:
-            _relative_second(proposal, output)
+        if second is not None:  # its path is relative to the mapping file
+            whole, here = second.absolute(), output.absolute().parent
+            path = whole.relative_to(here) if whole.is_relative_to(here) else whole
+            proposal.sections["second_file"]["path"] = str(path)
         replace_file(output, proposal.to_toml(table.name))
         t.notice(f"{output}: the mapping; import with --format {output}")
     else:
         t.notice("nothing was written; -o mapping.toml keeps this as a mapping to edit")
     t.document(
-        {
-            "mapping": proposal.sections,
-            "understood": [
-                {"section": u.what, "columns": u.columns, "meaning": u.meaning, "first": u.example}
-                for u in proposal.understood
-            ],
-            "unsure": [{"section": what, "what": words} for what, words in proposal.unsure],
-            "unused": [{"column": name, "why": why} for name, why in proposal.unused],
-            "missing": proposal.lacking,
-            "outcome": outcome,
-            "written": None if output is None else str(output),
-        }
+        mapping=proposal.sections,
+        understood=[
+            {"section": u.what, "columns": u.columns, "meaning": u.meaning, "first": u.example}
+            for u in proposal.understood
+        ],
+        unsure=[{"section": what, "what": words} for what, words in proposal.unsure],
+        unused=[{"column": name, "why": why} for name, why in proposal.unused],
+        missing=proposal.lacking,
+        outcome=outcome,
+        written=None if output is None else str(output),
     )
-
-
-def _relative_second(proposal: Proposal, output: Path) -> None:
-    """Write the second file's path relative to the mapping file."""
-    section = proposal.sections["second_file"]
-    section["path"] = str(Path(section["path"]).absolute())
-    here = output.absolute().parent
-    if Path(section["path"]).is_relative_to(here):
-        section["path"] = str(Path(section["path"]).relative_to(here))
 
 
 @command()
@@ -209,12 +178,10 @@ def info(run: Path, as_json: bool = False) -> None:
     t.document({**to_json(found, str(run), parts), **more})
 
 
-@command(
-    """
+@command("""
     number | N | The revision; the latest one if left out.
     release | --release | Accept none: the latest one is used again.
-    """
-)
+    """)
 def accept(
     run: Path, number: int | None = None, release: bool = False, as_json: bool = False
 ) -> None:
@@ -237,19 +204,15 @@ def accept(
         )
     used = records[-1] if chosen is None else chosen
     t.document(
-        {
-            "accepted": None if chosen is None else chosen.number,
-            "in_use": used.number,
-            "latest": records[-1].number,
-        }
+        accepted=None if chosen is None else chosen.number,
+        in_use=used.number,
+        latest=records[-1].number,
     )
 
 
-@command(
-    """
+@command("""
     robot | --robot FILE | URDF or DH table of its robot, for a campaign that does not hold it.
-    """
-)
+    """)
 def repair(run: Path, robot: Path | None = None, as_json: bool = False) -> None:
     """Open a campaign again that a bad revision closes: it is set aside, no reading is."""
     t = terminal(as_json)
@@ -257,41 +220,35 @@ def repair(run: Path, robot: Path | None = None, as_json: bool = False) -> None:
     if robot is not None:
         put_robot(run, robot)
         t.show(f"{run} holds its robot now: {robot}")
-    put = None if robot is None else str(robot)
-    if done is None:
-        if robot is None:
-            t.show(f"{run}: no revision is bad; nothing was changed.")
-        t.document({"set_aside": [], "original": None, "robot": put})
-        return
-    numbers = ", ".join(map(str, done.revisions))
-    t.show(
-        f"{run}: {done.why}. Set aside: revision{'s' * (len(done.revisions) > 1)} {numbers}. All "
-        f"readings are there; the file as it was is {done.original}. Fit again with:"
+    if done is None and robot is None:
+        t.show(f"{run}: no revision is bad; nothing was changed.")
+    if done is not None:
+        numbers = ", ".join(map(str, done.revisions))
+        t.show(
+            f"{run}: {done.why}. Set aside: revision{'s' * (len(done.revisions) > 1)} {numbers}. "
+            f"All readings are there; the file as it was is {done.original}. Fit again with:"
+        )
+        t.command(f"hilcal identify {quoted(run)}")
+    t.document(
+        set_aside=[] if done is None else list(done.revisions),
+        original=None if done is None else str(done.original),
+        robot=None if robot is None else str(robot),
     )
-    t.command(f"hilcal identify {quoted(run)}")
-    t.document({"set_aside": list(done.revisions), "original": str(done.original), "robot": put})
 
 
 def _named(record: RevisionRecord) -> str:
     return f"revision {record.number} ({model_name(record.effects)})"
 
 
-@command(
-    """
+@command("""
     directory | DIR | With campaign files, in folders below as well.
     out | -o PRIOR.json | What to expect of another arm.
     report | --report F.html | Write it as one HTML page.
-    """
-)
+    """)
 def fleet(
-    directory: Path,
-    out: Path,
-    report: Path | None = None,
-    record: Path | None = None,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    as_json: bool = False,
-) -> None:
+    directory: Path, out: Path, report: Path | None = None, record: Path | None = None,
+    workers: int | None = None, scheduler: str | None = None, as_json: bool = False,
+) -> None:  # fmt: skip
     """Pool many campaigns: a prior for other arms, arms unlike their type, drift."""
     # loads all that is fitted and shown
     from hilcal.cli.fitting import check_record

@@ -31,22 +31,16 @@ from hilcal.transfer.compare import compare as compare_campaigns
 from hilcal.validation import validate as validate_campaign
 
 
-@command(
-    """
+@command("""
     later | [LATER.hilcal] | A later campaign of the same arm, of 15 readings or more: what has
         changed?
     same_setup | --same-setup | With LATER: tracker and base stand as they did; else the tracker's
         place is estimated from the later readings.
-    """
-)
+    """)
 def compare(
-    run: Path,
-    later: Path | None = None,
-    same_setup: bool = False,
-    revision: int | None = None,
-    effects_from: list[Path] | None = None,
-    as_json: bool = False,
-) -> None:
+    run: Path, later: Path | None = None, same_setup: bool = False, revision: int | None = None,
+    effects_from: list[Path] | None = None, as_json: bool = False,
+) -> None:  # fmt: skip
     """Show where the model fails; with a later campaign, what has changed on the arm."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     if later is None:
@@ -91,19 +85,15 @@ def _one(t: Terminal, run: Path, revision: int | None, catalogue: Catalogue) -> 
     t.show([*where_table(places), ""])
     t.show(worst_table(worst, left_out))
     t.document(
-        {
-            "revision": number,
-            "model": list(found.model.named),
-            "readings": found.mode,
-            "error": {"fit": found.error.to_json(), "holdout": found.holdout.to_json()},
-            "variance_factor": found.variance_factor,
-            "variance_factor_interval": list(found.variance_factor_interval),
-            "noise_floor_m": e.noise_floor,
-            "where": [
-                {"variable": p.variable, "share": p.share, "p_value": p.p_value} for p in places
-            ],
-            "worst": [asdict(w) for w in worst],
-        }
+        revision=number,
+        model=list(found.model.named),
+        readings=found.mode,
+        error={"fit": found.error.to_json(), "holdout": found.holdout.to_json()},
+        variance_factor=found.variance_factor,
+        variance_factor_interval=list(found.variance_factor_interval),
+        noise_floor_m=e.noise_floor,
+        where=[{"variable": p.variable, "share": p.share, "p_value": p.p_value} for p in places],
+        worst=[asdict(w) for w in worst],
     )
 
 
@@ -111,23 +101,16 @@ OVER = 5.0
 """Errors in units of the noise from which another place of the tracker is suspected; a guess."""
 
 
-@command(
-    """
+@command("""
     other | OTHER.hilcal | A campaign that was never fitted.
     register | --register | The tracker was set up anew: fit its place first.
     limit | --limit LENGTH | The largest 3-D position error allowed, e.g. "0.1 mm"; exit 5 where it
         is not kept.
-    """
-)
+    """)
 def validate(
-    run: Path,
-    other: Path,
-    register: bool = False,
-    limit: str | None = None,
-    revision: int | None = None,
-    effects_from: list[Path] | None = None,
-    as_json: bool = False,
-) -> None:
+    run: Path, other: Path, register: bool = False, limit: str | None = None,
+    revision: int | None = None, effects_from: list[Path] | None = None, as_json: bool = False,
+) -> None:  # fmt: skip
     """Predict readings of another campaign with the model."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     limit_m = None if limit is None else parse_length(limit, "--limit")
@@ -153,20 +136,19 @@ def validate(
         words = validation_failure(shares, judged)
         failed = CannotAnswerError(words) if shares.undecided else LimitError(words)
     t.document(
-        {
-            "revision": judged.number,
-            "model": list(done.model.named),
-            "readings": judged.mode,
-            "registered": register,
-            "n_readings": judged.readings,
-            "n_fitted": judged.fitted,
-            "never_fitted": judged.unseen,
-            "n_measurements": len(found.raw),
-            "error": found.error.to_json(),
-            "variance_factor": found.variance_factor,
-            "noise_floor_m": found.noise_floor,
-            **beyond.to_dict(),
-            **shares.to_dict(),
-        },
+        None,
         failed,
+        revision=judged.number,
+        model=list(done.model.named),
+        readings=judged.mode,
+        registered=register,
+        n_readings=judged.readings,
+        n_fitted=judged.fitted,
+        never_fitted=judged.unseen,
+        n_measurements=len(found.raw),
+        error=found.error.to_json(),
+        variance_factor=found.variance_factor,
+        noise_floor_m=found.noise_floor,
+        **beyond.to_dict(),
+        **shares.to_dict(),
     )

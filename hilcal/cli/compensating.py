@@ -74,8 +74,7 @@ class CompensationOptions:
 AS_USUAL = CompensationOptions()
 
 
-@command(
-    """
+@command("""
     model | RUN.hilcal | A campaign with a revision, or a calibration (JSON).
     points | POINTS | Where to go: a table (CSV, XLSX …) or a program: UR .script, KUKA .src, ABB
         .mod, FANUC .ls, Yaskawa .jbi.
@@ -92,19 +91,13 @@ AS_USUAL = CompensationOptions()
     leave | --leave | Keep waypoints of a program that cannot be corrected as they are.
     kind | --format FORMAT | table, or a mapping, as for import.
     force | --force | Replace existing files.
-    """
-)
+    """)
 def compensate(
-    model: Path,
-    points: Path,
-    output: list[Path] | None = None,
-    asked: CompensationOptions = AS_USUAL,
-    revision: int | None = None,
-    effects_from: list[Path] | None = None,
-    kind: str = "table",
-    force: bool = False,
+    model: Path, points: Path, output: list[Path] | None = None,
+    asked: CompensationOptions = AS_USUAL, revision: int | None = None,
+    effects_from: list[Path] | None = None, kind: str = "table", force: bool = False,
     as_json: bool = False,
-) -> None:
+) -> None:  # fmt: skip
     """Find the joint values that put the tool where it was asked to be, under a load."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     for path in output or ():

@@ -113,13 +113,11 @@ def doubtful_case(
 ) -> tuple[RehearsalSettings, Plan, bool]:
     """Draw an effect to hide and a small campaign that leaves it in doubt.
 
-    Both come from the seed; another `number` is another case. The effect is one of those that are
-    hard to separate where None is given. A case counts when for each of `DRAWS` draws of the noise
-    a rival explains the readings about as well as the hidden effect, and when the diagnosis of the
-    first draw names both, and says that more readings would separate them.
-
-    Returned are the settings with the effect and the seed of this case, the plan of its first
-    campaign, and whether that leaves a doubt; it is the last case where none of `TRIES` does.
+    Both come from the seed; another `number` is another case. A case counts when for each of
+    `DRAWS` draws of the noise a rival explains the readings about as well as the hidden effect, and
+    when the diagnosis of the first draw names both, and says that more readings would separate
+    them. Returned are its settings, the plan of its first campaign, and whether that leaves a
+    doubt; it is the last case where none of `TRIES` does.
     """
     loads = told.config.loads[1::2] or told.config.loads
     quick = {"candidates": min(told.config.planning.candidates, CANDIDATES), "against": ()}
@@ -143,13 +141,13 @@ def doubtful_case(
     return case, plan, False
 
 
-def _fit(r: Rehearsal, case: RehearsalSettings) -> Fit:
-    return fit(baseline(r.cell, r.readings, r.mode, case.catalogue), r.readings, r.mode)
+def _fit(r: Rehearsal, catalogue: Catalogue) -> Fit:
+    return fit(baseline(r.cell, r.readings, r.mode, catalogue), r.readings, r.mode)
 
 
 def _resembled(r: Rehearsal, case: RehearsalSettings) -> bool:
     """Whether the hidden effect is clearly there, and a rival explains the readings as well."""
-    p = linearise(_fit(r, case))
+    p = linearise(_fit(r, case.catalogue))
     effects = [e for e in candidates(p.fit) if e.name in (r.hidden, *RESEMBLING)]
     found = {s.effect: s for s in rank_suspects(p, effects)}
     own = found.pop(r.hidden, None)
@@ -161,7 +159,7 @@ def _resembled(r: Rehearsal, case: RehearsalSettings) -> bool:
 
 def _left_open(r: Rehearsal, case: RehearsalSettings) -> bool:
     """Whether the diagnosis leaves the hidden effect and others that could be separated from it."""
-    d = judge(Evidence(_fit(r, case)), History())
+    d = judge(Evidence(_fit(r, case.catalogue)), History())
     return r.hidden in left_open(d) and all(rival.possible for rival in d.separability)
 
 
@@ -174,7 +172,7 @@ def doubted(
     """
     with working(t.progress) as say:
         say("fitting and diagnosing the first readings")
-        found = fit(baseline(r.cell, r.readings, r.mode, catalogue), r.readings, r.mode)
+        found = _fit(r, catalogue)
         d = diagnose(found, say=say)
     document: dict[str, object] = {"verdict": d.verdict, "message": message(d), "suspects": []}
     known = (content_hash(r.readings), len(r.readings))
@@ -202,8 +200,7 @@ POSES = 20
 VALIDATION = 10  # Poses of the validation campaign; a choice for the same reason
 
 
-@command(
-    """
+@command("""
     hide | --hide EFFECT | An effect, random, nothing, or invented: a law that the catalogue lacks.
     seed | --seed | Of everything random.
     output | -o --output RUN.hilcal | The campaign file to make.
@@ -212,20 +209,13 @@ VALIDATION = 10  # Poses of the validation campaign; a choice for the same reaso
     without_devices | --without-devices | Draw the readings at once, through no wire.
     ambiguous | --ambiguous | Measure little at first, so that the effect is in doubt; then what
         settles it.
-    """
-)
+    """)
 def demo(
-    hide: str | None = None,
-    seed: int | None = None,
-    output: Path = Path("demo.hilcal"),
-    poses: int = POSES,
-    validation: int = VALIDATION,
-    without_devices: bool = False,
-    ambiguous: bool = False,
-    record: Path | None = None,
-    effects_from: list[Path] | None = None,
+    hide: str | None = None, seed: int | None = None, output: Path = Path("demo.hilcal"),
+    poses: int = POSES, validation: int = VALIDATION, without_devices: bool = False,
+    ambiguous: bool = False, record: Path | None = None, effects_from: list[Path] | None = None,
     as_json: bool = False,
-) -> None:
+) -> None:  # fmt: skip
     """Rehearse the whole story on a simulated cell, through real drivers and wires."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     check_record(record)
@@ -241,8 +231,10 @@ def demo(
         config, wanted or RANDOM, number, output, configs_dir() / "cells", catalogue, world
     )
     laws = None
-    if wanted == INVENTED:
-        laws = LawSearch(output.absolute().parent, _law_name(output), replacing=True)
+    if wanted == INVENTED:  # named after the campaign, which it replaces, too
+        word = re.sub(r"[^a-z0-9]+", "_", output.stem.lower()).strip("_")
+        name = f"law_of_{word}" if word else "law"
+        laws = LawSearch(output.absolute().parent, name, replacing=True)
     with _campaign(t, told, poses, without_devices, ambiguous) as (m, r, doubt):
         with working(t.progress) as say:
             model = baseline(r.cell, r.readings, r.mode, catalogue)
@@ -292,24 +284,31 @@ def demo(
     t.show("As one HTML page, with a certificate first:")
     t.command(f"hilcal report {quoted(output)}{more}")
     t.document(
-        {
-            "campaign": str(output),
-            "hidden": r.hidden,
-            "strength_sigma": r.strength_sigma,
-            "seed": number,
-            "readings": r.mode,
-            "found": ok,
-            **({} if laws is None else laws_json(laws)),
-            **({} if doubt is None else {"doubt": doubt.document}),
-            "verdict": found.verdict,
-            "message": message(found.diagnosis),
-            "rejected": list(found.rejected),
-            "revisions": revisions_json(rows),
-            "parameters": [asdict(p) for p in truth],
-            "truth": r.world.truth,
-            "compensation": None if improved is None else _improvement_json(improved),
-            "diagnoses": [to_json(s.diagnosis) for s in found.steps],
-        }
+        campaign=str(output),
+        hidden=r.hidden,
+        strength_sigma=r.strength_sigma,
+        seed=number,
+        readings=r.mode,
+        found=ok,
+        **{} if laws is None else laws_json(laws),
+        **{} if doubt is None else {"doubt": doubt.document},
+        verdict=found.verdict,
+        message=message(found.diagnosis),
+        rejected=list(found.rejected),
+        revisions=revisions_json(rows),
+        parameters=[asdict(p) for p in truth],
+        truth=r.world.truth,
+        compensation=None
+        if improved is None
+        else {
+            "points": improved.everything.count,
+            "before_m": improved.everything.before.mean_m,
+            "after_m": improved.everything.after.mean_m,
+            "stated_m": improved.everything.band_m,
+            "inside": improved.everything.inside,
+            "measured": improved.to_dict(),
+        },
+        diagnoses=[to_json(s.diagnosis) for s in found.steps],
     )
 
 
@@ -376,19 +375,6 @@ def _put_to_use(t: Terminal, p: Procedure, measure: Measure, drawn: bool) -> Imp
     return improved
 
 
-def _improvement_json(found: Improvement) -> dict[str, object]:
-    """Return the error before and after, measured, for JSON."""
-    e = found.everything
-    return {
-        "points": e.count,
-        "before_m": e.before.mean_m,
-        "after_m": e.after.mean_m,
-        "stated_m": e.band_m,
-        "inside": e.inside,
-        "measured": found.to_dict(),
-    }
-
-
 def _introduce(t: Terminal, r: Rehearsal, choice: str, seed: int) -> None:
     used = np.unique(r.readings.load)
     loads = [name for k, name in enumerate(r.readings.load_names) if k in used and name != "none"]
@@ -406,12 +392,6 @@ def _introduce(t: Terminal, r: Rehearsal, choice: str, seed: int) -> None:
     )
     kind = "deflections: loaded minus unloaded" if r.mode == "deflection" else "absolute positions"
     t.show(f"The model is fitted to {kind}.\n")
-
-
-def _law_name(output: Path) -> str:
-    """Return the name of the law that a demo finds: after its campaign, which it replaces, too."""
-    word = re.sub(r"[^a-z0-9]+", "_", output.stem.lower()).strip("_")
-    return f"law_of_{word}" if word else "law"
 
 
 def _judge_law(r: Rehearsal, found: Refinement, laws: LawSearch) -> tuple[bool, str]:

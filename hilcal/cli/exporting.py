@@ -115,8 +115,7 @@ class Wanted:
             check_new(path, force)
 
 
-@command(
-    """
+@command("""
     readings | --readings F.csv|F.parquet | The readings as stored, to be imported again.
     table | --table F.csv|F.parquet | The same with the arm's scatter in their covariance.
     cell | --cell CELL.toml | The cell's configuration, for --readings.
@@ -138,16 +137,11 @@ class Wanted:
     base_link | --base-link NAME | Link or body of --into that the arm begins at.
     tip_link | --tip-link NAME | Link, body or site of --into that is its flange.
     force | --force | Replace existing files.
-    """
-)
+    """)
 def export(
-    run: Path,
-    wanted: Wanted,
-    revision: int | None = None,
-    force: bool = False,
-    effects_from: list[Path] | None = None,
-    as_json: bool = False,
-) -> None:
+    run: Path, wanted: Wanted, revision: int | None = None, force: bool = False,
+    effects_from: list[Path] | None = None, as_json: bool = False,
+) -> None:  # fmt: skip
     """Hand over: readings, parameters, calibration, URDF, DH, frames."""
     t = terminal(as_json)
     wanted.check(force)

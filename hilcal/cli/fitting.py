@@ -237,8 +237,7 @@ def _drifts(text: str | None) -> dict[str, float]:
     return found
 
 
-@command(
-    """
+@command("""
     effects | --effects A,B | Effects to fit, besides unknown frames; with options:
         creep(joints=each).
     scaling | --scaling S | none, gu, gc or all, side by side.
@@ -246,23 +245,14 @@ def _drifts(text: str | None) -> dict[str, float]:
         for good.
     cell | --cell CELL.toml | The cell of a stream, READINGS.parquet as RUN.
     out | -o F.json | Of a stream: write its calibration.
-    """
-)
+    """)
 def identify(
-    run: Path,
-    effects: str | None = None,
-    scaling: str = "gc",
-    readings: str | None = None,
-    fit_validation: bool = False,
-    prior: PriorOptions = NO_PRIOR,
-    effects_from: list[Path] | None = None,
-    cell: Path | None = None,
-    out: Path | None = None,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    details: bool = False,
+    run: Path, effects: str | None = None, scaling: str = "gc", readings: str | None = None,
+    fit_validation: bool = False, prior: PriorOptions = NO_PRIOR,
+    effects_from: list[Path] | None = None, cell: Path | None = None, out: Path | None = None,
+    workers: int | None = None, scheduler: str | None = None, details: bool = False,
     as_json: bool = False,
-) -> None:
+) -> None:  # fmt: skip
     """Fit a model to the readings, and keep it as a revision.
 
     A Parquet table in place of the campaign is read as a stream, in passes that need little memory.
@@ -370,22 +360,15 @@ def identify_stream(
     t.document(document)
 
 
-@command(
-    """
+@command("""
     draws | --draws N | Campaigns drawn.
     seed | --seed | Of the draws.
-    """
-)
+    """)
 def bootstrap(
-    run: Path,
-    revision: int | None = None,
-    draws: int = DRAWS,
-    seed: int = 0,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    effects_from: list[Path] | None = None,
-    as_json: bool = False,
-) -> None:
+    run: Path, revision: int | None = None, draws: int = DRAWS, seed: int = 0,
+    workers: int | None = None, scheduler: str | None = None,
+    effects_from: list[Path] | None = None, as_json: bool = False,
+) -> None:  # fmt: skip
     """Draw the poses again, refit, and compare the scatter with the stated uncertainties."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     check_draws(draws, seed)
@@ -401,11 +384,4 @@ def bootstrap(
         with counting(t.progress, "draws", draws) as advance:
             found = draw_again(fit, engine, draws, seed, advance)
     t.show(bootstrap_report(found))
-    t.document(
-        {
-            "revision": number,
-            "seed": seed,
-            **found.to_dict(),
-            "remarks": [*bootstrap_remarks(found)],
-        }
-    )
+    t.document(revision=number, seed=seed, **found.to_dict(), remarks=[*bootstrap_remarks(found)])

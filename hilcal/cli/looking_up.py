@@ -122,12 +122,10 @@ def _source(kind: type[Effect], catalogue: Catalogue) -> str:
     return "built in" if kind in BUILT_IN else "installed"
 
 
-@command(
-    """
+@command("""
     name | NAME | Lower case, digits and _.
     output | -o --output FILE.py | The file; NAME.py by default.
-    """
-)
+    """)
 def new(name: str, output: Path | None = None, as_json: bool = False) -> None:
     """Write a file with one effect that works as it stands, to be changed into your own."""
     t = terminal(as_json)
@@ -170,21 +168,15 @@ DRIVERS_OWN: dict[str, type[Section]] = {
 """Keys of the drivers that come with the program, by section."""
 
 
-@command(
-    """
+@command("""
     section | SECTION | One of them, e.g. tracker.
-    """
-)
+    """)
 def config(section: str | None = None, as_json: bool = False) -> None:
     """Explain the sections and keys of CELL.toml: unit, default, example."""
     t, known = terminal(as_json), reference.tables(DRIVERS_OWN)
-    if section is None:
-        t.show(sections_overview(known))
-        t.document({"sections": [asdict(s) for s in known]})
-        return
-    found = reference.table(section, known)
-    t.show(section_report(found))
-    t.document({"sections": [asdict(found)]})
+    found = known if section is None else (reference.table(section, known),)
+    t.show(sections_overview(found) if section is None else section_report(found[0]))
+    t.document(sections=[asdict(s) for s in found])
 
 
 def write_page(path: str = "docs/reference/cell-configuration.md") -> None:
@@ -192,20 +184,15 @@ def write_page(path: str = "docs/reference/cell-configuration.md") -> None:
     replace_file(path, reference_page(reference.tables(DRIVERS_OWN)))
 
 
-@command(
-    """
+@command("""
     runs | --runs | Monte-Carlo runs.
     seed | --seed | Of the random numbers.
     workers | --workers N | Processes of this machine; 1 by default.
-    """
-)
+    """)
 def scaling(
-    runs: int = 2000,
-    seed: int = 1,
-    workers: int | None = None,
-    scheduler: str | None = None,
+    runs: int = 2000, seed: int = 1, workers: int | None = None, scheduler: str | None = None,
     as_json: bool = False,
-) -> None:
+) -> None:  # fmt: skip
     """Show what the scalings none, gu and gc do to the same data."""
     from hilcal.engine.engine import open_engine
     from hilcal.study.scaling import check, experiments, scaling_study, table

@@ -67,34 +67,21 @@ def write(
             record_plan(cell, config, made.plan, made.summary, record, powers)
 
 
-@command(
-    f"""
+@command(f"""
     readings | --readings | Or so many readings, repeats not counted, at as many poses and under
         those loads that tell most.
     criterion | --criterion {"|".join(CRITERIA)} | The optimality criterion.
     after | --after RUN.hilcal | Plan on from what it knows already.
     unloaded_first | --unloaded-first | All unloaded readings before the loads: for run --until; a
         drift costs more.
-    """
-)
+    """)
 def plan(
-    cell: Path,
-    output: Path,
-    poses: int = POSES,
-    readings: int | None = None,
-    criterion: str | None = None,
-    after: Path | None = None,
-    revision: int | None = None,
-    prior: PriorOptions = NO_PRIOR,
-    seed: int = 0,
-    unloaded_first: bool = False,
-    quick: bool = False,
-    csv: Path | None = None,
-    record: Path | None = None,
-    details: bool = False,
-    effects_from: list[Path] | None = None,
-    as_json: bool = False,
-) -> None:
+    cell: Path, output: Path, poses: int = POSES, readings: int | None = None,
+    criterion: str | None = None, after: Path | None = None, revision: int | None = None,
+    prior: PriorOptions = NO_PRIOR, seed: int = 0, unloaded_first: bool = False,
+    quick: bool = False, csv: Path | None = None, record: Path | None = None, details: bool = False,
+    effects_from: list[Path] | None = None, as_json: bool = False,
+) -> None:  # fmt: skip
     """Choose poses, loads and their order, with a proof of how near to the best they are."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     check_record(record)
@@ -127,24 +114,18 @@ def plan(
     t.document({**made.to_dict(), "plan": str(output)})
 
 
-@command(
-    """
+@command("""
     save_calibration | --save-calibration F.toml | Write the kinematics that the arm's controller
         holds, for [robot] calibration.
     factory | --factory F.hilcal | Is the arm still what its factory measured? Measures a few
         readings without a load into a new campaign, or takes those of one that is there.
     yes | --yes -y | With --factory: do not ask before the arm moves.
-    """
-)
+    """)
 def check(
-    cell: Path,
-    plan: Path | None = None,
-    save_calibration: Path | None = None,
-    factory: Path | None = None,
-    yes: bool = False,
-    effects_from: list[Path] | None = None,
+    cell: Path, plan: Path | None = None, save_calibration: Path | None = None,
+    factory: Path | None = None, yes: bool = False, effects_from: list[Path] | None = None,
     as_json: bool = False,
-) -> None:
+) -> None:  # fmt: skip
     """Connect to every device and report its state; nothing moves without --factory."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     if save_calibration is not None and save_calibration.suffix.lower() != ".toml":
@@ -183,13 +164,12 @@ def check(
     elif dry is not None:
         failed = refusal(dry, str(plan))
     t.document(
-        {
-            "ok": not any(a.problems for a in answers) and not (dry and dry.problems),
-            "devices": [answer_json(a) for a in answers],
-            "plan": None if dry is None else asdict(dry),
-            **({} if judged is None else {"factory": judged}),
-        },
+        None,
         failed,
+        ok=not any(a.problems for a in answers) and not (dry and dry.problems),
+        devices=[answer_json(a) for a in answers],
+        plan=None if dry is None else asdict(dry),
+        **{} if judged is None else {"factory": judged},
     )
 
 
@@ -265,30 +245,18 @@ def refuse_unready(answers: tuple[ConnectionResult, ...]) -> None:
         raise DeviceError("; ".join(lines))
 
 
-@command(
-    """
+@command("""
     poses | --poses | As many readings as so many poses take under every load, 20 unless given; new
         poses, where a misfit depends on the pose alone.
     suspects | --suspects A,B | Separate these, whatever is diagnosed.
     cell | --cell CELL.toml | The cell, where it has other loads now.
-    """
-)
+    """)
 def next_(
-    run: Path,
-    output: Path,
-    poses: int | None = None,
-    suspects: str | None = None,
-    cell: Path | None = None,
-    seed: int = 0,
-    quick: bool = False,
-    csv: Path | None = None,
-    revision: int | None = None,
-    prior: PriorOptions = NO_PRIOR,
-    record: Path | None = None,
-    effects_from: list[Path] | None = None,
-    details: bool = False,
-    as_json: bool = False,
-) -> None:
+    run: Path, output: Path, poses: int | None = None, suspects: str | None = None,
+    cell: Path | None = None, seed: int = 0, quick: bool = False, csv: Path | None = None,
+    revision: int | None = None, prior: PriorOptions = NO_PRIOR, record: Path | None = None,
+    effects_from: list[Path] | None = None, details: bool = False, as_json: bool = False,
+) -> None:  # fmt: skip
     """Plan the measurements that separate the leading suspects; exit 4 where none are in doubt."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     check_record(record)

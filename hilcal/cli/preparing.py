@@ -123,11 +123,7 @@ class Draft:
 
 
 def number(words: str, unit: str) -> float:
-    """Read a number, in `unit` or in the one that is behind it.
-
-    Raises:
-        InputError: it is none.
-    """
+    """Read a number, in `unit` or in the one that is behind it."""
     found = _quantities(words, unit)
     if len(found) != 1:
         raise InputError(f"{words.strip()!r} is no number; valid: one in {unit}")
@@ -225,8 +221,7 @@ tracker_place | Where does the tracker stand, roughly? x, y, z in m, base axes |
     return [CellQuestion(*(part.strip() for part in line.split(" |"))) for line in lines]
 
 
-@command(
-    f"""
+@command(f"""
     cell | CELL.toml | The file to write.
     robot | --robot | The arm, e.g. ur10e, or a .urdf.
     host | --host | Address of its controller.
@@ -245,29 +240,16 @@ tracker_place | Where does the tracker stand, roughly? x, y, z in m, base axes |
     readings | --readings KIND | absolute (unless given) or deflection: what is fitted.
     floor | --floor Z | Height that the arm stays above, m.
     tracker_place | --tracker-place X,Y,Z | Of the tracker in base axes, m.
-    """
-)
+    """)
 def init(
-    cell: Path = Path("CELL.toml"),
-    robot: str | None = None,
-    host: str | None = None,
-    repeatability: str | None = None,
-    tracker: str | None = None,
-    tracker_port: str | None = None,
-    tracker_accuracy: str | None = None,
-    force_sensor: str | None = None,
-    force_port: str | None = None,
-    target: str | None = None,
-    load_point: str | None = None,
-    tool_mass: str | None = None,
-    tool_com: str | None = None,
-    load: list[str] | None = None,
-    readings: str | None = None,
-    floor: str | None = None,
-    tracker_place: str | None = None,
-    force: bool = False,
-    as_json: bool = False,
-) -> None:
+    cell: Path = Path("CELL.toml"), robot: str | None = None, host: str | None = None,
+    repeatability: str | None = None, tracker: str | None = None, tracker_port: str | None = None,
+    tracker_accuracy: str | None = None, force_sensor: str | None = None,
+    force_port: str | None = None, target: str | None = None, load_point: str | None = None,
+    tool_mass: str | None = None, tool_com: str | None = None, load: list[str] | None = None,
+    readings: str | None = None, floor: str | None = None, tracker_place: str | None = None,
+    force: bool = False, as_json: bool = False,
+) -> None:  # fmt: skip
     """Write a commented CELL.toml: asks at a terminal, else takes the options."""
     t = terminal(as_json)
     options = {f"--{name.replace('_', '-')}": value for name, value in locals().items()}
@@ -361,12 +343,10 @@ def _complete(draft: Draft) -> None:
     check_effects(cell_from_config(config, draft.base_dir), config, installed())
 
 
-@command(
-    """
+@command("""
     cell | CELL.toml | Also look at this cell's ports and addresses.
     folder | --folder DIR | Where campaigns are stored.
-    """
-)
+    """)
 def doctor(cell: Path | None = None, folder: Path = Path("."), as_json: bool = False) -> None:
     """Look at packages, ports, permissions, network, clock and disk of this computer."""
     t = terminal(as_json)

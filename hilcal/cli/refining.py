@@ -116,20 +116,13 @@ def diagnose(
     t.document({"revision": number, **to_json(d)})
 
 
-@command(
-    """
+@command("""
     effect | EFFECT | See hilcal effects; with options: "creep(joints=each)".
-    """
-)
+    """)
 def add(
-    run: Path,
-    effect: str,
-    revision: int | None = None,
-    record: Path | None = None,
-    view: bool = False,
-    effects_from: list[Path] | None = None,
-    as_json: bool = False,
-) -> None:
+    run: Path, effect: str, revision: int | None = None, record: Path | None = None,
+    view: bool = False, effects_from: list[Path] | None = None, as_json: bool = False,
+) -> None:  # fmt: skip
     """Add an effect to the model: error before and after."""
     catalogue = catalogue_with(effects_from)
     wanted = read_effects_text(effect, "EFFECT", catalogue)
@@ -139,20 +132,13 @@ def add(
     _change(run, revision, name, record, view, as_json, catalogue, options)
 
 
-@command(
-    """
+@command("""
     effect | EFFECT | One of the model.
-    """
-)
+    """)
 def remove(
-    run: Path,
-    effect: str,
-    revision: int | None = None,
-    record: Path | None = None,
-    view: bool = False,
-    effects_from: list[Path] | None = None,
-    as_json: bool = False,
-) -> None:
+    run: Path, effect: str, revision: int | None = None, record: Path | None = None,
+    view: bool = False, effects_from: list[Path] | None = None, as_json: bool = False,
+) -> None:  # fmt: skip
     """Take an effect out of the model: error before and after."""
     catalogue = catalogue_with(effects_from)
     catalogue[effect]  # an unknown name is refused
@@ -201,18 +187,15 @@ def _change(
                 chapters = o.chapters(say, c.number)
             record_story(t, chapters, record)
     t.document(
-        {
-            "revisions": revisions_json(rows),
-            "verdict": d.verdict,
-            "message": message(d),
-            **({} if c.expected is None else {"addition": suspect_json(c.expected)}),
-            "diagnosis": to_json(d),
-        }
+        revisions=revisions_json(rows),
+        verdict=d.verdict,
+        message=message(d),
+        **{} if c.expected is None else {"addition": suspect_json(c.expected)},
+        diagnosis=to_json(d),
     )
 
 
-@command(
-    """
+@command("""
     effects | --effects A,B | Effects to start from, as for identify.
     from_latest | --from-latest | Start from the latest revision.
     revision | --revision N | Start from this revision.
@@ -220,23 +203,13 @@ def _change(
         is written beside the campaign: found.py.
     background | --background/--no-background | Where named effects leave more than noise, also fit
         all others of the catalogue, as a background that predicts.
-    """
-)
+    """)
 def refine(
-    run: Path,
-    effects: str | None = None,
-    readings: str | None = None,
-    from_latest: bool = False,
-    revision: int | None = None,
-    prior: PriorOptions = NO_PRIOR,
-    discover: bool = False,
-    background: bool = True,
-    record: Path | None = None,
-    view: bool = False,
-    details: bool = False,
-    effects_from: list[Path] | None = None,
-    as_json: bool = False,
-) -> None:
+    run: Path, effects: str | None = None, readings: str | None = None, from_latest: bool = False,
+    revision: int | None = None, prior: PriorOptions = NO_PRIOR, discover: bool = False,
+    background: bool = True, record: Path | None = None, view: bool = False, details: bool = False,
+    effects_from: list[Path] | None = None, as_json: bool = False,
+) -> None:  # fmt: skip
     """Diagnose and add until the model is adequate."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     named = wanted_effects(effects, catalogue)
@@ -317,18 +290,16 @@ def refine(
             live.revised(chapters[-1])
         record_story(t, chapters, record)
     t.document(
-        {
-            "revisions": revisions_json(rows),
-            "verdict": last.verdict,
-            "message": message(last),
-            "rejected": list(found.rejected),
-            "background": background_of(found.fit).to_json(),
-            **({} if laws is None else laws_json(laws)),
-            "frames": frames_to_json(found.fit),
-            **prior_to_json(found.fit),
-            "other_arm": None if other is None else other.to_json(),
-            "diagnosis": to_json(last),
-        }
+        revisions=revisions_json(rows),
+        verdict=last.verdict,
+        message=message(last),
+        rejected=list(found.rejected),
+        background=background_of(found.fit).to_json(),
+        **{} if laws is None else laws_json(laws),
+        frames=frames_to_json(found.fit),
+        **prior_to_json(found.fit),
+        other_arm=None if other is None else other.to_json(),
+        diagnosis=to_json(last),
     )
 
 
@@ -356,24 +327,17 @@ def revisions_json(rows: Sequence[RevisionRow]) -> list[dict[str, object]]:
     ]
 
 
-@command(
-    """
+@command("""
     output | -o --output F.py | The effect, to be edited.
     against | --against MODEL | Beside this model instead of the revision in use: effects A,B;
         baseline; or the file of an exported calibration, whose effects are fitted to this run.
     alternatives | --alternatives | Also write laws that these readings do not tell from it:
         F_or_1.py; hilcal next plans what separates them.
-    """
-)
+    """)
 def discover(
-    run: Path,
-    output: Path,
-    against: str | None = None,
-    alternatives: bool = False,
-    revision: int | None = None,
-    effects_from: list[Path] | None = None,
-    as_json: bool = False,
-) -> None:
+    run: Path, output: Path, against: str | None = None, alternatives: bool = False,
+    revision: int | None = None, effects_from: list[Path] | None = None, as_json: bool = False,
+) -> None:  # fmt: skip
     """Search a law for what no effect explains, and write it as an effect."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     wanted = _effects_against(against, catalogue)

@@ -85,8 +85,7 @@ from hilcal.transfer.factory import check_factory
 from hilcal.whole_file import replace_file
 
 
-@command(
-    """
+@command("""
     output | -o --output RUN.hilcal | The campaign file.
     resume | --resume | Go on with what is missing in RUN.hilcal.
     append | --append | Measure a further plan into RUN.hilcal, see hilcal next.
@@ -95,21 +94,12 @@ from hilcal.whole_file import replace_file
         20 um": the arm goes home, and the load is taken off. Exit 4 where all readings do not do;
         they are kept.
     yes | --yes -y | Without --plan: do not ask whether to measure what was planned.
-    """
-)
+    """)
 def run(
-    cell: Path,
-    output: Path,
-    plan: Path | None = None,
-    resume: bool = False,
-    append: bool = False,
-    rehearse: bool = False,
-    until: str | None = None,
-    yes: bool = False,
-    view: bool = False,
-    effects_from: list[Path] | None = None,
-    as_json: bool = False,
-) -> None:
+    cell: Path, output: Path, plan: Path | None = None, resume: bool = False, append: bool = False,
+    rehearse: bool = False, until: str | None = None, yes: bool = False, view: bool = False,
+    effects_from: list[Path] | None = None, as_json: bool = False,
+) -> None:  # fmt: skip
     """Measure a campaign: every step of the plan, each reading stored before the next motion."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     config, numbers = read_cell(cell)
@@ -491,25 +481,18 @@ def lasting_cell(p: Procedure) -> Iterator[CellConfig]:
 FASTEST = 200.0  # Clock of a simulated world, as `[simulation] clock` allows
 
 
-@command(
-    """
+@command("""
     output | -o --output DIR | Where the devices meet; gets a cell.toml.
     hide | --hide EFFECT | An effect, random or nothing.
     seed | --seed | Of everything random.
     person | --person | `run` asks you for each load, as in a real cell; without it nobody is asked.
     clock | --clock N | The simulated world goes so many times faster than real time, e.g. 20.
-    """
-)
+    """)
 def simulate(
-    cell: Path,
-    output: Path,
-    plan: Path | None = None,
-    hide: str | None = None,
-    seed: int | None = None,
-    person: bool = False,
-    clock: float | None = None,
+    cell: Path, output: Path, plan: Path | None = None, hide: str | None = None,
+    seed: int | None = None, person: bool = False, clock: float | None = None,
     effects_from: list[Path] | None = None,
-) -> None:
+) -> None:  # fmt: skip
     """Run simulated devices for a cell until Ctrl-C, for `check` and `run` to talk to."""
     t, catalogue = terminal(False), catalogue_with(effects_from)
     config, numbers = read_cell(cell)

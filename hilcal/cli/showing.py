@@ -25,8 +25,7 @@ from hilcal.store.schema import is_campaign
 from hilcal.tables.units import parse_length
 
 
-@command(
-    """
+@command("""
     later | [LATER.hilcal] | A later campaign of the same arm: compare the two.
     output | -o --output F.html | The page; RUN.html unless given.
     limit | --limit LENGTH | The largest 3-D position error allowed, e.g. "0.1 mm": the page says
@@ -36,20 +35,12 @@ from hilcal.tables.units import parse_length
     operator | --operator NAME | Who answers for the measurement.
     appendix | --appendix | Also what only another expert asks for: rejected suspects, each joint,
         correlations, scalings, commands, hashes of revisions.
-    """
-)
+    """)
 def report(
-    run: Path,
-    later: Path | None = None,
-    output: Path | None = None,
-    limit: str | None = None,
-    validation: Path | None = None,
-    operator: str = "",
-    revision: int | None = None,
-    appendix: bool = False,
-    effects_from: list[Path] | None = None,
-    as_json: bool = False,
-) -> None:
+    run: Path, later: Path | None = None, output: Path | None = None, limit: str | None = None,
+    validation: Path | None = None, operator: str = "", revision: int | None = None,
+    appendix: bool = False, effects_from: list[Path] | None = None, as_json: bool = False,
+) -> None:  # fmt: skip
     """Write the whole story as one HTML page, a certificate first; it prints on six pages."""
     from hilcal.write_report import Asked, write_report
 
@@ -71,32 +62,24 @@ def report(
         t.show(done.limit)
     t.show(f"Report: {output} ({output.stat().st_size / 1e6:.1f} MB); print it for a PDF.")
     t.document(
-        {
-            "report": str(output),
-            "bytes": output.stat().st_size,
-            "headline": done.headline,
-            "passed": done.passed,
-            "verdict": done.verdict,
-        }
+        report=str(output),
+        bytes=output.stat().st_size,
+        headline=done.headline,
+        passed=done.passed,
+        verdict=done.verdict,
     )
 
 
 ENDING = 5.0  # How long a server of a page or a story may delay the end, s
 
 
-@command(
-    """
+@command("""
     port | --port | Port to serve viewers on.
-    """
-)
+    """)
 def view(
-    run: Path,
-    revision: int | None = None,
-    record: Path | None = None,
-    port: int = PORT,
-    effects_from: list[Path] | None = None,
-    as_json: bool = False,
-) -> None:
+    run: Path, revision: int | None = None, record: Path | None = None, port: int = PORT,
+    effects_from: list[Path] | None = None, as_json: bool = False,
+) -> None:  # fmt: skip
     """Tell the story of the revisions in rerun."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     check_record(record)
@@ -169,8 +152,7 @@ def viewer_command() -> str:
     return "rerun"
 
 
-@command(
-    """
+@command("""
     run | RUN.hilcal|TABLE | The campaign file, or a table.
     config | --config CELL.toml | Begin with a table, measured in this cell.
     kind | --format FORMAT | Of the table, as hilcal import takes it.
@@ -178,19 +160,12 @@ def viewer_command() -> str:
     output | -o --output RUN.hilcal | Of a table; TABLE.hilcal beside it else.
     port | --port | Port on this machine; 8787, or a free one, unless given.
     no_browser | --no-browser | Do not open the page, only print its address.
-    """
-)
+    """)
 def workbench(
-    run: Path,
-    config: Path | None = None,
-    kind: str = "table",
-    second: Path | None = None,
-    output: Path | None = None,
-    port: int | None = None,
-    no_browser: bool = False,
-    effects_from: list[Path] | None = None,
-    as_json: bool = False,
-) -> None:
+    run: Path, config: Path | None = None, kind: str = "table", second: Path | None = None,
+    output: Path | None = None, port: int | None = None, no_browser: bool = False,
+    effects_from: list[Path] | None = None, as_json: bool = False,
+) -> None:  # fmt: skip
     """Compare, add, remove, change the cell, measure next on one page of this machine alone."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     from hilcal.workbench.guard import UNUSED_S

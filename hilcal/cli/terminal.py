@@ -14,7 +14,7 @@ from typing import TextIO
 
 from rich.console import Console, RenderableType
 
-from hilcal.cli.failing import error_document
+from hilcal.cli import error_document
 from hilcal.errors import HilcalError
 from hilcal.identification.fit_document import plain
 from hilcal.present.progress import SafeConsole
@@ -47,18 +47,21 @@ class Terminal:
         """Print a command on a line of its own, which no line's end divides, to be copied."""
         self.people.print(f"  {line}", markup=False, highlight=False, soft_wrap=True)
 
-    def document(self, content: Mapping[str, object], failed: HilcalError | None = None) -> None:
+    def document(
+        self,
+        content: Mapping[str, object] | None = None,
+        failed: HilcalError | None = None,
+        /,
+        **keys: object,
+    ) -> None:
         """Print the JSON document, where it is asked for.
 
-        With `failed`, why the command fails nevertheless, which is in the document as "error".
-
-        Raises:
-            HilcalError: `failed`, after printing.
+        With `failed`, why the command fails nevertheless, which is in the document as "error" and
+        raised after printing.
         """
-        if failed is not None:
-            content = {**content, **error_document(failed)}
+        whole = {**(content or {}), **keys, **(error_document(failed) if failed else {})}
         if self.json:
-            print(json.dumps(plain(content), allow_nan=False, indent=2), file=self.out, flush=True)
+            print(json.dumps(plain(whole), allow_nan=False, indent=2), file=self.out, flush=True)
         if failed is not None:
             raise failed
 

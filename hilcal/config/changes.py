@@ -37,10 +37,6 @@ def changed(config: CellConfig, changes: Changes) -> CellConfig:
 
     Args:
         changes: of some keys of `CHANGEABLE`; None leaves a key out.
-
-    Raises:
-        InputError: a key that cannot be changed, a value that CELL.toml would not take, or other
-            names of targets.
     """
     if not changes:
         return config
@@ -66,11 +62,7 @@ def changed(config: CellConfig, changes: Changes) -> CellConfig:
 
 
 def read_value(section: str, key: str, text: str) -> Any:
-    """Return a value that was written as in CELL.toml; nothing is None.
-
-    Raises:
-        InputError: not one value of TOML.
-    """
+    """Return a value that was written as in CELL.toml; nothing is None."""
     if not text.strip():
         return None
     try:

@@ -71,11 +71,7 @@ def tables(options: Mapping[str, type[Section]] | None = None) -> tuple[KeyTable
 
 
 def table(name: str, known: tuple[KeyTable, ...]) -> KeyTable:
-    """Return a section by name, with or without its brackets.
-
-    Raises:
-        InputError: no such section (lists the valid ones).
-    """
+    """Return a section by name, with or without its brackets."""
     plain, names = name.strip().strip("[]").strip(), [t.name for t in known]
     for t in known:
         if t.name == plain:

@@ -34,11 +34,7 @@ class Cluster:
     def results(
         self, task: Task, items: Sequence[Any], seeds: Sequence[np.random.SeedSequence | None]
     ) -> Iterator[tuple[int, Any]]:
-        """Yield (number of the item, result) as they are done.
-
-        Raises:
-            ClusterError: the cluster is gone, or an item ended every worker that computed it.
-        """
+        """Yield (number of the item, result) as they are done."""
         from distributed import KilledWorker, as_completed
         from distributed.client import FutureCancelledError
 

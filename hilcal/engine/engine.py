@@ -67,16 +67,10 @@ ALONE = Engine(None)  # Computes in this process; BLAS has as many threads as it
 
 @contextmanager
 def open_engine(workers: int | None = None, scheduler: str | None = None) -> Iterator[Engine]:
-    """Yield an engine; its workers end with the block.
+    """Yield an engine of processes of this machine, or a cluster; workers end with the block.
 
-    Args:
-        workers: processes of this machine, one per processor by default; 1 computes here.
-        scheduler: address of a cluster's scheduler, in place of workers of this machine. Whoever
-            reaches one at a tcp:// address can run code there, and here; tls:// keeps others out.
-
-    Raises:
-        InputError: both workers and a scheduler; a number below 1; an address that is none.
-        ClusterError: nothing answers at the address.
+    Whoever reaches a scheduler at a tcp:// address can run code there, and here; tls:// keeps
+    others out. An address that is none is an InputError, one where nothing answers a ClusterError.
     """
     if scheduler is not None:
         if workers is not None:

@@ -129,11 +129,7 @@ class Processes:
     def results(
         self, task: Task, items: Sequence[Any], seeds: Sequence[np.random.SeedSequence | None]
     ) -> Iterator[tuple[int, Any]]:
-        """Yield (number of the item, result) as they are done.
-
-        Raises:
-            ClusterError: an item ended every worker that computed it.
-        """
+        """Yield (number of the item, result) as they are done."""
         todo, deaths = deque(range(len(items))), Counter[int]()
         busy: dict[Any, tuple[_Worker, int]] = {}
         try:

@@ -266,12 +266,7 @@ def _point(y: Floats, theta: Floats, parts: tuple[Reduced, ...]) -> _StreamPoint
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StreamFit(WithVarianceFactor):
-    """A model fitted to a stream.
-
-    Attributes:
-        condition: condition number of the whitened columns, in physical units and scaled.
-        named: (row in the file, from 1; Mahalanobis distance) of the worst of them.
-    """
+    """A model fitted to a stream."""
 
     model: Model  # robot and effects
     sample: Fit  # the fit of the sample that it started from
@@ -287,11 +282,13 @@ class StreamFit(WithVarianceFactor):
     dof: float  # degrees of freedom
     rank: int  # number of directions that the data determine
     condition: tuple[float, float]
+    """condition number of the whitened columns, in physical units and scaled."""
     error: ErrorBlock  # error block of the fit
     holdout: ErrorBlock  # the same, each tenth of the stream predicted without it
     noise_floor: float  # rms position error by the stated noise alone, m
     outliers: int  # number of readings set aside as gross errors
     named: tuple[tuple[int, float], ...]
+    """(row in the file, from 1; Mahalanobis distance) of the worst of them."""
     passes: int  # passes over the stream
     converged: bool  # whether the last step was negligible
 
@@ -313,16 +310,10 @@ def fit_stream(
     """Fit a model to a stream of absolute readings.
 
     Args:
-        stream: the readings.
-        cell: the cell that they were measured in.
-        engine: what the passes run on.
         effects: options by effect, besides unknown frames; the baseline where None.
-        catalogue: the effects that a model can have; the installed ones unless given.
-        prior: what another campaign taught of the arm.
         counting: shows how far a pass is, as `present.progress.counting` does.
 
     Raises:
-        InputError: a row that cannot be right, or effects that cannot be.
         CannotAnswerError: too few readings, or an unknown frame that they do not determine.
     """
     work = PassTask(stream, Model(cell, ()), _scatter(stream, cell), {})

@@ -164,11 +164,7 @@ def check_wrenches(
 
 
 def check_names(table: ColumnTable) -> None:
-    """Refuse empty poses and loads, and other spellings of `none`.
-
-    Raises:
-        InputError: names the row.
-    """
+    """Refuse empty poses and loads, and other spellings of `none`."""
     for column in ("pose", "load"):
         if "" in table.text[column]:
             i = table.text[column].index("")
@@ -208,11 +204,7 @@ class Observed:
     def put(
         self, table: ColumnTable, value: Floats, cov: Floats, std: Mapping[ObserverName, float]
     ) -> tuple[Floats, Floats]:
-        """Return values (N, m) and covariances (N, m, m) with distances and heights put in.
-
-        Raises:
-            InputError: one that cannot be right, or whose standard deviation nothing states.
-        """
+        """Return values (N, m) and covariances (N, m, m) with distances and heights put in."""
         value, cov = value.copy(), cov.copy()
         for kind in KINDS:
             of, _, variance = columns.ONE[kind]

@@ -103,12 +103,7 @@ def _closest(name: str, valid: Iterable[str]) -> str | None:
 def check_header(
     path: str, header: Sequence[str], units: Units, arm: str, spare: Collection[str] = ()
 ) -> None:
-    """Refuse a header that does not fit an arm; `spare` columns may be missing.
-
-    Raises:
-        InputError: a column is unnamed, duplicated, unknown or missing, or a group of columns
-            is incomplete; names the column and the closest valid name.
-    """
+    """Refuse a header that does not fit an arm; `spare` columns may be missing."""
     for k, name in enumerate(header, start=1):
         if not 0 < len(name) <= 80:
             raise InputError(f"{path}: column {k} has no name, or a long one, in row 1")
@@ -178,11 +173,7 @@ def _hint(missing: Sequence[str], header: Sequence[str], units: Units, arm: str)
 
 
 def covariance_size(path: str, header: Sequence[str]) -> int | None:
-    """Size m of the covariance that the table gives, None where it gives none.
-
-    Raises:
-        InputError: the triangle is incomplete, or larger or smaller than the reading.
-    """
+    """Size m of the covariance that the table gives, None where it gives none."""
     given = [c for c in header if c in covariance_columns(6)]
     if not given:
         return None

@@ -60,16 +60,7 @@ def open_tables(
 
 @limits.bounded
 def open_grid(path: str | Path, how: FileFormat, check: Check | None = None) -> Grid:
-    """Open one file as a table of cells.
-
-    Args:
-        how: it is written.
-        check: is given the names of its columns as it has them, with repeats and empty ones.
-
-    Raises:
-        InputError: no such file, a kind that is not read, no table in it, or the package that
-            reads it is not installed.
-    """
+    """Open one file as a table of cells; `check` is given the names of its columns."""
     name, content = str(path), content_of(path)
     kind = kind_of(name, content)
     with _undamaged(name, "what its first bytes say"):
@@ -368,11 +359,7 @@ def decoded(path: str, content: bytes, encoding: str | None) -> str:
 
 
 def read_text(path: str, content: bytes, how: FileFormat, check: Check | None = None) -> Grid:
-    """Read delimited text; `check` is given its header.
-
-    Raises:
-        InputError: not text, no readings, a row of another length.
-    """
+    """Read delimited text; `check` is given its header."""
     text = decoded(path, content, how.encoding)
     return grid_of_rows(path, list(records(path, text, how)), how, check)
 

@@ -146,11 +146,7 @@ class ColumnTable:
         return np.stack([self.number[name] for name in names], axis=1)
 
     def refuse(self, bad: Bools, names: Sequence[str], what: Callable[[float], str]) -> None:
-        """Raise for the first true cell of an (N, k) mask over number columns.
-
-        Raises:
-            InputError: a cell is marked; `what` makes from its value the reason.
-        """
+        """Raise for the first true cell of an (N, k) mask over number columns."""
         if bad.any():
             i, j = divmod(int(np.argmax(bad)), bad.shape[1])
             value = float(self.number[names[j]][i])

@@ -25,39 +25,32 @@ TABLE = "table"  # The exchange table: the format that is read without a mapping
 def import_readings(
     path: Path, form: str | Path | Mapping, config: CellConfig, arm: Arm, second: Path | None = None
 ) -> ImportResult:
-    """Read a table into a cell.
+    """Read a table into a cell, which has its tracker's noise and place, gravity, and loads.
 
     Args:
         form: "table" (the exchange table), the name of a mapping that comes with the
             program, the path of a mapping file, or a mapping.
-        config: the cell: its tracker's noise and place, its gravity, and whether tables include
-            the arm's scatter.
         second: the second file of a mapping that is for two.
-
-    Raises:
-        InputError: an unknown format, or anything in the table that cannot be right.
     """
     mapping = form if isinstance(form, Mapping) else _mapping(form)
-    tracker = config.tracker
+    tracker, gravity = config.tracker, config.robot.gravity_m_s2
     noise, station = tracker_noise(tracker), tracker.station_m
-    targets = [target.name for target in config.tool.targets]
-    if mapping is None and second is not None:
-        raise InputError(f"--second {second}: only for a --format with a section [second_file]")
-    if mapping is None:
-        result = import_table(path, arm, noise, station, targets, _std(config))
-    else:
-        gravity, std = config.robot.gravity_m_s2, _std(config)
+    targets, std = [target.name for target in config.tool.targets], _std(config)
+    if mapping is not None:
         result = import_mapped(path, mapping, arm, noise, station, gravity, second, targets, std)
+    elif second is None:
+        result = import_table(path, arm, noise, station, targets, std)
+    else:
+        raise InputError(f"--second {second}: only for a --format with a section [second_file]")
     limits.check_fitted(len(result.readings), result.readings.m, f"{path}: ")
     where = "" if tracker.frame == "tracker" or station else ", as if it stood at the arm's base"
     notes = tuple(note + where * (note == FROM_TRACKER) for note in result.notes)
     stated = FROM_TRACKER not in result.notes
     covers = WHOLE if stated and config.repeatability.in_tables else result.covers
     copied = _copies(result.readings)
-    notes += _told(result.readings, copied)
+    notes += _copies_note(result.readings, copied)
     kept, named = _named_loads(result.readings[~copied], config)
-    stated_noise = stated or tracker.states_noise
-    return ImportResult(kept, (*notes, *named), covers, stated_noise, not stated)
+    return ImportResult(kept, (*notes, *named), covers, stated or tracker.states_noise, not stated)
 
 
 def _std(config: CellConfig) -> dict[ObserverName, float]:
@@ -81,25 +74,25 @@ def _mapping(form: str | Path) -> Mapping | None:
 
 def _named_loads(readings: Readings, config: CellConfig) -> tuple[Readings, tuple[str, ...]]:
     """Let loads of a table that states no force act as `[[loads]]` has them by name; say which."""
+
+    def plain(name: str) -> str:
+        return "".join(name.split()).casefold()
+
     s, gravity = readings.states, np.asarray(config.robot.gravity_m_s2)
-    loaded = [k for k in np.unique(readings.load) if readings.load_names[k] != UNLOADED]
-    if s.wrench.any() or not loaded:
+    if s.wrench.any():
         return readings, ()
-    known = {_plain(load.name): load.wrench(gravity) for load in config.loads}
-    wrench, told = s.wrench.copy(), []
-    for k in loaded:
+    known = {plain(load.name): load.wrench(gravity) for load in config.loads}
+    wrench, notes = s.wrench.copy(), []
+    for k in np.unique(readings.load):
         name = readings.load_names[k]
-        own = known.get(_plain(name))
+        if name == UNLOADED:
+            continue
         where = "is not stated by the table, nor by [[loads]] of the cell: it is taken as none"
-        if own is not None:
-            wrench[readings.load == k] = own
+        if plain(name) in known:
+            wrench[readings.load == k] = known[plain(name)]
             where = "is that of [[loads]] of the cell, since the table states none"
-        told.append(f"load {name}: its force {where}")
-    return replace(readings, states=replace(s, wrench=wrench)), tuple(told)
-
-
-def _plain(name: str) -> str:
-    return "".join(name.split()).casefold()
+        notes.append(f"load {name}: its force {where}")
+    return replace(readings, states=replace(s, wrench=wrench)), tuple(notes)
 
 
 def _copies(readings: Readings) -> Bools:
@@ -126,7 +119,7 @@ def _copies(readings: Readings) -> Bools:
     return np.asarray(copied & (same | whole))
 
 
-def _told(readings: Readings, copied: Bools) -> tuple[str, ...]:
+def _copies_note(readings: Readings, copied: Bools) -> tuple[str, ...]:
     """Say how many rows are copies, and name the first."""
     if not copied.any():
         return ()

@@ -29,11 +29,7 @@ Block = tuple[str, str, np.ndarray]
 
 
 def read(path: str) -> tuple[list[str], list[Block]]:
-    """Return the names of all variables, and the matrices of N > 1 rows in them.
-
-    Raises:
-        InputError: the file is damaged or no MAT file of version 7 or before.
-    """
+    """Return the names of all variables, and the matrices of N > 1 rows in them."""
     command = [sys.executable, "-P", "-m", __name__, str(Path(path).absolute())]
     ours = str(Path(__file__).resolve().parents[2])
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([ours, *sys.path[1:]])}

@@ -6,7 +6,7 @@ reading that stands alone. A row group of the file is what one worker reads; it 
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,16 +31,13 @@ NAMES = ("pose", "load", "cycle")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReadingStream:
-    """A Parquet file of readings; nothing of it is held.
-
-    Attributes:
-        station: (3,) where the tracker's beam starts, m; the origin where None.
-    """
+    """A Parquet file of readings; nothing of it is held."""
 
     path: Path
     arm: Arm  # its number of joints, their limits and its reach are checked
     noise: TrackerNoise | None  # gives the covariances where the file has none
     station: tuple[float, ...] | None
+    """(3,) where the tracker's beam starts, m; the origin where None."""
     columns: tuple[str, ...]
     rows: tuple[int, ...]  # number of rows of each row group
     covers: str = INSTRUMENT  # what its covariances cover, `INSTRUMENT` or `WHOLE`
@@ -55,11 +52,7 @@ class ReadingStream:
         return sum(self.rows[:group])
 
     def chunks(self, group: int) -> Iterator[Readings]:
-        """Yield the readings of a row group, at most `CHUNK` at a time.
-
-        Raises:
-            InputError: a damaged file, or a row that cannot be right, by its number.
-        """
+        """Yield the readings of a row group, at most `CHUNK` at a time."""
         row = 1 + self.first_row(group)
         for table in _tables(self.path, group, self.columns):
             yield self._readings(table, row)
@@ -92,12 +85,8 @@ def open_stream(
 ) -> ReadingStream:
     """Open a Parquet file of readings; only its description and its first rows are read.
 
-    Args:
-        noise: gives the covariances where the file has none.
-        station: (3,) where the tracker's beam starts, m; the origin where None.
-
-    Raises:
-        InputError: no pyarrow, a damaged or interrupted file, a column that is missing or unknown.
+    `noise` gives the covariances where the file has none; the tracker's beam starts at `station`
+    (3,), m, or at the origin.
     """
     file = _opened(path)
     header = list(file.schema_arrow.names)
@@ -122,11 +111,10 @@ def open_stream(
     stream = ReadingStream(path, arm, noise, station, names, rows)
     first = next(k for k, count in enumerate(rows) if count)
     covers = _covers(path, first) if columns.COVERS in header else INSTRUMENT
-    rounding = None
-    if not covers.endswith(ROUNDING):
-        rounding = rounding_variance(next(stream.chunks(first)).value[:, :3], 1.0)
-    covers = covers.removesuffix(ROUNDING)
-    return ReadingStream(path, arm, noise, station, names, rows, covers, rounding)
+    if covers.endswith(ROUNDING):
+        return replace(stream, covers=covers.removesuffix(ROUNDING))
+    rounding = rounding_variance(next(stream.chunks(first)).value[:, :3], 1.0)
+    return replace(stream, covers=covers, rounding=rounding)
 
 
 def _opened(path: Path) -> Any:

@@ -189,23 +189,20 @@ class UnderstoodColumn:
 
 @dataclass(slots=True, eq=False)
 class Proposal:
-    """A mapping in the making.
-
-    Attributes:
-        unsure: sentences on what should be checked, by section.
-        unused: columns without a meaning, with the reason.
-        lacking: sentences on what an import needs and was not found.
-        alternatives: columns of the position and of the joints that are as good by their values,
-            the chosen ones first; empty lists where names tell.
-    """
+    """A mapping in the making."""
 
     sections: dict[str, dict[str, Any]] = field(default_factory=dict)  # of the mapping, by name
     understood: list[UnderstoodColumn] = field(default_factory=list)  # what the table holds
     unsure: list[tuple[str, str]] = field(default_factory=list)
+    """sentences on what should be checked, by section."""
     unused: list[tuple[str, str]] = field(default_factory=list)
+    """columns without a meaning, with the reason."""
     lacking: list[str] = field(default_factory=list)
+    """sentences on what an import needs and was not found."""
     open_convention: bool = False  # whether the orientation's convention is a guess
     alternatives: list[tuple[list[str], list[str]]] = field(default_factory=list)
+    """columns of the position and of the joints that are as good by their values, the chosen ones
+    first; empty lists where names tell."""
 
     def mapping(self, kind: type[M]) -> M:
         """Return the mapping, `Mapping` for readings, `PointMapping` for points."""

@@ -43,15 +43,7 @@ class Proposed:
 
 @limits.bounded
 def propose(path: Path, second: Path | None = None, joints: int | None = None) -> Proposed:
-    """Look at a table and propose a mapping.
-
-    Args:
-        second: a second file that holds the other columns of the same readings.
-        joints: number of the arm's joints, where it is known.
-
-    Raises:
-        InputError: a file that cannot be read, or two that do not belong together.
-    """
+    """Look at a table, or two that hold columns of the same readings, and propose a mapping."""
     first = sniff(path)
     grid, doubts = first.grid, [("file", words) for words in first.doubts]
     other: dict[str, Any] | None = None

@@ -48,11 +48,7 @@ class Sniffed:
 
 
 def sniff(path: str | Path) -> Sniffed:
-    """Guess how a file is written, and open it.
-
-    Raises:
-        InputError: no such file, a kind that is not read, or no table of numbers in it.
-    """
+    """Guess how a file is written, and open it."""
     content = content_of(path)
     name = str(path)
     kind = kind_of(name, content)

@@ -85,12 +85,10 @@ def readings_of(
     """Check a table with the exchange table's columns, in SI units, and make readings of it.
 
     Args:
-        noise: gives the covariances where there are none.
         station: (3,) where the tracker's beam starts, m; the origin where None.
         covariance: (K, m, m) of the K rows with a position, in place of the table's columns.
-        rounding: (3,) variance of the positions' rounding, m², added where it counts beside the
-            covariance; found from the positions where None.
-        std: standard deviations of distances and heights, m, for a table that states none.
+        rounding: (3,) variance of the positions' rounding, m²; found from the positions where None.
+        std: of distances and heights, m, for a table that states none.
     """
     checks.check_names(table)
     pose, pose_names = _index(table.text["pose"])
@@ -366,14 +364,9 @@ def write_table(
 ) -> None:
     """Write an exchange table that `read_table` reads back exactly: CSV, or Parquet by its name.
 
-    Args:
-        path: the file; CSV unless it ends in .parquet.
-        covers: what their covariances cover, see `covariance` and `with_what_rounding_does`.
-        about: further metadata of a Parquet file.
-        units: of the joints' values (`Arm.units`); all in rad where None.
-
-    Raises:
-        InputError: a name that a table cannot hold, no pyarrow, or the file cannot be written.
+    `covers` says what the covariances cover, see `readings.covariance` and
+    `with_what_rounding_does`; `units` are those of the joints' values (`Arm.units`), all rad where
+    None.
     """
     about = {"table": "readings", "covers": covers, **(about or {})}
     write_columns(Path(path), exchange_columns(readings, covers, units), about)

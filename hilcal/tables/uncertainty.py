@@ -39,20 +39,14 @@ def mapped_covariance(
     noise: TrackerNoise | None,
     station: Floats | Sequence[float] | None,
 ) -> tuple[Floats | None, tuple[str, ...]]:
-    """Return the covariances that the table states, by a mapping, and notes on them.
+    """Return the covariances (N, m, m) that the table states, by a mapping, and notes on them.
 
         V = E D C D Eᵀ + V_tracker
 
     with D the standard deviations (of the position's axes and the orientation's angles), C their
     correlation, E the axes about which the angles turn, and the instrument's covariance where the
-    mapping adds it. Orientations without a figure of their own have the instrument's.
-
-    Args:
-        position: (N, 3) m.
-        station: (3,) where its beam starts.
-
-    Returns:
-        (N, m, m) m² and rad², None where the table states none; and one sentence per decision.
+    mapping adds it. Orientations without a figure of their own have the instrument's. None where
+    the table states none; m² and rad².
     """
     m = 3 if angles is None else 6
     origin = np.zeros(3) if station is None else np.asarray(station, dtype=float)
@@ -202,11 +196,8 @@ def floored(
     """Raise variances that are zero, or far below the others, to those of the instrument.
 
     An instrument that writes 0.000 has a scatter below its last digit, not none; such a reading
-    would outweigh all others. Adding to a diagonal element keeps a covariance positive.
-
-    Args:
-        covariance: (N, m, m), m² and rad².
-        instrument: covariances (N, m, m) of the noise in [tracker]; None where it is not known.
+    would outweigh all others. Adding to a diagonal element of a covariance (N, m, m) keeps it
+    positive. `instrument` is that of the noise in [tracker]; None where it is not known.
     """
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     m = variance.shape[1]
@@ -273,23 +264,13 @@ def step(values: Floats) -> float:
 
 
 def rounding_variance(position: Floats, unit: float) -> Floats:
-    """(3,) variance Δ²/12 of each axis, m², of positions (N, 3) that are multiples of Δ.
-
-    Args:
-        position: in the file's unit.
-        unit: metres in that unit.
-    """
+    """(3,) variance Δ²/12, m², of positions (N, 3) that are multiples of Δ, in a unit."""
     delta = unit * np.array([step(position[:, k]) for k in range(3)])
     return np.asarray(np.where(delta > _FINEST, delta, 0.0) ** 2 / 12)
 
 
 def with_rounding(covariance: Floats, extra: Floats) -> tuple[Floats, tuple[str, ...]]:
-    """Add what rounding does to the positions, where it counts beside the stated covariance.
-
-    Args:
-        covariance: (N, m, m), m².
-        extra: (3,) variances of the rounding, m².
-    """
+    """Add rounding's variances (3,), m², where they count beside covariances (N, m, m)."""
     counts: Bools = extra > COUNTS * np.median(covariance[:, range(3), range(3)], axis=0)
     if not counts.any():
         return covariance, ()
@@ -309,9 +290,6 @@ def check_joint_rounding(
     """Return a note where rounded joint angles move the target more than the noise does.
 
     A rounding of Δ displaces the target by up to Δ/√12 times the reach, one standard deviation.
-
-    Args:
-        covariance: (N, m, m), m².
     """
     size = max((step(q[:, k]) for k in range(q.shape[1])), default=0.0)
     std = unit * size / np.sqrt(12)

@@ -38,26 +38,12 @@ _SHAPE = re.compile(r"\s*(?P<number>[-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*(?P<unit>\S*
 
 
 def parse_length(text: str, what: str) -> float:
-    """Return a length in m, e.g. of "0.1 mm".
-
-    Args:
-        text: a number over 0 and its unit.
-
-    Raises:
-        InputError: anything else.
-    """
+    """Return a length in m, e.g. of "0.1 mm"."""
     return _parse(text, what, METRIC, 'a length over 0 in m, mm, um, e.g. "0.1 mm"')
 
 
 def parse_duration(text: str, what: str) -> float:
-    """Return a duration in s, e.g. of "90 min".
-
-    Args:
-        text: a number over 0 and its unit.
-
-    Raises:
-        InputError: anything else.
-    """
+    """Return a duration in s, e.g. of "90 min"."""
     return _parse(text, what, SECONDS, 'a duration over 0 in s, min, h, e.g. "90 min"')
 
 
@@ -110,13 +96,9 @@ intrinsic). Rotations about fixed axes are intrinsic ones in the reverse order."
 
 
 def rotations(convention: str, numbers: Floats, unit: float) -> Floats:
-    """(N, 3, 3) rotation matrices of the numbers (N, k) of a convention.
+    """(N, 3, 3) rotations of the numbers (N, k) of a convention; `unit` of angles, rad.
 
-    Args:
-        convention: a key of `CONVENTIONS`.
-        numbers: in the order of the convention's columns; quaternions and matrices need not be
-            exactly normalised, the nearest rotation is taken.
-        unit: radians in the unit of angles.
+    Quaternions and matrices need not be exactly normalised, the nearest rotation is taken.
     """
     from scipy.spatial.transform import Rotation  # slow to import
 

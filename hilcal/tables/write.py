@@ -21,7 +21,7 @@ from hilcal.store.revision import RevisionRecord
 from hilcal.tables.columns import TEXT, WRENCH, joint_columns
 from hilcal.tables.files import package
 from hilcal.types import Floats
-from hilcal.whole_file import replacing
+from hilcal.whole_file import replace_file, replacing
 
 UNITS = ("m2", "rad2", "m", "rad", "N", "Nm", "s", "degC")  # Ends of names that are units
 KEY = b"hilcal"
@@ -32,11 +32,7 @@ Column = Sequence[object] | np.ndarray  # Numbers, or words; None for a cell wit
 
 
 def check_suffix(path: Path) -> None:
-    """Refuse names of other kinds of files.
-
-    Raises:
-        InputError: names the valid ones.
-    """
+    """Refuse names of other kinds of files."""
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{path}: unknown kind of table; valid: {' or '.join(SUFFIXES)}")
 
@@ -44,12 +40,7 @@ def check_suffix(path: Path) -> None:
 def write_columns(path: Path, columns: Mapping[str, Column], about: Mapping[str, object]) -> None:
     """Write columns of equal length; a file of that name is replaced when the new one is complete.
 
-    Args:
-        path: ends in .csv or .parquet.
-        about: what the table is about, for the metadata of Parquet; CSV has no place for it.
-
-    Raises:
-        InputError: another ending, no pyarrow for Parquet, or the file cannot be written.
+    `about` says what the table is about, for the metadata of Parquet; CSV has no place for it.
     """
     check_suffix(path)
     plain = {
@@ -61,11 +52,17 @@ def write_columns(path: Path, columns: Mapping[str, Column], about: Mapping[str,
         with replacing(path) as new:
             parquet.write_table(table, new)
         return
-    with replacing(path) as new, new.open("w", encoding="utf-8", newline="") as stream:
-        out = csv.writer(stream, lineterminator="\n")
-        out.writerow(map(csv_text, plain))
-        cells = [[_cell(v) for v in values] for values in plain.values()]
-        out.writerows(zip(*cells, strict=True))
+    replace_file(path, csv_of(plain))
+
+
+def csv_of(columns: Mapping[str, Column]) -> str:
+    """Return columns of equal length as CSV."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(map(csv_text, columns))
+    values = (v.tolist() if isinstance(v, np.ndarray) else v for v in columns.values())
+    writer.writerows(zip(*([_cell(v) for v in column] for column in values), strict=True))
+    return out.getvalue()
 
 
 def unit_of(name: str) -> str | None:
@@ -111,7 +108,12 @@ def revision_table(records: Sequence[RevisionRecord], in_use: int | None) -> dic
 def _row(r: RevisionRecord, used: bool) -> dict[str, object]:
     fitted: Mapping[str, Any] = r.result_json["identify"]
     judged: Mapping[str, Any] = r.result_json.get("diagnose", {})
-    row: dict[str, object] = {
+    errors = {
+        f"{what}_{key}": _number(fitted["error"][what][key])
+        for what in ("fit", "holdout")
+        for key in ("mean_m", "rms_m", "max_m", "rms_sigma")
+    }
+    return {
         "revision": r.number,
         "in_use": int(used),
         "created": r.created,
@@ -126,14 +128,9 @@ def _row(r: RevisionRecord, used: bool) -> dict[str, object]:
         "n_parameters": len(fitted["parameters"]),
         "variance_factor": _number(fitted["variance_factor"]),
         "verdict": judged.get("verdict"),
+        **errors,
+        "readings_sha256": r.data_hash,
     }
-    for what in ("fit", "holdout"):
-        block = fitted["error"][what]
-        for key in ("mean_m", "rms_m", "max_m"):
-            row[f"{what}_{key}"] = _number(block[key])
-        row[f"{what}_rms_sigma"] = _number(block["rms_sigma"])
-    row["readings_sha256"] = r.data_hash
-    return row
 
 
 def _number(value: Any) -> float | None:
@@ -146,24 +143,16 @@ def plan_csv(
     """Return a plan as CSV: `x_order` from 1, pose, load, cycle, q1_rad ... (and wrenches).
 
     The columns are those of the exchange table: who measures by hand adds x_m, y_m, z_m and
-    imports it.
-
-    Args:
-        wrenches: (6,) by load, base axes, N and N·m; adds fx_N ... mz_Nm where given.
-        units: of the joints' values (`Arm.units`); all in rad where None.
-
-    Raises:
-        KeyError: a load of the plan has no wrench.
+    imports it. `units` are those of the joints' values, all rad where None.
     """
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    forces = WRENCH if wrenches is not None else ()
-    writer.writerow((ORDER, *TEXT, "cycle", *joint_columns(units or plan.q.shape[1]), *forces))
-    for k, step in enumerate(plan.steps, start=1):
-        texts = csv_text(step.pose), csv_text(step.load)
-        row: list[object] = [k, *texts, step.cycle, *plan.joints(step.pose).tolist()]
-        if wrenches is not None:
-            free = step.load == UNLOADED
-            row += (np.zeros(6) if free else np.asarray(wrenches[step.load])).tolist()
-        writer.writerow(row)
-    return out.getvalue()
+    columns: dict[str, Column] = {ORDER: list(range(1, 1 + len(plan.steps)))}
+    columns |= {name: [getattr(step, name) for step in plan.steps] for name in TEXT}
+    columns["cycle"] = [step.cycle for step in plan.steps]
+    joints = joint_columns(units or plan.q.shape[1])
+    q = np.array([plan.joints(step.pose) for step in plan.steps]).reshape(-1, len(joints))
+    columns |= dict(zip(joints, q.T, strict=True))
+    if wrenches is not None:
+        free = {UNLOADED: np.zeros(6)}
+        w = np.array([{**wrenches, **free}[step.load] for step in plan.steps]).reshape(-1, 6)
+        columns |= dict(zip(WRENCH, w.T, strict=True))
+    return csv_of(columns)

@@ -41,9 +41,9 @@ from hilcal.calibration.dh_table import dh_rows, to_csv, to_toml
 from hilcal.calibration.handover import ur_kinematics, urdf
 from hilcal.calibration.points import read_points
 from hilcal.calibration.urscript import movej_program, waypoints
+from hilcal.cli import Failures, Watched
 from hilcal.cli.compensating import _csv
 from hilcal.cli.exporting import _write_parameters
-from hilcal.cli.failing import Failures, Watched
 from hilcal.cli.terminal import Terminal
 from hilcal.config import load_config
 from hilcal.config.reference import cell_text

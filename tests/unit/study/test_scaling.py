@@ -14,8 +14,18 @@ from hilcal.errors import CannotAnswerError, InputError
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import Deviation, evaluate
 from hilcal.robot.se3 import rotation_vector
-from hilcal.study.scaling import CORRELATIONS, CURVES, UNITS, experiments, scaling_study, table
-from hilcal.study.scaling_design import TARGET, WRENCHES, bound, make_design
+from hilcal.study.scaling import (
+    CORRELATIONS,
+    CURVES,
+    TARGET,
+    UNITS,
+    WRENCHES,
+    bound,
+    experiments,
+    make_design,
+    scaling_study,
+    table,
+)
 
 SEED = 7
 
