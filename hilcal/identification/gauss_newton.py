@@ -13,7 +13,7 @@ problem there, whose rows may be any that have the same products.
 """
 
 from dataclasses import dataclass, replace
-from typing import ClassVar, Generic, TypeVar
+from typing import ClassVar, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -206,8 +206,7 @@ class NewtonPoint:
 P = TypeVar("P", bound=NewtonPoint)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Minimum(Generic[P]):
+class Minimum(NamedTuple, Generic[P]):
     """Where the steps ended."""
 
     point: P
@@ -387,10 +386,6 @@ class Solution:
     def coordinates(self) -> Floats:
         """Return z (K,) of the parameters that have a prior; zero for flat directions."""
         return prior_coordinates(self.equations.basis, self.y, self.prior)
-
-    def projected_residual(self) -> Floats:
-        """(R,) whitened residual after the model's remaining step: `white` to within that step."""
-        return self.projection().residual(self.white, self.coordinates())
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -201,7 +201,9 @@ class Linearisation:
 
 def linearise(fit: Fit) -> Linearisation:
     """Return the linearisation of a gc-scaled fit."""
-    return Linearisation(fit, fit.solution.projection(), fit.solution.projected_residual())
+    s = fit.solution
+    off = s.projection()
+    return Linearisation(fit, off, off.residual(s.white, s.coordinates()))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

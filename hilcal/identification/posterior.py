@@ -237,8 +237,11 @@ def parameter_differences(earlier: Posterior, later: Posterior) -> Differences:
     scale = earlier.scale[one]
     first, before = _likelihood(earlier, one, scale)
     second, after = _likelihood(later, other, scale)
-    parallel = _parallel_sum(first, second)
-    covariance = np.asarray(np.linalg.inv(parallel + np.eye(len(common)) / FREE**2), dtype=float)
+    values, vectors = np.linalg.eigh(first + second)
+    half = vectors[:, values > LEAST] / np.sqrt(values[values > LEAST])
+    parallel = (first @ half) @ (half.T @ second)
+    some = (parallel + parallel.T) / 2 + np.eye(len(common)) / FREE**2
+    covariance = np.asarray(np.linalg.inv(some), dtype=float)
     known = 1.0 / np.diag(covariance) - 1.0 / FREE**2
     d, names = np.asarray(after - before, dtype=float), np.array(of)
     effects = [_effect(e, covariance, d, np.flatnonzero(names == e)) for e in dict.fromkeys(of)]
@@ -266,15 +269,6 @@ def _likelihood(p: Posterior, chosen: Ints, scale: Floats) -> tuple[Floats, Floa
     mean = (vectors[:, seen] / values[seen]) @ (vectors[:, seen].T @ (whole @ (p.mean / p.scale)))
     by = p.scale[chosen] / scale
     return schur_complement(data, chosen) / (by[:, None] * by), mean[chosen] * by
-
-
-def _parallel_sum(a: Floats, b: Floats) -> Floats:
-    """A (A + B)⁻ B (K, K) of two information matrices."""
-    values, vectors = np.linalg.eigh(a + b)
-    seen = values > LEAST
-    half = vectors[:, seen] / np.sqrt(values[seen])
-    p = (a @ half) @ (half.T @ b)
-    return np.asarray((p + p.T) / 2)
 
 
 def _effect(effect: str, covariance: Floats, d: Floats, rows: Ints) -> EffectDifference:

@@ -296,7 +296,9 @@ def predictive(
         b = rows_in(stated)
     position = of.columns(w.raw(model.jacobian(prediction, theta, 3)).reshape(-1, model.size)) * std
     rows, points = w.rows_of(fold), np.repeat(fold, 3)
-    left_out, left_out_m2 = _left_out(a, rows, ((b, rows), (position, points)), root, noise)
+    left_out, left_out_m2 = left_out_variances(
+        a, rows, ((b, rows), (position, points)), root, noise
+    )
     scatter_m2 = noise * float(np.trace(wider[:, :3, :3], axis1=1, axis2=2).mean())
     root = of.transform(root * std[:, None])
     factor = max(least, left_out_sigma**2 / (scatter + left_out))
@@ -323,7 +325,7 @@ def _spectrum(
     return values, vectors, noise
 
 
-def _left_out(
+def left_out_variances(
     a: Floats, fold: Ints, asked: Sequence[tuple[Floats, Ints]], root: Floats, noise: float
 ) -> list[float]:
     """Mean variance of rows of each fold, predicted without it.
