@@ -144,12 +144,8 @@ def carried_prior(
 ) -> CarriedPrior:
     """Return a posterior as prior, with the drift that its effects declare.
 
-    Args:
-        posterior: what another campaign taught.
-        relation: "arm" or "type"; of another arm of the type the parameters differ by as much as
-            effects say with `spread`, and the same arm may have drifted by `drift`.
-        stated: drift of effects by name, in units of S, where it is known better.
-        catalogue: has its effects; the installed ones unless given.
+    Another arm of the type differs by as much as effects say with `spread`; the same arm may have
+    drifted by `drift`. Drifts of effects may be stated, in units of S, where they are known better.
 
     Raises:
         InputError: another relation, an effect that is not at hand, or a drift that cannot be.

@@ -430,13 +430,8 @@ def solve(
 ) -> Solution:
     """Fit all parameters of the model to the readings.
 
-    Args:
-        model: robot and effects.
-        readings: what was measured.
-        w: the scaling.
-        start: (P,) starting parameters; zero unless given, the mean of a carried prior.
-        prior: (P,) prior standard deviations to keep as they are; otherwise those of
-            shrunk families are chosen by the evidence.
+    They start at zero, or at the mean of a carried prior, unless a start (P,) is given. Given prior
+    standard deviations (P,) are kept; otherwise the evidence chooses those of shrunk families.
     """
     space = coordinates_of(model)
     if len(space.index):

@@ -132,15 +132,11 @@ def excess(
     root: Floats,
     before: Excess = NONE,
 ) -> Excess:
-    """Return what a residual has beyond the stated noise.
+    """Return what a residual (D, m) has beyond the stated noise.
 
-    Args:
-        raw: (D, m) residual.
-        stated: scaling by V.
-        used: scaling by which C was found, of the same measurements.
-        rows: (R, P) derivatives, whitened by `used`.
-        root: (P, K) root of C over the noise factor that it was found with.
-        before: what `used` has already; a part that has some is not asked for chance again.
+    V is stated; C, of root (P, K) over its noise factor, was found with another scaling of the same
+    measurements, by which rows (R, P) are whitened, and which has some excess `before` already: a
+    part that has some is not asked for chance again.
     """
     spread, every = _spread(used, rows, root), _every(len(raw))
     position, attitude = 0.0, 1.0
@@ -234,14 +230,10 @@ def predictive(
 ) -> Predictive:
     """Return what a gc-scaled fit knows of other readings.
 
-    Args:
-        model: the model.
-        theta: (P,) its parameters.
-        prior: (P,) prior standard deviations of the fit; infinite for flat parameters, zero for
-            groups that were dropped. The prior that the model carries takes their place.
-        fitted: the readings that it was fitted to, without gross errors.
-        mode: "deflection" or "absolute".
-        left_out_sigma: rms of the whitened residual on poses left out.
+    Prior standard deviations (P,) of the fit are infinite for flat parameters, zero for groups that
+    were dropped; the prior that the model carries takes their place. The readings are those that it
+    was fitted to, without gross errors, and `left_out_sigma` is the rms of the whitened residual on
+    poses left out.
     """
     stated = whitening(fitted, mode, "gc")
     prediction = model.predict(fitted.states, theta)
