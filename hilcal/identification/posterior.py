@@ -159,11 +159,18 @@ class Posterior(Brief):
     @property
     def std(self) -> Floats:
         """(K,) standard deviations, SI; infinite where a direction without information enters."""
-        values, vectors = np.linalg.eigh(self.information * (self.scale[:, None] * self.scale))
-        seen = values > LEAST
+        values, vectors = spectrum(self.information * (self.scale[:, None] * self.scale))
+        seen = values > 0
         std = np.sqrt(np.sum(vectors[:, seen] ** 2 / values[seen], axis=1))
         moved = np.linalg.norm(vectors[:, ~seen], axis=1)
         return np.where(moved <= NULL_SHARE * std, std * self.scale, np.inf)
+
+
+def spectrum(information: Floats, least: float = LEAST) -> tuple[Floats, Floats]:
+    """Eigenvalues (K,), zero where hardly anything is determined, and vectors of information."""
+    values, vectors = np.linalg.eigh((information + information.T) / 2)
+    values[values < least] = 0.0
+    return values, vectors
 
 
 def determined(information: Floats) -> Floats:
@@ -172,8 +179,7 @@ def determined(information: Floats) -> Floats:
     A fit holds those where they are whose information is below `INFORMATION`², see
     `regression.normal_equations`: where they stand was not learnt.
     """
-    values, vectors = np.linalg.eigh((information + information.T) / 2)
-    values[values < INFORMATION**2] = 0.0
+    values, vectors = spectrum(information, INFORMATION**2)
     root = vectors * np.sqrt(values)
     found = root @ root.T
     return np.asarray((found + found.T) / 2)
@@ -237,8 +243,8 @@ def parameter_differences(earlier: Posterior, later: Posterior) -> Differences:
     scale = earlier.scale[one]
     first, before = _likelihood(earlier, one, scale)
     second, after = _likelihood(later, other, scale)
-    values, vectors = np.linalg.eigh(first + second)
-    half = vectors[:, values > LEAST] / np.sqrt(values[values > LEAST])
+    values, vectors = spectrum(first + second)
+    half = vectors[:, values > 0] / np.sqrt(values[values > 0])
     parallel = (first @ half) @ (half.T @ second)
     some = (parallel + parallel.T) / 2 + np.eye(len(common)) / FREE**2
     covariance = np.asarray(np.linalg.inv(some), dtype=float)
@@ -263,10 +269,9 @@ def parameter_differences(earlier: Posterior, later: Posterior) -> Differences:
 def _likelihood(p: Posterior, chosen: Ints, scale: Floats) -> tuple[Floats, Floats]:
     """Information (K, K) and mean (K,) by the readings alone, in ordinary magnitudes."""
     whole = p.information * (p.scale[:, None] * p.scale)
-    values, vectors = np.linalg.eigh(whole - np.diag(p.own_precision * p.scale**2))
-    seen = values > LEAST
-    data = (vectors[:, seen] * values[seen]) @ vectors[:, seen].T
-    mean = (vectors[:, seen] / values[seen]) @ (vectors[:, seen].T @ (whole @ (p.mean / p.scale)))
+    values, vectors = spectrum(whole - np.diag(p.own_precision * p.scale**2))
+    e, values = vectors[:, values > 0], values[values > 0]
+    data, mean = (e * values) @ e.T, (e / values) @ (e.T @ (whole @ (p.mean / p.scale)))
     by = p.scale[chosen] / scale
     return schur_complement(data, chosen) / (by[:, None] * by), mean[chosen] * by
 
