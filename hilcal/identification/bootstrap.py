@@ -122,14 +122,7 @@ def bootstrap(
     """Draw the poses of a fit again and again, and fit its model to each draw.
 
     Readings that were set aside as gross errors are not drawn. Draw b has the random numbers of
-    (seed, b), on any number of workers.
-
-    Args:
-        fit: what is to be judged.
-        engine: what the draws run on.
-        draws: B.
-        seed: of the draws.
-        advance: told the number of draws that are done.
+    (seed, b), on any number of workers; `advance` is told the number of draws that are done.
 
     Raises:
         InputError: too few draws, or a negative seed.

@@ -33,12 +33,11 @@ import scipy.linalg as sl
 
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import InputError
-from hilcal.identification.posterior import Posterior
+from hilcal.identification.posterior import Posterior, spectrum
 from hilcal.identification.priors import names_of
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
 from hilcal.readings.same_readings import among
-from hilcal.regression.normal_equations import INFORMATION
 from hilcal.regression.schur import schur_complement
 from hilcal.robot.arm import Arm
 from hilcal.types import Bools, Floats, Ints
@@ -144,12 +143,8 @@ def carried_prior(
 ) -> CarriedPrior:
     """Return a posterior as prior, with the drift that its effects declare.
 
-    Args:
-        posterior: what another campaign taught.
-        relation: "arm" or "type"; of another arm of the type the parameters differ by as much as
-            effects say with `spread`, and the same arm may have drifted by `drift`.
-        stated: drift of effects by name, in units of S, where it is known better.
-        catalogue: has its effects; the installed ones unless given.
+    Another arm of the type differs by as much as effects say with `spread`; the same arm may have
+    drifted by `drift`. Drifts of effects may be stated, in units of S, where they are known better.
 
     Raises:
         InputError: another relation, an effect that is not at hand, or a drift that cannot be.
@@ -318,6 +313,5 @@ def _spectrum(p: Posterior, place: tuple[int, ...]) -> tuple[Floats, Floats]:
     scaled = p.information * (p.scale[:, None] * p.scale)
     rows = np.array(place, dtype=np.int64)
     some = scaled if len(place) == len(scaled) else schur_complement(scaled, rows)
-    values, vectors = np.linalg.eigh((some + some.T) / 2)
-    values[values < INFORMATION**2 / 2] = 0.0
+    values, vectors = spectrum(some)
     return values, vectors if values.any() else np.eye(len(values))

@@ -18,7 +18,6 @@ the probability P(B(F, p_(n)) ≥ n), times F and the number of sites for the le
 is too small, what is along the site, at two poses at least, is a law's (`along_one_site`).
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
@@ -374,24 +373,19 @@ def _in_a_row(order: Ints, shift: Floats) -> Bools:
 
 
 def site_columns(model: Model, theta: Floats, prediction: Prediction, readings: Readings) -> Floats:
-    """(N, m, P) changes of N readings by each site."""
-    p = prediction
-    moves = motion(model.cell, p.observation, p.situation.chain, p.deviation, readings.m)
+    """(N, m, P) changes of N readings by each site; last by 1 N and 1 N·m on the force sensor."""
+    p, states, at, m = prediction, readings.states, prediction.observation, readings.m
+    moves = motion(model.cell, at, p.situation.chain, p.deviation, m)
     turns = [moves.by_slot(k, slice(3, 6)) for k in range(p.situation.wrench.shape[1])]
-    sensor = np.stack([*_by_wrench(model, theta, p, readings)], axis=2)
-    return np.concatenate([*turns, sensor], axis=2)
-
-
-def _by_wrench(model: Model, theta: Floats, p: Prediction, readings: Readings) -> Iterator[Floats]:
-    """Changes (N, m) by 1 N and 1 N·m along the axes of the flange, which the sensor reads."""
-    states, at = readings.states, p.observation
+    sensor = []
     for part in (slice(0, 3), slice(3, 6)):
         for axis in np.moveaxis(p.situation.chain.rotation[-1], 2, 0):
             wrench = states.wrench.copy()
             wrench[:, part] += axis
             o = model.predict(replace(states, wrench=wrench), theta, p).observation
             turn = se3.rotation_vector(o.rotation @ at.rotation.swapaxes(1, 2))
-            yield np.concatenate([o.position - at.position, turn], axis=1)[:, : readings.m]
+            sensor.append(np.concatenate([o.position - at.position, turn], axis=1)[:, :m])
+    return np.concatenate([*turns, np.stack(sensor, axis=2)], axis=2)
 
 
 def along_one_site(shift: Floats, columns: Floats, pose: Ints) -> Bools:

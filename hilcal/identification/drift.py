@@ -231,7 +231,15 @@ def evidence_of_carried(
         space = coordinates_of(of)
         used = a[:, place[space.index]]
         x = np.hstack([known, used @ space.matrix])
-        return _restricted(y - used @ space.mean, flat, x, solution.beta)
+        low = np.linalg.cholesky(x @ x.T + solution.beta * np.eye(len(x)))
+        columns = np.column_stack([flat, y - used @ space.mean])
+        white = sl.solve_triangular(low, columns, lower=True, check_finite=False)
+        f, r = white[:, :-1], white[:, -1]
+        values, vectors = np.linalg.eigh(f.T @ f)
+        seen = values > 1e-12 * values.max(initial=0.0)
+        along = (f @ vectors[:, seen]).T @ r / np.sqrt(values[seen])
+        log_det = 2 * float(np.log(np.diag(low)).sum()) + float(np.log(values[seen]).sum())
+        return -0.5 * (log_det + float(r @ r) - float(along @ along))
 
     every = np.arange(model.size)
     with_all, found = likelihood(model, every), {}
@@ -240,15 +248,3 @@ def evidence_of_carried(
         kept = np.delete(every, model.slices()[model.names.index(name)])
         found[name] = with_all - likelihood(rest, kept)
     return found
-
-
-def _restricted(y: Floats, flat: Floats, x: Floats, beta: float) -> float:
-    """ℓ for V = β 1 + X Xᵀ."""
-    low = np.linalg.cholesky(x @ x.T + beta * np.eye(len(x)))
-    white = sl.solve_triangular(low, np.column_stack([flat, y]), lower=True, check_finite=False)
-    f, r = white[:, :-1], white[:, -1]
-    values, vectors = np.linalg.eigh(f.T @ f)
-    seen = values > 1e-12 * values.max(initial=0.0)
-    along = (f @ vectors[:, seen]).T @ r / np.sqrt(values[seen])
-    log_det = 2 * float(np.log(np.diag(low)).sum()) + float(np.log(values[seen]).sum())
-    return -0.5 * (log_det + float(r @ r) - float(along @ along))

@@ -80,14 +80,10 @@ def with_joint_scatter(cell: Cell, readings: Readings, joint_std: Floats) -> Rea
     """Return the readings with the scatter of the joints added to the instrument's covariance.
 
     V = V_instrument + R J Σ_q Jᵀ Rᵀ with the Jacobian of the nominal arm and R the orientation of
-    the base in the sensor's frame, estimated from the readings where it is unknown. With too few
-    poses to estimate it, the readings are returned as they are; nothing can be fitted to them
-    either. Targets that were read in one arrival have the scatter in common (`Readings.common`).
-
-    Args:
-        cell: the cell.
-        readings: N readings whose covariances are the instrument's alone.
-        joint_std: (n,) standard deviations from one arrival to the next, rad.
+    the base in the sensor's frame, estimated from the readings where it is unknown, and standard
+    deviations (n,) from one arrival to the next, rad. With too few poses to estimate it, the
+    readings are returned as they are; nothing can be fitted to them either. Targets that were read
+    in one arrival have the scatter in common (`Readings.common`).
     """
     factor = _scatter(cell, readings, joint_std)
     return readings if factor is None else with_scatter(readings, factor)

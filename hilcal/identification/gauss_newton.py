@@ -13,7 +13,7 @@ problem there, whose rows may be any that have the same products.
 """
 
 from dataclasses import dataclass, replace
-from typing import ClassVar, Generic, TypeVar
+from typing import ClassVar, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -206,8 +206,7 @@ class NewtonPoint:
 P = TypeVar("P", bound=NewtonPoint)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Minimum(Generic[P]):
+class Minimum(NamedTuple, Generic[P]):
     """Where the steps ended."""
 
     point: P
@@ -388,10 +387,6 @@ class Solution:
         """Return z (K,) of the parameters that have a prior; zero for flat directions."""
         return prior_coordinates(self.equations.basis, self.y, self.prior)
 
-    def projected_residual(self) -> Floats:
-        """(R,) whitened residual after the model's remaining step: `white` to within that step."""
-        return self.projection().residual(self.white, self.coordinates())
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Iterate(NewtonPoint):
@@ -435,13 +430,8 @@ def solve(
 ) -> Solution:
     """Fit all parameters of the model to the readings.
 
-    Args:
-        model: robot and effects.
-        readings: what was measured.
-        w: the scaling.
-        start: (P,) starting parameters; zero unless given, the mean of a carried prior.
-        prior: (P,) prior standard deviations to keep as they are; otherwise those of
-            shrunk families are chosen by the evidence.
+    They start at zero, or at the mean of a carried prior, unless a start (P,) is given. Given prior
+    standard deviations (P,) are kept; otherwise the evidence chooses those of shrunk families.
     """
     space = coordinates_of(model)
     if len(space.index):

@@ -39,7 +39,7 @@ from hilcal.identification.solver import shortened
 from hilcal.identification.validation import require_columns
 from hilcal.model.model import Model, Prediction
 from hilcal.readings.readings import Readings
-from hilcal.readings.whitening import Mode, Whitening, covariance_blocks, whitening
+from hilcal.readings.whitening import Whitening, covariance_blocks, whitening
 from hilcal.regression.projection import Projection, projection
 from hilcal.types import Floats
 
@@ -61,11 +61,6 @@ class EarlierFit:
     root: Floats  # (P, K) R, root of κC
     noise: float  # a, variance of the noise in units of the stated one
     by_pose: float  # c, variance of the misfit that all readings of a pose share, likewise
-
-    @property
-    def mode(self) -> Mode:
-        """Kind of readings."""
-        return self.fit.mode
 
 
 def earlier_fit(fit: Fit) -> EarlierFit:

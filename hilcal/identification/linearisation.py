@@ -201,7 +201,9 @@ class Linearisation:
 
 def linearise(fit: Fit) -> Linearisation:
     """Return the linearisation of a gc-scaled fit."""
-    return Linearisation(fit, fit.solution.projection(), fit.solution.projected_residual())
+    s = fit.solution
+    off = s.projection()
+    return Linearisation(fit, off, off.residual(s.white, s.coordinates()))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -267,17 +269,10 @@ def eliminate_columns(
     beta: float,
     rank: int,
 ) -> ReducedModel:
-    """Take columns out of a fitted model.
+    """Take some (P,) of the whitened columns A (R, P), with gram AᵀA, out of a fitted model.
 
-    Args:
-        columns: (R, P) A, whitened columns of all parameters.
-        gram: (P, P) AᵀA.
-        white: (R,) whitened residual of the fit.
-        theta: (P,) parameters of the fit.
-        prior: (P,) their prior standard deviations: infinite for flat ones, zero for held ones.
-        out: (P,) which to take out.
-        beta: noise variance factor that the priors are weighed against.
-        rank: number of rows that carry information.
+    Of the fit: whitened residual (R,), parameters (P,) and their prior standard deviations,
+    infinite for flat ones, zero for held ones; noise factor, and rank: rows with information.
     """
     stay = ~out & (prior > 0)
     basis = find_basis(columns, np.ones(columns.shape[1]), np.where(stay, prior, 0.0))

@@ -158,11 +158,18 @@ class Posterior(Brief):
     @property
     def std(self) -> Floats:
         """(K,) standard deviations, SI; infinite where a direction without information enters."""
-        values, vectors = np.linalg.eigh(self.information * (self.scale[:, None] * self.scale))
-        seen = values > LEAST
+        values, vectors = spectrum(self.information * (self.scale[:, None] * self.scale))
+        seen = values > 0
         std = np.sqrt(np.sum(vectors[:, seen] ** 2 / values[seen], axis=1))
         moved = np.linalg.norm(vectors[:, ~seen], axis=1)
         return np.where(moved <= NULL_SHARE * std, std * self.scale, np.inf)
+
+
+def spectrum(information: Floats, least: float = LEAST) -> tuple[Floats, Floats]:
+    """Eigenvalues (K,), zero where hardly anything is determined, and vectors of information."""
+    values, vectors = np.linalg.eigh((information + information.T) / 2)
+    values[values < least] = 0.0
+    return values, vectors
 
 
 def determined(information: Floats) -> Floats:
@@ -171,8 +178,7 @@ def determined(information: Floats) -> Floats:
     A fit holds those where they are whose information is below `INFORMATION`², see
     `regression.normal_equations`: where they stand was not learnt.
     """
-    values, vectors = np.linalg.eigh((information + information.T) / 2)
-    values[values < INFORMATION**2] = 0.0
+    values, vectors = spectrum(information, INFORMATION**2)
     root = vectors * np.sqrt(values)
     found = root @ root.T
     return np.asarray((found + found.T) / 2)
@@ -236,8 +242,11 @@ def parameter_differences(earlier: Posterior, later: Posterior) -> Differences:
     scale = earlier.scale[one]
     first, before = _likelihood(earlier, one, scale)
     second, after = _likelihood(later, other, scale)
-    parallel = _parallel_sum(first, second)
-    covariance = np.asarray(np.linalg.inv(parallel + np.eye(len(common)) / FREE**2), dtype=float)
+    values, vectors = spectrum(first + second)
+    half = vectors[:, values > 0] / np.sqrt(values[values > 0])
+    parallel = (first @ half) @ (half.T @ second)
+    some = (parallel + parallel.T) / 2 + np.eye(len(common)) / FREE**2
+    covariance = np.asarray(np.linalg.inv(some), dtype=float)
     known = 1.0 / np.diag(covariance) - 1.0 / FREE**2
     d, names = np.asarray(after - before, dtype=float), np.array(of)
     effects = [_effect(e, covariance, d, np.flatnonzero(names == e)) for e in dict.fromkeys(of)]
@@ -259,21 +268,11 @@ def parameter_differences(earlier: Posterior, later: Posterior) -> Differences:
 def _likelihood(p: Posterior, chosen: Ints, scale: Floats) -> tuple[Floats, Floats]:
     """Information (K, K) and mean (K,) by the readings alone, in ordinary magnitudes."""
     whole = p.information * (p.scale[:, None] * p.scale)
-    values, vectors = np.linalg.eigh(whole - np.diag(p.own_precision * p.scale**2))
-    seen = values > LEAST
-    data = (vectors[:, seen] * values[seen]) @ vectors[:, seen].T
-    mean = (vectors[:, seen] / values[seen]) @ (vectors[:, seen].T @ (whole @ (p.mean / p.scale)))
+    values, vectors = spectrum(whole - np.diag(p.own_precision * p.scale**2))
+    e, values = vectors[:, values > 0], values[values > 0]
+    data, mean = (e * values) @ e.T, (e / values) @ (e.T @ (whole @ (p.mean / p.scale)))
     by = p.scale[chosen] / scale
     return schur_complement(data, chosen) / (by[:, None] * by), mean[chosen] * by
-
-
-def _parallel_sum(a: Floats, b: Floats) -> Floats:
-    """A (A + B)⁻ B (K, K) of two information matrices."""
-    values, vectors = np.linalg.eigh(a + b)
-    seen = values > LEAST
-    half = vectors[:, seen] / np.sqrt(values[seen])
-    p = (a @ half) @ (half.T @ b)
-    return np.asarray((p + p.T) / 2)
 
 
 def _effect(effect: str, covariance: Floats, d: Floats, rows: Ints) -> EffectDifference:

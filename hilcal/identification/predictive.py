@@ -131,15 +131,11 @@ def excess(
     root: Floats,
     before: Excess = NONE,
 ) -> Excess:
-    """Return what a residual has beyond the stated noise.
+    """Return what a residual (D, m) has beyond the stated noise.
 
-    Args:
-        raw: (D, m) residual.
-        stated: scaling by V.
-        used: scaling by which C was found, of the same measurements.
-        rows: (R, P) derivatives, whitened by `used`.
-        root: (P, K) root of C over the noise factor that it was found with.
-        before: what `used` has already; a part that has some is not asked for chance again.
+    V is stated; C, of root (P, K) over its noise factor, was found with another scaling of the same
+    measurements, by which rows (R, P) are whitened, and which has some excess `before` already: a
+    part that has some is not asked for chance again.
     """
     spread, every = _spread(used, rows, root), _every(len(raw))
     position, attitude = 0.0, 1.0
@@ -233,14 +229,10 @@ def predictive(
 ) -> Predictive:
     """Return what a gc-scaled fit knows of other readings.
 
-    Args:
-        model: the model.
-        theta: (P,) its parameters.
-        prior: (P,) prior standard deviations of the fit; infinite for flat parameters, zero for
-            groups that were dropped. The prior that the model carries takes their place.
-        fitted: the readings that it was fitted to, without gross errors.
-        mode: "deflection" or "absolute".
-        left_out_sigma: rms of the whitened residual on poses left out.
+    Prior standard deviations (P,) of the fit are infinite for flat parameters, zero for groups that
+    were dropped; the prior that the model carries takes their place. The readings are those that it
+    was fitted to, without gross errors, and `left_out_sigma` is the rms of the whitened residual on
+    poses left out.
     """
     stated = whitening(fitted, mode, "gc")
     prediction = model.predict(fitted.states, theta)
@@ -295,7 +287,9 @@ def predictive(
         b = rows_in(stated)
     position = of.columns(w.raw(model.jacobian(prediction, theta, 3)).reshape(-1, model.size)) * std
     rows, points = w.rows_of(fold), np.repeat(fold, 3)
-    left_out, left_out_m2 = _left_out(a, rows, ((b, rows), (position, points)), root, noise)
+    left_out, left_out_m2 = left_out_variances(
+        a, rows, ((b, rows), (position, points)), root, noise
+    )
     scatter_m2 = noise * float(np.trace(wider[:, :3, :3], axis1=1, axis2=2).mean())
     root = of.transform(root * std[:, None])
     factor = max(least, left_out_sigma**2 / (scatter + left_out))
@@ -322,7 +316,7 @@ def _spectrum(
     return values, vectors, noise
 
 
-def _left_out(
+def left_out_variances(
     a: Floats, fold: Ints, asked: Sequence[tuple[Floats, Ints]], root: Floats, noise: float
 ) -> list[float]:
     """Mean variance of rows of each fold, predicted without it.

@@ -449,13 +449,8 @@ def best_placement(
 ) -> Placement:
     """Return the best placement from several starts: closed forms, then rotations of a cube.
 
-    Args:
-        data: flange poses and readings.
-        given: base and targets as configured, or the nominal ones.
-        free: (6 + 6 T,) what is estimated.
-        good: whitened rms misfit per reading at which no other start is tried.
-        steps: most steps from each start.
-        rotated: of the rotations of a cube, the number of those that fit best and are tried.
+    Of these as many as `rotated` are tried, those that fit best. No other start is tried at a
+    whitened rms misfit per reading of `good`; each goes `steps` at most.
     """
     found: list[Placement] = []
     for start in _closed_forms(data, given, free):

@@ -62,16 +62,10 @@ def validate(
     *,
     registered: bool = False,
 ) -> Validation:
-    """Predict other readings with a fitted model.
+    """Predict other readings, which took no part, with a model that was fitted to some.
 
-    Args:
-        model: the model.
-        theta: (P,) its parameters.
-        fitted: the readings that it was fitted to.
-        other: readings that took no part.
-        mode: "deflection" or "absolute".
-        registered: estimate `base_frame`, and nothing else, from the other readings first:
-            the tracker was set up anew.
+    With `registered` the tracker was set up anew: `base_frame`, and nothing else, is estimated from
+    the other readings first.
 
     Raises:
         InputError: an effect of the model needs a column that the other readings lack.

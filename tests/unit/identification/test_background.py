@@ -19,7 +19,7 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.family_sizes import family_sizes
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.mixed_fit import mixed_fit
-from hilcal.identification.predictive import predictive
+from hilcal.identification.predictive import predictive_of
 from hilcal.library import read_table
 from hilcal.mixed.evidence import evidence
 from hilcal.readings.readings import Readings
@@ -35,21 +35,21 @@ from studies.study_cases import study_case, with_study_loads
 from tests.support.cli_cases import CELL
 from tests.support.fit_cases import based
 
+UR10 = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")
+
 
 @pytest.fixture(scope="module")
 def series(ipa_ur10: Path) -> Readings:
-    cell = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")
     path = ipa_ur10 / "Series_B" / "measurements_joint_configurations.csv"
-    r = read_table(path, cell, "ipa-ur10")
+    r = read_table(path, UR10, "ipa-ur10")
     r = replace(r, value=r.value[:, :3], covariance=r.covariance[:, :3, :3])
     return r[np.random.default_rng(5).permutation(len(r))]
 
 
 @pytest.fixture(scope="module")
 def found(series: Readings) -> Refinement:
-    cell = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")
     some = series[:30]
-    return refine(baseline(cell, some, "absolute"), some, "absolute", background=True)
+    return refine(baseline(UR10, some, "absolute"), some, "absolute", background=True)
 
 
 def error(fit: Fit, of: Readings) -> float:
@@ -76,9 +76,8 @@ def test_it_predicts_other_poses_far_better_than_what_is_named(
 @pytest.mark.long
 def test_it_is_stored_and_found_again(found: Refinement, series: Readings) -> None:
     fit, some = found.fit, series[:30]
-    cell = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")
     record = to_record(fit, found.diagnosis.to_dict(), BACKGROUND, content_hash(fit.readings))
-    again = restore(from_text(to_text(record), 2), cell, some)
+    again = restore(from_text(to_text(record), 2), UR10, some)
     assert again.model.named == fit.model.named == record.effects
     assert again.model.background == fit.model.background
     moved = again.predict(series[:50].states).position - fit.predict(series[:50].states).position
@@ -88,7 +87,7 @@ def test_it_is_stored_and_found_again(found: Refinement, series: Readings) -> No
     stored = dict(record.parameters_json)
     stored["random"] = {**stored["random"], "std": {"joint_compliance": [1.0]}}
     with pytest.raises(InputError, match="is damaged"):
-        restore(replace(record, parameters_json=stored), cell, some)
+        restore(replace(record, parameters_json=stored), UR10, some)
 
 
 def test_naming_keeps_the_prediction_and_removing_does_not(
@@ -136,17 +135,13 @@ def test_the_sizes_of_its_families_are_told_with_intervals(found: Refinement) ->
 @pytest.mark.long
 def test_bands_do_not_depend_on_how_large_the_noise_is_stated(series: Readings) -> None:
     """Of a table that states the arm's scatter, too: its factor is estimated and in the band."""
-    cell = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")
-    test = series[500:700]
-    sizes = []
+    test, sizes = series[500:700], []
     for by in (1.0, 9.0):
         some = replace(series[:40], covariance=by * series[:40].covariance, scatter_stated=True)
-        fit = refine(baseline(cell, some, "absolute"), some, "absolute").fit
+        fit = refine(baseline(UR10, some, "absolute"), some, "absolute").fit
         assert fit.model.background
         assert fit.readings.arm_scatter is None
-        known = predictive(
-            fit.model, fit.theta, fit.solution.prior, some, "absolute", fit.holdout.rms_sigma
-        )
+        known = predictive_of(fit)
         prediction = fit.model.predict(test.states, fit.theta)
         of = replace(test, covariance=by * test.covariance, scatter_stated=True)
         total = known.of_reading(prediction, whitening(of, "absolute", "gc"))

@@ -14,6 +14,7 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.misdescription import (
     BEYOND_NOISE,
     Described,
+    DescriptionFinding,
     Hypothesis,
     examine,
     other_arm,
@@ -22,6 +23,7 @@ from hilcal.identification.misdescription import (
 from hilcal.identification.registration import register
 from hilcal.identification.table_preview import clearly_best, rank_conventions
 from hilcal.readings.readings import Readings
+from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm, robot_names
 from hilcal.robot.conventions import as_counted
 from hilcal.types import Floats
@@ -32,29 +34,46 @@ from tests.support.campaigns import configuration
 from tests.support.rows import first
 from tests.unit.identification.test_registration import BASE, CELL, OFFSET, pose_of, told
 
+PLAIN = told(BASE, np.eye(4), False, False)
 
-def readings_of(change: Hypothesis | None, m: int, noise: float = 5e-5):
+
+def readings_of(change: Hypothesis | None = None, m: int = 3) -> Readings:
     """Readings by an arm that is otherwise than the catalogue's, at the same joint values."""
-    rng = np.random.default_rng(2)
-    q = rng.uniform(-2, 2, (40, 6))
+    q = np.random.default_rng(2).uniform(-2, 2, (40, 6))
     nothing = Described(CELL.arm, q, q[:, :3], None, True, True)
-    arm = CELL.arm if change is None else change.applied(nothing).arm
+    return by_arm(CELL.arm if change is None else change.applied(nothing).arm, q, m)
+
+
+def by_arm(arm: Arm, q: Floats, m: int = 3) -> Readings:
     value = read(arm, q, BASE, pose_of(np.eye(3), OFFSET), m)
-    sigma = np.full(m, noise)
-    return table_of(q, value + noise * rng.normal(size=value.shape), sigma)
+    noise = 5e-5 * np.random.default_rng(3).normal(size=value.shape)
+    return table_of(q, value + noise, np.full(m, 5e-5))
 
 
-def found_in(readings, cell=None):
-    cell = cell or told(BASE, np.eye(4), False, False)
-    return examine(register(cell, readings), readings), cell
+def found_in(readings: Readings, cell: Cell = PLAIN) -> tuple[DescriptionFinding | None, str]:
+    """What is wrong, and in words."""
+    finding = examine(register(cell, readings), readings)
+    return finding, "" if finding is None else finding.words(cell, readings)
+
+
+def moved(rows: list[int], order: list[int]) -> Readings:
+    good = readings_of()
+    value = good.value.copy()
+    value[rows] = value[order]
+    return replace(good, value=value)
 
 
 @pytest.mark.parametrize("m", [3, 6])
 def test_a_right_description_passes(m):
-    readings = readings_of(None, m)
+    readings = readings_of(m=m)
     assert found_in(readings)[0] is None
-    model = baseline(told(BASE, np.eye(4), False, False), readings, "absolute")
-    assert model.names == ("base_frame", "target_offset")
+    assert baseline(PLAIN, readings, "absolute").names == ("base_frame", "target_offset")
+
+
+@pytest.mark.parametrize("joint", [1, 6])
+def test_a_gauge_is_not_proposed(joint):
+    """The zero of joint 1 goes into the base, that of the last joint into the target."""
+    assert found_in(readings_of(Hypothesis("joint", joint, 1, 0.7)))[0] is None
 
 
 @pytest.mark.parametrize(
@@ -76,71 +95,55 @@ def test_a_right_description_passes(m):
     ],
 )
 def test_the_reason_is_named_with_the_line_to_write(change, said):
-    readings = readings_of(change, 3)
     with pytest.raises(InputError, match=said) as refused:
-        baseline(told(BASE, np.eye(4), False, False), readings, "absolute")
+        baseline(PLAIN, readings_of(change), "absolute")
     assert "\n" not in str(refused.value)
 
 
 def test_millimetres_and_swapped_rows_are_named():
-    good = readings_of(None, 3)
-    scaled = replace(good, value=1e3 * good.value)
-    finding, cell = found_in(scaled)
-    assert "the positions are millimetres" in finding.words(cell, scaled)
-    value = good.value.copy()
-    value[[4, 19]] = value[[19, 4]]
-    crossed = replace(good, value=value)
-    finding, cell = found_in(crossed)
+    good = readings_of()
+    assert "the positions are millimetres" in found_in(replace(good, value=1e3 * good.value))[1]
+    finding, said = found_in(moved([4, 19], [19, 4]))
     assert finding.swapped == ((4, 19),)
-    assert "rows are swapped (p5/none with p20/none)" in finding.words(cell, crossed)
+    assert "rows are swapped (p5/none with p20/none)" in said
 
 
-@pytest.mark.parametrize("shift", [1, -2])
-def test_positions_of_other_rows_are_named(shift):
+@pytest.mark.parametrize(("shift", "words"), [(1, "1 row after"), (-2, "2 rows before")])
+def test_positions_of_other_rows_are_named(shift, words):
     """Also where three of four readings of a pose are the same, and look right."""
-    good = readings_of(None, 3)
-    off = replace(good, value=np.roll(good.value, shift, axis=0))
-    finding, cell = found_in(off)
-    way = "after" if shift > 0 else "before"
-    rows = "1 row" if shift == 1 else "2 rows"
-    said = finding.words(cell, off)
+    good = readings_of()
+    finding, said = found_in(replace(good, value=np.roll(good.value, shift, axis=0)))
     assert finding.refused
-    assert f"each position stands {rows} {way} the joint values it belongs to" in said
+    assert f"each position stands {words} the joint values it belongs to" in said
     assert said.endswith("correct it in the table")
     four = good[np.repeat(np.arange(40), 8)]
-    off = replace(four, value=np.roll(four.value, 1, axis=0))
-    finding, cell = found_in(off)
-    assert "each position stands 1 row after" in finding.words(cell, off)
+    said = found_in(replace(four, value=np.roll(four.value, 1, axis=0)))[1]
+    assert "each position stands 1 row after" in said
 
 
 @pytest.mark.long
-def test_exchanged_columns_of_joints_are_named():
-    good = readings_of(None, 3)
-    for order, said in (
+@pytest.mark.parametrize(
+    ("order", "words"),
+    [
         ([0, 4, 2, 3, 1, 5], "the columns of joints 2 and 5 are exchanged"),
         ([0, 1, 2, 3, 5, 4], "the columns of joints 5 and 6 are exchanged"),
         ([1, 2, 3, 4, 5, 0], "joint 1's values are in the column of joint 6"),
-    ):
-        off = replace(good, states=replace(good.states, q=good.states.q[:, order]))
-        finding, cell = found_in(off)
-        assert finding.refused
-        assert said in finding.words(cell, off)
-
-
-def test_a_gauge_is_not_proposed():
-    """The zero of joint 1 goes into the base, that of the last joint into the target."""
-    for joint in (1, 6):
-        assert found_in(readings_of(Hypothesis("joint", joint, 1, 0.7), 3))[0] is None
+    ],
+)
+def test_exchanged_columns_of_joints_are_named(order, words):
+    good = readings_of()
+    off = replace(good, states=replace(good.states, q=good.states.q[:, order]))
+    finding, said = found_in(off)
+    assert finding.refused
+    assert words in said
 
 
 @pytest.mark.long
 def test_nonsense_is_refused_with_what_was_tried():
-    good = readings_of(None, 3)
-    mixed = replace(good, value=good.value[np.random.default_rng(0).permutation(len(good))])
-    finding, cell = found_in(mixed)
+    finding, said = found_in(moved(list(range(40)), np.random.default_rng(0).permutation(40)))
     assert finding.refused
     assert not finding.explanations
-    assert "Nothing that was tried explains it" in finding.words(cell, mixed)
+    assert "Nothing that was tried explains it" in said
 
 
 @pytest.mark.parametrize("seed", [0, 1, 4, 5])
@@ -155,17 +158,12 @@ def test_another_arm_counts_its_joints_as_the_cell_says() -> None:
     """The controller's signs are the cell's, whatever arm it is."""
     config = configuration()
     robot = config.robot.model_copy(update={"joint_sign": (1, 1, -1, 1, 1, 1)})
-    config = config.model_copy(update={"robot": robot})
-    cell = replace(cell_from_config(config), registration_known=False, target_known=False)
+    cell = cell_from_config(config.model_copy(update={"robot": robot}))
+    cell = replace(cell, registration_known=False, target_known=False)
     q = np.random.default_rng(2).uniform(-2, 2, (40, 6))
-    arm = as_counted(load_arm("ur5e"), robot)
-    value = read(arm, q, BASE, pose_of(np.eye(3), OFFSET), 3)
-    value = value + 5e-5 * np.random.default_rng(3).normal(size=value.shape)
-    of = table_of(q, value, np.full(3, 5e-5))
-    finding, _ = found_in(of, cell)
-    words = finding.words(cell, of)
-    assert "the arm is another one, ur5e" in words
-    assert "turns the other way" not in words
+    _, said = found_in(by_arm(as_counted(load_arm("ur5e"), robot), q), cell)
+    assert "the arm is another one, ur5e" in said
+    assert "turns the other way" not in said
 
 
 TARGET = np.array([0.03, -0.02, 0.1])

@@ -1,7 +1,6 @@
 """Stations, distances and heights: derivative, registration, fits, verdicts, tables, refusals."""
 
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,21 +32,21 @@ from tests.support.fit_cases import based, named
 from tests.support.observer_cases import NORMAL, POINTS, Observed, base_cell, observed, stated
 from tests.support.rows import first
 
-Case = Callable[[int], Observed]
 KNOWN = replace(base_cell(stated("ABC")), registration_known=True)
-CASES: dict[str, Case] = {
-    "two stations": lambda seed: observed(["S1", "S2"], seed, alternate=True),
-    "station, point and gauge": lambda seed: observed(["S1", "A", "G"], seed),
-    "three unknown points": lambda seed: observed(["A", "B", "C"], seed, base=True),
-    "three known points": lambda seed: observed(["A", "B", "C"], seed, cell=KNOWN, base=True),
-    "a gauge": lambda seed: observed(["G"], seed, base=True),
+CASES: dict[str, tuple[list[str], dict[str, object]]] = {
+    "two stations": (["S1", "S2"], {"alternate": True}),
+    "station, point and gauge": (["S1", "A", "G"], {}),
+    "three unknown points": (["A", "B", "C"], {"base": True}),
+    "three known points": (["A", "B", "C"], {"base": True, "cell": KNOWN}),
+    "a gauge": (["G"], {"base": True}),
 }
+NAMES = [ObserverName(*each.split()) for each in ("station S1", "station S2", "point A", "gauge G")]
 
 
-def fitted(c: Observed, mode: Mode = "absolute") -> Fit:
+def fitted(c: Observed, mode: Mode = "absolute", readings: Readings | None = None) -> Fit:
     joint_std = configuration().repeatability.per_joint(6)
-    readings = with_joint_scatter(c.cell, c.readings, joint_std)
-    return based(c.cell, readings, mode)
+    given = c.readings if readings is None else readings
+    return based(c.cell, with_joint_scatter(c.cell, given, joint_std), mode)
 
 
 def apart(c: Observed, found: Fit) -> np.ndarray:
@@ -55,14 +54,6 @@ def apart(c: Observed, found: Fit) -> np.ndarray:
     truth = true_parameters(c.world, "joint_compliance")
     told = [v for k, v in named(found).items() if k.startswith("joint_compliance")]
     return np.array([(value - t) / std for (value, std), t in zip(told, truth, strict=True)])
-
-
-NAMES = [
-    ObserverName("station", "S1"),
-    ObserverName("station", "S2"),
-    ObserverName("point", "A"),
-    ObserverName("gauge", "G"),
-]
 
 
 @pytest.mark.parametrize("moved", [0.0, 20.0])
@@ -92,72 +83,54 @@ def test_jacobian_is_the_derivative_of_the_prediction(moved: float) -> None:
 @pytest.mark.parametrize("mode", first(1, ["absolute", "deflection"]))
 @pytest.mark.parametrize("case", first(1, list(CASES)))
 def test_true_parameters_lie_in_their_bands_and_residuals_are_noise(case: str, mode: Mode) -> None:
-    found = [(c := CASES[case](seed), fitted(c, mode)) for seed in range(12)]
+    who, kept = CASES[case]
+    found = [(c := observed(who, seed, **kept), fitted(c, mode)) for seed in range(12)]
     z = np.array([apart(c, f) for c, f in found])
     # 72 errors of about a third as many independent ones: their rms scatters by 0.12.
     assert 0.6 < np.sqrt(np.mean(z**2)) < 1.4
-    factors = [f.variance_factor for _, f in found]
-    assert 0.9 < np.mean(factors) < 1.1
+    assert 0.9 < np.mean([f.variance_factor for _, f in found]) < 1.1
     assert sum(int(f.outlier.sum()) for _, f in found) == 0
 
 
 @pytest.mark.parametrize("case", first(1, list(CASES)))
 def test_verdicts(case: str) -> None:
+    who, kept = CASES[case]
     for seed, effect in ((20, None), (21, None), (22, "joint_tilt_compliance"), (23, "creep")):
-        who, kept = {
-            "two stations": (["S1", "S2"], {"alternate": True}),
-            "station, point and gauge": (["S1", "A", "G"], {}),
-            "three unknown points": (["A", "B", "C"], {"base": True}),
-            "three known points": (["A", "B", "C"], {"base": True, "cell": KNOWN}),
-            "a gauge": (["G"], {"base": True}),
-        }[case]
         d = diagnose(fitted(observed(who, seed, effect=effect, strength=5.0, **kept)))
-        if effect is None:
-            assert d.verdict == "adequate"
-        else:
-            assert d.verdict == "missing_effect"
-            assert d.suspects[0].effect == effect
+        assert d.verdict == ("adequate" if effect is None else "missing_effect")
+        assert effect is None or d.suspects[0].effect == effect
 
 
 def test_where_stations_points_and_gauges_are() -> None:
-    c = observed(["S1", "S2", "A", "G"], 3)
-    f = fitted(c)
-    cell, values = f.model.cell, named(f)
-    _, station, point, gauge = cell.observers
+    f = fitted(observed(["S1", "S2", "A", "G"], 3))
+    values = named(f)
+    _, station, point, gauge = f.model.cell.observers
+    s2, a = (
+        np.array([values[f"observer_frame.{name}.{e}"] for e in elements])
+        for name, elements in (("S2", ("x", "y", "z", "rx", "ry", "rz")), ("A", "xyz"))
+    )
+    placed = (se3.matrix(*se3.exp(s2[:, 0])) @ station.frame)[:3, 3]
+    assert np.all(np.abs(placed - [0.4, 1.9, 0.3]) < 4 * s2[:3, 1])
+    assert np.all(np.abs(a[:, 0] - point.frame[:3, 3] - POINTS["A"]) < 4 * a[:, 1])
     turn = se3.rotation(np.array([0.1, -0.2, 2.2]))
-    for name, true, of in (
-        ("point A", np.array(POINTS["A"]), point),
-        ("station S2", np.array([0.4, 1.9, 0.3]), station),
-    ):
-        del name
-        own = np.array([values[f"observer_frame.{of.name.name}.{a}"] for a in "xyz"])
-        begun = -of.frame[:3, 3] if of is point else of.frame[:3, 3]
-        at = begun + own[:, 0]
-        if of is station:
-            twist = [values[f"observer_frame.S2.{a}"][0] for a in ("x", "y", "z", "rx", "ry", "rz")]
-            at = (se3.matrix(*se3.exp(np.array(twist))) @ of.frame)[:3, 3]
-            np.testing.assert_allclose(of.frame[:3, :3], turn, atol=2e-3)
-        assert np.all(np.abs(at - true) < 4 * own[:, 1])
+    np.testing.assert_allclose(station.frame[:3, :3], turn, atol=2e-3)
     assert np.degrees(np.arccos(gauge.frame[0, :3] @ NORMAL)) < 0.5
 
 
 def test_fresh_readings_are_predicted_to_their_noise() -> None:
     c = observed(["A", "B", "C"], 5, base=True, poses=20)
-    f = fitted(c)
-    fresh = observed(["A", "B", "C"], 5, base=True, poses=14)
-    other = replace(observed(["C", "A", "B"], 6, base=True), world=c.world)
-    del fresh
+    f, r = fitted(c), observed(["C", "A", "B"], 6, base=True).readings
     # The arm of seed 6 is another one: its readings are made anew by the arm of seed 5.
-    at = c.world.sight(other.readings.states).position
-    names = other.readings.observers
-    centre = np.array([POINTS[names[k].name] for k in other.readings.observer])
-    value = other.readings.value.copy()
-    noise = np.random.default_rng(1).standard_normal(len(value))
+    at = c.world.sight(r.states).position
+    centre = np.array([POINTS[r.observers[k].name] for k in r.observer])
+    value, noise = r.value.copy(), np.random.default_rng(1).standard_normal(len(r))
     value[:, 0] = np.linalg.norm(at - centre, axis=1) + 1e-5 * noise
-    readings = replace(other.readings, value=value)
-    found = validate(f.model, f.theta, f.readings, readings, "absolute")
+    found = validate(f.model, f.theta, f.readings, replace(r, value=value), "absolute")
     assert found.readings.observers == c.readings.observers
     assert found.error.rms_m < 3e-5
+    other = observed(["A", "D"], 6, base=True).readings
+    with pytest.raises(InputError, match="point D observed these readings, but not those"):
+        validate(f.model, f.theta, f.readings, other, "absolute")
 
 
 def test_a_bar_of_unknown_length() -> None:
@@ -165,7 +138,7 @@ def test_a_bar_of_unknown_length() -> None:
     c = observed(["S1", "A"], 2, cell=cell)
     value = c.readings.value.copy()
     value[c.readings.scalar, 0] += 0.123
-    f = fitted(replace(c, readings=replace(c.readings, value=value)))
+    f = fitted(c, readings=replace(c.readings, value=value))
     found, std = named(f)["observer_frame.A.offset"]
     offset = f.model.cell.observers[1].offset + found
     assert abs(offset - 0.123) < 4 * std
@@ -206,30 +179,25 @@ def test_a_distance_that_is_far_off_is_set_aside() -> None:
     value = c.readings.value.copy()
     value[17, 0] += 3e-3
     value[40, 0] += 2e-4
-    f = fitted(replace(c, readings=replace(c.readings, value=value)))
+    f = fitted(c, readings=replace(c.readings, value=value))
     assert np.flatnonzero(f.outlier).tolist() == [17, 40]
 
 
 def test_tables_files_and_calibrations_keep_observers(tmp_path: Path) -> None:
     c = observed(["S1", "S2", "A", "G"], 0)
-    write_table(c.readings, tmp_path / "t.csv")
-    write_table(c.readings, tmp_path / "t.parquet")
-    back = read_table(tmp_path / "t.csv", cell_of().arm, None)
-    assert content_hash(back) == content_hash(c.readings)
-    assert content_hash(read_table(tmp_path / "t.parquet", cell_of().arm, None)) == content_hash(
-        back
-    )
+    for name in ("t.csv", "t.parquet"):
+        write_table(c.readings, tmp_path / name)
+        back = read_table(tmp_path / name, cell_of().arm, None)
+        assert content_hash(back) == content_hash(c.readings)
     with CampaignFile.create(tmp_path / "r.hilcal", "{}", ".", "test") as file:
         file.append_readings(back[:10])
         file.append_readings(back[10:])
         assert content_hash(file.readings()) == content_hash(back)
         with pytest.raises(InputError, match="other observers"):
             file.append_readings(observed(["S1", "S2", "B", "G"], 0).readings)
-    f = fitted(c)
-    made = Calibration.of(f)
+    made, q = Calibration.of(fitted(c)), c.readings.states.q[:4]
     made.save(tmp_path / "c.json")
     again = Calibration.load(tmp_path / "c.json")
-    q = c.readings.states.q[:4]
     np.testing.assert_allclose(again.predict(q).position, made.predict(q).position, atol=1e-12)
 
 
@@ -317,13 +285,6 @@ def test_a_cell_names_its_gauges(tmp_path: Path) -> None:
     )
     with pytest.raises(InputError, match="origin_m without direction"):
         Cell.load(tmp_path / "cell.toml")
-
-
-def test_other_observers_are_refused_by_name() -> None:
-    c = observed(["A", "B", "C"], 5, base=True)
-    f, other = fitted(c), observed(["A", "D"], 6, base=True).readings
-    with pytest.raises(InputError, match="point D observed these readings, but not those"):
-        validate(f.model, f.theta, f.readings, other, "absolute")
 
 
 def test_one_tracker_stays_as_it_was() -> None:

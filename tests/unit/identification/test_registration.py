@@ -12,10 +12,9 @@ from hilcal.cell import Cell
 from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.baseline import with_effects
-from hilcal.identification.fit import fit
 from hilcal.identification.full_prediction import gross_errors
 from hilcal.identification.linearisation import linearise
-from hilcal.identification.registration import register
+from hilcal.identification.registration import Registration, register
 from hilcal.present.registration import registration_lines
 from hilcal.readings.readings import Readings, States
 from hilcal.readings.whitening import MODES, Mode
@@ -28,6 +27,7 @@ from tests.support.rows import first
 
 CELL = replace(cell_of(), target_known=False)
 KNOWN = [(False, False), (False, True), (True, False), (True, True)]
+EITHER = pytest.mark.parametrize("m", [3, 6])
 
 angles = st.floats(-np.pi, np.pi)
 turns = st.tuples(angles, angles, angles).map(lambda a: Rotation.from_euler("ZYX", a).as_matrix())
@@ -39,6 +39,10 @@ def pose_of(turn, place):
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = turn, place
     return pose
+
+
+def at(*place: float) -> np.ndarray:
+    return pose_of(np.eye(3), place)
 
 
 def poses(count: int = 12) -> np.ndarray:
@@ -53,12 +57,12 @@ def flanges_at(q) -> np.ndarray:
 def seen(registration, target, m, q=None, noise=0.0, seed=0) -> Readings:
     """Readings of the rigid arm, by products of homogeneous matrices."""
     q = poses() if q is None else q
-    at = registration @ flanges_at(q) @ target
+    there = registration @ flanges_at(q) @ target
     rng = np.random.default_rng(seed)
-    value = at[:, :3, 3] + noise * rng.normal(size=(len(q), 3))
+    value = there[:, :3, 3] + noise * rng.normal(size=(len(q), 3))
     if m == 6:
         turned = Rotation.from_rotvec(noise * rng.normal(size=(len(q), 3)))
-        value = np.hstack([value, (turned * Rotation.from_matrix(at[:, :3, :3])).as_rotvec()])
+        value = np.hstack([value, (turned * Rotation.from_matrix(there[:, :3, :3])).as_rotvec()])
     zero = np.zeros(len(q), dtype=np.int64)
     return Readings(
         states=States(q, np.zeros((len(q), 6))),
@@ -83,6 +87,12 @@ def told(registration, target, registration_known, target_known) -> Cell:
     )
 
 
+def registered(readings: Readings, target=None) -> Registration:
+    """Readings from an unknown base, of a target that is unknown unless given."""
+    known = target is not None
+    return register(told(np.eye(4), target if known else np.eye(4), False, known), readings)
+
+
 @pytest.mark.parametrize("m", first(1, [6, 3]))
 @pytest.mark.parametrize(("registration_known", "target_known"), KNOWN)
 @given(turn=turns, place=places, tool=turns, offset=offsets)
@@ -92,7 +102,7 @@ def test_what_is_unknown_is_found_exactly(
     registration, target = pose_of(turn, place), pose_of(tool, offset)
     cell = told(registration, target, registration_known, target_known)
     if m == 3 and not target_known:  # the target's axes cannot be seen in positions
-        target = pose_of(np.eye(3), offset)
+        target = at(*offset)
     found = register(cell, seen(registration, target, m)).cell
     # Rounding of readings up to 14 m away, through a few well-conditioned systems; the
     # alternation for positions stops when it moves by less than 1e-12 m.
@@ -100,85 +110,64 @@ def test_what_is_unknown_is_found_exactly(
     np.testing.assert_allclose(found.target, target, rtol=0, atol=2e-9)
 
 
-@pytest.mark.parametrize("m", [3, 6])
+@EITHER
 def test_rotations_are_rotations_and_what_is_known_stays(m):
     turn = Rotation.from_rotvec([0.0, 0.0, np.pi]).as_matrix()
-    registration, target = pose_of(turn, [1.0, 2.0, 3.0]), pose_of(np.eye(3), [0.1, 0.0, 0.2])
+    registration, target = pose_of(turn, [1.0, 2.0, 3.0]), at(0.1, 0.0, 0.2)
     readings = seen(registration, target, m, noise=1e-3)
     for registration_known, target_known in KNOWN:
-        cell = told(registration, target, registration_known, target_known)
-        found = register(cell, readings).cell
-        for pose in (found.registration, found.target):
+        found = register(told(registration, target, registration_known, target_known), readings)
+        for pose in (found.cell.registration, found.cell.target):
             np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
             assert np.linalg.det(pose[:3, :3]) > 0
             np.testing.assert_array_equal(pose[3], [0, 0, 0, 1])
         if registration_known:
-            np.testing.assert_array_equal(found.registration, registration)
+            np.testing.assert_array_equal(found.cell.registration, registration)
         if target_known:
-            np.testing.assert_array_equal(found.target[:3, 3], target[:3, 3])
+            np.testing.assert_array_equal(found.cell.target[:3, 3], target[:3, 3])
 
 
-@pytest.mark.parametrize("m", [3, 6])
+@EITHER
 def test_noise_enters_in_proportion(m):
     """Errors of the start are of the noise's size over the lever, and fall with it."""
     turn = Rotation.from_rotvec([1.0, -2.0, 0.5]).as_matrix()
-    registration, target = pose_of(turn, [2.0, -1.0, 0.3]), pose_of(np.eye(3), [0.1, 0.05, 0.2])
-    cell = told(registration, target, False, False)
-    sizes = []
+    registration, target = pose_of(turn, [2.0, -1.0, 0.3]), at(0.1, 0.05, 0.2)
+    back, sizes = np.linalg.inv(registration), []
     for noise in (1e-3, 1e-5):
-        off = []
-        for seed in range(20):
-            found = register(cell, seen(registration, target, m, noise=noise, seed=seed)).cell
-            x = np.linalg.inv(registration) @ found.registration
-            off.append([np.linalg.norm(x[:3, 3]), np.linalg.norm(x[:3, :3] - np.eye(3))])
-        sizes.append(np.sqrt(np.mean(np.square(off), axis=0)))
+        made = (seen(registration, target, m, noise=noise, seed=seed) for seed in range(20))
+        x = np.array([back @ registered(r).cell.registration - np.eye(4) for r in made])
+        off = [np.linalg.norm(x[:, :3, 3], axis=1), np.linalg.norm(x[:, :3, :3], axis=(1, 2))]
+        sizes.append(np.sqrt(np.mean(np.square(off), axis=1)))
     np.testing.assert_allclose(sizes[0] / sizes[1], 100, rtol=0.05)
     assert np.all(sizes[1] < 10 * 1e-5)
 
 
-@pytest.mark.parametrize("m", [3, 6])
+@EITHER
 def test_too_few_poses_cannot_answer(m):
-    registration = pose_of(np.eye(3), [1.0, 0.0, 0.0])
     for q in (poses()[:3], np.repeat(poses()[:3], 5, axis=0)):
-        readings = seen(registration, np.eye(4), m, q)
         with pytest.raises(CannotAnswerError, match="3 distinct poses; measure at least 4"):
-            register(told(registration, np.eye(4), False, False), readings)
-
-
-def on_the_last_axis() -> np.ndarray:
-    """(4, 4) a target that the last joint does not move."""
-    return pose_of(np.eye(3), [0.0, 0.0, 0.2])
-
-
-def test_positions_on_a_line_cannot_answer():
-    """Four poses, two positions: the last joint turns about the target."""
-    q = np.repeat(poses()[:2], 3, axis=0)
-    q[:, 5] += np.tile([0.0, 1.0, 2.0], 2)
-    registration = pose_of(np.eye(3), [1.0, 0.0, 0.0])
-    readings = seen(registration, on_the_last_axis(), 3, q)
-    with pytest.raises(CannotAnswerError, match="spread in space"):
-        register(told(registration, on_the_last_axis(), False, True), readings)
+            registered(seen(at(1.0, 0.0, 0.0), np.eye(4), m, q))
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-5])
-def test_positions_in_one_point_cannot_answer(noise):
-    """Poses about one tip, here on the first joint's axis, do not tell how the base is turned."""
-    q = np.tile(np.array([0.0, -np.pi / 2, 0.1, -np.pi / 2, 0.2, 0.3]), (8, 1))
-    q[:, 0] = np.linspace(-2, 2, 8)
-    tip = np.linalg.inv(flanges_at(q)[0]) @ np.array([0.0, 0.0, 1.0, 1.0])
-    registration, target = pose_of(np.eye(3), [1.0, 0.0, 0.0]), pose_of(np.eye(3), tip[:3])
-    readings = seen(registration, target, 3, q, noise)
-    with pytest.raises(CannotAnswerError, match="spread in space"):
-        register(told(registration, target, False, True), readings)
+def test_positions_on_a_line_or_in_one_point_cannot_answer(noise):
+    """The last joint turns about the target; or about one tip on the first joint's axis."""
+    line = np.repeat(poses()[:2], 3, axis=0)
+    line[:, 5] += np.tile([0.0, 1.0, 2.0], 2)
+    point = np.tile(np.array([0.0, -np.pi / 2, 0.1, -np.pi / 2, 0.2, 0.3]), (8, 1))
+    point[:, 0] = np.linspace(-2, 2, 8)
+    tip = np.linalg.inv(flanges_at(point)[0]) @ np.array([0.0, 0.0, 1.0, 1.0])
+    for q, target in ((line, at(0.0, 0.0, 0.2)), (point, at(*tip[:3]))):
+        with pytest.raises(CannotAnswerError, match="spread in space"):
+            registered(seen(at(1.0, 0.0, 0.0), target, 3, q, noise), target)
 
 
 def test_turns_about_one_axis_give_a_start_that_explains_the_readings():
     """Shifts along the axis cannot be told apart; the start is one of those that fit."""
     q = np.tile(poses()[0], (6, 1))
     q[:, 0] += np.linspace(0, 1, 6)
-    registration, target = pose_of(np.eye(3), [1.0, 0.0, 0.0]), pose_of(np.eye(3), [0.1, 0.0, 0.2])
-    readings = seen(registration, target, 3, q)
-    found = register(told(registration, target, False, False), readings).cell
+    readings = seen(at(1.0, 0.0, 0.0), at(0.1, 0.0, 0.2), 3, q)
+    found = registered(readings).cell
     again = (found.registration @ flanges_at(q) @ found.target)[:, :3, 3]
     np.testing.assert_allclose(again, readings.value, rtol=0, atol=1e-6)
 
@@ -203,33 +192,26 @@ def pointing_down(count, jitter=0.0):
     return q
 
 
-def one_axis(count):
-    q = np.tile([0.1, -1.3, 1.2, -1.0, -1.2, 0.4], (count, 1))
-    q[:, 0] += np.linspace(0, 1.5, count)
-    return q
-
-
-@pytest.mark.parametrize("m", [3, 6])
+@EITHER
 @pytest.mark.parametrize("noise", [0.0, 2e-5])
 def test_one_orientation_registers_to_the_noise_and_holds_the_target(m, noise):
-    readings = seen(BASE, target_of(m), m, pointing_down(40), noise)
-    found = register(told(BASE, np.eye(4), False, False), readings)
+    found = registered(seen(BASE, target_of(m), m, pointing_down(40), noise))
     assert found.rms < 2 * noise + 1e-9
     assert len(found.undetermined) == 3
     np.testing.assert_allclose(found.cell.target[:3, 3], 0, atol=1e-3)
     assert np.linalg.norm(found.cell.registration[:3, 3] - BASE[:3, 3]) < 0.3
     for u in found.undetermined:
-        np.testing.assert_allclose(
-            np.linalg.norm(u.target_shift), np.linalg.norm(u.base_shift), rtol=0.1
-        )
+        shifts = [np.linalg.norm(x) for x in (u.target_shift, u.base_shift)]
+        assert shifts[0] == pytest.approx(shifts[1], rel=0.1)
     words = " ".join(registration_lines(found))
     assert "the target's offset along the flange's z from the height of the base" in words
 
 
-@pytest.mark.parametrize("m", [3, 6])
+@EITHER
 def test_one_axis_registers_to_the_noise_at_ordinary_places(m):
-    readings = seen(BASE, target_of(m), m, one_axis(12), 1e-5)
-    found = register(told(BASE, np.eye(4), False, False), readings)
+    q = np.tile([0.1, -1.3, 1.2, -1.0, -1.2, 0.4], (12, 1))
+    q[:, 0] += np.linspace(0, 1.5, 12)
+    found = registered(seen(BASE, target_of(m), m, q, 1e-5))
     assert found.rms < 3e-5
     assert found.undetermined
     assert np.linalg.norm(found.cell.target[:3, 3]) < 1.0
@@ -237,10 +219,10 @@ def test_one_axis_registers_to_the_noise_at_ordinary_places(m):
     assert "joints 2 to 6 never turned" in " ".join(registration_lines(found))
 
 
-@pytest.mark.parametrize("m", [3, 6])
+@EITHER
 def test_poses_that_turn_leave_nothing_undetermined(m):
     q = np.random.default_rng(1).uniform(-2, 2, (30, 6))
-    found = register(told(BASE, np.eye(4), False, False), seen(BASE, target_of(m), m, q, 1e-5))
+    found = registered(seen(BASE, target_of(m), m, q, 1e-5))
     assert found.undetermined == ()
     np.testing.assert_allclose(found.cell.target[:3, 3], OFFSET, atol=1e-4)
 
@@ -249,22 +231,21 @@ def test_positions_count_although_attitudes_of_one_axis_are_blind():
     """Attitudes alone leave the base's turn about the common axis open; positions tell it."""
     q = pointing_down(40)
     q[:, 5] += np.linspace(0, 2, 40)  # turns about the vertical only
-    found = register(told(BASE, np.eye(4), False, True), seen(BASE, np.eye(4), 6, q, 1e-5))
+    found = registered(seen(BASE, np.eye(4), 6, q, 1e-5), np.eye(4))
     assert found.rms < 3e-5
     np.testing.assert_allclose(found.cell.registration, BASE, atol=2e-4)
 
 
-@pytest.mark.parametrize("m", [3, 6])
+@EITHER
 def test_an_undetermined_target_costs_no_accuracy(m):
     """Orientations that scatter by 0.1 mrad do not tell the target's offset but depend on it."""
     target = target_of(m)
     readings = seen(BASE, target, m, pointing_down(80, 1e-4), 1e-5)
-    known, unknown = (told(BASE, target, False, is_known) for is_known in (True, False))
-    first, second = readings[:40], readings[40:]
+    some, other = readings[:40], readings[40:]
     error = []
-    for cell in (known, unknown):
-        found = based(cell, first, "absolute", [])
-        off = found.predict(second.states).position - second.value[:, :3]
+    for known in (True, False):
+        found = based(told(BASE, target, False, known), some, "absolute", [])
+        off = found.predict(other.states).position - other.value[:, :3]
         error.append(np.sqrt(np.mean(np.sum(off**2, axis=1))))
     assert error[1] < 1.15 * error[0]
 
@@ -275,21 +256,21 @@ def test_a_known_frame_is_left_alone():
     found = register(cell, readings)
     assert found.cell is cell
     assert not found.estimated
-    moved = register(replace(cell, registration=np.eye(4)), readings)
-    assert moved.rms > 1.0
+    assert register(replace(cell, registration=np.eye(4)), readings).rms > 1.0
 
+
+# --- several targets ------------------------------------------------------------------------
 
 OF_THREE = [(True, True, True), (False, True, False), (False, False, False)]
 
 
-@pytest.mark.parametrize("m", [3, 6])
+@EITHER
 @pytest.mark.parametrize("known", OF_THREE)
 def test_base_and_targets_are_registered_together(known: tuple[bool, ...], m: int) -> None:
     c = reflectors(known=known, joint_std=0.0, m=m)
     cell = register(c.cell, c.readings).cell
     assert c.world.offsets is not None
-    true = OFFSETS + c.world.offsets
-    off = cell.all_targets[:, :3, 3] - true
+    off = cell.all_targets[:, :3, 3] - (OFFSETS + c.world.offsets)
     # The nominal arm is rigid: its loads move the targets by up to 1 mm.
     assert np.abs(off).max() < 5e-4
     assert np.all(off[list(known)] == 0.0)
@@ -297,20 +278,16 @@ def test_base_and_targets_are_registered_together(known: tuple[bool, ...], m: in
     assert np.linalg.norm(rotation_vector(turn)) < 1e-3
 
 
-@pytest.mark.parametrize("m", [3, 6])
+@EITHER
 def test_derivatives_agree_with_differences(m: int) -> None:
     c = reflectors(known=(False, True, False), m=m, poses=4)
-    names = ("joint_compliance", "encoder_offset")
-    model = with_effects(c.cell, c.readings, "absolute", names)
-    assert [p.name for p in model.effects[1].parameters][::m] == ["R1.x", "R3.x"]
-    rng = np.random.default_rng(1)
-    scale = np.array([p.scale for e in model.effects for p in e.parameters])
-    theta = 0.3 * scale * rng.standard_normal(model.size)
     states = c.readings.states
+    model = with_effects(c.cell, c.readings, "absolute", ("joint_compliance", "encoder_offset"))
+    assert [p.name for p in model.effects[1].parameters][::m] == ["R1.x", "R3.x"]
+    scale = np.array([p.scale for e in model.effects for p in e.parameters])
+    theta = 0.3 * scale * np.random.default_rng(1).standard_normal(model.size)
     exact = model.jacobian(model.predict(states, theta), theta, 3)
-    for k in range(model.size):
-        step = np.zeros(model.size)
-        step[k] = 1e-2 * scale[k]
+    for k, step in enumerate(1e-2 * np.diag(scale)):
         ahead, back = (model.predict(states, theta + s).observation for s in (step, -step))
         quotient = (ahead.position - back.position) / (2 * step[k])
         np.testing.assert_allclose(exact[:, :, k], quotient, atol=2e-6 * np.abs(quotient).max())
@@ -319,11 +296,10 @@ def test_derivatives_agree_with_differences(m: int) -> None:
 def test_one_offset_moves_one_target() -> None:
     c = reflectors(known=(False, True, False), poses=4)
     model = with_effects(c.cell, c.readings, "absolute", ())
-    theta = np.zeros(model.size)
-    before = model.predict(c.readings.states, theta).observation.position
-    theta[-3:] = 1e-3  # target_offset.R3
-    moved = model.predict(c.readings.states, theta).observation.position - before
-    distance = np.linalg.norm(moved, axis=1)
+    theta = np.zeros((2, model.size))
+    theta[1, -3:] = 1e-3  # target_offset.R3
+    before, after = (model.predict(c.readings.states, t).observation.position for t in theta)
+    distance = np.linalg.norm(after - before, axis=1)
     np.testing.assert_allclose(distance, np.where(c.readings.target == 2, np.sqrt(3) * 1e-3, 0.0))
 
 
@@ -333,33 +309,29 @@ def test_swapped_names_and_a_displaced_reading_are_named(
 ) -> None:
     c = reflectors("base_compliance", known=known, seed=1, joint_std=1e-5, poses=14, strength=4.0)
     r = c.readings
-    first, second, third = np.flatnonzero((r.pose == 4) & (r.load == 2))
+    one, other, _ = np.flatnonzero((r.pose == 4) & (r.load == 2))
     lone = np.flatnonzero((r.pose == 7) & (r.load == 1))[2]
     number, value = r.target.copy(), r.value.copy()
-    number[[first, second]] = number[[second, first]]
+    number[[one, other]] = number[[other, one]]
     value[lone] += [1e-3, 0.0, 0.0]
     wrong = replace(r, states=replace(r.states, target=number), value=value)
-    named = {g.row: g.reason for g in gross_errors(based(c.cell, wrong, mode))}
-    assert set(named) == {first, second, lone}
-    assert named[first] == "target R2: lies where R1 is: were they swapped?"
-    assert named[second] == "target R1: lies where R2 is: were they swapped?"
-    assert named[lone].startswith("target R3: ")
-    assert third not in named
+    reasons = {g.row: g.reason for g in gross_errors(based(c.cell, wrong, mode))}
+    assert set(reasons) == {one, other, lone}
+    assert reasons[one] == "target R2: lies where R1 is: were they swapped?"
+    assert reasons[other] == "target R1: lies where R2 is: were they swapped?"
+    assert reasons[lone].startswith("target R3: ")
 
 
 def test_the_misfit_of_a_displaced_reflector_follows_the_target() -> None:
     c = reflectors(seed=2, joint_std=1e-5)
-    moved = c.cell.all_targets.copy()
-    moved[1, :3, 3] += [2e-4, -1e-4, 1e-4]
+    moved, by = c.cell.all_targets.copy(), np.array([2e-4, -1e-4, 1e-4])
+    moved[1, :3, 3] += by
     cell = c.cell.with_targets(moved)
-    found = based(cell, c.readings, "absolute")
-    shares = misfit_breakdown(linearise(found))
-    assert shares[0].variable == "target"
-    assert shares[0].share > 0.9
-    model = with_effects(cell, c.readings, "absolute", ["joint_compliance", "target_offset"])
-    offset = model.slices()[model.names.index("target_offset")]
-    theta = fit(model, c.readings, "absolute").theta[offset].reshape(3, 3)
+    share = misfit_breakdown(linearise(based(cell, c.readings, "absolute")))[0]
+    assert share.variable == "target"
+    assert share.share > 0.9
+    found = based(cell, c.readings, "absolute", ["joint_compliance", "target_offset"])
+    rows = found.model.slices()[found.model.names.index("target_offset")]
+    theta = found.theta[rows].reshape(3, 3)
     # A common displacement of all targets is hardly told from one of the base; a single one is.
-    np.testing.assert_allclose(
-        theta[1] - theta[[0, 2]].mean(axis=0), [-2e-4, 1e-4, -1e-4], atol=1.5e-5
-    )
+    np.testing.assert_allclose(theta[1] - theta[[0, 2]].mean(axis=0), -by, atol=1.5e-5)
