@@ -13,7 +13,7 @@ and its eigenvectors takes seconds, once, when an uncertainty is first asked for
 import base64
 import math
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -24,21 +24,8 @@ from hilcal.identification.gauss_newton import whitened_jacobian
 from hilcal.model.model import Model
 from hilcal.readings.readings import ObserverName, Readings, SerialNoise, States
 from hilcal.readings.whitening import Mode, whitening
+from hilcal.store.codec import numbers
 from hilcal.types import Floats
-
-LARGEST = 1e9
-"""No length, angle, mass, force or parameter is as large, in SI units."""
-
-
-def check_numbers(
-    what: str, values: Floats | float, shape: Sequence[int] = (), *, least: float = -LARGEST
-) -> None:
-    """Refuse numbers of another shape, or that nothing in a cell has, by a ValueError."""
-    array = np.asarray(values, dtype=float)
-    if array.shape != tuple(shape):
-        raise ValueError(f"{what} has shape {array.shape}; expected {tuple(shape)}")
-    if not np.all((array >= least) & (array <= LARGEST)):
-        raise ValueError(f"{what} has a number that cannot be")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,19 +52,19 @@ class CovarianceSource:
         r, n = self.readings, model.cell.arm.n
         count = len(r.states)
         limits.check_numbers("what its covariance follows from", count * r.m * max(model.size, 1))
-        check_numbers("prior", self.prior, (model.size,), least=0.0)
-        check_numbers("noise", self.noise, least=0.0)
-        check_numbers("factor", self.factor, least=0.0)
+        numbers("prior", self.prior, (model.size,), least=0.0)
+        numbers("noise", self.noise, least=0.0)
+        numbers("factor", self.factor, least=0.0)
         widths = dict.fromkeys(("q", "joint_temperature", "approach", "q_actual", "torque"), n)
         widths |= {"wrench": 6}
         for f in fields(States):
             values = getattr(r.states, f.name)
             if values is not None:
                 wide = (widths[f.name],) if f.name in widths else ()
-                check_numbers(f.name, values, (count, *wide))
-        check_numbers("covariance", r.covariance, (count, r.m, r.m))
+                numbers(f.name, values, (count, *wide))
+        numbers("covariance", r.covariance, (count, r.m, r.m))
         if r.common is not None:
-            check_numbers("common", r.common, (count, r.m, r.common.shape[-1]))
+            numbers("common", r.common, (count, r.m, r.common.shape[-1]))
         indices = {
             "pose": (r.pose, r.pose_names),
             "load": (r.load, r.load_names),

@@ -17,7 +17,7 @@ import numpy as np
 
 from hilcal import __version__, limits
 from hilcal.calibration.calibration import Calibration
-from hilcal.calibration.covariance_source import CovarianceSource, check_numbers
+from hilcal.calibration.covariance_source import CovarianceSource
 from hilcal.calibration.measured import WORDS, Condition, Measured, SensorMount
 from hilcal.calibration.scatter import Scatter
 from hilcal.cell import Cell, Observer
@@ -28,7 +28,15 @@ from hilcal.model.model import Model
 from hilcal.readings.readings import ObserverName
 from hilcal.readings.whitening import MODES
 from hilcal.robot.arm import Arm
-from hilcal.store.codec import decode, encode, read_document, read_file, write_document
+from hilcal.store.codec import (
+    decode,
+    encode,
+    frames,
+    numbers,
+    read_document,
+    read_file,
+    write_document,
+)
 from hilcal.types import Floats
 
 FORMAT, VERSION = "hilcal-calibration", 2
@@ -119,9 +127,8 @@ def _read(content: Mapping[str, Any], known: Catalogue) -> Calibration:
         raise InputError(
             f"written by hilcal {content['hilcal']}, whose effects have other parameters"
         )
-    theta, std = (decode(Floats, content[k]) for k in ("theta", "std"))
-    check_numbers("theta", theta, (len(names),))
-    check_numbers("std", std, (len(names),), least=0.0)
+    theta = numbers("theta", content["theta"], (len(names),))
+    std = numbers("std", content["std"], (len(names),), least=0.0)
     root = learnt = None
     if "learnt" in content:
         learnt = CovarianceSource.from_json(content["learnt"])
@@ -129,7 +136,7 @@ def _read(content: Mapping[str, Any], known: Catalogue) -> Calibration:
     else:
         flat = np.frombuffer(base64.b64decode(content["covariance_root"]), dtype="<f4")
         root = flat.reshape(len(std), -1).astype(float) * std[:, None]
-        check_numbers("covariance_root", root, root.shape)
+        numbers("covariance_root", root, root.shape)
     stored = dict(content["scatter"])  # older programs told whether it was known alone
     scatter = decode(Scatter, {"source": "stated" if stored["known"] else "unknown"} | stored)
     calibration = Calibration(
@@ -170,45 +177,31 @@ def _small(c: Calibration) -> dict[str, object] | None:
 def _cell(content: Mapping[str, Any], arm: Arm) -> Cell:
     """Return a cell as it was stored; refuses one that cannot be."""
     _check_arm(arm)
-    arrays = ("target", "load_point", "tool_com", "gravity", "registration")
-    numbers: dict[str, Any] = {name: decode(Floats, content[name]) for name in arrays}
+    vectors: dict[str, Any] = {
+        name: numbers(name, content[name], (3,)) for name in ("load_point", "tool_com", "gravity")
+    }
     cell = Cell(
         arm=arm,
-        tool_mass=float(content["tool_mass"]),
+        target=frames("target", content["target"]),
+        registration=frames("registration", content["registration"]),
+        tool_mass=float(numbers("tool_mass", content["tool_mass"], least=0.0)),
         registration_known=bool(content["registration_known"]),
         target_known=all(content["known_targets"]),
         measured_torques=bool(content.get("measured_torques", False)),
         observers=tuple(map(_observer, content.get("observers", ()))),
-        **numbers,
+        **vectors,
     )
-    for name, shape in (("load_point", (3,)), ("tool_com", (3,)), ("gravity", (3,))):
-        check_numbers(name, getattr(cell, name), shape)
-    check_numbers("tool_mass", cell.tool_mass, least=0.0)
-    targets = decode(Floats | None, content["targets"])
-    frames = {"target": cell.target, "registration": cell.registration, "targets": targets}
-    for name, frame in frames.items():
-        if frame is not None:
-            _check_frames(name, frame)
-    if targets is None:
+    if content["targets"] is None:
         return cell
+    targets = frames("targets", content["targets"], several=True)
     several = replace(cell, targets=targets, target_names=tuple(content["target_names"]))
     return several.with_targets(targets, content["known_targets"])
 
 
 def _observer(content: Mapping[str, Any]) -> Observer:
-    frame = decode(Floats, content["frame"])
-    _check_frames("observer", frame)
+    frame = frames("observer", content["frame"])
     free = decode(tuple[int, ...], content["free"])
     return Observer(decode(ObserverName, content), frame, free, float(content["offset_m"]))
-
-
-def _check_frames(what: str, frames: Floats) -> None:
-    """Refuse (..., 4, 4) matrices that are no rotation and translation."""
-    check_numbers(what, frames, (*frames.shape[:-2], 4, 4))
-    turn = frames[..., :3, :3]
-    orthonormal = np.allclose(turn @ np.swapaxes(turn, -1, -2), np.eye(3), atol=1e-6)
-    if not orthonormal or np.any(frames[..., 3, :] != [0.0, 0.0, 0.0, 1.0]):
-        raise ValueError(f"{what} is no frame")
 
 
 def _check_arm(arm: Arm) -> None:
@@ -216,13 +209,13 @@ def _check_arm(arm: Arm) -> None:
     n = arm.links.shape[0] - 1
     if n < 1:
         raise ValueError("the arm has no joints")
-    _check_frames("links", arm.links)
-    check_numbers("masses", arm.masses, (n,), least=0.0)
-    check_numbers("coms", arm.coms, (n, 3))
-    check_numbers("payload", arm.payload, least=0.0)
+    frames("links", arm.links, several=True)
+    numbers("masses", arm.masses, (n,), least=0.0)
+    numbers("coms", arm.coms, (n, 3))
+    numbers("payload", arm.payload, least=0.0)
     for name, shape in (("coupling", (n, n)), ("drive", (n, n)), ("mimic", (n, n + 1))):
         if getattr(arm, name) is not None:
-            check_numbers(name, getattr(arm, name), shape)
+            numbers(name, getattr(arm, name), shape)
     if arm.sign is not None and not np.all(np.abs(arm.sign) == np.ones(n)):
         raise ValueError("sign is not ±1 for each joint")
     for ends in (arm.q_min, arm.q_max, arm.torque_max):
@@ -234,20 +227,20 @@ def _check_arm(arm: Arm) -> None:
 
 def _check(c: Calibration, n: int) -> None:
     """Refuse numbers of a calibration of n joints that cannot be."""
-    check_numbers("misfit_m2", c.misfit, least=0.0)
-    check_numbers("joint_std", c.scatter.joint_std, (n,), least=0.0)
-    check_numbers("std_m", c.scatter.std_m, least=0.0)
+    numbers("misfit_m2", c.misfit, least=0.0)
+    numbers("joint_std", c.scatter.joint_std, (n,), least=0.0)
+    numbers("std_m", c.scatter.std_m, least=0.0)
     if np.isnan(c.measured.most_std_m):
         raise ValueError("most_std_m is no number")
     for r in c.measured.ranges:
-        check_numbers(f"range of {r.variable}", np.array([r.low, r.high]), (2,))
+        numbers(f"range of {r.variable}", np.array([r.low, r.high]), (2,))
     for name, x in c.conditions.items():
         if name not in WORDS:
             raise ValueError(f"{name!r} is no condition")
-        check_numbers(name, x.mean, (n,) if name in ("joint_temperature", "approach") else ())
-        check_numbers(f"variance by {name}", x.variance_m2, least=0.0)
+        numbers(name, x.mean, (n,) if name in ("joint_temperature", "approach") else ())
+        numbers(f"variance by {name}", x.variance_m2, least=0.0)
     for name, wrench in c.loads.items():
-        check_numbers(f"load {name}", wrench, (6,))
+        numbers(f"load {name}", wrench, (6,))
     if c.sensor is not None:
         place = np.stack([c.sensor.origin_m, c.sensor.rotvec_rad])
-        check_numbers("force_sensor", place, (2, 3))
+        numbers("force_sensor", place, (2, 3))

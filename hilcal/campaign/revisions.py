@@ -23,13 +23,12 @@ from hilcal.model.model import Model
 from hilcal.names import quoted
 from hilcal.readings.readings import ArmScatter, Readings, SerialNoise
 from hilcal.readings.whitening import MODES, SCALINGS, Mode, Scaling
+from hilcal.store.codec import LARGEST, frames, numbers
 from hilcal.store.kept_texts import COMMAND
 from hilcal.store.revision import CARRIED, STORED, RevisionRecord, to_text
 from hilcal.store.rows import content_hash
 from hilcal.types import Floats
 
-_LARGEST = 1e9
-"""No parameter and no length of a frame is as large, in SI units."""
 _WIDEST = 1e100
 """No prior is as wide: its square, times those of whitened rows, is within double precision."""
 SERIAL = "serial_noise"
@@ -191,8 +190,8 @@ def _restored(
 ) -> tuple[Model, Floats]:
     """Do the same of a record that may be damaged: then any exception can be raised."""
     stored: Mapping[str, Any] = record.parameters_json
-    targets = _frames(stored.get("targets", [stored["target"]]))
-    (registration,) = _frames([stored["registration"]])
+    targets = frames("targets", stored.get("targets", [stored["target"]]), several=True)
+    registration = frames("registration", stored["registration"])
     if len(targets) != len(cell.known_targets):
         raise InputError(
             f"revision {record.number} is of {len(targets)} targets, the cell has "
@@ -202,8 +201,8 @@ def _restored(
     cell = cell.observed_by(readings.observers)
     if cell.observers:
         observed = stored["observers"]
-        frames = _frames([o["frame"] for o in observed])
-        trios = zip(cell.observers, frames, observed, strict=True)
+        places = frames("observers", [o["frame"] for o in observed], several=True)
+        trios = zip(cell.observers, places, observed, strict=True)
         placed = (replace(o, frame=f, offset=float(s["offset_m"])) for o, f, s in trios)
         cell = replace(cell, observers=tuple(placed))
     options, of_random = record.options["effects"], stored.get(RANDOM)
@@ -213,7 +212,7 @@ def _restored(
     std = of_random["std"] if of_random else {}
     random = {name: np.array(values, dtype=float) for name, values in std.items()}
     for name, values in random.items():
-        if values.shape != (size.get(name),) or not np.all((values > 0) & (values < _LARGEST)):
+        if values.shape != (size.get(name),) or not np.all((values > 0) & (values < LARGEST)):
             raise ValueError("random effects with standard deviations that are none")
     background = frozenset(names) - frozenset(record.effects)
     if not background <= random.keys() or not set(record.effects) <= set(names):
@@ -224,21 +223,7 @@ def _restored(
             f"revision {record.number} was made by hilcal {record.program_version}, whose effects "
             "have other parameters; run hilcal identify again"
         )
-    theta = np.array(stored["theta"], dtype=float)
-    if theta.shape != (model.size,) or not np.all(np.abs(theta) < _LARGEST):
-        raise ValueError("parameters that are none")
-    return model, theta
-
-
-def _frames(stored: Sequence[Any]) -> Floats:
-    """(K, 4, 4) rotations and translations; refuses others."""
-    frames = np.array(stored, dtype=float)
-    rigid = frames.shape[1:] == (4, 4) and bool(np.all(np.abs(frames) < _LARGEST))
-    turn = frames[:, :3, :3] if rigid else np.zeros((1, 3, 3))
-    rigid = rigid and np.allclose(turn @ np.swapaxes(turn, 1, 2), np.eye(3), atol=1e-6)
-    if not rigid or np.any(frames[:, 3] != [0.0, 0.0, 0.0, 1.0]):
-        raise ValueError("the stored frames are no rigid transforms")
-    return frames
+    return model, numbers("theta", stored["theta"], (model.size,))
 
 
 def carried_of(record: RevisionRecord) -> CarriedPrior | None:

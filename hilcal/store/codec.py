@@ -8,7 +8,7 @@ are passed over: so what earlier programs wrote is read.
 import base64
 import json
 import types
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field, fields, is_dataclass
 from functools import cache
 from pathlib import Path
@@ -24,6 +24,8 @@ from hilcal.types import Floats
 from hilcal.whole_file import replace_file
 
 T = TypeVar("T")
+LARGEST = 1e9
+"""No length, angle, mass, force or parameter is as large, in SI units."""
 
 
 def encode(value: Any) -> Any:
@@ -73,6 +75,29 @@ def _hints(kind: Any) -> Mapping[str, Any]:
 
 def _required(f: Field[Any]) -> bool:
     return f.default is MISSING and f.default_factory is MISSING
+
+
+def numbers(
+    what: str, values: object, shape: Sequence[int] = (), *, least: float = -LARGEST
+) -> Floats:
+    """Return numbers as an array; a ValueError for another shape, or what nothing in a cell has."""
+    array = np.asarray(values, dtype=float)
+    if array.shape != tuple(shape):
+        raise ValueError(f"{what} has shape {array.shape}; expected {tuple(shape)}")
+    if not np.all((array >= least) & (array <= LARGEST)):
+        raise ValueError(f"{what} has a number that cannot be")
+    return array
+
+
+def frames(what: str, values: object, *, several: bool = False) -> Floats:
+    """Return a rotation and translation (4, 4), or K of them; a ValueError for what is none."""
+    array = np.asarray(values, dtype=float)
+    numbers(what, array, (*array.shape[:several], 4, 4))
+    turn = array[..., :3, :3]
+    orthonormal = np.allclose(turn @ np.swapaxes(turn, -1, -2), np.eye(3), atol=1e-6)
+    if not orthonormal or np.any(array[..., 3, :] != [0.0, 0.0, 0.0, 1.0]):
+        raise ValueError(f"{what} is no frame: a rotation and a translation")
+    return array
 
 
 def pack(values: Floats) -> str:

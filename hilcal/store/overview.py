@@ -3,7 +3,7 @@
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from hilcal.config import CellConfig
 from hilcal.readings.readings import Readings
 from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.codec import encode
 from hilcal.store.kept_texts import COMMAND
 from hilcal.store.revision import RevisionRecord
 from hilcal.store.run_log import PLAN, RunLog
@@ -151,28 +152,21 @@ def to_json(o: Overview, path: str, covariance: str) -> dict[str, object]:
     """Return the document of `info --json`."""
     return {
         "campaign": path,
-        "created": o.created,
-        "program_version": o.program_version,
-        "source": o.source,
+        **{name: encode(getattr(o, name)) for name in ("created", "program_version", "source")},
         "robot": o.config.robot.model,
         "n_readings": 0 if o.readings is None else len(o.readings),
         "n_poses": o.poses,
         "elements": None if o.readings is None else o.readings.m,
-        "loads": dict(o.loads),
-        "targets": dict(o.targets),
+        **{name: encode(getattr(o, name)) for name in ("loads", "targets")},
         "covariance": covariance,
-        "plans": o.plans,
-        "planned": o.planned,
-        "measured": o.measured,
-        "instruments": [asdict(i) for i in o.instruments],
+        **{name: encode(getattr(o, name)) for name in ("plans", "planned", "measured")},
+        "instruments": encode(o.instruments),
         "tares": [{"utc": t.utc, "zero": t.wrench.tolist()} for t in o.tares],
         "drift": {
             "limit_sigma": o.config.acquire.drift_limit_sigma,
-            "returns": [{**asdict(r), "shift_m": r.shift_m.tolist()} for r in o.returns],
+            "returns": encode(o.returns),
         },
-        "tool": o.tool,
-        "repeatability": o.repeatability,
-        "events": [dict(e) for e in o.events],
+        **{name: encode(getattr(o, name)) for name in ("tool", "repeatability", "events")},
         "accepted": o.accepted,
         "in_use": o.in_use,
         "revisions": [_revision_json(r, o) for r in o.revisions],

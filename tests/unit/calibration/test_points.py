@@ -13,8 +13,9 @@ from hilcal.errors import InputError
 from hilcal.robot import se3
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate
+from hilcal.tables.guessing.propose import propose
 from hilcal.tables.mapping import Mapping, PointMapping, find_mapping
-from hilcal.tables.propose import propose
+from tests.support.refusals import check, refusals
 
 ARM = load_arm("ur10e")
 LOADS = {"10kg": np.array([0.0, 0.0, -98.0665, 0.0, 0.0, 0.0])}
@@ -191,28 +192,13 @@ def test_a_pose_out_of_reach_is_named(tmp_path: Path) -> None:
         on_branch(read_points(written(tmp_path, text), ARM, LOADS), ARM, TOOL, None)
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("pose\na\n", "neither joint values nor poses"),
-        *(
-            (f"{JOINTS},speed\n1,1,1,1,1,1,1\n", words)
-            for words in ("unknown column 'speed'", "air_degC", "sensor_fx_N", "rx_rad", "--format")
-        ),
-        ("q1_rad,q2_rad\n1,1\n", "column 'q3_rad' is missing"),
-        ("x_m,y_m,z_m\n1,1,1\n", "one half is missing"),
-        (f"{JOINTS},load\n1,1,1,1,1,1,5kg\n", "row 2, column 'load': unknown load '5kg'; valid: "),
-        (f"{JOINTS},load,fx_N,fy_N,fz_N,mx_Nm,my_Nm,mz_Nm\n" + "1," * 12 + "1\n", "both load"),
-        (f"{JOINTS},{JOINTS.replace('rad', 'deg')}\n" + "1," * 11 + "1\n", "both q1_rad and q1_d"),
-        (f"{JOINTS},q1_rad\n" + "1," * 6 + "1\n", "twice"),
-        (f"{JOINTS}\n1,1,1,x,1,1\n", "row 2, column 'q4_rad'"),
-        (f"{JOINTS}\n", "no readings"),
-    ],
-)
-def test_tables_that_cannot_be_used_are_refused(tmp_path: Path, text: str, words: str) -> None:
+@refusals("points")
+def test_tables_that_cannot_be_used_are_refused(
+    case: tuple[str, str], given: str, tmp_path: Path
+) -> None:
     with pytest.raises(InputError) as error:
-        read_points(written(tmp_path, text), ARM, LOADS)
-    assert words in str(error.value)
+        read_points(written(tmp_path, given), ARM, LOADS)
+    check(case, str(error.value).replace(f"{tmp_path}/", ""))
 
 
 def test_waypoints_of_a_program_are_found_and_replaced(tmp_path: Path) -> None:

@@ -34,6 +34,7 @@ from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate
 from hilcal.types import Floats
 from tests.support.maker_arms import EXAMPLES, maker_arm, urdf_of
+from tests.support.refusals import check, refusals
 from tests.support.rows import first
 
 DELTA = 1e-3 * np.array([0.7, -0.4, 0.9, -1.1, 0.5, -0.8])
@@ -276,61 +277,16 @@ def test_a_joint_that_passes_zero_changes_its_turn(arms: dict[str, Arm], tmp_pat
         inform.corrected(q)
 
 
-@pytest.mark.parametrize(
-    ("maker", "old", "new", "words"),
-    [
-        ("krl", "LIN XP2 C_DIS", "LIN XP2:XP3 C_DIS", "line 28: the point 'XP2:XP3' is computed"),
-        ("krl", "gripper_open( )", "XP1.X=XP1.X+1", "XP1 (weld.dat line 7): line 31 uses or chang"),
-        ("krl", "gripper_open( )", "PTP_REL {A1 5}", "line 31: PTP_REL is not corrected"),
-        ("krl", "PTP home1", "PTP XHOME", "line 37: the point 'XHOME' is not in this program"),
-        ("krl", "PTP home1", "open( )", "not known: open of line 37 may set them"),
-        ("krl", "$OUT[7]=TRUE", "$TOOL.X=5", "line 40: '$TOOL.X=' changes what points mean"),
-        ("krl", "$OUT[7]=TRUE", "$IPO_MODE=#TCP", "line 40: '$IPO_MODE=#TCP' changes"),
-        ("krl", "BAS(#TOOL, 1)", "BAS(#TOOL, 5)", "TOOL_DATA[5] is not in the program; give it"),
-        ("krl", "E1 0.0,E2", "E1 20.0,E2", "E1 moves, and it is not known what that carries"),
-        ("krl", "#BASE", "#TCP", "has its tool outside of the arm"),
-        ("krl", ",S 2,T 18,E1", ",S 0,T 18,E1", "no solution of krl has the configuration"),
-        ("krl", "A1 5,", "", "(weld.dat line 14): not all of X, Y, Z"),
-        ("rapid", "MoveL p30,", "p30.trans.x:=1;MoveL p30,", "'Offs(p30,0,0,40)' is computed"),
-        ("rapid", "MoveL p30,", "MoveL CRobT(),", "line 20: the point 'CRobT()' is computed"),
-        (
-            "rapid",
-            "SetDO doGrip,1",
-            "PDispOn p10,tGun",
-            "line 22: PDispOn changes what points mean",
-        ),
-        ("rapid", "SetDO doGrip,1", "SearchL di1,p,p10,v9,tGun", "uses or changes 'p10'"),
-        ("rapid", "0,0,40)", "0,0,z)", "is computed while the program runs"),
-        ("rapid", "fine,tool0;", "fine,tPen;", "the tool 'tPen' is not in the program; give it by"),
-        ("rapid", "[FALSE,TRUE,", "[FALSE,FALSE,", "the work object 'wTable' is not fixed"),
-        ("rapid", ",[9E+09,", ",[150,", "an external axis moves"),
-        ("fanuc", "CNT100    ;", "CNT100 Offset,PR[1]    ;", "line 12 uses or changes it"),
-        ("fanuc", "L P[3]", "L PR[3]", "line 15: a position register"),
-        ("fanuc", "L P[3]", "L P[R[1]]", "P[1] (line 19): line 15 uses or changes it otherwise"),
-        ("fanuc", "R[1]=R[1]+1", "UFRAME[1]=PR[2]", "line 14: 'UFRAME[1]=' changes a frame"),
-        ("fanuc", "UF : 1, UT : 2", "UF : 4, UT : 2", "frame 4 is not in the program; give it"),
-        ("fanuc", "T, 0, 0, 0", "T, 0, 0, 1", "turn_axes = [1, 4, 6]"),
-        (
-            "inform",
-            "DOUT OT#(1) ON",
-            "SFTON P001 UF#(1)",
-            "line 28: SFTON changes what points mean",
-        ),
-        ("inform", "DOUT OT#(1) ON", "IMOV P007 V=9", "line 28: IMOV is not corrected; and 1 more"),
-        ("inform", "POSTYPE USER", "POSTYPE MASTER", "POSTYPE MASTER is not corrected"),
-        ("inform", "///USER 3", "///USER 9", "frame 9 is not in the program; give it by --frames"),
-        ("inform", "C00003=", "BC00001=500.0\r\nC00003=", "a base axis moves the arm"),
-        ("inform", "P007 V", "P008 V", "line 30: the point 'P008 V=50.0' is not in this job"),
-    ],
-)
+@refusals("makers")
 def test_what_is_not_understood_is_refused_by_line(
-    maker: str, old: str, new: str, words: str, arms: dict[str, Arm], tmp_path: Path
+    case: tuple[str, str], given: str, arms: dict[str, Arm], tmp_path: Path
 ) -> None:
-    copied(maker, tmp_path, lambda text: text.replace(old, new))
+    """A maker, what stands in its example, and what is written in its place."""
+    maker, old, new = given.split("\n")[:3]
+    copied(maker, tmp_path, lambda text: text.replace(old, new.replace("<new line>", "\r\n")))
     with pytest.raises(InputError) as error:
         read(maker, arms, tmp_path)
-    assert words in str(error.value)
-    assert "weld." in str(error.value)
+    check(case, str(error.value).replace(f"{tmp_path}/", ""))
 
 
 @pytest.mark.parametrize(
