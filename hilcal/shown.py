@@ -11,12 +11,9 @@ from typing import TYPE_CHECKING, Any, Protocol
 if TYPE_CHECKING:
     import pandas as pd
 
-MOST_LINES = 15
-"""Lines of a `repr`."""
-WIDTH = 70
-"""Characters of a value in it; longer ones are named by type and size."""
-FEW = 7
-"""Numbers of an array that are written out."""
+MOST_LINES = 15  # lines of a `repr`
+WIDTH = 70  # characters of a value in it; longer ones are named by type and size
+FEW = 7  # numbers of an array that are written out
 
 
 class Presenter(Protocol):

@@ -25,8 +25,7 @@ from hilcal.types import Bools, Floats, Ints
 if TYPE_CHECKING:
     from hilcal.transfer.pooled import Pooled
 
-MOST = 1500
-"""Points that a chart draws; a choice by the size of the page, 8 MB."""
+MOST = 1500  # points that a chart draws; a choice by the size of the page, 8 MB
 MOST_POSES, LONGEST_NAME = 16, 12
 """Poses up to which all their names stand at the axis, and characters of such a name; choices."""
 LONGEST, MOST_ARROWS = 0.25, 300
@@ -114,10 +113,7 @@ def residual_by_load(story: Story, revision: StoryRevision) -> go.Figure:
 def residual_over(
     story: Story, revision: StoryRevision, values: Floats, name: str, unit: str
 ) -> go.Figure:
-    """Draw the residual of each reading in σ over a variable.
-
-    `values` (N,) are in units for people, NaN where not known; `unit` is "" for a pure number.
-    """
+    """Draw residuals in σ over values (N,) in a unit for people, NaN where not known."""
     d = drawn(story, revision)
     known = np.isfinite(values)
     x = np.where(known, values, np.median(values[known]) if known.any() else 0.0)
@@ -179,11 +175,7 @@ def _residuals(d: ChartReadings, x: Floats, title: str, words: str) -> go.Figure
 
 
 def measured_predicted(story: Story, revision: StoryRevision) -> go.Figure:
-    """Draw what was measured over what is predicted, along the three base axes.
-
-    Deflections are drawn as they are; of absolute readings the deviation from the nominal arm.
-    Points on the diagonal are predicted exactly.
-    """
+    """Draw what was measured over what is predicted, less the nominal arm, along the base axes."""
     d = drawn(story, revision, most=500)  # three points each
     x, y = (1e6 * story.deviation(v) for v in (revision.predicted, story.measured))
     ends = np.array([min(x.min(), y.min()), max(x.max(), y.max())])
@@ -211,10 +203,7 @@ def measured_predicted(story: Story, revision: StoryRevision) -> go.Figure:
 def workspace(
     story: Story, revision: StoryRevision, plane: Literal["xy", "xz"] = "xy"
 ) -> go.Figure:
-    """Draw the target of each reading in base axes, marked by its level, with its residual.
-
-    `plane` is of the base's axes; "xy" is seen from above.
-    """
+    """Draw the target of each reading, by its level, with its residual; "xy" is seen from above."""
     d = drawn(story, revision, most=1000)
     axes = ["xyz".index(a) for a in plane]
     at, residual = story.anchor[d.index][:, axes], revision.residual[d.index][:, axes]
@@ -251,11 +240,7 @@ def magnification(largest_m: float) -> float:
 
 
 def added_variable(r: DependenceCurve, effect: str) -> go.Figure:
-    """Draw residual over regressor, both freed of what the model can do.
-
-    Where the suspect is right the points lie on the line of slope 1, where it explains nothing
-    around zero.
-    """
+    """Draw residual over regressor, both freed of what the model can do: slope 1 if it is right."""
     at = worst_and_even(np.abs(r.y), MOST)
     ends = np.array([r.x.min(), r.x.max()])
     slope = float(r.x @ r.y / max(float(r.x @ r.x), 1e-300))
@@ -305,10 +290,7 @@ def curve_chart(c: DependenceCurve) -> go.Figure:
 
 
 def parameter_correlations(fit: Fit) -> tuple[list[str], Floats]:
-    """Return names and correlations (K, K) of the identifiable parameters, formal ones.
-
-    Cov(θ) = T H⁻¹ Tᵀ, as in `identification.uncertainty`.
-    """
+    """Return names and correlations (K, K) of identifiable parameters: Cov(θ) = T H⁻¹ Tᵀ."""
     s = fit.solution
     covariance = s.transform @ s.equations.inverse(s.beta) @ s.transform.T
     names = [f"{e.name}.{p.name}" for e in fit.model.effects for p in e.parameters]
@@ -349,11 +331,7 @@ def correlations(fit: Fit) -> go.Figure:
 
 
 def noise_check(fit: Fit) -> go.Figure:
-    """Draw the histogram of the whitened residual with the standard normal density.
-
-    With n elements and p effective parameters the rms of the residual is sqrt(1 − p/n) where model
-    and noise are right; the density is that of this standard deviation.
-    """
+    """Draw the histogram of the whitened residual, and what noise leaves of it: N(0, 1 − p/n)."""
     white = fit.white[np.isfinite(fit.white)]
     reach = float(np.clip(np.ceil(np.quantile(np.abs(white), 0.995)), RANGE, WIDEST))
     edges, width = np.linspace(-reach, reach, BINS + 1, retstep=True)

@@ -48,8 +48,7 @@ UNDIAGNOSED = "not diagnosed"
 LITTLE = 0.2
 """Share of the predictable misfit that the first suspect must explain for its own chart to be
 shown, not those of the variables; a guess."""
-LEAST_CARRIED = 0.02
-"""Share of the misfit below which a variable is not shown; a guess."""
+LEAST_CARRIED = 0.02  # share of the misfit below which a variable is not shown; a guess
 MOST_SUSPECTS, MOST_PARAMETERS = 3, 40
 
 
@@ -305,10 +304,7 @@ def _revision(c: Chapter, e: FullPrediction, residual: Floats, measured: Floats)
 
 
 def follows(d: Diagnosis) -> DependenceCurve | None:
-    """Return what the residual follows: the first suspect, or the variable that carries most of it.
-
-    It is the variable where the suspect explains little of that; None where there is neither.
-    """
+    """Return what the residual follows: the first suspect, or the variable that carries most."""
     known = 0.0 if d.lead is None else d.lead.holdout_share
     explained = d.insufficiency is None and known >= LITTLE * d.predictable_share
     carried = [v for v in d.dependences if v.share >= LEAST_CARRIED and v.determined]

@@ -24,22 +24,13 @@ from hilcal.present.html.report import identity
 if TYPE_CHECKING:
     from hilcal.transfer.fleet import Fleet
 
-Named = tuple[str, str]
-"""Name and SHA-256 of a campaign's file."""
+Named = tuple[str, str]  # name and SHA-256 of a campaign's file
 
 
 def comparison_page(
     c: Comparison, files: tuple[Named, Named], operator: str, made: str, version: str
 ) -> str:
-    """Return the comparison as HTML.
-
-    Args:
-        c: the comparison.
-        files: of the earlier campaign and of the later one.
-        operator: who answers for the measurement; empty where nobody is named.
-        made: when the report was made, ISO 8601, UTC.
-        version: of the program.
-    """
+    """Return the comparison of an earlier and a later file as HTML; `made` is an ISO 8601 time."""
     (earlier, _), (later, _) = files
     arm = c.fit.model.cell.arm.name
     charts: list[Block] = [Chart("Error today, by pose", error_by_pose(c), wide=True, height=0)]

@@ -30,8 +30,7 @@ from hilcal.robot.body import body_poses
 from hilcal.store.plan import Step
 from hilcal.types import Floats
 
-PORTS = 20
-"""Ports that are tried, from the wanted one; a choice."""
+PORTS = 20  # ports that are tried, from the wanted one; a choice
 MEMORY = "256MiB"
 """What the server keeps for viewers that come late at most; a choice, some 5000 readings."""
 SHARE = 0.02
@@ -42,20 +41,17 @@ SIGMA_LENGTH, ARROW_CAP = 0.02, 0.4
 """One σ of a residual is drawn this long, and no arrow longer than that, m; choices."""
 BALL = SIGMA_LENGTH * style.BALL_SIGMAS
 """Radius of the ball that holds 99 % of the readings where the model is right, m."""
-LIMIT = style.BALL_SIGMAS / 3**0.5
-"""The same in the σ of a reading."""
+LIMIT = style.BALL_SIGMAS / 3**0.5  # the same in the σ of a reading
 ALARM = 0.001
 """Chance that noise alone leaves as many readings outside their balls as is called wrong."""
-WORST, REMARKS = 3, 3
-"""Readings, and remarks, that are listed."""
+WORST, REMARKS = 3, 3  # readings, and remarks, that are listed
 BALLS, MANY = 60, 300
 """Readings from which a ball, and an arrow, is drawn only where the arrow leaves its ball; choices,
 for legibility."""
 FLUENT = 1000
 """Residuals that a viewer draws one by one. Of 10,000 each of its pictures took 3.5 times the
 processor time of 100 (tests/benchmarks/test_viewer_speed.py); of this many some 1.2 times."""
-GROUPS = 150
-"""Groups that more of them are divided into: as many as a finished recording has bars."""
+GROUPS = 150  # groups that more of them are divided into: as many as a finished recording has bars
 TIMELINE = "time"
 RESIDUALS = "in σ: an arrow that leaves its noise ball = model wrong"
 IN_TIME = "in σ: grey noise, amber doubtful, red model wrong"
@@ -162,11 +158,7 @@ class LiveTally:
         return np.asarray(self.anchor[step.pose][target])
 
     def add(self, event: ReadingStored) -> list[tuple[int, LiveResidual, LiveJudgement | None]]:
-        """Take note of a reading.
-
-        Returns:
-            Each target that was read, with its residual; judged, or None without a model yet.
-        """
+        """Take note of a reading; returns each target's residual, judged where there is a model."""
         self.last, self.done, self.left = event, event.done, event.left_real
         read = ((event.target, event.live), *event.others)
         return [(k, live, self._judge(event.step, k, live)) for k, live in read]
@@ -291,10 +283,7 @@ class LiveScene:
             self._rec.log(f"{self._series}/limit", rr.Scalars(LIMIT))
 
     def end(self, to_open: bool) -> None:
-        """Tell the story once more, whole: its words know now which revision is the last.
-
-        `to_open`: let it open at the first revision, as a file does; else it stays at the last one.
-        """
+        """Tell the story once more, whole; `to_open`: at the first revision, as a file does."""
         self.settle()
         self._now = None
         if self._story is None:
@@ -447,14 +436,7 @@ def _balls(at: Sequence[Floats]) -> rr.Ellipsoids3D:
 
 
 def follow(messages: BinaryIO, reply: Callable[..., None], record: Path, port: int) -> None:
-    """Show what messages tell, until they end.
-
-    Args:
-        messages: pickled pairs of a time of day, s, and what happened; see `LiveScene`.
-        reply: told `url` when viewers can be served (None: they cannot), and each `problem`.
-        record: the recording; a file that is there is replaced.
-        port: the first to be tried, on the loopback interface only.
-    """
+    """Show what pickled (time of day, s; event) tell, in a file and at a free port from `port`."""
     identifier = str(uuid.uuid4())
     outlets = [_Outlet(identifier, reply, f"recording {record}", file=record)]
     with contextlib.suppress(OSError):
