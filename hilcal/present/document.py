@@ -146,10 +146,7 @@ def note(text: str) -> Words:
 
 
 def table(
-    *heads: str,
-    rows: Iterable[Sequence[str]] = (),
-    left: Sequence[int] = (0,),
-    caption: str = "",
+    *heads: str, rows: Iterable[Sequence[str]] = (), left: Sequence[int] = (0,), caption: str = ""
 ) -> Table:
     """Return a table with some rows."""
     return Table(heads, [tuple(row) for row in rows], tuple(left), caption)
