@@ -12,8 +12,8 @@ from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification.baseline import baseline
 from hilcal.identification.family_sizes import FamilySize
 from hilcal.identification.fit import fit
-from hilcal.present import chart_style as style
 from hilcal.present import charts
+from hilcal.present import charts as style
 from hilcal.present.charts import MOST_FAMILIES
 from hilcal.present.document import says
 from hilcal.present.story import LEVEL_NAMES, Chapter, build_story, of_left_out, regressor
