@@ -3,35 +3,29 @@
 import contextlib
 import ctypes
 import ctypes.util
+import functools
 import json
 import os
 import socket
-import struct
 import subprocess
 import tempfile
 import time
-import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
+from PIL import Image
 
-from hilcal.errors import HilcalError, InputError
 from hilcal.present.viewer.recording import executable
 
 if TYPE_CHECKING:
-    from rerun.experimental import ViewerClient, ViewerState
+    from rerun.experimental import ViewerClient
 
 _ICD_DIRS = ("/usr/share/vulkan/icd.d", "/usr/local/share/vulkan/icd.d", "/etc/vulkan/icd.d")
-_START_TIMEOUT = 60.0
-_LOAD_TIMEOUT = 120.0
-_SETTLE = 0.3
-_MISSING = (
-    "no Vulkan driver: pictures need the Vulkan loader and a driver; "
-    "on Debian install mesa-vulkan-drivers and libvulkan1"
-)
+_START_TIMEOUT, _LOAD_TIMEOUT, _SETTLE = 60.0, 120.0, 0.3
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,30 +49,14 @@ class ViewReport:
 def vulkan_available() -> bool:
     """Return whether the Vulkan loader and at least one driver description are installed."""
     named = os.environ.get("VK_DRIVER_FILES") or os.environ.get("VK_ICD_FILENAMES")
+    drivers = any(any(Path(d).glob("*.json")) for d in _ICD_DIRS)
     if named:
         drivers = any(Path(p).is_file() for p in named.split(os.pathsep))
-    else:
-        drivers = any(any(Path(d).glob("*.json")) for d in _ICD_DIRS)
-    if not drivers:
-        return False
     try:
         ctypes.CDLL(ctypes.util.find_library("vulkan") or "libvulkan.so.1")
     except OSError:
         return False
-    return True
-
-
-def picture(
-    rrd: Path,
-    png: Path,
-    timeline: str | None = None,
-    at: int | None = None,
-    view: str | None = None,
-    size: tuple[int, int] = (1920, 1080),
-    longest: int | None = None,
-) -> tuple[ViewReport, ...]:
-    """Draw a recording into one PNG file; see `pictures`."""
-    return pictures(rrd, [Shot(png, timeline, at, view)], size, longest)
+    return drivers
 
 
 def pictures(
@@ -89,23 +67,9 @@ def pictures(
 ) -> tuple[ViewReport, ...]:
     """Draw a recording into PNG files, one per shot, with one start of the viewer.
 
-    Args:
-        rrd: the recording.
-        shots: what to draw.
-        size: width and height of the window, points; the picture may have twice the pixels.
-        longest: longest side of the pictures, pixels; None for all pixels.
-
-    Returns:
-        The views, with what they reported; no problems in a sound recording.
-
-    Raises:
-        InputError: no such recording, timeline or view.
-        HilcalError: no Vulkan driver, or the viewer failed.
+    `size` is of the window, points; `longest` the longest side of the pictures, pixels. Returns the
+    views with what they reported: no problems in a sound recording.
     """
-    if not Path(rrd).is_file():
-        raise InputError(f"recording {rrd}: no such file")
-    if not vulkan_available():
-        raise HilcalError(_MISSING)
     problems: dict[str, set[str]] = {}
     with opened(rrd, size) as (viewer, _):
         for shot in shots:
@@ -119,54 +83,48 @@ def pictures(
 @contextlib.contextmanager
 def opened(rrd: Path, size: tuple[int, int]) -> Iterator[tuple["ViewerClient", int]]:
     """A headless viewer that has shown a recording, and the number of its process."""
+
+    def loaded() -> None:
+        state = viewer.get_state()
+        if not state.views or state.loading:
+            raise TimeoutError("the recording is not loaded")
+
     with _headless(size) as (viewer, process):
         viewer.open([str(Path(rrd).resolve())])
-        _wait_until_loaded(viewer)
-        _draw_first(viewer)
+        _until(loaded, _LOAD_TIMEOUT)
+        # the first picture compiles shaders and loads meshes: it may take its time
+        _until(lambda: viewer.take_screenshot(max_size=64), _LOAD_TIMEOUT)
         yield viewer, process
 
 
-def _draw_first(viewer: "ViewerClient") -> None:
-    """Draw the first picture, which compiles shaders and loads meshes: it may take its time."""
-    end = time.monotonic() + _LOAD_TIMEOUT
+def _until(do: Callable[[], T], seconds: float) -> T:
+    """Try until it works."""
+    end = time.monotonic() + seconds
     while True:
         try:
-            viewer.take_screenshot(max_size=64)
-        except TimeoutError:
+            return do()
+        except (OSError, RuntimeError):
             if time.monotonic() > end:
                 raise
-        else:
-            return
+            time.sleep(0.05)
 
 
 def _take(viewer: "ViewerClient", shot: Shot, longest: int | None) -> None:
-    state = viewer.get_state()
     if shot.timeline is not None:
-        names = [t.name for r in state.recordings for t in r.timelines]
-        if shot.timeline not in names:
-            raise InputError(
-                f"no timeline {shot.timeline!r}; the recording has {', '.join(sorted(names))}"
-            )
-        if shot.at is None:
-            viewer.set_time(shot.timeline, play_state="paused")
-        else:
-            viewer.set_time(shot.timeline, sequence=shot.at, play_state="paused")
+        at = {} if shot.at is None else {"sequence": shot.at}
+        viewer.set_time(shot.timeline, play_state="paused", **at)
         time.sleep(_SETTLE)
-        state = viewer.get_state()
     view_id = None
     if shot.view is not None:
-        view_id = next((v.view_id for v in state.views if v.name == shot.view), None)
-        if view_id is None:
-            names = [v.name for v in state.views if v.name]
-            raise InputError(f"no view {shot.view!r}; the recording has {', '.join(names)}")
-        _bring_forward(viewer, view_id)
-    Path(shot.png).write_bytes(viewer.take_screenshot(view_id, max_size=longest))
+        (view_id,) = (v.view_id for v in viewer.get_state().views if v.name == shot.view)
+        _bring_forward(viewer, f"/view/{view_id}")
+    shoot = functools.partial(viewer.take_screenshot, view_id, max_size=longest)
+    Path(shot.png).write_bytes(_until(shoot, _LOAD_TIMEOUT))
 
 
-def _bring_forward(viewer: "ViewerClient", view_id: str) -> None:
+def _bring_forward(viewer: "ViewerClient", path: str) -> None:
     """Make a view the active one of its tabs: only what is on the window is drawn."""
     parts = viewer.get_blueprint().blueprint
-    path = f"/view/{view_id}"
     for name, part in parts.items():
         container = part.get("ContainerBlueprint", {})
         if path in container.get("contents", ()) and container.get("active_tab", path) != path:
@@ -176,37 +134,31 @@ def _bring_forward(viewer: "ViewerClient", view_id: str) -> None:
             return
 
 
-def _wait_until_loaded(viewer: "ViewerClient") -> "ViewerState":
-    end = time.monotonic() + _LOAD_TIMEOUT
-    while True:
-        state = viewer.get_state()
-        if state.views and not state.loading:
-            return state
-        if time.monotonic() > end:
-            raise HilcalError(f"the viewer did not load the recording within {_LOAD_TIMEOUT:g} s")
-        time.sleep(0.05)
-
-
 @contextlib.contextmanager
 def _headless(size: tuple[int, int]) -> Iterator[tuple["ViewerClient", int]]:
     """Run a viewer of our own in a home of its own, with analytics off; end it afterwards."""
-    with tempfile.TemporaryDirectory(prefix="hilcal-picture-") as home, socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-        probe.close()
+    from rerun.experimental import ViewerClient
+
+    with tempfile.TemporaryDirectory(prefix="hilcal-picture-") as home:
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            port = probe.getsockname()[1]
+        command = [executable(), "--headless", "--hide-welcome-screen", "--bind", "127.0.0.1"]
+        command += ["--port", str(port), "--window-size", f"{size[0]}x{size[1]}"]
+
+        def connected() -> ViewerClient:
+            assert process.poll() is None, f"the viewer failed: {log.read_text(errors='replace')}"
+            socket.create_connection(("127.0.0.1", port), 0.2).close()
+            client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+            client.get_state()
+            return client
+
         log = Path(home, "viewer.log")
-        command = [executable(), "--headless", "--hide-welcome-screen"]
-        command += ["--bind", "127.0.0.1", "--port", str(port)]
-        command += ["--window-size", f"{size[0]}x{size[1]}"]
         with log.open("wb") as sink:
-            process = subprocess.Popen(
-                command, env=_environment(Path(home)), stdout=sink, stderr=subprocess.STDOUT
-            )
+            env = _environment(Path(home))
+            process = subprocess.Popen(command, env=env, stdout=sink, stderr=subprocess.STDOUT)
         try:
-            yield _connect(process, port), process.pid
-        except (ConnectionError, RuntimeError) as error:
-            tail = log.read_text(errors="replace").strip().splitlines()[-1:] or ["no message"]
-            raise HilcalError(f"the viewer failed: {error}; it said: {tail[0]}") from error
+            yield _until(connected, _START_TIMEOUT), process.pid
         finally:
             process.terminate()
             try:
@@ -216,82 +168,24 @@ def _headless(size: tuple[int, int]) -> Iterator[tuple["ViewerClient", int]]:
                 process.wait()
 
 
-def _connect(process: subprocess.Popen[bytes], port: int) -> "ViewerClient":
-    from rerun.experimental import ViewerClient
-
-    end = time.monotonic() + _START_TIMEOUT
-    while True:
-        if process.poll() is not None:
-            raise ConnectionError(f"it exited with status {process.returncode}")
-        try:
-            with socket.create_connection(("127.0.0.1", port), 0.2):
-                pass
-            client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
-            client.get_state()
-        except (OSError, RuntimeError) as error:
-            if time.monotonic() > end:
-                raise ConnectionError(f"it did not answer in {_START_TIMEOUT:g} s") from error
-            time.sleep(0.05)
-        else:
-            return client
-
-
 def _environment(home: Path) -> dict[str, str]:
-    config, run = home / "config", home / "run"
-    for folder in (config / "rerun", run):
-        folder.mkdir(parents=True, mode=0o700)
-    (config / "rerun" / "analytics.json").write_text(
-        json.dumps({"analytics_enabled": False, "analytics_id": "off", "metadata": {}})
-    )
+    for name in ("config/rerun", "run"):
+        (home / name).mkdir(parents=True, mode=0o700)
+    off = {"analytics_enabled": False, "analytics_id": "off", "metadata": {}}
+    (home / "config" / "rerun" / "analytics.json").write_text(json.dumps(off))
     env = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
     return env | {
         "HOME": str(home),
-        "XDG_CONFIG_HOME": str(config),
+        "XDG_CONFIG_HOME": str(home / "config"),
         "XDG_DATA_HOME": str(home / "data"),
         "XDG_CACHE_HOME": str(home / "cache"),
-        "XDG_RUNTIME_DIR": str(run),
+        "XDG_RUNTIME_DIR": str(home / "run"),
         "RUST_LOG": "error",  # warnings pop up over the picture
         "NO_COLOR": "1",
     }
 
 
 def pixels(png: Path) -> np.ndarray:
-    """Decode an 8-bit PNG without interlace into (height, width, channels)."""
-    data, at, body = png.read_bytes(), 8, b""
-    while at < len(data):
-        size, kind = struct.unpack(">I4s", data[at : at + 8])
-        chunk = data[at + 8 : at + 8 + size]
-        if kind == b"IHDR":
-            width, height, depth, color = struct.unpack(">IIBB", chunk[:10])
-        elif kind == b"IDAT":
-            body += chunk
-        at += size + 12
-    assert depth == 8
-    channels = {2: 3, 6: 4}[color]
-    raw = np.frombuffer(zlib.decompress(body), np.uint8).reshape(height, width * channels + 1)
-    out = np.zeros((height, width * channels), dtype=np.uint8)
-    above = np.zeros(width * channels, dtype=np.uint8)
-    for i, line in enumerate(raw):
-        above = out[i] = unfilter(int(line[0]), line[1:], above, channels)
-    return out.reshape(height, width, channels)
-
-
-def unfilter(kind: int, line: np.ndarray, above: np.ndarray, step: int) -> np.ndarray:
-    """Undo one PNG line filter."""
-    if kind == 0:
-        return line
-    if kind == 1:
-        return np.cumsum(line.reshape(-1, step), axis=0, dtype=np.uint8).reshape(-1)
-    if kind == 2:
-        return line + above
-    done = [0] * step
-    corner = [0] * step + above.tolist()
-    for k, (value, up) in enumerate(zip(line.tolist(), above.tolist(), strict=True)):
-        left, diagonal = done[k], corner[k]
-        if kind == 3:
-            guess = (left + up) // 2
-        else:
-            p = left + up - diagonal
-            guess = min((left, up, diagonal), key=lambda c: abs(p - c))
-        done.append((value + guess) & 255)
-    return np.array(done[step:], dtype=np.uint8)
+    """(height, width, 3) of a PNG."""
+    with Image.open(png) as image:
+        return np.asarray(image.convert("RGB"))
