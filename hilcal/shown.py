@@ -34,12 +34,11 @@ class Presenter(Protocol):
 
 def brief(value: Any) -> str:
     """Return a dataclass in at most `MOST_LINES` lines: what its `_brief` says, else its fields."""
-    told = getattr(value, "_brief", None)
-    if told is None:
-        found = {f.name: shortened(getattr(value, f.name)) for f in fields(value) if f.repr}
+    if (of := getattr(value, "_brief", None)) is not None:
+        texts = of()
     else:
-        found = told()
-    lines = [f"  {name}: {text}" for name, text in found.items()]
+        texts = {f.name: shortened(getattr(value, f.name)) for f in fields(value) if f.repr}
+    lines = [f"  {name}: {text}" for name, text in texts.items()]
     if len(lines) > MOST_LINES - 2:
         left = len(lines) - (MOST_LINES - 3)
         lines = [*lines[: MOST_LINES - 3], f"  ... and {left} more"]

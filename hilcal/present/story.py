@@ -273,7 +273,7 @@ def pose_numbers(names: Sequence[str]) -> Ints:
 def _revision(c: Chapter, e: FullPrediction, residual: Floats, measured: Floats) -> StoryRevision:
     d, named = c.diagnosis, f"Model: {model_name(c.fit.model.named)}."
     changed = change(c.added, c.removed, c.fit.readings.arm_scatter is not None)
-    told = UNDIAGNOSED if d is None else d.verdict
+    judged = UNDIAGNOSED if d is None else d.verdict
     drawn = None if d is None else follows(d)
     verdict: list[Block] = [f"{UNDIAGNOSED.capitalize()}: run hilcal diagnose for a verdict."]
     details: list[Block] = [misses(c.fit)]
@@ -286,13 +286,13 @@ def _revision(c: Chapter, e: FullPrediction, residual: Floats, measured: Floats)
     return StoryRevision(
         revision=c.number,
         change=changed,
-        verdict=told,
+        verdict=judged,
         residual=residual,
         predicted=measured - residual,
         whitened_norm2=mahalanobis2(e.raw[:, :3], e.whitening.covariance[:, :3, :3]),
         error=c.fit.error,
         holdout=c.fit.holdout,
-        cells=revision_cells(c.number, changed, c.fit, told),
+        cells=revision_cells(c.number, changed, c.fit, judged),
         panels={
             "verdict": (*verdict, named),
             "details": (*details, errors(c.fit)),

@@ -130,8 +130,8 @@ def serve(story: Story, ip: str = "127.0.0.1", port: int = PORT) -> Iterator[Ser
 def _opened(story: Story) -> rr.RecordingStream:
     arrays = (story.q, story.pose, story.anchor, story.measured, story.covariance)
     names = (story.arm.name, story.mode, story.load_names, story.pose_names)
-    told = [(r.revision, r.change, r.verdict, r.cells, r.panels) for r in story.revisions]
-    return recording.opened(names, *arrays, told, *(r.residual for r in story.revisions))
+    words = [(r.revision, r.change, r.verdict, r.cells, r.panels) for r in story.revisions]
+    return recording.opened(names, *arrays, words, *(r.residual for r in story.revisions))
 
 
 def tell(rec: rr.RecordingStream, story: Story) -> None:
@@ -327,13 +327,13 @@ def verdict(story: Story, r: StoryRevision) -> str:
 def details(story: Story, r: StoryRevision) -> str:
     """Return what the verdict rests on, as the terminal has it, and the worst reading."""
     outside, i = float(np.mean(r.level > 0)), worst(r)
-    told = (
+    words = (
         f"{numbers.percent(outside)} of readings are outside their 99 % noise ball (noise alone: "
         f"1 %). Worst: pose {story.pose_name(i)}, load {story.load_names[i]}, "
         f"{numbers.length(float(r.size_m[i]))} ({r.sigma[i]:.1f} σ)."
     )
     head = heading(f"Revision {r.revision}: {r.name}")
-    return style.markdown([head, told, *r.panels.get("details", ())])
+    return style.markdown([head, words, *r.panels.get("details", ())])
 
 
 def pose_cards(story: Story) -> list[str]:

@@ -114,7 +114,7 @@ def judged(step: Step, live: LiveResidual, target: str = "") -> LiveJudgement | 
 class LiveTally:
     """A campaign that is being measured."""
 
-    told: Measuring
+    measured: Measuring
     bodies: Floats  # (P, n + 2, 4, 4) poses of the arm's bodies at each pose of the plan
     anchor: dict[str, Floats]  # (T, 3) nominal positions of the targets by pose, base axes, m
     done: int = 0  # readings that are stored
@@ -129,23 +129,23 @@ class LiveTally:
     group_worst: float = 0.0  # largest `LiveJudgement.norm2` of the group that is being measured
 
     @classmethod
-    def of(cls, told: Measuring) -> "LiveTally":
+    def of(cls, measured: Measuring) -> "LiveTally":
         """Return that of a campaign that begins, or goes on."""
-        bodies = body_poses(told.arm, told.plan.q)
+        bodies = body_poses(measured.arm, measured.plan.q)
         flange = bodies[:, -1]
-        at = flange[:, None, :3, 3] + np.einsum("pij,tj->pti", flange[:, :3, :3], told.targets)
-        anchor = dict(zip(told.plan.pose_names, at, strict=True))
-        return cls(told, bodies, anchor, len({step for _, step in told.earlier}))
+        at = flange[:, None, :3, 3] + np.einsum("pij,tj->pti", flange[:, :3, :3], measured.targets)
+        anchor = dict(zip(measured.plan.pose_names, at, strict=True))
+        return cls(measured, bodies, anchor, len({step for _, step in measured.earlier}))
 
     @property
     def total(self) -> int:
         """Readings that are planned."""
-        return len(self.told.plan.steps)
+        return len(self.measured.plan.steps)
 
     @property
     def group(self) -> int:
         """Residuals, one after the other, of which a viewer keeps those that stand out; 1: all."""
-        planned = self.total * len(self.told.targets)
+        planned = self.total * len(self.measured.targets)
         return 1 if planned <= FLUENT else math.ceil(planned / GROUPS)
 
     @property
@@ -164,7 +164,7 @@ class LiveTally:
         return [(k, live, self._judge(event.step, k, live)) for k, live in read]
 
     def _judge(self, step: Step, target: int, live: LiveResidual) -> LiveJudgement | None:
-        j = judged(step, live, self.told.names[target] if self.told.names else "")
+        j = judged(step, live, self.measured.names[target] if self.measured.names else "")
         if j is None:
             return None
         begins, outside = self.judged % self.group == 0, int(j.level > 0)
@@ -218,7 +218,7 @@ def live_blueprint(d: LiveTally, world: str, series: str) -> rrb.Blueprint:
     ever, now = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()
     every = archetypes.VisibleTimeRanges(timeline=TIMELINE, start=ever, end=now)
     of = "Residual of each reading," if d.group == 1 else f"Worst of every {d.group} residuals,"
-    middle, size = style.center(d.targets, d.told.arm.reach)
+    middle, size = style.center(d.targets, d.measured.arm.reach)
     points = np.vstack([d.targets, d.bodies[0, :, :3, 3]])
     scene = style.view3d(
         "world",
@@ -305,12 +305,12 @@ class LiveScene:
     def _series(self) -> str:
         return f"live/{self._acts}"
 
-    def _measuring(self, wall: float, told: Measuring) -> None:
-        rec, d = self._rec, LiveTally.of(told)
+    def _measuring(self, wall: float, what: Measuring) -> None:
+        rec, d = self._rec, LiveTally.of(what)
         self._acts, self._now = self._acts + 1, d
-        rec.send_recording_name(f"hilcal: {style.safe(told.name)}")
+        rec.send_recording_name(f"hilcal: {style.safe(what.name)}")
         fixed(rec, "world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
-        self._arm = style.MovingArm(rec, f"{self._world}/arm", told.arm, told.targets)
+        self._arm = style.MovingArm(rec, f"{self._world}/arm", what.arm, what.targets)
         fixed(rec, "words/live_guide", style.document(GUIDE))
         planned = rr.Points3D(d.targets, colors=[style.GREY], radii=[0.006])
         fixed(rec, f"{self._world}/planned", planned)
@@ -318,8 +318,8 @@ class LiveScene:
             fixed(rec, f"{self._series}/{name}", style.series(name, color, 0.0, 4.0)[1])
         line = rr.SeriesLines(colors=[style.NOISE], widths=[1.5], names=["99 %"])
         fixed(rec, f"{self._series}/limit", line)
-        if told.earlier:  # what earlier sessions measured, as one batch
-            walls, steps = zip(*told.earlier, strict=True)
+        if what.earlier:  # what earlier sessions measured, as one batch
+            walls, steps = zip(*what.earlier, strict=True)
             dots = rr.Points3D.columns(
                 positions=[d.place(step) for step in steps],
                 colors=np.tile(np.array(style.MEASURED, dtype=np.uint8), (len(steps), 1)),
@@ -327,7 +327,7 @@ class LiveScene:
             )
             time = rr.TimeColumn(TIMELINE, timestamp=list(walls))
             along(rec, f"{self._world}/dots", time, dots)
-        self._passed.append((wall, tuple(told.plan.q[0].tolist())))
+        self._passed.append((wall, tuple(what.plan.q[0].tolist())))
         self._move()
         self._words(d)
         self._show(live_blueprint(d, self._world, self._series))
@@ -336,7 +336,7 @@ class LiveScene:
         """Send where the arm has been since the last time."""
         passed, self._passed, self._since = self._passed, [], 0
         if passed and self._arm is not None and self._now is not None:
-            bodies = body_poses(self._now.told.arm, np.array([q for _, q in passed]))
+            bodies = body_poses(self._now.measured.arm, np.array([q for _, q in passed]))
             self._arm.send(TIMELINE, [wall for wall, _ in passed], bodies)
 
     def _event(self, d: LiveTally, what: object) -> None:
@@ -472,7 +472,7 @@ class _Outlet:
         """Open it: a file that is read later, or a port."""
         self._reply, self._name, self._file = reply, name, file
         self._scene: LiveScene | None = None
-        self._told, self._written = 0, 0
+        self._drawn, self._written = 0, 0
         config = rr.ChunkBatcherConfig(flush_tick=timedelta(days=1)) if file else None
         self._rec = recording.stream(identifier, config)
         try:
@@ -497,11 +497,11 @@ class _Outlet:
             return
         try:
             draw(self._scene)
-            self._told += whole
-            little = self._told - self._written < max(1.0, SHARE * self._told)
+            self._drawn += whole
+            little = self._drawn - self._written < max(1.0, SHARE * self._drawn)
             if not whole or (self._file and little and not now):
                 return
-            self._written = self._told
+            self._written = self._drawn
             self._scene.settle()
         except (InputError, ValueError, IndexError, KeyError) as error:
             self._reply(problem=f"{self._name}: not drawn: {error}")
