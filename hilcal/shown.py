@@ -11,12 +11,9 @@ from typing import TYPE_CHECKING, Any, Protocol
 if TYPE_CHECKING:
     import pandas as pd
 
-MOST_LINES = 15
-"""Lines of a `repr`."""
-WIDTH = 70
-"""Characters of a value in it; longer ones are named by type and size."""
-FEW = 7
-"""Numbers of an array that are written out."""
+MOST_LINES = 15  # lines of a `repr`
+WIDTH = 70  # characters of a value in it; longer ones are named by type and size
+FEW = 7  # numbers of an array that are written out
 
 
 class Presenter(Protocol):
@@ -37,12 +34,11 @@ class Presenter(Protocol):
 
 def brief(value: Any) -> str:
     """Return a dataclass in at most `MOST_LINES` lines: what its `_brief` says, else its fields."""
-    told = getattr(value, "_brief", None)
-    if told is None:
-        found = {f.name: shortened(getattr(value, f.name)) for f in fields(value) if f.repr}
+    if (of := getattr(value, "_brief", None)) is not None:
+        texts = of()
     else:
-        found = told()
-    lines = [f"  {name}: {text}" for name, text in found.items()]
+        texts = {f.name: shortened(getattr(value, f.name)) for f in fields(value) if f.repr}
+    lines = [f"  {name}: {text}" for name, text in texts.items()]
     if len(lines) > MOST_LINES - 2:
         left = len(lines) - (MOST_LINES - 3)
         lines = [*lines[: MOST_LINES - 3], f"  ... and {left} more"]

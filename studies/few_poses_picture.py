@@ -8,7 +8,7 @@ from pathlib import Path
 import plotly.graph_objects as go
 
 from hilcal.errors import InputError
-from hilcal.present.chart_style import GREY, HOLDOUT, LIGHT, MEASURED, figure
+from hilcal.present.charts import GREY, HOLDOUT, LIGHT, MEASURED, figure
 from studies.few_poses_command import SKETCH_MM
 from studies.picture import HEIGHT, WIDTH
 

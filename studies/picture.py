@@ -9,7 +9,7 @@ import plotly.graph_objects as go
 from plotly.offline import get_plotlyjs
 
 from hilcal.errors import InputError
-from hilcal.present.chart_style import LIGHT
+from hilcal.present.charts import LIGHT
 
 WIDTH, HEIGHT = 720, 400
 """CSS pixels, where a figure says nothing else."""

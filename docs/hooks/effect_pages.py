@@ -15,7 +15,7 @@ from hilcal.cli import main
 from hilcal.effects.catalogue import BUILT_IN
 from hilcal.effects.protocol import Effect, Parameter
 from hilcal.numbers import unit_for
-from hilcal.present.chart_style import template
+from hilcal.present.charts import template
 from studies.picture import svgs
 
 PICTURE = (

@@ -21,7 +21,7 @@ from hilcal.effects.check import ROBOT, example_cell
 from hilcal.effects.protocol import Effect, Parameter
 from hilcal.model.model import Model
 from hilcal.numbers import unit_for
-from hilcal.present.chart_style import AMBER, HOLDOUT, MEASURED, NOISE, template
+from hilcal.present.charts import AMBER, HOLDOUT, MEASURED, NOISE, template
 from hilcal.readings.readings import States
 from hilcal.types import Floats
 

@@ -39,12 +39,10 @@ COMPUTER = partial(Finding, "computer")
 PROGRAM = partial(Finding, "program")
 LEAST_FREE = 1e9
 """Free space below which a campaign may fill the disk, bytes: its recordings take up to 0.1 GB."""
-SLOW_WRITE = 0.1
-"""Durable write that makes a campaign slow, s: a reading takes about a second."""
+SLOW_WRITE = 0.1  # durable write that makes a campaign slow, s: a reading takes about a second
 LEAST_MEMORY = 2e9
 """Memory below which large campaigns do not fit, bytes (12,000 readings took 1.84 GB)."""
-FIRST_DAY = datetime(2026, 1, 1).astimezone()
-"""A clock before this day has never been set."""
+FIRST_DAY = datetime(2026, 1, 1).astimezone()  # A clock before this day has never been set
 ON_NETWORK = ("nfs", "nfs4", "cifs", "smb3", "9p", "fuse.sshfs")
 """File systems on which SQLite's locks are not to be relied on (SQLite FAQ, question 5)."""
 _TIME_ERROR, _WRITES = 5, 9

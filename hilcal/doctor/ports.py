@@ -28,8 +28,7 @@ MEDDLERS = {
 """Services that open adapters of others."""
 SECONDS = 1.0
 """How long an answer may take, s. A choice: on a cell's own network it takes a millisecond."""
-SLOW = 0.02
-"""Time of connecting that a controller in the same room never needs, s. A choice."""
+SLOW = 0.02  # time of connecting that a controller in the same room never needs, s. A choice
 
 
 @dataclass(frozen=True, slots=True)

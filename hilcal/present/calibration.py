@@ -64,10 +64,8 @@ DOES: Mapping[str, str] = {
     "seconds",
 }
 """Steps that compute, and how long they take for a campaign of some hundred readings."""
-MOST_LEFT, LISTED = 6, 12
-"""Points without a correction, and points, that are listed."""
-MOST, WORST = 4, 6
-"""Variables, and poses, that are listed."""
+MOST_LEFT, LISTED = 6, 12  # points without a correction, and points, that are listed
+MOST, WORST = 4, 6  # variables, and poses, that are listed
 DOUBTED = 1.5
 """Error over the stated standard deviation from which the statement is called too small."""
 WIDER = 1.5
@@ -262,10 +260,7 @@ def _outside(o: Outside, k: int) -> str:
 def compensation_report(
     calibration: Calibration, names: Sequence[str], before: Floats, c: Compensation
 ) -> Iterator[Block]:
-    """Yield the summary and the points with the largest corrections.
-
-    `before` (N, n) are the joint values that were given for the points of these names.
-    """
+    """Yield the summary and the points with the largest corrections, of given values (N, n)."""
     now, later = c.before.error_m, c.after.band_m
     expected = length(float(np.sqrt(np.mean(c.after.std_m**2))))
     asked = "the unloaded arm" if calibration.mode == "deflection" else "the nominal arm"

@@ -303,10 +303,7 @@ def event_words(e: Mapping[str, Any]) -> str:
 
 
 def _revisions_tables(o: Overview) -> Iterator[Block]:
-    """Yield the revisions of each kind of readings, whose errors do not compare, as a table.
-
-    An arrow marks the one in use.
-    """
+    """Yield a table of each kind of readings, whose errors do not compare; → is the one in use."""
     kinds = dict.fromkeys(str(r.options["readings"]) for r in o.revisions)
     branched = any(r.made_from not in (None, r.number - 1) for r in o.revisions)
     first = ("rev.", "from", "model") if branched else ("rev.", "model")
@@ -348,10 +345,7 @@ def utc(time: str) -> str:
 
 
 def two_revisions(a: RevisionRecord, b: RevisionRecord) -> Table:
-    """Return model, cell, verdict, errors and parameters of two revisions, as they were stored.
-
-    The difference, second minus first, is empty where they agree.
-    """
+    """Return two revisions as they were stored, and the difference, second minus first, if any."""
     heads = ("", f"revision {a.number}", f"revision {b.number}", "difference")
     out = table(*heads, left=(0, 1, 2, 3))
 

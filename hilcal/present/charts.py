@@ -1,32 +1,55 @@
-"""Charts of fits, diagnoses, comparisons and stories; each a pure function of such values."""
+"""Charts of fits, diagnoses and stories, pure functions of such values; what all charts share.
 
+The colours are those of the viewer (Okabe and Ito's, which colour-blind people tell apart), darker
+or lighter where that is needed for a contrast of 3 : 1 on both papers (WCAG 2.2, 1.4.11). No chart
+tells anything by colour alone.
+"""
+
+import html
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 import plotly.graph_objects as go
-from scipy.stats import norm
+from scipy.stats import chi2, norm
 
 from hilcal import numbers
-from hilcal.diagnosis.comparison import Comparison
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.effect_ranking import LEAST_SHARE
 from hilcal.identification.family_sizes import FamilySize
 from hilcal.identification.fit import Fit
-from hilcal.present import chart_style as style
-from hilcal.present.comparison import FAR, words_of
+from hilcal.names import escaped
 from hilcal.present.document import load_name
 from hilcal.present.fit import CERTAIN, follows
-from hilcal.present.story import LEVEL_NAMES, DependenceCurve, Story, StoryRevision, worst_and_even
+from hilcal.present.story import (
+    LEVEL_NAMES,
+    LIMITS,
+    DependenceCurve,
+    Story,
+    StoryRevision,
+    worst_and_even,
+)
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Bools, Floats, Ints
 
-if TYPE_CHECKING:
-    from hilcal.transfer.pooled import Pooled
-
-MOST = 1500
-"""Points that a chart draws; a choice by the size of the page, 8 MB."""
+MEASURED = "#3a96d0"
+NOISE = "#009e73"
+HOLDOUT = "#cc79a7"
+GREY = "#888b94"
+AMBER = "#c07f00"
+RED = "#e0325c"
+LIGHT, DARK = "#ffffff", "#15171c"
+"""The papers that charts are drawn on."""
+LEVELS = (GREY, AMBER, RED)
+SYMBOLS = ("circle", "diamond", "x")
+"""Marks of the levels, so that they are told apart without colours."""
+CONFIG: dict[str, object] = {"displayModeBar": False, "responsive": True, "scrollZoom": False}
+"""Options for plotly.js: no toolbar, and the wheel scrolls the page."""
+SIGMA_LIMITS = np.sqrt(chi2.ppf(LIMITS, 3)).tolist()
+"""Mahalanobis distances from which a reading is doubtful, and outside."""
+_INK = {False: ("#24272e", "#d9dbe0"), True: ("#e4e5e9", "#3b3f48")}
+MOST = 1500  # points that a chart draws; a choice by the size of the page, 8 MB
 MOST_POSES, LONGEST_NAME = 16, 12
 """Poses up to which all their names stand at the axis, and characters of such a name; choices."""
 LONGEST, MOST_ARROWS = 0.25, 300
@@ -35,6 +58,115 @@ MOST_VARIABLES, MOST_CORRELATED, MOST_FAMILIES = 12, 30, 16
 RANGE, WIDEST, BINS = 5.0, 50.0, 40
 """Least and largest range of the histogram, σ; what lies beyond is counted in its last bins."""
 _NICE = (1.0, 2.0, 5.0)
+
+
+def template(dark: bool) -> go.layout.Template:
+    """Return the look of charts on a light or dark page: transparent paper, quiet grid."""
+    ink, grid = _INK[dark]
+    axis = {
+        **dict.fromkeys(("gridcolor", "linecolor", "zerolinecolor"), grid),
+        "automargin": True,
+        "autotickangles": [0, 90],
+        "title": {"standoff": 8, "font": {"size": 12}},
+        "ticks": "",
+    }
+    layout = go.Layout(
+        font={"color": ink, "family": "system-ui, sans-serif", "size": 13},
+        paper_bgcolor="rgba(0,0,0,0)",
+        plot_bgcolor="rgba(0,0,0,0)",
+        xaxis={**axis, "ticklabelstandoff": 8},  # off the labels of the other axis
+        yaxis=axis,
+        hoverlabel={"align": "left", "bgcolor": DARK if dark else LIGHT, "font": {"color": ink}},
+        legend={"orientation": "h", "y": 1.02, "yanchor": "bottom", "x": 0, "font": {"size": 12}},
+        hovermode="closest",
+        margin={"l": 10, "r": 10, "t": 30, "b": 10},
+    )
+    return go.layout.Template(layout=layout)
+
+
+def figure(
+    says: str,
+    x: str = "",
+    y: str = "",
+    height: int = 360,
+    traces: Sequence[object] = (),
+    **layout: object,
+) -> go.Figure:
+    """Return a figure in the light scheme, `height` CSS pixels high and as wide as the page.
+
+    `says` is the sentence that it shows; `x` and `y` are the titles of the axes, with their units.
+    """
+    out = go.Figure(data=list(traces))
+    out.update_layout(template=template(False), height=height, meta={"says": escaped(says)})
+    out.update_layout(xaxis={"title": {"text": x}}, yaxis={"title": {"text": y}})
+    out.update_layout(**layout)
+    return out
+
+
+def line(
+    x: Floats, y: Floats, name: str = "", color: str = NOISE, dash: str = "solid"
+) -> go.Scatter:
+    """Return a line that tells nothing when it is pointed at."""
+    look = {"color": color, "width": 2, "dash": dash}
+    more = {"name": name, "showlegend": bool(name), "hoverinfo": "skip"}
+    return go.Scatter(x=single(x), y=single(y), mode="lines", line=look, **more)
+
+
+def marks(
+    x: object, y: object, color: str = MEASURED, symbol: str = "circle", size: int = 6, **more: Any
+) -> go.Scatter:
+    """Return points, at numbers or names; `more` is their name and what they tell."""
+    x, y = (single(v) if isinstance(v, np.ndarray) else v for v in (x, y))
+    marker = {"color": color, "symbol": symbol, "size": size}
+    return go.Scatter(**{"x": x, "y": y, "mode": "markers", "marker": marker, **more})
+
+
+def bar(
+    values: Sequence[float], names: Sequence[str], color: object, text: Sequence[str], **more: Any
+) -> go.Bar:
+    """Return horizontal bars with a text each."""
+    look = {"orientation": "h", "textposition": "auto", "marker": {"color": color}}
+    return go.Bar(x=list(values), y=list(names), text=list(text), **look, **more)
+
+
+def bars(
+    names: Sequence[str],
+    values: Sequence[float],
+    hover: Sequence[str],
+    says: str,
+    x: str,
+    colors: Sequence[str] | str = MEASURED,
+) -> go.Figure:
+    """Draw horizontal bars, the first on top, each with its value in two digits."""
+    more = {"hovertext": [label(h) for h in hover], "hoverinfo": "text", "showlegend": False}
+    formats = ((v, ".0f" if abs(v) >= 10 else ".2g") for v in values)
+    text = ["0" if abs(v) < 0.005 else format(v, how) for v, how in formats]
+    trace = bar(values, [label(n) for n in names], colors, text, **more)
+    out = figure(says, x=x, traces=[trace], height=90 + 28 * len(names))
+    out.update_yaxes(autorange="reversed")
+    return out
+
+
+def label(words: str) -> str:
+    """Return words without a meaning in the HTML that plotly takes for labels."""
+    return html.escape(escaped(words), quote=False)
+
+
+def in_scheme(chart: go.Figure, dark: bool) -> go.Figure:
+    """Return a copy of a chart for a light or dark page."""
+    return go.Figure(chart).update_layout(template=template(dark))
+
+
+def empty(words: str) -> go.Figure:
+    """Return a chart of nothing that says why."""
+    note = {"text": words, "showarrow": False, "xref": "paper", "yref": "paper", "x": 0.5, "y": 0.5}
+    hidden = {"visible": False}
+    return figure(words, height=160, annotations=[note], xaxis=hidden, yaxis=hidden)
+
+
+def single(values: Floats) -> Floats:
+    """Return numbers as they are drawn: single precision makes pages half as large."""
+    return np.asarray(values, dtype=np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,14 +207,14 @@ class ChartReadings:
             if story.target is not None and len(story.target_names) > 1:
                 words += f", {story.target_names[int(story.target[i])]}"
             distance = f"{numbers.length(float(size[i]))}, {sigma[i]:.1f} σ"
-            out.append(f"{style.label(words)}: {distance}")
+            out.append(f"{label(words)}: {distance}")
         return out
 
     def marks(self, x: Floats, y: Floats, level: int, mine: Bools, **more: Any) -> go.Scatter:
         """Return some (K,) as points of a level at x, y (K,)."""
-        at = x[mine], y[mine], style.LEVELS[level], style.SYMBOLS[level]
+        at = x[mine], y[mine], LEVELS[level], SYMBOLS[level]
         more |= {"name": LEVEL_NAMES[level], "text": self.named(mine)}
-        return style.marks(*at, **more, hovertemplate="%{text}<extra></extra>")
+        return marks(*at, **more, hovertemplate="%{text}<extra></extra>")
 
 
 def drawn(story: Story, revision: StoryRevision, most: int = MOST) -> ChartReadings:
@@ -95,7 +227,7 @@ def residual_by_pose(story: Story, revision: StoryRevision) -> go.Figure:
     d, full = drawn(story, revision), [story.pose_name(int(i)) for i in story.first]
     out = _residuals(d, story.row[d.index].astype(float), "", _by(story, revision, "pose"))
     short = [n if len(n) <= LONGEST_NAME else f"…{n[1 - LONGEST_NAME :]}" for n in full]
-    names, step = [style.label(n) for n in short], -(-len(full) // MOST_POSES)
+    names, step = [label(n) for n in short], -(-len(full) // MOST_POSES)
     return out.update_xaxes(tickvals=list(range(0, len(names), step)), ticktext=names[::step])
 
 
@@ -107,17 +239,14 @@ def residual_by_load(story: Story, revision: StoryRevision) -> go.Figure:
     # beside each other within a load, so that points do not hide each other
     beside = np.random.default_rng(0).uniform(-0.3, 0.3, len(of))
     out = _residuals(d, (of + beside)[d.index], "load", _by(story, revision, "load"))
-    names = [style.label(load_name(name)) for name in loads]
+    names = [label(load_name(name)) for name in loads]
     return out.update_xaxes(tickvals=list(range(len(names))), ticktext=names)
 
 
 def residual_over(
     story: Story, revision: StoryRevision, values: Floats, name: str, unit: str
 ) -> go.Figure:
-    """Draw the residual of each reading in σ over a variable.
-
-    `values` (N,) are in units for people, NaN where not known; `unit` is "" for a pure number.
-    """
+    """Draw residuals in σ over values (N,) in a unit for people, NaN where not known."""
     d = drawn(story, revision)
     known = np.isfinite(values)
     x = np.where(known, values, np.median(values[known]) if known.any() else 0.0)
@@ -172,31 +301,27 @@ def _by(story: Story, revision: StoryRevision, what: str) -> str:
 def _residuals(d: ChartReadings, x: Floats, title: str, words: str) -> go.Figure:
     """Draw residuals over x (K,); each point carries the number of its reading."""
     traces = [d.marks(x, d.sigma, k, mine, customdata=d.index[mine]) for k, mine in d.by_level()]
-    out = style.figure(words + d.note, x=title, y="residual [σ]", traces=traces, height=320)
-    for limit, color in zip(style.SIGMA_LIMITS, (style.AMBER, style.RED), strict=True):
+    out = figure(words + d.note, x=title, y="residual [σ]", traces=traces, height=320)
+    for limit, color in zip(SIGMA_LIMITS, (AMBER, RED), strict=True):
         out.add_hline(limit, line={"color": color, "dash": "dot", "width": 1})
     return out.update_yaxes(rangemode="tozero")
 
 
 def measured_predicted(story: Story, revision: StoryRevision) -> go.Figure:
-    """Draw what was measured over what is predicted, along the three base axes.
-
-    Deflections are drawn as they are; of absolute readings the deviation from the nominal arm.
-    Points on the diagonal are predicted exactly.
-    """
+    """Draw what was measured over what is predicted, less the nominal arm, along the base axes."""
     d = drawn(story, revision, most=500)  # three points each
     x, y = (1e6 * story.deviation(v) for v in (revision.predicted, story.measured))
     ends = np.array([min(x.min(), y.min()), max(x.max(), y.max())])
-    traces: list[object] = [style.line(ends, ends, "exact", dash="dash")]
-    colors = (style.MEASURED, style.HOLDOUT, style.AMBER)
+    traces: list[object] = [line(ends, ends, "exact", dash="dash")]
+    colors = (MEASURED, HOLDOUT, AMBER)
     for k, (axis, color) in enumerate(zip("xyz", colors, strict=True)):
         values = "measured %{y:.1f} µm, predicted %{x:.1f} µm<extra></extra>"
         more: dict[str, Any] = {
             "text": d.named(),
             "hovertemplate": f"%{{text}}<br>{axis}: {values}",
         }
-        at = (x[d.index, k], y[d.index, k], color, style.SYMBOLS[k])
-        traces.append(style.marks(*at, name=f"base {axis}", **more))
+        at = (x[d.index, k], y[d.index, k], color, SYMBOLS[k])
+        traces.append(marks(*at, name=f"base {axis}", **more))
     what = "deflection" if story.mode == "deflection" else "deviation from the nominal arm"
     total = np.sum((y - y.mean(axis=0)) ** 2)
     share = 100 * (1 - np.sum((y - x) ** 2) / total) if total > 0 else 0.0
@@ -205,16 +330,13 @@ def measured_predicted(story: Story, revision: StoryRevision) -> go.Figure:
         f"measured.{d.note}"
     )
     titles = {k: f"{v} {what.split()[0]} [µm]" for k, v in (("x", "predicted"), ("y", "measured"))}
-    return style.figure(says, **titles, traces=traces, height=420)
+    return figure(says, **titles, traces=traces, height=420)
 
 
 def workspace(
     story: Story, revision: StoryRevision, plane: Literal["xy", "xz"] = "xy"
 ) -> go.Figure:
-    """Draw the target of each reading in base axes, marked by its level, with its residual.
-
-    `plane` is of the base's axes; "xy" is seen from above.
-    """
+    """Draw the target of each reading, by its level, with its residual; "xy" is seen from above."""
     d = drawn(story, revision, most=1000)
     axes = ["xyz".index(a) for a in plane]
     at, residual = story.anchor[d.index][:, axes], revision.residual[d.index][:, axes]
@@ -226,9 +348,9 @@ def workspace(
         start, end = at[worst], at[worst] + times * residual[worst]
         gap = np.full_like(start, np.nan)  # between one line and the next
         lines = np.stack([start, end, gap], axis=1).reshape(-1, 2)
-        traces.append(style.line(lines[:, 0], lines[:, 1], color=style.LEVELS[k]))
+        traces.append(line(lines[:, 0], lines[:, 1], color=LEVELS[k]))
         traces.append(d.marks(at[:, 0], at[:, 1], k, mine, size=5, showlegend=False))
-    outside = int((revision.level == len(style.LEVELS) - 1).sum())
+    outside = int((revision.level == len(LEVELS) - 1).sum())
     says = (
         f"Targets with their errors, {times:g} times enlarged: {outside} of {len(story)} readings "
         f"are outside the noise (crosses, red); the largest error is "
@@ -236,7 +358,7 @@ def workspace(
     )
     says = "The same from the side." if plane == "xz" else says
     x, y = (f"base {a} [m]" for a in plane)
-    out = style.figure(says, x=x, y=y, traces=traces, height=280)
+    out = figure(says, x=x, y=y, traces=traces, height=280)
     out.update_yaxes(scaleanchor="x", constrain="domain")
     return out.update_xaxes(constrain="domain")
 
@@ -251,64 +373,57 @@ def magnification(largest_m: float) -> float:
 
 
 def added_variable(r: DependenceCurve, effect: str) -> go.Figure:
-    """Draw residual over regressor, both freed of what the model can do.
-
-    Where the suspect is right the points lie on the line of slope 1, where it explains nothing
-    around zero.
-    """
+    """Draw residual over regressor, both freed of what the model can do: slope 1 if it is right."""
     at = worst_and_even(np.abs(r.y), MOST)
     ends = np.array([r.x.min(), r.x.max()])
     slope = float(r.x @ r.y / max(float(r.x @ r.x), 1e-300))
     hover = "would explain %{x:.1f}, residual %{y:.1f}<extra></extra>"
     traces = [
-        style.marks(r.x[at], r.y[at], name="readings", size=5, hovertemplate=hover),
-        style.line(ends, ends, "if it is right: slope 1", dash="dash"),
-        style.line(ends, slope * ends, f"found: slope {slope:.2f}", style.RED),
+        marks(r.x[at], r.y[at], name="readings", size=5, hovertemplate=hover),
+        line(ends, ends, "if it is right: slope 1", dash="dash"),
+        line(ends, slope * ends, f"found: slope {slope:.2f}", RED),
     ]
     note = "" if len(at) == len(r.x) else f" Of {len(r.x)} points {len(at)} are drawn."
     says = (
         f"Residual against what {effect} would explain: slope {slope:.2f}, where 1 means that it "
         f"is right and 0 that it explains nothing.{note}"
     )
-    return style.figure(says, x="it would explain [µm]", y=r.y_label, traces=traces, height=340)
+    return figure(says, x="it would explain [µm]", y=r.y_label, traces=traces, height=340)
 
 
 def misfit_shares(d: Diagnosis) -> go.Figure:
     """Draw the share of the misfit that follows each recorded variable, the largest on top."""
     rows = [v for v in d.misfit_breakdown if v.share >= LEAST_SHARE][:MOST_VARIABLES]
     if not rows:
-        return style.empty("The misfit follows no recorded variable.")
+        return empty("The misfit follows no recorded variable.")
     shares, names = [100 * v.share for v in rows], [v.variable for v in rows]
     hover = [f"{v.variable}: {100 * v.share:.0f} %, {numbers.p_equals(v.p_value)}" for v in rows]
-    colors = [style.MEASURED if v.p_value < CERTAIN else style.GREY for v in rows]
+    colors = [MEASURED if v.p_value < CERTAIN else GREY for v in rows]
     says = f"{follows(d.misfit_breakdown)} Grey bars are within chance."
-    return style.bars(names, shares, hover, says, "share of the misfit [%]", colors)
+    return bars(names, shares, hover, says, "share of the misfit [%]", colors)
 
 
 def curve_chart(c: DependenceCurve) -> go.Figure:
     """Draw means over a variable with standard uncertainties, and the law, where there is one."""
-    points = style.marks(
-        [style.label(n) for n in c.names] if c.names else c.x,
+    points = marks(
+        [label(n) for n in c.names] if c.names else c.x,
         c.y,
         size=8,
-        error_y={"type": "data", "array": c.error, "color": style.GREY},
+        error_y={"type": "data", "array": c.error, "color": GREY},
         mode="markers" if c.names or c.line is not None else "lines+markers",
-        line={"color": style.MEASURED},
+        line={"color": MEASURED},
         name="readings, mean ± standard uncertainty",
         hovertemplate="%{x}: %{y:.3g} ± %{error_y.array:.2g}<extra></extra>",
         showlegend=c.line is not None,
     )
     says = f"{c.y_label} over {c.x_label}, from {c.y.min():.3g} to {c.y.max():.3g}; {c.says}"
-    traces = [points] if c.line is None else [style.line(c.line[0], c.line[1], "law"), points]
-    x, y = style.label(c.x_label), style.label(c.y_label)
-    return style.figure(says, x=x, y=y, traces=traces, height=320)
+    traces = [points] if c.line is None else [line(c.line[0], c.line[1], "law"), points]
+    x, y = label(c.x_label), label(c.y_label)
+    return figure(says, x=x, y=y, traces=traces, height=320)
 
 
 def parameter_correlations(fit: Fit) -> tuple[list[str], Floats]:
-    """Return names and correlations (K, K) of the identifiable parameters, formal ones.
-
-    Cov(θ) = T H⁻¹ Tᵀ, as in `identification.uncertainty`.
-    """
+    """Return names and correlations (K, K) of identifiable parameters: Cov(θ) = T H⁻¹ Tᵀ."""
     s = fit.solution
     covariance = s.transform @ s.equations.inverse(s.beta) @ s.transform.T
     names = [f"{e.name}.{p.name}" for e in fit.model.effects for p in e.parameters]
@@ -322,7 +437,7 @@ def correlations(fit: Fit) -> go.Figure:
     """Draw the correlations of the identifiable parameters; of many, those of the strongest."""
     names, of = parameter_correlations(fit)
     if len(names) < 2:
-        return style.empty("Fewer than two parameters are identifiable: nothing is correlated.")
+        return empty("Fewer than two parameters are identifiable: nothing is correlated.")
     away = np.abs(of - np.diag(np.diag(of)))
     i, j = np.unravel_index(int(np.argmax(away)), away.shape)
     says = (
@@ -332,28 +447,24 @@ def correlations(fit: Fit) -> go.Figure:
     some: Ints = np.sort(np.argsort(-away.max(axis=1), kind="stable")[:MOST_CORRELATED])
     if len(some) < len(names):
         says += f" The {len(some)} most correlated of {len(names)} parameters are drawn."
-    shown = [style.label(names[k]) for k in some]
+    shown = [label(names[k]) for k in some]
     trace = go.Heatmap(
-        z=style.drawn(of[np.ix_(some, some)]),
+        z=single(of[np.ix_(some, some)]),
         y=shown,
         hovertext=[[f"{a}<br>{b}" for a in shown] for b in shown],
         zmin=-1,
         zmax=1,
-        colorscale=[[0, style.RED], [0.5, "rgba(136,139,148,0.08)"], [1, style.MEASURED]],
+        colorscale=[[0, RED], [0.5, "rgba(136,139,148,0.08)"], [1, MEASURED]],
         hovertemplate="%{hovertext}<br>%{z:+.2f}<extra></extra>",
         colorbar={"title": {"text": "correlation"}, "thickness": 12},
     )
-    out = style.figure(says, traces=[trace], height=100 + 16 * len(some))
+    out = figure(says, traces=[trace], height=100 + 16 * len(some))
     out.update_yaxes(autorange="reversed", tickfont={"size": 10})
     return out.update_xaxes(showticklabels=False)
 
 
 def noise_check(fit: Fit) -> go.Figure:
-    """Draw the histogram of the whitened residual with the standard normal density.
-
-    With n elements and p effective parameters the rms of the residual is sqrt(1 − p/n) where model
-    and noise are right; the density is that of this standard deviation.
-    """
+    """Draw the histogram of the whitened residual, and what noise leaves of it: N(0, 1 − p/n)."""
     white = fit.white[np.isfinite(fit.white)]
     reach = float(np.clip(np.ceil(np.quantile(np.abs(white), 0.995)), RANGE, WIDEST))
     edges, width = np.linspace(-reach, reach, BINS + 1, retstep=True)
@@ -361,11 +472,11 @@ def noise_check(fit: Fit) -> go.Figure:
     expected = np.sqrt(min(fit.dof / max(len(white), 1), 1.0))
     fine = np.linspace(-reach, reach, 401)
     density = len(white) * width * norm.pdf(fine, scale=max(expected, 1e-9))
-    look = {"width": 0.9 * width, "name": "measured", "marker": {"color": style.MEASURED}}
+    look = {"width": 0.9 * width, "name": "measured", "marker": {"color": MEASURED}}
     hover = "%{x:.2f} σ: %{y} elements<extra></extra>"
     traces = [
         go.Bar(x=0.5 * (edges[1:] + edges[:-1]), y=counts, hovertemplate=hover, **look),
-        style.line(fine, density, "the stated noise"),
+        line(fine, density, "the stated noise"),
     ]
     factor, (low, high) = fit.variance_factor, fit.variance_factor_interval
     fits = f"the residual is {'larger' if factor > 1 else 'smaller'} than the stated noise"
@@ -377,23 +488,23 @@ def noise_check(fit: Fit) -> go.Figure:
         f"{beyond} of {len(white)} elements are beyond {RANGE:.0f} σ."
     )
     titles = {"x": "whitened residual [σ]", "y": "number of elements"}
-    return style.figure(says, **titles, traces=traces, height=320)
+    return figure(says, **titles, traces=traces, height=320)
 
 
 def error_per_revision(story: Story) -> go.Figure:
     """Draw the rms error of each revision, the first on top, and what noise alone would leave."""
     of = story.revisions
     changes = [(r.change if k else "") or "start" for k, r in enumerate(of)]
-    names = [style.label(f"{r.revision}: {c}") for r, c in zip(of, changes, strict=True)]
+    names = [label(f"{r.revision}: {c}") for r, c in zip(of, changes, strict=True)]
     traces: list[object] = []
     for errors, name, color in (
-        ([r.error for r in of], "fitted poses", style.MEASURED),
-        ([r.holdout for r in of], "poses left out", style.HOLDOUT),
+        ([r.error for r in of], "fitted poses", MEASURED),
+        ([r.holdout for r in of], "poses left out", HOLDOUT),
     ):
         rms = [1e6 * e.rms_m for e in errors]
-        template = "%{y}: %{text} µm, " + name + "<extra></extra>"
+        hover = "%{y}: %{text} µm, " + name + "<extra></extra>"
         text = [numbers.digits(v) for v in rms]
-        traces.append(style.bar(rms, names, color, text, name=name, hovertemplate=template))
+        traces.append(bar(rms, names, color, text, name=name, hovertemplate=hover))
     floor, noise = 1e6 * story.noise_floor_m, numbers.length(story.noise_floor_m)
     left, fitted = (
         [numbers.length(e.rms_m) for e in errors]
@@ -407,87 +518,14 @@ def error_per_revision(story: Story) -> go.Figure:
             f"{' to '.join(fitted)} on the fitted ones, over {len(of)} revisions; noise alone "
             f"would leave {noise}."
         )
-    out = style.figure(says, x="error, rms [µm]", traces=traces, height=130 + 26 * len(names))
-    line = {"color": style.NOISE, "dash": "dash", "width": 2}
-    out.add_vline(floor, line=line, layer="below")
+    out = figure(says, x="error, rms [µm]", traces=traces, height=130 + 26 * len(names))
+    dashed = {"color": NOISE, "dash": "dash", "width": 2}
+    out.add_vline(floor, line=dashed, layer="below")
     # for the legend alone: a shape has no entry there
-    named = {"name": f"noise alone, {numbers.digits(floor)} µm", "mode": "lines", "line": line}
+    named = {"name": f"noise alone, {numbers.digits(floor)} µm", "mode": "lines", "line": dashed}
     out.add_trace(go.Scatter(x=[None], y=[names[0]], hoverinfo="skip", **named))
     out.update_yaxes(autorange="reversed")
     return out.update_xaxes(rangemode="tozero")
-
-
-def error_by_pose(c: Comparison) -> go.Figure:
-    """Draw the error of the earlier calibration at each later reading, and what it states."""
-    of = c.today.prediction
-    r, rows = of.readings, of.whitening.reading
-    error, stated = 1e6 * np.linalg.norm(of.raw[:, :3], axis=1), 1e6 * c.today.beyond.stated_m
-    names = [r.pose_names[k] for k in r.pose[rows]]
-    loads = [load_name(r.load_names[k]) for k in r.load[rows]]
-    hover = [
-        style.label(f"{n}, {load}: {e:.0f} µm, stated {s:.0f} µm")
-        for n, load, e, s in zip(names, loads, error, stated, strict=True)
-    ]
-    poses, more = [style.label(n) for n in names], {"hovertext": hover, "hoverinfo": "text"}
-    states = "standard deviation that the calibration states"
-    traces = [
-        style.marks(poses, error, style.MEASURED, "circle", 7, name="error today", **more),
-        style.marks(poses, stated, style.NOISE, "line-ew-open", 7, name=states, **more),
-    ]
-    worst = int(np.argmax(error))
-    says = (
-        f"The error today is {error[worst]:.0f} µm at most, at {names[worst]} ({loads[worst]}); "
-        f"{numbers.length(of.error.rms_m)} rms, where the calibration states "
-        f"{numbers.length(c.today.stated_m)}."
-    )
-    kind = "error" if r.scalar.any() else "3-D error"
-    return style.figure(says, x="pose", y=f"{kind} [µm]", traces=traces)
-
-
-def changes_chart(c: Comparison) -> go.Figure:
-    """Draw how far each change moves the target in the later readings."""
-    moved = [1e6 * x.moved_m for x in c.changes.found]
-    names = [words_of(x.candidate) for x in c.changes.found]
-    hover = [f"{n}: {m:.0f} µm rms" for n, m in zip(names, moved, strict=True)]
-    says = f"{names[0]} moves the target most: {moved[0]:.0f} µm rms." if names else "No change."
-    return style.bars(names, moved, hover, says, "moves the target by, rms [µm]")
-
-
-def arms_chart(t: "Pooled") -> go.Figure:
-    """Draw each arm's parameters by their distance from the type, over what most arms have."""
-    names, off = [p.parameter for p in t.parameters], t.distance
-    odd = {(o.arm, o.parameter) for o in t.odd if not o.campaign}
-    traces = []
-    for unlike, words, color, symbol in (
-        (False, "like its type", style.MEASURED, "circle"),
-        (True, "unlike its type", style.RED, "x"),
-    ):
-        chosen = [
-            (off[a, k], name, f"{arm}, {name}: {off[a, k]:+.1f} σ")
-            for k, name in enumerate(names)
-            for a, arm in enumerate(t.arms)
-            if np.isfinite(off[a, k]) and ((arm, name) in odd) == unlike
-        ]
-        if chosen:
-            x, y, hover = zip(*chosen, strict=True)
-            more: dict[str, Any] = {"hovertext": list(map(style.label, hover)), "hoverinfo": "text"}
-            at = (np.array(x), list(map(style.label, y)), color, symbol, 9)
-            traces.append(style.marks(*at, name=words, opacity=0.8, **more))
-    arms = sorted({arm for arm, _ in odd})
-    says = f"The {len(t.arms)} arms of the type are alike within what they scatter by."
-    if arms:
-        verb = "is" if len(arms) == 1 else "are"
-        says = f"{', '.join(arms)} {verb} unlike the others of the type."
-    band = {"type": "rect", "x0": -FAR, "x1": FAR, "y0": 0, "y1": 1, "yref": "paper"}
-    look = {"fillcolor": style.NOISE, "opacity": 0.12, "line": {"width": 0}, "layer": "below"}
-    return style.figure(
-        says,
-        x="distance from the mean of the type [σ]",
-        height=140 + 24 * len(names),
-        traces=traces,
-        yaxis={"autorange": "reversed", "title": {"text": ""}},
-        shapes=[{**band, **look}],
-    )
 
 
 def made_of(sizes: Sequence[FamilySize]) -> go.Figure:
@@ -495,18 +533,16 @@ def made_of(sizes: Sequence[FamilySize]) -> go.Figure:
     shown, first = sizes[:MOST_FAMILIES], sizes[0]
     traces = []
     for named, words, color, symbol in (
-        (True, "named", style.MEASURED, "circle"),
-        (False, "predicted with, not named", style.GREY, "diamond"),
+        (True, "named", MEASURED, "circle"),
+        (False, "predicted with, not named", GREY, "diamond"),
     ):
         if not (of := [s for s in shown if s.named == named]):
             continue
         low, at, high = np.array([(s.low, s.std, s.high) for s in of]).T / [s.ordinary for s in of]
         error = {"type": "data", "symmetric": False, "array": high - at, "arrayminus": at - low}
-        hover = {"hovertext": [style.label(_size(s)) for s in of], "hoverinfo": "text"}
-        names, error_x = [style.label(s.name) for s in of], {**error, "color": color}
-        traces.append(
-            style.marks(at, names, color, symbol, 9, name=words, error_x=error_x, **hover)
-        )
+        hover = {"hovertext": [label(_size(s)) for s in of], "hoverinfo": "text"}
+        names, error_x = [label(s.name) for s in of], {**error, "color": color}
+        traces.append(marks(at, names, color, symbol, 9, name=words, error_x=error_x, **hover))
     says = (
         f"{first.name} moves the target most, by {numbers.length(first.moves_m)} rms. Sizes are "
         "standard deviations of the parameters, with 95 % intervals; 1 is an ordinary arm, and "
@@ -515,15 +551,15 @@ def made_of(sizes: Sequence[FamilySize]) -> go.Figure:
     if len(shown) < len(sizes):
         says += f" The {len(shown)} of {len(sizes)} families are drawn that move the target most."
     ordinary = {"type": "line", "x0": 1, "x1": 1, "y0": 0, "y1": 1, "yref": "paper"}
-    order = [style.label(s.name) for s in reversed(shown)]
-    return style.figure(
+    order = [label(s.name) for s in reversed(shown)]
+    return figure(
         says,
         height=130 + 22 * len(shown),
         traces=traces,
         # 1, 2 and 5 of each decade
         xaxis={"type": "log", "dtick": "D2", "title": {"text": "size, by that of an ordinary arm"}},
         yaxis={"categoryorder": "array", "categoryarray": order, "title": {"text": ""}},
-        shapes=[{**ordinary, "line": {"color": style.NOISE, "width": 1, "dash": "dash"}}],
+        shapes=[{**ordinary, "line": {"color": NOISE, "width": 1, "dash": "dash"}}],
     )
 
 

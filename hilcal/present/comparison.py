@@ -18,12 +18,9 @@ if TYPE_CHECKING:
     from hilcal.transfer.members import TypeSize
     from hilcal.transfer.pooled import DiagnosedEffect, Odd, Pooled
 
-MOST_PARAMETERS, MOST_ROWS = 6, 12
-"""Parameters of a change, and of both fits, that are listed."""
-CLEAR = 2.0
-"""Standard deviations from which one of several parameters of a change is listed."""
-FAR = 3.0
-"""Standard deviations between which most arms lie; a choice."""
+MOST_PARAMETERS, MOST_ROWS = 6, 12  # parameters of a change, and of both fits, that are listed
+CLEAR = 2.0  # standard deviations from which one of several parameters of a change is listed
+FAR = 3.0  # standard deviations between which most arms lie; a choice
 KNOWN = {
     "list": "arms.csv",
     "serial number": "the serial number that the arm told",

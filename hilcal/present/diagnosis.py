@@ -32,16 +32,13 @@ REVISION_HEADS = (
     *("variance\nfactor", "verdict"),
 )
 """Of a table of revisions."""
-NEAR = 0.99
-"""Component from which a direction is called an axis; a choice."""
+NEAR = 0.99  # component from which a direction is called an axis; a choice
 BARS = "▁▂▃▄▅▆▇█"
 CURVES = 2
-COMPARED = 24
-"""Parameters that are compared with the true ones."""
+COMPARED = 24  # parameters that are compared with the true ones
 FEW, LEAST_BINS = 3, 3
 """Effects that a law is said to resemble, and bins that make a curve; choices."""
-RARE = 0.01
-"""Probability below which no figure is written."""
+RARE = 0.01  # probability below which no figure is written
 NOT_TRIED = "could not be tried in the exact model"
 NEWCOMER = f"""\
 The lines that follow are those of a real run: what the arm does, and each reading with its pose,
@@ -233,10 +230,7 @@ def _repeats(e: PureError) -> Iterator[str]:
 
 
 def curves(dependences: Sequence[Dependence], most: int = CURVES) -> Iterator[Block]:
-    """Yield the curve of each leading variable as a row of bars and a table.
-
-    Only of those that carry `LEAST_SHARE` or more, and by a curve only where it is determined.
-    """
+    """Yield the curve of each variable that carries `LEAST_SHARE`, where it is determined."""
     carrying = [d for d in dependences if d.share >= LEAST_SHARE][:most]
     for d in carrying:
         carries = f"{d.variable} carries {percent(d.share)}"
@@ -268,15 +262,7 @@ def _binned(
     names: Sequence[str] = (),
     law: Floats | None = None,
 ) -> Table:
-    """Return means over K bins of a variable, drawn as bars in the heading.
-
-    Args:
-        heads: the variable, and what the means are of.
-        unit_of: of the means, SI.
-        bins: (K,) variable, mean and its standard uncertainty.
-        names: (K,) of the bins, where the variable only counts them.
-        law: (K,) of a law there.
-    """
+    """Return K bins (variable, mean in SI, standard uncertainty), drawn as bars in the heading."""
     x, y, error = bins
     unit, factor = numbers.unit_for(unit_of, list(y))
     height = (y - y.min()) / ((y.max() - y.min()) or 1.0) * (len(BARS) - 1)

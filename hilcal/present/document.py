@@ -31,8 +31,7 @@ STYLES: dict[Tone, str] = {
     "good": "bold green",
     "doubt": "bold yellow",
 }
-GAPS = (3, 2)
-"""Blanks between two columns on a terminal: the wider where there is room."""
+GAPS = (3, 2)  # blanks between two columns on a terminal: the wider where there is room
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,10 +101,7 @@ class Table:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chart:
-    """A figure of plotly with its title; `wide`: it takes the whole width of a page.
-
-    `height` is in CSS pixels, 0 for the figure's own: three rows of 230 are a printed page.
-    """
+    """A figure of plotly; `wide` as the page, `height` in CSS pixels, 0 for the figure's own."""
 
     title: str
     figure: "go.Figure"
@@ -150,10 +146,7 @@ def note(text: str) -> Words:
 
 
 def table(
-    *heads: str,
-    rows: Iterable[Sequence[str]] = (),
-    left: Sequence[int] = (0,),
-    caption: str = "",
+    *heads: str, rows: Iterable[Sequence[str]] = (), left: Sequence[int] = (0,), caption: str = ""
 ) -> Table:
     """Return a table with some rows."""
     return Table(heads, [tuple(row) for row in rows], tuple(left), caption)

@@ -32,8 +32,7 @@ from hilcal.stream.fit import StreamFit
 from hilcal.types import Ints
 
 ALL_ROWS = 60
-SCREEN = 6
-"""Parameters on the first screen."""
+SCREEN = 6  # parameters on the first screen
 PARAMETER_COLUMNS = ("parameter", "value", "±", "unit", "meaning")
 STRONGEST, DIRECTIONS, GROSS, MOST_LISTED = 5, 8, 8, 6
 POSE = "pose"
@@ -102,10 +101,7 @@ def _listed(lines: Sequence[str], most: int) -> Iterator[str]:
 
 
 def parameters(fit: Fit, most: int = ALL_ROWS, where: str = "--details") -> Iterator[Block]:
-    """Yield a table of at most so many parameters, and a summary of each large family.
-
-    Of more, those of frames come last; `where` says how the others are to be had.
-    """
+    """Yield a table of some parameters, frames last, and each family; `where` is the rest."""
     rows: list[tuple[str, ...]] = []
     frames: list[tuple[str, ...]] = []
     families, unseen = [], []

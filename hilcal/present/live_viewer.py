@@ -53,17 +53,14 @@ class Revised:
     story: Story
 
 
-PORT = 9877
-"""Not 9876: there a viewer listens itself, and one that finds it taken opens no window."""
-MOST = 2000
-"""Messages that wait for the process at most, some 500 bytes each; a choice."""
+PORT = 9877  # not 9876: there a viewer listens itself, and one that finds it taken opens no window
+MOST = 2000  # messages that wait for the process at most, some 500 bytes each; a choice
 ARM_S = 0.2
 """Between two places of the arm that are told, s; a choice: motion is seen, files stay small."""
 START_S, END_S = 20.0, 10.0
 """How long the process may take to start, for it loads the viewer's library, and to finish the
 recording, s; choices."""
-NICE = 15
-"""Behind everything else, so that the arm's watchdog never waits for a picture; a choice."""
+NICE = 15  # behind everything else, so that the arm's watchdog never waits for a picture; a choice
 _ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -76,13 +73,7 @@ class LiveViewer:
     """
 
     def __init__(self, record: Path, say: Say, port: int = PORT) -> None:
-        """Start nothing yet.
-
-        Args:
-            record: where the recording goes; a file that is there is replaced.
-            say: told of problems, one line each, from another thread.
-            port: the first to be tried.
-        """
+        """Start nothing; `say` is told of problems from another thread, `port` is tried first."""
         self.record, self.dropped = record, 0
         self.url: str | None = None
         self._say, self._port = say, port

@@ -21,8 +21,7 @@ CRITERIA = {
     "separate": "power to separate the leading suspects (T-optimality)",
 }
 BAR = 30
-SCREEN = 4
-"""Remarks on the first screen; the most important come first."""
+SCREEN = 4  # remarks on the first screen; the most important come first
 UNCERTAIN = 1e-3
 """Least certified efficiency that tells anything. A choice: the last digit that is printed."""
 LIKE = 1.1
@@ -253,11 +252,7 @@ def brief_plan(s: PlanSummary) -> str:
 
 
 def next_report(found: Next, poses: int, readings: int, details: bool = True) -> Iterator[Block]:
-    """Yield the powers of the pairs, now and then, and what makes the difference.
-
-    `poses` beside the reference and `readings` are the plan's; without `details` of each suspect
-    only the pair that is separated least.
-    """
+    """Yield the powers of the pairs, now and then; without `details` each suspect's weakest."""
     yield heading("Telling the suspects apart")
     yield power_table(found.powers if details else _weakest(found.powers))
     yield note(

@@ -61,11 +61,7 @@ def _line(console: Console, since: float, text: str, width: int = 5) -> None:
 
 @contextmanager
 def working(console: Console) -> Iterator[Say]:
-    """Yield a function that shows what is being done now.
-
-    On a terminal one line with a spinner and the time; otherwise one line each, with the
-    seconds since the start.
-    """
+    """Yield what shows what is being done: a spinner on a terminal, else a line each."""
     begun = time.monotonic()
     if console.is_terminal:
         with console.status("") as status:
@@ -250,10 +246,7 @@ def watching(console: Console, total: int) -> Iterator[_Watcher]:
 
 
 def figures(event: ReadingStored) -> str:
-    """Return deflection and residual of a reading for people.
-
-    A deflection from a predicted unloaded position is marked by ≈.
-    """
+    """Return deflection (≈: from a predicted unloaded position) and residual of a reading."""
     parts, live = [], event.live
     if event.deflection is not None:
         parts.append(f"deflection {numbers.length(event.deflection)}")

@@ -19,8 +19,7 @@ from hilcal.readings.whitening import Mode
 from hilcal.robot import se3
 from hilcal.types import Bools, Floats
 
-PLACES = 5, 4
-"""Decimals of a position in m and of an angle in degrees. A choice."""
+PLACES = 5, 4  # decimals of a position in m and of an angle in degrees. A choice
 ALONG = 0.98
 """Share of its length that one element must have for a direction to be named after that axis."""
 WORDS: dict[CovarianceParts, str] = {
@@ -96,10 +95,7 @@ def fitted_lines(fit: Fit) -> Iterator[str]:
 
 
 def base_line(cell: Cell, found: RobotFrames, mode: Mode = "absolute") -> str:
-    """Return where the robot's base is, which poses, exports and errors are counted from.
-
-    Of deflections (`mode`) it is that of the nominal arm, and is written to 1 mm.
-    """
+    """Return where the robot's base is; of deflections the nominal arm's, to 1 mm."""
     if np.array_equal(found.base, np.eye(4)) and found.base_stated:
         return "The robot's base: the axes that the positions are given in."
     why, places = "as the cell states it", PLACES

@@ -48,8 +48,7 @@ UNDIAGNOSED = "not diagnosed"
 LITTLE = 0.2
 """Share of the predictable misfit that the first suspect must explain for its own chart to be
 shown, not those of the variables; a guess."""
-LEAST_CARRIED = 0.02
-"""Share of the misfit below which a variable is not shown; a guess."""
+LEAST_CARRIED = 0.02  # share of the misfit below which a variable is not shown; a guess
 MOST_SUSPECTS, MOST_PARAMETERS = 3, 40
 
 
@@ -274,7 +273,7 @@ def pose_numbers(names: Sequence[str]) -> Ints:
 def _revision(c: Chapter, e: FullPrediction, residual: Floats, measured: Floats) -> StoryRevision:
     d, named = c.diagnosis, f"Model: {model_name(c.fit.model.named)}."
     changed = change(c.added, c.removed, c.fit.readings.arm_scatter is not None)
-    told = UNDIAGNOSED if d is None else d.verdict
+    judged = UNDIAGNOSED if d is None else d.verdict
     drawn = None if d is None else follows(d)
     verdict: list[Block] = [f"{UNDIAGNOSED.capitalize()}: run hilcal diagnose for a verdict."]
     details: list[Block] = [misses(c.fit)]
@@ -287,13 +286,13 @@ def _revision(c: Chapter, e: FullPrediction, residual: Floats, measured: Floats)
     return StoryRevision(
         revision=c.number,
         change=changed,
-        verdict=told,
+        verdict=judged,
         residual=residual,
         predicted=measured - residual,
         whitened_norm2=mahalanobis2(e.raw[:, :3], e.whitening.covariance[:, :3, :3]),
         error=c.fit.error,
         holdout=c.fit.holdout,
-        cells=revision_cells(c.number, changed, c.fit, told),
+        cells=revision_cells(c.number, changed, c.fit, judged),
         panels={
             "verdict": (*verdict, named),
             "details": (*details, errors(c.fit)),
@@ -305,10 +304,7 @@ def _revision(c: Chapter, e: FullPrediction, residual: Floats, measured: Floats)
 
 
 def follows(d: Diagnosis) -> DependenceCurve | None:
-    """Return what the residual follows: the first suspect, or the variable that carries most of it.
-
-    It is the variable where the suspect explains little of that; None where there is neither.
-    """
+    """Return what the residual follows: the first suspect, or the variable that carries most."""
     known = 0.0 if d.lead is None else d.lead.holdout_share
     explained = d.insufficiency is None and known >= LITTLE * d.predictable_share
     carried = [v for v in d.dependences if v.share >= LEAST_CARRIED and v.determined]

@@ -11,7 +11,7 @@ from nicegui import ui
 from nicegui.events import GenericEventArguments
 
 from hilcal.names import escaped
-from hilcal.present import chart_style as style
+from hilcal.present import charts as style
 from hilcal.present.document import Table, says
 from hilcal.workbench.work import Work
 

@@ -33,8 +33,7 @@ PATHS = ("/_nicegui/", "/_nicegui_ws/", "/viewer/")
 """What is served beside the page; the rest does not exist."""
 LOOPBACK = ("127.0.0.1", "::1")
 TOKEN = "token"  # noqa: S105 (its name)
-UNUSED_S = 600.0
-"""How long a token waits for its use, s; a choice."""
+UNUSED_S = 600.0  # how long a token waits for its use, s; a choice
 _ENTERED = b"""<!doctype html><title>hilcal</title><link rel="icon" href="data:,">
 <meta http-equiv="refresh" content="0; url=/">"""
 """The page itself leads on: a browser that another page or a file sent here would not send a strict

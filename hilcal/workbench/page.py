@@ -19,8 +19,7 @@ from hilcal.workbench.session import Snapshot, WorkbenchSession
 from hilcal.workbench.viewer import WebViewer
 from hilcal.workbench.work import Answer, Say, Work
 
-TICK, LOOK = 0.2, 2.0
-"""How often a tab looks whether something has changed, and at the file, s."""
+TICK, LOOK = 0.2, 2.0  # how often a tab looks whether something has changed, and at the file, s
 CSS = Path(__file__).with_name("page.css")
 SCRIPT = Path(__file__).with_name("page.js")
 DARK = "matchMedia('(prefers-color-scheme: dark)').matches"
@@ -209,13 +208,7 @@ class View:
         self._redraw(self.planned, lambda view, d: cards.planned(view.session))
 
     def _do(self, place: str, what: str, act: Callable[[Snapshot, Say], object]) -> None:
-        """Begin something on the snapshot of this tab; only one thing is done at a time.
-
-        Args:
-            place: of the button, where the answer stays: what `act` returns if it is a text.
-            what: is done, in words.
-            act: does it.
-        """
+        """Begin something on this tab's snapshot; the text that `act` returns stays there."""
         snapshot = self.tab.snapshot
         if snapshot is not None and not self.work.start(
             what, lambda say: act(snapshot, say), place

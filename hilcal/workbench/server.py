@@ -17,18 +17,12 @@ from hilcal.optional import needed_by
 from hilcal.workbench.session import WorkbenchSession
 
 HOST = "127.0.0.1"
-PORT = 8787
-"""The port that is tried where none is asked for; a choice."""
-GRACE = 2
-"""How long an open page may delay the end, s."""
+PORT = 8787  # the port that is tried where none is asked for; a choice
+GRACE = 2  # how long an open page may delay the end, s
 
 
 def require_nicegui() -> None:
-    """Refuse to begin where the user-interface library is not installed.
-
-    Raises:
-        InputError: says how to install it.
-    """
+    """Refuse to begin where the user-interface library is not installed."""
     with needed_by("the workbench"):
         import nicegui  # noqa: F401
 

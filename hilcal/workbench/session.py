@@ -178,12 +178,7 @@ class WorkbenchSession:
             return self._show(o.at(record.cell), record.number, chapters, stamp=stamp)
 
     def add(self, snapshot: Snapshot, effect: str, say: Say = silent) -> Snapshot:
-        """Add an effect, written as for `hilcal add`, to the shown model; see `changes`.
-
-        Raises:
-            InputError: not one effect, or one that cannot be added.
-            CannotAnswerError: the readings do not determine it.
-        """
+        """Add an effect, written as for `hilcal add`, to the shown model; see `changes`."""
         with self._writing(snapshot) as o:
             wanted = read_effects_text(effect, "effect", o.catalogue)
             if len(wanted) != 1:
@@ -200,25 +195,14 @@ class WorkbenchSession:
             return self._changed(o, remove_effect(o, *of, effect, say, snapshot.diagnosis))
 
     def go_back(self, snapshot: Snapshot, number: int, say: Say = silent) -> Snapshot:
-        """Show a revision, and let every command use it; nothing is taken away.
-
-        Raises:
-            InputError: no such revision, or one that cannot be restored.
-        """
+        """Show a revision, and let every command use it; nothing is taken away."""
         with self._writing(snapshot) as o:
             chapters = self._chapters(o, number, say)
             o.accept(None if number == len(o.file.revisions()) else number)
             return self._show(o.at(o.file.revision(number).cell), number, chapters)
 
     def fit_anew(self, snapshot: Snapshot | None, say: Say = silent) -> Snapshot:
-        """Fit the model of the revision in use to all readings, those appended later included.
-
-        A prior that the revision was fitted with is kept.
-
-        Raises:
-            InputError: no revision.
-            CannotAnswerError: the readings do not determine it.
-        """
+        """Fit the model and prior of the revision in use to all readings, also later ones."""
         with self._writing(snapshot, changed=True) as o:
             record = o.in_use()
             if record is None:
@@ -436,11 +420,7 @@ class WorkbenchSession:
         return self.snapshot
 
     def _stamp(self) -> Stamp:
-        """Return what tells whether the file was changed.
-
-        Raises:
-            InputError: it is not there.
-        """
+        """Return what tells whether the file was changed; InputError where it is not there."""
         try:
             found = self.path.stat()
         except OSError as error:

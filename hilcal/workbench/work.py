@@ -30,14 +30,7 @@ class Work:
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def start(self, what: str, do: Callable[[Say], object], place: str = "file") -> bool:
-        """Begin a piece of work in a thread of its own; not while another is being done.
-
-        What it raises, or the text that it returns, is kept as its answer. The thread does not
-        outlive the program.
-
-        Returns:
-            Whether it was begun.
-        """
+        """Begin work in a thread unless some is being done; its text or error is the answer."""
         with self._lock:
             if self.what is not None:
                 return False

@@ -156,7 +156,7 @@ def _revision(k, parts, truth, offset, covariance, torque, names):
         error=error,
         holdout=ErrorBlock(**{key: 1.06 * v for key, v in error.to_json().items()}),
         cells=(str(k), EFFECTS[k], "", "", "", "", "", verdict),
-        panels={"verdict": (words, *([suspects] if left else []))},
+        panels={"verdict": (words, *([suspects] if left else [])), "parameters": (suspects, words)},
         follows=DependenceCurve(
             left[0], "", torque[:, 1], 1e6 * residual[:, 2], "torque of joint 2 [Nm]", "z [µm]"
         )

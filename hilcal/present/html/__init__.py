@@ -15,7 +15,7 @@ with needed_by("pages"):
     from plotly.offline import get_plotlyjs
 
 from hilcal.names import escaped
-from hilcal.present import chart_style as style
+from hilcal.present import charts as style
 from hilcal.present.document import Block, Chart, PageSection, captioned, says
 
 HERE = Path(__file__).parent

@@ -1,14 +1,18 @@
 """The pages that compare two campaigns of one arm, or the arms of a fleet."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import plotly.graph_objects as go
 
 from hilcal import numbers
 from hilcal.diagnosis.change import LEVEL
 from hilcal.diagnosis.comparison import Comparison
 from hilcal.names import quoted
+from hilcal.present import charts
 from hilcal.present.campaign import utc
-from hilcal.present.charts import arms_chart, changes_chart, error_by_pose
 from hilcal.present.comparison import (
+    FAR,
     closing,
     comparison_report,
     headline,
@@ -16,35 +20,113 @@ from hilcal.present.comparison import (
     sentence,
     type_report,
     unlike_words,
+    words_of,
 )
-from hilcal.present.document import Block, Chart, PageSection, Words, captioned, heading, table
+from hilcal.present.document import (
+    Block,
+    Chart,
+    PageSection,
+    Words,
+    captioned,
+    heading,
+    load_name,
+    table,
+)
 from hilcal.present.html import Card, FirstScreen, render
 from hilcal.present.html.report import identity
 
 if TYPE_CHECKING:
     from hilcal.transfer.fleet import Fleet
+    from hilcal.transfer.pooled import Pooled
 
-Named = tuple[str, str]
-"""Name and SHA-256 of a campaign's file."""
+Named = tuple[str, str]  # name and SHA-256 of a campaign's file
+
+
+def error_by_pose(c: Comparison) -> go.Figure:
+    """Draw the error of the earlier calibration at each later reading, and what it states."""
+    of = c.today.prediction
+    r, rows = of.readings, of.whitening.reading
+    error, stated = 1e6 * np.linalg.norm(of.raw[:, :3], axis=1), 1e6 * c.today.beyond.stated_m
+    names = [r.pose_names[k] for k in r.pose[rows]]
+    loads = [load_name(r.load_names[k]) for k in r.load[rows]]
+    hover = [
+        charts.label(f"{n}, {load}: {e:.0f} µm, stated {s:.0f} µm")
+        for n, load, e, s in zip(names, loads, error, stated, strict=True)
+    ]
+    poses, more = [charts.label(n) for n in names], {"hovertext": hover, "hoverinfo": "text"}
+    states = "standard deviation that the calibration states"
+    traces = [
+        charts.marks(poses, error, charts.MEASURED, "circle", 7, name="error today", **more),
+        charts.marks(poses, stated, charts.NOISE, "line-ew-open", 7, name=states, **more),
+    ]
+    worst = int(np.argmax(error))
+    says = (
+        f"The error today is {error[worst]:.0f} µm at most, at {names[worst]} ({loads[worst]}); "
+        f"{numbers.length(of.error.rms_m)} rms, where the calibration states "
+        f"{numbers.length(c.today.stated_m)}."
+    )
+    kind = "error" if r.scalar.any() else "3-D error"
+    return charts.figure(says, x="pose", y=f"{kind} [µm]", traces=traces)
+
+
+def changes_chart(c: Comparison) -> go.Figure:
+    """Draw how far each change moves the target in the later readings."""
+    moved = [1e6 * x.moved_m for x in c.changes.found]
+    names = [words_of(x.candidate) for x in c.changes.found]
+    hover = [f"{n}: {m:.0f} µm rms" for n, m in zip(names, moved, strict=True)]
+    says = f"{names[0]} moves the target most: {moved[0]:.0f} µm rms." if names else "No change."
+    return charts.bars(names, moved, hover, says, "moves the target by, rms [µm]")
+
+
+def arms_chart(t: "Pooled") -> go.Figure:
+    """Draw each arm's parameters by their distance from the type, over what most arms have."""
+    names, off = [p.parameter for p in t.parameters], t.distance
+    odd = {(o.arm, o.parameter) for o in t.odd if not o.campaign}
+    traces = []
+    for unlike, words, color, symbol in (
+        (False, "like its type", charts.MEASURED, "circle"),
+        (True, "unlike its type", charts.RED, "x"),
+    ):
+        chosen = [
+            (off[a, k], name, f"{arm}, {name}: {off[a, k]:+.1f} σ")
+            for k, name in enumerate(names)
+            for a, arm in enumerate(t.arms)
+            if np.isfinite(off[a, k]) and ((arm, name) in odd) == unlike
+        ]
+        if chosen:
+            x, y, hover = zip(*chosen, strict=True)
+            more: dict[str, Any] = {
+                "hovertext": list(map(charts.label, hover)),
+                "hoverinfo": "text",
+            }
+            at = (np.array(x), list(map(charts.label, y)), color, symbol, 9)
+            traces.append(charts.marks(*at, name=words, opacity=0.8, **more))
+    arms = sorted({arm for arm, _ in odd})
+    says = f"The {len(t.arms)} arms of the type are alike within what they scatter by."
+    if arms:
+        verb = "is" if len(arms) == 1 else "are"
+        says = f"{', '.join(arms)} {verb} unlike the others of the type."
+    band = {"type": "rect", "x0": -FAR, "x1": FAR, "y0": 0, "y1": 1, "yref": "paper"}
+    look = {"fillcolor": charts.NOISE, "opacity": 0.12, "line": {"width": 0}, "layer": "below"}
+    return charts.figure(
+        says,
+        x="distance from the mean of the type [σ]",
+        height=140 + 24 * len(names),
+        traces=traces,
+        yaxis={"autorange": "reversed", "title": {"text": ""}},
+        shapes=[{**band, **look}],
+    )
 
 
 def comparison_page(
     c: Comparison, files: tuple[Named, Named], operator: str, made: str, version: str
 ) -> str:
-    """Return the comparison as HTML.
-
-    Args:
-        c: the comparison.
-        files: of the earlier campaign and of the later one.
-        operator: who answers for the measurement; empty where nobody is named.
-        made: when the report was made, ISO 8601, UTC.
-        version: of the program.
-    """
+    """Return the comparison of an earlier and a later file as HTML; `made` is an ISO 8601 time."""
     (earlier, _), (later, _) = files
     arm = c.fit.model.cell.arm.name
-    charts: list[Block] = [Chart("Error today, by pose", error_by_pose(c), wide=True, height=0)]
+    drawn: list[Block] = [Chart("Error today, by pose", error_by_pose(c), wide=True, height=0)]
     if c.changes.found:
-        charts.append(Chart("What each change moves", changes_chart(c), wide=True, height=0))
+        drawn.append(Chart("What each change moves", changes_chart(c), wide=True, height=0))
     shas = [(which, *file) for which, file in zip(("earlier", "later"), files, strict=True)]
     provenance = (
         table("campaign", "name", "SHA-256", rows=shas, caption="Files"),
@@ -58,7 +140,7 @@ def comparison_page(
     )
     sections = (
         PageSection("changes", "What has changed", tuple(comparison_report(c, earlier, later))),
-        PageSection("today", "The earlier calibration today", tuple(charts)),
+        PageSection("today", "The earlier calibration today", tuple(drawn)),
         PageSection("provenance", "Provenance", provenance),
     )
     about = f"{arm}, {earlier} and {later}, {made[:10]}"

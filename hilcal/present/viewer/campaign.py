@@ -38,14 +38,10 @@ SERIES = {
     "noise": style.NOISE,
 }
 """Of the errors of revisions: entity and colour, see `ERRORS`."""
-BARS = 150
-"""Bars of poses at most."""
-_BINS = 12
-"""Of single readings over what they may follow, for their mean."""
-SIGMA_LENGTH, ARROW_CAP = 0.02, 0.40
-"""One σ is drawn this long, and no arrow longer, m."""
-DEFLECTION_LENGTH, DEFLECTION_CAP = 0.25, 0.6
-"""The same of a large measured deflection, m."""
+BARS = 150  # bars of poses at most
+_BINS = 12  # of single readings over what they may follow, for their mean
+SIGMA_LENGTH, ARROW_CAP = 0.02, 0.40  # one σ is drawn this long, and no arrow longer, m
+DEFLECTION_LENGTH, DEFLECTION_CAP = 0.25, 0.6  # the same of a large measured deflection, m
 ARROWS, BALLS, PAIRS = 150, 60, 150
 """How much is drawn at most, so that a picture stays legible and a file small."""
 _LABEL_ABOVE = np.array([0.0, 0.0, 0.3])
@@ -85,14 +81,7 @@ class Served:
 
 
 def record(story: Story, *sinks: recording.Sink) -> rr.RecordingStream:
-    """Send a story to sinks, flushed after each revision; equal stories give equal recordings.
-
-    Returns:
-        The open stream; it closes, and ends its sinks, when it is dropped.
-
-    Raises:
-        HilcalError: a sink does not take the data (disk full, ...).
-    """
+    """Send a story to sinks, flushed after each revision; they end when the stream is dropped."""
     rec = _opened(story)
     rec.set_sinks(*sinks)
     # Active, too: a viewer that has shown another recording would keep the layout of that one.
@@ -141,8 +130,8 @@ def serve(story: Story, ip: str = "127.0.0.1", port: int = PORT) -> Iterator[Ser
 def _opened(story: Story) -> rr.RecordingStream:
     arrays = (story.q, story.pose, story.anchor, story.measured, story.covariance)
     names = (story.arm.name, story.mode, story.load_names, story.pose_names)
-    told = [(r.revision, r.change, r.verdict, r.cells, r.panels) for r in story.revisions]
-    return recording.opened(names, *arrays, told, *(r.residual for r in story.revisions))
+    words = [(r.revision, r.change, r.verdict, r.cells, r.panels) for r in story.revisions]
+    return recording.opened(names, *arrays, words, *(r.residual for r in story.revisions))
 
 
 def tell(rec: rr.RecordingStream, story: Story) -> None:
@@ -206,10 +195,7 @@ def _poses(rec: rr.RecordingStream, story: Story) -> None:
 
 
 def blueprint(story: Story) -> rrb.Blueprint:
-    """Left: 3-D over the error of each revision. Right: the verdict over residual and details.
-
-    It opens at the first revision and stands there; that of a growing story goes along with it.
-    """
+    """Left: 3-D over errors. Right: the verdict over details. A growing story is followed."""
     residual, deflection, bars = titles(story)
     left = rrb.Vertical(
         rrb.Tabs(_view3d(story, residual, "deflection"), _view3d(story, deflection, "residual")),
@@ -276,10 +262,7 @@ def _error_bars(rec: rr.RecordingStream, story: Story) -> None:
 
 
 def _curve_bars(rec: rr.RecordingStream, entity: str, c: DependenceCurve | None) -> None:
-    """Log a curve as bars over its variable, and beside each that of the law, where it has one.
-
-    Single readings are drawn by their mean in bins of equal count.
-    """
+    """Log a curve, readings by their mean in bins, as bars, and beside each that of the law."""
     bars: dict[str, Floats] = {}
     edges = np.zeros(0)
     if c is not None and len(c.x):
@@ -307,10 +290,7 @@ def _curve_bars(rec: rr.RecordingStream, entity: str, c: DependenceCurve | None)
 
 
 def _pose_bars(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
-    """Log the worst reading of each pose in σ, its Mahalanobis distance, one series per level.
-
-    The tallest bar is the worst reading of all. A bar of several poses is that of the worst.
-    """
+    """Log the worst reading of each pose, or of a few, in σ, one series per level."""
     _, left, width, height = _bar_places(story, r)
     for i, name in enumerate(style.LEVEL_NAMES):
         mine = levels(height**2) == i
@@ -347,13 +327,13 @@ def verdict(story: Story, r: StoryRevision) -> str:
 def details(story: Story, r: StoryRevision) -> str:
     """Return what the verdict rests on, as the terminal has it, and the worst reading."""
     outside, i = float(np.mean(r.level > 0)), worst(r)
-    told = (
+    words = (
         f"{numbers.percent(outside)} of readings are outside their 99 % noise ball (noise alone: "
         f"1 %). Worst: pose {story.pose_name(i)}, load {story.load_names[i]}, "
         f"{numbers.length(float(r.size_m[i]))} ({r.sigma[i]:.1f} σ)."
     )
     head = heading(f"Revision {r.revision}: {r.name}")
-    return style.markdown([head, told, *r.panels.get("details", ())])
+    return style.markdown([head, words, *r.panels.get("details", ())])
 
 
 def pose_cards(story: Story) -> list[str]:
@@ -509,11 +489,7 @@ def _words(story: Story, r: StoryRevision, i: int) -> str:
 
 
 def leader(at: Floats, ball: Floats) -> Floats:
-    """(K, 2, 3) dots from above a noise ball to the label of its reading, m.
-
-    Thin, dotted and grey, so that nobody takes them for a residual, which is a solid arrow. `at`
-    (3,) is the ball's middle, `ball` has its half axes.
-    """
+    """(K, 2, 3) dots from above a noise ball to its label, m: nobody takes them for an arrow."""
     top = float(_LABEL_ABOVE[2])
     z = np.arange(min(1.1 * float(ball.max()), top - _DOT), top, 2.0 * _DOT)
     ends = np.stack([z, np.minimum(z + 0.5 * _DOT, top)], 1)

@@ -28,8 +28,7 @@ if TYPE_CHECKING:  # above this layer
 _JOINT = re.compile(r"\.j(\d+)\b")
 _STANDS = (0.0, -1.4, 1.0, -1.2, -1.57, 0.0)
 """Joint values of the drawn arms, rad: upright, so that many stand side by side; a choice."""
-_APART = (0.62, 0.95)
-"""Distances of arms and of their rows, shares of the reach; a choice."""
+_APART = (0.62, 0.95)  # distances of arms and of their rows, shares of the reach; a choice
 _NAMED, _ROWS = 40, 12
 """Arms up to which each has its name beside it, and parameters that are drawn; choices."""
 _LEAST_RANGE_S = 86400.0

@@ -30,8 +30,7 @@ from hilcal.robot.body import body_poses
 from hilcal.store.plan import Step
 from hilcal.types import Floats
 
-PORTS = 20
-"""Ports that are tried, from the wanted one; a choice."""
+PORTS = 20  # ports that are tried, from the wanted one; a choice
 MEMORY = "256MiB"
 """What the server keeps for viewers that come late at most; a choice, some 5000 readings."""
 SHARE = 0.02
@@ -42,20 +41,17 @@ SIGMA_LENGTH, ARROW_CAP = 0.02, 0.4
 """One σ of a residual is drawn this long, and no arrow longer than that, m; choices."""
 BALL = SIGMA_LENGTH * style.BALL_SIGMAS
 """Radius of the ball that holds 99 % of the readings where the model is right, m."""
-LIMIT = style.BALL_SIGMAS / 3**0.5
-"""The same in the σ of a reading."""
+LIMIT = style.BALL_SIGMAS / 3**0.5  # the same in the σ of a reading
 ALARM = 0.001
 """Chance that noise alone leaves as many readings outside their balls as is called wrong."""
-WORST, REMARKS = 3, 3
-"""Readings, and remarks, that are listed."""
+WORST, REMARKS = 3, 3  # readings, and remarks, that are listed
 BALLS, MANY = 60, 300
 """Readings from which a ball, and an arrow, is drawn only where the arrow leaves its ball; choices,
 for legibility."""
 FLUENT = 1000
 """Residuals that a viewer draws one by one. Of 10,000 each of its pictures took 3.5 times the
 processor time of 100 (tests/benchmarks/test_viewer_speed.py); of this many some 1.2 times."""
-GROUPS = 150
-"""Groups that more of them are divided into: as many as a finished recording has bars."""
+GROUPS = 150  # groups that more of them are divided into: as many as a finished recording has bars
 TIMELINE = "time"
 RESIDUALS = "in σ: an arrow that leaves its noise ball = model wrong"
 IN_TIME = "in σ: grey noise, amber doubtful, red model wrong"
@@ -118,7 +114,7 @@ def judged(step: Step, live: LiveResidual, target: str = "") -> LiveJudgement | 
 class LiveTally:
     """A campaign that is being measured."""
 
-    told: Measuring
+    measured: Measuring
     bodies: Floats  # (P, n + 2, 4, 4) poses of the arm's bodies at each pose of the plan
     anchor: dict[str, Floats]  # (T, 3) nominal positions of the targets by pose, base axes, m
     done: int = 0  # readings that are stored
@@ -133,23 +129,23 @@ class LiveTally:
     group_worst: float = 0.0  # largest `LiveJudgement.norm2` of the group that is being measured
 
     @classmethod
-    def of(cls, told: Measuring) -> "LiveTally":
+    def of(cls, measured: Measuring) -> "LiveTally":
         """Return that of a campaign that begins, or goes on."""
-        bodies = body_poses(told.arm, told.plan.q)
+        bodies = body_poses(measured.arm, measured.plan.q)
         flange = bodies[:, -1]
-        at = flange[:, None, :3, 3] + np.einsum("pij,tj->pti", flange[:, :3, :3], told.targets)
-        anchor = dict(zip(told.plan.pose_names, at, strict=True))
-        return cls(told, bodies, anchor, len({step for _, step in told.earlier}))
+        at = flange[:, None, :3, 3] + np.einsum("pij,tj->pti", flange[:, :3, :3], measured.targets)
+        anchor = dict(zip(measured.plan.pose_names, at, strict=True))
+        return cls(measured, bodies, anchor, len({step for _, step in measured.earlier}))
 
     @property
     def total(self) -> int:
         """Readings that are planned."""
-        return len(self.told.plan.steps)
+        return len(self.measured.plan.steps)
 
     @property
     def group(self) -> int:
         """Residuals, one after the other, of which a viewer keeps those that stand out; 1: all."""
-        planned = self.total * len(self.told.targets)
+        planned = self.total * len(self.measured.targets)
         return 1 if planned <= FLUENT else math.ceil(planned / GROUPS)
 
     @property
@@ -162,17 +158,13 @@ class LiveTally:
         return np.asarray(self.anchor[step.pose][target])
 
     def add(self, event: ReadingStored) -> list[tuple[int, LiveResidual, LiveJudgement | None]]:
-        """Take note of a reading.
-
-        Returns:
-            Each target that was read, with its residual; judged, or None without a model yet.
-        """
+        """Take note of a reading; returns each target's residual, judged where there is a model."""
         self.last, self.done, self.left = event, event.done, event.left_real
         read = ((event.target, event.live), *event.others)
         return [(k, live, self._judge(event.step, k, live)) for k, live in read]
 
     def _judge(self, step: Step, target: int, live: LiveResidual) -> LiveJudgement | None:
-        j = judged(step, live, self.told.names[target] if self.told.names else "")
+        j = judged(step, live, self.measured.names[target] if self.measured.names else "")
         if j is None:
             return None
         begins, outside = self.judged % self.group == 0, int(j.level > 0)
@@ -226,7 +218,7 @@ def live_blueprint(d: LiveTally, world: str, series: str) -> rrb.Blueprint:
     ever, now = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()
     every = archetypes.VisibleTimeRanges(timeline=TIMELINE, start=ever, end=now)
     of = "Residual of each reading," if d.group == 1 else f"Worst of every {d.group} residuals,"
-    middle, size = style.center(d.targets, d.told.arm.reach)
+    middle, size = style.center(d.targets, d.measured.arm.reach)
     points = np.vstack([d.targets, d.bodies[0, :, :3, 3]])
     scene = style.view3d(
         "world",
@@ -291,10 +283,7 @@ class LiveScene:
             self._rec.log(f"{self._series}/limit", rr.Scalars(LIMIT))
 
     def end(self, to_open: bool) -> None:
-        """Tell the story once more, whole: its words know now which revision is the last.
-
-        `to_open`: let it open at the first revision, as a file does; else it stays at the last one.
-        """
+        """Tell the story once more, whole; `to_open`: at the first revision, as a file does."""
         self.settle()
         self._now = None
         if self._story is None:
@@ -316,12 +305,12 @@ class LiveScene:
     def _series(self) -> str:
         return f"live/{self._acts}"
 
-    def _measuring(self, wall: float, told: Measuring) -> None:
-        rec, d = self._rec, LiveTally.of(told)
+    def _measuring(self, wall: float, what: Measuring) -> None:
+        rec, d = self._rec, LiveTally.of(what)
         self._acts, self._now = self._acts + 1, d
-        rec.send_recording_name(f"hilcal: {style.safe(told.name)}")
+        rec.send_recording_name(f"hilcal: {style.safe(what.name)}")
         fixed(rec, "world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
-        self._arm = style.MovingArm(rec, f"{self._world}/arm", told.arm, told.targets)
+        self._arm = style.MovingArm(rec, f"{self._world}/arm", what.arm, what.targets)
         fixed(rec, "words/live_guide", style.document(GUIDE))
         planned = rr.Points3D(d.targets, colors=[style.GREY], radii=[0.006])
         fixed(rec, f"{self._world}/planned", planned)
@@ -329,8 +318,8 @@ class LiveScene:
             fixed(rec, f"{self._series}/{name}", style.series(name, color, 0.0, 4.0)[1])
         line = rr.SeriesLines(colors=[style.NOISE], widths=[1.5], names=["99 %"])
         fixed(rec, f"{self._series}/limit", line)
-        if told.earlier:  # what earlier sessions measured, as one batch
-            walls, steps = zip(*told.earlier, strict=True)
+        if what.earlier:  # what earlier sessions measured, as one batch
+            walls, steps = zip(*what.earlier, strict=True)
             dots = rr.Points3D.columns(
                 positions=[d.place(step) for step in steps],
                 colors=np.tile(np.array(style.MEASURED, dtype=np.uint8), (len(steps), 1)),
@@ -338,7 +327,7 @@ class LiveScene:
             )
             time = rr.TimeColumn(TIMELINE, timestamp=list(walls))
             along(rec, f"{self._world}/dots", time, dots)
-        self._passed.append((wall, tuple(told.plan.q[0].tolist())))
+        self._passed.append((wall, tuple(what.plan.q[0].tolist())))
         self._move()
         self._words(d)
         self._show(live_blueprint(d, self._world, self._series))
@@ -347,7 +336,7 @@ class LiveScene:
         """Send where the arm has been since the last time."""
         passed, self._passed, self._since = self._passed, [], 0
         if passed and self._arm is not None and self._now is not None:
-            bodies = body_poses(self._now.told.arm, np.array([q for _, q in passed]))
+            bodies = body_poses(self._now.measured.arm, np.array([q for _, q in passed]))
             self._arm.send(TIMELINE, [wall for wall, _ in passed], bodies)
 
     def _event(self, d: LiveTally, what: object) -> None:
@@ -447,14 +436,7 @@ def _balls(at: Sequence[Floats]) -> rr.Ellipsoids3D:
 
 
 def follow(messages: BinaryIO, reply: Callable[..., None], record: Path, port: int) -> None:
-    """Show what messages tell, until they end.
-
-    Args:
-        messages: pickled pairs of a time of day, s, and what happened; see `LiveScene`.
-        reply: told `url` when viewers can be served (None: they cannot), and each `problem`.
-        record: the recording; a file that is there is replaced.
-        port: the first to be tried, on the loopback interface only.
-    """
+    """Show what pickled (time of day, s; event) tell, in a file and at a free port from `port`."""
     identifier = str(uuid.uuid4())
     outlets = [_Outlet(identifier, reply, f"recording {record}", file=record)]
     with contextlib.suppress(OSError):
@@ -490,7 +472,7 @@ class _Outlet:
         """Open it: a file that is read later, or a port."""
         self._reply, self._name, self._file = reply, name, file
         self._scene: LiveScene | None = None
-        self._told, self._written = 0, 0
+        self._drawn, self._written = 0, 0
         config = rr.ChunkBatcherConfig(flush_tick=timedelta(days=1)) if file else None
         self._rec = recording.stream(identifier, config)
         try:
@@ -515,11 +497,11 @@ class _Outlet:
             return
         try:
             draw(self._scene)
-            self._told += whole
-            little = self._told - self._written < max(1.0, SHARE * self._told)
+            self._drawn += whole
+            little = self._drawn - self._written < max(1.0, SHARE * self._drawn)
             if not whole or (self._file and little and not now):
                 return
-            self._written = self._told
+            self._written = self._drawn
             self._scene.settle()
         except (InputError, ValueError, IndexError, KeyError) as error:
             self._reply(problem=f"{self._name}: not drawn: {error}")

@@ -35,8 +35,7 @@ SEEN, TURNED, HIDDEN, UNKNOWN = range(4)
 known, as the tracker's place is not."""
 SIGHT_COLORS = np.array([style.NOISE, style.AMBER, style.RED, style.GREY], dtype=np.uint8)
 SIGHT_WORDS = ("seen", "turned too far away", "hidden", "sight not checked")
-NOT_FIRST = ("", "takes about")
-"""Rows of what a plan costs that stand with the details."""
+NOT_FIRST = ("", "takes about")  # rows of what a plan costs that stand with the details
 STEPS = "Plan step by step: a bead per pose and load, beam green = seen"
 TRACKER = "From the tracker"
 SCHEDULE = "Schedule: minute of each reading by step, colour by load"

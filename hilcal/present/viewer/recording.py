@@ -24,12 +24,7 @@ Sink = rr.FileSink | rr.GrpcServerSink
 
 
 def bind(ip: str, port: int) -> None:
-    """Bind a port and let it go; the server itself would only log that it is taken.
-
-    Raises:
-        OSError: it is taken, or not allowed.
-        OverflowError: no port has this number.
-    """
+    """Bind a port and let it go, or raise OSError: the server itself would only log it."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         probe.bind((ip, port))

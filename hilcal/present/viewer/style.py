@@ -34,12 +34,10 @@ LEVEL_COLORS = np.array([GREY, AMBER, RED], dtype=np.uint8)
 # grey in its light one. Only white is legible in both, so colours are told by marks beside words.
 LABEL: Color = (255, 255, 255)
 LEADER: Color = (165, 168, 176)
-LEVEL_NAMES = tuple(name.split()[0] for name in story.LEVEL_NAMES)
-"""Of entities."""
+LEVEL_NAMES = tuple(name.split()[0] for name in story.LEVEL_NAMES)  # of entities
 MARKS = {"good": "✓ ", "doubt": "✗ "}
 BALL_SIGMAS = float(np.sqrt(stats.chi2.ppf(story.LIMITS[0], 3)))
-ROD, TARGET = 0.0065, 0.012
-"""Radii of the tool's rod and of the target, shares of the reach."""
+ROD, TARGET = 0.0065, 0.012  # radii of the tool's rod and of the target, shares of the reach
 EYE = np.array([1.05, -1.35, 0.55])
 # Views that draw with light colours stay dark in the light theme too.
 BACKGROUND = rrb.Background(color=(22, 24, 29), kind=rrb.BackgroundKind.SolidColor)
@@ -266,10 +264,7 @@ def hidden(eye: Floats, points: Floats, things: tuple[Obstacle, ...]) -> Bools:
 def direction(
     turn: float, middle: Floats, size: float, points: Floats, things: tuple[Obstacle, ...]
 ) -> Floats:
-    """Return the direction (3,) to the eye, in half sizes (m) of the picture about its middle (3,).
-
-    It is that near the preferred `turn` about z, rad, from where things hide fewest points (K, 3).
-    """
+    """Return the direction (3,) to an eye near `turn`, rad, from where fewest points are hidden."""
     angles = [(turn + a, z) for z in _HEIGHTS for a in _TURNS]
     places = [np.array([1.7 * np.cos(a), 1.7 * np.sin(a), z]) for a, z in angles]
     covered = [hidden(middle + size * place, points, things).mean() for place in places]

@@ -4,26 +4,19 @@ import os
 import pty
 import socket
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 
 from hilcal.doctor import computer as machine
-from hilcal.doctor.computer import NATIVE, Finding, clock, disk, load, packages
+from hilcal.doctor.computer import NATIVE, clock, disk, load, packages
 from hilcal.doctor.ports import System, reachable, serial_ports
 
 
-def states(findings: tuple[Finding, ...] | list[Finding]) -> list[str]:
-    return [f.state for f in findings]
-
-
-# --- packages ---------------------------------------------------------------------------------
-
-
 def test_packages_are_told_with_their_versions_and_those_that_lack() -> None:
-    found = packages(
+    there, lacking, later, optional = packages(
         [
             "numpy>=2.0",
             "no-such-package>=3,<4",
@@ -32,7 +25,6 @@ def test_packages_are_told_with_their_versions_and_those_that_lack() -> None:
             'no-such-linter; extra == "dev"',
         ]
     )
-    there, lacking, later, optional = found
     assert there.said.startswith("numpy 2.")
     assert (lacking.name, lacking.state) == ("no-such-package", "problem")
     assert "pip install 'no-such-package>=3,<4'" in lacking.mend
@@ -54,32 +46,28 @@ def test_a_package_that_does_not_load_is_a_problem(
     assert "does not load: OSError: wrong processor" in broken.said
 
 
-# --- computer ---------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
-    ("now", "status", "state", "said"),
+    ("year", "status", "state", "said"),
     [
-        (datetime(2031, 5, 1, tzinfo=UTC), 0, "ok", "synchronised"),
-        (datetime(2031, 5, 1, tzinfo=UTC), 5, "warning", "not synchronised"),
-        (datetime(2031, 5, 1, tzinfo=UTC), None, "ok", "is not known"),
-        (datetime(1970, 1, 2, tzinfo=UTC), 0, "problem", "never set"),
+        (2031, 0, "ok", "synchronised"),
+        (2031, 5, "warning", "not synchronised"),
+        (2031, None, "ok", "is not known"),
+        (1970, 0, "problem", "never set"),
     ],
 )
-def test_the_clock(now: datetime, status: int | None, state: str, said: str) -> None:
-    found = clock(lambda: now, lambda: status)
+def test_the_clock(year: int, status: int | None, state: str, said: str) -> None:
+    found = clock(lambda: datetime(year, 5, 1, tzinfo=UTC), lambda: status)
     assert found.state == state
     assert said in found.said
 
 
-def test_a_folder_that_can_be_measured_into(tmp_path: Path) -> None:
-    space, writing = disk(tmp_path)[0], disk(tmp_path)[-1]
+def test_a_folder_that_can_be_measured_into_and_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    space, *_, writing = disk(tmp_path)
     assert "GB free" in space.said
     assert writing.state in ("ok", "warning")
     assert list(tmp_path.iterdir()) == []  # nothing is left behind
-
-
-def test_a_folder_that_cannot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (lacking,) = disk(tmp_path / "no")
     assert lacking.state == "problem"
 
@@ -109,9 +97,6 @@ def test_a_busy_computer_is_a_warning() -> None:
     assert "the arm stops by itself" in busy.mend
 
 
-# --- serial ports -----------------------------------------------------------------------------
-
-
 @pytest.fixture
 def port() -> Iterator[str]:
     """A real character device that nobody else has open."""
@@ -121,39 +106,42 @@ def port() -> Iterator[str]:
     os.close(there)
 
 
-def a_system(root: Path, port: str, latency: int | None = None) -> System:
-    """A kernel that shows one adapter."""
-    by_id = root / "dev" / "serial" / "by-id"
-    by_id.mkdir(parents=True)
-    (by_id / "usb-FTDI_tracker").symlink_to(port)
-    (root / "proc").mkdir()
-    if latency is not None:
-        timer = root / "sys" / "bus" / "usb-serial" / "devices" / Path(port).name
-        timer.mkdir(parents=True)
-        (timer / "latency_timer").write_text(f"{latency}\n")
-    return System(root / "dev", root / "sys", root / "proc")
+@pytest.fixture
+def system(tmp_path: Path, port: str) -> Callable[..., System]:
+    """Make a kernel that shows one adapter."""
+
+    def made(latency: int | None = None) -> System:
+        by_id = tmp_path / "dev" / "serial" / "by-id"
+        by_id.mkdir(parents=True)
+        (by_id / "usb-FTDI_tracker").symlink_to(port)
+        (tmp_path / "proc").mkdir()
+        if latency is not None:
+            timer = tmp_path / "sys" / "bus" / "usb-serial" / "devices" / Path(port).name
+            timer.mkdir(parents=True)
+            (timer / "latency_timer").write_text(f"{latency}\n")
+        return System(tmp_path / "dev", tmp_path / "sys", tmp_path / "proc")
+
+    return made
 
 
-def test_a_port_is_told_by_its_lasting_name(port: str, tmp_path: Path) -> None:
-    at = a_system(tmp_path, port, latency=1)
-    (found,) = serial_ports({"tracker": port}, {port: "USB Serial"}, at)
+def test_a_port_is_told_by_its_lasting_name(port, system) -> None:
+    (found,) = serial_ports({"tracker": port}, {port: "USB Serial"}, system(latency=1))
     assert found.state == "ok"
-    assert found.name.endswith("by-id/usb-FTDI_tracker")
     assert found.name.startswith("tracker: ")
+    assert found.name.endswith("by-id/usb-FTDI_tracker")
     assert "USB Serial" in found.said
 
 
-def test_a_slow_adapter_is_told_with_the_line_that_mends_it(port: str, tmp_path: Path) -> None:
-    at = a_system(tmp_path, port, latency=16)
-    (found,) = serial_ports({}, {port: "USB Serial"}, at)
+def test_a_slow_adapter_is_told_with_the_line_that_mends_it(port, system) -> None:
+    (found,) = serial_ports({}, {port: "USB Serial"}, system(latency=16))
     assert found.state == "warning"
     assert "up to 16 ms" in found.said
     assert found.mend.startswith("echo 1 | sudo tee ")
     assert found.mend.endswith("/latency_timer")
 
 
-def test_a_port_of_the_cell_that_is_not_there(port: str, tmp_path: Path) -> None:
-    at = a_system(tmp_path, port)
+def test_a_port_of_the_cell_that_is_not_there(port, system, tmp_path: Path) -> None:
+    at = system()
     found = serial_ports({"tracker": str(tmp_path / "ttyUSB7")}, {port: "USB Serial"}, at)
     assert found[0].state == "problem"
     assert "usb-FTDI_tracker" in found[0].mend  # which there is instead
@@ -161,10 +149,14 @@ def test_a_port_of_the_cell_that_is_not_there(port: str, tmp_path: Path) -> None
     assert (none.state, none.said) == ("ok", "none is plugged in")
 
 
-def test_a_port_without_the_right_to_use_it(
-    port: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_port_without_the_right_to_use_it_and_a_file_that_is_none(
+    port, system, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    at = a_system(tmp_path, port)
+    at, path = system(), tmp_path / "notes.txt"
+    path.write_text("")
+    (wrong,) = serial_ports({"tracker": str(path)}, {}, at)
+    assert wrong.state == "problem"
+    assert "no serial port" in wrong.said
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     (wanted,) = serial_ports({"tracker": port}, {}, at)
     assert wanted.state == "problem"
@@ -173,16 +165,8 @@ def test_a_port_without_the_right_to_use_it(
     assert other.state == "warning"  # no device of the cell
 
 
-def test_a_file_that_is_no_port(tmp_path: Path) -> None:
-    path = tmp_path / "notes.txt"
-    path.write_text("")
-    (found,) = serial_ports({"tracker": str(path)}, {}, System(tmp_path, tmp_path, tmp_path))
-    assert found.state == "problem"
-    assert "no serial port" in found.said
-
-
-def test_who_has_a_port_open_and_who_meddles(port: str, tmp_path: Path) -> None:
-    at = a_system(tmp_path, port)
+def test_who_has_a_port_open_and_who_meddles(port, system) -> None:
+    at = system()
     for number, name in ((4242, "minicom"), (4243, "ModemManager")):
         folder = at.proc / str(number) / "fd"
         folder.mkdir(parents=True)
@@ -194,24 +178,16 @@ def test_who_has_a_port_open_and_who_meddles(port: str, tmp_path: Path) -> None:
     assert meddler.name == "ModemManager"
 
 
-# --- network ----------------------------------------------------------------------------------
-
-
-def test_services_that_answer_and_that_do_not() -> None:
-    with (
-        socket.create_server(("127.0.0.1", 0)) as server,
-        socket.create_server(("127.0.0.1", 0)) as closed,
-    ):
-        open_port, closed_port = server.getsockname()[1], closed.getsockname()[1]
+def test_services_and_hosts_that_answer_and_that_do_not() -> None:
+    here = ("127.0.0.1", 0)
+    with socket.create_server(here) as server, socket.create_server(here) as closed:
+        open_port, closed_port = (s.getsockname()[1] for s in (server, closed))
         closed.close()
         answers, refuses = reachable("127.0.0.1", {open_port: "one", closed_port: "two"})
     assert answers.state in ("ok", "warning")  # a busy machine may be slow
     assert "answers in" in answers.said
     assert refuses.state == "problem"
     assert "refused" in refuses.said
-
-
-def test_a_host_that_nobody_knows() -> None:
     (found,) = reachable("no-such-arm.invalid", {30004: "RTDE"})
     assert found.state == "problem"
     assert "is not known" in found.said

@@ -13,8 +13,7 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.carried import carried_prior
 from hilcal.identification.fit import fit
 from hilcal.identification.posterior import Posterior
-from hilcal.present.charts import arms_chart
-from hilcal.present.html.other_pages import fleet_page
+from hilcal.present.html.other_pages import arms_chart, fleet_page
 from hilcal.readings.readings import Readings
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.campaign_file import CampaignFile

@@ -11,28 +11,10 @@ from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification.baseline import baseline
 from hilcal.identification.family_sizes import FamilySize
-from hilcal.identification.fit import Fit, fit
-from hilcal.present import chart_style as style
-from hilcal.present.charts import (
-    LONGEST,
-    MOST_FAMILIES,
-    added_variable,
-    correlations,
-    curve_chart,
-    drawn,
-    error_per_revision,
-    made_of,
-    magnification,
-    measured_predicted,
-    misfit_shares,
-    noise_check,
-    parameter_correlations,
-    residual_by_joint,
-    residual_by_load,
-    residual_by_pose,
-    residual_by_time,
-    workspace,
-)
+from hilcal.identification.fit import fit
+from hilcal.present import charts
+from hilcal.present import charts as style
+from hilcal.present.charts import MOST_FAMILIES
 from hilcal.present.document import says
 from hilcal.present.story import LEVEL_NAMES, Chapter, build_story, of_left_out, regressor
 from tests.support.campaigns import campaign
@@ -40,23 +22,29 @@ from tests.support.viewer_story import ANGLE, LOAD, story
 
 
 @cache
-def fitted() -> Fit:
-    made = campaign("joint_tilt_compliance", "deflection", poses=12, strength=6.0)
-    return fit(baseline(made.cell, made.readings, made.mode), made.readings, made.mode)
-
-
-@cache
 def judged() -> Diagnosis:
-    return diagnose(fitted())
+    made = campaign("joint_tilt_compliance", "deflection", poses=12, strength=6.0)
+    return diagnose(fit(baseline(made.cell, made.readings, made.mode), made.readings, made.mode))
+
+
+@pytest.fixture(scope="module")
+def told():
+    return story()
+
+
+@pytest.fixture
+def first(told):
+    return told, told.revisions[0]
 
 
 def points(figure, axis: str) -> np.ndarray:
-    return np.concatenate([np.asarray(getattr(t, axis), float) for t in figure.data if t.text])
+    """Sorted values of the points that have a name."""
+    values = [np.asarray(getattr(t, axis), float) for t in figure.data if t.text]
+    return np.sort(np.concatenate(values))
 
 
-def test_each_revision_has_a_bar_for_both_errors_and_the_noise_is_shown():
-    told = story()
-    figure = error_per_revision(told)
+def test_each_revision_has_a_bar_for_both_errors_and_the_noise_is_shown(told):
+    figure = charts.error_per_revision(told)
     for trace, key in zip(figure.data[:2], ("error", "holdout"), strict=True):
         rms = [1e6 * getattr(r, key).rms_m for r in told.revisions]
         np.testing.assert_allclose(np.asarray(trace.x), rms)
@@ -70,92 +58,77 @@ def test_each_revision_has_a_bar_for_both_errors_and_the_noise_is_shown():
 def test_measured_over_predicted_differs_by_the_residual(mode: str):
     told = story(mode=mode)
     r = told.revisions[0]
-    line, *axes = measured_predicted(told, r).data
+    line, *axes = charts.measured_predicted(told, r).data
     assert line.name == "exact"
     for k, trace in enumerate(axes):
         off = np.asarray(trace.y, float) - np.asarray(trace.x, float)
         np.testing.assert_allclose(off, 1e6 * r.residual[:, k], atol=1e-3)
 
 
-def test_residuals_are_mahalanobis_distances_with_their_names():
-    told = story()
-    r = told.revisions[0]
-    sigma = np.sort(np.sqrt(r.whitened_norm2))
+def test_residuals_are_mahalanobis_distances_with_their_names_colours_and_marks(first):
+    told, r = first
+    timed = replace(told, time_s=60.0 * np.arange(len(told)))
+    by_joint = charts.residual_by_joint(told, r, 1)
+    limits = (0.0, *style.SIGMA_LIMITS, np.inf)
     for figure in (
-        residual_by_pose(told, r),
-        residual_by_load(told, r),
-        residual_by_joint(told, r, 1),
-        residual_by_time(told, r),
-        residual_by_time(replace(told, time_s=60.0 * np.arange(len(told))), r),
+        charts.residual_by_pose(told, r),
+        charts.residual_by_load(told, r),
+        by_joint,
+        charts.residual_by_time(told, r),
+        charts.residual_by_time(timed, r),
     ):
-        np.testing.assert_allclose(np.sort(points(figure, "y")), sigma, rtol=1e-6)
+        np.testing.assert_allclose(points(figure, "y"), np.sort(r.sigma), rtol=1e-6)
         assert says(figure)
-    by_joint = residual_by_joint(told, r, 1)
-    np.testing.assert_allclose(
-        np.sort(points(by_joint, "x")), np.sort(np.degrees(told.q[:, 1])), rtol=1e-6
-    )
-    text = [name for trace in by_joint.data for name in trace.text]
+        for trace in figure.data:
+            k, y = LEVEL_NAMES.index(trace.name), np.asarray(trace.y, float)
+            assert (trace.marker.color, trace.marker.symbol) == (style.LEVELS[k], style.SYMBOLS[k])
+            assert ((y >= limits[k] - 1e-5) & (y <= limits[k + 1] + 1e-5)).all()
+    angles = np.sort(np.degrees(told.q[:, 1]))
+    np.testing.assert_allclose(points(by_joint, "x"), angles, rtol=1e-6)
     worst = int(np.argmax(r.whitened_norm2))
     size = 1e6 * np.linalg.norm(r.residual[worst])
-    assert any(
-        name.startswith(f"{told.pose_name(worst)}, {told.load_names[worst]}: {size:.0f} µm")
-        for name in text
-    )
-
-
-def test_levels_have_a_colour_and_a_mark():
-    told = story()
-    figure = residual_by_pose(told, told.revisions[0])
-    limits = (0.0, *style.SIGMA_LIMITS, np.inf)
-    for trace in figure.data:
-        k = LEVEL_NAMES.index(trace.name)
-        assert (trace.marker.color, trace.marker.symbol) == (style.LEVELS[k], style.SYMBOLS[k])
-        y = np.asarray(trace.y, float)
-        assert ((y >= limits[k] - 1e-5) & (y <= limits[k + 1] + 1e-5)).all()
+    name = f"{told.pose_name(worst)}, {told.load_names[worst]}: {size:.0f} µm"
+    assert any(text.startswith(name) for trace in by_joint.data for text in trace.text)
 
 
 @pytest.mark.parametrize("plane", ["xy", "xz"])
-def test_arrows_are_the_residuals_enlarged(plane: str):
-    told = story()
-    r = told.revisions[0]
-    figure = workspace(told, r, plane)
-    times = magnification(float(np.linalg.norm(r.residual, axis=1).max()))
-    assert 0.4 * LONGEST <= times * np.linalg.norm(r.residual, axis=1).max() <= LONGEST
+def test_arrows_are_the_residuals_enlarged(plane: str, first):
+    told, r = first
+    largest = float(r.size_m.max())
+    times = charts.magnification(largest)
+    assert 0.4 * charts.LONGEST <= times * largest <= charts.LONGEST
     lengths = []
-    for trace in figure.data:
+    for trace in charts.workspace(told, r, plane).data:
         if trace.mode == "lines":
             xy = np.stack([np.asarray(getattr(trace, a), float) for a in "xy"], 1)
             lengths.append(np.linalg.norm(xy[1::3] - xy[::3], axis=1))
     seen = r.residual[:, ["xyz".index(a) for a in plane]]
-    expected = times * np.linalg.norm(seen, axis=1)
-    np.testing.assert_allclose(np.sort(np.concatenate(lengths)), np.sort(expected), atol=1e-6)
+    expected = np.sort(times * np.linalg.norm(seen, axis=1))
+    np.testing.assert_allclose(np.sort(np.concatenate(lengths)), expected, atol=1e-6)
 
 
 def test_errors_of_poses_left_out_take_the_place_of_the_residual():
-    f = fitted()
+    f = judged().fit
     told = build_story([Chapter(1, None, f, None)])
-    fit_only = told.revisions[0]
-    r = of_left_out(fit_only, f)
-    size = np.linalg.norm(r.residual, axis=1)
-    assert np.sqrt(np.mean(size**2)) == pytest.approx(f.holdout.rms_m, rel=1e-9)
-    assert size.max() == pytest.approx(f.holdout.max_m, rel=1e-9)
+    r = of_left_out(told.revisions[0], f)
+    assert np.sqrt(np.mean(r.size_m**2)) == pytest.approx(f.holdout.rms_m, rel=1e-9)
+    assert r.size_m.max() == pytest.approx(f.holdout.max_m, rel=1e-9)
     np.testing.assert_allclose(told.measured - r.predicted, r.residual, atol=1e-12)
-    assert r.whitened_norm2.sum() > fit_only.whitened_norm2.sum()
+    assert r.whitened_norm2.sum() > told.revisions[0].whitened_norm2.sum()
 
 
 def test_of_very_many_readings_the_worst_are_drawn_and_it_is_said():
     told = story(poses=100)
     r = told.revisions[0]
-    some = drawn(told, r, most=50)
-    worst = np.argsort(-r.whitened_norm2)[:10]
-    assert set(worst) <= set(some.index.tolist())
+    some = charts.drawn(told, r, most=50)
+    assert set(np.argsort(-r.whitened_norm2)[:10]) <= set(some.index.tolist())
     assert len(some.index) == 50
     assert "Of 300 readings 50 are drawn" in some.note
 
 
 def test_a_pose_named_like_markup_stays_text():
     told = story(names="<script>alert(1)</script>")
-    figure = residual_by_load(told, told.revisions[0])
+    figure = charts.residual_by_load(told, told.revisions[0])
     words = [*figure.layout.xaxis.ticktext, *(n for t in figure.data for n in t.text)]
     assert words
     assert not any("<" in w for w in words)
@@ -164,38 +137,33 @@ def test_a_pose_named_like_markup_stays_text():
 def test_an_added_variable_plot_shows_its_slope():
     d = judged()
     found = regressor(d.fit, d.suspects[0])
-    assert found is not None
-    figure = added_variable(found, "joint_tilt_compliance")
-    slope = float(np.polyfit(found.x, found.y, 1)[0])
-    assert slope == pytest.approx(1.0, abs=0.2)
+    figure = charts.added_variable(found, "joint_tilt_compliance")
+    assert np.polyfit(found.x, found.y, 1)[0] == pytest.approx(1.0, abs=0.2)
     assert f"slope {float(found.x @ found.y / (found.x @ found.x)):.2f}" in says(figure)
     np.testing.assert_allclose(np.asarray(figure.data[0].y, float), found.y, atol=1e-3)
 
 
 def test_shares_and_curves_of_the_misfit():
     d = judged()
-    (bar,) = misfit_shares(d).data
-    np.testing.assert_allclose(
-        np.asarray(bar.x, float),
-        [100 * v.share for v in d.misfit_breakdown if v.share >= 0.01][:12],
-    )
+    (bar,) = charts.misfit_shares(d).data
+    shares = [100 * v.share for v in d.misfit_breakdown if v.share >= 0.01][:12]
+    np.testing.assert_allclose(np.asarray(bar.x, float), shares)
     for curve in (ANGLE, LOAD):
-        (trace,) = curve_chart(curve).data
+        (trace,) = charts.curve_chart(curve).data
         np.testing.assert_allclose(np.asarray(trace.y, float), curve.y)
         np.testing.assert_allclose(np.asarray(trace.error_y.array, float), curve.error)
 
 
 def test_correlations_are_those_of_the_normal_equations():
-    f = fitted()
-    names, of = parameter_correlations(f)
+    f = judged().fit
+    names, of = charts.parameter_correlations(f)
     assert set(names) == {p.name for p in f.parameters if p.identifiable}
     np.testing.assert_allclose(np.diag(of), 1.0)
     np.testing.assert_allclose(of, of.T)
     # The same from a Jacobian by differences of the predictions, over the determined parameters;
     # the frame, which deflections hardly determine, is held here and not in the fit.
-    every = [f"{e.name}.{p.name}" for e in f.model.effects for p in e.parameters]
     scale = {f"{e.name}.{p.name}": p.scale for e in f.model.effects for p in e.parameters}
-    columns = []
+    every, columns = list(scale), []
     for name in names:
         step = np.zeros(len(every))
         step[every.index(name)] = 1e-3 * scale[name]
@@ -205,17 +173,17 @@ def test_correlations_are_those_of_the_normal_equations():
     inverse = np.linalg.inv(np.stack(columns, 1).T @ np.stack(columns, 1))
     std = np.sqrt(np.diag(inverse))
     np.testing.assert_allclose(of, inverse / np.outer(std, std), atol=0.05)
-    (heat,) = correlations(f).data
+    (heat,) = charts.correlations(f).data
     assert np.asarray(heat.z).shape == (min(len(names), 30),) * 2
 
 
 def test_the_noise_check_counts_every_element():
-    f = fitted()
-    bar, normal = noise_check(f).data
+    f = judged().fit
+    bar, normal = charts.noise_check(f).data
     assert int(np.sum(bar.y)) == len(f.white)
     step, width = float(normal.x[1] - normal.x[0]), float(bar.x[1] - bar.x[0])
     assert np.sum(normal.y) * step == pytest.approx(width * len(f.white), rel=1e-3)
-    assert "larger than the stated noise" in says(noise_check(f))
+    assert "larger than the stated noise" in says(charts.noise_check(f))
 
 
 def luminance(color: str) -> float:
@@ -227,17 +195,15 @@ def luminance(color: str) -> float:
 @pytest.mark.parametrize("color", [style.MEASURED, style.NOISE, style.HOLDOUT, *style.LEVELS])
 @pytest.mark.parametrize("paper", [style.LIGHT, style.DARK])
 def test_colours_stand_out_on_both_papers(color: str, paper: str):
-    one, other = sorted((luminance(color), luminance(paper)))
-    assert (other + 0.05) / (one + 0.05) >= 3.0
+    low, high = sorted((luminance(color), luminance(paper)))
+    assert (high + 0.05) / (low + 0.05) >= 3.0
 
 
-def test_a_scheme_changes_the_look_and_nothing_else():
-    told = story()
-    figure = error_per_revision(told)
+def test_a_scheme_changes_the_look_and_nothing_else(told):
+    figure = charts.error_per_revision(told)
     dark = style.in_scheme(figure, dark=True)
     assert dark.layout.template.layout.font.color != figure.layout.template.layout.font.color
-    assert dark.data == figure.data
-    assert says(dark) == says(figure)
+    assert (dark.data, says(dark)) == (figure.data, says(figure))
 
 
 def test_the_sizes_of_families_are_drawn_by_those_of_an_ordinary_arm_with_their_intervals():
@@ -245,10 +211,9 @@ def test_the_sizes_of_families_are_drawn_by_those_of_an_ordinary_arm_with_their_
         FamilySize(f"f{k}", f"f{k}", k == 0, 2.0, 1.0, 6.0, 4.0, "rad", 1e-3 / (k + 1))
         for k in range(MOST_FAMILIES + 3)
     ]
-    figure = made_of(sizes)
+    figure = charts.made_of(sizes)
     named, other = figure.data
-    assert list(named.y) == ["f0"]
-    assert list(other.y) == [s.name for s in sizes[1:MOST_FAMILIES]]
+    assert [*named.y, *other.y] == [s.name for s in sizes[:MOST_FAMILIES]]
     for trace in figure.data:
         np.testing.assert_allclose(trace.x, 0.5)
         np.testing.assert_allclose(trace.x + trace.error_x.array, 1.5)

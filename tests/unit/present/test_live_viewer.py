@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import psutil
@@ -24,6 +25,7 @@ from tests.support.paths import ROOT
 SOON = 0.05
 """A call that only puts something into a queue takes less, s, on a machine that is busy, too."""
 posix = pytest.mark.skipif(os.name != "posix", reason="signals")
+growing = pytest.mark.filterwarnings("ignore:RRD file has no footer")
 
 
 @pytest.fixture
@@ -39,18 +41,12 @@ def said() -> list[str]:
 
 
 @pytest.fixture
-def live(home, said) -> Iterator[LiveViewer]:
+def live(home, said, free_port) -> Iterator[LiveViewer]:
     """A started viewer on a free port."""
-    made = LiveViewer(home / "run.live.rrd", said.append, free_port())
+    made = LiveViewer(home / "run.live.rrd", said.append, free_port)
     made.start()
     yield made
     made.close()
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def tell(live: LiveViewer, poses: int = 24, paced: bool = False) -> float:
@@ -68,13 +64,16 @@ def tell(live: LiveViewer, poses: int = 24, paced: bool = False) -> float:
     return slowest
 
 
-def client(url: str, path: Path) -> subprocess.Popen[bytes]:
+@contextmanager
+def client(url: str, path: Path) -> Iterator["subprocess.Popen[bytes]"]:
     """A viewer without a window, that saves what it gets."""
-    return subprocess.Popen(
-        [executable(), "--port", "auto", "--save", str(path), url],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
+    command = [executable(), "--port", "auto", "--save", str(path), url]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
 
 
 def readings(path: Path) -> int:
@@ -100,7 +99,7 @@ def alive(pid: int) -> bool:
     return psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
 
 
-@pytest.mark.filterwarnings("ignore:RRD file has no footer")
+@growing
 def test_a_viewer_that_comes_late_gets_all_and_the_recording_has_it_too(home, said):
     with socket.socket() as taken:  # the wanted port: the next one is taken instead
         taken.bind(("127.0.0.1", 0))
@@ -109,7 +108,6 @@ def test_a_viewer_that_comes_late_gets_all_and_the_recording_has_it_too(home, sa
         live = LiveViewer(home / "run.live.rrd", said.append, port)
         live.start()
     try:
-        assert live.url is not None
         assert live.url.startswith("rerun+http://127.0.0.1:")
         assert str(port) not in live.url
         process = psutil.Process(live.pid)
@@ -118,28 +116,20 @@ def test_a_viewer_that_comes_late_gets_all_and_the_recording_has_it_too(home, sa
         assert process.nice() > 0
         assert tell(live, 24) < SOON
         until(lambda: readings(live.record) >= 0.9 * (48 - BLIND), "not recorded")  # in batches
-        late = client(live.url, home / "late.rrd")
-        try:
-            until(lambda: readings(home / "late.rrd") == 48 - BLIND, "the late viewer lacks some")
-        finally:
-            late.kill()
-            late.wait()
+        with client(live.url, late := home / "late.rrd"):
+            until(lambda: readings(late) == 48 - BLIND, "the late viewer lacks some")
     finally:
         live.close()
     assert readings(live.record) == 48 - BLIND
     assert RrdReader(live.record).store() is not None  # it has its footer: whole
-    assert (said, live.dropped) == ([], 0)
-    assert not alive(process.pid)
+    assert (said, live.dropped, alive(process.pid)) == ([], 0, False)
 
 
 @pytest.mark.slow
 @posix
-@pytest.mark.filterwarnings("ignore:RRD file has no footer")
-def test_a_frozen_viewer_costs_nothing(live, said, home, monkeypatch):
-    url = live.url
-    assert url is not None
-    frozen = client(url, home / "frozen.rrd")
-    try:
+@growing
+def test_a_frozen_viewer_costs_nothing(live, said, home):
+    with client(live.url, home / "frozen.rrd") as frozen:
         time.sleep(1.0)
         frozen.send_signal(signal.SIGSTOP)
         before = psutil.Process(live.pid).memory_info().rss
@@ -147,9 +137,6 @@ def test_a_frozen_viewer_costs_nothing(live, said, home, monkeypatch):
         until(lambda: readings(live.record) >= 0.95 * 980, "not recorded", 60.0)
         grown = psutil.Process(live.pid).memory_info().rss - before
         assert grown < 400e6  # what the server keeps for late viewers, and what it is kept in
-    finally:
-        frozen.kill()
-        frozen.wait()
     live.close()
     assert readings(live.record) == 980 - BLIND  # up to a thousand each is drawn
     assert said == []
@@ -161,8 +148,7 @@ def test_a_process_that_is_frozen_is_dropped_and_ended(live, said, monkeypatch):
     monkeypatch.setattr(live_viewer, "END_S", 1.0)
     pid = live.pid
     os.kill(pid, signal.SIGSTOP)
-    slowest = tell(live, 1500)
-    assert slowest < SOON
+    assert tell(live, 1500) < SOON
     assert live._queue.qsize() <= live_viewer.MOST
     assert live.dropped > 0
     begun = time.monotonic()
@@ -195,51 +181,43 @@ def test_no_free_port_is_said_and_the_recording_is_written_all_the_same(home, sa
     assert readings(live.record) == 24 - BLIND
 
 
-FULL = """
-import resource, sys, time
+PROGRAM = """
+import os, resource, signal, sys, time
 from pathlib import Path
 from tests.unit.present.test_live_viewer import tell
 from hilcal.present.live_viewer import LiveViewer
-resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, resource.RLIM_INFINITY))
+{before}
 live = LiveViewer(Path(sys.argv[1]), print, int(sys.argv[2]))
 live.start()
-slowest = tell(live, 60)
-time.sleep(3)
-print("goes on", live.url is not None, slowest < 0.05)
-live.close()
+slowest = tell(live, {poses})
+{after}
 """
-KILLED = """
-import os, signal, sys, time
-from pathlib import Path
-from tests.unit.present.test_live_viewer import tell
-from hilcal.present.live_viewer import LiveViewer
-live = LiveViewer(Path(sys.argv[1]), print, int(sys.argv[2]))
-live.start()
-tell(live, 24)
-while live._queue.qsize():
-    time.sleep(0.01)
-print(live.pid, flush=True)
-os.kill(os.getpid(), signal.SIGKILL)
-"""
+FULL = PROGRAM.format(
+    before="resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, resource.RLIM_INFINITY))",
+    poses=60,
+    after='time.sleep(3)\nprint("goes on", live.url is not None, slowest < 0.05)\nlive.close()',
+)
+KILLED = PROGRAM.format(
+    before="",
+    poses=24,
+    after="while live._queue.qsize():\n    time.sleep(0.01)\n"
+    "print(live.pid, flush=True)\nos.kill(os.getpid(), signal.SIGKILL)",
+)
 
 
-def run(code: str, path: Path) -> str:
+def run(code: str, path: Path, port: int) -> str:
     """Let a program of its own tell a campaign; returns what it printed."""
+    command, env = [sys.executable, "-c", code, str(path), str(port)], {"PYTHONPATH": str(ROOT)}
     done = subprocess.run(
-        [sys.executable, "-c", code, str(path), str(free_port())],
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=120,
+        command, env=os.environ | env, capture_output=True, text=True, check=False, timeout=120
     )
     return done.stdout + done.stderr
 
 
 @pytest.mark.slow
 @posix
-def test_a_full_disk_ends_the_recording_only(home):
-    told = run(FULL, home / "full.live.rrd")
+def test_a_full_disk_ends_the_recording_only(home, free_port):
+    told = run(FULL, home / "full.live.rrd", free_port)
     assert told.count("cannot be written") == 1
     assert "everything else goes on" in told
     assert "goes on True True" in told
@@ -247,9 +225,9 @@ def test_a_full_disk_ends_the_recording_only(home):
 
 @pytest.mark.slow
 @posix
-def test_the_recording_is_whole_although_the_command_was_killed(home):
+def test_the_recording_is_whole_although_the_command_was_killed(home, free_port):
     path = home / "killed.live.rrd"
-    pid = int(run(KILLED, path).split()[-1])
+    pid = int(run(KILLED, path, free_port).split()[-1])
     until(lambda: not alive(pid), "the process has stayed behind")
     assert RrdReader(path).store() is not None
     assert readings(path) == 48 - BLIND

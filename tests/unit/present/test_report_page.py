@@ -1,6 +1,5 @@
 """The report in a browser: whole on a desk and on a phone, light and dark, offline, on paper."""
 
-import base64
 import itertools
 import json
 import re
@@ -35,7 +34,6 @@ from tests.support.browser import DESKTOP, PHONE, needs_chromium, open_browser
 from tests.support.picture import pixels
 from tests.support.report_pages import EVIL, opened, small_content
 
-DRAW_ALL = "drawAll()"
 PAPER = 681
 """Width of A4 without its margins, 180 mm, in CSS pixels."""
 CUT = (
@@ -66,10 +64,14 @@ needs_poppler = pytest.mark.skipif(
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[ReportContent, Path]:
     folder = tmp_path_factory.mktemp("report")
-    m = small_content(folder)
-    path = folder / "report.html"
+    m, path = small_content(folder), folder / "report.html"
     path.write_text(page_of(m), encoding="utf-8")
     return m, path
+
+
+@pytest.fixture(scope="module")
+def text(made) -> str:
+    return made[1].read_text(encoding="utf-8")
 
 
 @pytest.fixture(scope="module")
@@ -85,78 +87,64 @@ def plain(m: ReportContent) -> ReportContent:
 
 def large(m: ReportContent) -> ReportContent:
     """The same with many revisions, poses of long names, and instruments, with no appendix."""
-    told = m.story
-    last = told.revisions[-1]
-    many = tuple(
-        replace(last, revision=k, change="+ periodic_joint_compliance" if k else "")
-        for k in range(12)
-    )
-    named = tuple(f"calibration pose number {k:03d}" for k in range(len(told)))
-    story = replace(
-        told, revisions=many, pose_names=named, pose=np.arange(len(told)),
-        time_s=60.0 * np.arange(len(told)),
-    )  # fmt: skip
-    one = MeasuringDevice(
-        "tracker", "leica", "Leica AT960-MR", "750123", {"firmware": "3.1"}, m.made
-    )
-    overview = replace(m.overview, instruments=(one,) * 5)
+    told, count = m.story, len(m.story)
+    change = ["", *["+ periodic_joint_compliance"] * 11]
+    many = tuple(replace(told.revisions[-1], revision=k, change=c) for k, c in enumerate(change))
+    named = tuple(f"calibration pose number {k:03d}" for k in range(count))
+    pose, time_s = np.arange(count), 60.0 * np.arange(count)
+    story = replace(told, revisions=many, pose_names=named, pose=pose, time_s=time_s)
+    name, facts = "Leica AT960-MR", {"firmware": "3.1"}
+    device = MeasuringDevice("tracker", "leica", name, "750123", facts, m.made)
+    overview = replace(m.overview, instruments=(device,) * 5)
     return replace(plain(m), story=story, overview=overview)
 
 
-def read(values: object) -> np.ndarray:
-    """Numbers of a chart, which plotly may write as base64."""
-    if isinstance(values, dict):
-        return np.frombuffer(base64.b64decode(values["bdata"]), dtype=values["dtype"])
-    return np.asarray(values, float)
-
-
 class Outline(HTMLParser):
-    """Headings, tables and charts of a page, and text outside of scripts."""
+    """The tags of a page with their attributes."""
 
-    def __init__(self) -> None:
+    def __init__(self, text: str) -> None:
         super().__init__()
-        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.found: list[tuple[str, dict[str, str | None]]] = []
+        self.feed(text)
+        self.tags = [tag for tag, _ in self.found]
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, dict(attrs)))
+        self.found.append((tag, dict(attrs)))
+
+    def of(self, tag: str, key: str) -> list[str | None]:
+        return [attrs[key] for name, attrs in self.found if name == tag]
 
 
-def test_the_page_is_one_file_with_its_headings_tables_and_sentences(made) -> None:
-    text = made[1].read_text(encoding="utf-8")
-    outline = Outline()
-    outline.feed(text)
-    tags = [tag for tag, _ in outline.tags]
-    assert tags.count("h1") == 1
-    levels = [int(t[1]) for t in tags if re.fullmatch(r"h[1-6]", t)]
+def test_the_page_is_one_file_with_its_headings_tables_and_sentences(text) -> None:
+    outline = Outline(text)
+    assert outline.tags.count("h1") == 1
+    levels = [int(t[1]) for t in outline.tags if re.fullmatch(r"h[1-6]", t)]
     assert all(b <= a + 1 for a, b in itertools.pairwise(levels)), levels
-    for name, found in outline.tags:
+    for name, found in outline.found:
         assert not (name in ("script", "img", "iframe") and "src" in found)
-        if name == "th":
-            assert found["scope"] in ("row", "col")
         if found.get("class") == "chart":
             assert len(str(found["aria-label"])) > 20
             assert found["role"] == "img"
-        if name == "link":
-            assert found["href"] == "data:,"
-    assert tags.count("table") == tags.count("caption")
-    ids = [found["id"] for name, found in outline.tags if name == "section"]
+    assert set(outline.of("th", "scope")) <= {"row", "col"}
+    assert set(outline.of("link", "href")) == {"data:,"}
+    assert outline.tags.count("table") == outline.tags.count("caption")
+    ids = outline.of("section", "id")
     assert ids[: len(MAIN)] == MAIN
     assert set(ids[len(MAIN) :]) == {"joints", "rejected", "all", "scalings", "provenance"}
-    links = [found["href"] for name, found in outline.tags if name == "a"]
-    assert links == [f"#{i}" for i in ids]
+    assert outline.of("a", "href") == [f"#{i}" for i in ids]
 
 
-def test_names_are_text_and_nothing_else(made) -> None:
-    text = made[1].read_text(encoding="utf-8")
+def test_names_are_text_and_what_is_in_scripts_is_json(text) -> None:
     assert EVIL not in text
     assert "<img" not in text.split("<body>")[1].split("<script>/**")[0]
     assert "&lt;script&gt;" in text
+    found = re.findall(r'<script type="application/json">(.*?)</script>', text, re.S)
+    assert len(found) > 10
+    assert all("data" in json.loads(script) for script in found)
 
 
-def test_numbers_of_the_certificate_are_those_of_the_fit(made) -> None:
-    m, path = made
-    text = path.read_text(encoding="utf-8")
-    error = left_out_errors(m.fit)
+def test_numbers_of_the_certificate_are_those_of_the_fit(made, text) -> None:
+    m, error = made[0], left_out_errors(made[0].fit)
     assert error.max() == pytest.approx(m.fit.holdout.max_m)
     words, passed = limit_words(m)
     assert passed == bool(error.max() <= m.limit_m)
@@ -174,60 +162,47 @@ def test_numbers_of_the_certificate_are_those_of_the_fit(made) -> None:
 
 def test_what_is_said_to_be_wrong_is_of_poses_left_out(made) -> None:
     """The pose that fits worst is not the one that is predicted worst."""
-    m, _ = made
-    error = left_out_errors(m.fit)
-    worst = f"furthest off: {numbers.length(error.max())}"
-    assert worst in first_screen(m).answers[1][1]
-    size = np.linalg.norm(m.left_out.residual, axis=1)
-    np.testing.assert_allclose(np.sort(size), np.sort(error), rtol=1e-9)
+    m, error = made[0], left_out_errors(made[0].fit)
+    assert f"furthest off: {numbers.length(error.max())}" in first_screen(m).answers[1][1]
+    np.testing.assert_allclose(np.sort(m.left_out.size_m), np.sort(error), rtol=1e-9)
     by_pose = next(p for p in sections(m)[1].blocks if isinstance(p, Chart))
-    drawn = np.concatenate([read(t["y"]) for t in json.loads(by_pose.figure.to_json())["data"]])
+    drawn = np.concatenate([np.asarray(trace.y, float) for trace in by_pose.figure.data])
     np.testing.assert_allclose(np.sort(drawn) ** 2, np.sort(m.left_out.whitened_norm2), rtol=1e-5)
 
 
-def test_poses_left_out_beyond_the_noise_are_not_said_to_be_within_it(made) -> None:
-    m, _ = made
+@pytest.mark.parametrize(("sigma", "within"), [(1.0, True), (1.57, False)])
+def test_poses_left_out_beyond_the_noise_are_not_said_to_be_within_it(made, sigma, within) -> None:
+    m, fit = made[0], replace(made[0].fit)
     calm = replace(m.diagnosis, reason="residual_is_noise")
-    for sigma, within in ((1.0, True), (1.57, False)):
-        fit = replace(m.fit)
-        fit.__dict__["holdout"] = replace(m.fit.holdout, rms_sigma=sigma)
-        said = where_wrong(replace(m, chapters=(Chapter(1, None, fit, calm),)))
-        assert ("all poses and loads are predicted within it" in said) == within
-        assert (f"by {sigma:.2f} times the noise" in said) != within
+    fit.__dict__["holdout"] = replace(m.fit.holdout, rms_sigma=sigma)
+    said = where_wrong(replace(m, chapters=(Chapter(1, None, fit, calm),)))
+    assert ("all poses and loads are predicted within it" in said) == within
+    assert (f"by {sigma:.2f} times the noise" in said) != within
 
 
 def test_results_show_themselves_in_a_notebook(made) -> None:
-    (m, path), shown = made, []
-    for result, words in (
-        (m.fit, numbers.length(m.fit.holdout.rms_m)),
-        (m.diagnosis, m.diagnosis.suspects[0].effect),
-        (
-            Refinement((RefinementStep(m.fit, m.diagnosis, None),)),
-            m.diagnosis.verdict.replace("_", " "),
-        ),
-    ):
-        text = result._repr_html_()
-        assert words in text
-        shown.append(text)
-    with Campaign.open(path.parent / "a&<b>.hilcal") as run:
-        shown.append(run._repr_html_())
-    for text in shown:
-        outline = Outline()
-        outline.feed(text)
-        tags = [tag for tag, _ in outline.tags]
-        assert tags.count("table") == tags.count("caption") > 0
-        assert EVIL not in text
-
-
-def test_without_an_appendix_the_page_has_the_parameters_and_nothing_else_of_it(made) -> None:
     m, path = made
-    short, long = page_of(plain(m)), path.read_text(encoding="utf-8")
-    outline = Outline()
-    outline.feed(short)
-    assert [found["id"] for name, found in outline.tags if name == "section"] == MAIN
+    path_of = Refinement((RefinementStep(m.fit, m.diagnosis, None),))
+    with Campaign.open(path.parent / "a&<b>.hilcal") as run:
+        for result, words in (
+            (m.fit, numbers.length(m.fit.holdout.rms_m)),
+            (m.diagnosis, m.diagnosis.suspects[0].effect),
+            (path_of, m.diagnosis.verdict.replace("_", " ")),
+            (run, "readings of"),
+        ):
+            shown = result._repr_html_()
+            tags = Outline(shown).tags
+            assert words in shown
+            assert tags.count("table") == tags.count("caption") > 0
+            assert EVIL not in shown
+
+
+def test_without_an_appendix_the_page_has_the_parameters_and_nothing_else_of_it(made, text) -> None:
+    m, short = made[0], page_of(plain(made[0]))
+    assert Outline(short).of("section", "id") == MAIN
     for words in ("Correlations", "SHA-256 of its readings", "Scaling none, gu", "Over joint 1",
                   "Other suspects", "Commands as they were typed"):  # fmt: skip
-        assert words in long
+        assert words in text
         assert words not in short
     rejected = [s.effect for s in m.diagnosis.suspects if not s.passes]
     assert rejected
@@ -239,6 +214,11 @@ def test_without_an_appendix_the_page_has_the_parameters_and_nothing_else_of_it(
         factor = {"µrad/(N·m)": 1e6}[unit]
         assert (value, std) == numbers.with_std(factor * p.value, factor * p.std)
         assert f">{value}</td>" in short
+
+
+def draw_all(page) -> None:
+    page.evaluate("drawAll()")
+    page.wait_for_function("charts.every((c) => c._fullLayout && c.querySelector('svg'))")
 
 
 @needs_chromium
@@ -254,30 +234,25 @@ def test_without_an_appendix_the_page_has_the_parameters_and_nothing_else_of_it(
 def test_it_is_whole_in_a_browser(made, browser: Browser, size, scheme: str) -> None:
     m, path = made
     with opened(browser, path, viewport=size, color_scheme=scheme) as (page, bad):
-        head = page.locator("h1")
-        box, answers = head.bounding_box(), page.locator(".answers").bounding_box()
-        assert box is not None
-        assert answers is not None
+        answers = page.locator(".answers").bounding_box()
         assert answers["y"] + answers["height"] < size["height"]
-        assert "joint_tilt_compliance" in head.inner_text() or m.diagnosis.lead is None
-        page.evaluate(DRAW_ALL)
-        page.wait_for_function("charts.every((c) => c._fullLayout && c.querySelector('svg'))")
+        title = page.locator("h1").inner_text()
+        assert "joint_tilt_compliance" in title or m.diagnosis.lead is None
+        draw_all(page)
         assert page.evaluate("document.documentElement.scrollWidth") <= size["width"]
         drawn = page.evaluate(
             "charts.map((c) => [c.getAttribute('aria-label').split(':')[0], c._fullData.map("
             "(t) => (t.x && !t.isempty ? Array.from(t.x).filter((v) => v !== null).length : 0))])"
         )
-        counts = {name: sum(points) for name, points in drawn}
-        readings = len(m.story)
+        counts, readings = {name: sum(points) for name, points in drawn}, len(m.story)
         assert counts["By pose"] == counts["By load"] == counts["Over joint 3"] == readings
         assert counts["Measured against predicted"] == 3 * readings + 2
         marks = "c => c.getAttribute('aria-label').startsWith('By pose:')"
-        found = page.evaluate(f"charts.find({marks}).querySelectorAll('.point').length")
-        assert found == readings
+        points = page.evaluate(f"charts.find({marks}).querySelectorAll('.point').length")
+        assert points == readings
         ink = page.evaluate("charts[0]._fullLayout.font.color")
         assert ink == {"light": "#24272e", "dark": "#e4e5e9"}[scheme]
-        assert page.evaluate(f"({CUT})()") == []
-        assert page.evaluate(f"({OVERLAPPING})()") == []
+        assert page.evaluate(f"({CUT})()") == page.evaluate(f"({OVERLAPPING})()") == []
         assert page.evaluate("window.harmed") is None
         assert bad == []
 
@@ -290,8 +265,7 @@ def test_it_prints_on_six_pages_at_most(made, browser: Browser, tmp_path: Path, 
     with opened(browser, path, viewport=DESKTOP) as (page, bad):
         page.evaluate(f"window.onbeforeprint = () => {{ window.over = ({OVERLAPPING})(); }}")
         pdf = page.pdf(prefer_css_page_size=True)
-        assert page.evaluate("window.over") == []
-        assert bad == []
+        assert page.evaluate("window.over") == bad == []
     assert 2 <= len(re.findall(rb"/Type\s*/Page\b", pdf)) <= MOST_PAGES
 
 
@@ -302,28 +276,25 @@ def test_long_names_of_many_poses_do_not_lie_over_each_other_on_a_phone(
     path = tmp_path / "page.html"
     path.write_text(page_of(large(made[0])), encoding="utf-8")
     with opened(browser, path, viewport=PHONE) as (page, _):
-        page.evaluate(DRAW_ALL)
-        page.wait_for_function("charts.every((c) => c._fullLayout && c.querySelector('svg'))")
+        draw_all(page)
         assert page.evaluate(f"({OVERLAPPING})()") == []
 
 
 @needs_chromium
 @pytest.mark.slow
 def test_it_prints_on_a4_in_light_colours_with_all_charts(made, browser: Browser) -> None:
-    _, path = made
-    with opened(browser, path, viewport=DESKTOP, color_scheme="dark") as (page, bad):
+    with opened(browser, made[1], viewport=DESKTOP, color_scheme="dark") as (page, bad):
         page.evaluate(
             "window.addEventListener('beforeprint', () => { window.printed = charts.map("
             "(c) => [!!c._fullLayout, c.getBoundingClientRect().width,"
-            " c._fullLayout.font.color]);"
-            f" window.cut = ({CUT})(); }})"
+            f" c._fullLayout.font.color]); window.cut = ({CUT})(); }})"
         )
         pdf = page.pdf(prefer_css_page_size=True)
-        printed = page.evaluate("window.printed")
         assert page.evaluate("window.cut") == []
-        assert all(drawn for drawn, _, _ in printed)
-        assert max(width for _, width, _ in printed) <= PAPER
-        assert {ink for _, _, ink in printed} == {"#24272e"}
+        drawn, widths, inks = zip(*page.evaluate("window.printed"), strict=True)
+        assert all(drawn)
+        assert max(widths) <= PAPER
+        assert set(inks) == {"#24272e"}
         assert re.search(rb"/MediaBox \[0 0 59[45][.0-9]* 84[12][.0-9]*\]", pdf)
         assert page.evaluate("charts[0]._fullLayout.font.color") == "#e4e5e9"  # as it was
         page.set_viewport_size({"width": PAPER, "height": 1000})
@@ -339,17 +310,17 @@ def test_it_prints_on_a4_in_light_colours_with_all_charts(made, browser: Browser
 def test_printed_pages_are_numbered_light_and_end_with_no_heading(
     made, browser: Browser, tmp_path: Path
 ) -> None:
+    pdf = str(tmp_path / "page.pdf")
     with opened(browser, made[1], viewport=DESKTOP, color_scheme="dark") as (page, _):
         titles = set(page.locator("h2, h3, caption").all_text_contents())
-        page.pdf(path=tmp_path / "page.pdf", prefer_css_page_size=True, print_background=True)
-    pdf = str(tmp_path / "page.pdf")
+        page.pdf(path=pdf, prefer_css_page_size=True, print_background=True)
     told = subprocess.run(["pdftotext", "-layout", pdf, "-"], capture_output=True, text=True)
     pages = [[x.strip() for x in p.splitlines() if x.strip()] for p in told.stdout.split("\f")]
     pages = [p for p in pages if p]
     assert len(pages) > 5
-    for k, lines in enumerate(pages):
-        assert lines[-1] == f"page {k + 1} of {len(pages)}"
-        foot = lines[-3:-1] if k + 1 < len(pages) else lines[-2:-1]
+    for k, lines in enumerate(pages, start=1):
+        assert lines[-1] == f"page {k} of {len(pages)}"
+        foot = lines[-3:-1] if k < len(pages) else lines[-2:-1]
         assert not titles & set(foot), foot
         assert len(lines) > 3  # no page for the end of a table alone
     subprocess.run(["pdftoppm", "-r", "20", "-png", pdf, str(tmp_path / "p")], check=True)
@@ -357,11 +328,3 @@ def test_printed_pages_are_numbered_light_and_end_with_no_heading(
         ink = pixels(png)[..., :3]
         assert np.median(ink) == 255  # white paper
         assert (ink < 200).any()  # and something on it
-
-
-def test_what_is_in_scripts_is_json(made) -> None:
-    text = made[1].read_text(encoding="utf-8")
-    found = re.findall(r'<script type="application/json">(.*?)</script>', text, re.S)
-    assert len(found) > 10
-    for one in found:
-        assert "data" in json.loads(one)

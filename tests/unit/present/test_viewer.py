@@ -14,13 +14,12 @@ import pytest
 from rerun.chunk import RrdReader
 from scipy.spatial.transform import Rotation
 
-from hilcal.errors import HilcalError, InputError
+from hilcal.errors import InputError
 from hilcal.present.document import table
 from hilcal.present.story import levels, worst_and_even
 from hilcal.present.viewer import campaign, save, serve, style
 from hilcal.present.viewer.recording import executable
 from hilcal.robot.body import body_poses, capsules
-from tests.support import picture
 from tests.support.paths import ROOT
 from tests.support.picture import Shot, pictures, pixels, vulkan_available
 from tests.support.recordings import rows, same, texts
@@ -332,25 +331,6 @@ def test_every_view_is_drawn_without_a_report(told, recording, tmp_path):
     assert [v for v in reports if v.problems] == []
     for shot in shots:
         assert colors(pixels(shot.png)) > 20, shot
-
-
-@pytest.mark.long
-@pytest.mark.vulkan
-@needs_vulkan
-def test_unknown_timeline_and_view_are_named(recording, tmp_path):
-    with pytest.raises(InputError, match=r"no timeline 'frame'; the recording has .*revision"):
-        picture.picture(recording, tmp_path / "a.png", "frame", 0, size=(320, 200))
-    with pytest.raises(InputError, match=r"no view 'Nothing'; the recording has .*Verdict"):
-        picture.picture(recording, tmp_path / "a.png", view="Nothing", size=(320, 200))
-
-
-def test_missing_recording_or_driver_is_refused(recording, tmp_path, monkeypatch):
-    with pytest.raises(InputError, match=r"no such file"):
-        picture.picture(tmp_path / "none.rrd", tmp_path / "a.png")
-    monkeypatch.setenv("VK_DRIVER_FILES", str(tmp_path / "none.json"))
-    assert not vulkan_available()
-    with pytest.raises(HilcalError, match="mesa-vulkan-drivers"):
-        picture.picture(recording, tmp_path / "a.png")
 
 
 # where a recording goes

@@ -52,9 +52,9 @@ from hilcal.drivers.terminal_operator import TerminalOperator
 from hilcal.errors import InputError
 from hilcal.identification import posterior_document
 from hilcal.names import check_name, check_names, csv_text, escaped, from_csv, quoted
-from hilcal.present import chart_style
+from hilcal.present import charts as chart_style
 from hilcal.present import html as page
-from hilcal.present.chart_style import label as in_chart
+from hilcal.present.charts import label as in_chart
 from hilcal.present.document import Chart, Items, PageSection, Words, table
 from hilcal.present.html import FirstScreen
 from hilcal.present.progress import SafeConsole, counting, working

@@ -16,7 +16,7 @@ from hilcal.identification.carried import carried_prior
 from hilcal.present.campaign import left_out_m, two_revisions, verdict_of
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.whole_file import replace_file
-from hilcal.workbench.session import WorkbenchSession
+from hilcal.workbench.session import Snapshot, WorkbenchSession
 from tests.support.bench_cases import BASE, few_effects, stored
 from tests.support.campaigns import campaign, configuration
 
@@ -26,14 +26,23 @@ def run(tmp_path: Path) -> Path:
     return stored(tmp_path / "run.hilcal")
 
 
+@pytest.fixture
+def session(run: Path) -> WorkbenchSession:
+    return WorkbenchSession(run, few_effects())
+
+
+@pytest.fixture
+def snapshot(session: WorkbenchSession) -> Snapshot:
+    return session.load()
+
+
 def revisions(path: Path) -> list[tuple[str | None, str | None, int | None]]:
     with Campaign.open(path, read_only=True) as o:
         return [(r.added, r.removed, r.made_from) for r in o.file.revisions()]
 
 
-def test_an_operator_adds_removes_and_goes_back(run: Path) -> None:
+def test_an_operator_adds_removes_and_goes_back(run: Path, session) -> None:
     before = run.read_bytes()
-    session = WorkbenchSession(run, few_effects())
     snapshot = session.load()
     assert (run.read_bytes(), list(run.parent.iterdir())) == (before, [run])  # only looked at
     assert (snapshot.number, snapshot.records, snapshot.in_use) == (None, (), None)
@@ -43,7 +52,6 @@ def test_an_operator_adds_removes_and_goes_back(run: Path) -> None:
     assert snapshot.removable == ("joint_compliance",)
 
     r = session.evidence(snapshot, BASE)
-    assert r is not None
     assert 0.5 < float(r.x @ r.y / (r.x @ r.x)) < 2.0
     assert session.evidence(snapshot, "no_such_effect") is None
 
@@ -59,7 +67,6 @@ def test_an_operator_adds_removes_and_goes_back(run: Path) -> None:
     assert revisions(run) == []
 
     added = session.add(snapshot, BASE)
-    assert session.changed is not None
     assert (added.number, [r.added for r in added.records]) == (2, [None, BASE])
     assert added.fit.holdout.rms_m < 0.8 * snapshot.fit.holdout.rms_m
     assert [c.number for c in added.chapters] == [1, 2]
@@ -79,12 +86,9 @@ def test_an_operator_adds_removes_and_goes_back(run: Path) -> None:
     assert (back.number, back.accepted, back.in_use) == (2, 2, 2)
     assert revisions(run) == [(None, None, None), (BASE, None, 1), (None, BASE, 2)]
     with Campaign.open(run, read_only=True) as o:
-        kept = o.in_use()
-        assert kept is not None
-        assert kept.number == 2  # what every command takes
+        assert o.in_use().number == 2  # what every command takes
     assert session.go_back(back, 3).accepted is None  # the latest: none needs to be accepted
     first = session.load(revision=1)
-    assert first.number == 1
 
     os.utime(run)  # another command wrote to it
     assert session.stale
@@ -98,10 +102,8 @@ def test_an_operator_adds_removes_and_goes_back(run: Path) -> None:
         session.load()
 
 
-def test_a_changed_cell_keeps_how_the_model_was_reached(run: Path) -> None:
+def test_a_changed_cell_keeps_how_the_model_was_reached(run: Path, session, snapshot) -> None:
     """A verdict that doubts an addition doubts it in another cell, too, also when read again."""
-    session = WorkbenchSession(run, few_effects())
-    snapshot = session.load()
     mass = {("tool", "mass_kg"): "1.4"}
     with pytest.raises(InputError, match="no value differs from what is used already"):
         session.change_cell(snapshot, {("tool", "mass_kg"): " 0.8 "})
@@ -123,20 +125,15 @@ def test_a_changed_cell_keeps_how_the_model_was_reached(run: Path) -> None:
     assert two_revisions(*again.records[:2]).rows[0][3] == f"+ {BASE}"
 
 
-def test_a_calibration_is_of_a_revision_that_is_kept(run: Path, tmp_path: Path) -> None:
-    session = WorkbenchSession(run, few_effects())
-    name, content = session.document(session.load(), "calibration")
+def test_a_calibration_is_of_a_revision_that_is_kept(run: Path, session, snapshot) -> None:
+    name, content = session.document(snapshot, "calibration")
     assert name == "run-calibration.json"
-    kept = session.snapshot
-    assert kept is not None
-    assert (kept.number, revisions(run)) == (1, [(None, None, None)])
-    replace_file(tmp_path / name, content)
-    assert Calibration.load(tmp_path / name).source["revision"] == 1
+    assert (session.snapshot.number, revisions(run)) == (1, [(None, None, None)])
+    replace_file(run.with_name(name), content)
+    assert Calibration.load(run.with_name(name)).source["revision"] == 1
 
 
-def test_readings_that_came_later_are_fitted_anew(run: Path) -> None:
-    session = WorkbenchSession(run, few_effects())
-    snapshot = session.load()
+def test_readings_that_came_later_are_fitted_anew(run: Path, session, snapshot) -> None:
     with Campaign.open(run, few_effects()) as o:
         o.append(snapshot.fit)
         o.file.append_readings(o.file.readings()[:6])
@@ -163,15 +160,12 @@ def test_fitting_anew_keeps_the_prior_of_another_campaign(run: Path) -> None:
         o.append(fitted_with(prior, o, o.fit_in_use()[1]))
     anew = WorkbenchSession(later, few_effects()).fit_anew(None)
     kept = anew.fit.model.prior
-    assert kept is not None
     assert kept.with_drift(None).to_json() == prior.to_json()  # the drift is chosen anew
     with Campaign.open(later, few_effects(), read_only=True) as o:
         assert o.fit(2).model.prior is not None
 
 
-def test_a_plan_names_what_it_separates_or_why_there_is_none(run: Path) -> None:
-    session = WorkbenchSession(run, few_effects())
-    snapshot = session.load()
+def test_a_plan_names_what_it_separates_or_why_there_is_none(run: Path, session, snapshot) -> None:
     exists = run.with_name("there.json")
     exists.touch()
     with pytest.raises(InputError, match="the file exists; choose another name"):
@@ -182,9 +176,7 @@ def test_a_plan_names_what_it_separates_or_why_there_is_none(run: Path) -> None:
         session.plan(kept, None, run.with_name("plan.json"))
 
 
-def test_the_readings_that_were_picked_are_told_apart(run: Path) -> None:
-    session = WorkbenchSession(run, few_effects())
-    snapshot = session.load()
+def test_the_readings_that_were_picked_are_told_apart(run: Path, session, snapshot) -> None:
     story = snapshot.story
     pulled = np.flatnonzero(np.array(story.load_names) == "pull y")
     told = {d.variable: d for d in session.differences(snapshot, pulled)}
