@@ -11,15 +11,12 @@ from hilcal.diagnosis.background_evidence import (
     p_value_of_others,
     proved,
 )
-from hilcal.diagnosis.diagnosis import Diagnosis, History, Verdict
-from hilcal.diagnosis.effect_probabilities import effect_probabilities
-from hilcal.diagnosis.effect_ranking import LEAST_SHARE
-from hilcal.diagnosis.evidence import Evidence
-from hilcal.diagnosis.promise import LEAST_KEPT, kept_by_refit
+from hilcal.diagnosis.diagnosis import Diagnosis, History, Verdict, effect_probabilities
+from hilcal.diagnosis.effect_ranking import LEAST_KEPT, LEAST_SHARE, kept_by_refit
+from hilcal.diagnosis.evidence import Alternative, Evidence
 from hilcal.diagnosis.residual_regression import Regressions
 from hilcal.diagnosis.serial_noise import serial_noise, with_serial_noise
 from hilcal.diagnosis.stepwise import Refits, add, exchange, predicts_better, remove
-from hilcal.diagnosis.stepwise_alternatives import Alternative
 from hilcal.diagnosis.verdict import NOTHING, judge, judge_naming
 from hilcal.discovery.proposal import LawSearch
 from hilcal.identification.arm_scatter import with_arm_scatter, with_prior_scatter
@@ -41,8 +38,7 @@ __all__ = ["Refinement", "RefinementStep", "add", "predicts_better", "refine", "
 MOST_REVISIONS = 15
 MOST_SCATTERS = 2
 """Estimates of the arm's scatter at most: the first, and one more with what was added after it."""
-BACKGROUND = "background"
-"""What a step with a background has as its addition."""
+BACKGROUND = "background"  # what a step with a background has as its addition
 FAR = 0.1
 """Share of an effect's evidence by which others must be better while the model is not adequate;
 a guess."""
@@ -52,19 +48,12 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RefinementStep(Brief):
-    """One revision: a fit, its diagnosis, and what was changed to get there.
+    """One revision: a fit, its diagnosis, and what was changed to get there."""
 
-    Attributes:
-        fit: the fit.
-        diagnosis: of it, with all that the refinement learnt of it.
-        added: the effect that was added to the revision before, or `BACKGROUND`.
-        removed: the effect that was removed from it.
-    """
-
-    fit: Fit
-    diagnosis: Diagnosis
-    added: str | None
-    removed: str | None = None
+    fit: Fit  # the fit
+    diagnosis: Diagnosis  # of it, with all that the refinement learnt of it
+    added: str | None  # the effect that was added to the revision before, or `BACKGROUND`
+    removed: str | None = None  # the effect that was removed from it
 
     def __repr__(self) -> str:
         """Return the step in a line."""
@@ -211,19 +200,11 @@ class Path:
         self,
         first: Fit,
         say: Say = lambda text: None,
-        before: History = NOTHING,
-        laws: LawSearch | None = None,
-        seen: Callable[[RefinementStep], None] = lambda step: None,
+        before: History = NOTHING,  # how its model was reached
+        laws: LawSearch | None = None,  # searches laws
+        seen: Callable[[RefinementStep], None] = lambda step: None,  # takes each step
     ) -> None:
-        """Begin with a fit, the effects of which stay.
-
-        Args:
-            first: the fit.
-            say: takes progress, one line each.
-            before: how its model was reached.
-            laws: searches laws.
-            seen: takes each step.
-        """
+        """Begin with a fit, the effects of which stay."""
         self.steps: list[RefinementStep] = []
         self._given, self._before, self._say = first.model.named, before, say
         self._laws, self._seen = laws, seen

@@ -27,7 +27,7 @@ from hilcal.effects.protocol import Effect
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.effect_columns import computable, effect_columns
 from hilcal.identification.linearisation import Linearisation, linearise
-from hilcal.regression.power import family_power
+from hilcal.regression.evidence import family_power
 from hilcal.regression.schur import schur_complement
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Floats

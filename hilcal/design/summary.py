@@ -17,8 +17,8 @@ from hilcal.design.predicted import PredictedUncertainty, predicted
 from hilcal.design.timing import Confounding, Duration
 from hilcal.effects.protocol import FRAME_ROLES, Role
 from hilcal.errors import CannotAnswerError
+from hilcal.regression.evidence import VISIBLE
 from hilcal.regression.schur import schur_complement
-from hilcal.regression.spectrum import VISIBLE
 from hilcal.store.plan import REFERENCE
 from hilcal.types import Floats
 

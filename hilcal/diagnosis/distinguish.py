@@ -20,38 +20,24 @@ the larger value (or the smaller one) than one of the others. A choice."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recorded:
-    """A recorded variable of all readings.
+    """A recorded variable of all readings."""
 
-    Attributes:
-        name: e.g. "joint 2 torque".
-        unit: SI; "" for a pure number.
-        values: (N,) of all readings; NaN where a reading was set aside.
-        labels: names of the values 0, 1, ... where they are not numbers.
-    """
-
-    name: str
-    unit: str
-    values: Floats
-    labels: tuple[str, ...] = ()
+    name: str  # e.g. "joint 2 torque"
+    unit: str  # SI; "" for a pure number
+    values: Floats  # (N,) of all readings; NaN where a reading was set aside
+    labels: tuple[str, ...] = ()  # names of the values 0, 1, ... where they are not numbers
 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """How the picked readings differ from the others in one variable.
+    """How the picked readings differ from the others in one variable."""
 
-    Attributes:
-        variable: e.g. "joint 2 torque"; "load 5 kg" for one of several names.
-        unit: SI; "" for a share.
-        picked: median of the picked readings; the share of that name among them.
-        others: the same of the others.
-        larger: probability that a picked reading has the larger value than one of the others,
-            ties counted half.
-    """
-
-    variable: str
-    unit: str
-    picked: float
-    others: float
+    variable: str  # e.g. "joint 2 torque"; "load 5 kg" for one of several names
+    unit: str  # SI; "" for a share
+    picked: float  # median of the picked readings; the share of that name among them
+    others: float  # the same of the others
+    # probability that a picked reading has the larger value than one of the others, ties counted
+    # half
     larger: float
 
     @property
@@ -83,7 +69,6 @@ def distinguish(fit: Fit, picked: Bools) -> tuple[Difference, ...]:
     """Compare readings with the others in every recorded variable; the clearest difference first.
 
     Args:
-        fit: the fit.
         picked: (N,) which of its readings; measurements alone are compared, so that the unloaded
             readings of deflections do not count as others.
     """

@@ -22,33 +22,22 @@ from hilcal.readings.whitening import whitening
 from hilcal.regression.schur import inverse_root
 from hilcal.types import Floats
 
-LEAST = 8
-"""Distinct poses from which a registration is estimated; a guess."""
-GROWTH = 1.15
-"""The model is fitted again after so many times as many readings; a guess."""
+LEAST = 8  # distinct poses from which a registration is estimated; a guess
+GROWTH = 1.15  # the model is fitted again after so many times as many readings; a guess
 ORDINARY = 3.0
 """Prior standard deviation of every parameter, in units of its ordinary magnitude; a guess."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Known:
-    """A model as fitted to the first readings of a campaign.
+    """A model as fitted to the first readings of a campaign."""
 
-    Attributes:
-        model: the model.
-        theta: (P,) its parameters.
-        covariance: (P, P) of the parameters, for noise of the stated size.
-        rms: 3-D distance of the readings from the fit, root mean square, m.
-        count: readings that it was fitted to.
-        loaded: whether any of them was loaded.
-    """
-
-    model: Model
-    theta: Floats
-    covariance: Floats
-    rms: float
-    count: int
-    loaded: bool
+    model: Model  # the model
+    theta: Floats  # (P,) its parameters
+    covariance: Floats  # (P, P) of the parameters, for noise of the stated size
+    rms: float  # 3-D distance of the readings from the fit, root mean square, m
+    count: int  # readings that it was fitted to
+    loaded: bool  # whether any of them was loaded
 
 
 class LiveModel:

@@ -11,7 +11,7 @@ from hilcal.identification.fit import Fit, fit
 from hilcal.identification.linearisation import left_out_by_pose
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
-from hilcal.regression.paired_test import LEAST_GAIN, improves
+from hilcal.regression.leave_out import LEAST_GAIN, improves
 from hilcal.types import Floats
 
 
@@ -23,7 +23,6 @@ def add(before: Fit, effect: str, options: Options | None = None) -> Fit:
     its standard deviation.
 
     Args:
-        before: the fit.
         effect: its name; with options as `read_effects_text` reads them.
         options: of the effect, where they are not the usual ones.
 

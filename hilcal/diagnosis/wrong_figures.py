@@ -31,47 +31,30 @@ MOST_LEFT = 0.7
 MARGIN = 10.0
 """Of the criterion: figures within it of the best are named as well; very strong evidence (Kass
 and Raftery, *Bayes factors*, J. Am. Stat. Assoc. 90 (1995) 773)."""
-PROMISING = 0.2
-"""Share of χ² that the first step must promise for a refit; a choice."""
-AS_PROMISING = 0.5
-"""The same as a share of what the best one promises."""
-STEPS = 5
-"""Most refits of a figure; a choice, two or three are usual."""
-SMALL = 1.0
-"""Step, in those of the derivative, that is not worth another refit."""
+PROMISING = 0.2  # share of χ² that the first step must promise for a refit; a choice
+AS_PROMISING = 0.5  # the same as a share of what the best one promises
+STEPS = 5  # most refits of a figure; a choice, two or three are usual
+SMALL = 1.0  # step, in those of the derivative, that is not worth another refit
 OFF = {"load": 1.2, "tool_mass": 1.3}
 """Factor from which on a mass is a mistake; choices: scales are better, guesses are not."""
-LARGEST = 0.5
-"""Share of a mass that one step takes away at most; it doubles or trebles at most."""
-HANGS = 0.999
-"""Cosine to gravity from which on a force is that of a mass."""
-OFF_M = 0.02
-"""Shift from which on a centre of mass is a mistake, m; a choice."""
+LARGEST = 0.5  # share of a mass that one step takes away at most; it doubles or trebles at most
+HANGS = 0.999  # cosine to gravity from which on a force is that of a mass
+OFF_M = 0.02  # shift from which on a centre of mass is a mistake, m; a choice
 STEP: dict[FigureKind, float] = {"load": 1e-2, "tool_mass": 1e-1, "tool_com": 1e-2}
 """Steps of the derivatives: of the wrench and the mass as a share, of the centre in m."""
 
 
 @dataclass(frozen=True, slots=True)
 class WrongFigure:
-    """A figure that seems to be another one than was entered.
+    """A figure that seems to be another one than was entered."""
 
-    Attributes:
-        kind: a load's mass or pull, the tool's mass, or its centre of mass.
-        load: name of the load, where it is one.
-        stated: as it was entered: kg, N for a pull, or the centre, flange axes, m.
-        found: as the readings tell it.
-        unit: of both.
-        rms_m: of the residual's positions, m.
-        rms_with_m: with the figure that was found.
-    """
-
-    kind: FigureKind
-    load: str
-    stated: tuple[float, ...]
-    found: tuple[float, ...]
-    unit: str
-    rms_m: float
-    rms_with_m: float
+    kind: FigureKind  # a load's mass or pull, the tool's mass, or its centre of mass
+    load: str  # name of the load, where it is one
+    stated: tuple[float, ...]  # as it was entered: kg, N for a pull, or the centre, flange axes, m
+    found: tuple[float, ...]  # as the readings tell it
+    unit: str  # of both
+    rms_m: float  # of the residual's positions, m
+    rms_with_m: float  # with the figure that was found
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +110,6 @@ def wrong_figures(of: Fit, suspects: Sequence[Suspect]) -> tuple[WrongFigure, ..
     None of a model with a background: that was asked before it was fitted.
 
     Args:
-        of: a fit.
         suspects: effects that could be missing, as they are scored.
     """
     if of.model.background:

@@ -24,7 +24,7 @@ from hilcal.readings.whitening import Mode, Whitening
 from hilcal.types import Floats
 
 CHANCE = 0.0005
-"""p-value of χ² below which there is an excess: that of `diagnosis.noise_verdict`."""
+"""p-value of χ² below which there is an excess: that of `diagnosis.noise`."""
 SOME = 400
 """Measurements, evenly spaced, from which a mean leverage is taken, for speed; a choice."""
 SAME = 0.05

@@ -22,8 +22,7 @@ from hilcal.identification.regularisation import (
 )
 from hilcal.identification.solver import shortened
 from hilcal.model.model import Model
-from hilcal.regression.normal_equations import TALL
-from hilcal.regression.triangle import triangle_of
+from hilcal.regression.normal_equations import TALL, triangle_of
 from hilcal.types import Floats
 
 MAX_ITERATIONS = 20

@@ -16,7 +16,7 @@ from hilcal.identification.gauss_newton import Solution, whitened_jacobian
 from hilcal.identification.priors import FIRST_GUESS, prior_of, scales_of
 from hilcal.model.model import Model
 from hilcal.readings.whitening import Whitening
-from hilcal.regression.fold_evidence import FamilyProblem, solutions
+from hilcal.regression.empirical_bayes import FamilyProblem, solutions
 from hilcal.regression.leave_out import Fold, folds
 from hilcal.types import Floats, Ints
 

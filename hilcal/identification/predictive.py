@@ -20,7 +20,7 @@ parameters with this W and Λ leave belong together; they are found by turns.
 Where the model has a background its standard deviations are in units of the instrument's noise,
 and σ is the factor of that as the mixed model estimates it, also where the arm's scatter is stated.
 The uncertainty of the variances makes C larger by how far it moves the parameters (see
-`mixed.prediction`), and κ is at least what it makes of predictions on the whole (see
+`mixed.variances`), and κ is at least what it makes of predictions on the whole (see
 `variance_spread`). Both hold that motion, once where it acts and once as a mean: with 20, 30 and 60
 poses of 30 simulated arms that have all effects, 95, 92 and 95 % of other poses are then in their
 95 % band, and 93, 89 and 93 % with κ alone. Without a background σ² is from the residual, at
@@ -35,7 +35,7 @@ that of the prior then.
 How much wider predictions are since the variances of a background are estimated themselves.
 
 At given variances rows that are predicted without their fold are off by e with the variance v (see
-`mixed.prediction.left_out`). With x = (log s, η) drawn from its posterior, by weights from the
+`mixed.equations.left_out`). With x = (log s, η) drawn from its posterior, by weights from the
 normal approximation at its maximum x̂, the mean square is E[Σ v] + E|e − E e|². The factor is its
 ratio to Σ v at x̂. Source: Kackar and Harville, *Approximations for standard errors of estimators of
 fixed and random effects in mixed linear models*, JASA 79 (1984) 853.
@@ -53,8 +53,7 @@ from hilcal.identification.gauss_newton import whitened_jacobian
 from hilcal.identification.holdout import ordinary
 from hilcal.identification.mixed_fit import INSTRUMENT, mixed_fit_at
 from hilcal.identification.residual import residual
-from hilcal.mixed.equations import equations
-from hilcal.mixed.prediction import left_out
+from hilcal.mixed.equations import equations, left_out
 from hilcal.mixed.variances import Variances, log_posterior
 from hilcal.model.model import Model, Prediction
 from hilcal.readings.readings import Readings

@@ -3,9 +3,7 @@
 from collections.abc import Iterator, Sequence
 
 from hilcal import numbers
-from hilcal.diagnosis.change import LEVEL, POWER
-from hilcal.diagnosis.change_candidates import Candidate
-from hilcal.diagnosis.change_found import Change, Limit
+from hilcal.diagnosis.change import LEVEL, POWER, Candidate, Change, Limit
 from hilcal.diagnosis.comparison import Comparison
 from hilcal.identification.parameter_differences import Differences
 from hilcal.names import quoted

@@ -11,11 +11,9 @@ from hilcal.design.checked_plan import CheckedPlan, checked
 from hilcal.design.next import Next, PairPower, measure_next, measure_poses
 from hilcal.design.planner import Request
 from hilcal.design.summary import about, summarise
-from hilcal.diagnosis.diagnosis import Diagnosis
-from hilcal.diagnosis.doubt import in_doubt
+from hilcal.diagnosis.diagnosis import Diagnosis, in_doubt
 from hilcal.diagnosis.effect_ranking import Suspect
-from hilcal.diagnosis.more_poses import pose_powers
-from hilcal.diagnosis.pose_alone import PoseAlone
+from hilcal.diagnosis.pose_alone import PoseAlone, pose_powers
 from hilcal.diagnosis.stepwise import remove
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.fit import Fit

@@ -1,4 +1,8 @@
-"""Prediction of rows that are left out, with the model and a family of columns refitted.
+"""Paired test of the errors on poses left out, before and after a change of the model.
+
+----
+
+Prediction of rows that are left out, with the model and a family of columns refitted.
 
 Each fold is refitted by one Gauss-Newton step from the fit to all rows, in which the fold's rows
 are taken out of the normal equations exactly. A residual of the fit to all rows would already know
@@ -16,33 +20,57 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import norm, wilcoxon
 
 from hilcal.regression.normal_equations import NormalEquations
 from hilcal.regression.projection import Projection
 from hilcal.regression.schur import inverse_root, positive_solve
 from hilcal.types import Bools, Floats, Ints
 
-ROUNDING = 1e-6
-"""Ridge of flat directions, whose gram is the identity."""
+LEAST_GAIN = 0.002
+"""Share by which the rms error on poses left out must fall for an effect to stay ..."""
+SURE = 2.0
+"""... and by how many of its standard errors, from pose to pose; or as surely by its ranks."""
+FEWEST = 8  # poses from which ranks are judged
+
+
+def improves(before: Floats, after: Floats, sure: float = SURE) -> bool:
+    """Compare the squared whitened residuals of poses (P,), each predicted without itself.
+
+    The gain must be certain from pose to pose: by its mean, or where few poses gain very much
+    (then the mean scatters, however sure the gain is) by Wilcoxon's signed ranks, at the same
+    level. Source: Wilcoxon, *Individual comparisons by ranking methods*, Biometrics Bulletin 1
+    (1945) 80-83.
+
+    Args:
+        before: (P,) of the model as it was.
+        after: (P,) of the changed one.
+        sure: how many standard errors the gain must be.
+    """
+    if float(np.sum(after)) >= (1 - LEAST_GAIN) ** 2 * float(np.sum(before)):
+        return False
+    gain = before - after
+    error = float(np.std(gain)) / np.sqrt(max(len(gain) - 1, 1))
+    if float(np.mean(gain)) > sure * error:
+        return True
+    if np.count_nonzero(gain) < FEWEST:
+        return False
+    return float(wilcoxon(gain, alternative="greater").pvalue) < float(norm.sf(sure))
+
+
+ROUNDING = 1e-6  # ridge of flat directions, whose gram is the identity
 SMALL = 48
 """Parameters of a family up to which it is solved for in all folds at once; a choice by timing."""
-FAMILY_ROUNDING = 1e-10
-"""Least ridge of a family, as a share of the largest square of a column."""
+FAMILY_ROUNDING = 1e-10  # least ridge of a family, as a share of the largest square of a column
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fold:
-    """The model's normal equations without one fold.
+    """The model's normal equations without one fold."""
 
-    Attributes:
-        out: (R,) rows of the fold.
-        inverse_root: (K, K) T with Tᵀ T = H⁻¹ without them.
-        rhs: (K,) right-hand side without them, for a step from the fit.
-    """
-
-    out: Bools
-    inverse_root: Floats
-    rhs: Floats
+    out: Bools  # (R,) rows of the fold
+    inverse_root: Floats  # (K, K) T with Tᵀ T = H⁻¹ without them
+    rhs: Floats  # (K,) right-hand side without them, for a step from the fit
 
     def rows(self, p: Projection) -> Floats:
         """Return the model's columns in the rows of the fold."""
@@ -58,27 +86,16 @@ class Fold:
 
 
 def folds(
-    p: Projection,
-    white: Floats,
-    equations: NormalEquations,
-    theta: Floats,
-    prior: Floats,
-    magnitude: Floats,
-    beta: float,
-    fold: Ints,
+    p: Projection,  # the fit's columns by identifiable coordinates, with the ridge of its priors
+    white: Floats,  # (R,) its whitened residual
+    equations: NormalEquations,  # its normal equations, over all parameters
+    theta: Floats,  # (P,) its parameters
+    prior: Floats,  # (P,) their prior standard deviations, infinite for flat ones
+    magnitude: Floats,  # (P,) standard deviations that flat parameters have without a fold
+    beta: float,  # noise variance factor that priors are weighed against
+    fold: Ints,  # (R,) fold of each row, from 0
 ) -> tuple[Fold, ...]:
-    """Return the normal equations of a step from a fit without each fold.
-
-    Args:
-        p: the fit's columns by identifiable coordinates, with the ridge of its priors.
-        white: (R,) its whitened residual.
-        equations: its normal equations, over all parameters.
-        theta: (P,) its parameters.
-        prior: (P,) their prior standard deviations, infinite for flat ones.
-        magnitude: (P,) standard deviations that flat parameters have without a fold.
-        beta: noise variance factor that priors are weighed against.
-        fold: (R,) fold of each row, from 0.
-    """
+    """Return the normal equations of a step from a fit without each fold."""
     basis = equations.basis
     flat, held = slice(0, len(basis.singular)), basis.held
     h = equations.gram + np.diag(p.ridge + np.where(p.ridge > 0, 0.0, ROUNDING))
@@ -101,16 +118,11 @@ def folds(
 def left_out_residual(
     folds: tuple[Fold, ...],
     p: Projection,
-    white: Floats,
-    x: Floats | None = None,
+    white: Floats,  # (R,) residual of the model fitted to all rows
+    x: Floats | None = None,  # (R, F) whitened columns of the family; None for the model alone
     ridge: float = 0.0,
 ) -> Floats:
-    """Return the residual (R,) of each row, predicted without its fold by model and family.
-
-    Args:
-        white: (R,) residual of the model fitted to all rows.
-        x: (R, F) whitened columns of the family; None for the model alone.
-    """
+    """Return the residual (R,) of each row, predicted without its fold by model and family."""
     if x is None:
         left = np.zeros(len(white))
         for fold in folds:
@@ -126,16 +138,11 @@ class FamilyProducts:
     """Products of a family's columns with themselves and with the model's, in each fold.
 
     Their sums over the folds serve the tests of the whole family.
-
-    Attributes:
-        x: (R, F) whitened columns.
-        parts: of each fold.
-        whole: of all rows.
     """
 
-    x: Floats
-    parts: tuple["_Products", ...]
-    whole: "_Products"
+    x: Floats  # (R, F) whitened columns
+    parts: tuple["_Products", ...]  # of each fold
+    whole: "_Products"  # of all rows
 
 
 def family_products(
@@ -164,14 +171,10 @@ def family_products(
 def left_out_of_families(
     folds: tuple[Fold, ...],
     p: Projection,
-    white: Floats,
+    white: Floats,  # (R,) residual of the model fitted to all rows
     families: Sequence[tuple[FamilyProducts, float]],
 ) -> list[Floats]:
-    """Return `left_out_residual` (R,) of each family, each beside the model by itself.
-
-    Args:
-        white: (R,) residual of the model fitted to all rows.
-    """
+    """Return `left_out_residual` (R,) of each family, each beside the model by itself."""
     found = [np.zeros(len(white)) for _ in families]
     small = [_in_all_folds(folds, of, ridge) for of, ridge in families]
 
@@ -253,12 +256,7 @@ class FamilyFolds:
     """Model and family without each fold, for any residuals and ridges: products formed once."""
 
     def __init__(self, folds: tuple[Fold, ...], p: Projection, x: Floats | None = None) -> None:
-        """Form the products.
-
-        Args:
-            folds: of the model; their right-hand sides are not used.
-            x: (R, F) whitened columns of the family; None for the model alone.
-        """
+        """Form the products."""
         self._x = x = np.zeros((len(p.rows), 0)) if x is None else x
         self._folds, self._p = folds, p
         gram, cross = x.T @ x, p.rows.T @ x

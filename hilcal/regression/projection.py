@@ -20,17 +20,11 @@ from hilcal.types import Floats
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Projection:
-    """M of one linear model.
+    """M of one linear model."""
 
-    Attributes:
-        rows: (R, K) B.
-        ridge: (K,) Λ.
-        inverse_root: (K, K) T with Tᵀ T = H⁻¹.
-    """
-
-    rows: Floats
-    ridge: Floats
-    inverse_root: Floats
+    rows: Floats  # (R, K) B
+    ridge: Floats  # (K,) Λ
+    inverse_root: Floats  # (K, K) T with Tᵀ T = H⁻¹
 
     def solve(self, rhs: Floats) -> Floats:
         """Return H⁻¹ times (K,) or (K, P)."""

@@ -53,8 +53,7 @@ from hilcal.identification.variance_factor import WithVarianceFactor
 from hilcal.model.model import Model
 from hilcal.readings.covariance import WHOLE
 from hilcal.readings.readings import Readings
-from hilcal.regression.normal_equations import NormalEquations
-from hilcal.regression.triangle import combined
+from hilcal.regression.normal_equations import NormalEquations, combined
 from hilcal.stream.passes import (
     Errors,
     PassTask,

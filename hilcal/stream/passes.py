@@ -18,7 +18,7 @@ from hilcal.model.model import Model, Prediction
 from hilcal.readings.covariance import with_scatter
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Whitening, whitening
-from hilcal.regression.triangle import Triangle
+from hilcal.regression.normal_equations import Triangle
 from hilcal.tables.parquet_stream import ReadingStream
 from hilcal.types import Bools, Floats, Ints
 

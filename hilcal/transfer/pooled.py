@@ -16,7 +16,8 @@ from scipy.stats import norm
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.posterior import Posterior, PosteriorEffect, Source
 from hilcal.readings.ranges import Range
-from hilcal.regression.hierarchy import (
+from hilcal.regression.schur import schur_complement
+from hilcal.regression.variance_components import (
     FALSE_ALARM,
     UNDETERMINED,
     FleetEstimates,
@@ -25,7 +26,6 @@ from hilcal.regression.hierarchy import (
     hierarchy,
     unlike,
 )
-from hilcal.regression.schur import schur_complement
 from hilcal.store.revision import seconds_of, utc_now
 from hilcal.transfer.members import Member
 from hilcal.transfer.type_sizes import TypeSize, type_sizes

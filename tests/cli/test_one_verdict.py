@@ -11,9 +11,8 @@ import pytest
 
 from hilcal.campaign.campaign import Campaign
 from hilcal.config import CellConfig, load_config
-from hilcal.diagnosis.diagnosis import Diagnosis
+from hilcal.diagnosis.diagnosis import Diagnosis, in_doubt
 from hilcal.diagnosis.document import to_json
-from hilcal.diagnosis.doubt import in_doubt
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit

@@ -15,7 +15,7 @@ from hilcal.model.model import Model
 from hilcal.present.verdict import message
 from hilcal.readings.readings import Readings
 from hilcal.refinement import MOST_REVISIONS, Refinement, add, refine
-from hilcal.regression.paired_test import LEAST_GAIN
+from hilcal.regression.leave_out import LEAST_GAIN
 from tests.support.campaigns import campaign, cell_of, measured, plan, world_of
 from tests.support.effect_cases import make
 

@@ -8,7 +8,7 @@ import numpy as np
 from hilcal import numbers
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.effect_ranking import LEAST_SHARE, Suspect
-from hilcal.diagnosis.repeats import classes
+from hilcal.diagnosis.noise import classes
 from hilcal.identification.family_sizes import family_sizes
 from hilcal.present.campaign import info_report
 from hilcal.present.charts import evidence, readings

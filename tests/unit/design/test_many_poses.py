@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hilcal.design.next import measure_poses
-from hilcal.diagnosis.more_poses import pose_powers
+from hilcal.diagnosis.pose_alone import pose_powers
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.drivers.simulated.rehearsal import planned_states, simulate
 from hilcal.identification.baseline import baseline

@@ -12,7 +12,7 @@ from hilcal.identification.effect_columns import effect_columns
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.linearisation import linearise
 from hilcal.readings.whitening import Mode
-from hilcal.regression.power import family_power
+from hilcal.regression.evidence import family_power
 from hilcal.regression.projection import projection
 from hilcal.regression.schur import schur_complement
 from hilcal.types import Floats

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from hilcal.config import load_config
-from hilcal.diagnosis.catalogue_sufficiency import forward_selection, insufficiency
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.document import to_json
 from hilcal.diagnosis.effect_ranking import candidates
+from hilcal.diagnosis.evidence import forward_selection, insufficiency
 from hilcal.diagnosis.stepwise import Refits, add
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification.baseline import baseline

@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, kstest
 
-from hilcal.diagnosis.noise import PureError, pure_error
-from hilcal.diagnosis.noise_verdict import judge_noise
-from hilcal.diagnosis.repeats import classes, contrasts
+from hilcal.diagnosis.noise import PureError, classes, contrasts, judge_noise, pure_error
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit
 from hilcal.model.model import Model

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hilcal.diagnosis.effect_probabilities import LARGEST, PRIOR_ODDS, effect_probabilities
-from hilcal.diagnosis.stepwise_alternatives import Alternative
+from hilcal.diagnosis.diagnosis import LARGEST, PRIOR_ODDS, effect_probabilities
+from hilcal.diagnosis.evidence import Alternative
 from hilcal.identification.baseline import baseline
 from hilcal.refinement import refine
 from tests.support.campaigns import campaign

@@ -5,8 +5,8 @@ import pytest
 
 from hilcal.diagnosis.document import suspect_json
 from hilcal.diagnosis.effect_ranking import candidates
+from hilcal.diagnosis.evidence import StepwiseAlternatives
 from hilcal.diagnosis.stepwise import add
-from hilcal.diagnosis.stepwise_alternatives import StepwiseAlternatives
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.joint_compliance import JointCompliance
 from hilcal.errors import InputError

@@ -6,9 +6,15 @@ import numpy as np
 import pytest
 
 from hilcal.config import load_config
-from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
-from hilcal.diagnosis.plausible_size import most, unloaded_readings
-from hilcal.diagnosis.promise import LEAST_KEPT, kept_by_refit, kept_by_step
+from hilcal.diagnosis.effect_ranking import (
+    LEAST_KEPT,
+    candidates,
+    kept_by_refit,
+    kept_by_step,
+    most,
+    rank_suspects,
+    unloaded_readings,
+)
 from hilcal.diagnosis.stepwise import add
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.catalogue import BUILT_IN

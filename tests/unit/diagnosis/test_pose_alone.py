@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilcal.diagnosis.diagnosis import Diagnosis
+from hilcal.diagnosis.diagnosis import Diagnosis, in_doubt
 from hilcal.diagnosis.document import to_json
-from hilcal.diagnosis.doubt import in_doubt
 from hilcal.diagnosis.effect_ranking import candidates
-from hilcal.diagnosis.more_poses import chance, enough
+from hilcal.diagnosis.pose_alone import chance, enough
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hilcal.diagnosis.pose_constants import pose_constants
+from hilcal.diagnosis.misfit_breakdown import pose_constants
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import Linearisation, linearise

@@ -5,12 +5,10 @@ import pytest
 
 from hilcal.diagnosis import effect_ranking
 from hilcal.diagnosis import residual_regression as regression
-from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
-from hilcal.diagnosis.evidence import backward_elimination
-from hilcal.diagnosis.plausible_size import most, unloaded_readings
+from hilcal.diagnosis.effect_ranking import candidates, most, rank_suspects, unloaded_readings
+from hilcal.diagnosis.evidence import StepwiseAlternatives, backward_elimination
 from hilcal.diagnosis.residual_regression import Regressions, residual_regression
 from hilcal.diagnosis.stepwise import add
-from hilcal.diagnosis.stepwise_alternatives import StepwiseAlternatives
 from hilcal.identification import effect_columns
 from hilcal.identification.baseline import baseline
 from hilcal.identification.effect_columns import columns_of_each

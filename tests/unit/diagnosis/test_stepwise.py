@@ -7,12 +7,17 @@ import pytest
 from scipy.stats import f as f_distribution
 from scipy.stats import ncf
 
-from hilcal.diagnosis.doubt import in_doubt
+from hilcal.diagnosis.diagnosis import in_doubt
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
-from hilcal.diagnosis.evidence import CHANCE, backward_elimination
+from hilcal.diagnosis.evidence import (
+    CHANCE,
+    PRICE,
+    Alternative,
+    StepwiseAlternatives,
+    backward_elimination,
+)
 from hilcal.diagnosis.minimum_detectable_effect import POWER, least_strength
 from hilcal.diagnosis.stepwise import add, exchange, remove
-from hilcal.diagnosis.stepwise_alternatives import PRICE, Alternative, StepwiseAlternatives
 from hilcal.drivers.simulated.injected_effects import hide
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
@@ -20,7 +25,7 @@ from hilcal.identification.effect_columns import effect_columns
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.linearisation import linearise
 from hilcal.refinement import Path
-from hilcal.regression.power import noncentrality_of_power
+from hilcal.regression.evidence import noncentrality_of_power
 from tests.support.campaigns import NOTHING, Campaign, campaign, measured, plan, world_of
 
 

@@ -5,7 +5,7 @@ import pytest
 from sklearn.ensemble import ExtraTreesRegressor
 
 from hilcal.diagnosis import tree_share as module
-from hilcal.diagnosis.tree_share import LEAF, PRECISE, TreePrediction, predicted
+from hilcal.diagnosis.residual_regression import LEAF, PRECISE, TreePrediction, predicted
 from hilcal.types import Floats, Ints
 
 POSES, LOADS, FEATURES, FOLDS = 40, 3, 6, 5

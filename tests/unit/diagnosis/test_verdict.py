@@ -4,8 +4,7 @@ import itertools
 
 import pytest
 
-from hilcal.diagnosis.diagnosis import VERDICTS, Diagnosis, History
-from hilcal.diagnosis.doubt import in_doubt
+from hilcal.diagnosis.diagnosis import VERDICTS, Diagnosis, History, in_doubt
 from hilcal.diagnosis.evidence import Evidence
 from hilcal.diagnosis.verdict import judge
 from hilcal.identification.baseline import baseline

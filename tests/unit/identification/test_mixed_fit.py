@@ -9,7 +9,7 @@ from hilcal.config import load_config
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.identification.mixed_fit import mixed_fit
-from hilcal.mixed.evidence import evidence
+from hilcal.mixed.variances import evidence
 from studies.random_campaigns import rehearsal_states
 from studies.study_cases import study_case, with_study_loads
 from tests.support.cli_cases import CELL

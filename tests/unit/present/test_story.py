@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hilcal.diagnosis.diagnosis import Diagnosis
-from hilcal.diagnosis.effect_ranking import LeftOut
+from hilcal.diagnosis.effect_ranking import Later as LeftOut
 from hilcal.diagnosis.residual_regression import Dependence
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.drivers.simulated.rehearsal import Rehearsal

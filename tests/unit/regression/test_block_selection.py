@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hilcal.regression.block_selection import BlockSelection, block_evidence
+from hilcal.regression.forward_selection import BlockSelection, block_evidence
 
 STRENGTHS = np.logspace(-2, 3, 21)
 ROWS, MODEL, BLOCKS, WIDTH, FOLDS = 400, 12, 15, 4, 5

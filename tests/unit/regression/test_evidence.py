@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from hilcal.regression.evidence import NOTHING, STRENGTHS, score_family
+from hilcal.regression.evidence import NOTHING, STRENGTHS, score_family, visible
 from hilcal.regression.forward_selection import CandidateFamilies, forward_selection
-from hilcal.regression.spectrum import visible
 from hilcal.types import Floats
 from tests.support.regression_cases import KINDS, Problem, problem
 

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from hilcal.regression.empirical_bayes import maximise_evidence
-from hilcal.regression.fold_evidence import FamilyProblem, solutions
+from hilcal.regression.empirical_bayes import FamilyProblem, maximise_evidence, solutions
 
 GROUPS, MEMBERS, ROWS, FLAT, FOLDS = 100, 2, 300, 4, 10
 

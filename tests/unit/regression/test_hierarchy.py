@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from hilcal.regression.hierarchy import FALSE_ALARM, FleetEstimates, hierarchy
+from hilcal.regression.variance_components import FALSE_ALARM, FleetEstimates, hierarchy
 from hilcal.types import Floats
 
 ARMS, TIMES, SIZE = 30, 2, 6

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hilcal.regression.power import family_power, noncentrality_of_power, power_of_test
+from hilcal.regression.evidence import family_power, noncentrality_of_power, power_of_test
 
 
 @pytest.mark.parametrize("rank", [1, 4, 20])

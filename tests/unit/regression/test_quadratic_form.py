@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import beta
 
-from hilcal.regression.quadratic_form import ratio_tail
+from hilcal.regression.evidence import ratio_tail
 
 
 def exact(k: int, dimension: int, level: float, c: float) -> float:

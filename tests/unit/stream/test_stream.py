@@ -17,8 +17,7 @@ from hilcal.identification import gauss_newton_steps
 from hilcal.identification.fit import Fit, fit
 from hilcal.readings.readings import Readings
 from hilcal.regression import normal_equations
-from hilcal.regression.normal_equations import find_basis
-from hilcal.regression.triangle import Triangle, combined
+from hilcal.regression.normal_equations import Triangle, combined, find_basis
 from hilcal.stream.fit import StreamFit, fit_stream
 from hilcal.tables.parquet_stream import ReadingStream, open_stream
 from hilcal.types import Floats
