@@ -34,20 +34,6 @@ def add(before: Fit, effect: str, options: Options | None = None) -> Fit:
     return fit(model, before.readings, before.mode, before.scaling, start)
 
 
-class Refits:
-    """Fits with one more effect, each made once: judgement and refinement try the same ones."""
-
-    def __init__(self) -> None:
-        """Begin with none."""
-        self._made: dict[tuple[Fit, str], Fit] = {}
-
-    def add(self, before: Fit, effect: str) -> Fit:
-        """Return what `add` returns."""
-        if (before, effect) not in self._made:
-            self._made[before, effect] = add(before, effect)
-        return self._made[before, effect]
-
-
 def remove(before: Fit, effect: str) -> Fit:
     """Refit without an effect, from where the fit stands.
 

@@ -1,8 +1,4 @@
-"""Paired test of the errors on poses left out, before and after a change of the model.
-
-----
-
-Prediction of rows that are left out, with the model and a family of columns refitted.
+"""Prediction of rows that are left out, with the model and a family of columns refitted.
 
 Each fold is refitted by one Gauss-Newton step from the fit to all rows, in which the fold's rows
 are taken out of the normal equations exactly. A residual of the fit to all rows would already know
@@ -17,7 +13,7 @@ the model without it where it is not.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from scipy.stats import norm, wilcoxon
@@ -32,6 +28,8 @@ LEAST_GAIN = 0.002
 SURE = 2.0
 """... and by how many of its standard errors, from pose to pose; or as surely by its ranks."""
 FEWEST = 8  # poses from which ranks are judged
+ROUNDING = 1e-6  # ridge of flat directions, whose gram is the identity
+FAMILY_ROUNDING = 1e-10  # least ridge of a family, as a share of the largest square of a column
 
 
 def improves(before: Floats, after: Floats, sure: float = SURE) -> bool:
@@ -56,12 +54,6 @@ def improves(before: Floats, after: Floats, sure: float = SURE) -> bool:
     if np.count_nonzero(gain) < FEWEST:
         return False
     return float(wilcoxon(gain, alternative="greater").pvalue) < float(norm.sf(sure))
-
-
-ROUNDING = 1e-6  # ridge of flat directions, whose gram is the identity
-SMALL = 48
-"""Parameters of a family up to which it is solved for in all folds at once; a choice by timing."""
-FAMILY_ROUNDING = 1e-10  # least ridge of a family, as a share of the largest square of a column
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,15 +126,24 @@ def left_out_residual(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FamilyProducts:
-    """Products of a family's columns with themselves and with the model's, in each fold.
+class Products:
+    """BᵀX, XᵀX and Xᵀr of some rows."""
 
-    Their sums over the folds serve the tests of the whole family.
+    cross: Floats
+    gram: Floats
+    rhs: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FamilyProducts:
+    """Products of a family's columns with themselves and with the model's.
+
+    Those of all rows serve the tests of the whole family.
     """
 
     x: Floats  # (R, F) whitened columns
-    parts: tuple["_Products", ...]  # of each fold
-    whole: "_Products"  # of all rows
+    parts: tuple[Products, ...]  # of each fold
+    whole: Products  # of all rows
 
 
 def family_products(
@@ -153,110 +154,56 @@ def family_products(
     Args:
         folds: of the model; each row is in one.
         white: (R,) residual of the model fitted to all rows.
-        families: X of each.
     """
     every = list(families)
-
-    def products(fold: Fold) -> list[_Products]:
+    parts: list[list[Products]] = [[] for _ in every]
+    for fold in folds:
         own, y = fold.rows(p), white[fold.out]
-        return [_Products.of(own, x[fold.out], y) for x in every]
+        for x, of in zip(every, parts, strict=True):
+            mine = x[fold.out]
+            of.append(Products(own.T @ mine, mine.T @ mine, mine.T @ y))
 
-    by_fold = [products(fold) for fold in folds]
-    return [
-        FamilyProducts(x, parts, _Products.sum(parts))
-        for x, parts in zip(every, zip(*by_fold, strict=True), strict=True)
-    ]
+    def whole(of: list[Products]) -> Products:
+        sums = (sum(getattr(each, f.name) for each in of) for f in fields(Products))
+        return Products(*sums)
+
+    return [FamilyProducts(x, tuple(of), whole(of)) for x, of in zip(every, parts, strict=True)]
 
 
 def left_out_of_families(
     folds: tuple[Fold, ...],
     p: Projection,
-    white: Floats,  # (R,) residual of the model fitted to all rows
+    white: Floats,
     families: Sequence[tuple[FamilyProducts, float]],
 ) -> list[Floats]:
-    """Return `left_out_residual` (R,) of each family, each beside the model by itself."""
+    """Return `left_out_residual` (R,) of each family with its ridge, beside the model by itself."""
     found = [np.zeros(len(white)) for _ in families]
-    small = [_in_all_folds(folds, of, ridge) for of, ridge in families]
-
     for f, fold in enumerate(folds):
         out, own = fold.out, fold.rows(p)
-        for (of, ridge), left, known in zip(families, found, small, strict=True):
-            back, step = known[f] if known else _without(fold, of.whole, of.parts[f], ridge)
+        size = fold.inverse_root @ fold.rhs
+        for (of, ridge), left in zip(families, found, strict=True):
+            whole, part = of.whole, of.parts[f]
+            # Eliminate the model's own coordinates, then solve for the family.
+            along = fold.inverse_root @ (whole.cross - part.cross)
+            h = whole.gram - along.T @ along - part.gram
+            largest = float(np.diagonal(whole.gram).max(initial=0.0))
+            h[np.diag_indices_from(h)] += max(ridge, FAMILY_ROUNDING * largest)
+            step = positive_solve(h, whole.rhs - part.rhs - along.T @ size)
+            back = fold.inverse_root.T @ (size - along @ step)
             left[out] = white[out] - own @ back - of.x[out] @ step
     return found
-
-
-def _in_all_folds(
-    folds: tuple[Fold, ...], of: FamilyProducts, ridge: float
-) -> list[tuple[Floats, Floats]]:
-    """Return `_without` of each fold; nothing where the family is not small."""
-    if of.x.shape[1] > SMALL:
-        return []
-    root = np.stack([fold.inverse_root for fold in folds])
-    along = root @ (of.whole.cross - np.stack([own.cross for own in of.parts]))
-    across = np.swapaxes(along, 1, 2)
-    size = (root @ np.stack([fold.rhs for fold in folds])[..., None])[..., 0]
-    h = of.whole.gram - np.stack([own.gram for own in of.parts]) - across @ along
-    each = np.arange(h.shape[1])
-    h[:, each, each] += _least_ridge(of.whole, ridge)
-    rhs = of.whole.rhs - np.stack([own.rhs for own in of.parts])
-    inverse = inverse_root(h)
-    known = inverse @ (rhs[..., None] - across @ size[..., None])
-    step = (np.swapaxes(inverse, 1, 2) @ known)[..., 0]
-    back = np.swapaxes(root, 1, 2) @ (size[..., None] - along @ step[..., None])
-    return list(zip(back[..., 0], step, strict=True))
-
-
-def _least_ridge(whole: "_Products", ridge: float) -> float:
-    """Ridge of a family, at least what rounding asks for."""
-    return max(ridge, FAMILY_ROUNDING * float(np.diagonal(whole.gram).max(initial=0.0)))
-
-
-def _without(
-    fold: Fold, whole: "_Products", own: "_Products", ridge: float
-) -> tuple[Floats, Floats]:
-    """Return the steps (K,) of the model and (F,) of a family without a fold."""
-    # Eliminate the model's own coordinates, then solve for the family.
-    along = fold.inverse_root @ (whole.cross - own.cross)
-    size = fold.inverse_root @ fold.rhs
-    h = along.T @ along
-    np.subtract(whole.gram, h, out=h)
-    h -= own.gram
-    h[np.diag_indices_from(h)] += _least_ridge(whole, ridge)
-    step = positive_solve(h, whole.rhs - own.rhs - along.T @ size)
-    return fold.inverse_root.T @ (size - along @ step), step
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Products:
-    """BᵀX, XᵀX and Xᵀr of some rows."""
-
-    cross: Floats
-    gram: Floats
-    rhs: Floats
-
-    @classmethod
-    def of(cls, rows: Floats, x: Floats, white: Floats) -> "_Products":
-        """Form them."""
-        return cls(rows.T @ x, x.T @ x, x.T @ white)
-
-    @classmethod
-    def sum(cls, of: Sequence["_Products"]) -> "_Products":
-        """Return those of the rows of all."""
-        first = of[0]
-        out = cls(first.cross.copy(), first.gram.copy(), first.rhs.copy())
-        for more in of[1:]:
-            np.add(out.cross, more.cross, out=out.cross)
-            np.add(out.gram, more.gram, out=out.gram)
-            np.add(out.rhs, more.rhs, out=out.rhs)
-        return out
 
 
 class FamilyFolds:
     """Model and family without each fold, for any residuals and ridges: products formed once."""
 
     def __init__(self, folds: tuple[Fold, ...], p: Projection, x: Floats | None = None) -> None:
-        """Form the products."""
+        """Form the products.
+
+        Args:
+            folds: of the model; their right-hand sides are not used.
+            x: (R, F) whitened columns of the family; None for the model alone.
+        """
         self._x = x = np.zeros((len(p.rows), 0)) if x is None else x
         self._folds, self._p = folds, p
         gram, cross = x.T @ x, p.rows.T @ x
@@ -276,7 +223,6 @@ class FamilyFolds:
         """
         x, p = self._x, self._p
         total, rhs = p.rows.T @ y, x.T @ y
-        least = max(ridge, self._rounding)
         left = np.zeros(y.shape)
         for fold, (c, at, gram) in zip(self._folds, self._of, strict=True):
             out, own, r = x[fold.out], fold.rows(p), y[fold.out]
@@ -284,18 +230,12 @@ class FamilyFolds:
             left[fold.out] = r - own @ steps
             if x.shape[1]:
                 h, b = gram.copy(), rhs - out.T @ r - c.T @ steps
-                h[np.diag_indices_from(h)] += least
+                h[np.diag_indices_from(h)] += max(ridge, self._rounding)
                 family = positive_solve(h, b)
                 left[fold.out] += own @ (at @ family) - out @ family
         return left
 
 
-def left_out_residuals(
-    folds: tuple[Fold, ...],
-    p: Projection,
-    y: Floats,
-    x: Floats | None = None,
-    ridge: float = 0.0,
-) -> Floats:
-    """Return `FamilyFolds.left_out` (R, K) of residuals y (R, K)."""
-    return FamilyFolds(folds, p, x).left_out(y, ridge)
+def left_out_residuals(folds: tuple[Fold, ...], p: Projection, y: Floats) -> Floats:
+    """Return `FamilyFolds.left_out` (R, K) of the model alone, of residuals y (R, K)."""
+    return FamilyFolds(folds, p).left_out(y)

@@ -1,6 +1,6 @@
-"""Variance components of a whitened residual beside a fitted linear model, by REML.
+"""Variance components by restricted likelihood: of a fit's residual, and of units of a kind.
 
-The residual of a model with the whitened columns B and the ridge Λ of their priors is taken as
+**Residual.** That of a model with the whitened columns B and the ridge Λ of their priors is
 
     y ~ N(B θ, Σ),    Σ = 1 + Σ_i s_i K_i,    s_i ≥ 0
 
@@ -17,16 +17,8 @@ The maximum is found by Newton's method with the average information AI, steps h
 not fall, components at zero held there while their slope is negative. AI⁻¹ is the covariance of
 the s_i. Since P enters by its diagonal blocks alone, a step costs two products of B.
 
-Sources: Patterson and Thompson, *Recovery of inter-block information when block sizes are unequal*,
-Biometrika 58 (1971) 545-554; Gilmour, Thompson and Cullis, *Average information REML*, Biometrics
-51 (1995) 1440-1450; Searle, Casella and McCulloch, *Variance Components* (1992), chapter 6.
-
-----
-
-What units of a kind have in common, in what they differ, and how they change: empirical Bayes.
-
-Campaign c of arm a at time t found the parameters m_c with the information M_c (singular where
-nothing was determined). With K parameters in ordinary magnitudes
+**Units.** Campaign c of arm a at time t found the parameters m_c with the information M_c (singular
+where nothing was determined). With K parameters in ordinary magnitudes
 
     θ_c = μ + β t_c + u_a + e_c,    u_a ~ N(0, diag τ²),    e_c ~ N(0, diag ω²),
     m_c | θ_c ~ N(θ_c, M_c⁻¹)
@@ -36,8 +28,10 @@ maximise the restricted likelihood, by EM: with everything else integrated out, 
 E[u_ak²], ω_k² that of E[e_ck²]. Elements of u_a that are known to be unlike the others (`apart`)
 have no prior, and count in no mean.
 
-Sources: Laird and Ware, *Random-effects models for longitudinal data*, Biometrics 38 (1982)
-963-974; Searle, Casella and McCulloch, *Variance Components* (1992), chapter 8.
+Sources: Patterson and Thompson, *Recovery of inter-block information when block sizes are unequal*,
+Biometrika 58 (1971) 545-554; Gilmour, Thompson and Cullis, *Average information REML*, Biometrics
+51 (1995) 1440-1450; Laird and Ware, *Random-effects models for longitudinal data*, Biometrics 38
+(1982) 963-974; Searle, Casella and McCulloch, *Variance Components* (1992), chapters 6 and 8.
 """
 
 from collections.abc import Sequence
@@ -53,6 +47,20 @@ STEPS = 50  # most Newton steps; a choice, fewer than ten are usual
 HALVINGS = 12  # most halvings of a step; a choice
 CONVERGED = 1e-6
 """Gain of ℓ that ends the iteration: the s_i are then within 0.002 of their σ; a choice."""
+EM_STEPS = 400  # most EM steps; a choice: fleets of 30 arms take about 100
+EM_CONVERGED = 1e-4
+"""Relative change of every variance that ends EM; a choice, far below their sampling error."""
+LEAST = 1e-8
+"""Least variance, and least information of a parameter of an arm, in ordinary magnitudes squared;
+below every measurement: a choice."""
+START = (1.0, 0.05)  # variances τ², ω² that EM starts from; a choice
+UNDETERMINED = 5.0
+"""Standard uncertainty of an arm's parameter, in ordinary magnitudes, from which on nothing is said
+of it; a choice."""
+FALSE_ALARM = 0.01
+"""Probability that anything is named in a fleet where nothing is unlike; a choice."""
+FEWEST = 5
+"""Arms that are needed to call one unlike the others; a choice: three hardly have a spread."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -191,22 +199,6 @@ def _log_det(t: Floats) -> float:
     return float(-2 * np.log(values[values > 0]).sum())
 
 
-EM_STEPS = 400  # most EM steps; a choice: fleets of 30 arms take about 100
-EM_CONVERGED = 1e-4
-"""Relative change of every variance that ends EM; a choice, far below their sampling error."""
-LEAST = 1e-8
-"""Least variance, and least information of a parameter of an arm, in ordinary magnitudes squared;
-below every measurement: a choice."""
-START = (1.0, 0.05)  # variances τ², ω² that EM starts from; a choice
-UNDETERMINED = 5.0
-"""Standard uncertainty of an arm's parameter, in ordinary magnitudes, from which on nothing is said
-of it; a choice."""
-FALSE_ALARM = 0.01
-"""Probability that anything is named in a fleet where nothing is unlike; a choice."""
-FEWEST = 5
-"""Arms that are needed to call one unlike the others; a choice: three hardly have a spread."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class FleetEstimates:
     """What C campaigns of A arms found of K parameters, in ordinary magnitudes."""
@@ -295,9 +287,11 @@ def unlike(values: Floats, variance: Floats) -> tuple[Unlike, ...]:
         mine = np.flatnonzero(known[:, k])
         while len(mine) >= FEWEST and len(mine) > 0.8 * known[:, k].sum():
             y, s2 = values[mine, k], variance[mine, k]
-            off, sd = np.array(
-                [_against(np.delete(y, i), np.delete(s2, i), y[i], s2[i]) for i in range(len(mine))]
-            ).T
+            away = []
+            for i in range(len(mine)):
+                tau2, mean, of_mean = _others(np.delete(y, i), np.delete(s2, i))
+                away.append((y[i] - mean, np.sqrt(tau2 + s2[i] + of_mean)))
+            off, sd = np.array(away).T
             worst = int(np.argmax(np.abs(off / sd)))
             sigma = abs(float(off[worst] / sd[worst]))
             p = min(1.0, 2 * tests * float(student.sf(sigma, len(mine) - 2)))
@@ -308,17 +302,9 @@ def unlike(values: Floats, variance: Floats) -> tuple[Unlike, ...]:
     return tuple(sorted(named, key=lambda one: one.p_value))
 
 
-def _against(y: Floats, s2: Floats, value: float, variance: float) -> tuple[float, float]:
-    """Distance of a value from the mean of others, and its standard deviation."""
-    tau2 = _spread(y, s2)
-    w = 1.0 / (tau2 + s2)
-    mean = float(w @ y / w.sum())
-    return value - mean, float(np.sqrt(tau2 + variance + 1.0 / w.sum()))
-
-
-def _spread(y: Floats, s2: Floats) -> float:
-    """Variance of units beyond that of their errors, by REML's fixed point."""
-    s2 = np.maximum(s2, LEAST)
+def _others(y: Floats, variance: Floats) -> tuple[float, float, float]:
+    """Variance of units beyond that of their errors, by REML's fixed point; mean, its variance."""
+    s2 = np.maximum(variance, LEAST)
     tau2 = max(float(np.var(y, ddof=1) - s2.mean()), 0.0)
     for _ in range(50):
         w = 1.0 / (tau2 + s2)
@@ -327,29 +313,25 @@ def _spread(y: Floats, s2: Floats) -> float:
         tau2, before = max(change, 0.0), tau2
         if abs(tau2 - before) <= EM_CONVERGED * max(tau2, LEAST):
             break
-    return tau2
+    w = 1.0 / (tau2 + variance)
+    return tau2, float(w @ y / w.sum()), 1.0 / float(w.sum())
 
 
 def _em(of: FleetEstimates, apart: Bools) -> Hierarchy:
-    k, arms = of.mean.shape[1], of.arms
-    repeated = of.repeated
+    k, repeated = of.mean.shape[1], of.repeated
     timed = repeated and bool(np.ptp(of.time) > 0)
     tau2 = np.full(k, START[0])
     omega2 = np.full(k, START[1] if repeated else 0.0)
-    normal = ~apart
-    many = np.bincount(of.arm, minlength=arms)[of.arm] > 1
+    normal = np.maximum((~apart).sum(axis=0), 1)
+    many = np.bincount(of.arm, minlength=of.arms)[of.arm] > 1
     for _ in range(EM_STEPS):
         e = _expectation(of, tau2, omega2, apart, timed)
-        new_tau2 = np.maximum(
-            np.where(normal, e.u2, 0.0).sum(axis=0) / np.maximum(normal.sum(axis=0), 1), LEAST
-        )
-        new_omega2 = np.maximum(e.e2[many].mean(axis=0), LEAST) if repeated else omega2
-        change = max(
-            float(np.abs(new_tau2 / np.maximum(tau2, LEAST) - 1).max()),
-            float(np.abs(new_omega2 / np.maximum(omega2, LEAST) - 1).max()) if repeated else 0.0,
-        )
-        tau2, omega2 = new_tau2, new_omega2
-        if change < EM_CONVERGED:
+        before = np.concatenate([tau2, omega2])
+        tau2 = np.maximum(np.where(apart, 0.0, e.u2).sum(axis=0) / normal, LEAST)
+        if repeated:
+            omega2 = np.maximum(e.e2[many].mean(axis=0), LEAST)
+        now = np.concatenate([tau2, omega2])
+        if np.abs((now - before) / np.maximum(before, LEAST)).max() < EM_CONVERGED:
             break
     e = _expectation(of, tau2, omega2, apart, timed)
     whole = np.zeros((2 * k, 2 * k))
@@ -373,29 +355,27 @@ def _expectation(
     of: FleetEstimates, tau2: Floats, omega2: Floats, apart: Bools, timed: bool
 ) -> _Expected:
     """E-step: the joint normal distribution of b = (μ, β), u and e, given the variances."""
-    k, arms = of.mean.shape[1], of.arms
-    eye = np.eye(k)
-    m = of.information
+    k, m, eye = of.mean.shape[1], of.information, np.eye(of.mean.shape[1])
     # e_c integrated out: N = (M⁻¹ + Ω)⁻¹ = (1 + M Ω)⁻¹ M
     n = np.linalg.solve(eye + m * omega2, m)
     n = (n + np.swapaxes(n, 1, 2)) / 2
-    design = np.zeros((len(m), k, 2 * k if timed else k))
-    design[:, :, :k] = eye
+    design = np.tile(eye, (len(m), 1, 1))
     if timed:
-        design[:, :, k:] = of.time[:, None, None] * eye
+        design = np.concatenate([design, of.time[:, None, None] * eye], axis=2)
     nx, ny = n @ design, np.einsum("cij,cj->ci", n, of.mean)
-    size = design.shape[2]
-    sum_n = np.zeros((arms, k, k))
-    sum_nx = np.zeros((arms, k, size))
-    sum_ny = np.zeros((arms, k))
-    np.add.at(sum_n, of.arm, n)
-    np.add.at(sum_nx, of.arm, nx)
-    np.add.at(sum_ny, of.arm, ny)
+
+    def of_arms(x: Floats) -> Floats:
+        """Sums (A, ...) over the campaigns of each arm."""
+        out = np.zeros((of.arms, *x.shape[1:]))
+        np.add.at(out, of.arm, x)
+        return out
+
+    sum_n, sum_nx, sum_ny = of_arms(n), of_arms(nx), of_arms(ny)
     precision = np.where(apart, LEAST, 1.0 / np.maximum(tau2, LEAST))
     u_cov = np.linalg.inv(sum_n + precision[:, :, None] * eye)
     h = np.einsum("cki,ckj->ij", design, nx) - np.einsum("aki,akl,alj->ij", sum_nx, u_cov, sum_nx)
     g = np.einsum("cki,ck->i", design, ny) - np.einsum("aki,akl,al->i", sum_nx, u_cov, sum_ny)
-    b_cov = np.linalg.inv((h + h.T) / 2 + LEAST * np.eye(size))
+    b_cov = np.linalg.inv((h + h.T) / 2 + LEAST * np.eye(len(h)))
     b = b_cov @ g
     # u_a = C_a (Σ N m − Σ N X b)
     by_b = u_cov @ sum_nx
@@ -411,8 +391,7 @@ def _expectation(
     spread = np.diag(omega2) - gain * omega2 + gain @ rest @ np.swapaxes(gain, 1, 2)
     e2 = e**2 + np.diagonal(spread, axis1=1, axis2=2)
     alone = np.linalg.inv(sum_n + LEAST * eye)
-    drifted = np.zeros_like(of.mean) if not timed else of.time[:, None] * b[k:]
-    own = np.zeros((arms, k))
-    np.add.at(own, of.arm, np.einsum("cij,cj->ci", n, of.mean - drifted))
+    drifted = of.time[:, None] * b[k:] if timed else np.zeros_like(of.mean)
+    own = of_arms(np.einsum("cij,cj->ci", n, of.mean - drifted))
     arm_mean = np.einsum("akl,al->ak", alone, own)
     return _Expected(b, b_cov, u2, e2, arm_mean, np.diagonal(alone, axis1=1, axis2=2).copy())
