@@ -188,9 +188,7 @@ def refine_from(
     path = Path(first, say, history, laws, seen)
     changed = True
     while changed:
-        # Where suspects are rejected, the step is judged anew: a law may be looked for after all.
-        while path.room and (path.add_law() or path.add_one() or path.add_law()):
-            pass
+        path.extend()
         changed = path.reconsider()
         changed = changed or (background and path.take_background()) or path.take_scatter()
     path.pool_lines()
@@ -203,10 +201,10 @@ class Path:
     def __init__(
         self,
         first: Fit,
-        say: Say,
-        before: History,
-        laws: LawSearch | None,
-        seen: Callable[[RefinementStep], None],
+        say: Say = lambda text: None,
+        before: History = NOTHING,
+        laws: LawSearch | None = None,
+        seen: Callable[[RefinementStep], None] = lambda step: None,
     ) -> None:
         """Begin with a fit, the effects of which stay; `before` says how its model was reached."""
         self.steps: list[RefinementStep] = []
@@ -217,11 +215,10 @@ class Path:
         self._background_tried = False
         taken = first.readings.arm_scatter is not None
         self._scattered = [first.model.names] if taken else []
-        self._append(first, None)
+        self.append(first, None)
 
     @property
-    def room(self) -> bool:
-        """Whether another revision may follow."""
+    def _room(self) -> bool:
         return len(self.steps) < MOST_REVISIONS
 
     def _evidence_of(
@@ -237,7 +234,7 @@ class Path:
             rejected=tuple(n for n in self._rejected if n not in names),
         )
 
-    def _append(
+    def append(
         self, found: Fit, added: str | None, removed: str | None = None, what: str = ""
     ) -> None:
         """Say what was done, judge a fit and append it."""
@@ -247,7 +244,13 @@ class Path:
         self.steps.append(RefinementStep(found, diagnosis, added, removed))
         self._seen(self.steps[-1])
 
-    def add_law(self) -> bool:
+    def extend(self) -> None:
+        """Add suspects while any lowers the error on poses left out."""
+        # Where suspects are rejected, the step is judged anew: a law may be looked for after all.
+        while self._room and (self._add_law() or self._add_one() or self._add_law()):
+            pass
+
+    def _add_law(self) -> bool:
         """Add a law where no effect of the catalogue explains the misfit; whether one was added.
 
         It is looked for as well where the misfit is about to be taken for the arm's scatter, which
@@ -261,10 +264,10 @@ class Path:
         proposed = self._laws.propose(last.fit, self._say)
         if proposed is None or not predicts_better(last.fit, proposed[0]):
             return False
-        self._append(*proposed, what=f"added {proposed[1]}")
+        self.append(*proposed, what=f"added {proposed[1]}")
         return True
 
-    def add_one(self) -> bool:
+    def _add_one(self) -> bool:
         """Try the suspects, best first; returns whether one was added.
 
         The step is judged anew where suspects were rejected.
@@ -286,7 +289,7 @@ class Path:
             self.steps[-1] = replace(last, diagnosis=diagnosis)
         if found is None:
             return False
-        self._append(*found, what=f"added {found[1]}")
+        self.append(*found, what=f"added {found[1]}")
         return True
 
     def reconsider(self) -> bool:
@@ -297,7 +300,7 @@ class Path:
             return False
         added = [n for n in last.fit.model.named if n not in self._given]
         names = [*added, *carried_effects(last.fit.model)]
-        if not names or not self.room:
+        if not names or not self._room:
             return False
         self._say(f"reconsidering {', '.join(names)}")
         others = {a.effect: a for a in last.diagnosis.alternatives}
@@ -325,7 +328,7 @@ class Path:
         last = self.steps[-1]
         tried = self._background_tried or bool(last.fit.model.background)
         d = last.diagnosis
-        if tried or not self.room or d.wrong_figures:
+        if tried or not self._room or d.wrong_figures:
             return False
         self._background_tried = True
         if not allows_background(last.fit):
@@ -367,7 +370,7 @@ class Path:
         fitted, names = last.fit, last.fit.model.names
         if fitted.model.background:  # the scatter is in its covariance
             return False
-        if not self.room or len(self._scattered) == MOST_SCATTERS or names in self._scattered:
+        if not self._room or len(self._scattered) == MOST_SCATTERS or names in self._scattered:
             return False
         judged = last.diagnosis
         if fitted.readings.arm_scatter is not None:
@@ -380,7 +383,7 @@ class Path:
         self._scattered.append(names)
         readings = with_arm_scatter(fitted.model.cell, fitted.readings, judged.scatter)
         found = fit(fitted.model, readings, fitted.mode, start=fitted.theta)
-        self._append(found, None, what="the arm's scatter enters the covariance")
+        self.append(found, None, what="the arm's scatter enters the covariance")
         return True
 
     def pool_lines(self) -> None:
@@ -431,10 +434,10 @@ class Path:
             return False
         self._change(trials[0], first, other.effect)
         for name, trial in zip(rest, trials[1:], strict=True):
-            self._append(trial, name, what=f"added {name}")
+            self.append(trial, name, what=f"added {name}")
         return True
 
     def _change(self, trial: Fit, added: str | None, removed: str) -> None:
         self._removed.append(removed)
         what = f"removed {removed}" if added is None else f"{added} in place of {removed}"
-        self._append(trial, added, removed, what)
+        self.append(trial, added, removed, what)

@@ -1,4 +1,4 @@
-"""Families added to a model one after the other by algebra, the one with most evidence first.
+"""Families, or blocks of columns, added to a model one after the other, most evidence first.
 
 A refit with one more effect takes seconds to minutes on a large campaign. At the linearisation of
 a fit, with S and g of all families and ‖r‖² (see `evidence`), a family f with the ridge λ is added
@@ -6,13 +6,9 @@ by the elimination of its columns (`schur.eliminate`). The log evidence of a cha
 the sum of theirs, ln p(r | all) − ln p(r | none), so that one large family and several small ones
 compare.
 
-----
-
-Blocks of columns chosen beside a model one after the other by their evidence, without each fold.
-
-With B (R, K) the columns of the model with the ridge Λ, X_l (R, W) the blocks, y what remains, and
-M = 1 − B H⁻¹ Bᵀ, H = BᵀB + Λ, on the rows that are not left out, blocks are columns M X_l that
-explain M y:
+Blocks are chosen without each fold. With B (R, K) the columns of the model with the ridge Λ,
+X_l (R, W) the blocks, y what remains, and M = 1 − B H⁻¹ Bᵀ, H = BᵀB + Λ, on the rows that are not
+left out, blocks are columns M X_l that explain M y:
 
     X_kᵀ M M X_l = X_kᵀ X_l − E_kᵀ C_l − C_kᵀ Λ C_l,    E = Bᵀ X,  C = H⁻¹ E
 
@@ -22,13 +18,17 @@ formed once for each fold, and without a fold are those of the others together.
 
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property, reduce
+from functools import cached_property
 
 import numpy as np
 
 from hilcal.regression.evidence import FamilyScore, log_evidence, score_family, visible
 from hilcal.regression.schur import eliminate, positive_solve
 from hilcal.types import Bools, Floats, Ints
+
+SPANNED = 1e-6
+"""Eigenvalues of a chosen block's gram below this share of the largest are left out: directions
+that the model and earlier blocks nearly explain; a choice."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,23 +39,15 @@ class CandidateFamilies:
     gradient: Floats  # (P,) g
     rss: float  # ‖r‖²
     dof: float  # degrees of freedom ν of the residual without any of the families
-    columns: Mapping[str, slice]  # the columns of each family that is not in the model
-    # effective number of parameters of the families that are in the model by now
-    spent: float = 0.0
-    # largest plausible strength of each family that has one
-    most: Mapping[str, float] = field(default_factory=dict)
+    columns: Mapping[str, slice]  # of each family that is not in the model
+    spent: float = 0.0  # effective number of parameters of the families that are in the model
+    most: Mapping[str, float] = field(default_factory=dict)  # largest plausible strengths
 
     def scores(self) -> dict[str, FamilyScore]:
         """Score each family by itself."""
+        s, g, model = self.information, self.gradient, (self.rss, self.dof, self.spent)
         return {
-            name: score_family(
-                self.information[k, k],
-                self.gradient[k],
-                self.rss,
-                self.dof,
-                self.spent,
-                self.most.get(name, np.inf),
-            )
+            name: score_family(s[k, k], g[k], *model, self.most.get(name, np.inf))
             for name, k in self.columns.items()
         }
 
@@ -65,17 +57,15 @@ class CandidateFamilies:
 
     def with_family(self, name: str, found: FamilyScore) -> "CandidateFamilies":
         """Add a family to the model, with the ridge of its score."""
-        s, g, rss = eliminate(
-            self.information, self.gradient, self.rss, self.columns[name], found.ridge
-        )
-        others = {n: k for n, k in self.columns.items() if n != name}
+        out = self.columns[name]
+        s, g, rss = eliminate(self.information, self.gradient, self.rss, out, found.ridge)
         spent = self.spent + found.effective
-        return CandidateFamilies(s, g, rss, self.dof, others, spent, self.most)
+        return replace(self.without([name]), information=s, gradient=g, rss=rss, spent=spent)
 
 
 def families_beside(
     information: Floats,  # (P, P) S of all families' columns beside the model
-    residual: Floats,  # (R,) residual r of the model
+    residual: Floats,  # (R,) r of the model
     dof: float,
     x: Floats,  # (R, P) whitened columns of all families, in ordinary magnitudes
     columns: Mapping[str, slice],
@@ -93,11 +83,11 @@ class Addition:
     name: str  # the family with most evidence
     score: FamilyScore
     scores: Mapping[str, FamilyScore]  # of all families that can be added
-    before: CandidateFamilies  # the families beside the model without it
+    before: CandidateFamilies  # beside the model without it
 
     @cached_property
     def after(self) -> CandidateFamilies:
-        """Return the families beside the model with it."""
+        """The families beside the model with it."""
         return self.before.with_family(self.name, self.score)
 
 
@@ -116,11 +106,6 @@ def forward_selection(families: CandidateFamilies, most: int) -> Iterator[Additi
         families = step.after
 
 
-SPANNED = 1e-6
-"""Eigenvalues of a chosen block's gram below this share of the largest are left out: directions
-that the model and earlier blocks nearly explain; a choice."""
-
-
 def block_evidence(gram: Floats, g: Floats, rss: float, dof: float, strengths: Floats) -> Floats:
     """(L,) gain in log evidence of each of L blocks, at its best prior strength.
 
@@ -137,53 +122,31 @@ def block_evidence(gram: Floats, g: Floats, rss: float, dof: float, strengths: F
     return np.asarray(found.max(axis=0))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _BlockSums:
-    """Products over some rows: BᵀB, Bᵀ[X, y], X_lᵀX_l (L, W, W), Xᵀy, yᵀy, and their number."""
-
-    gram: Floats
-    cross: Floats
-    blocks: Floats
-    slope: Floats
-    square: float
-    rows: int
-
-    def plus(self, other: "_BlockSums", sign: int = 1) -> "_BlockSums":
-        """Return those over these rows and others; without the others where the sign is −1."""
-        return _BlockSums(
-            self.gram + sign * other.gram,
-            self.cross + sign * other.cross,
-            self.blocks + sign * other.blocks,
-            self.slope + sign * other.slope,
-            self.square + sign * other.square,
-            self.rows + sign * other.rows,
-        )
-
-
 class BlockSelection:
     """Blocks that can be chosen beside a model."""
 
     def __init__(self, own: Floats, ridge: Floats, x: Floats, y: Floats, fold: Ints) -> None:
-        """Form all products, fold by fold."""
-        self._shape = x.shape[1:]
-        self._own, self._ridge, self._y = own, ridge, y
-        self._x = x.reshape(len(y), -1)
-        self._fold = fold
-        folds = range(int(fold.max()) + 1)
-        self._of = [self._sums(fold == f) for f in folds]
-        self._all = reduce(_BlockSums.plus, self._of)
+        """Form all products, fold by fold.
 
-    def _sums(self, rows: Bools) -> _BlockSums:
+        Args:
+            own: (R, K) B.
+            ridge: (K,) Λ.
+            x: (R, L, W) all blocks.
+            y: (R,) what remains where the model stands.
+            fold: (R,) fold of each row, from 0.
+        """
+        self._shape, self._own, self._ridge, self._y = x.shape[1:], own, ridge, y
+        self._x, self._fold = x.reshape(len(y), -1), fold
+        self._of = [self._sums(fold == f) for f in range(int(fold.max()) + 1)]
+        self._all = [sum(parts) for parts in zip(*self._of, strict=True)]
+
+    def _sums(self, rows: Bools) -> list[Floats]:
+        """Products of some rows: BᵀB, Bᵀ[X, y], X_lᵀX_l (L, W, W), Xᵀy, yᵀy, and their number."""
         own, x, y = self._own[rows], self._x[rows], self._y[rows]
         blocks = x.reshape(len(y), *self._shape).transpose(1, 2, 0)
-        return _BlockSums(
-            own.T @ own,
-            np.column_stack([own.T @ x, own.T @ y]),
-            blocks @ blocks.transpose(0, 2, 1),
-            x.T @ y,
-            float(y @ y),
-            len(y),
-        )
+        cross = np.column_stack([own.T @ x, own.T @ y])
+        square = blocks @ blocks.transpose(0, 2, 1)
+        return [own.T @ own, cross, square, x.T @ y, y @ y, np.array(len(y))]
 
     def without(self, f: int, most: int, least: float, strengths: Floats) -> list[int]:
         """Return the blocks that the rows without fold f choose, the first one first.
@@ -194,18 +157,20 @@ class BlockSelection:
             strengths: (T,) prior standard deviations that are tried.
         """
         # a sample of the rows need not have any of the last folds
-        s = self._all.plus(self._of[f], -1) if f < len(self._of) else self._all
+        out = self._of[f] if f < len(self._of) else [0.0 * whole for whole in self._all]
+        sums = [whole - part for whole, part in zip(self._all, out, strict=True)]
+        inner, cross, square, slope, rss, count_of_rows = sums
         count, width = self._shape
-        c = positive_solve(s.gram + np.diag(self._ridge), s.cross)
-        e, by_ridge = s.cross[:, :-1], self._ridge[:, None] * c
+        c = positive_solve(inner + np.diag(self._ridge), cross)
+        e, by_ridge = cross[:, :-1], self._ridge[:, None] * c
         c, own = c[:, :-1], c[:, -1]
         lifted, pull = e + by_ridge[:, :-1], by_ridge[:, -1]
         blocks = [m.reshape(len(e), count, width).transpose(1, 2, 0) for m in (c, lifted)]
-        gram = s.blocks - blocks[0] @ blocks[1].transpose(0, 2, 1)
+        gram = square - blocks[0] @ blocks[1].transpose(0, 2, 1)
         gram = (gram + gram.transpose(0, 2, 1)) / 2
-        g = s.slope - e.T @ own - c.T @ pull
-        rss = s.square - float((s.cross[:, -1] + pull) @ own)
-        dof, rows = max(s.rows - len(e), 1), self._fold != f
+        g = slope - e.T @ own - c.T @ pull
+        rss = float(rss - (cross[:, -1] + pull) @ own)
+        dof, rows = max(int(count_of_rows) - len(e), 1), self._fold != f
         chosen: list[int] = []
         gone = np.zeros((0, count * width))
         for _ in range(most):

@@ -1,18 +1,4 @@
-"""QR of a tall matrix whose rows come a few at a time: the triangle is all that is kept.
-
-    [R; rows] = Q R'
-
-by Householder reflections (LAPACK's `tpqrt`), so that R'ᵀ R' is the sum of all products of rows
-without ever being formed: columns that are nearly dependent lose no digits. Triangles of parts of
-the rows are combined in the same way (TSQR). Column by column the error is that of a QR of the
-whole matrix, whatever the units of the columns are.
-
-Source: Demmel, Grigori, Hoemmen and Langou, *Communication-optimal parallel and sequential QR and
-LU factorizations*, SIAM J. Sci. Comput. 34 (2012) A206-A239.
-
-----
-
-The whitened linear problem: rank analysis, parameter scaling, priors, solution.
+"""The whitened linear problem: rank analysis, parameter scaling, priors, solution; QR in parts.
 
     minimise ‖r − A δ‖² + β ‖(θ + δ − 0)/σ‖²  over δ
 
@@ -25,6 +11,16 @@ parameters move along a direction by an ordinary amount. Directions with s below
 `INFORMATION` (or below rounding) are not identifiable and are held at zero; the other flat
 directions are rotated and scaled to be orthonormal before the normal equations are formed,
 so that forming them costs no accuracy.
+
+Of a tall matrix whose rows come a few at a time only the triangle of its QR is kept,
+
+    [R; rows] = Q R'
+
+by Householder reflections (LAPACK's `tpqrt`), so that R'ᵀ R' is the sum of all products of rows
+without ever being formed: columns that are nearly dependent lose no digits. Triangles of parts of
+the rows are combined in the same way (TSQR). Source: Demmel, Grigori, Hoemmen and Langou,
+*Communication-optimal parallel and sequential QR and LU factorizations*, SIAM J. Sci. Comput. 34
+(2012) A206-A239.
 """
 
 from collections.abc import Iterable
@@ -37,6 +33,17 @@ from scipy.linalg.lapack import dtpqrt
 from hilcal.regression.schur import inverse_root, positive_solve
 from hilcal.types import Bools, Floats, Ints
 
+INFORMATION = 0.2
+"""In units of the residual's spread: a direction is estimated where five times the ordinary
+magnitude along it would move all data together by one σ."""
+NULL_SHARE = 0.1
+"""Share of its standard uncertainty by which an unidentifiable direction, off by an ordinary
+magnitude, may move an identifiable parameter; a choice, no study set it."""
+ROUNDING = 1e-10
+TALL = 10_000
+"""Rows from which on the QR is done in parts that stay in the processor's cache: a third of the
+time for 300,000 rows of 30; a choice by timing."""
+_ROWS = 4096  # rows that are worked on at a time; a choice by memory
 ROWS = 3072
 """Rows that are reduced at a time; a choice by timing: they stay in the processor's cache."""
 BLOCK = 8  # columns whose reflections are applied together; a choice by timing
@@ -84,19 +91,6 @@ def combined(parts: Iterable[Floats], size: int) -> Floats:
     for part in parts:
         whole.add(part)
     return whole.r
-
-
-INFORMATION = 0.2
-"""In units of the residual's spread: a direction is estimated where five times the ordinary
-magnitude along it would move all data together by one σ."""
-NULL_SHARE = 0.1
-"""Share of its standard uncertainty by which an unidentifiable direction, off by an ordinary
-magnitude, may move an identifiable parameter; a choice, no study set it."""
-ROUNDING = 1e-10
-TALL = 10_000
-"""Rows from which on the QR is done in parts that stay in the processor's cache: a third of the
-time for 300,000 rows of 30; a choice by timing."""
-_ROWS = 4096  # rows that are worked on at a time; a choice by memory
 
 
 @dataclass(frozen=True, slots=True, eq=False)

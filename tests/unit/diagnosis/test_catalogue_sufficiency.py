@@ -4,13 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from hilcal.config import load_config
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.document import to_json
 from hilcal.diagnosis.effect_ranking import candidates
-from hilcal.diagnosis.evidence import forward_selection, insufficiency
-from hilcal.diagnosis.stepwise import Refits, add
+from hilcal.diagnosis.evidence import insufficiency, whole_catalogue
+from hilcal.diagnosis.noise import MISFIT_ALARM
+from hilcal.diagnosis.stepwise import add
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification.baseline import baseline
 from hilcal.identification.effect_columns import effect_columns
@@ -99,7 +101,8 @@ def test_noise_that_repeats_show_is_not_an_unknown_effect() -> None:
     found = fitted("deflection", "hysteresis", stated=0.5, cycles=2)
     d = diagnose(found)
     assert d.suspects[0].effect == "hysteresis"
-    assert not forward_selection(found).is_noise
+    _, square, dof = whole_catalogue(found)
+    assert chi2.sf(square, dof) < MISFIT_ALARM
     assert d.verdict in ("missing_effect", "ambiguous")
 
 
@@ -111,21 +114,14 @@ def test_no_refit_is_made_where_algebra_leaves_noise_and_at_most_two_elsewhere()
         return add(before, effect)
 
     explained = fitted("deflection", "link_compliance")
-    assert forward_selection(explained).is_noise
+    _, square, dof = whole_catalogue(explained)
+    assert chi2.sf(square, dof) >= MISFIT_ALARM
     assert insufficiency(explained, counted) is None
     assert made == []
     unknown = insufficiency(fitted("absolute", "swaying bench"), counted)
     assert unknown is not None
     assert unknown.effects[: unknown.refitted] == tuple(made)
     assert 1 <= len(made) <= 2
-
-
-def test_the_same_refit_is_made_once() -> None:
-    found, refits = fitted("deflection", "link_compliance"), Refits()
-    first = refits.add(found, "hysteresis")
-    assert refits.add(found, "hysteresis") is first
-    assert refits.add(found, "backlash") is not first
-    assert refits.add(first, "backlash").model.names[-2:] == ("hysteresis", "backlash")
 
 
 def test_a_fit_that_is_not_quite_at_rest_credits_no_effect_with_its_own_step() -> None:

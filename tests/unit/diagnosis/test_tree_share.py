@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from sklearn.ensemble import ExtraTreesRegressor
 
-from hilcal.diagnosis import tree_share as module
+from hilcal.diagnosis import residual_regression as module
 from hilcal.diagnosis.residual_regression import LEAF, PRECISE, TreePrediction, predicted
 from hilcal.types import Floats, Ints
 
