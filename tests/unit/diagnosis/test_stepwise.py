@@ -20,20 +20,12 @@ from hilcal.diagnosis.minimum_detectable_effect import POWER, least_strength
 from hilcal.diagnosis.stepwise import add, exchange, remove
 from hilcal.drivers.simulated.injected_effects import hide
 from hilcal.errors import InputError
-from hilcal.identification.baseline import baseline
 from hilcal.identification.effect_columns import effect_columns
-from hilcal.identification.fit import Fit, fit
 from hilcal.identification.linearisation import linearise
 from hilcal.refinement import Path
 from hilcal.regression.evidence import noncentrality_of_power
 from tests.support.campaigns import NOTHING, Campaign, campaign, measured, plan, world_of
-
-
-def fitted(c: Campaign, *effects: str) -> Fit:
-    found = fit(baseline(c.cell, c.readings, c.mode), c.readings, c.mode)
-    for name in effects:
-        found = add(found, name)
-    return found
+from tests.support.diagnosis_cases import fitted
 
 
 def work(c: Campaign, *effects: str) -> Path:
