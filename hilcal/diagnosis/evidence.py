@@ -24,10 +24,9 @@ repeated from there. A residual that remains after two refits, and that repeats 
 regression show not to be noise, no effect of the catalogue explains.
 """
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import cached_property
-from types import MappingProxyType
 
 import numpy as np
 from scipy.stats import chi2
@@ -128,14 +127,11 @@ class StepwiseAlternatives:
         self._fit, self._model = fit, model_columns(fit)
         self._x, self._columns, self._most = catalogue_columns(fit)
         self._gram, self._products = self._x.T @ self._x, self._model.white.T @ self._x
-        self.eliminated: dict[str, FamilyScore] = {}
-        """Score of each effect that `of` was asked for, against the model without it."""
 
     def of(self, effect: str, excluded: Collection[str] = ()) -> Alternative:
         """Return the other effects, but for some, that explain together what one does."""
         reduced = eliminate_effect(self._fit, self._model, effect)
-        self.eliminated[effect] = reduced.score()
-        own = self.eliminated[effect].log_evidence
+        own = reduced.score().log_evidence
         information = reduced.information(self._x, self._gram, self._products)
         families = families_beside(
             information, reduced.residual, reduced.dof, self._x, self._columns, self._most
@@ -282,7 +278,6 @@ class Evidence:
         self._regressions = regressions or Regressions()
         self._background = background
         self._known: dict[tuple[str, frozenset[str]], Alternative] = {}
-        self._eliminated: dict[str, FamilyScore] = {}
 
     @cached_property
     def linearisation(self) -> Linearisation:
@@ -368,7 +363,7 @@ class Evidence:
     @cached_property
     def redundant(self) -> tuple[str, ...]:
         """Effects of the model without which the readings are explained as well."""
-        return (*spoken_against(self.fit), *backward_elimination(self.fit, self._eliminated))
+        return (*spoken_against(self.fit), *backward_elimination(self.fit))
 
     @cached_property
     def insufficiency(self) -> Insufficiency | None:
@@ -388,20 +383,14 @@ class Evidence:
             # Not kept: the columns of the whole catalogue are the largest arrays of a judgement.
             algebra = StepwiseAlternatives(self.fit)
             self._known |= {key: algebra.of(key[0], excluded) for key in keys}
-            self._eliminated |= algebra.eliminated
         return tuple(self._known[key] for key in keys)
 
 
-def backward_elimination(
-    fit: Fit, known: Mapping[str, FamilyScore] = MappingProxyType({})
-) -> dict[str, FamilyScore]:
+def backward_elimination(fit: Fit) -> dict[str, FamilyScore]:
     """Return the redundant effects, each scored against the model without it; weakest first.
 
     Those with a carried prior are judged by `spoken_against`: other readings speak for them; random
     ones beside a background by `background_evidence`.
-
-    Args:
-        known: such scores, as far as they were made.
     """
     carried = fit.solution.space.carried(fit.model.size)
     beside = fit.model.random if fit.model.background else ()
@@ -410,10 +399,10 @@ def backward_elimination(
         for e, mine in zip(fit.model.effects, fit.model.slices(), strict=True)
         if e.role == "effect" and e.name not in beside and not carried[mine].any()
     ]
-    scores = {name: known[name] for name in judged if name in known}
-    if len(scores) < len(judged):
-        x = model_columns(fit)
-        scores = {n: scores.get(n) or eliminate_effect(fit, x, n).score() for n in judged}
+    if not judged:
+        return {}
+    x = model_columns(fit)
+    scores = {n: eliminate_effect(fit, x, n).score() for n in judged}
     found = [n for n in judged if scores[n].p_value > CHANCE]
     return {n: scores[n] for n in sorted(found, key=lambda n: -scores[n].p_value)}
 

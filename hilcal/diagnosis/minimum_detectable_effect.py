@@ -28,7 +28,7 @@ from hilcal.regression.evidence import (
     Spectrum,
     noncentrality_of_power,
     score_family,
-    visible,
+    spectrum,
 )
 from hilcal.regression.leave_out import FamilyFolds, improves
 from hilcal.types import Floats
@@ -71,7 +71,7 @@ def least_strength(
 ) -> Strength:
     """Return the smallest strength of a family that would be revealed."""
     if rank is None:
-        rank = int(visible(np.linalg.eigvalsh((s + s.T) / 2)).sum())
+        rank = spectrum(s).rank
     beta = np.random.default_rng(SEED).standard_normal((DIRECTIONS, len(s)))
     gain = np.sum(beta @ s * beta, axis=1)
     if rank == 0 or dof - rank < 1 or float(np.median(gain)) <= 0.0:

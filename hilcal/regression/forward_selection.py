@@ -18,7 +18,8 @@ formed once for each fold, and without a fold are those of the others together.
 
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, reduce
+from typing import Any
 
 import numpy as np
 
@@ -138,15 +139,15 @@ class BlockSelection:
         self._shape, self._own, self._ridge, self._y = x.shape[1:], own, ridge, y
         self._x, self._fold = x.reshape(len(y), -1), fold
         self._of = [self._sums(fold == f) for f in range(int(fold.max()) + 1)]
-        self._all = [sum(parts) for parts in zip(*self._of, strict=True)]
+        self._all = [reduce(np.add, parts) for parts in zip(*self._of, strict=True)]
 
-    def _sums(self, rows: Bools) -> list[Floats]:
+    def _sums(self, rows: Bools) -> list[Any]:
         """Products of some rows: BᵀB, Bᵀ[X, y], X_lᵀX_l (L, W, W), Xᵀy, yᵀy, and their number."""
         own, x, y = self._own[rows], self._x[rows], self._y[rows]
         blocks = x.reshape(len(y), *self._shape).transpose(1, 2, 0)
         cross = np.column_stack([own.T @ x, own.T @ y])
         square = blocks @ blocks.transpose(0, 2, 1)
-        return [own.T @ own, cross, square, x.T @ y, y @ y, np.array(len(y))]
+        return [own.T @ own, cross, square, x.T @ y, float(y @ y), len(y)]
 
     def without(self, f: int, most: int, least: float, strengths: Floats) -> list[int]:
         """Return the blocks that the rows without fold f choose, the first one first.
@@ -157,9 +158,10 @@ class BlockSelection:
             strengths: (T,) prior standard deviations that are tried.
         """
         # a sample of the rows need not have any of the last folds
-        out = self._of[f] if f < len(self._of) else [0.0 * whole for whole in self._all]
-        sums = [whole - part for whole, part in zip(self._all, out, strict=True)]
-        inner, cross, square, slope, rss, count_of_rows = sums
+        out = self._of[f] if f < len(self._of) else [0] * len(self._all)
+        inner, cross, square, slope, rss, count_of_rows = (
+            whole - part for whole, part in zip(self._all, out, strict=True)
+        )
         count, width = self._shape
         c = positive_solve(inner + np.diag(self._ridge), cross)
         e, by_ridge = cross[:, :-1], self._ridge[:, None] * c
@@ -170,7 +172,7 @@ class BlockSelection:
         gram = (gram + gram.transpose(0, 2, 1)) / 2
         g = slope - e.T @ own - c.T @ pull
         rss = float(rss - (cross[:, -1] + pull) @ own)
-        dof, rows = max(int(count_of_rows) - len(e), 1), self._fold != f
+        dof, rows = max(count_of_rows - len(e), 1), self._fold != f
         chosen: list[int] = []
         gone = np.zeros((0, count * width))
         for _ in range(most):

@@ -14,6 +14,7 @@ the model without it where it is not.
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
+from functools import reduce
 
 import numpy as np
 from scipy.stats import norm, wilcoxon
@@ -164,8 +165,8 @@ def family_products(
             of.append(Products(own.T @ mine, mine.T @ mine, mine.T @ y))
 
     def whole(of: list[Products]) -> Products:
-        sums = (sum(getattr(each, f.name) for each in of) for f in fields(Products))
-        return Products(*sums)
+        each = ([getattr(part, f.name) for part in of] for f in fields(Products))
+        return Products(*(reduce(np.add, parts) for parts in each))
 
     return [FamilyProducts(x, tuple(of), whole(of)) for x, of in zip(every, parts, strict=True)]
 
@@ -236,6 +237,12 @@ class FamilyFolds:
         return left
 
 
-def left_out_residuals(folds: tuple[Fold, ...], p: Projection, y: Floats) -> Floats:
-    """Return `FamilyFolds.left_out` (R, K) of the model alone, of residuals y (R, K)."""
-    return FamilyFolds(folds, p).left_out(y)
+def left_out_residuals(
+    folds: tuple[Fold, ...],
+    p: Projection,
+    y: Floats,
+    x: Floats | None = None,
+    ridge: float = 0.0,
+) -> Floats:
+    """Return `FamilyFolds.left_out` (R, K) of residuals y (R, K)."""
+    return FamilyFolds(folds, p, x).left_out(y, ridge)

@@ -13,8 +13,6 @@ from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.document import to_json
 from hilcal.diagnosis.effect_ranking import candidates, most, rank_suspects, unloaded_readings
 from hilcal.diagnosis.evidence import (
-    StepwiseAlternatives,
-    backward_elimination,
     insufficiency,
     spoken_against,
     whole_catalogue,
@@ -217,16 +215,6 @@ def test_the_residual_of_a_fit_is_regressed_once(
     assert made.tree_share(linearise(shared), 0.5) == made.tree_share(linearise(shared), 0.5)
     assert len(grown) == len(set(grown))
     assert 0.5 in grown
-
-
-def test_redundant_effects_by_scores_that_the_alternatives_made(shared: Fit) -> None:
-    algebra = StepwiseAlternatives(shared)
-    algebra.of("encoder_offset")
-    by_itself, shared = (backward_elimination(shared, k) for k in ({}, algebra.eliminated))
-    assert "encoder_offset" in algebra.eliminated
-    assert list(by_itself) == list(shared)
-    for name, one in by_itself.items():
-        assert one.p_value == pytest.approx(shared[name].p_value, rel=1e-9)
 
 
 HIDDEN = "joint_tilt_compliance"
