@@ -5,8 +5,8 @@ both follows a noncentral χ² of non-centrality
 
     λ = βᵀ S β,   S = M_ee − M_en M_nn⁻ M_ne,   n: the model and f
 
-with as many degrees of freedom as S has visible directions (`regression.power`). S at the readings
-so far is the one that a diagnosis tests e with, with f in its model.
+with as many degrees of freedom as S has visible directions (`regression.evidence`). S at the
+readings so far is the one that a diagnosis tests e with, with f in its model.
 
 Estimate of an effect that is not in the model, from the readings so far.
 

@@ -66,18 +66,11 @@ VERDICTS: dict[Reason, Verdict] = {
 
 @dataclass(frozen=True, slots=True)
 class History:
-    """How a model was reached, as far as the judgement depends on it.
+    """How a model was reached, as far as the judgement depends on it."""
 
-    Attributes:
-        added: effects of the model that earlier diagnoses chose; another may fit as well.
-        removed: effects that were taken out of the model because others explain more.
-        rejected: effects whose addition was tried by a refit and did not lower the error on
-            poses left out.
-    """
-
-    added: tuple[str, ...] = ()
-    removed: tuple[str, ...] = ()
-    rejected: tuple[str, ...] = ()
+    added: tuple[str, ...] = ()  # effects that earlier diagnoses chose; another may fit as well
+    removed: tuple[str, ...] = ()  # taken out of the model because others explain more
+    rejected: tuple[str, ...] = ()  # tried by a refit: the error on poses left out did not fall
 
 
 @dataclass(frozen=True, slots=True, eq=False)

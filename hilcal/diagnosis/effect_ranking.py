@@ -93,39 +93,21 @@ class Later(Generic[T]):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Suspect(Brief):
-    """An effect that is not in the model, and what it would explain.
+    """An effect that is not in the model, and what it would explain."""
 
-    Attributes:
-        effect: canonical name.
-        score: the joint test of the whole family.
-        share: share of the misfit it explains.
-        left_out: what it explains on poses left out.
-        explains: whether it passes the tests of the fitted readings and of its share.
-        detection: the smallest strength of it that these readings would reveal.
-        needs: where it is implausible, its size: (unit, rms of the parameters that it would need,
-            rms that is plausible), SI.
-        kept: share of what the linearisation promised that the exact model keeps; 1 where that
-            was not looked at, since the suspect fails other tests.
-        refuted: whether the error on poses left out does not fall by it after all: beside geometry,
-            where no load was hung, or as a refit has shown.
-        most: largest plausible strength, in ordinary magnitudes.
-        same_as: other suspects that these readings do not separate from it.
-        coarse: name of the effect of the model that it is finer than; empty for one that the model
-            does not have.
-    """
-
-    effect: str
-    score: FamilyScore
-    share: float
-    left_out: Later[HeldOut]
-    explains: bool
-    detection: Later[Strength]
+    effect: str  # canonical name
+    score: FamilyScore  # the joint test of the whole family
+    share: float  # share of the misfit it explains
+    left_out: Later[HeldOut]  # what it explains on poses left out
+    explains: bool  # whether it passes the tests of the fitted readings and of its share
+    detection: Later[Strength]  # the smallest strength of it that these readings would reveal
+    # where it is implausible: (unit, rms of the parameters that it needs, plausible rms), SI
     needs: tuple[tuple[str, float, float], ...] = ()
-    kept: float = 1.0
-    refuted: bool = False
-    most: float = np.inf
-    same_as: tuple[str, ...] = ()
-    coarse: str = ""
+    kept: float = 1.0  # share of the promise that the exact model keeps; 1 where it fails anyway
+    refuted: bool = False  # beside geometry on unloaded arms, or by a refit: predicts no better
+    most: float = np.inf  # largest plausible strength, in ordinary magnitudes
+    same_as: tuple[str, ...] = ()  # other suspects that these readings do not separate from it
+    coarse: str = ""  # effect of the model that it is finer than; empty where it has none
 
     def __repr__(self) -> str:
         """Return the suspect in a line."""

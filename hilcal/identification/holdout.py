@@ -3,7 +3,7 @@
 Whole poses are left out, never single readings: readings of one pose share its errors. Each
 fold is refitted by one Gauss-Newton step from the full fit, in which the fold's rows are
 taken out of the normal equations exactly. The strengths of shrunk families are chosen anew in each
-fold (`regression.fold_evidence`).
+fold (`regression.empirical_bayes`).
 
 Without a fold the flat parameters have a prior about zero (see `regression.leave_out`), whose
 standard deviation is their ordinary magnitude, or the rms of the effect's parameters in the full

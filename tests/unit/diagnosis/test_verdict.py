@@ -13,7 +13,6 @@ from hilcal.diagnosis.background_evidence import background_evidence, p_value_of
 from hilcal.diagnosis.diagnosis import (
     LARGEST,
     PRIOR_ODDS,
-    VERDICTS,
     Diagnosis,
     History,
     effect_probabilities,
@@ -101,16 +100,6 @@ def test_an_adequate_model_is_in_doubt_where_another_effect_could_replace_an_add
     assert in_doubt(chosen) == ("tracker_scale", *others)[:4]
     without = judge(e, History(added=("tracker_scale",), removed=others))
     assert set(others).isdisjoint(in_doubt(without))
-
-
-def test_every_reason_has_a_verdict():
-    assert set(VERDICTS.values()) == {
-        "adequate",
-        "missing_effect",
-        "ambiguous",
-        "unknown_effect",
-        "noise_misjudged",
-    }
 
 
 STD = 2.5e-5

@@ -29,7 +29,7 @@ from hilcal.refinement import add
 from hilcal.robot.chain import evaluate
 from tests.support.campaigns import Campaign
 from tests.support.cli_cases import rehearsal
-from tests.unit.diagnosis.test_diagnose_unknown import hidden
+from tests.unit.diagnosis.test_residual_regression import hidden
 
 
 def chapters_of(r: Rehearsal) -> list[Chapter]:
