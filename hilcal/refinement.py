@@ -107,8 +107,8 @@ class Refinement(Shown):
     def probabilities(self, effects: Iterable[str]) -> dict[str, float]:
         """Return the probability that the arm has each effect, by name.
 
-        See `diagnosis.diagnosis.effect_probabilities`. An effect that no step tested has 0.04: prior odds of
-        one to nine, less the price of its strength.
+        See `effect_probabilities`. An effect that no step tested has 0.04: prior odds of one to
+        nine, less the price of its strength.
         """
         return effect_probabilities([s.diagnosis for s in self.steps], effects)
 
