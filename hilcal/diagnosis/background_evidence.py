@@ -76,13 +76,9 @@ def p_value_of_others(of: Fit) -> float:
 
 
 def background_is_better(before: Fit, after: Fit) -> bool:
-    """Whether a background belongs to the model.
+    """Whether a background belongs to the model: `after` has one, `before` the named effects alone.
 
     The error on poses left out must fall by a share, both weighted by the noise of the latter.
-
-    Args:
-        before: the fit of the named effects alone.
-        after: the fit of all, each with its standard deviation.
     """
     raw, w = all_left_out(after)
     one, other = (float(np.sum(w.whiten(r) ** 2)) for r in (all_left_out(before)[0], raw))

@@ -182,12 +182,9 @@ def _most_wanted(fit: Fit, names: Collection[str]) -> str | None:
 
 
 def error_today(at: Setting, changes: Changes, drawing: float | None) -> Today:
-    """Return the error of the earlier parameters, with the tracker's place as it is now.
+    """Return the error of the earlier parameters at later readings, with the tracker as it is now.
 
-    Args:
-        at: the later readings.
-        changes: since then.
-        drawing: rms error with the arm as drawn, m.
+    `drawing` is the rms error with the arm as drawn, m.
     """
     found = remeasure(frames_alone(at))
     w, raw = at.w, found.raw

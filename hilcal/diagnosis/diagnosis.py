@@ -190,9 +190,6 @@ def in_doubt(d: Diagnosis, most: int = MOST) -> tuple[str, ...]:
     Either they are all missing from the model, the first suspect first, or the first one is an
     addition to the model that one of the others could replace, or they all depend on the pose
     alone, as the misfit does.
-
-    Args:
-        most: number of effects at most.
     """
     if d.reason == "inseparable_suspects":
         return (d.suspects[0].effect, *(s.effect for s in d.separability))[:most]

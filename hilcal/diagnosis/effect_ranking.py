@@ -207,11 +207,7 @@ def frame_effects(fit: Fit) -> tuple[Effect, ...]:
 
 
 def unloaded_readings(fit: Fit, frames: Sequence[EffectColumns] | None = None) -> Unloaded | None:
-    """Return the unloaded readings; None for a fit of absolute readings, which shows all itself.
-
-    Args:
-        frames: columns of `frame_effects`; computed where they are not given.
-    """
+    """Return the unloaded readings; None for absolute readings, which show all themselves."""
     if fit.mode == "absolute":
         return None
     if frames is None:
@@ -445,12 +441,7 @@ def geometry_columns(p: Linearisation, effects: Sequence[Effect]) -> Floats:
 
 
 def beyond_geometry(p: Linearisation, of: EffectColumns, geometry: Floats, evidence: float) -> bool:
-    """Whether a family explains the readings beside geometry, too.
-
-    Args:
-        geometry: (R, Q) columns of `geometry_columns`.
-        evidence: log evidence that it must have.
-    """
+    """Whether a family explains the readings beside geometry, at some log evidence."""
     q, fit = geometry.shape[1], p.fit
     if not q:
         return True

@@ -222,14 +222,7 @@ def insufficiency(
     say: Callable[[str], None] = lambda text: None,
     regressions: Regressions | None = None,
 ) -> Insufficiency | None:
-    """Return what the whole catalogue leaves of a misfit; None where that is noise.
-
-    Args:
-        fit: a fit of which a suspect passes all tests.
-        refit: returns a fit with one more effect.
-        say: takes progress, one line each.
-        regressions: those that were made.
-    """
+    """Return what the whole catalogue leaves of a misfit with a suspect; None for noise."""
     current, names = fit, list[str]()
     misfit = fit.chi2 - fit.dof
     while True:

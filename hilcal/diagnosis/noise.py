@@ -125,12 +125,7 @@ class NoiseVerdict:
 
 
 def judge_noise(fit: Fit, repeats: PureError | None, predictable: bool) -> NoiseVerdict:
-    """Judge the noise of a fit in which no effect is found missing.
-
-    Args:
-        repeats: the scatter of repeated readings.
-        predictable: whether anything predicts the residual on poses left out.
-    """
+    """Judge the noise where no effect is missing; whether anything predicts the residual counts."""
     high = float(chi2.sf(fit.chi2, fit.dof)) < MISFIT_ALARM
     low = float(chi2.cdf(fit.chi2, fit.dof)) < MISFIT_ALARM
     if not high and not low:

@@ -158,9 +158,6 @@ def wrong_figures(of: Fit, suspects: Sequence[Suspect]) -> tuple[WrongFigure, ..
     """Return the figures that explain the misfit, the best first; any one of several does.
 
     None of a model with a background: that was asked before it was fitted.
-
-    Args:
-        suspects: effects that could be missing, as they are scored.
     """
     if of.model.background:
         return ()

@@ -145,12 +145,7 @@ def _lines(effect: Effect, index: Ints) -> list[Family]:
 def log_std_prior(
     priors: Sequence[LogStdPrior], families: Sequence[Family]
 ) -> tuple[Floats, Floats]:
-    """Mean (F + N,) and precision (F + N, F + N) of log s and η.
-
-    Args:
-        priors: of each of them by itself.
-        families: the first F of them.
-    """
+    """Mean (F + N,) and precision (F + N, F + N) of log s of families and of η."""
     covariance = np.diag([p.spread**2 for p in priors])
     effect = np.array([f.effect for f in families])
     unknown = np.array([not f.known for f in families], dtype=float)

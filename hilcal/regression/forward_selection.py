@@ -108,12 +108,9 @@ def forward_selection(families: CandidateFamilies, most: int) -> Iterator[Additi
 
 
 def block_evidence(gram: Floats, g: Floats, rss: float, dof: float, strengths: Floats) -> Floats:
-    """(L,) gain in log evidence of each of L blocks, at its best prior strength.
+    """(L,) gain in log evidence of each of L blocks, at its best of the prior strengths (T,).
 
-    Args:
-        gram: (L, W, W) of the blocks beside the model.
-        g: (L, W) their products with the residual.
-        strengths: (T,) prior standard deviations that are tried.
+    `gram` (L, W, W) is of the blocks beside the model, g (L, W) their products with the residual.
     """
     lam, u = np.linalg.eigh(gram)
     seen = visible(lam)
@@ -127,14 +124,9 @@ class BlockSelection:
     """Blocks that can be chosen beside a model."""
 
     def __init__(self, own: Floats, ridge: Floats, x: Floats, y: Floats, fold: Ints) -> None:
-        """Form all products, fold by fold.
+        """Form all products of B (R, K), Λ (K,), all blocks (R, L, W) and y (R,), fold by fold.
 
-        Args:
-            own: (R, K) B.
-            ridge: (K,) Λ.
-            x: (R, L, W) all blocks.
-            y: (R,) what remains where the model stands.
-            fold: (R,) fold of each row, from 0.
+        y is what remains where the model stands; folds are numbered from 0.
         """
         self._shape, self._own, self._ridge, self._y = x.shape[1:], own, ridge, y
         self._x, self._fold = x.reshape(len(y), -1), fold
@@ -152,10 +144,7 @@ class BlockSelection:
     def without(self, f: int, most: int, least: float, strengths: Floats) -> list[int]:
         """Return the blocks that the rows without fold f choose, the first one first.
 
-        Args:
-            most: number of blocks at most.
-            least: gain in log evidence that each needs.
-            strengths: (T,) prior standard deviations that are tried.
+        At most `most`, each with a gain in log evidence of at least `least` at its best strength.
         """
         # a sample of the rows need not have any of the last folds
         out = self._of[f] if f < len(self._of) else [0] * len(self._all)

@@ -150,12 +150,7 @@ class FamilyProducts:
 def family_products(
     folds: tuple[Fold, ...], p: Projection, white: Floats, families: Iterable[Floats]
 ) -> list[FamilyProducts]:
-    """Form the products of families of whitened columns (R, F).
-
-    Args:
-        folds: of the model; each row is in one.
-        white: (R,) residual of the model fitted to all rows.
-    """
+    """Form the products of families of whitened columns (R, F) with residuals (R,)."""
     every = list(families)
     parts: list[list[Products]] = [[] for _ in every]
     for fold in folds:
@@ -199,12 +194,7 @@ class FamilyFolds:
     """Model and family without each fold, for any residuals and ridges: products formed once."""
 
     def __init__(self, folds: tuple[Fold, ...], p: Projection, x: Floats | None = None) -> None:
-        """Form the products.
-
-        Args:
-            folds: of the model; their right-hand sides are not used.
-            x: (R, F) whitened columns of the family; None for the model alone.
-        """
+        """Form the products of a family X (R, F), or of the model alone."""
         self._x = x = np.zeros((len(p.rows), 0)) if x is None else x
         self._folds, self._p = folds, p
         gram, cross = x.T @ x, p.rows.T @ x
@@ -217,11 +207,7 @@ class FamilyFolds:
             self._of.append((c, at, gram - out.T @ out - c.T @ at))
 
     def left_out(self, y: Floats, ridge: float = 0.0) -> Floats:
-        """Return `left_out_residual` (R, K) of K residuals of models at zero, as simulated ones.
-
-        Args:
-            y: (R, K) what remains where all parameters are zero.
-        """
+        """Return `left_out_residual` (R, K) of K simulated residuals y (R, K) of models at zero."""
         x, p = self._x, self._p
         total, rhs = p.rows.T @ y, x.T @ y
         left = np.zeros(y.shape)

@@ -252,16 +252,10 @@ def flat_products(a: Floats, target: Floats, basis: Basis) -> FlatProducts:
 def normal_equations(
     a: Floats, target: Floats, basis: Basis, gram: Floats, known: FlatProducts | None = None
 ) -> NormalEquations:
-    """Form the normal equations of A (R, P) in the coordinates of a basis.
+    """Form the normal equations of A (R, P), with AᵀA (P, P), in the coordinates of a basis.
 
     The flat directions are formed from their rows, which are orthonormal, so that squaring
-    costs no accuracy; columns with a prior are taken from the gram AᵀA (P, P), for speed.
-
-    Args:
-        a: A.
-        target: (R,) right-hand side.
-        gram: AᵀA.
-        known: products of the flat coordinates, where they are known.
+    costs no accuracy; columns with a prior are taken from AᵀA, for speed.
     """
     flat, of = len(basis.singular), flat_products(a, target, basis) if known is None else known
     held = basis.held

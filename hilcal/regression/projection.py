@@ -76,12 +76,6 @@ class Projection:
 
 
 def projection(rows: Floats, ridge: Floats, gram: Floats | None = None) -> Projection:
-    """Return M of the columns B (R, K) with the ridge Λ (K,).
-
-    Args:
-        rows: B.
-        ridge: Λ, at least zero.
-        gram: (K, K) BᵀB where it is known.
-    """
+    """Return M of the columns B (R, K) with the ridge Λ (K,), from BᵀB (K, K) where it is known."""
     h = (rows.T @ rows if gram is None else gram) + np.diag(ridge)
     return Projection(rows, ridge, inverse_root(h))

@@ -82,11 +82,7 @@ class VarianceComponents:
 
 
 def variance_components(blocks: Sequence[BlockRows], ridge: Floats) -> VarianceComponents:
-    """Maximise the restricted likelihood.
-
-    Args:
-        ridge: (K,) Λ, zero for a column without a prior.
-    """
+    """Maximise the restricted likelihood, with Λ (K,), zero for a column without a prior."""
     count = len(blocks[0].components)
     zero = _at(blocks, ridge, np.zeros(count))
     here = _at(blocks, ridge, _start(blocks, zero))
@@ -270,15 +266,12 @@ def hierarchy(of: FleetEstimates) -> tuple[Hierarchy, tuple[Unlike, ...]]:
 
 
 def unlike(values: Floats, variance: Floats) -> tuple[Unlike, ...]:
-    """Name elements of (U, K) values that are unlike those of the other units.
+    """Name elements of values (U, K), of variance (U, K), that are unlike those of other units.
 
     Each is compared with the distribution of the others, of which it is no part: mean, and the
     variance beyond that of the values themselves. The worst is taken out first. `FALSE_ALARM`
-    holds for all elements together (Bonferroni), by Student's t of the others' number.
-
-    Args:
-        values: (U, K).
-        variance: (U, K) of their errors; those above `UNDETERMINED`² are left out.
+    holds for all elements together (Bonferroni), by Student's t of the others' number. Values with
+    a variance above `UNDETERMINED`² are left out.
     """
     known = variance < UNDETERMINED**2
     tests = max(int(known.sum()), 1)
