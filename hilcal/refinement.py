@@ -2,24 +2,23 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import cache
 
 from hilcal import limits
 from hilcal.diagnosis.background_evidence import (
     TOGETHER,
+    BackgroundEffect,
     background_evidence,
     background_is_better,
     p_value_of_others,
     proved,
 )
-from hilcal.diagnosis.diagnosis import Diagnosis, History, Verdict
-from hilcal.diagnosis.effect_probabilities import effect_probabilities
-from hilcal.diagnosis.effect_ranking import LEAST_SHARE
-from hilcal.diagnosis.evidence import Evidence
-from hilcal.diagnosis.promise import LEAST_KEPT, kept_by_refit
+from hilcal.diagnosis.diagnosis import Diagnosis, History, Verdict, effect_probabilities
+from hilcal.diagnosis.effect_ranking import LEAST_KEPT, LEAST_SHARE, kept_by_refit
+from hilcal.diagnosis.evidence import Alternative, Evidence
 from hilcal.diagnosis.residual_regression import Regressions
 from hilcal.diagnosis.serial_noise import serial_noise, with_serial_noise
-from hilcal.diagnosis.stepwise import Refits, add, exchange, predicts_better, remove
-from hilcal.diagnosis.stepwise_alternatives import Alternative
+from hilcal.diagnosis.stepwise import add, exchange, predicts_better, remove
 from hilcal.diagnosis.verdict import NOTHING, judge, judge_naming
 from hilcal.discovery.discovery import LawSearch
 from hilcal.identification.arm_scatter import with_arm_scatter, with_prior_scatter
@@ -41,8 +40,7 @@ __all__ = ["Refinement", "RefinementStep", "add", "predicts_better", "refine", "
 MOST_REVISIONS = 15
 MOST_SCATTERS = 2
 """Estimates of the arm's scatter at most: the first, and one more with what was added after it."""
-BACKGROUND = "background"
-"""What a step with a background has as its addition."""
+BACKGROUND = "background"  # what a step with a background has as its addition
 FAR = 0.1
 """Share of an effect's evidence by which others must be better while the model is not adequate;
 a guess."""
@@ -52,18 +50,11 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RefinementStep(Brief):
-    """One revision: a fit, its diagnosis, and what was changed to get there.
-
-    Attributes:
-        fit: the fit.
-        diagnosis: of it, with all that the refinement learnt of it.
-        added: the effect that was added to the revision before, or `BACKGROUND`.
-        removed: the effect that was removed from it.
-    """
+    """One revision: a fit, its diagnosis, and what was changed to get there."""
 
     fit: Fit
-    diagnosis: Diagnosis
-    added: str | None
+    diagnosis: Diagnosis  # with all that the refinement learnt of the fit
+    added: str | None  # the effect that was added to the revision before, or `BACKGROUND`
     removed: str | None = None
 
     def __repr__(self) -> str:
@@ -116,8 +107,8 @@ class Refinement(Shown):
     def probabilities(self, effects: Iterable[str]) -> dict[str, float]:
         """Return the probability that the arm has each effect, by name.
 
-        See `diagnosis.effect_probabilities`. An effect that no step tested has 0.04: prior odds of
-        one to nine, less the price of its strength.
+        See `effect_probabilities`. An effect that no step tested has 0.04: prior odds of one to
+        nine, less the price of its strength.
         """
         return effect_probabilities([s.diagnosis for s in self.steps], effects)
 
@@ -135,7 +126,7 @@ def refine(
     """Fit, diagnose, add the first suspect, and repeat.
 
     An effect stays only if the error on poses left out falls, and the refit keeps what the
-    linearisation promised (see `diagnosis.promise`). Where the readings do not separate
+    linearisation promised (see `diagnosis.effect_ranking`). Where the readings do not separate
     the first suspect from others it is added all the same, since any of them lowers the error.
     When no suspect is left, every addition is reconsidered: a redundant one is removed, one that
     others replace better is exchanged for them. Where more than noise is left then, and
@@ -215,29 +206,25 @@ class Path:
         laws: LawSearch | None = None,
         seen: Callable[[RefinementStep], None] = lambda step: None,
     ) -> None:
-        """Begin with a fit, the effects of which stay.
-
-        Args:
-            first: the fit.
-            say: takes progress, one line each.
-            before: how its model was reached.
-            laws: searches laws.
-            seen: takes each step.
-        """
+        """Begin with a fit, the effects of which stay; `before` says how its model was reached."""
         self.steps: list[RefinementStep] = []
         self._given, self._before, self._say = first.model.named, before, say
         self._laws, self._seen = laws, seen
         self._rejected, self._removed = [*before.rejected], [*before.removed]
-        self._refits, self._regressions = Refits(), Regressions()
+        self._add, self._regressions = cache(add), Regressions()
         self._background_tried = False
         taken = first.readings.arm_scatter is not None
         self._scattered = [first.model.names] if taken else []
-        say("diagnosing")
         self.append(first, None)
 
     @property
     def _room(self) -> bool:
         return len(self.steps) < MOST_REVISIONS
+
+    def _evidence_of(
+        self, found: Fit, background: tuple[BackgroundEffect, ...] | None = None
+    ) -> Evidence:
+        return Evidence(found, self._add, self._say, self._regressions, background)
 
     def _history(self, of: Fit) -> History:
         names = of.model.named
@@ -247,9 +234,12 @@ class Path:
             rejected=tuple(n for n in self._rejected if n not in names),
         )
 
-    def append(self, found: Fit, added: str | None, removed: str | None = None) -> None:
-        """Judge a fit and append it."""
-        self._evidence = Evidence(found, self._refits.add, self._say, self._regressions)
+    def append(
+        self, found: Fit, added: str | None, removed: str | None = None, what: str = ""
+    ) -> None:
+        """Say what was done, judge a fit and append it."""
+        self._say(f"{what}; diagnosing" if what else "diagnosing")
+        self._evidence = self._evidence_of(found)
         diagnosis = judge(self._evidence, self._history(found))
         self.steps.append(RefinementStep(found, diagnosis, added, removed))
         self._seen(self.steps[-1])
@@ -274,8 +264,7 @@ class Path:
         proposed = self._laws.propose(last.fit, self._say)
         if proposed is None or not predicts_better(last.fit, proposed[0]):
             return False
-        self._say(f"added {proposed[1]}; diagnosing")
-        self.append(*proposed)
+        self.append(*proposed, what=f"added {proposed[1]}")
         return True
 
     def _add_one(self) -> bool:
@@ -285,32 +274,29 @@ class Path:
         """
         last, found = self.steps[-1], None
         before = len(self._rejected)
-        for name in last.diagnosis.significant:
-            if name in self._removed:
+        for s in last.diagnosis.suspects:
+            if not s.passes or s.effect in self._removed:
                 continue
-            self._say(f"adding {name}")
-            trial = self._refits.add(last.fit, name)
-            score = next(s.score for s in last.diagnosis.suspects if s.effect == name)
-            kept = kept_by_refit(last.fit, trial, score) >= LEAST_KEPT
+            self._say(f"adding {s.effect}")
+            trial = self._add(last.fit, s.effect)
+            kept = kept_by_refit(last.fit, trial, s.score) >= LEAST_KEPT
             if kept and predicts_better(last.fit, trial):
-                found = trial, name
+                found = trial, s.effect
                 break
-            self._rejected.append(name)
+            self._rejected.append(s.effect)
         if len(self._rejected) > before:
             diagnosis = judge(self._evidence, self._history(last.fit))
             self.steps[-1] = replace(last, diagnosis=diagnosis)
         if found is None:
             return False
-        self._say(f"added {found[1]}; diagnosing")
-        self.append(*found)
+        self.append(*found, what=f"added {found[1]}")
         return True
 
     def reconsider(self) -> bool:
         """Judge every addition anew; returns whether one was removed or exchanged."""
         last = self.steps[-1]
-        if last.diagnosis.wrong_figures:
-            return False
-        if last.fit.model.background:  # what is named does not depend on what was added before
+        # What is named beside a background does not depend on what was added before.
+        if last.diagnosis.wrong_figures or last.fit.model.background:
             return False
         added = [n for n in last.fit.model.named if n not in self._given]
         names = [*added, *carried_effects(last.fit.model)]
@@ -324,9 +310,8 @@ class Path:
                 if not predicts_better(without, last.fit):
                     self._change(without, None, name)
                     return True
-            if name not in added:
-                continue
-            if self._better(last, others[name]) and self._exchange(last, others[name]):
+            better = name in added and self._better(last, others[name])
+            if better and self._exchange(last, others[name]):
                 return True
         return False
 
@@ -357,31 +342,24 @@ class Path:
         found = with_background(last.fit, self._given)
         if found is None or not background_is_better(last.fit, found):
             return False
-        doubtful = not proved_together or last.diagnosis.verdict == "unknown_effect"
+        doubtful = not proved_together or d.verdict == "unknown_effect"
         if doubtful and not predicts_better(last.fit, found):
             return False
         self._say("the background of all effects predicts better; diagnosing")
-        self._name(found)
-        return True
-
-    def _name(self, found: Fit) -> None:
-        """Append a fit with a background, and those that name its effects that are proved."""
         tested = background_evidence(found)
         names = proved(tested)[: MOST_REVISIONS - len(self.steps) - 1]
         fits = [found]
-        for name in names:
+        for name in names:  # those that are proved are named
             model = fits[-1].model
             model = replace(model, background=model.background - {name})
             fits.append(replace(fits[-1], model=model))
         judged, self._evidence = judge_naming(
-            fits,
-            tested,
-            self._history,
-            lambda left: Evidence(fits[-1], self._refits.add, self._say, self._regressions, left),
+            fits, tested, self._history, lambda left: self._evidence_of(fits[-1], left)
         )
-        for one, d, name in zip(fits, judged, (BACKGROUND, *names), strict=True):
-            self.steps.append(RefinementStep(one, d, name))
+        for one, diagnosis, name in zip(fits, judged, (BACKGROUND, *names), strict=True):
+            self.steps.append(RefinementStep(one, diagnosis, name))
             self._seen(self.steps[-1])
+        return True
 
     def take_scatter(self) -> bool:
         """Fit with the arm's scatter in the covariance; returns whether anything was changed.
@@ -398,14 +376,14 @@ class Path:
         if fitted.readings.arm_scatter is not None:
             stated = fitted.readings.as_stated()
             fitted = fit(fitted.model, stated, fitted.mode, start=fitted.theta)
-            evidence = Evidence(fitted, self._refits.add, regressions=self._regressions)
+            evidence = Evidence(fitted, self._add, regressions=self._regressions)
             judged = judge(evidence, self._history(fitted))
         if judged.reason != "arm_scatter" or judged.scatter is None:
             return False
         self._scattered.append(names)
-        self._say("the arm's scatter enters the covariance; diagnosing")
         readings = with_arm_scatter(fitted.model.cell, fitted.readings, judged.scatter)
-        self.append(fit(fitted.model, readings, fitted.mode, start=fitted.theta), None)
+        found = fit(fitted.model, readings, fitted.mode, start=fitted.theta)
+        self.append(found, None, what="the arm's scatter enters the covariance")
         return True
 
     def pool_lines(self) -> None:
@@ -420,7 +398,7 @@ class Path:
         found = with_pooled_lines(last.fit)
         if found is None or predicts_better(found, last.fit):
             return
-        self._evidence = Evidence(found, self._refits.add, self._say, self._regressions)
+        self._evidence = self._evidence_of(found)
         judged = judge(self._evidence, self._history(found))
         self.steps[-1] = replace(last, fit=found, diagnosis=judged)
 
@@ -447,7 +425,7 @@ class Path:
         first, *rest = other.others
         trials = [exchange(last.fit, other.effect, first)]
         for name in rest:
-            trials.append(self._refits.add(trials[-1], name))
+            trials.append(self._add(trials[-1], name))
         found = trials[-1]
         if last.diagnosis.residual_is_noise and not rest:
             if found.holdout_of_all.rms_sigma > last.fit.holdout_of_all.rms_sigma:
@@ -456,12 +434,10 @@ class Path:
             return False
         self._change(trials[0], first, other.effect)
         for name, trial in zip(rest, trials[1:], strict=True):
-            self._say(f"added {name}; diagnosing")
-            self.append(trial, name)
+            self.append(trial, name, what=f"added {name}")
         return True
 
     def _change(self, trial: Fit, added: str | None, removed: str) -> None:
         self._removed.append(removed)
         what = f"removed {removed}" if added is None else f"{added} in place of {removed}"
-        self._say(f"{what}; diagnosing")
-        self.append(trial, added, removed)
+        self.append(trial, added, removed, what)

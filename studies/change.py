@@ -15,10 +15,8 @@ import numpy as np
 
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
-from hilcal.diagnosis.change import LEVEL, POWER, STATED_DOF, find_changes
-from hilcal.diagnosis.change_candidates import changing
-from hilcal.diagnosis.change_found import Changes
-from hilcal.diagnosis.completed import completed
+from hilcal.diagnosis.change import LEVEL, POWER, STATED_DOF, Changes, changing, find_changes
+from hilcal.diagnosis.comparison import completed
 from hilcal.drivers.simulated.injected_effects import (
     Draw,
     joint_compliance,
@@ -32,7 +30,7 @@ from hilcal.identification.baseline import with_effects
 from hilcal.identification.fit import fit
 from hilcal.identification.later_readings import EarlierFit, earlier_fit, setting
 from hilcal.readings.readings import Readings
-from hilcal.regression.power import noncentrality_of_power
+from hilcal.regression.evidence import noncentrality_of_power
 from hilcal.types import Floats
 from studies.random_campaigns import rehearsal_states
 from studies.study_cases import with_study_loads

@@ -12,7 +12,7 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.diagnosis.change import find_changes
-from hilcal.diagnosis.completed import completed
+from hilcal.diagnosis.comparison import completed
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.fit import fit
 from hilcal.identification.later_readings import EarlierFit, earlier_fit, setting

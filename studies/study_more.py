@@ -9,8 +9,7 @@ from hilcal.config import CellConfig
 from hilcal.config.sections import CellLoad
 from hilcal.design.next import measure_next
 from hilcal.design.planner import Request
-from hilcal.diagnosis.diagnosis import Diagnosis
-from hilcal.diagnosis.doubt import in_doubt
+from hilcal.diagnosis.diagnosis import Diagnosis, in_doubt
 from hilcal.drivers.simulated.rehearsal import planned_states, simulate
 from hilcal.errors import CannotAnswerError
 from hilcal.readings.readings import Readings, States

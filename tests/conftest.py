@@ -73,7 +73,7 @@ FIRST = (
     "test_diagnose",
     "test_simulated_cell",
     "test_geocom_driver",
-    "test_catalogue_sufficiency",
+    "test_evidence",
     "test_devices",
     "test_operator",
     "test_user_effects",

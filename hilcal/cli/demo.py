@@ -30,8 +30,8 @@ from hilcal.design.next import measure_next
 from hilcal.design.planner import Request
 from hilcal.design.summary import refuse
 from hilcal.diagnosis.diagnosis import Diagnosis, History
+from hilcal.diagnosis.diagnosis import in_doubt as left_open
 from hilcal.diagnosis.document import to_json
-from hilcal.diagnosis.doubt import in_doubt as left_open
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
 from hilcal.diagnosis.evidence import Evidence
 from hilcal.diagnosis.verdict import diagnose, judge

@@ -5,8 +5,8 @@ both follows a noncentral χ² of non-centrality
 
     λ = βᵀ S β,   S = M_ee − M_en M_nn⁻ M_ne,   n: the model and f
 
-with as many degrees of freedom as S has visible directions (`regression.power`). S at the readings
-so far is the one that a diagnosis tests e with, with f in its model.
+with as many degrees of freedom as S has visible directions (`regression.evidence`). S at the
+readings so far is the one that a diagnosis tests e with, with f in its model.
 
 Estimate of an effect that is not in the model, from the readings so far.
 
@@ -28,7 +28,7 @@ from hilcal.effects.protocol import Effect
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.effect_columns import computable, effect_columns
 from hilcal.identification.linearisation import Linearisation, linearise
-from hilcal.regression.power import family_power
+from hilcal.regression.evidence import family_power
 from hilcal.regression.schur import schur_complement
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Floats

@@ -24,7 +24,7 @@ from hilcal.design.predicted import predicted
 from hilcal.design.run_order import Ordering
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.fit import Fit
-from hilcal.regression.power import family_power
+from hilcal.regression.evidence import family_power
 from hilcal.regression.schur import schur_complement
 from hilcal.robot.chain import evaluate
 from hilcal.store.plan import REFERENCE, UNLOADED

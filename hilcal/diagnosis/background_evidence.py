@@ -1,7 +1,7 @@
 """Which effects of a model's background the readings prove, each beside all others.
 
 The test of an effect is the restricted likelihood ratio against its standard deviation being zero,
-with those of all others estimated anew (see `mixed.evidence`).
+with those of all others estimated anew (see `mixed.variances`).
 """
 
 from collections.abc import Iterator
@@ -10,7 +10,7 @@ from itertools import groupby
 
 import numpy as np
 
-from hilcal.diagnosis.effect_ranking import SAME_EVIDENCE, Detection, LeftOut, Suspect
+from hilcal.diagnosis.effect_ranking import SAME_EVIDENCE, Later, Suspect
 from hilcal.diagnosis.minimum_detectable_effect import Strength
 from hilcal.identification.background import UNSURE
 from hilcal.identification.fit import Fit, all_left_out
@@ -21,10 +21,9 @@ from hilcal.identification.mixed_fit import (
     sizes_at,
     with_all_effects,
 )
-from hilcal.mixed.equations import Equations
-from hilcal.mixed.evidence import evidence
+from hilcal.mixed.variances import evidence
 from hilcal.regression.evidence import FamilyScore
-from hilcal.types import Floats, Ints
+from hilcal.types import Floats
 
 PROVED = 0.01
 """Chance of naming any effect of the background where none is there, over all that are tested; a
@@ -37,33 +36,21 @@ TOGETHER = 0.05
 there; a choice: the error on poses left out has to fall, too."""
 LIKELY = 0.1
 """p-value below which an effect of the background is named as one that may be there; a choice."""
-SEED = 0
-"""Of the simulated ratios, so that equal fits give equal p-values."""
+SEED = 0  # of the simulated ratios, so that equal fits give equal p-values
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BackgroundEffect:
-    """One effect of the background.
+    """One effect of the background."""
 
-    Attributes:
-        effect: its name.
-        p_value: of the test against its absence.
-        ratio: the restricted likelihood ratio.
-        rank: number of its directions that the others do not span.
-        std: root of the mean square of its standard deviations, in ordinary magnitudes.
-        rms_m: root of the mean square of what it moves the measured positions by, m.
-        share: of the misfit that the background explains, in whitened squares.
-        step: (q,) its parameters, in ordinary magnitudes.
-    """
-
-    effect: str
-    p_value: float
-    ratio: float
-    rank: int
-    std: float
-    rms_m: float
-    share: float
-    step: Floats
+    effect: str  # its name
+    p_value: float  # of the test against its absence
+    ratio: float  # the restricted likelihood ratio
+    rank: int  # number of its directions that the others do not span
+    std: float  # root of the mean square of its standard deviations, in ordinary magnitudes
+    rms_m: float  # root of the mean square of what it moves the measured positions by, m
+    share: float  # of the misfit that the background explains, in whitened squares
+    step: Floats  # (q,) its parameters, in ordinary magnitudes
 
 
 def p_value_of_others(of: Fit) -> float:
@@ -71,7 +58,6 @@ def p_value_of_others(of: Fit) -> float:
 
     They are tested at the fit, by one multiple of their ordinary sizes.
     """
-    named = of.model.named
     kept = of.readings[~of.outlier].as_stated()
     model = with_all_effects(of.model, kept.states)
     known = {
@@ -83,20 +69,16 @@ def p_value_of_others(of: Fit) -> float:
         [known.get((e.name, p.name), 0.0) for e in model.effects for p in e.parameters]
     )
     problem = linearised_problem(model, kept, of.mode, theta)
-    families = problem.families.random
-    numbers = [k for k, f in enumerate(families) if f.effect not in named]
+    random = problem.families.random
+    numbers = [k for k, f in enumerate(random) if f.effect not in of.model.named]
     start = sizes_at(problem, model, theta)
     return evidence(problem, numbers, np.random.default_rng(SEED), start).p_value
 
 
 def background_is_better(before: Fit, after: Fit) -> bool:
-    """Whether a background belongs to the model.
+    """Whether a background belongs to the model: `after` has one, `before` the named effects alone.
 
     The error on poses left out must fall by a share, both weighted by the noise of the latter.
-
-    Args:
-        before: the fit of the named effects alone.
-        after: the fit of all, each with its standard deviation.
     """
     raw, w = all_left_out(after)
     one, other = (float(np.sum(w.whiten(r) ** 2)) for r in (all_left_out(before)[0], raw))
@@ -105,56 +87,41 @@ def background_is_better(before: Fit, after: Fit) -> bool:
 
 def background_evidence(fit: Fit) -> tuple[BackgroundEffect, ...]:
     """Test the effects of a background that the readings show; smallest p-values first."""
-    model = fit.model
+    model, theta = fit.model, fit.theta
     if not model.background:
         return ()
-    kept = fit.readings[~fit.outlier].as_stated()
-    found = mixed_fit_at(model, kept, fit.mode, fit.theta)
+    found = mixed_fit_at(model, fit.readings[~fit.outlier].as_stated(), fit.mode, theta)
     problem, log_std = found.equations.problem, found.log_std
     rng, families = np.random.default_rng(SEED), problem.families.random
-    moves, most = _motion(fit), {e.name: e.most() for e in model.effects}
+    moves = fit.whitening.raw(model.jacobian(fit.solution.prediction, theta, 3))  # (D, 3, P)
+    most = {e.name: e.most() for e in model.effects}
     tested = []
     numbered = [(k, f) for k, f in enumerate(families) if f.effect in model.background]
     for name, own in groupby(numbered, lambda kf: kf[1].effect):
-        mine = list(own)
-        test = evidence(problem, [k for k, _ in mine], rng, log_std, UNSURE * most[name])
+        numbers, mine = zip(*own, strict=True)
+        test = evidence(problem, numbers, rng, log_std, UNSURE * most[name])
         if not test.rank:
             continue
-        index = np.concatenate([f.parameters for _, f in mine])
-        magnitude = np.concatenate([f.magnitude for _, f in mine])
-        std = np.concatenate([np.full(len(f.parameters), np.exp(log_std[k])) for k, f in mine])
+        index = np.concatenate([f.parameters for f in mine])
+        std = np.exp(np.repeat(log_std[list(numbers)], [len(f.parameters) for f in mine]))
+        moved = np.sum((moves[:, :, index] @ theta[index]) ** 2, axis=1)
+        columns = np.flatnonzero(np.isin(problem.family, numbers)) + problem.flat
+        white = problem.x[:, columns] @ found.equations.coordinates[columns]
         tested.append(
             BackgroundEffect(
-                name,
-                test.p_value,
-                test.ratio,
-                test.rank,
-                float(np.sqrt(np.mean(std**2))),
-                _moved(moves, fit.theta, index),
-                _white(found.equations, [k for k, _ in mine]),
-                fit.theta[index] / magnitude,
+                effect=name,
+                p_value=test.p_value,
+                ratio=test.ratio,
+                rank=test.rank,
+                std=float(np.sqrt(np.mean(std**2))),
+                rms_m=float(np.sqrt(np.mean(moved))),
+                share=float(np.sum(white**2)),
+                step=theta[index] / np.concatenate([f.magnitude for f in mine]),
             )
         )
     total = sum(b.share for b in tested) or 1.0
     shares = [replace(b, share=b.share / total) for b in tested]
     return tuple(sorted(shares, key=lambda b: (b.p_value, -b.rms_m)))
-
-
-def _motion(fit: Fit) -> Floats:
-    """(D, 3, P) derivatives of the measured positions, not whitened."""
-    jacobian = fit.model.jacobian(fit.solution.prediction, fit.theta, 3)
-    return fit.whitening.raw(jacobian)
-
-
-def _moved(moves: Floats, theta: Floats, index: Ints) -> float:
-    by = moves[:, :, index] @ theta[index]
-    return float(np.sqrt(np.mean(np.sum(by**2, axis=1))))
-
-
-def _white(e: Equations, numbers: list[int]) -> float:
-    p = e.problem
-    own = np.flatnonzero(np.isin(p.family, numbers)) + p.flat
-    return float(np.sum((p.x[:, own] @ e.coordinates[own]) ** 2))
 
 
 def proved(found: tuple[BackgroundEffect, ...]) -> tuple[str, ...]:
@@ -188,8 +155,8 @@ def as_suspects(found: tuple[BackgroundEffect, ...]) -> Iterator[Suspect]:
             effect=b.effect,
             score=score,
             share=b.share,
-            left_out=LeftOut(lambda: HeldOut(0.0, False)),
+            left_out=Later(lambda: HeldOut(0.0, False)),
             explains=False,
-            detection=Detection(lambda: Strength(np.inf, ())),
+            detection=Later(lambda: Strength(np.inf, ())),
             same_as=tuple(n for n in likely if n != b.effect) if b.effect in likely else (),
         )

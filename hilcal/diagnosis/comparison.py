@@ -1,40 +1,55 @@
-"""Two campaigns of one arm as data: the error of the earlier calibration today, the changes."""
+"""Two campaigns of one arm: the earlier fit completed, its error today, the changes since.
 
+An effect that is on the arm all the time and not in the earlier model is found in later readings as
+well as in the earlier ones, and would be taken for a change. So before later readings are judged,
+the effects of the candidates are scored beside the earlier fit on its own readings, and those that
+have evidence are added. What is left then and is no stated noise is taken as scatter of the joints,
+or of the target: it has another shape than the tracker's noise, which is far smaller along the beam
+than across it, and as a multiple of that noise it would look like a change.
+"""
+
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.stats import chi2
 from scipy.stats import f as f_distribution
 
-from hilcal.diagnosis.change import LEVEL
-from hilcal.diagnosis.change_found import Changes
+from hilcal.diagnosis.change import LEVEL, Changes
+from hilcal.diagnosis.effect_ranking import SAME_EVIDENCE
+from hilcal.diagnosis.stepwise import add
+from hilcal.errors import HilcalError
+from hilcal.identification.arm_scatter import estimate_arm_scatter, with_arm_scatter
+from hilcal.identification.effect_columns import effect_columns
+from hilcal.identification.extrapolation import Extrapolation, extrapolation
 from hilcal.identification.fit import Fit
+from hilcal.identification.fit import fit as solve
 from hilcal.identification.later_readings import Setting, beside_frames, frames_alone, remeasure
-from hilcal.identification.posterior import Differences
+from hilcal.identification.linearisation import linearise
+from hilcal.identification.parameter_differences import Differences
 from hilcal.identification.residual import error_block
-from hilcal.identification.validation import Extrapolation, Validation, extrapolation
+from hilcal.identification.validation import Validation
 from hilcal.readings.whitening import Mode
 from hilcal.shown import Shown
+
+MOST = 2
+"""Most effects that are added. A choice: an earlier model that lacks more is no calibration."""
+MISFIT = 0.01  # p-value of χ² below which what is left is more than the stated noise; a choice
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Today:
     """The error of the earlier calibration at the later readings.
 
-    Attributes:
-        prediction: of the later readings; nothing but the tracker's place was fitted, if that.
-        beyond: what the earlier fit states of them, and which lie outside of what it measured.
-        z: rms of the error over what the earlier fit states, all correlations counted: the root of
-            a mean square that is 1 where nothing has changed.
-        p_value: of such an error, or a larger one, without any change.
-        drawing_m: rms error with the arm as drawn, before any calibration, m; None where the
-            frames cannot be registered.
+    z is the rms of the error over what the earlier fit states, all correlations counted: the root
+    of a mean square that is 1 where nothing has changed.
     """
 
-    prediction: Validation
-    beyond: Extrapolation
+    prediction: Validation  # nothing but the tracker's place was fitted, if that
+    beyond: Extrapolation  # what the earlier fit states of them, and which it did not measure
     z: float
-    p_value: float
-    drawing_m: float | None
+    p_value: float  # of such an error, or a larger one, without any change
+    drawing_m: float | None  # rms error with the arm as drawn, m; None without a registration
 
     @property
     def stated_m(self) -> float:
@@ -121,13 +136,55 @@ class Comparison(Shown):
         }
 
 
-def error_today(at: Setting, changes: Changes, drawing: float | None) -> Today:
-    """Return the error of the earlier parameters, with the tracker's place as it is now.
+def completed(
+    fit: Fit, names: Collection[str], say: Callable[[str], None] = lambda text: None
+) -> tuple[Fit, tuple[str, ...]]:
+    """Return a gc-scaled fit with what its own readings ask for and its scatter; what was added.
 
     Args:
-        at: the later readings.
-        changes: since then.
-        drawing: rms error with the arm as drawn, m.
+        names: effects that may be added.
+    """
+    added: list[str] = []
+    while len(added) < MOST and (wanted := _most_wanted(fit, names)) is not None:
+        say(f"adding {wanted} to the earlier model, as its own readings ask for")
+        try:
+            fit = add(fit, wanted)
+        except HilcalError:
+            break
+        added.append(wanted)
+    if fit.readings.arm_scatter is None and chi2.sf(fit.chi2, fit.dof) <= MISFIT:
+        say("estimating the scatter of the earlier readings")
+        scatter = estimate_arm_scatter(fit)
+        if scatter is not None:
+            readings = with_arm_scatter(fit.model.cell, fit.readings, scatter)
+            say("fitting the earlier readings with it")
+            fit = solve(fit.model, readings, fit.mode, start=fit.theta)
+    return fit, tuple(added)
+
+
+def _most_wanted(fit: Fit, names: Collection[str]) -> str | None:
+    """Return the effect with most evidence that is not in the model; None where none has any."""
+    p, states, model = linearise(fit), fit.readings[~fit.outlier].states, fit.model
+    found: dict[str, tuple[float, float]] = {}
+    for kind in model.catalogue.effects:
+        possible = kind.name in names and kind.name not in model.names
+        if possible and kind.computable(states) and kind.applies(model.cell):
+            effect = model.catalogue.make(kind.name, model.cell, states, m=fit.whitening.m)
+            score = p.score(effect_columns(fit, effect.for_scoring(states)).white)
+            if score.rank:
+                found[kind.name] = score.log_evidence, score.p_value
+    sure = {
+        name: evidence
+        for name, (evidence, p_value) in found.items()
+        if evidence > SAME_EVIDENCE and p_value * len(found) < LEVEL
+    }
+    return max(sure, key=lambda name: sure[name]) if sure else None
+
+
+def error_today(at: Setting, changes: Changes, drawing: float | None) -> Today:
+    """Return the error of the earlier parameters at later readings, with the tracker as it is now.
+
+    `drawing` is the rms error with the arm as drawn, m.
     """
     found = remeasure(frames_alone(at))
     w, raw = at.w, found.raw
@@ -141,12 +198,8 @@ def error_today(at: Setting, changes: Changes, drawing: float | None) -> Today:
         registered=at.anew,
     )
     knows, lift = at.earlier.knows, beside_frames(at)
-    here = replace(
-        knows,
-        model=found.model,
-        theta=found.theta,
-        covariance=lift @ lift.T / knows.factor,
-    )
+    covariance = lift @ lift.T / knows.factor
+    here = replace(knows, model=found.model, theta=found.theta, covariance=covariance)
     fit, before = at.earlier.fit, changes.before
     ratio = before.rss / before.dof
     return Today(

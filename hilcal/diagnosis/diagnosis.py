@@ -3,24 +3,32 @@
 It holds data only; `hilcal.present.verdict` writes its sentence.
 """
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
 from hilcal.diagnosis.background_evidence import BackgroundEffect
-from hilcal.diagnosis.catalogue_sufficiency import Insufficiency
 from hilcal.diagnosis.document import to_json
 from hilcal.diagnosis.effect_ranking import Suspect
+from hilcal.diagnosis.evidence import Alternative, Insufficiency, Separability
 from hilcal.diagnosis.misfit_breakdown import MisfitShare
-from hilcal.diagnosis.noise import PureError
-from hilcal.diagnosis.noise_verdict import NoiseVerdict
+from hilcal.diagnosis.noise import NoiseVerdict, PureError
 from hilcal.diagnosis.pose_alone import PoseAlone
 from hilcal.diagnosis.residual_regression import Dependence
-from hilcal.diagnosis.separability import Separability
-from hilcal.diagnosis.stepwise_alternatives import Alternative
 from hilcal.diagnosis.wrong_figures import WrongFigure
 from hilcal.identification.fit import Fit
 from hilcal.readings.readings import ArmScatter
 from hilcal.shown import Shown, Tabular, presenter
+
+MOST = 4
+"""Effects to separate at once at most: each pair, both ways round, is a term of the design; a
+guess."""
+PRIOR_ODDS = 1.0 / 9.0
+"""That an arm has an effect of the catalogue which readings can prove: one in ten; a choice."""
+LARGEST = 30.0
+"""Log evidence from which on nothing is gained: a probability of 1 - 2e-12."""
 
 Verdict = Literal["adequate", "missing_effect", "ambiguous", "unknown_effect", "noise_misjudged"]
 Reason = Literal[
@@ -58,18 +66,11 @@ VERDICTS: dict[Reason, Verdict] = {
 
 @dataclass(frozen=True, slots=True)
 class History:
-    """How a model was reached, as far as the judgement depends on it.
+    """How a model was reached, as far as the judgement depends on it."""
 
-    Attributes:
-        added: effects of the model that earlier diagnoses chose; another may fit as well.
-        removed: effects that were taken out of the model because others explain more.
-        rejected: effects whose addition was tried by a refit and did not lower the error on
-            poses left out.
-    """
-
-    added: tuple[str, ...] = ()
-    removed: tuple[str, ...] = ()
-    rejected: tuple[str, ...] = ()
+    added: tuple[str, ...] = ()  # effects that earlier diagnoses chose; another may fit as well
+    removed: tuple[str, ...] = ()  # taken out of the model because others explain more
+    rejected: tuple[str, ...] = ()  # tried by a refit: the error on poses left out did not fall
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,15 +112,15 @@ class Diagnosis(Shown, Tabular):
     reason: Reason
     suspects: tuple[Suspect, ...]
     misfit_breakdown: tuple[MisfitShare, ...]
-    predictable_share: float
-    dependences: tuple[Dependence, ...]
-    follows: tuple[str, ...]
-    pure_error: PureError | None
-    noise: NoiseVerdict | None
-    redundant: tuple[str, ...]
-    separability: tuple[Separability, ...]
-    insufficiency: Insufficiency | None
-    alternatives: tuple[Alternative, ...]
+    predictable_share: float = 0.0
+    dependences: tuple[Dependence, ...] = ()
+    follows: tuple[str, ...] = ()
+    pure_error: PureError | None = None
+    noise: NoiseVerdict | None = None
+    redundant: tuple[str, ...] = ()
+    separability: tuple[Separability, ...] = ()
+    insufficiency: Insufficiency | None = None
+    alternatives: tuple[Alternative, ...] = ()
     scatter: ArmScatter | None = None
     pose_alone: PoseAlone | None = None
     background: tuple[BackgroundEffect, ...] = ()
@@ -181,3 +182,55 @@ class Diagnosis(Shown, Tabular):
     def to_dict(self) -> dict[str, object]:
         """Return the JSON document of `hilcal diagnose --json`, the sentence included."""
         return to_json(self)
+
+
+def in_doubt(d: Diagnosis, most: int = MOST) -> tuple[str, ...]:
+    """Return effects that the readings do not separate; none unless the verdict is `ambiguous`.
+
+    Either they are all missing from the model, the first suspect first, or the first one is an
+    addition to the model that one of the others could replace, or they all depend on the pose
+    alone, as the misfit does.
+    """
+    if d.reason == "inseparable_suspects":
+        return (d.suspects[0].effect, *(s.effect for s in d.separability))[:most]
+    if d.reason == "inseparable_addition":
+        a = next(a for a in d.alternatives if a.inseparable)
+        return (a.effect, *(a.same_as or a.others))[:most]
+    return d.pose_alone.effects[:most] if d.pose_alone is not None else ()
+
+
+def effect_probabilities(steps: Sequence[Diagnosis], effects: Iterable[str]) -> dict[str, float]:
+    """Return the probability that the arm has each effect, each judged by itself.
+
+    The odds for an effect are the prior odds times exp(L - 1), with L its log evidence at the
+    strength that the evidence prefers, which costs one unit. L is, whichever was said last:
+
+        of an effect that was named: against the model without it
+        of an effect of a background: half the restricted likelihood ratio, beside all others
+        of another suspect: beside the model of the step that tested it
+        of an effect that no step tested: 0
+
+    Where others explain as much as a named effect, they share the probability: the named one stays
+    with 1 / (1 + exp(L_others - L - (number of others) + 1)), and the others have the rest.
+
+    Args:
+        steps: diagnoses of a refinement, in its order; the last one judges what was named.
+    """
+    others = steps[-1].alternatives
+    evidence = {a.effect: a.own for a in others}
+    for d in reversed(steps):
+        evidence = {b.effect: b.ratio / 2 for b in d.background} | evidence
+        evidence = {s.effect: s.score.log_evidence for s in d.suspects} | evidence
+    wanted = tuple(effects)
+    p = {name: _present(evidence.get(name, 0.0)) for name in {*wanted, *evidence}}
+    for a in others:
+        away = np.clip(a.log_evidence - a.own - len(a.others) + 1, -LARGEST, LARGEST)
+        stays = float(1.0 / (1.0 + np.exp(away)))
+        p |= {name: max(p.get(name, 0.0), 1.0 - stays) for name in a.others}
+        p[a.effect] = min(p[a.effect], stays)
+    return {name: p[name] for name in wanted}
+
+
+def _present(log_evidence: float) -> float:
+    gain = np.clip(log_evidence, -LARGEST, LARGEST) - 1.0
+    return float(1.0 / (1.0 + np.exp(-gain) / PRIOR_ODDS))

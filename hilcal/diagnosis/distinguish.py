@@ -20,39 +20,23 @@ the larger value (or the smaller one) than one of the others. A choice."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recorded:
-    """A recorded variable of all readings.
+    """A recorded variable of all readings."""
 
-    Attributes:
-        name: e.g. "joint 2 torque".
-        unit: SI; "" for a pure number.
-        values: (N,) of all readings; NaN where a reading was set aside.
-        labels: names of the values 0, 1, ... where they are not numbers.
-    """
-
-    name: str
-    unit: str
-    values: Floats
-    labels: tuple[str, ...] = ()
+    name: str  # e.g. "joint 2 torque"
+    unit: str  # SI; "" for a pure number
+    values: Floats  # (N,) of all readings; NaN where a reading was set aside
+    labels: tuple[str, ...] = ()  # names of the values 0, 1, ... where they are not numbers
 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """How the picked readings differ from the others in one variable.
+    """How the picked readings differ from the others in one variable."""
 
-    Attributes:
-        variable: e.g. "joint 2 torque"; "load 5 kg" for one of several names.
-        unit: SI; "" for a share.
-        picked: median of the picked readings; the share of that name among them.
-        others: the same of the others.
-        larger: probability that a picked reading has the larger value than one of the others,
-            ties counted half.
-    """
-
-    variable: str
-    unit: str
-    picked: float
-    others: float
-    larger: float
+    variable: str  # e.g. "joint 2 torque"; "load 5 kg" for one of several names
+    unit: str  # SI; "" for a share
+    picked: float  # median of the picked readings; the share of that name among them
+    others: float  # the same of the others
+    larger: float  # probability that a picked reading has the larger value, ties counted half
 
     @property
     def clear(self) -> bool:
@@ -83,10 +67,11 @@ def distinguish(fit: Fit, picked: Bools) -> tuple[Difference, ...]:
     """Compare readings with the others in every recorded variable; the clearest difference first.
 
     Args:
-        fit: the fit.
         picked: (N,) which of its readings; measurements alone are compared, so that the unloaded
             readings of deflections do not count as others.
     """
+    from scipy.stats import rankdata  # slow to import
+
     measured = np.zeros(len(picked), dtype=bool)
     measured[np.flatnonzero(~fit.outlier)[fit.whitening.reading]] = True
     mine, others = picked & measured, ~picked & measured
@@ -94,20 +79,13 @@ def distinguish(fit: Fit, picked: Bools) -> tuple[Difference, ...]:
         return ()
     found = []
     for v in recorded_values(fit):
-        kinds = [(f"{v.name} {name}", float(k)) for k, name in enumerate(v.labels)]
-        columns = [(name, (v.values == k).astype(float)) for name, k in kinds]
-        for name, x in columns or [(v.name, v.values)]:
-            middle = np.mean if columns else np.median
+        kinds = [
+            (f"{v.name} {name}", (v.values == k).astype(float)) for k, name in enumerate(v.labels)
+        ]
+        middle = np.mean if kinds else np.median
+        for name, x in kinds or [(v.name, v.values)]:
             a, b = x[mine], x[others]
-            found.append(
-                Difference(name, v.unit, float(middle(a)), float(middle(b)), _larger(a, b))
-            )
+            ranks = rankdata(np.concatenate([a, b]))[: len(a)]
+            larger = float((ranks.sum() - len(a) * (len(a) + 1) / 2) / (len(a) * len(b)))
+            found.append(Difference(name, v.unit, float(middle(a)), float(middle(b)), larger))
     return tuple(sorted(found, key=lambda d: -abs(d.larger - 0.5)))
-
-
-def _larger(a: Floats, b: Floats) -> float:
-    """Probability that a value of a (K,) is larger than one of b (L,), ties counted half."""
-    from scipy.stats import rankdata  # slow to import
-
-    ranks = rankdata(np.concatenate([a, b]))[: len(a)]
-    return float((ranks.sum() - len(a) * (len(a) + 1) / 2) / (len(a) * len(b)))

@@ -3,36 +3,47 @@
 A suspect passes all tests where the F-test over the whole catalogue rejects that it is absent,
 its evidence is positive, it explains a share of the misfit on poses left out, the error there
 falls by more than it scatters from pose to pose, its parameters need not be larger than is
-plausible, and the exact model keeps what the linearisation promised (see `promise`).
+plausible, and the exact model keeps what the linearisation promised.
 
-All is scored at plausible sizes: the standard deviation of the parameters is at most what
-`plausible_size.most` states. Where more than a share `LOST` of its evidence needs larger ones, the
-effect is implausible, and the size that it would need is stated.
+Plausible sizes. The standard deviation of the parameters is at most what the effect states, and
+what absolute positions allow: deflections show errors of geometry and encoders in the second order
+only, their unloaded readings in the first. With the frames estimated, the displacements there can
+hardly be larger than what the model misses,
 
-Whether gravity tells of an effect of the load where no load was hung.
+    t g ≤ `ALLOWED` s,    s² = mean |P y|²,    g² = mean Σ_p |P x_p|²
 
-Absolute readings of an unloaded arm show a compliance by the torque of the arm's own mass alone.
-That is a smooth function of the joint angles, and so is what a wrong geometry does: with few poses
-either explains the other. So a suspect that acts through loads must explain the readings beside
-geometry: its evidence beside all effects that are constant in the arm's axes (link geometry, zero
-offsets) is positive at 20 : 1, and the error on poses left out falls beyond what they make it fall,
-by more than it scatters from pose to pose.
+y the residual of the unloaded readings, x_p their displacement by an ordinary magnitude of
+parameter p, P the projection off the frames. Elastic effects are not held to that: a controller may
+compensate for what gravity does. Where more than a share `LOST` of the evidence needs larger sizes,
+the effect is implausible, and the size that it would need is stated.
+
+Promise. Columns hold for small parameters. So the step that the score promises is taken, with the
+model's own parameters beside it, and the exact model is evaluated there; where that loses much of
+the promise, a refit decides. Promise and what was kept are reductions of ‖r‖² − dof.
+
+Unloaded arms. Absolute readings without a load show a compliance by the torque of the arm's own
+mass alone, a smooth function of the joint angles, as a wrong geometry is. So a suspect that acts
+through loads must there explain the readings beside all effects that are constant in the arm's axes
+(link geometry, zero offsets): with evidence at 20 : 1, and on poses left out.
 """
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
+from typing import Generic, TypeVar
 
 import numpy as np
 
-from hilcal.diagnosis.family_detection import large, least_of_family
-from hilcal.diagnosis.minimum_detectable_effect import Strength, least_strength
-from hilcal.diagnosis.plausible_size import Unloaded, frame_effects, most, unloaded_readings
-from hilcal.diagnosis.promise import LEAST_KEPT, kept, kept_by_refit
+from hilcal.diagnosis.minimum_detectable_effect import (
+    Strength,
+    large,
+    least_of_family,
+    least_strength,
+)
 from hilcal.diagnosis.stepwise import add
-from hilcal.effects.protocol import Effect, Situation
-from hilcal.errors import InputError
+from hilcal.effects.protocol import Effect
+from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.effect_columns import (
     EffectColumns,
     columns_in_parts,
@@ -41,25 +52,23 @@ from hilcal.identification.effect_columns import (
 )
 from hilcal.identification.fit import Fit
 from hilcal.identification.linearisation import HeldOut, Linearisation, by_pose, linearise
-from hilcal.regression.evidence import FamilyScore, score_family
-from hilcal.regression.leave_out import left_out_residual
-from hilcal.regression.paired_test import improves
+from hilcal.identification.residual import residual
+from hilcal.regression.evidence import FamilyScore, Spectrum, score_family, spectrum
+from hilcal.regression.leave_out import improves, left_out_residual
 from hilcal.regression.schur import eliminate
-from hilcal.regression.spectrum import Spectrum, spectrum
 from hilcal.shown import Brief
 from hilcal.types import Floats
 
-SAME_EVIDENCE = 3.0
-"""Two suspects whose evidence differs by less than e³ = 20 : 1 count as inseparable."""
+ALLOWED = 2.0
+"""Displacement that an effect may make in unloaded readings, in units of what the model misses
+there: as much again may be hidden by other errors. A choice."""
+ROUNDING = 1e-9
+LEAST_KEPT = 0.5  # share of a promise that must be kept; true effects of 3 σ keep 0.9; a choice
+SAME_EVIDENCE = 3.0  # suspects whose evidence differs by less, e³ = 20 : 1, are inseparable
 FALSE_ALARM = 0.001
 """Chance of naming any effect where none is missing, over the whole catalogue."""
-MOST_KEPT = 1_000_000
-"""Numbers of an effect's columns up to which they are kept until the smallest strength that would
-be revealed is asked for, 8 MB; larger ones are computed again then. A choice."""
 LEAST_SHARE = 0.01
 """An effect that explains less of the misfit on poses left out is not worth adding; a guess."""
-
-
 LOST = 0.2
 """Share of its evidence that an effect may lose at plausible sizes. A choice: a prior that is too
 narrow by half costs a few units however strong the evidence is."""
@@ -67,74 +76,38 @@ SURE = 3.1
 """Standard errors, from pose to pose, by which the error on poses left out must fall: a chance of
 one in a thousand, since a dozen effects of the load try."""
 
-
-@dataclass(frozen=True, eq=False)
-class Detection:
-    """The smallest strength that would be revealed, which takes most of the time of a ranking.
-
-    No verdict depends on it; so it is computed when it is first asked for.
-    """
-
-    _compute: Callable[[], Strength]
-
-    @cached_property
-    def least(self) -> Strength:
-        """The smallest strength that these readings would reveal."""
-        return self._compute()
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
-class LeftOut:
-    """The reduction of the error on poses left out.
+class Later(Generic[T]):
+    """What no verdict depends on: computed when it is first asked for, then kept."""
 
-    No verdict depends on that of an effect that fails the test of the fitted readings: it is
-    computed when it is first asked for.
-    """
-
-    _compute: Callable[[], HeldOut]
+    compute: Callable[[], T]
 
     @cached_property
-    def found(self) -> HeldOut:
-        """The reduction."""
-        return self._compute()
+    def value(self) -> T:
+        """What was computed."""
+        return self.compute()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Suspect(Brief):
-    """An effect that is not in the model, and what it would explain.
+    """An effect that is not in the model, and what it would explain."""
 
-    Attributes:
-        effect: canonical name.
-        score: the joint test of the whole family.
-        share: share of the misfit it explains.
-        left_out: what it explains on poses left out.
-        explains: whether it passes the tests of the fitted readings and of its share.
-        detection: the smallest strength of it that these readings would reveal, computed when it
-            is first asked for.
-        needs: where it is implausible, its size: (unit, rms of the parameters that it would need,
-            rms that is plausible), SI.
-        kept: share of what the linearisation promised that the exact model keeps; 1 where that
-            was not looked at, since the suspect fails other tests.
-        refuted: whether the error on poses left out does not fall by it after all: beside geometry,
-            where no load was hung (see `gravity`), or as a refit has shown.
-        most: largest plausible strength, in ordinary magnitudes; see `plausible_size`.
-        same_as: other suspects that these readings do not separate from it.
-        coarse: name of the effect of the model that it is finer than; empty for one that the model
-            does not have.
-    """
-
-    effect: str
-    score: FamilyScore
-    share: float
-    left_out: LeftOut
-    explains: bool
-    detection: Detection
+    effect: str  # canonical name
+    score: FamilyScore  # the joint test of the whole family
+    share: float  # share of the misfit it explains
+    left_out: Later[HeldOut]  # what it explains on poses left out
+    explains: bool  # whether it passes the tests of the fitted readings and of its share
+    detection: Later[Strength]  # the smallest strength of it that these readings would reveal
+    # where it is implausible: (unit, rms of the parameters that it needs, plausible rms), SI
     needs: tuple[tuple[str, float, float], ...] = ()
-    kept: float = 1.0
-    refuted: bool = False
-    most: float = np.inf
-    same_as: tuple[str, ...] = ()
-    coarse: str = ""
+    kept: float = 1.0  # share of the promise that the exact model keeps; 1 where it fails anyway
+    refuted: bool = False  # beside geometry on unloaded arms, or by a refit: predicts no better
+    most: float = np.inf  # largest plausible strength, in ordinary magnitudes
+    same_as: tuple[str, ...] = ()  # other suspects that these readings do not separate from it
+    coarse: str = ""  # effect of the model that it is finer than; empty where it has none
 
     def __repr__(self) -> str:
         """Return the suspect in a line."""
@@ -144,17 +117,17 @@ class Suspect(Brief):
     @property
     def holdout_share(self) -> float:
         """Share of the misfit that it explains on poses left out."""
-        return self.left_out.found.share
+        return self.left_out.value.share
 
     @property
     def sure(self) -> bool:
         """Whether the error on poses left out falls by more than it scatters from pose to pose."""
-        return not self.refuted and self.left_out.found.sure
+        return not self.refuted and self.left_out.value.sure
 
     @property
     def least(self) -> Strength:
         """The smallest strength of it that these readings would reveal."""
-        return self.detection.least
+        return self.detection.value
 
     @property
     def shown(self) -> bool:
@@ -184,71 +157,104 @@ def candidates(fit: Fit) -> tuple[Effect, ...]:
         InputError: `[plausible]` or `[ordinary]` of the cell names an effect that the catalogue
             does not hold.
     """
-    states = fit.readings[~fit.outlier].states
-    model, out = fit.model, []
+    states, model = fit.readings[~fit.outlier].states, fit.model
     config = model.cell.config
     for section in ("plausible", "ordinary") if config else ():
         for name in getattr(config, section):
             if name not in model.catalogue.names:
                 valid = ", ".join(model.catalogue.names)
                 raise InputError(f"[{section}] {name}: no such effect; valid: {valid}")
-    for kind in model.catalogue.effects:
-        possible = kind.computable(states) and kind.applies(model.cell)
-        if kind.name not in model.names and possible:
-            effect = model.catalogue.make(kind.name, model.cell, states, m=fit.whitening.m)
-            out.append(effect.for_scoring(states))
+    others = (kind for kind in model.catalogue.effects if kind.name not in model.names)
+    made = (
+        model.catalogue.make(kind.name, model.cell, states, m=fit.whitening.m)
+        for kind in others
+        if kind.computable(states) and kind.applies(model.cell)
+    )
     beside = model.random if model.background else ()
     finer = (e.refined(states) for e in model.effects if e.name not in beside)
-    return (*out, *(e for e in finer if e is not None))
+    return (*(e.for_scoring(states) for e in made), *(e for e in finer if e is not None))
 
 
 def catalogue_columns(fit: Fit) -> tuple[Floats, dict[str, slice], dict[str, float]]:
     """Return the columns (R, P) of all `candidates`, which are whose, and how large each may be."""
     families = list(columns_of_each(fit, candidates(fit)))
-    ends = np.cumsum([0] + [len(f.scale) for f in families])
+    ends = np.cumsum([0] + [len(f.scale) for f in families]).tolist()
     columns = np.hstack([np.zeros((len(fit.white), 0)), *(f.white for f in families)])
-    of = {
-        f.effect.name: slice(int(a), int(b))
-        for f, a, b in zip(families, ends[:-1], ends[1:], strict=True)
-    }
+    names = [f.effect.name for f in families]
     bare = unloaded_readings(fit)
-    return columns, of, {f.effect.name: most(f, bare) for f in families}
+    return (
+        columns,
+        dict(zip(names, map(slice, ends[:-1], ends[1:]), strict=True)),
+        {name: most(f, bare) for name, f in zip(names, families, strict=True)},
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Unloaded:
+    """The unloaded readings of a campaign of deflections."""
+
+    frames: Floats  # (K, F) orthonormal displacements by the frames
+    missed: float  # s, m
+
+
+def frame_effects(fit: Fit) -> tuple[Effect, ...]:
+    """Effects whose columns `unloaded_readings` needs; none for a fit of absolute readings."""
+    if fit.mode == "absolute":
+        return ()
+    states, model = fit.readings[~fit.outlier].states, fit.model
+    kinds = model.catalogue.with_role("registration", "target")
+    return tuple(kind(model.cell, states) for kind in kinds)
+
+
+def unloaded_readings(fit: Fit, frames: Sequence[EffectColumns] | None = None) -> Unloaded | None:
+    """Return the unloaded readings; None for absolute readings, which show all themselves."""
+    if fit.mode == "absolute":
+        return None
+    if frames is None:
+        frames = list(columns_of_each(fit, frame_effects(fit)))
+    readings = fit.readings[~fit.outlier]
+    rows = readings.unloaded
+    columns = np.concatenate([each.unloaded for each in frames], axis=2)
+    u, s, _ = np.linalg.svd(columns.reshape(3 * int(rows.sum()), -1), full_matrices=False)
+    u = u[:, s > ROUNDING * s.max(initial=0.0)]
+    off = readings.value[:, :3] - fit.solution.prediction.observation.position
+    y = off[rows].reshape(-1)
+    missed = y - u @ (u.T @ y)
+    return Unloaded(u, float(np.sqrt(missed @ missed / max(len(y) - u.shape[1], 1))))
+
+
+def most(of: EffectColumns, bare: Unloaded | None) -> float:
+    """Return the largest plausible strength of an effect, in ordinary magnitudes."""
+    own = of.effect.most()
+    if bare is None or of.effect.elastic:
+        return own
+    x = of.unloaded.reshape(-1, len(of.scale))
+    free = (x - bare.frames @ (bare.frames.T @ x)).ravel()
+    moved = float(np.sqrt(free @ free / len(x)))
+    return min(own, ALLOWED * bare.missed / moved) if moved > ROUNDING * bare.missed else own
 
 
 def rank_suspects(
     p: Linearisation,
-    effects: Sequence[Effect],
-    level: float = FALSE_ALARM,
-    refit: Callable[[Fit, str], Fit] = add,
+    effects: Sequence[Effect],  # that are not in the model
+    level: float = FALSE_ALARM,  # of the test over all of them together
+    refit: Callable[[Fit, str], Fit] = add,  # returns a fit with one more effect
 ) -> tuple[Suspect, ...]:
-    """Score all effects; best first, see `ranked`.
-
-    Args:
-        p: linearisation of the fit.
-        effects: that are not in the model.
-        level: of the test over all of them together.
-        refit: returns a fit with one more effect.
-    """
-    small: dict[str, EffectColumns] = {}
-    found = []
-    for part in _scored(p, effects, level):
-        for scored in part:
-            of = scored.of
-            if of.numbers <= MOST_KEPT:
-                small[of.effect.name] = of
-            found.append(_suspect(p, scored, level, len(effects)))
+    """Score all effects; best first, see `ranked`."""
+    found = [
+        _suspect(p, s, level, len(effects)) for part in _scored(p, effects, level) for s in part
+    ]
     tested = max(sum(s.score.rank > 0 for s in found), 1)
+    no_load = p.fit.mode == "absolute" and not p.fit.solution.prediction.situation.load.wrench.any()
+    geometry = Later(lambda: geometry_columns(p, effects))
     out: list[Suspect] = []
-    geometry: Floats | None = None
-    for k, s in enumerate(found):
+    for effect, s in zip(effects, found, strict=True):
         explains = s.score.p_value * tested < level and s.score.log_evidence > 0
         s = replace(s, explains=explains and s.holdout_share >= LEAST_SHARE)
         if s.passes:
-            own = small.get(s.effect) or effect_columns(p.fit, effects[k])
-            if unloaded(p) and through_load(effects[k]):
-                if geometry is None:
-                    geometry = geometry_columns(p, effects)
-                s = replace(s, refuted=not beyond_geometry(p, own, geometry, SAME_EVIDENCE))
+            own = effect_columns(p.fit, effect)
+            if no_load and through_load(effect):
+                s = replace(s, refuted=not beyond_geometry(p, own, geometry.value, SAME_EVIDENCE))
             if s.passes:
                 s = replace(s, kept=kept(p, own, s.score, refit))
         out.append(s)
@@ -256,12 +262,7 @@ def rank_suspects(
 
 
 def addition(before: Fit, after: Fit) -> Suspect:
-    """Return what was to be expected of the last effect of a model, and what the refit kept of it.
-
-    Args:
-        before: a gc-scaled fit.
-        after: the fit with one more effect.
-    """
+    """Return what a gc-scaled fit let expect of the last effect of the next, and what that kept."""
     p, effect = linearise(before), after.model.effects[-1]
     if effect.name in before.model.names:  # a finer form took its place
         effect = copy(effect)
@@ -277,7 +278,6 @@ def ranked(suspects: Iterable[Suspect], rejected: Collection[str] = ()) -> tuple
     lower the error on poses left out, then the others; by evidence in each of these groups.
 
     Args:
-        suspects: in any order.
         rejected: names of those whose addition did not lower the error on poses left out.
     """
     found = [replace(s, refuted=True) if s.effect in rejected else s for s in suspects]
@@ -286,42 +286,27 @@ def ranked(suspects: Iterable[Suspect], rejected: Collection[str] = ()) -> tuple
     others = [s for s in evident if s.plausible and s.keeps and s.effect not in rejected]
 
     def same_as(s: Suspect) -> tuple[str, ...]:
-        if s.score.log_evidence <= SAME_EVIDENCE:
-            return ()
         own = s.score.log_evidence
         near = (o for o in others if abs(o.score.log_evidence - own) < SAME_EVIDENCE)
         return tuple(o.effect for o in near if o is not s)
 
-    return tuple(replace(s, same_as=same_as(s)) for s in found)
+    return tuple(replace(s, same_as=same_as(s) if s in evident else ()) for s in found)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Scored:
-    """An effect that was scored, and what it was scored by.
-
-    Attributes:
-        of: its columns.
-        information: (P, P) S.
-        spectrum: of S.
-        gradient: (P,) g.
-        largest: largest plausible strength.
-        score: its score.
-        held: reduction of the error on poses left out; None where the fitted readings rule the
-            effect out.
-    """
+    """An effect that was scored, and what it was scored by."""
 
     of: EffectColumns
-    information: Floats
-    spectrum: Spectrum
-    gradient: Floats
-    largest: float
+    information: Floats  # (P, P) S
+    spectrum: Spectrum  # of S
+    gradient: Floats  # (P,) g
+    largest: float  # largest plausible strength
     score: FamilyScore
-    held: HeldOut | None = None
+    held: HeldOut | None = None  # None where the fitted readings rule the effect out
 
 
-def _scored(
-    p: Linearisation, effects: Sequence[Effect], level: float
-) -> Iterator[tuple[_Scored, ...]]:
+def _scored(p: Linearisation, effects: Sequence[Effect], level: float) -> Iterator[list[_Scored]]:
     """Score effects, those together that were whitened together."""
     frames = frame_effects(p.fit)
     of_frames: list[EffectColumns] = []
@@ -337,34 +322,27 @@ def _scored(
             scored.append(_Scored(of, s, of_s, g, largest, p.score_of(of_s, g, largest)))
         able = [c for c in scored if c.score.p_value < level and c.score.log_evidence > 0]
         held = iter(_left_out(p, [(c.of.white, c.score) for c in able]))
-        yield tuple(replace(c, held=next(held)) if c in able else c for c in scored)
+        yield [replace(c, held=next(held)) if c in able else c for c in scored]
 
 
 def _suspect(p: Linearisation, scored: _Scored, level: float, count: int) -> Suspect:
-    """Describe one of `count` effects that are tested together."""
-    of, of_s, result = scored.of, scored.spectrum, scored.score
-    s, largest, effect, known = scored.information, scored.largest, of.effect, scored.held
-    columns: Callable[[], EffectColumns] = lambda: of  # noqa: E731 - of the small ones alone
-    if of.numbers > MOST_KEPT:
-        columns = partial(effect_columns, p.fit, effect)
-    left_out = LeftOut(lambda: _left_out(p, [(columns().white, result)])[0])
-    if known is not None:
-        left_out = LeftOut(lambda: known)
+    """Describe one of `count` effects that are tested together.
+
+    Columns are large: they are computed again where something that is asked for later needs them.
+    """
+    of_s, result, effect = scored.spectrum, scored.score, scored.of.effect
+    s, largest, known = scored.information, scored.largest, scored.held
+
+    def left_out() -> HeldOut:
+        return known or _left_out(p, [(effect_columns(p.fit, effect).white, result)])[0]
 
     def least() -> Strength:
-        own = columns()
-        found = least_strength(
-            s,
-            own.motion,
-            own.scale,
-            tuple(q.unit for q in effect.parameters),
-            p.fit.dof,
-            max(p.fit.variance_factor, 1.0),
-            level / count,
-            of_s.rank,
-        )
+        own = effect_columns(p.fit, effect)
+        units = tuple(q.unit for q in effect.parameters)
+        noise, each = max(p.fit.variance_factor, 1.0), level / count
+        found = least_strength(s, own.motion, own.scale, units, p.fit.dof, noise, each, of_s.rank)
         if large(of_s, p.fit.dof):
-            return least_of_family(p, own, of_s, found, level / count, LEAST_SHARE, largest)
+            return least_of_family(p, own, of_s, found, each, LEAST_SHARE, largest)
         return found
 
     return Suspect(
@@ -372,10 +350,10 @@ def _suspect(p: Linearisation, scored: _Scored, level: float, count: int) -> Sus
         coarse=effect.coarse,
         score=result,
         share=p.share(result.gain),
-        left_out=left_out,
+        left_out=Later(left_out),
         explains=False,
         needs=_implausible(p, scored),
-        detection=Detection(least),
+        detection=Later(least),
         most=largest,
     )
 
@@ -393,24 +371,55 @@ def _implausible(p: Linearisation, scored: _Scored) -> tuple[tuple[str, float, f
     if not at_most.bounded:
         return ()
     free = p.score_of(scored.spectrum, scored.gradient)
-    lost = free.log_evidence - at_most.log_evidence
-    if lost <= max(SAME_EVIDENCE, LOST * free.log_evidence):
+    if free.log_evidence - at_most.log_evidence <= max(SAME_EVIDENCE, LOST * free.log_evidence):
         return ()
     units = np.array([q.unit for q in of.effect.parameters])
-    needed = of.scale * free.step
+
+    def rms(x: Floats, unit: str) -> float:
+        return float(np.sqrt(np.mean(x[units == unit] ** 2)))
+
     return tuple(
-        (unit, _rms(needed[units == unit]), scored.largest * _rms(of.scale[units == unit]))
+        (unit, rms(of.scale * free.step, unit), scored.largest * rms(of.scale, unit))
         for unit in dict.fromkeys(units.tolist())
     )
 
 
-def _rms(x: Floats) -> float:
-    return float(np.sqrt(np.mean(x**2)))
+def kept_by_refit(before: Fit, after: Fit, score: FamilyScore) -> float:
+    """Return the share of the promise that a refit with the effect kept; 1 where none was made.
+
+    Fits that set other readings aside are not compared.
+    """
+    promised = score.gain - score.effective
+    if promised <= 0 or np.any(before.outlier != after.outlier):
+        return 1.0
+    return ((before.chi2 - before.dof) - (after.chi2 - after.dof)) / promised
 
 
-def unloaded(p: Linearisation) -> bool:
-    """Whether no load acts in any of the fitted readings."""
-    return p.fit.mode == "absolute" and not np.any(p.fit.solution.prediction.situation.load.wrench)
+def kept_by_step(p: Linearisation, of: EffectColumns, score: FamilyScore) -> float:
+    """Return the share of an effect's promise that the exact model keeps at the promised step."""
+    fit, s = p.fit, p.fit.solution
+    aim = s.white - of.white @ score.step
+    z = p.projection.solve(p.rows.T @ aim - p.projection.ridge * s.coordinates())
+    model = replace(fit.model, effects=(*fit.model.effects, of.effect))
+    theta = np.concatenate([s.theta + s.transform @ z, of.scale * score.step])
+    try:
+        found = model.predict(s.prediction.situation.states, theta, near=s.prediction)
+    except CannotAnswerError:
+        return 0.0
+    w, readings = fit.whitening, fit.readings[~fit.outlier]
+    linear = float(np.sum((aim - p.rows @ z) ** 2))
+    exact = float(np.sum(w.whiten(residual(readings, found, w)) ** 2))
+    return (fit.chi2 - exact) / max(fit.chi2 - linear, 1e-300)
+
+
+def kept(
+    p: Linearisation, of: EffectColumns, score: FamilyScore, refit: Callable[[Fit, str], Fit]
+) -> float:
+    """Return the share of the promise that the step keeps, or where that is little a refit."""
+    share = kept_by_step(p, of, score)
+    if share >= LEAST_KEPT:
+        return share
+    return max(share, kept_by_refit(p.fit, refit(p.fit, of.effect.name), score))
 
 
 def through_load(effect: Effect) -> bool:
@@ -420,45 +429,71 @@ def through_load(effect: Effect) -> bool:
 
 def geometry_columns(p: Linearisation, effects: Sequence[Effect]) -> Floats:
     """Whitened columns (R, Q) of the effects that are constant in the arm's axes."""
-    s = p.fit.solution.prediction.situation
-    constant = [e for e in effects if _constant(e, s)]
-    families = [of.white for of in columns_of_each(p.fit, constant)]
-    return np.hstack([np.zeros((len(p.residual), 0)), *families])
+    situation = p.fit.solution.prediction.situation
 
+    def constant(effect: Effect) -> bool:
+        columns = effect.columns(situation)
+        fields = all(c.field in ("dq", "twist") and len(c.values) == 1 for c in columns)
+        return bool(columns) and fields and not effect.elastic
 
-def _constant(effect: Effect, s: Situation) -> bool:
-    columns = effect.columns(s)
-    fields = all(c.field in ("dq", "twist") and len(c.values) == 1 for c in columns)
-    return bool(columns) and fields and not effect.elastic
+    families = columns_of_each(p.fit, [e for e in effects if constant(e)])
+    return np.hstack([np.zeros((len(p.residual), 0)), *(of.white for of in families)])
 
 
 def beyond_geometry(p: Linearisation, of: EffectColumns, geometry: Floats, evidence: float) -> bool:
-    """Whether a family explains the readings beside geometry, too.
-
-    Args:
-        p: linearisation of the fit.
-        of: the family.
-        geometry: (R, Q) columns of `geometry_columns`.
-        evidence: log evidence that it must have.
-    """
-    if not geometry.shape[1]:
-        return True
+    """Whether a family explains the readings beside geometry, at some log evidence."""
     q, fit = geometry.shape[1], p.fit
+    if not q:
+        return True
     x = np.hstack([geometry, of.white])
     s, g = p.information(x), x.T @ p.residual
     first = score_family(s[:q, :q], g[:q], p.rss, fit.dof)
     if first.rank == 0:
         return True
     rest, gradient, rss = eliminate(s, g, p.rss, slice(0, q), first.ridge)
-    found = score_family(
-        rest[q:, q:], gradient[q:], rss, fit.dof, first.effective, of.effect.most()
-    )
+    largest = of.effect.most()
+    found = score_family(rest[q:, q:], gradient[q:], rss, fit.dof, first.effective, largest)
     if found.rank == 0 or found.log_evidence <= evidence:
         return False
     # One ridge for both: columns in units of their strength.
     both = np.hstack([geometry / np.sqrt(first.ridge), of.white / np.sqrt(found.ridge)])
-    left = [
+    before, after = (
         by_pose(fit, left_out_residual(p.folds, p.projection, fit.white, columns, 1.0))
         for columns in (both[:, :q], both)
-    ]
-    return improves(left[0], left[1], SURE)
+    )
+    return improves(before, after, SURE)
+
+
+def added_variable(fit: Fit, suspect: Suspect) -> tuple[Floats, Floats] | None:
+    """(K,) what the suspect would explain, and the residual along it, m.
+
+    With X the suspect's columns, freed of what the fitted model can do, and s its estimated
+    parameters, c = X s is what it would explain of each measurement (3-vectors, raw). Taken are |c|
+    and the residual along c, both with the sign of c along the direction in which the c spread
+    most. Where the suspect is right the points lie on the line of slope 1. None where it explains
+    nothing, or is no effect that could be added.
+
+    Source: Cook and Weisberg, *Residuals and Influence in Regression*, 1982.
+    """
+    p = linearise(fit)
+    effect = next((e for e in candidates(p.fit) if e.name == suspect.effect), None)
+    if effect is None or not len(suspect.score.step):
+        return None
+    w, s = fit.whitening, fit.solution
+    scale = np.array([q.scale for q in effect.parameters])
+    jacobian = fit.model.jacobian_of((effect,), s.prediction, s.theta, w.m)
+    contribution = w.raw(jacobian @ (scale * suspect.score.step))
+    if p.rows.shape[1]:
+        z = p.projection.solve(p.rows.T @ w.whiten(contribution).reshape(-1))
+        adapted = fit.model.predict(s.prediction.situation.states, s.theta - s.transform @ z)
+        shift = adapted.observation.position - s.prediction.observation.position
+        contribution[:, :3] += w.raw(shift)
+    c = contribution[:, :3]
+    size = np.linalg.norm(c, axis=1)
+    seen = size > 1e-9 * max(float(size.max(initial=0.0)), 1e-15)
+    if not seen.any():
+        return None
+    main = np.linalg.svd(c, full_matrices=False)[2][0]
+    side = np.where(c @ main < 0, -1.0, 1.0)[seen]
+    along = np.sum(fit.raw[seen, :3] * c[seen], axis=1) / size[seen]
+    return side * size[seen], side * along

@@ -12,7 +12,7 @@ from hilcal.identification.baseline import with_effects
 from hilcal.identification.fit import mahalanobis2
 from hilcal.identification.folds import distinct_poses
 from hilcal.identification.full_covariance import with_joint_scatter
-from hilcal.identification.gauss_newton import Solution, solve, whitened_jacobian
+from hilcal.identification.gauss_newton import solve, whitened_jacobian
 from hilcal.identification.priors import scales_of
 from hilcal.identification.residual import residual
 from hilcal.measuring.progress import LiveResidual
@@ -22,33 +22,30 @@ from hilcal.readings.whitening import whitening
 from hilcal.regression.schur import inverse_root
 from hilcal.types import Floats
 
-LEAST = 8
-"""Distinct poses from which a registration is estimated; a guess."""
-GROWTH = 1.15
-"""The model is fitted again after so many times as many readings; a guess."""
+LEAST = 8  # distinct poses from which a registration is estimated; a guess
+GROWTH = 1.15  # the model is fitted again after so many times as many readings; a guess
 ORDINARY = 3.0
 """Prior standard deviation of every parameter, in units of its ordinary magnitude; a guess."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Known:
-    """A model as fitted to the first readings of a campaign.
-
-    Attributes:
-        model: the model.
-        theta: (P,) its parameters.
-        covariance: (P, P) of the parameters, for noise of the stated size.
-        rms: 3-D distance of the readings from the fit, root mean square, m.
-        count: readings that it was fitted to.
-        loaded: whether any of them was loaded.
-    """
+    """A model as fitted to the first readings of a campaign."""
 
     model: Model
-    theta: Floats
-    covariance: Floats
-    rms: float
-    count: int
-    loaded: bool
+    theta: Floats  # (P,)
+    covariance: Floats  # (P, P) of the parameters, for noise of the stated size
+    rms: float  # 3-D distance of the readings from the fit, root mean square, m
+    count: int  # readings that it was fitted to
+    loaded: bool  # whether any of them was loaded
+
+    def compared(self, last: Readings) -> tuple[Floats, Floats, Floats]:
+        """Residual (m,) of a reading, covariance J C Jᵀ (m, m) of its prediction, axes (3, 3)."""
+        predicted = self.model.predict(last.states, self.theta)
+        off = residual(last, predicted, whitening(last, "absolute", "gc"))[0]
+        jacobian = self.model.jacobian(predicted, self.theta, last.m)[0]
+        spread = jacobian @ self.covariance @ jacobian.T
+        return off, spread, predicted.observation.axes[0]
 
 
 class LiveModel:
@@ -75,7 +72,7 @@ class LiveModel:
         before, last = readings[:-1], readings[-1:]
         try:
             known = self._renewed(before)
-            return LiveResidual() if known is None else _compared(known, last)
+            return LiveResidual() if known is None else _live_residual(known, last)
         except HilcalError:
             return LiveResidual()
 
@@ -90,54 +87,32 @@ class LiveModel:
             model = with_effects(self._cell, readings, "absolute", names)
             w = whitening(readings, "absolute", "gc")
             found = solve(model, readings, w)
-            rows = whitened_jacobian(model, found.prediction, found.theta, w, found.live)
             rms = float(np.sqrt(np.mean(np.sum(found.raw[:, :3] ** 2, axis=1))))
-            covariance = _covariance(model, found, rows)
-            self._known = _Known(model, found.theta, covariance, rms, count, loaded)
+            scale = ORDINARY * scales_of(model)
+            a = np.zeros((w.m * len(w), model.size))
+            rows = whitened_jacobian(model, found.prediction, found.theta, w, found.live)
+            a[:, found.live] = rows * scale[found.live]
+            root = inverse_root(a.T @ a + np.eye(model.size)) * scale
+            self._known = _Known(model, found.theta, root.T @ root, rms, count, loaded)
         return self._known
 
 
-def _covariance(model: Model, found: Solution, rows: Floats) -> Floats:
-    """(P, P) posterior covariance of the parameters with the prior of `ORDINARY` magnitudes."""
-    scale = ORDINARY * scales_of(model)
-    a = np.zeros((len(rows), model.size))
-    a[:, found.live] = rows * scale[found.live]
-    root = inverse_root(a.T @ a + np.eye(model.size)) * scale
-    return np.asarray(root.T @ root)
-
-
-def _compared(known: _Known, last: Readings) -> LiveResidual:
+def _live_residual(known: _Known, last: Readings) -> LiveResidual:
     """Compare one reading with a fitted model."""
-    loaded = bool(np.any(last.states.wrench))
-    own, off = _spread(known, last), _residual(known, last)
-    sigma = float(np.sqrt(mahalanobis2(off, last.covariance + own)[0] / last.m))
-    uncertain = bool(np.trace(own[0, :3, :3]) > np.trace(last.covariance[0, :3, :3]))
-    residual_m = float(np.linalg.norm(off[0, :3]))
-    axes = known.model.predict(last.states, known.theta).observation.axes[0]
-    spread = axes.T @ (last.covariance + own)[0, :3, :3] @ axes
+    off, own, axes = known.compared(last)
+    spread = own + last.covariance[0]
+    residual_m = float(np.linalg.norm(off[:3]))
     found = LiveResidual(
         residual_m,
-        sigma,
-        uncertain,
-        vector=tuple((axes.T @ off[0, :3]).tolist()),
-        covariance=tuple(spread.ravel().tolist()),
+        float(np.sqrt(mahalanobis2(off[None], spread[None])[0] / last.m)),
+        bool(np.trace(own[:3, :3]) > np.trace(last.covariance[0, :3, :3])),
+        vector=tuple((axes.T @ off[:3]).tolist()),
+        covariance=tuple((axes.T @ spread[:3, :3] @ axes).ravel().tolist()),
     )
-    if not loaded:
+    if not np.any(last.states.wrench):
         return found
     rest = replace(last, states=replace(last.states, wrench=np.zeros_like(last.states.wrench)))
-    deflection_std = float(np.sqrt(known.rms**2 + np.trace(_spread(known, rest)[0, :3, :3])))
-    deflection = float(np.linalg.norm(_residual(known, rest)[0, :3]))
+    off, own, _ = known.compared(rest)
+    deflection_std = float(np.sqrt(known.rms**2 + np.trace(own[:3, :3])))
+    deflection = float(np.linalg.norm(off[:3]))
     return replace(found, deflection=deflection, deflection_std=deflection_std)
-
-
-def _residual(known: _Known, last: Readings) -> Floats:
-    """(1, m) residual of a reading."""
-    w = whitening(last, "absolute", "gc")
-    return residual(last, known.model.predict(last.states, known.theta), w)
-
-
-def _spread(known: _Known, last: Readings) -> Floats:
-    """(1, m, m) covariance of the prediction of a reading, J C Jᵀ."""
-    told = known.model.predict(last.states, known.theta)
-    jac = known.model.jacobian(told, known.theta, last.m)
-    return np.asarray(jac @ known.covariance @ np.swapaxes(jac, 1, 2))

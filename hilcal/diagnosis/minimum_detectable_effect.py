@@ -1,41 +1,56 @@
 """Minimum detectable effect: the smallest strength of an effect that a campaign would reveal.
 
 A family with the parameters t β in ordinary magnitudes adds the non-centrality t² βᵀ S β to its
-F-test (see `regression.power`). The strength stated is the t at which the test, at the level of
+F-test (see `regression.evidence`). The strength stated is the t at which the test, at the level of
 naming an effect, has the power `POWER` for a typical direction β: the median over random ones. At
 the tool it is the rms displacement that these parameters make at the measured target, beyond what
 the fitted model can explain.
+
+The F-test alone says little of a family of many parameters: it rejects its absence where no pose
+predicts another yet, and a family that the poses limit, as a transmission error with more waves
+than they resolve, is scored by a part of its parameters. So whole campaigns are simulated by
+algebra, at the linearisation of the fit: parameters β ~ N(0, t² 1) of the family, noise of the size
+found, and every test that a suspect must pass, poses left out included. The size stated is the
+smallest of a grid at which nine draws in ten pass; that of the family at its finest is stated
+beside it.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
-from hilcal.regression.power import noncentrality_of_power
-from hilcal.regression.spectrum import visible
+from hilcal.identification.effect_columns import EffectColumns, effect_columns
+from hilcal.identification.linearisation import Linearisation, by_pose
+from hilcal.regression.evidence import (
+    LARGE_FAMILY,
+    FamilyScore,
+    Spectrum,
+    noncentrality_of_power,
+    score_family,
+    spectrum,
+)
+from hilcal.regression.leave_out import FamilyFolds, improves
 from hilcal.types import Floats
 
 POWER = 0.9
 DIRECTIONS = 64
-_SEED = 20240611
+DRAWS = 16  # campaigns at each size; a choice, for time
+GRID = np.logspace(0.0, 1.5, 7)  # sizes, in units of that which the F-test reveals; a choice
+SEED, SEED_OF_FAMILY = 20240611, 20240612
 
 
 @dataclass(frozen=True, slots=True)
 class Strength:
     """The smallest strength of an effect that would have been revealed.
 
-    Attributes:
-        displacement_m: rms displacement of the target (of the deflection), m; infinite where
-            these readings cannot show the effect.
-        parameters: the same in the effect's own units: (unit, rms of its parameters), SI.
-        ordinary: the same in the effect's ordinary magnitudes.
-        finest_m: displacement from which the effect would have been revealed were it finer than the
-            poses resolve (see `Effect.fine`), infinite where never; None where no such limit is.
+    `finest_m` is the displacement from which the effect would have been revealed were it finer than
+    the poses resolve (see `Effect.fine`), infinite where never; None where no such limit is.
     """
 
-    displacement_m: float
-    parameters: tuple[tuple[str, float], ...]
-    ordinary: float = np.inf
+    displacement_m: float  # rms, of the target (of the deflection), m; infinite for never
+    parameters: tuple[tuple[str, float], ...]  # (unit, rms of the parameters), SI
+    ordinary: float = np.inf  # the same in the effect's ordinary magnitudes
     finest_m: float | None = None
 
     @property
@@ -45,47 +60,125 @@ class Strength:
 
 
 def least_strength(
-    s: Floats,
-    motion: Floats,
-    scale: Floats,
-    units: tuple[str, ...],
-    dof: float,
-    variance: float,
-    level: float,
-    rank: int | None = None,
+    s: Floats,  # (P, P) information Xᵀ M X of the family in ordinary magnitudes
+    motion: Floats,  # (D, 3, P) of each measured position by ordinary magnitudes, m
+    scale: Floats,  # (P,) ordinary magnitudes, SI
+    units: tuple[str, ...],  # (P,) physical units
+    dof: float,  # degrees of freedom of the fit
+    variance: float,  # its variance factor, at least 1
+    level: float,  # of the test, between 0 and 1
+    rank: int | None = None,  # number of directions that can be tested, where it is known
 ) -> Strength:
-    """Return the smallest strength of a family that would be revealed.
-
-    Args:
-        s: (P, P) information Xᵀ M X of the family in ordinary magnitudes, beside the model.
-        motion: (D, 3, P) displacement of each measured position by the parameters in ordinary
-            magnitudes, m.
-        scale: (P,) ordinary magnitudes, SI.
-        units: (P,) physical units.
-        dof: degrees of freedom of the fit.
-        variance: its variance factor: how much larger than stated the scatter is, at least 1.
-        level: of the test, between 0 and 1.
-        rank: number of directions that can be tested, where it is known.
-    """
+    """Return the smallest strength of a family that would be revealed."""
     if rank is None:
-        values = np.asarray(np.linalg.eigvalsh((s + s.T) / 2), dtype=float)
-        rank = int(visible(values).sum())
-    unseen = Strength(np.inf, tuple((u, np.inf) for u in dict.fromkeys(units)))
-    if rank == 0 or dof - rank < 1:
-        return unseen
-    wanted = noncentrality_of_power(rank, dof - rank, level, POWER)
-    beta = np.random.default_rng(_SEED).standard_normal((DIRECTIONS, len(s)))
+        rank = spectrum(s).rank
+    beta = np.random.default_rng(SEED).standard_normal((DIRECTIONS, len(s)))
     gain = np.sum(beta @ s * beta, axis=1)
-    if float(np.median(gain)) <= 0.0:
-        return unseen
+    if rank == 0 or dof - rank < 1 or float(np.median(gain)) <= 0.0:
+        return _never(units)
+    wanted = noncentrality_of_power(rank, dof - rank, level, POWER)
     t = np.sqrt(wanted * variance / np.maximum(gain, 1e-300))
-    typical = float(np.median(t))
     flat = motion.reshape(-1, motion.shape[2])
     gram = flat.T @ flat / len(motion)
     moved = t * np.sqrt(np.sum(beta @ gram * beta, axis=1))
+    return _strength(float(np.median(moved)), float(np.median(t)), scale, units)
+
+
+def _never(units: tuple[str, ...]) -> Strength:
+    return Strength(np.inf, tuple((u, np.inf) for u in dict.fromkeys(units)))
+
+
+def _strength(moved: float, t: float, scale: Floats, units: tuple[str, ...]) -> Strength:
+    """Return the strength of a displacement by t ordinary magnitudes."""
     names = np.array(units)
-    own = tuple(
-        (unit, typical * float(np.sqrt(np.mean(scale[names == unit] ** 2))))
-        for unit in dict.fromkeys(units)
-    )
-    return Strength(float(np.median(moved)), own, typical)
+    rms = {u: float(np.sqrt(np.mean(scale[names == u] ** 2))) for u in dict.fromkeys(units)}
+    return Strength(moved, tuple((u, t * own) for u, own in rms.items()), t)
+
+
+def large(s: Spectrum, dof: float) -> bool:
+    """Whether a family is large against the degrees of freedom, which hides what it predicts."""
+    return s.rank > LARGE_FAMILY * dof
+
+
+def least_of_family(
+    p: Linearisation,  # of the fit
+    of: EffectColumns,  # the family, as it is scored
+    s: Spectrum,  # of its information
+    start: Strength,  # what the F-test alone would reveal
+    level: float,  # of the test, between 0 and 1
+    least_share: float,  # share of the misfit on poses left out that must be explained
+    largest: float,  # largest plausible strength
+) -> Strength:
+    """Return the smallest strength of a large family that all tests would reveal."""
+    if not start.visible:
+        return start
+    fine = of.effect.fine(p.fit.readings[~p.fit.outlier].states)
+    tests = SuspectTests(p, of, s, level, least_share, largest)
+    least = _least(tests, of, start.displacement_m)
+    if fine is None:
+        return least
+    finest = _least(tests, effect_columns(p.fit, fine), start.displacement_m)
+    return replace(least, finest_m=finest.displacement_m)
+
+
+def _least(tests: "SuspectTests", full: EffectColumns, start: float) -> Strength:
+    """`least_of_family` where the parameters of `full` are there and those of a family scored."""
+    rng = np.random.default_rng(SEED_OF_FAMILY)
+    beta = rng.standard_normal((len(full.scale), DRAWS))
+    signal = full.white @ beta
+    noise = max(tests.p.fit.variance_factor, 1.0)
+    error = np.sqrt(noise) * rng.standard_normal(signal.shape)
+    moved = np.sqrt(np.mean(np.sum(np.einsum("dip,pk->dik", full.motion, beta) ** 2, axis=1)))
+    units = tuple(q.unit for q in full.effect.parameters)
+    for displacement in (GRID * start).tolist():
+        t = displacement / float(moved)
+        if np.mean(tests.found(t * signal + error, POWER)) >= POWER:
+            return _strength(displacement, t, full.scale, units)
+    return _never(units)
+
+
+@dataclass(frozen=True, eq=False)
+class SuspectTests:
+    """The tests that a suspect must pass, of simulated residuals; see `least_of_family`."""
+
+    p: Linearisation
+    of: EffectColumns
+    s: Spectrum
+    level: float
+    least_share: float
+    largest: float
+
+    @cached_property
+    def _folds(self) -> tuple[FamilyFolds, FamilyFolds]:
+        """The model without each fold, without the family and with it."""
+        p = self.p
+        return FamilyFolds(p.folds, p.projection), FamilyFolds(p.folds, p.projection, self.of.white)
+
+    def found(self, y: Floats, enough: float = 0.0) -> list[bool]:
+        """Whether each of K simulated residuals y (R, K) would reveal the family.
+
+        Once a share of `enough` is out of reach, the remaining ones are not looked at and count as
+        not revealing it.
+        """
+        p = self.p
+        r = p.project_out(y)
+        g, rss = self.of.white.T @ r, np.sum(r * y, axis=0)
+        scores: list[FamilyScore] = []
+        able = [False] * y.shape[1]
+        for k in range(len(able)):
+            c = score_family(self.s, g[:, k], float(rss[k]), p.fit.dof, most=self.largest)
+            scores.append(c)
+            able[k] = c.p_value < self.level and c.log_evidence > 0
+            failed = len(scores) - sum(able)
+            if 1.0 - failed / len(able) < enough:
+                return able
+        if np.mean(able) < POWER:
+            return able
+        ridge = float(np.median([c.ridge for c in scores]))
+        before, after = (of.left_out(y, ridge) for of in self._folds)
+        out = []
+        for k, fit_able in enumerate(able):
+            a, b = by_pose(p.fit, before[:, k]), by_pose(p.fit, after[:, k])
+            share = float(a.sum() - b.sum()) / max(float(a.sum()) - p.fit.whitening.rank, 1.0)
+            out.append(fit_able and share >= self.least_share and improves(a, b))
+        return out

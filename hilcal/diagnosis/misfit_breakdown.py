@@ -5,29 +5,47 @@ errs as a smooth function of x: columns φ_k(x) times the motion of each joint a
 base axis. Of several targets, "target" asks whether one of them is displaced on the flange. The
 family is scored like a suspect, so its p-value is exact; its share is the part of the misfit that
 it predicts on poses left out. It names no cause.
+
+Constants of each pose, three displacements of the target, are columns C, whitened and orthonormal;
+each has rows in one pose alone. Beside the model they are M C, with M = 1 − Q Qᵀ (see
+`regression.projection`), and with W = CᵀQ their Gram matrix is the identity less one of no more
+than the model's rank,
+
+    CᵀM²C = 1 − W (2 − QᵀQ) Wᵀ = 1 − V Vᵀ,    VᵀV = diag(t)
+
+What they take of a vector x is ‖Uᵀx‖² of an orthonormal basis U of their span: with z = CᵀM x
+
+    zᵀ (CᵀM²C)⁺ z = ‖z‖² + Σ_{t_k < 1} (v_kᵀ z)² / (1 − t_k) − Σ_{t_k = 1} (v_kᵀ z)²
+
+where t = 1 is a direction that the model holds already. Thousands of poses cost a small
+factorisation each and one of the model's size.
 """
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from scipy.stats import chi2
+from scipy.stats import f as f_distribution
 
-from hilcal.diagnosis.pose_constants import pose_constants
 from hilcal.identification.linearisation import Linearisation
 from hilcal.model.observe import motion
-from hilcal.readings.readings import angle_name, travel_name
-from hilcal.types import Floats
+from hilcal.readings.ranges import angle_name, travel_name
+from hilcal.regression.projection import Projection
+from hilcal.types import Floats, Ints
 
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
+DETERMINED = 1e-6  # singular value of a determined direction over the largest; below: rounding
+HELD = 1.0 - DETERMINED**2  # t from which on the model holds a direction already
 POLYNOMIAL = 3
 ROW_ORDER = "row order"
 """The variable in place of the time where the readings do not state it: a drift shows by it."""
-MANY = 4000
-"""Degrees of freedom from which the families of joint angles are finer."""
+MANY = 4000  # degrees of freedom from which the families of joint angles are finer
 MOST_AT_ONCE = 8_000_000
 """Numbers of the columns that are scored together, 64 MB; a choice."""
-
 
 Group = Literal["joints", "load and target", "time and air", "pose", "direction"]
 """Kinds of variables. The share of a pose is what its readings have in common, that of a direction
@@ -39,53 +57,39 @@ _GROUPS: dict[str, Group] = {
     "pose": "pose",
     "direction": "direction",
 }
+_Named = tuple[str, Floats]
 
 
 @dataclass(frozen=True, slots=True)
 class MisfitShare:
-    """How far the misfit follows one variable.
+    """How far the misfit follows one variable."""
 
-    Attributes:
-        variable: e.g. "joint 2 angle", "joint 2 torque", "load", "time".
-        share: share of the misfit that it predicts on poses left out; see `Group` for others.
-        p_value: of the joint test.
-    """
-
-    variable: str
-    share: float
-    p_value: float
+    variable: str  # e.g. "joint 2 angle", "joint 2 torque", "load", "time"
+    share: float  # of the misfit that it predicts on poses left out; see `Group` for others
+    p_value: float  # of the joint test
 
     @property
     def group(self) -> Group:
         """What kind of variable it is."""
-        head = self.variable.split()[0]
-        return _GROUPS.get(head, "time and air")
+        return _GROUPS.get(self.variable.split()[0], "time and air")
 
 
 def misfit_breakdown(p: Linearisation) -> tuple[MisfitShare, ...]:
     """Score all variables that vary in these readings; largest share first."""
     fit, w = p.fit, p.fit.whitening
-    prediction, model = fit.solution.prediction, fit.model
-    moves = motion(
-        model.cell,
-        prediction.observation,
-        prediction.situation.chain,
-        prediction.deviation,
-        w.m,
-    )
-    count = len(prediction.situation.angle)
-    axes = np.zeros((count, w.m, 3))
-    axes[:, :3] = prediction.observation.axes
+    at, model = fit.solution.prediction, fit.model
+    moves = motion(model.cell, at.observation, at.situation.chain, at.deviation, w.m)
+    axes = np.zeros((len(at.situation.angle), w.m, 3))
+    axes[:, :3] = at.observation.axes
     # Motions of ordinary size: 1 mrad of a joint, 1 mm of the target.
     generic = 1e-3 * np.concatenate([moves.drives, axes], axis=2)
-    at_measurement = generic[w.reading]
 
-    def raws() -> Iterator[tuple[str, Floats]]:
+    def raws() -> Iterator[_Named]:
         for name, basis, follows_load in _variables(p):
             if follows_load:
                 yield name, w.raw(_times(generic, basis))
             else:
-                yield name, _times(at_measurement, basis[w.reading])
+                yield name, _times(generic[w.reading], basis[w.reading])
         target = fit.readings.target[~fit.outlier][w.reading]
         if np.ptp(target) > 0:
             member = (target[:, None] == np.unique(target)).astype(float)
@@ -97,19 +101,14 @@ def misfit_breakdown(p: Linearisation) -> tuple[MisfitShare, ...]:
     return tuple(sorted(out, key=lambda v: (-v.share, v.p_value)))
 
 
-_Named = tuple[str, Floats]
-
-
 def _batches(columns: Iterable[_Named]) -> Iterator[list[_Named]]:
     """Collect named columns up to `MOST_AT_ONCE` numbers."""
     batch: list[_Named] = []
-    size = 0
     for name, x in columns:
-        if batch and size + x.size > MOST_AT_ONCE:
+        if batch and sum(y.size for _, y in batch) + x.size > MOST_AT_ONCE:
             yield batch
-            batch, size = [], 0
+            batch = []
         batch.append((name, x))
-        size += x.size
     if batch:
         yield batch
 
@@ -136,7 +135,6 @@ def _variables(p: Linearisation) -> list[tuple[str, Floats, bool]]:
     fit = p.fit
     readings = fit.readings[~fit.outlier]
     s, situation = readings.states, fit.solution.prediction.situation
-    absolute = fit.mode == "absolute"
     harmonics = np.arange(1, 3 if fit.dof < MANY else 7)
     out: list[tuple[str, Floats, bool]] = []
     for j in range(situation.angle.shape[1]):
@@ -165,7 +163,7 @@ def _variables(p: Linearisation) -> list[tuple[str, Floats, bool]]:
     loads = np.unique(readings.load)
     if len(loads) > 1:
         member = (readings.load[:, None] == loads).astype(float)
-        out.append(("load", member[:, member.any(axis=0)], absolute))
+        out.append(("load", member, fit.mode == "absolute"))
     return out
 
 
@@ -192,30 +190,98 @@ def _poses(p: Linearisation) -> list[MisfitShare]:
 def _axes(p: Linearisation) -> list[MisfitShare]:
     """Directions: towards the base axis, around it, and up."""
     fit, w = p.fit, p.fit.whitening
-    if fit.readings.serial is not None:
-        return []  # what readings have in common counts as one, not as many
-    if fit.readings.scalar.any():
-        return []  # a distance has no direction to choose
+    # What readings have in common counts as one, not as many; a distance has no direction.
+    if fit.readings.serial is not None or fit.readings.scalar.any():
+        return []
     o = fit.solution.prediction.observation
     x = o.base_position[w.reading]
     across = np.maximum(np.hypot(x[:, 0], x[:, 1]), 1e-300)
     up = np.tile([0.0, 0.0, 1.0], (len(x), 1))
     radial = np.stack([x[:, 0] / across, x[:, 1] / across, 0 * across], axis=1)
-    around = np.cross(up, radial)
-    excess = {}
-    scale = len(fit.raw) * w.m / max(fit.dof, 1.0)
-    for name, direction in (("radial", radial), ("tangential", around), ("vertical", up)):
+    count = len(fit.raw)
+    square = {}
+    for name, direction in (
+        ("radial", radial),
+        ("tangential", np.cross(up, radial)),
+        ("vertical", up),
+    ):
         e = np.einsum("dij,dj->di", o.axes[w.reading], direction)
         r = np.sum(e * fit.raw[:, :3], axis=1)
         v = np.einsum("di,dij,dj->d", e, w.covariance[:, :3, :3], e)
-        excess[name] = float(np.sum(r**2 / v)) * scale
-    count = len(fit.raw)
-    total = sum(max(value - count, 0.0) for value in excess.values())
+        square[name] = float(np.sum(r**2 / v)) * count * w.m / max(fit.dof, 1.0)
+    total = sum(max(value - count, 0.0) for value in square.values())
+    least = max(total, 3 * np.sqrt(6 * count))
     return [
         MisfitShare(
-            f"direction {name}",
-            0.0 if total == 0 else max(value - count, 0.0) / max(total, 3 * np.sqrt(6 * count)),
-            float(chi2.sf(value, count)),
+            f"direction {name}", max(value - count, 0.0) / least, float(chi2.sf(value, count))
         )
-        for name, value in excess.items()
+        for name, value in square.items()
     ]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseConstants:
+    """Constants of each pose beside a model."""
+
+    projection: Projection  # M
+    columns: "csr_array"  # (R, 3 poses) C
+    shared: Floats  # (3 poses, K) V
+    t: Floats  # (K,) squares of its columns, which are orthogonal
+    rank: int  # number of directions beside the model
+    gain: float  # reduction of ‖r‖² by them
+    p_value: float  # of that
+
+    def square(self, x: Floats) -> float:
+        """Return the square ‖Uᵀx‖² of whitened columns x (R, P) that the constants take."""
+        z = np.asarray(self.columns.T @ self.projection.project_out(x))
+        return _square(z, self.shared, self.t)
+
+
+def pose_constants(p: Linearisation) -> PoseConstants | None:
+    """Split the residual by displacements of each pose; None where poses have too few readings."""
+    fit, w = p.fit, p.fit.whitening
+    poses = int(fit.pose.max()) + 1
+    if poses * 3 > fit.dof / 2 or len(fit.pose) < 2 * poses:
+        return None
+    axes = np.zeros((len(fit.pose), w.m, 3))
+    axes[:, :3] = 1e-3 * fit.solution.prediction.observation.axes[w.reading]
+    columns, there = _orthonormal(w.whiten(axes), w.rows_of(fit.pose))
+    b, inverse_root = p.projection.rows, p.projection.inverse_root
+    values, vectors = np.linalg.eigh(
+        2.0 * np.eye(len(inverse_root)) - inverse_root @ (b.T @ b) @ inverse_root.T
+    )
+    shared = np.asarray(columns.T @ b) @ inverse_root.T @ (vectors * np.sqrt(np.abs(values)))
+    t, turn = np.linalg.eigh(shared.T @ shared)
+    shared = shared @ turn
+    rank = there - int(np.count_nonzero(t >= HELD))
+    if rank <= 0 or fit.dof - rank <= 0:
+        return None
+    gain = _square(np.asarray(columns.T @ p.project_out(p.residual[:, None])), shared, t)
+    within = (p.rss - gain) / (fit.dof - rank)
+    p_value = float(f_distribution.sf(gain / rank / within, rank, fit.dof - rank))
+    return PoseConstants(p.projection, columns, shared, t, rank, gain, p_value)
+
+
+def _orthonormal(columns: Floats, pose: Ints) -> "tuple[csr_array, int]":
+    """Columns (R, 3 poses) of columns (R, 3) that each pose has alone, orthonormal; their rank."""
+    from scipy.sparse import csr_array  # slow to import
+
+    values = np.zeros_like(columns)
+    order = np.argsort(pose, kind="stable")
+    parts = np.split(order, np.flatnonzero(np.diff(pose[order])) + 1)
+    found = [np.linalg.svd(columns[rows], full_matrices=False) for rows in parts]
+    least = DETERMINED * max(float(s.max(initial=0.0)) for _, s, _ in found)
+    for rows, (u, s, _) in zip(parts, found, strict=True):
+        values[np.ix_(rows, s > least)] = u[:, s > least]
+    there = sum(int(np.count_nonzero(s > least)) for _, s, _ in found)
+    at = 3 * pose[:, None] + np.arange(3)
+    start = 3 * np.arange(len(pose) + 1)
+    shape = len(pose), 3 * (int(pose.max()) + 1)
+    return csr_array((values.reshape(-1), at.reshape(-1), start), shape=shape), there
+
+
+def _square(z: Floats, shared: Floats, t: Floats) -> float:
+    """Return zᵀ (1 − V Vᵀ)⁺ z, of all columns of z."""
+    along = np.sum((shared.T @ z) ** 2, axis=1)
+    held = t >= HELD
+    return float(np.sum(z**2) + np.sum(along[~held] / (1.0 - t[~held])) - np.sum(along[held]))

@@ -1,6 +1,6 @@
 """Whether the noise of a fit's readings is correlated along their order, and how far.
 
-The law is that of `readings.readings`. A misfit looks alike where neighbours in the order are
+The law is that of `readings.serial_noise`. A misfit looks alike where neighbours in the order are
 neighbours in joint space, so it is estimated beside all that could be missing. With L the whitening
 of the measurements by the covariance without correlation, B the columns of the model and y their
 residual,
@@ -32,6 +32,7 @@ Source: Patterson and Thompson, Biometrika 58 (1971) 545-554.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import block_diag, lapack, solve_triangular
@@ -41,8 +42,8 @@ from hilcal.identification.effect_columns import columns_of_each
 from hilcal.identification.fit import Fit, fit
 from hilcal.model.observe import motion
 from hilcal.readings.covariance import instrument_root
-from hilcal.readings.readings import Clock, SerialNoise
-from hilcal.readings.whitening import Group, arrival_groups, deflection_groups, runs
+from hilcal.readings.reading_groups import arrival_groups, deflection_groups, runs
+from hilcal.readings.serial_noise import Clock, SerialNoise
 from hilcal.regression.schur import inverse_root
 from hilcal.types import Floats, Ints
 
@@ -51,39 +52,28 @@ CHANCE = 8.0
 with one and two degrees of freedom (Self and Liang, JASA 82 (1987) 605), on two clocks."""
 AGAINST = 6.0
 """Gain of the restricted log likelihood by another σ² than 1 that speaks against it: that of
-`noise_verdict.MISFIT_ALARM`."""
+`noise.MISFIT_ALARM`."""
 SUSPECT = 0.5 * CHANCE
 """Gain that slope and curvature at white noise must promise for more to be computed; a choice: it
 is as rough as a third."""
-SIZES = (1.0, 10.0, 100.0)
-"""Variances of a rival that are tried, in that of the noise, and ..."""
+SIZES = (1.0, 10.0, 100.0)  # variances of a rival that are tried, in that of the noise; a choice
 LEAD = 2.0
-"""... factor by which its gain exceeds that of serial noise at `STARTS` where it explains the
-readings far better; choices, rough but for little computing."""
-FEWEST = 12
-"""Readings below which nothing is estimated; a choice."""
-MOST_READINGS = 600
-"""Measurements above which nothing is estimated; a choice by timing."""
-POSITION = 3
-"""Elements of a reading by which it is estimated: an attitude follows its position."""
+"""Factor by which a rival at one of `SIZES` gains more than serial noise at `STARTS` where it
+explains the readings far better; a choice, rough but for little computing."""
+FEWEST = 12  # readings below which nothing is estimated; a choice
+MOST_READINGS = 600  # measurements above which nothing is estimated; a choice by timing
+POSITION = 3  # elements of a reading by which it is estimated: an attitude follows its position
 MOST_ROWS = 450
 """Rows that are used at most, for speed; a choice: ρ of 150 readings is known to 0.05."""
-PIECE = 50
-"""Measurements in each of the runs that are used of a large campaign; a choice."""
-LEAST, MOST = np.exp(-12.0), np.exp(12.0)
-"""Bounds of v_f: none, and far more than noise."""
-MOST_SHARE = 0.999
-"""Bound of φ; with it every covariance has an inverse."""
+PIECE = 50  # measurements in each of the runs that are used of a large campaign; a choice
+LEAST, MOST = np.exp(-12.0), np.exp(12.0)  # bounds of v_f: none, and far more than noise
+MOST_SHARE = 0.999  # bound of φ; with it every covariance has an inverse
 ROUNDING = 1e-9
 """Least variance, in units of the noise, and least information, as a share of the mean."""
-MOST_NAMED = 2
-"""Rivals that are named."""
-SOME = 0.01
-"""Mean variance, in that of the noise, from which on a rival is named; a choice."""
-SHARE_STEP, LENGTH_STEP = 0.02, 0.05
-"""Steps of φ and log τ by which the curvature is taken."""
-STARTS = (0.3, 0.8, 0.97)
-"""Values of ρ from which the likelihood is climbed."""
+MOST_NAMED = 2  # rivals that are named
+SOME = 0.01  # mean variance, in that of the noise, from which on a rival is named; a choice
+SHARE_STEP, LENGTH_STEP = 0.02, 0.05  # steps of φ and log τ by which the curvature is taken
+STARTS = (0.3, 0.8, 0.97)  # values of ρ from which the likelihood is climbed
 
 
 def with_serial_noise(white: Fit, prior: Floats | None = None) -> Fit:
@@ -98,18 +88,11 @@ def with_serial_noise(white: Fit, prior: Floats | None = None) -> Fit:
         return white
     readings = white.readings.with_serial(noise)
     found = fit(white.model, readings, white.mode, white.scaling, white.theta, prior)
-    noise = replace(noise, wider=_wider(white, found))
-    return replace(found, readings=readings.with_serial(noise))
-
-
-def _wider(white: Fit, serial: Fit) -> tuple[float, float]:
-    """Least and largest ratio of the formal uncertainties of parameters that both determine."""
-    a, b = white.uncertainty, serial.uncertainty
+    a, b = white.uncertainty, found.uncertainty
     both = a.identifiable & b.identifiable & (a.formal > 0)
-    if not both.any():
-        return 1.0, 1.0
-    ratio = b.formal[both] / a.formal[both]
-    return float(ratio.min()), float(ratio.max())
+    ratio = b.formal[both] / a.formal[both] if both.any() else np.ones(1)
+    noise = replace(noise, wider=(float(ratio.min()), float(ratio.max())))
+    return replace(found, readings=readings.with_serial(noise))
 
 
 def serial_noise(found: Fit) -> SerialNoise | None:
@@ -125,14 +108,14 @@ def serial_noise(found: Fit) -> SerialNoise | None:
     names, rivals = by_order.rivals()
     if by_order.outdone(rivals):
         return None
-    problem, alone = by_order, by_order.climbed(by_order.none(), serial=True)
+    problem, alone = by_order, by_order.climbed(by_order.none, serial=True)
     timed = None if found.readings.states.time is None else _problem(found, "time")
     if timed is not None:
-        other = timed.climbed(timed.none(), serial=True)
+        other = timed.climbed(timed.none, serial=True)
         if other.value >= alone.value:
             problem, alone = timed, other
             names, rivals = problem.rivals()
-    if alone.value - problem.climbed(problem.none(), serial=False).value < CHANCE:
+    if alone.value - problem.climbed(problem.none, serial=False).value < CHANCE:
         return None
     effects = problem.climbed(rivals, serial=False)
     both = problem.climbed(rivals, serial=True, start=effects)
@@ -140,12 +123,12 @@ def serial_noise(found: Fit) -> SerialNoise | None:
     if gain >= CHANCE or alone.value - effects.value >= SAME_EVIDENCE:
         # Variances that are not needed take some of the noise for their own.
         needed = both.value - alone.value >= SAME_EVIDENCE
-        return problem.noise(*((both, rivals) if needed else (alone, problem.none())), gain)
+        return problem.noise(*((both, rivals) if needed else (alone, problem.none)), gain)
     if effects.value - alone.value >= SAME_EVIDENCE:
         return None
     worst = np.argsort(-effects.v)[:MOST_NAMED]
     instead = tuple(names[k] for k in worst if effects.v[k] > SOME)
-    return replace(problem.noise(alone, problem.none(), gain), proved=False, instead=instead)
+    return replace(problem.noise(alone, problem.none, gain), proved=False, instead=instead)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -158,39 +141,40 @@ class _SerialPoint:
     value: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class _SerialProblem:
-    """What the likelihood is of, R rows of N readings.
-
-    Attributes:
-        fit: the fit.
-        clock: what t is.
-        rows: (N,) readings that are used, of those that were fitted.
-        y: (R,) whitened residual, at the parameters' prior mean.
-        columns: (R, K) of the model, whitened.
-        ridge: (K,) of their priors.
-        factor: (R, N, m) A.
-        difference: (R, N·m) L D.
-        t: (N,) positions.
-        own: (R, R) K(0).
-    """
+    """What the likelihood is of, R rows of N readings."""
 
     fit: Fit
-    clock: Clock
-    rows: Ints
-    y: Floats
-    columns: Floats
-    ridge: Floats
-    factor: Floats
-    difference: Floats
-    t: Floats
-    own: Floats
+    clock: Clock  # what t is
+    rows: Ints  # (N,) readings that are used, of those that were fitted
+    y: Floats  # (R,) whitened residual, at the parameters' prior mean
+    columns: Floats  # (R, K) of the model, whitened
+    ridge: Floats  # (K,) of their priors
+    factor: Floats  # (R, N, m) A
+    difference: Floats  # (R, N·m) L D
+    t: Floats  # (N,) positions
 
-    @property
+    @cached_property
+    def away(self) -> Floats:
+        """(N, N) distances of the readings."""
+        return np.abs(self.t[:, None] - self.t)
+
+    @cached_property
     def step(self) -> float:
         """Median distance of consecutive readings."""
         gaps = np.diff(np.sort(self.t))
         return float(np.median(gaps[gaps > 0])) if (gaps > 0).any() else 1.0
+
+    @property
+    def free(self) -> int:
+        """Degrees of freedom."""
+        return len(self.y) - int(np.sum(self.ridge == 0))
+
+    @property
+    def none(self) -> Floats:
+        """No K_f (0, R, R)."""
+        return np.zeros((0, len(self.y), len(self.y)))
 
     def correlated(self, c: Floats) -> Floats:
         """A (C ⊗ 1) Aᵀ (R, R) of a correlation (N, N)."""
@@ -198,9 +182,10 @@ class _SerialProblem:
         flat = np.swapaxes(self.factor, 1, 2).reshape(len(self.y), -1)
         return np.asarray(moved.reshape(len(self.y), -1) @ flat.T)
 
-    def none(self) -> Floats:
-        """No K_f (0, R, R)."""
-        return np.zeros((0, len(self.y), len(self.y)))
+    @cached_property
+    def own(self) -> Floats:
+        """K(0)."""
+        return self.correlated(np.eye(len(self.t)))
 
     def rivals(self) -> tuple[list[str], Floats]:
         """Names and K_f (F, R, R) of all."""
@@ -208,8 +193,7 @@ class _SerialProblem:
         return [name for name, _ in found], np.stack([k for _, k in found])
 
     def _rivals(self) -> Iterator[tuple[str, Floats]]:
-        kept = self.fit.readings[~self.fit.outlier]
-        s = self.fit.solution.prediction.situation
+        kept, p = self.fit.readings[~self.fit.outlier], self.fit.solution.prediction
 
         def of_columns(x: Floats) -> Floats:
             white = self.difference @ x[:, :POSITION].reshape(-1, x.shape[2])
@@ -220,36 +204,29 @@ class _SerialProblem:
         time = kept.states.time
         t = np.arange(len(kept), dtype=float) if time is None else time
         scaled = 2 * (t - t.min()) / max(float(np.ptp(t)), 1e-300) - 1
-        p = self.fit.solution.prediction
-        cell, m = self.fit.model.cell, POSITION
-        moves = motion(cell, p.observation, p.situation.chain, p.deviation, m)
+        chain = p.situation.chain
+        moves = motion(self.fit.model.cell, p.observation, chain, p.deviation, POSITION)
         for motions in (moves.drives, p.observation.axes):
             powers = [motions * scaled[:, None, None] ** k for k in (1, 2, 3)]
             yield "the time", of_columns(np.concatenate(powers, axis=2)[self.rows])
         pose = kept.pose[self.rows]
         yield "the pose", self.correlated((pose[:, None] == pose).astype(float))
-        torque = s.torque[self.rows] / np.maximum(np.abs(s.torque).max(axis=0), 1e-300)
-        angle = s.angle[self.rows]
+        torque = p.situation.torque
+        torque = torque[self.rows] / np.maximum(np.abs(torque).max(axis=0), 1e-300)
+        angle = p.situation.angle[self.rows]
         x = np.concatenate([np.cos(angle), np.sin(angle), torque], axis=1)
         square = np.sum((x[:, None] - x) ** 2, axis=2)
         yield "angles and torques", self.correlated(np.exp(-0.5 * square))
 
     def climbed(
         self,
-        rivals: Floats,
+        rivals: Floats,  # the K_f
         *,
-        serial: bool,
-        start: _SerialPoint | None = None,
-        stated: bool = False,
+        serial: bool,  # whether φ may be more than zero
+        start: _SerialPoint | None = None,  # of v_f, and of φ and τ where it has serial noise
+        stated: bool = False,  # whether σ² = 1
     ) -> _SerialPoint:
-        """Maximise the restricted likelihood, with or without serial noise.
-
-        Args:
-            rivals: the K_f.
-            serial: whether φ may be more than zero.
-            start: where to begin with v_f, and to begin at all where that has serial noise.
-            stated: whether σ² = 1.
-        """
+        """Maximise the restricted likelihood, with or without serial noise."""
         from scipy.optimize import minimize  # slow to import
 
         step, count = self.step, len(rivals)
@@ -273,95 +250,78 @@ class _SerialProblem:
             *[(np.log(LEAST), np.log(MOST))] * count,
         ]
         found = minimize(climb, x, jac=True, bounds=bounds, method="L-BFGS-B")
-        share, length = found.x[:2]
-        return _SerialPoint(
-            float(share), float(np.exp(length)), np.exp(found.x[2:]), -float(found.fun)
-        )
+        share, length = (float(x) for x in (found.x[0], np.exp(found.x[1])))
+        return _SerialPoint(share, length, np.exp(found.x[2:]), -float(found.fun))
 
-    def _likelihood(
-        self, rivals: Floats, share: float, length: float, v: Floats, stated: bool = False
-    ) -> tuple[float, Floats]:
-        """ℓ and its slope by φ, τ and v (2 + F,)."""
-        away = np.abs(self.t[:, None] - self.t)
-        c = np.exp(-away / length)
-        serial = self.correlated(c) - self.own if share > 0 else None
-        sigma = np.eye(len(self.y))
-        if serial is not None:
-            sigma += share * serial
-        sigma += np.tensordot(v, rivals, axes=1)
-        lower = np.asarray(np.linalg.cholesky(sigma + ROUNDING * np.eye(len(sigma))), dtype=float)
-        inverse = _inverse(lower)
+    def _projected(self, sigma: Floats) -> tuple[Floats, Floats, float]:
+        """P (R, R), P y, and log det Σ + log det H."""
+        lower = np.linalg.cholesky(sigma + ROUNDING * np.eye(len(sigma)))
+        half = np.tril(lapack.dpotri(lower, lower=1)[0])
+        inverse = half + np.tril(half, -1).T
         b = inverse @ self.columns
         h = self.columns.T @ b + np.diag(self.ridge)
         h += ROUNDING * float(np.trace(h)) / len(h) * np.eye(len(h))
         lifted = b @ inverse_root(h).T
         p = inverse - lifted @ lifted.T
-        py = p @ self.y
-        free = len(self.y) - int(np.sum(self.ridge == 0))
+        log_det = 2 * float(np.log(np.diag(lower)).sum()) + float(np.linalg.slogdet(h)[1])
+        return p, p @ self.y, log_det
+
+    def _likelihood(
+        self, rivals: Floats, share: float, length: float, v: Floats, stated: bool = False
+    ) -> tuple[float, Floats]:
+        """ℓ and its slope by φ, τ and v (2 + F,)."""
+        c = np.exp(-self.away / length)
+        sigma = np.eye(len(self.y)) + np.tensordot(v, rivals, axes=1)
+        if share > 0:
+            serial = self.correlated(c) - self.own
+            sigma += share * serial
+        p, py, log_det = self._projected(sigma)
         square = float(self.y @ py)
-        log_h = np.linalg.slogdet(h)[1]
-        log_det = 2 * float(np.log(np.diag(lower)).sum()) + float(log_h)
-        noise = 1.0 if stated else square / free
-        value = -0.5 * (free * np.log(noise) + square / noise + log_det)
+        noise = 1.0 if stated else square / self.free
+        value = -0.5 * (self.free * np.log(noise) + square / noise + log_det)
         slope = -0.5 * (p - np.outer(py, py) / noise)
         by_share = by_length = 0.0
-        if serial is not None:
+        if share > 0:
             by_share = float(np.vdot(slope, serial))
-            by_length = float(np.vdot(slope, share * self.correlated(c * away / length**2)))
+            by_length = float(np.vdot(slope, share * self.correlated(c * self.away / length**2)))
         by_v = np.tensordot(rivals, slope, axes=2)
         return value, np.concatenate([[by_share, by_length], by_v])
 
-    def _white(self) -> tuple[Floats, Floats, float, int]:
-        """P (R, R) and P y of white noise, σ² there, and degrees of freedom."""
-        h = self.columns.T @ self.columns + np.diag(self.ridge)
-        h += ROUNDING * float(np.trace(h)) / len(h) * np.eye(len(h))
-        q = self.columns @ inverse_root(h).T
-        p = np.eye(len(self.y)) - q @ q.T
-        py = p @ self.y
-        free = len(self.y) - int(np.sum(self.ridge == 0))
-        return p, py, max(float(self.y @ py) / free, 1e-300), free
+    @cached_property
+    def _white(self) -> tuple[Floats, Floats, float]:
+        """P (R, R) and P y of white noise, and σ² there."""
+        p, py, _ = self._projected(np.eye(len(self.y)))
+        return p, py, max(float(self.y @ py) / self.free, 1e-300)
 
     def promise(self) -> float:
         """Gain of ℓ by serial noise as its slope and curvature at white noise let expect."""
-        p, py, noise, free = self._white()
-        away, found = np.abs(self.t[:, None] - self.t), 0.0
+        (p, py, noise), found = self._white, 0.0
         for rho in STARTS:
-            k = self.correlated(rho ** (away / self.step)) - self.own
+            k = self.correlated(rho ** (self.away / self.step)) - self.own
             pk = p @ k
             trace = float(np.trace(pk))
             slope = 0.5 * (float(py @ k @ py) / noise - trace)
-            curvature = 0.5 * (float(np.sum(pk * pk.T)) - trace**2 / free)
+            curvature = 0.5 * (float(np.sum(pk * pk.T)) - trace**2 / self.free)
             if slope > 0 and curvature > 0:
                 found = max(found, 0.5 * slope**2 / curvature)
         return found
 
     def outdone(self, rivals: Floats) -> bool:
         """Whether that of the rivals which ℓ rises most for explains far more than serial noise."""
-        p, py, noise, free = self._white()
+        p, py, noise = self._white
         trace = np.tensordot(rivals, p, axes=2)
         slope = 0.5 * (np.tensordot(rivals, np.outer(py, py), axes=2) / noise - trace)
-        curvature = 0.5 * (np.sum(rivals**2, axis=(1, 2)) - trace**2 / free)
+        curvature = 0.5 * (np.sum(rivals**2, axis=(1, 2)) - trace**2 / self.free)
         k = int(np.argmax(np.maximum(slope, 0.0) ** 2 / np.maximum(curvature, ROUNDING)))
-        away, white = np.abs(self.t[:, None] - self.t) / self.step, self._value(None)
-        serial = max(self._value(0.5 * (self.correlated(r**away) - self.own)) for r in STARTS)
-        other = max(self._value(x * rivals[k]) for x in SIZES)
-        return other - white >= LEAD * max(serial - white, 0.0) + CHANCE + SAME_EVIDENCE
 
-    def _value(self, more: Floats | None) -> float:
-        """ℓ with Σ = 1 and more (R, R); see `_likelihood`."""
-        both = np.column_stack([self.columns, self.y])
-        log_det = 0.0
-        if more is not None:
-            lower = np.linalg.cholesky((1.0 + ROUNDING) * np.eye(len(more)) + more)
-            both = solve_triangular(lower, both, lower=True)
-            log_det = 2 * float(np.log(np.diag(lower)).sum())
-        b, y = both[:, :-1], both[:, -1]
-        h = b.T @ b + np.diag(self.ridge)
-        h += ROUNDING * float(np.trace(h)) / len(h) * np.eye(len(h))
-        free = len(y) - int(np.sum(self.ridge == 0))
-        square = float(y @ y) - float(np.sum((inverse_root(h) @ (b.T @ y)) ** 2))
-        log_det += float(np.linalg.slogdet(h)[1])
-        return -0.5 * (free * float(np.log(square / free)) + free + log_det)
+        def value(share: float = 0.0, rho: float = 0.5, size: float = 0.0) -> float:
+            length = -self.step / float(np.log(rho))
+            return self._likelihood(rivals[[k]], share, length, np.array([size]))[0]
+
+        white = value()
+        serial = max(value(0.5, rho) for rho in STARTS)
+        other = max(value(size=size) for size in SIZES)
+        return other - white >= LEAD * max(serial - white, 0.0) + CHANCE + SAME_EVIDENCE
 
     def noise(self, free: _SerialPoint, rivals: Floats, gain: float) -> SerialNoise:
         """Return the estimate; its uncertainties are by the curvature of ℓ."""
@@ -375,10 +335,8 @@ class _SerialProblem:
             g = self._likelihood(rivals, max(share + a, 0.0), length, at.v, stated)[1]
             return np.array([g[0], g[1] * length])
 
-        def curvature(a: float, b: float) -> Floats:
-            return (slopes(-a, -b) - slopes(a, b)) / (2 * (a + b))
-
-        h = np.stack([curvature(SHARE_STEP, 0.0), curvature(0.0, LENGTH_STEP)])
+        steps = (SHARE_STEP, 0.0), (0.0, LENGTH_STEP)
+        h = np.stack([(slopes(-a, -b) - slopes(a, b)) / (2 * (a + b)) for a, b in steps])
         both = share == at.share and float(np.linalg.det(h)) > 0 and h[0, 0] > 0
         c = np.linalg.inv(h) if both else np.diag(1.0 / np.maximum(np.diag(h), 1.0))
         rho = float(np.exp(-self.step / at.length))
@@ -395,24 +353,25 @@ class _SerialProblem:
 
 def _problem(found: Fit, clock: Clock) -> _SerialProblem | None:
     """Form the likelihood's rows along a clock; None where it stands still, or V has no inverse."""
-    every = found.readings
+    every, m = found.readings, POSITION
     t = every.states.time if clock == "time" else np.arange(len(every), dtype=float)
     assert t is not None  # noqa: S101 - the caller's condition
     along, t = replace(every, along=t)[~found.outlier], t[~found.outlier]
     if np.ptp(t) == 0:
         return None
     groups = (deflection_groups if found.mode == "deflection" else arrival_groups)(along)
-    chosen = _some(runs(along, groups, PIECE))
+    pieces = runs(along, groups, PIECE)  # all, or as many, evenly spaced, as have `MOST_ROWS`
+    share = min(MOST_ROWS / (m * sum(p[0].size for p in pieces)), 1.0)
+    evenly = np.linspace(0, len(pieces) - 1, max(int(len(pieces) * share), 1))
+    chosen = [pieces[k] for k in evenly.astype(int)]
     place = np.zeros(len(along), dtype=np.int64)
     place[found.whitening.reading] = np.arange(len(found.raw))
     loaded = np.concatenate([g[0][0] for g in chosen])
-    reference = np.concatenate([g[1][0] for g in chosen])
-    rows = np.concatenate([loaded, reference])
-    m = POSITION
+    rows = np.concatenate([loaded, *(g[1][0] for g in chosen)])
     weights = block_diag(*(g[2] for g in chosen))
     difference = np.kron(np.concatenate([np.eye(len(loaded)), -weights], axis=1), np.eye(m))
     some = along[rows]
-    white = _diagonal(some.covariance[:, :m, :m])
+    white = block_diag(*some.covariance[:, :m, :m])
     if some.common is not None:
         flat = some.common[:, :m].reshape(len(rows) * m, -1)
         together = (some.arrivals[:, None] == some.arrivals) & ~np.eye(len(rows), dtype=bool)
@@ -434,32 +393,7 @@ def _problem(found: Fit, clock: Clock) -> _SerialProblem | None:
     y = inverse @ found.raw[place[loaded], :m].reshape(-1) + columns @ s.coordinates()
     each = whitened.reshape(len(y), len(rows), m)
     factor = np.einsum("rni,nij->rnj", each, instrument_root(some, m))
-    flat = factor.reshape(len(y), -1)
     ridge = s.equations.basis.prior_precision
     if len(y) < 2 * np.sum(ridge == 0):
         return None
-    return _SerialProblem(
-        found, clock, rows, y, columns, ridge, factor, whitened, t[rows], flat @ flat.T
-    )
-
-
-def _inverse(lower: Floats) -> Floats:
-    """Return the inverse of L Lᵀ."""
-    half, _ = lapack.dpotri(lower, lower=1)
-    out = np.tril(half)
-    return np.asarray(out + np.tril(out, -1).T)
-
-
-def _diagonal(blocks: Floats) -> Floats:
-    """(N·m, N·m) matrix of blocks (N, m, m)."""
-    n, m = blocks.shape[:2]
-    out = np.zeros((n, m, n, m))
-    out[np.arange(n), :, np.arange(n)] = blocks
-    return out.reshape(n * m, n * m)
-
-
-def _some(pieces: list[Group]) -> list[Group]:
-    """All pieces of an order, or as many of them, evenly spaced, as have `MOST_ROWS`."""
-    size = POSITION * sum(p[0].size for p in pieces)
-    count = max(int(len(pieces) * min(MOST_ROWS / size, 1.0)), 1)
-    return [pieces[k] for k in np.linspace(0, len(pieces) - 1, count).astype(int)]
+    return _SerialProblem(found, clock, rows, y, columns, ridge, factor, whitened, t[rows])

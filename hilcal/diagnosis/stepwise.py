@@ -11,7 +11,7 @@ from hilcal.identification.fit import Fit, fit
 from hilcal.identification.linearisation import left_out_by_pose
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
-from hilcal.regression.paired_test import LEAST_GAIN, improves
+from hilcal.regression.leave_out import LEAST_GAIN, improves
 from hilcal.types import Floats
 
 
@@ -23,7 +23,6 @@ def add(before: Fit, effect: str, options: Options | None = None) -> Fit:
     its standard deviation.
 
     Args:
-        before: the fit.
         effect: its name; with options as `read_effects_text` reads them.
         options: of the effect, where they are not the usual ones.
 
@@ -33,20 +32,6 @@ def add(before: Fit, effect: str, options: Options | None = None) -> Fit:
     """
     model, start = _grown(before.model, before.theta, effect, before.readings, options)
     return fit(model, before.readings, before.mode, before.scaling, start)
-
-
-class Refits:
-    """Fits with one more effect, each made once: judgement and refinement try the same ones."""
-
-    def __init__(self) -> None:
-        """Begin with none."""
-        self._made: dict[tuple[Fit, str], Fit] = {}
-
-    def add(self, before: Fit, effect: str) -> Fit:
-        """Return what `add` returns."""
-        if (before, effect) not in self._made:
-            self._made[before, effect] = add(before, effect)
-        return self._made[before, effect]
 
 
 def remove(before: Fit, effect: str) -> Fit:

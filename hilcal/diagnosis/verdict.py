@@ -5,7 +5,7 @@ The rules, in this order:
 0. A figure of the cell that was entered otherwise explains the misfit (see `wrong_figures`):
    `ambiguous`, until that is settled; nothing else is looked for.
 1. A suspect passes all tests (see `effect_ranking.Suspect.passes`), and all effects of the
-   catalogue together leave more than noise (see `catalogue_sufficiency`): `unknown_effect`.
+   catalogue together leave more than noise (see `evidence`): `unknown_effect`.
 2. A suspect passes, and the readings separate it from every other: `missing_effect`; else
    `ambiguous`.
 3. None passes, and χ² is what chance allows: `adequate`; or `ambiguous` where another effect could
@@ -18,15 +18,15 @@ The rules, in this order:
 5. χ² is too large, nothing predicts the residual (no suspect, no learner, no variable) or repeated
    readings scatter as much, and the arm's own scatter is not in the stated covariance. It is
    estimated (see `arm_scatter`), before rule 4. Where something predicts no more of the
-   misfit than is negligible in an uncertainty budget (`noise_verdict.PREDICTABLE`), c holds too,
+   misfit than is negligible in an uncertainty budget (`noise.PREDICTABLE`), c holds too,
    and the share is said; a and b then leave it to rule 4:
    a. the readings prefer a noisier instrument at more than 20 : 1: `noise_misjudged`;
-   b. the scatter is larger than an arm's repeatability can be (see `arm_repeatability`):
+   b. the scatter is larger than an arm's repeatability can be (see `noise`):
       `noise_misjudged`, be it the instrument, or an arm or a target that was loose;
    c. else `adequate`. An arm whose scatter is not stated was taken for one without any, which no
       arm is; so where the readings do not tell its scatter from a noisier instrument, that is said
       and the verdict stays.
-6. Otherwise the stated noise is too small, or too large: `noise_misjudged` (see `noise_verdict`).
+6. Otherwise the stated noise is too small, or too large: `noise_misjudged` (see `noise`).
    This holds where the arm's repeatability is stated, too: the noise is then complete, and wrong.
 
 A noise that was estimated from the readings (`Readings.noise_stated`) is too large where something
@@ -57,23 +57,23 @@ from dataclasses import replace
 import numpy as np
 
 from hilcal import limits
-from hilcal.diagnosis.arm_repeatability import instrument_instead, of_repeatability_size
 from hilcal.diagnosis.background_evidence import BackgroundEffect, as_suspects
 from hilcal.diagnosis.diagnosis import Diagnosis, History, Reason
 from hilcal.diagnosis.effect_ranking import FALSE_ALARM, LEAST_SHARE, ranked
-from hilcal.diagnosis.evidence import Evidence
+from hilcal.diagnosis.evidence import Evidence, Separability, separability
 from hilcal.diagnosis.misfit_breakdown import MisfitShare
-from hilcal.diagnosis.noise_verdict import PREDICTABLE, judge_noise
+from hilcal.diagnosis.noise import (
+    PREDICTABLE,
+    instrument_instead,
+    judge_noise,
+    of_repeatability_size,
+)
 from hilcal.diagnosis.residual_regression import ResidualRegression
-from hilcal.diagnosis.separability import Separability, separability
 from hilcal.identification.fit import Fit
-from hilcal.readings.readings import ArmScatter
 
 NOTHING = History()
-IN_SAMPLE = ("pose", "direction")
-"""First words of variables whose share is not of poses left out."""
-MOST_NAMED = 2
-"""Variables that a sentence names."""
+IN_SAMPLE = ("pose", "direction")  # first words of variables whose share is not of poses left out
+MOST_NAMED = 2  # variables that a sentence names
 BESIDE_A_BACKGROUND: tuple[Reason, ...] = (
     "residual_is_noise", "inseparable_addition", "arm_scatter", "misjudged_noise",
 )  # fmt: skip
@@ -128,64 +128,38 @@ def judge_naming(
     left = [tuple(b for b in tested if b.effect in f.model.background) for f in fits]
     e = evidence(left[-1])
     last = judge(e, history(fits[-1]))
+    named = {b.effect for b in last.background}
+    others = [s for s in last.suspects if s.effect not in named]
     before = (
-        _before_named(last, f, history(f), own) for f, own in zip(fits[:-1], left, strict=False)
+        replace(
+            last,
+            fit=f,
+            history=history(f),
+            reason="background",
+            suspects=(*as_suspects(own), *others),
+            background=own,
+        )
+        for f, own in zip(fits[:-1], left, strict=False)
     )
     return (*before, last), e
-
-
-def _before_named(
-    d: Diagnosis, fit: Fit, history: History, background: tuple[BackgroundEffect, ...]
-) -> Diagnosis:
-    """Return the judgement before effects of a background are named.
-
-    Args:
-        d: of the model that names them.
-        fit: with them in its background.
-        history: of that model.
-        background: the effects of its background.
-    """
-    known = {b.effect for b in d.background}
-    others = tuple(s for s in d.suspects if s.effect not in known)
-    return replace(
-        d,
-        fit=fit,
-        history=history,
-        reason="background",
-        suspects=(*as_suspects(background), *others),
-        background=background,
-    )
 
 
 def judge(e: Evidence, history: History) -> Diagnosis:
     """Combine the evidence of a fit with what is known of the way to its model."""
     if e.wrong_figures:
-        return _wrong_figure(e, history)
+        return Diagnosis(
+            fit=e.fit,
+            history=history,
+            reason="wrong_figure",
+            suspects=(),
+            misfit_breakdown=e.misfit_breakdown,
+            pure_error=e.pure_error,
+            wrong_figures=e.wrong_figures,
+        )
     found = _with_arrivals(e, history)
     if e.fit.disagreement is not None and not any(s.passes for s in found.suspects):
         return replace(found, reason="readings_disagree")
     return found
-
-
-def _wrong_figure(e: Evidence, history: History) -> Diagnosis:
-    """Judge a fit that a figure of the cell explains: no effect is looked for before that."""
-    return Diagnosis(
-        fit=e.fit,
-        history=history,
-        reason="wrong_figure",
-        suspects=(),
-        misfit_breakdown=e.misfit_breakdown,
-        predictable_share=0.0,
-        dependences=(),
-        follows=(),
-        pure_error=e.pure_error,
-        noise=None,
-        redundant=(),
-        separability=(),
-        insufficiency=None,
-        alternatives=(),
-        wrong_figures=e.wrong_figures,
-    )
 
 
 def _with_arrivals(e: Evidence, history: History) -> Diagnosis:
@@ -193,51 +167,46 @@ def _with_arrivals(e: Evidence, history: History) -> Diagnosis:
     inner = e.by_arrivals
     if inner is None or e.arm_scatter is None:
         return _judged(e, history)
-    told = _judged(inner, history)
-    share, by = told.predictable_share, told.follows
+    found = _judged(inner, history)
+    share, by = found.predictable_share, found.follows
     scatter = replace(e.arm_scatter, predicted_share=share, predicted_by=by)
-    if told.reason != "residual_is_noise":
-        return replace(told, fit=e.fit, scatter=scatter)
+    found = replace(found, fit=e.fit, scatter=scatter)
+    if found.reason != "residual_is_noise":
+        return found
     size = of_repeatability_size(scatter, e.fit.model.cell.arm)
-    return replace(
-        told,
-        fit=e.fit,
-        reason="arm_scatter" if size else "misjudged_noise",
-        noise=judge_noise(e.fit, e.pure_error, False),
-        scatter=scatter,
-    )
+    noise = judge_noise(e.fit, e.pure_error, False)
+    return replace(found, reason="arm_scatter" if size else "misjudged_noise", noise=noise)
 
 
 def _judged(e: Evidence, history: History) -> Diagnosis:
     """Judge by the evidence as it is."""
+    readings, arm = e.fit.readings, e.fit.model.cell.arm
     added = () if e.fit.model.background else history.added
     suspects = ranked(e.suspects, history.rejected)
     lead = suspects[0] if suspects and suspects[0].passes else None
     insufficiency = None if lead is None else e.insufficiency
-    noise, scatter = None, e.fit.readings.arm_scatter
+    noise, scatter = None, readings.arm_scatter
     rivals: tuple[Separability, ...] = ()
     reason: Reason
     if lead is not None:
         trees = e.tree_share(lead.holdout_share) if e.misfit else 0.0
         regression = ResidualRegression(trees, ())
-        predicted = max(regression.share, lead.holdout_share) if e.misfit else 0.0
+        predicted = max(trees, lead.holdout_share) if e.misfit else 0.0
         if insufficiency is not None:
             reason = "insufficient_catalogue"
-            regression = ResidualRegression(regression.share, insufficiency.dependences)
+            regression = ResidualRegression(trees, insufficiency.dependences)
         else:
             rivals = separability(e.linearisation, lead, e.effects) if lead.same_as else ()
             reason = "inseparable_suspects" if rivals else "one_suspect"
         follows = _carrying(regression)
     else:
         # A noise that was estimated with something missing is too large to show it.
-        hidden = not e.fit.readings.noise_stated and e.regression.sure
+        hidden = not readings.noise_stated and e.regression.sure
         regression = e.regression if e.misfit or hidden else ResidualRegression(0.0, ())
         significant = _significant(e.misfit_breakdown)
         follows = _carrying(regression) or tuple(v.variable for v in significant)
-        sizes = [
-            *(v.share for v in significant),
-            *(s.holdout_share for s in suspects if s.explains),
-        ]
+        sizes = [v.share for v in significant]
+        sizes += [s.holdout_share for s in suspects if s.explains]
         predicted = max([regression.share, *sizes]) if e.misfit or hidden else 0.0
         # What an implausible size would explain is no noise either.
         patterns = [
@@ -247,11 +216,15 @@ def _judged(e: Evidence, history: History) -> Diagnosis:
         ]
         predictable = regression.share > PREDICTABLE or bool(sizes) or bool(patterns)
         noise = judge_noise(e.fit, e.pure_error, predictable)
-        in_fit = e.fit.readings.arm_scatter is not None
+        in_fit = readings.arm_scatter is not None
         little = noise.reason == "predictable" and max(predicted, *patterns, 0.0) <= PREDICTABLE
         may = e.misfit and (noise.misjudged or little) and _may_scatter(e)
         found = e.arm_scatter if may else None
-        by_arm = found is not None and _explained_by_arm(e.fit, found)
+        by_arm = (
+            found is not None
+            and not instrument_instead(found)
+            and of_repeatability_size(found, arm)
+        )
         if found is not None and (by_arm or noise.misjudged):
             by = follows[:MOST_NAMED]
             scatter = replace(found, predicted_share=predicted, predicted_by=by)
@@ -266,7 +239,7 @@ def _judged(e: Evidence, history: History) -> Diagnosis:
         else:
             in_doubt = any(a.inseparable for a in e.alternatives(added, history.removed))
             reason = "inseparable_addition" if in_doubt else "residual_is_noise"
-        serial = e.fit.readings.serial
+        serial = readings.serial
         if reason in ("residual_is_noise", "arm_scatter") and serial and not serial.proved:
             reason = "serial_or_effect"
         beside = reason == "misjudged_noise" or reason in BESIDE_A_BACKGROUND
@@ -305,12 +278,6 @@ def _may_scatter(e: Evidence) -> bool:
     )
     readings = e.fit.readings
     return not readings.scatter_stated and readings.arm_scatter is None and not same
-
-
-def _explained_by_arm(fit: Fit, scatter: ArmScatter) -> bool:
-    """Whether an arm's repeatability is the explanation of what is left."""
-    arm = fit.model.cell.arm
-    return not instrument_instead(scatter) and of_repeatability_size(scatter, arm)
 
 
 def _predicted(e: Evidence, regression: ResidualRegression) -> bool:

@@ -31,47 +31,30 @@ MOST_LEFT = 0.7
 MARGIN = 10.0
 """Of the criterion: figures within it of the best are named as well; very strong evidence (Kass
 and Raftery, *Bayes factors*, J. Am. Stat. Assoc. 90 (1995) 773)."""
-PROMISING = 0.2
-"""Share of χ² that the first step must promise for a refit; a choice."""
-AS_PROMISING = 0.5
-"""The same as a share of what the best one promises."""
-STEPS = 5
-"""Most refits of a figure; a choice, two or three are usual."""
-SMALL = 1.0
-"""Step, in those of the derivative, that is not worth another refit."""
+PROMISING = 0.2  # share of χ² that the first step must promise for a refit; a choice
+AS_PROMISING = 0.5  # the same as a share of what the best one promises
+STEPS = 5  # most refits of a figure; a choice, two or three are usual
+SMALL = 1.0  # step, in those of the derivative, that is not worth another refit
 OFF = {"load": 1.2, "tool_mass": 1.3}
 """Factor from which on a mass is a mistake; choices: scales are better, guesses are not."""
-LARGEST = 0.5
-"""Share of a mass that one step takes away at most; it doubles or trebles at most."""
-HANGS = 0.999
-"""Cosine to gravity from which on a force is that of a mass."""
-OFF_M = 0.02
-"""Shift from which on a centre of mass is a mistake, m; a choice."""
+LARGEST = 0.5  # share of a mass that one step takes away at most; it doubles or trebles at most
+HANGS = 0.999  # cosine to gravity from which on a force is that of a mass
+OFF_M = 0.02  # shift from which on a centre of mass is a mistake, m; a choice
 STEP: dict[FigureKind, float] = {"load": 1e-2, "tool_mass": 1e-1, "tool_com": 1e-2}
 """Steps of the derivatives: of the wrench and the mass as a share, of the centre in m."""
 
 
 @dataclass(frozen=True, slots=True)
 class WrongFigure:
-    """A figure that seems to be another one than was entered.
+    """A figure that seems to be another one than was entered."""
 
-    Attributes:
-        kind: a load's mass or pull, the tool's mass, or its centre of mass.
-        load: name of the load, where it is one.
-        stated: as it was entered: kg, N for a pull, or the centre, flange axes, m.
-        found: as the readings tell it.
-        unit: of both.
-        rms_m: of the residual's positions, m.
-        rms_with_m: with the figure that was found.
-    """
-
-    kind: FigureKind
-    load: str
-    stated: tuple[float, ...]
-    found: tuple[float, ...]
-    unit: str
-    rms_m: float
-    rms_with_m: float
+    kind: FigureKind  # a load's mass or pull, the tool's mass, or its centre of mass
+    load: str  # name of the load, where it is one
+    stated: tuple[float, ...]  # as it was entered: kg, N for a pull, or the centre, flange axes, m
+    found: tuple[float, ...]  # as the readings tell it
+    unit: str  # of both
+    rms_m: float  # of the residual's positions, m
+    rms_with_m: float  # with the figure that was found
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,16 +85,49 @@ class _Figure:
         out = []
         for by in h * np.eye(self.size):
             there = self.changed(of, by)
-            states = there.readings[~of.outlier].states
-            ahead = there.model.predict(states, of.theta, near)
+            ahead = there.model.predict(there.readings[~of.outlier].states, of.theta, near)
             out.append((of.raw - residual(kept, ahead, of.whitening)) / h)
         return np.stack([of.whitening.whiten(x).reshape(-1) for x in out], axis=1)
 
-    def further(self, by: Floats, step: Floats) -> Floats:
-        """Return a change (k,) and a step from there as one change; no mass changes its sign."""
-        if self.kind == "tool_com":
-            return by + step
-        return np.asarray((1.0 + by) * (1.0 + np.clip(step, -LARGEST, 2.0)) - 1.0)
+    def step(self, of: Fit) -> tuple[Floats, float]:
+        """Gauss-Newton's step (k,) beside the model, and the share of χ² that it takes."""
+        p = linearise(of)
+        x = self.columns(of, of.solution.prediction)
+        g = x.T @ p.residual
+        step = np.linalg.pinv(p.information(x), rcond=1e-9, hermitian=True) @ g
+        return step, float(step @ g) / p.rss
+
+    def first_step(self, of: Fit) -> tuple[Floats, float]:
+        """`step`, or where most readings under a load were set aside, what they ask for."""
+        mine = of.readings.load == self.load
+        aside = np.count_nonzero(of.outlier & mine)
+        if self.kind != "load" or 2 * aside <= np.count_nonzero(mine):
+            return self.step(of)
+        raw, w = with_outliers(of)
+        prediction = of.model.predict(of.readings.states, of.theta)
+        whole = replace(of, outlier=np.zeros_like(of.outlier), raw=raw, whitening=w)
+        x, r = self.columns(whole, prediction)[:, 0], w.whiten(raw).reshape(-1)
+        size = float(x @ r) / max(float(x @ x), 1e-300)
+        return np.array([size]), size * float(x @ r) / max(float(r @ r), 1e-300)
+
+    def refitted(self, of: Fit, step: Floats) -> tuple[Floats, Fit]:
+        """Return the change (k,) that fits best, from a first step on, and the fit with it.
+
+        Raises:
+            CannotAnswerError: the arm has no equilibrium with it.
+        """
+        by, now = np.zeros(self.size), of
+        for _ in range(STEPS):
+            if self.kind == "tool_com":
+                by = by + step
+            else:  # no mass changes its sign
+                by = (1.0 + by) * (1.0 + np.clip(step, -LARGEST, 2.0)) - 1.0
+            changed = self.changed(of, by)
+            now = fit(changed.model, changed.readings, of.mode, start=now.theta)
+            step, _ = self.step(now)
+            if np.abs(step).max() < SMALL * STEP[self.kind]:
+                break
+        return by, now
 
     def off(self, by: Floats) -> bool:
         """Whether so much is a mistake."""
@@ -120,53 +136,57 @@ class _Figure:
         factor = 1.0 + float(by[0])
         return max(factor, 1.0 / factor) > OFF[self.kind]
 
+    def named(self, of: Fit, by: Floats, now: Fit) -> WrongFigure:
+        """Return what a change (k,) of the figure of a fit says, and the fit with it."""
+        cell, readings, load = of.model.cell, of.readings, ""
+        if self.kind == "tool_com":
+            stated, found, unit = cell.tool_com, cell.tool_com + by, "m"
+        else:
+            stated, unit = np.array([cell.tool_mass]), "kg"
+            if self.kind == "load":
+                load = readings.load_names[self.load]
+                force = readings.states.wrench[readings.load == self.load, :3].mean(axis=0)
+                size, g = float(np.linalg.norm(force)), float(np.linalg.norm(cell.gravity))
+                hangs = g > 0.0 and float(force @ cell.gravity) > HANGS * size * g
+                stated, unit = np.array([size / g if hangs else size]), "kg" if hangs else "N"
+            found = stated * (1.0 + by)
+        figures = tuple(stated.tolist()), tuple(found.tolist())
+        return WrongFigure(self.kind, load, *figures, unit, of.error.rms_m, now.error.rms_m)
+
 
 def wrong_figures(of: Fit, suspects: Sequence[Suspect]) -> tuple[WrongFigure, ...]:
     """Return the figures that explain the misfit, the best first; any one of several does.
 
     None of a model with a background: that was asked before it was fitted.
-
-    Args:
-        of: a fit.
-        suspects: effects that could be missing, as they are scored.
     """
     if of.model.background:
         return ()
     best = min((s.score.delta_bic for s in suspects if s.score.rank), default=0.0)
-    tried = [(figure, *_first(of, figure)) for figure in _figures(of)]
+    tried = [(figure, *figure.first_step(of)) for figure in _figures(of)]
     most = max((share for _, _, share in tried), default=0.0)
-    found: list[tuple[float, _Figure, Floats, Fit]] = []
+    found: list[tuple[float, WrongFigure]] = []
     for figure, step, share in tried:
         if share < max(PROMISING, AS_PROMISING * most):
             continue
         try:
-            by, now = _refitted(of, figure, step)
+            by, now = figure.refitted(of, step)
         except CannotAnswerError:  # no equilibrium with it: it explains nothing
             continue
         bic = _criterion(of, now, figure.size)
         if bic is not None and figure.off(by) and bic < min(best, -MARGIN):
-            found.append((bic, figure, by, now))
+            found.append((bic, figure.named(of, by, now)))
     found.sort(key=lambda f: f[0])
-    return tuple(
-        _named(of, figure, by, now) for bic, figure, by, now in found if bic <= found[0][0] + MARGIN
-    )
+    return tuple(figure for bic, figure in found if bic <= found[0][0] + MARGIN)
 
 
-def _refitted(of: Fit, figure: _Figure, step: Floats) -> tuple[Floats, Fit]:
-    """Return the change (k,) of a figure that fits best, and the fit with it.
-
-    Raises:
-        CannotAnswerError: the arm has no equilibrium with it.
-    """
-    by, now = np.zeros(figure.size), of
-    for _ in range(STEPS):
-        by = figure.further(by, step)
-        changed = figure.changed(of, by)
-        now = fit(changed.model, changed.readings, of.mode, start=now.theta)
-        step = _step(now, figure)[0]
-        if np.abs(step).max() < SMALL * STEP[figure.kind]:
-            break
-    return by, now
+def _figures(of: Fit) -> Iterator[_Figure]:
+    """Yield the figures that these readings depend on."""
+    loads = np.unique(of.readings.load[np.any(of.readings.states.wrench != 0, axis=1)])
+    # Of deflections under one load it is a common factor of all compliances.
+    if len(loads) > 1 or of.mode == "absolute":
+        yield from (_Figure("load", int(k)) for k in loads)
+    if of.mode == "absolute" and of.model.cell.tool_mass > 0.0:
+        yield from (_Figure("tool_mass"), _Figure("tool_com"))
 
 
 def _criterion(before: Fit, after: Fit, size: int) -> float | None:
@@ -182,66 +202,4 @@ def _criterion(before: Fit, after: Fit, size: int) -> float | None:
         least = min(least, MOST_LEFT * chi2)
     if after.chi2 > least:
         return None
-    count = w.rank
-    return float(count * np.log(max(after.chi2, 1e-300) / chi2) + size * np.log(count))
-
-
-def _figures(of: Fit) -> Iterator[_Figure]:
-    """Yield the figures that these readings depend on."""
-    loaded = np.any(of.readings.states.wrench != 0, axis=1)
-    loads = np.unique(of.readings.load[loaded])
-    # Of deflections under one load it is a common factor of all compliances.
-    if len(loads) > 1 or of.mode == "absolute":
-        yield from (_Figure("load", int(k)) for k in loads)
-    if of.mode == "absolute" and of.model.cell.tool_mass > 0.0:
-        yield _Figure("tool_mass")
-        yield _Figure("tool_com")
-
-
-def _first(of: Fit, figure: _Figure) -> tuple[Floats, float]:
-    """First step of a figure (k,), and the share of χ² that it takes.
-
-    Where most readings under a load were set aside as gross errors, the step is what they ask for.
-    """
-    mine = of.readings.load == figure.load
-    if figure.kind != "load" or 2 * np.count_nonzero(of.outlier & mine) <= np.count_nonzero(mine):
-        step, gain = _step(of, figure)
-        return step, gain / linearise(of).rss
-    raw, w = with_outliers(of)
-    prediction = of.model.predict(of.readings.states, of.theta)
-    whole = replace(of, outlier=np.zeros_like(of.outlier), raw=raw, whitening=w)
-    x, r = figure.columns(whole, prediction)[:, 0], w.whiten(raw).reshape(-1)
-    size = float(x @ r) / max(float(x @ x), 1e-300)
-    return np.array([size]), size * float(x @ r) / max(float(r @ r), 1e-300)
-
-
-def _step(of: Fit, figure: _Figure) -> tuple[Floats, float]:
-    """Gauss-Newton's step of a figure (k,) beside the model, and by how much χ² falls then."""
-    p = linearise(of)
-    x = figure.columns(of, of.solution.prediction)
-    s, g = p.information(x), x.T @ p.residual
-    step = np.linalg.pinv(s, rcond=1e-9, hermitian=True) @ g
-    return step, float(step @ g)
-
-
-def _named(of: Fit, figure: _Figure, by: Floats, now: Fit) -> WrongFigure:
-    cell, readings = of.model.cell, of.readings
-    if figure.kind == "tool_com":
-        stated, found, unit = cell.tool_com, cell.tool_com + by, "m"
-    else:
-        one, unit = np.array([cell.tool_mass]), "kg"
-        if figure.kind == "load":
-            force = readings.states.wrench[readings.load == figure.load, :3].mean(axis=0)
-            size, g = float(np.linalg.norm(force)), float(np.linalg.norm(cell.gravity))
-            hangs = g > 0.0 and float(force @ cell.gravity) > HANGS * size * g
-            one, unit = np.array([size / g if hangs else size]), "kg" if hangs else "N"
-        stated, found = one, one * (1.0 + by)
-    return WrongFigure(
-        kind=figure.kind,
-        load=readings.load_names[figure.load] if figure.kind == "load" else "",
-        stated=tuple(stated.tolist()),
-        found=tuple(found.tolist()),
-        unit=unit,
-        rms_m=of.error.rms_m,
-        rms_with_m=now.error.rms_m,
-    )
+    return float(w.rank * np.log(max(after.chi2, 1e-300) / chi2) + size * np.log(w.rank))

@@ -23,7 +23,7 @@ from typing import Literal
 import numpy as np
 from scipy.stats import chi2
 
-from hilcal.diagnosis.noise_verdict import MISFIT_ALARM, PREDICTABLE
+from hilcal.diagnosis.noise import MISFIT_ALARM, PREDICTABLE
 from hilcal.diagnosis.residual_regression import Dependence, residual_regression
 from hilcal.discovery.curve import Curve, curves
 from hilcal.discovery.known_effects import KnownEffects, instead_of_law, known_effects, resembling
@@ -40,7 +40,7 @@ from hilcal.identification.folds import random_folds
 from hilcal.identification.linearisation import by_pose, left_out_by_pose, linearise
 from hilcal.readings.readings import Readings
 from hilcal.regression.evidence import score_family
-from hilcal.regression.paired_test import improves
+from hilcal.regression.leave_out import improves
 from hilcal.shown import Shown
 from hilcal.types import Bools, Floats
 from hilcal.whole_file import replace_file

@@ -42,7 +42,7 @@ from hilcal.identification.gauss_newton import Solution, whitened_jacobian
 from hilcal.identification.priors import names_of
 from hilcal.model.model import Model
 from hilcal.readings.whitening import Whitening
-from hilcal.regression.quadratic_form import ratio_tail
+from hilcal.regression.evidence import ratio_tail
 from hilcal.regression.schur import inverse_root
 from hilcal.types import Floats, Ints
 

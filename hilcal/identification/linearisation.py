@@ -24,18 +24,17 @@ from hilcal.identification.fit import Fit
 from hilcal.identification.folds import folds_of, random_folds
 from hilcal.identification.gauss_newton import columns_of
 from hilcal.identification.priors import scales_of
-from hilcal.regression.evidence import FamilyScore, score_family
+from hilcal.regression.evidence import FamilyScore, Spectrum, score_family
 from hilcal.regression.leave_out import (
     FamilyProducts,
     Fold,
     family_products,
+    improves,
     left_out_of_families,
     left_out_residual,
 )
 from hilcal.regression.normal_equations import Basis, find_basis, normal_equations
-from hilcal.regression.paired_test import improves
 from hilcal.regression.projection import Projection
-from hilcal.regression.spectrum import Spectrum
 from hilcal.types import Bools, Floats, Ints
 
 LEAST_MISFIT = 3.0  # standard deviations of χ² that a misfit counts as at least; a choice

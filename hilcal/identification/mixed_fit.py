@@ -17,9 +17,8 @@ from hilcal.identification.full_covariance import joint_factors
 from hilcal.identification.residual import residual
 from hilcal.mixed.equations import Equations
 from hilcal.mixed.families import Families, LogStdPrior, families_of
-from hilcal.mixed.prediction import coordinates_covariance
 from hilcal.mixed.problem import MixedProblem, Noise, independent_rows, mixed_problem
-from hilcal.mixed.variances import Variances, estimate_variances
+from hilcal.mixed.variances import Variances, coordinates_covariance, estimate_variances
 from hilcal.model.model import Model
 from hilcal.readings.covariance import scatter_alone
 from hilcal.readings.readings import Readings, States

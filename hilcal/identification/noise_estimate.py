@@ -44,9 +44,8 @@ from hilcal.identification.mixed_fit import (
     variances_with_noise,
     with_all_effects,
 )
-from hilcal.mixed.evidence import evidence
 from hilcal.mixed.families import KNOWN, LogStdPrior
-from hilcal.mixed.variances import Variances
+from hilcal.mixed.variances import Variances, evidence
 from hilcal.model.model import Model
 from hilcal.readings.covariance import INSTRUMENT, WHOLE
 from hilcal.readings.readings import Readings

@@ -30,10 +30,9 @@ from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.linalg.lapack import dpotri
 
 from hilcal.mixed.problem import MixedProblem
-from hilcal.types import Floats
+from hilcal.types import Floats, Ints
 
-EIGENVALUE = 1e-12
-"""Share of the largest below which an eigenvalue is zero."""
+EIGENVALUE = 1e-12  # share of the largest below which an eigenvalue is zero
 
 
 class _ByColumns:
@@ -124,23 +123,14 @@ class _ByRows:
 
 @dataclass(frozen=True, eq=False)
 class Equations:
-    """The equations of a problem at logarithms of the standard deviations.
+    """The equations of a problem at logarithms of the standard deviations."""
 
-    Attributes:
-        problem: rows, columns and noise.
-        log_std: (F + N,) log s of the families, η of the noise.
-        rows: (R, K) T.
-        target: (R,) t.
-        noise_std: (R,) R^½.
-        projection: P.
-    """
-
-    problem: MixedProblem
-    log_std: Floats
-    rows: Floats
-    target: Floats
-    noise_std: Floats
-    projection: _ByColumns | _ByRows
+    problem: MixedProblem  # rows, columns and noise
+    log_std: Floats  # (F + N,) log s of the families, η of the noise
+    rows: Floats  # (R, K) T
+    target: Floats  # (R,) t
+    noise_std: Floats  # (R,) R^½
+    projection: _ByColumns | _ByRows  # P
 
     @property
     def _count(self) -> int:
@@ -267,3 +257,25 @@ def equations(problem: MixedProblem, log_std: Floats) -> Equations:
     rows[:, problem.flat :] *= np.exp(log_std)[problem.family]
     form = _ByRows if rows.shape[0] < rows.shape[1] else _ByColumns
     return Equations(problem, log_std, rows, target, noise_std, form(rows, problem.flat))
+
+
+def left_out(e: Equations, fold: Ints) -> tuple[Floats, Floats]:
+    """Predict rows without their fold F, at given variances.
+
+        y_F − ŷ_F = D (P_FF)⁻¹ P_F t,    covariance D (P_FF)⁻¹ D,    D² = R_FF
+
+    Args:
+        e: the equations of all rows.
+        fold: (R,) number of each row's fold.
+
+    Returns:
+        (R,) measured minus predicted, and (R,) its variance, that of the noise included.
+    """
+    p = e.projection.project(np.eye(len(fold)))
+    off, variance = np.empty(len(fold)), np.empty(len(fold))
+    for f in range(int(fold.max()) + 1):
+        mine = fold == f
+        inverse, std = np.linalg.inv(p[np.ix_(mine, mine)]), e.noise_std[mine]
+        off[mine] = std * (inverse @ e.residual[mine])
+        variance[mine] = std**2 * np.diagonal(inverse)
+    return off, variance

@@ -23,13 +23,11 @@ from hilcal.effects.protocol import FRAME_ROLES, Effect
 from hilcal.model.model import Model
 from hilcal.types import Floats, Ints
 
-KNOWN = 1e-3
-"""Spread of the logarithm of a standard deviation that is known."""
+KNOWN = 1e-3  # spread of the logarithm of a standard deviation that is known
 ARM = 1.5
 """Of an arm as a whole: a factor of 4.5 either way, so that one whose errors are a tenth or ten
 times the ordinary ones is no surprise; a choice."""
-EFFECT = 1.0
-"""Of an effect beside its arm: a factor of 2.7; a choice."""
+EFFECT = 1.0  # of an effect beside its arm: a factor of 2.7; a choice
 LINE = 0.7
 """Of a line of an effect, as one wave of one gear, beside its pool: a factor of 2; a choice. With
 0.5 to 1 simulated transmission errors were predicted alike."""
@@ -37,50 +35,32 @@ LINE = 0.7
 
 @dataclass(frozen=True, slots=True)
 class LogStdPrior:
-    """What is known of the logarithm of a standard deviation before it is estimated: normal.
+    """What is known of the logarithm of a standard deviation before it is estimated: normal."""
 
-    Attributes:
-        mean: of log s, s in ordinary magnitudes.
-        spread: standard deviation of what is its own; see `mixed.families` for what families share.
-    """
-
-    mean: float
+    mean: float  # of log s, s in ordinary magnitudes
+    # standard deviation of what is its own; see `mixed.families` for what families share
     spread: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Family:
-    """Parameters u ~ N(0, s² D) of one effect.
+    """Parameters u ~ N(0, s² D) of one effect."""
 
-    Attributes:
-        name: the effect's, with what sets the family apart where the effect has several.
-        parameters: (q,) indices of the parameters in the model.
-        magnitude: (q,) root of D's diagonal: ordinary magnitudes, SI.
-        prior: what is known of log s.
-        known: whether s is known, and shares nothing with other families.
-        pool: what families of one effect belong to that are lines of it; empty for others.
-        pool_spread: of what the log s of the families of a pool share.
-    """
-
-    name: str
+    name: str  # the effect's, with what sets the family apart where the effect has several
     effect: str
-    parameters: Ints
-    magnitude: Floats
-    prior: LogStdPrior
-    known: bool = False
-    pool: str = ""
-    pool_spread: float = 0.0
+    parameters: Ints  # (q,) indices of the parameters in the model
+    magnitude: Floats  # (q,) root of D's diagonal: ordinary magnitudes, SI
+    prior: LogStdPrior  # what is known of log s
+    known: bool = False  # whether s is known, and shares nothing with other families
+    pool: str = ""  # what families of one effect belong to that are lines of it; empty for others
+    pool_spread: float = 0.0  # of what the log s of the families of a pool share
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Families:
-    """All parameters of a model.
+    """All parameters of a model."""
 
-    Attributes:
-        frames: (F,) indices of those without a prior: registration and target, flat effects.
-    """
-
-    frames: Ints
+    frames: Ints  # (F,) indices of those without a prior: registration and target, flat effects
     random: tuple[Family, ...]
 
     @property
@@ -97,7 +77,6 @@ def families_of(model: Model, flat: Collection[str] = (), lines: Collection[str]
     need, is a family of known standard deviation.
 
     Args:
-        model: the model.
         flat: effects of it whose parameters have no prior.
         lines: effects of which each group is a family, about the size of its pool.
     """
@@ -166,12 +145,7 @@ def _lines(effect: Effect, index: Ints) -> list[Family]:
 def log_std_prior(
     priors: Sequence[LogStdPrior], families: Sequence[Family]
 ) -> tuple[Floats, Floats]:
-    """Mean (F + N,) and precision (F + N, F + N) of log s and η.
-
-    Args:
-        priors: of each of them by itself.
-        families: the first F of them.
-    """
+    """Mean (F + N,) and precision (F + N, F + N) of log s of families and of η."""
     covariance = np.diag([p.spread**2 for p in priors])
     effect = np.array([f.effect for f in families])
     unknown = np.array([not f.known for f in families], dtype=float)

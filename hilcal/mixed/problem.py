@@ -24,37 +24,23 @@ direction counts as not moved by the readings (the gauge of base and target)."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Noise:
-    """One component of the noise: covariance exp(2 η) R_k.
-
-    Attributes:
-        variance: (R,) diagonal of R_k.
-        prior: what is known of η.
-    """
+    """One component of the noise: covariance exp(2 η) R_k."""
 
     name: str
-    variance: Floats
-    prior: LogStdPrior
+    variance: Floats  # (R,) diagonal of R_k
+    prior: LogStdPrior  # what is known of η
 
 
 @dataclass(frozen=True, eq=False)
 class MixedProblem:
-    """Rows, columns and noise at a linearisation.
+    """Rows, columns and noise at a linearisation."""
 
-    Attributes:
-        y: (R,) measured minus what the model predicts without frames and families.
-        x: (R, K) columns [Q | Z D^½].
-        frames: (F, k) b of the first k coordinates: b = frames @ coordinates.
-        families: of the other columns.
-        family: (K − k,) family of each of them.
-        noise: components, that of the instrument first.
-    """
-
-    y: Floats
-    x: Floats
-    frames: Floats
-    families: Families
-    family: Ints
-    noise: tuple[Noise, ...]
+    y: Floats  # (R,) measured minus what the model predicts without frames and families
+    x: Floats  # (R, K) columns [Q | Z D^½]
+    frames: Floats  # (F, k) b of the first k coordinates: b = frames @ coordinates
+    families: Families  # of the other columns
+    family: Ints  # (K − k,) family of each of them
+    noise: tuple[Noise, ...]  # components, that of the instrument first
 
     @property
     def flat(self) -> int:
@@ -107,18 +93,12 @@ class MixedProblem:
 
 
 def mixed_problem(
-    y: Floats,
-    jacobian: Floats,
+    y: Floats,  # (R,) as in `MixedProblem`
+    jacobian: Floats,  # (R, P) whitened derivative by all parameters of the model
     families: Families,
-    noise: Sequence[Noise],
+    noise: Sequence[Noise],  # components, that of the instrument first
 ) -> MixedProblem:
-    """Build the problem from whitened rows.
-
-    Args:
-        y: (R,) as in `MixedProblem`.
-        jacobian: (R, P) whitened derivative by all parameters of the model.
-        noise: components, that of the instrument first.
-    """
+    """Build the problem from whitened rows."""
     frames = _frame_basis(jacobian[:, families.frames])
     random = families.random
     counts = [len(f.parameters) for f in random]

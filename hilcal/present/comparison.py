@@ -4,9 +4,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from hilcal import numbers
-from hilcal.diagnosis.change import LEVEL, POWER
-from hilcal.diagnosis.change_candidates import Candidate
-from hilcal.diagnosis.change_found import Change, Limit
+from hilcal.diagnosis.change import LEVEL, POWER, Candidate, Change, Limit
 from hilcal.diagnosis.comparison import Comparison
 from hilcal.identification.posterior import Differences
 from hilcal.names import quoted

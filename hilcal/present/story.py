@@ -11,9 +11,8 @@ import numpy as np
 from scipy import stats
 
 from hilcal import numbers
-from hilcal.diagnosis.added_variable import added_variable
 from hilcal.diagnosis.diagnosis import Diagnosis
-from hilcal.diagnosis.effect_ranking import Suspect
+from hilcal.diagnosis.effect_ranking import Suspect, added_variable
 from hilcal.diagnosis.residual_regression import Dependence
 from hilcal.discovery.curve import drawn_laws
 from hilcal.discovery.law import Coefficient

@@ -4,15 +4,19 @@ from collections.abc import Mapping
 
 from hilcal import numbers
 from hilcal.calibration.scatter import ScatterSource
-from hilcal.diagnosis.arm_repeatability import INDUSTRIAL, RP_PER_RMS, instrument_instead, separated
 from hilcal.diagnosis.background_evidence import LIKELY
 from hilcal.diagnosis.diagnosis import Diagnosis, Verdict
 from hilcal.diagnosis.effect_ranking import LEAST_SHARE, Suspect
-from hilcal.diagnosis.noise import PureError
-from hilcal.diagnosis.noise_verdict import NoiseVerdict
+from hilcal.diagnosis.evidence import Alternative, Separability
+from hilcal.diagnosis.noise import (
+    INDUSTRIAL,
+    RP_PER_RMS,
+    NoiseVerdict,
+    PureError,
+    instrument_instead,
+    separated,
+)
 from hilcal.diagnosis.pose_alone import PoseAlone
-from hilcal.diagnosis.separability import Separability
-from hilcal.diagnosis.stepwise_alternatives import Alternative
 from hilcal.diagnosis.wrong_figures import WrongFigure
 from hilcal.identification.full_prediction import disagreement_words
 from hilcal.numbers import few, length, p_equals, sizes

@@ -15,11 +15,9 @@ from hilcal.design.next import Next, PairPower, measure_next, measure_poses
 from hilcal.design.planner import Request, make
 from hilcal.design.predicted import predicted
 from hilcal.design.summary import about, summarise
-from hilcal.diagnosis.diagnosis import Diagnosis
-from hilcal.diagnosis.doubt import in_doubt
+from hilcal.diagnosis.diagnosis import Diagnosis, in_doubt
 from hilcal.diagnosis.effect_ranking import Suspect
-from hilcal.diagnosis.more_poses import pose_powers
-from hilcal.diagnosis.pose_alone import PoseAlone
+from hilcal.diagnosis.pose_alone import PoseAlone, pose_powers
 from hilcal.diagnosis.stepwise import remove
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.fit import Fit

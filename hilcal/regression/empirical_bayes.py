@@ -10,68 +10,60 @@ than stated. Groups are dropped that shrink to nothing, and those whose evidence
 σ_g = 0, where Σ q_p²/s_p over the group is less than its size (q, s: quality and sparsity of a
 column).
 
+Strengths that maximise the evidence of all rows know of the rows of a fold: groups that fit its
+noise were kept, with strengths that fit it. With 150 poses and 360 parameters the error on poses
+left out was so predicted 1.1 to 1.4 times too small. So for a prediction each fold maximises the
+evidence of its own rows, from the strengths of all rows. Groups that were dropped enter again where
+the other rows speak for them: where Σ q²/s over the group exceeds its size, with the variance that
+its moments give,
+
+    q = dᵀ M y,   s = β dᵀ M d,   σ² = Σ (q² − s) / Σ (s/β)²
+
+d the columns of the group, M the projection off the others.
+
 Sources: MacKay, *Bayesian interpolation*, Neural Computation 4 (1992) 415-447; Tipping and
 Faul, *Fast marginal likelihood maximisation for sparse Bayesian models*, AISTATS 2003.
 """
 
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
 
 import numpy as np
 import scipy.linalg as sl
 from scipy.special import exp1
 from scipy.stats import chi2
 
-from hilcal.regression.schur import eliminate
+from hilcal.regression.schur import eliminate, inverse_root
 from hilcal.types import Floats, Ints
 
 ITERATIONS = 25
 """Most fixed-point iterations; a choice, the strengths are needed to `TOLERANCE` only."""
-NEGLIGIBLE = 1e-3
-"""Share of the noise per parameter below which a group counts as zero; a guess."""
+NEGLIGIBLE = 1e-3  # share of the noise per parameter below which a group counts as zero; a guess
 TOLERANCE = 0.2
 """Change of the logarithm of a variance at which it counts as converged: 10 % of σ; a choice."""
-PATIENCE = 3
-"""Iterations before groups are judged by quality and sparsity; a choice."""
+PATIENCE = 3  # iterations before groups are judged by quality and sparsity; a choice
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EmpiricalPrior:
-    """Result of the evidence maximisation.
+    """Result of the evidence maximisation."""
 
-    Attributes:
-        std: (P,) prior standard deviations, zero where a group was dropped.
-        beta: noise variance factor.
-        effective: effective number of parameters in the shrunk families.
-    """
-
-    std: Floats
-    beta: float
-    effective: float
+    std: Floats  # (P,) prior standard deviations, zero where a group was dropped
+    beta: float  # noise variance factor
+    effective: float  # effective number of parameters in the shrunk families
 
 
 def maximise_evidence(
-    gram: Floats,
-    rhs: Floats,
-    target_norm2: float,
-    rows: int,
-    flat: int,
-    groups: Ints,
-    start: Floats,
-    beta: float = 1.0,
+    gram: Floats,  # (F + P, F + P) gram of [flat columns, family columns], family columns unscaled
+    rhs: Floats,  # (F + P,) right-hand side
+    target_norm2: float,  # ‖target‖²
+    rows: int,  # number of whitened rows R that carry information
+    flat: int,  # number F of flat columns, which come first
+    groups: Ints,  # (P,) group of each family column
+    start: Floats,  # (P,) starting standard deviations
+    beta: float = 1.0,  # starting noise variance factor
 ) -> EmpiricalPrior:
-    """Maximise the evidence over the group variances.
-
-    Args:
-        gram: (F + P, F + P) gram of [flat columns, family columns], family columns unscaled.
-        rhs: (F + P,) right-hand side.
-        target_norm2: ‖target‖².
-        rows: number of whitened rows R that carry information.
-        flat: number F of flat columns, which come first.
-        groups: (P,) group of each family column.
-        start: (P,) starting standard deviations.
-        beta: starting noise variance factor.
-    """
+    """Maximise the evidence over the group variances."""
     g, b, yy = gram, rhs, target_norm2
     if flat:
         g, b, yy = eliminate(gram, rhs, target_norm2, slice(0, flat))
@@ -85,7 +77,6 @@ def maximise_evidence(
     effective = 0.0
     keep = np.flatnonzero(active[groups])
     g, b = g[np.ix_(keep, keep)], b[keep]
-    room = np.empty(g.size)
     for iteration in range(ITERATIONS):
         if not len(keep):
             effective = 0.0
@@ -93,7 +84,7 @@ def maximise_evidence(
             break
         group = groups[keep]
         std = np.sqrt(variance[group])
-        inverse = _inverse_root(g, std, beta, room[: g.size].reshape(g.shape))
+        inverse = _inverse_root(g, std, beta)
         posterior = np.einsum("ij,ij->j", inverse, inverse)
         z = inverse.T @ (inverse @ (std * b / beta))
         gamma = np.bincount(group, weights=1 - posterior, minlength=count)
@@ -138,21 +129,16 @@ def spent_by_groups(share: Floats, size: Ints) -> Floats:
     Args:
         share: t, the share γ/k of each group that the data determine.
     """
-    return np.asarray(size + _excess(size) * (1.0 - np.clip(share, 0.0, 1.0)))
-
-
-def _excess(size: Ints) -> Floats:
-    """c_k of `spent_by_groups`."""
     k = np.asarray(size, dtype=float)
     kept, mean = chi2.sf(k, k), k * chi2.sf(k, k + 2.0)
-    # E[1/x; x > k], by parts where χ² of k − 2 degrees of freedom does not exist.
     inverse = np.array([_mean_inverse(float(v)) for v in k.reshape(-1)]).reshape(k.shape)
-    return np.asarray((mean - k**2 * inverse - k * kept) / (k * inverse))
+    excess = (mean - k**2 * inverse - k * kept) / (k * inverse)
+    return np.asarray(size + excess * (1.0 - np.clip(share, 0.0, 1.0)))
 
 
 @cache
 def _mean_inverse(k: float) -> float:
-    """E[1/x; x > k] of χ²_k."""
+    """E[1/x; x > k] of χ²_k, by parts where that of k − 2 degrees of freedom does not exist."""
     if k > 2:
         return float(chi2.sf(k, k - 2.0)) / (k - 2.0)
     if k == 2:
@@ -161,23 +147,122 @@ def _mean_inverse(k: float) -> float:
     return 2.0 * density - float(chi2.sf(1.0, 1.0))
 
 
-def _inverse_root(g: Floats, std: Floats, beta: float, room: Floats) -> Floats:
+def _inverse_root(g: Floats, std: Floats, beta: float) -> Floats:
     """Return T (K, K) with Tᵀ T = (1 + H)⁻¹, H = S G S/β of a positive semidefinite G.
 
     Where H is so large that 1 is below its rounding, by its eigenvalues, which are at least zero.
-
-    Args:
-        g: (K, K) G.
-        std: (K,) diagonal of S.
-        beta: β.
-        room: (K, K) memory that is used, and may be returned.
     """
-    h = np.multiply(g, std / beta, out=room)
-    h *= std[:, None]
-    up = h.T  # in LAPACK's order, not turned over in memory
-    up[np.diag_indices_from(up)] += 1.0
-    up, failed = sl.lapack.dpotrf(up, lower=0, clean=1, overwrite_a=1)
+    h = g * (std / beta) * std[:, None]
+    low, failed = sl.lapack.dpotrf((h + np.eye(len(h))).T, lower=1, clean=1, overwrite_a=1)
     if not failed:
-        return np.asarray(sl.lapack.dtrtri(up, lower=0, overwrite_c=1)[0].T)
-    values, vectors = np.linalg.eigh(g * (std / beta) * std[:, None])
+        return np.asarray(sl.lapack.dtrtri(low, lower=1, overwrite_c=1)[0])
+    values, vectors = np.linalg.eigh(h)
     return np.asarray((vectors / np.sqrt(1.0 + np.maximum(values, 0.0))).T)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FamilyProblem:
+    """The linear problem y = A u: unshrunk columns first, then groups that share a prior."""
+
+    rows: Floats  # (R, F + P) A
+    target: Floats  # (R,) y
+    ridge: Floats  # (F, F) prior precision of the unshrunk columns, times β
+    pull: Floats  # (F,) right-hand side that this prior adds
+    groups: Ints  # (P,) group of each shrunk column
+    std: Floats  # (P,) strengths by all rows, zero for groups that were dropped
+    beta: float  # noise variance factor by all rows
+
+
+def solutions(p: FamilyProblem, fold: Ints) -> Floats:
+    """Return u (F + P) without each fold (folds, F + P), of the fold (R,) of each row, from 0."""
+    flat, count_of = len(p.pull), np.bincount(fold)
+    own = [p.rows[fold == f] for f in range(len(count_of))]
+    grams = [a.T @ a for a in own]
+    sides = [a.T @ p.target[fold == f] for f, a in enumerate(own)]
+    whole, rhs = np.sum(grams, axis=0), np.sum(sides, axis=0)
+    whole[:flat, :flat] += p.ridge
+    rhs[:flat] += p.pull
+    square = np.bincount(fold, weights=p.target**2)
+
+    def without(f: int) -> Floats:
+        rest = _Rest(whole, grams[f], rhs - sides[f], flat, float(square.sum() - square[f]))
+        count = len(fold) - int(count_of[f]) - flat
+        first = rest.maximised(p.std, p.groups, p.beta, count)
+        start = rest.with_dropped(p.groups, first.std, first.beta)
+        last = rest.maximised(start, p.groups, first.beta, count)
+        return rest.solution(last.std, last.beta)
+
+    return np.array([without(f) for f in range(len(grams))])
+
+
+@dataclass(frozen=True, eq=False)
+class _Rest:
+    """The problem of all rows but a fold's; of its products only what is needed is formed."""
+
+    whole: Floats  # (F + P, F + P) AᵀA of all rows
+    own: Floats  # the same of the fold
+    rhs: Floats  # (F + P,) Aᵀy of the rest
+    flat: int  # number F of unshrunk columns
+    square: float  # ‖y‖² of the rest
+
+    @cached_property
+    def _cross(self) -> Floats:
+        """(F, P + 1) what the unshrunk columns take off AᵀA and Aᵀy of the others: crossᵀ cross."""
+        flat = self.flat
+        rows = self.whole[:flat] - self.own[:flat]
+        right = np.column_stack([rows[:, flat:], self.rhs[:flat]])
+        return np.asarray(inverse_root(rows[:, :flat]) @ right)
+
+    @cached_property
+    def _beside(self) -> Floats:
+        """(P,) Aᵀy of the shrunk columns, beside the unshrunk ones."""
+        return np.asarray(self.rhs[self.flat :] - self._cross[:, :-1].T @ self._cross[:, -1])
+
+    def gram(self, rows: Ints, columns: Ints) -> Floats:
+        """AᵀA between some shrunk columns and others, beside the unshrunk ones."""
+        at = np.ix_(self.flat + rows, self.flat + columns)
+        taken = self._cross[:, rows].T @ self._cross[:, columns]
+        return np.asarray(self.whole[at] - self.own[at] - taken)
+
+    def maximised(self, std: Floats, groups: Ints, beta: float, count: int) -> EmpiricalPrior:
+        """Maximise the evidence over the strengths that are not zero."""
+        live, out = np.flatnonzero(std), np.zeros(len(groups))
+        square = self.square - float(self._cross[:, -1] @ self._cross[:, -1])
+        gram, beside = self.gram(live, live), self._beside[live]
+        found = maximise_evidence(gram, beside, square, count, 0, groups[live], std[live], beta)
+        out[live] = found.std
+        return replace(found, std=out)
+
+    def with_dropped(self, groups: Ints, std: Floats, beta: float) -> Floats:
+        """Return strengths (P,), with dropped groups where the rows speak for them."""
+        out, live = np.flatnonzero(std == 0), np.flatnonzero(std > 0)
+        if not len(out):
+            return std
+        h = self.gram(live, live) + np.diag(beta / std[live] ** 2)
+        x = np.column_stack([self.gram(live, out), self._beside[live]])
+        x = sl.solve_triangular(sl.cholesky(h, lower=True), x, lower=True)
+        at = self.flat + out
+        size = self.whole[at, at] - self.own[at, at] - np.sum(self._cross[:, out] ** 2, axis=0)
+        free = np.maximum(size - np.sum(x[:, :-1] ** 2, axis=0), 1e-300)
+        slope = self._beside[out] - x[:, :-1].T @ x[:, -1]
+        group, count = groups[out], int(groups.max()) + 1
+        members = np.bincount(group, minlength=count)
+        quality = np.bincount(group, weights=slope**2 / (beta * free), minlength=count)
+        excess = np.bincount(group, weights=slope**2 - beta * free, minlength=count)
+        spread = np.bincount(group, weights=free**2, minlength=count)
+        enters = (quality > members) & (excess > 0)
+        variance = np.where(enters, excess / np.maximum(spread, 1e-300), 0.0)
+        start = std.copy()
+        start[out] = np.sqrt(variance[group])
+        return start
+
+    def solution(self, std: Floats, beta: float) -> Floats:
+        """Return u (F + P) for strengths (P,)."""
+        kept = std > 0
+        live = np.concatenate([np.arange(self.flat), self.flat + np.flatnonzero(kept)])
+        at = np.ix_(live, live)
+        ridge = np.concatenate([np.zeros(self.flat), beta / std[kept] ** 2])
+        h = self.whole[at] - self.own[at] + np.diag(ridge)
+        u = np.zeros(len(self.rhs))
+        u[live] = sl.cho_solve(sl.cho_factor(h), self.rhs[live])
+        return u

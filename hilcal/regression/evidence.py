@@ -1,4 +1,4 @@
-"""Test and evidence of a family of columns beside a fitted model; no refit is needed.
+"""Test, power and evidence of a family of columns beside a fitted model; no refit is needed.
 
 With r the whitened residual of the model, M the projection off its columns (`projection`) and
 X (R, P) the family's columns in ordinary magnitudes, everything follows from
@@ -11,6 +11,9 @@ The whole family is judged at once:
   the variance-component test gᵀ g / ‖r‖² (Rao score of a common variance), whose null
   distribution is a ratio of quadratic forms. Both are exact for normal errors, also when the
   noise is misjudged by a common factor.
+- power: parameters β add the non-centrality λ = βᵀ S β to the reduction of the sum of squares. The
+  F-test with k directions and ν − k degrees of freedom then follows the noncentral F distribution;
+  where the noise is known (ν infinite) the test is the χ² test.
 - evidence: with the conjugate prior β | σ² ~ N(0, σ² t² 1), p(σ²) ∝ 1/σ² and ν degrees of freedom
   of r, the logarithm of the marginal-likelihood ratio of the model with the family to that
   without it is
@@ -26,59 +29,79 @@ Diagnosis and planning use this one formula. With the stated noise taken for the
 misfit of variance factor φ would overstate the evidence of each direction by about φ.
 
 Sources: O'Hagan and Forster, *Bayesian Inference* (2004), chapter 11; Goeman, van de Geer and van
-Houwelingen, *Testing against a high dimensional alternative*, J. R. Stat. Soc. B 68 (2006) 477-493.
+Houwelingen, *Testing against a high dimensional alternative*, J. R. Stat. Soc. B 68 (2006) 477-493;
+Kuonen, *Saddlepoint approximations for distributions of quadratic forms in normal variables*,
+Biometrika 86 (1999) 929-935; Lugannani and Rice, Adv. Appl. Prob. 12 (1980).
 """
 
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.special import log_ndtr
+from scipy.stats import chi2, ncf, ncx2, norm
 from scipy.stats import f as f_distribution
 
-from hilcal.regression.quadratic_form import ratio_tail
-from hilcal.regression.spectrum import Spectrum, spectrum
-from hilcal.types import Floats
+from hilcal.types import Bools, Floats
 
-LARGE_FAMILY = 0.1
-"""Share of the degrees of freedom from which a family counts as large; a guess."""
+VISIBLE = 1e-4
+"""Eigenvalues of S below this are left out of tests: such a direction moves all data together by
+less than 0.01 σ at ordinary magnitude; a guess."""
+RELATIVE = 1e-10  # eigenvalues of S below this share of the largest are rounding
+NEAR_MEAN = 2e-3
+"""Distance from the mean, in standard deviations, within which Lugannani's formula loses digits."""
+LARGE_FAMILY = 0.1  # share of the degrees of freedom from which a family is large; a guess
 ROUNDING = 1e-12
 STRENGTHS = np.logspace(-3, 3, 61)
 """Prior standard deviations τ that are tried, in ordinary magnitudes; t² = τ² ν / ‖r‖²."""
 
 
+@dataclass(frozen=True, eq=False)
+class Spectrum:
+    """Eigenvalues and eigenvectors of S = U Λ Uᵀ (P, P)."""
+
+    values: Floats  # (P,) ascending
+    seen: Bools  # (P,) which belong to directions that can be tested
+    vectors: Floats  # (P, P) U, eigenvectors in columns
+
+    @property
+    def rank(self) -> int:
+        """Number of directions that can be tested."""
+        return int(np.count_nonzero(self.seen))
+
+
+def visible(values: Floats) -> Bools:
+    """Return which eigenvalues (..., P) of S belong to directions that can be tested."""
+    largest = values.max(axis=-1, keepdims=True, initial=0.0)
+    return np.asarray(values > np.maximum(VISIBLE, RELATIVE * largest))
+
+
+def spectrum(s: Floats) -> Spectrum:
+    """Return the spectrum of S (P, P).
+
+    Raises:
+        LinAlgError: the eigenvalues do not converge, as where S is not finite.
+    """
+    values, vectors = np.linalg.eigh((s + s.T) / 2)
+    return Spectrum(values, visible(values), vectors)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class FamilyScore:
-    """What a family explains.
+    """What a family explains."""
 
-    Attributes:
-        p_value: of the joint test.
-        log_evidence: gain in log evidence by adding the family.
-        strength: τ where the evidence is largest.
-        ridge: t⁻² there, the prior precision of the parameters in units of the noise; infinite
-            where no direction is visible.
-        rank: number of visible directions of the family.
-        effective: effective number of parameters at that strength.
-        gain: reduction of ‖r‖² at that strength.
-        delta_bic: change of the Bayesian information criterion; negative speaks for it.
-        step: (P,) posterior mean of the parameters, in ordinary magnitudes.
-        spectrum: of S; None where no direction is visible.
-        noise: ‖r‖²_t / ν.
-        bounded: whether a larger strength than is plausible has more evidence.
-        by_strength: (T,) log evidence at each of `STRENGTHS`; empty for no visible direction.
-    """
-
-    p_value: float
-    log_evidence: float
-    strength: float
-    ridge: float
-    rank: int
-    effective: float
-    gain: float
-    delta_bic: float
-    step: Floats
-    spectrum: Spectrum | None
-    noise: float
-    bounded: bool = False
-    by_strength: Floats = field(default_factory=lambda: np.zeros(0))
+    p_value: float  # of the joint test
+    log_evidence: float  # gain in log evidence by adding the family
+    strength: float  # τ where the evidence is largest
+    ridge: float  # t⁻² there, the parameters' prior precision; infinite for nothing visible
+    rank: int  # number of visible directions of the family
+    effective: float  # effective number of parameters at that strength
+    gain: float  # reduction of ‖r‖² at that strength
+    delta_bic: float  # change of the Bayesian information criterion; negative speaks for it
+    step: Floats  # (P,) posterior mean of the parameters, in ordinary magnitudes
+    spectrum: Spectrum | None  # of S; None where no direction is visible
+    noise: float  # ‖r‖²_t / ν
+    bounded: bool = False  # whether a larger strength than is plausible has more evidence
+    by_strength: Floats = field(default_factory=lambda: np.zeros(0))  # (T,) log evidence at each
 
     @property
     def marginal(self) -> float:
@@ -103,50 +126,37 @@ NOTHING = FamilyScore(1.0, 0.0, 0.0, np.inf, 0, 0.0, 0.0, 0.0, np.zeros(0), None
 
 
 def log_evidence(
-    lam: Floats, explained: Floats, rss: float, dof: float, strengths: Floats = STRENGTHS
+    lam: Floats,  # (..., P) eigenvalues of S
+    explained: Floats,  # (..., P) reduction of ‖r‖² by each eigenvector without a prior
+    rss: float,  # ‖r‖²
+    dof: float,  # ν
+    strengths: Floats = STRENGTHS,  # (T,) τ
 ) -> Floats:
-    """Return the log evidence (T, ...) of families at each strength τ.
-
-    Args:
-        lam: (..., P) eigenvalues of S.
-        explained: (..., P) reduction of ‖r‖² by each eigenvector without a prior.
-        rss: ‖r‖².
-        dof: ν.
-        strengths: (T,) τ.
-    """
-    t2 = (strengths**2 * dof / rss).reshape(-1, *(1,) * lam.ndim)
-    shrunk = t2 * lam / (1 + t2 * lam)
-    left = np.maximum(rss - (shrunk * explained).sum(axis=-1), ROUNDING * rss)
-    return np.asarray(-0.5 * np.log1p(t2 * lam).sum(axis=-1) - 0.5 * dof * np.log(left / rss))
+    """Return the log evidence (T, ...) of families at each strength τ."""
+    return _evidence(lam, explained, rss, dof, strengths)[0]
 
 
-def _by_strength(lam: Floats, explained: Floats, rss: float, dof: float) -> tuple[Floats, Floats]:
-    """`log_evidence` (T,) of one family, and prior standard deviations t σ (T,), σ² = ‖r‖²_t / ν.
-
-    τ is t σ for the σ of the residual without the family, which holds what the family explains.
-    """
-    grown = np.multiply.outer(STRENGTHS**2 * (dof / rss), lam)
-    grown += 1.0
-    left = np.maximum(rss - (float(explained.sum()) - (1.0 / grown) @ explained), ROUNDING * rss)
-    evidence = -0.5 * np.log(grown).sum(axis=1) - 0.5 * dof * np.log(left / rss)
-    return evidence, STRENGTHS * np.sqrt(left / rss)
+def _evidence(
+    lam: Floats, explained: Floats, rss: float, dof: float, strengths: Floats
+) -> tuple[Floats, Floats]:
+    """`log_evidence`, and ‖r‖²_t / ‖r‖² (T, ...)."""
+    grown = 1.0 + np.multiply.outer(strengths**2 * (dof / rss), lam)
+    left = rss - explained.sum(axis=-1) + (explained / grown).sum(axis=-1)
+    left = np.maximum(left / rss, ROUNDING)
+    return -0.5 * np.log(grown).sum(axis=-1) - 0.5 * dof * np.log(left), left
 
 
 def score_family(
-    s: Floats | Spectrum,
-    g: Floats,
-    rss: float,
-    dof: float,
+    s: Floats | Spectrum,  # (P, P) S, or its spectrum
+    g: Floats,  # (P,)
+    rss: float,  # ‖r‖²
+    dof: float,  # degrees of freedom ν of r
     spent: float = 0.0,
     most: float = np.inf,
 ) -> FamilyScore:
     """Score a family.
 
     Args:
-        s: (P, P) S, or its spectrum.
-        g: (P,) g.
-        rss: ‖r‖².
-        dof: degrees of freedom ν of r.
         spent: effective number of parameters of families with a prior that are in the model
             beside those that `dof` counts. They lower the degrees of freedom of the test; in the
             evidence their determinant has counted already, where they were added.
@@ -154,22 +164,22 @@ def score_family(
             it.
     """
     of = s if isinstance(s, Spectrum) else spectrum(s)
-    seen, rank = of.seen, of.rank
-    if rank == 0 or rss <= 0 or dof - spent <= 1:
+    seen, rank, free = of.seen, of.rank, dof - spent
+    if rank == 0 or rss <= 0 or free <= 1:
         return NOTHING
-    lam, c = of.values[seen], of.along(g)[seen]
-    explained = c**2 / lam
-    free, small = dof - spent, rank <= LARGE_FAMILY * (dof - spent)
+    lam, c = of.values[seen], (of.vectors.T @ g)[seen]
+    explained, small = c**2 / lam, rank <= LARGE_FAMILY * free
     if small:
         gain = min(float(explained.sum()), (1 - ROUNDING) * rss)
         rest = max((rss - gain) / (free - rank), 1e-300)
         p_value = float(f_distribution.sf(gain / rank / rest, rank, free - rank))
     else:
         p_value = ratio_tail(lam, free, float(c @ c) / rss)
-    evidence, strengths = _by_strength(lam, explained, rss, dof)
+    evidence, left = _evidence(lam, explained, rss, dof, STRENGTHS)
     freely = int(np.argmax(evidence))
     if np.isfinite(most):
-        evidence = np.where(strengths <= most, evidence, -np.inf)
+        # τ is t σ for the σ of the residual without the family, which holds what it explains.
+        evidence = np.where(STRENGTHS * np.sqrt(left) <= most, evidence, -np.inf)
         evidence[0] = max(evidence[0], -1e300)
     best = int(np.argmax(evidence))
     ridge = rss / (dof * float(STRENGTHS[best]) ** 2)
@@ -187,9 +197,97 @@ def score_family(
         effective=effective,
         gain=gain,
         delta_bic=dof * float(np.log(max(1 - full / rss, 1e-300))) + count * float(np.log(dof)),
-        step=of.combined(step),
+        step=of.vectors @ step,
         spectrum=of,
         noise=max(rss - gain, ROUNDING * rss) / dof,
         bounded=best != freely,
         by_strength=evidence,
     )
+
+
+def ratio_tail(eigenvalues: Floats, dimension: float, c: float) -> float:
+    """Probability that a ratio of quadratic forms zᵀ L z / zᵀ z of z ~ N(0, I_R) exceeds c.
+
+    It is P(Σ (λ_i − c) χ²_1 > 0), by the saddlepoint approximation of Lugannani and Rice.
+
+    Args:
+        eigenvalues: (K,) non-zero eigenvalues λ of L.
+        dimension: R, at least K; the other R − K eigenvalues are zero.
+    """
+    top = float(eigenvalues.max(initial=0.0))
+    if c <= 0 or top <= 0:
+        return 1.0
+    if c >= top:
+        return 0.0
+    d = np.append(eigenvalues - c, -c)
+    weight = np.append(np.ones(len(eigenvalues)), max(dimension - len(eigenvalues), 0.0))
+    d, weight = d[weight > 0], weight[weight > 0]
+    if d.min() >= 0:
+        return 1.0
+    scale = np.abs(d).max()
+    d = d / scale
+
+    from scipy.optimize import brentq  # slow to import
+
+    def slope(t: float) -> float:
+        return float(np.sum(weight * d / (1 - 2 * t * d)))
+
+    # The cumulant generating function lives on 1/(2 d_min) < t < 1/(2 d_max).
+    low, high = 0.5 / d.min(), 0.5 / d.max()
+    inside = 1 - 1e-9
+    t = float(brentq(slope, low * inside, high * inside, xtol=1e-14, maxiter=500))
+    cumulant = -0.5 * float(np.sum(weight * np.log1p(-2 * t * d)))
+    curvature = 2 * float(np.sum(weight * (d / (1 - 2 * t * d)) ** 2))
+    w = np.sign(t) * np.sqrt(max(-2 * cumulant, 0.0))
+    v = t * np.sqrt(curvature)
+    if abs(w) < NEAR_MEAN:
+        # The formula is 0/0 at the mean: go straight from one side of it to the other.
+        total = float(weight.sum())
+        mean = float(eigenvalues.sum()) / total
+        spread = np.sqrt(2 * float(np.sum(weight * (scale * d + c - mean) ** 2))) / total
+        low, high = mean - 3 * NEAR_MEAN * spread, mean + 3 * NEAR_MEAN * spread
+        p_low, p_high = (ratio_tail(eigenvalues, dimension, at) for at in (low, high))
+        return float(p_low + (p_high - p_low) * (c - low) / (high - low))
+    if w > 8:
+        # Deep tail, in logarithms: sf(w) + φ(w) (1/v − 1/w)
+        return float(np.exp(log_ndtr(-(w + np.log(v / w) / w))))
+    return float(np.clip(norm.sf(w + np.log(v / w) / w), 0.0, 1.0))
+
+
+def family_power(s: Floats, beta: Floats, level: float, dof: float = np.inf) -> float:
+    """Return the probability that the test at `level` finds a family with the parameters β.
+
+    Args:
+        s: (P, P) S.
+        beta: (P,) β.
+        level: of the test; returned where no direction of the family is visible.
+        dof: degrees of freedom of the residual without the family; infinite for known noise.
+    """
+    of = spectrum(s)
+    if of.rank == 0 or dof - of.rank < 1:
+        return level
+    noncentrality = float((of.values * (of.vectors.T @ beta) ** 2)[of.seen].sum())
+    return power_of_test(noncentrality, of.rank, dof - of.rank, level)
+
+
+def power_of_test(noncentrality: float, rank: int, rest: float, level: float) -> float:
+    """Return the power of the F-test with `rank` and `rest` degrees of freedom."""
+    if noncentrality <= 0.0:
+        return level
+    if np.isinf(rest):
+        return float(ncx2.sf(chi2.isf(level, rank), rank, noncentrality))
+    return float(ncf.sf(f_distribution.isf(level, rank, rest), rank, rest, noncentrality))
+
+
+def noncentrality_of_power(rank: int, rest: float, level: float, power: float) -> float:
+    """Return the non-centrality at which the F-test at `level` has the given power."""
+    from scipy.optimize import brentq  # slow to import
+
+    high = 10.0 * (rank + 1.0) + 4.0 * rank * float(f_distribution.isf(level, rank, rest))
+
+    def lacks(value: float) -> float:
+        return power_of_test(value, rank, rest, level) - power
+
+    while lacks(high) < 0.0:
+        high *= 2.0
+    return float(brentq(lacks, 0.0, high, xtol=1e-6 * high))

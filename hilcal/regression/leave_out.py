@@ -13,36 +13,57 @@ the model without it where it is not.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import reduce
 
 import numpy as np
+from scipy.stats import norm, wilcoxon
 
 from hilcal.regression.normal_equations import NormalEquations
 from hilcal.regression.projection import Projection
 from hilcal.regression.schur import inverse_root, positive_solve
 from hilcal.types import Bools, Floats, Ints
 
-ROUNDING = 1e-6
-"""Ridge of flat directions, whose gram is the identity."""
-SMALL = 48
-"""Parameters of a family up to which it is solved for in all folds at once; a choice by timing."""
-FAMILY_ROUNDING = 1e-10
-"""Least ridge of a family, as a share of the largest square of a column."""
+LEAST_GAIN = 0.002
+"""Share by which the rms error on poses left out must fall for an effect to stay ..."""
+SURE = 2.0
+"""... and by how many of its standard errors, from pose to pose; or as surely by its ranks."""
+FEWEST = 8  # poses from which ranks are judged
+ROUNDING = 1e-6  # ridge of flat directions, whose gram is the identity
+FAMILY_ROUNDING = 1e-10  # least ridge of a family, as a share of the largest square of a column
+
+
+def improves(before: Floats, after: Floats, sure: float = SURE) -> bool:
+    """Compare the squared whitened residuals of poses (P,), each predicted without itself.
+
+    The gain must be certain from pose to pose: by its mean, or where few poses gain very much
+    (then the mean scatters, however sure the gain is) by Wilcoxon's signed ranks, at the same
+    level. Source: Wilcoxon, *Individual comparisons by ranking methods*, Biometrics Bulletin 1
+    (1945) 80-83.
+
+    Args:
+        before: (P,) of the model as it was.
+        after: (P,) of the changed one.
+        sure: how many standard errors the gain must be.
+    """
+    if float(np.sum(after)) >= (1 - LEAST_GAIN) ** 2 * float(np.sum(before)):
+        return False
+    gain = before - after
+    error = float(np.std(gain)) / np.sqrt(max(len(gain) - 1, 1))
+    if float(np.mean(gain)) > sure * error:
+        return True
+    if np.count_nonzero(gain) < FEWEST:
+        return False
+    return float(wilcoxon(gain, alternative="greater").pvalue) < float(norm.sf(sure))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fold:
-    """The model's normal equations without one fold.
+    """The model's normal equations without one fold."""
 
-    Attributes:
-        out: (R,) rows of the fold.
-        inverse_root: (K, K) T with Tᵀ T = H⁻¹ without them.
-        rhs: (K,) right-hand side without them, for a step from the fit.
-    """
-
-    out: Bools
-    inverse_root: Floats
-    rhs: Floats
+    out: Bools  # (R,) rows of the fold
+    inverse_root: Floats  # (K, K) T with Tᵀ T = H⁻¹ without them
+    rhs: Floats  # (K,) right-hand side without them, for a step from the fit
 
     def rows(self, p: Projection) -> Floats:
         """Return the model's columns in the rows of the fold."""
@@ -58,27 +79,16 @@ class Fold:
 
 
 def folds(
-    p: Projection,
-    white: Floats,
-    equations: NormalEquations,
-    theta: Floats,
-    prior: Floats,
-    magnitude: Floats,
-    beta: float,
-    fold: Ints,
+    p: Projection,  # the fit's columns by identifiable coordinates, with the ridge of its priors
+    white: Floats,  # (R,) its whitened residual
+    equations: NormalEquations,  # its normal equations, over all parameters
+    theta: Floats,  # (P,) its parameters
+    prior: Floats,  # (P,) their prior standard deviations, infinite for flat ones
+    magnitude: Floats,  # (P,) standard deviations that flat parameters have without a fold
+    beta: float,  # noise variance factor that priors are weighed against
+    fold: Ints,  # (R,) fold of each row, from 0
 ) -> tuple[Fold, ...]:
-    """Return the normal equations of a step from a fit without each fold.
-
-    Args:
-        p: the fit's columns by identifiable coordinates, with the ridge of its priors.
-        white: (R,) its whitened residual.
-        equations: its normal equations, over all parameters.
-        theta: (P,) its parameters.
-        prior: (P,) their prior standard deviations, infinite for flat ones.
-        magnitude: (P,) standard deviations that flat parameters have without a fold.
-        beta: noise variance factor that priors are weighed against.
-        fold: (R,) fold of each row, from 0.
-    """
+    """Return the normal equations of a step from a fit without each fold."""
     basis = equations.basis
     flat, held = slice(0, len(basis.singular)), basis.held
     h = equations.gram + np.diag(p.ridge + np.where(p.ridge > 0, 0.0, ROUNDING))
@@ -101,16 +111,11 @@ def folds(
 def left_out_residual(
     folds: tuple[Fold, ...],
     p: Projection,
-    white: Floats,
-    x: Floats | None = None,
+    white: Floats,  # (R,) residual of the model fitted to all rows
+    x: Floats | None = None,  # (R, F) whitened columns of the family; None for the model alone
     ridge: float = 0.0,
 ) -> Floats:
-    """Return the residual (R,) of each row, predicted without its fold by model and family.
-
-    Args:
-        white: (R,) residual of the model fitted to all rows.
-        x: (R, F) whitened columns of the family; None for the model alone.
-    """
+    """Return the residual (R,) of each row, predicted without its fold by model and family."""
     if x is None:
         left = np.zeros(len(white))
         for fold in folds:
@@ -122,43 +127,43 @@ def left_out_residual(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Products:
+    """BᵀX, XᵀX and Xᵀr of some rows."""
+
+    cross: Floats
+    gram: Floats
+    rhs: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class FamilyProducts:
-    """Products of a family's columns with themselves and with the model's, in each fold.
+    """Products of a family's columns with themselves and with the model's.
 
-    Their sums over the folds serve the tests of the whole family.
-
-    Attributes:
-        x: (R, F) whitened columns.
-        parts: of each fold.
-        whole: of all rows.
+    Those of all rows serve the tests of the whole family.
     """
 
-    x: Floats
-    parts: tuple["_Products", ...]
-    whole: "_Products"
+    x: Floats  # (R, F) whitened columns
+    parts: tuple[Products, ...]  # of each fold
+    whole: Products  # of all rows
 
 
 def family_products(
     folds: tuple[Fold, ...], p: Projection, white: Floats, families: Iterable[Floats]
 ) -> list[FamilyProducts]:
-    """Form the products of families of whitened columns (R, F).
-
-    Args:
-        folds: of the model; each row is in one.
-        white: (R,) residual of the model fitted to all rows.
-        families: X of each.
-    """
+    """Form the products of families of whitened columns (R, F) with residuals (R,)."""
     every = list(families)
-
-    def products(fold: Fold) -> list[_Products]:
+    parts: list[list[Products]] = [[] for _ in every]
+    for fold in folds:
         own, y = fold.rows(p), white[fold.out]
-        return [_Products.of(own, x[fold.out], y) for x in every]
+        for x, of in zip(every, parts, strict=True):
+            mine = x[fold.out]
+            of.append(Products(own.T @ mine, mine.T @ mine, mine.T @ y))
 
-    by_fold = [products(fold) for fold in folds]
-    return [
-        FamilyProducts(x, parts, _Products.sum(parts))
-        for x, parts in zip(every, zip(*by_fold, strict=True), strict=True)
-    ]
+    def whole(of: list[Products]) -> Products:
+        each = ([getattr(part, f.name) for part in of] for f in fields(Products))
+        return Products(*(reduce(np.add, parts) for parts in each))
+
+    return [FamilyProducts(x, tuple(of), whole(of)) for x, of in zip(every, parts, strict=True)]
 
 
 def left_out_of_families(
@@ -167,98 +172,29 @@ def left_out_of_families(
     white: Floats,
     families: Sequence[tuple[FamilyProducts, float]],
 ) -> list[Floats]:
-    """Return `left_out_residual` (R,) of each family, each beside the model by itself.
-
-    Args:
-        white: (R,) residual of the model fitted to all rows.
-    """
+    """Return `left_out_residual` (R,) of each family with its ridge, beside the model by itself."""
     found = [np.zeros(len(white)) for _ in families]
-    small = [_in_all_folds(folds, of, ridge) for of, ridge in families]
-
     for f, fold in enumerate(folds):
         out, own = fold.out, fold.rows(p)
-        for (of, ridge), left, known in zip(families, found, small, strict=True):
-            back, step = known[f] if known else _without(fold, of.whole, of.parts[f], ridge)
+        size = fold.inverse_root @ fold.rhs
+        for (of, ridge), left in zip(families, found, strict=True):
+            whole, part = of.whole, of.parts[f]
+            # Eliminate the model's own coordinates, then solve for the family.
+            along = fold.inverse_root @ (whole.cross - part.cross)
+            h = whole.gram - along.T @ along - part.gram
+            largest = float(np.diagonal(whole.gram).max(initial=0.0))
+            h[np.diag_indices_from(h)] += max(ridge, FAMILY_ROUNDING * largest)
+            step = positive_solve(h, whole.rhs - part.rhs - along.T @ size)
+            back = fold.inverse_root.T @ (size - along @ step)
             left[out] = white[out] - own @ back - of.x[out] @ step
     return found
-
-
-def _in_all_folds(
-    folds: tuple[Fold, ...], of: FamilyProducts, ridge: float
-) -> list[tuple[Floats, Floats]]:
-    """Return `_without` of each fold; nothing where the family is not small."""
-    if of.x.shape[1] > SMALL:
-        return []
-    root = np.stack([fold.inverse_root for fold in folds])
-    along = root @ (of.whole.cross - np.stack([own.cross for own in of.parts]))
-    across = np.swapaxes(along, 1, 2)
-    size = (root @ np.stack([fold.rhs for fold in folds])[..., None])[..., 0]
-    h = of.whole.gram - np.stack([own.gram for own in of.parts]) - across @ along
-    each = np.arange(h.shape[1])
-    h[:, each, each] += _least_ridge(of.whole, ridge)
-    rhs = of.whole.rhs - np.stack([own.rhs for own in of.parts])
-    inverse = inverse_root(h)
-    known = inverse @ (rhs[..., None] - across @ size[..., None])
-    step = (np.swapaxes(inverse, 1, 2) @ known)[..., 0]
-    back = np.swapaxes(root, 1, 2) @ (size[..., None] - along @ step[..., None])
-    return list(zip(back[..., 0], step, strict=True))
-
-
-def _least_ridge(whole: "_Products", ridge: float) -> float:
-    """Ridge of a family, at least what rounding asks for."""
-    return max(ridge, FAMILY_ROUNDING * float(np.diagonal(whole.gram).max(initial=0.0)))
-
-
-def _without(
-    fold: Fold, whole: "_Products", own: "_Products", ridge: float
-) -> tuple[Floats, Floats]:
-    """Return the steps (K,) of the model and (F,) of a family without a fold."""
-    # Eliminate the model's own coordinates, then solve for the family.
-    along = fold.inverse_root @ (whole.cross - own.cross)
-    size = fold.inverse_root @ fold.rhs
-    h = along.T @ along
-    np.subtract(whole.gram, h, out=h)
-    h -= own.gram
-    h[np.diag_indices_from(h)] += _least_ridge(whole, ridge)
-    step = positive_solve(h, whole.rhs - own.rhs - along.T @ size)
-    return fold.inverse_root.T @ (size - along @ step), step
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Products:
-    """BᵀX, XᵀX and Xᵀr of some rows."""
-
-    cross: Floats
-    gram: Floats
-    rhs: Floats
-
-    @classmethod
-    def of(cls, rows: Floats, x: Floats, white: Floats) -> "_Products":
-        """Form them."""
-        return cls(rows.T @ x, x.T @ x, x.T @ white)
-
-    @classmethod
-    def sum(cls, of: Sequence["_Products"]) -> "_Products":
-        """Return those of the rows of all."""
-        first = of[0]
-        out = cls(first.cross.copy(), first.gram.copy(), first.rhs.copy())
-        for more in of[1:]:
-            np.add(out.cross, more.cross, out=out.cross)
-            np.add(out.gram, more.gram, out=out.gram)
-            np.add(out.rhs, more.rhs, out=out.rhs)
-        return out
 
 
 class FamilyFolds:
     """Model and family without each fold, for any residuals and ridges: products formed once."""
 
     def __init__(self, folds: tuple[Fold, ...], p: Projection, x: Floats | None = None) -> None:
-        """Form the products.
-
-        Args:
-            folds: of the model; their right-hand sides are not used.
-            x: (R, F) whitened columns of the family; None for the model alone.
-        """
+        """Form the products of a family X (R, F), or of the model alone."""
         self._x = x = np.zeros((len(p.rows), 0)) if x is None else x
         self._folds, self._p = folds, p
         gram, cross = x.T @ x, p.rows.T @ x
@@ -271,14 +207,9 @@ class FamilyFolds:
             self._of.append((c, at, gram - out.T @ out - c.T @ at))
 
     def left_out(self, y: Floats, ridge: float = 0.0) -> Floats:
-        """Return `left_out_residual` (R, K) of K residuals of models at zero, as simulated ones.
-
-        Args:
-            y: (R, K) what remains where all parameters are zero.
-        """
+        """Return `left_out_residual` (R, K) of K simulated residuals y (R, K) of models at zero."""
         x, p = self._x, self._p
         total, rhs = p.rows.T @ y, x.T @ y
-        least = max(ridge, self._rounding)
         left = np.zeros(y.shape)
         for fold, (c, at, gram) in zip(self._folds, self._of, strict=True):
             out, own, r = x[fold.out], fold.rows(p), y[fold.out]
@@ -286,7 +217,7 @@ class FamilyFolds:
             left[fold.out] = r - own @ steps
             if x.shape[1]:
                 h, b = gram.copy(), rhs - out.T @ r - c.T @ steps
-                h[np.diag_indices_from(h)] += least
+                h[np.diag_indices_from(h)] += max(ridge, self._rounding)
                 family = positive_solve(h, b)
                 left[fold.out] += own @ (at @ family) - out @ family
         return left

@@ -1,4 +1,4 @@
-"""The whitened linear problem: rank analysis, parameter scaling, priors, solution.
+"""The whitened linear problem: rank analysis, parameter scaling, priors, solution; QR in parts.
 
     minimise ‖r − A δ‖² + β ‖(θ + δ − 0)/σ‖²  over δ
 
@@ -11,15 +11,26 @@ parameters move along a direction by an ordinary amount. Directions with s below
 `INFORMATION` (or below rounding) are not identifiable and are held at zero; the other flat
 directions are rotated and scaled to be orthonormal before the normal equations are formed,
 so that forming them costs no accuracy.
+
+Of a tall matrix whose rows come a few at a time only the triangle of its QR is kept,
+
+    [R; rows] = Q R'
+
+by Householder reflections (LAPACK's `tpqrt`), so that R'ᵀ R' is the sum of all products of rows
+without ever being formed: columns that are nearly dependent lose no digits. Triangles of parts of
+the rows are combined in the same way (TSQR). Source: Demmel, Grigori, Hoemmen and Langou,
+*Communication-optimal parallel and sequential QR and LU factorizations*, SIAM J. Sci. Comput. 34
+(2012) A206-A239.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg as sl
+from scipy.linalg.lapack import dtpqrt
 
 from hilcal.regression.schur import inverse_root, positive_solve
-from hilcal.regression.triangle import Triangle
 from hilcal.types import Bools, Floats, Ints
 
 INFORMATION = 0.2
@@ -32,37 +43,72 @@ ROUNDING = 1e-10
 TALL = 10_000
 """Rows from which on the QR is done in parts that stay in the processor's cache: a third of the
 time for 300,000 rows of 30; a choice by timing."""
-_ROWS = 4096
-"""Rows that are worked on at a time; a choice by memory."""
+_ROWS = 4096  # rows that are worked on at a time; a choice by memory
+ROWS = 3072
+"""Rows that are reduced at a time; a choice by timing: they stay in the processor's cache."""
+BLOCK = 8  # columns whose reflections are applied together; a choice by timing
+
+
+class Triangle:
+    """The triangle R (K, K) of all rows so far."""
+
+    def __init__(self, size: int) -> None:
+        """Begin without rows, of K columns."""
+        self._r = np.zeros((size, size), order="F")
+
+    @property
+    def r(self) -> Floats:
+        """(K, K) R, upper triangular."""
+        return np.triu(self._r)
+
+    def add(self, rows: Floats, right: Floats | None = None) -> None:
+        """Reduce rows (N, K); (N, K − 1) with the last column `right` (N,) given apart."""
+        block = min(BLOCK, len(self._r))
+        for start in range(0, len(rows), ROWS):
+            some = slice(start, start + ROWS)
+            part = np.empty((len(rows[some]), len(self._r)), order="F")  # it is overwritten
+            part[:, : rows.shape[1]] = rows[some]
+            if right is not None:
+                part[:, -1] = right[some]
+            self._r, _, _, info = dtpqrt(0, block, self._r, part, overwrite_a=1, overwrite_b=1)
+            if info:
+                raise ArithmeticError(f"LAPACK's dtpqrt refuses argument {-info}")
+
+
+def triangle_of(a: Floats, right: Floats) -> Floats:
+    """Return the triangle (P + 1, P + 1) of a matrix A (R, P) and a column b (R,) beside it.
+
+    Its rows have the products of those of [A, b]: they can be solved in place of them.
+    """
+    whole = Triangle(a.shape[1] + 1)
+    whole.add(a, right)
+    return whole.r
+
+
+def combined(parts: Iterable[Floats], size: int) -> Floats:
+    """Return the triangle (K, K) of triangles (K, K), in their order."""
+    whole = Triangle(size)
+    for part in parts:
+        whole.add(part)
+    return whole.r
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Basis:
-    """Coordinates z of the identifiable subspace: θ = T z.
+    """Coordinates z of the identifiable subspace: θ = T z."""
 
-    Attributes:
-        transform: (P, K) columns of θ per z; prior columns are scaled units.
-        prior_precision: (K,) 1/σ² in z coordinates (zero for flat ones).
-        null: (P, U) unit directions, in units of the ordinary magnitudes, that are not
-            identifiable.
-        flat: (P,) parameters without a prior.
-        held: indices of the parameters with a prior, in the order of their z.
-        singular: (K_flat,) singular values that were kept.
-        structural: number of directions of the flat parameters that the columns span, up to
-            rounding, identifiable under the noise or not.
-        condition_unscaled: condition number of A in physical units, identifiable part.
-        condition_scaled: the same after parameter scaling.
-    """
-
-    transform: Floats
-    prior_precision: Floats
+    transform: Floats  # (P, K) columns of θ per z; prior columns are scaled units
+    prior_precision: Floats  # (K,) 1/σ² in z coordinates (zero for flat ones)
+    # (P, U) unit directions, in units of the ordinary magnitudes, that are not identifiable
     null: Floats
-    flat: Bools
-    held: Ints
-    singular: Floats
+    flat: Bools  # (P,) parameters without a prior
+    held: Ints  # indices of the parameters with a prior, in the order of their z
+    singular: Floats  # (K_flat,) singular values that were kept
+    # number of directions of the flat parameters that the columns span, up to rounding,
+    # identifiable under the noise or not
     structural: int
-    condition_unscaled: float
-    condition_scaled: float
+    condition_unscaled: float  # condition number of A in physical units, identifiable part
+    condition_scaled: float  # the same after parameter scaling
 
     def restricted(self, kept: Bools) -> "Basis":
         """Return the basis over some of the parameters (P,), where the others are held at zero."""
@@ -100,22 +146,19 @@ class Basis:
 
 
 def find_basis(
-    a: Floats,
-    scale: Floats,
+    a: Floats,  # (R, P) whitened Jacobian
+    scale: Floats,  # (P,) ordinary magnitudes
     prior: Floats,
     spread: float | None = 1.0,
-    triangle: Floats | None = None,
+    triangle: Floats | None = None,  # what `flat_triangle` returns, where it is known
 ) -> Basis:
     """Rank analysis of A (R, P): the identifiable directions of the flat parameters.
 
     Args:
-        a: (R, P) whitened Jacobian.
-        scale: (P,) ordinary magnitudes.
-        prior: (P,) prior standard deviations, infinite for flat parameters, zero for
-            parameters held at zero.
-        spread: standard deviation of the whitened residual, at least 1; None where rows are
-            not in units of noise, so that only rounding decides the rank.
-        triangle: what `flat_triangle` returns, where it is known.
+        prior: (P,) prior standard deviations, infinite for flat parameters, zero for parameters
+            held at zero.
+        spread: standard deviation of the whitened residual, at least 1; None where rows are not in
+            units of noise, so that only rounding decides the rank.
     """
     flat = np.isinf(prior)
     held = np.flatnonzero(~flat & (prior > 0))
@@ -160,15 +203,11 @@ def _conditions(r: Floats, scale: Floats, rank: int) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NormalEquations:
-    """H z = b in the coordinates of a basis, H = gram + β·diag(prior precision).
-
-    Attributes:
-        gram: (K, K) Tᵀ AᵀA T.
-        rhs: (K,) Tᵀ Aᵀ target; z is a step for flat directions, absolute for those with a prior.
-    """
+    """H z = b in the coordinates of a basis, H = gram + β·diag(prior precision)."""
 
     basis: Basis
-    gram: Floats
+    gram: Floats  # (K, K) Tᵀ AᵀA T
+    # (K,) Tᵀ Aᵀ target; z is a step for flat directions, absolute for those with a prior
     rhs: Floats
 
     def inverse_root(self, beta: float) -> Floats:
@@ -192,19 +231,12 @@ class NormalEquations:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FlatProducts:
-    """Products of the rows by F flat coordinates, from which normal equations are put together.
+    """Products of the rows by F flat coordinates, from which normal equations are put together."""
 
-    Attributes:
-        own: (F, F) with each other.
-        all: (F, P) with all columns of A.
-        target: (F,) with the target.
-        columns: (P,) of all columns of A with the target.
-    """
-
-    own: Floats
-    all: Floats
-    target: Floats
-    columns: Floats
+    own: Floats  # (F, F) with each other
+    all: Floats  # (F, P) with all columns of A
+    target: Floats  # (F,) with the target
+    columns: Floats  # (P,) of all columns of A with the target
 
     def restricted(self, kept: Bools) -> "FlatProducts":
         """Return those over some columns (P,) of A, which the flat coordinates are made of."""
@@ -220,16 +252,10 @@ def flat_products(a: Floats, target: Floats, basis: Basis) -> FlatProducts:
 def normal_equations(
     a: Floats, target: Floats, basis: Basis, gram: Floats, known: FlatProducts | None = None
 ) -> NormalEquations:
-    """Form the normal equations of A (R, P) in the coordinates of a basis.
+    """Form the normal equations of A (R, P), with AᵀA (P, P), in the coordinates of a basis.
 
     The flat directions are formed from their rows, which are orthonormal, so that squaring
-    costs no accuracy; columns with a prior are taken from the gram AᵀA (P, P), for speed.
-
-    Args:
-        a: A.
-        target: (R,) right-hand side.
-        gram: AᵀA.
-        known: products of the flat coordinates, where they are known.
+    costs no accuracy; columns with a prior are taken from AᵀA, for speed.
     """
     flat, of = len(basis.singular), flat_products(a, target, basis) if known is None else known
     held = basis.held

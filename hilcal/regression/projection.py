@@ -20,17 +20,11 @@ from hilcal.types import Floats
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Projection:
-    """M of one linear model.
+    """M of one linear model."""
 
-    Attributes:
-        rows: (R, K) B.
-        ridge: (K,) Λ.
-        inverse_root: (K, K) T with Tᵀ T = H⁻¹.
-    """
-
-    rows: Floats
-    ridge: Floats
-    inverse_root: Floats
+    rows: Floats  # (R, K) B
+    ridge: Floats  # (K,) Λ
+    inverse_root: Floats  # (K, K) T with Tᵀ T = H⁻¹
 
     def solve(self, rhs: Floats) -> Floats:
         """Return H⁻¹ times (K,) or (K, P)."""
@@ -82,12 +76,6 @@ class Projection:
 
 
 def projection(rows: Floats, ridge: Floats, gram: Floats | None = None) -> Projection:
-    """Return M of the columns B (R, K) with the ridge Λ (K,).
-
-    Args:
-        rows: B.
-        ridge: Λ, at least zero.
-        gram: (K, K) BᵀB where it is known.
-    """
+    """Return M of the columns B (R, K) with the ridge Λ (K,), from BᵀB (K, K) where it is known."""
     h = (rows.T @ rows if gram is None else gram) + np.diag(ridge)
     return Projection(rows, ridge, inverse_root(h))

@@ -23,12 +23,10 @@ import scipy.linalg as sl
 
 from hilcal.types import Bools, Floats, Ints
 
+# Least eigenvalue of an information matrix of unit diagonal that counts as information. Products of
+# double precision leave about 1e-16 times the number of rows in place of a zero; at 1e-12 a
+# parameter's standard uncertainty is a million times what it were if the others were known
 DETERMINED = 1e-12
-"""Least eigenvalue of an information matrix of unit diagonal that counts as information.
-
-Products of double precision leave about 1e-16 times the number of rows in place of a zero; at
-1e-12 a parameter's standard uncertainty is a million times what it were if the others were known.
-"""
 _SOUND = 1e-2
 """Share of the largest admissible inverse, 1/`DETERMINED`, up to which Cholesky's factor serves."""
 
@@ -117,17 +115,11 @@ def schur_complement(m: Floats, interest: Ints, nuisance: Ints | None = None) ->
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SchurComplement:
-    """S at one M, with what its derivatives by M need.
+    """S at one M, with what its derivatives by M need."""
 
-    Attributes:
-        matrix: (I, I) S.
-        lift: (P, I) U.
-        inverse: (P, P) Y; None where there is no nuisance parameter.
-    """
-
-    matrix: Floats
-    lift: Floats
-    inverse: Floats | None
+    matrix: Floats  # (I, I) S
+    lift: Floats  # (P, I) U
+    inverse: Floats | None  # (P, P) Y; None where there is no nuisance parameter
 
     def embed(self, inner: Floats) -> Floats:
         """Return U G Uᵀ (P, P) of G (I, I): the gradient by M of tr(G S)."""

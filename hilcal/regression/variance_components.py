@@ -1,6 +1,6 @@
-"""Variance components of a whitened residual beside a fitted linear model, by REML.
+"""Variance components by restricted likelihood: of a fit's residual, and of units of a kind.
 
-The residual of a model with the whitened columns B and the ridge Λ of their priors is taken as
+**Residual.** That of a model with the whitened columns B and the ridge Λ of their priors is
 
     y ~ N(B θ, Σ),    Σ = 1 + Σ_i s_i K_i,    s_i ≥ 0
 
@@ -17,63 +17,72 @@ The maximum is found by Newton's method with the average information AI, steps h
 not fall, components at zero held there while their slope is negative. AI⁻¹ is the covariance of
 the s_i. Since P enters by its diagonal blocks alone, a step costs two products of B.
 
+**Units.** Campaign c of arm a at time t found the parameters m_c with the information M_c (singular
+where nothing was determined). With K parameters in ordinary magnitudes
+
+    θ_c = μ + β t_c + u_a + e_c,    u_a ~ N(0, diag τ²),    e_c ~ N(0, diag ω²),
+    m_c | θ_c ~ N(θ_c, M_c⁻¹)
+
+μ and the common drift β are flat; the variances τ² between arms and ω² from campaign to campaign
+maximise the restricted likelihood, by EM: with everything else integrated out, τ_k² is the mean of
+E[u_ak²], ω_k² that of E[e_ck²]. Elements of u_a that are known to be unlike the others (`apart`)
+have no prior, and count in no mean.
+
 Sources: Patterson and Thompson, *Recovery of inter-block information when block sizes are unequal*,
 Biometrika 58 (1971) 545-554; Gilmour, Thompson and Cullis, *Average information REML*, Biometrics
-51 (1995) 1440-1450; Searle, Casella and McCulloch, *Variance Components* (1992), chapter 6.
+51 (1995) 1440-1450; Laird and Ware, *Random-effects models for longitudinal data*, Biometrics 38
+(1982) 963-974; Searle, Casella and McCulloch, *Variance Components* (1992), chapters 6 and 8.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import t as student
 
 from hilcal.regression.schur import inverse_root, positive_solve
-from hilcal.types import Floats
+from hilcal.types import Bools, Floats, Ints
 
-STEPS = 50
-"""Most Newton steps; a choice, fewer than ten are usual."""
-HALVINGS = 12
-"""Most halvings of a step; a choice."""
+STEPS = 50  # most Newton steps; a choice, fewer than ten are usual
+HALVINGS = 12  # most halvings of a step; a choice
 CONVERGED = 1e-6
 """Gain of ℓ that ends the iteration: the s_i are then within 0.002 of their σ; a choice."""
+EM_STEPS = 400  # most EM steps; a choice: fleets of 30 arms take about 100
+EM_CONVERGED = 1e-4
+"""Relative change of every variance that ends EM; a choice, far below their sampling error."""
+LEAST = 1e-8
+"""Least variance, and least information of a parameter of an arm, in ordinary magnitudes squared;
+below every measurement: a choice."""
+START = (1.0, 0.05)  # variances τ², ω² that EM starts from; a choice
+UNDETERMINED = 5.0
+"""Standard uncertainty of an arm's parameter, in ordinary magnitudes, from which on nothing is said
+of it; a choice."""
+FALSE_ALARM = 0.01
+"""Probability that anything is named in a fleet where nothing is unlike; a choice."""
+FEWEST = 5
+"""Arms that are needed to call one unlike the others; a choice: three hardly have a spread."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BlockRows:
-    """Whitened rows in blocks of one size, G blocks of S rows.
+    """Whitened rows in blocks of one size, G blocks of S rows."""
 
-    Attributes:
-        y: (G, S) residual.
-        rows: (G, S, K) columns B of the model.
-        components: (C, G, S, S) blocks of the K_i.
-    """
-
-    y: Floats
-    rows: Floats
-    components: Floats
+    y: Floats  # (G, S) residual
+    rows: Floats  # (G, S, K) columns B of the model
+    components: Floats  # (C, G, S, S) blocks of the K_i
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VarianceComponents:
-    """Result of the maximisation.
+    """Result of the maximisation."""
 
-    Attributes:
-        variance: (C,) s_i.
-        covariance: (C, C) of the s_i; zero for one that is held at zero.
-        log_likelihood: gain of ℓ over all s_i = 0.
-    """
-
-    variance: Floats
-    covariance: Floats
-    log_likelihood: float
+    variance: Floats  # (C,) s_i
+    covariance: Floats  # (C, C) of the s_i; zero for one that is held at zero
+    log_likelihood: float  # gain of ℓ over all s_i = 0
 
 
 def variance_components(blocks: Sequence[BlockRows], ridge: Floats) -> VarianceComponents:
-    """Maximise the restricted likelihood.
-
-    Args:
-        ridge: (K,) Λ, zero for a column without a prior.
-    """
+    """Maximise the restricted likelihood, with Λ (K,), zero for a column without a prior."""
     count = len(blocks[0].components)
     zero = _at(blocks, ridge, np.zeros(count))
     here = _at(blocks, ridge, _start(blocks, zero))
@@ -184,3 +193,198 @@ def _log_det(t: Floats) -> float:
     triangular = not np.triu(t, 1).any()
     values = np.abs(np.diag(t)) if triangular else np.linalg.svd(t, compute_uv=False)
     return float(-2 * np.log(values[values > 0]).sum())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FleetEstimates:
+    """What C campaigns of A arms found of K parameters, in ordinary magnitudes."""
+
+    mean: Floats  # (C, K)
+    information: Floats  # (C, K, K)
+    arm: Ints  # (C,) number of the arm
+    time: Floats  # (C,) time since the arm's first campaign
+
+    @property
+    def arms(self) -> int:
+        """Number of arms A."""
+        return int(self.arm.max()) + 1
+
+    @property
+    def repeated(self) -> bool:
+        """Whether any arm was measured more than once."""
+        return len(self.arm) > self.arms
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hierarchy:
+    """The fitted model."""
+
+    mu: Floats  # (K,) μ
+    slope: Floats  # (K,) β per unit of time; zero where no arm was measured at two times
+    covariance: Floats  # (2 K, 2 K) of (μ, β)
+    between: Floats  # (K,) τ²
+    within: Floats  # (K,) ω²; zero where no arm was measured twice
+    arm_mean: Floats  # (A, K) each arm by itself: μ + u_a, without the prior of the others
+    arm_variance: Floats  # (A, K) its variance by the fits and ω²
+    apart: Bools  # (A, K) elements that are unlike the other arms'
+
+    @property
+    def predictive(self) -> Floats:
+        """(K, K) covariance of another arm's parameters in its first campaign."""
+        k = len(self.mu)
+        return np.asarray(self.covariance[:k, :k] + np.diag(self.between + self.within))
+
+    @property
+    def between_std_error(self) -> Floats:
+        """(K,) standard error of τ, by the expected information of τ² over the arms."""
+        weight = 1.0 / (self.between + self.arm_variance) ** 2
+        of_square = np.sqrt(
+            2.0 / np.maximum(np.sum(np.where(self.apart, 0.0, weight), axis=0), LEAST)
+        )
+        return np.asarray(of_square / (2 * np.sqrt(np.maximum(self.between, LEAST))))
+
+
+@dataclass(frozen=True, slots=True)
+class Unlike:
+    """One element that is unlike the others."""
+
+    unit: int  # number of the arm, or of the campaign
+    parameter: int  # index
+    off: float  # by how much, ordinary magnitudes
+    sigma: float  # the same in standard deviations of what the others let expect
+    p_value: float  # of that among all that were looked at
+
+
+def hierarchy(of: FleetEstimates) -> tuple[Hierarchy, tuple[Unlike, ...]]:
+    """Fit the model, name what is unlike, and fit again without it."""
+    apart = np.zeros((of.arms, of.mean.shape[1]), dtype=bool)
+    found = _em(of, apart)
+    named = unlike(found.arm_mean, found.arm_variance)
+    for one in named:
+        apart[one.unit, one.parameter] = True
+    return (_em(of, apart) if named else found), named
+
+
+def unlike(values: Floats, variance: Floats) -> tuple[Unlike, ...]:
+    """Name elements of values (U, K), of variance (U, K), that are unlike those of other units.
+
+    Each is compared with the distribution of the others, of which it is no part: mean, and the
+    variance beyond that of the values themselves. The worst is taken out first. `FALSE_ALARM`
+    holds for all elements together (Bonferroni), by Student's t of the others' number. Values with
+    a variance above `UNDETERMINED`² are left out.
+    """
+    known = variance < UNDETERMINED**2
+    tests = max(int(known.sum()), 1)
+    named: list[Unlike] = []
+    for k in range(values.shape[1]):
+        mine = np.flatnonzero(known[:, k])
+        while len(mine) >= FEWEST and len(mine) > 0.8 * known[:, k].sum():
+            y, s2 = values[mine, k], variance[mine, k]
+            away = []
+            for i in range(len(mine)):
+                tau2, mean, of_mean = _others(np.delete(y, i), np.delete(s2, i))
+                away.append((y[i] - mean, np.sqrt(tau2 + s2[i] + of_mean)))
+            off, sd = np.array(away).T
+            worst = int(np.argmax(np.abs(off / sd)))
+            sigma = abs(float(off[worst] / sd[worst]))
+            p = min(1.0, 2 * tests * float(student.sf(sigma, len(mine) - 2)))
+            if p >= FALSE_ALARM:
+                break
+            named.append(Unlike(int(mine[worst]), k, float(off[worst]), sigma, p))
+            mine = np.delete(mine, worst)
+    return tuple(sorted(named, key=lambda one: one.p_value))
+
+
+def _others(y: Floats, variance: Floats) -> tuple[float, float, float]:
+    """Variance of units beyond that of their errors, by REML's fixed point; mean, its variance."""
+    s2 = np.maximum(variance, LEAST)
+    tau2 = max(float(np.var(y, ddof=1) - s2.mean()), 0.0)
+    for _ in range(50):
+        w = 1.0 / (tau2 + s2)
+        mean = float(w @ y / w.sum())
+        change = float(w**2 @ ((y - mean) ** 2 - s2) / (w**2).sum() + 1.0 / w.sum())
+        tau2, before = max(change, 0.0), tau2
+        if abs(tau2 - before) <= EM_CONVERGED * max(tau2, LEAST):
+            break
+    w = 1.0 / (tau2 + variance)
+    return tau2, float(w @ y / w.sum()), 1.0 / float(w.sum())
+
+
+def _em(of: FleetEstimates, apart: Bools) -> Hierarchy:
+    k, repeated = of.mean.shape[1], of.repeated
+    timed = repeated and bool(np.ptp(of.time) > 0)
+    tau2 = np.full(k, START[0])
+    omega2 = np.full(k, START[1] if repeated else 0.0)
+    normal = np.maximum((~apart).sum(axis=0), 1)
+    many = np.bincount(of.arm, minlength=of.arms)[of.arm] > 1
+    for _ in range(EM_STEPS):
+        e = _expectation(of, tau2, omega2, apart, timed)
+        before = np.concatenate([tau2, omega2])
+        tau2 = np.maximum(np.where(apart, 0.0, e.u2).sum(axis=0) / normal, LEAST)
+        if repeated:
+            omega2 = np.maximum(e.e2[many].mean(axis=0), LEAST)
+        now = np.concatenate([tau2, omega2])
+        if np.abs((now - before) / np.maximum(before, LEAST)).max() < EM_CONVERGED:
+            break
+    e = _expectation(of, tau2, omega2, apart, timed)
+    whole = np.zeros((2 * k, 2 * k))
+    size = len(e.b)
+    whole[:size, :size] = e.covariance
+    slope = e.b[k:] if timed else np.zeros(k)
+    return Hierarchy(e.b[:k], slope, whole, tau2, omega2, e.arm_mean, e.arm_variance, apart.copy())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Expected:
+    b: Floats
+    covariance: Floats
+    u2: Floats
+    e2: Floats
+    arm_mean: Floats
+    arm_variance: Floats
+
+
+def _expectation(
+    of: FleetEstimates, tau2: Floats, omega2: Floats, apart: Bools, timed: bool
+) -> _Expected:
+    """E-step: the joint normal distribution of b = (μ, β), u and e, given the variances."""
+    k, m, eye = of.mean.shape[1], of.information, np.eye(of.mean.shape[1])
+    # e_c integrated out: N = (M⁻¹ + Ω)⁻¹ = (1 + M Ω)⁻¹ M
+    n = np.linalg.solve(eye + m * omega2, m)
+    n = (n + np.swapaxes(n, 1, 2)) / 2
+    design = np.tile(eye, (len(m), 1, 1))
+    if timed:
+        design = np.concatenate([design, of.time[:, None, None] * eye], axis=2)
+    nx, ny = n @ design, np.einsum("cij,cj->ci", n, of.mean)
+
+    def of_arms(x: Floats) -> Floats:
+        """Sums (A, ...) over the campaigns of each arm."""
+        out = np.zeros((of.arms, *x.shape[1:]))
+        np.add.at(out, of.arm, x)
+        return out
+
+    sum_n, sum_nx, sum_ny = of_arms(n), of_arms(nx), of_arms(ny)
+    precision = np.where(apart, LEAST, 1.0 / np.maximum(tau2, LEAST))
+    u_cov = np.linalg.inv(sum_n + precision[:, :, None] * eye)
+    h = np.einsum("cki,ckj->ij", design, nx) - np.einsum("aki,akl,alj->ij", sum_nx, u_cov, sum_nx)
+    g = np.einsum("cki,ck->i", design, ny) - np.einsum("aki,akl,al->i", sum_nx, u_cov, sum_ny)
+    b_cov = np.linalg.inv((h + h.T) / 2 + LEAST * np.eye(len(h)))
+    b = b_cov @ g
+    # u_a = C_a (Σ N m − Σ N X b)
+    by_b = u_cov @ sum_nx
+    u = np.einsum("akl,al->ak", u_cov, sum_ny) - by_b @ b
+    u_full = u_cov + by_b @ b_cov @ np.swapaxes(by_b, 1, 2)
+    u2 = u**2 + np.diagonal(u_full, axis1=1, axis2=2)
+    # e_c = Ω N (m − X b − u_a)
+    left = of.mean - np.einsum("cij,j->ci", design, b) - u[of.arm]
+    gain = omega2[:, None] * n
+    e = np.einsum("cij,cj->ci", gain, left)
+    toward = design - by_b[of.arm]
+    rest = u_cov[of.arm] + toward @ b_cov @ np.swapaxes(toward, 1, 2)
+    spread = np.diag(omega2) - gain * omega2 + gain @ rest @ np.swapaxes(gain, 1, 2)
+    e2 = e**2 + np.diagonal(spread, axis1=1, axis2=2)
+    alone = np.linalg.inv(sum_n + LEAST * eye)
+    drifted = of.time[:, None] * b[k:] if timed else np.zeros_like(of.mean)
+    own = of_arms(np.einsum("cij,cj->ci", n, of.mean - drifted))
+    arm_mean = np.einsum("akl,al->ak", alone, own)
+    return _Expected(b, b_cov, u2, e2, arm_mean, np.diagonal(alone, axis1=1, axis2=2).copy())

@@ -20,7 +20,7 @@ import pytest
 from hilcal.effects.protocol import Effect
 from hilcal.identification.priors import scales_of
 from hilcal.model.model import Model
-from hilcal.regression.triangle import Triangle
+from hilcal.regression.normal_equations import Triangle
 from hilcal.stream import fit as passes
 from hilcal.tables.parquet_stream import ReadingStream, open_stream
 from hilcal.types import Floats

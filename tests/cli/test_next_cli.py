@@ -15,8 +15,7 @@ import pytest
 from hilcal.cli import demo
 from hilcal.cli.running import RehearsalSettings
 from hilcal.config import load_config
-from hilcal.diagnosis.diagnosis import History
-from hilcal.diagnosis.doubt import in_doubt
+from hilcal.diagnosis.diagnosis import History, in_doubt
 from hilcal.diagnosis.evidence import Evidence
 from hilcal.diagnosis.verdict import judge
 from hilcal.drivers.simulated.injected_effects import HARD_TO_SEPARATE

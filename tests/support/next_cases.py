@@ -9,8 +9,7 @@ from hilcal.cell import cell_from_config
 from hilcal.config import load_config
 from hilcal.design.next import Next, measure_next
 from hilcal.design.planner import Request, make
-from hilcal.diagnosis.diagnosis import Diagnosis
-from hilcal.diagnosis.doubt import in_doubt
+from hilcal.diagnosis.diagnosis import Diagnosis, in_doubt
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.drivers.simulated.rehearsal import Rehearsal, SimulationCase, case_of_plan, read_plan
 from hilcal.identification.baseline import baseline

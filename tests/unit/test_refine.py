@@ -15,8 +15,9 @@ from hilcal.model.model import Model
 from hilcal.present.verdict import message
 from hilcal.readings.readings import Readings
 from hilcal.refinement import MOST_REVISIONS, Refinement, add, refine
-from hilcal.regression.paired_test import LEAST_GAIN
+from hilcal.regression.leave_out import LEAST_GAIN
 from tests.support.campaigns import campaign, cell_of, measured, plan, world_of
+from tests.support.diagnosis_cases import fitted
 from tests.support.effect_cases import make
 
 
@@ -115,7 +116,7 @@ def test_shares_on_poses_left_out_are_what_a_refit_reaches_there():
 
 def test_adding_starts_where_the_fit_stands():
     c = campaign("hysteresis", seed=0, plan_seed=0)
-    before = fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute")
+    before = fitted(c)
     after = add(before, "hysteresis")
     again = fit(after.model, c.readings, "absolute")
     assert np.abs((after.theta - again.theta) / after.uncertainty.formal).max() < 1e-4

@@ -8,7 +8,7 @@ import pytest
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.scatter import budget
 from hilcal.config import Repeatability
-from hilcal.diagnosis.arm_repeatability import RP_PER_RMS
+from hilcal.diagnosis.noise import RP_PER_RMS
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.full_covariance import joint_factors

@@ -9,9 +9,7 @@ import pytest
 import hilcal as hc
 from hilcal.cell import Cell
 from hilcal.config import load_config
-from hilcal.diagnosis.change import find_changes
-from hilcal.diagnosis.change_candidates import candidates
-from hilcal.diagnosis.change_found import Changes
+from hilcal.diagnosis.change import Changes, candidates, find_changes
 from hilcal.drivers.simulated.injected_effects import nothing_hidden
 from hilcal.drivers.simulated.rehearsal import measurement_noise
 from hilcal.drivers.simulated.truth import Truth

@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, kstest
 
-from hilcal.diagnosis.noise import PureError, pure_error
-from hilcal.diagnosis.noise_verdict import judge_noise
-from hilcal.diagnosis.repeats import classes, contrasts
+from hilcal.diagnosis.noise import PureError, classes, contrasts, judge_noise, pure_error
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit
 from hilcal.model.model import Model
@@ -61,17 +59,12 @@ def null_p_values(mode, m, seeds):
 
 @pytest.mark.long
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("m", [3, pytest.param(6, marks=pytest.mark.slow)])
-def test_the_factor_is_chi_square_and_so_is_what_is_left(mode, m):
-    for p in null_p_values(mode, m, 40):
-        assert kstest(p, "uniform").pvalue > 1e-3 / 8
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("m", [3, 6])
-def test_the_factor_is_chi_square_over_many_seeds(mode, m):
-    for p in null_p_values(mode, m, 300):
+@pytest.mark.parametrize(
+    ("m", "seeds"),
+    [(3, 40), *(pytest.param(m, 300, marks=pytest.mark.slow) for m in (3, 6))],
+)
+def test_the_factor_is_chi_square_and_so_is_what_is_left(mode, m, seeds):
+    for p in null_p_values(mode, m, seeds):
         assert kstest(p, "uniform").pvalue > 1e-3 / 8
 
 

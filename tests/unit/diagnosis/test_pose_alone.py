@@ -1,21 +1,54 @@
-"""A misfit that is the same under every load of a pose: what the data do say of it."""
+"""Constants of poses against dense algebra; a misfit that depends on the pose alone."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from hilcal.diagnosis.diagnosis import Diagnosis
+from hilcal.diagnosis.diagnosis import Diagnosis, in_doubt
 from hilcal.diagnosis.document import to_json
-from hilcal.diagnosis.doubt import in_doubt
 from hilcal.diagnosis.effect_ranking import candidates
-from hilcal.diagnosis.more_poses import chance, enough
+from hilcal.diagnosis.misfit_breakdown import pose_constants
+from hilcal.diagnosis.pose_alone import chance
 from hilcal.diagnosis.verdict import diagnose
-from hilcal.identification.baseline import baseline
+from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import fit
-from hilcal.identification.linearisation import linearise
+from hilcal.identification.linearisation import Linearisation, linearise
 from hilcal.present.verdict import message
+from hilcal.readings.whitening import Mode
+from hilcal.types import Floats
 from tests.support.campaigns import campaign, measured, plan
+from tests.support.diagnosis_cases import fitted
+
+
+def dense(p: Linearisation) -> Floats:
+    """Orthonormal basis (R, K) of the constants beside the model."""
+    f, w = p.fit, p.fit.whitening
+    poses = int(f.pose.max()) + 1
+    raw = np.zeros((len(f.pose), w.m, poses, 3))
+    axes = f.solution.prediction.observation.axes[w.reading]
+    for k, pose in enumerate(f.pose):
+        raw[k, :3, pose] = axes[k]
+    free = p.project_out(w.whiten(raw.reshape(len(raw), w.m, -1)))
+    u, s, _ = np.linalg.svd(free, full_matrices=False)
+    return np.asarray(u[:, s > 1e-6 * s.max()])
+
+
+@pytest.mark.parametrize("mode", ["absolute", "deflection"])
+@pytest.mark.parametrize("effects", [None, ("transmission_error", "joint_compliance")])
+def test_equal_to_dense_columns(mode: Mode, effects: tuple[str, ...] | None) -> None:
+    c = campaign("creep", mode, 0, poses=12)
+    some = baseline(c.cell, c.readings, mode)
+    model = some if effects is None else with_effects(c.cell, c.readings, mode, effects)
+    p = linearise(fit(model, c.readings, mode))
+    found, u = pose_constants(p), dense(p)
+    assert found is not None
+    assert found.rank == u.shape[1]
+    if mode == "absolute" and effects is None:  # a shift of the base is one of all poses
+        assert found.rank < 36
+    assert found.gain == pytest.approx(float(np.sum((u.T @ p.residual) ** 2)), rel=1e-6)
+    x = np.random.default_rng(0).standard_normal((len(p.residual), 4))
+    assert found.square(x) == pytest.approx(float(np.sum((u.T @ x) ** 2)), rel=1e-6)
 
 
 def fine_error(seed: int, first: int) -> Diagnosis:
@@ -49,7 +82,7 @@ def test_a_transmission_error_too_fine_for_thirty_poses_is_ambiguous(seed: int) 
 
 def test_what_depends_on_the_load_is_not_of_the_pose_alone() -> None:
     c = campaign("creep", "absolute", 0, poses=30)
-    d = diagnose(fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute"))
+    d = diagnose(fitted(c))
     assert d.pose_alone is None
     assert d.lead is not None
     assert d.lead.effect == "creep"
@@ -59,11 +92,8 @@ def test_the_chance_grows_with_the_poses() -> None:
     """Thirty poses hardly ever tell, many do."""
     options = {"plan_seed": 0, "poses": 30, "strength": 2.0, "harmonics": 21}
     c = campaign("transmission_error", "absolute", 0, **options)
-    p = linearise(fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute"))
+    p = linearise(fitted(c))
     effect = next(e for e in candidates(p.fit) if e.name == "transmission_error")
     few, many = (chance(p, effect, n, 1e-4, 0.01) for n in (0, 160))
     assert few < 0.2
     assert many > 0.9
-    least = enough(p, effect, 130, 1e-4, 0.01)
-    assert least.chance >= 0.9
-    assert 33 < least.more <= 195

@@ -7,28 +7,25 @@ import pytest
 from scipy.stats import f as f_distribution
 from scipy.stats import ncf
 
-from hilcal.diagnosis.doubt import in_doubt
+from hilcal.diagnosis.diagnosis import in_doubt
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
-from hilcal.diagnosis.evidence import CHANCE, backward_elimination
+from hilcal.diagnosis.evidence import (
+    CHANCE,
+    PRICE,
+    Alternative,
+    StepwiseAlternatives,
+    backward_elimination,
+)
 from hilcal.diagnosis.minimum_detectable_effect import POWER, least_strength
 from hilcal.diagnosis.stepwise import add, exchange, remove
-from hilcal.diagnosis.stepwise_alternatives import PRICE, Alternative, StepwiseAlternatives
 from hilcal.drivers.simulated.injected_effects import hide
 from hilcal.errors import InputError
-from hilcal.identification.baseline import baseline
 from hilcal.identification.effect_columns import effect_columns
-from hilcal.identification.fit import Fit, fit
 from hilcal.identification.linearisation import linearise
 from hilcal.refinement import Path
-from hilcal.regression.power import noncentrality_of_power
+from hilcal.regression.evidence import noncentrality_of_power
 from tests.support.campaigns import NOTHING, Campaign, campaign, measured, plan, world_of
-
-
-def fitted(c: Campaign, *effects: str) -> Fit:
-    found = fit(baseline(c.cell, c.readings, c.mode), c.readings, c.mode)
-    for name in effects:
-        found = add(found, name)
-    return found
+from tests.support.diagnosis_cases import fitted
 
 
 def work(c: Campaign, *effects: str) -> Path:
@@ -56,7 +53,7 @@ def test_what_is_not_there_is_needless_but_for_chance(mode, effects):
     for seed in range(30):
         c = campaign(NOTHING, mode, seed, poses=12, plan_seed=1, registration_known=True)
         found = fitted(c, *effects)
-        judged = {n.effect: n.score.p_value for n in backward_elimination(found)}
+        judged = {n: score.p_value for n, score in backward_elimination(found).items()}
         p_values += [judged.get(name, 0.0) for name in effects]
     assert set(effects) >= set(judged)
     kept = sum(p < CHANCE for p in p_values)
@@ -70,12 +67,12 @@ def test_what_is_not_there_is_needless_but_for_chance(mode, effects):
 def test_what_is_there_is_not_backward_elimination(effect):
     mode = "absolute" if effect == "transmission_error" else "deflection"
     c = campaign(effect, mode, 3, poses=30, strength=1.0)
-    assert effect not in [n.effect for n in backward_elimination(fitted(c, effect))]
+    assert effect not in backward_elimination(fitted(c, effect))
 
 
 def test_the_starting_model_is_never_backward_elimination():
     c = campaign(NOTHING, "absolute", 1)
-    assert backward_elimination(fitted(c)) == ()
+    assert backward_elimination(fitted(c)) == {}
 
 
 # --- reconsidered ---------------------------------------------------------------------------

@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from hilcal.mixed.equations import _ByColumns, _ByRows, equations
-from hilcal.mixed.evidence import evidence
+from hilcal.mixed.equations import _ByColumns, _ByRows, equations, left_out
 from hilcal.mixed.families import Families, Family, LogStdPrior
-from hilcal.mixed.prediction import left_out, predict
 from hilcal.mixed.problem import MixedProblem, Noise, independent_rows, mixed_problem
-from hilcal.mixed.variances import estimate_variances
+from hilcal.mixed.variances import estimate_variances, evidence, predict
 from hilcal.types import Floats
 
 FLAT = LogStdPrior(0.0, 3.0)

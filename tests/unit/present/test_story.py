@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hilcal.diagnosis.diagnosis import Diagnosis
-from hilcal.diagnosis.effect_ranking import LeftOut
+from hilcal.diagnosis.effect_ranking import Later as LeftOut
 from hilcal.diagnosis.residual_regression import Dependence
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.errors import InputError
@@ -21,7 +21,7 @@ from hilcal.readings.readings import Readings
 from hilcal.refinement import add
 from hilcal.robot.chain import evaluate
 from tests.support.cli_cases import rehearsal
-from tests.unit.diagnosis.test_diagnose_unknown import hidden
+from tests.unit.diagnosis.test_residual_regression import hidden
 
 
 def fitted(cell, readings: Readings, mode: str) -> Fit:

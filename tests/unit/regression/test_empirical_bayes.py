@@ -1,13 +1,25 @@
-"""Families of parameters: the data decide how strong they are, and which are needless."""
+"""Families: the data decide how strong they are and which are needless; folds; intervals."""
 
 import numpy as np
 import pytest
 
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import Fit, fit
-from hilcal.identification.gauss_newton import effective_parameters
+from hilcal.identification.regularisation import effective_parameters
+from hilcal.identification.uncertainty import (
+    HIDDEN,
+    dropped_group_factors,
+    hyperparameter_factors,
+)
 from hilcal.identification.validation import validate
-from hilcal.regression.empirical_bayes import EmpiricalPrior, maximise_evidence, spent_by_groups
+from hilcal.regression.empirical_bayes import (
+    EmpiricalPrior,
+    FamilyProblem,
+    maximise_evidence,
+    solutions,
+    spent_by_groups,
+)
+from hilcal.regression.projection import projection
 from hilcal.regression.schur import eliminate
 from tests.support.campaigns import campaign, measured, noiseless, plan
 from tests.support.effect_cases import make
@@ -191,3 +203,172 @@ def test_flat_columns_may_be_eliminated_before() -> None:
     assert (whole.std > 0).any()
     np.testing.assert_allclose(beside.std, whole.std, rtol=1e-9)
     assert abs(beside.beta - whole.beta) < 1e-9 * whole.beta
+
+
+GROUPS, MEMBERS, ROWS, FLAT, FOLDS = 100, 2, 300, 4, 10
+
+
+def errors(seed: int) -> tuple[float, float, float]:
+    """RMS error: promised by folds, promised with the strengths of all rows, and real."""
+    rng = np.random.default_rng(seed)
+    group = np.repeat(np.arange(GROUPS), MEMBERS)
+    size = np.where(rng.random(GROUPS) < 0.2, 0.3, 0.0)[group]
+    truth = np.concatenate([5 * rng.normal(size=FLAT), size * rng.normal(size=len(group))])
+    a = rng.normal(size=(ROWS, len(truth)))
+    y = a @ truth + rng.normal(size=ROWS)
+
+    def fitted(rows: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        gram, rhs = rows.T @ rows, rows.T @ target
+        found = maximise_evidence(
+            gram, rhs, float(target @ target), len(rows), FLAT, group, np.full(len(group), 0.1)
+        )
+        return found.std, rhs, found.beta
+
+    std, _, beta = fitted(a, y)
+    problem = FamilyProblem(a, y, np.zeros((FLAT, FLAT)), np.zeros(FLAT), group, std, beta)
+    fold = np.arange(ROWS) % FOLDS
+    honest = solutions(problem, fold)
+
+    def at(strengths: np.ndarray, rows: np.ndarray, target: np.ndarray) -> np.ndarray:
+        live = np.append(np.arange(FLAT), FLAT + np.flatnonzero(strengths))
+        ridge = np.append(np.zeros(FLAT), beta / strengths[strengths > 0] ** 2)
+        x = rows[:, live]
+        u = np.zeros(rows.shape[1])
+        u[live] = np.linalg.solve(x.T @ x + np.diag(ridge), x.T @ target)
+        return u
+
+    def left(u_of: list[np.ndarray]) -> float:
+        off = [y[fold == f] - a[fold == f] @ u for f, u in enumerate(u_of)]
+        return float(np.sqrt(np.mean(np.concatenate(off) ** 2)))
+
+    kept = [at(std, a[fold != f], y[fold != f]) for f in range(FOLDS)]
+    real = float(np.sqrt(1 + np.sum((at(std, a, y) - truth) ** 2)))
+    return left(list(honest)), left(kept), real
+
+
+def test_folds_promise_the_error_on_rows_that_were_never_there() -> None:
+    found = np.array([errors(seed) for seed in range(20)])
+    honest, fixed = found[:, 2] / found[:, 0], found[:, 2] / found[:, 1]
+    # A fold has nine tenths of the rows, so that it promises a little too much error.
+    assert 0.93 < np.mean(honest) < 1.03
+    assert np.mean(fixed) > 1.1
+
+
+def test_without_dropped_groups_and_shrinkage_a_fold_is_least_squares() -> None:
+    rng = np.random.default_rng(0)
+    a, truth = rng.normal(size=(200, 8)), rng.normal(size=8)
+    y = a @ truth + 1e-3 * rng.normal(size=200)
+    p = FamilyProblem(
+        a / 1e-3, y / 1e-3, np.zeros((2, 2)), np.zeros(2), np.arange(6) // 3, np.ones(6), 1.0
+    )
+    fold = np.arange(200) % 5
+    for f, u in enumerate(solutions(p, fold)):
+        exact = np.linalg.lstsq(a[fold != f], y[fold != f], rcond=None)[0]
+        np.testing.assert_allclose(u, exact, rtol=0, atol=1e-5)
+
+
+LEARNT = 0.7
+
+
+def covered(truth: np.ndarray, campaigns: int = 4000) -> tuple[float, float]:
+    """Share of 95 % intervals that hold the truth, of pairs that were learnt: as chosen, widened.
+
+    A pair is measured with unit noise; its prior variance is that of most evidence.
+    """
+    rng = np.random.default_rng(0)
+    inside, wide, count = 0, 0, 0
+    for _ in range(campaigns):
+        z = truth + rng.normal(size=2)
+        variance = float(z @ z) / 2 - 1
+        if variance <= 0:
+            continue
+        shrunk = variance / (1 + variance)
+        std = np.sqrt(shrunk)
+        if std >= LEARNT * np.sqrt(variance):
+            continue
+        prior = np.full(2, np.sqrt(variance))
+        factor = hyperparameter_factors(
+            shrunk * np.eye(2), shrunk * z, prior, np.zeros(2, dtype=np.int64)
+        )
+        off = np.abs(shrunk * z - truth)
+        count += 2
+        inside += int((off < 1.96 * std).sum())
+        wide += int((off < 1.96 * std * factor).sum())
+    return inside / count, wide / count
+
+
+@pytest.mark.parametrize(
+    "truth",
+    [
+        (0, 0),
+        (3, 3),
+        *(
+            pytest.param(further, marks=pytest.mark.long)
+            for further in ((1, 0), (1, 1), (2, 0), (2, 2), (3, 0), (8, 2))
+        ),
+    ],
+)
+def test_intervals_hold_the_truth_about_as_often_as_stated(truth):
+    as_chosen, wide = covered(np.array(truth, dtype=float))
+    assert wide >= as_chosen
+    assert 0.915 <= wide <= 0.99
+    if truth == (0, 0):  # what noise alone brought in is the worst case
+        assert as_chosen < 0.9
+
+
+def test_a_strong_group_is_hardly_widened_and_a_flat_parameter_not_at_all():
+    covariance, theta = np.diag([0.01, 0.01, 1.0]), np.array([30.0, -20.0, 2.0])
+    prior, groups = np.array([25.0, 25.0, np.inf]), np.array([0, 0, -1])
+    factor = hyperparameter_factors(covariance, theta, prior, groups)
+    np.testing.assert_allclose(factor, 1.0, atol=2e-3)
+    assert factor[2] == 1.0
+
+
+def test_a_change_of_units_changes_nothing():
+    rng = np.random.default_rng(1)
+    a = rng.normal(size=(4, 3))
+    covariance = np.linalg.inv(a.T @ a + np.eye(3) / 0.5**2)
+    theta, prior, groups = rng.normal(size=3), np.full(3, 0.5), np.zeros(3, dtype=np.int64)
+    plain = hyperparameter_factors(covariance, theta, prior, groups)
+    scaled = hyperparameter_factors(1e-10 * covariance, 1e-5 * theta, 1e-5 * prior, groups)
+    np.testing.assert_allclose(plain, scaled, rtol=1e-9)
+    assert (plain > 1.0).any()
+
+
+def test_groups_are_taken_one_by_one():
+    covariance = np.diag([0.3, 0.2, 0.4, 0.1])
+    theta, prior = np.array([0.5, 0.4, 1.0, -0.8]), np.array([0.7, 0.7, 1.1, 1.1])
+    together = hyperparameter_factors(covariance, theta, prior, np.array([0, 0, 1, 1]))
+    first = hyperparameter_factors(covariance[:2, :2], theta[:2], prior[:2], np.array([0, 0]))
+    np.testing.assert_allclose(together[:2], first)
+    dropped = hyperparameter_factors(
+        covariance, theta, np.where([1, 1, 0, 0], prior, 0.0), np.array([0, 0, 1, 1])
+    )
+    np.testing.assert_allclose(dropped[2:], 1.0)
+
+
+def test_what_a_dropped_group_could_do_widens_what_it_is_confused_with():
+    rng = np.random.default_rng(2)
+    kept = rng.normal(size=(200, 3))
+    like_first = 0.9 * kept[:, [0]] + 0.3 * rng.normal(size=(200, 1))
+    apart = rng.normal(size=(200, 1))
+    apart -= kept @ np.linalg.lstsq(kept, apart, rcond=None)[0]
+    dropped, groups = np.hstack([like_first, apart]), np.array([0, 1])
+    h = kept.T @ kept
+    factor = dropped_group_factors(np.eye(3), projection(kept, np.zeros(3)), dropped, groups, 1.0)
+    assert factor[0] > 1.5
+    assert np.all(factor[1:] < 1.1)
+    # As if the dropped ones were in the model, with a prior of their size.
+    inverse = np.linalg.inv(h)
+    free = dropped - kept @ inverse @ kept.T @ dropped
+    prior = np.sum(free**2, axis=0) / HIDDEN
+    full = np.hstack([kept, dropped])
+    joint = np.linalg.inv(full.T @ full + np.diag([0.0, 0.0, 0.0, *prior]))
+    np.testing.assert_allclose(factor, np.sqrt(np.diag(joint)[:3] / np.diag(inverse)), rtol=1e-6)
+
+
+def test_a_dropped_column_that_others_stand_for_altogether_changes_nothing():
+    kept = np.random.default_rng(3).normal(size=(50, 2))
+    p, copy = projection(kept, np.zeros(2)), kept @ np.array([[1.0], [2.0]])
+    factor = dropped_group_factors(np.eye(2), p, copy, np.array([0]), 1.0)
+    np.testing.assert_allclose(factor, 1.0)

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from hilcal.identification.linearisation import eliminate_columns
-from hilcal.regression import leave_out
 from hilcal.regression.leave_out import (
     FamilyFolds,
     Fold,
@@ -84,19 +83,6 @@ def test_families_together_are_predicted_as_each_by_itself() -> None:
     for of in products:
         whole = p.schur(of.whole.gram, of.whole.cross)
         np.testing.assert_allclose(whole, p.information(of.x), rtol=1e-11, atol=1e-12)
-
-
-@pytest.mark.parametrize("ridge", [0.0, 0.8])
-def test_a_small_family_is_solved_for_in_all_folds_as_in_each(
-    ridge: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    each, p, white, x = model(1.0)
-    if ridge > 0:
-        x = np.hstack([x, x[:, :1] + x[:, 1:]])  # its columns depend on each other
-    together = left_out_residual(each, p, white, x, ridge)
-    monkeypatch.setattr(leave_out, "SMALL", -1)
-    alone = left_out_residual(each, p, white, x, ridge)
-    np.testing.assert_allclose(together, alone, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("ridge", [0.0, 0.8, 40.0])

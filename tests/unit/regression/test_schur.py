@@ -1,8 +1,11 @@
-"""Schur complements, regular and singular, against least squares and finite differences."""
+"""Schur complements, projections and groups of what is connected, against dense algebra."""
 
 import numpy as np
 import pytest
+from scipy.sparse.csgraph import connected_components
 
+from hilcal.regression.connected import connected, groups_within
+from hilcal.regression.projection import projection
 from hilcal.regression.schur import (
     differentiable_schur_complement,
     eliminate,
@@ -12,6 +15,7 @@ from hilcal.regression.schur import (
     schur_complement,
 )
 from hilcal.types import Floats
+from tests.support.regression_cases import KINDS, problem
 
 INTEREST = np.array([0, 2, 5])
 OTHERS = np.array([1, 3, 4, 6, 7])
@@ -137,3 +141,68 @@ def test_solutions_follow_the_rule_for_singular_blocks(least: float) -> None:
     zero[3] = zero[:, 3] = 0.0
     root = inverse_root(zero)
     np.testing.assert_allclose(positive_solve(zero, rhs), root.T @ (root @ rhs), rtol=1e-12)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_products_are_those_of_the_dense_matrix(kind: str) -> None:
+    of = problem(kind)
+    p, m = of.projection, of.dense
+    np.testing.assert_allclose(p.project_out(of.x), m @ of.x, atol=1e-12)
+    np.testing.assert_allclose(p.project_out(of.y), m @ of.y, atol=1e-12)
+    np.testing.assert_allclose(p.information(of.x), of.x.T @ m @ of.x, rtol=1e-12, atol=1e-11)
+    q = p.root()
+    np.testing.assert_allclose(np.eye(len(m)) - q @ q.T, m, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_effective_number_of_parameters_is_the_trace_of_the_hat_matrix(kind: str) -> None:
+    of = problem(kind)
+    hat = np.eye(len(of.y)) - of.dense
+    assert of.projection.effective() == pytest.approx(np.trace(hat), rel=1e-12, abs=1e-12)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("off", [0.0, 0.3])
+def test_the_residual_does_not_depend_on_where_the_model_stands(kind: str, off: float) -> None:
+    of = problem(kind)
+    z = of.estimate + off
+    found = of.projection.residual(of.y - of.rows @ z, z)
+    np.testing.assert_allclose(found, of.dense @ of.y, atol=1e-12)
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
+def test_columns_that_depend_on_each_other_count_once(scale: float) -> None:
+    rng = np.random.default_rng(0)
+    own, y = rng.standard_normal((30, 3)), rng.standard_normal(30)
+    double = scale * np.hstack([own, own @ rng.standard_normal((3, 2)), np.zeros((30, 1))])
+    p, q = projection(double, np.zeros(6)), np.linalg.qr(own)[0]
+    np.testing.assert_allclose(p.project_out(y), y - q @ (q.T @ y), atol=1e-10)
+    assert p.effective() == pytest.approx(3.0)
+
+
+def test_things_are_joined_also_through_others() -> None:
+    group = connected(np.array([0, 3, 4]), np.array([3, 4, 0]), 6)
+    assert len(set(group)) == 4
+    assert group[0] == group[3] == group[4]
+
+
+def test_points_are_joined_where_no_coordinate_differs_by_more() -> None:
+    points = np.array([[0.0, 0.0], [0.9, -0.9], [1.8, -0.9], [4.0, 0.0], [4.0, 1.1]])
+    group = groups_within(points, 1.0)
+    assert group[0] == group[1] == group[2]
+    assert len(set(group)) == 3
+
+
+def test_groups_and_their_numbers_are_those_of_a_graph() -> None:
+    rng = np.random.default_rng(3)
+    for _ in range(60):
+        count, size = int(rng.integers(1, 80)), int(rng.integers(1, 7))
+        points = np.round(rng.standard_normal((count, size)), 1)[rng.integers(0, count, count)]
+        distance = float(rng.choice([0.0, 1e-6, 0.1, 0.5]))
+        near = np.all(np.abs(points[:, None] - points) <= distance, axis=2)
+        expected = connected_components(near, directed=False)[1]
+        assert np.array_equal(groups_within(points, distance), expected)
+
+
+def test_nothing_is_in_no_group() -> None:
+    assert len(groups_within(np.zeros((0, 6)), 1.0)) == 0

@@ -1,6 +1,6 @@
 """hilcal: read the table, refine, predict with bands, name, and discover where a law is asked for.
 
-How its probabilities are meant: `hilcal.diagnosis.effect_probabilities`.
+How its probabilities are meant: `hilcal.diagnosis.diagnosis`.
 """
 
 # mypy: disable-error-code="attr-defined, name-defined, operator"

@@ -6,19 +6,19 @@ from hilcal.diagnosis.document import least
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
 from hilcal.diagnosis.minimum_detectable_effect import least_strength
 from hilcal.diagnosis.verdict import diagnose
-from hilcal.identification.baseline import baseline
 from hilcal.identification.effect_columns import effect_columns
-from hilcal.identification.fit import Fit, fit
+from hilcal.identification.fit import Fit
 from hilcal.identification.linearisation import linearise
 from hilcal.present.diagnosis import could_have_been_seen
 from tests.support.campaigns import campaign
+from tests.support.diagnosis_cases import fitted
 
 ERROR = "transmission_error"
 
 
 def found(poses: int) -> Fit:
     c = campaign("none", "absolute", 0, poses=poses, plan_seed=0)
-    return fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute")
+    return fitted(c)
 
 
 def test_a_family_is_seen_from_where_poses_left_out_show_it_and_not_finer_than_poses_resolve() -> (

@@ -1,0 +1,277 @@
+"""Suspects: of plausible size, keep their promise, told by gravity, finer than one effect."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hilcal.config import load_config
+from hilcal.diagnosis.document import suspect_json
+from hilcal.diagnosis.effect_ranking import (
+    LEAST_KEPT,
+    beyond_geometry,
+    candidates,
+    geometry_columns,
+    kept_by_refit,
+    kept_by_step,
+    most,
+    rank_suspects,
+    through_load,
+    unloaded_readings,
+)
+from hilcal.diagnosis.evidence import StepwiseAlternatives
+from hilcal.diagnosis.stepwise import add
+from hilcal.diagnosis.verdict import diagnose
+from hilcal.effects.catalogue import BUILT_IN
+from hilcal.effects.joint_compliance import JointCompliance
+from hilcal.errors import InputError
+from hilcal.identification.baseline import baseline, with_effects
+from hilcal.identification.effect_columns import effect_columns
+from hilcal.identification.fit import Fit, fit
+from hilcal.identification.linearisation import linearise
+from hilcal.present.diagnosis import finer
+from hilcal.present.verdict import message
+from hilcal.refinement import refine
+from studies.study_cases import study_case
+from tests.support.campaigns import NOTHING, Campaign, campaign, configuration, measured, plan
+from tests.support.diagnosis_cases import fitted
+from tests.support.paths import ROOT
+
+SECOND_ORDER = {"link_geometry", "encoder_offset", "joint_coupling", "link_mass"}
+
+
+def unmodelled(law: str, robot: str) -> Fit:
+    case = study_case(
+        load_config(ROOT / "configs/cells/demo_ur10e.toml"),
+        robot,
+        "deflection",
+        (law,),
+        3.0,
+        seed=0,
+    )
+    return fit(baseline(case.cell, case.readings, "deflection"), case.readings, "deflection")
+
+
+@pytest.mark.parametrize(
+    ("law", "robot"), [("crosswise compliance", "ur5e"), ("compliance by another joint", "ur10e")]
+)
+def test_no_error_of_second_order_is_named_for_deflections(law: str, robot: str) -> None:
+    d = diagnose(unmodelled(law, robot))
+    assert d.verdict == "unknown_effect"
+    assert not SECOND_ORDER & set(d.significant)
+    geometry = next(s for s in d.suspects if s.effect == "link_geometry")
+    needed = {unit: rms for unit, rms, _ in geometry.needs}
+    assert needed["m"] > 0.01 or needed["rad"] > 0.01
+    assert "plausible" in message(d) or d.suspects[0].effect != "link_geometry"
+
+
+def test_every_effect_that_ships_states_what_is_plausible() -> None:
+    assert all(1.0 <= kind.plausible < np.inf for kind in BUILT_IN)
+
+
+def test_the_cell_may_allow_more() -> None:
+    c = campaign("none", "absolute", 1)
+    found = fitted(c)
+
+    def largest(factor: dict[str, float]) -> float:
+        config = configuration().model_copy(update={"plausible": factor})
+        cell = replace(found.model.cell, config=config)
+        same = replace(found, model=replace(found.model, cell=cell))
+        (e,) = (e for e in candidates(same) if e.name == "link_geometry")
+        return e.most()
+
+    assert largest({}) == pytest.approx(3.0)
+    assert largest({"link_geometry": 4.0}) == pytest.approx(12.0)
+    with pytest.raises(InputError, match=r"\[plausible\] gremlins: no such effect"):
+        largest({"gremlins": 2.0})
+
+
+def test_unloaded_readings_bound_what_geometry_may_do_to_deflections() -> None:
+    """A geometry that is off by so much is allowed as much, and not ten times as much."""
+    c = campaign("link_geometry", "absolute", 1, strength=10.0)
+    found = fitted(replace(c, mode="deflection"))
+    (e,) = (e for e in candidates(found) if e.name == "link_geometry")
+    off = c.world.physics.link_geometry
+    allowed = most(effect_columns(found, e), unloaded_readings(found))
+    true = float(np.sqrt(np.mean((1e3 * off) ** 2)))
+    assert true < allowed < 10 * true
+    assert most(effect_columns(found, e), None) == pytest.approx(e.most())
+
+
+@pytest.mark.parametrize("effect", ["link_geometry", "joint_tilt_compliance"])
+def test_true_effects_keep_their_promise(effect: str) -> None:
+    mode = "absolute" if effect == "link_geometry" else "deflection"
+    c = campaign(effect, mode, 1)
+    found = fitted(c)
+    p = linearise(found)
+    (s,) = rank_suspects(p, [e for e in candidates(found) if e.name == effect])
+    (e,) = (e for e in candidates(found) if e.name == effect)
+    assert s.passes
+    assert s.plausible
+    assert kept_by_step(p, effect_columns(found, e), s.score) == pytest.approx(1.0, abs=0.1)
+    assert kept_by_refit(found, add(found, effect), s.score) == pytest.approx(1.0, abs=0.15)
+
+
+def test_a_refit_that_changes_nothing_keeps_nothing() -> None:
+    c = campaign("joint_tilt_compliance", "deflection", 1)
+    found = fitted(c)
+    p = linearise(found)
+    (e,) = (e for e in candidates(found) if e.name == "joint_tilt_compliance")
+    (s,) = rank_suspects(p, [e], refit=lambda before, effect: before)
+    assert s.keeps
+    assert kept_by_refit(found, found, s.score) == 0.0
+    far = replace(s.score, step=100 * s.score.step)
+    assert kept_by_step(p, effect_columns(found, e), far) < LEAST_KEPT
+
+
+POSES = 30
+
+
+def without_loads(seed: int, stiff: bool) -> Fit:
+    """Unloaded readings of an arm whose geometry is off, as compliant as any or hardly so."""
+    c = campaign("link_geometry", "absolute", seed, plan_seed=0, poses=POSES, strength=10.0)
+    world, r = c.world, c.readings
+    if stiff:
+        given = world.physics.joint_compliance
+        world = replace(world, physics=world.physics.with_effect("joint_compliance", 1e-6 * given))
+        r = measured(world, plan(POSES, 0), np.random.default_rng(seed))
+    r = r[r.load == 0]
+    return fit(baseline(c.cell, r, "absolute"), r, "absolute")
+
+
+def test_a_stiff_arm_with_a_wrong_geometry_is_not_compliant() -> None:
+    for seed in range(2):
+        found = without_loads(seed, stiff=True)
+        p = linearise(found)
+        effects = candidates(found)
+        elastic = {e.name for e in effects if through_load(e)}
+        assert {"joint_compliance", "link_mass", "load_point"} <= elastic
+        assert not {"link_geometry", "transmission_error", "hysteresis"} & elastic
+        assert not elastic & {s.effect for s in rank_suspects(p, effects) if s.passes}
+        geometry = geometry_columns(p, effects)
+        for e in effects:
+            if e.name in elastic:
+                assert not beyond_geometry(p, effect_columns(found, e), geometry, 3.0), e.name
+
+
+def test_gravity_tells_of_a_compliant_arm() -> None:
+    found = without_loads(0, stiff=False)
+    p, effects = linearise(found), candidates(found)
+    (e,) = (e for e in effects if e.name == "joint_compliance")
+    assert beyond_geometry(p, effect_columns(found, e), geometry_columns(p, effects), 3.0)
+    assert "joint_compliance" in {s.effect for s in rank_suspects(p, effects) if s.passes}
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_it_is_named_in_absolute_readings(seed: int) -> None:
+    c = campaign("joint_coupling", "absolute", seed, poses=30, strength=2.0)
+    d = diagnose(fitted(c))
+    assert d.verdict == "missing_effect"
+    assert d.suspects[0].effect == "joint_coupling"
+    assert d.suspects[0].same_as == ()
+
+
+def test_deflections_do_not_show_it() -> None:
+    """Ten times the noise in positions cancels: the same commanded angles stand on both sides."""
+    c = campaign("joint_coupling", "absolute", 1, poses=20, strength=10.0)
+    d = diagnose(fitted(replace(c, mode="deflection")))
+    assert "joint_coupling" not in d.significant
+    assert d.verdict == "adequate"
+
+
+@pytest.mark.parametrize("effect", ["encoder_offset", "transmission_error"])
+def test_others_are_not_taken_for_it(effect: str) -> None:
+    c = campaign(effect, "absolute", 1, poses=30, strength=2.0)
+    d = diagnose(fitted(c))
+    assert d.suspects[0].effect == effect
+
+
+EACH = "joint_compliance(joints=each)"
+
+
+@pytest.fixture(scope="module", params=[1, 2])
+def arm(request) -> Campaign:
+    """An arm whose joints differ, as simulated, and nothing hidden."""
+    return campaign(NOTHING, "deflection", request.param, poses=12, registration_known=True)
+
+
+def with_joints(c: Campaign, joints: str) -> Fit:
+    options = {"joint_compliance": {"joints": joints}}
+    model = with_effects(c.cell, c.readings, "deflection", options, options)
+    return fit(model, c.readings, "deflection")
+
+
+@pytest.mark.parametrize("joints", ["common", "1-3/4-6"])
+def test_the_verdict_is_to_let_joints_differ(arm, joints):
+    d = diagnose(with_joints(arm, joints))
+    assert d.verdict == "missing_effect"
+    assert d.significant[0] == EACH
+    lead = d.suspects[0]
+    assert lead.share > 0.95
+    assert message(d).startswith(f"let joints differ: {EACH} explains")
+    assert suspect_json(lead)["finer_than"] == "joint_compliance"
+    assert list(finer(d)) == [
+        "Let joints differ: joint_compliance has one parameter for several joints; to give each "
+        f'its own: hilcal add RUN "{EACH}".'
+    ]
+
+
+def test_refine_lets_them_differ_and_names_no_other_effect(arm):
+    start = with_joints(arm, "common")
+    found = refine(start.model, arm.readings, "deflection")
+    assert [s.added for s in found.steps] == [None, EACH]
+    assert found.verdict == "adequate"
+    assert found.fit.model.names == start.model.names
+    own = found.fit.model.effects[-1]
+    assert own.options["joints"] == "each"
+    again = with_joints(arm, "each")
+    np.testing.assert_allclose(found.fit.theta, again.theta, rtol=1e-6)
+    assert found.fit.chi2 == pytest.approx(again.chi2, rel=1e-8)
+
+
+def test_a_model_whose_joints_differ_has_no_finer_suspect(arm):
+    found = with_joints(arm, "each")
+    assert not any(e.coarse for e in candidates(found))
+
+
+def test_a_finer_form_is_no_alternative_to_the_effect(arm):
+    c = campaign("creep", "deflection", 1, poses=12, strength=3.0)
+    found = add(with_joints(c, "each"), "creep")
+    assert "creep(joints=each)" in [e.name for e in candidates(found)]
+    alternative = StepwiseAlternatives(found).of("creep")
+    assert not any("creep" in name for name in (*alternative.same_as, *alternative.others))
+
+
+def test_only_what_is_finer_takes_the_place_of_an_effect(arm):
+    halves = with_joints(arm, "1-3/4-6")
+    assert add(halves, "joint_compliance(joints=1/2/3/4-6)").model.effects[-1].options == {
+        "joints": "1/2/3/4-6"
+    }
+    for other in ("joint_compliance", "joint_compliance(joints=common)"):
+        with pytest.raises(InputError, match="joint_compliance is in the model already"):
+            add(halves, other)
+    with pytest.raises(InputError, match="joint_compliance is in the model already"):
+        add(halves, "joint_compliance", {"joints": "1-2/3-6"})
+
+
+@pytest.mark.parametrize(
+    ("own", "other", "finer_"),
+    [
+        ("each", "common", True),
+        ("each", "1-3/4-6", True),
+        ("2/3", "2+3", True),
+        ("1/2/3", "2+3", True),
+        ("1-2/3-6", "1-3/4-6", False),
+        ("2/3", "common", False),
+        ("common", "each", False),
+        ("each", "each", False),
+    ],
+)
+def test_finer_is_what_splits_groups_and_keeps_joints(arm, own, other, finer_):
+    states = arm.readings.states
+    one, two = (JointCompliance(arm.cell, states, {"joints": j}) for j in (own, other))
+    assert one.refines(two) is finer_
+    refined = two.refined(states)
+    if refined is not None:
+        assert refined.refines(two)
+        assert refined.refined(states) is None

@@ -1,0 +1,289 @@
+"""What a judgement shares, whether the catalogue suffices, what speaks against effects."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.stats import chi2, multivariate_normal
+
+from hilcal.config import load_config
+from hilcal.diagnosis import residual_regression as regression
+from hilcal.diagnosis.diagnosis import Diagnosis
+from hilcal.diagnosis.document import to_json
+from hilcal.diagnosis.effect_ranking import candidates, most, rank_suspects, unloaded_readings
+from hilcal.diagnosis.evidence import (
+    insufficiency,
+    spoken_against,
+    whole_catalogue,
+)
+from hilcal.diagnosis.noise import MISFIT_ALARM
+from hilcal.diagnosis.residual_regression import Regressions, residual_regression
+from hilcal.diagnosis.stepwise import add
+from hilcal.diagnosis.verdict import diagnose
+from hilcal.identification import effect_columns as columns_module
+from hilcal.identification.baseline import baseline, with_effects
+from hilcal.identification.carried import CarriedPrior, carried_prior
+from hilcal.identification.carried_evidence import carried_effects, evidence_of_carried
+from hilcal.identification.effect_columns import columns_of_each, effect_columns
+from hilcal.identification.fit import Fit, fit
+from hilcal.identification.gauss_newton import whitened_jacobian
+from hilcal.identification.linearisation import Linearisation, linearise
+from hilcal.identification.posterior import Posterior
+from hilcal.identification.priors import names_of
+from hilcal.present.verdict import message
+from hilcal.readings.readings import Readings
+from hilcal.readings.whitening import Mode
+from hilcal.refinement import refine
+from hilcal.robot.catalogue import configs_dir
+from studies.study_cases import study_case
+from tests.support.campaigns import Campaign, campaign, measured, plan
+from tests.support.diagnosis_cases import fitted
+
+CELL = configs_dir() / "cells" / "demo_ur10e.toml"
+
+
+def studied(
+    mode: Mode, *hidden: str, seed: int = 1, strength: float = 3.0, stated: float = 1.0, cycles=1
+) -> Fit:
+    c = study_case(
+        load_config(CELL), "ur5e", mode, hidden, strength, seed, stated=stated, cycles=cycles
+    )
+    return fit(baseline(c.cell, c.readings, mode), c.readings, mode)
+
+
+@pytest.mark.parametrize("seeds", [(0,), pytest.param((1, 2, 3), marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("mode", "law", "variable"),
+    [
+        pytest.param("deflection", "relaxing bench", "time under load", marks=pytest.mark.long),
+        ("absolute", "swaying bench", "air temperature"),
+        ("absolute", "coupled joint", "joint 2 torque"),
+    ],
+)
+def test_a_law_that_only_resembles_an_effect_is_unknown(
+    mode: Mode, law: str, variable: str, seeds: tuple[int, ...]
+) -> None:
+    led = 0
+    for seed in seeds:
+        d = diagnose(studied(mode, law, seed=seed))
+        assert d.verdict == "unknown_effect", (seed, message(d))
+        assert variable in [c.variable for c in d.dependences[:2]]
+        led += d.lead is not None
+        if d.lead is not None:
+            check_insufficiency(d)
+    assert led > 0
+
+
+def check_insufficiency(d: Diagnosis) -> None:
+    i = d.insufficiency
+    assert d.reason == "insufficient_catalogue"
+    assert i is not None
+    assert d.suspects[0].effect in message(d)
+    assert 0.02 < i.share < 1.0
+    assert i.variance_factor > 1.0
+    assert 0 <= i.refitted <= len(i.effects)
+    assert d.separability == ()
+    assert to_json(d)["beyond"] == {
+        "effects": list(i.effects),
+        "refitted": i.refitted,
+        "share": i.share,
+        "variance_factor": i.variance_factor,
+    }
+
+
+@pytest.mark.parametrize(
+    ("mode", "effects"),
+    [
+        ("deflection", ("creep", "load_point")),  # turns a lever: far from linear
+        ("absolute", ("link_geometry",)),
+        ("absolute", ("encoder_offset", "load_point")),
+        pytest.param("deflection", ("link_compliance",), marks=pytest.mark.slow),
+        pytest.param(
+            *("deflection", ("sensor_misalignment", "joint_tilt_compliance")),
+            marks=pytest.mark.slow,
+        ),
+        pytest.param("absolute", ("hysteresis", "link_mass"), marks=pytest.mark.slow),
+    ],
+)
+def test_effects_of_the_catalogue_explain_all(mode: Mode, effects: tuple[str, ...]) -> None:
+    d = diagnose(studied(mode, *effects))
+    assert d.lead is not None
+    assert d.verdict in ("missing_effect", "ambiguous")
+    assert d.insufficiency is None
+
+
+@pytest.mark.long
+def test_noise_that_repeats_show_is_not_an_unknown_effect() -> None:
+    found = studied("deflection", "hysteresis", stated=0.5, cycles=2)
+    d = diagnose(found)
+    assert d.suspects[0].effect == "hysteresis"
+    _, square, dof = whole_catalogue(found)
+    assert chi2.sf(square, dof) < MISFIT_ALARM
+    assert d.verdict in ("missing_effect", "ambiguous")
+
+
+def test_no_refit_is_made_where_algebra_leaves_noise_and_at_most_two_elsewhere() -> None:
+    made: list[str] = []
+
+    def counted(before: Fit, effect: str) -> Fit:
+        made.append(effect)
+        return add(before, effect)
+
+    explained = studied("deflection", "link_compliance")
+    _, square, dof = whole_catalogue(explained)
+    assert chi2.sf(square, dof) >= MISFIT_ALARM
+    assert insufficiency(explained, counted) is None
+    assert made == []
+    unknown = insufficiency(studied("absolute", "swaying bench"), counted)
+    assert unknown is not None
+    assert unknown.effects[: unknown.refitted] == tuple(made)
+    assert 1 <= len(made) <= 2
+
+
+def test_a_fit_that_is_not_quite_at_rest_credits_no_effect_with_its_own_step() -> None:
+    at_rest = studied("absolute")
+    s = at_rest.solution
+    step = np.random.default_rng(0).standard_normal(s.rows.shape[1])
+    theta = s.theta - s.equations.basis.transform @ step
+    off = replace(at_rest, solution=replace(s, theta=theta, white=s.white + s.rows @ step))
+    one, other = linearise(at_rest), linearise(off)
+    np.testing.assert_allclose(other.residual, one.residual, atol=1e-9)
+    for effect in candidates(at_rest):
+        x = effect_columns(at_rest, effect).white
+        assert other.score(x).log_evidence == pytest.approx(one.score(x).log_evidence, abs=1e-6)
+
+
+@pytest.fixture(scope="module")
+def shared() -> Fit:
+    c = campaign("hysteresis", "deflection", poses=12)
+    return add(fitted(c), "encoder_offset")
+
+
+@pytest.mark.parametrize("together", [0, 20_000, 8_000_000])
+def test_columns_of_several_effects_are_those_of_each(
+    shared: Fit, together: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(columns_module, "TOGETHER", together)
+    effects = candidates(shared)
+    s, w = shared.solution, shared.whitening
+    for effect, of in zip(effects, columns_of_each(shared, effects), strict=True):
+        assert of.effect is effect
+        jacobian = shared.model.jacobian_of((effect,), s.prediction, s.theta, w.m) * of.scale
+        unloaded = jacobian[shared.readings.unloaded, :3]
+        np.testing.assert_allclose(of.unloaded, unloaded, rtol=1e-11, atol=1e-15)
+        motion = w.raw(jacobian)[:, :3]
+        np.testing.assert_allclose(of.motion, motion, rtol=1e-11, atol=1e-15)
+        white = w.whiten_readings(jacobian)
+        atol = 1e-12 * np.abs(white).max(initial=0.0)
+        np.testing.assert_allclose(of.white, white, rtol=1e-9, atol=atol)
+
+
+def test_scores_of_a_catalogue_are_those_of_each_effect_by_itself(shared: Fit) -> None:
+    p, effects, w = linearise(shared), candidates(shared), shared.whitening
+    ranked = {s.effect: s.score for s in rank_suspects(p, effects)}
+    bare = unloaded_readings(shared)
+    for of in columns_of_each(shared, effects):
+        jacobian = shared.model.jacobian_of(
+            (of.effect,), shared.solution.prediction, shared.theta, 3
+        )
+        x = w.whiten(w.raw(jacobian)) * of.scale
+        score = p.score(x, x.T @ p.project_out(x), most(of, bare))
+        together = ranked[of.effect.name]
+        assert (together.rank, together.strength) == (score.rank, score.strength)
+        assert together.log_evidence == pytest.approx(score.log_evidence, rel=1e-9, abs=1e-9)
+        assert together.gain == pytest.approx(score.gain, rel=1e-9, abs=1e-9)
+        assert together.p_value == pytest.approx(score.p_value, rel=1e-6)
+
+
+def test_the_residual_of_a_fit_is_regressed_once(
+    shared: Fit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    alone = residual_regression(linearise(shared))
+    grown: list[float] = []
+    trees = regression.tree_share
+
+    def counted(p: Linearisation, beyond: float) -> float:
+        grown.append(beyond)
+        return trees(p, beyond)
+
+    monkeypatch.setattr(regression, "tree_share", counted)
+    made = Regressions()
+    first = made.of(linearise(shared))
+    assert (first.share, len(first.dependences)) == (alone.share, len(alone.dependences))
+    assert made.of(linearise(shared)) is first
+    assert made.tree_share(linearise(shared), 0.5) == made.tree_share(linearise(shared), 0.5)
+    assert len(grown) == len(set(grown))
+    assert 0.5 in grown
+
+
+HIDDEN = "joint_tilt_compliance"
+NAMES = ("joint_compliance", HIDDEN)
+
+
+@cache
+def before() -> tuple[Campaign, CarriedPrior]:
+    """A campaign of an arm whose joints tilt, and what it taught."""
+    c = campaign(HIDDEN, "absolute", 1, poses=20, registration_known=True)
+    found = fit(with_effects(c.cell, c.readings, "absolute", NAMES), c.readings, "absolute")
+    return c, carried_prior(Posterior.of(found))
+
+
+@cache
+def later(*, repaired: bool, poses: int) -> Readings:
+    c, _ = before()
+    physics = c.world.physics
+    if repaired:
+        stiff = np.zeros_like(getattr(physics, HIDDEN))
+        physics = physics.with_effect(HIDDEN, stiff)
+    world = replace(c.world, physics=physics)
+    return measured(world, plan(poses, 91), np.random.default_rng(7))
+
+
+def with_prior(*, repaired: bool, poses: int = 10) -> Fit:
+    c, prior = before()
+    r = later(repaired=repaired, poses=poses)
+    return fit(baseline(c.cell, r, "absolute", prior=prior), r, "absolute")
+
+
+def test_what_was_repaired_is_spoken_against_and_what_is_there_is_not() -> None:
+    assert spoken_against(with_prior(repaired=True)) == (HIDDEN,)
+    assert spoken_against(with_prior(repaired=False)) == ()
+
+
+def test_the_evidence_is_the_ratio_of_normal_densities_of_the_readings() -> None:
+    """Against the densities written out, flat parameters with a wide prior instead."""
+    found = with_prior(repaired=True, poses=3)
+    model, s, p = found.model, found.solution, before()[1].posterior
+    assert carried_effects(model) == (HIDDEN,)
+    a = whitened_jacobian(model, s.prediction, s.theta, found.whitening, np.arange(model.size))
+    y = s.white + a @ s.theta
+    drift = model.prior.drift if model.prior is not None else np.zeros(0)
+    c = (1 + drift[0] ** 2) * np.linalg.inv(p.information)
+    of = carried_prior(p)
+    c += np.diag((drift[1:][of.group] * of.unit) ** 2)
+
+    def density(names: tuple[str, ...]) -> float:
+        mean, cov = np.zeros(len(y)), s.beta * np.eye(len(y))
+        kept = [k for k, name in enumerate(p.names) if name.split(".")[0] in names]
+        own = [list(names_of(model)).index(p.names[k]) for k in kept]
+        mean = a[:, own] @ p.mean[kept]
+        cov += a[:, own] @ c[np.ix_(kept, kept)] @ a[:, own].T
+        flat = np.delete(a, [list(names_of(model)).index(n) for n in p.names], axis=1)
+        cov += 1e4**2 * flat @ flat.T
+        return float(multivariate_normal(mean, cov).logpdf(y))
+
+    expected = density(("joint_compliance", HIDDEN)) - density(("joint_compliance",))
+    evidence = evidence_of_carried(model, s, found.whitening, (HIDDEN,))[HIDDEN]
+    assert evidence == pytest.approx(expected, rel=1e-3)
+    assert abs(expected) > 1
+
+
+def test_refine_takes_a_repaired_effect_out_and_leaves_one_that_is_there() -> None:
+    for repaired in (True, False):
+        c, prior = before()
+        r = later(repaired=repaired, poses=10)
+        path = refine(baseline(c.cell, r, "absolute", prior=prior), r, "absolute")
+        assert (HIDDEN in path.fit.model.names) is not repaired
+        assert [s.removed for s in path.steps if s.removed] == ([HIDDEN] if repaired else [])
+        assert path.verdict == "adequate"
