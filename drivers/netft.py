@@ -20,7 +20,7 @@ import numpy as np
 from pydantic import Field
 
 from hilcal.config import CellConfig
-from hilcal.config.rig import Whole
+from hilcal.config.sections import Whole
 from hilcal.drivers import force_stream as fs
 from hilcal.drivers.force_stream import DEVICE
 from hilcal.drivers.links import address, network_failures

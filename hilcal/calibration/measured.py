@@ -25,15 +25,15 @@ from hilcal.identification.predictive import Predictive
 from hilcal.identification.validation import FAR
 from hilcal.measuring.force import shift
 from hilcal.model.model import Model
-from hilcal.readings.ranges import (
+from hilcal.readings.readings import (
     Range,
+    States,
     angle_name,
     ranges_of,
     travel_name,
     turning_variables,
     variables,
 )
-from hilcal.readings.readings import States
 from hilcal.robot import se3
 from hilcal.robot.chain import evaluate
 from hilcal.types import Bools, Floats

@@ -28,9 +28,7 @@ from typing import Literal
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.diagnosis.arm_repeatability import RP_PER_RMS, stated_repeatability
-from hilcal.diagnosis.noise import FEWEST
-from hilcal.diagnosis.repeats import classes
+from hilcal.diagnosis.noise import FEWEST, RP_PER_RMS, classes, stated_repeatability
 from hilcal.errors import InputError
 from hilcal.identification.fit import Fit
 from hilcal.identification.full_covariance import joint_factors

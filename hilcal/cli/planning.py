@@ -25,7 +25,7 @@ from hilcal.design.next import Next, PairPower
 from hilcal.design.nominal_model import check_effects
 from hilcal.design.planner import Planned, Request, make
 from hilcal.design.summary import CheckedPlan, about, checked, refusal, remarks, summarise
-from hilcal.diagnosis.doubt import MOST
+from hilcal.diagnosis.diagnosis import MOST
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import DeviceError, HilcalError, InputError

@@ -28,8 +28,8 @@ from hilcal.cli.showing import followed
 from hilcal.cli.terminal import Terminal, agreed, handled, somebody_there, terminal, told_to_end
 from hilcal.config import CellConfig
 from hilcal.config.reference import to_toml
-from hilcal.design.checked_plan import refuse
 from hilcal.design.goal import GoalRule
+from hilcal.design.summary import refuse
 from hilcal.diagnosis.live_model import LiveModel
 from hilcal.drivers.simulated.rehearsal import (
     NOTHING,

@@ -18,9 +18,9 @@ from hilcal.design.predicted import predicted
 from hilcal.design.run_order import Confounding, Duration
 from hilcal.effects.protocol import FRAME_ROLES, Role
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.measuring.dry_run import DryRun, dry_run
+from hilcal.measuring.route import DryRun, dry_run
+from hilcal.regression.evidence import VISIBLE
 from hilcal.regression.schur import schur_complement
-from hilcal.regression.spectrum import VISIBLE
 from hilcal.shown import Shown, Tabular
 from hilcal.store.plan import REFERENCE, Plan
 from hilcal.types import Floats

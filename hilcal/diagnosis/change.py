@@ -29,11 +29,9 @@ from scipy.stats import f as f_distribution
 from hilcal.cell import Cell
 from hilcal.diagnosis.effect_ranking import SAME_EVIDENCE
 from hilcal.effects.catalogue import Catalogue
-from hilcal.effects.changed import Changeable, Directions, Kind
-from hilcal.effects.protocol import Effect
+from hilcal.effects.protocol import Changeable, Directions, Effect, Kind
 from hilcal.errors import CannotAnswerError
-from hilcal.identification.earlier_fit import EarlierFit
-from hilcal.identification.later_readings import Moving, Remeasured, Setting, remeasure
+from hilcal.identification.later_readings import EarlierFit, Moving, Remeasured, Setting, remeasure
 from hilcal.readings.readings import States
 from hilcal.regression.evidence import (
     FamilyScore,

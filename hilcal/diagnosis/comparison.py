@@ -21,14 +21,13 @@ from hilcal.diagnosis.stepwise import add
 from hilcal.errors import HilcalError
 from hilcal.identification.arm_scatter import estimate_arm_scatter, with_arm_scatter
 from hilcal.identification.effect_columns import effect_columns
-from hilcal.identification.extrapolation import Extrapolation, extrapolation
 from hilcal.identification.fit import Fit
 from hilcal.identification.fit import fit as solve
 from hilcal.identification.later_readings import Setting, beside_frames, frames_alone, remeasure
 from hilcal.identification.linearisation import linearise
-from hilcal.identification.parameter_differences import Differences
+from hilcal.identification.posterior import Differences
 from hilcal.identification.residual import error_block
-from hilcal.identification.validation import Validation
+from hilcal.identification.validation import Extrapolation, Validation, extrapolation
 from hilcal.readings.whitening import Mode
 from hilcal.shown import Shown
 

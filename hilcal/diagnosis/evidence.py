@@ -63,7 +63,7 @@ from hilcal.diagnosis.wrong_figures import WrongFigure, wrong_figures
 from hilcal.effects.protocol import Effect
 from hilcal.errors import InputError
 from hilcal.identification.arm_scatter import estimate_arm_scatter, with_arm_scatter
-from hilcal.identification.carried_evidence import carried_effects, evidence_of_carried
+from hilcal.identification.drift import carried_effects, evidence_of_carried
 from hilcal.identification.effect_columns import effect_columns
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.linearisation import (
@@ -72,7 +72,7 @@ from hilcal.identification.linearisation import (
     linearise,
     model_columns,
 )
-from hilcal.readings.arm_scatter import ArmScatter
+from hilcal.readings.readings import ArmScatter
 from hilcal.regression.evidence import FamilyScore
 from hilcal.regression.forward_selection import families_beside, forward_selection
 from hilcal.regression.schur import schur_complement

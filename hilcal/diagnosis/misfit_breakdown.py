@@ -31,7 +31,7 @@ from scipy.stats import f as f_distribution
 
 from hilcal.identification.linearisation import Linearisation
 from hilcal.model.observe import motion
-from hilcal.readings.ranges import angle_name, travel_name
+from hilcal.readings.readings import angle_name, travel_name
 from hilcal.regression.projection import Projection
 from hilcal.types import Floats, Ints
 

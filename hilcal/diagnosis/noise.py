@@ -38,10 +38,9 @@ from scipy.stats import f as f_distribution
 
 from hilcal.diagnosis.effect_ranking import SAME_EVIDENCE
 from hilcal.identification.fit import Fit
-from hilcal.identification.variance_factor import variance_interval
+from hilcal.identification.residual import variance_interval
 from hilcal.model.observe import motion
-from hilcal.readings.arm_scatter import ArmScatter
-from hilcal.readings.readings import Readings
+from hilcal.readings.readings import ArmScatter, Readings
 from hilcal.readings.whitening import Bucket, Whitening, whitening
 from hilcal.regression.connected import connected, groups_within
 from hilcal.robot.arm import Arm

@@ -42,8 +42,8 @@ from hilcal.identification.effect_columns import columns_of_each
 from hilcal.identification.fit import Fit, fit
 from hilcal.model.observe import motion
 from hilcal.readings.covariance import instrument_root
-from hilcal.readings.reading_groups import arrival_groups, deflection_groups, runs
-from hilcal.readings.serial_noise import Clock, SerialNoise
+from hilcal.readings.readings import Clock, SerialNoise
+from hilcal.readings.whitening import arrival_groups, deflection_groups, runs
 from hilcal.regression.schur import inverse_root
 from hilcal.types import Floats, Ints
 

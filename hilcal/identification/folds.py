@@ -20,7 +20,7 @@ from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Whitening
 from hilcal.regression.connected import groups_within
-from hilcal.regression.fold_evidence import FamilyProblem, solutions
+from hilcal.regression.empirical_bayes import FamilyProblem, solutions
 from hilcal.regression.leave_out import Fold, folds
 from hilcal.types import Floats, Ints
 

@@ -31,9 +31,9 @@ from hilcal.regression.normal_equations import (
     NormalEquations,
     find_basis,
     normal_equations,
+    triangle_of,
 )
 from hilcal.regression.projection import Projection, projection
-from hilcal.regression.triangle import triangle_of
 from hilcal.types import Bools, Floats, Ints
 
 # All of these are choices.

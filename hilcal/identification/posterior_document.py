@@ -8,8 +8,7 @@ import numpy as np
 
 from hilcal import __version__, limits
 from hilcal.identification.posterior import Posterior, PosteriorEffect, Source
-from hilcal.readings.arm_scatter import ArmScatter
-from hilcal.readings.ranges import Range
+from hilcal.readings.readings import ArmScatter, Range
 from hilcal.readings.whitening import MODES
 from hilcal.store.codec import (
     decode,

@@ -56,12 +56,10 @@ from hilcal.identification.mixed_fit import INSTRUMENT, mixed_fit_at
 from hilcal.identification.posterior import Posterior, PosteriorEffect, Source, determined
 from hilcal.identification.priors import scales_of
 from hilcal.identification.residual import residual
-from hilcal.mixed.equations import equations
-from hilcal.mixed.prediction import left_out
+from hilcal.mixed.equations import equations, left_out
 from hilcal.mixed.variances import Variances, log_posterior
 from hilcal.model.model import Model, Prediction
-from hilcal.readings.ranges import ranges_of
-from hilcal.readings.readings import Readings
+from hilcal.readings.readings import Readings, ranges_of
 from hilcal.readings.same_readings import prints
 from hilcal.readings.whitening import Mode, Whitening, whitening
 from hilcal.regression.schur import schur_complement

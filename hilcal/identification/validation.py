@@ -22,8 +22,7 @@ from hilcal.identification.registration import register, targets_as_fitted
 from hilcal.identification.residual import ErrorBlock, error_block, noise_floor, residual
 from hilcal.identification.robot_frames import whole_turns
 from hilcal.model.model import Model
-from hilcal.readings.ranges import ranges_of, turning_variables, variables
-from hilcal.readings.readings import Readings
+from hilcal.readings.readings import Readings, ranges_of, turning_variables, variables
 from hilcal.readings.whitening import Mode, Whitening, inverse_root, whitening
 from hilcal.shown import Shown
 from hilcal.types import Bools, Floats, Ints

@@ -10,11 +10,10 @@ from hilcal.calibration.tool import tool_of
 from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.design.checked_plan import CheckedPlan, checked
 from hilcal.design.next import Next, PairPower, measure_next, measure_poses
 from hilcal.design.planner import Request, make
 from hilcal.design.predicted import predicted
-from hilcal.design.summary import about, summarise
+from hilcal.design.summary import CheckedPlan, about, checked, summarise
 from hilcal.diagnosis.diagnosis import Diagnosis, in_doubt
 from hilcal.diagnosis.effect_ranking import Suspect
 from hilcal.diagnosis.pose_alone import PoseAlone, pose_powers

@@ -25,9 +25,8 @@ from hilcal.calibration.improvement import Improvement, improvement
 from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.design.checked_plan import CheckedPlan, checked
 from hilcal.design.planner import Request, make
-from hilcal.design.summary import about, remarks, summarise
+from hilcal.design.summary import CheckedPlan, about, checked, remarks, summarise
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import InputError
@@ -59,9 +58,8 @@ from hilcal.procedure.state import (
     settings_of,
 )
 from hilcal.procedure.validation_plan import corrected_plan, expected_of, paired, validation_plan
-from hilcal.readings.arm_scatter import ArmScatter
 from hilcal.readings.covariance import COVERS, INSTRUMENT
-from hilcal.readings.readings import Readings
+from hilcal.readings.readings import ArmScatter, Readings
 from hilcal.readings.same_readings import already
 from hilcal.readings.whitening import Mode, usual_mode
 from hilcal.refinement import Refinement, refine

@@ -16,9 +16,9 @@ from hilcal.calibration.compensation import Compensation
 from hilcal.calibration.tool import tool_of, tool_poses
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.design.checked_plan import refuse
 from hilcal.design.feasible import REASONS, Space, draw
 from hilcal.design.run_order import Chosen, Ordering, order_plan, pace, timeline
+from hilcal.design.summary import refuse
 from hilcal.errors import CannotAnswerError
 from hilcal.measuring.route import approach_sides, dry_run, duration, route
 from hilcal.present.calibration import refusals

@@ -55,8 +55,7 @@ from hilcal.model.model import Model, Prediction
 from hilcal.readings.covariance import WHOLE, with_scatter
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Whitening, whitening
-from hilcal.regression.normal_equations import NormalEquations
-from hilcal.regression.triangle import Triangle, combined
+from hilcal.regression.normal_equations import NormalEquations, Triangle, combined
 from hilcal.tables import columns
 from hilcal.tables.parquet_stream import ReadingStream
 from hilcal.types import Bools, Floats, Ints

@@ -7,10 +7,8 @@ import numpy as np
 
 from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.revisions import mode_of
-from hilcal.diagnosis.change import find_changes
-from hilcal.diagnosis.change_candidates import changing
-from hilcal.diagnosis.comparison import Comparison, error_today
-from hilcal.diagnosis.completed import completed
+from hilcal.diagnosis.change import changing, find_changes
+from hilcal.diagnosis.comparison import Comparison, completed, error_today
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.fit import Fit
 from hilcal.identification.later_readings import earlier_fit, setting

@@ -17,7 +17,8 @@ from scipy.stats import norm
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.posterior import Posterior, PosteriorEffect, Source
 from hilcal.readings.readings import Range
-from hilcal.regression.hierarchy import (
+from hilcal.regression.schur import schur_complement
+from hilcal.regression.variance_components import (
     FALSE_ALARM,
     UNDETERMINED,
     FleetEstimates,
@@ -26,7 +27,6 @@ from hilcal.regression.hierarchy import (
     hierarchy,
     unlike,
 )
-from hilcal.regression.schur import schur_complement
 from hilcal.store.revision import seconds_of, utc_now
 from hilcal.transfer.members import Member, TypeSize, type_sizes
 from hilcal.types import Floats

@@ -11,8 +11,8 @@ import pytest
 from hilcal import __version__
 from hilcal.campaign.campaign import Campaign
 from hilcal.config import load_config
+from hilcal.diagnosis.diagnosis import in_doubt
 from hilcal.diagnosis.document import to_json
-from hilcal.diagnosis.doubt import in_doubt
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.drivers.simulated.rehearsal import simulate
 from hilcal.effects.catalogue import installed

@@ -20,7 +20,7 @@ import pytest
 
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig, load_config
-from hilcal.config.template import to_toml
+from hilcal.config.reference import to_toml
 from hilcal.drivers.simulated.cell_processes import SimulatedCell
 from hilcal.drivers.simulated.rehearsal import case_of_plan, simulated_cell
 from hilcal.drivers.simulated.world import World

@@ -35,7 +35,7 @@ from hilcal.readings.readings import Readings
 from hilcal.robot import chain as chains
 from hilcal.robot import se3
 from hilcal.store.plan import Plan, Step
-from hilcal.store.stored_schema import Detail, check, check_event
+from hilcal.store.stored_schema import DETAIL, check, check_event
 from hilcal.types import Bools, Floats
 
 REGISTRATION = se3.matrix(se3.rotation(np.array([0.02, -0.03, 2.1])), np.array([2.4, -1.6, -0.5]))
@@ -155,7 +155,7 @@ class MemoryStore:
         assert len(reading) == 1
         assert not self.world.is_moving, "stored in motion"
         text = json.dumps(detail, allow_nan=False)
-        check(Detail, json.loads(text))
+        check(DETAIL, json.loads(text))
         self.rows.append((step, reading, text))
         self.world.call("store.recorded")
 

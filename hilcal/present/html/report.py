@@ -11,7 +11,7 @@ from hilcal import numbers
 from hilcal.calibration.scatter import COVERAGE, budget
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.effect_ranking import LEAST_SHARE, Suspect
-from hilcal.diagnosis.repeats import classes
+from hilcal.diagnosis.noise import classes
 from hilcal.identification.family_sizes import family_sizes
 from hilcal.identification.fit import Fit
 from hilcal.identification.full_covariance import CovarianceParts

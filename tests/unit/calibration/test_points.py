@@ -13,8 +13,8 @@ from hilcal.errors import InputError
 from hilcal.robot import se3
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate
-from hilcal.tables.guessing.propose import propose
 from hilcal.tables.mapping import Mapping, PointMapping, find_mapping
+from hilcal.tables.propose import propose
 from tests.support.refusals import check, refusals
 
 ARM = load_arm("ur10e")

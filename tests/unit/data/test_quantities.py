@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 from hilcal.cell import Cell
 from hilcal.errors import InputError
 from hilcal.readings.covariance import TrackerNoise
-from hilcal.readings.ranges import Range
-from hilcal.readings.readings import Readings, States
+from hilcal.readings.readings import Range, Readings, States
 from hilcal.readings.same_readings import already, never_fitted
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.rows import content_hash

@@ -7,7 +7,7 @@ import pytest
 
 from hilcal.readings import whitening as scaling_module
 from hilcal.readings.covariance import symmetric_root
-from hilcal.readings.serial_noise import SerialNoise
+from hilcal.readings.readings import SerialNoise
 from hilcal.readings.whitening import MODES, has_unloaded, whitening
 from tests.unit.data.test_whitening import make_readings, random_readings, spd
 

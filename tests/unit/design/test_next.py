@@ -23,7 +23,7 @@ from hilcal.design.next import DRAWS, measure_next, measure_poses
 from hilcal.design.nominal_model import after
 from hilcal.design.planner import Request
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
-from hilcal.diagnosis.more_poses import pose_powers
+from hilcal.diagnosis.pose_alone import pose_powers
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.drivers.simulated.rehearsal import planned_states, simulate
 from hilcal.errors import CannotAnswerError, InputError
@@ -34,7 +34,7 @@ from hilcal.identification.linearisation import linearise
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode
 from hilcal.refinement import add, refine
-from hilcal.regression.power import family_power
+from hilcal.regression.evidence import family_power
 from hilcal.regression.projection import projection
 from hilcal.regression.schur import schur_complement
 from hilcal.store.plan import REFERENCE, UNLOADED

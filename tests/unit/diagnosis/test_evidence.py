@@ -24,7 +24,7 @@ from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification import effect_columns as columns_module
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.carried import CarriedPrior, carried_prior
-from hilcal.identification.carried_evidence import carried_effects, evidence_of_carried
+from hilcal.identification.drift import carried_effects, evidence_of_carried
 from hilcal.identification.effect_columns import columns_of_each, effect_columns
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.gauss_newton import whitened_jacobian

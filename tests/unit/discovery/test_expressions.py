@@ -19,8 +19,8 @@ from hilcal.effects.from_file import effects_of
 from hilcal.effects.protocol import Situation
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.fit import Fit, fit
-from hilcal.present.charts import style
-from hilcal.present.charts.evidence import curve_chart
+from hilcal.present.charts import curve_chart
+from hilcal.present.document import says
 from hilcal.present.story import Chapter, build_story
 from hilcal.present.viewer import save
 from studies.benchmark.formula import Formula
@@ -155,7 +155,7 @@ def test_a_law_is_seen_on_the_page_and_in_the_viewer(tmp_path: Path) -> None:
     assert one.x_label == "q_5 [°]"
     assert one.y_label == "dq_3/τ_3 of joint 3 [µrad/(N·m)]"
     assert dict(one.facts)["coefficients"].startswith("a = ")
-    assert "dq_3 = a·cos(q_5)·τ_3" in style.says(curve_chart(one))
+    assert "dq_3 = a·cos(q_5)·τ_3" in says(curve_chart(one))
     save(story, tmp_path / "x.rrd")
     law = rows(tmp_path / "x.rrd", "/law/law", "BarChart:values", "revision")
     assert set(law) == {2}

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hilcal.config.joints import Conventions, Coupling
+from hilcal.config.sections import Conventions, Coupling
 from hilcal.drivers.simulated import truth
-from hilcal.effects.links import long_links
+from hilcal.effects.link_compliance import long_links
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import fit

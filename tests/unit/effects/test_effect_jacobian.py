@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilcal.effects.elastic_joints import JointCompliance
+from hilcal.effects.joint_compliance import JointCompliance
 from hilcal.effects.protocol import Effect, Response
 from hilcal.model.model import Model
 from hilcal.robot.statics import Load, slot_wrenches

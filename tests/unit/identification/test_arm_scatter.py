@@ -22,9 +22,8 @@ from hilcal.identification.full_covariance import with_common_scatter, with_join
 from hilcal.identification.linearisation import linearise
 from hilcal.identification.registration import register
 from hilcal.present.verdict import message
-from hilcal.readings.arm_scatter import ArmScatter, ScatterKind
 from hilcal.readings.covariance import COVERS, INSTRUMENT
-from hilcal.readings.readings import Readings
+from hilcal.readings.readings import ArmScatter, Readings, ScatterKind
 from hilcal.readings.whitening import Mode, whitening
 from hilcal.robot import se3
 from hilcal.store.campaign_file import CampaignFile

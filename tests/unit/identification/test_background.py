@@ -21,7 +21,7 @@ from hilcal.identification.fit import Fit, fit
 from hilcal.identification.mixed_fit import mixed_fit
 from hilcal.identification.predictive import predictive_of
 from hilcal.library import read_table
-from hilcal.mixed.evidence import evidence
+from hilcal.mixed.variances import evidence
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import whitening
 from hilcal.refinement import BACKGROUND, Refinement, refine

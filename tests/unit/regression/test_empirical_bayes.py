@@ -5,7 +5,7 @@ import pytest
 
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import Fit, fit
-from hilcal.identification.regularisation import effective_parameters
+from hilcal.identification.gauss_newton import effective_parameters
 from hilcal.identification.uncertainty import (
     HIDDEN,
     dropped_group_factors,

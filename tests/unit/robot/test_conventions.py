@@ -9,7 +9,7 @@ import pytest
 
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig
-from hilcal.config.joints import Conventions, Coupling
+from hilcal.config.sections import Conventions, Coupling
 from hilcal.design.feasible import Space, draw
 from hilcal.errors import InputError
 from hilcal.model.model import Model
