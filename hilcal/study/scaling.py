@@ -187,24 +187,38 @@ UNITS: tuple[tuple[str, float, float], ...] = (
 
 @dataclass(frozen=True, slots=True)
 class StudyCell:
-    """One scaling of one experiment; `_mc` are standard uncertainties of the Monte-Carlo."""
+    """One scaling of one experiment; `_mc` are standard uncertainties of the Monte-Carlo.
 
-    scaling: Scaling  # "none", "gu" or "gc"
-    correlation: float  # share ρ of each element's variance that is common to the elements
-    unit: str  # units that the deflections were written in
-    shared_unloaded: bool  # whether the loads of a pose share one unloaded reading
+    Attributes:
+        scaling: "none", "gu" or "gc".
+        correlation: share ρ of each element's variance that is common to the elements.
+        unit: units that the deflections were written in.
+        shared_unloaded: whether the loads of a pose share one unloaded reading.
+        error_over_bound: root mean square over runs and parameters of the error of a parameter
+            in units of its bound, sqrt(F⁻¹_jj); 1 where the bound is attained.
+        error_over_bound_mc: of it.
+        coverage: share of the stated 95 % intervals that hold the true parameter.
+        coverage_mc: of it.
+        variance_factor: mean χ²/dof of the whitened residual; None for `none`, where it has
+            no meaning.
+        parameter_error_over_bound: (n,) the same per parameter.
+        parameter_coverage: (n,) the same per parameter.
+        unit_shift: largest change of any estimate in any run against the first unit, in
+            units of the bound.
+    """
+
+    scaling: Scaling
+    correlation: float
+    unit: str
+    shared_unloaded: bool
     error_over_bound: float
-    """root mean square over runs and parameters of the error of a parameter in units of its bound,
-    sqrt(F⁻¹_jj); 1 where the bound is attained."""
-    error_over_bound_mc: float  # of it
-    coverage: float  # share of the stated 95 % intervals that hold the true parameter
-    coverage_mc: float  # of it
+    error_over_bound_mc: float
+    coverage: float
+    coverage_mc: float
     variance_factor: float | None
-    """mean χ²/dof of the whitened residual; None for `none`, where it has no meaning."""
-    parameter_error_over_bound: tuple[float, ...]  # (n,) the same per parameter
-    parameter_coverage: tuple[float, ...]  # (n,) the same per parameter
+    parameter_error_over_bound: tuple[float, ...]
+    parameter_coverage: tuple[float, ...]
     unit_shift: float
-    """largest change of any estimate in any run against the first unit, in units of the bound."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -138,7 +138,7 @@ def test_wrong_readings_are_listed_and_the_others_fitted(tmp_path, capsys):
     for asked in (("identify",), ("refine",), ("identify", "--details"), ("refine", "--details")):
         words = ok(capsys, asked[0], run, "--readings", "absolute", *asked[1:]).out
         assert told in " ".join(words.split())
-        assert (f"  {names[0][0]}/{names[0][1]}: " in words) == ("--details" in command)
+        assert (f"  {names[0][0]}/{names[0][1]}: " in words) == ("--details" in asked)
 
 
 def test_what_is_set_aside_is_in_no_figure_of_the_fit(tmp_path, capsys):
