@@ -35,7 +35,8 @@ from tests.support.campaign_cases import STARVED
 from tests.support.foreign_tables import lines as table_of
 from tests.support.foreign_tables import write
 from tests.support.screen import AtTerminal
-from tests.unit.calibration.test_base import by_pinocchio, by_ur, flanges, pose, seen
+from tests.unit.calibration.other_eyes import by_pinocchio, flanges, urdf_model
+from tests.unit.calibration.test_base import by_ur, pose, seen
 
 pytestmark = pytest.mark.slow
 HIDDEN, SEED, POSES, RUN = "link_geometry", 5, 20, "rehearsal.hilcal"
@@ -283,7 +284,7 @@ def test_every_export_puts_the_arm_where_the_tracker_finds_it(day):
     wanted, found = seen(stiff, states, base), c.predict(states.q)
     urdf, ur = (day.home / "a.urdf").read_text(), (day.home / "a.yaml").read_text()
     exported = {
-        "URDF": by_pinocchio(urdf, states.q) @ tool,
+        "URDF": by_pinocchio(urdf_model(urdf), states.q) @ tool,
         "DH": flanges(load_arm(str(day.home / "a.toml")), states.q) @ tool,
         "UR": by_ur(ur, states.q) @ pose(told["tcp_for_ur_kinematics"]),
     }
