@@ -25,6 +25,7 @@ from typing import Literal
 import numpy as np
 from scipy.stats import beta, binom, chi2
 
+from hilcal.errors import CannotAnswerError
 from hilcal.identification.gauss_newton import Solution
 from hilcal.identification.least_trimmed_squares import (
     MISFIT,
@@ -382,10 +383,14 @@ def site_columns(model: Model, theta: Floats, prediction: Prediction, readings: 
         for axis in np.moveaxis(p.situation.chain.rotation[-1], 2, 0):
             wrench = states.wrench.copy()
             wrench[:, part] += axis
-            o = model.predict(replace(states, wrench=wrench), theta, p).observation
+            try:
+                o = model.predict(replace(states, wrench=wrench), theta, p).observation
+            except CannotAnswerError:  # parameters so large that more load has no equilibrium
+                continue
             turn = se3.rotation_vector(o.rotation @ at.rotation.swapaxes(1, 2))
             sensor.append(np.concatenate([o.position - at.position, turn], axis=1)[:, :m])
-    return np.concatenate([*turns, np.stack(sensor, axis=2)], axis=2)
+    columns = [*turns, *(column[:, :, None] for column in sensor)]
+    return np.concatenate(columns, axis=2)
 
 
 def along_one_site(shift: Floats, columns: Floats, pose: Ints) -> Bools:
