@@ -222,7 +222,11 @@ def test_the_force_sensor_streams_without_a_loss(force: ForceSensorDevice) -> No
     after = force.losses()
     assert sample.frames > 20
     assert after.frames - before.frames >= sample.frames - 2
-    assert (after.lost, after.corrupt) == (before.lost, before.corrupt)
+    assert after.corrupt == before.corrupt
+    end = time.monotonic() + PATIENCE
+    while force.losses().lost > before.lost and time.monotonic() < end:
+        time.sleep(0.05)  # by arrival, a frame that is late counts as lost until it has come
+    assert force.losses().lost <= before.lost
     assert np.isfinite(sample.wrench).all()
     assert np.linalg.eigvalsh(sample.covariance).min() >= -1e-12
     newest = force.latest()
