@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.sim_serial_cases import force_sensor
+from tests.support.instruments import force_sensor
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -3,10 +3,13 @@
 import csv
 import io
 import json
+import sqlite3
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import hilcal as hc
@@ -20,6 +23,8 @@ from hilcal.store.plan import Plan, Step
 from hilcal.store.procedure_log import ProcedureLog
 from hilcal.store.run_log import RunLog, create_run
 from hilcal.tables.table import write_table
+from tests.fuzz.damage import document_damaged
+from tests.fuzz.harness import Make, Parser
 from tests.support.campaigns import campaign, configuration
 
 EVENTS: dict[str, dict[str, Any]] = {
@@ -66,20 +71,32 @@ class Bench:
         return list(csv.reader(io.StringIO(self.table.decode())))
 
     @cached_property
-    def run(self) -> bytes:
-        path = self.folder / "sound.hilcal"
+    def documents(self) -> dict[str, str]:
+        """What belongs to `run`, as text."""
+        path, saved = self.folder / "sound.hilcal", self.folder / "sound.json"
         with CampaignFile.create(
             path, configuration().to_json(), str(self.folder), "fuzz", overwrite=True
         ) as file:
             file.append_readings(self.readings)
         with Campaign.open(path) as run:
-            found = hc.fit(hc.baseline(run.cell, run.readings), run.readings)
-            run.append(found)
-            self.calibration = self.folder / "sound.json"
-            run.calibration().save(self.calibration)
-            self.posterior = json.dumps(run.posterior().to_json())
-            self.parameters = json.dumps(parameters_document.to_json(found, {"x": 1}))
-        return path.read_bytes()
+            fit = hc.fit(hc.baseline(run.cell, run.readings), run.readings)
+            run.append(fit)
+            run.calibration().save(saved)
+            posterior = json.dumps(run.posterior().to_json())
+        with closing(sqlite3.connect(path)) as db:
+            revision = db.execute("SELECT content FROM revisions").fetchone()[0]
+        return {
+            "calibration": saved.read_text(),
+            "posterior": posterior,
+            "parameters": json.dumps(parameters_document.to_json(fit, {"x": 1})),
+            "revision": str(revision),
+        }
+
+    @cached_property
+    def run(self) -> bytes:
+        """A campaign with one fit."""
+        assert self.documents
+        return (self.folder / "sound.hilcal").read_bytes()
 
     @cached_property
     def measured(self) -> bytes:
@@ -115,16 +132,38 @@ class Bench:
         return Plan(("a", "b"), q, steps).to_json()
 
     def path(self, name: str, data: bytes) -> Path:
+        """Write a file; a journal beside it, of the input before, goes."""
         path = self.folder / name
+        path.with_name(f"{name}-journal").unlink(missing_ok=True)
         path.write_bytes(data)
         return path
 
-    def of_run(self, name: str) -> Callable[[], str]:
-        """Return what gives the text of a document that belongs to `run`."""
+    def reader(
+        self,
+        name: str,
+        file: str,
+        make: Make,
+        read: Callable[[Path], object],
+        limit_s: float = 2.0,
+    ) -> Parser:
+        """Return the parser of a file, which is written where others may lie beside it."""
 
-        def text() -> str:
-            assert self.run
-            found = getattr(self, name)
-            return found.read_text() if isinstance(found, Path) else str(found)
+        def parse(data: bytes) -> bool:
+            read(self.path(file, data))
+            return True
 
-        return text
+        return Parser(name, make, parse, limit_s)
+
+    def document(
+        self,
+        name: str,
+        text: Callable[[], str],
+        read: Callable[[Path], object],
+        limit_s: float = 2.0,
+    ) -> Parser:
+        """Return the parser of a JSON document, which is made when it is first needed."""
+
+        def make(by: Random) -> bytes:
+            return document_damaged(text(), by)
+
+        return self.reader(name, f"{name}.json", make, read, limit_s)

@@ -81,6 +81,18 @@ def words_damaged(text: str, rng: Random) -> str:
     return text
 
 
+def text_damaged(
+    text: str, rng: Random, *, by_words: bool = False, encoding: str = "utf-8"
+) -> bytes:
+    """Bytes of a text damaged, or its lines; `by_words`, each word counts as a line."""
+    if rng.random() < 0.4:
+        return bytes_damaged(text.encode(encoding), rng)
+    if not by_words:
+        return words_damaged(text, rng).encode(encoding, "replace")
+    damaged = words_damaged(text.replace(" ", "\n"), rng)
+    return damaged.replace("\n", " ").encode(encoding, "replace")
+
+
 def _place(root: list[Any], rng: Random) -> tuple[Any, Any]:
     """A (container, key) in a document, each depth as likely as the others."""
     holder: Any = root

@@ -1,7 +1,9 @@
 """Parsers of files, given damaged ones."""
 
+import atexit
 import csv
 import io
+import os
 import shutil
 import tempfile
 from collections.abc import Callable
@@ -27,8 +29,8 @@ from hilcal.tables.importing import import_readings
 from hilcal.tables.mapping import Mapping, load_mapping
 from tests.fuzz import stored
 from tests.fuzz.bench import CELL, Bench
-from tests.fuzz.damage import NUMBERS, bytes_damaged, document_damaged, toml_damaged, words_damaged
-from tests.fuzz.harness import MEMORY_DISK, Accepted, Parser
+from tests.fuzz.damage import NUMBERS, bytes_damaged, text_damaged, toml_damaged, words_damaged
+from tests.fuzz.harness import Accepted, Make, Parser
 from tests.fuzz.packed import packed
 from tests.support.campaigns import configuration
 from tests.support.description_files import MJCF, SDF
@@ -103,18 +105,14 @@ def _table(bench: Bench) -> Parser:
     arm = load_arm(config.robot.model)
 
     def make(by: Random) -> bytes:
-        kind = by.random()
-        if kind < 0.3:
-            return bytes_damaged(bench.table, by)
-        if kind < 0.5:
-            return words_damaged(bench.table.decode(), by).encode("utf-8", "replace")
+        if by.random() < 0.5:
+            return text_damaged(bench.table.decode(), by)
         return _csv(_cell_damaged(bench.rows, by))
 
-    def parse(data: bytes) -> bool:
-        _plain(import_readings(bench.path("t.csv", data), "table", config, arm).readings)
-        return True
+    def read(path: Path) -> None:
+        _plain(import_readings(path, "table", config, arm).readings)
 
-    return Parser("table", make, parse)
+    return bench.reader("table", "t.csv", make, read)
 
 
 def _points(bench: Bench) -> Parser:
@@ -126,199 +124,144 @@ def _points(bench: Bench) -> Parser:
         data = _csv(_cell_damaged(rows, by))
         return bytes_damaged(data, by) if by.random() < 0.3 else data
 
-    def parse(data: bytes) -> bool:
-        found = read_points(bench.path("p.csv", data), arm, {"none": np.zeros(6)})
-        if np.any(np.isinf(found.q)) or np.abs(np.nan_to_num(found.q)).max() > 1e3:
+    def read(path: Path) -> None:
+        q = read_points(path, arm, {"none": np.zeros(6)}).q
+        if np.any(np.isinf(q)) or np.abs(np.nan_to_num(q)).max() > 1e3:
             raise Accepted("points: joints that cannot be")
-        return True
 
-    return Parser("points", make, parse)
-
-
-def _chain(bench: Bench) -> Parser:
-    """A damaged table all the way: import, registration, fit, diagnosis."""
-    cell = hc.Cell.load(CELL)
-
-    def make(by: Random) -> bytes:
-        return _csv(_cell_damaged(bench.rows, by))
-
-    def parse(data: bytes) -> bool:
-        readings = hc.read_table(bench.path("t.csv", data), cell)
-        found = hc.fit(hc.baseline(cell, readings), readings)
-        hc.diagnose(found)
-        return True
-
-    return Parser("chain", make, parse, limit_s=120.0)
+    return bench.reader("points", "p.csv", make, read)
 
 
-def _cell_chain(bench: Bench) -> Parser:
-    """A sound table in a damaged cell, all the way."""
-    text = CELL.read_text()
+def _diagnosed(cell: hc.Cell, readings: hc.Readings) -> None:
+    """Go all the way: registration, fit, diagnosis."""
+    hc.diagnose(hc.fit(hc.baseline(cell, readings), readings))
 
-    def make(by: Random) -> bytes:
+
+def _chains(bench: Bench, damaged_campaign: Make) -> list[Parser]:
+    """A damaged table, a damaged cell or a damaged campaign, all the way."""
+    cell, text = hc.Cell.load(CELL), CELL.read_text()
+
+    def table(path: Path) -> None:
+        _diagnosed(cell, hc.read_table(path, cell))
+
+    def of_cell(path: Path) -> None:
+        damaged = hc.Cell.load(path)
+        _diagnosed(damaged, hc.read_table(bench.path("s.csv", bench.table), damaged))
+
+    def campaign(path: Path) -> None:
+        with Campaign.open(path) as run:
+            _diagnosed(run.cell, run.readings)
+
+    def words(by: Random) -> bytes:
         return words_damaged(text, by).encode("utf-8", "replace")
 
-    def parse(data: bytes) -> bool:
-        cell = hc.Cell.load(bench.path("chain.toml", data))
-        readings = hc.read_table(bench.path("s.csv", bench.table), cell)
-        hc.diagnose(hc.fit(hc.baseline(cell, readings), readings))
-        return True
+    def cells(by: Random) -> bytes:
+        return _csv(_cell_damaged(bench.rows, by))
 
-    return Parser("cell_chain", make, parse, limit_s=120.0)
-
-
-def _campaign_chain(bench: Bench, damaged: Parser) -> Parser:
-    """A damaged campaign, all the way."""
-
-    def parse(data: bytes) -> bool:
-        path = bench.path("chain.hilcal", data)
-        path.with_name("chain.hilcal-journal").unlink(missing_ok=True)
-        with Campaign.open(path) as run:
-            hc.diagnose(hc.fit(hc.baseline(run.cell, run.readings), run.readings))
-        return True
-
-    return Parser("campaign_chain", damaged.make, parse, limit_s=120.0)
+    return [
+        bench.reader("chain", "chain.csv", cells, table, 120.0),
+        bench.reader("cell_chain", "chain.toml", words, of_cell, 120.0),
+        bench.reader("campaign_chain", "chain.hilcal", damaged_campaign, campaign, 120.0),
+    ]
 
 
 def _toml(bench: Bench, name: str, folder: str, read: Callable[[Path], object]) -> Parser:
     texts = [p.read_text() for p in sorted((configs_dir() / folder).glob("*.toml"))]
-
-    def make(by: Random) -> bytes:
-        return toml_damaged(by.choice(texts), by)
-
-    def parse(data: bytes) -> bool:
-        read(bench.path(f"{name}.toml", data))
-        return True
-
-    return Parser(name, make, parse)
+    return bench.reader(name, f"{name}.toml", lambda by: toml_damaged(by.choice(texts), by), read)
 
 
-def _factory(bench: Bench) -> Parser:
+def _factory(bench: Bench) -> list[Parser]:
     """Kinematics of one arm, in each of the three forms."""
     nominal, made = load_arm("ur5e"), factory_of("ur5e")
     deltas = made.rows - nominal_rows(nominal)
     keys = ("delta_theta", "delta_a", "delta_d", "delta_alpha")
     conf = "".join(f"{k} = {v}\n" for k, v in zip(keys, deltas.tolist(), strict=True))
-    texts = [(".yaml", UR5E_YAML), (".conf", f"[mounting]\n{conf}"), (".toml", made.to_toml())]
+    texts = {".yaml": UR5E_YAML, ".conf": f"[mounting]\n{conf}", ".toml": made.to_toml()}
 
-    def make(by: Random) -> bytes:
-        k = by.randrange(len(texts))
-        return bytes([k]) + bytes_damaged(texts[k][1].encode(), by)
-
-    def parse(data: bytes) -> bool:
-        path = bench.path(f"factory{texts[data[0] % len(texts)][0]}", data[1:])
+    def read(path: Path) -> None:
         arm = with_factory(nominal, read_factory(path, nominal))
         if not np.isfinite(arm.links).all():
             raise Accepted("factory: transforms that are no numbers")
-        return True
 
-    return Parser("factory", make, parse)
+    def parser(name: str, text: bytes) -> Parser:
+        return bench.reader(name, name, lambda by: bytes_damaged(text, by), read)
 
-
-def _document(
-    bench: Bench, name: str, sound: Callable[[], str], read: Callable[[Path], object]
-) -> Parser:
-    kept: list[str] = []
-
-    def make(by: Random) -> bytes:
-        if not kept:
-            kept.append(sound())
-        return document_damaged(kept[0], by)
-
-    def parse(data: bytes) -> bool:
-        read(bench.path(f"{name}.json", data))
-        return True
-
-    return Parser(name, make, parse)
+    return [parser(f"factory{suffix}", text.encode()) for suffix, text in texts.items()]
 
 
 def _urdf(bench: Bench) -> Parser:
     text = urdf(load_arm("ur10e"))
 
-    def make(by: Random) -> bytes:
-        if by.random() < 0.3:
-            return bytes_damaged(text.encode(), by)
-        return words_damaged(text.replace(" ", "\n"), by).replace("\n", " ").encode(
-            "utf-8", "replace"
-        )  # fmt: skip
-
-    def parse(data: bytes) -> bool:
-        arm = arm_from_urdf(bench.path("a.urdf", data))
+    def read(path: Path) -> None:
+        arm = arm_from_urdf(path)
         if not np.all(np.isfinite(arm.q_min)) or not arm.n:
             raise Accepted("urdf: an arm that cannot be")
-        return True
 
-    return Parser("urdf", make, parse)
-
-
-def _text_damaged(data: bytes, by: Random) -> bytes:
-    """A program or description with bytes or words changed."""
-    if by.random() < 0.5:
-        return bytes_damaged(data, by)
-    text = words_damaged(data.decode("latin-1").replace(" ", "\n"), by)
-    return text.replace("\n", " ").encode("latin-1", "replace")
+    return bench.reader("urdf", "a.urdf", lambda by: text_damaged(text, by, by_words=True), read)
 
 
 def _maker_program(bench: Bench, maker: str, name: str, frames: str | None) -> Parser:
     """A program of another maker than UR, read and written."""
-    arm, data = maker_arm(maker, bench.folder), (EXAMPLES / name).read_bytes()
+    arm, text = maker_arm(maker, bench.folder), (EXAMPLES / name).read_bytes().decode("latin-1")
     if maker == "krl":
         bench.path("weld.dat", (EXAMPLES / "weld.dat").read_bytes())
 
-    def parse(content: bytes) -> bool:
-        path = bench.path(name, content)
+    def make(by: Random) -> bytes:
+        return text_damaged(text, by, by_words=True, encoding="latin-1")
+
+    def read(path: Path) -> None:
         given = None if frames is None else EXAMPLES / frames
-        found = understood(path, arm, frames=given, leave=True)
-        if not np.all(np.isfinite(found.q)):
+        program = understood(path, arm, frames=given, leave=True)
+        if not np.all(np.isfinite(program.q)):
             raise Accepted(f"{maker}: points that are nowhere")
-        if any(path.with_suffix(s).read_bytes() != c for s, c in found.corrected(found.q).items()):
+        corrected = program.corrected(program.q)
+        if any(path.with_suffix(s).read_bytes() != content for s, content in corrected.items()):
             raise Accepted(f"{maker}: text that changed without a correction")
-        return True
 
-    return Parser(maker, lambda by: _text_damaged(data, by), parse, limit_s=10.0)
+    return bench.reader(maker, name, make, read, 10.0)
 
 
-def _own_file(bench: Bench, name: str, text: str, ends: tuple[str, str]) -> Parser:
-    """A description that an arm is written into."""
+def _own_files(bench: Bench) -> list[Parser]:
+    """Descriptions that an arm is written into."""
     arm = maker_arm("krl", bench.folder)
     links = arm.links.copy()
     links[2, :3, 3] += 1e-4
     new = Corrected(replace(arm, links=links), (), ())
 
-    def parse(content: bytes) -> bool:
-        correct_file(bench.path(name, content), arm, new, *ends)
-        return True
+    def parser(name: str, text: str, base: str, tip: str) -> Parser:
+        def make(by: Random) -> bytes:
+            return text_damaged(text, by, by_words=True)
 
-    return Parser(name, lambda by: _text_damaged(text.encode(), by), parse)
+        return bench.reader(name, name, make, lambda path: correct_file(path, arm, new, base, tip))
+
+    return [
+        parser("own.urdf", urdf_of("krl"), "base_link", "tool0"),
+        parser("own.xml", MJCF, "base", "flange"),
+        parser("own.sdf", SDF, "base", "tool0"),
+    ]
 
 
 def _campaign_fit(bench: Bench) -> Parser:
     """A damaged campaign, and its fit."""
     work = bench.folder / "mended.hilcal"
 
-    def make(by: Random) -> bytes:
-        return stored.mended(bench.run, work, by)
-
-    def parse(data: bytes) -> bool:
-        path = bench.path("c.hilcal", data)
-        path.with_name("c.hilcal-journal").unlink(missing_ok=True)
+    def read(path: Path) -> None:
         with Campaign.open(path) as run:
             _plain(run.readings)
             if run.latest() is not None:
                 run.calibration()
-        return True
 
-    return Parser("campaign_fit", make, parse, limit_s=20.0)
+    def make(by: Random) -> bytes:
+        return stored.mended(bench.run, work, by)
+
+    return bench.reader("campaign_fit", "c.hilcal", make, read, 20.0)
 
 
 def parsers() -> list[Parser]:
-    """All of them."""
-    folder = Path(tempfile.mkdtemp(prefix="hilcal-fuzz-", dir=MEMORY_DISK))
-    import atexit
-
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    bench = Bench(folder)
-
+    """All of them; SQLite waits for the disk at every commit, but not where files are in memory."""
+    memory = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
+    bench = Bench(Path(tempfile.mkdtemp(prefix="hilcal-fuzz-", dir=memory)))
+    atexit.register(shutil.rmtree, bench.folder, ignore_errors=True)
     campaigns = _campaign_fit(bench)
     return [
         _table(bench),
@@ -327,26 +270,23 @@ def parsers() -> list[Parser]:
         _toml(bench, "mapping", "mappings", lambda p: load_mapping(p, Mapping)),
         _toml(bench, "cell", "cells", hc.Cell.load),
         _toml(bench, "arm", "robots", arm_from_dh),
-        _document(
-            bench,
+        bench.document(
             "config",
             configuration().to_json,
             lambda p: CellConfig.from_json(p.read_text(errors="replace")),
         ),
-        _document(bench, "plan", lambda: bench.plan, load_plan),
-        _document(bench, "parameters", bench.of_run("parameters"), parameters_document.read),
-        _factory(bench),
+        bench.document("plan", lambda: bench.plan, load_plan),
+        bench.document(
+            "parameters", lambda: bench.documents["parameters"], parameters_document.read
+        ),
+        *_factory(bench),
         _urdf(bench),
         _maker_program(bench, "krl", "weld.src", "config.dat"),
         _maker_program(bench, "rapid", "weld.mod", None),
         _maker_program(bench, "fanuc", "weld.ls", "fanuc.toml"),
         _maker_program(bench, "inform", "weld.jbi", "yaskawa.toml"),
-        _own_file(bench, "own.urdf", urdf_of("krl"), ("base_link", "tool0")),
-        _own_file(bench, "own.xml", MJCF, ("base", "flange")),
-        _own_file(bench, "own.sdf", SDF, ("base", "tool0")),
+        *_own_files(bench),
         campaigns,
         *stored.parsers(bench),
-        _chain(bench),
-        _cell_chain(bench),
-        _campaign_chain(bench, campaigns),
+        *_chains(bench, campaigns.make),
     ]

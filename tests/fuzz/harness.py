@@ -7,7 +7,6 @@ check raises `Accepted`). An input of a finding is kept as a file, which `--repl
 
 import gc
 import hashlib
-import os
 import re
 import resource
 import signal
@@ -28,10 +27,6 @@ MEMORY = 3 << 30
 """Address space beyond what the process has, bytes; a choice: a table of readings needs little."""
 
 
-MEMORY_DISK = next((d for d in ("/dev/shm",) if os.access(d, os.W_OK)), None)
-"""SQLite waits for the disk at every commit; a file in memory does not."""
-
-
 class Accepted(AssertionError):
     """A damaged reading passed for a sound one."""
 
@@ -44,12 +39,16 @@ class Hung(BaseException):
     """An input took longer than the limit."""
 
 
+Make = Callable[[Random], bytes]
+"""Returns a damaged input."""
+
+
 @dataclass(frozen=True, slots=True)
 class Parser:
     """What is tried."""
 
     name: str  # on the command line
-    make: Callable[[Random], bytes]  # returns a damaged input
+    make: Make
     parse: Callable[[bytes], bool]
     limit_s: float = 2.0  # processor time that one input may take
     refusals: tuple[type[Exception], ...] = ()
@@ -69,26 +68,18 @@ class Outcome:
     stopped: bool = False  # whether it was told to end before
 
 
-def fuzz(
-    parser: Parser, inputs: int, seed: int, keep: Path | None = None, seconds: float = float("inf")
-) -> Outcome:
-    """Give a parser so many damaged inputs, or as many as there is processor time for."""
+def fuzz(parser: Parser, inputs: int, seed: int, keep: Path | None = None) -> Outcome:
+    """Give a parser so many damaged inputs; Ctrl-C ends it before."""
     out = Outcome()
-    end = time.process_time() + seconds
-
-    def stop(*_: object) -> None:
-        out.stopped = True
-
-    with limited(), handled(signal.SIGINT, stop), warnings.catch_warnings():
+    with limited(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        batch = 0
-        while out.inputs < inputs and time.process_time() < end and not out.stopped:
-            rng = Random(f"{parser.name}/{seed}/{batch}")
-            for _ in range(min(BATCH, inputs - out.inputs)):
+        try:
+            for k in range(inputs):
+                if k % BATCH == 0:
+                    rng = Random(f"{parser.name}/{seed}/{k // BATCH}")
                 _one(parser, parser.make(rng), out, keep)
-                if out.stopped:
-                    break
-            batch += 1
+        except KeyboardInterrupt:
+            out.stopped = True
     return out
 
 
@@ -148,22 +139,13 @@ def limited() -> Iterator[None]:
     def hung(*_: object) -> None:
         raise Hung
 
-    limits = resource.getrlimit(resource.RLIMIT_AS)
+    limits, handler = resource.getrlimit(resource.RLIMIT_AS), signal.getsignal(signal.SIGPROF)
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     most = pages * resource.getpagesize() + MEMORY
     resource.setrlimit(resource.RLIMIT_AS, (most, limits[1]))
-    try:
-        with handled(signal.SIGPROF, hung):
-            yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_AS, limits)
-
-
-@contextmanager
-def handled(number: signal.Signals, handler: Callable[..., None]) -> Iterator[None]:
-    """Give a signal another handler for a while."""
-    before = signal.signal(number, handler)
+    signal.signal(signal.SIGPROF, hung)
     try:
         yield
     finally:
-        signal.signal(number, before)
+        signal.signal(signal.SIGPROF, handler)
+        resource.setrlimit(resource.RLIMIT_AS, limits)

@@ -31,7 +31,7 @@ from hilcal.tables.propose import propose
 from hilcal.tables.write import revision_table
 from hilcal.transfer.members import LIST, entries
 from tests.fuzz.bench import Bench
-from tests.fuzz.damage import NUMBERS, bytes_damaged, document_damaged, words_damaged
+from tests.fuzz.damage import NUMBERS, bytes_damaged, document_damaged, text_damaged
 from tests.fuzz.harness import Accepted, Parser
 from tests.support.unguarded import unguarded
 
@@ -154,45 +154,13 @@ def _campaigns(bench: Bench, name: str, sound: Callable[[], bytes]) -> Parser:
         data = sound()
         return mended(data, work, by) if by.random() < 0.7 else bytes_damaged(data, by)
 
-    def parse(data: bytes) -> bool:
-        path = bench.path(f"{name}.hilcal", data)
-        path.with_name(f"{path.name}-journal").unlink(missing_ok=True)
+    def read(path: Path) -> None:
         with CampaignFile.open(path) as file:
             _told(file)
         if name == "measured":
             next_step(path)
-        return True
 
-    return Parser(name, make, parse, limit_s=20.0)
-
-
-def _text(
-    bench: Bench,
-    name: str,
-    sound: Callable[[], str],
-    damaged: Callable[[str, Random], bytes],
-    use: Callable[[Path], object],
-    suffix: str,
-) -> Parser:
-    kept: list[str] = []
-
-    def make(by: Random) -> bytes:
-        if not kept:
-            kept.append(sound())
-        return damaged(kept[0], by)
-
-    def parse(data: bytes) -> bool:
-        use(bench.path(f"{name}{suffix}", data))
-        return True
-
-    return Parser(name, make, parse, limit_s=10.0)
-
-
-def _damaged_text(text: str, by: Random) -> bytes:
-    """Bytes, or numbers and words of a text changed."""
-    if by.random() < 0.4:
-        return bytes_damaged(text.encode(), by)
-    return words_damaged(text, by).encode("utf-8", "replace")
+    return bench.reader(name, f"{name}.hilcal", make, read, 20.0)
 
 
 def _program(path: Path) -> None:
@@ -244,30 +212,15 @@ def _compensated(path: Path) -> None:
             found.compensate(q, wrench)
 
 
-def _carried(bench: Bench) -> Callable[[Path], None]:
-    arm = load_arm("ur10e")
-
-    def use(path: Path) -> None:
-        prior = carried_prior(posterior_document.read(path))
-        check_arm(prior, arm)
-        found = prior.posterior
-        prior.index_in(found.names)
-        if prior.unit.shape != found.mean.shape or prior.group.shape != found.mean.shape:
-            raise Accepted("prior: arrays of other lengths")
-        if not all(np.all(np.isfinite(a)) for a in (found.mean, found.scale, found.prints)):
-            raise Accepted("prior: numbers that are not finite")
-
-    return use
-
-
-def _preview(bench: Bench) -> Parser:
-    def make(by: Random) -> bytes:
-        return _damaged_text(bench.table.decode(), by)
-
-    def parse(data: bytes) -> bool:
-        return len(propose(bench.path("p.csv", data)).grid.rows) > 0
-
-    return Parser("preview", make, parse, limit_s=10.0)
+def _carried(path: Path) -> None:
+    prior = carried_prior(posterior_document.read(path))
+    check_arm(prior, load_arm("ur10e"))
+    found = prior.posterior
+    prior.index_in(found.names)
+    if prior.unit.shape != found.mean.shape or prior.group.shape != found.mean.shape:
+        raise Accepted("prior: arrays of other lengths")
+    if not all(np.all(np.isfinite(a)) for a in (found.mean, found.scale, found.prints)):
+        raise Accepted("prior: numbers that are not finite")
 
 
 def _stream(bench: Bench) -> Parser:
@@ -282,44 +235,42 @@ def _stream(bench: Bench) -> Parser:
     pq.write_table(pa.table(columns), out)
     sound = out.getvalue()
 
-    def parse(data: bytes) -> bool:
-        found = open_stream(bench.path("s.parquet", data), arm, None, None)
-        for group in range(len(found.rows)):
-            for readings in found.chunks(group):
+    def read(path: Path) -> None:
+        stream = open_stream(path, arm, None, None)
+        for group in range(len(stream.rows)):
+            for readings in stream.chunks(group):
                 if not np.all(np.isfinite(readings.value)):
                     raise Accepted("stream: readings that are not finite")
-        return True
 
-    return Parser("stream", lambda by: bytes_damaged(sound, by), parse)
+    return bench.reader("stream", "s.parquet", lambda by: bytes_damaged(sound, by), read)
 
 
 def parsers(bench: Bench) -> list[Parser]:
     """All of them."""
 
-    of_run = bench.of_run
+    def text(
+        name: str, file: str, sound: Callable[[], str], read: Callable[[Path], object]
+    ) -> Parser:
+        return bench.reader(name, file, lambda by: text_damaged(sound(), by), read, 10.0)
 
-    def stored_revision() -> str:
-        path = bench.path("of.hilcal", bench.run)
-        with closing(sqlite3.connect(path)) as db:
-            return str(db.execute("SELECT content FROM revisions").fetchone()[0])
-
-    effect = Path(str(template.__file__)).read_text()
+    effect = Path(str(template.__file__)).read_bytes()
     listed = "campaign,arm,date\na.hilcal,one,2026-03-31\n"
     return [
         _campaigns(bench, "campaign", lambda: bench.run),
         _campaigns(bench, "measured", lambda: bench.measured),
-        _text(bench, "program", lambda: PROGRAM, _damaged_text, _program, ".script"),
-        _text(bench, "program_left", lambda: LEFT, _damaged_text, _program, ".script"),
-        _text(bench, "fleet", lambda: listed, _damaged_text, _fleet, ".csv"),
-        _text(
-            bench, "discovered", lambda: effect, lambda s, by: bytes_damaged(s.encode(), by),
-            lambda p: installed().with_file(p), ".py",
+        text("program", "p.script", lambda: PROGRAM, _program),
+        text("program_left", "p.script", lambda: LEFT, _program),
+        text("fleet", "fleet.csv", lambda: listed, _fleet),
+        text("preview", "preview.csv", lambda: bench.table.decode(), propose),
+        bench.reader(
+            "discovered",
+            "discovered.py",
+            lambda by: bytes_damaged(effect, by),
+            lambda path: installed().with_file(path),
+            10.0,
         ),
-        _text(bench, "revision", stored_revision, document_damaged, _revision, ".json"),
-        _text(
-            bench, "calibration", of_run("calibration"), document_damaged, _compensated, ".json"
-        ),
-        _text(bench, "posterior", of_run("posterior"), document_damaged, _carried(bench), ".json"),
-        _preview(bench),
+        bench.document("revision", lambda: bench.documents["revision"], _revision, 10.0),
+        bench.document("calibration", lambda: bench.documents["calibration"], _compensated, 10.0),
+        bench.document("posterior", lambda: bench.documents["posterior"], _carried, 10.0),
         _stream(bench),
-    ]  # fmt: skip
+    ]

@@ -6,12 +6,14 @@ reached and only what is physically possible may be accepted.
 """
 
 import math
+import socket
 import struct
 import time
 from collections.abc import Callable, Sequence
 from random import Random
 from types import SimpleNamespace
 from typing import Any
+from unittest import mock
 
 import minimalmodbus
 import numpy as np
@@ -23,7 +25,7 @@ from hilcal.drivers import bota, emscon, ft300, geocom, netft, onrobot_hex
 from hilcal.drivers import emscon_packets as es
 from hilcal.drivers import natnet_frames as nn
 from hilcal.drivers.emscon import EmsconConnection, EmsconTracker
-from hilcal.drivers.force_stream import RING, ForceStream, SensorFormat
+from hilcal.drivers.force_stream import RING, ForceStream
 from hilcal.drivers.geocom import GeoComOptions, GeoComTracker, Link
 from hilcal.drivers.natnet import NatNetTracker
 from hilcal.drivers.simulated.natnet_server import BODY, Cameras
@@ -32,8 +34,90 @@ from hilcal.drivers.ur_link.lines import LinkError
 from hilcal.measuring.devices import Clock
 from tests.fuzz.damage import NUMBERS, bytes_damaged
 from tests.fuzz.harness import Accepted, Parser, passed
-from tests.fuzz.stand_ins import Port, Socket, Time, finite, instead
-from tests.support.geocom_cases import crc16_arc, line
+from tests.support.geocom_cases import crc16, line
+
+# --- what stands in for clocks, ports and sockets: it gives some bytes and never waits ---
+
+
+class Time:
+    """A clock that advances when it is read: deadlines pass without waiting."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def monotonic(self) -> float:
+        self.now += 1e-3
+        return self.now
+
+    def monotonic_ns(self) -> int:
+        return int(1e9 * self.monotonic())
+
+    def sleep(self, seconds: float) -> None:
+        self.now += max(0.0, seconds)
+
+
+class Port:
+    """A serial port that holds some bytes and then is silent."""
+
+    is_open, baudrate, timeout, port, in_waiting = True, 115200, 0.1, "fuzz", 0
+
+    def __init__(self) -> None:
+        self.held = b""
+
+    def read(self, count: int = 1) -> bytes:
+        out, self.held = self.held[:count], self.held[count:]
+        return out
+
+    def read_until(self, end: bytes) -> bytes:
+        out, sep, self.held = self.held.partition(end)
+        return out + sep
+
+    def write(self, data: bytes) -> int:
+        return len(data)
+
+    def open(self) -> None: ...
+    def close(self) -> None: ...
+    def flush(self) -> None: ...
+    def reset_input_buffer(self) -> None: ...
+    def reset_output_buffer(self) -> None: ...
+
+
+class Socket:
+    """A connection that gives some bytes in pieces and then closes."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+
+    def recv(self, count: int) -> bytes:
+        out, self._data = self._data[:count], self._data[count:]
+        return out
+
+    def settimeout(self, seconds: float) -> None: ...
+    def close(self) -> None: ...
+    def sendall(self, data: bytes) -> None: ...
+    def shutdown(self, how: int) -> None: ...
+    def __enter__(self) -> "Socket":
+        return self
+
+    def __exit__(self, *_: object) -> None: ...
+
+
+def network(data: bytes) -> Any:
+    """In place of the sockets of `ur_link.lines`: every connection gives these bytes."""
+    fake = SimpleNamespace(
+        create_connection=lambda *_, **__: Socket(data),
+        gaierror=socket.gaierror,
+        SHUT_WR=socket.SHUT_WR,
+    )
+    return mock.patch.object(lines, "socket", fake)
+
+
+def finite(rng: Random) -> float:
+    value = rng.choice(NUMBERS)
+    return float(value) if rng.random() < 0.5 else rng.uniform(-1e3, 1e3)
+
+
+# --- UR controllers ---
 
 
 def _rtde_frame(kind: str, body: bytes) -> bytes:
@@ -42,7 +126,7 @@ def _rtde_frame(kind: str, body: bytes) -> bytes:
 
 def rtde() -> Parser:
     names = reading.OUTPUTS
-    kinds = ",".join("VECTOR6D" for _ in names).encode()
+    kinds = ",".join(["VECTOR6D"] * len(names)).encode()
     version = _rtde_frame("V", b"\1")
     asked: list[tuple[bytes, Callable[[], object]]] = [
         (
@@ -77,7 +161,7 @@ def rtde() -> Parser:
         return bytes([k]) + bytes_damaged(corpus[k], by, corpus)
 
     def parse(data: bytes) -> bool:
-        with instead(lines, _network(data[1:])):
+        with network(data[1:]):
             asked[data[0] % len(asked)][1]()
         return True
 
@@ -105,7 +189,7 @@ def dashboard_server() -> Parser:
         return bytes([by.randrange(len(asked))]) + data
 
     def parse(data: bytes) -> bool:
-        with instead(lines, _network(data[1:])):
+        with network(data[1:]):
             asked[data[0] % len(asked)]()
         return True
 
@@ -124,7 +208,7 @@ def primary_port() -> Parser:
         return bytes_damaged(by.choice(corpus), by, corpus)
 
     def parse(data: bytes) -> bool:
-        with instead(lines, _network(data)):
+        with network(data):
             found = reading.read_kinematics("fuzz", 1.0)
         if not np.isfinite(found.links).all():
             raise Accepted("primary: transforms that are no numbers")
@@ -135,10 +219,9 @@ def primary_port() -> Parser:
 
 def packet() -> Parser:
     """What the receive worker passes on: a packet whose numbers the network may have changed."""
-    width = {"payload_cog": 3}
-    single = {"timestamp", "robot_mode", "runtime_state", "safety_status_bits", "speed_scaling",
-              "target_speed_fraction", "payload"}  # fmt: skip
-    size = {name: 1 if name in single else width.get(name, 6) for name in reading.OUTPUTS}
+    whole = {"robot_mode", "runtime_state", "safety_status_bits"}
+    single = whole | {"timestamp", "speed_scaling", "target_speed_fraction", "payload"}
+    size = {name: 1 if name in single else 6 for name in reading.OUTPUTS} | {"payload_cog": 3}
     layout = struct.Struct(f">{sum(size.values())}d")
     usual = [0.5] * sum(size.values())
 
@@ -153,12 +236,11 @@ def packet() -> Parser:
         values = list(struct.unpack(f">{len(data) // 8}d", data[: len(data) // 8 * 8]))
         fields: dict[str, Any] = {}
         for name, count in size.items():
-            taken, values = values[:count], values[count:]
-            whole = name in ("robot_mode", "runtime_state", "safety_status_bits")
-            one: Any = taken[0] if taken else 0.0
-            if whole:
+            several, values = values[:count], values[count:]
+            one: Any = several[0] if several else 0.0
+            if name in whole:
                 one = int(one) if math.isfinite(one) else 0
-            fields[name] = one if name in single else taken
+            fields[name] = one if name in single else several
         got = reading.read({"host_ns": 1, "fields": fields}).sample
         if np.abs(got.q).max() > 100.0 or np.abs(got.joint_temperature).max() > 200.0:
             raise Accepted("packet: joints or temperatures that cannot be")
@@ -167,23 +249,7 @@ def packet() -> Parser:
     return Parser("packet", make, parse, refusals=(reading.ReadingError,))
 
 
-def _network(data: bytes) -> dict[str, Any]:
-    import socket
-
-    fake = SimpleNamespace(
-        create_connection=lambda *_, **__: Socket(data),
-        gaierror=socket.gaierror,
-        SHUT_WR=socket.SHUT_WR,
-    )
-    return {"socket": fake}
-
-
 TARGET = np.array([0.5, 2.8, 0.4])
-
-
-class _Line(Socket):
-    def settimeout(self, seconds: float) -> None: ...
-    def close(self) -> None: ...
 
 
 def _emscon() -> Parser:
@@ -205,7 +271,7 @@ def _emscon() -> Parser:
     def parse(data: bytes) -> bool:
         line = EmsconConnection.__new__(EmsconConnection)
         line.where, line.changes, line.open = "fuzz", [], True
-        line._came, line._socket = bytearray(), _Line(data[1:])  # type: ignore[assignment]
+        line._came, line._socket = bytearray(), Socket(data[1:])  # type: ignore[assignment]
         tracker = EmsconTracker.__new__(EmsconTracker)
         target = "pose" if data[0] else "position"
         tracker._options = emscon.EmsconOptions(target=target)  # type: ignore[arg-type]
@@ -242,7 +308,7 @@ def _natnet() -> Parser:
         version = versions[data[0] % 4]
         tracker._server = nn.NatNetServer("fuzz", "1", version)
         if data[0] < 4:
-            bodies = tracker._next(_Line(data[1:]))  # type: ignore[arg-type]
+            bodies = tracker._next(Socket(data[1:]))  # type: ignore[arg-type]
             for body in bodies or ():
                 if not np.isfinite([*body.position, *body.quaternion]).all():
                     raise Accepted("natnet: a pose that cannot be")
@@ -271,28 +337,22 @@ def _page() -> Parser:
     return Parser("netft_page", make, parse)
 
 
-def network_parsers() -> list[Parser]:
-    """All of them."""
-    return [_emscon(), _natnet(), _page()]
-
-
 # --- frames of force sensors ---
 
-
-def _sums(name: str) -> tuple[SensorFormat, int]:
-    match name:
-        case "ft300":
-            return ft300.SENSOR, 0
-        case "bota":
-            return bota.SENSOR, 0
-        case _:
-            return onrobot_hex._sensor(50.0, 2000.0, 1000.0), 0
+SENSORS = {
+    "ft300": ft300.SENSOR,
+    "bota": bota.SENSOR,
+    "hex": onrobot_hex._sensor(50.0, 2000.0, 1000.0),
+}
 
 
 def _force(name: str) -> Parser:
-    sensor, _ = _sums(name)
+    sensor = SENSORS[name]
     form, unit = sensor.frame, sensor.unit
     rng = np.random.default_rng(1)
+
+    def framed(body: bytes) -> bytes:
+        return form.header + body + form.checksum(form.header + body)
 
     def frame(k: int, wrench: Sequence[float] | None = None, **more: Any) -> bytes:
         body = np.zeros(1, dtype=sensor.body)
@@ -302,11 +362,7 @@ def _force(name: str) -> Parser:
             for field, value in ({"ticks": k, "temperature": 25.0} | more).items():
                 if field in (sensor.body.names or ()):
                     body[field] = value
-        bare = form.header + body.tobytes()
-        return bare + form.checksum(bare)
-
-    def framed(body: bytes) -> bytes:
-        return form.header + body + form.checksum(form.header + body)
+        return framed(body.tobytes())
 
     streams = [[frame(1000 * (k + 1)) for k in range(4)] for _ in range(32)]
     head = len(form.header)
@@ -378,15 +434,18 @@ def _force(name: str) -> Parser:
 
 def _geocom() -> Parser:
     rng = np.random.default_rng(2)
-    virtual = Time()
-    quiet: dict[str, Any] = {"drain": lambda *_: True, "time": virtual}
+
+    def quiet() -> Any:
+        return mock.patch.multiple(geocom, drain=lambda *_: True, time=clock)
+
+    clock = Time()
     port = Port()
     link = Link.__new__(Link)
     link._path, link._baud, link._port = "fuzz", 115200, port  # type: ignore[assignment]
     link._connection = geocom._Connection(port)  # type: ignore[arg-type]
     link._instrument = GeoCom.__new__(GeoCom)
     port.held = b"".join(line(f"%R1P,0,{k}", body) for k, body in enumerate(("0", "0,15", "0")))
-    with instead(geocom, quiet), instead(geo, {"sleep": lambda _: None}):
+    with quiet(), mock.patch.multiple(geo, sleep=lambda _: None):
         GeoCom.__init__(link._instrument, link._connection, attempts=1, checksum=True)
     config = Tracker(driver="geocom", port="fuzz")
     tracker = GeoComTracker(link, config, GeoComOptions(), Clock(1.0))
@@ -426,7 +485,7 @@ def _geocom() -> Parser:
             words = rest.rstrip(b"\r\n").split(b":", 1)
             bare = words[0].rsplit(b",", 1)[0].decode("latin-1")
             body = words[-1].decode("latin-1")
-            crc = crc16_arc(f"{bare}:{body}")
+            crc = crc16(f"{bare}:{body}".encode())
             mended = f"{bare},{crc}:{body}\r\n".encode("latin-1")
             return b"\1" + head + b"\r\n" + mended
         return b"\0" + damaged
@@ -435,7 +494,7 @@ def _geocom() -> Parser:
         port.held = data[1:]
         link._instrument.transaction_counter = 0
         tracker._full_known, tracker._last_ms = True, 0.0
-        with instead(geocom, quiet):
+        with quiet():
             sample = tracker.measure()
         distance = float(np.linalg.norm(sample.value))
         if not np.all(np.isfinite(sample.covariance)) or not 0.1 < distance < 101.0:
@@ -453,14 +512,12 @@ def _geocom() -> Parser:
 
 
 def _modbus() -> Parser:
-    virtual = Time()
-    port = Port()
+    port, clock = Port(), Time()
     registers = [struct.pack(">4H", *range(k, k + 4)) for k in range(1, 3000, 97)]
-    minimalmodbus_quiet = {"time": virtual}
 
     def answer(words: bytes, slave: int = 9, function: int = 3) -> bytes:
         bare = bytes([slave, function, len(words) % 256]) + words
-        return bare + modbus_crc(bare)
+        return bare + crc16(bare, 0xFFFF).to_bytes(2, "little")
 
     corpus = [answer(words) for words in registers]
     sound = {struct.unpack(">4H", words) for words in registers}
@@ -475,8 +532,8 @@ def _modbus() -> Parser:
     def parse(data: bytes) -> bool:
         port.held = data[1:]
         with (
-            instead(ft300, {"drain": lambda *_: True}),
-            instead(minimalmodbus, minimalmodbus_quiet),
+            mock.patch.multiple(ft300, drain=lambda *_: True),
+            mock.patch.object(minimalmodbus, "time", clock),
         ):
             got = ft300.read_registers(port, 9, 500, 4)  # type: ignore[arg-type]
         if len(got) != 4 or not all(0 <= word < 65536 for word in got):
@@ -488,25 +545,17 @@ def _modbus() -> Parser:
     return Parser("modbus", make, parse)
 
 
-def modbus_crc(data: bytes) -> bytes:
-    """Modbus over Serial Line V1.02, 6.2.2, bit by bit."""
-    crc = 0xFFFF
-    for byte in data:
-        crc ^= byte
-        for _ in range(8):
-            crc = crc >> 1 ^ (0xA001 if crc & 1 else 0)
-    return crc.to_bytes(2, "little")
-
-
 def parsers() -> list[Parser]:
     """All of them."""
     return [
-        *(_force(name) for name in ("ft300", "bota", "hex")),
+        *(_force(name) for name in SENSORS),
         _geocom(),
         _modbus(),
         rtde(),
         dashboard_server(),
         primary_port(),
         packet(),
-        *network_parsers(),
+        _emscon(),
+        _natnet(),
+        _page(),
     ]

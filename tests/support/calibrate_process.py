@@ -13,8 +13,8 @@ from hilcal.procedure.state import Files
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.run_log import RunLog
 from tests.support.campaign_cases import LOOK_S, still_running
+from tests.support.paths import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 CELL = """\
 [robot]
 model = "ur10e"

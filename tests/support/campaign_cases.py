@@ -31,7 +31,9 @@ from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan, Step
 from hilcal.store.run_log import RunLog
 from hilcal.types import Floats
+from tests.support.paths import ROOT
 from tests.support.spread_plan import spread_plan
+from tests.support.timing import wait_until
 
 DEADLINE = 60.0  # nothing here may take longer, s; far above what it takes
 HAND_S = 2.0
@@ -67,10 +69,6 @@ class Site:
         """Set the speed slider on the pendant; what runs goes on at that share of its speed."""
         self.ask("arm", "set", slider=share)
 
-    def now(self) -> float:
-        """Time as the simulated devices stamp it, s."""
-        return time.monotonic()
-
     def shorter(self, directory: Path, poses: int) -> "Site":
         """The same cell with a plan of fewer poses."""
         plan = spread_plan(self.cell, self.config, poses, np.random.default_rng(7), repeats=0)
@@ -93,20 +91,12 @@ class Site:
                 answers.append(stream.readline().strip())
         return answers
 
-    def until(self, what: Callable[[], bool]) -> None:
-        """Wait until something holds."""
-        end = time.monotonic() + DEADLINE
-        while not what():
-            assert time.monotonic() < end
-            time.sleep(0.02)
-
 
 @contextmanager
 def site(
     directory: Path,
     *,
-    clock: float = 20.0,
-    poses: int = 3,
+    poses: int,
     seed: int = 5,
     tracker: dict[str, Any] | None = None,
     force_sensor: dict[str, Any] | None = None,
@@ -115,7 +105,7 @@ def site(
     base_dir = configs_dir() / "cells"
     config = load_config(base_dir / "demo_ur10e.toml")
     changes = {
-        "simulation": config.simulation.model_copy(update={"clock": clock}),
+        "simulation": config.simulation.model_copy(update={"clock": 20.0}),
         "operator": config.operator.model_copy(update={"options": {"hand_s": HAND_S}}),
         "loads": config.loads[:2],
         "tracker": config.tracker.model_copy(update=tracker),
@@ -137,7 +127,6 @@ def site(
         )
 
 
-ROOT = Path(__file__).resolve().parents[2]
 BEGUN = "waiting for the operator to take everything off"
 """What a run says as soon as every device is there and ready."""
 TAKEN = re.compile(r"\d+/\d+ ")
@@ -307,35 +296,6 @@ Then = TypeVar("Then")
 Act = Callable[[Site], object]
 
 
-@pytest.fixture(scope="module")
-def cell(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[Site]:
-    """One simulated cell for a file, with a plan that is long enough for all of its runs."""
-    runs = sum(
-        item.path == request.path and "path" in getattr(item, "fixturenames", ())
-        for item in request.session.items
-    )
-    readings = 3 * runs // 2 + 5 + getattr(request.module, "MORE_READINGS", 0)
-    poses = -(-(readings - 4) // 3)  # with two loads, P poses are 3 P + 4 readings and some
-    with site(tmp_path_factory.mktemp("cell"), poses=poses) as made:
-        yield made
-
-
-@pytest.fixture(autouse=True)
-def nothing_goes_on(cell: Site) -> Iterator[None]:
-    """End what a test that failed has left running, and let the arm move at its full speed."""
-    yield
-    cell.end_runs()
-    cell.slider(1.0)
-
-
-@pytest.fixture(scope="module")
-def path(cell: Site) -> Path:
-    """The campaign that the tests of a file measure, one after the other."""
-    return cell.directory / "run.hilcal"
-
-
 @dataclass(frozen=True, slots=True)
 class Fault:
     """What happens in the middle of a run, what is said, and how it is put right."""
@@ -355,6 +315,11 @@ def act(device: str, op: str, **arguments: object) -> Act:
 
 def nothing(cell: Site) -> None:
     """Nothing has to be put right."""
+
+
+def switch(name: str, device: str, op: str, *says: str, fast: bool = False) -> Fault:
+    """A fault that is switched on and off."""
+    return Fault(name, act(device, op, on=True), act(device, op, on=False), says, fast=fast)
 
 
 def each(faults: tuple[Fault, ...]) -> pytest.MarkDecorator:
@@ -382,7 +347,7 @@ def meets(fault: Fault, cell: Site, path: Path, *, moving: bool) -> None:
     """Let a run meet a fault after its first reading, and check what the operator sees."""
     for left in reversed(range(TRIES)):
         run, goal = begin(cell, path, Run.moving if moving else Run.measuring)
-        since = cell.now()
+        since = time.monotonic()
         try:
             fault.do(cell)
             line = failed(run)
@@ -453,7 +418,10 @@ def right(site: Site, path: Path) -> None:
     sight = site.world.sight(readings.states)
     off = readings.value - sight.value(readings.m)
     scatter = site.config.repeatability.per_joint(site.cell.arm.n)
-    known = with_joint_scatter(_registered(site), readings, scatter)
+    registered = replace(
+        site.cell, registration=site.world.registration, registration_known=True, target_known=True
+    )
+    known = with_joint_scatter(registered, readings, scatter)
     white = np.linalg.solve(np.linalg.cholesky(known.covariance), off[:, :, None])
     # a wrong pose, load or a broken frame is off by hundreds
     worst = int(np.abs(white).max(axis=(1, 2)).argmax())
@@ -463,16 +431,10 @@ def right(site: Site, path: Path) -> None:
     )
 
 
-def _registered(site: Site) -> Cell:
-    return replace(
-        site.cell, registration=site.world.registration, registration_known=True, target_known=True
-    )
-
-
-def stopped_within(cell: Site, since: float, seconds: float = 0.5) -> None:
-    """Check that the arm stands since at most so long after `since` (monotonic, s)."""
-    cell.until(lambda: not cell.ask("arm", "state")["moving"])
-    assert cell.ask("arm", "state")["rest_ns"] * 1e-9 - since <= seconds
+def stopped_within(cell: Site, since: float) -> None:
+    """Check that the arm stands since at most half a second after `since` (monotonic, s)."""
+    wait_until(lambda: not cell.ask("arm", "state")["moving"], "at rest", DEADLINE)
+    assert cell.ask("arm", "state")["rest_ns"] * 1e-9 - since <= 0.5
 
 
 def stopped_on_its_way(cell: Site, since: float, goal: Floats) -> None:

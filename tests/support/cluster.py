@@ -19,9 +19,8 @@ WORKER = ("--host", "127.0.0.1", "--no-nanny", "--no-dashboard", "--nthreads", "
 
 @contextmanager
 def running(*command: str) -> "Iterator[subprocess.Popen[str]]":
-    here = {**os.environ, "PYTHONPATH": str(ROOT)}
     process = subprocess.Popen(
-        [sys.executable, "-m", *command], env=here, cwd=ROOT, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-m", *command], env=HERE, cwd=ROOT, stderr=subprocess.PIPE, text=True
     )
     try:
         yield process

@@ -12,7 +12,7 @@ import pytest
 from hilcal.config import CellConfig
 from hilcal.drivers import bota, ft300, onrobot_hex
 from hilcal.errors import DeviceError
-from tests.support.sim_serial_cases import force_sensor
+from tests.support.instruments import WARM, WRENCH, force_sensor
 
 OPEN: dict[str, Callable] = {
     "ft300": ft300.open_force_sensor,
@@ -22,8 +22,6 @@ OPEN: dict[str, Callable] = {
 OPTIONS = {"hex": {"counts_per_N": 50.0, "counts_per_Nm": 2000.0}}
 ALL = pytest.mark.parametrize("kind", OPEN)
 BOTH = pytest.mark.parametrize("kind", ["ft300", "bota"])
-WRENCH = np.array([1.0, -2.0, 30.0, 0.1, 0.2, -0.3])
-WARM = ("--on", "1e6")  # its zero drifts no more
 DEADLINE_S = 2.0
 SLACK_S = 2.0  # a machine that does other work
 
@@ -48,12 +46,12 @@ def truth_of(simulated):
     return WRENCH + np.array(state["bias"]), np.array(state["noise"]), 0.01
 
 
-def fails(action, match, within=DEADLINE_S):
+def fails(action, match):
     """Do it again and again until it fails, with one line, in time."""
     start = time.monotonic()
 
     def again() -> None:
-        while time.monotonic() < start + within + SLACK_S:
+        while time.monotonic() < start + DEADLINE_S + SLACK_S:
             try:
                 action()
             except DeviceError as error:
@@ -64,7 +62,7 @@ def fails(action, match, within=DEADLINE_S):
 
     with pytest.raises(DeviceError, match=match) as caught:
         again()
-    assert time.monotonic() - start < within + SLACK_S
+    assert time.monotonic() - start < DEADLINE_S + SLACK_S
     assert "\n" not in str(caught.value)
     assert str(caught.value).startswith("force sensor: ")
 
@@ -77,7 +75,7 @@ def instruments():
 
         def start(kind):
             if kind not in running:
-                running[kind] = stack.enter_context(force_sensor(kind, tuple(WRENCH), *WARM))
+                running[kind] = stack.enter_context(force_sensor(kind, *WARM))
             return running[kind]
 
         yield start
@@ -109,9 +107,9 @@ def steady(sensor, seconds):
     return sensor.average(seconds)
 
 
-def settled(sensor, right, seconds=15.0):
+def settled(sensor, right):
     """The losses as soon as they are right; on a busy machine frames are held up for a while."""
-    end = time.monotonic() + seconds
+    end = time.monotonic() + 15.0
     while not right(count := sensor.losses()) and time.monotonic() < end:
         time.sleep(0.05)
     return count

@@ -10,10 +10,9 @@ from contextlib import contextmanager
 from hilcal.config import CellConfig
 
 
-def crc16_arc(text: str) -> int:
-    """CRC-16/ARC of a line."""
-    crc = 0
-    for byte in text.encode():
+def crc16(data: bytes, crc: int = 0) -> int:
+    """CRC-16/ARC, bit by bit; of Modbus (over Serial Line V1.02, 6.2.2) where it begins at FFFF."""
+    for byte in data:
         crc ^= byte
         for _ in range(8):
             crc = (crc >> 1) ^ (0xA001 if crc & 1 else 0)
@@ -22,7 +21,7 @@ def crc16_arc(text: str) -> int:
 
 def line(head: str, body: str) -> bytes:
     """A reply with its checksum; `head` is %R1P,com,transaction."""
-    return f"{head},{crc16_arc(f'{head}:{body}')}:{body}\r\n".encode()
+    return f"{head},{crc16(f'{head}:{body}'.encode())}:{body}\r\n".encode()
 
 
 Table = dict[int, str | Callable[[str, str], bytes]]

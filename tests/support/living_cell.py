@@ -21,12 +21,6 @@ from tests.support.arm_cases import arm_of
 from tests.support.example_cell import ur10e_arm
 
 
-def rz(angle):
-    out = np.eye(4)
-    out[:3, :3] = Rotation.from_euler("z", angle).as_matrix()
-    return out
-
-
 def turn(axis, angle):
     out = np.eye(4)
     out[:3, :3] = Rotation.from_euler(axis, angle).as_matrix()
@@ -41,7 +35,7 @@ def frames(arm, q, base=(0, 0, 0), tilt=None, beam=None):
     for j in range(arm.n):
         place = place @ turn("x", tilt[j, 0]) @ turn("y", tilt[j, 1])
         slots.append(place)
-        place = place @ rz(q[j])
+        place = place @ turn("z", q[j])
         bodies.append(place)
         if beam is not None and j + 1 in beam:
             place = place @ bent(arm.links[j + 1], beam[j + 1])
@@ -142,10 +136,10 @@ class Life:
         self.arrivals = 0
         self.now_ns = 0
 
-    def rest_at(self, q: Floats, side: Floats = SIDE) -> Any:
+    def rest_at(self, q: Floats) -> Any:
         """Let the arm arrive, and return the truth."""
         self.arrivals += 1
-        fields = {"q": q, "side": side, "arrivals": self.arrivals, "moving": 0.0, "alive": 1.0}
+        fields = {"q": q, "side": SIDE, "arrivals": self.arrivals, "moving": 0.0, "alive": 1.0}
         self.board.write("arm", **fields)
         return self.look()
 

@@ -17,7 +17,8 @@ from typing import Self
 
 import pyte
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.support.paths import ROOT
+
 HISTORY = 2000  # lines that have scrolled off the top and can still be read
 DEADLINE = 120.0  # nothing that is waited for may take longer, s; far above what it takes
 STANDING_S = 0.5

@@ -2,14 +2,13 @@
 
 import json
 import os
-import secrets
 import socket
 import struct
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,28 +17,14 @@ import numpy as np
 
 from hilcal.drivers.simulated import admin
 from hilcal.drivers.simulated.blackboard import Blackboard
+from hilcal.drivers.simulated.cell_processes import free_host
+from tests.support.paths import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
-PORTS = (29999, 30001, 30003, 30004)
 _READY = 20.0  # s
 
 
 def environment() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-
-
-def free_host() -> str:
-    """A loopback address on which no controller listens."""
-    while True:
-        a, b, c = (secrets.randbelow(200) + 20 for _ in range(3))
-        host = f"127.{a}.{b}.{c}"
-        try:
-            with ExitStack() as stack:
-                for port in PORTS:
-                    stack.enter_context(socket.socket()).bind((host, port))
-        except OSError:
-            continue
-        return host
 
 
 @dataclass
@@ -84,13 +69,12 @@ def start(
     scale: float = 1.0,
     truth: dict[str, Any] | None = None,
     *arguments: str,
-    host: str | None = None,
 ) -> SimulatedUr:
     """Start a controller in a world of its own; `truth` are fields of the blackboard's section."""
     board = Blackboard.create(directory / "world.bin", scale)
     if truth is not None:
         board.write("truth", **{"flange": np.eye(4), "time": 1e-6, **truth})
-    host = host or free_host()
+    host = free_host()
     process = subprocess.Popen(
         command(directory, host, *arguments), stdin=subprocess.PIPE, env=environment()
     )
@@ -133,12 +117,9 @@ class Client:
             raise ClientError(result["error"])
         return result["result"]
 
-    def kill(self) -> None:
+    def close(self) -> None:
         self.process.kill()
         self.process.wait()
-
-    def close(self) -> None:
-        self.kill()
         self.process.stdin.close()
         self.process.stdout.close()
 

@@ -31,6 +31,7 @@ from tests.support.campaign_cases import (
     stopped_on_its_way,
 )
 from tests.support.spread_plan import spread_plan
+from tests.support.timing import wait_until
 from tests.wire import test_fault_matrix_person as person
 from tests.wire.test_fault_matrix_arm import MOTION, REST
 from tests.wire.test_fault_matrix_serial import FORCE, OVERCOME, TRACKER
@@ -107,7 +108,7 @@ class Soak:
 
     def act(self) -> None:
         """Do one thing by chance, and check what must hold after it."""
-        ways: list[tuple[float, Callable[[], str]]] = [
+        ways: list[tuple[float, Callable[[], None]]] = [
             (0.30, self.one_fault),
             (0.15, self.two_faults),
             (0.10, self.fault_during_recovery),
@@ -121,7 +122,7 @@ class Soak:
         (way,) = self.rng.choices([w for _, w in ways], [p for p, _ in ways])
         self.do(way)
 
-    def do(self, way: Callable[[], str]) -> None:
+    def do(self, way: Callable[[], None]) -> None:
         """Do it; a failed check is kept, and the next thing is done on another cell."""
         self.counts[way.__name__] += 1
         before, self._met = self._met, ""
@@ -142,23 +143,23 @@ class Soak:
                 self.findings.append(f"{where}: {words[:200]} … {words[-1500:]}")
             self.close()
 
-    def one_fault(self) -> str:
+    def one_fault(self) -> None:
         """A run meets a fault in motion, while measuring, or at any other moment."""
         run, moment = self._begun()
         fault = self._drawn(moment)
         goal = run.moving() if moment == "moving" else None
         if moment == "measuring":
             run.measuring()
-        return self._meets(run, (fault,), goal, exact=moment != "any")
+        self._meets(run, (fault,), goal, exact=moment != "any")
 
-    def two_faults(self) -> str:
+    def two_faults(self) -> None:
         """A second fault comes within a second of the first."""
         run, moment = self._begun()
         one, two = self._drawn(moment), self._drawn("any")
         goal = run.moving() if moment == "moving" else None
-        return self._meets(run, (one, two), goal, exact=False)
+        self._meets(run, (one, two), goal, exact=False)
 
-    def fault_during_recovery(self) -> str:
+    def fault_during_recovery(self) -> None:
         """The operator goes on while the fault is there still, or the next one comes at once."""
         run, moment = self._begun()
         first, second = self._drawn(moment), self._drawn("any")
@@ -173,9 +174,8 @@ class Soak:
         finally:
             self._undo((first, second))
         self._sound()
-        return f"{first.name}, {second.name}"
 
-    def load_falls(self) -> str:
+    def load_falls(self) -> None:
         """A load falls off in motion or while it is measured, and is hung again."""
         run, moment = self._begun()
         try:
@@ -194,9 +194,8 @@ class Soak:
             run.interrupt()
             self._ended(run)
         self._sound()
-        return "load falls"
 
-    def wrong_weights(self) -> str:
+    def wrong_weights(self) -> None:
         """The person hangs another weight than asked for, once or every time."""
         before = self.path
         measured = self._count_stored() > 0
@@ -216,9 +215,8 @@ class Soak:
         for _ in range(times + 1):  # mistakes that the run did not come to, and nothing at the end
             self.site.ask("world", "hang", name=None)
         self._sound()
-        return "wrong weights"
 
-    def second_process(self) -> str:
+    def second_process(self) -> None:
         """Another command fits the campaign, and stores its revision, while it is measured."""
         run, _ = self._begun()
         beside: list[subprocess.Popen[bytes]] = []
@@ -239,14 +237,13 @@ class Soak:
             run.interrupt()
         self._ended(run)
         self._sound()
-        return "second process"
 
-    def signal(self) -> str:
+    def signal(self) -> None:
         """Ctrl-C or a kill at any moment."""
         run, moment = self._begun()
         goal = run.moving() if moment == "moving" else None
         hard = self.rng.random() < 0.5
-        since = self.site.now()
+        since = time.monotonic()
         (run.kill if hard else run.interrupt)()
         code, words = run.end()
         assert code in ((-signal.SIGKILL, 0) if hard else (130, 0)), words
@@ -256,9 +253,8 @@ class Soak:
         self._gone(run)
         self._sound()
         self.counts["kills" if hard else "interrupts"] += 1
-        return "kill" if hard else "interrupt"
 
-    def check(self) -> str:
+    def check(self) -> None:
         """`hilcal check` names a fault that is there, and is content without."""
         fault = self._drawn("any") if self.rng.random() < 0.7 else None
         command = [sys.executable, "-m", "hilcal", "check", str(self.site.toml)]
@@ -278,9 +274,8 @@ class Soak:
         if fault is None and done.returncode:  # a run before has lost the target
             assert "it is not locked on its target" in words, words
         assert self.site.ask("arm", "state")["arrivals"] == arrivals, "check has moved the arm"
-        return "check"
 
-    def calibrate(self) -> str:
+    def calibrate(self) -> None:
         """`calibrate --rehearse --resume` is killed at a random moment."""
         if self._calibration is None:
             here = self.folder / f"calibrate{self.counts['calibrations']}"
@@ -298,7 +293,6 @@ class Soak:
         except BaseException:
             self._calibration = None
             raise
-        return "calibrate"
 
     # --- parts ---
 
@@ -348,7 +342,7 @@ class Soak:
         """A fault; a person's and a device's that repeats itself come after the tare only."""
         kinds: list[tuple[Fault, ...]] = [
             MOTION if moment == "moving" else REST,
-            (*TRACKER, *FORCE, *_overcome()),
+            (*TRACKER, *FORCE, *OVERCOME["tracker"], *OVERCOME["force"]),
         ]
         if moment != "any":
             kinds.append(person.MOTION if moment == "moving" else person.REST)
@@ -360,8 +354,8 @@ class Soak:
 
     def _meets(
         self, run: Run, faults: tuple[Fault, ...], goal: object, *, exact: bool, undo: bool = True
-    ) -> str:
-        since = self.site.now()
+    ) -> None:
+        since = time.monotonic()
         self._met = ", ".join(fault.name for fault in faults)
         try:
             for k, fault in enumerate(faults):
@@ -389,7 +383,6 @@ class Soak:
             self._gone(run)
         self._sound()
         self.site.slider(1.0)
-        return ", ".join(fault.name for fault in faults)
 
     def _undo(self, faults: tuple[Fault, ...]) -> None:
         """Mend everything; twice, since a protective stop is not unlocked in local mode."""
@@ -398,7 +391,7 @@ class Soak:
 
     def _stands(self, fault: Fault, since: float) -> None:
         """Wait until an arm that was in motion stands, and keep how long that took."""
-        self.site.until(lambda: not self.site.ask("arm", "state")["moving"])
+        wait_until(lambda: not self.site.ask("arm", "state")["moving"], "at rest")
         took = self.site.ask("arm", "state")["rest_ns"] * 1e-9 - since
         self.slowest[fault.name] = round(max(took, self.slowest.get(fault.name, 0.0)), 3)
         assert took <= IN_MOTION, f"{fault.name}: the arm stood after {took:.2f} s"
@@ -475,19 +468,3 @@ class Soak:
         with CampaignFile.open(self.path, read_only=True) as campaign:
             log = RunLog(campaign)
             return log.done() == frozenset(log.plan.steps)
-
-
-def _overcome() -> tuple[Fault, ...]:
-    """Faults that a run goes on from."""
-    out = []
-    for device, rows in OVERCOME.items():
-        for op, arguments, off in rows:
-
-            def do(s: Site, d: str = device, o: str = op, a: object = arguments) -> object:
-                return s.ask(d, o, **a)  # type: ignore[arg-type]
-
-            def undo(s: Site, d: str = device, off: object = off) -> object:
-                return None if off is None else s.ask(d, off[0], **off[1])  # type: ignore[index]
-
-            out.append(Fault(f"{device} {op}", do, undo, ()))
-    return tuple(out)

@@ -1,4 +1,4 @@
-"""How long work takes, where a machine has other work too: the shortest of several times."""
+"""How long work takes, and waiting, where a machine has other work too."""
 
 import time
 from collections.abc import Callable
@@ -13,3 +13,11 @@ def shortest(works: dict[str, Callable[[], object]], rounds: int) -> dict[str, f
             work()
             times[name].append(time.process_time() - start)
     return {name: min(seconds) for name, seconds in times.items()}
+
+
+def wait_until(holds: Callable[[], object], what: str, seconds: float = 30.0) -> None:
+    """Wait until something holds; the limit is far above what a busy machine takes."""
+    end = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < end, f"never {what}"
+        time.sleep(0.01)

@@ -16,8 +16,7 @@ from hilcal.drivers import emscon_packets as es
 from hilcal.drivers.emscon import EmsconTracker, open_tracker
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.devices import PointingTracker, TargetLostError
-from tests.support.network_cases import TARGET, TURNED, cell, emscon
-from tests.support.sim_serial_cases import Instrument
+from tests.support.instruments import TARGET, TURNED, Instrument, cell, emscon
 
 There = tuple[Instrument, str]
 

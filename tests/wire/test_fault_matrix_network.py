@@ -17,15 +17,12 @@ from tests.support.campaign_cases import (
     finish,
     meets,
     nothing,
-    nothing_goes_on,
-    path,
     right,
     site,
+    switch,
 )
 
-pytestmark = pytest.mark.long
-
-__all__ = ["nothing_goes_on", "path"]  # fixtures
+pytestmark = [pytest.mark.long, pytest.mark.usefixtures("nothing_goes_on")]
 
 
 @pytest.fixture(scope="module")
@@ -37,10 +34,6 @@ def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
         force_sensor={"driver": "netft", "port": None, "host": "192.168.1.1"},
     ) as made:
         yield made
-
-
-def switched(device: str, op: str, *says: str) -> Fault:
-    return Fault(op, act(device, op, on=True), act(device, op, on=False), (device, *says))
 
 
 PRISM = Fault(
@@ -57,14 +50,15 @@ SHAKEN = Fault(
     act("tracker", "fail", command=es.START_MEASUREMENT, status=0, count=0),
     ("tracker", "does not stand firmly"),
 )
-STALL = switched("force", "stall", "nothing came")
 AT_REST = (
-    switched("tracker", "beam", "not found|no measurement", "searched 2 times"),
-    switched("tracker", "mute", "no answer"),
+    switch(
+        "beam broken", "tracker", "beam", "tracker", "not found|no measurement", "searched 2 times"
+    ),
+    switch("tracker mute", "tracker", "mute", "tracker", "no answer"),
     PRISM,
     DROP,
     SHAKEN,
-    STALL,
+    switch("force sensor stalled", "force", "stall", "force", "nothing came"),
 )
 ERROR = Fault(
     "error of the sensor",

@@ -17,20 +17,16 @@ from tests.support.campaign_cases import (
     Site,
     act,
     begin,
-    cell,
     each,
     failed,
     finish,
     meets,
     nothing,
-    nothing_goes_on,
-    path,
     right,
+    switch,
 )
 
-pytestmark = pytest.mark.long
-
-__all__ = ["cell", "nothing_goes_on", "path"]  # fixtures
+pytestmark = [pytest.mark.long, pytest.mark.usefixtures("nothing_goes_on")]
 
 SCRIPT_PORT = 30003
 HAND = [20.0, 35.0, -44.0, 0.0, 0.0, 0.0]
@@ -51,10 +47,6 @@ def another_program(s: Site) -> None:
     assert s.config.robot.host is not None
     with socket.create_connection((s.config.robot.host, SCRIPT_PORT), timeout=5.0) as line:
         line.sendall(text.encode())
-
-
-def switch(name: str, device: str, op: str, *says: str, fast: bool = False) -> Fault:
-    return Fault(name, act(device, op, on=True), act(device, op, on=False), says, fast=fast)
 
 
 LEANING = Fault(

@@ -17,30 +17,21 @@ from tests.support.campaign_cases import (
     Site,
     act,
     begin,
-    cell,
     each,
     failed,
     finish,
     meets,
-    nothing_goes_on,
-    path,
+    nothing,
     right,
     stopped_on_its_way,
+    switch,
 )
 
-pytestmark = pytest.mark.long
-
-__all__ = ["cell", "nothing_goes_on", "path"]  # fixtures
+pytestmark = [pytest.mark.long, pytest.mark.usefixtures("nothing_goes_on")]
 
 NO_FORCE = [0.0] * 6
 HIT = [0.0, 0.0, -280.0, 0.0, 0.0, 0.0]
 TOO_MUCH = "max_force_N|over its range"  # with a load on the hook it may be beyond the range
-
-
-def switch(name: str, device: str, op: str, says: tuple[str, ...], *, fast: bool = False) -> Fault:
-    """A fault that is switched on and off."""
-    on, off = act(device, op, on=True), act(device, op, on=False)
-    return Fault(name, on, off, (device, *says), fast=fast)
 
 
 def unplugged(device: str) -> Fault:
@@ -55,7 +46,7 @@ def rate(device: str, wrong: int, good: int, says: str) -> Fault:
 
 
 TRACKER = (
-    switch("beam broken", "tracker", "beam", ("no target in sight", "searched 2 times")),
+    switch("beam broken", "tracker", "beam", "tracker", "no target in sight", "searched 2 times"),
     Fault(
         "angles only, distance 0.0 (1285)",
         act("tracker", "meas_s", seconds=10.0),  # longer than it is waited for
@@ -63,17 +54,17 @@ TRACKER = (
         ("tracker", "only angles", "1285", "searched 2 times"),
         fast=True,
     ),
-    switch("no distance (1292)", "tracker", "dist_error", ("distance", "1292")),
-    switch("tracker mute", "tracker", "mute", ("no answer",)),
-    switch("tracker busy", "tracker", "busy", ("1293",)),
+    switch("no distance (1292)", "tracker", "dist_error", "tracker", "distance", "1292"),
+    switch("tracker mute", "tracker", "mute", "tracker", "no answer"),
+    switch("tracker busy", "tracker", "busy", "tracker", "1293"),
     unplugged("tracker"),
     rate("tracker", 9600, 115200, "no answer|what comes is no GeoCOM"),
 )
 
 FORCE = (
     unplugged("force"),
-    switch("force sensor stalled", "force", "stall", ("nothing came",)),
-    switch("force sensor mute", "force", "mute", ("nothing came",)),
+    switch("force sensor stalled", "force", "stall", "force", "nothing came"),
+    switch("force sensor mute", "force", "mute", "force", "nothing came"),
     rate("force", 57600, 19200, "no whole frame|nothing came"),
     Fault(
         "overload",
@@ -84,33 +75,44 @@ FORCE = (
     ),
 )
 
-NONE = ("flip", {"probability": 0.0})
-FLIPS = {"probability": 0.02}
+
+def damage(device: str, op: str) -> Fault:
+    """The line flips or cuts for a while."""
+    on, off = act(device, op, probability=0.02), act(device, op, probability=0.0)
+    return Fault(f"{device} {op}", on, off, ())
+
+
+def once(device: str, op: str, **arguments: object) -> Fault:
+    """What is over after once."""
+    return Fault(f"{device} {op}", act(device, op, **arguments), nothing, ())
+
+
 OVERCOME = {
     "tracker": (
-        ("lock_lost", {}, None),
-        ("warn", {"code": 1283}, ("warn", {"code": 0})),
-        ("wrong_trid", {"count": 1}, None),
-        ("delay", {"rpc": 2167, "seconds": 1.5}, None),  # the answer comes too late
-        ("half_frame", {}, None),
-        ("flip", FLIPS, NONE),
+        once("tracker", "lock_lost"),
+        Fault(
+            "tracker warns",
+            act("tracker", "warn", code=1283),
+            act("tracker", "warn", code=0),
+            (),
+        ),
+        once("tracker", "wrong_trid", count=1),
+        once("tracker", "delay", rpc=2167, seconds=1.5),  # the answer comes too late
+        once("tracker", "half_frame"),
+        damage("tracker", "flip"),
     ),
     "force": (
-        ("half_frame", {}, None),
-        ("garbage", {"count": 50}, None),
-        ("flip", FLIPS, NONE),
-        ("cut", FLIPS, ("cut", {"probability": 0.0})),
+        once("force", "half_frame"),
+        once("force", "garbage", count=50),
+        damage("force", "flip"),
+        damage("force", "cut"),
     ),
 }
+"""Faults that a run goes on from, by the line that they are on."""
 MORE_READINGS = len(OVERCOME["tracker"])
-BOTH = ("tracker", "force")
 START = {
-    "unplugged": tuple([(d, op, {}) for d in BOTH] for op in ("unplug", "replug")),
-    "mute": tuple([(d, "mute", {"on": on}) for d in BOTH] for on in (True, False)),
-    "at another rate": (
-        [("tracker", "baud", {"baud": 9600}), ("force", "baud", {"baud": 57600})],
-        [("tracker", "baud", {"baud": 115200}), ("force", "baud", {"baud": 19200})],
-    ),
+    what: [fault for fault in (*TRACKER, *FORCE) if fault.name.endswith(what)]
+    for what in ("unplugged", "mute", "at another rate")
 }
 
 
@@ -134,7 +136,7 @@ def test_a_fault_of_the_force_sensor_at_rest(fault: Fault, cell: Site, path: Pat
 def test_a_hit_stops_the_arm(cell: Site, path: Path) -> None:
     """A collision is over after a moment, for the arm bounces off."""
     run, goal = begin(cell, path, Run.moving)
-    since = cell.now()
+    since = time.monotonic()
     cell.ask("force", "overload", force=HIT)
     time.sleep(0.1)
     cell.ask("force", "overload", force=NO_FORCE)
@@ -148,14 +150,13 @@ def test_faults_that_are_overcome_cost_nothing(cell: Site, path: Path) -> None:
     """All of them in one run, each for a whole reading, at both lines at a time."""
     run, _ = begin(cell, path, Run.measuring)
     for row in zip_longest(*OVERCOME.values()):
-        faults = [(d, *fault) for d, fault in zip(OVERCOME, row, strict=True) if fault is not None]
-        for device, op, on, _ in faults:
-            cell.ask(device, op, **on)
+        faults = [fault for fault in row if fault is not None]
+        for fault in faults:
+            fault.do(cell)
         run.measuring()
-        run.next_reading(str(faults))
-        for device, _, _, off in faults:
-            if off is not None:
-                cell.ask(device, off[0], **off[1])
+        run.next_reading(", ".join(fault.name for fault in faults))
+        for fault in faults:
+            fault.undo(cell)
     run.interrupt()
     failed(run, 130)
     right(cell, path)
@@ -167,14 +168,14 @@ def test_instruments_that_are_not_ready_are_named_at_once(
     what: str, cell: Site, path: Path
 ) -> None:
     arrivals = cell.ask("arm", "state")["arrivals"]
-    for device, op, arguments in START[what][0]:
-        cell.ask(device, op, **arguments)
+    for fault in START[what]:
+        fault.do(cell)
     try:
         line = failed(Run(cell, path))
         assert cell.ask("arm", "state")["arrivals"] == arrivals
     finally:
-        for device, op, arguments in START[what][1]:
-            cell.ask(device, op, **arguments)
+        for fault in START[what]:
+            fault.undo(cell)
     assert "tracker" in line
     assert "force sensor" in line
 

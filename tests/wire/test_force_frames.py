@@ -28,15 +28,15 @@ def frames_of(kind, number, rng):
     return bodies, [frame + spec.checksum(frame) for frame in whole]
 
 
-def damaged(frames, rng, most_bits, flips=0.02, cuts=0.02):
+def damaged(frames, rng, most_bits):
     """Frames after flips (1 to `most_bits` bits) and truncations; which of them are whole."""
     out, whole = [], []
     for frame in frames:
         data = bytearray(frame)
-        if rng.random() < flips:
+        if rng.random() < 0.02:
             for _ in range(rng.integers(1, most_bits + 1)):
                 data[rng.integers(len(data))] ^= 1 << int(rng.integers(8))
-        if rng.random() < cuts:
+        if rng.random() < 0.02:
             del data[int(rng.integers(1, len(data))) :]
         out.append(bytes(data))
         whole.append(bytes(data) == frame)
@@ -117,8 +117,8 @@ def test_a_frame_inside_a_frame_is_not_taken():
     assert deframer.push(b"noise" + inner + b"noise" + b"".join(outer)) == bodies
 
 
-def ticks_at(numbers, period=1000, start=0):
-    return [(start + int(k) * period) % 2**32 for k in numbers]
+def ticks_at(numbers, start=0):
+    return [(start + 1000 * int(k)) % 2**32 for k in numbers]
 
 
 @pytest.mark.parametrize("start", [0, 2**32 - 50_000])
@@ -154,10 +154,10 @@ def test_a_sensor_that_begins_to_count_anew_is_followed():
     assert counter.follow(100, ticks_at(range(100)), 1.0) == [False] + [True] * 99
 
 
-def arrivals(counter, times, read_every=0.005):
+def arrivals(counter, times):
     """Give frames that arrived at times (s) as a reader that looks now and then finds them."""
     at = 0
-    for now in np.arange(0.0, times[-1] + read_every, read_every):
+    for now in np.arange(0.0, times[-1] + 0.005, 0.005):
         count = int(np.searchsorted(times, now, side="right")) - at
         if count:
             counter.follow(count, [], float(now))

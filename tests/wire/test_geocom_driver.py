@@ -16,7 +16,7 @@ from hilcal.drivers.geocom import (
 )
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.devices import Clock, TargetLostError
-from tests.support import sim_serial_cases as simulated
+from tests.support import instruments as simulated
 from tests.support.geocom_cases import GREETING, cell, line, table_instrument
 
 TARGET = (0.5, 2.8, 0.4)
@@ -225,10 +225,10 @@ POINT = D * np.array([np.sin(V) * np.sin(HZ), np.sin(V) * np.cos(HZ), np.cos(V)]
 FULL = f"0,{HZ},{V},1e-6,1e-5,2e-5,1e-6,{D},"
 
 
-def full(code=0, ms=4000):
+def full():
     """Replies to full measurements, each with a time of its own."""
-    count = iter(range(ms, ms + 1000))
-    return lambda transaction, _: line(f"%R1P,0,{transaction}", f"{code}{FULL[1:]}{next(count)}")
+    count = iter(range(4000, 5000))
+    return lambda transaction, _: line(f"%R1P,0,{transaction}", f"{FULL}{next(count)}")
 
 
 @pytest.fixture(scope="module")
@@ -269,22 +269,19 @@ def refused(error, config):
 # configuration
 
 
-def test_readings_in_base_axes_are_no_readings_of_an_instrument():
-    assert 'must be "tracker"' in refused(InputError, cell("/dev/x", frame="base"))
-
-
-def test_port_is_needed():
-    config = cell("x")
-    lacking = config.model_copy(
-        update={"tracker": config.tracker.model_copy(update={"port": None})}
-    )
-    assert "port" in refused(InputError, lacking)
-
-
-def test_unknown_option_lists_the_valid_ones():
-    text = refused(InputError, cell("/dev/x", options={"search": 1.0}))
-    assert "search_rad" in text
-    assert "max_distance_m" in text
+@pytest.mark.parametrize(
+    ("tracker", "words"),
+    [
+        ({"frame": "base"}, ['must be "tracker"']),
+        ({"port": None}, ["port"]),
+        ({"options": {"search": 1.0}}, ["search_rad", "max_distance_m"]),
+    ],
+)
+def test_configuration_that_cannot_be_is_refused(tracker, words):
+    config = cell("/dev/x")
+    config = config.model_copy(update={"tracker": config.tracker.model_copy(update=tracker)})
+    text = refused(InputError, config)
+    assert all(word in text for word in words)
 
 
 # opening
@@ -358,7 +355,7 @@ def test_instrument_that_dies_is_noticed():
     with simulated.tracker() as station:
         device = open_tracker(cell(station.port))
         station.admin("die")
-        time.sleep(0.1)
+        station.process.wait(30.0)
         with pytest.raises(DeviceError):
             device.measure()
         device.close()
@@ -419,46 +416,33 @@ def test_report_of_an_empty_battery_and_no_lock(opened):
     assert "not locked" in problems
 
 
-@pytest.mark.parametrize("code", [1285, 1288, 1289, 1292, 1294, 8710, 8711, 8725])
-def test_codes_without_a_distance_are_lost_targets(opened, code):
-    device, _ = opened({2167: f"{code},{HZ},{V},1e-6,0,0,0,0.0,0"})
-    with pytest.raises(TargetLostError, match=str(code)):
-        device.measure()
-
-
-@pytest.mark.parametrize("code", [0, 1283, 1284])
-def test_distance_zero_is_never_a_reading_whatever_the_code(opened, code):
-    device, _ = opened({2167: f"{code},{HZ},{V},1e-6,0,0,0,0.0,0"})
-    with pytest.raises(TargetLostError, match=r"0\.0 m"):
-        device.measure()
-
-
-@pytest.mark.parametrize(
-    ("code", "words"), [(1291, "atmospheric"), (1290, "level"), (99999, "99999")]
+NO_DISTANCE = f"{HZ},{V},1e-6,0,0,0,0.0,0"
+NO_TARGET = (1285, 1288, 1289, 1292, 1294, 8710, 8711, 8725)
+BROKEN = ((1291, "atmospheric"), (1290, "level"), (99999, "99999"))
+ODD = (
+    f"0,{HZ},{V},1e-6,0,0,0,nan,77",
+    f"0,inf,{V},1e-6,0,0,0,{D},77",
+    f"0,{HZ},{V},1e-6,0,0,0,{D}",
+    f"0,{HZ},{V},1e-6,0,0,0,{D},77,1",
+    f"0,{HZ},{V},1e-6,0,0,0,three,77",
+    "0",
 )
-def test_other_codes_are_failures_of_the_instrument(opened, code, words):
-    device, _ = opened({2167: f"{code},{HZ},{V},1e-6,0,0,0,0.0,0"})
-    with pytest.raises(DeviceError, match=words) as caught:
-        device.measure()
-    assert not isinstance(caught.value, TargetLostError)
 
 
 @pytest.mark.parametrize(
-    "body",
+    ("body", "lost", "words"),
     [
-        f"0,{HZ},{V},1e-6,0,0,0,nan,77",
-        f"0,inf,{V},1e-6,0,0,0,{D},77",
-        f"0,{HZ},{V},1e-6,0,0,0,{D}",
-        f"0,{HZ},{V},1e-6,0,0,0,{D},77,1",
-        f"0,{HZ},{V},1e-6,0,0,0,three,77",
-        "0",
+        *((f"{code},{NO_DISTANCE}", True, str(code)) for code in NO_TARGET),
+        *((f"{code},{NO_DISTANCE}", True, r"0\.0 m") for code in (0, 1283, 1284)),
+        *((f"{code},{NO_DISTANCE}", False, words) for code, words in BROKEN),
+        *((body, False, "measuring: the instrument gives") for body in ODD),
     ],
 )
-def test_reply_of_another_form_is_no_reading(opened, body):
+def test_what_is_no_reading_is_a_lost_target_or_a_failure(opened, body, lost, words):
     device, _ = opened({2167: body})
-    with pytest.raises(DeviceError, match="measuring: the instrument gives") as caught:
+    with pytest.raises(DeviceError, match=words) as caught:
         device.measure()
-    assert not isinstance(caught.value, TargetLostError)
+    assert isinstance(caught.value, TargetLostError) is lost
 
 
 def test_distance_of_the_measurement_before_is_no_new_reading(opened):

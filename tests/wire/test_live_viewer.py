@@ -12,22 +12,9 @@ import pytest
 from rerun.chunk import RrdReader
 
 from hilcal.present.viewer.recording import executable
-from tests.support.campaign_cases import (
-    STARVED,
-    TRIES,
-    EndedError,
-    Run,
-    Site,
-    cell,
-    nothing_goes_on,
-    path,
-    right,
-    whole,
-)
+from tests.support.campaign_cases import STARVED, TRIES, EndedError, Run, Site, right, whole
 
-pytestmark = pytest.mark.slow
-
-__all__ = ["cell", "nothing_goes_on", "path"]  # fixtures
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("nothing_goes_on")]
 
 MORE_READINGS = 12
 URL = re.compile(r"rerun\+http://127\.0\.0\.1:\d+/proxy")

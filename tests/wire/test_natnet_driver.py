@@ -12,9 +12,8 @@ from scipy.spatial.transform import Rotation
 from hilcal.drivers.natnet import NatNetTracker, open_tracker
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.devices import TargetLostError
-from tests.support.network_cases import TARGET, TURNED, cell, natnet
+from tests.support.instruments import TARGET, TURNED, Instrument, cell, natnet
 from tests.support.rows import first
-from tests.support.sim_serial_cases import Instrument
 
 There = tuple[Instrument, str]
 FRAME_STD, OFF = 5e-5, 2e-4

@@ -20,7 +20,7 @@ from hilcal.drivers.terminal_operator import open_operator as open_terminal
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring import devices
 from hilcal.store.campaign_file import CampaignFile
-from tests.support.campaign_cases import STARVED, Site, cell, nothing_goes_on
+from tests.support.campaign_cases import STARVED, TRIES, Site
 from tests.support.cli_cases import Capsys, run
 from tests.support.living_cell import config
 from tests.support.paths import ROOT
@@ -238,10 +238,6 @@ def test_the_terminal_has_no_options():
         open_terminal(config(operator={"options": {"socket": "x"}}))
 
 
-__all__ = ["cell", "nothing_goes_on"]  # fixtures
-
-TRIES = 3
-"""The devices' deadlines are real time; on a computer that is too busy a run is begun again."""
 ASKED = "Enter = done, q = give up:"
 
 
@@ -254,6 +250,7 @@ def toml(cell: Site, tmp_path: Path) -> Path:
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures("nothing_goes_on")
 def test_questions_stay_answers_are_understood_and_ctrl_c_says_how_to_go_on(
     cell: Site, toml: Path, tmp_path: Path
 ) -> None:

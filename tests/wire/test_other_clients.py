@@ -5,7 +5,6 @@ manuals. UR's own library for Python is in no package registry; its recipes are 
 
 import csv
 import struct
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,9 +12,11 @@ import numpy as np
 import pytest
 
 from hilcal.drivers.force_stream import crc_modbus, crc_x25
+from hilcal.drivers.simulated import pty_port
 from hilcal.drivers.simulated.force_server import Ft300
-from hilcal.drivers.simulated.pty_port import crc16
+from tests.support.geocom_cases import crc16
 from tests.support.sim_ur_cases import ClientError, SimulatedUr, Wire, client, start
+from tests.support.timing import wait_until
 
 
 @pytest.fixture
@@ -86,11 +87,7 @@ def test_a_control_loop_writes_and_two_cannot_hold_one_register(arm: SimulatedUr
         assert other.ask("I", b"no_such_register") == b"\0NOT_FOUND"
     with Wire(arm.host) as third:  # the registers are free when their holder has gone
         assert third.ask("V", struct.pack(">H", 2)) == b"\x01"
-        for _ in range(100):
-            if third.ask("I", setp)[0]:
-                break
-        else:
-            raise AssertionError("the registers stay taken")
+        wait_until(lambda: third.ask("I", setp)[0], "free: the registers")
 
 
 def test_ur_rtde_records_and_writes_inputs(arm: SimulatedUr, tmp_path: Path) -> None:
@@ -103,9 +100,7 @@ def test_ur_rtde_records_and_writes_inputs(arm: SimulatedUr, tmp_path: Path) -> 
         assert run("io", "setStandardDigitalOut", 1, True)
         with pytest.raises(ClientError, match="already in use"):
             other("io", "open", arm.host)
-        deadline = time.monotonic() + 5.0
-        while not run("receive", "getActualDigitalOutputBits") & 1 << 1:
-            assert time.monotonic() < deadline, "the output is never set"
+        wait_until(lambda: run("receive", "getActualDigitalOutputBits") & 1 << 1, "set: the output")
         assert run("receive", "stopFileRecording")
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
@@ -125,22 +120,9 @@ def test_an_unknown_protocol_is_not_spoken(arm: SimulatedUr) -> None:
 # --- Modbus RTU: MODBUS over Serial Line V1.02, and Application Protocol V1.1b3 ------------------
 
 
-def crc(data: bytes) -> bytes:
-    """CRC of Modbus over Serial Line V1.02, 6.2.2, by its generating procedure."""
-    register = 0xFFFF
-    for byte in data:
-        register ^= byte
-        for _ in range(8):
-            out = register & 1
-            register >>= 1
-            if out:
-                register ^= 0xA001
-    return bytes([register & 0xFF, register >> 8])
-
-
 def test_a_request_that_the_line_has_damaged_is_not_answered() -> None:
     request = b"\x09\x03" + struct.pack(">HH", 500, 1)
-    whole = request + crc(request)
+    whole = request + crc16(request, 0xFFFF).to_bytes(2, "little")
     for bit in range(8 * len(whole)):
         damaged = bytearray(whole)
         damaged[bit // 8] ^= 1 << bit % 8
@@ -178,4 +160,4 @@ def test_check_values_of_the_checksums() -> None:
     """Of "123456789", as the catalogue of parametrised CRC algorithms (reveng) gives them."""
     assert crc_modbus(b"123456789") == 0x4B37
     assert crc_x25(b"123456789") == 0x906E
-    assert crc16(b"123456789", 0) == 0xBB3D
+    assert pty_port.crc16(b"123456789", 0) == 0xBB3D

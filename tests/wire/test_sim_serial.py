@@ -18,7 +18,7 @@ from scipy import stats
 from hilcal.drivers.simulated.admin import Operations
 from hilcal.drivers.simulated.geocom_server import Beam, PolarPoint
 from hilcal.drivers.simulated.pty_port import PtyPort
-from tests.support.sim_serial_cases import Instrument, tracker
+from tests.support.instruments import Instrument, tracker
 
 BAUD = 115200
 
@@ -65,7 +65,7 @@ def test_carries_every_byte_value_both_ways(port: PtyPort) -> None:
 
 
 def test_bytes_take_ten_bits_each(port: PtyPort) -> None:
-    frames = 20
+    frames = 60
     with client(port) as line:
         start = time.monotonic()
         for _ in range(frames):
@@ -108,35 +108,6 @@ def test_old_bytes_are_gone_when_a_client_opens(port: PtyPort) -> None:
         port.send(b"new")
         port.drain()
         assert line.read(100) == b"new"
-
-
-def test_flips_come_as_often_as_asked(port: PtyPort) -> None:
-    frames, share = 2000, 0.1
-    past = time.monotonic() - 100.0
-    port.faults()["flip"](probability=share)
-    spoilt = 0
-    with client(port) as line:
-        for _ in range(frames):
-            port.send(b"01234567", past)
-            port.pump()
-            spoilt += line.read(8) != b"01234567"
-    # binomial, five standard deviations
-    assert abs(spoilt - frames * share) < 5 * np.sqrt(frames * share * (1 - share))
-
-
-def test_a_cut_frame_is_a_shorter_beginning(port: PtyPort) -> None:
-    port.faults()["cut"](probability=1.0)
-    with client(port) as line:
-        for _ in range(100):
-            port.send(b"<123456789")
-        port.faults()["cut"](probability=0.0)
-        port.send(b"<end")
-        port.drain()
-        got = line.read_until(b"<end").removesuffix(b"<end")
-    beginnings = [b"<" + rest for rest in got.split(b"<")[1:]]
-    assert len(beginnings) == 100
-    assert all(b"<123456789".startswith(beginning) for beginning in beginnings)
-    assert {len(beginning) for beginning in beginnings} == set(range(1, 10))
 
 
 def test_plugged_in_again_it_works_under_the_same_name(port: PtyPort) -> None:
@@ -223,8 +194,8 @@ def cartesian(hz: float, v: float, distance: float) -> np.ndarray:
 
 
 @contextlib.contextmanager
-def geocom(station: Instrument, timeout: float = 5.0) -> Iterator[GeoCom]:
-    port = serial.Serial(str(station.port), 115200, timeout=timeout, exclusive=True)
+def geocom(station: Instrument) -> Iterator[GeoCom]:
+    port = serial.Serial(str(station.port), 115200, timeout=5.0, exclusive=True)
     with SerialConnection(port) as connection:
         yield GeoCom(connection, checksum=True)
 

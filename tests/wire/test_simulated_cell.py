@@ -6,7 +6,6 @@ import socket
 import stat
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -34,6 +33,7 @@ from tests.support.paths import ROOT
 from tests.support.rows import first
 from tests.support.sim_ur_cases import SimulatedUr
 from tests.support.sim_ur_cases import start as start_server
+from tests.support.timing import wait_until
 
 DEVICES = ("world", "arm", "tracker", "force")
 SENSOR = {"driver": "ft300", "port": "to be filled in", "origin_m": [0.0, 0.0, 0.04]}
@@ -58,16 +58,6 @@ def answers(host, port):
     with socket.socket() as line:
         line.settimeout(2.0)
         return line.connect_ex((host, port)) == 0
-
-
-def gone(pids, seconds=5.0):
-    """Whether the processes end within so many seconds."""
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        if not any(map(running, pids)):
-            return True
-        time.sleep(0.02)
-    return False
 
 
 def running(pid):
@@ -205,7 +195,7 @@ def test_the_devices_end_with_a_parent_that_is_killed(tmp_path, how):
         assert all(map(running, pids))
         parent.send_signal(how)
         parent.wait(10.0)
-        assert gone(pids)
+        wait_until(lambda: not any(map(running, pids)), "ended", 15.0)
 
 
 # what goes wrong at the start
@@ -286,13 +276,6 @@ def test_what_cannot_be_simulated_is_refused_before_anything_starts(tmp_path):
     assert not list(tmp_path.glob("*.log"))
 
 
-def wait_until(condition, seconds=10.0):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "never came true"
-        time.sleep(0.005)
-
-
 @pytest.fixture
 def process(tmp_path):
     made = config()
@@ -300,7 +283,7 @@ def process(tmp_path):
     arguments = ("--seed", "5")
     process = DeviceProcess("world", "hilcal.drivers.simulated.world_server", tmp_path, arguments)
     process.start()
-    wait_until(lambda: process.socket.exists() or process.ended)
+    wait_until(lambda: process.socket.exists() or process.ended, "started")
     process.check()
     yield process
     process.end()
@@ -311,13 +294,13 @@ def test_a_world_that_died_goes_on_where_it_was(process, tmp_path):
     ask(process.socket, "hang", name="pull")
     since, begun = board.read("truth")["load_since"], board.time
     ask(process.socket, "die")
-    wait_until(lambda: process.ended)
+    wait_until(lambda: process.ended, "ended")
     with pytest.raises(DeviceError, match="ended with exit code 70"):
         process.check()
     with pytest.raises(DeviceError, match=r"simulated device at world\.sock"):
         ask(process.socket, "state")
     process.start()
-    wait_until(lambda: process.socket.exists() or process.ended)
+    wait_until(lambda: process.socket.exists() or process.ended, "started")
     state = ask(process.socket, "state")
     assert (state["load"], state["load_since"]) == ("pull", since)
     assert state["time"] > begun
@@ -339,7 +322,7 @@ def test_a_process_without_a_world_says_so_in_one_line(tmp_path):
         "world", "hilcal.drivers.simulated.world_server", tmp_path, ("--seed", "5")
     )
     process.start()
-    wait_until(lambda: process.ended)
+    wait_until(lambda: process.ended, "ended")
     with pytest.raises(DeviceError, match=r"world: ended with exit code 2: .*world\.json"):
         process.check()
     process.end()

@@ -21,18 +21,15 @@ from tests.support.campaign_cases import (
     Run,
     Site,
     begin,
-    cell,
     failed,
     finish,
-    nothing_goes_on,
-    path,
     right,
     stopped_on_its_way,
     stopped_within,
     whole,
 )
 
-__all__ = ["cell", "nothing_goes_on", "path"]  # fixtures
+pytestmark = pytest.mark.usefixtures("nothing_goes_on")
 
 LONGEST = 5.0  # the moment of a kill is drawn up to here, s; a run takes longer
 SLOW = 0.3  # position of the speed slider meanwhile: the arm moves for about half of the time

@@ -3,45 +3,37 @@
 import socket
 import threading
 import time
+from contextlib import closing
 
 import numpy as np
 import pytest
 
+from hilcal.drivers.simulated.cell_processes import free_host
 from hilcal.drivers.ur import open_arm
 from hilcal.drivers.ur_link.control import Control
 from hilcal.drivers.ur_link.worker import WorkerError
 from hilcal.errors import DeviceError, InputError
-from tests.support import sim_ur_cases
 from tests.support import ur_driver_cases as cases
-from tests.support.ur_driver_cases import sim
+from tests.support.ur_driver_cases import arm, sim
 
-__all__ = ["sim"]  # fixtures
-
-
-@pytest.fixture
-def arm(sim):
-    opened = cases.controlled(sim)
-    yield opened
-    opened.close()
-    assert cases.children() == []
+__all__ = ["arm", "sim"]  # fixtures
 
 
 def test_opening_and_report_move_nothing_and_upload_nothing(sim):
     before = sim.admin()
-    arm = open_arm(cases.config(sim.host))
-    try:
+    with closing(open_arm(cases.config(sim.host))) as arm:
         report = arm.report()
-        words = dict(report.facts)
+        facts = dict(report.facts)
         assert "UR10e" in report.name
         assert "20235500001" in report.name
-        assert words["controller version"] == (cases.GENERATIONS[sim.is_x])
-        assert words["robot mode"] == "running"
-        assert words["safety"] == "normal"
-        assert words["remote control"] == "yes"
-        assert "°C" in words["joint temperatures"]
-        assert words["RTDE rate"].endswith("of 125 Hz")
+        assert facts["controller version"] == cases.GENERATIONS[sim.is_x]
+        assert facts["robot mode"] == "running"
+        assert facts["safety"] == "normal"
+        assert facts["remote control"] == "yes"
+        assert "°C" in facts["joint temperatures"]
+        assert facts["RTDE rate"].endswith("of 125 Hz")
         # A busy machine sends late, which the report rightly says.
-        assert [found for found in report.problems if "RTDE comes at" not in found] == []
+        assert [problem for problem in report.problems if "RTDE comes at" not in problem] == []
         sample = arm.sample()
         np.testing.assert_allclose(sample.q, before["q"], atol=1e-4)
         np.testing.assert_array_equal(sample.q_target, before["q"])
@@ -49,16 +41,21 @@ def test_opening_and_report_move_nothing_and_upload_nothing(sim):
         assert sample.ft_raw_wrench.shape == (6,)
         assert abs(sample.host_ns - time.monotonic_ns()) < 1e9
         assert arm.sample().timestamp > sample.timestamp
-    finally:
-        arm.close()
     after = sim.admin()
     assert after["q"] == before["q"]
     assert after["scripts"] == before["scripts"]
 
 
+@pytest.fixture
+def put_right(sim):
+    """After the test there is no fault."""
+    yield
+    cases.put_right(sim)
+
+
+@pytest.mark.usefixtures("put_right")
 def test_report_names_everything_that_hinders_a_run(sim):
-    arm = open_arm(cases.config(sim.host, model="ur5e"))
-    try:
+    with closing(open_arm(cases.config(sim.host, model="ur5e"))) as arm:
         sim.admin("local_mode")
         sim.admin("emergency_stop")
         problems = " | ".join(arm.report().problems)
@@ -69,9 +66,6 @@ def test_report_names_everything_that_hinders_a_run(sim):
         sim.admin("release_emergency_stop")
         with pytest.raises(DeviceError, match=r"not running \(power off\)"):
             arm.take_control(1.0, np.zeros(3))
-    finally:
-        cases.put_right(sim)
-        arm.close()
 
 
 def test_host_and_options_are_checked():
@@ -125,11 +119,8 @@ def test_payload_that_the_controller_does_not_take_is_told_by_its_cause(
     monkeypatch.setattr(Control, "set_payload", lambda *_: True)
     if op is not None:
         sim.admin(op)
-    try:
-        with pytest.raises(DeviceError, match=says):
-            arm.set_payload(4.0, cases.COM)
-    finally:
-        cases.put_right(sim)
+    with pytest.raises(DeviceError, match=says):
+        arm.set_payload(4.0, cases.COM)
     assert sim.admin()["payload"] == cases.MASS
 
 
@@ -193,8 +184,7 @@ def test_motion_that_nobody_watches_stops_by_itself(arm, sim):
 
 def test_second_program_is_refused_and_disturbs_nothing(arm, sim):
     goal = cases.away(arm, by=0.5)
-    other = open_arm(cases.config(sim.host))
-    try:
+    with closing(open_arm(cases.config(sim.host))) as other:
         arm.start_move(goal, cases.SPEED, cases.ACCELERATION)
         assert arm.moving()
         begun = time.monotonic()
@@ -202,32 +192,26 @@ def test_second_program_is_refused_and_disturbs_nothing(arm, sim):
             other.take_control(0.0, np.zeros(3))
         assert time.monotonic() - begun < 8.0
         cases.finish(arm)
-    finally:
-        other.close()
     np.testing.assert_allclose(sim.admin()["q"], goal, atol=2e-5)
     assert sim.admin()["payload"] == cases.MASS
 
 
 def test_motion_in_a_world_that_goes_faster(tmp_path):
-    running = cases.start(tmp_path, scale=20.0)
-    try:
-        arm = cases.controlled(running, clock=20.0)
-        try:
-            goal = cases.away(arm, by=2.0)
-            arm.start_move(goal, cases.SPEED, cases.ACCELERATION)
-            cases.finish(arm)
-            np.testing.assert_allclose(running.admin()["q"], goal, atol=2e-5)
-        finally:
-            arm.close()
-    finally:
-        running.close()
+    with (
+        closing(cases.start(tmp_path, scale=20.0)) as running,
+        closing(cases.controlled(running, clock=20.0)) as arm,
+    ):
+        goal = cases.away(arm, by=2.0)
+        arm.start_move(goal, cases.SPEED, cases.ACCELERATION)
+        cases.finish(arm)
+        np.testing.assert_allclose(running.admin()["q"], goal, atol=2e-5)
 
 
 def test_controller_that_does_not_tell_its_payload(tmp_path):
-    running = cases.start(tmp_path, "--version", "5.4.0.0")
-    arm = None
-    try:
-        arm = open_arm(cases.config(running.host))
+    with (
+        closing(cases.start(tmp_path, "--version", "5.4.0.0")) as running,
+        closing(open_arm(cases.config(running.host))) as arm,
+    ):
         sample = arm.sample()
         assert sample.payload_com is None
         assert sample.ft_raw_wrench is None
@@ -236,10 +220,6 @@ def test_controller_that_does_not_tell_its_payload(tmp_path):
         with pytest.raises(DeviceError, match=r"5\.5\.1"):
             arm.take_control(1.0, np.zeros(3))
         running.wait("script_running", False)
-    finally:
-        if arm is not None:
-            arm.close()
-        running.close()
 
 
 @pytest.mark.parametrize(
@@ -252,10 +232,10 @@ def test_controller_that_does_not_tell_its_payload(tmp_path):
 )
 def test_versions_of_polyscope_x(tmp_path, version, says):
     """Before 10.11 there is no Robot API; 10.11 does not tell modes, nor 10.12 the model."""
-    running = cases.start(tmp_path, "--version", version)
-    arm = None
-    try:
-        arm = open_arm(cases.config(running.host))
+    with (
+        closing(cases.start(tmp_path, "--version", version)) as running,
+        closing(open_arm(cases.config(running.host))) as arm,
+    ):
         np.testing.assert_allclose(arm.sample().q, running.admin()["q"], atol=1e-4)
         problems = [found for found in arm.report().problems if "RTDE comes at" not in found]
         if says:
@@ -269,25 +249,18 @@ def test_versions_of_polyscope_x(tmp_path, version, says):
             cases.finish(arm)
             np.testing.assert_allclose(arm.sample().q, goal, atol=1e-3)
         arm.stop()
-    finally:
-        if arm is not None:
-            arm.close()
-        running.close()
 
 
 CONNECT_S = 8.0  # deadline of opening (the requirement)
 
 
+@pytest.mark.usefixtures("put_right")
 def test_local_mode_is_refused_before_anything_is_uploaded(sim):
     scripts = sim.admin("local_mode")["scripts"]
-    arm = open_arm(cases.config(sim.host))
-    try:
+    with closing(open_arm(cases.config(sim.host))) as arm:
         with pytest.raises(DeviceError, match="local mode"):
             arm.take_control(1.0, np.zeros(3))
         assert sim.admin()["scripts"] == scripts
-    finally:
-        arm.close()
-        cases.put_right(sim)
 
 
 def fails_to_open(host):
@@ -304,43 +277,33 @@ def fails_to_open(host):
 
 
 def test_nobody_there():
-    assert "refuses the connection" in fails_to_open(sim_ur_cases.free_host())
+    assert "refuses the connection" in fails_to_open(free_host())
 
 
-def test_mute_controller(sim):
-    sim.admin("rtde_mute", on=True)
-    try:
-        assert "does not answer" in fails_to_open(sim.host)
-    finally:
-        cases.put_right(sim)
+@pytest.mark.usefixtures("put_right")
+@pytest.mark.parametrize(
+    ("op", "says"), [("rtde_mute", "does not answer"), ("rtde_stall", "no data")]
+)
+def test_controller_that_is_mute_or_negotiates_and_sends_nothing(op, says, sim):
+    sim.admin(op, on=True)
+    assert says in fails_to_open(sim.host)
 
 
-def test_controller_that_negotiates_and_sends_no_data(sim):
-    sim.admin("rtde_stall", on=True)
-    try:
-        assert "no data" in fails_to_open(sim.host)
-    finally:
-        cases.put_right(sim)
-
-
+@pytest.mark.usefixtures("put_right")
 def test_mute_dashboard(sim):
     sim.admin("dashboard_mute", on=True)
-    arm = open_arm(cases.config(sim.host))
-    try:
+    with closing(open_arm(cases.config(sim.host))) as arm:
         assert any("without it" in problem for problem in arm.report().problems)
         begun = time.monotonic()
         with pytest.raises(DeviceError, match=r"cannot take control: .*does not answer"):
             arm.take_control(1.0, np.zeros(3))
         assert time.monotonic() - begun < CONNECT_S
         assert not sim.admin()["script_running"]
-    finally:
-        cases.put_right(sim)
-        arm.close()
 
 
 @pytest.mark.parametrize("says", [b"", b"\x00\x05V\x01", b"SSH-2.0-OpenSSH_9\r\n", b"\x00\x01V"])
 def test_something_else_on_the_port(says):
-    host = sim_ur_cases.free_host()
+    host = free_host()
     with socket.socket() as server:
         server.bind((host, 30004))
         server.listen(4)

@@ -6,16 +6,20 @@ import socket
 import subprocess
 import sys
 import time
+from contextlib import closing, contextmanager
 
 import numpy as np
 import psutil
 import pytest
 
+from hilcal.drivers.simulated.cell_processes import free_host
 from hilcal.drivers.ur_link import supervision
 from hilcal.errors import DeviceError
-from tests.support import sim_ur_cases
 from tests.support import ur_driver_cases as cases
+from tests.support.paths import ROOT
 from tests.support.rows import first
+from tests.support.sim_ur_cases import environment
+from tests.support.timing import wait_until
 from tests.support.ur_driver_cases import arm, sim
 
 __all__ = ["arm", "sim"]  # fixtures
@@ -38,7 +42,9 @@ def test_fault_in_motion_stops_the_arm_and_names_its_cause(arm, sim, fault):
     cases.check_resting(sim, since)
     for words in (sim.host, *FAULTS[fault], "--resume"):
         assert words in text
-    assert error_again(arm)
+    for command in (arm.moving, lambda: arm.start_move(np.zeros(6), 0.5, 0.5)):
+        with pytest.raises(DeviceError, match="not under control"):  # it has not ended by itself
+            command()
     cases.put_right(sim)
     arm.take_control(cases.MASS, cases.COM)  # what the next run does
     arm.start_move(cases.away(arm, by=0.1), cases.SPEED, cases.ACCELERATION)
@@ -63,15 +69,6 @@ def test_motion_that_is_refused_is_told(arm, sim):
     assert not sim.admin()["moving"]
 
 
-def error_again(arm):
-    """A motion that failed is not taken for one that has ended."""
-    with pytest.raises(DeviceError, match="not under control"):
-        arm.moving()
-    with pytest.raises(DeviceError, match="not under control"):
-        arm.start_move(np.zeros(6), 0.5, 0.5)
-    return True
-
-
 def test_sample_in_motion_stops_the_arm_when_the_link_is_lost(arm, sim):
     cases.under_way(arm, sim)
     since = sim.admin("rtde_drop")["fault_ns"]
@@ -80,10 +77,7 @@ def test_sample_in_motion_stops_the_arm_when_the_link_is_lost(arm, sim):
 
 
 def test_protective_stop_names_its_cause_and_is_recovered_from(tmp_path):
-    running = cases.start(tmp_path)
-    arm = None
-    try:
-        arm = cases.controlled(running)
+    with closing(cases.start(tmp_path)) as running, closing(cases.controlled(running)) as arm:
         cases.under_way(arm, running)
         since = running.admin("protective_stop")["fault_ns"]
         text = cases.error_of(arm.moving)
@@ -93,18 +87,11 @@ def test_protective_stop_names_its_cause_and_is_recovered_from(tmp_path):
         with pytest.raises(DeviceError, match="protective stop"):
             arm.take_control(cases.MASS, cases.COM)
         assert any("protective stop" in problem for problem in arm.report().problems)
-    finally:
-        if arm is not None:
-            arm.close()
-        running.close()
 
 
 @pytest.mark.slow
 def test_program_that_a_protective_stop_left_paused_is_ended(tmp_path):
-    running = cases.start(tmp_path)
-    arm = other = None
-    try:
-        other = cases.controlled(running)
+    with closing(cases.start(tmp_path)) as running, closing(cases.controlled(running)) as other:
         running.admin("protective_stop")
         os.kill(other.workers[0], signal.SIGSTOP)
         running.wait("runtime", 4)
@@ -112,14 +99,9 @@ def test_program_that_a_protective_stop_left_paused_is_ended(tmp_path):
         supervision.ask(running.host, ("unlock protective stop",), 2.0)
         os.kill(other.workers[1], signal.SIGKILL)
         assert running.wait("safety", 1)["runtime"] == 4
-        arm = cases.controlled(running)
-        arm.start_move(cases.away(arm, by=0.1), cases.SPEED, cases.ACCELERATION)
-        cases.finish(arm)
-    finally:
-        for one in (arm, other):
-            if one is not None:
-                one.close()
-        running.close()
+        with closing(cases.controlled(running)) as arm:
+            arm.start_move(cases.away(arm, by=0.1), cases.SPEED, cases.ACCELERATION)
+            cases.finish(arm)
 
 
 def test_controller_mute_in_motion(arm, sim):
@@ -143,9 +125,7 @@ def test_stop_says_so_when_it_cannot_be_seen_that_the_arm_stands(arm, sim):
 
 @pytest.mark.long
 def test_controller_dies_in_motion(tmp_path):
-    running = cases.start(tmp_path)
-    arm = cases.controlled(running)
-    try:
+    with closing(cases.start(tmp_path)) as running, closing(cases.controlled(running)) as arm:
         cases.under_way(arm, running)
         with pytest.raises(DeviceError):
             running.admin("die")
@@ -154,9 +134,6 @@ def test_controller_dies_in_motion(tmp_path):
         assert arm.report().problems
         with pytest.raises(DeviceError, match="refuses the connection"):
             arm.take_control(1.0, np.zeros(3))
-    finally:
-        arm.close()
-        running.close()
     assert cases.children() == []
 
 
@@ -241,7 +218,31 @@ def test_interrupt_from_the_terminal_does_not_end_the_children(arm, sim):
     np.testing.assert_allclose(sim.admin()["q"], goal, atol=2e-5)
 
 
-_PARENT = """
+@contextmanager
+def program(code, host):
+    """Another program that uses the arm at a host."""
+    parent = subprocess.Popen(
+        [sys.executable, "-c", code, host],
+        stdout=subprocess.PIPE,
+        cwd=ROOT,
+        env=environment(),
+    )
+    try:
+        yield parent
+    finally:
+        parent.kill()
+        parent.wait()
+        parent.stdout.close()
+
+
+def _runs(pid):
+    try:
+        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
+
+
+MOVING = """
 import sys, time
 import numpy as np
 from tests.support import ur_driver_cases as cases
@@ -256,13 +257,7 @@ while arm.moving():
 
 
 def test_kill_9_of_the_program_stops_the_arm_and_leaves_no_process(sim):
-    parent = subprocess.Popen(
-        [sys.executable, "-c", _PARENT, sim.host],
-        stdout=subprocess.PIPE,
-        cwd=sim_ur_cases.ROOT,
-        env=sim_ur_cases.environment(),
-    )
-    try:
+    with program(MOVING, sim.host) as parent:
         for _ in range(30):
             assert parent.stdout.readline() == b"moves\n"
         pids = [p.pid for p in psutil.Process(parent.pid).children(recursive=True)]
@@ -272,19 +267,11 @@ def test_kill_9_of_the_program_stops_the_arm_and_leaves_no_process(sim):
         state = sim.wait("moving", False)
         assert state["rest_ns"] - killed < cases.STOP_NS
         parent.wait()
-        end = time.monotonic() + 5.0
-        while any(_runs(pid) for pid in pids):
-            assert time.monotonic() < end, "a child outlived the program"
-            time.sleep(0.01)
-    finally:
-        parent.kill()
-        parent.wait()
-        parent.stdout.close()
-    arm = cases.controlled(sim)  # and the next program takes over
-    arm.close()
+        wait_until(lambda: not any(map(_runs, pids)), "ended: the children", 5.0)
+    cases.controlled(sim).close()  # and the next program takes over
 
 
-_TAKING = """
+TAKING = """
 import sys
 from tests.support import ur_driver_cases as cases
 from hilcal.drivers.ur import open_arm
@@ -295,34 +282,20 @@ open_arm(cases.config(sys.argv[1])).take_control(cases.MASS, cases.COM)
 @pytest.mark.long
 def test_kill_9_while_control_is_taken_leaves_no_program_behind(sim):
     scripts = sim.admin()["scripts"]
-    parent = subprocess.Popen(
-        [sys.executable, "-c", _TAKING, sim.host],
-        cwd=sim_ur_cases.ROOT,
-        env=sim_ur_cases.environment(),
-    )
     try:
-        while sim.admin()["scripts"] == scripts:
-            assert parent.poll() is None
-            time.sleep(0.001)
-        parent.kill()  # the robot's program is uploaded and has no watchdog yet
-        sim.wait("script_running", False)
-        sim.wait("rtde_clients", 0)
-        arm = cases.controlled(sim)  # and the next program takes over
-        arm.close()
+        with program(TAKING, sim.host) as parent:
+            while sim.admin()["scripts"] == scripts:
+                assert parent.poll() is None
+                time.sleep(0.001)
+            parent.kill()  # the robot's program is uploaded and has no watchdog yet
+            sim.wait("script_running", False)
+            sim.wait("rtde_clients", 0)
+            cases.controlled(sim).close()  # and the next program takes over
     finally:
-        parent.kill()
-        parent.wait()
         cases.supervision(sim).stop(2.0)
 
 
-def _runs(pid):
-    try:
-        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
-    except psutil.NoSuchProcess:
-        return False
-
-
-_HANGING = """
+HANGING = """
 import sys, threading
 from hilcal.drivers.ur_link.worker import Worker
 arguments = (sys.argv[1], "125.0", "timestamp")
@@ -335,27 +308,14 @@ thread.join()
 
 @pytest.mark.long
 def test_child_that_hangs_in_the_client_library_ends_with_the_program():
-    host = sim_ur_cases.free_host()
+    host = free_host()
     with socket.socket() as server:
         server.bind((host, 30004))
         server.listen(4)
-        parent = subprocess.Popen(
-            [sys.executable, "-c", _HANGING, host],
-            cwd=sim_ur_cases.ROOT,
-            env=sim_ur_cases.environment(),
-        )
-        try:
+        with program(HANGING, host) as parent:
             line, _ = server.accept()  # the library is in its constructor, and stays there
             with line:
                 (child,) = psutil.Process(parent.pid).children()
                 parent.kill()
                 parent.wait()
-                end = time.monotonic() + 5.0
-                while child.is_running() and child.status() != psutil.STATUS_ZOMBIE:
-                    assert time.monotonic() < end, "the child outlived the program"
-                    time.sleep(0.01)
-        except psutil.NoSuchProcess:
-            pass
-        finally:
-            parent.kill()
-            parent.wait()
+                wait_until(lambda: not _runs(child.pid), "ended: the child", 5.0)

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hilcal.config.reference import to_toml
-from hilcal.drivers.simulated.cell_processes import SimulatedCell
+from hilcal.drivers.simulated.cell_processes import SimulatedCell, free_host
 from hilcal.drivers.simulated.ur_rtde import outputs_since
 from hilcal.drivers.simulated.ur_server import API
 from hilcal.drivers.simulated.ur_state import line
@@ -41,7 +41,6 @@ from hilcal.measuring.route import duration
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.factory import nominal_rows
 from hilcal.store.campaign_file import CampaignFile
-from tests.support import sim_ur_cases
 from tests.support import ur_driver_cases as cases
 from tests.support.cli_cases import ok
 from tests.support.factory_cases import write
@@ -178,8 +177,7 @@ def test_an_older_controller_is_read_without(tmp_path) -> None:
 
 def test_torques_hold_the_arm_and_the_friction_of_the_arrival(tmp_path) -> None:
     with closing(cases.start(tmp_path, "--version", NEW)) as sim:
-        arm = cases.controlled(sim)
-        try:
+        with closing(cases.controlled(sim)) as arm:
             for sign in (1.0, -1.0):
                 q = arm.sample().q + 0.05 * sign
                 arm.start_move(q, 0.5, 4.0)
@@ -196,24 +194,21 @@ def test_torques_hold_the_arm_and_the_friction_of_the_arrival(tmp_path) -> None:
             assert arm.workers == (receive, command)
             arm.take_control(cases.MASS, cases.COM)
             assert arm.sample().torque is not None
-        finally:
-            arm.close()
         assert cases.children() == []
 
 
 def test_a_stalled_link_ends_the_torques_not_the_arm(tmp_path) -> None:
-    with closing(cases.start(tmp_path, "--version", NEW)) as sim:
-        arm = open_arm(cases.config(sim.host))
-        try:
-            (_, torques) = arm.workers
-            os.kill(torques, signal.SIGSTOP)
-            begun = time.monotonic()
-            assert arm.sample().torque is None
-            assert time.monotonic() - begun < 5.0
-            assert arm.sample().torque is None
-            assert len(arm.workers) == 1
-        finally:
-            arm.close()
+    with (
+        closing(cases.start(tmp_path, "--version", NEW)) as sim,
+        closing(open_arm(cases.config(sim.host))) as arm,
+    ):
+        (_, torques) = arm.workers
+        os.kill(torques, signal.SIGSTOP)
+        begun = time.monotonic()
+        assert arm.sample().torque is None
+        assert time.monotonic() - begun < 5.0
+        assert arm.sample().torque is None
+        assert len(arm.workers) == 1
 
 
 @pytest.mark.long
@@ -255,7 +250,7 @@ def answer(body: bytes) -> bytes:
 @contextmanager
 def server(port: int, says: Callable[[bytes], bytes]) -> Iterator[tuple[str, list[bytes]]]:
     """Something that listens on a port, and what it was asked, one connection after the other."""
-    host, asked = sim_ur_cases.free_host(), []
+    host, asked = free_host(), []
     with socket.socket() as door:
         door.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         door.bind((host, port))
@@ -326,7 +321,7 @@ def test_other_answers_are_one_line(says: bytes, words: str) -> None:
 
 def test_a_mute_one_costs_its_deadline_and_no_more() -> None:
     with socket.socket() as door:
-        host = sim_ur_cases.free_host()
+        host = free_host()
         door.bind((host, API))
         door.listen()
         begun = time.monotonic()
@@ -375,25 +370,19 @@ def test_something_else_on_the_primary_port_is_one_line(says: bytes) -> None:
 @pytest.mark.parametrize("version", cases.GENERATIONS)
 def test_a_controller_tells_the_kinematics_of_its_factory(tmp_path, version: str) -> None:
     made = write(tmp_path / "cal.toml", "ur10e")
-    running = cases.start(
-        tmp_path, "--version", version, "--calibration", str(tmp_path / "cal.toml")
-    )
-    arm = open_arm(cases.config(running.host))
-    try:
+    options = ("--version", version, "--calibration", str(tmp_path / "cal.toml"))
+    with (
+        closing(cases.start(tmp_path, *options)) as running,
+        closing(open_arm(cases.config(running.host))) as arm,
+    ):
         report = arm.report()
         np.testing.assert_allclose(report.kinematics.rows, made.rows, rtol=1e-9, atol=1e-9)
         assert report.kinematics.status == 2
         assert dict(report.fields)["kinematics"] == report.kinematics.to_dict()
-    finally:
-        arm.close()
-        running.close()
 
 
 def test_a_controller_without_a_calibration_tells_the_nominal_ones(tmp_path) -> None:
-    running = cases.start(tmp_path)
-    try:
+    with closing(cases.start(tmp_path)) as running:
         found = read_kinematics(running.host, 2.0)
-    finally:
-        running.close()
     np.testing.assert_allclose(found.rows, nominal_rows(load_arm("ur10e")), rtol=0, atol=1e-12)
     assert found.status == 0

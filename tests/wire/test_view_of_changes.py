@@ -5,8 +5,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import psutil
@@ -16,6 +14,7 @@ from rerun.chunk import RrdReader
 from hilcal.present.viewer.recording import executable
 from hilcal.store.campaign_file import CampaignFile
 from tests.support.bench_cases import BASE, stored
+from tests.support.timing import wait_until
 
 pytestmark = pytest.mark.slow
 
@@ -39,13 +38,6 @@ def begun(folder: Path, *words: object) -> tuple["subprocess.Popen[str]", Path]:
         return subprocess.Popen(line, stdout=out, stderr=out, text=True), told
 
 
-def until(what: Callable[[], bool]) -> None:
-    end = time.monotonic() + LONG
-    while not what():
-        assert time.monotonic() < end
-        time.sleep(0.05)
-
-
 def revisions(recording: Path) -> set[int]:
     """The revisions whose verdicts a recording has."""
     try:
@@ -62,7 +54,7 @@ def test_added_and_removed_a_viewer_sees_both_revisions(tmp_path: Path) -> None:
     run = stored(tmp_path / "run.hilcal")
     for word, seen in (("add", {1, 2}), ("remove", {1, 2, 3})):
         process, told = begun(tmp_path, word, run, BASE)
-        until(lambda told=told: URL.search(told.read_text()) is not None)
+        wait_until(lambda told=told: URL.search(told.read_text()), "served", LONG)
         url = URL.search(told.read_text())
         assert url is not None
         late = tmp_path / f"{word}.rrd"
@@ -73,7 +65,8 @@ def test_added_and_removed_a_viewer_sees_both_revisions(tmp_path: Path) -> None:
         )
         try:
             assert process.wait(LONG) == 0, told.read_text()
-            until(lambda late=late: len(revisions(late)) > 0)  # what it had sent when it ended
+            # what it had sent when it ended
+            wait_until(lambda late=late: revisions(late), "seen", LONG)
         finally:
             client.kill()
             client.wait()
@@ -99,7 +92,7 @@ def test_sigterm_completes_the_recording_and_leaves_no_process(tmp_path: Path) -
     run = stored(tmp_path / "run.hilcal")
     process, told = begun(tmp_path, "refine", run)
     recording = run.with_name("run.live.rrd")
-    until(lambda: recording.exists() and len(revisions(recording)) > 0)
+    wait_until(lambda: recording.exists() and revisions(recording), "recorded", LONG)
     children = psutil.Process(process.pid).children(recursive=True)
     os.kill(process.pid, signal.SIGTERM)
     code = process.wait(LONG)

@@ -1,21 +1,23 @@
 """A short run of `python -m tests.fuzz`, and what longer ones have found."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
-from random import Random
 
 import numpy as np
 import pytest
 
+from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.urscript import program_points
 from hilcal.config import CellConfig
 from hilcal.errors import HilcalError, InputError
 from hilcal.identification import parameters_document, posterior_document
 from hilcal.identification.registration import inverse_roots
 from hilcal.readings.covariance import is_covariance
-from hilcal.store.plan import read_plan
+from hilcal.store.plan import load_plan, read_plan
 from hilcal.tables.mapping import Mapping, load_mapping
 from tests.fuzz import files, harness, stored, wire
+from tests.fuzz.bench import Bench
 
 FEW = {
     "chain": 2,
@@ -27,6 +29,7 @@ FEW = {
     "mat": 20,
     "calibration": 30,
     "cell": 60,
+    **dict.fromkeys(("factory.yaml", "factory.conf", "factory.toml"), 50),
     **dict.fromkeys(("krl", "rapid", "fanuc", "inform"), 30),
 }
 PARSERS = {parser.name: parser for parser in (*wire.parsers(), *files.parsers())}
@@ -67,46 +70,34 @@ def test_the_sample_programs_are_understood(tmp_path: Path) -> None:
 DEEP = "[" * 100_000 + "]" * 100_000
 
 
-@pytest.mark.parametrize("kind", ["plan", "cell", "posterior", "parameters", "calibration"])
-def test_documents_nested_too_deeply(kind: str, tmp_path: Path) -> None:
-    path = tmp_path / "deep.json"
-    path.write_text(DEEP)
-    from hilcal.calibration.calibration import Calibration
-
-    read = {
-        "plan": lambda: read_plan(DEEP, "x"),
-        "cell": lambda: CellConfig.from_json(DEEP),
-        "posterior": lambda: posterior_document.read(path),
-        "parameters": lambda: parameters_document.read(path),
-        "calibration": lambda: Calibration.load(path),
-    }[kind]
+@pytest.mark.parametrize(
+    ("text", "read"),
+    [
+        (DEEP, load_plan),
+        (DEEP, lambda path: CellConfig.from_json(path.read_text())),
+        (DEEP, posterior_document.read),
+        (DEEP, parameters_document.read),
+        (DEEP, Calibration.load),
+        ("a = " + "[" * 5000, lambda path: load_mapping(path, Mapping)),
+    ],
+    ids=["plan", "cell", "posterior", "parameters", "calibration", "mapping"],
+)
+def test_documents_nested_too_deeply(
+    text: str, read: Callable[[Path], object], tmp_path: Path
+) -> None:
+    path = tmp_path / "deep"
+    path.write_text(text)
     with pytest.raises(InputError, match="nested too deeply"):
-        read()
-
-
-def test_a_toml_file_nested_too_deeply(tmp_path: Path) -> None:
-    path = tmp_path / "m.toml"
-    path.write_text("a = " + "[" * 5000)
-    with pytest.raises(InputError, match="nested too deeply"):
-        load_mapping(path, Mapping)
+        read(path)
 
 
 def test_a_prior_whose_number_of_columns_is_infinite(tmp_path: Path) -> None:
     """An OverflowError: Python's JSON reads 1e999 as infinity."""
-    path, rng = tmp_path / "prior.json", Random(0)
-    sound = next(d for d in iter(lambda: PARSERS["posterior"].make(rng), b"") if _is_prior(d))
-    content = json.loads(sound)
+    path, content = tmp_path / "prior.json", json.loads(Bench(tmp_path).documents["posterior"])
     content["prints"]["columns"] = float("inf")
     path.write_text(json.dumps(content).replace("Infinity", "1e999"))
     with pytest.raises(InputError, match="a damaged prior"):
         posterior_document.read(path)
-
-
-def _is_prior(data: bytes) -> bool:
-    try:
-        return PARSERS["posterior"].parse(data)
-    except HilcalError:
-        return False
 
 
 def test_correlations_that_have_no_eigenvalues() -> None:

@@ -52,17 +52,16 @@ FOREIGN = {
 }
 
 
-def make(path: Path, config: str | None = None, base: str = "", robot: str | None = None) -> Path:
-    told = {COVERS: WHOLE} | ({} if robot is None else {"robot_file": robot})
-    config = load_config(CELL).to_json() if config is None else config
-    with CampaignFile.create(path, config, base, "made", more=told) as file:
+def make(path: Path, config: str, base: str = "") -> Path:
+    with CampaignFile.create(path, config, base, "made", more={COVERS: WHOLE}) as file:
         file.append_readings(rehearsal("nothing", poses=8).readings)
     return path
 
 
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    return make(tmp_path_factory.mktemp("plain") / "run.hilcal").read_bytes()
+    path = tmp_path_factory.mktemp("plain") / "run.hilcal"
+    return make(path, load_config(CELL).to_json()).read_bytes()
 
 
 @pytest.fixture
@@ -167,10 +166,10 @@ def test_a_pipe_in_the_place_of_a_campaign_is_not_waited_for(
 # the robot
 
 
-def own_robot(tmp_path: Path, model: str, robot: str | None = None) -> Path:
+def own_robot(tmp_path: Path, model: str) -> Path:
     config = json.loads(load_config(CELL).to_json())
     config["robot"]["model"] = model
-    return make(tmp_path / "run.hilcal", json.dumps(config), str(tmp_path / "gone"), robot)
+    return make(tmp_path / "run.hilcal", json.dumps(config), str(tmp_path / "gone"))
 
 
 def test_no_robot_is_read_that_is_not_in_the_campaign(tmp_path: Path, capsys: Capsys) -> None:

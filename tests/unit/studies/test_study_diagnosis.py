@@ -2,13 +2,23 @@
 
 import io
 import json
+from typing import Any
 
 import pytest
 from rich.console import Console
 
 from hilcal.errors import InputError
 from hilcal.readings.whitening import MODES
-from studies.diagnosis import Inside, Outcome, Sample, run_case
+from studies.diagnosis import (
+    Added,
+    Asked,
+    Inside,
+    Judgement,
+    Outcome,
+    Refined,
+    Sample,
+    run_case,
+)
 from studies.diagnosis_claims import claims
 from studies.diagnosis_document import document
 from studies.diagnosis_pool import run_all
@@ -26,18 +36,65 @@ from studies.diagnosis_rates import (
 from studies.diagnosis_table import report
 from studies.study_cases import effects_shown, laws_shown
 from tests.support.cli_cases import Capsys, ok, refused
-from tests.support.study_diagnosis_cases import asked, outcome, quick, refined, said
 
 
-def extent(*kinds: str, **given: object) -> Extent:
-    usual: dict[str, object] = {
+def asked(**given: Any) -> Asked:
+    """A question; two effects are a pair."""
+    usual: dict[str, Any] = {
+        "kind": "hidden", "robot": "ur10e", "mode": "absolute",
+        "hidden": ("creep",), "strength": 2.0, "seed": 0,
+    }  # fmt: skip
+    return Asked(**{**usual, **given})
+
+
+def said(
+    lead: str = "creep",
+    *same_as: str,
+    verdict: str = "missing_effect",
+    variables: tuple[str, ...] = ("time", "load"),
+    carriers: tuple[str, ...] = (),
+) -> Judgement:
+    return Judgement(verdict, lead, same_as, variables, carriers, "a sentence of times", 1.5)
+
+
+def refined(
+    *added: str,
+    same_as: tuple[str, ...] = (),
+    verdict: str = "adequate",
+    holdout: float = 1.0,
+    inside: tuple[Inside, ...] = (),
+) -> Refined:
+    return Refined(
+        judgement=said(verdict=verdict),
+        added=tuple(Added(a, same_as) for a in added),
+        model=("joint_compliance", *added),
+        holdout=holdout,
+        holdout_real=holdout,
+        intervals=inside,
+    )
+
+
+def outcome(lead: str = "creep", *same_as: str, **given: Any) -> Outcome:
+    """The answer that `lead` is first, to a question about creep."""
+    return Outcome(asked(**given), said(lead, *same_as))
+
+
+def quick(question: Asked) -> Outcome:
+    """An answer without any work; by module and name, so that other processes find it."""
+    if question.seed < 0:
+        raise RuntimeError("a seed below 0")
+    return Outcome(question, said(f"effect {question.seed}"))
+
+
+def extent(*kinds: str, **given: Any) -> Extent:
+    usual: dict[str, Any] = {
         "kinds": kinds,
         "robots": ("ur3e", "ur10e"),
         "modes": MODES,
         "effects": {m: effects_shown(m) for m in MODES},
         "laws": {m: laws_shown(m) for m in MODES},
     }
-    return Extent(**{**usual, **given})  # type: ignore[arg-type]
+    return Extent(**usual | given)
 
 
 @pytest.mark.parametrize(

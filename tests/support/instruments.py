@@ -1,0 +1,156 @@
+"""Simulated instruments for tests: a process each, in a world that the test writes."""
+
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hilcal.config import CellConfig
+from hilcal.drivers.simulated.admin import ask
+from hilcal.drivers.simulated.blackboard import Blackboard
+from hilcal.drivers.simulated.cell_processes import EMSCON_PORT, WEB_PORT, free_host
+
+START_S = 30.0
+TRACKER_NOISE = ("--range-std", "5e-6", "0.15e-6", "--transverse-std", "7.5e-6", "3e-6")
+TARGET = (0.5, 2.8, 0.4)
+TURNED = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+WRENCH = np.array([1.0, -2.0, 30.0, 0.1, 0.2, -0.3])
+WARM = ("--on", "1e6")
+"""The zero of a force sensor that has been on for so long drifts no more."""
+
+
+@dataclass(eq=False)
+class Instrument:
+    """A running simulated instrument."""
+
+    port: Path  # the name to open
+    socket: Path  # its admin socket
+    board: Blackboard  # the shared world; the test is its writer
+    process: subprocess.Popen[bytes]  # the server
+
+    def admin(self, op: str, **arguments: Any) -> Any:
+        """Switch a fault, or ask for the state."""
+        return ask(self.socket, op, **arguments)
+
+    def truth(self, **fields: Any) -> None:
+        """Write what is true in the world, e.g. `target` or `sensor_wrench`."""
+        self.board.write("truth", time=self.board.time, **fields)
+
+    def close(self) -> None:
+        """End the server as the end of its parent would."""
+        assert self.process.stdin is not None
+        self.process.stdin.close()
+        try:
+            self.process.wait(5.0)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+            raise
+
+
+@contextmanager
+def running(
+    module: str, name: str, *options: str, scale: float = 1.0, seed: int = 1, **truth: Any
+) -> Iterator[Instrument]:
+    """Run `hilcal.drivers.simulated.<module>` in a world that says `truth` from the beginning."""
+    with tempfile.TemporaryDirectory() as directory:
+        board = Blackboard.create(Path(directory) / "world.bin", scale)
+        command = [sys.executable, "-m", f"hilcal.drivers.simulated.{module}"]
+        command += ["--directory", directory, "--seed", str(seed), *options]
+        if truth:  # before it starts: no frame of an empty world is on its way then
+            board.write("truth", time=board.time, **truth)
+        process = subprocess.Popen(command, stdin=subprocess.PIPE)
+        port = Path(directory) / name
+        instrument = Instrument(port, port.with_suffix(".sock"), board, process)
+        try:
+            deadline = time.monotonic() + START_S
+            while not instrument.socket.exists():
+                assert process.poll() is None, f"{module} ended with {process.returncode}"
+                assert time.monotonic() < deadline, f"{module} did not start"
+                time.sleep(0.01)
+            yield instrument
+        finally:
+            instrument.close()
+
+
+@contextmanager
+def tracker(
+    target: tuple[float, float, float] = TARGET, *options: str, scale: float = 20.0
+) -> Iterator[Instrument]:
+    """Run a GeoCOM station that sees `target` (its own axes, m)."""
+    at = np.array(target)
+    with running(
+        "geocom_server", "tracker", *TRACKER_NOISE, *options, scale=scale, target=at
+    ) as station:
+        yield station
+
+
+@contextmanager
+def force_sensor(
+    kind: str, *options: str, scale: float = 1.0, seed: int = 1
+) -> Iterator[Instrument]:
+    """Run a force sensor ("ft300", "bota", "hex") that feels `WRENCH` (its axes, N and N·m)."""
+    with running(
+        "force_server", "force", "--kind", kind, *options,
+        scale=scale, seed=seed, sensor_wrench=WRENCH,
+    ) as sensor:  # fmt: skip
+        yield sensor
+
+
+# in a network
+
+
+@contextmanager
+def emscon() -> Iterator[tuple[Instrument, str]]:
+    """Run a laser tracker that sees `TARGET`, turned by `TURNED`; yields its address, too."""
+    host = free_host()
+    place = ("--host", host, "--port", str(EMSCON_PORT))
+    with running(
+        "emscon_server", "tracker", *TRACKER_NOISE, *place,
+        scale=20.0, target=np.array(TARGET), target_rotation=TURNED,
+    ) as station:  # fmt: skip
+        yield station, f"{host}:{EMSCON_PORT}"
+
+
+@contextmanager
+def natnet(*options: str) -> Iterator[tuple[Instrument, str]]:
+    """Run cameras that see `TARGET`, turned by `TURNED`; yields their address, too."""
+    host = free_host()
+    with running(
+        "natnet_server", "tracker", "--host", host, *options,
+        scale=2.0, target=np.array(TARGET), target_rotation=TURNED,
+    ) as cameras:  # fmt: skip
+        yield cameras, host
+
+
+@contextmanager
+def netft() -> Iterator[tuple[Instrument, str]]:
+    """Run a Net F/T that feels `WRENCH`, warm; yields its address without a port, too."""
+    host = free_host()
+    place = ("--kind", "netft", "--host", host)
+    with running("force_server", "force", *place, *WARM, sensor_wrench=WRENCH) as sensor:
+        yield sensor, host
+
+
+def cell(address: str, driver: str, **options: Any) -> CellConfig:
+    """A cell whose tracker is in the network."""
+    return CellConfig.model_validate(
+        {
+            "robot": {"model": "ur10e"},
+            "tracker": {"driver": driver, "host": address, "options": options},
+            "simulation": {"clock": 20.0},
+        }
+    )
+
+
+def force_cell(host: str, **options: Any) -> CellConfig:
+    """A cell whose force sensor is a Net F/T."""
+    section = {"driver": "netft", "host": host, "options": {"web_port": WEB_PORT, **options}}
+    return CellConfig.model_validate({"robot": {"model": "ur10e"}, "force_sensor": section})
