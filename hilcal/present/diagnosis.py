@@ -49,7 +49,7 @@ how far it misses. While it is fitted to few poses, and lacks what is hidden, th
 
 def verdict_line(d: Diagnosis) -> Words:
     """Return the verdict with its message; names of the catalogue keep their spelling."""
-    words = numbers.sentence(message(d), d.fit.model.catalogue.names)
+    words = message(d)
     tone: Tone = "good" if d.verdict == "adequate" else "doubt"
     return Words(f"Verdict: {headline(d)}.\n{words}", tone, headline(d))
 
@@ -284,7 +284,7 @@ def step_report(number: int, change: str, d: Diagnosis) -> Iterator[Block]:
         yield follows(d.misfit_breakdown)
     if d.significant:
         yield from ("", suspects_table(d))
-    yield from (numbers.sentence(message(d), d.fit.model.catalogue.names), "")
+    yield from (message(d), "")
 
 
 @dataclass(frozen=True, slots=True)

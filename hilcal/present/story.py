@@ -277,7 +277,7 @@ def _revision(c: Chapter, e: FullPrediction, residual: Floats, measured: Floats)
     verdict: list[Block] = [f"{UNDIAGNOSED.capitalize()}: run hilcal diagnose for a verdict."]
     details: list[Block] = [misses(c.fit)]
     if d is not None:
-        verdict = [numbers.sentence(message(d), d.fit.model.catalogue.names)]
+        verdict = [message(d)]
         verdict += [suspects_table(d, MOST_SUSPECTS)] if d.significant else []
         details = list(diagnosis_report(d))
         if drawn is not None:

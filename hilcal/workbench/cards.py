@@ -117,7 +117,7 @@ def _verdict(view: View, d: Snapshot) -> None:
         part.props("data-part=verdict")
         words = plain(numbers.sentence(headline(judged)))
         ui.html(f"<h2 class='verdict {kind}'>{mark} {words}</h2>", sanitize=False)
-        ui.label(numbers.sentence(message(judged), fit.model.catalogue.names))
+        ui.label(message(judged))
         low, high = fit.variance_factor_interval
         with ui.element("div").classes("numbers"):
             number("error on poses left out", numbers.length(fit.holdout.rms_m))

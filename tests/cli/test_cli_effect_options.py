@@ -148,7 +148,7 @@ def test_joints_that_differ_are_let_differ(campaign, tmp_path, capsys):
     found = ok(capsys, "diagnose", campaign, "--json").document
     assert found["suspects"][0]["effect"] == finer
     assert found["suspects"][0]["finer_than"] == "joint_compliance"
-    assert found["message"].startswith(f"let joints differ: {finer} explains")
+    assert found["message"].startswith(f"Let joints differ: {finer} explains")
     assert found["tests"]["each"] == found["tests"]["level"] / found["tests"]["count"]
     refused_ = refused(capsys, 4, "next", campaign, "-o", tmp_path / "next.json")
     assert f"hilcal add {campaign} '{finer}'" in refused_

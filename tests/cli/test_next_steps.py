@@ -305,7 +305,7 @@ TAKEN: dict[str, dict[str, str]] = {
     "present/story": {"run hilcal diagnose for a verdict": f"{RARE}what_a_recording_names",
         "run hilcal identify first": f"{RARE}what_a_recording_names"},
     "present/verdict": {
-        "hilcal next plans": "tests/cli/test_next_cli.py::test_next_in_json_and_in_words",
+        "Run hilcal next": "tests/cli/test_next_cli.py::test_next_in_json_and_in_words",
         "hilcal refine --readings absolute": f"{HERE}deflections_lack_the_unloaded_arm",
     },
     "present/viewer/live": {"`hilcal refine` does": f"{RARE}what_a_recording_names",

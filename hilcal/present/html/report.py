@@ -182,7 +182,7 @@ def _missing(d: Diagnosis | None) -> str:
         return "Not judged; hilcal identify --scaling gc, then hilcal diagnose, say it."
     if d.verdict == "adequate":
         return "Nothing that these readings could show."
-    words = numbers.sentence(message(d), d.significant)
+    words = message(d)
     if d.lead is None or d.wrong_figures:
         return words
     name = d.lead.coarse or d.lead.effect
@@ -491,7 +491,7 @@ def _evidence(m: ReportContent) -> PageSection:
         return PageSection("evidence", title, (words,))
     parts: list[Block] = []
     if d.verdict == "adequate":  # else the first screen has it
-        parts.append(numbers.sentence(message(d)))
+        parts.append(message(d))
     parts.append(_suspects_table(d.suspects[:MOST_LISTED], "Suspects, best first"))
     parts += [*doubtful(d), *redundant_line(d)]
     parts += _added_variables(d, [s for s in d.suspects if s.passes][:MOST_CURVES])

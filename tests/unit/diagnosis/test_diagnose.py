@@ -91,7 +91,7 @@ def test_nothing_hidden_is_adequate(mode):
         of = "of the catalogue" if mode == "absolute" else "that deflections show"
         if d.not_shown and mode == "absolute":
             of = "that these readings could show"
-        assert f"no effect {of} is missing" in message(d)
+        assert f"No effect {of} is missing" in message(d)
 
 
 def test_what_deflections_cannot_show_is_part_of_the_verdict():
@@ -103,8 +103,8 @@ def test_what_deflections_cannot_show_is_part_of_the_verdict():
         assert d.verdict == "adequate", message(d)
         assert effect in d.not_shown
         assert headline(d) == "adequate for deflections; geometry is not calibrated"
-        assert "geometry is not calibrated" in message(d)
-        assert "no effect of the catalogue" not in message(d)
+        assert "Geometry is not calibrated" in message(d)
+        assert "No effect of the catalogue" not in message(d)
         told = to_json(d)
         assert effect in told["not_shown"]
         assert {s["effect"] for s in told["suspects"] if not s["shown"]} >= set(d.not_shown)
@@ -217,7 +217,7 @@ def test_misjudged_noise_without_repeats_cannot_be_known_to_be_it():
     d = diagnose(fitted(c, readings=with_noise(clean, np.random.default_rng(0), 2.0)))
     assert d.verdict == "noise_misjudged"
     assert d.pure_error is None
-    assert "without repeated readings it cannot be known" in message(d)
+    assert "Without repeated readings it cannot be known" in message(d)
 
 
 def test_repeats_measure_the_noise_whatever_the_model_misses():

@@ -208,7 +208,7 @@ def test_the_verdict_is_to_let_joints_differ(arm, joints):
     assert d.significant[0] == EACH
     lead = d.suspects[0]
     assert lead.share > 0.95
-    assert message(d).startswith(f"let joints differ: {EACH} explains")
+    assert message(d).startswith(f"Let joints differ: {EACH} explains")
     assert suspect_json(lead)["finer_than"] == "joint_compliance"
     assert list(finer(d)) == [
         "Let joints differ: joint_compliance has one parameter for several joints; to give each "

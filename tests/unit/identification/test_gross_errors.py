@@ -258,7 +258,7 @@ def test_more_than_can_be_told_is_said(mode: Mode) -> None:
     readings, _ = spoil(c.readings, 0.6, 5e-3, np.random.default_rng(0))
     found = refine(baseline(c.cell, readings, mode), readings, mode)
     assert found.verdict == "unknown_effect"
-    assert "more than 45 % of the readings disagree" in message(found.diagnosis)
+    assert "More than 45 % of the readings disagree" in message(found.diagnosis)
     assert not found.fit.outlier.any()
 
 
