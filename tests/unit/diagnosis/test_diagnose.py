@@ -11,7 +11,6 @@ from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.document import to_json
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
 from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
-from hilcal.diagnosis.noise import pure_error
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.drivers.simulated.injected_effects import DEFLECTION_EFFECTS
 from hilcal.effects.catalogue import BUILT_IN
@@ -160,39 +159,6 @@ def test_scores_foretell_what_adding_does(mode):
         assert f_distribution.isf(s.score.p_value, rank, rest) == pytest.approx(ratio, rel=0.03)
 
 
-def test_effects_that_cannot_be_told_apart_name_each_other():
-    """Turning the base about z is turning the first joint, elastically as well."""
-    found = fitted(campaign("base_compliance", "deflection", 3, poses=8))
-    p = linearise(found)
-    by_name = {s.effect: s for s in rank_suspects(p, candidates(p.fit))}
-    for s in by_name.values():
-        for other in s.same_as:
-            assert s.effect in by_name[other].same_as
-    tilt, base = by_name["joint_tilt_compliance"], by_name["base_compliance"]
-    apart = abs(tilt.score.log_evidence - base.score.log_evidence)
-    assert ("base_compliance" in tilt.same_as) == (apart < 3)
-
-
-def unknown_effect(poses: int = 30, strength: float = 4.0) -> Campaign:
-    """dq_3 = a sign(q_1) |q_2|: in no catalogue."""
-    c = campaign(plan_seed=0, poses=poses)
-    p = plan(poses)
-    q = p.states.q
-    off = np.zeros_like(q)
-    off[:, 2] = np.sign(q[:, 0]) * np.abs(q[:, 1])
-    at = [c.world.sight(replace(p.states, q=q + a * off)).position for a in (0.0, 1e-4)]
-    white = np.linalg.solve(np.linalg.cholesky(c.readings.covariance), (at[1] - at[0])[:, :, None])
-    a = 1e-4 * strength / np.sqrt(np.mean(white**2))
-    moved = c.world.sight(replace(p.states, q=q + a * off)).position - at[0]
-    return replace(c, readings=replace(c.readings, value=c.readings.value + moved))
-
-
-def test_an_effect_outside_the_catalogue_is_never_called_adequate():
-    d = diagnose(fitted(unknown_effect()))
-    assert d.verdict != "adequate"
-    assert d.verdict != "noise_misjudged"
-
-
 # --- the noise is ---------------------------------------------------------------------------
 
 
@@ -218,23 +184,6 @@ def test_misjudged_noise_without_repeats_cannot_be_known_to_be_it():
     assert d.verdict == "noise_misjudged"
     assert d.pure_error is None
     assert "without repeated readings it cannot be known" in message(d)
-
-
-def test_repeats_measure_the_noise_whatever_the_model_misses():
-    factors, expected = [], []
-    for seed in range(6):
-        c = campaign("encoder_offset", seed=seed, plan_seed=0, cycles=3, registration_known=True)
-        found = fitted(c)
-        repeats = pure_error(found)
-        assert repeats.lack_of_fit_p < 1e-6
-        factors.append(repeats.factor)
-        expected.append(1 / repeats.dof)
-    # 4 σ of the mean of six variance factors.
-    assert np.mean(factors) == pytest.approx(1, abs=4 * np.sqrt(2 * np.sum(expected)) / 6)
-
-
-def test_without_repeats_there_is_no_pure_error():
-    assert pure_error(fitted(campaign(plan_seed=0))) is None
 
 
 # --- where ----------------------------------------------------------------------------------

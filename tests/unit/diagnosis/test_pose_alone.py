@@ -80,14 +80,6 @@ def test_a_transmission_error_too_fine_for_thirty_poses_is_ambiguous(seed: int) 
     assert to_json(d)["pose_alone"]["more"] == 130
 
 
-def test_what_depends_on_the_load_is_not_of_the_pose_alone() -> None:
-    c = campaign("creep", "absolute", 0, poses=30)
-    d = diagnose(fitted(c))
-    assert d.pose_alone is None
-    assert d.lead is not None
-    assert d.lead.effect == "creep"
-
-
 def test_the_chance_grows_with_the_poses() -> None:
     """Thirty poses hardly ever tell, many do."""
     options = {"plan_seed": 0, "poses": 30, "strength": 2.0, "harmonics": 21}
