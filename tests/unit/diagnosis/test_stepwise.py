@@ -155,8 +155,12 @@ def test_effects_added_by_algebra_explain_what_they_do_in_a_fit():
 
 def test_an_exchange_needs_an_effect_that_is_there_and_one_that_is_not():
     found = fitted(campaign(NOTHING, "deflection", 1), "backlash")
-    with pytest.raises(InputError, match="hysteresis is not in the model"):
-        exchange(found, "hysteresis", "base_compliance")
+    for changed in (
+        lambda: remove(found, "hysteresis"),
+        lambda: exchange(found, "hysteresis", "creep"),
+    ):
+        with pytest.raises(InputError, match="hysteresis is not in the model"):
+            changed()
     with pytest.raises(InputError, match="joint_compliance is in the model already"):
         exchange(found, "backlash", "joint_compliance")
 
