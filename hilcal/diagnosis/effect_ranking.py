@@ -37,7 +37,6 @@ import numpy as np
 
 from hilcal.diagnosis.minimum_detectable_effect import (
     Strength,
-    large,
     least_of_family,
     least_strength,
 )
@@ -341,9 +340,7 @@ def _suspect(p: Linearisation, scored: _Scored, level: float, count: int) -> Sus
         units = tuple(q.unit for q in effect.parameters)
         noise, each = max(p.fit.variance_factor, 1.0), level / count
         found = least_strength(s, own.motion, own.scale, units, p.fit.dof, noise, each, of_s.rank)
-        if large(of_s, p.fit.dof):
-            return least_of_family(p, own, of_s, found, each, LEAST_SHARE, largest)
-        return found
+        return least_of_family(p, own, of_s, found, each, LEAST_SHARE, largest)
 
     return Suspect(
         effect=effect.name,

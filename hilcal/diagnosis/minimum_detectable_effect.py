@@ -95,11 +95,6 @@ def _strength(moved: float, t: float, scale: Floats, units: tuple[str, ...]) -> 
     return Strength(moved, tuple((u, t * own) for u, own in rms.items()), t)
 
 
-def large(s: Spectrum, dof: float) -> bool:
-    """Whether a family is large against the degrees of freedom, which hides what it predicts."""
-    return s.rank > LARGE_FAMILY * dof
-
-
 def least_of_family(
     p: Linearisation,  # of the fit
     of: EffectColumns,  # the family, as it is scored
@@ -109,8 +104,11 @@ def least_of_family(
     least_share: float,  # share of the misfit on poses left out that must be explained
     largest: float,  # largest plausible strength
 ) -> Strength:
-    """Return the smallest strength of a large family that all tests would reveal."""
-    if not start.visible:
+    """Return the smallest strength of a family that all tests would reveal.
+
+    Of one that is small against the degrees of freedom that is what the F-test alone would reveal.
+    """
+    if not start.visible or s.rank <= LARGE_FAMILY * p.fit.dof:
         return start
     fine = of.effect.fine(p.fit.readings[~p.fit.outlier].states)
     tests = SuspectTests(p, of, s, level, least_share, largest)

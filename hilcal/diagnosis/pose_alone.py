@@ -109,14 +109,12 @@ def pose_alone(
     return PoseAlone(share, names, poses, more, sure)
 
 
-def pose_powers(before: Fit, effects: Sequence[str], more: int) -> Iterator[PosePower]:
-    """Yield how well the first of some effects is told from each of the others.
-
-    Args:
-        before: a fit of a model without them.
-        effects: two effects or more that depend on the pose alone.
-        more: further poses, read unloaded.
-    """
+def pose_powers(
+    before: Fit,  # of a model without the effects
+    effects: Sequence[str],  # two or more that depend on the pose alone
+    more: int,  # further poses, read unloaded
+) -> Iterator[PosePower]:
+    """Yield how well the first of some effects is told from each of the others."""
     states, model = before.readings[~before.outlier].states, before.model
     first, *rivals = effects
     made = model.catalogue.make(first, model.cell, states, m=before.readings.m)

@@ -189,11 +189,8 @@ def with_background(of: Fit, named: Collection[str]) -> Fit | None:
 
     The noise is as the mixed model estimates it: the arm's scatter is in the covariance, and a
     factor of the instrument's makes the standard deviations of the effects smaller by as much,
-    which is the same fit. Readings that were set aside as gross errors stay so.
-
-    Args:
-        of: a fit that allows it.
-        named: effects that are not of the background.
+    which is the same fit. Readings that were set aside as gross errors stay so. The `named` effects
+    are not of the background.
     """
     readings = of.readings.as_stated()
     try:

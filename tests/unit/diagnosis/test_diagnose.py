@@ -190,20 +190,6 @@ def test_where_names_each_variable_once_and_in_order():
 # --- form -----------------------------------------------------------------------------------
 
 
-def test_the_document_holds_the_contract():
-    d = diagnose(fitted(campaign("hysteresis", plan_seed=0)))
-    document = to_json(d)
-    assert document["model"] == ["base_frame", "joint_compliance"]
-    assert document["verdict"] == d.verdict
-    assert document["message"] == message(d)
-    assert document["variance_factor"] == d.fit.variance_factor
-    assert document["predictable_share"] == d.predictable_share
-    assert {"variable", "share", "p_value"} <= set(document["where"][0])
-    keys = {"effect", "p_value", "share", "holdout_share", "delta_bic", "same_as"}
-    assert keys <= set(document["suspects"][0])
-    assert document["suspects"][0]["effect"] == d.suspects[0].effect
-
-
 def test_a_diagnosis_needs_whitened_residuals():
     c = campaign(plan_seed=0)
     found = fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute", "none")

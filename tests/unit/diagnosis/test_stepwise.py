@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.stats import f as f_distribution
 
-from hilcal.diagnosis.diagnosis import in_doubt
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
 from hilcal.diagnosis.evidence import (
     CHANCE,
@@ -109,16 +108,6 @@ def test_a_large_family_that_took_the_part_of_two_effects_is_exchanged_for_them(
     names = w.steps[-1].fit.model.names
     assert {"encoder_offset", "tracker_drift"} <= set(names)
     assert "link_geometry" not in names
-
-
-def test_an_addition_that_cannot_be_told_from_another_is_a_doubt():
-    c = campaign("tracker_scale", "absolute", 1, poses=20, strength=1.0)
-    w = work(c, "tracker_scale")
-    d = w.steps[-1].diagnosis
-    assert StepwiseAlternatives(w.steps[-1].fit).of("tracker_scale").same_as
-    assert not w.reconsider()
-    assert d.reason == "inseparable_addition"
-    assert in_doubt(d)[0] == "tracker_scale"
 
 
 @pytest.mark.parametrize("mode", ["absolute", "deflection"])

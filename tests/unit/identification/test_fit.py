@@ -181,16 +181,6 @@ def test_an_over_complete_model_predicts_what_the_world_shows_elsewhere():
     assert off.max() < 0.05 * sigma
 
 
-def test_redundant_effects_share_one_direction():
-    """The first zero is the base's turn about z; both cannot be told."""
-    c = campaign(plan_seed=0)
-    found = based(c.cell, c.readings, "absolute", ("joint_compliance", "encoder_offset"))
-    (null,) = found.uncertainty.null
-    unseen = {n for n, (_, std) in named(found).items() if np.isinf(std)}
-    assert unseen == {"base_frame.rz", "encoder_offset.j1"}
-    assert all(name in null for name in unseen)
-
-
 @pytest.mark.parametrize("count", [1, 2])
 @pytest.mark.parametrize("mode", MODES)
 def test_no_more_elements_than_parameters_cannot_answer(mode, count):
