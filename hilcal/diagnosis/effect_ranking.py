@@ -36,6 +36,9 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from hilcal.diagnosis.minimum_detectable_effect import (
+    LEAST_SHARE as LEAST_SHARE,
+)
+from hilcal.diagnosis.minimum_detectable_effect import (
     Strength,
     least_of_family,
     least_strength,
@@ -66,8 +69,6 @@ LEAST_KEPT = 0.5  # share of a promise that must be kept; true effects of 3 σ k
 SAME_EVIDENCE = 3.0  # suspects whose evidence differs by less, e³ = 20 : 1, are inseparable
 FALSE_ALARM = 0.001
 """Chance of naming any effect where none is missing, over the whole catalogue."""
-LEAST_SHARE = 0.01
-"""An effect that explains less of the misfit on poses left out is not worth adding; a guess."""
 LOST = 0.2
 """Share of its evidence that an effect may lose at plausible sizes. A choice: a prior that is too
 narrow by half costs a few units however strong the evidence is."""
@@ -236,24 +237,21 @@ def most(of: EffectColumns, bare: Unloaded | None) -> float:
 def rank_suspects(
     p: Linearisation,
     effects: Sequence[Effect],  # that are not in the model
-    level: float = FALSE_ALARM,  # of the test over all of them together
     refit: Callable[[Fit, str], Fit] = add,  # returns a fit with one more effect
 ) -> tuple[Suspect, ...]:
     """Score all effects; best first, see `ranked`."""
-    found = [
-        _suspect(p, s, level, len(effects)) for part in _scored(p, effects, level) for s in part
-    ]
+    found = [_suspect(p, s, len(effects)) for part in _scored(p, effects) for s in part]
     tested = max(sum(s.score.rank > 0 for s in found), 1)
     no_load = p.fit.mode == "absolute" and not p.fit.solution.prediction.situation.load.wrench.any()
     geometry = Later(lambda: geometry_columns(p, effects))
     out: list[Suspect] = []
     for effect, s in zip(effects, found, strict=True):
-        explains = s.score.p_value * tested < level and s.score.log_evidence > 0
+        explains = s.score.p_value * tested < FALSE_ALARM and s.score.log_evidence > 0
         s = replace(s, explains=explains and s.holdout_share >= LEAST_SHARE)
         if s.passes:
             own = effect_columns(p.fit, effect)
             if no_load and through_load(effect):
-                s = replace(s, refuted=not beyond_geometry(p, own, geometry.value, SAME_EVIDENCE))
+                s = replace(s, refuted=not beyond_geometry(p, own, geometry.value))
             if s.passes:
                 s = replace(s, kept=kept(p, own, s.score, refit))
         out.append(s)
@@ -305,7 +303,7 @@ class _Scored:
     held: HeldOut | None = None  # None where the fitted readings rule the effect out
 
 
-def _scored(p: Linearisation, effects: Sequence[Effect], level: float) -> Iterator[list[_Scored]]:
+def _scored(p: Linearisation, effects: Sequence[Effect]) -> Iterator[list[_Scored]]:
     """Score effects, those together that were whitened together."""
     frames = frame_effects(p.fit)
     of_frames: list[EffectColumns] = []
@@ -319,12 +317,12 @@ def _scored(p: Linearisation, effects: Sequence[Effect], level: float) -> Iterat
         for of, (s, g) in zip(part[rest:], p.families(part[rest:]), strict=True):
             of_s, largest = spectrum(s), most(of, bare)
             scored.append(_Scored(of, s, of_s, g, largest, p.score_of(of_s, g, largest)))
-        able = [c for c in scored if c.score.p_value < level and c.score.log_evidence > 0]
+        able = [c for c in scored if c.score.p_value < FALSE_ALARM and c.score.log_evidence > 0]
         held = iter(_left_out(p, [(c.of.white, c.score) for c in able]))
         yield [replace(c, held=next(held)) if c in able else c for c in scored]
 
 
-def _suspect(p: Linearisation, scored: _Scored, level: float, count: int) -> Suspect:
+def _suspect(p: Linearisation, scored: _Scored, count: int) -> Suspect:
     """Describe one of `count` effects that are tested together.
 
     Columns are large: they are computed again where something that is asked for later needs them.
@@ -338,9 +336,9 @@ def _suspect(p: Linearisation, scored: _Scored, level: float, count: int) -> Sus
     def least() -> Strength:
         own = effect_columns(p.fit, effect)
         units = tuple(q.unit for q in effect.parameters)
-        noise, each = max(p.fit.variance_factor, 1.0), level / count
+        noise, each = max(p.fit.variance_factor, 1.0), FALSE_ALARM / count
         found = least_strength(s, own.motion, own.scale, units, p.fit.dof, noise, each, of_s.rank)
-        return least_of_family(p, own, of_s, found, each, LEAST_SHARE, largest)
+        return least_of_family(p, own, of_s, found, each, largest)
 
     return Suspect(
         effect=effect.name,
@@ -437,8 +435,8 @@ def geometry_columns(p: Linearisation, effects: Sequence[Effect]) -> Floats:
     return np.hstack([np.zeros((len(p.residual), 0)), *(of.white for of in families)])
 
 
-def beyond_geometry(p: Linearisation, of: EffectColumns, geometry: Floats, evidence: float) -> bool:
-    """Whether a family explains the readings beside geometry, at some log evidence."""
+def beyond_geometry(p: Linearisation, of: EffectColumns, geometry: Floats) -> bool:
+    """Whether a family explains the readings beside geometry, beyond doubt."""
     q, fit = geometry.shape[1], p.fit
     if not q:
         return True
@@ -450,7 +448,7 @@ def beyond_geometry(p: Linearisation, of: EffectColumns, geometry: Floats, evide
     rest, gradient, rss = eliminate(s, g, p.rss, slice(0, q), first.ridge)
     largest = of.effect.most()
     found = score_family(rest[q:, q:], gradient[q:], rss, fit.dof, first.effective, largest)
-    if found.rank == 0 or found.log_evidence <= evidence:
+    if found.rank == 0 or found.log_evidence <= SAME_EVIDENCE:
         return False
     # One ridge for both: columns in units of their strength.
     both = np.hstack([geometry / np.sqrt(first.ridge), of.white / np.sqrt(found.ridge)])

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from hilcal.diagnosis.effect_ranking import FALSE_ALARM, LEAST_SHARE, most, unloaded_readings
+from hilcal.diagnosis.effect_ranking import FALSE_ALARM, most, unloaded_readings
 from hilcal.diagnosis.minimum_detectable_effect import SuspectTests
 from hilcal.diagnosis.misfit_breakdown import pose_constants
 from hilcal.diagnosis.noise import MISFIT_ALARM
@@ -74,7 +74,6 @@ def pose_alone(
     p: Linearisation,
     effects: Sequence[Effect],  # that are not in the model
     level: float,  # of the test of a suspect, between 0 and 1
-    least: float,  # share of the misfit on poses left out that a suspect must explain
 ) -> PoseAlone | None:
     """Return a misfit that depends on the pose alone; None where it does not, or no effect does."""
     found = pose_constants(p)
@@ -103,7 +102,7 @@ def pose_alone(
     more, sure = about, 0.0
     for part in SHARES:
         more = max(int(np.ceil(part * about)), 1)
-        sure = chance(p, first, more, level, least)
+        sure = chance(p, first, more, level)
         if sure >= SURE:
             break
     return PoseAlone(share, names, poses, more, sure)
@@ -126,7 +125,7 @@ def pose_powers(
             p = linearise(add(before, rival))
         except HilcalError:
             continue
-        now, then = (chance(p, made, n, level, LEAST_SHARE, strength) for n in (0, more))
+        now, then = (chance(p, made, n, level, strength) for n in (0, more))
         yield PosePower(first, rival, now, then)
 
 
@@ -142,7 +141,6 @@ def chance(
     effect: Effect,
     more: int,  # further poses, read unloaded
     level: float,  # of the test of a suspect, between 0 and 1
-    least: float,  # share of the misfit on poses left out that must be explained
     strength: float | None = None,  # of its parameters; that which explains the misfit unless given
 ) -> float:
     """Return the chance that a family passes every test with so many more poses."""
@@ -160,7 +158,7 @@ def chance(
     y = signal + rng.standard_normal(signal.shape)
     s = spectrum(q.information(scored.white))
     largest = most(scored, unloaded_readings(then))
-    return float(np.mean(SuspectTests(q, scored, s, level, least, largest).found(y)))
+    return float(np.mean(SuspectTests(q, scored, s, level, largest).found(y)))
 
 
 def _with(before: Fit, more: int, rng: np.random.Generator) -> Fit:

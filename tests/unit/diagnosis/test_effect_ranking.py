@@ -138,14 +138,14 @@ def test_a_stiff_arm_with_a_wrong_geometry_is_not_compliant() -> None:
         geometry = geometry_columns(p, effects)
         for e in effects:
             if e.name in elastic:
-                assert not beyond_geometry(p, effect_columns(found, e), geometry, 3.0), e.name
+                assert not beyond_geometry(p, effect_columns(found, e), geometry), e.name
 
 
 def test_gravity_tells_of_a_compliant_arm() -> None:
     found = without_loads(0, stiff=False)
     p, effects = linearise(found), candidates(found)
     (e,) = (e for e in effects if e.name == "joint_compliance")
-    assert beyond_geometry(p, effect_columns(found, e), geometry_columns(p, effects), 3.0)
+    assert beyond_geometry(p, effect_columns(found, e), geometry_columns(p, effects))
     assert "joint_compliance" in {s.effect for s in rank_suspects(p, effects) if s.passes}
 
 

@@ -86,6 +86,6 @@ def test_the_chance_grows_with_the_poses() -> None:
     c = campaign("transmission_error", "absolute", 0, **options)
     p = linearise(fitted(c))
     effect = next(e for e in candidates(p.fit) if e.name == "transmission_error")
-    few, many = (chance(p, effect, n, 1e-4, 0.01) for n in (0, 160))
+    few, many = (chance(p, effect, n, 1e-4) for n in (0, 160))
     assert few < 0.2
     assert many > 0.9

@@ -20,6 +20,7 @@ from hilcal.errors import InputError
 from hilcal.identification.effect_columns import effect_columns
 from hilcal.identification.linearisation import linearise
 from hilcal.refinement import Path
+from hilcal.regression.evidence import spectrum
 from tests.support.campaigns import NOTHING, Campaign, campaign, measured, plan, world_of
 from tests.support.diagnosis_cases import fitted
 
@@ -168,7 +169,7 @@ def test_at_its_least_strength_an_effect_is_found_as_often_as_said(effect):
     s = of.white.T @ p.project_out(of.white)
     units = tuple(q.unit for q in e.parameters)
     level = 1e-3
-    least = least_strength(s, of.motion, of.scale, units, found.dof, 1.0, level)
+    least = least_strength(s, of.motion, of.scale, units, found.dof, 1.0, level, spectrum(s).rank)
     rng = np.random.default_rng(2)
     hits = []
     for _ in range(300):

@@ -15,9 +15,10 @@ from hilcal.identification.predictive import (
 )
 from hilcal.identification.robot_frames import whole_turns
 from hilcal.identification.validation import Extrapolation, Validation, extrapolation, validate
-from hilcal.readings.readings import Readings, States
+from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import whitening
 from hilcal.types import Floats
+from studies.random_descriptions import readings_of
 from tests.support.campaigns import campaign
 from tests.support.fit_cases import based
 
@@ -75,17 +76,8 @@ def readings(rng: np.random.Generator) -> Readings:
     turn = np.zeros((COUNT, M, M))
     turn[:, :3, :3], turn[:, 3:, 3:] = axes, np.eye(3)
     covariance = turn * NOISE**2 @ np.swapaxes(turn, 1, 2)
-    each = np.arange(COUNT)
-    return Readings(
-        states=States(q=rng.normal(size=(COUNT, 6)), wrench=np.zeros((COUNT, 6))),
-        pose=each,
-        load=np.zeros(COUNT, dtype=int),
-        cycle=np.zeros(COUNT, dtype=int),
-        value=np.zeros((COUNT, M)),
-        covariance=covariance,
-        load_names=("none",),
-        pose_names=tuple(f"p{k}" for k in each),
-    )
+    made = readings_of(rng.normal(size=(COUNT, 6)), np.zeros((COUNT, M)), NOISE)
+    return replace(made, covariance=covariance)
 
 
 def drawn(extra_m: float, factor: float, parameters: int = 0) -> tuple[Excess, Readings]:

@@ -16,9 +16,10 @@ from hilcal.identification.full_prediction import gross_errors
 from hilcal.identification.linearisation import linearise
 from hilcal.identification.registration import Registration, register
 from hilcal.present.registration import registration_lines
-from hilcal.readings.readings import Readings, States
+from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import MODES, Mode
 from hilcal.robot.se3 import rotation_vector
+from studies.random_descriptions import readings_of
 from tests.support.arm_cases import slots_of
 from tests.support.campaigns import cell_of, plan
 from tests.support.fit_cases import based
@@ -63,17 +64,7 @@ def seen(registration, target, m, q=None, noise=0.0, seed=0) -> Readings:
     if m == 6:
         turned = Rotation.from_rotvec(noise * rng.normal(size=(len(q), 3)))
         value = np.hstack([value, (turned * Rotation.from_matrix(there[:, :3, :3])).as_rotvec()])
-    zero = np.zeros(len(q), dtype=np.int64)
-    return Readings(
-        states=States(q, np.zeros((len(q), 6))),
-        pose=np.arange(len(q)),
-        load=zero,
-        cycle=zero,
-        value=value,
-        covariance=np.tile(1e-10 * np.eye(m), (len(q), 1, 1)),
-        load_names=("none",),
-        pose_names=tuple(f"p{k}" for k in range(len(q))),
-    )
+    return readings_of(q, value, np.full(m, 1e-5))
 
 
 def told(registration, target, registration_known, target_known) -> Cell:
