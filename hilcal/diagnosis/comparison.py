@@ -138,10 +138,9 @@ class Comparison(Shown):
 def completed(
     fit: Fit, names: Collection[str], say: Callable[[str], None] = lambda text: None
 ) -> tuple[Fit, tuple[str, ...]]:
-    """Return a gc-scaled fit with what its own readings ask for and its scatter; what was added.
+    """Return a gc-scaled fit with those of some effects that its readings ask for, and these.
 
-    Args:
-        names: effects that may be added.
+    Its scatter is estimated, too, where it is more than the stated noise.
     """
     added: list[str] = []
     while len(added) < MOST and (wanted := _most_wanted(fit, names)) is not None:

@@ -66,11 +66,9 @@ def recorded_values(fit: Fit) -> tuple[Recorded, ...]:
 
 
 def distinguish(fit: Fit, picked: Bools) -> tuple[Difference, ...]:
-    """Compare readings with the others in every recorded variable; the clearest difference first.
+    """Compare picked readings (N,) with the others in every variable; clearest difference first.
 
-    Args:
-        picked: (N,) which of its readings; measurements alone are compared, so that the unloaded
-            readings of deflections do not count as others.
+    Measurements alone are compared: the unloaded readings of deflections do not count as others.
     """
     from scipy.stats import rankdata  # slow to import
 

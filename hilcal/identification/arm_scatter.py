@@ -20,11 +20,11 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.identification.fit import Fit
-from hilcal.identification.full_covariance import joint_factors
+from hilcal.identification.full_covariance import joint_factors, whitened_blocks
 from hilcal.model.model import Model
 from hilcal.readings.covariance import scatter_alone, with_scatter
 from hilcal.readings.readings import ArmScatter, Readings, ScatterKind
-from hilcal.readings.whitening import Whitening, covariance_blocks, whitening
+from hilcal.readings.whitening import Whitening, whitening
 from hilcal.regression.variance_components import (
     BlockRows,
     VarianceComponents,
@@ -90,12 +90,6 @@ class _Whitened:
             at = stop
         return out
 
-    def component(self, factor: Floats) -> list[Floats]:
-        """Whitened covariance of each bucket (G, S, S) by a factor F (N, m, k)."""
-        of = scatter_alone(self.readings, factor)
-        parts = zip(self.w.buckets, covariance_blocks(of, self.w), strict=True)
-        return [b.factor @ c @ np.swapaxes(b.factor, 1, 2) for b, c in parts]
-
     def instrument(self) -> list[Floats]:
         """The same for the stated covariance itself."""
         seen = [np.any(b.factor != 0, axis=2) for b in self.w.buckets]
@@ -113,7 +107,8 @@ def estimate_arm_scatter(fit: Fit) -> ArmScatter | None:
     def maximised(kind: ScatterKind | None) -> VarianceComponents:
         if kind is None:  # a noisier instrument
             return variance_components(data.blocks([data.instrument()]), ridge)
-        parts = [data.component(f) for f in factors(cell, data.readings, kind)]
+        each = (scatter_alone(data.readings, f) for f in factors(cell, data.readings, kind))
+        parts = [whitened_blocks(of, data.w) for of in each]
         return variance_components(data.blocks(parts), ridge)
 
     found, noisier = {kind: maximised(kind) for kind in KINDS}, maximised(None)

@@ -64,15 +64,10 @@ class BackgroundPart:
 
 @dataclass(frozen=True, slots=True)
 class Background:
-    """What a background moves; effects that the readings do not tell apart can cancel in it.
+    """What a background moves; effects that the readings do not tell apart can cancel in it."""
 
-    Attributes:
-        rms_m: of all its effects together, m.
-        parts: of each, what moves most first.
-    """
-
-    rms_m: float
-    parts: tuple[BackgroundPart, ...]
+    rms_m: float  # of all its effects together, m
+    parts: tuple[BackgroundPart, ...]  # of each, what moves most first
 
     @property
     def effects(self) -> tuple[str, ...]:

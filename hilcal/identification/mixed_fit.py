@@ -13,7 +13,7 @@ import numpy as np
 from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.effects.spec import EffectSpec
 from hilcal.errors import CannotAnswerError
-from hilcal.identification.full_covariance import joint_factors
+from hilcal.identification.full_covariance import joint_factors, whitened_blocks
 from hilcal.identification.residual import residual
 from hilcal.mixed.equations import Equations
 from hilcal.mixed.families import Families, LogStdPrior, families_of
@@ -22,7 +22,7 @@ from hilcal.mixed.variances import Variances, coordinates_covariance, estimate_v
 from hilcal.model.model import Model
 from hilcal.readings.covariance import scatter_alone
 from hilcal.readings.readings import Readings, States
-from hilcal.readings.whitening import Mode, Whitening, covariance_blocks, whitening
+from hilcal.readings.whitening import Mode, Whitening, whitening
 from hilcal.types import Floats
 
 HARMONICS = 64
@@ -273,17 +273,11 @@ def _noise(
         whole = np.concatenate([s.reshape(-1) for s in seen]).astype(np.float64)
         return rows, [Noise(INSTRUMENT, whole, prior)]
     of = scatter_alone(readings, _scatter_factors(model, readings))
-    turned, instrument, scatter, start = np.empty_like(rows), [], [], 0
-    for b, c, s in zip(w.buckets, covariance_blocks(of, w), seen, strict=True):
-        u, variance = independent_rows(b.factor @ c @ np.swapaxes(b.factor, 1, 2), s)
-        stop = start + s.size
-        block = rows[start:stop].reshape(*s.shape, -1)
-        turned[start:stop] = (np.swapaxes(u, 1, 2) @ block).reshape(s.size, -1)
-        instrument.append((variance > UNSEEN).reshape(-1).astype(np.float64))
-        scatter.append(np.maximum(variance, 0.0).reshape(-1))
-        start = stop
-    components = ((INSTRUMENT, instrument), (SCATTER, scatter))
-    return turned, [Noise(name, np.concatenate(v), prior) for name, v in components]
+    blocks = zip(whitened_blocks(of, w), seen, strict=True)
+    bases, variances = zip(*(independent_rows(c, s) for c, s in blocks), strict=True)
+    variance = np.concatenate([v.reshape(-1) for v in variances])
+    instrument = Noise(INSTRUMENT, (variance > UNSEEN).astype(np.float64), prior)
+    return _turned(rows, bases), [instrument, Noise(SCATTER, np.maximum(variance, 0.0), prior)]
 
 
 def _noise_of(
@@ -295,29 +289,35 @@ def _noise_of(
     eigenvectors; of the arm's, the last one, what is correlated between two of these parts is left
     out.
     """
-    blocks = [
-        covariance_blocks(
-            replace(readings, covariance=p.covariance, common=p.common, serial=None), w
-        )
+    of_parts = [
+        whitened_blocks(replace(readings, covariance=p.covariance, common=p.common, serial=None), w)
         for p in parts
     ]
-    turned, start = np.empty_like(rows), 0
+    bases = []
     variances: list[list[Floats]] = [[] for _ in parts]
-    for k, b in enumerate(w.buckets):
-        *instrument, arm = (b.factor @ of[k] @ np.swapaxes(b.factor, 1, 2) for of in blocks)
+    for blocks in zip(*of_parts, strict=True):
+        *instrument, arm = blocks
         size = max(float(np.abs(arm).max(initial=0.0)), 1e-300)
         apart = sum((j * x for j, x in enumerate(instrument, 1)), LITTLE * arm / size)
         u = np.linalg.eigh(apart)[1]
-        stop = start + u.shape[0] * u.shape[1]
-        block = rows[start:stop].reshape(*u.shape[:2], -1)
-        turned[start:stop] = (np.swapaxes(u, 1, 2) @ block).reshape(stop - start, -1)
-        for of_part, x in zip(variances, (*instrument, arm), strict=True):
+        bases.append(u)
+        for of_part, x in zip(variances, blocks, strict=True):
             of_part.append(np.einsum("gij,gik,gkj->gj", u, x, u).reshape(-1))
-        start = stop
-    return turned, [
+    return _turned(rows, bases), [
         Noise(p.name, np.maximum(np.concatenate(v), 0.0), p.prior)
         for p, v in zip(parts, variances, strict=True)
     ]
+
+
+def _turned(rows: Floats, bases: Sequence[Floats]) -> Floats:
+    """Rows (R, ...) by the axes U (G, S, S) of each bucket."""
+    out, start = np.empty_like(rows), 0
+    for u in bases:
+        stop = start + u.shape[0] * u.shape[1]
+        block = rows[start:stop].reshape(*u.shape[:2], -1)
+        out[start:stop] = (np.swapaxes(u, 1, 2) @ block).reshape(stop - start, -1)
+        start = stop
+    return out
 
 
 def scatter_part(model: Model, readings: Readings) -> NoisePart:

@@ -92,22 +92,6 @@ def test_a_hidden_effect_leads(effect, mode):
     assert lead.holdout_share > 0.3
 
 
-@pytest.mark.parametrize("effect", ["encoder_offset", "hysteresis", "tracker_drift"])
-def test_the_verdict_names_it_and_adding_it_settles_it(effect):
-    found = fitted(hidden(effect, "absolute", 4))
-    d = diagnose(found)
-    assert d.verdict in ("missing_effect", "ambiguous")
-    assert d.significant[0] == effect
-    assert effect in message(d)
-    after = add(found, effect)
-    assert after.holdout.rms_sigma < 0.6 * found.holdout.rms_sigma
-    low, high = after.variance_factor_interval
-    # 1 lies in the 99.9 % interval, which is 1.7 times as wide.
-    middle = after.variance_factor
-    assert middle - 1.7 * (middle - low) < 1 < middle + 1.7 * (high - middle)
-    assert diagnose(after).verdict == "adequate"
-
-
 @pytest.mark.parametrize("mode", MODES)
 def test_scores_foretell_what_adding_does(mode):
     """The F-test of a family is that of the refit with all its columns free."""
