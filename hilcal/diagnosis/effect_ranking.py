@@ -30,8 +30,7 @@ through loads must there explain the readings beside all effects that are consta
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Generic, TypeVar
+from functools import cache
 
 import numpy as np
 
@@ -76,31 +75,20 @@ SURE = 3.1
 """Standard errors, from pose to pose, by which the error on poses left out must fall: a chance of
 one in a thousand, since a dozen effects of the load try."""
 
-T = TypeVar("T")
-
-
-@dataclass(frozen=True, eq=False)
-class Later(Generic[T]):
-    """What no verdict depends on: computed when it is first asked for, then kept."""
-
-    compute: Callable[[], T]
-
-    @cached_property
-    def value(self) -> T:
-        """What was computed."""
-        return self.compute()
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Suspect(Brief):
-    """An effect that is not in the model, and what it would explain."""
+    """An effect that is not in the model, and what it would explain.
+
+    What no verdict depends on is a function: it is computed when it is first asked for.
+    """
 
     effect: str  # canonical name
     score: FamilyScore  # the joint test of the whole family
     share: float  # share of the misfit it explains
-    left_out: Later[HeldOut]  # what it explains on poses left out
+    left_out: Callable[[], HeldOut]  # what it explains on poses left out
     explains: bool  # whether it passes the tests of the fitted readings and of its share
-    detection: Later[Strength]  # the smallest strength of it that these readings would reveal
+    detection: Callable[[], Strength]  # the smallest one that these readings would reveal
     # where it is implausible: (unit, rms of the parameters that it needs, plausible rms), SI
     needs: tuple[tuple[str, float, float], ...] = ()
     kept: float = 1.0  # share of the promise that the exact model keeps; 1 where it fails anyway
@@ -117,17 +105,17 @@ class Suspect(Brief):
     @property
     def holdout_share(self) -> float:
         """Share of the misfit that it explains on poses left out."""
-        return self.left_out.value.share
+        return self.left_out().share
 
     @property
     def sure(self) -> bool:
         """Whether the error on poses left out falls by more than it scatters from pose to pose."""
-        return not self.refuted and self.left_out.value.sure
+        return not self.refuted and self.left_out().sure
 
     @property
     def least(self) -> Strength:
         """The smallest strength of it that these readings would reveal."""
-        return self.detection.value
+        return self.detection()
 
     @property
     def shown(self) -> bool:
@@ -243,7 +231,7 @@ def rank_suspects(
     found = [_suspect(p, s, len(effects)) for part in _scored(p, effects) for s in part]
     tested = max(sum(s.score.rank > 0 for s in found), 1)
     no_load = p.fit.mode == "absolute" and not p.fit.solution.prediction.situation.load.wrench.any()
-    geometry = Later(lambda: geometry_columns(p, effects))
+    geometry = cache(lambda: geometry_columns(p, effects))
     out: list[Suspect] = []
     for effect, s in zip(effects, found, strict=True):
         explains = s.score.p_value * tested < FALSE_ALARM and s.score.log_evidence > 0
@@ -251,7 +239,7 @@ def rank_suspects(
         if s.passes:
             own = effect_columns(p.fit, effect)
             if no_load and through_load(effect):
-                s = replace(s, refuted=not beyond_geometry(p, own, geometry.value))
+                s = replace(s, refuted=not beyond_geometry(p, own, geometry()))
             if s.passes:
                 s = replace(s, kept=kept(p, own, s.score, refit))
         out.append(s)
@@ -330,9 +318,11 @@ def _suspect(p: Linearisation, scored: _Scored, count: int) -> Suspect:
     of_s, result, effect = scored.spectrum, scored.score, scored.of.effect
     s, largest, known = scored.information, scored.largest, scored.held
 
+    @cache
     def left_out() -> HeldOut:
         return known or _left_out(p, [(effect_columns(p.fit, effect).white, result)])[0]
 
+    @cache
     def least() -> Strength:
         own = effect_columns(p.fit, effect)
         units = tuple(q.unit for q in effect.parameters)
@@ -345,10 +335,10 @@ def _suspect(p: Linearisation, scored: _Scored, count: int) -> Suspect:
         coarse=effect.coarse,
         score=result,
         share=p.share(result.gain),
-        left_out=Later(left_out),
+        left_out=left_out,
         explains=False,
         needs=_implausible(p, scored),
-        detection=Later(least),
+        detection=least,
         most=largest,
     )
 
