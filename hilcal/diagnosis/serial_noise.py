@@ -79,9 +79,8 @@ STARTS = (0.3, 0.8, 0.97)  # values of ρ from which the likelihood is climbed
 def with_serial_noise(white: Fit, prior: Floats | None = None) -> Fit:
     """Return a fit with the correlation of its noise in the covariance, where there is some.
 
-    Args:
-        white: a fit; as it is where its covariance has the correlation.
-        prior: standard deviations (P,) that it was given.
+    `prior` are the standard deviations (P,) that it was given. A fit whose covariance has the
+    correlation stays as it is.
     """
     noise = serial_noise(white) if white.readings.serial is None else None
     if noise is None:

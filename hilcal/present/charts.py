@@ -17,7 +17,7 @@ from scipy.stats import chi2, norm
 from hilcal import numbers
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.effect_ranking import LEAST_SHARE
-from hilcal.identification.family_sizes import FamilySize
+from hilcal.identification.background import FamilySize
 from hilcal.identification.fit import Fit
 from hilcal.names import escaped
 from hilcal.present.document import load_name

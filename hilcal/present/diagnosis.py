@@ -9,8 +9,8 @@ from hilcal import numbers
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.effect_ranking import FALSE_ALARM, LEAST_SHARE, Suspect
 from hilcal.diagnosis.live_model import LEAST
-from hilcal.diagnosis.misfit_breakdown import ROW_ORDER
 from hilcal.diagnosis.noise import PureError
+from hilcal.diagnosis.recorded import ROW_ORDER
 from hilcal.diagnosis.residual_regression import Dependence
 from hilcal.diagnosis.stepwise import predicts_better
 from hilcal.discovery.curve import Curve

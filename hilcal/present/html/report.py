@@ -12,7 +12,7 @@ from hilcal.calibration.scatter import COVERAGE, budget
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.effect_ranking import LEAST_SHARE, Suspect
 from hilcal.diagnosis.noise import classes
-from hilcal.identification.family_sizes import family_sizes
+from hilcal.identification.background import family_sizes
 from hilcal.identification.fit import Fit
 from hilcal.identification.full_covariance import CovarianceParts
 from hilcal.identification.full_prediction import error_before, names

@@ -24,7 +24,6 @@ from hilcal.identification.posterior import Posterior, Source, parameter_differe
 from hilcal.identification.posterior_document import read, write
 from hilcal.identification.predictive import predictive
 from hilcal.readings.readings import Readings
-from hilcal.readings.same_readings import among
 from hilcal.robot.catalogue import configs_dir, load_arm
 from hilcal.store.revision import from_text, to_text
 from hilcal.store.rows import content_hash
@@ -107,13 +106,6 @@ def test_a_harmonic_that_was_dropped_is_not_known_to_be_zero() -> None:
     std = p.std[p.index("transmission_error")][dropped]
     assert len(std)
     assert ((std > 0) & np.isfinite(std)).all()
-
-
-def test_its_readings_are_known_again() -> None:
-    found = fitted("joint_compliance")
-    p = Posterior.of(found)
-    assert among(found.readings[5:9], p.prints).all()
-    assert not among(of_links(3).readings, p.prints).any()
 
 
 def test_what_is_no_posterior_is_refused() -> None:

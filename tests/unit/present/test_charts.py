@@ -9,8 +9,8 @@ import pytest
 from hilcal import numbers
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.verdict import diagnose
+from hilcal.identification.background import FamilySize
 from hilcal.identification.baseline import baseline
-from hilcal.identification.family_sizes import FamilySize
 from hilcal.identification.fit import fit
 from hilcal.present import charts
 from hilcal.present import charts as style

@@ -14,7 +14,8 @@ from hilcal import numbers
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.document import to_json as diagnosis_json
 from hilcal.diagnosis.effect_ranking import FALSE_ALARM
-from hilcal.diagnosis.misfit_breakdown import ROW_ORDER, MisfitShare, misfit_breakdown
+from hilcal.diagnosis.misfit_breakdown import MisfitShare, misfit_breakdown
+from hilcal.diagnosis.recorded import ROW_ORDER
 from hilcal.diagnosis.residual_regression import Dependence
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.options import typical_compliances
