@@ -21,6 +21,7 @@ from hilcal.config.sections import (
     Point,
     Sight,
     Whole,
+    check_distinct,
 )
 from hilcal.errors import InputError
 from hilcal.toml import NonNegative, Positive, Vector3, check_json, load_section, suggest
@@ -148,10 +149,7 @@ class Tool(CellSection):
                 "target_m together with [[tool.targets]]; give the offset of each target in its "
                 "own section"
             )
-        names = [t.name for t in self.targets]
-        for name in names:
-            if names.count(name) > 1:
-                raise ValueError(f'two [[tool.targets]] have the name "{name}"; names must differ')
+        check_distinct("tool.targets", self.targets)
         return self
 
 
@@ -321,11 +319,8 @@ class CellConfig(CellSection):
 
     @model_validator(mode="after")
     def _distinct_names(self) -> "CellConfig":
-        for section, things in (("loads", self.loads), ("obstacles", self.obstacles)):
-            names = [thing.name for thing in things]
-            for name in names:
-                if names.count(name) > 1:
-                    raise ValueError(f'two [[{section}]] have the name "{name}"; names must differ')
+        check_distinct("loads", self.loads)
+        check_distinct("obstacles", self.obstacles)
         return self
 
     @model_validator(mode="after")

@@ -166,9 +166,14 @@ def _orientation_by_values(g: Guesser, free: list[str]) -> None:
     for k in range(len(free) - 3):
         names = free[k : k + 4]
         if is_quaternion(g.block(names)):
-            g.take("orientation", names, "quaternion, w first", convention="quaternion-wxyz")
-            g.proposal.open_convention = True
+            _take_quaternion(g, names)
             return
+
+
+def _take_quaternion(g: Guesser, names: list[str]) -> None:
+    """Take four numbers for a quaternion; which of them is w is a guess."""
+    g.take("orientation", names, "quaternion, w first", convention="quaternion-wxyz")
+    g.proposal.open_convention = True
 
 
 def _kind(c: ColumnName) -> str:
@@ -335,8 +340,7 @@ def _four_numbers(g: Guesser) -> bool:
     for by_number in groups.values():
         names = [by_number[k] for k in sorted(by_number)]
         if len(names) == 4 and is_quaternion(g.block(names)):
-            g.take("orientation", names, "quaternion, w first", convention="quaternion-wxyz")
-            g.proposal.open_convention = True
+            _take_quaternion(g, names)
             return True
     return False
 

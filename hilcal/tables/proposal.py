@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from hilcal.config.reference import inline
 from hilcal.errors import InputError
 from hilcal.names import escaped
 from hilcal.tables.grid import Grid
@@ -221,22 +222,11 @@ class Proposal:
             lines.append("")
             lines += [f"# check: {words}" for about, words in self.unsure if about == name]
             lines.append(f"[{name}]")
-            lines += [f"{key} = {_value(value)}" for key, value in section.items()]
+            lines += [f"{key} = {inline(value)}" for key, value in section.items()]
         if self.unused:
             lines += ["", "# not used:"]
             lines += [f"#   {name} ({why})" for name, why in self.unused]
         return "\n".join(map(escaped, lines)) + "\n"
-
-
-def _value(value: Any) -> str:
-    """Return a value as TOML."""
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        return '"' + escaped(value).replace("\\", "\\\\").replace('"', '\\"') + '"'
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(map(_value, value))}]"
-    return repr(value)
 
 
 class Guesser:

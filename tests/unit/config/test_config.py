@@ -152,12 +152,6 @@ def test_json_round_trip(target, mass, loads, joint_std, base):  # type: ignore[
     assert CellConfig.from_json(config.to_json()) == config
 
 
-def test_a_configuration_cannot_be_changed(tmp_path):
-    config = load(tmp_path, ROBOT)
-    with pytest.raises(ValueError, match="frozen"):
-        config.tool.mass_kg = 1.0
-
-
 LOAD = '[[loads]]\nname = "a"\nmass_kg = 1.0\n'
 
 
@@ -253,24 +247,6 @@ incidence_max_rad = 0.7
 clearance_m = 0.02
 """
 )
-
-
-def test_defaults(tmp_path):
-    config = load(tmp_path, ROBOT)
-    planning, sight = config.planning, config.sight
-    assert planning.model == ("joint_compliance",)
-    assert (planning.readings, planning.against, planning.criterion) == (
-        "deflection",
-        "catalogue",
-        None,
-    )
-    assert planning.work_q_rad == ()
-    assert planning.work_min_m is planning.work_max_m is planning.reading_s is None
-    assert (planning.work_load, planning.load_change_s) == ("none", 60.0)
-    assert (planning.candidates, planning.singularity) == (2000, 0.05)
-    assert config.obstacles == ()
-    assert sight.tracker_m is sight.target_normal is None
-    assert (sight.incidence_max_rad, sight.clearance_m) == (0.5, 0.03)
 
 
 def test_everything_is_taken_over_and_written_back(tmp_path):

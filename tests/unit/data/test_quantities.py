@@ -22,15 +22,14 @@ from tests.support.campaigns import cell_of
 
 
 @pytest.mark.parametrize(
-    ("text", "metres"), [("0.1 mm", 1e-4), ("100um", 1e-4), ("100 µm", 1e-4), (" 2e-3 m ", 2e-3)]
+    ("parse", "text", "number"),
+    [
+        *((parse_length, text, 1e-4) for text in ("0.1 mm", "100um", "100 µm", " 1e-4 m ")),
+        *((parse_duration, text, 5400) for text in ("90 min", "1.5h", "5400 s")),
+    ],
 )
-def test_a_length(text, metres):
-    assert math.isclose(parse_length(text, "--limit"), metres)
-
-
-@pytest.mark.parametrize(("text", "seconds"), [("90 min", 5400), ("1.5h", 5400), ("20 s", 20)])
-def test_a_duration(text, seconds):
-    assert math.isclose(parse_duration(text, "--max-time"), seconds)
+def test_a_length_or_a_duration(parse, text, number):
+    assert math.isclose(parse(text, "--option"), number)
 
 
 @pytest.mark.parametrize(
@@ -270,12 +269,8 @@ def test_a_copy_is_known_whatever_it_went_through(m):
     )
     assert already(copy, r).all()
     assert already(r, copy).all()
-
-
-def test_positions_alone_are_compared_with_positions():
-    r = campaign(6)
-    alone = replace(r, value=r.value[:, :3], covariance=r.covariance[:, :3, :3])
-    assert already(alone, r).all()
+    positions = replace(r, value=r.value[:, :3], covariance=r.covariance[:, :3, :3])
+    assert already(positions, r).all()
 
 
 def test_what_was_measured_again_is_another_reading():

@@ -18,7 +18,6 @@ from hilcal.readings.readings import States
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import drive_jacobian, evaluate
 from hilcal.robot.conventions import as_counted
-from hilcal.robot.scene import pinocchio_model
 from hilcal.robot.urdf import arm_from_urdf
 from hilcal.tables.table import read_table
 from tests.support.effect_cases import make
@@ -57,21 +56,6 @@ def test_jacobian_by_the_controllers_values_agrees_with_differences():
     for j in range(6):
         ahead, back = (evaluate(arm, q + s * np.eye(6)[j]).position[-1] for s in (step, -step))
         np.testing.assert_allclose(found[:, :, j], (ahead - back) / (2 * step), atol=1e-8)
-
-
-def test_pinocchio_agrees_with_signs_and_zeros():
-    arm, q = described(joint_sign=SIGN, joint_offset_deg=OFFSET), np.array([0.1, 1, 0.3, 2, 1, -1])
-    assert arm.coupling is None
-    model = pinocchio_model(arm)
-    data = model.createData()
-    pin.framesForwardKinematics(model, data, q)
-    np.testing.assert_allclose(
-        data.oMf[model.nframes - 1].translation, evaluate(arm, q[None]).position[-1][0], atol=1e-12
-    )
-
-
-def test_an_arm_without_these_keys_is_the_catalogues():
-    np.testing.assert_array_equal(described().links, load_arm("ur10e").links)
 
 
 @pytest.mark.parametrize(
