@@ -357,19 +357,10 @@ class CellConfig(CellSection):
 
     @classmethod
     def from_json(cls, text: str) -> "CellConfig":
-        """Read what `to_json` wrote.
-
-        Raises:
-            InputError: not JSON, unknown key, missing key or bad value.
-        """
+        """Read what `to_json` wrote; raises as `check_json` does."""
         return check_json(text, cls, "stored cell configuration")
 
 
 def load_config(path: Path) -> CellConfig:
-    """Read CELL.toml; paths in it are relative to its directory.
-
-    Raises:
-        InputError: unreadable file, syntax error (names the line), unknown key (lists the
-            valid ones of its section), missing key or bad value.
-    """
+    """Read CELL.toml, whose paths are relative to its directory; raises as `load_section` does."""
     return load_section(path, CellConfig)

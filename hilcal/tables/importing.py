@@ -13,13 +13,10 @@ from hilcal.readings.readings import ObserverName, Readings
 from hilcal.robot.arm import Arm
 from hilcal.store.plan import UNLOADED
 from hilcal.tables.mapped import import_mapped
-from hilcal.tables.mapping import Mapping, find_mapping, mapping_names
+from hilcal.tables.mapping import TABLE, Mapping, find_mapping
 from hilcal.tables.table import FROM_TRACKER, ImportResult, import_table
 from hilcal.tables.uncertainty import rounding_variance
-from hilcal.toml import suggest
 from hilcal.types import Bools
-
-TABLE = "table"  # The exchange table: the format that is read without a mapping
 
 
 def import_readings(
@@ -32,7 +29,10 @@ def import_readings(
             program, the path of a mapping file, or a mapping.
         second: the second file of a mapping that is for two.
     """
-    mapping = form if isinstance(form, Mapping) else _mapping(form)
+    if isinstance(form, Mapping):
+        mapping: Mapping | None = form
+    else:
+        mapping = None if str(form) == TABLE else find_mapping(form, Mapping)
     tracker, gravity = config.tracker, config.robot.gravity_m_s2
     noise, station = tracker_noise(tracker), tracker.station_m
     targets, std = [target.name for target in config.tool.targets], _std(config)
@@ -58,18 +58,6 @@ def _std(config: CellConfig) -> dict[ObserverName, float]:
     points = {ObserverName("point", k): p.std_m for k, p in config.points.items()}
     gauges = {ObserverName("gauge", k): g.std_m for k, g in config.gauges.items()}
     return {name: std for name, std in (points | gauges).items() if std is not None}
-
-
-def _mapping(form: str | Path) -> Mapping | None:
-    if str(form) == TABLE:
-        return None
-    names = (TABLE, *mapping_names())
-    if str(form) not in names and Path(form).suffix.lower() != ".toml":
-        raise InputError(
-            f"--format {form} is unknown{suggest(str(form), names)}; valid: {', '.join(names)}, "
-            f"or the path of a mapping file (.toml)"
-        )
-    return find_mapping(form, Mapping)
 
 
 def _named_loads(readings: Readings, config: CellConfig) -> tuple[Readings, tuple[str, ...]]:

@@ -164,8 +164,7 @@ def import_mapped(
     if mapping.rows is not None and mapping.rows.plausible_only:
         scatter = readings.covariance
         if noise is not None and mapping.std is not None and mapping.std.add_instrument:
-            origin = np.zeros(3) if station is None else np.asarray(station, dtype=float)
-            scatter = scatter - tracker_covariance(position, noise, origin, readings.m)
+            scatter = scatter - tracker_covariance(position, noise, station, readings.m)
         readings, left_out = _plausible(readings, scatter, grid.rows, arm.reach + TOOL)
         notes += left_out
     else:

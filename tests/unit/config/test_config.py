@@ -173,7 +173,10 @@ def test_what_is_not_toml_is_told_by_its_place(tmp_path, text, place):
 
 
 @pytest.mark.parametrize(("text", "message"), [
-    ('[robot]\nmodel = "ur11"\n', r'unknown robot "ur11".*valid: .*ur10, ur10e, ur12e, ur15'),
+    (
+        '[robot]\nmodel = "ur11"\n',
+        r'unknown robot "ur11" \(did you mean "ur1.*valid: .*ur10, ur10e, ur12e, ur15',
+    ),
     ('[robot]\nmodel = "none.urdf"\n', r"none\.urdf: No such file"),
     ('[robot]\nmodel = "none.toml"\n', r"none\.toml: no such file"),
     (ROBOT + "base_link = 'a'\n", r'base_link = "a" is only for a URDF'),
