@@ -26,9 +26,9 @@ class MeasuringDevice:
 
     device: str  # part of the cell, e.g. "tracker"
     driver: str
-    name: str  # as it told it
-    serial_number: str | None  # None where it told none
-    facts: Mapping[str, str]  # what else it told, by name
+    name: str  # as it answered
+    serial_number: str | None  # None where it gave none
+    facts: Mapping[str, str]  # what else it answered, by name
     utc: str  # when it answered first, ISO 8601
 
 

@@ -99,10 +99,10 @@ def guess_by_values(g: Guesser) -> None:
     Neighbouring columns are tried: positions vary by hundreds (mm) or stay small (m), joint
     angles stay within one turn. Where several choices are as good, that is said.
     """
-    told = words.NOMINAL | words.STD | words.TIME | words.TEMPERATURE | words.LOAD | words.MASS
+    named = words.NOMINAL | words.STD | words.TIME | words.TEMPERATURE | words.LOAD | words.MASS
     free = []
     for name, c in g.free.items():
-        if g.number(name) and c.axis is None and not c.has(told | words.POSE):
+        if g.number(name) and c.axis is None and not c.has(named | words.POSE):
             values = g.block([name])[:, 0]
             counts = len(values) > 2 and np.all(np.diff(values) == 1)  # the rows
             if not counts and np.ptp(values[np.isfinite(values)]) > 0:

@@ -144,11 +144,11 @@ def import_mapped(
     mapping, grid, table, notes = of.mapping, of.grid, of.table, of.notes
     q = _joint_units(mapping.joints, arm) * _block(of.raw, grid, mapping.joints.columns)
     noise = noise if mapping.instrument is None else mapping.instrument.noise()
-    covariance, rounding, told, position = None, None, tuple[str, ...](), np.zeros((len(q), 0))
+    covariance, rounding, stated, position = None, None, tuple[str, ...](), np.zeros((len(q), 0))
     if mapping.position is not None:
         position = table.matrix(columns.POSITION)
         whole = np.asarray(np.isfinite(position).all(axis=1))
-        covariance, told = mapped_covariance(
+        covariance, stated = mapped_covariance(
             table.taken(whole),
             grid.rows_with(whole),
             mapping,
@@ -169,7 +169,7 @@ def import_mapped(
         notes += left_out
     else:
         notes += _stale(grid, position, q)
-    notes += [*(told or result.notes[:1]), *result.notes[1:]]
+    notes += [*(stated or result.notes[:1]), *result.notes[1:]]
     unit, name = units.ANGLES[mapping.joints.unit], mapping.joints.unit
     names = own_columns(columns.joint_columns(arm.units), q.shape[1], arm)
     q = q[:, [k for k, column in enumerate(names) if column.endswith("_rad")]]

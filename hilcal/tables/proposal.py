@@ -121,7 +121,7 @@ class ColumnName:
 def parse(name: str, unit_cell: str = "") -> ColumnName:
     """Take a column's name apart."""
     rest, unit = _unit(name)
-    told = UNITS.get(unit_cell.strip(" []()<>").replace("µ", "u").replace("μ", "u").lower())
+    stated = UNITS.get(unit_cell.strip(" []()<>").replace("µ", "u").replace("μ", "u").lower())
     for sign, word in CHINESE.items():
         rest = rest.replace(sign, word)
     rest = re.sub(r"(?<=[a-zµ])(?=[A-Z])", " ", rest)
@@ -151,7 +151,7 @@ def parse(name: str, unit_cell: str = "") -> ColumnName:
             words.append(letters[1:])
         else:
             words.append(letters)
-    return ColumnName(name, tuple(words), axis, tuple(numbers), told or unit)
+    return ColumnName(name, tuple(words), axis, tuple(numbers), stated or unit)
 
 
 def _unit(name: str) -> tuple[str, str | None]:

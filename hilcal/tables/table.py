@@ -249,8 +249,8 @@ def measured_of(table: ColumnTable, arm: Arm, whole: Bools | None = None) -> tup
     value = table.matrix(columns.POSITION)
     station = np.array(table.text.get(columns.STATION, [""] * len(value)))
     for name in dict.fromkeys(station.tolist()):
-        mine = station == name
-        checks.check_positions(table.taken(mine), value[mine], states.q[mine], arm)
+        own = station == name
+        checks.check_positions(table.taken(own), value[own], states.q[own], arm)
     if columns.ROTATION[0] in table.number:
         rotation = table.matrix(columns.ROTATION)
         checks.check_rotations(table, rotation)
