@@ -367,12 +367,10 @@ def _forces(g: Guesser, whole: Group) -> None:
     if force is None:
         return
     names = [force[axis] for axis in "xyz"]
-    unit = g.unit(names)
-    section: dict[str, object] = {"unit": unit if unit in FORCES else "N"}
+    section: dict[str, object] = {"unit": g.unit(names, FORCES) or "N"}
     if moment is not None:
         turning = [moment[axis] for axis in "xyz"]
-        stated = g.unit(turning)
-        section["moment_unit"] = stated if stated in MOMENTS else "Nm"
+        section["moment_unit"] = g.unit(turning, MOMENTS) or "Nm"
         names += turning
     g.unsure("wrench", 'base axes, and of = "load" (exerted on the tool), or "reaction"?')
     g.take("wrench", names, ", ".join(map(str, section.values())), **section)
@@ -387,14 +385,12 @@ def _std(g: Guesser, whole: Group, stem: tuple[object, ...], position_unit: str)
         return
     names = [axes[axis] for axis in "xyz"] if axes is not None else single[:1]
     first = parse(names[0])
-    stated = g.unit(names)
-    section: dict[str, object] = {"unit": stated if stated in LENGTHS else position_unit}
+    section: dict[str, object] = {"unit": g.unit(names, LENGTHS) or position_unit}
     turned = _like(whole.get("std_angle", {}), stem)
     orientation = g.proposal.sections.get("orientation")
     if axes is not None and turned is not None and orientation is not None:
         names += [turned[axis] for axis in "xyz"]
-        stated = g.unit(names[3:])
-        section["angle_unit"] = stated or orientation.get("unit", "rad")
+        section["angle_unit"] = g.unit(names[3:]) or orientation.get("unit", "rad")
     kind = "std"
     if first.has(words.EXPANDED):
         kind, section["k"] = "expanded", 2.0

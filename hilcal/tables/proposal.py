@@ -2,7 +2,7 @@
 
 import re
 import unicodedata
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,6 +13,7 @@ from hilcal.errors import InputError
 from hilcal.names import escaped
 from hilcal.tables.grid import Grid
 from hilcal.tables.mapping import M
+from hilcal.tables.units import ANGLES, LENGTHS
 from hilcal.toml import check_section
 from hilcal.types import Floats
 
@@ -277,17 +278,18 @@ class Guesser:
         if self.free.pop(name, None) is not None:
             self.proposal.unused.append((name, why))
 
-    def unit(self, names: Sequence[str]) -> str | None:
-        """Return the unit that the names of columns, or the row of units, state."""
+    def unit(self, names: Sequence[str], known: Collection[str] | None = None) -> str | None:
+        """Return the unit that the names of columns, or the row of units, state: a known one."""
         found = {self.columns[self.grid.names.index(name)].unit for name in names}
-        return found.pop() if len(found) == 1 else None
+        unit = found.pop() if len(found) == 1 else None
+        return unit if known is None or unit in known else None
 
 
 def angle_unit(g: Guesser, what: str, names: Sequence[str]) -> str:
     """Return the unit of angles by name, else by size."""
-    stated = g.unit(names)
+    stated = g.unit(names, ANGLES)
     largest = float(np.nanmax(np.abs(g.block(names))))
-    if stated in ("rad", "mrad", "deg", "arcsec"):
+    if stated is not None:
         if stated == "rad" and largest > TURN:
             g.unsure(what, f"named rad, but up to {largest:.4g}: read as degrees")
             return "deg"
@@ -300,8 +302,7 @@ def angle_unit(g: Guesser, what: str, names: Sequence[str]) -> str:
 
 def length_unit(g: Guesser, what: str, names: Sequence[str]) -> str:
     """Return the unit of positions by name, else by size."""
-    stated = g.unit(names)
-    if stated in ("m", "mm", "um", "in"):
+    if (stated := g.unit(names, LENGTHS)) is not None:
         return stated
     largest = float(np.nanmax(np.abs(g.block(names))))
     unit = "mm" if largest > FAR else "m"
