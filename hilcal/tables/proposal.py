@@ -223,11 +223,18 @@ class Proposal:
             lines.append("")
             lines += [f"# check: {words}" for about, words in self.unsure if about == name]
             lines.append(f"[{name}]")
-            lines += [f"{key} = {inline(value)}" for key, value in section.items()]
+            lines += [f"{key} = {inline(_escaped(value))}" for key, value in section.items()]
         if self.unused:
             lines += ["", "# not used:"]
             lines += [f"#   {name} ({why})" for name, why in self.unused]
         return "\n".join(map(escaped, lines)) + "\n"
+
+
+def _escaped(value: Any) -> Any:
+    """Return a value with its texts escaped."""
+    if isinstance(value, list | tuple):
+        return [_escaped(v) for v in value]
+    return escaped(value) if isinstance(value, str) else value
 
 
 class Guesser:

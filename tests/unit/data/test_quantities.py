@@ -208,18 +208,6 @@ def test_a_table_without_the_column(tmp_path):
         read_table(path, cell_of().arm, NOISE, targets=NAMES)
 
 
-@pytest.mark.parametrize(("old", "new", "message"), [
-    ('name = "R2"', 'name = "R1"', r'two \[\[tool.targets\]\] have the name "R1"'),
-    ("[[tool.targets]]", "[tool]\ntarget_m = [0, 0, 0]\n[[tool.targets]]", "target_m together"),
-    ("[0.06, 0.02, 0.12]", "[60.0, 20.0, 120.0]", r"over 5 m off the flange; is it in m"),
-    ('name = "R2"', 'nam = "R2"', r'has no key "nam"')])  # fmt: skip
-def test_wrong_targets(tmp_path, old, new, message):
-    (tmp_path / "cell.toml").write_text(CELL.replace(old, new, 1))
-    with pytest.raises(InputError, match=message) as raised:
-        Cell.load(tmp_path / "cell.toml")
-    assert "\n" not in str(raised.value)
-
-
 LOADS = 3
 NOISE_M = 5e-6
 
