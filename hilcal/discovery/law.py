@@ -1,11 +1,9 @@
 """A law in readable form: where it acts, its formula, its parameters, what speaks for it."""
 
-import hashlib
 import re
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from types import ModuleType
+from pathlib import Path
 
 import numpy as np
 
@@ -13,6 +11,7 @@ from hilcal.discovery.amplitudes import Amplitude, Factor, unit_of
 from hilcal.discovery.screen import LawTerm, Screen
 from hilcal.discovery.sites import ORDINARY, Site
 from hilcal.effects.check import NAME
+from hilcal.effects.from_file import effects_of
 from hilcal.effects.protocol import Effect, Situation
 from hilcal.errors import InputError
 from hilcal.names import escaped, quoted
@@ -342,7 +341,8 @@ def source_of_form(
     source = _HEAD.format(
         name=name, formula=form.text(), file=_in_docstring(quoted(file)),
         evidence="\n".join(map(_in_docstring, evidence.split("\n"))),
-        imports=", Response" if form.elastic else "", class_name=class_name(name),
+        imports=", Response" if form.elastic else "",
+        class_name="".join(part.capitalize() for part in name.split("_")),
         attributes="".join(attributes), parameters="\n".join(_parameters(form, found)),
         columns="\n".join(_moving(form)),
     )  # fmt: skip
@@ -361,23 +361,9 @@ def _in_docstring(line: str) -> str:
     return escaped(line).replace("\\", "\\\\").replace('"', '\\"')
 
 
-def class_name(name: str) -> str:
-    """Return the name of the class of an effect."""
-    return "".join(part.capitalize() for part in name.split("_"))
-
-
 def effect_class(source: str, name: str) -> type[Effect]:
     """Return the effect of a source, as a file with it would give it."""
-    hashed = hashlib.sha256(source.encode()).hexdigest()[:16]
-    module = ModuleType(f"law_{hashed}")
-    module.__file__ = f"<law {name}>"
-    sys.modules[module.__name__] = module
-    try:
-        exec(compile(source, module.__file__, "exec"), module.__dict__)  # noqa: S102 - made above
-    finally:
-        del sys.modules[module.__name__]
-    found: type[Effect] = module.__dict__[class_name(name)]
-    return found
+    return effects_of(source.encode(), Path(f"<law {name}>")).effects[0]
 
 
 def _parameters(form: Form, found: tuple[Coefficient, ...]) -> Iterator[str]:

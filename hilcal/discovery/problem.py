@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from hilcal.discovery.compose import composed_terms, grown
-from hilcal.discovery.screen import LawTerm, Scored, Screen, ScreenedTerm, Screening
+from hilcal.discovery.screen import LawTerm, Scored, Screen, ScreenedTerm
 from hilcal.regression.evidence import FamilyScore, score_family
 from hilcal.regression.projection import Projection, projection
 from hilcal.types import Bools, Floats, Ints
@@ -134,9 +134,12 @@ class Beside:
         _, told, units = self._shadows
         yield from zip(told.tolist(), units, strict=True)
 
-    @cached_property
-    def screened(self) -> "Screening":
-        """All candidates beside the model and the chosen terms."""
+    def _screened(self) -> tuple[Floats, Floats, Floats, Floats]:
+        """Products of all candidates beside the model and the chosen terms, as in `Screen`.
+
+        (S, F) each: xᵀ r; xᵀ M x, zero where little of a column is left; xᵀ M x' with the partner,
+        and with a constant at the site.
+        """
         p = self.problem
         slope, square, across, across_one = p.slope, p.square, p.across, p.across_one
         partner, one = p.screen.grammar.partner, p.screen.one
@@ -147,7 +150,7 @@ class Beside:
             across_one = across_one - own * own[:, [one]]
         if self.chosen:
             square = np.where(square > LEFT * p.square, square, np.float32(0.0))
-        return Screening(slope, square, across, across_one)
+        return slope, square, across, across_one
 
     @cached_property
     def _known(self) -> tuple[frozenset[int], frozenset[str]]:
@@ -201,7 +204,8 @@ class Beside:
         and "pc" for both; "1" and "2" for the zero of the first and of the second factor of a
         product.
         """
-        p, all_ = self.problem, self.screened
+        p = self.problem
+        slopes, squares, across, across_one = self._screened()
         words, one = p.screen.grammar, p.screen.one
         partner = words.partner
         has = np.flatnonzero(partner >= 0)
@@ -209,7 +213,7 @@ class Beside:
         found: dict[str, list[ScreenedTerm]] = {k: [] for k in ("", "p", "c", "pc", "1", "2")}
         for s in range(len(p.screen.sites)):
             price = self._prices(s).astype(np.float32)
-            a, g, h = all_.square[s], all_.slope[s], all_.across[s]
+            a, g, h = squares[s], slopes[s], across[s]
             for constant in (False, True):
                 own = ""
                 seen = a > 0
@@ -217,12 +221,12 @@ class Beside:
                 if constant:
                     if not seen[one]:
                         break
-                    own, c = "c", all_.across_one[s]
+                    own, c = "c", across_one[s]
                     gain0 = float(g[one] ** 2 / a[one])
                     h = h - c * (c[partner] / a[one])
                     g = g - c * (g[one] / a[one])
                     a = a - c * (c / a[one])
-                    seen = seen & (a > LEFT * all_.square[s])
+                    seen = seen & (a > LEFT * squares[s])
                 safe = np.where(seen, a, 1.0)
                 gain = np.where(seen, g * g / safe, 0.0)
                 odds = self.evidence(gain + gain0, 1 + constant) - price - LOG2 * constant
@@ -231,7 +235,7 @@ class Beside:
                 odds = self.evidence(both + gain0, 2 + constant)
                 odds = odds - price[has] - LOG2 * (1 + constant)
                 keep_largest(found["p" + own], np.where(both > 0, odds, -np.inf), s, has)
-            a, g = all_.square[s], all_.slope[s]
+            a, g = squares[s], slopes[s]
             for key, less, h in zip("12", words.less, p.screen.across_less[:, s], strict=True):
                 h = np.float32(p.share) * h
                 for told in (shadow[s] for shadow in self._shadows[0]):

@@ -69,16 +69,6 @@ class ScreenedTerm:
     odds: float
 
 
-@dataclass(frozen=True, eq=False)
-class Screening:
-    """All candidates beside some columns, as in `Screen`."""
-
-    slope: Floats  # (S, F) xᵀ r
-    square: Floats  # (S, F) xᵀ M x; zero where little of a column is left
-    across: Floats  # (S, F) xᵀ M x' with the partner
-    across_one: Floats  # (S, F) xᵀ M x' with a constant at the site
-
-
 MOST_READINGS = 400  # that the screening uses; a choice, by time: it takes their square
 SEEN = 1e-4  # share of a column's square that must be left, for single precision
 ALIKE = 1 - 1e-9  # Cosine of two sites' motions from which on they are the same; rounding

@@ -7,8 +7,8 @@ from functools import cached_property
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.config import CellConfig
-from hilcal.measuring.clearance import clearance_of, sight_of
+from hilcal.config import CellConfig, ForceSensor
+from hilcal.measuring.clearance import Clearance
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.robot.body import body_poses, is_known
@@ -84,8 +84,12 @@ class Feasibility:
         """Build the shapes once."""
         self.cell, self.config = cell, config
         self.margins = Margins() if margins is None else margins
-        self.shapes = clearance_of(cell, config)
-        self.sight = sight_of(self.shapes)
+        self.shapes = Clearance(cell, config)
+        self.sight = self.shapes.sight
+        known = is_known(cell.arm)
+        self._guessed = (
+            "" if known else f"the shape of {cell.arm.name} is not known: its links are guessed"
+        )
         low, high = config.limits.workspace_min_m, config.limits.workspace_max_m
         self._floor = low is None
         self._box = (low or (-np.inf, -np.inf, 0.0), high or (np.inf, np.inf, np.inf))
@@ -95,8 +99,7 @@ class Feasibility:
     @property
     def remarks(self) -> tuple[str, ...]:
         """What is guessed."""
-        guessed = self._guessed
-        return (guessed,) if guessed else ()
+        return (self._guessed,) if self._guessed else ()
 
     # states
 
@@ -204,14 +207,12 @@ class Feasibility:
         if kind == JOINTS:
             yield self._joints(q)
         elif kind == WORKSPACE:
-            poses = body_poses(self.cell.arm, q, at.chain)[:, self._body]
-            ends = poses[:, :, None, :3, :3] @ self._ends[..., None]
-            places = ends[..., 0] + poses[:, :, None, :3, 3]
+            places = self._places(body_poses(self.cell.arm, q, at.chain), slice(None))
             yield self._inside(self._names, places, self._radius, self._held, self._rates)
         elif kind == TORQUE:
             yield self._torque(at.chain, load)
-        elif kind == SENSOR and self.config.force_sensor is not None:
-            yield self._moment(at.chain, load)
+        elif kind == SENSOR and (sensor := self.config.force_sensor) is not None:
+            yield self._moment(sensor, at.chain, load)
         elif kind == ITSELF:
             yield _Touch(scene.itself, q, margins.itself, scene.itself.rates, guessed=self._guessed)
         elif kind == OBSTACLE:
@@ -300,10 +301,8 @@ class Feasibility:
         limit = self.margins.bear * usable
         return _Bounds(torque - limit, drive.T @ rates, BETWEEN_SHARE * usable, told)
 
-    def _moment(self, chain: Chain, load: str) -> "_Bounds":
-        sensor, cell, pull = self.config.force_sensor, self.cell, self._pull(load)
-        if sensor is None:
-            raise ValueError("the cell has no force sensor")
+    def _moment(self, sensor: ForceSensor, chain: Chain, load: str) -> "_Bounds":
+        cell, pull = self.cell, self._pull(load)
         at = np.asarray(sensor.origin_m)
         weight, origin = cell.tool_mass * cell.gravity, chain.point(at)
         moment = pull[3:] + se3.cross(chain.point(cell.load_point) - origin, pull[:3])
@@ -323,12 +322,6 @@ class Feasibility:
 
     # helpers
 
-    @property
-    def _guessed(self) -> str:
-        arm = self.cell.arm
-        known = is_known(arm)
-        return "" if known else f"the shape of {arm.name} is not known: its links are guessed"
-
     def _set_bodies(self) -> None:
         """Which capsules are held to which sides of the workspace, and how they move."""
         scene, arm = self.shapes.scene, self.cell.arm
@@ -346,9 +339,7 @@ class Feasibility:
         first = float(arm.q_min[0]) if slides else -np.pi
         last = float(arm.q_max[0]) if slides else np.pi
         turns[:, 0] = np.linspace(first, last, len(turns))
-        poses = body_poses(arm, turns)[:, self._body[mount]]
-        ends = (poses[:, :, None, :3, :3] @ self._ends[mount][..., None])[..., 0]
-        ends = ends + poses[:, :, None, :3, 3]
+        ends = self._places(body_poses(arm, turns), mount)
         everywhere = np.ones((int(mount.sum()), len(_SIDES)), dtype=np.bool_)
         names = [self._names[k] for k in np.flatnonzero(mount)]
         fixed = self._inside(names, ends, self._radius[mount], everywhere, self._rates[mount])
@@ -371,6 +362,12 @@ class Feasibility:
                 for i in range(1, arm.n + 1)
             ]
         )
+
+    def _places(self, poses: Floats, which: Bools | slice) -> Floats:
+        """(N, B, 2, 3) ends of some capsules, by the poses (N, n + 1, 4, 4) of all bodies."""
+        at = poses[:, self._body[which]]
+        ends = at[:, :, None, :3, :3] @ self._ends[which][..., None]
+        return np.asarray(ends[..., 0] + at[:, :, None, :3, 3])
 
     def _always(self, q: Floats) -> Bools:
         return np.ones(len(q), dtype=np.bool_)

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hilcal.config import CellLoad, ForceSensor, Limits, Motion, Tool
-from hilcal.measuring.clearance import clearance_of
+from hilcal.measuring.clearance import Clearance
 from hilcal.measuring.feasibility import BETWEEN_M
 from hilcal.measuring.route import APPROACH_RAD, dry_run, duration, home, route
 from hilcal.robot.catalogue import load_arm
@@ -74,7 +74,7 @@ def test_reference_at_a_joint_limit_is_approached_from_within(side: int) -> None
 
 def box(bench: Bench, q: Any) -> tuple[Any, Any]:
     """The smallest box around forearm, wrists and tool in all states."""
-    parts = clearance_of(bench.cell, bench.config).scene.parts
+    parts = Clearance(bench.cell, bench.config).scene.parts
     return reached(bench.cell, parts, np.asarray(q))
 
 

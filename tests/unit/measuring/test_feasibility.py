@@ -11,7 +11,7 @@ import pytest
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig, CellLoad, ForceSensor, Limits
 from hilcal.design.feasible import Space
-from hilcal.measuring.clearance import clearance_of
+from hilcal.measuring.clearance import Clearance
 from hilcal.measuring.devices import ArmSample
 from hilcal.measuring.motion import SLACK_M, Guard
 from hilcal.measuring.route import dry_run
@@ -113,7 +113,7 @@ def test_wrong_number_of_joints(bench: Bench) -> None:
 @pytest.mark.parametrize("axis", range(3))
 def test_workspace_of_the_actual_pose(bench: Bench, side: str, axis: int) -> None:
     """A box that ends where forearm, wrists and tool do, less and more than the slack."""
-    parts = clearance_of(bench.cell, bench.config).scene.parts
+    parts = Clearance(bench.cell, bench.config).scene.parts
     low, high = reached(bench.cell, parts, np.array([POSES["p1"]]))
     edge = (low if side == "min" else high)[axis]
     inwards = 1.0 if side == "min" else -1.0
