@@ -24,25 +24,6 @@ _RECORDED = re.compile(r"s\.states\.(time|air)(?:_temperature)?|np\.")
 _OTHER = re.compile(r"\bs\.|\brecorded\(|\bwhere\(|\bhypot\(|\[")
 
 
-def expressions(law: "Law") -> dict[str, str]:
-    """Return the value of a law by site, in its unit, where plain arithmetic says it.
-
-    E.g. {"dq_3": "0.0002*(sin(3 * q4))"}. Quantities are `q1` ... (rad), `tau1` ... (torques of the
-    drives, N·m), `force` (of the load, N), `time` (s) and `air` (air temperature, °C); operators
-    are Python's, functions have numpy's names, but for `max`. Other sites are left out.
-    """
-    terms: dict[str, list[str]] = {}
-    for p in law.form.parts:
-        value = law.parameters[p.coefficient].value
-        terms.setdefault(p.site.symbol, []).append(f"{value!r}*({p.amplitude.code()})")
-    plain = {}
-    for symbol, own in terms.items():
-        text = " + ".join(own).replace("np.ones(len(s.angle))", "1.0").replace("np.maximum", "max")
-        text = _FORCE.sub("force", _JOINT.sub(_joints, text))
-        plain[symbol] = _RECORDED.sub(lambda m: m[1] or "", text)
-    return {symbol: text for symbol, text in plain.items() if not _OTHER.search(text)}
-
-
 def _joints(m: re.Match[str]) -> str:
     first, last = int(m[2]), int(m[3] or int(m[2]) + 1)
     return "(" + " + ".join(f"{_QUANTITIES[m[1]]}{j + 1}" for j in range(first, last)) + ")"
@@ -174,14 +155,6 @@ def with_coefficients(form: Form, kept: Sequence[int]) -> Form:
     return Form(tuple(parts))
 
 
-def ordinary(form: Form) -> Floats:
-    """(P,) motions that one unit of the whitened columns' coefficients stands for."""
-    out = np.ones(form.count)
-    for p in form.parts:
-        out[p.coefficient] = ORDINARY[p.site.unit]
-    return out
-
-
 @dataclass(frozen=True, slots=True)
 class Coefficient:
     """A parameter of a law."""
@@ -194,7 +167,9 @@ class Coefficient:
 
 def coefficients(form: Form, step: Floats, std: Floats) -> tuple[Coefficient, ...]:
     """Return the coefficients of a law, SI, from (P,) means and uncertainties, ordinary motions."""
-    size = ordinary(form)
+    size = np.ones(form.count)
+    for p in form.parts:
+        size[p.coefficient] = ORDINARY[p.site.unit]
     return tuple(
         Coefficient(LETTERS[k], float(v), float(e), form.unit(k))
         for k, (v, e) in enumerate(zip(step * size, std * size, strict=True))
@@ -241,8 +216,23 @@ class Law:
 
     @property
     def expressions(self) -> dict[str, str]:
-        """Its value at each site as arithmetic of named quantities; see `expressions`."""
-        return expressions(self)
+        """Its value by site, in the site's unit, where plain arithmetic says it.
+
+        E.g. {"dq_3": "0.0002*(sin(3 * q4))"}. Quantities are `q1` ... (rad), `tau1` ... (torques
+        of the drives, N·m), `force` (of the load, N), `time` (s) and `air` (air temperature, °C);
+        operators are Python's, functions have numpy's names, but for `max`. Other sites are left
+        out.
+        """
+        terms: dict[str, list[str]] = {}
+        for p in self.form.parts:
+            value = self.parameters[p.coefficient].value
+            terms.setdefault(p.site.symbol, []).append(f"{value!r}*({p.amplitude.code()})")
+        plain = {}
+        for symbol, own in terms.items():
+            text = " + ".join(own).replace("np.ones(len(s.angle))", "1.0")
+            text = _JOINT.sub(_joints, text.replace("np.maximum", "max"))
+            plain[symbol] = _RECORDED.sub(lambda m: m[1] or "", _FORCE.sub("force", text))
+        return {symbol: text for symbol, text in plain.items() if not _OTHER.search(text)}
 
     @property
     def acts_on(self) -> tuple[str, ...]:

@@ -4,7 +4,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from hilcal.effects.options import positive, rated_torques
+from hilcal.effects.options import positive
 from hilcal.effects.per_joint import TorqueLaw, joint_change
 from hilcal.effects.protocol import Situation
 from hilcal.readings.readings import States
@@ -28,7 +28,7 @@ class Backlash(TorqueLaw):
         """Read how wide the crossing is."""
         super().setup(states)
         self.options.setdefault("crossing", 0.01)
-        self.crossing = positive(self.name, self.options, "crossing") * rated_torques(self.cell)
+        self.crossing = positive(self.name, self.options, "crossing") * self.cell.arm.ratings
 
     def of_torque(self, s: Situation) -> tuple[Floats, Floats]:
         """Return tanh(τ_j/τ0_j), and (1 − tanh²(τ_j/τ0_j))/τ0_j."""

@@ -1,6 +1,7 @@
 """A bench in memory: devices that share one small world, cell, plans, and a store."""
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -30,6 +31,7 @@ from hilcal.measuring.devices import (
     TrackerSample,
     WrenchSample,
 )
+from hilcal.measuring.progress import Remark
 from hilcal.measuring.run import run
 from hilcal.readings.readings import Readings
 from hilcal.robot import chain as chains
@@ -459,6 +461,33 @@ class Bench:
         force = None if self.config.force_sensor is None else FakeForce(self.world)
         self.rig = Rig(FakeArm(self.world), FakeTracker(self.world), force, self.operator)
         self.clock = FakeClock(world=self.world)
+
+
+def before(device: Any, call: str, do: Callable[..., None]) -> None:
+    """Have something done before each call of a device, with what the call is given."""
+    real = getattr(device, call)
+
+    def first(*given: Any) -> Any:
+        do(*given)
+        return real(*given)
+
+    setattr(device, call, first)
+
+
+def changed(device: Any, call: str, by: Callable[[Any], Any]) -> None:
+    """Have something else returned by each call of a device, made of what it returns."""
+    real = getattr(device, call)
+    setattr(device, call, lambda *given: by(real(*given)))
+
+
+def asked_for(b: Bench) -> list[str]:
+    """Names of the loads that were asked for, in order."""
+    return [name for name, _ in b.operator.asked]
+
+
+def remarks(b: Bench, words: str = "") -> list[str]:
+    """Remarks that hold some words."""
+    return [note.text for note in b.notes.of(Remark) if words in note.text]
 
 
 def measure(b: Bench, plan: Plan | None = None, **more: Any) -> Readings:

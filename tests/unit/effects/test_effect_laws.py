@@ -8,7 +8,6 @@ import pytest
 from hilcal.cell import Cell
 from hilcal.drivers.simulated.truth import Truth
 from hilcal.drivers.simulated.world import SimulatedNoise, World
-from hilcal.effects.protocol import Situation
 from hilcal.model.model import Model
 from hilcal.readings.readings import States
 from tests.support.campaigns import followed, true_parameters
@@ -151,36 +150,12 @@ def rigid_position(cell: Cell, states: States) -> np.ndarray:
     return Model(cell, ()).predict(states, np.zeros(0)).observation.position
 
 
-def test_harmonics_and_sides_are_what_they_say():
-    cell = CELLS["ur10e"]
-    s = situation(cell)
-    effect = make("transmission_error", cell, s.states, {"harmonics": 4})
-    theta = np.random.default_rng(0).normal(size=48)
-    by_name = {p.name: t for p, t in zip(effect.parameters, theta, strict=True)}
-    dq = effect.deviation(theta, s).dq
-    for j in range(6):
-        q = s.angle[:, j]
-        expected = sum(
-            by_name[f"j{j + 1}.cos{k}"] * np.cos(k * q)
-            + by_name[f"j{j + 1}.sin{k}"] * np.sin(k * q)
-            for k in range(1, 5)
-        )
-        np.testing.assert_allclose(dq[:, j], expected, rtol=0, atol=1e-13)
-    h = np.arange(1.0, 7.0)
-    dq = make("hysteresis", cell, s.states).deviation(h, s).dq
-    np.testing.assert_array_equal(dq, h * s.states.approach)
-
-
 def test_drift_starts_at_its_reference_time():
     cell = CELLS["ur10e"]
-    states = some_states(cell)
+    states = situation(cell).states
     rate = 1e-8 * np.arange(1.0, 7.0)
     for reference, start in ((None, states.time.min()), (100.0, 100.0)):
         given = {} if reference is None else {"reference_s": reference}
         effect = make("tracker_drift", cell, states, given)
-        station = effect.deviation(rate, situation_of(cell, states)).station
+        station = effect.deviation(rate, situation(cell)).station
         np.testing.assert_allclose(station, (states.time - start)[:, None] * rate, rtol=1e-13)
-
-
-def situation_of(cell: Cell, states: States) -> Situation:
-    return Model(cell, ()).predict(states, np.zeros(0)).situation

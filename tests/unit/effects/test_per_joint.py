@@ -118,14 +118,6 @@ def test_other_groups_are_refused_with_what_would_be_valid(given, wrong):
 # --- what it means --------------------------------------------------------------------------
 
 
-def test_every_effect_of_the_joints_can_be_grouped():
-    assert set(PER_JOINT) == {
-        "encoder_offset", "transmission_error", "hysteresis", "joint_compliance",
-        "joint_stiffening", "joint_tilt_compliance", "periodic_joint_compliance", "backlash",
-        "creep", "thermal_joint_drift",
-    }  # fmt: skip
-
-
 @pytest.mark.parametrize("groups", GROUPS)
 @pytest.mark.parametrize("name", PER_JOINT)
 def test_a_shared_parameter_is_the_same_number_at_each_of_its_joints(name, groups):
@@ -198,14 +190,6 @@ def test_names_and_magnitudes(name):
     assert some[kinds].scale == every[kinds].scale
     assert some[0].meaning == every[0].meaning.replace("joint 1", "joints 1+4-5")
     assert {p.unit for p in some} == {p.unit for p in every}
-
-
-def test_compliance_of_joints_by_their_groups():
-    cell = CELLS["ur10e"]
-    effect = make("joint_compliance", cell, some_states(cell), {"joints": "2/4-5"})
-    found = effect.compliance(np.array([3.0, 7.0]))
-    assert found.tolist() == [0.0, 3.0, 0.0, 7.0, 7.0, 0.0]
-    assert type(2 * found) is type(found + found) is np.ndarray
 
 
 def test_harmonics_of_shared_joints_have_one_variance():
