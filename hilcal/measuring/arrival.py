@@ -69,8 +69,8 @@ class RoughRegistration:
         """
         pose = self.pose()
         if pose is None:
-            told, self._repeated = self._repeated, []
-            return told
+            repeated, self._repeated = self._repeated, []
+            return repeated
         far = _far(pose, np.array(self._held), np.array(self._seen))
         out = []
         for k, step in enumerate(self._step):

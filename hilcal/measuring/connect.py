@@ -158,9 +158,6 @@ def _answer(device: str, driver: str, made: Any, why: Exception | None) -> Conne
     return ConnectionResult(device, driver, None, said)
 
 
-WHAT = "its kinematics"
-
-
 def told_by(answers: tuple[ConnectionResult, ...]) -> FactoryKinematics | None:
     """Return the kinematics that the arm's controller tells; None where it does not."""
     return next((a.report.kinematics for a in answers if a.report and a.report.kinematics), None)
@@ -184,17 +181,21 @@ def nominal_arm(cell: Cell) -> Arm:
     return load_arm(robot.model, cell.base_dir, base_link=robot.base_link, tip_link=robot.tip_link)
 
 
-def _compared(report: Report, told: FactoryKinematics, cell: Cell) -> Report:
-    robot = cell.configured().robot
+def _compared(report: Report, held: FactoryKinematics, cell: Cell) -> Report:
+    """Add how the kinematics that the controller holds differ from the cell's."""
+    robot, what = cell.configured().robot, "its kinematics"
     problems = list(report.problems)
     try:
         nominal = nominal_arm(cell)
-        ours = with_factory(nominal, told)
+        ours = with_factory(nominal, held)
     except InputError as error:  # an arm with other joints, or a campaign without its file
-        return replace(report, facts=(*report.facts, (WHAT, str(error))))
+        return replace(report, facts=(*report.facts, (what, str(error))))
     rms, most = flange_difference(ours, nominal)
-    what = "measured by the factory" if told.status == LINEARISED else "not measured by the factory"
-    words = f"{what}: the flange is {1e3 * rms:.2f} mm (rms; most {1e3 * most:.2f} mm) from nominal"
+    measured = "measured" if held.status == LINEARISED else "not measured"
+    words = (
+        f"{measured} by the factory: the flange is {1e3 * rms:.2f} mm (rms; most "
+        f"{1e3 * most:.2f} mm) from nominal"
+    )
     off = 0.0
     if cell.factory is not None:
         off = flange_difference(ours, with_factory(nominal, cell.factory))[1]
@@ -212,7 +213,7 @@ def _compared(report: Report, told: FactoryKinematics, cell: Cell) -> Report:
     names = ("kinematics_from_nominal_rms_m", "kinematics_from_nominal_max_m")
     return replace(
         report,
-        facts=(*report.facts, (WHAT, words)),
+        facts=(*report.facts, (what, words)),
         problems=tuple(problems),
         fields=(*report.fields, *zip(names, (rms, most), strict=True)),
     )

@@ -233,7 +233,7 @@ class Feasibility:
         low, high = arm.q_min + kept, arm.q_max - kept
         more = self.margins.joint
 
-        def told(k: int, over: float, state: int) -> Violation:
+        def violation(k: int, over: float, state: int) -> Violation:
             return Violation(
                 JOINTS, arm.joint_names[k], UNLOADED,
                 f"{arm.joint_names[k]} is at {q[state, k]:.4g} {arm.unit(k)}; usable are "
@@ -241,7 +241,7 @@ class Feasibility:
             )  # fmt: skip
 
         over = np.maximum(low - q, q - high) + more
-        return _Bounds(over, np.zeros((arm.n, arm.n)), np.zeros(arm.n), told)
+        return _Bounds(over, np.zeros((arm.n, arm.n)), np.zeros(arm.n), violation)
 
     def _inside(
         self, names: list[str], places: Floats, radius: Floats, held: Bools, rates: Floats
@@ -252,7 +252,7 @@ class Feasibility:
         body, side = np.nonzero(held)
         margin = self.margins.inside
 
-        def told(k: int, over: float, state: int) -> Violation:
+        def violation(k: int, over: float, state: int) -> Violation:
             name, (axis, below) = names[body[k]], _SIDES[side[k]]
             far, limit = over - margin, self._box[0 if below else 1][axis]
             if below and self._floor:
@@ -268,7 +268,7 @@ class Feasibility:
             return Violation(WORKSPACE, f"{name} {axis} {below}", UNLOADED, text)
 
         chosen = over.reshape(len(over), len(names), len(_SIDES))[:, body, side] + margin
-        return _Bounds(chosen, rates[body], np.full(len(body), BETWEEN_M), told)
+        return _Bounds(chosen, rates[body], np.full(len(body), BETWEEN_M), violation)
 
     def _torque(self, chain: Chain, load: str) -> "_Bounds":
         cell, arm, share = self.cell, self.cell.arm, self.config.limits.torque_share
@@ -279,7 +279,7 @@ class Feasibility:
         usable = share * np.asarray(arm.torque_max, dtype=float)
         slides = arm.slides
 
-        def told(k: int, over: float, state: int) -> Violation:
+        def violation(k: int, over: float, state: int) -> Violation:
             name = arm.joint_names[k]
             text = (
                 f"{name} bears {torque[state, k]:.4g} {'N' if slides[k] else 'N·m'}; usable are "
@@ -299,7 +299,7 @@ class Feasibility:
         rates = np.where(slides[:, None] | slides, force, rates)
         drive = np.eye(arm.n) if arm.drive is None else np.abs(arm.drive)
         limit = self.margins.bear * usable
-        return _Bounds(torque - limit, drive.T @ rates, BETWEEN_SHARE * usable, told)
+        return _Bounds(torque - limit, drive.T @ rates, BETWEEN_SHARE * usable, violation)
 
     def _moment(self, sensor: ForceSensor, chain: Chain, load: str) -> "_Bounds":
         cell, pull = self.cell, self._pull(load)
@@ -310,7 +310,7 @@ class Feasibility:
         size = np.linalg.norm(moment, axis=1)[:, None]
         most = sensor.max_moment_Nm
 
-        def told(k: int, over: float, state: int) -> Violation:
+        def violation(k: int, over: float, state: int) -> Violation:
             text = f"{size[state, k]:.4g} N·m on the force sensor; max_moment_Nm is {most:g}"
             return Violation(SENSOR, "moment", load, text)
 
@@ -318,7 +318,7 @@ class Feasibility:
         rate = sum(float(np.linalg.norm(a) * np.linalg.norm(f)) for a, f in levers)
         rates = np.full((1, cell.arm.n), rate)
         limit = self.margins.bear * most
-        return _Bounds(size - limit, rates, np.array([BETWEEN_SHARE * most]), told)
+        return _Bounds(size - limit, rates, np.array([BETWEEN_SHARE * most]), violation)
 
     # helpers
 
@@ -396,8 +396,7 @@ class _Bounds:
     over: Floats  # (N, K)
     rates: Floats  # (K, n) they change by no more than this per radian of a joint of the chain
     fine: Floats  # (K,) by how much they may be over zero between the samples of a motion
-    told: Callable[[int, float, int], Violation]
-    """The finding of column k, with its number, in a state."""
+    violation: Callable[[int, float, int], Violation]  # of column k, by how much, in a state
 
     def beyond(self, rows: Ints, turn: Floats | None) -> Bools:
         """(R,) whether states are over zero, or might be within turns (R, n)."""
@@ -407,15 +406,14 @@ class _Bounds:
         return np.asarray(~np.all(over <= _ROUNDING, axis=1))  # what is not a number is beyond
 
     def findings(self, kind: str) -> Iterator[Violation]:
-        worst = self.over.argmax(axis=0)
-        told: dict[str, tuple[float, Violation]] = {}
-        for k, state in enumerate(worst.tolist()):
+        worst: dict[str, tuple[float, Violation]] = {}
+        for k, state in enumerate(self.over.argmax(axis=0).tolist()):
             over = float(self.over[state, k])
             if not over <= _ROUNDING:
-                found = self.told(k, over, state)
-                if found.of not in told or told[found.of][0] < over:
-                    told[found.of] = over, found
-        yield from (found for _, found in told.values())
+                broken = self.violation(k, over, state)
+                if broken.of not in worst or worst[broken.of][0] < over:
+                    worst[broken.of] = over, broken
+        yield from (broken for _, broken in worst.values())
 
 
 @dataclass(frozen=True, slots=True, eq=False)

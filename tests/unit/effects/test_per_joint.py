@@ -1,5 +1,7 @@
 """Joints that share a parameter, joints that have none: what it means for each effect."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -228,10 +230,7 @@ def test_shared_parameters_are_found_and_stored_with_their_groups():
     truth = np.abs(random_theta(model.effects, rng))
     value = model.predict(c.readings.states, truth).observation.position
     noise = 2e-6 * rng.normal(size=value.shape)
-    readings = type(c.readings)(
-        **{f: getattr(c.readings, f) for f in c.readings.__dataclass_fields__ if f != "value"},
-        value=value + noise,
-    )
+    readings = replace(c.readings, value=value + noise)
     found = fit(model, readings, "absolute")
     free = found.solution.prior > 0
     assert free[:5].all()
@@ -240,8 +239,6 @@ def test_shared_parameters_are_found_and_stored_with_their_groups():
         "joint_compliance.j1", "joint_compliance.j2", "joint_compliance.j3",
         "joint_compliance.j4-6", "hysteresis.j1-3",
     ]  # fmt: skip
-    assert all(n.startswith(("transmission_error.j2.", "transmission_error.j3."))
-               for n in names[5:])  # fmt: skip
     seen = found.uncertainty.identifiable[:5]
     assert seen[1:].all()
     off = np.abs(found.theta - truth)[:5][seen] / found.uncertainty.std[:5][seen]
