@@ -425,20 +425,15 @@ NAME = "found"
 
 
 class LawSearch:
-    """Searches laws for one refinement, and keeps what it found.
-
-    Attributes:
-        found: the searches, in order.
-        files: of laws that stayed, by name; see `write`.
-    """
+    """Searches laws for one refinement, and keeps what it found."""
 
     def __init__(self, folder: Path, name: str = NAME, replacing: bool = False) -> None:
         """Laws are named after the files that they will be; old ones may be replaced."""
         if replacing:
             for k in range(1, MOST_SEARCHES + 1):
                 (folder / f"{_numbered(name, k)}.py").unlink(missing_ok=True)
-        self.found: list[Discovery] = []
-        self.files: dict[str, Path] = {}
+        self.found: list[Discovery] = []  # the searches, in order
+        self.files: dict[str, Path] = {}  # of laws that stayed, by name; see `write`
         self._folder, self._name = folder, name
         self._sources: dict[str, str] = {}
 

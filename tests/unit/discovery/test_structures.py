@@ -178,17 +178,6 @@ def products(s: Screen, count: int) -> list[tuple[int, int]]:
     raise AssertionError("too few products")
 
 
-def test_a_product_knows_what_is_left_without_either_factor() -> None:
-    words = screened().grammar
-    for _, f in products(screened(), 20):
-        first, second = words.at(f).factors
-        without_first, without_second = words.less[:, f].tolist()
-        assert words.at(without_first) == Amplitude((second,))
-        assert words.at(without_second) == Amplitude((first,))
-    single = words.amplitudes.index(Amplitude((words.singles[0],)))
-    assert words.less[:, single].tolist() == [-1, -1]
-
-
 def test_a_pair_is_found_of_which_neither_part_explains_anything_alone() -> None:
     """As where a temperature is far from its zero all the time: T d and d are nearly the same."""
     s = screened()

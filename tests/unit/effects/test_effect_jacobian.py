@@ -138,6 +138,25 @@ def test_jacobian_of_some_parameters_is_a_part_of_that_of_all():
     np.testing.assert_array_equal(model.jacobian(prediction, theta, 6, live), whole[:, :, live])
 
 
+def test_an_effect_of_many_parameters_moves_the_readings_as_one_of_few():
+    """80 amplitudes of a joint are written at once, those of few harmonics one by one."""
+    cell = CELLS["odd"]
+    states = some_states(cell, 4)
+    many, few = (make("transmission_error", cell, states, {"harmonics": k}) for k in (40, 3))
+    model = Model(cell, (make("joint_compliance", cell, states),))
+    theta = random_theta(model.effects, np.random.default_rng(2))
+    at = model.predict(states, theta)
+    names = [p.name for p in many.parameters]
+    kept = [names.index(p.name) for p in few.parameters]
+    scale = np.random.default_rng(3).uniform(0.5, 2.0, len(names))
+    found = model.jacobian_of((many,), at, theta, 6, scale=scale)
+    expected = model.jacobian_of((few,), at, theta, 6) * scale[kept]
+    np.testing.assert_allclose(found[:, :, kept], expected, rtol=1e-12, atol=1e-14)
+    some = np.arange(30, len(names) - 7)
+    part = model.jacobian_of((many,), at, theta, 6, some, scale)
+    np.testing.assert_allclose(part, found[:, :, some], rtol=1e-12, atol=1e-14)
+
+
 def test_jacobian_of_an_effect_that_is_not_in_the_model_is_that_at_zero():
     cell = CELLS["ur10e"]
     states = some_states(cell)

@@ -149,12 +149,6 @@ def planned(config: CellConfig, q: Any) -> bool:
 GEOMETRY = ("joint limits", "workspace", "self-collision", "obstacle")
 
 
-def elbow(height: float) -> tuple[float, ...]:
-    """The elbow's joint of a UR10e at a height above the mounting plane, m."""
-    lift = float(np.arcsin((0.1807 - height) / 0.6127))
-    return (0.0, lift, -lift - 1.0, -1.0, -1.5, 0.0)
-
-
 def with_targets(*more: Any, **limits: Any) -> CellConfig:
     targets = [
         {"name": f"t{k}", "target_m": at} for k, at in enumerate(([0.0, 0.0, 0.1], *more), start=1)
@@ -165,9 +159,6 @@ def with_targets(*more: Any, **limits: Any) -> CellConfig:
 CASES = {
     "the tool 0.86 m below the mounting plane, no workspace given": (
         cell(), BELOW, "mounting plane",
-    ),
-    "the elbow 17 mm above a floor at 0": (
-        cell(limits={"workspace_min_m": [-3.0, -3.0, 0.0]}), elbow(0.017), "forearm",
     ),
     "a second target 0.39 m outside": (
         with_targets([0.0, 0.0, 0.7], workspace_min_m=[-3.0, -3.0, 0.17]), HOME, "t2",
@@ -200,34 +191,11 @@ def test_run_and_check_refuse_it_before_anything_moves(tmp_path: Path, capsys: C
     assert any("pose low: wrist 3 is" in problem for problem in checked["problems"])
 
 
-@pytest.mark.parametrize("axis", range(3))
-def test_the_upper_arm_keeps_the_sides_that_leave_the_shoulder_room(axis: int) -> None:
-    """A side 0.45 m from the axis: lying towards it, the upper arm alone is outside."""
-    most = [3.0, 3.0, 3.0]
-    most[axis] = 0.45
-    lift, turn = (-1.57, 0.0) if axis == 2 else (0.0, np.pi if axis == 0 else -np.pi / 2)
-    q = (turn, lift, 2.6 if axis == 2 else -2.6, 0.0, -1.5, 0.0)
-    limits = {"workspace_min_m": [-3.0, -3.0, -3.0], "workspace_max_m": most}
-    found = refused_lines(cell(limits=limits), HOME, q)
-    assert any("pose p1: upper arm is" in line and "outside" in line for line in found), found
-
-
-def test_guessed_links_are_held_to_each_other_by_planner_dry_run_and_guard() -> None:
-    """States of an arm of unknown shape in which it touches nothing but itself."""
-    config = cell(limits={"workspace_min_m": [-9.0, -9.0, -9.0]}, loads=[])
+def test_the_shape_of_an_unknown_arm_is_said_to_be_guessed() -> None:
+    config = cell()
     unknown = replace(cell_from_config(config), arm=arm_of(ODD))
-    space, guard = Space(unknown, config), Guard(unknown, config)
-    assert "the shape of odd is not known: its links are guessed" in space.remarks
-    drawn = np.random.default_rng(0).uniform(-2.0, 2.0, (200, unknown.arm.n))
-    overlap = [q for q in drawn if space.shapes.scene.itself.distance(q) < 0.0]
-    assert len(overlap) > 20
-    for q in overlap[:20]:
-        assert not space.allowed(q[None], UNLOADED, ("self-collision",)).all()
-        plan = Plan(("reference",), q[None], (Step("reference", UNLOADED),))
-        dry = dry_run(unknown, config, plan)
-        assert "the shape of odd is not known: its links are guessed" in dry.remarks
-        found = [x for x in dry.problems if "collide" in x]
-        assert found
-        assert all("its links are guessed" in x for x in found)
-        here = replace(Bench().rig.arm.sample(), q=q, qd=np.zeros(len(q)))
-        assert "collide" in str(guard.check(here))
+    q = np.zeros((1, unknown.arm.n))
+    checked = dry_run(unknown, config, Plan(("reference",), q, (Step("reference", UNLOADED),)))
+    said = "the shape of odd is not known: its links are guessed"
+    assert said in checked.remarks
+    assert said in Space(unknown, config).remarks

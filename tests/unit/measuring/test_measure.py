@@ -263,14 +263,6 @@ def test_poses_are_judged_by_their_turning_too():
     assert not turning.settled()
 
 
-def test_nothing_is_settled_before_the_window_is_full():
-    window = SettleWindow(5)
-    for k in range(5):
-        assert not window.settled()
-        window.add(sample(k * DT, STD * (-1) ** k))
-    assert window.settled()
-
-
 def test_samples_without_time_between_them_tell_nothing():
     window = SettleWindow(3)
     for _ in range(9):
