@@ -4,6 +4,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from importlib.metadata import EntryPoint, entry_points
+from operator import methodcaller
 from typing import Any
 
 from hilcal.cell import Cell
@@ -120,42 +121,39 @@ def connect(config: CellConfig) -> tuple[Rig | None, tuple[ConnectionResult, ...
         parts.append(("force sensor", devices.FORCE_SENSORS, sensor, "[force_sensor] driver"))
     factories = [driver(group, name, key) for _, group, name, key in parts]
     with ThreadPoolExecutor(len(parts)) as pool:
-        opened = list(pool.map(lambda factory: _open(factory, config), factories))
-    made = dict(zip((part for part, *_ in parts), (device for device, _ in opened), strict=True))
-    answers = tuple(
-        _answer(part, name or "", device, why)
-        for (part, _, name, _), (device, why) in zip(parts, opened, strict=True)
-    )
-    wrong = [why for _, why in opened if isinstance(why, InputError)]
-    if wrong or any(answer.failure for answer in answers):
-        for device in made.values():
-            if device is not None:
-                device.close()
-        if wrong:
-            raise wrong[0]
-        return None, answers
-    rig = Rig(made["arm"], made["tracker"], made.get("force sensor"), made["operator"])
-    return rig, answers
+        opened = list(pool.map(lambda factory: _tried(factory, config), factories))
+    made: dict[str, Any] = {}
+    answers: list[ConnectionResult] = []
+    for (part, _, name, _), (device, error) in zip(parts, opened, strict=True):
+        made[part] = device
+        report, why = (None, error) if error is not None else _tried(methodcaller("report"), device)
+        failure = "" if why is None else _failure(part, why)
+        answers.append(ConnectionResult(part, name or "", report, failure))
+    if not any(answer.failure for answer in answers):
+        rig = Rig(made["arm"], made["tracker"], made.get("force sensor"), made["operator"])
+        return rig, tuple(answers)
+    for device in made.values():
+        if device is not None:
+            device.close()
+    for _, error in opened:
+        if isinstance(error, InputError):
+            raise error
+    return None, tuple(answers)
 
 
-def _open(factory: Factory, config: CellConfig) -> tuple[Any, Exception | None]:
+def _tried(do: Callable[..., Any], *given: object) -> tuple[Any, Exception | None]:
+    """Return what a driver answers, or its error: one of somebody else's may fail in any way."""
     try:
-        return factory(config), None
-    except Exception as error:  # a driver of somebody else's may fail in any way
+        return do(*given), None
+    except Exception as error:
         return None, error
 
 
-def _answer(device: str, driver: str, made: Any, why: Exception | None) -> ConnectionResult:
-    try:
-        if why is None:
-            return ConnectionResult(device, driver, made.report())
-    except Exception as error:  # as above
-        why = error
+def _failure(device: str, why: Exception) -> str:
     words = str(why)
     if not isinstance(why, HilcalError):
         words = f"{type(why).__name__}: {' '.join(words.split())}"
-    said = words if words.startswith(device) else f"{device}: {words}"
-    return ConnectionResult(device, driver, None, said)
+    return words if words.startswith(device) else f"{device}: {words}"
 
 
 def told_by(answers: tuple[ConnectionResult, ...]) -> FactoryKinematics | None:

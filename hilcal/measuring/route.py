@@ -243,10 +243,11 @@ def way_home(
     hanging = here.hanging if here.change_to is None else here.change_to
     to = Stop(base, q_home, hanging, change_to=None if hanging == UNLOADED else UNLOADED)
     way: list[Stop] = []
+    limits = Feasibility(cell, config)
     for stop in reversed(behind):
         at = Stop(stop.name, stop.q, hanging)
         way.append(at)
-        if np.array_equal(at.q, q_home) or not route_problems(cell, config, (at, to)):
+        if np.array_equal(at.q, q_home) or not on_route(limits, (at, to)):
             break
     way = [*way[1:], to]
     returned = here.step is not None and (here.step.pose, here.step.load) == (base, UNLOADED)
