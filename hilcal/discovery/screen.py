@@ -159,8 +159,8 @@ class Screen:
         return int(np.count_nonzero(self.square))
 
     def inner(self, v: Floats) -> Floats:
-        """(S, F) xᵀ v of all candidates, v (R,), in single precision."""
-        by_reading = np.einsum("srn,r->sn", self.form, v[self.rows].astype(np.float32))
+        """(S, F) xᵀ v of all candidates, v (R',) of the rows of the screening, single precision."""
+        by_reading = np.einsum("srn,r->sn", self.form, v)
         return np.asarray(by_reading @ self.values)
 
     def columns(self, which: list[tuple[int, int]]) -> Floats:

@@ -233,7 +233,7 @@ class Feasibility:
         low, high = arm.q_min + kept, arm.q_max - kept
         more = self.margins.joint
 
-        def violation(k: int, over: float, state: int) -> Violation:
+        def violation(k: int, state: int) -> Violation:
             return Violation(
                 JOINTS, arm.joint_names[k], UNLOADED,
                 f"{arm.joint_names[k]} is at {q[state, k]:.4g} {arm.unit(k)}; usable are "
@@ -252,9 +252,9 @@ class Feasibility:
         body, side = np.nonzero(held)
         margin = self.margins.inside
 
-        def violation(k: int, over: float, state: int) -> Violation:
+        def violation(k: int, state: int) -> Violation:
             name, (axis, below) = names[body[k]], _SIDES[side[k]]
-            far, limit = over - margin, self._box[0 if below else 1][axis]
+            far, limit = chosen[state, k] - margin, self._box[0 if below else 1][axis]
             if below and self._floor:
                 text = (
                     f"{name} is {far:.3g} m below the mounting plane z = 0; where the arm may go "
@@ -279,7 +279,7 @@ class Feasibility:
         usable = share * np.asarray(arm.torque_max, dtype=float)
         slides = arm.slides
 
-        def violation(k: int, over: float, state: int) -> Violation:
+        def violation(k: int, state: int) -> Violation:
             name = arm.joint_names[k]
             text = (
                 f"{name} bears {torque[state, k]:.4g} {'N' if slides[k] else 'N·m'}; usable are "
@@ -310,7 +310,7 @@ class Feasibility:
         size = np.linalg.norm(moment, axis=1)[:, None]
         most = sensor.max_moment_Nm
 
-        def violation(k: int, over: float, state: int) -> Violation:
+        def violation(k: int, state: int) -> Violation:
             text = f"{size[state, k]:.4g} N·m on the force sensor; max_moment_Nm is {most:g}"
             return Violation(SENSOR, "moment", load, text)
 
@@ -396,7 +396,7 @@ class _Bounds:
     over: Floats  # (N, K)
     rates: Floats  # (K, n) they change by no more than this per radian of a joint of the chain
     fine: Floats  # (K,) by how much they may be over zero between the samples of a motion
-    violation: Callable[[int, float, int], Violation]  # of column k, by how much, in a state
+    violation: Callable[[int, int], Violation]  # of column k in a state
 
     def beyond(self, rows: Ints, turn: Floats | None) -> Bools:
         """(R,) whether states are over zero, or might be within turns (R, n)."""
@@ -410,7 +410,7 @@ class _Bounds:
         for k, state in enumerate(self.over.argmax(axis=0).tolist()):
             over = float(self.over[state, k])
             if not over <= _ROUNDING:
-                broken = self.violation(k, over, state)
+                broken = self.violation(k, state)
                 if broken.of not in worst or worst[broken.of][0] < over:
                     worst[broken.of] = over, broken
         yield from (broken for _, broken in worst.values())

@@ -39,7 +39,6 @@ class ToolLoad:
     gravity: Floats  # (3,) base axes, m/s²
     chi2: float  # sum of squared whitened residuals
     dof: int  # its degrees of freedom; 0 after a tare
-    poses: int  # number of readings used
 
     @property
     def com(self) -> Floats:
@@ -124,7 +123,6 @@ def identify_tool_load(
         gravity=gravity,
         chi2=float(residual @ residual),
         dof=len(y) - PARAMETERS,
-        poses=len(wrench),
     )
 
 
@@ -140,7 +138,7 @@ def tare(
     tool = design(rotation, gravity)[:, 6:] @ np.concatenate([[mass], moment])
     cov = np.zeros((PARAMETERS, PARAMETERS))
     cov[:6, :6] = covariance
-    return ToolLoad(wrench - tool, float(mass), moment, cov, gravity, chi2=0.0, dof=0, poses=1)
+    return ToolLoad(wrench - tool, float(mass), moment, cov, gravity, chi2=0.0, dof=0)
 
 
 def shift(wrench: Floats, arm: Floats) -> Floats:
@@ -316,7 +314,7 @@ class ForceMeter:
         self._tared_down: Floats | None = None
         nothing = np.zeros((PARAMETERS, PARAMETERS))
         moment = cell.tool_mass * self._com
-        self.tool = ToolLoad(np.zeros(6), cell.tool_mass, moment, nothing, cell.gravity, 0.0, 0, 0)
+        self.tool = ToolLoad(np.zeros(6), cell.tool_mass, moment, nothing, cell.gravity, 0.0, 0)
 
     def felt(self) -> Floats:
         """Return the present wrench (6,) against the zero, sensor axes."""

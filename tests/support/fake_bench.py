@@ -498,6 +498,17 @@ def measure(b: Bench, plan: Plan | None = None, **more: Any) -> Readings:
     return readings
 
 
+def interrupt(b: Bench, stored: int, plan: Plan | None = None, **more: Any) -> None:
+    """Kill a run when so many readings are stored, and start the program anew."""
+    b.world.kill_after = ("store.recorded", stored)
+    try:
+        measure(b, plan, **more)
+    except Killed:
+        b.world.again()
+    else:
+        raise AssertionError("the run came to its end")
+
+
 def rows(readings: Readings, load: str) -> Bools:
     """Which readings were taken under a load."""
     return readings.load == readings.load_names.index(load)

@@ -190,7 +190,6 @@ def test_a_bend_of_a_product_is_found_with_its_site_and_quantities() -> None:
 def test_the_effect_of_a_bend_does_what_was_hidden() -> None:
     before, moved = campaign()
     d = found()
-    assert d.after is not None
     assert agreement(before, d.after, moved) > 0.99
     assert d.after.variance_factor < 0.5 * before.variance_factor
     check_effect(effect_class(d.source, "beyond"))

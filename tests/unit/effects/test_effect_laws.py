@@ -123,33 +123,6 @@ def test_prediction_is_what_the_world_shows(names, arm):
         assert moved > 1e-9  # a hundred times the tolerance
 
 
-@pytest.mark.parametrize("arm", CELLS)
-def test_errors_of_the_force_sensor_add_but_for_their_products(arm):
-    """What two of them leave out is one as a share of what the other moves."""
-    cell = CELLS[arm]
-    states = some_states(cell, 6)
-    for scale in (1.0, 1e-2):
-        b = both(("joint_compliance", *SENSOR), cell, states, scale)
-        joints = Model(cell, b.model.effects[:1])
-        true = joints.predict(states, b.theta[: cell.arm.n]).observation.position
-        all_of_them = b.model.predict(states, b.theta).observation.position - true
-        bias, gain, turn = (b.theta[at] for at in b.model.slices()[1:])
-        loaded = states.wrench[np.any(states.wrench != 0, axis=1)]
-        least = [np.linalg.norm(loaded[:, part], axis=1).min() for part in (slice(3), slice(3, 6))]
-        share = np.linalg.norm(bias[:3]) / least[0] + np.linalg.norm(bias[3:]) / least[1]
-        share += np.abs(gain).max() + np.linalg.norm(turn)
-        moved = np.linalg.norm(all_of_them, axis=1).max()
-        # Every error alone moves at most what its share of the wrench does to soft joints.
-        soft = np.linalg.norm(true - rigid_position(cell, states), axis=1).max()
-        assert apart(b, states)[0] <= 3 * share**2 * soft + 1e-11
-        assert 3 * share**2 * soft < moved or scale == 1.0
-        assert moved > 1e-6 * scale**2
-
-
-def rigid_position(cell: Cell, states: States) -> np.ndarray:
-    return Model(cell, ()).predict(states, np.zeros(0)).observation.position
-
-
 def test_drift_starts_at_its_reference_time():
     cell = CELLS["ur10e"]
     states = situation(cell).states

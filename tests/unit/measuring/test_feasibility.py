@@ -37,7 +37,7 @@ def bench() -> Bench:
 
 def sample(bench: Bench, **changes: object) -> ArmSample:
     bench.world.q = np.array(POSES["p1"])
-    return replace(bench.rig.arm.sample(), **changes)  # type: ignore[arg-type]
+    return replace(bench.rig.arm.sample(), **changes)
 
 
 def test_all_is_well_with_and_without_a_force_sensor(bench: Bench) -> None:

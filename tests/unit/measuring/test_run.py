@@ -28,10 +28,10 @@ from tests.support.fake_bench import (
     STD,
     TORQUE,
     Bench,
-    Killed,
     asked_for,
     before,
     changed,
+    interrupt,
     measure,
     plan_of,
     remarks,
@@ -124,7 +124,6 @@ def test_approach_sides_are_those_of_the_motions(ran: Bench) -> None:
         side = np.where(goal == q, side, np.sign(goal - q))
         q = goal
         expected[tuple(goal), load] = side
-    assert readings.states.approach is not None
     assert np.all(np.abs(readings.states.approach) == 1)
     for k in range(len(readings)):
         pose = POSES[readings.pose_names[readings.pose[k]]]
@@ -136,10 +135,6 @@ def test_approach_sides_are_those_of_the_motions(ran: Bench) -> None:
 def test_times_and_temperatures(ran: Bench) -> None:
     readings = ran.store.readings()
     s = readings.states
-    assert s.time is not None
-    assert s.load_time is not None
-    assert s.joint_temperature is not None
-    assert s.q_actual is not None
     assert np.all(np.diff(s.time) > 0)
     assert np.all(s.load_time > 0)
     assert np.all(s.load_time <= s.time)
@@ -240,7 +235,7 @@ def test_repeatability_is_estimated_at_the_end() -> None:
         at = chain.point(b.cell.target[:3, 3])[0] + SAG * b.world.pull()[:3]
         return REGISTRATION[:3, :3] @ at + REGISTRATION[:3, 3]
 
-    b.world.position = position  # type: ignore[method-assign]
+    b.world.position = position
     plan = plan_of(*((p, "none", c) for c in range(12) for p in ("p1", "p2", "p3")))
     measure(b, plan)
     found = b.store.last("repeatability")
@@ -264,7 +259,6 @@ def test_repeatability_law() -> None:
                 position = rng.normal(0.0, np.sqrt((1.0 + 4.0 * gain) / 3.0), 3)
                 visits.append(UnloadedVisit(pose, position, np.eye(3) / 3.0, gain))
         found = repeatability(visits)
-        assert found is not None
         squares.append(found.joint_std**2)
     assert np.mean(squares) == pytest.approx(4.0, rel=0.1)
     assert repeatability([UnloadedVisit("a", np.zeros(3), np.eye(3), 1.0)]) is None
@@ -276,7 +270,6 @@ def test_an_arm_that_does_not_scatter_is_seldom_said_to() -> None:
         at = rng.normal(0.0, 1e-5, (8, 3))
         found = repeatability([UnloadedVisit("ab"[k % 2], x, 1e-10 * np.eye(3), 1.0)
                                for k, x in enumerate(at)])  # fmt: skip
-        assert found is not None
         said += "joint_std_rad is about" in found.words(np.zeros(6))
     assert said < 12
 
@@ -285,7 +278,6 @@ def test_a_cell_without_a_tool() -> None:
     b = Bench(tool=Tool(target_m=(0.0, 0.0, 0.1)))
     b.world.tool_mass = 0.0
     measure(b)
-    assert b.world.payload is not None
     assert b.world.payload[0] == 0.0
 
 
@@ -377,22 +369,18 @@ def test_unloaded_poses_that_do_not_tell_the_tool_are_no_failure() -> None:
 
 def test_resume_measures_exactly_what_is_missing_and_time_goes_on() -> None:
     b, plan = Bench(), usual_plan()
-    b.world.kill_after = ("store.recorded", 7)
     day = [1000.0]
 
     def wall() -> float:
         return day[0] + b.world.time
 
-    with pytest.raises(Killed):
-        measure(b, plan, wall=wall)
+    interrupt(b, 7, plan, wall=wall)
     done = len(b.store.rows)
     assert 5 < done < len(plan.steps)
-    b.world.again()
     day[0] += 7200.0  # two hours later
     loads = len(b.operator.asked)
     readings = measure(b, plan, wall=wall)
     assert [s for s, _, _ in b.store.rows] == list(plan.steps)
-    assert readings.states.time is not None
     gaps = np.diff(readings.states.time)
     assert 7200.0 < gaps[done - 1] < 7200.0 + 120.0
     assert np.all(np.delete(gaps, done - 1) < 60.0)
@@ -404,23 +392,16 @@ def test_resume_measures_exactly_what_is_missing_and_time_goes_on() -> None:
 @pytest.mark.long
 def test_time_never_goes_back_whatever_the_clock_on_the_wall_does() -> None:
     b, plan = Bench(), usual_plan()
-    b.world.kill_after = ("store.recorded", 4)
-    with pytest.raises(Killed):
-        measure(b, plan, wall=lambda: 5000.0 + b.world.time)
-    b.world.again()
+    interrupt(b, 4, plan, wall=lambda: 5000.0 + b.world.time)
     readings = measure(b, plan, wall=lambda: 1000.0 + b.world.time)
-    assert readings.states.time is not None
     assert np.all(np.diff(readings.states.time) > 0)
 
 
 @pytest.mark.long
 def test_a_load_that_still_hangs_at_a_resume_is_noticed() -> None:
     b, plan = Bench(), usual_plan()
-    b.world.kill_after = ("store.recorded", 7)
-    with pytest.raises(Killed):
-        measure(b, plan)
+    interrupt(b, 7, plan)
     assert b.world.load == "3kg"
-    b.world.again()
     b.world.wrong = ["3kg"]  # the first answer is wrong
     # the sensor was off meanwhile
     b.world.offset = b.world.offset + np.array([2.0, 2.0, -2.0, 0, 0, 0])
@@ -456,10 +437,7 @@ def test_the_tool_is_known_from_an_earlier_session_after_the_sensor_was_off() ->
     """Another bias in the second session: the pulls are measured right nevertheless."""
     b, plan = Bench(), usual_plan()
     b.world.tool_mass = 1.4
-    b.world.kill_after = ("store.recorded", 7)
-    with pytest.raises(Killed):
-        measure(b, plan)
-    b.world.again()
+    interrupt(b, 7, plan)
     b.world.offset = -b.world.offset
     readings = measure(b, plan)
     assert np.allclose(
@@ -474,7 +452,6 @@ def test_torques_are_averaged_over_the_reading() -> None:
     b = Bench()
     b.world.torques = np.inf
     torque = measure(b).states.torque
-    assert torque is not None
     # means of at least three samples that scatter by 0.1 N·m
     assert np.abs(torque - TORQUE).max() < 5 * 0.1 / np.sqrt(3)
     assert not remarks(b, LOST)
@@ -486,7 +463,6 @@ def test_a_lost_link_is_said_once_and_readings_go_on(tmp_path: Path) -> None:
     b.world.torques = 60
     readings = measure(b)
     torque = readings.states.torque
-    assert torque is not None
     lost = np.isnan(torque).all(axis=1)
     assert np.array_equal(lost, np.isnan(torque).any(axis=1))
     assert 0 < lost.argmax() < len(lost)
@@ -513,24 +489,19 @@ def test_a_lost_link_is_said_once_and_readings_go_on(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=rf"but {lost.sum()} of {len(lost)} readings have none"):
         require_torques(measured, readings)
     some, all_of_them = check_torques(b.cell, readings), check_torques(b.cell, readings[~lost])
-    assert some is not None
-    assert all_of_them is not None
     assert some.to_json() == all_of_them.to_json()
 
 
 @pytest.mark.parametrize("first", [0, np.inf])
 def test_a_campaign_goes_on_as_it_began(first: float) -> None:
     b = Bench()
-    b.world.torques, b.world.kill_after = first, ("store.recorded", 4)
-    with pytest.raises(Killed):
-        measure(b)
-    b.world.again()
+    b.world.torques = first
+    interrupt(b, 4)
     b.world.torques = -1 if first else np.inf
     torque = measure(b).states.torque
     if not first:
         assert torque is None
     else:
-        assert torque is not None
         assert np.isfinite(torque[:4]).all()
         assert np.isnan(torque[4:]).all()
         assert len(remarks(b, LOST)) == 1

@@ -112,8 +112,6 @@ def check_fault(fault: BaseException, k: int) -> None:
     assert [step for step, _, _ in b.store.rows][: len(before)] == before
     assert each_once(b, plan), k
     readings = b.store.readings()
-    assert readings is not None
-    assert readings.states.time is not None
     assert np.all(np.diff(readings.states.time) > 0), k
 
 
@@ -274,7 +272,6 @@ def test_a_reading_of_another_reflector_is_told_as_soon_as_the_tracker_has_its_p
             doubted += [str(step) for step, _ in known.late_doubts()]
         assert doubted == ["p1, none, cycle 0"]
         pose = known.pose()
-        assert pose is not None
         assert np.allclose(pose[0], cell.registration[:3, :3], atol=1e-9)
 
 
@@ -417,7 +414,7 @@ def test_an_arm_that_does_not_arrive() -> None:
     def short(q: Any, speed: float, acceleration: float) -> None:
         real(q - 0.002, speed, acceleration)
 
-    b.rig.arm.start_move = short  # type: ignore[method-assign]
+    b.rig.arm.start_move = short
     with pytest.raises(DeviceError, match=r"stands 0\.002 rad off"):
         measure(b)
 
@@ -425,7 +422,7 @@ def test_an_arm_that_does_not_arrive() -> None:
 @pytest.mark.long
 def test_a_motion_that_never_ends_is_given_up() -> None:
     b = Bench()
-    b.rig.arm.moving = lambda: True  # type: ignore[method-assign]
+    b.rig.arm.moving = lambda: True
     with pytest.raises(DeviceError, match="not finished after"):
         measure(b)
     assert b.world.calls[-2] == "arm.stop"
@@ -497,7 +494,7 @@ def test_drift_that_ends_is_waited_for() -> None:
     quiet = Bench()
     measure(quiet, few)
     assert max(t.settling for t in quiet.notes.of(ReadingStored)) < 1.0
-    away = b.store.readings().value - quiet.store.readings().value  # type: ignore[union-attr]
+    away = b.store.readings().value - quiet.store.readings().value
     assert np.abs(away).max() < 6 * STD
 
 

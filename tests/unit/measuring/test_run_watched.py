@@ -15,10 +15,10 @@ from hilcal.robot.chain import evaluate
 from tests.support.fake_bench import (
     POSES,
     Bench,
-    Killed,
     asked_for,
     before,
     changed,
+    interrupt,
     measure,
     plan_of,
     remarks,
@@ -54,7 +54,6 @@ def carried(b: Bench) -> list[tuple[str, float]]:
     found = []
 
     def noted(*_: object) -> None:
-        assert b.world.payload is not None
         found.append((b.world.load, b.world.payload[0]))
 
     before(b.rig.arm, "start_move", noted)
@@ -149,10 +148,7 @@ def test_an_operator_who_cannot_be_asked_is_not_taken_to_agree() -> None:
 def test_a_campaign_that_goes_on_says_that_the_arm_stands_elsewhere_and_asks() -> None:
     for moved, questions in ((False, 0), (True, 1)):
         b = Bench()
-        b.world.kill_after = ("store.recorded", 1)
-        with pytest.raises(Killed):
-            measure(b, SHORT)
-        b.world.again()
+        interrupt(b, 1, SHORT)
         if moved:
             b.world.q = FREE.copy()
         measure(b, SHORT)
@@ -491,7 +487,7 @@ def test_a_load_that_stays_wrong_ends_the_run() -> None:
 def test_a_tracker_whose_target_does_not_move_with_the_arm_is_named_before_any_reading() -> None:
     b = Bench()
     still = b.world.position()
-    b.world.position = lambda: still  # type: ignore[method-assign]
+    b.world.position = lambda: still
     with pytest.raises(DeviceError, match="repeats an old reading, or follows a reflector"):
         measure(b)
     assert b.store.rows == []
@@ -538,14 +534,11 @@ def test_stored_readings_of_a_stuck_tracker_do_not_keep_a_campaign_from_going_on
     """As older versions stored them: four right ones, then three at one and the same place."""
     b = Bench()
     plan = usual_plan()
-    b.world.kill_after = ("store.recorded", 7)
-    with pytest.raises(Killed):
-        measure(b, plan)
+    interrupt(b, 7, plan)
     step, reading, _ = b.store.rows[3]
     for k in (4, 5, 6):
         step, other, text = b.store.rows[k]
         b.store.rows[k] = (step, replace(other, value=reading.value), text)
-    b.world.again()
     assert len(measure(b, plan)) == len(plan.steps)
 
 

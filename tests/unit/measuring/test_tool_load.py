@@ -70,7 +70,7 @@ def test_without_noise_everything_is_recovered(seed, mass, com, poses):
     assert found.mass == pytest.approx(mass, abs=1e-8)
     assert found.moment == pytest.approx(mass * np.array(com), abs=1e-8)
     assert found.chi2 == pytest.approx(0.0, abs=1e-8)
-    assert (found.dof, found.poses) == (6 * poses - 10, poses)
+    assert found.dof == 6 * poses - 10
     if mass > 0.5:
         assert found.com == pytest.approx(np.array(com), abs=1e-6)
     assert found.load_wrench(wrench, R) == pytest.approx(np.zeros((poses, 6)), abs=1e-6)
@@ -96,15 +96,6 @@ def test_estimates_scatter_as_their_covariance_says(rng):
     assert np.mean(chi2 > chi2_law.ppf(0.95, 6 * K - 10)) == pytest.approx(0.05, abs=0.023)
     com = np.array([f.com for f in found])
     assert com.std(axis=0) == pytest.approx(found[0].com_std, rel=0.1)
-
-
-def test_the_least_certain_readings_weigh_least(rng):
-    R, cov = rotations(10, rng), covariances(10, rng)
-    wrench = reading(R)
-    wrench[0] += 50.0
-    cov[0] *= 1e10
-    found = identify_tool_load(wrench, cov, R, GRAVITY)
-    assert found.mass == pytest.approx(MASS, abs=1e-4)
 
 
 def test_a_wrong_model_shows_in_the_variance_factor(rng):

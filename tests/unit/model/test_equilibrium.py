@@ -107,7 +107,6 @@ def test_elastic_pendulum_hangs_where_its_torques_balance() -> None:
     model = model_of(cell, states, ("joint_compliance",))
     compliance = 1e-3
     p = model.predict(states, np.array([compliance]))
-    assert p.deviation.dq is not None
     for i in range(9):
         gap = lambda x, i=i: x - compliance * 7.0 * 10.0 * 0.8 * np.cos(q[i] + x)  # noqa: E731
         expected = so.brentq(gap, -1, 1, xtol=1e-15, rtol=1e-15)
