@@ -17,7 +17,7 @@ from hilcal.design.run_order import pace, timeline
 from hilcal.design.summary import PlanSummary
 from hilcal.errors import InputError
 from hilcal.measuring.clearance import TRACKER_UNKNOWN as NO_TRACKER
-from hilcal.measuring.clearance import Clearance, LineOfSight, clearance_of, sight_of
+from hilcal.measuring.clearance import Clearance, LineOfSight
 from hilcal.measuring.route import route
 from hilcal.present import plan as plan_blocks
 from hilcal.present.document import Block, Words, heading, load_name, pairs, table
@@ -110,11 +110,11 @@ class PlanView:
     @cached_property
     def shapes(self) -> Clearance:
         """Shapes of arm, tool, obstacles and loads, as collisions are checked."""
-        return clearance_of(self.cell, self.config)
+        return Clearance(self.cell, self.config)
 
     @cached_property
     def _view(self) -> LineOfSight | None:
-        return sight_of(self.shapes)
+        return self.shapes.sight
 
     @property
     def tracker(self) -> Floats | None:

@@ -31,7 +31,7 @@ from hilcal.identification.carried import CarriedPrior, carried_prior
 from hilcal.identification.fit import fit
 from hilcal.identification.full_covariance import with_joint_scatter
 from hilcal.identification.posterior import Posterior
-from hilcal.measuring.clearance import LineOfSight, clearance_of
+from hilcal.measuring.clearance import Clearance, LineOfSight
 from hilcal.measuring.devices import TrackerSample
 from hilcal.measuring.measure import average
 from hilcal.measuring.route import seconds_at_rest
@@ -551,7 +551,7 @@ def test_sight_and_time_of_each_target() -> None:
     c = reflectors(poses=6)
     cell = replace(c.cell, registration_known=True)
     q = poses_in(c.readings)
-    view = LineOfSight(clearance_of(cell, several), np.array([3.0, 0.5, 0.4]))
+    view = LineOfSight(Clearance(cell, several), np.array([3.0, 0.5, 0.4]))
     seen = np.array([view.sees(q, "none", k) for k in range(3)])
     np.testing.assert_array_equal(view.free(q, "none"), seen.all(axis=0))
     for k in range(len(q)):
