@@ -1,6 +1,5 @@
 """The commands from import to view: exit codes, documents, words, one verdict everywhere."""
 
-import csv
 import json
 import sys
 from dataclasses import replace
@@ -22,7 +21,6 @@ from hilcal.present.verdict import message
 from hilcal.refinement import refine
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.tables.table import read_table
 from studies.diagnosis import judgement
 from studies.serial_noise import serial_readings
 from studies.study_cases import study_case
@@ -292,23 +290,6 @@ def test_view_writes_a_recording_that_can_be_read(campaign, tmp_path, capsys):
     assert "no folder" in refused(capsys, 2, "view", campaign, "--record", missing)
 
 
-def test_export_writes_tables_that_go_in_again(campaign, tmp_path, capsys):
-    readings, parameters = tmp_path / "readings.csv", tmp_path / "parameters.csv"
-    assert "revision" in refused(capsys, 2, "export", campaign, "--parameters", parameters)
-    assert "--table" in refused(capsys, 2, "export", campaign)
-    ok(capsys, "refine", campaign)
-    ok(capsys, "export", campaign, "--table", readings, "--parameters", parameters)
-    refused(capsys, 2, "export", campaign, "--table", readings)
-    with CampaignFile.open(campaign) as stored:
-        again = read_table(readings, rehearsal("nothing").cell.arm, None)
-        assert (again.value == stored.readings().value).all()
-    with parameters.open(encoding="utf-8", newline="") as stream:
-        rows = list(csv.DictReader(stream))
-    j2 = next(row for row in rows if row["name"] == "hysteresis.j2")
-    assert float(j2["value"]) > 0
-    assert j2["unit"] == "rad"
-
-
 def test_effects_lists_the_catalogue(capsys):
     d = ok(capsys, "effects", "--json").document
     assert [e["name"] for e in d["effects"]] == list(installed().names)
@@ -332,14 +313,6 @@ def test_a_scheduler_that_anybody_can_reach_is_said(capsys):
     said, error = run(capsys, *given).err.splitlines()
     assert said.startswith("--scheduler tcp://127.0.0.1:1: without TLS")
     assert error.startswith("error: ")
-
-
-@pytest.mark.long
-def test_json_leaves_words_to_stderr(campaign, capsys):
-    for command in (["identify"], ["compare"], ["diagnose"], ["refine"]):
-        result = ok(capsys, *command, campaign, "--json")
-        json.loads(result.out)
-        assert "noise alone" in result.err
 
 
 def test_version(capsys):

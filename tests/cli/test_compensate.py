@@ -163,16 +163,6 @@ def test_a_name_is_neither_a_line_of_a_program_nor_a_formula(capsys, fitted, tmp
     assert [point["name"] for point in told["points"]] == ["w0", "=1+1", "w2"]
 
 
-def test_the_corrected_geometry_is_handed_over(capsys, fitted, tmp_path):
-    paths = [tmp_path / name for name in ("a.urdf", "a.yaml", "f.json")]
-    options = zip(("--urdf", "--ur-kinematics", "--frames"), paths, strict=True)
-    given = [word for pair in options for word in pair]
-    shown = ok(capsys, "export", fitted, *given)
-    assert "Not in it, since not constant: joint_compliance" in shown.out
-    assert all(path.stat().st_size > 100 for path in paths)
-    assert "--force" in refused(capsys, 2, "export", fitted, *given)
-
-
 def test_points_outside_are_refused_by_name_unless_told_otherwise(capsys, fitted, tmp_path):
     points = table(
         tmp_path, fitted, fx_N="0", fy_N="0", fz_N="-400", mx_Nm="0", my_Nm="0", mz_Nm="0"

@@ -19,7 +19,7 @@ from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan
 from hilcal.store.procedure_log import purpose_of
 from studies.random_campaigns import rehearse
-from tests.support.cli_cases import CELL, ok, quickly_planned, refused, rehearsal, run
+from tests.support.cli_cases import CELL, ok, quickly_planned, refused, run
 from tests.support.screen import AtTerminal
 from tests.support.user_effect_cases import CLASS
 
@@ -159,15 +159,6 @@ def test_what_cannot_be_hidden(tmp_path, capsys):
     assert "--seed" in line
 
 
-def test_a_rehearsal_repeats_itself_and_loads_every_joint():
-    one, two, other = rehearsal("hysteresis"), rehearsal("hysteresis"), rehearsal("hysteresis", 2)
-    np.testing.assert_array_equal(one.readings.value, two.readings.value)
-    assert not np.array_equal(one.readings.value, other.readings.value)
-    torque = one.world.drive_torque(one.readings.states)
-    unloaded = np.repeat(torque[one.readings.unloaded], 5, axis=0)
-    assert (np.abs(torque - unloaded).max(axis=0) > 5.0).all()  # N·m
-
-
 def test_a_random_choice_gives_nothing_away():
     config = load_config(CELL)
     drawn = [rehearse(config, "random", seed, 3) for seed in range(6)]
@@ -280,21 +271,7 @@ def test_what_is_missing_is_measured_after_a_failure(capsys):
     assert (said.out + said.err).count("nothing came for 0.2 s") == 2
 
 
-def test_a_device_that_always_fails_ends_it(capsys):
-    once, calls = work(TRIES)
-    with pytest.raises(DeviceError, match=r"nothing came for 0\.2 s"):
-        to_the_end(terminal(False), once, lambda: 7)
-    assert len(calls) == TRIES
-
-
 def test_as_long_as_readings_come_it_goes_on(capsys):
     once, calls = work(3 * TRIES)
     to_the_end(terminal(False), once, lambda: len(calls) // 2)
     assert len(calls) == 3 * TRIES + 1
-
-
-def test_other_errors_end_it_at_once(capsys):
-    once, calls = work(1, InputError)
-    with pytest.raises(InputError):
-        to_the_end(terminal(False), once, lambda: 7)
-    assert len(calls) == 1

@@ -270,6 +270,7 @@ def whole(pages):
 
 def test_the_words_of_a_campaign_stay_whole(readings, home, capsys, pages):
     run = "run.hilcal"
+    ok(capsys, "import", readings, "--preview", "--config", CELL)
     ok(capsys, "import", readings, "--config", CELL, "-o", run)
     ok(capsys, "identify", run, "--scaling", "all")
     ok(capsys, "compare", run)

@@ -1,13 +1,11 @@
 """`hilcal import` of tables as people have them: one line for whatever is wrong."""
 
-import json
 from collections.abc import Callable
 
 import numpy as np
 import pytest
 
 from hilcal.cell import cell_from_config
-from hilcal.cli import main
 from hilcal.config import load_config
 from hilcal.store.campaign_file import CampaignFile
 from tests.support.cli_cases import ok, refused
@@ -245,17 +243,6 @@ def test_zero_standard_deviations_are_the_instruments(tmp_path, capsys):
     assert np.sqrt(x.covariance[1].diagonal()).min() > 5e-6
 
 
-def test_rounded_values_are_not_believed_to_the_micrometre(tmp_path, capsys):
-    rounded = lines(
-        HEADER, [f"P{k}" for k in range(12)], np.rad2deg(C.q), np.round(1e3 * C.position, 1),
-        np.full((12, 3), 0.001), np.full(12, 20.5), np.zeros(12),
-    )  # fmt: skip
-    d = imported(capsys, tmp_path, rounded)
-    assert any("positions are rounded to 0.1 mm" in n and "28.9 µm" in n for n in d["notes"])
-    expected = 1e-12 + 1e-8 / 12
-    np.testing.assert_allclose(values(tmp_path).covariance[0].diagonal(), expected, rtol=1e-6)
-
-
 def test_rounded_joints_are_said(tmp_path, capsys):
     text = lines(
         HEADER, [f"P{k}" for k in range(12)], np.round(np.rad2deg(C.q), 1), 1e3 * C.position,
@@ -314,13 +301,6 @@ def test_the_preview_says_what_is_wrong_with_the_description(tmp_path, capsys):
     assert "joint 4 turns the other way" in d["outcome"][-1]
 
 
-def test_words_fit_eighty_columns(tmp_path, capsys, monkeypatch):
-    path = write(tmp_path / "t.csv", GOOD)
-    monkeypatch.setattr("hilcal.cli.terminal.WIDTH", 80)
-    words = ok(capsys, "import", path, "--preview", "--config", CELL).out
-    assert max(map(len, words.splitlines())) <= 80
-
-
 @pytest.mark.parametrize("name", ["spatial-analyzer", "spatial-analyzer-points", "polyworks",
                                   "tracker-pilot"])  # fmt: skip
 def test_shipped_mappings(name, tmp_path, capsys):
@@ -352,13 +332,6 @@ def test_shipped_mappings(name, tmp_path, capsys):
     x = values(tmp_path)
     np.testing.assert_allclose(x.states.q, C.q, atol=1e-7)
     np.testing.assert_allclose(x.value[:, :3], C.position, atol=1e-8)
-
-
-def test_the_document_is_json_only(tmp_path, capsys):
-    path = write(tmp_path / "t.csv", GOOD)
-    with pytest.raises(SystemExit):
-        main(["import", str(path), "--preview", "--json"])
-    assert json.loads(capsys.readouterr().out)["missing"] == []
 
 
 def test_loads_that_a_table_only_names_act_as_the_cell_states_them(tmp_path, capsys):
