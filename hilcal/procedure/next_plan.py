@@ -23,7 +23,7 @@ from hilcal.identification.fit import Fit
 from hilcal.names import quoted
 from hilcal.present.progress import Say
 from hilcal.procedure.state import Settings, duration_of, reference_in
-from hilcal.procedure.validation_plan import RECORDED
+from hilcal.procedure.validation_plan import recorded
 from hilcal.readings.readings import States
 from hilcal.robot.chain import evaluate
 from hilcal.store.plan import Plan
@@ -353,8 +353,7 @@ def predicted_error(calibration: Calibration, fitted: States, config: CellConfig
     loads of the readings: the distance that 95 % of all these points are within.
     """
     states = _work(fitted, config)
-    columns = {k: v for k in RECORDED if (v := getattr(states, k)) is not None}
-    told = calibration.predict(states.q, states.wrench, recorded=columns)
+    told = calibration.predict(states.q, states.wrench, recorded=recorded(states))
     assert told.covariance is not None  # noqa: S101  (asked for by default)
     of = tool_of(calibration.model, calibration.theta, None)
     chain = evaluate(calibration.model.cell.arm, states.q)

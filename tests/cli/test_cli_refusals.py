@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from hilcal.errors import InputError
-from hilcal.store.campaign_file import CampaignFile
-from tests.support.cli_cases import CELL, ok, refused, rehearsal, run, start, table
+from tests.support.cli_cases import CELL, ok, refused, rehearsal, run, start, stored_readings, table
 
 Capsys = pytest.CaptureFixture[str]
 Rows = list[list[str]]
@@ -134,18 +133,14 @@ def test_usage_errors_are_one_line(campaign, capsys):
 
 def test_fewer_readings_than_parameters(tmp_path, capsys):
     r = rehearsal("nothing", poses=4)
-    path = tmp_path / "few.hilcal"
-    unloaded = r.readings.unloaded
-    with CampaignFile.create(path, r.config.to_json(), str(tmp_path), "test") as file:
-        file.append_readings(r.readings[unloaded])
+    unloaded = r.readings[r.readings.unloaded]
+    path = stored_readings(tmp_path / "few.hilcal", unloaded, r.config)
     line = refused(
         capsys, 4, "identify", path, "--effects", "encoder_offset,link_geometry", "--readings",
         "absolute",
     )  # fmt: skip
     assert "measure" in line
-    two = tmp_path / "two.hilcal"
-    with CampaignFile.create(two, r.config.to_json(), str(tmp_path), "test") as file:
-        file.append_readings(r.readings[r.readings.pose < 2])
+    two = stored_readings(tmp_path / "two.hilcal", r.readings[r.readings.pose < 2], r.config)
     assert "poses" in refused(capsys, 4, "identify", two)
 
 
@@ -250,7 +245,7 @@ def test_what_cannot_be_hidden_is_refused_before_anything_is_planned(
     def planned(*_: object) -> None:
         raise AssertionError("it plans first")
 
-    for name in ("make_plan", "make_checked"):
+    for name in ("make_plan", "checked_plan"):
         monkeypatch.setattr(f"hilcal.cli.running.{name}", planned)
     path, words = tmp_path / "CELL.toml", CELL.read_text(encoding="utf-8")
     path.write_text(words.replace("[simulation]", '[simulation]\nhide = "foo"'), encoding="utf-8")

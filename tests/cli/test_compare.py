@@ -13,15 +13,14 @@ import hilcal as hc
 from hilcal.config import CellConfig, Repeatability, load_config
 from hilcal.drivers.simulated.world import World, stand
 from hilcal.identification.full_covariance import joint_factors
-from hilcal.readings.covariance import COVERS, INSTRUMENT
+from hilcal.readings.covariance import INSTRUMENT
 from hilcal.readings.readings import Readings
 from hilcal.robot.catalogue import configs_dir
-from hilcal.store.campaign_file import CampaignFile
 from studies.change import StudiedArm, measured, remeasured, studied_arm
 from studies.study_cases import with_study_loads
 from tests.support.campaigns import campaign as simulated
 from tests.support.campaigns import cell_of, configuration
-from tests.support.cli_cases import ok, refused
+from tests.support.cli_cases import ok, refused, stored_readings
 from tests.support.report_pages import write_campaign
 
 CONFIG = load_config(configs_dir() / "cells" / "demo_ur10e.toml")
@@ -40,10 +39,7 @@ class Site:
         return self.folder / "a.hilcal"
 
     def store(self, name: str, readings: Readings, config: CellConfig | None = None) -> Path:
-        path, told = self.folder / name, config or self.config
-        with CampaignFile.create(path, told.to_json(), str(self.folder), "test") as file:
-            file.append_readings(readings)
-        return path
+        return stored_readings(self.folder / name, readings, config or self.config)
 
     def measured(self, seed: int, zeros: Sequence[float] = (0.0,) * 6) -> Readings:
         """Fifteen readings with other zeros of the joints, by a tracker that stands elsewhere."""
@@ -181,11 +177,10 @@ def test_two_campaigns_of_one_arm_have_a_page_that_says_what_has_changed(campaig
     world = simulated("joint_tilt_compliance", "deflection", poses=6, strength=8.0).world
     compliance = world.physics.joint_compliance * [1, 2, 1, 1, 1, 1]
     worn = replace(world, physics=world.physics.with_effect("joint_compliance", compliance))
-    config, later = configuration(), campaign.with_name("later.hilcal")
+    config = configuration()
     loads = [(load.name, load.wrench(cell_of().gravity)) for load in config.loads]
-    base = str(configs_dir() / "cells")
-    with CampaignFile.create(later, config.to_json(), base, "test") as file:
-        file.append_readings(measured(worn, loads, 4, np.random.default_rng(8)))
+    readings = measured(worn, loads, 4, np.random.default_rng(8))
+    later = stored_readings(campaign.with_name("later.hilcal"), readings, config)
     page = campaign.with_name("both.html")
     found = ok(capsys, "report", campaign, later, "-o", page, "--json").document
     assert found["headline"] == "Something has changed: joint 2"
@@ -211,10 +206,9 @@ def test_the_certificate_never_takes_the_arm_to_come_back_exactly(tmp_path, caps
     r, true = site.readings, replace(site.cell, registration=site.world.registration)
     f = joint_factors(true, r, site.world.joint_std)
     r = replace(r, covariance=r.covariance - f @ np.swapaxes(f, 1, 2))
-    run, base = tmp_path / "run.hilcal", str(configs_dir() / "cells")
     config = configuration().model_copy(update={"repeatability": Repeatability()})
-    with CampaignFile.create(run, config.to_json(), base, "t", more={COVERS: INSTRUMENT}) as file:
-        file.append_readings(r[(r.cycle == 0) | (r.load == r.load_names.index("none"))])
+    kept = r[(r.cycle == 0) | (r.load == r.load_names.index("none"))]
+    run = stored_readings(tmp_path / "run.hilcal", kept, config, INSTRUMENT)
     ok(capsys, "report", run)
     text = run.with_suffix(".html").read_text(encoding="utf-8")
     assert "taken as zero" not in text

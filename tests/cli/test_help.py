@@ -1,16 +1,13 @@
 """The help of every command, completion, errors as JSON, widths; what is loaded at the start."""
 
-import ast
 import inspect
 import io
-import re
 import subprocess
 import sys
 from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
-import typer
 from rich.console import Console
 
 from hilcal.cli import looking_up
@@ -123,40 +120,6 @@ def test_an_unexpected_error_and_an_interrupt_are_documents(capsys, monkeypatch)
 def test_a_usage_error_names_the_help(capsys):
     assert refused(capsys, 2, "run", "x", "--foo").endswith("see hilcal run -h")
     assert refused(capsys, 2, "diagnos").endswith("Did you mean 'diagnose'? See hilcal -h")
-
-
-SAID = re.compile(r"hilcal ([a-z]+)((?: (?!and |or |first|again|to )[^\s\"'`;,)(]+)*)")
-
-
-def test_every_step_that_a_message_names_can_be_taken():
-    """Each command that the program's words name is one, and has the options that they give it."""
-    wrong, seen = [], set()
-    for path in sorted((*ROOT.glob("hilcal/**/*.py"), *ROOT.glob("drivers/**/*.py"))):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if not isinstance(node, ast.JoinedStr | ast.Constant):
-                continue
-            parts = node.values if isinstance(node, ast.JoinedStr) else [node]
-            words = "".join(
-                p.value if isinstance(p, ast.Constant) and isinstance(p.value, str) else "X"
-                for p in parts
-            )
-            for name, rest in SAID.findall(words):
-                if name not in COMMANDS:
-                    continue
-                seen.add(name)
-                places = [COMMANDS[name].place, *(p for _, p in COMMANDS[name].subcommands)]
-                known = set()
-                for place in filter(None, places):
-                    made = typer.Typer()
-                    made.command()(load(place))
-                    known |= {o for p in typer.main.get_command(made).params for o in p.opts}
-                wrong += [
-                    f"{path.relative_to(ROOT)}:{node.lineno}: hilcal {name} {option}"
-                    for option in re.findall(r"(?<= )--?[a-z][a-z-]*", rest)
-                    if option not in known
-                ]
-    assert {"identify", "refine", "accept", "next", "plan", "run"} <= seen
-    assert not wrong
 
 
 HEAVY = ("numpy", "scipy", "pydantic", "pinocchio", "rerun", "sklearn", "rich.console", "dask")

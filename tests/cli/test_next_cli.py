@@ -21,27 +21,23 @@ from hilcal.effects.catalogue import installed
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
-from hilcal.robot.catalogue import configs_dir
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import REFERENCE, Plan, Step, joined, load_plan, with_new_names
 from hilcal.store.run_log import RunLog
 from hilcal.workbench.session import WorkbenchSession
 from tests.cli.test_until_goal import site
 from tests.support.campaigns import configuration
-from tests.support.cli_cases import CELL, ok, refused, table
+from tests.support.cli_cases import CELL, ok, refused, stored_readings, table
 from tests.support.next_cases import SMALL, doubtful
 from tests.unit.data.test_run_log import MADE, STEPS, _campaign, _reading
 from tests.unit.design.test_next import fine_error
 
 TILT, LINK, BASE = "joint_tilt_compliance", "link_compliance", "base_compliance"
-CELLS = str(configs_dir() / "cells")
 
 
 def stored(path, effect, seed):
     """Write a small campaign, as `hilcal import` would."""
-    with CampaignFile.create(path, SMALL.to_json(), CELLS, "a test", overwrite=True) as campaign:
-        campaign.append_readings(doubtful(effect, seed).rehearsal.readings)
-    return path
+    return stored_readings(path, doubtful(effect, seed).rehearsal.readings, SMALL)
 
 
 @pytest.fixture
@@ -122,9 +118,7 @@ def test_an_effect_that_was_added_in_doubt_is_in_doubt_still(ambiguous, tmp_path
 
 @pytest.mark.long
 def test_a_misfit_of_the_pose_alone_asks_for_new_poses(tmp_path, capsys):
-    path = tmp_path / "run.hilcal"
-    with CampaignFile.create(path, configuration().to_json(), CELLS, "a test") as campaign:
-        campaign.append_readings(fine_error()[1])
+    path = stored_readings(tmp_path / "run.hilcal", fine_error()[1], configuration())
     ok(capsys, "identify", path, "--readings", "absolute")
     plan = tmp_path / "next.json"
     result = ok(capsys, "next", path, "-o", plan, "--poses", "10", "--json")

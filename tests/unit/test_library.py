@@ -19,11 +19,10 @@ from hilcal.config import load_config
 from hilcal.config.reference import to_toml
 from hilcal.readings.covariance import WHOLE
 from hilcal.robot.catalogue import configs_dir
-from hilcal.store.campaign_file import CampaignFile
 from hilcal.tables.table import write_table
 from studies.change import measured
 from studies.random_campaigns import rehearse
-from tests.support.cli_cases import quickly_planned
+from tests.support.cli_cases import quickly_planned, stored_readings
 from tests.support.paths import ROOT
 
 CELL = configs_dir() / "cells" / "demo_ur10e.toml"
@@ -53,8 +52,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
         (run, readings),
         (later, measured(worn, loads, 4, np.random.default_rng(8))),
     ):
-        with CampaignFile.create(path, config.to_json(), str(CELL.parent), "test") as file:
-            file.append_readings(content)
+        stored_readings(path, content, config)
     cell = folder / "CELL.toml"
     cell.write_text(to_toml(quickly_planned(config)), encoding="utf-8")
     return SimpleNamespace(table=table, run=run, later=later, cell=cell, folder=folder)
