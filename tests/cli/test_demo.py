@@ -7,13 +7,8 @@ from hilcal.cli.running import TRIES, first_plan, to_the_end
 from hilcal.cli.terminal import terminal
 from hilcal.config import load_config
 from hilcal.drivers.simulated.rehearsal import (
-    INVENTED,
-    check_choice,
     choices,
-    invented_law,
-    own_choices,
 )
-from hilcal.effects.catalogue import installed
 from hilcal.errors import DeviceError, InputError
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan
@@ -145,13 +140,6 @@ def test_an_invented_law_is_discovered(tmp_path, capsys):
     assert stored.document["verdict"] == "adequate"
 
 
-def test_the_invented_law_is_an_effect_that_the_catalogue_lacks():
-    world = invented_law(installed())
-    assert INVENTED not in installed().names
-    assert INVENTED in own_choices(world)
-    check_choice(INVENTED, world)
-
-
 def test_what_cannot_be_hidden(tmp_path, capsys):
     line = refused(capsys, 2, "demo", "--hide", "gremlins", "-o", tmp_path / "x.hilcal")
     assert all(name in line for name in (*choices(), "random", "nothing"))
@@ -252,13 +240,14 @@ def test_a_script_is_shown_the_plan_and_goes_on(toml, capsys):
         assert campaign.n_readings == 0
 
 
-def work(failures, kind=DeviceError):
+def work(failures):
+    """Work that fails so many times, and its calls."""
     calls = []
 
     def once():
         calls.append(1)
         if len(calls) <= failures:
-            raise kind("force sensor: nothing came for 0.2 s")
+            raise DeviceError("force sensor: nothing came for 0.2 s")
 
     return once, calls
 
@@ -269,6 +258,13 @@ def test_what_is_missing_is_measured_after_a_failure(capsys):
     assert len(calls) == 3
     said = capsys.readouterr()
     assert (said.out + said.err).count("nothing came for 0.2 s") == 2
+
+
+def test_a_device_that_always_fails_ends_it():
+    once, calls = work(TRIES)
+    with pytest.raises(DeviceError, match=r"nothing came for 0\.2 s"):
+        to_the_end(terminal(False), once, lambda: 7)
+    assert len(calls) == TRIES
 
 
 def test_as_long_as_readings_come_it_goes_on(capsys):

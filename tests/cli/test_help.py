@@ -136,36 +136,30 @@ def loaded(code, of=HEAVY):
     return set(of) & set(done.stderr.split())
 
 
-@pytest.mark.parametrize("option", ["--help", "--version"])
-def test_help_and_version_load_no_library_of_the_computation(option):
+COMPLETING = {"_HILCAL_COMPLETE": "complete_bash", "COMP_WORDS": "hilcal di", "COMP_CWORD": "1"}
+
+
+@pytest.mark.parametrize(("given", "environment", "allowed"), [
+    (["--help"], {}, set()),
+    (["--version"], {}, set()),
+    ([], COMPLETING, {"pydantic"}),  # typer parses by it
+], ids=["help", "version", "completion"])  # fmt: skip
+def test_what_computes_nothing_loads_no_library_of_the_computation(given, environment, allowed):
     code = f"""
-from hilcal.cli import main
-try:
-    main([{option!r}])
-except SystemExit as ended:
-    assert ended.code == 0
-"""
-    assert loaded(code) == set()
-
-
-def test_completing_a_command_loads_no_library_of_the_computation():
-    code = """
 import os
-os.environ.update(_HILCAL_COMPLETE="complete_bash", COMP_WORDS="hilcal di", COMP_CWORD="1")
+os.environ.update({environment})
 from hilcal.cli import main
 try:
-    main([])
+    main({given})
 except SystemExit as ended:
     assert ended.code == 0
 """
-    assert loaded(code) <= {"pydantic"}  # typer parses by it
+    assert loaded(code) <= allowed
 
 
 def test_the_package_loads_nothing_until_a_name_is_used():
     assert loaded("import hilcal") == set()
-    assert "numpy" in loaded(
-        "import hilcal.model.model"
-    )  # the measurement itself can find something
+    assert "numpy" in loaded("import hilcal.model.model")  # what loads something is noticed
 
 
 def test_commands_load_no_library_that_they_may_not_need():

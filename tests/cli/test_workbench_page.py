@@ -174,17 +174,6 @@ def test_the_token_is_good_for_one_exchange(served):
     assert [asked(guard, "/?token=secret") for _ in range(3)] == [200, 403, 403]
 
 
-def test_the_token_that_nobody_uses_dies(monkeypatch):
-    monkeypatch.setattr("hilcal.workbench.guard.UNUSED_S", 0.1)
-    unused, used = (AccessGuard(nothing, 8787, "secret") for _ in range(2))
-    assert asked(used, "/?token=secret") == 200
-    assert not unused.abandoned
-    time.sleep(0.2)
-    assert unused.abandoned
-    assert asked(unused, "/?token=secret") == 403
-    assert not used.abandoned
-
-
 @pytest.mark.long
 def test_the_session_ends_with_the_token_that_nobody_uses(tmp_path):
     run = stored(tmp_path / "run.hilcal")
