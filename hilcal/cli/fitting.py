@@ -124,23 +124,16 @@ def scalings(name: str) -> tuple[Scaling, ...]:
     return found
 
 
-def wanted_effects(given: str | None, catalogue: Catalogue) -> dict[str, dict[str, object]] | None:
+def wanted_effects(
+    given: str | None, catalogue: Catalogue, option: str = "--effects"
+) -> dict[str, dict[str, object]] | None:
     """Read `--effects "a, b(option=value)"`: options by name, see `read_effects_text`."""
     if given is None:
         return None
-    wanted = read_effects_text(given, "--effects", catalogue)
+    wanted = read_effects_text(given, option, catalogue)
     if not wanted:
-        raise InputError("--effects is empty; give one name or several, separated by commas")
+        raise InputError(f"{option} is empty; give one name or several, separated by commas")
     return wanted
-
-
-def effect_names(asked: str | None, catalogue: Catalogue) -> tuple[str, ...] | None:
-    """Read names of effects where they cannot have options; raises as `wanted_effects` does."""
-    wanted = wanted_effects(asked, catalogue)
-    for name, options in (wanted or {}).items():
-        if options:
-            raise InputError(f"--effects: {name} takes no options here; valid: {name}")
-    return None if wanted is None else tuple(wanted)
 
 
 def check_options(o: Campaign, wanted: Mapping[str, Options]) -> None:

@@ -13,9 +13,9 @@ from hilcal.cli.fitting import (
     NO_PRIOR,
     PriorOptions,
     check_record,
-    effect_names,
     fit_of,
     fitted_with,
+    wanted_effects,
 )
 from hilcal.cli.options import POSES, catalogue_with, check_seed, command
 from hilcal.cli.terminal import Terminal, terminal
@@ -303,12 +303,12 @@ def _without_suspects(
 
 
 def _named(text: str | None, catalogue: Catalogue) -> tuple[str, ...] | None:
-    if text is None:
+    """Read `--suspects`: names of effects, which have no options here."""
+    wanted = wanted_effects(text, catalogue, "--suspects")
+    if wanted is None:
         return None
-    try:
-        names = effect_names(text, catalogue) or ()
-    except InputError as error:
-        raise InputError(str(error).replace("--effects", "--suspects")) from None
-    if not 2 <= len(names) <= MOST:
-        raise InputError(f"--suspects has {len(names)} names; valid: 2 to {MOST}")
-    return names
+    for name in (name for name, options in wanted.items() if options):
+        raise InputError(f"--suspects: {name} takes no options here; valid: {name}")
+    if not 2 <= len(wanted) <= MOST:
+        raise InputError(f"--suspects has {len(wanted)} names; valid: 2 to {MOST}")
+    return tuple(wanted)

@@ -37,7 +37,12 @@ from hilcal.identification.carried import CarriedPrior
 from hilcal.identification.full_covariance import full_readings
 from hilcal.identification.validation import Acceptance, acceptance, extrapolation
 from hilcal.present.progress import Say
-from hilcal.procedure.next_plan import Decision, PredictedError, decide, predicted_error
+from hilcal.procedure.next_plan import (
+    Decision,
+    FurtherMeasuring,
+    PredictedError,
+    predicted_error,
+)
 from hilcal.procedure.state import (
     BEGUN,
     DECIDED,
@@ -249,9 +254,8 @@ class Procedure:
                 d = diagnose(o.restore(record), o.history(record.number), say)
             rng = self._rng(_FURTHER, len(run.plans))
             reference = reference_of(run.plans[0])
-            found = decide(
-                self.cell, self._planned(), self.settings, d, run.plans, reference, rng, say
-            )
+            asked = (self.cell, self._planned(), self.settings)
+            found = FurtherMeasuring(*asked, d, run.plans, reference, rng, say).decide()
             plan = found.plan if found.measures else None
             if plan is not None:
                 plan = run.with_new_names(plan)  # `run` checks every motion of it

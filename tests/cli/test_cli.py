@@ -23,22 +23,10 @@ from hilcal.store.campaign_file import CampaignFile
 from studies.diagnosis import judgement
 from studies.serial_noise import serial_readings
 from studies.study_cases import study_case
-from tests.support.cli_cases import CELL, ok, refused, rehearsal, run, stored_readings, table
+from tests.support.cli_cases import CELL, ok, refused, rehearsal, run, stored_readings
 from tests.support.next_cases import SMALL, doubtful
 
 ERROR = {"rms_m", "mean_m", "max_m", "rms_sigma"}
-
-
-@pytest.fixture(scope="module")
-def hysteresis_table(tmp_path_factory):
-    return table(tmp_path_factory.mktemp("tables") / "hysteresis.csv", "hysteresis")
-
-
-@pytest.fixture
-def campaign(hysteresis_table, tmp_path, capsys):
-    path = tmp_path / "run.hilcal"
-    ok(capsys, "import", hysteresis_table, "--config", CELL, "-o", path)
-    return path
 
 
 def test_import_says_what_was_read(hysteresis_table, tmp_path, capsys):
