@@ -141,16 +141,6 @@ def test_the_public_names_are_documented_and_typed() -> None:
             assert signature.return_annotation is not inspect.Signature.empty, name
 
 
-def test_fit_diagnosis_and_residuals_in_eight_lines(site: SimpleNamespace) -> None:
-    """What docs/how-to/use-the-library.md promises."""
-    with hc.Campaign.open(site.run) as run:
-        fit = hc.fit(hc.baseline(run.cell, run.readings), run.readings)
-        diagnosis = hc.diagnose(fit)
-        residuals = fit.residuals(frame="base")
-    assert diagnosis.suspects[0].effect == "joint_tilt_compliance"
-    assert residuals.shape == (40, 3)
-
-
 def test_wrong_words_are_refused_with_the_valid_ones(site: SimpleNamespace) -> None:
     cell = hc.Cell.load(site.cell)
     readings = hc.read_table(site.table, cell)
