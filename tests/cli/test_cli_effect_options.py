@@ -5,19 +5,7 @@ import shutil
 import pytest
 
 from hilcal.store.campaign_file import CampaignFile
-from tests.support.cli_cases import CELL, ok, refused, table
-
-
-@pytest.fixture(scope="module")
-def measured(tmp_path_factory):
-    return table(tmp_path_factory.mktemp("tables") / "hysteresis.csv", "hysteresis")
-
-
-@pytest.fixture
-def campaign(measured, tmp_path, capsys):
-    path = tmp_path / "run.hilcal"
-    ok(capsys, "import", measured, "--config", CELL, "-o", path)
-    return path
+from tests.support.cli_cases import ok, refused
 
 
 def names_of(result, effect):
