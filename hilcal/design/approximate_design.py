@@ -298,7 +298,7 @@ def relax(
     if tolerance is None:
         tolerance = KINKED_TOLERANCE if criterion.kinked else TOLERANCE
     cap = np.inf if most is None else float(most)
-    prior = checked(units, budget, prior)
+    prior = given_prior(units, budget, prior)
     share = min(budget / float(units.cost.sum()), cap)
     spread = prior + units.information(np.full(len(units), share))
     criterion.require(spread, names)
@@ -339,7 +339,7 @@ def relax(
     return _pruned(whole, top[1], top[0].weight, best)
 
 
-def checked(units: CandidateSet, budget: float, prior: Floats | None) -> Floats:
+def given_prior(units: CandidateSet, budget: float, prior: Floats | None) -> Floats:
     """Return the prior information (P, P); refuse a budget that no unit fits into."""
     least = float(units.cost.min())
     if budget < least * (1.0 - 1e-12):

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as sl
 
-from hilcal.design.approximate_design import KINKED_TOLERANCE, ApproximateDesign, checked, relax
+from hilcal.design.approximate_design import KINKED_TOLERANCE, ApproximateDesign, given_prior, relax
 from hilcal.design.criterion import CandidateSet, Criterion, best_first
 from hilcal.errors import CannotAnswerError
 from hilcal.types import Floats, Ints
@@ -57,7 +57,7 @@ def best(
         relaxed = relax(
             units, criterion, budget, prior, most=most, names=names, tolerance=tolerance
         )
-    known = checked(units, budget, prior)
+    known = given_prior(units, budget, prior)
     felt = criterion.relevant(units, known, budget)
     search = _Search(units, felt, budget, known, relaxed, most)
     usual, enough = (KINKED_EFFORT, KINKED_ENOUGH) if felt.kinked else (EFFORT, ENOUGH)
