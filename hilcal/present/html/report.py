@@ -126,7 +126,9 @@ def first_screen(m: ReportContent) -> FirstScreen:
         ("Where is it wrong?", where_wrong(m)),
         ("What is missing?", _missing(m.diagnosis)),
     )
-    return FirstScreen(*_headline(m.diagnosis), answers, tuple(_cards(m)), *limit_words(m))
+    verdict = None if m.diagnosis is None else m.diagnosis.verdict
+    cards = tuple(_cards(m))
+    return FirstScreen(*_headline(m.diagnosis), answers, cards, *limit_words(m), verdict)
 
 
 def _headline(d: Diagnosis | None) -> tuple[str, str]:
