@@ -17,7 +17,7 @@ from hilcal.identification.torques import ARM, TOOL, TorqueCheck, TorqueFactor
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode
 from hilcal.robot import se3
-from hilcal.types import Bools, Floats
+from hilcal.types import Floats
 
 PLACES = 5, 4  # decimals of a position in m and of an angle in degrees. A choice
 ALONG = 0.98
@@ -109,10 +109,18 @@ def base_line(cell: Cell, found: RobotFrames, mode: Mode = "absolute") -> str:
 def undetermined_lines(found: Registration) -> Iterator[str]:
     """Yield a sentence for each direction of the frames that the poses do not determine."""
     names = found.cell.target_names if found.cell.targets is not None else ()
+    still = [int(k) + 1 for k in np.flatnonzero(found.still)]
+    why = "the tool hardly changed its orientation, or turned about one axis only"
+    if len(still) == 1:
+        why = f"joint {still[0]} never turned"
+    elif still and still == list(range(still[0], still[-1] + 1)):
+        why = f"joints {still[0]} to {still[-1]} never turned"
+    elif still:
+        why = f"joints {numbers.names(list(map(str, still)))} never turned"
     for u in found.undetermined:
         what = _undetermined(u, names)
         verb = "separate" if " from " in what else "determine"
-        yield f"The poses cannot {verb} {what}{_why(found.still)}; it stays near the start."
+        yield f"The poses cannot {verb} {what}: {why}; it stays near the start."
 
 
 def _undetermined(u: Undetermined, names: tuple[str, ...]) -> str:
@@ -143,18 +151,6 @@ def _axis_words(v: Floats, axes: str) -> str:
     if abs(unit[k]) > ALONG:
         return f"{axes} {'xyz'[k]}"
     return f"{axes} direction ({', '.join(f'{x:.2f}' for x in unit)})"
-
-
-def _why(still: Bools) -> str:
-    """Say which joints never turned, where some did not."""
-    which = [int(k) + 1 for k in np.flatnonzero(still)]
-    if not which:
-        return ": the tool hardly changed its orientation, or turned about one axis only"
-    if len(which) == 1:
-        return f": joint {which[0]} never turned"
-    if which == list(range(which[0], which[-1] + 1)):
-        return f": joints {which[0]} to {which[-1]} never turned"
-    return f": joints {numbers.names(list(map(str, which)))} never turned"
 
 
 def _at(t: Floats, places: tuple[int, int] = PLACES) -> str:

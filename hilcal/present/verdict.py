@@ -19,7 +19,7 @@ from hilcal.diagnosis.noise import (
 from hilcal.diagnosis.pose_alone import PoseAlone
 from hilcal.diagnosis.wrong_figures import WrongFigure
 from hilcal.identification.full_prediction import disagreement_words
-from hilcal.numbers import few, length, p_equals, sizes
+from hilcal.numbers import few, length, p_equals, percent, sizes
 from hilcal.readings.readings import ArmScatter, SerialNoise
 from hilcal.robot.arm import Arm
 
@@ -89,10 +89,6 @@ def _verdict(d: Diagnosis) -> str:
     return f"{adequate}; but {doubts}: measure what separates them"
 
 
-def _share(share: float) -> str:
-    return f"{100 * share:.0f} %"
-
-
 def _figure(f: WrongFigure) -> str:
     change = f"({length(f.rms_m)} → {length(f.rms_with_m)} rms with it)"
     if f.kind == "tool_com":
@@ -145,7 +141,7 @@ def _background(d: Diagnosis) -> str:
 
 def _explains(s: Suspect) -> str:
     return (
-        f"explains {_share(s.share)} of the misfit, {_share(max(s.holdout_share, 0))} on "
+        f"explains {percent(s.share)} of the misfit, {percent(max(s.holdout_share, 0))} on "
         f"poses left out ({p_equals(s.score.p_value)})"
     )
 
@@ -159,7 +155,7 @@ def implausible(s: Suspect) -> str:
 
 def broken(s: Suspect) -> str:
     """Say how much the exact model keeps of what the linearisation promised."""
-    return f"the exact model keeps {_share(max(s.kept, 0.0))} of what its linearisation promises"
+    return f"the exact model keeps {percent(max(s.kept, 0.0))} of what its linearisation promises"
 
 
 def _inseparable(d: Diagnosis) -> str:
@@ -194,15 +190,15 @@ def _insufficient(d: Diagnosis) -> str:
         raise ValueError("a diagnosis of an insufficient catalogue without what it leaves")
     follows = f", which follows {' and '.join(d.follows)}" if d.follows else ""
     return (
-        f"{lead.effect} explains {_share(lead.share)} of the misfit, but all effects of the "
-        f"catalogue together leave {_share(i.share)} of it, "
+        f"{lead.effect} explains {percent(lead.share)} of the misfit, but all effects of the "
+        f"catalogue together leave {percent(i.share)} of it, "
         f"{i.variance_factor**0.5:.2g} times the stated noise{follows}: {lead.effect} may only "
         f"resemble the missing effect{_repeats_scatter_less(i.noise, d.pure_error)}"
     )
 
 
 def _no_suspect(d: Diagnosis) -> str:
-    none = f"no effect of the catalogue explains {_share(LEAST_SHARE)} of it or more"
+    none = f"no effect of the catalogue explains {percent(LEAST_SHARE)} of it or more"
     if d.suspects and d.suspects[0].explains:
         best = d.suspects[0]
         tried = best.effect in d.history.rejected
@@ -212,32 +208,32 @@ def _no_suspect(d: Diagnosis) -> str:
         elif not best.keeps:
             but = broken(best)
         none = (
-            f"the best effect of the catalogue, {best.effect}, explains {_share(best.share)} "
+            f"the best effect of the catalogue, {best.effect}, explains {percent(best.share)} "
             f"of it, but {but}"
         )
     repeats, share = _repeats_scatter_less(d.noise, d.pure_error), d.predictable_share
     if share < LEAST_SHARE and repeats:
         return (
             f"Residuals are {_spread(d)} and follow nothing recorded, but "
-            f"{_share(d.repeated_share)} of the misfit is the same when a pose is repeated: "
+            f"{percent(d.repeated_share)} of the misfit is the same when a pose is repeated: "
             f"the pose itself predicts it{repeats}; {none}"
         )
     if repeats:
-        repeats = f"{repeats}: {_share(d.repeated_share)} of the misfit is the same in them"
-    percent = _share(share) if share >= 0.005 else f"{100 * share:.1g} %"
+        repeats = f"{repeats}: {percent(d.repeated_share)} of the misfit is the same in them"
+    predicted = percent(share) if share >= 0.005 else f"{100 * share:.1g} %"
     follows = f"; it follows {' and '.join(d.follows)}" if d.follows else ""
     return (
-        f"Residuals are {_spread(d)}, {percent} of the misfit is predicted on poses left out, and "
-        f"{none}{follows}{repeats}"
+        f"Residuals are {_spread(d)}, {predicted} of the misfit is predicted on poses left out, "
+        f"and {none}{follows}{repeats}"
     )
 
 
 def _pose_alone(d: Diagnosis, a: PoseAlone) -> str:
     first, *rest = a.effects
-    chance = "" if a.chance is None else f" with a chance of {_share(a.chance)}"
+    chance = "" if a.chance is None else f" with a chance of {percent(a.chance)}"
     others = f", or {' or '.join(rest[:2])}," if rest else ""
     return (
-        f"Residuals are {_spread(d)}, and {_share(a.share)} of the misfit is the same under "
+        f"Residuals are {_spread(d)}, and {percent(a.share)} of the misfit is the same under "
         f"every load of a pose: it depends on the pose alone. {first} finer than {a.poses} poses "
         f"can resolve{others} would do that, and so would an arm that repeats worse than stated, "
         f"where each pose was arrived at once; {a.more} more poses tell{chance}"
@@ -302,12 +298,10 @@ def _left_to_the_arm(d: Diagnosis) -> str:
     if s.predicted_share >= 0.005:
         by = " and ".join(s.predicted_by) or "what was recorded"
         size = length(s.predicted_share**0.5 * s.size_m)
-        alone, predicted = (
-            "",
-            (
-                f"; {_share(s.predicted_share)} of it, {size} rms, follows {by} on poses left out, "
-                "which is negligible beside the rest"
-            ),
+        alone = ""
+        predicted = (
+            f"; {percent(s.predicted_share)} of it, {size} rms, follows {by} on poses left out, "
+            "which is negligible beside the rest"
         )
     doubt = large = ""
     if not separated(s):
@@ -381,7 +375,7 @@ def repeatability_source(source: ScatterSource, arm: Arm) -> str:
 def correlated(n: SerialNoise) -> str:
     """Say that the readings are correlated along their order, and what it does."""
     unit = "s" if n.clock == "time" else "readings"
-    share = "" if n.share > 0.95 else f" in {_share(n.share)} of their variance"
+    share = "" if n.share > 0.95 else f" in {percent(n.share)} of their variance"
     doubt = ""
     if not n.proved:
         others = " and ".join(n.instead) or "effects of the catalogue"

@@ -36,7 +36,7 @@ from hilcal.workbench.elements import (
     soft,
     title,
 )
-from hilcal.workbench.session import Snapshot, WorkbenchSession
+from hilcal.workbench.session import Snapshot
 
 if TYPE_CHECKING:
     from hilcal.workbench.page import View
@@ -80,9 +80,9 @@ def snapshot(view: View, d: Snapshot) -> None:
     with ui.element("div").classes("two"):
         _fails(view, d)
         _missing(view, d)
-        view.readings, view.evidence = (ui.column().classes("part") for _ in range(2))
-    view.draw_readings()
-    view.draw_evidence()
+        for name in ("readings", "evidence"):
+            view.places[name] = ui.column().classes("part")
+            view.redraw(name)
     with ui.element("div").classes("two"):
         with ui.column().classes("stack"):
             with _part("How the error fell"):
@@ -106,7 +106,7 @@ def snapshot(view: View, d: Snapshot) -> None:
             for file, name in DOWNLOADS.items():
                 button(view, name, partial(view.download, file), "outline")
         answer(view, "download")
-    view.draw_plan()
+    view.redraw("planned")
 
 
 def _verdict(view: View, d: Snapshot) -> None:
@@ -348,7 +348,7 @@ def _laws(view: View, d: Snapshot) -> None:
             chart(view, charts.curve_chart(law)).props("data-part=law")
 
 
-def viewer(view: View) -> None:
+def viewer(view: View, d: Snapshot) -> None:
     """Draw the 3-D view, or what opens it."""
     with ui.column().classes("part").style("margin: 16px 0 32px"):
         title("The arm and its readings in space")
@@ -405,19 +405,19 @@ def _next_measurement(view: View, d: Snapshot) -> None:
 
         button(view, "Plan the next measurements", plan, "unelevated")
         answer(view, "next")
-        view.planned = ui.column().style("width: 100%; gap: 8px")
+        view.places["planned"] = ui.column().style("width: 100%; gap: 8px")
 
 
-def planned(session: WorkbenchSession) -> None:
-    """Draw the next measurements."""
-    if session.planned is None:
+def planned(view: View, d: Snapshot) -> None:
+    """Draw the next measurements, where they are planned."""
+    if view.session.planned is None:
         return
-    next_, path = session.planned
+    next_, path = view.session.planned
     summary, powers = next_.made.summary, next_.found.powers
     words = powers_summary(powers, summary.poses, summary.readings)
     ui.label(words).props("data-part=planned")
     for effect, rival, now, then in power_rows(powers):
         soft(f"If {effect} is there, {rival} is ruled out: {now} now, {then} then.")
     ui.label(f"The plan is in {path.name}. Measure it into the same campaign with:")
-    ui.label(session.run_line()).classes("code")
+    ui.label(view.session.run_line()).classes("code")
     soft("Then read the file again here.")

@@ -2,7 +2,6 @@
 
 import contextlib
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -73,23 +72,6 @@ it, over the recorded variable that carries most of it; *Details* names both axe
 """
 
 
-@dataclass(frozen=True, slots=True)
-class Served:
-    """A recording that viewers can open at `url` for as long as it is served."""
-
-    url: str
-
-
-def record(story: Story, *sinks: recording.Sink) -> rr.RecordingStream:
-    """Send a story to sinks, flushed after each revision; they end when the stream is dropped."""
-    rec = _opened(story)
-    rec.set_sinks(*sinks)
-    # Active, too: a viewer that has shown another recording would keep the layout of that one.
-    rec.send_blueprint(blueprint(story), make_active=True, make_default=True)
-    tell(rec, story)
-    return rec
-
-
 def save(story: Story, path: Path) -> None:
     """Write a story as a recording file, whole or not at all; an existing file is replaced.
 
@@ -102,10 +84,11 @@ def save(story: Story, path: Path) -> None:
 
 
 @contextlib.contextmanager
-def serve(story: Story, ip: str = "127.0.0.1", port: int = PORT) -> Iterator[Served]:
-    """Serve a story to viewers until the block ends; viewers may join late and rejoin.
+def serve(story: Story, ip: str = "127.0.0.1", port: int = PORT) -> Iterator[str]:
+    """Serve a story at the address that is yielded until the block ends.
 
-    The operator opens `rerun <url>`. The viewer's analytics are switched off for this user.
+    Viewers, as `rerun ADDRESS`, may join late and rejoin; their analytics are switched off for
+    this user.
 
     Raises:
         InputError: the port is taken.
@@ -118,11 +101,15 @@ def serve(story: Story, ip: str = "127.0.0.1", port: int = PORT) -> Iterator[Ser
     except (OSError, OverflowError) as error:
         raise InputError(f"{at}: {error}; choose a free port of this machine") from error
     try:
-        rec = record(story, rr.GrpcServerSink(bind_ip=ip, port=port))
+        rec = _opened(story)
+        rec.set_sinks(rr.GrpcServerSink(bind_ip=ip, port=port))
+        # Active, too: a viewer that has shown another recording would keep the layout of that one.
+        rec.send_blueprint(blueprint(story), make_active=True, make_default=True)
+        tell(rec, story)
     except (OSError, RuntimeError) as error:
         raise HilcalError(f"{at}: {error}") from error
     try:
-        yield Served(f"rerun+http://{ip}:{port}/proxy")
+        yield f"rerun+http://{ip}:{port}/proxy"
     finally:
         rec.disconnect()
 
@@ -240,7 +227,7 @@ def _view3d(story: Story, name: str, without: str) -> rrb.Spatial3DView:
     far = [worst(r) for r in story.revisions]
     stands = story.bodies[story.row[far], :, :3, 3].reshape(-1, 3)
     points = np.vstack([story.anchor, stands, story.anchor[far] + _LABEL_ABOVE])
-    middle, size = style.center(story.anchor, story.arm.reach)
+    middle, size = style.center(story.anchor, 0.3 * story.arm.reach)
     place = style.near(middle, style.EYE * size, points)
     contents = ["+ $origin/**", f"- $origin/{without}/**", "- $origin/live/**"]
     return style.view3d("world", name, place, middle, contents)

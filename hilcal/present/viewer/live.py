@@ -218,7 +218,7 @@ def live_blueprint(d: LiveTally, world: str, series: str) -> rrb.Blueprint:
     ever, now = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()
     every = archetypes.VisibleTimeRanges(timeline=TIMELINE, start=ever, end=now)
     of = "Residual of each reading," if d.group == 1 else f"Worst of every {d.group} residuals,"
-    middle, size = style.center(d.targets, d.measured.arm.reach)
+    middle, size = style.center(d.targets, 0.3 * d.measured.arm.reach)
     points = np.vstack([d.targets, d.bodies[0, :, :3, 3]])
     scene = style.view3d(
         "world",

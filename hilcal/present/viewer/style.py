@@ -283,11 +283,11 @@ def in_view(eye: Floats, look: Floats, points: Floats) -> Bools:
     return np.asarray((depth > 0.0) & (upright < half) & (np.abs(way @ right) < _ASPECT * half))
 
 
-def center(points: Floats, reach: float) -> tuple[Floats, float]:
-    """Middle of points (K, 3) and the origin, and half their size: where the eye looks, m."""
+def center(points: Floats, least: float) -> tuple[Floats, float]:
+    """Middle of points (K, 3) and the origin, and half their size, at least so much, m."""
     points = np.vstack([points, np.zeros((1, 3))])
     lo, hi = points.min(0), points.max(0)
-    return (lo + hi) / 2, max(float(np.linalg.norm(hi - lo)) / 2, 0.3 * reach)
+    return (lo + hi) / 2, max(float(np.linalg.norm(hi - lo)) / 2, least)
 
 
 def near(look: Floats, way: Floats, points: Floats) -> Floats:

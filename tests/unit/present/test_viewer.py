@@ -315,10 +315,10 @@ def test_a_viewer_that_joins_late_gets_the_whole_story(told, tmp_path, monkeypat
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
     late = tmp_path / "late.rrd"
-    with serve(told, port=free_port) as served:
-        assert served.url == f"rerun+http://127.0.0.1:{free_port}/proxy"
+    with serve(told, port=free_port) as url:
+        assert url == f"rerun+http://127.0.0.1:{free_port}/proxy"
         client = subprocess.Popen(
-            [executable(), "--port", "auto", "--save", str(late), served.url],
+            [executable(), "--port", "auto", "--save", str(late), url],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
