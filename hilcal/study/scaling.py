@@ -246,13 +246,13 @@ class ScalingStudy:
         """Return the study as plain values, with a summary per scaling."""
         summary = {}
         for scaling in SCALINGS:
-            mine = [c for c in self.cells if c.scaling == scaling]
+            cells = [c for c in self.cells if c.scaling == scaling]
             summary[scaling] = {
-                "error_over_bound_min": min(c.error_over_bound for c in mine),
-                "error_over_bound_max": max(c.error_over_bound for c in mine),
-                "coverage_min": min(c.coverage for c in mine),
-                "coverage_max": max(c.coverage for c in mine),
-                "unit_shift_max": max(c.unit_shift for c in mine),
+                "error_over_bound_min": min(c.error_over_bound for c in cells),
+                "error_over_bound_max": max(c.error_over_bound for c in cells),
+                "coverage_min": min(c.coverage for c in cells),
+                "coverage_max": max(c.coverage for c in cells),
+                "unit_shift_max": max(c.unit_shift for c in cells),
             }
         return asdict(self) | {"level": LEVEL, "summary": summary}
 

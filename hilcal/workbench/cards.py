@@ -243,7 +243,7 @@ def readings(view: View, d: Snapshot) -> None:
     if picked is None:
         soft("Click a point: the readings of its pose, and what sets them apart.")
         return
-    ui.label(f"{view.tab.told}:").style("font-weight: 500")
+    ui.label(f"{view.tab.picked_title}:").style("font-weight: 500")
     clear = [difference(x) for x in view.session.differences(d, np.array(picked)) if x.clear]
     said = "Nothing recorded sets them apart from the others."
     if clear:
@@ -263,8 +263,8 @@ def difference(x: Difference) -> str:
     """Write how picked readings differ from the others."""
     if x.variable.startswith("load "):
         name = "unloaded" if x.variable == f"load {UNLOADED}" else x.variable
-        mine, others = numbers.percent(x.picked), numbers.percent(x.others)
-        return f"{name}: {mine} of them, {others} of the others"
+        picked, others = numbers.percent(x.picked), numbers.percent(x.others)
+        return f"{name}: {picked} of them, {others} of the others"
     unit, factor = numbers.angle_or(x.unit)
     a, b = (numbers.digits(factor * value) for value in (x.picked, x.others))
     return f"{x.variable} {a} {unit}, the others {b} {unit}".replace(" ,", ",").rstrip()

@@ -33,7 +33,7 @@ class Tab:
     suspect: str | None = None  # the missing effect whose evidence is shown
     variable: str | None = None  # over which residuals are drawn; None for the pose
     picked: list[int] | None = None  # measurements of the story that were clicked
-    told: str = ""  # what they are, in words
+    picked_title: str = ""  # what they are, in words
     dark: bool = False  # whether the browser asks for a dark page
     texts: dict[tuple[str, str], str] = field(default_factory=dict)
     """Values of the cell by section and key, as they were typed and not used yet."""
@@ -309,12 +309,12 @@ class View:
         snapshot = self.tab.snapshot
         if snapshot is not None and 0 <= measurement < len(snapshot.story):
             story = snapshot.story
-            mine = np.flatnonzero(story.pose == story.pose[measurement]).tolist()
-            self._pick(mine, f"The readings of pose {story.pose_name(measurement)}")
+            readings = np.flatnonzero(story.pose == story.pose[measurement]).tolist()
+            self._pick(readings, f"The readings of pose {story.pose_name(measurement)}")
 
-    def _pick(self, measurements: list[int], told: str) -> None:
+    def _pick(self, measurements: list[int], title: str) -> None:
         """Show some readings, and what distinguishes them."""
-        self.tab.picked, self.tab.told = measurements, told
+        self.tab.picked, self.tab.picked_title = measurements, title
         self.redraw("readings")
 
 

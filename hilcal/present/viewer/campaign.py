@@ -20,6 +20,7 @@ from hilcal.present.story import (
     Story,
     StoryRevision,
     levels,
+    round_factor,
     worst_and_even,
 )
 from hilcal.present.viewer import recording, style
@@ -365,14 +366,14 @@ def log_line(story: Story, r: StoryRevision) -> str:
 def residual_scale(story: Story) -> float:
     """Return the m that are drawn per m of residual."""
     sigma = float(np.sqrt(np.median(np.trace(story.covariance, axis1=1, axis2=2)) / 3))
-    return style.nice(SIGMA_LENGTH / sigma) if sigma > 0 else 1.0
+    return round_factor(SIGMA_LENGTH / sigma, style.FACTORS) if sigma > 0 else 1.0
 
 
 def deflection_scale(story: Story) -> float:
     """Return the m that are drawn per m of deflection."""
     moved = np.linalg.norm(story.deviation(story.measured), axis=1)
     typical = float(np.quantile(moved, 0.95))
-    return style.nice(DEFLECTION_LENGTH / typical) if typical > 0 else 1.0
+    return round_factor(DEFLECTION_LENGTH / typical, style.FACTORS) if typical > 0 else 1.0
 
 
 def noise_balls(story: Story, rows: Ints) -> tuple[Floats, Floats]:

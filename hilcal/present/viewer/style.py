@@ -1,6 +1,5 @@
 """What all views share: colours, shapes of the arm, labels, words as markdown, frames and eyes."""
 
-import math
 import re
 from collections.abc import Iterable, Sequence
 from typing import Any, Literal
@@ -43,7 +42,7 @@ EYE = np.array([1.05, -1.35, 0.55])
 BACKGROUND = rrb.Background(color=(22, 24, 29), kind=rrb.BackgroundKind.SolidColor)
 GRID = rrb.LineGrid3D(visible=True, spacing=0.25, stroke_width=0.7, color=(120, 124, 132, 70))
 
-_NICE = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)
+FACTORS = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)  # by which lengths are enlarged, times 10^k
 # Greek letters and these signs are in the viewer's fonts; a missing glyph ends the viewer.
 _SIGNS = "■●▲→µ²³±×√Δ✓✗⚠°"
 _BARS = str.maketrans("", "", "▁▂▃▄▅▆▇█")  # of tables on a terminal; not in the viewer's fonts
@@ -67,14 +66,6 @@ def safe(text: str) -> str:
 def escaped(text: str) -> str:
     """Text made safe, on one line, and without any meaning in markdown."""
     return _MARKDOWN.sub(r"\\\1", safe(" ".join(text.translate(_BARS).split())))
-
-
-def nice(value: float) -> float:
-    """Largest of 1, 1.5, 2, 3, 4, 5, 6, 8 times a power of ten that is at most `value`."""
-    if not (math.isfinite(value) and value > 0):
-        return 1.0
-    power = 10.0 ** math.floor(math.log10(value))
-    return float(max(f for f in _NICE if f * power <= value * (1 + 1e-9)) * power)
 
 
 def markdown(blocks: Iterable[Block]) -> str:

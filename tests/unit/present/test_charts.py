@@ -16,7 +16,7 @@ from hilcal.present import charts
 from hilcal.present import charts as style
 from hilcal.present.charts import MOST_FAMILIES
 from hilcal.present.document import says
-from hilcal.present.story import LEVEL_NAMES, regressor
+from hilcal.present.story import LEVEL_NAMES, regressor, round_factor
 from tests.support.campaigns import campaign
 from tests.support.picture import contrast
 from tests.support.viewer_story import ANGLE, LOAD, story
@@ -96,7 +96,7 @@ def test_residuals_are_mahalanobis_distances_with_their_names_colours_and_marks(
 def test_arrows_are_the_residuals_enlarged(plane: str, first):
     told, r = first
     largest = float(r.size_m.max())
-    times = charts.magnification(largest)
+    times = round_factor(charts.LONGEST / largest, (1, 2, 5))
     assert 0.4 * charts.LONGEST <= times * largest <= charts.LONGEST
     lengths = []
     for trace in charts.workspace(told, r, plane).data:
