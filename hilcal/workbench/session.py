@@ -271,15 +271,11 @@ class WorkbenchSession:
     ) -> NextPlan:
         """Plan the measurements that settle what the shown diagnosis leaves open, and save them.
 
-        Args:
-            snapshot: what is shown.
-            poses: as many readings as so many poses take; what the doubt needs where None.
-            output: the plan's file; it must not exist.
-            say: takes progress.
-            quick: without comparing criteria and numbers of poses, as `hilcal next` does.
+        `poses` is what the doubt needs where None; `quick` compares no criteria, nor numbers of
+        poses, as `hilcal next` does.
 
         Raises:
-            InputError: a file that cannot be written, or a plan that may not be run.
+            InputError: a file that exists or cannot be written, or a plan that may not be run.
             CannotAnswerError: nothing is in doubt, or no measurement would settle it.
         """
         if output.exists():

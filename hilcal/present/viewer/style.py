@@ -11,6 +11,7 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from hilcal.config import Obstacle
+from hilcal.measuring.clearance import holds
 from hilcal.present import story
 from hilcal.present.document import Block, Chart, Items, Table, Words, says
 from hilcal.present.viewer.recording import along, fixed
@@ -241,15 +242,9 @@ def hidden(eye: Floats, points: Floats, things: tuple[Obstacle, ...]) -> Bools:
     """Return (K,) which of the points (K, 3) an obstacle hides from an eye (3,), m."""
     at = eye + _SAMPLES[:, None] * (points - eye)[:, None]
     out = np.zeros(len(points), dtype=np.bool_)
-    for x in things:
-        if x.center_m is not None and x.size_m is not None:
-            off = np.abs(at - np.array(x.center_m)) <= 0.5 * np.array(x.size_m)
-            out |= off.all(axis=2).any(axis=1)
-        elif x.bottom_m is not None and x.radius_m is not None and x.height_m is not None:
-            off = at - np.array(x.bottom_m)
-            inside = np.hypot(off[..., 0], off[..., 1]) <= x.radius_m
-            out |= (inside & (off[..., 2] >= 0.0) & (off[..., 2] <= x.height_m)).any(axis=1)
-    return np.asarray(out)
+    for thing in things:
+        out |= holds(thing, at).any(axis=1)
+    return out
 
 
 def direction(

@@ -45,7 +45,7 @@ def test_everything_is_told_and_fits(shown, width: int) -> None:
         "deflection ± 12.0 µm, predicted for the deflection under each load at 100 feasible poses",
         "it is not the accuracy of the robot: geometry, registration, repeatability and effects "
         "outside of the model are not in it",
-        "joint_compliance.j2 0.60 6.00 µrad/(N·m) 10 %",
+        "joint_compliance.j2 0.60 6.00 µrad/(N·m) 10.0 %",
         "base_frame.x 12 µm",
         "D (this) 12.0 µm 24.0 µm 3.8 % 132 0.020 4.00 98.7 %",
         "I 9.00 µm 30.0 µm - 66.0 0.010 2.00 -",
