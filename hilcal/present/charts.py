@@ -19,6 +19,7 @@ from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.effect_ranking import LEAST_SHARE
 from hilcal.identification.family_sizes import FamilySize
 from hilcal.identification.fit import Fit
+from hilcal.identification.priors import names_of
 from hilcal.names import escaped
 from hilcal.present.document import load_name
 from hilcal.present.fit import CERTAIN, follows
@@ -420,7 +421,7 @@ def parameter_correlations(fit: Fit) -> tuple[list[str], Floats]:
     """Return names and correlations (K, K) of identifiable parameters: Cov(θ) = T H⁻¹ Tᵀ."""
     s = fit.solution
     covariance = s.transform @ s.equations.inverse(s.beta) @ s.transform.T
-    names = [f"{e.name}.{p.name}" for e in fit.model.effects for p in e.parameters]
+    names = names_of(fit.model)
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     keep = np.flatnonzero(fit.uncertainty.identifiable & s.estimated & (std > 0))
     of = covariance[np.ix_(keep, keep)] / np.outer(std[keep], std[keep])
