@@ -407,22 +407,9 @@ def _scene(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
     """Log one revision at the recording's current time: arrows, balls, the arm at its worst."""
     far, drawn, balls = worst(r), shown(story, r), balled(story, r)
     style.stand(rec, story.bodies[story.row[far]])
-    level = r.level[drawn]
-    arrows_ = rr.Arrows3D(
-        origins=story.anchor[drawn],
-        vectors=arrows(story, r, drawn),
-        colors=style.LEVEL_COLORS[level],
-        radii=np.where(level > 0, 0.0055, 0.0035),
-    )
-    rec.log("world/residual/arrows", arrows_)
-    half, quaternions = noise_balls(story, balls)
-    noise = rr.Ellipsoids3D(
-        centers=story.anchor[balls],
-        half_sizes=half,
-        quaternions=quaternions,
-        colors=[(*style.NOISE, 46)],
-        fill_mode="solid",
-    )
+    of = story.anchor[drawn], arrows(story, r, drawn), r.level[drawn]
+    rec.log("world/residual/arrows", style.residual_arrows(*of))
+    noise = style.noise_balls(story.anchor[balls], *noise_balls(story, balls))
     rec.log("world/residual/noise", noise)
     at, words = story.anchor[far], f"worst: pose {story.pose_name(far)}, {_words(story, r, far)}"
     rec.log("world/residual/worst", style.labels([at + _LABEL_ABOVE], [words]))

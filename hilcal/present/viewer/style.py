@@ -165,6 +165,19 @@ def _arrays(of: Shapes) -> tuple[Floats, Floats, Floats, "np.ndarray[Any, np.dty
     return start, end, radius, np.array(colors, dtype=np.uint8)
 
 
+def residual_arrows(at: Any, vectors: Any, level: Any) -> rr.Arrows3D:
+    """Return residuals at places (K, 3) in the colours of their levels (K,), outside ones bold."""
+    of = np.asarray(level)
+    colors, radii = LEVEL_COLORS[of], np.where(of > 0, 0.0055, 0.0035)
+    return rr.Arrows3D(origins=at, vectors=vectors, colors=colors, radii=radii)
+
+
+def noise_balls(at: Any, half: Any, turn: Floats | None = None) -> rr.Ellipsoids3D:
+    """Return balls at places (K, 3) with half axes (K, 3), m, turned by quaternions (K, 4)."""
+    shape = {"centers": at, "half_sizes": half, "quaternions": turn}
+    return rr.Ellipsoids3D(**shape, colors=[(*NOISE, 46)], fill_mode="solid")
+
+
 class MovingArm:
     """The arm with its targets as one entity, so that a place of it is one small message."""
 
