@@ -281,9 +281,11 @@ def _pose_bars(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
     """Log the worst reading of each pose, or of a few, in σ, one series per level."""
     _, left, width, height = _bar_places(story, r)
     for i, name in enumerate(style.LEVEL_NAMES):
-        mine = levels(height**2) == i
-        some = mine if mine.any() else np.arange(len(height)) == 0  # else a bar without a height
-        color, tall = style.LEVEL_COLORS[i].tolist(), np.where(mine, height, 0.0)[some]
+        members = levels(height**2) == i
+        some = (
+            members if members.any() else np.arange(len(height)) == 0
+        )  # else a bar without a height
+        color, tall = style.LEVEL_COLORS[i].tolist(), np.where(members, height, 0.0)[some]
         bar = rr.BarChart(tall, abscissa=left[some], widths=width[some], color=color)
         rec.log(f"bars/{name}", bar)
 

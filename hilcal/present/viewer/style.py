@@ -208,8 +208,8 @@ class MovingArm:
 def log_shapes(rec: rr.RecordingStream, of: Shapes) -> None:
     """Log the shapes of every body at `world/arm/bodyI`."""
     for i in sorted({p.body for p, _ in of}):
-        mine = _arrays([shape for shape in of if shape[0].body == i])
-        fixed(rec, f"world/arm/body{i}", drawn_capsules(*mine))
+        of_body = _arrays([shape for shape in of if shape[0].body == i])
+        fixed(rec, f"world/arm/body{i}", drawn_capsules(*of_body))
 
 
 def quaternions_of(rotation: Floats) -> Floats:
