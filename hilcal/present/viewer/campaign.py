@@ -282,9 +282,8 @@ def _pose_bars(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
     _, left, width, height = _bar_places(story, r)
     for i, name in enumerate(style.LEVEL_NAMES):
         members = levels(height**2) == i
-        some = (
-            members if members.any() else np.arange(len(height)) == 0
-        )  # else a bar without a height
+        # a level without members has a bar without a height
+        some = members if members.any() else np.arange(len(height)) == 0
         color, tall = style.LEVEL_COLORS[i].tolist(), np.where(members, height, 0.0)[some]
         bar = rr.BarChart(tall, abscissa=left[some], widths=width[some], color=color)
         rec.log(f"bars/{name}", bar)
