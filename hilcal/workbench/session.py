@@ -141,21 +141,15 @@ class WorkbenchSession:
 
     Every method that takes a snapshot raises InputError where that is outdated; `say` takes
     progress, one line each.
-
-    Attributes:
-        snapshot: what is shown; None before `load`.
-        changed: what the last change did; None before any, and after another revision was chosen.
-        planned: the next measurements that were planned last, and their file.
-        count: grows whenever another snapshot is shown.
     """
 
     def __init__(self, path: str | Path, catalogue: Catalogue | None = None) -> None:
         """Take a file; nothing is read yet."""
         self.path, self._catalogue = Path(path), catalogue
-        self.snapshot: Snapshot | None = None
-        self.changed: Changed | None = None
-        self.planned: tuple[NextPlan, Path] | None = None
-        self.count = 0
+        self.snapshot: Snapshot | None = None  # what is shown; None before `load`
+        self.changed: Changed | None = None  # by the last change; None where another was chosen
+        self.planned: tuple[NextPlan, Path] | None = None  # the last plan, and its file
+        self.count = 0  # of the snapshots that were shown
         self._known: dict[int, Chapter] = {}
         self._hash = ""
 
