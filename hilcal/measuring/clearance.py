@@ -179,21 +179,21 @@ class LineOfSight:
         gap = np.minimum(_SHY * (TOOL_RADIUS + radius), 0.5 * length)
         end = target - gap * way / np.where(length > 0.0, length, 1.0)
         start = np.broadcast_to(self.tracker, end.shape)
-        stands = [x.name for x in config.obstacles if _holds(x, self.tracker, radius)]
+        stands = [x.name for x in config.obstacles if holds(x, self.tracker, radius)]
         near = self.clearance.near(offset, radius)
         return Segment("beam", start, end, max(radius, 1e-4), near.union(stands))
 
 
-def _holds(thing: Obstacle, point: Floats, margin: float) -> bool:
-    """Whether a point is in an obstacle, or closer to it than `margin` along each axis."""
+def holds(thing: Obstacle, points: Floats, margin: float = 0.0) -> Bools:
+    """Return which of some points (..., 3) an obstacle holds, made larger by `margin`, m."""
     if thing.center_m is not None and thing.size_m is not None:
-        off = np.abs(point - np.array(thing.center_m)) - 0.5 * np.array(thing.size_m)
-        return bool(np.all(off <= margin))
+        off = np.abs(points - np.array(thing.center_m)) - 0.5 * np.array(thing.size_m)
+        return np.asarray(np.all(off <= margin, axis=-1))
     if thing.bottom_m is None or thing.radius_m is None or thing.height_m is None:
-        return False
-    off = point - np.array(thing.bottom_m)
-    upright = -margin <= off[2] <= thing.height_m + margin
-    return bool(upright and np.hypot(off[0], off[1]) <= thing.radius_m + margin)
+        return np.zeros(points.shape[:-1], dtype=np.bool_)
+    off = points - np.array(thing.bottom_m)
+    upright = (off[..., 2] >= -margin) & (off[..., 2] <= thing.height_m + margin)
+    return np.asarray(upright & (np.hypot(off[..., 0], off[..., 1]) <= thing.radius_m + margin))
 
 
 def segment_distance(a: Floats, b: Floats, c: Floats, d: Floats) -> Floats:

@@ -18,7 +18,7 @@ from hilcal.diagnosis.noise import (
 )
 from hilcal.diagnosis.wrong_figures import WrongFigure
 from hilcal.identification.full_prediction import disagreement_words
-from hilcal.numbers import few, length, p_equals, sizes
+from hilcal.numbers import few, length, p_equals, percent, sizes
 from hilcal.readings.readings import ArmScatter, SerialNoise
 from hilcal.robot.arm import Arm
 
@@ -77,10 +77,6 @@ def _verdict(d: Diagnosis) -> list[str]:
     if d.reason != "inseparable_addition":
         return adequate
     return [*adequate, f"But {'; '.join(doubts)}. Measure what separates them."]
-
-
-def _share(share: float) -> str:
-    return f"{100 * share:.0f} %"
 
 
 def _figures(found: tuple[WrongFigure, ...]) -> list[str]:
@@ -158,7 +154,7 @@ def _one_suspect(d: Diagnosis) -> list[str]:
 
 def _explains(s: Suspect) -> str:
     return (
-        f"explains {_share(s.share)} of the misfit, {_share(max(s.holdout_share, 0))} on "
+        f"explains {percent(s.share)} of the misfit, {percent(max(s.holdout_share, 0))} on "
         f"poses left out ({p_equals(s.score.p_value)})"
     )
 
@@ -172,7 +168,7 @@ def implausible(s: Suspect) -> str:
 
 def broken(s: Suspect) -> str:
     """Say how much the exact model keeps of what the linearisation promised."""
-    return f"the exact model keeps {_share(max(s.kept, 0.0))} of what its linearisation promises"
+    return f"the exact model keeps {percent(max(s.kept, 0.0))} of what its linearisation promises"
 
 
 def _inseparable(d: Diagnosis) -> list[str]:
@@ -208,8 +204,8 @@ def _insufficient(d: Diagnosis) -> list[str]:
         raise ValueError("a diagnosis of an insufficient catalogue without what it leaves")
     follows = f", and follow {' and '.join(d.follows)}" if d.follows else ""
     return [
-        f"{lead.effect} explains {_share(lead.share)} of the misfit, but all effects of the "
-        f"catalogue together leave {_share(i.share)} of it.",
+        f"{lead.effect} explains {percent(lead.share)} of the misfit, but all effects of the "
+        f"catalogue together leave {percent(i.share)} of it.",
         f"The residuals are then {i.variance_factor**0.5:.2g} times the stated noise{follows}.",
         f"So {lead.effect} may only resemble the missing effect.",
         *_repeats_scatter_less(i.noise, d.pure_error),
@@ -217,7 +213,7 @@ def _insufficient(d: Diagnosis) -> list[str]:
 
 
 def _no_suspect(d: Diagnosis) -> list[str]:
-    none = f"No effect of the catalogue explains {_share(LEAST_SHARE)} of it or more."
+    none = f"No effect of the catalogue explains {percent(LEAST_SHARE)} of it or more."
     if d.suspects and d.suspects[0].explains:
         best = d.suspects[0]
         tried = best.effect in d.history.rejected
@@ -227,25 +223,25 @@ def _no_suspect(d: Diagnosis) -> list[str]:
         elif not best.keeps:
             but = broken(best)
         none = (
-            f"The best effect of the catalogue, {best.effect}, explains {_share(best.share)} "
+            f"The best effect of the catalogue, {best.effect}, explains {percent(best.share)} "
             f"of it, but {but}."
         )
     repeats, share = _repeats_scatter_less(d.noise, d.pure_error), d.predictable_share
     if share < LEAST_SHARE and repeats:
         return [
             f"Residuals are {_spread(d)} and follow nothing recorded.",
-            f"But {_share(d.repeated_share)} of the misfit is the same when a pose is repeated: "
+            f"But {percent(d.repeated_share)} of the misfit is the same when a pose is repeated: "
             "the pose itself predicts it.",
             *repeats,
             none,
         ]
     if repeats:
-        repeats += [f"{_share(d.repeated_share)} of the misfit is the same in them."]
-    percent = _share(share) if share >= 0.005 else f"{100 * share:.1g} %"
+        repeats += [f"{percent(d.repeated_share)} of the misfit is the same in them."]
+    predicted = percent(share) if share >= 0.005 else f"{100 * share:.1g} %"
     follows = f"; it follows {' and '.join(d.follows)}" if d.follows else ""
     return [
         f"Residuals are {_spread(d)}.",
-        f"{percent} of the misfit is predicted on poses left out{follows}.",
+        f"{predicted} of the misfit is predicted on poses left out{follows}.",
         none,
         *repeats,
     ]
@@ -256,11 +252,11 @@ def _pose_alone(d: Diagnosis) -> list[str]:
     if a is None:
         raise ValueError("a diagnosis of a misfit by pose without its share")
     first, *rest = a.effects
-    chance = "" if a.chance is None else f" with a chance of {_share(a.chance)}"
+    chance = "" if a.chance is None else f" with a chance of {percent(a.chance)}"
     others = f", or {' or '.join(rest[:2])}," if rest else ""
     return [
         f"Residuals are {_spread(d)}.",
-        f"{_share(a.share)} of the misfit is the same under every load of a pose: it depends on "
+        f"{percent(a.share)} of the misfit is the same under every load of a pose: it depends on "
         "the pose alone.",
         f"{first} finer than {a.poses} poses can resolve{others} would do that.",
         "So would an arm that repeats worse than stated, where each pose was arrived at once.",
@@ -333,8 +329,8 @@ def _left_to_the_arm(d: Diagnosis) -> list[str]:
         by = " and ".join(s.predicted_by) or "what was recorded"
         size = length(s.predicted_share**0.5 * s.size_m)
         predicted = (
-            f"{_share(s.predicted_share)} of it, {size} rms, follows {by} on poses left out, which "
-            "is negligible beside the rest."
+            f"{percent(s.predicted_share)} of it, {size} rms, follows {by} on poses left out, "
+            "which is negligible beside the rest."
         )
     doubt = []
     if not separated(s):
@@ -414,7 +410,7 @@ def repeatability_source(source: ScatterSource, arm: Arm) -> str:
 def correlated(n: SerialNoise) -> str:
     """Say that the readings are correlated along their order, and what it does."""
     unit = "s" if n.clock == "time" else "readings"
-    share = "" if n.share > 0.95 else f" in {_share(n.share)} of their variance"
+    share = "" if n.share > 0.95 else f" in {percent(n.share)} of their variance"
     doubt = ""
     if not n.proved:
         others = " and ".join(n.instead) or "effects of the catalogue"

@@ -126,7 +126,9 @@ def first_screen(m: ReportContent) -> FirstScreen:
         ("Where is it wrong?", where_wrong(m)),
         ("What is missing?", _missing(m.diagnosis)),
     )
-    return FirstScreen(*_headline(m.diagnosis), answers, tuple(_cards(m)), *limit_words(m))
+    verdict = None if m.diagnosis is None else m.diagnosis.verdict
+    cards = tuple(_cards(m))
+    return FirstScreen(*_headline(m.diagnosis), answers, cards, *limit_words(m), verdict)
 
 
 def _headline(d: Diagnosis | None) -> tuple[str, str]:
@@ -353,10 +355,10 @@ def _by_load(m: ReportContent) -> Table:
     heads = ("load", "n", "rms", "largest", "at pose", *limit)
     out = table(*heads, caption="Error of poses left out, by load")
     for k in np.unique(kept.load):
-        mine = np.flatnonzero(kept.load == k)
-        worst = mine[int(np.argmax(error[mine]))]
-        rms, most = (length(float(x)) for x in (np.sqrt(np.mean(error[mine] ** 2)), error[worst]))
-        row = [load_name(fit.readings.load_names[k]), str(len(mine)), rms, most]
+        under = np.flatnonzero(kept.load == k)
+        worst = under[int(np.argmax(error[under]))]
+        rms, most = (length(float(x)) for x in (np.sqrt(np.mean(error[under] ** 2)), error[worst]))
+        row = [load_name(fit.readings.load_names[k]), str(len(under)), rms, most]
         row.append(fit.readings.pose_names[kept.pose[worst]])
         if m.limit_m is not None:
             row.append("kept" if error[worst] <= m.limit_m else "over")

@@ -137,11 +137,15 @@ def test_gross_errors_are_shown_as_well() -> None:
     story = build_story([Chapter(1, None, found, None)])
     assert len(story) == len(value)
     assert int(np.argmax(story.revisions[0].whitened_norm2)) == 17
-    left = of_left_out(story.revisions[0], found).size_m
+    apart = of_left_out(story.revisions[0], found)
+    np.testing.assert_allclose(story.measured - apart.predicted, apart.residual, atol=1e-12)
+    assert apart.whitened_norm2.sum() > story.revisions[0].whitened_norm2.sum()
+    left = apart.size_m
     assert int(np.argmax(left)) == 17
     kept = left_out_errors(found)
     np.testing.assert_allclose(np.sort(left[~found.outlier]), np.sort(kept), rtol=1e-9)
     assert kept.max() == pytest.approx(found.holdout.max_m)
+    assert np.sqrt(np.mean(kept**2)) == pytest.approx(found.holdout.rms_m, rel=1e-9)
 
 
 def test_other_readings_do_not_make_one_story() -> None:
