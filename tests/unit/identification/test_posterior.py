@@ -20,6 +20,7 @@ from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.carried import CarriedPrior, carried_prior
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.fit_document import to_json
+from hilcal.identification.parameters_document import covariance_of
 from hilcal.identification.posterior import Posterior, Source, parameter_differences
 from hilcal.identification.posterior_document import read, write
 from hilcal.identification.predictive import predictive
@@ -27,6 +28,7 @@ from hilcal.readings.readings import Readings
 from hilcal.robot.catalogue import configs_dir, load_arm
 from hilcal.store.revision import from_text, to_text
 from hilcal.store.rows import content_hash
+from hilcal.types import Floats
 from studies.change import StudiedArm, studied_arm
 from studies.change import measured as measured_again
 from tests.support.campaigns import Campaign, campaign, measured, noiseless, plan, with_noise
@@ -226,6 +228,13 @@ def test_a_prior_and_new_readings_are_as_all_readings_together() -> None:
     assert np.abs((found.theta - together.theta) / std).max() < 0.5
     assert found.dof > alone.dof + 5
     assert found.holdout.rms_m < alone.holdout.rms_m
+
+    def correlation(of: Fit) -> Floats:
+        covariance = covariance_of(of)
+        std = np.sqrt(np.diag(covariance))
+        return np.asarray(covariance / std / std[:, None])
+
+    np.testing.assert_allclose(correlation(found), correlation(together), atol=0.1)
 
 
 def test_a_prior_that_knows_nothing_changes_nothing() -> None:
