@@ -391,8 +391,8 @@ def view(run: Campaign, port: int = 9877) -> Iterator[str]:
     """
     from hilcal.present.viewer import serve
 
-    with serve(build_story(run.chapters()), port=port) as served:
-        yield served.url
+    with serve(build_story(run.chapters()), port=port) as url:
+        yield url
 
 
 def _mode(asked: str | None, data: Readings, cell: Cell) -> Mode:

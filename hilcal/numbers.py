@@ -1,7 +1,7 @@
 """Numbers for people: sensible digits, and units in which they are easy to read."""
 
 import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 
 # SI unit: units for people with their factor, small values first, and the value from which
 # the next one is better.
@@ -133,10 +133,9 @@ def condition(value: float | None) -> str:
     return "-" if value is None else digits(value, 2)
 
 
-def sentence(message: str, keep: Collection[str] = ()) -> str:
-    """Write a message as a sentence; words of `keep`, such as effects, keep their spelling."""
-    first = message.split(" ", 1)[0].rstrip(",:;")
-    head = message if first in keep else message[:1].upper() + message[1:]
+def sentence(message: str) -> str:
+    """Write a message as a sentence."""
+    head = message[:1].upper() + message[1:]
     return head if head.endswith(".") else f"{head}."
 
 

@@ -11,6 +11,7 @@ from hilcal.campaign.campaign import Campaign
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.fit import Fit, fit
 from hilcal.names import quoted
+from hilcal.present.html import FirstScreen
 from hilcal.present.html.report import ReportContent, Tested, first_screen, page
 from hilcal.present.story import build_story, of_left_out
 from hilcal.procedure.state import IMPROVED, Files
@@ -24,16 +25,6 @@ from hilcal.validation import validate
 from hilcal.whole_file import replace_file
 
 Say = Callable[[str], None]
-
-
-@dataclass(frozen=True, slots=True)
-class ReportSummary:
-    """What a page says first."""
-
-    headline: str  # the verdict in a few words
-    limit: str  # whether the limit is kept, in words; empty without one
-    passed: bool | None  # the same; None without a limit
-    verdict: str | None  # of the diagnosis; None where nothing was diagnosed
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,9 +83,9 @@ def report(
 
 def write_report(
     run: Campaign, path: Path, asked: Asked, say: Say = lambda text: None
-) -> ReportSummary:
+) -> FirstScreen:
     """Write a page as `report` does, and return what it says first."""
-    later, validation, verdict = asked.later, asked.validation, None
+    later, validation = asked.later, asked.validation
     if path.resolve() in {c.path.resolve() for c in (run, later, validation) if c is not None}:
         raise InputError(f"{path}: this is the campaign itself; name another file for the page")
     if not path.absolute().parent.is_dir():  # said before minutes of work
@@ -121,9 +112,8 @@ def write_report(
             m = content_of(run, replace(asked, validation=validation), say)
         say("writing the page")
         html, first = page(m), first_screen(m)
-        verdict = None if m.diagnosis is None else m.diagnosis.verdict
     replace_file(path, html)
-    return ReportSummary(first.headline, first.limit, first.passed, verdict)
+    return first
 
 
 def content_of(

@@ -14,6 +14,7 @@ from typing import Annotated
 
 import numpy as np
 import typer
+from scipy.stats import chi2
 
 from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.options import Json, OneJob, Scheduler, one_by_default
@@ -77,6 +78,7 @@ class Found:
         rms_m: rms error of positions at other poses.
         best_m: that of the best linear predictor.
         inside: share of the others within their 95 % band.
+        best_inside: share within that of the best linear predictor: which way these arms fell.
         named: effects that the last model names.
         verdict: of it.
         without_m: rms error without a background; None where that was not asked for.
@@ -87,6 +89,7 @@ class Found:
     rms_m: float
     best_m: float
     inside: float
+    best_inside: float
     named: tuple[str, ...]
     verdict: str
     without_m: float | None
@@ -154,7 +157,13 @@ def refined(case: Case) -> Found | None:
     noise = [0.0, float(np.log(SCATTER / SCATTER_RAD))][: len(problem.noise)]
     best = equations(problem, np.concatenate([log_std, noise]))
     known = problem.parameters(best.coordinates, model.size)
-    ideal = test.value - model.predict(test.states, known).observation.position
+    ideal_prediction = model.predict(test.states, known)
+    ideal = test.value - ideal_prediction.observation.position
+    x = problem.coordinates(model.jacobian(ideal_prediction, known, 3))
+    moved = joint_factors(cell, test, np.full(cell.arm.n, SCATTER))
+    band = x @ best.covariance @ np.swapaxes(x, 1, 2) + moved @ np.swapaxes(moved, 1, 2)
+    band += INSTRUMENT_M**2 * np.eye(3)
+    square = np.einsum("ni,nij,nj->n", ideal, np.linalg.inv(band), ideal)
     names = last.fit.model.named
     without = None
     if case.without:
@@ -167,6 +176,7 @@ def refined(case: Case) -> Found | None:
         _rms(off),
         _rms(ideal),
         inside,
+        float(np.mean(square < chi2.ppf(0.95, 3))),
         tuple(n for n in names if n not in ("base_frame", "target_offset")),
         last.verdict,
         without,
@@ -207,6 +217,7 @@ def _figures(poses: int, found: list[Found]) -> list[Figure]:
     middle = float(np.exp(np.mean(np.log(ratio))))
     best = 1e6 * float(np.median([f.best_m for f in found]))
     least = min(f.inside for f in found)
+    ideal, lowest = np.mean([f.best_inside for f in found]), min(f.best_inside for f in found)
     beside = np.array([f.rms_m / f.without_m for f in found if f.without_m])
     more = []
     if len(beside):
@@ -228,6 +239,10 @@ def _figures(poses: int, found: list[Found]) -> list[Figure]:
             f"{inside:.0%} ({least:.0%})",
             f"{BAND[0]:.0%} to {BAND[1]:.0%}",
             BAND[0] <= inside <= BAND[1],
+        ),
+        Figure(
+            f"{poses} positions: of the best linear predictor's errors, within its own (least arm)",
+            f"{ideal:.0%} ({lowest:.0%})",
         ),
         Figure(f"{poses} positions: verdicts", each),
     ]

@@ -14,8 +14,8 @@ import typer
 from hilcal.cli.options import Json
 from hilcal.cli.terminal import terminal
 from hilcal.errors import CannotAnswerError
+from hilcal.identification.background import family_sizes
 from hilcal.identification.baseline import baseline
-from hilcal.identification.family_sizes import family_sizes
 from hilcal.refinement import refine
 from studies.few_poses_command import series_of
 from studies.records import Figure, Keep, keep

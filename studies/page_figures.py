@@ -18,8 +18,8 @@ from hilcal.design.planner import Planned, Request, make
 from hilcal.design.summary import summarise
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.drivers.simulated.rehearsal import NOTHING, case_of_plan, read_plan
+from hilcal.identification.background import FamilySize
 from hilcal.identification.baseline import baseline
-from hilcal.identification.family_sizes import FamilySize
 from hilcal.identification.fit import fit
 from hilcal.present import charts as style
 from hilcal.present.charts import made_of

@@ -172,6 +172,7 @@ class WorldState:
             except InputError:
                 self._load, self._since = before
                 raise
+            self._known = None  # a load that swings may be at rest by the next look
             self._note(f"asked for {self._name(wanted)}, hung {self._name(load)}")
             return None if load == 0 else self._name(load)
 

@@ -43,6 +43,7 @@ from hilcal.robot.arm import Arm
 from hilcal.robot.chain import evaluate
 from hilcal.robot.factory import SAME, flange_difference, of_dict, with_factory
 from hilcal.shown import Brief
+from hilcal.store.codec import read_file, write_document
 from hilcal.store.schema import is_campaign
 from hilcal.stream.fit import StreamFit
 from hilcal.types import Bools, Floats, Ints
@@ -59,38 +60,27 @@ class Calibration(Brief):
     >>> found = calibration.compensate(q, [0, 0, -50, 0, 0, 0])
     >>> bool(found.after.error_m.max() < 1e-9), found.q.shape
     (True, (3, 6))
-
-    Attributes:
-        theta: (P,) its parameters.
-        mode: kind of readings that it was fitted to.
-        root: (P, K) R with κ C = R Rᵀ; None where it is computed when needed, from `learnt`.
-        misfit: s², m².
-        scatter: the arm's scatter.
-        measured: where the fitted readings lie.
-        loads: (6,) wrench at the load point, base axes, by the name of a load of the cell.
-        source: what it is from, for people.
-        sensor: where the force sensor stands; None without one.
-        learnt: what the covariance follows from, where it does.
-        conditions: what is taken where points lack a column of `States`, by column.
     """
 
     model: Model
-    theta: Floats
-    mode: Mode
+    theta: Floats  # (P,) its parameters
+    mode: Mode  # kind of readings that it was fitted to
     root: Floats | None
-    misfit: float
-    scatter: Scatter
-    measured: Measured
-    loads: Mapping[str, Floats]
-    source: Mapping[str, Any]
-    sensor: SensorMount | None = None
-    learnt: CovarianceSource | None = None
+    """(P, K) R with κ C = R Rᵀ; None where it is computed when needed, from `learnt`."""
+    misfit: float  # s², m²
+    scatter: Scatter  # of the arm
+    measured: Measured  # where the fitted readings lie
+    loads: Mapping[str, Floats]  # (6,) wrench at the load point, base axes, by load of the cell
+    source: Mapping[str, Any]  # what it is from, for people
+    sensor: SensorMount | None = None  # where the force sensor stands; None without one
+    learnt: CovarianceSource | None = None  # what the covariance follows from, where it does
     conditions: Mapping[str, Condition] = field(default_factory=dict)
-    _tracked: ToolPose = field(init=False, repr=False)
+    """What is taken where points lack a column of `States`, by column."""
 
-    def __post_init__(self) -> None:
-        """Keep the tracked target as the usual tool."""
-        object.__setattr__(self, "_tracked", tool_of(self.model, self.theta, None))
+    @cached_property
+    def _tracked(self) -> ToolPose:
+        """The tracked target, the usual tool."""
+        return tool_of(self.model, self.theta, None)
 
     @classmethod
     def of(cls, found: Fit, source: Mapping[str, Any] | None = None) -> "Calibration":
@@ -146,20 +136,20 @@ class Calibration(Brief):
         Raises:
             InputError: no calibration, or one with effects that are not at hand.
         """
-        from hilcal.calibration.storage import read
+        from hilcal.calibration.storage import from_json
 
         if Path(path).is_file() and is_campaign(Path(path)):
             import hilcal  # campaigns are above calibrations: the library knows them
 
             with hilcal.Campaign.open(path, catalogue, read_only=True) as run:
                 return run.calibration()
-        return read(Path(path), catalogue)
+        return read_file(Path(path), "calibration", lambda c: from_json(c, catalogue))
 
     def save(self, path: str | Path) -> None:
         """Write it as one JSON file, which needs nothing else to be loaded."""
-        from hilcal.calibration.storage import write
+        from hilcal.calibration.storage import to_json
 
-        write(self, Path(path))
+        write_document(Path(path), to_json(self), indent=1)
 
     def predict(
         self,

@@ -37,31 +37,20 @@ EXACT = 1e-12
 """How far the form may be off, rad and m, for an effect to count as of that form."""
 
 
-@dataclass(slots=True, eq=False)
 class CompiledForm:
-    """The sum of the effects so far."""
+    """The sum of the effects so far; arrays of what no effect has yet have no rows."""
 
-    a: Floats
-    linear: Floats
-    by_wrench: Floats
-    b: Floats
-    compliance: Floats
-    by_angle: Floats
-    by_torque: Floats
-    torque: Floats
-    by_values: Floats
-    soft: Floats
-    gain: Floats
-    bias: Floats
-
-    @classmethod
-    def empty(cls, n: int) -> "CompiledForm":
-        """Return the form of an arm of n joints without any effect."""
-        return cls(
-            np.zeros(n), np.zeros((n, n)), np.zeros((n, 6)), np.zeros((n + 1, 6)),
-            np.zeros((n + 1, 6, 6)), np.zeros((0, NODES)), np.zeros((0, TORQUE_NODES)), np.ones(n),
-            np.zeros((0, 6, n)), np.zeros((0, NODES)), np.zeros((0, 6)), np.zeros(6),
-        )  # fmt: skip
+    def __init__(self, n: int) -> None:
+        """Begin with an arm of n joints without any effect."""
+        self.a, self.linear, self.by_wrench = np.zeros(n), np.zeros((n, n)), np.zeros((n, 6))
+        self.b, self.compliance = np.zeros((n + 1, 6)), np.zeros((n + 1, 6, 6))
+        self.by_values: Floats = np.zeros((0, 6, n))
+        self.by_angle: Floats = np.zeros((0, NODES))
+        self.soft: Floats = np.zeros((0, NODES))
+        self.by_torque: Floats = np.zeros((0, TORQUE_NODES))
+        self.torque = np.ones(n)
+        self.gain: Floats = np.zeros((0, 6))
+        self.bias = np.zeros(6)
 
     def laws(self) -> tuple[Floats, ...]:
         """Return constants and compliances, as the kernel takes them."""
@@ -90,15 +79,13 @@ class CompiledForm:
         found = e.deviation(theta, s)
         if all(x is None for x in (found.dq, found.twist, found.base, found.target)):
             return True  # what instruments do moves no tool
-        if e.needs:
+        if e.needs or not _only(found):
             return False
-        return self._elastic(e, theta, s) if e.elastic else self._rigid(e, theta, s)
+        of_kind = self._elastic if e.elastic else self._rigid
+        return of_kind(e, theta, s, found)
 
-    def _elastic(self, e: Effect, theta: Floats, s: Situation) -> bool:
+    def _elastic(self, e: Effect, theta: Floats, s: Situation, found: Deviation) -> bool:
         n = s.angle.shape[1]
-        found = e.deviation(theta, s)
-        if not _only(found):
-            return False
         by_wrench, compliance = np.zeros((n, 6)), np.zeros((n + 1, 6, 6))
         for c in range(6):
             unit = np.zeros_like(s.wrench)
@@ -164,10 +151,7 @@ class CompiledForm:
         self.by_torque = _added(self.by_torque, values.T)
         return True
 
-    def _rigid(self, e: Effect, theta: Floats, s: Situation) -> bool:
-        found = e.deviation(theta, s)
-        if not _only(found):
-            return False
+    def _rigid(self, e: Effect, theta: Floats, s: Situation, found: Deviation) -> bool:
         twist = np.zeros(self.b.shape) if found.twist is None else found.twist[0]
         n = s.angle.shape[1]
         if found.dq is None and found.twist is not None:
@@ -353,7 +337,7 @@ def compiled(tool: ToolPose, mode: Mode) -> Compiled | tuple[str, ...]:
         return (f"{arm.name}'s joints (not six, coupled, or sliding)",)
     if tool.moving:
         return tuple(e.name for e, _ in tool.moving)
-    s, form = _situation(tool), CompiledForm.empty(arm.n)
+    s, form = _situation(tool), CompiledForm(arm.n)
     first_moment, point = np.zeros((arm.n, 3)), cell.load_point
     by_point: list[tuple[Effect, Floats]] = []
     for e, mine in zip(model.effects, model.slices(), strict=True):
@@ -374,7 +358,7 @@ def compiled(tool: ToolPose, mode: Mode) -> Compiled | tuple[str, ...]:
         packed(arm.masses), first_moment, form.gain, form.bias,
     )  # fmt: skip
     links = (packed(arm.links[:, :3, :3]), packed(arm.links[:, :3, 3]), packed(arm.coms))
-    bare = CompiledForm.empty(arm.n)
+    bare = CompiledForm(arm.n)
     nominal = bare.laws(), bare.tables()
     unit = np.zeros_like(s.wrench[:1])
     unit[..., 5] = 1.0

@@ -20,7 +20,7 @@ parameter estimation", IEEE CDC 1983, for parallel axes.
 
 import csv
 import io
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -185,14 +185,13 @@ def _judged(rows: DhRows, arm: Arm) -> DhRows:
     def moved(poses: Floats) -> float:
         return float(np.linalg.norm((poses - there)[:, :3, 3], axis=1).max())
 
-    return DhRows(
-        rows.convention, rows.a, rows.d, rows.alpha, rows.offset, rows.base, rows.flange,
+    return replace(
+        rows,
         base_moves=moved(held @ rows.flange),
         flange_moves=moved(rows.base @ held),
         table_moves=moved(held),
         disagreement=moved(rows.base @ held @ rows.flange),
-        slides=rows.slides,
-    )  # fmt: skip
+    )
 
 
 def _centres(rows: DhRows, arm: Arm) -> Floats:

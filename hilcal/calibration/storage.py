@@ -10,7 +10,6 @@ import base64
 import json
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,15 +27,7 @@ from hilcal.model.model import Model
 from hilcal.readings.readings import ObserverName
 from hilcal.readings.whitening import MODES
 from hilcal.robot.arm import Arm
-from hilcal.store.codec import (
-    decode,
-    encode,
-    frames,
-    numbers,
-    read_document,
-    read_file,
-    write_document,
-)
+from hilcal.store.codec import decode, encode, frames, numbers, read_document
 from hilcal.types import Floats
 
 FORMAT, VERSION = "hilcal-calibration", 2
@@ -50,16 +41,6 @@ _CELL = (
     *("target", "load_point", "tool_mass", "tool_com", "gravity", "registration", "targets"),
     *("target_names", "known_targets", "registration_known", "measured_torques"),
 )
-
-
-def write(c: Calibration, path: Path) -> None:
-    """Write a calibration to a file."""
-    write_document(path, to_json(c), indent=1)
-
-
-def read(path: Path, catalogue: Catalogue | None = None) -> Calibration:
-    """Read a calibration from a file."""
-    return read_file(path, "calibration", lambda content: from_json(content, catalogue))
 
 
 def to_json(c: Calibration) -> dict[str, object]:

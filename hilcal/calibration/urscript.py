@@ -266,14 +266,14 @@ class _Program:
                 near = [*more, *(n.value for n in named if n.arg == "qnear")]
                 if len(near) != len(more) + len(named) or len(near) > 1:
                     return None
-                wanted, branch = self.value(pose, k), [self.value(n, k) for n in near]
-                if not _is_six(wanted, "p") or not all(_is_six(b, "") for b in branch):
+                wanted = _pose(self.value(pose, k))
+                branch = _six(self.value(near[0], k)) if near else None
+                if wanted is None or (near and branch is None):
                     return None
-                return (_six(branch[0]) if branch else None), _pose(wanted)
+                return branch, wanted
         value = self.value(node, k)
-        if _is_six(value, "p"):
-            return None, _pose(value)
-        return (_six(value), None) if _is_six(value, "") else None
+        q, goal = _six(value), _pose(value)
+        return None if q is None and goal is None else (q, goal)
 
     def why_not(self, node: ast.expr, s: Statement) -> str:
         """Say why a target is not understood."""
@@ -358,7 +358,7 @@ def _waypoint(p: _Program, k: int, setup: Mapping[str, tuple[int, list[Value | N
                 "come before it; valid: once before the first motion, not in if or while"
             )
     tool = setup[_TOOL][1][0] if _TOOL in setup else None
-    return replace(out, q=found[0], pose=found[1], tool=None if tool is None else _pose(tool))
+    return replace(out, q=found[0], pose=found[1], tool=_pose(tool))
 
 
 def _set_up(
@@ -371,7 +371,7 @@ def _set_up(
     values = [p.value(a, k) for a in (*s.call.args, *(n.value for n in s.call.keywords))]
     if name == _TOOL:
         values = values[:1]
-        if not values or not _is_six(values[0], "p"):
+        if not values or _pose(values[0]) is None:
             raise InputError(f"line {s.line}: set_tcp without a pose of numbers; valid: p[x, y, …]")
     elif None in values:
         raise InputError(f"line {s.line}: {name} is computed while it runs; valid: numbers")
@@ -413,18 +413,17 @@ def _is_pose(node: ast.expr) -> bool:
     return isinstance(node, ast.Subscript) and isinstance(node.slice, ast.Tuple)
 
 
-def _is_six(value: Value | None, kind: str) -> bool:
-    return isinstance(value, tuple) and value[0] == kind and len(value[1]) == JOINTS
+def _six(value: Value | None, kind: str = "") -> Floats | None:
+    """(6,) numbers of a list, or of a pose where `kind` is "p"; None of any other value."""
+    if isinstance(value, tuple) and value[0] == kind and len(value[1]) == JOINTS:
+        return np.array(value[1])
+    return None
 
 
-def _six(value: Value | None) -> Floats:
-    assert isinstance(value, tuple)  # noqa: S101 - see `_is_six`
-    return np.array(value[1])
-
-
-def _pose(value: Value | None) -> Floats:
-    six = _six(value)
-    return se3.matrix(se3.rotation(six[3:]), six[:3])
+def _pose(value: Value | None) -> Floats | None:
+    """(4, 4) of a pose; None of any other value."""
+    six = _six(value, "p")
+    return None if six is None else se3.matrix(se3.rotation(six[3:]), six[:3])
 
 
 STEPS = 40

@@ -60,14 +60,15 @@ _KINDS = {
 }
 
 
-def error_document(error: HilcalError) -> dict[str, object]:
+def one_line(message: object) -> str:
+    """Return a message as it is printed: on one line, without control characters."""
+    return escaped(" ".join(str(message).split()))
+
+
+def error_document(message: object, code: int) -> dict[str, object]:
     """Return an error as a command's document holds it."""
-    return _document(escaped(" ".join(str(error).split())), error.exit_code)
-
-
-def _document(line: str, code: int) -> dict[str, object]:
     kind = _KINDS.get(code, "unexpected")
-    return {"error": {"message": line, "kind": kind, "exit_code": code}}
+    return {"error": {"message": one_line(message), "kind": kind, "exit_code": code}}
 
 
 class Watched:
@@ -100,10 +101,9 @@ class Failures:
         """Say what failed in one line, and in one document; returns the exit code."""
         if self.debug and error is not None:
             traceback.print_exception(error)
-        line = escaped(" ".join(message.split()))
-        print(_laid_out(f"error: {line}"), file=sys.stderr)
+        print(_laid_out(f"error: {one_line(message)}"), file=sys.stderr)
         if self.as_json and not self.out.written:
-            self.out.write(json.dumps(_document(line, code), indent=2) + "\n")
+            self.out.write(json.dumps(error_document(message, code), indent=2) + "\n")
             self.out.flush()
         return code
 

@@ -11,7 +11,7 @@ from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.fitting import PriorOptions
 from hilcal.cli.options import POSES, catalogue_with, command
 from hilcal.cli.planning import answers_of, read_cell, refuse_unready
-from hilcal.cli.refining import chapter_of, rows_of
+from hilcal.cli.refining import chapters_of, errors_by_revision
 from hilcal.cli.running import lasting_cell, measure, to_the_end
 from hilcal.cli.showing import followed
 from hilcal.cli.terminal import Terminal, agreed, somebody_there, terminal
@@ -38,7 +38,7 @@ from hilcal.present.calibration import (
     step_heading,
     validation_lines,
 )
-from hilcal.present.diagnosis import key, revisions_table, verdict_line
+from hilcal.present.diagnosis import verdict_line
 from hilcal.present.fit import prior_lines
 from hilcal.present.live_viewer import LiveViewer
 from hilcal.present.plan import plan_facts
@@ -330,15 +330,14 @@ class CalibrationOperator:
         found: Any
         with working(t.progress) as say:
             if step.kind == "refine" and viewer is not None:
-                found = p.refine(say, lambda n, s: viewer.revised(chapter_of(n, s)))
+                found = p.refine(say, lambda n, s: viewer.revised(*chapters_of([n], [s])))
             else:
                 found = p.compute(step, say)
         if step.kind == "refine":
             with CampaignFile.open(p.run, read_only=True) as campaign:
                 refined = ProcedureLog(campaign).last(REFINED) or {"revisions": []}
-            rows = rows_of(refined["revisions"], found.steps)
-            t.show(revisions_table([r.shown for r in rows]))
-            t.show([key(found.fit.readings), verdict_line(found.diagnosis), ""])
+            t.show(errors_by_revision(chapters_of(refined["revisions"], found.steps)))
+            t.show([verdict_line(found.diagnosis), ""])
             t.show(prior_lines(found.fit))
         elif step.kind == "decide":
             of = p.settings

@@ -133,7 +133,8 @@ def compensate(
     become = fates(other.program.points if other else task.waypoints, refused)
     kept = [k for k, why in enumerate(refused) if not why]
     if not asked.leave or not kept:
-        _refuse(points, of.names, refused, _unreachable(found) | np.array(unclear, bool))
+        wrong = ~found.inverse.solved | found.singular | found.limits.any(axis=1)
+        _refuse(points, of.names, refused, wrong | np.array(unclear, bool))
     elif any(refused):
         q, task = q[kept], _only(task, kept, refused)
         wanted = None if wanted is None else wanted[kept]
@@ -245,10 +246,6 @@ def _numbers(written: str, count: int, option: str) -> Floats:
     if len(values) != count or not np.isfinite(values).all():
         raise InputError(f"{option} {written!r}; valid: {count} numbers")
     return values
-
-
-def _unreachable(found: Compensation) -> Bools:
-    return np.asarray(~found.inverse.solved | found.singular | found.limits.any(axis=1))
 
 
 def _refuse(path: Path, names: tuple[str, ...], refused: list[str], wrong: Bools) -> None:

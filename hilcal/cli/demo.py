@@ -16,7 +16,7 @@ from hilcal.campaign.revisions import to_record
 from hilcal.cli.fitting import check_record, finish, record_story
 from hilcal.cli.options import catalogue_with, check_seed, command
 from hilcal.cli.planning import separates
-from hilcal.cli.refining import chapter_of, revisions_json, rows_of
+from hilcal.cli.refining import changed, chapters_of, errors_by_revision, revisions_json
 from hilcal.cli.running import (
     RehearsalSettings,
     RehearsedCampaign,
@@ -29,7 +29,7 @@ from hilcal.config import load_config
 from hilcal.design.next import measure_next
 from hilcal.design.planner import Request
 from hilcal.design.summary import refuse
-from hilcal.diagnosis.diagnosis import Diagnosis, History
+from hilcal.diagnosis.diagnosis import History
 from hilcal.diagnosis.diagnosis import in_doubt as left_open
 from hilcal.diagnosis.document import to_json
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
@@ -58,9 +58,7 @@ from hilcal.names import quoted
 from hilcal.present.calibration import improvement_report
 from hilcal.present.diagnosis import (
     compared,
-    key,
     refined_laws,
-    revisions_table,
     step_report,
     truth_table,
     verdict_line,
@@ -78,6 +76,7 @@ from hilcal.refinement import refine as refine_model
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.campaign_file import may_write
 from hilcal.store.plan import REFERENCE, Plan
+from hilcal.store.revision import RevisionRecord
 from hilcal.store.rows import content_hash
 
 STRENGTH = 4.0  # Of what is hidden, in units of the noise: clearly there in so few readings
@@ -100,11 +99,9 @@ SHARE = 0.8
 class Doubted:
     """A first diagnosis, and the plan that would settle it."""
 
-    fit: Fit
-    diagnosis: Diagnosis
-    hashed: str  # hash of these readings
     readings: int
-    plan: Plan | None  # the measurements that separate the suspects; None where nothing is in doubt
+    record: RevisionRecord | None  # of the diagnosis; None where nothing is in doubt
+    plan: Plan | None  # the measurements that separate the suspects; None as the record
     document: dict[str, object]
 
 
@@ -175,10 +172,9 @@ def doubted(
         found = _fit(r, catalogue)
         d = diagnose(found, say=say)
     document: dict[str, object] = {"verdict": d.verdict, "message": message(d), "suspects": []}
-    known = (content_hash(r.readings), len(r.readings))
     suspects = left_open(d)
     if not suspects:
-        return Doubted(found, d, *known, None, document)
+        return Doubted(len(r.readings), None, None, document)
     t.show(step_report(1, model_name(found.model.named), d))
     t.show(heading(f"Ambiguous between {numbers.names(suspects)}: what would settle it?"))
     with working(t.progress) as say:
@@ -191,7 +187,8 @@ def doubted(
     visited = len({s.pose for s in plan.steps} - {REFERENCE})
     t.show(next_report(chosen, visited, len(plan.steps)))
     document |= {"suspects": list(suspects), **separates(chosen)}
-    return Doubted(found, d, *known, plan, document)
+    record = to_record(found, to_json(d), None, content_hash(r.readings))
+    return Doubted(len(r.readings), record, plan, document)
 
 
 CELL = "demo_ur10e.toml"
@@ -247,18 +244,17 @@ def demo(
         settings = Settings(poses, validation, seed=number, readings=r.mode, hide=told.choice)
         p = Procedure(output, r.cell, r.config, told.base_dir, catalogue, settings)
         with Campaign.open(output, catalogue) as o:
-            if doubt is not None and doubt.plan is not None:
-                first = to_json(doubt.diagnosis)
-                o.file.append_revision(to_record(doubt.fit, first, None, doubt.hashed))
+            if doubt is not None and doubt.record is not None:
+                o.file.append_revision(doubt.record)
             p.resume(o.file)
             numbered = p.keep(o, found)
-        rows = rows_of(numbered, found.steps)
-        for row, s in zip(rows, found.steps, strict=True):
-            t.show(step_report(row.number, row.shown[1], s.diagnosis))
+        chapters = chapters_of(numbered, found.steps)
+        for c, s in zip(chapters, found.steps, strict=True):
+            t.show(step_report(c.number, changed(c), s.diagnosis))
         if laws is not None:
             t.show(refined_laws(laws))
         t.show(heading("The error, revision by revision"))
-        t.show([revisions_table([r.shown for r in rows]), key(rows[-1].fit.readings)])
+        t.show(errors_by_revision(chapters))
         truth = compared(found.steps[-1].fit, r.world.truth)
         if truth:
             t.show(heading("What was found against what is true"))
@@ -276,7 +272,6 @@ def demo(
             f"The simulated arm moved by the law of {r.hidden} itself: this shows whether such a "
             "campaign reveals it, not whether the law is right."
         )
-    chapters = [chapter_of(k, s) for k, s in zip(numbered, found.steps, strict=True)]
     record_story(t, chapters, record)
     files_given = [*(effects_from or ()), *(() if laws is None else laws.files.values())]
     more = "".join(f" --effects-from {quoted(path)}" for path in files_given)
@@ -295,7 +290,7 @@ def demo(
         verdict=found.verdict,
         message=message(found.diagnosis),
         rejected=list(found.rejected),
-        revisions=revisions_json(rows),
+        revisions=revisions_json(chapters),
         parameters=[asdict(p) for p in truth],
         truth=r.world.truth,
         compensation=None

@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -178,17 +178,14 @@ def _write_data(run: Campaign, wanted: Wanted, force: bool) -> Iterator[str]:
         kept = run.file.about(ROBOT_FILE)
         if kept is not None:
             robot = cell.parent / Path(run.config.robot.model).name
-            _beside(robot, kept, force)
+            if robot.exists() and not force and robot.read_bytes() != kept.encode():
+                raise InputError(
+                    f"{robot}: another file is there; choose another folder or give --force"
+                )
+            replace_file(robot, kept)
             yield f"{robot}: the robot, as the campaign keeps it"
         replace_file(cell, cell_toml(run))
         yield f"{cell}: the cell's configuration"
-
-
-def _beside(path: Path, text: str, force: bool) -> None:
-    """Write a robot's file; one of another content is replaced with --force only."""
-    if path.exists() and not force and path.read_bytes() != text.encode():
-        raise InputError(f"{path}: another file is there; choose another folder or give --force")
-    replace_file(path, text)
 
 
 def cell_toml(run: Campaign) -> str:
@@ -214,7 +211,8 @@ def _write_model(
     source["readings_sha256"] = record.data_hash
     if parameters is not None and parameters.suffix.lower() == ".csv":
         rows = record.result_json["identify"]["parameters"]
-        _write_parameters(parameters, rows)
+        names = ("name", "value", "std", "unit", "identifiable")
+        write_columns(parameters, {name: [row[name] for row in rows] for name in names}, {})
         yield f"{parameters}: {len(rows)} parameters of revision {number}"
         parameters = None
     if wanted.residuals is not None or parameters is not None:
@@ -335,9 +333,3 @@ def _dh_words(path: Path, rows: dh_table.DhRows, holds: str, alone: bool) -> Ite
             f"Nearly parallel axes have distant common normals: d up to {far:.0f} m, which cancel; "
             "compute in double precision."
         )
-
-
-def _write_parameters(path: Path, rows: Sequence[dict[str, object]]) -> None:
-    names = ("name", "value", "std", "unit", "identifiable")
-    columns = {name: [row[name] for row in rows] for name in names}
-    write_columns(path, columns, {})

@@ -124,23 +124,16 @@ def scalings(name: str) -> tuple[Scaling, ...]:
     return found
 
 
-def wanted_effects(given: str | None, catalogue: Catalogue) -> dict[str, dict[str, object]] | None:
+def wanted_effects(
+    given: str | None, catalogue: Catalogue, option: str = "--effects"
+) -> dict[str, dict[str, object]] | None:
     """Read `--effects "a, b(option=value)"`: options by name, see `read_effects_text`."""
     if given is None:
         return None
-    wanted = read_effects_text(given, "--effects", catalogue)
+    wanted = read_effects_text(given, option, catalogue)
     if not wanted:
-        raise InputError("--effects is empty; give one name or several, separated by commas")
+        raise InputError(f"{option} is empty; give one name or several, separated by commas")
     return wanted
-
-
-def effect_names(asked: str | None, catalogue: Catalogue) -> tuple[str, ...] | None:
-    """Read names of effects where they cannot have options; raises as `wanted_effects` does."""
-    wanted = wanted_effects(asked, catalogue)
-    for name, options in (wanted or {}).items():
-        if options:
-            raise InputError(f"--effects: {name} takes no options here; valid: {name}")
-    return None if wanted is None else tuple(wanted)
 
 
 def check_options(o: Campaign, wanted: Mapping[str, Options]) -> None:
@@ -149,12 +142,7 @@ def check_options(o: Campaign, wanted: Mapping[str, Options]) -> None:
         o.catalogue.make(name, o.cell, o.readings.states, options).prior_std()
 
 
-def chosen(found: Fit) -> dict[str, dict[str, object]]:
-    """Options of the effects of a fit that are not the usual ones, by name."""
-    return chosen_of(found.model, found.readings)
-
-
-def chosen_of(model: Model, readings: Readings) -> dict[str, dict[str, object]]:
+def chosen(model: Model, readings: Readings) -> dict[str, dict[str, object]]:
     """Options of the effects of a model that are not the usual ones for its readings, by name."""
     named = (e for e in model.effects if e.name not in model.background)
     options = {e.name: chosen_options(e, readings.states, readings.m) for e in named}
@@ -163,7 +151,7 @@ def chosen_of(model: Model, readings: Readings) -> dict[str, dict[str, object]]:
 
 def titles(model: Model, readings: Readings) -> tuple[str, ...]:
     """Names of a model's effects, with the options that are not the usual ones."""
-    given = chosen_of(model, readings)
+    given = chosen(model, readings)
     return tuple(write_effect(name, given.get(name, {})) for name in model.named)
 
 
@@ -219,7 +207,8 @@ def fitted_with(prior: CarriedPrior, o: Campaign, found: Fit) -> Fit:
     learnt = [e.name for e in prior.posterior.effects]
     more = [n for n in learnt if o.catalogue[n].computable(o.readings.states)]
     names = dict.fromkeys((*found.model.names, *more))
-    model = with_effects(o.cell, o.readings, found.mode, names, chosen(found), o.catalogue, prior)
+    given = chosen(found.model, found.readings)
+    model = with_effects(o.cell, o.readings, found.mode, names, given, o.catalogue, prior)
     return with_serial_noise(fit(model, with_prior_scatter(model, found.readings), found.mode))
 
 
@@ -321,7 +310,8 @@ def identify(
 
 def options_line(found: Fit) -> list[str]:
     """Return a line with the options that are not the usual ones; none where all are usual."""
-    given = [write_effect(name, options) for name, options in chosen(found).items()]
+    options = chosen(found.model, found.readings)
+    given = [write_effect(name, of) for name, of in options.items()]
     return [f"Options: {', '.join(given)}."] if given else []
 
 

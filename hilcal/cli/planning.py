@@ -13,9 +13,9 @@ from hilcal.cli.fitting import (
     NO_PRIOR,
     PriorOptions,
     check_record,
-    effect_names,
     fit_of,
     fitted_with,
+    wanted_effects,
 )
 from hilcal.cli.options import POSES, catalogue_with, check_seed, command
 from hilcal.cli.terminal import Terminal, terminal
@@ -23,8 +23,8 @@ from hilcal.config import CellConfig, load_config
 from hilcal.design.choice import CRITERIA, canonical
 from hilcal.design.next import Next, PairPower
 from hilcal.design.nominal_model import check_effects
-from hilcal.design.planner import Planned, Request, make
-from hilcal.design.summary import CheckedPlan, about, checked, refusal, remarks, summarise
+from hilcal.design.planner import Request, make
+from hilcal.design.summary import CheckedPlan, about, checked, refusal, summarise
 from hilcal.diagnosis.diagnosis import MOST
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue
@@ -38,6 +38,7 @@ from hilcal.present.campaign import check_report
 from hilcal.present.plan import brief_plan, next_report, plan_report, plan_screen, poses_report
 from hilcal.present.progress import Say, working
 from hilcal.procedure.next_plan import Doubt, doubt_to_settle, next_plan, without
+from hilcal.procedure.procedure import with_origin
 from hilcal.procedure.state import reference_in
 from hilcal.store.plan import Plan, load_plan
 from hilcal.tables.write import plan_csv
@@ -206,23 +207,7 @@ def make_plan(
 ) -> Plan:
     """Return a plan of so many poses, each read unloaded and under every load that it bears."""
     rng = np.random.default_rng(check_seed(seed))
-    return _with_origin(make(cell, config, Request(poses), rng, None, say, catalogue))
-
-
-def make_checked(
-    cell: Cell, config: CellConfig, poses: int, seed: int, catalogue: Catalogue, say: Say
-) -> CheckedPlan:
-    """Return the same plan with its dry run, its summary, and what other numbers of poses give."""
-    rng = np.random.default_rng(check_seed(seed))
-    chosen = make(cell, config, Request(poses), rng, None, say, catalogue)
-    summary = summarise(chosen, config, rng, say, compare=False)
-    say("checking every motion in a dry run")
-    return checked(cell, config, _with_origin(chosen), summary)
-
-
-def _with_origin(chosen: Planned) -> Plan:
-    """Return a plan that says where it is from."""
-    return replace(chosen.ordered.plan, about={**about(chosen), "remarks": list(remarks(chosen))})
+    return with_origin(make(cell, config, Request(poses), rng, None, say, catalogue))
 
 
 def answer_json(answer: ConnectionResult) -> dict[str, object]:
@@ -318,12 +303,12 @@ def _without_suspects(
 
 
 def _named(text: str | None, catalogue: Catalogue) -> tuple[str, ...] | None:
-    if text is None:
+    """Read `--suspects`: names of effects, which have no options here."""
+    wanted = wanted_effects(text, catalogue, "--suspects")
+    if wanted is None:
         return None
-    try:
-        names = effect_names(text, catalogue) or ()
-    except InputError as error:
-        raise InputError(str(error).replace("--effects", "--suspects")) from None
-    if not 2 <= len(names) <= MOST:
-        raise InputError(f"--suspects has {len(names)} names; valid: 2 to {MOST}")
-    return names
+    for name in (name for name, options in wanted.items() if options):
+        raise InputError(f"--suspects: {name} takes no options here; valid: {name}")
+    if not 2 <= len(wanted) <= MOST:
+        raise InputError(f"--suspects has {len(wanted)} names; valid: 2 to {MOST}")
+    return tuple(wanted)

@@ -1,8 +1,7 @@
 """`diagnose`, `add`, `remove`, `refine`, `discover`: which effect is missing."""
 
 import itertools
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from hilcal import numbers
@@ -41,7 +40,7 @@ from hilcal.effects.written import read_effects_text, write_effect
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.background import background_of
 from hilcal.identification.baseline import masses_note
-from hilcal.identification.fit import Fit, fit
+from hilcal.identification.fit import fit
 from hilcal.identification.fit_document import frames_to_json, prior_to_json
 from hilcal.identification.misdescription import other_arm_of
 from hilcal.identification.torques import check_torques
@@ -59,6 +58,7 @@ from hilcal.present.diagnosis import (
     silence,
     verdict_line,
 )
+from hilcal.present.document import Block
 from hilcal.present.fit import follows, model_name, prior_lines, set_aside
 from hilcal.present.progress import working
 from hilcal.present.registration import covariance_words, fitted_lines, other_arm_line, torque_lines
@@ -71,38 +71,37 @@ from hilcal.store.revision import change
 from hilcal.whole_file import replace_file
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RevisionRow:
-    """A revision as it is listed: what it changed, its fit and the verdict on it."""
-
-    number: int
-    fit: Fit
-    verdict: str
-    added: str | None = None
-    removed: str | None = None
-
-    @property
-    def shown(self) -> tuple[int, str, Fit, str]:
-        """The same as `revisions_table` takes it."""
-        scatter = self.fit.readings.arm_scatter is not None
-        return self.number, change(self.added, self.removed, scatter), self.fit, self.verdict
-
-
-def rows_of(numbers: Sequence[int], steps: Sequence[RefinementStep]) -> list[RevisionRow]:
-    """Return the steps of a refinement as they are listed, by the numbers of their revisions."""
+def chapters_of(numbers: Iterable[int], steps: Iterable[RefinementStep]) -> list[Chapter]:
+    """Return the steps of a refinement by the numbers of their revisions."""
     return [
-        RevisionRow(number, s.fit, s.diagnosis.verdict, s.added, s.removed)
+        Chapter(number, s.added, s.fit, s.diagnosis, s.removed)
         for number, s in zip(numbers, steps, strict=True)
     ]
 
 
+def errors_by_revision(chapters: Sequence[Chapter], stored: str = "") -> list[Block]:
+    """Return the table in which the error falls, and what its columns are.
+
+    `stored` is the verdict on a chapter that has no diagnosis.
+    """
+    rows = [(c.number, changed(c), c.fit, _verdict(c, stored)) for c in chapters]
+    return [revisions_table(rows), key(chapters[-1].fit.readings)]
+
+
+def changed(c: Chapter) -> str:
+    """Return what a revision changed; empty for a first model."""
+    return change(c.added, c.removed, c.fit.readings.arm_scatter is not None)
+
+
+def _verdict(c: Chapter, stored: str) -> str:
+    return stored if c.diagnosis is None else c.diagnosis.verdict
+
+
 @command()
 def diagnose(
-    run: Path,
-    revision: int | None = None,
-    effects_from: list[Path] | None = None,
+    run: Path, revision: int | None = None, effects_from: list[Path] | None = None,
     as_json: bool = False,
-) -> None:
+) -> None:  # fmt: skip
     """Say which effect the model lacks."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
@@ -169,15 +168,13 @@ def _change(
                 c = remove_effect(o, number, before, effect, say)
             else:
                 c = add_effect(o, number, before, effect, options, say)
+            made = Chapter(c.number, c.added, c.fit, c.diagnosis, c.removed)
             if live is not None:
-                live.revised(Chapter(c.number, c.added, c.fit, c.diagnosis, c.removed))
-        stored, d = o.file.revision(number), c.diagnosis
-        verdict = str(stored.result_json.get("diagnose", {}).get("verdict", ""))
-        rows: list[RevisionRow] = [
-            RevisionRow(number, before, verdict, stored.added, stored.removed),
-            RevisionRow(c.number, c.fit, d.verdict, c.added, c.removed),
-        ]
-        t.show([revisions_table([r.shown for r in rows]), key(c.fit.readings)])
+                live.revised(made)
+        first, d = o.file.revision(number), c.diagnosis
+        verdict = str(first.result_json.get("diagnose", {}).get("verdict", ""))
+        both = [Chapter(number, first.added, before, None, first.removed), made]
+        t.show(errors_by_revision(both, verdict))
         named = write_effect(effect, options or {})
         t.show(fell(before, c.fit, named) if adds else rose(before, c.fit, effect))
         t.show([] if c.expected is None else addition_lines(c.expected))
@@ -187,7 +184,7 @@ def _change(
                 chapters = o.chapters(say, c.number)
             record_story(t, chapters, record)
     t.document(
-        revisions=revisions_json(rows),
+        revisions=revisions_json(both, verdict),
         verdict=d.verdict,
         message=message(d),
         **{} if c.expected is None else {"addition": suspect_json(c.expected)},
@@ -236,31 +233,26 @@ def refine(
                 say("registering")
                 model, fitted = starting_model(o, mode, named, known), o.readings
             how = NOTHING if latest is None else o.history(latest.number)
-            numbers_to_be = itertools.count(len(o.file.revisions()) + 1)
-            first = latest
+            begun = () if latest is None else (latest.number,)
+            numbers_to_be = itertools.chain(begun, itertools.count(len(o.file.revisions()) + 1))
 
-            def seen(step: RefinementStep) -> None:
-                nonlocal first
-                number = next(numbers_to_be) if first is None else first.number
-                first = None
+            def judged(step: RefinementStep) -> None:
                 if live is not None:
-                    live.revised(chapter_of(number, step))
+                    live.revised(*chapters_of([next(numbers_to_be)], [step]))
 
-            found = refine_model(model, fitted, mode, say, how, laws, seen, background)
+            found = refine_model(model, fitted, mode, say, how, laws, judged, background)
             if laws is not None:
                 laws.write(found.names)
             for step in found.steps:
                 finish(step.fit, say)
-            begun = () if latest is None else (latest.number,)
             records = [
                 o.record(s.fit, s.diagnosis, s.added, s.removed) for s in found.steps[len(begun) :]
             ]
             before = len(o.file.revisions())
             numbered = (*begun, *o.append_records(records, *begun))
-            rows = rows_of(numbered, found.steps)
-        t.show(revisions_table([r.shown for r in rows]))
-        t.show(key(rows[-1].fit.readings))
-        t.show(options_line(rows[-1].fit))
+            chapters = chapters_of(numbered, found.steps)
+        t.show(errors_by_revision(chapters))
+        t.show(options_line(found.fit))
         if o.noise is not None:
             t.show(numbers.sentence(covariance_words(o.covariance_parts, o.noise)))
         t.show(set_aside(found.fit, details))
@@ -285,12 +277,11 @@ def refine(
         if last.verdict != "adequate" and not last.dependences:
             t.show(follows(last.misfit_breakdown))
         t.show([*curves(last.dependences, len(last.dependences) if details else 1)])
-        chapters = [chapter_of(n, s) for n, s in zip(numbered, found.steps, strict=True)]
         if live is not None:  # its verdict may have changed when others were tried
             live.revised(chapters[-1])
         record_story(t, chapters, record)
     t.document(
-        revisions=revisions_json(rows),
+        revisions=revisions_json(chapters),
         verdict=last.verdict,
         message=message(last),
         rejected=list(found.rejected),
@@ -303,13 +294,8 @@ def refine(
     )
 
 
-def chapter_of(number: int, step: RefinementStep) -> Chapter:
-    """Return a step of a refinement as a chapter of the story."""
-    return Chapter(number, step.added, step.fit, step.diagnosis, step.removed)
-
-
-def revisions_json(rows: Sequence[RevisionRow]) -> list[dict[str, object]]:
-    """Return what the contract says of each revision."""
+def revisions_json(chapters: Iterable[Chapter], stored: str = "") -> list[dict[str, object]]:
+    """Return what the contract says of each revision; `stored` is as in `errors_by_revision`."""
     return [
         {
             "revision": r.number,
@@ -321,9 +307,9 @@ def revisions_json(rows: Sequence[RevisionRow]) -> list[dict[str, object]]:
             "variance_factor": r.fit.variance_factor,
             "variance_factor_interval": list(r.fit.variance_factor_interval),
             "error": {"fit": r.fit.error.to_json(), "holdout": r.fit.holdout.to_json()},
-            "verdict": r.verdict or None,
+            "verdict": _verdict(r, stored) or None,
         }
-        for r in rows
+        for r in chapters
     ]
 
 

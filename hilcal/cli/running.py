@@ -19,7 +19,6 @@ from hilcal.cli.options import POSES, catalogue_with, check_seed, command
 from hilcal.cli.planning import (
     answer_json,
     dry_checked,
-    make_checked,
     make_plan,
     read_cell,
     refuse_unready,
@@ -73,7 +72,7 @@ from hilcal.present.live_viewer import LiveViewer, Several
 from hilcal.present.plan import plan_facts
 from hilcal.present.progress import Say, counting, full_words, missed_words, watching, working
 from hilcal.present.registration import covariance_words
-from hilcal.procedure.procedure import Measure, Procedure
+from hilcal.procedure.procedure import Measure, Procedure, checked_plan
 from hilcal.procedure.state import WORLD
 from hilcal.readings.covariance import COVERS, WHOLE
 from hilcal.readings.readings import Readings
@@ -169,9 +168,10 @@ def _own_plan(
 ) -> Plan:
     """Make a plan, show it, and ask whether to measure it, where somebody can be asked."""
     with working(t.progress) as say:
-        made = make_checked(cell, config, POSES, config.simulation.seed, catalogue, say)
+        seed = check_seed(config.simulation.seed)
+        rng = np.random.default_rng(seed)
+        made = checked_plan(cell, config, POSES, rng, catalogue, say)
     t.show(plan_facts(made.summary))
-    seed = config.simulation.seed
     whole = ("hilcal", "plan", str(path), "-o", "plan.json", *(("--seed", str(seed)) * bool(seed)))
     if notes := len(made.summary.remarks):
         t.show(f"What it assumes and leaves out ({notes} note{'s' * (notes > 1)}):")

@@ -96,10 +96,10 @@ def view(
         story = build_story(chapters)
     guard = _end_of_process()  # a viewer that does not answer may delay it; the campaign is closed
     try:
-        with told_to_end(signal.SIGINT, signal.SIGTERM) as wait, serve(story, port=port) as served:
+        with told_to_end(signal.SIGINT, signal.SIGTERM) as wait, serve(story, port=port) as url:
             t.show("Open the viewer with:")
-            t.command(f"{viewer_command()} {served.url}")
-            t.document({"url": served.url, "revisions": [c.number for c in chapters]})
+            t.command(f"{viewer_command()} {url}")
+            t.document({"url": url, "revisions": [c.number for c in chapters]})
             sys.stdout.flush()
             t.notice("Serving until Ctrl-C.")
             wait()

@@ -59,7 +59,9 @@ class Terminal:
         With `failed`, why the command fails nevertheless, which is in the document as "error" and
         raised after printing.
         """
-        whole = {**(content or {}), **keys, **(error_document(failed) if failed else {})}
+        whole = {**(content or {}), **keys}
+        if failed is not None:
+            whole |= error_document(failed, failed.exit_code)
         if self.json:
             print(json.dumps(plain(whole), allow_nan=False, indent=2), file=self.out, flush=True)
         if failed is not None:
@@ -73,19 +75,17 @@ def terminal(as_json: bool) -> Terminal:
     what a user's effect prints must not be in the document. Where both are a terminal they are one
     console, which prints above what is in progress, not into its line.
     """
-    progress, out = console(stderr=True), sys.stdout
+    progress, out = _console(sys.stderr), sys.stdout
     one = as_json or (progress.is_terminal and out.isatty())
-    people = progress if one else console(stderr=False)
+    people = progress if one else _console(out)
     if as_json:
         sys.stdout = sys.stderr
     return Terminal(as_json, people, progress, out)
 
 
-def console(*, stderr: bool) -> Console:
+def _console(stream: TextIO) -> Console:
     """Return a console; 100 columns where the stream is not a terminal."""
-    stream = sys.stderr if stderr else sys.stdout
-    width = None if stream.isatty() else WIDTH
-    return SafeConsole(file=stream, width=width)
+    return SafeConsole(file=stream, width=None if stream.isatty() else WIDTH)
 
 
 YES, NO = ("y", "yes"), ("n", "no", "q")

@@ -21,6 +21,7 @@ from hilcal.config.sections import (
     Point,
     Sight,
     Whole,
+    check_distinct,
 )
 from hilcal.errors import InputError
 from hilcal.toml import NonNegative, Positive, Vector3, check_json, load_section, suggest
@@ -148,10 +149,7 @@ class Tool(CellSection):
                 "target_m together with [[tool.targets]]; give the offset of each target in its "
                 "own section"
             )
-        names = [t.name for t in self.targets]
-        for name in names:
-            if names.count(name) > 1:
-                raise ValueError(f'two [[tool.targets]] have the name "{name}"; names must differ')
+        check_distinct("tool.targets", self.targets)
         return self
 
 
@@ -321,11 +319,8 @@ class CellConfig(CellSection):
 
     @model_validator(mode="after")
     def _distinct_names(self) -> "CellConfig":
-        for section, things in (("loads", self.loads), ("obstacles", self.obstacles)):
-            names = [thing.name for thing in things]
-            for name in names:
-                if names.count(name) > 1:
-                    raise ValueError(f'two [[{section}]] have the name "{name}"; names must differ')
+        check_distinct("loads", self.loads)
+        check_distinct("obstacles", self.obstacles)
         return self
 
     @model_validator(mode="after")
@@ -362,19 +357,10 @@ class CellConfig(CellSection):
 
     @classmethod
     def from_json(cls, text: str) -> "CellConfig":
-        """Read what `to_json` wrote.
-
-        Raises:
-            InputError: not JSON, unknown key, missing key or bad value.
-        """
+        """Read what `to_json` wrote; raises as `check_json` does."""
         return check_json(text, cls, "stored cell configuration")
 
 
 def load_config(path: Path) -> CellConfig:
-    """Read CELL.toml; paths in it are relative to its directory.
-
-    Raises:
-        InputError: unreadable file, syntax error (names the line), unknown key (lists the
-            valid ones of its section), missing key or bad value.
-    """
+    """Read CELL.toml, whose paths are relative to its directory; raises as `load_section` does."""
     return load_section(path, CellConfig)

@@ -1,6 +1,6 @@
 """Sections of CELL.toml: devices, motion, joints, loads, limits, observers, planning."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -25,6 +25,21 @@ class CellSection(Section):
         "$HOST": HOST,
         "$PORT": PORT,
     }
+
+
+def check_distinct(section: str, things: Sequence[Any]) -> None:
+    """Refuse two entries of a list of sections that have one name."""
+    names = [thing.name for thing in things]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f'two [[{section}]] have the name "{name}"; names must differ')
+
+
+def _check_box(section: Section, low: str, high: str) -> None:
+    """Refuse a corner that is not below the other one in x, y and z."""
+    a, b = getattr(section, low), getattr(section, high)
+    if a is not None and b is not None and not np.all(np.less(a, b)):
+        raise ValueError(f"{low} = {list(a)} is not below {high} = {list(b)}")
 
 
 class Motion(CellSection):
@@ -239,15 +254,7 @@ class Limits(CellSection):
 
     @model_validator(mode="after")
     def _box(self) -> "Limits":
-        low, high = self.workspace_min_m, self.workspace_max_m
-        if (
-            low is not None
-            and high is not None
-            and not all(a < b for a, b in zip(low, high, strict=True))
-        ):
-            raise ValueError(
-                f"workspace_min_m = {list(low)} is not below workspace_max_m = {list(high)}"
-            )
+        _check_box(self, "workspace_min_m", "workspace_max_m")
         return self
 
 
@@ -349,11 +356,9 @@ class Planning(CellSection):
         if (low is None) != (high is None):
             alone, other = ("work_min_m", "work_max_m")[:: 1 if high is None else -1]
             raise ValueError(f"{alone} alone; a box needs {other} too")
-        if low is not None and high is not None:
-            if self.work_q_rad:
-                raise ValueError("work_q_rad together with work_min_m; give one of them")
-            if not all(a < b for a, b in zip(low, high, strict=True)):
-                raise ValueError(f"work_min_m = {list(low)} is not below work_max_m = {list(high)}")
+        if low is not None and self.work_q_rad:
+            raise ValueError("work_q_rad together with work_min_m; give one of them")
+        _check_box(self, "work_min_m", "work_max_m")
         if len({len(q) for q in self.work_q_rad}) > 1:
             raise ValueError("work_q_rad has joint vectors of different lengths")
         return self

@@ -10,11 +10,9 @@ import scipy.linalg as sl
 from hilcal.design.criterion import (
     CandidateSet,
     Criterion,
-    Root,
     Smooth,
     best_first,
     prices,
-    square,
     upper_bound,
 )
 from hilcal.errors import CannotAnswerError, InputError
@@ -81,21 +79,17 @@ class BarrierProgram:
         for c, x, y in smooth.products:
             out -= c * _product(rows, x, y)
         for factor, v in smooth.squares:
-            if isinstance(factor, np.ndarray):
-                each = np.sum((flat @ v).reshape(n, size, -1) ** 2, axis=1)
-                out -= each @ factor @ each.T
-            else:
-                price = prices(rows, v)
-                out -= factor * np.outer(price, price)
+            each = np.sum((flat @ v).reshape(n, size, -1) ** 2, axis=1)
+            out -= each @ factor @ each.T
         return np.asarray(0.5 * (out + out.T))
 
 
-def _product(rows: Floats, x: Floats | Root, y: Floats | Root) -> Floats:
-    """Return (n, n) tr(X H_k Y H_l) of (n, R, P) rows, for semidefinite X and Y (P, P)."""
+def _product(rows: Floats, x: Floats, y: Floats) -> Floats:
+    """Return (n, n) tr(X H_k Y H_l) of (n, R, P) rows, for X and Y by their roots (P, r)."""
     n, size = rows.shape[:2]
     flat = rows.reshape(n * size, -1)
-    left = flat @ _root(x)
-    right = left if y is x else flat @ _root(y)
+    left = flat @ x
+    right = left if y is x else flat @ y
     if 2 * size * size <= min(left.shape[1], right.shape[1]):  # by the rows
         seen = left @ left.T
         seen *= seen if y is x else right @ right.T
@@ -113,20 +107,6 @@ def _product(rows: Floats, x: Floats | Root, y: Floats | Root) -> Floats:
 def _gram(t: Floats) -> Floats:
     upper = np.asarray(sl.blas.dsyrk(1.0, t.T, trans=1))
     return upper + np.triu(upper, 1).T
-
-
-def _root(x: Floats | Root) -> Floats:
-    """Return L (P, r) of a semidefinite X = L Lᵀ."""
-    if isinstance(x, Root):
-        return x.matrix
-    size = np.sqrt(np.diag(x))
-    there = np.flatnonzero(size > 0.0)
-    unit = x[np.ix_(there, there)] / np.outer(size[there], size[there])
-    values, vectors = np.linalg.eigh(unit)
-    kept = values > 1e-15 * float(values.max(initial=0.0))
-    root = np.zeros((len(x), int(kept.sum())))
-    root[there] = size[there, None] * vectors[:, kept] * np.sqrt(values[kept])
-    return root
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -318,7 +298,7 @@ def relax(
     if tolerance is None:
         tolerance = KINKED_TOLERANCE if criterion.kinked else TOLERANCE
     cap = np.inf if most is None else float(most)
-    prior = checked(units, budget, prior, most)
+    prior = given_prior(units, budget, prior)
     share = min(budget / float(units.cost.sum()), cap)
     spread = prior + units.information(np.full(len(units), share))
     criterion.require(spread, names)
@@ -359,24 +339,12 @@ def relax(
     return _pruned(whole, top[1], top[0].weight, best)
 
 
-def checked(units: CandidateSet, budget: float, prior: Floats | None, most: int | None) -> Floats:
-    """Return the prior information after a check of what a plan is made of."""
-    rows, cost = units.rows, units.cost
-    if rows.ndim != 3 or cost.shape != (len(rows),) or not len(rows) or not rows.shape[2]:
-        raise InputError(f"rows of shape {rows.shape} with costs of shape {cost.shape}")
-    if not np.isfinite(rows).all() or not np.isfinite(cost).all() or not np.all(cost > 0.0):
-        raise InputError("rows or costs of units are not finite, or a cost is not over 0")
-    if not np.isfinite(budget) or budget < float(cost.min()) * (1.0 - 1e-12):
-        raise InputError(f"a budget of {budget:g}; valid: at least {cost.min():g}, the least cost")
-    if most is not None and most < 1:
-        raise InputError(f"a unit at most {most} times; valid: 1 or more")
-    if prior is None:
-        return np.zeros((units.size, units.size))
-    prior = square(prior, "the prior information", units.size)
-    values = np.linalg.eigvalsh(prior)
-    if values[0] < -1e-9 * max(float(values[-1]), 0.0) or values[-1] < 0.0:
-        raise InputError("the prior information is not positive semidefinite")
-    return prior
+def given_prior(units: CandidateSet, budget: float, prior: Floats | None) -> Floats:
+    """Return the prior information (P, P); refuse a budget that no unit fits into."""
+    least = float(units.cost.min())
+    if budget < least * (1.0 - 1e-12):
+        raise InputError(f"a budget of {budget:g}; valid: at least {least:g}, the least cost")
+    return np.zeros((units.size, units.size)) if prior is None else 0.5 * (prior + prior.T)
 
 
 def _solved(

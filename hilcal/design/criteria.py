@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 
 import numpy as np
@@ -10,17 +10,14 @@ import numpy as np
 from hilcal.design.criterion import (
     CandidateSet,
     Criterion,
-    Root,
     Smooth,
     factors,
-    inverse,
+    inverse_factor,
     soft_least,
-    square,
 )
-from hilcal.errors import CannotAnswerError, InputError
+from hilcal.errors import CannotAnswerError
 from hilcal.regression.schur import (
     DETERMINED,
-    SchurComplement,
     differentiable_schur_complement,
     inverse_root,
     nuisance_inverse,
@@ -76,18 +73,18 @@ class D(SmoothCriterion):
         value, gradient = 0.0, np.zeros_like(m)
         products: list[tuple[float, Floats, Floats]] = []
         for c, at in self.blocks(len(m)):
-            found = inverse(m[np.ix_(at, at)])
+            found = inverse_factor(m[np.ix_(at, at)])
             if found is None:
                 return None
-            part = np.zeros_like(m)
-            part[np.ix_(at, at)] = found[0]
+            root = np.zeros((len(m), len(at)))
+            root[at] = found[0]
             value += c * found[1]
-            gradient += c * part
-            products.append((-c, part, part))
+            gradient += c * root @ root.T
+            products.append((-c, root, root))
         return Smooth(value, gradient, tuple(products), (), float(np.exp(value)) * gradient)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class MeanVariance(SmoothCriterion):
     """φ(M) = 1 / tr(C M⁻¹), the inverse of a mean variance: A- and I-optimality.
 
@@ -101,51 +98,47 @@ class MeanVariance(SmoothCriterion):
     name: str = "I"  # name by which a configuration calls it
     model: Floats | None = None  # (s, s) C_s of a model that comes first; None for none
 
-    def __post_init__(self) -> None:
-        """Refuse a matrix that is no mean of squares."""
-        c = square(self.c, "the matrix of the prediction poses")
-        scale = float(np.trace(c))
-        if not scale > 0.0 or np.linalg.eigvalsh(c)[0] < -1e-9 * scale:
-            raise InputError(
-                "the matrix of the prediction poses is not positive semidefinite, or zero"
-            )
-
-    @property
-    def parts(self) -> tuple[Floats, ...]:
-        """The matrices C (b, b) of M_bb⁻¹, b the first parameters."""
-        return (self.c,) if self.model is None else (self.c, self.model)
+    @cached_property
+    def roots(self) -> tuple[Floats, ...]:
+        """Roots (b, r) of the matrices C of M_bb⁻¹, b the first parameters."""
+        out = []
+        for c in (self.c,) if self.model is None else (self.c, self.model):
+            values, vectors = np.linalg.eigh(c)
+            kept = values > 1e-15 * values[-1]
+            out.append(vectors[:, kept] * np.sqrt(values[kept]))
+        return tuple(out)
 
     def value(self, m: Floats) -> Floats:
         """Return φ of (..., P, P) matrices; 0 where singular."""
         flat = m.reshape(-1, *m.shape[-2:])
         q, good = np.zeros(len(flat)), np.ones(len(flat), dtype=np.bool_)
-        for c in self.parts:
-            factor, regular = factors(flat[:, : len(c), : len(c)])
-            found = np.linalg.inv(factor)
-            q += np.einsum("nij,nij->n", found @ c, found)
+        for root in self.roots:
+            factor, regular = factors(flat[:, : len(root), : len(root)])
+            q += np.sum((np.linalg.inv(factor) @ root) ** 2, axis=(1, 2))
             good &= regular
         good &= q > 0.0
         return np.asarray(np.where(good, 1.0 / np.where(good, q, 1.0), 0.0).reshape(m.shape[:-2]))
 
     def __call__(self, m: Floats) -> Smooth | None:
         """Return f = −log q with gradient Σ M_bb⁻¹ C M_bb⁻¹ / q."""
-        found: list[tuple[Floats, Floats]] = []
+        pairs: list[tuple[Floats, Floats]] = []  # roots of M_bb⁻¹ C M_bb⁻¹ and of M_bb⁻¹
         q = 0.0
-        for c in self.parts:
+        for c in self.roots:
             b = len(c)
-            root = inverse(m[:b, :b])
-            if root is None:
+            found = inverse_factor(m[:b, :b])
+            if found is None:
                 return None
-            inverted, inner = np.zeros_like(m), np.zeros_like(m)
-            inverted[:b, :b] = root[0]
-            inner[:b, :b] = root[0] @ c @ root[0]
-            q += float(np.sum(c * root[0]))
-            found.append((inner, inverted))
+            half = found[0].T @ c
+            q += float(np.sum(half**2))
+            unused = ((0, len(m) - b), (0, 0))
+            pairs.append((np.pad(found[0] @ half, unused), np.pad(found[0], unused)))
         if not q > 0.0:
             return None
-        gradient = sum((inner for inner, _ in found), np.zeros_like(m)) / q
-        products = tuple((-2.0 / q, inner, inverted) for inner, inverted in found)
-        return Smooth(-float(np.log(q)), gradient, products, ((1.0, gradient),), gradient / q)
+        v = np.hstack([inner for inner, _ in pairs])
+        gradient = v @ v.T / q
+        products = tuple((-2.0 / q, inner, inverted) for inner, inverted in pairs)
+        squares = ((np.full((v.shape[1],) * 2, q**-2), v),)
+        return Smooth(-float(np.log(q)), gradient, products, squares, gradient / q)
 
 
 _FLOOR = 1e-14
@@ -174,7 +167,15 @@ class E(Criterion):
         scale = max(float(values[0]), _FLOOR * float(values[-1]))
 
         def smooth(m: Floats) -> Smooth | None:
-            part = _least(differentiable_schur_complement(m, self.interest), order * scale)
+            s = differentiable_schur_complement(m, self.interest)
+            values, vectors = np.linalg.eigh(s.matrix)
+            part = _smooth_least(values, s.lift @ vectors, order * scale)
+            if s.inverse is not None and self.interest is not None:
+                others = np.setdiff1d(np.arange(len(m)), self.interest)
+                root = np.zeros((len(m), len(others)))
+                root[others] = inverse_root(m[np.ix_(others, others)]).T
+                lifted = (-2.0, part.products[0][1], root)
+                part = replace(part, products=(*part.products, lifted))
             return part.scaled(1.0 / scale)
 
         return smooth
@@ -208,8 +209,8 @@ class K(Criterion):
 
         def smooth(m: Floats) -> Smooth | None:
             values, vectors = np.linalg.eigh(m)
-            least = _part(values, vectors, order * scale)
-            largest = _part(-values, vectors, order * most)  # F_max(M) = −F_min(−M)
+            least = _smooth_least(values, vectors, order * scale)
+            largest = _smooth_least(-values, vectors, order * most)  # F_max(M) = −F_min(−M)
             a, b = least.scaled(1.0 / scale), largest.scaled(ratio / scale)
             return Smooth(
                 a.value + b.value, a.gradient - b.gradient, a.products + b.products,
@@ -219,36 +220,18 @@ class K(Criterion):
         return smooth
 
 
-def _least(s: SchurComplement, width: float) -> Smooth:
-    """Return the smooth least eigenvalue of S as a function of M."""
-    part = _part(*np.linalg.eigh(s.matrix), width)
-    gradient = s.embed(part.gradient)
-    products = tuple((c, _embedded(s, x), _embedded(s, y)) for c, x, y in part.products)
-    if s.inverse is not None:
-        products = (*products, (-2.0, gradient, s.inverse))
-    squares = tuple((c, s.embed(v)) for c, v in part.squares)
-    return Smooth(part.value, gradient, products, squares, gradient)
+def _smooth_least(values: Floats, vectors: Floats, width: float) -> Smooth:
+    """Return the smooth least of eigenvalues (I,); their vectors (P, I) as M moves them.
 
+    With S = M − t 1, μ the width, the second derivative is
 
-def _embedded(s: SchurComplement, x: Floats | Root) -> Floats | Root:
-    return Root(s.lift @ x.matrix) if isinstance(x, Root) else s.embed(x)
-
-
-def _part(values: Floats, vectors: Floats, width: float) -> Smooth:
-    """Return the smooth least of the eigenvalues, with S = M − t 1.
-
-    Its second derivative is −μ tr(S⁻¹ H_k S⁻¹ H_l) + μ tr(S⁻² H_k) tr(S⁻² H_l) / tr(S⁻²).
+        −μ tr(S⁻¹ H_k S⁻¹ H_l) + μ tr(S⁻² H_k) tr(S⁻² H_l) / tr(S⁻²)
     """
     value, p = soft_least(values, width)
-    gradient = (vectors * p) @ vectors.T
-    inner = (vectors * p**2) @ vectors.T
-    return Smooth(
-        value,
-        gradient,
-        ((-1.0 / width, gradient, gradient),),
-        ((1.0 / (width * float(p @ p)), inner),),
-        gradient,
-    )
+    root = vectors * np.sqrt(p)
+    gradient = root @ root.T
+    squares = (np.outer(p**2, p**2) / (width * float(p @ p)), vectors)
+    return Smooth(value, gradient, ((-1.0 / width, root, root),), (squares,), gradient)
 
 
 _FELT = 1e-5  # weight from which a pair enters the curvature
@@ -262,16 +245,6 @@ class Pair:
     beta: Floats  # (E,) their values
     nuisance: Ints  # (F,) indices of the parameters of the model and of the rival effect
     name: str = "an effect from its rival"  # for messages where no candidate separates the two
-
-    def __post_init__(self) -> None:
-        """Refuse indices and values that do not belong together."""
-        if len(self.effect) != len(self.beta) or not np.any(self.beta):
-            raise InputError(
-                f"{self.name}: {len(self.beta)} values of {len(self.effect)} parameters; valid: "
-                "one of each, not all zero"
-            )
-        if len(np.intersect1d(self.effect, self.nuisance)):
-            raise InputError(f"{self.name}: a parameter is on both sides")
 
     def residual(self, m: Floats) -> Floats:
         """Return the parameters u (P,) of the residual after model and rival are fitted at M.
@@ -292,13 +265,8 @@ class Separate(Criterion):
     explain. Atkinson & Fedorov (1975), Biometrika 62(1), T-optimality, for linear rivals.
     """
 
-    pairs: tuple[Pair, ...]  # what is to be separated
+    pairs: tuple[Pair, ...]  # what is to be separated, one or more
     name = "separate"
-
-    def __post_init__(self) -> None:
-        """Refuse an empty list."""
-        if not self.pairs:
-            raise InputError("no pair of effects to separate")
 
     @cached_property
     def _common(self) -> Ints:
@@ -342,7 +310,7 @@ class Separate(Criterion):
             out[:, which] -= np.einsum("nfj,nfj->nj", explained, explained)
         return np.maximum(out, 0.0).reshape(*m.shape[:-2], len(self.pairs))
 
-    def _solved(self, m: Floats) -> tuple[Floats, Root, list[tuple[Ints, Root]]]:
+    def _solved(self, m: Floats) -> tuple[Floats, Floats, list[tuple[Ints, Floats]]]:
         """Return the residuals (N, P) of the pairs, and roots of the inverse of their nuisance.
 
         M_nn⁻ is that of the model, and by rival L S_ff⁻ Lᵀ more with L = (−M_mm⁻ M_mf, 1).
@@ -362,8 +330,8 @@ class Separate(Criterion):
             left, known = m[rival] @ lift, m[np.ix_(rival, rival)]
             root = lift @ _rival_root(left[None], known[None], np.arange(len(rival)))[0].T
             us[which] -= (us[which] @ m @ root) @ root.T
-            added.append((which, Root(root)))
-        return us, Root(own), added
+            added.append((which, root))
+        return us, own, added
 
     def value(self, m: Floats) -> Floats:
         """Return φ of (..., P, P) matrices."""
@@ -388,9 +356,9 @@ class Separate(Criterion):
         about = np.eye(int(felt.sum())) - p[felt] ** 2 / float(p[felt] @ p[felt])
         curved = -(about.T * p[felt] ** 2) @ about / (width * scale)
         weighted = us.T * np.sqrt(np.where(felt, p, 0.0))
-        products = [(-2.0 / scale, Root(weighted[:, felt]), own)]
+        products = [(-2.0 / scale, weighted[:, felt], own)]
         products += [
-            (-2.0 / scale, Root(weighted[:, which[felt[which]]]), root)
+            (-2.0 / scale, weighted[:, which[felt[which]]], root)
             for which, root in added
             if felt[which].any()
         ]

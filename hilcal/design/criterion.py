@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilcal.errors import CannotAnswerError, InputError
+from hilcal.errors import CannotAnswerError
 from hilcal.regression.schur import DETERMINED
 from hilcal.types import Bools, Floats, Ints
 
@@ -47,27 +47,19 @@ class CandidateSet:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Root:
-    """A semidefinite matrix L Lᵀ (P, P), where its root is known."""
-
-    matrix: Floats  # (P, r) L
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Smooth:
     """A smooth concave function f near a monotone function of the criterion φ, at one M.
 
-    With H_k = A_kᵀ A_k, the second derivative by the weights of units k and l is
+    With H_k = A_kᵀ A_k, the second derivative by the weights of units k and l is the sum of
 
-        Σ c · tr(X H_k Y H_l) over products (c, X, Y) + Σ c · tr(V H_k) tr(V H_l) over squares
+        c · tr(X H_k Y H_l) over products (c, L_x, L_y) with X = L_x L_xᵀ, Y = L_y L_yᵀ
+        Σ C_ab (v_aᵀ H_k v_a) (v_bᵀ H_l v_b) over squares (C, V), v_a the columns of V
     """
 
     value: float  # f(M)
     gradient: Floats  # (P, P) of f
-    products: tuple[tuple[float, Floats | Root, Floats | Root], ...]  # terms of its curvature
-    # terms of its curvature; (C, V) with matrices C (r, r) and V (P, r) of columns v_a stands for Σ
-    # C_ab tr(v_a v_aᵀ H_k) tr(v_b v_bᵀ H_l)
-    squares: tuple[tuple[float | Floats, Floats], ...]
+    products: tuple[tuple[float, Floats, Floats], ...]  # roots (P, r) and (P, s)
+    squares: tuple[tuple[Floats, Floats], ...]  # (r, r) and (P, r)
     above: Floats  # (P, P) Z such that φ(N) ≤ tr(Z N) for every information N ⪰ 0,
     below: Floats | None = None  # or with Y (P, P): φ(N) ≤ tr(Z N) / tr(Y N)
 
@@ -137,17 +129,16 @@ def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:6]) + more
 
 
-def inverse(m: Floats) -> tuple[Floats, float] | None:
-    """Return the inverse of M and log det M; None where M is not positive definite."""
+def inverse_factor(m: Floats) -> tuple[Floats, float] | None:
+    """Return R with M⁻¹ = R Rᵀ, and log det M; None where M is not positive definite."""
     try:
         factor = np.linalg.cholesky(m)
     except np.linalg.LinAlgError:
         return None
-    part = np.linalg.inv(factor)
-    found = part.T @ part
-    if not np.isfinite(found).all():
+    root = np.linalg.inv(factor).T
+    if not np.isfinite(root).all():
         return None
-    return found, float(2.0 * np.log(np.diag(factor)).sum())
+    return root, float(2.0 * np.log(np.diag(factor)).sum())
 
 
 def factors(m: Floats) -> tuple[Floats, Bools]:
@@ -189,17 +180,6 @@ def soft_least(values: Floats, width: float) -> tuple[float, Floats]:
     p = width / (gap + d)
     value = least - d - width * float(np.log(p).sum())
     return value, np.asarray(p / p.sum())
-
-
-def square(m: Floats, what: str, size: int | None = None) -> Floats:
-    """Return a finite symmetric (P, P) matrix."""
-    m = np.asarray(m, dtype=float)
-    p = m.shape[-1] if size is None and m.ndim else size
-    if m.shape != (p, p) or not np.isfinite(m).all():
-        raise InputError(f"{what} of shape {m.shape}; valid: a finite ({p}, {p}) matrix")
-    if not np.allclose(m, m.T, rtol=1e-8, atol=1e-12 * float(np.abs(m).max(initial=0.0))):
-        raise InputError(f"{what} is not symmetric")
-    return 0.5 * (m + m.T)
 
 
 def prices(rows: Floats, matrix: Floats) -> Floats:

@@ -8,11 +8,9 @@ both follows a noncentral χ² of non-centrality
 with as many degrees of freedom as S has visible directions (`regression.evidence`). S at the
 readings so far is the one that a diagnosis tests e with, with f in its model.
 
-Estimate of an effect that is not in the model, from the readings so far.
-
-The posterior of its parameters beside the fitted model, at the prior strength of most evidence:
-what adding the effect would estimate, to first order, and how uncertain it is. Evidence, mean and
-scale are those that a diagnosis scores the effect with; see `regression.evidence`.
+β of an effect that the readings so far support is drawn from its posterior beside the fitted
+model, at the prior strength of most evidence: what adding the effect would estimate, to first
+order. Evidence, mean and scale are those that a diagnosis scores the effect with.
 """
 
 from collections.abc import Sequence

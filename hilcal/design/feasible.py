@@ -20,22 +20,22 @@ PLANNED = Margins(joint=1e-6, inside=0.02, clear=0.02, itself=0.01, bear=0.98)  
 
 REASONS = {
     "joint limits": ("keep the joint limits", "[limits] joint_margin_rad"),
+    "payload": ("keep the payload", "[tool] mass_kg, [[loads]] mass_kg"),
     "workspace": ("keep workspace and floor", "[limits] workspace_min_m, workspace_max_m"),
+    "incidence": ("turn the target to the tracker", "[sight] incidence_max_rad, target_normal"),
+    "torque": ("keep the joint torques", "[limits] torque_share"),
+    "force sensor": ("keep the force sensor's range", "[force_sensor] max_force_N, max_moment_Nm"),
+    "singularity": ("are not singular", "[planning] singularity"),
     "self-collision": (
         "do not touch themselves",
         "[tool] target_m, load_point_m in flange axes, [robot] model",
     ),
     "obstacle": ("are clear of obstacles", "[[obstacles]]"),
-    "singularity": ("are not singular", "[planning] singularity"),
-    "torque": ("keep the joint torques", "[limits] torque_share"),
-    "payload": ("keep the payload", "[tool] mass_kg, [[loads]] mass_kg"),
-    "force sensor": ("keep the force sensor's range", "[force_sensor] max_force_N, max_moment_Nm"),
     "sight": ("leave the beam free", "[sight] clearance_m, [[obstacles]], the tracker's place"),
-    "incidence": ("turn the target to the tracker", "[sight] incidence_max_rad, target_normal"),
     "hanging": ("let what hangs or pulls hang free", "[[loads]] hang_m, radius_m, cable_m"),
 }
-"""Why a state may be left out, cheap and common reasons first: what the states that stay do, and
-what in the cell's configuration decides it."""
+"""Why a state may be left out, in the order of checking (cheap ones and those that leave little
+first): what the states that stay do, and what in the cell's configuration decides it."""
 
 
 class Space(Feasibility):
@@ -116,19 +116,6 @@ class Space(Feasibility):
 _CHUNK = 1 << 12
 _VAIN = 1 << 15  # drawn states after which nothing will come
 _MOST = 1 << 19, 64  # drawn at most: so many states, or so many per candidate
-_FUNNEL = (  # cheap ones and those that leave little first
-    "joint limits",
-    "payload",
-    "workspace",
-    "incidence",
-    "torque",
-    "force sensor",
-    "singularity",
-    "self-collision",
-    "obstacle",
-    "sight",
-    "hanging",
-)
 _OF_PAIRS = ("self-collision", "obstacle")
 _LOOK = 64  # states of which is told what touches
 _OF_LOADS = ("payload", "torque", "force sensor", "hanging", "sight")
@@ -163,7 +150,7 @@ def draw(
 
     sequence = qmc.Sobol(len(low), scramble=False)
     shift = rng.random(len(low))
-    left, lost = dict.fromkeys(_FUNNEL, 0), dict[str, Floats]()
+    left, lost = dict.fromkeys(REASONS, 0), dict[str, Floats]()
     found = [np.empty((0, len(low)))]
     drawn = have = 0
     most = max(_MOST[0], _MOST[1] * count) if most is None else most
@@ -191,7 +178,7 @@ def draw(
 
 def _kept(space: Space, q: Floats, left: dict[str, int], lost: dict[str, Floats]) -> Floats:
     """Return the states that are allowed unloaded; note what each reason leaves and takes."""
-    for reason in _FUNNEL:
+    for reason in REASONS:
         if len(q):
             keeps = space.keeps(reason, q, UNLOADED)
             if not keeps.all():

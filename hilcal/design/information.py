@@ -59,7 +59,7 @@ class Candidates:
         """Return the number of poses N."""
         return len(self.q)
 
-    def __getitem__(self, rows: slice) -> "Candidates":
+    def __getitem__(self, rows: slice | list[int]) -> "Candidates":
         """Return the chosen poses."""
         return Candidates(self.q[rows], self.loads, self.wrench, self.allowed[rows])
 
@@ -78,18 +78,6 @@ class ReadingDerivatives:
     rows: slice
     jacobian: Floats  # (N, 1 + L, m, P) by the parameters; m of all that one arrival reads
     covariance: Floats  # (N, 1 + L, m, m) of them
-
-
-def candidates(
-    nominal: NominalModel, config: CellConfig, q: Floats, allowed: Bools | None = None
-) -> Candidates:
-    """Return the states of poses (N, n) under the loads of a cell; all are allowed by default."""
-    gravity = nominal.cell.gravity
-    names = (UNLOADED, *(load.name for load in config.loads))
-    wrench = np.array([np.zeros(6), *(load.wrench(gravity) for load in config.loads)])
-    if allowed is None:
-        allowed = np.ones((len(q), len(names)), dtype=np.bool_)
-    return Candidates(np.asarray(q, dtype=float), names, wrench, allowed)
 
 
 def reading_derivatives(
@@ -291,6 +279,8 @@ def problem(
 ) -> DesignProblem:
     """Return the design problem of candidate poses (N, n), rad, under the loads of a cell.
 
+    `allowed` (N, 1 + L) are the states that may be taken; all where None.
+
     A unit of absolute positions is one reading. A unit of deflections is a pose with its unloaded
     reading and some loads: each by itself, all that the pose bears, and pairs where there are few
     loads. It costs as many readings as it takes, the unloaded one included.
@@ -300,24 +290,29 @@ def problem(
         raise InputError(
             '[planning] readings = "deflection" needs [[loads]]; give one, or readings = "absolute"'
         )
-    of = candidates(nominal, config, q, allowed)
+    loads = (UNLOADED, *(load.name for load in config.loads))
+    pulls = (load.wrench(nominal.cell.gravity) for load in config.loads)
+    if allowed is None:
+        allowed = np.ones((len(q), len(loads)), dtype=np.bool_)
+    of = Candidates(np.asarray(q, dtype=float), loads, np.array([np.zeros(6), *pulls]), allowed)
     against = potential(nominal, config, of) if len(of) else Potential((), (), ())
     terms = _terms(nominal, against)
     scale = np.array([t.scale for t in terms])
-    layout = _layout(of, mode, nominal.elements, len(terms))
-    rows = np.zeros((len(layout.what), layout.height, len(terms)))
+    what, height, layout_notes = _layout(of, mode, nominal.elements, len(terms))
+    rows = np.zeros((len(what), height, len(terms)))
     parts = reading_derivatives(nominal, config, of, against.effects, scale)
-    for place, block in unit_rows(parts, of.loads, layout.what, mode):
+    for place, block in unit_rows(parts, of.loads, what, mode):
         rows[place, : block.shape[1]] = block
     measured = information_of(nominal, against.effects, scale)
     count = len(nominal.live)
     precision = np.ones(len(terms))
     precision[:count] = (scale[:count] / nominal.prior_std[nominal.live]) ** 2
+    cost = np.array([float(len(readings_of(unit, mode))) for unit in what])
     return DesignProblem(
-        nominal=nominal, mode=mode, candidates=of, units=CandidateSet(rows, layout.cost),
-        what=layout.what, terms=terms, families=against.effects,
+        nominal=nominal, mode=mode, candidates=of, units=CandidateSet(rows, cost),
+        what=what, terms=terms, families=against.effects,
         prior=measured + np.diag(precision), measured=measured,
-        notes=(*nominal.notes, *against.notes, *layout.notes),
+        notes=(*nominal.notes, *against.notes, *layout_notes),
     )  # fmt: skip
 
 
@@ -335,18 +330,13 @@ def _terms(nominal: NominalModel, against: Potential) -> tuple[DesignTerm, ...]:
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Layout:
-    """The units pose by pose; `height` is that of the one with most rows."""
+def _layout(
+    of: Candidates, mode: Mode, m: int, size: int
+) -> tuple[tuple[tuple[int, tuple[str, ...]], ...], int, tuple[str, ...]]:
+    """Return pose and loads of each unit, the most rows that one has, and notes.
 
-    height: int
-    what: tuple[tuple[int, tuple[str, ...]], ...]
-    cost: Floats
-    notes: tuple[str, ...]
-
-
-def _layout(of: Candidates, mode: Mode, m: int, size: int) -> _Layout:
-    """Decide on the units; fewer kinds of them where memory would not do."""
+    Loads are combined in fewer ways where memory would not do.
+    """
     patterns, pattern = np.unique(of.allowed, axis=0, return_inverse=True)
     pattern = pattern.reshape(-1)
     tally = np.bincount(pattern, minlength=len(patterns))
@@ -376,9 +366,7 @@ def _layout(of: Candidates, mode: Mode, m: int, size: int) -> _Layout:
     what = tuple(
         (pose, tuple(of.loads[k] for k in s)) for pose, some in enumerate(of_pose) for s in some
     )
-    unloaded = 1.0 if mode == "deflection" else 0.0
-    cost = np.array([len(loads) + unloaded for _, loads in what])
-    return _Layout(height, what, cost, notes)
+    return what, height, notes
 
 
 def _subsets(allowed: Ints, mode: Mode, kinds: set[str]) -> Iterator[tuple[int, ...]]:

@@ -18,16 +18,15 @@ by the same coordinates. Source: Chaloner and Verdinelli, *Bayesian experimental
 Statistical Science 10 (1995) 273-304.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from hilcal.config import CellConfig
-from hilcal.design.criterion import CandidateSet, inverse
+from hilcal.design.criterion import CandidateSet, inverse_factor
 from hilcal.design.information import (
-    Candidates,
     DesignProblem,
     information_of,
     reading_derivatives,
@@ -64,11 +63,18 @@ def mixed_design(of: DesignProblem, config: CellConfig, work: PredictionPoses) -
     own = np.where(np.isinf(prior_std), of.scale[: len(prior_std)], prior_std)
     scale = np.concatenate([own, std])
     known = information_of(nominal, more, scale) + np.diag(~flat)
-    every = _AllColumns(of, config, more, scale)
-    coordinates = _coordinates(known, flat, every)
+
+    def whole_rows(step: int = 1) -> Iterator[tuple[Ints, Floats]]:
+        """Rows of the units of every `step`-th pose, with the columns of all effects."""
+        some = of.candidates[slice(None, None, step)]
+        parts = reading_derivatives(nominal, config, some, more, scale)
+        return unit_rows(parts, of.candidates.loads, of.what, of.mode, step)
+
+    sample = whole_rows(max(1, len(of.candidates) // SAMPLE))
+    coordinates = _coordinates(known, flat, sample)
     count = int(flat.sum()) + coordinates.random.shape[1]
     rows = np.zeros((*of.units.rows.shape[:2], count))
-    for place, some in every.rows(of.candidates):
+    for place, some in whole_rows():
         rows[place, : some.shape[1]] = coordinates.whitened(some)
     v = coordinates.columns(position_derivative(nominal, work, more, scale)).reshape(-1, count)
     prior = np.eye(count)
@@ -90,10 +96,10 @@ def balanced(of: MixedDesign) -> MixedDesign:
     size = np.sqrt(np.diag(every))
     if not np.all(size > 0):
         return of
-    found = inverse(every / np.outer(size, size))
+    found = inverse_factor(every / np.outer(size, size))
     if found is None:
         return of
-    turn = np.linalg.cholesky(found[0]) / size[:, None]
+    turn = np.linalg.cholesky(found[0] @ found[0].T) / size[:, None]
     rows = units.rows @ turn
     names = tuple(f"direction {k}" for k in range(1, len(size) + 1))
     prior, c = (0.5 * (m + m.T) for m in (turn.T @ m @ turn for m in (of.prior, of.c)))
@@ -135,21 +141,6 @@ def _with_scatter(nominal: NominalModel, config: CellConfig) -> CellConfig:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _AllColumns:
-    """The units of a problem with the columns of all effects."""
-
-    of: DesignProblem
-    config: CellConfig
-    more: tuple[Effect, ...]
-    scale: Floats
-
-    def rows(self, candidates: Candidates, step: int = 1) -> Iterator[tuple[Ints, Floats]]:
-        of, some = self.of, candidates[slice(None, None, step)]
-        parts = reading_derivatives(of.nominal, self.config, some, self.more, self.scale)
-        yield from unit_rows(parts, of.candidates.loads, of.what, of.mode, step)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class _Coordinates:
     """The change of coordinates."""
 
@@ -170,7 +161,7 @@ class _Coordinates:
         return np.asarray(np.linalg.solve(low, np.concatenate([rows @ self.flat, kept], axis=-1)))
 
 
-def _coordinates(known: Floats, flat: Bools, every: _AllColumns) -> _Coordinates:
+def _coordinates(known: Floats, flat: Bools, sample: Iterable[tuple[Ints, Floats]]) -> _Coordinates:
     """Complete the square, and find the directions that move the units most."""
     size, free = len(known), np.flatnonzero(flat)
     held = np.flatnonzero(~flat)
@@ -183,8 +174,7 @@ def _coordinates(known: Floats, flat: Bools, every: _AllColumns) -> _Coordinates
     root = np.zeros((size, len(held)))
     root[held] = solve_triangular(factor[0], np.eye(len(held)), lower=True).T
     gram, elements = np.zeros((len(held), len(held))), 0
-    candidates = every.of.candidates
-    for _, rows in every.rows(candidates, max(1, len(candidates) // SAMPLE)):
+    for _, rows in sample:
         moved = rows @ root
         gram += np.einsum("kri,krj->ij", moved, moved, optimize=True)
         elements += moved.shape[0] * moved.shape[1]

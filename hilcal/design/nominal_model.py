@@ -204,7 +204,7 @@ def planned_effects(config: CellConfig, catalogue: Catalogue) -> dict[str, dict[
         raise InputError(f"[planning] model: {error}") from None
 
 
-def checked(names: tuple[str, ...], key: str, catalogue: Catalogue) -> tuple[str, ...]:
+def known_effects(names: tuple[str, ...], key: str, catalogue: Catalogue) -> tuple[str, ...]:
     """Return the names of effects, each once."""
     for name in names:
         try:
@@ -224,7 +224,7 @@ def check_effects(cell: Cell, config: CellConfig, catalogue: Catalogue) -> None:
         raise InputError(words if known else f"[planning] model: {words}") from None
     potential_names(config, model)
     for section in ("plausible", "ordinary"):
-        checked(tuple(getattr(config, section)), f"[{section}]", catalogue)
+        known_effects(tuple(getattr(config, section)), f"[{section}]", catalogue)
 
 
 def potential_names(config: CellConfig, model: Model) -> tuple[str, ...]:
@@ -241,7 +241,7 @@ def potential_names(config: CellConfig, model: Model) -> tuple[str, ...]:
             if kind.applies(model.cell) and not kind.needs and kind.role != "observer"
         )
     else:
-        names = checked(asked, "[planning] against", model.catalogue)
+        names = known_effects(asked, "[planning] against", model.catalogue)
     return tuple(name for name in names if name not in model.names)
 
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as sl
 
-from hilcal.design.approximate_design import KINKED_TOLERANCE, ApproximateDesign, checked, relax
+from hilcal.design.approximate_design import KINKED_TOLERANCE, ApproximateDesign, given_prior, relax
 from hilcal.design.criterion import CandidateSet, Criterion, best_first
 from hilcal.errors import CannotAnswerError
 from hilcal.types import Floats, Ints
@@ -41,7 +41,6 @@ def best(
     *,
     most: int | None = None,  # how often a unit may be taken; any number of times by default
     names: Sequence[str] | None = None,
-    tolerance: float | None = None,  # relative gap of the continuous optimum
     effort: int | None = None,  # units put into a plan before the search ends; by default `EFFORT`
     relaxed: ApproximateDesign | None = None,  # the continuous optimum, where it is known
 ) -> Design:
@@ -53,13 +52,12 @@ def best(
     ones are taken out at once, and what is a little worse is gone on from for a while.
     """
     rng = np.random.default_rng(0) if rng is None else rng
-    if tolerance is None:
-        tolerance = KINKED_TOLERANCE if criterion.kinked else TOLERANCE
+    tolerance = KINKED_TOLERANCE if criterion.kinked else TOLERANCE
     if relaxed is None or relaxed.gap > tolerance:
         relaxed = relax(
             units, criterion, budget, prior, most=most, names=names, tolerance=tolerance
         )
-    known = checked(units, budget, prior, most)
+    known = given_prior(units, budget, prior)
     felt = criterion.relevant(units, known, budget)
     search = _Search(units, felt, budget, known, relaxed, most)
     usual, enough = (KINKED_EFFORT, KINKED_ENOUGH) if felt.kinked else (EFFORT, ENOUGH)

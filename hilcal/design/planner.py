@@ -59,28 +59,18 @@ class UndeterminedParameter:
     @property
     def remark(self) -> str:
         """What is not determined, why, and what would determine it, in a sentence or two."""
+        why, remedy = "no reading in this cell changes with it", ""
         if self.confounded:
-            return (
-                f"{self.name}: not determined; no reading in this cell separates it from "
-                f"{', '.join(self.confounded)}. The plan goes on without it"
-            )
-        if self.joint and self.unit == "m/N":
-            return (
-                f"{self.name}: not determined; no load of this cell makes a force along the travel "
-                f"of {self.joint}. The plan goes on without it: {self.joint} needs a pull along "
-                "it, [[loads]] with force_N, e.g. [80.0, 0.0, 0.0]"
-            )
-        if self.joint:
+            why = f"no reading in this cell separates it from {', '.join(self.confounded)}"
+        elif self.joint:
+            slides = self.unit == "m/N"
+            what = "force along the travel of" if slides else "torque about"
             needs = "need" if self.joint.startswith("joints") else "needs"
-            return (
-                f"{self.name}: not determined; no load of this cell makes a torque about "
-                f"{self.joint}. The plan goes on without it: {self.joint} {needs} a side pull, "
-                "[[loads]] with force_N across the axis, e.g. [80.0, 0.0, 0.0]"
-            )
-        return (
-            f"{self.name}: not determined; no reading in this cell changes with it. The plan goes "
-            "on without it"
-        )
+            pull, across = ("pull along it", "") if slides else ("side pull", " across the axis")
+            why = f"no load of this cell makes a {what} {self.joint}"
+            remedy = f": {self.joint} {needs} a {pull}, [[loads]] with force_N{across}, e.g. "
+            remedy += "[80.0, 0.0, 0.0]"
+        return f"{self.name}: not determined; {why}. The plan goes on without it{remedy}"
 
 
 def without_undetermined(

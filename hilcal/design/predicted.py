@@ -33,11 +33,6 @@ class PredictionPoses:
     derivative: Floats  # (T, 3, L) V, by the model's live parameters in their scales, m
     what: str  # in words, e.g. "deflection under 5kg at 100 poses".
 
-    def std(self, covariance: Floats) -> Floats:
-        """Return (T,) standard deviations of the position, sqrt(tr(V Cov Vᵀ)), m; Cov (L, L)."""
-        variance = np.einsum("tip,pq,tiq->t", self.derivative, covariance, self.derivative)
-        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
-
 
 def prediction_poses(
     nominal: NominalModel,
@@ -150,7 +145,6 @@ class PredictedUncertainty:
     units: tuple[str, ...]
     values: Floats  # at which they are assumed, SI
     std: Floats  # with the model complete, SI; infinite where not identifiable
-    std_open: Floats  # with the potential terms, SI
     position: float | None  # with the model complete, RMS where the robot works, m
     position_open: float | None  # the same with the potential terms
     positions: Floats  # (T,) per such pose, with the model complete
@@ -186,7 +180,6 @@ def predicted(
         units=tuple(t.unit for t in terms),
         values=np.array([t.value for t in terms]),
         std=_stated(closed, null, prior) * scale[:size],
-        std_open=_stated(opened, null_open, prior) * scale[:size],
         position=None if work is None else rms(positions),
         position_open=None if work is None else rms(positions_of(work, opened, null_open)),
         positions=positions,
@@ -217,11 +210,12 @@ def covariance(information: Floats, flat: Bools) -> tuple[Floats, Floats]:
 
 
 def positions_of(work: PredictionPoses, covariance: Floats, null: Floats) -> Floats:
-    """Return (T,) standard deviations of positions, m, by a covariance (L, L).
+    """Return (T,) standard deviations of positions, sqrt(tr(V Cov Vᵀ)), m; Cov (L, L).
 
     Infinite where a direction of `null` (L, U) moves one by a tenth of it at an ordinary magnitude.
     """
-    std = work.std(covariance)
+    variance = np.einsum("tip,pq,tiq->t", work.derivative, covariance, work.derivative)
+    std = np.sqrt(np.maximum(variance, 0.0))
     unseen = np.linalg.norm(work.derivative @ null, axis=(1, 2))
     return np.where(unseen <= NULL_SHARE * std, std, np.inf)
 

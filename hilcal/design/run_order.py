@@ -4,7 +4,7 @@ The poses under one load are a block of loops from the reference, along straight
 clear; the blocks follow each other in random order.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import pairwise, permutations
 from typing import Literal
@@ -15,7 +15,7 @@ from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.design import tour
 from hilcal.design.tour import NEVER
-from hilcal.errors import CannotAnswerError, InputError
+from hilcal.errors import CannotAnswerError
 from hilcal.measuring.route import duration, route, seconds_at_rest
 from hilcal.robot.arm import Arm
 from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step
@@ -101,14 +101,10 @@ class Confounding:
     bias_m: float  # mean error, m
     drift_std: float | None  # of a rate estimated by the reference poses, m/s
 
-    @property
-    def returned_m(self) -> float | None:
-        """Rms error of a deflection, m, after a correction by the drift at the reference."""
-        return None if self.drift_std is None else self.drift_std * self.lag_rms_s
-
     def about(self) -> dict[str, object]:
         """Return it for a plan's file."""
-        left, rate = self.returned_m, self.drift_std
+        rate = self.drift_std
+        left = None if rate is None else rate * self.lag_rms_s
         return {
             "deflections": self.deflections, "correlation": round(self.correlation, 4),
             "correlated_with": self.regressor, "lag_mean_s": round(self.lag_mean_s, 1),
@@ -303,7 +299,6 @@ def order_plan(
       it stays random towards everything that is no regressor, such as temperatures.
     """
     how = how or Ordering()
-    _check(config, names, chosen, how)
     used = [name for name in names if any(c.pose == name for c in chosen)]
     at = np.array([names.index(name) for name in used])
     draws = OrderDraws(cell, config, tuple(used), np.vstack([reference, q[at]]), how, rng)
@@ -335,26 +330,6 @@ def order_plan(
     }
     made = Plan(plan.pose_names, plan.q, plan.steps, about)
     return Ordered(made, time, plain_time, loss, plain_loss)
-
-
-def _check(
-    config: CellConfig, names: Sequence[str], chosen: Sequence[Chosen], how: Ordering
-) -> None:
-    if not chosen:
-        raise InputError("no reading is chosen; a plan needs at least one")
-    if how.slack < 0 or how.reference_every_s <= 0 or how.repeats < 0:
-        raise InputError(
-            f"slack {how.slack:g}, a reference every {how.reference_every_s:g} s, {how.repeats} "
-            "repeats; valid: 0 or more, over 0, 0 or more"
-        )
-    known = {UNLOADED, *(load.name for load in config.loads)}
-    for c in chosen:
-        if c.pose not in names or c.pose == REFERENCE:
-            raise InputError(f"there is no pose {c.pose!r} to measure")
-        if not c.loads or not set(c.loads) <= known or len(set(c.loads)) < len(c.loads):
-            raise InputError(f"pose {c.pose!r}: loads {c.loads}; valid: {', '.join(sorted(known))}")
-        if c.count < 1:
-            raise InputError(f"pose {c.pose!r}: count {c.count}; valid: 1 or more")
 
 
 def stops_of(
@@ -453,7 +428,7 @@ class OrderDraws:
                 continue
             first = set(self.rng.permutation(short)[: (len(short) + 1) // 2].tolist())
             parts = [
-                self._part(seconds, [k for k in short if (k in first) == own])
+                tour.improved(seconds, [k for k in short if (k in first) == own])
                 for own in (True, False)
             ]
             now = [tour.length(seconds, part) for part in parts]
@@ -464,18 +439,10 @@ class OrderDraws:
             orders[load] = [k for part in parts for k in self._walk(seconds, part, spare / 2)]
         return self._plan(orders, half=half, mixed=True)
 
-    def _part(self, seconds: Floats, part: list[int]) -> list[int]:
-        at = [0, *part]
-        return [at[k] for k in tour.improved(seconds[np.ix_(at, at)], range(1, len(at)))]
-
     def _walk(self, seconds: Floats, order: Sequence[int], spare: float) -> list[int]:
         """Return a random tour of some stops, at most so many seconds longer than this one."""
         budget = tour.length(seconds, order) + max(spare, 0.0)
-        at = [0, *order]
-        grid = seconds[np.ix_(at, at)]
-        moves = _MOVES * len(order)
-        walked = tour.shaken(grid, range(1, len(at)), budget, self.rng, moves)
-        return [at[k] for k in walked]
+        return tour.shaken(seconds, order, budget, self.rng, _MOVES * len(order))
 
     def _block(self, load: str, order: Sequence[int], mixed: bool) -> LoadBlock:
         """Cut an order into loops; mixed ones come in random order and direction."""
@@ -506,11 +473,11 @@ class OrderDraws:
         return time, confounding(plan, times, self.wrenches, how.drift, how.reading_std)
 
 
-def ways(q: Floats, load: str, passable: Passable, pace: Pace, near: int = NEAR) -> Ways:
+def ways(q: Floats, load: str, passable: Passable, pace: Pace) -> Ways:
     """Return the ways between poses (P + 1, n) under a load, the reference first."""
     legs = pace.legs(q, q)
     count = len(q)
-    close = np.argsort(legs, axis=1, kind="stable")[:, : near + 1]
+    close = np.argsort(legs, axis=1, kind="stable")[:, : NEAR + 1]
     tested = np.zeros((count, count), dtype=np.bool_)
     tested[np.arange(count)[:, None], close] = True
     tested |= tested.T
@@ -571,22 +538,21 @@ def assembled(
     passes = max([len(block.loops) + 1 for block in loaded], default=0)
     natural = 1 + len(free) + (1 if loaded else 0)
     returns = max(passes, natural)
+    steps: list[Step] = []
+
+    def read(block: LoadBlock, cycles: Iterator[int]) -> None:
+        for loop in block.loops:
+            steps.extend(Step(names[s.pose - 1], block.load, s.cycle) for s in loop)
+            steps.append(Step(REFERENCE, block.load, next(cycles)))
+
     at = iter(range(returns))
-    steps = [Step(REFERENCE, UNLOADED, next(at))]
-    for loop in before.loops:
-        steps += [Step(names[s.pose - 1], UNLOADED, s.cycle) for s in loop]
-        steps.append(Step(REFERENCE, UNLOADED, next(at)))
+    steps.append(Step(REFERENCE, UNLOADED, next(at)))
+    read(before, at)
     for block in loaded:
         share = np.round(np.linspace(0, returns - 1, len(block.loops) + 1)).astype(int).tolist()
-        cycles = iter(share)
-        steps.append(Step(REFERENCE, block.load, next(cycles)))
-        for loop in block.loops:
-            steps += [Step(names[s.pose - 1], block.load, s.cycle) for s in loop]
-            steps.append(Step(REFERENCE, block.load, next(cycles)))
+        steps.append(Step(REFERENCE, block.load, share[0]))
+        read(block, iter(share[1:]))
     if loaded:
         steps.append(Step(REFERENCE, UNLOADED, next(at)))
-    for loop in after.loops:
-        steps += [Step(names[s.pose - 1], UNLOADED, s.cycle) for s in loop]
-        steps.append(Step(REFERENCE, UNLOADED, next(at)))
-    steps += [Step(REFERENCE, UNLOADED, k) for k in at]
-    return tuple(steps)
+    read(after, at)
+    return (*steps, *(Step(REFERENCE, UNLOADED, k) for k in at))

@@ -356,13 +356,7 @@ def detectable_effects(planned: Planned, config: CellConfig) -> Iterator[Detecta
     information = of.measured + of.units.information(planned.counts[taken], taken)
     model = of.prior[:size, :size] - of.measured[:size, :size]
     information[:size, :size] += model
-    poses = sorted({of.what[k][0] for k in taken})
-    chosen = type(of.candidates)(
-        of.candidates.q[poses],
-        of.candidates.loads,
-        of.candidates.wrench,
-        of.candidates.allowed[poses],
-    )
+    chosen = of.candidates[sorted({of.what[k][0] for k in taken})]
     moves = [
         part.jacobian[:, 1:] - part.jacobian[:, :1] if of.mode == "deflection" else part.jacobian
         for part in reading_derivatives(of.nominal, config, chosen, of.families, of.scale)

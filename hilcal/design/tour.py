@@ -14,6 +14,7 @@ from hilcal.types import Floats
 NEVER = 1e7  # Seconds of a way that does not exist: more than any campaign, so that sums stay exact
 _EXACT = 7  # stops up to which every order is tried
 _LONGEST = 3  # stops of a segment that is moved as one
+_KICKS = 20  # double bridges
 _GAIN = 1e-9  # s, below which a change is rounding
 
 
@@ -23,7 +24,7 @@ def length(seconds: Floats, order: Sequence[int]) -> float:
     return float(seconds[way[:-1], way[1:]].sum())
 
 
-def shortest(seconds: Floats, rng: np.random.Generator, kicks: int = 20) -> list[int]:
+def shortest(seconds: Floats, rng: np.random.Generator) -> list[int]:
     """Return an order of stops 1 to m whose tour is short; the shortest up to 7 stops.
 
     Nearest insertion, then 2-opt and Or-opt exchanges until none helps, then the same again after
@@ -34,7 +35,7 @@ def shortest(seconds: Floats, rng: np.random.Generator, kicks: int = 20) -> list
         return _by_trial(seconds)
     best = improved(seconds, _inserted(seconds))
     least = length(seconds, best)
-    for _ in range(kicks):
+    for _ in range(_KICKS):
         a, b, c = sorted(int(k) for k in rng.choice(np.arange(1, count), 3, replace=False))
         order = improved(seconds, best[:a] + best[b:c] + best[a:b] + best[c:])
         if (here := length(seconds, order)) < least - _GAIN:

@@ -10,7 +10,7 @@ from itertools import groupby
 
 import numpy as np
 
-from hilcal.diagnosis.effect_ranking import SAME_EVIDENCE, Later, Suspect
+from hilcal.diagnosis.effect_ranking import SAME_EVIDENCE, Suspect
 from hilcal.diagnosis.minimum_detectable_effect import Strength
 from hilcal.identification.background import UNSURE
 from hilcal.identification.fit import Fit, all_left_out
@@ -155,8 +155,8 @@ def as_suspects(found: tuple[BackgroundEffect, ...]) -> Iterator[Suspect]:
             effect=b.effect,
             score=score,
             share=b.share,
-            left_out=Later(lambda: HeldOut(0.0, False)),
+            left_out=lambda: HeldOut(0.0, False),
             explains=False,
-            detection=Later(lambda: Strength(np.inf, ())),
+            detection=lambda: Strength(np.inf, ()),
             same_as=tuple(n for n in likely if n != b.effect) if b.effect in likely else (),
         )

@@ -259,15 +259,13 @@ _Step = tuple[Candidate, float, float, tuple[Candidate, ...]]
 """A change: candidate, p-value, log evidence, and what cannot be told from it."""
 
 
-def find_changes(at: Setting, say: Callable[[str], None] = lambda text: None) -> Changes:
+def find_changes(
+    at: Setting,  # later readings, none of which was fitted, beside the earlier fit
+    say: Callable[[str], None] = lambda text: None,  # takes progress, one line each
+) -> Changes:
     """Find what has changed between an earlier fit and later readings of the same arm.
 
-    Args:
-        at: later readings, none of which was fitted, beside the earlier fit.
-        say: takes progress, one line each.
-
-    Raises:
-        CannotAnswerError: too few readings, or no static equilibrium.
+    Too few readings, or no static equilibrium, raise CannotAnswerError.
     """
     earlier = at.earlier
     before = remeasure(at)

@@ -20,7 +20,7 @@ from hilcal.diagnosis.effect_ranking import SAME_EVIDENCE
 from hilcal.diagnosis.stepwise import add
 from hilcal.errors import HilcalError
 from hilcal.identification.arm_scatter import estimate_arm_scatter, with_arm_scatter
-from hilcal.identification.effect_columns import effect_columns
+from hilcal.identification.effect_columns import columns_of_each
 from hilcal.identification.fit import Fit
 from hilcal.identification.fit import fit as solve
 from hilcal.identification.later_readings import Setting, beside_frames, frames_alone, remeasure
@@ -138,10 +138,9 @@ class Comparison(Shown):
 def completed(
     fit: Fit, names: Collection[str], say: Callable[[str], None] = lambda text: None
 ) -> tuple[Fit, tuple[str, ...]]:
-    """Return a gc-scaled fit with what its own readings ask for and its scatter; what was added.
+    """Return a gc-scaled fit with those of some effects that its readings ask for, and these.
 
-    Args:
-        names: effects that may be added.
+    Its scatter is estimated, too, where it is more than the stated noise.
     """
     added: list[str] = []
     while len(added) < MOST and (wanted := _most_wanted(fit, names)) is not None:
@@ -164,20 +163,20 @@ def completed(
 def _most_wanted(fit: Fit, names: Collection[str]) -> str | None:
     """Return the effect with most evidence that is not in the model; None where none has any."""
     p, states, model = linearise(fit), fit.readings[~fit.outlier].states, fit.model
-    found: dict[str, tuple[float, float]] = {}
-    for kind in model.catalogue.effects:
-        possible = kind.name in names and kind.name not in model.names
-        if possible and kind.computable(states) and kind.applies(model.cell):
-            effect = model.catalogue.make(kind.name, model.cell, states, m=fit.whitening.m)
-            score = p.score(effect_columns(fit, effect.for_scoring(states)).white)
-            if score.rank:
-                found[kind.name] = score.log_evidence, score.p_value
+    possible = (k for k in model.catalogue.effects if k.name in names and k.name not in model.names)
+    effects = [
+        model.catalogue.make(kind.name, model.cell, states, m=fit.whitening.m).for_scoring(states)
+        for kind in possible
+        if kind.computable(states) and kind.applies(model.cell)
+    ]
+    scores = {of.effect.name: p.score(of.white) for of in columns_of_each(fit, effects)}
+    tested = {name: score for name, score in scores.items() if score.rank}
     sure = {
-        name: evidence
-        for name, (evidence, p_value) in found.items()
-        if evidence > SAME_EVIDENCE and p_value * len(found) < LEVEL
+        name: score.log_evidence
+        for name, score in tested.items()
+        if score.log_evidence > SAME_EVIDENCE and score.p_value * len(tested) < LEVEL
     }
-    return max(sure, key=lambda name: sure[name]) if sure else None
+    return max(sure, key=lambda name: sure[name], default=None)
 
 
 def error_today(at: Setting, changes: Changes, drawing: float | None) -> Today:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilcal.diagnosis.recorded import recorded
+from hilcal.diagnosis.recorded import state_variables
 from hilcal.identification.fit import Fit
 from hilcal.identification.linearisation import linearise
 from hilcal.types import Bools, Floats
@@ -46,29 +46,29 @@ class Difference:
 
 def recorded_values(fit: Fit) -> tuple[Recorded, ...]:
     """Return what was recorded of the readings of a fit and varies, and where the target was."""
-    used = ~fit.outlier
-    out: dict[str, Recorded] = {}
-
-    def put(name: str, unit: str, values: Floats, labels: tuple[str, ...] = ()) -> None:
+    used, readings = ~fit.outlier, fit.readings[~fit.outlier]
+    at = fit.solution.prediction.observation.base_position
+    varying = [(v.name, v.unit, v.values) for v in state_variables(linearise(fit))]
+    loads = np.unique(readings.load)
+    names = tuple(readings.load_names[k] for k in loads) if len(loads) > 1 else ()
+    if names:
+        varying.append(("load", "", np.searchsorted(loads, readings.load).astype(float)))
+    varying += [
+        ("distance from the base axis", "m", np.hypot(at[:, 0], at[:, 1])),
+        ("height above the base", "m", at[:, 2]),
+    ]
+    out = []
+    for name, unit, values in varying:
         everywhere = np.full(len(used), np.nan)
         everywhere[used] = values
-        out.setdefault(name, Recorded(name, unit, everywhere, labels))
-
-    for v in recorded(linearise(fit)):
-        if v.other is None and (v.name != "load" or v.labels):
-            put(v.name, v.unit, v.values, v.labels)
-    at = fit.solution.prediction.observation.base_position
-    put("distance from the base axis", "m", np.hypot(at[:, 0], at[:, 1]))
-    put("height above the base", "m", at[:, 2])
-    return tuple(out.values())
+        out.append(Recorded(name, unit, everywhere, names if name == "load" else ()))
+    return tuple(out)
 
 
 def distinguish(fit: Fit, picked: Bools) -> tuple[Difference, ...]:
-    """Compare readings with the others in every recorded variable; the clearest difference first.
+    """Compare picked readings (N,) with the others in every variable; clearest difference first.
 
-    Args:
-        picked: (N,) which of its readings; measurements alone are compared, so that the unloaded
-            readings of deflections do not count as others.
+    Measurements alone are compared: the unloaded readings of deflections do not count as others.
     """
     from scipy.stats import rankdata  # slow to import
 

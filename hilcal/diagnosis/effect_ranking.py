@@ -30,14 +30,15 @@ through loads must there explain the readings beside all effects that are consta
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Generic, TypeVar
+from functools import cache
 
 import numpy as np
 
 from hilcal.diagnosis.minimum_detectable_effect import (
+    LEAST_SHARE as LEAST_SHARE,
+)
+from hilcal.diagnosis.minimum_detectable_effect import (
     Strength,
-    large,
     least_of_family,
     least_strength,
 )
@@ -67,8 +68,6 @@ LEAST_KEPT = 0.5  # share of a promise that must be kept; true effects of 3 σ k
 SAME_EVIDENCE = 3.0  # suspects whose evidence differs by less, e³ = 20 : 1, are inseparable
 FALSE_ALARM = 0.001
 """Chance of naming any effect where none is missing, over the whole catalogue."""
-LEAST_SHARE = 0.01
-"""An effect that explains less of the misfit on poses left out is not worth adding; a guess."""
 LOST = 0.2
 """Share of its evidence that an effect may lose at plausible sizes. A choice: a prior that is too
 narrow by half costs a few units however strong the evidence is."""
@@ -76,31 +75,20 @@ SURE = 3.1
 """Standard errors, from pose to pose, by which the error on poses left out must fall: a chance of
 one in a thousand, since a dozen effects of the load try."""
 
-T = TypeVar("T")
-
-
-@dataclass(frozen=True, eq=False)
-class Later(Generic[T]):
-    """What no verdict depends on: computed when it is first asked for, then kept."""
-
-    compute: Callable[[], T]
-
-    @cached_property
-    def value(self) -> T:
-        """What was computed."""
-        return self.compute()
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Suspect(Brief):
-    """An effect that is not in the model, and what it would explain."""
+    """An effect that is not in the model, and what it would explain.
+
+    What no verdict depends on is a function: it is computed when it is first asked for.
+    """
 
     effect: str  # canonical name
     score: FamilyScore  # the joint test of the whole family
     share: float  # share of the misfit it explains
-    left_out: Later[HeldOut]  # what it explains on poses left out
+    left_out: Callable[[], HeldOut]  # what it explains on poses left out
     explains: bool  # whether it passes the tests of the fitted readings and of its share
-    detection: Later[Strength]  # the smallest strength of it that these readings would reveal
+    detection: Callable[[], Strength]  # the smallest one that these readings would reveal
     # where it is implausible: (unit, rms of the parameters that it needs, plausible rms), SI
     needs: tuple[tuple[str, float, float], ...] = ()
     kept: float = 1.0  # share of the promise that the exact model keeps; 1 where it fails anyway
@@ -117,17 +105,17 @@ class Suspect(Brief):
     @property
     def holdout_share(self) -> float:
         """Share of the misfit that it explains on poses left out."""
-        return self.left_out.value.share
+        return self.left_out().share
 
     @property
     def sure(self) -> bool:
         """Whether the error on poses left out falls by more than it scatters from pose to pose."""
-        return not self.refuted and self.left_out.value.sure
+        return not self.refuted and self.left_out().sure
 
     @property
     def least(self) -> Strength:
         """The smallest strength of it that these readings would reveal."""
-        return self.detection.value
+        return self.detection()
 
     @property
     def shown(self) -> bool:
@@ -237,24 +225,21 @@ def most(of: EffectColumns, bare: Unloaded | None) -> float:
 def rank_suspects(
     p: Linearisation,
     effects: Sequence[Effect],  # that are not in the model
-    level: float = FALSE_ALARM,  # of the test over all of them together
     refit: Callable[[Fit, str], Fit] = add,  # returns a fit with one more effect
 ) -> tuple[Suspect, ...]:
     """Score all effects; best first, see `ranked`."""
-    found = [
-        _suspect(p, s, level, len(effects)) for part in _scored(p, effects, level) for s in part
-    ]
+    found = [_suspect(p, s, len(effects)) for part in _scored(p, effects) for s in part]
     tested = max(sum(s.score.rank > 0 for s in found), 1)
     no_load = p.fit.mode == "absolute" and not p.fit.solution.prediction.situation.load.wrench.any()
-    geometry = Later(lambda: geometry_columns(p, effects))
+    geometry = cache(lambda: geometry_columns(p, effects))
     out: list[Suspect] = []
     for effect, s in zip(effects, found, strict=True):
-        explains = s.score.p_value * tested < level and s.score.log_evidence > 0
+        explains = s.score.p_value * tested < FALSE_ALARM and s.score.log_evidence > 0
         s = replace(s, explains=explains and s.holdout_share >= LEAST_SHARE)
         if s.passes:
             own = effect_columns(p.fit, effect)
             if no_load and through_load(effect):
-                s = replace(s, refuted=not beyond_geometry(p, own, geometry.value, SAME_EVIDENCE))
+                s = replace(s, refuted=not beyond_geometry(p, own, geometry()))
             if s.passes:
                 s = replace(s, kept=kept(p, own, s.score, refit))
         out.append(s)
@@ -306,7 +291,7 @@ class _Scored:
     held: HeldOut | None = None  # None where the fitted readings rule the effect out
 
 
-def _scored(p: Linearisation, effects: Sequence[Effect], level: float) -> Iterator[list[_Scored]]:
+def _scored(p: Linearisation, effects: Sequence[Effect]) -> Iterator[list[_Scored]]:
     """Score effects, those together that were whitened together."""
     frames = frame_effects(p.fit)
     of_frames: list[EffectColumns] = []
@@ -320,12 +305,12 @@ def _scored(p: Linearisation, effects: Sequence[Effect], level: float) -> Iterat
         for of, (s, g) in zip(part[rest:], p.families(part[rest:]), strict=True):
             of_s, largest = spectrum(s), most(of, bare)
             scored.append(_Scored(of, s, of_s, g, largest, p.score_of(of_s, g, largest)))
-        able = [c for c in scored if c.score.p_value < level and c.score.log_evidence > 0]
+        able = [c for c in scored if c.score.p_value < FALSE_ALARM and c.score.log_evidence > 0]
         held = iter(_left_out(p, [(c.of.white, c.score) for c in able]))
         yield [replace(c, held=next(held)) if c in able else c for c in scored]
 
 
-def _suspect(p: Linearisation, scored: _Scored, level: float, count: int) -> Suspect:
+def _suspect(p: Linearisation, scored: _Scored, count: int) -> Suspect:
     """Describe one of `count` effects that are tested together.
 
     Columns are large: they are computed again where something that is asked for later needs them.
@@ -333,27 +318,27 @@ def _suspect(p: Linearisation, scored: _Scored, level: float, count: int) -> Sus
     of_s, result, effect = scored.spectrum, scored.score, scored.of.effect
     s, largest, known = scored.information, scored.largest, scored.held
 
+    @cache
     def left_out() -> HeldOut:
         return known or _left_out(p, [(effect_columns(p.fit, effect).white, result)])[0]
 
+    @cache
     def least() -> Strength:
         own = effect_columns(p.fit, effect)
         units = tuple(q.unit for q in effect.parameters)
-        noise, each = max(p.fit.variance_factor, 1.0), level / count
+        noise, each = max(p.fit.variance_factor, 1.0), FALSE_ALARM / count
         found = least_strength(s, own.motion, own.scale, units, p.fit.dof, noise, each, of_s.rank)
-        if large(of_s, p.fit.dof):
-            return least_of_family(p, own, of_s, found, each, LEAST_SHARE, largest)
-        return found
+        return least_of_family(p, own, of_s, found, each, largest)
 
     return Suspect(
         effect=effect.name,
         coarse=effect.coarse,
         score=result,
         share=p.share(result.gain),
-        left_out=Later(left_out),
+        left_out=left_out,
         explains=False,
         needs=_implausible(p, scored),
-        detection=Later(least),
+        detection=least,
         most=largest,
     )
 
@@ -440,8 +425,8 @@ def geometry_columns(p: Linearisation, effects: Sequence[Effect]) -> Floats:
     return np.hstack([np.zeros((len(p.residual), 0)), *(of.white for of in families)])
 
 
-def beyond_geometry(p: Linearisation, of: EffectColumns, geometry: Floats, evidence: float) -> bool:
-    """Whether a family explains the readings beside geometry, at some log evidence."""
+def beyond_geometry(p: Linearisation, of: EffectColumns, geometry: Floats) -> bool:
+    """Whether a family explains the readings beside geometry, beyond doubt."""
     q, fit = geometry.shape[1], p.fit
     if not q:
         return True
@@ -453,7 +438,7 @@ def beyond_geometry(p: Linearisation, of: EffectColumns, geometry: Floats, evide
     rest, gradient, rss = eliminate(s, g, p.rss, slice(0, q), first.ridge)
     largest = of.effect.most()
     found = score_family(rest[q:, q:], gradient[q:], rss, fit.dof, first.effective, largest)
-    if found.rank == 0 or found.log_evidence <= evidence:
+    if found.rank == 0 or found.log_evidence <= SAME_EVIDENCE:
         return False
     # One ridge for both: columns in units of their strength.
     both = np.hstack([geometry / np.sqrt(first.ridge), of.white / np.sqrt(found.ridge)])

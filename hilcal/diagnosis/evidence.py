@@ -39,7 +39,6 @@ from hilcal.diagnosis.background_evidence import (
 )
 from hilcal.diagnosis.effect_ranking import (
     FALSE_ALARM,
-    LEAST_SHARE,
     SAME_EVIDENCE,
     Suspect,
     candidates,
@@ -333,7 +332,7 @@ class Evidence:
     def pose_alone(self) -> PoseAlone | None:
         """A misfit that is the same under every load of a pose."""
         level = FALSE_ALARM / max(len(self.effects), 1)
-        return pose_alone(self.linearisation, self.effects, level, LEAST_SHARE)
+        return pose_alone(self.linearisation, self.effects, level)
 
     @cached_property
     def by_arrivals(self) -> "Evidence | None":

@@ -28,12 +28,13 @@ from hilcal.regression.evidence import (
     Spectrum,
     noncentrality_of_power,
     score_family,
-    spectrum,
 )
 from hilcal.regression.leave_out import FamilyFolds, improves
 from hilcal.types import Floats
 
 POWER = 0.9
+LEAST_SHARE = 0.01
+"""An effect that explains less of the misfit on poses left out is not worth adding; a guess."""
 DIRECTIONS = 64
 DRAWS = 16  # campaigns at each size; a choice, for time
 GRID = np.logspace(0.0, 1.5, 7)  # sizes, in units of that which the F-test reveals; a choice
@@ -67,11 +68,9 @@ def least_strength(
     dof: float,  # degrees of freedom of the fit
     variance: float,  # its variance factor, at least 1
     level: float,  # of the test, between 0 and 1
-    rank: int | None = None,  # number of directions that can be tested, where it is known
+    rank: int,  # number of directions that can be tested
 ) -> Strength:
     """Return the smallest strength of a family that would be revealed."""
-    if rank is None:
-        rank = spectrum(s).rank
     beta = np.random.default_rng(SEED).standard_normal((DIRECTIONS, len(s)))
     gain = np.sum(beta @ s * beta, axis=1)
     if rank == 0 or dof - rank < 1 or float(np.median(gain)) <= 0.0:
@@ -95,25 +94,22 @@ def _strength(moved: float, t: float, scale: Floats, units: tuple[str, ...]) -> 
     return Strength(moved, tuple((u, t * own) for u, own in rms.items()), t)
 
 
-def large(s: Spectrum, dof: float) -> bool:
-    """Whether a family is large against the degrees of freedom, which hides what it predicts."""
-    return s.rank > LARGE_FAMILY * dof
-
-
 def least_of_family(
     p: Linearisation,  # of the fit
     of: EffectColumns,  # the family, as it is scored
     s: Spectrum,  # of its information
     start: Strength,  # what the F-test alone would reveal
     level: float,  # of the test, between 0 and 1
-    least_share: float,  # share of the misfit on poses left out that must be explained
     largest: float,  # largest plausible strength
 ) -> Strength:
-    """Return the smallest strength of a large family that all tests would reveal."""
-    if not start.visible:
+    """Return the smallest strength of a family that all tests would reveal.
+
+    Of one that is small against the degrees of freedom that is what the F-test alone would reveal.
+    """
+    if not start.visible or s.rank <= LARGE_FAMILY * p.fit.dof:
         return start
     fine = of.effect.fine(p.fit.readings[~p.fit.outlier].states)
-    tests = SuspectTests(p, of, s, level, least_share, largest)
+    tests = SuspectTests(p, of, s, level, largest)
     least = _least(tests, of, start.displacement_m)
     if fine is None:
         return least
@@ -145,7 +141,6 @@ class SuspectTests:
     of: EffectColumns
     s: Spectrum
     level: float
-    least_share: float
     largest: float
 
     @cached_property
@@ -180,5 +175,5 @@ class SuspectTests:
         for k, fit_able in enumerate(able):
             a, b = by_pose(p.fit, before[:, k]), by_pose(p.fit, after[:, k])
             share = float(a.sum() - b.sum()) / max(float(a.sum()) - p.fit.whitening.rank, 1.0)
-            out.append(fit_able and share >= self.least_share and improves(a, b))
+            out.append(fit_able and share >= LEAST_SHARE and improves(a, b))
         return out

@@ -29,9 +29,9 @@ import numpy as np
 from scipy.stats import chi2
 from scipy.stats import f as f_distribution
 
+from hilcal.diagnosis.recorded import state_variables
 from hilcal.identification.linearisation import Linearisation
 from hilcal.model.observe import motion
-from hilcal.readings.readings import angle_name, travel_name
 from hilcal.regression.projection import Projection
 from hilcal.types import Floats, Ints
 
@@ -41,8 +41,6 @@ if TYPE_CHECKING:
 DETERMINED = 1e-6  # singular value of a determined direction over the largest; below: rounding
 HELD = 1.0 - DETERMINED**2  # t from which on the model holds a direction already
 POLYNOMIAL = 3
-ROW_ORDER = "row order"
-"""The variable in place of the time where the readings do not state it: a drift shows by it."""
 MANY = 4000  # degrees of freedom from which the families of joint angles are finer
 MOST_AT_ONCE = 8_000_000
 """Numbers of the columns that are scored together, 64 MB; a choice."""
@@ -130,41 +128,25 @@ def _times(motions: Floats, basis: Floats) -> Floats:
     return product.reshape(*motions.shape[:2], -1)
 
 
-def _variables(p: Linearisation) -> list[tuple[str, Floats, bool]]:
-    """Name, functions (N, F), and whether a deflection takes their difference."""
-    fit = p.fit
-    readings = fit.readings[~fit.outlier]
-    s, situation = readings.states, fit.solution.prediction.situation
+def _variables(p: Linearisation) -> Iterator[tuple[str, Floats, bool]]:
+    """Yield name, functions (N, F), and whether a deflection takes their difference."""
+    fit, situation = p.fit, p.fit.solution.prediction.situation
     harmonics = np.arange(1, 3 if fit.dof < MANY else 7)
-    out: list[tuple[str, Floats, bool]] = []
-    for j in range(situation.angle.shape[1]):
-        phase = situation.angle[:, j, None] * harmonics
-        functions = np.concatenate([np.cos(phase), np.sin(phase)], axis=1)
-        slides = bool(situation.cell.arm.slides[j])
-        if slides:
-            functions = np.column_stack([functions, _powers(situation.values[:, j])])
-        out.append((travel_name(j) if slides else angle_name(j), functions, False))
-        torque = situation.torque[:, j]
-        if np.ptp(torque) > 1e-6:
-            name = f"joint {j + 1} {'force' if slides else 'torque'}"
-            out.append((name, _powers(torque, 0.0), True))
-        if s.approach is not None and np.ptp(s.approach[:, j]) > 0:
-            out.append((f"joint {j + 1} approach", s.approach[:, [j]], True))
-        if s.joint_temperature is not None and np.ptp(s.joint_temperature[:, j]) > 0:
-            out.append((f"joint {j + 1} temperature", _powers(s.joint_temperature[:, j]), True))
-    rows = np.flatnonzero(~fit.outlier).astype(float)
-    for name, values in (
-        ("time", s.time) if s.time is not None else (ROW_ORDER, rows),
-        ("time under load", s.load_time),
-        ("air temperature", s.air_temperature),
-    ):
-        if values is not None and np.ptp(values) > 0:
-            out.append((name, _powers(values), True))
-    loads = np.unique(readings.load)
+    for v in state_variables(p):
+        if v.kind in ("angle", "travel"):
+            phase = situation.angle[:, v.joint, None] * harmonics
+            functions = np.concatenate([np.cos(phase), np.sin(phase)], axis=1)
+            if v.kind == "travel":
+                functions = np.column_stack([functions, _powers(v.values)])
+            yield v.name, functions, False
+        elif v.kind == "approach":
+            yield v.name, v.values[:, None], True
+        else:
+            yield v.name, _powers(v.values, 0.0 if v.kind == "torque" else None), True
+    load = fit.readings[~fit.outlier].load
+    loads = np.unique(load)
     if len(loads) > 1:
-        member = (readings.load[:, None] == loads).astype(float)
-        out.append(("load", member, fit.mode == "absolute"))
-    return out
+        yield "load", (load[:, None] == loads).astype(float), fit.mode == "absolute"
 
 
 def _powers(x: Floats, centre: float | None = None) -> Floats:

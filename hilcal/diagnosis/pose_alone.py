@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from hilcal.diagnosis.effect_ranking import FALSE_ALARM, LEAST_SHARE, most, unloaded_readings
+from hilcal.diagnosis.effect_ranking import FALSE_ALARM, most, unloaded_readings
 from hilcal.diagnosis.minimum_detectable_effect import SuspectTests
 from hilcal.diagnosis.misfit_breakdown import pose_constants
 from hilcal.diagnosis.noise import MISFIT_ALARM
@@ -74,7 +74,6 @@ def pose_alone(
     p: Linearisation,
     effects: Sequence[Effect],  # that are not in the model
     level: float,  # of the test of a suspect, between 0 and 1
-    least: float,  # share of the misfit on poses left out that a suspect must explain
 ) -> PoseAlone | None:
     """Return a misfit that depends on the pose alone; None where it does not, or no effect does."""
     found = pose_constants(p)
@@ -103,20 +102,18 @@ def pose_alone(
     more, sure = about, 0.0
     for part in SHARES:
         more = max(int(np.ceil(part * about)), 1)
-        sure = chance(p, first, more, level, least)
+        sure = chance(p, first, more, level)
         if sure >= SURE:
             break
     return PoseAlone(share, names, poses, more, sure)
 
 
-def pose_powers(before: Fit, effects: Sequence[str], more: int) -> Iterator[PosePower]:
-    """Yield how well the first of some effects is told from each of the others.
-
-    Args:
-        before: a fit of a model without them.
-        effects: two effects or more that depend on the pose alone.
-        more: further poses, read unloaded.
-    """
+def pose_powers(
+    before: Fit,  # of a model without the effects
+    effects: Sequence[str],  # two or more that depend on the pose alone
+    more: int,  # further poses, read unloaded
+) -> Iterator[PosePower]:
+    """Yield how well the first of some effects is told from each of the others."""
     states, model = before.readings[~before.outlier].states, before.model
     first, *rivals = effects
     made = model.catalogue.make(first, model.cell, states, m=before.readings.m)
@@ -128,7 +125,7 @@ def pose_powers(before: Fit, effects: Sequence[str], more: int) -> Iterator[Pose
             p = linearise(add(before, rival))
         except HilcalError:
             continue
-        now, then = (chance(p, made, n, level, LEAST_SHARE, strength) for n in (0, more))
+        now, then = (chance(p, made, n, level, strength) for n in (0, more))
         yield PosePower(first, rival, now, then)
 
 
@@ -144,7 +141,6 @@ def chance(
     effect: Effect,
     more: int,  # further poses, read unloaded
     level: float,  # of the test of a suspect, between 0 and 1
-    least: float,  # share of the misfit on poses left out that must be explained
     strength: float | None = None,  # of its parameters; that which explains the misfit unless given
 ) -> float:
     """Return the chance that a family passes every test with so many more poses."""
@@ -162,7 +158,7 @@ def chance(
     y = signal + rng.standard_normal(signal.shape)
     s = spectrum(q.information(scored.white))
     largest = most(scored, unloaded_readings(then))
-    return float(np.mean(SuspectTests(q, scored, s, level, least, largest).found(y)))
+    return float(np.mean(SuspectTests(q, scored, s, level, largest).found(y)))
 
 
 def _with(before: Fit, more: int, rng: np.random.Generator) -> Fit:

@@ -1,16 +1,19 @@
 """Recorded variables of the state as smooth functions, and the possible motions of the target."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 
-from hilcal.diagnosis.misfit_breakdown import ROW_ORDER
 from hilcal.identification.linearisation import Linearisation
 from hilcal.model.observe import motion
 from hilcal.readings.readings import angle_name, travel_name
 from hilcal.types import Floats, Ints
 
+ROW_ORDER = "row order"
+"""The variable in place of the time where the readings do not state it: a drift shows by it."""
+ROUNDING = 1e-9  # share of the largest value within which a variable does not vary
 HARMONICS = 4
 POWERS = 4
 WIDTH = 9
@@ -49,56 +52,86 @@ class RecordedVariable:
         return replace(out, functions=out.functions[order]) if name == self.name else out
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class StateVariable:
+    """A number that is recorded of the state of each reading."""
+
+    name: str  # e.g. "joint 2 angle"
+    unit: str  # SI
+    kind: str  # "angle", "travel", "torque", "approach" or "other"
+    values: Floats  # (N,)
+    joint: int = 0  # number from 0, where it is of one
+
+
+def state_variables(p: Linearisation) -> Iterator[StateVariable]:
+    """Yield the position of each joint, and all else that is recorded of the states and varies."""
+    fit, at = p.fit, p.fit.solution.prediction.situation
+    s = fit.readings[~fit.outlier].states
+    approach, temperature = (x if x is None else x.T for x in (s.approach, s.joint_temperature))
+    for j, slides in enumerate(at.cell.arm.slides.tolist()):
+        name, joint = travel_name(j) if slides else angle_name(j), f"joint {j + 1}"
+        if slides:
+            yield StateVariable(name, "m", "travel", at.values[:, j], j)
+        else:
+            yield StateVariable(name, "rad", "angle", at.angle[:, j], j)
+        load = ("force", "N") if slides else ("torque", "N·m")
+        for what, unit, kind, values in (
+            (*load, "torque", at.torque[:, j]),
+            ("approach", "side", "approach", None if approach is None else approach[j]),
+            ("temperature", "°C", "other", None if temperature is None else temperature[j]),
+        ):
+            if values is not None and _varies(values):
+                yield StateVariable(f"{joint} {what}", unit, kind, values, j)
+    rows = np.flatnonzero(~fit.outlier).astype(float)
+    for name, unit, values in (
+        (ROW_ORDER, "row", rows) if s.time is None else ("time", "s", s.time),
+        ("time under load", "s", s.load_time),
+        ("air temperature", "°C", s.air_temperature),
+    ):
+        if values is not None and _varies(values):
+            yield StateVariable(name, unit, "other", values)
+
+
+def _varies(values: Floats) -> bool:
+    return bool(np.ptp(values) > ROUNDING * max(float(np.abs(values).max()), 1.0))
+
+
 def recorded(p: Linearisation) -> list[RecordedVariable]:
     """Everything recorded of the state that varies."""
     readings = p.fit.readings[~p.fit.outlier]
-    s, situation = readings.states, p.fit.solution.prediction.situation
+    situation = p.fit.solution.prediction.situation
+    force = np.linalg.norm(readings.states.wrench, axis=1)
+    pull = force / max(float(force.max()), 1e-300)
+    hung = RecordedVariable("load", "", pull, pull[:, None])
     out: list[RecordedVariable] = []
+    turns: list[RecordedVariable] = []
 
-    def smooth(name: str, unit: str, values: Floats | None, centre: float | None = None) -> None:
-        if values is None or np.ptp(values) <= 1e-9 * max(float(np.abs(values).max()), 1.0):
-            return
-        away = values - (np.median(values) if centre is None else centre)
+    def smooth(v: StateVariable, centre: float) -> None:
+        away = v.values - centre
         away = away / np.abs(away).max()
         # Higher powers are the less likely ones.
         powers = np.stack([away**k / max(k, 1) for k in range(POWERS + 1)], axis=1)
         # The straight line by itself, too: it is simpler than a curve of another variable.
-        out.extend(RecordedVariable(name, unit, values, f) for f in (powers, powers[:, :2]))
+        out.extend(RecordedVariable(v.name, v.unit, v.values, f) for f in (powers, powers[:, :2]))
 
-    force = np.linalg.norm(s.wrench, axis=1)
-    pull = force / max(float(force.max()), 1e-300)
-    hung = RecordedVariable("load", "", pull, pull[:, None])
-    turns: list[RecordedVariable] = []
-    for j in range(situation.angle.shape[1]):
-        angle = situation.angle[:, j]
-        k = np.arange(1, HARMONICS + 1)
-        waves = np.stack([np.cos(angle[:, None] * k) / k, np.sin(angle[:, None] * k) / k], axis=2)
-        waves = np.column_stack([np.ones(len(angle)), waves.reshape(len(angle), -1)])
-        # Laws go by the phase of a travel, people by the travel.
-        slides = bool(situation.cell.arm.slides[j])
-        name, unit = (travel_name(j), "m") if slides else (angle_name(j), "rad")
-        shown = situation.values[:, j] if slides else angle
-        out.append(RecordedVariable(name, unit, shown, waves))
-        if np.ptp(pull) > 0.01:
-            out.append(replace(out[-1], other=hung))
-        first = np.stack([np.ones(len(angle)), np.cos(angle), np.sin(angle)], axis=1)
-        turns.append(RecordedVariable(name, unit, shown, first))
-        if slides:
-            smooth(name, unit, shown, float(situation.cell.arm.usual_range[0][j]))
-        load = (f"joint {j + 1} force", "N") if slides else (f"joint {j + 1} torque", "N·m")
-        smooth(*load, situation.torque[:, j], 0.0)
-        if s.approach is not None and np.ptp(s.approach[:, j]) > 0:
-            side = s.approach[:, j]
-            sides = np.stack([np.ones(len(side)), side], axis=1)
-            out.append(RecordedVariable(f"joint {j + 1} approach", "side", side, sides))
-        if s.joint_temperature is not None:
-            smooth(f"joint {j + 1} temperature", "°C", s.joint_temperature[:, j])
-    if s.time is None:
-        smooth(ROW_ORDER, "row", np.flatnonzero(~p.fit.outlier).astype(float))
-    else:
-        smooth("time", "s", s.time)
-    smooth("time under load", "s", s.load_time)
-    smooth("air temperature", "°C", s.air_temperature)
+    for v in state_variables(p):
+        one = np.ones(len(v.values))
+        if v.kind in ("angle", "travel"):  # laws go by the phase of a travel, people by the travel
+            angle, k = situation.angle[:, v.joint, None], np.arange(1, HARMONICS + 1)
+            waves = np.stack([np.cos(angle * k) / k, np.sin(angle * k) / k], axis=2)
+            waves = np.column_stack([one, waves.reshape(len(one), -1)])
+            out.append(RecordedVariable(v.name, v.unit, v.values, waves))
+            if np.ptp(pull) > 0.01:
+                out.append(replace(out[-1], other=hung))
+            first = np.column_stack([one, np.cos(angle), np.sin(angle)])
+            turns.append(RecordedVariable(v.name, v.unit, v.values, first))
+            if v.kind == "travel" and _varies(v.values):
+                smooth(v, float(situation.cell.arm.usual_range[0][v.joint]))
+        elif v.kind == "approach":
+            sides = np.stack([one, v.values], axis=1)
+            out.append(RecordedVariable(v.name, v.unit, v.values, sides))
+        else:
+            smooth(v, 0.0 if v.kind == "torque" else float(np.median(v.values)))
     loads = np.unique(readings.load)
     if len(loads) > 1:
         member = (readings.load[:, None] == loads[:WIDTH]).astype(float)

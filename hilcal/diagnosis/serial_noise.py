@@ -12,6 +12,8 @@ are of readings. K_f, scaled to a mean variance of 1, is that
 
 - of each effect of the catalogue that is not in the model, Z_f Z_fᵀ;
 - of joints and target that move as powers of the time, of which the catalogue knows few laws;
+- of the arm's scatter, where nothing states it and several targets are read in one arrival: they
+  have it in common, as neighbours in the order have serial noise;
 - of a smooth field over joint angles and torques, and of poses, A (C_f ⊗ 1) Aᵀ, C_f their
   neighbourhood: what the catalogue lacks.
 
@@ -79,9 +81,8 @@ STARTS = (0.3, 0.8, 0.97)  # values of ρ from which the likelihood is climbed
 def with_serial_noise(white: Fit, prior: Floats | None = None) -> Fit:
     """Return a fit with the correlation of its noise in the covariance, where there is some.
 
-    Args:
-        white: a fit; as it is where its covariance has the correlation.
-        prior: standard deviations (P,) that it was given.
+    `prior` are the standard deviations (P,) that it was given. A fit whose covariance has the
+    correlation stays as it is.
     """
     noise = serial_noise(white) if white.readings.serial is None else None
     if noise is None:
@@ -209,6 +210,13 @@ class _SerialProblem:
         for motions in (moves.drives, p.observation.axes):
             powers = [motions * scaled[:, None, None] ** k for k in (1, 2, 3)]
             yield "the time", of_columns(np.concatenate(powers, axis=2)[self.rows])
+        arrival = kept.arrivals[self.rows]
+        together = arrival[:, None] == arrival
+        if not kept.scatter_stated and together.sum() > len(arrival):
+            flat = moves.drives[self.rows].reshape(len(arrival) * POSITION, -1)
+            each = np.ones((POSITION, POSITION))
+            scatter = (flat @ flat.T) * np.kron(together, each)
+            yield "the arm's scatter", self.difference @ scatter @ self.difference.T
         pose = kept.pose[self.rows]
         yield "the pose", self.correlated((pose[:, None] == pose).astype(float))
         torque = p.situation.torque

@@ -107,23 +107,15 @@ def diagnose(
 
 
 def judge_naming(
-    fits: Sequence[Fit],
-    tested: Sequence[BackgroundEffect],
-    history: Callable[[Fit], History],
-    evidence: Callable[[tuple[BackgroundEffect, ...]], Evidence],
+    fits: Sequence[Fit],  # of models that differ in what they name
+    tested: Sequence[BackgroundEffect],  # of the first one's background, see `background_evidence`
+    history: Callable[[Fit], History],  # of each of them
+    evidence: Callable[[tuple[BackgroundEffect, ...]], Evidence],  # of the last one
 ) -> tuple[tuple[Diagnosis, ...], Evidence]:
     """Judge one fit with a background and the same fit with more and more of it named.
 
-    What is predicted is the same, so that the last is judged, and the others follow from it.
-
-    Args:
-        fits: of models that differ in what they name.
-        tested: the effects of the first one's background, see `background_evidence`.
-        history: of each of them.
-        evidence: of the last one, from the effects of its background.
-
-    Returns:
-        A diagnosis of each, and the evidence for the last.
+    What is predicted is the same, so that the last is judged, and the others follow from it. A
+    diagnosis of each is returned, and the evidence for the last.
     """
     left = [tuple(b for b in tested if b.effect in f.model.background) for f in fits]
     e = evidence(left[-1])

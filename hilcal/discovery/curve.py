@@ -25,7 +25,7 @@ from hilcal.discovery.sites import ORDINARY, Place, Site, site_motions
 from hilcal.effects.force_sensor import sensor_error
 from hilcal.effects.protocol import Effect, Situation
 from hilcal.identification.fit import Fit
-from hilcal.types import Bools, Floats
+from hilcal.types import Bools, Floats, Ints
 
 MOST_CURVES = 3
 BINS = 12
@@ -82,25 +82,18 @@ def _curve(
     own = [(p, f) for p in parts for f in p.amplitude.factors if f.variable.symbol == symbol]
     others = [f for f in first.amplitude.factors if f.variable.symbol != symbol]
     v = own[0][1].variable
-    x = v.read(s)
-    other = np.prod([f.values(s) for f in others], axis=0) if others else np.ones(len(x))
     orders = {f.numbers[0] if f.shape.name in ("cos", "sin") else 0.0 for _, f in own}
     order = orders.pop() if len(orders) == 1 else 0.0
-    name = symbol
-    if order > HARMONICS:
-        x, name = _folded(x, order), f"{symbol} within a period of 2π/{order:g}"
+    x = _folded(v.read(s), order)
+    other = np.prod([f.values(s) for f in others], axis=0) if others else np.ones(len(x))
 
     def law(at: Floats) -> Floats:
-        told = [theta[p.coefficient] * f.shape.value(at, f.numbers) for p, f in own]
-        return np.asarray(np.sum(told, axis=0))
+        terms = [theta[p.coefficient] * f.shape.value(at, f.numbers) for p, f in own]
+        return np.asarray(np.sum(terms, axis=0))
 
     said, std = said_by_readings(after, motion)
-    size = np.abs(other)
-    kept = np.flatnonzero(np.isfinite(std) & (size > LEAST * float(size.max())))
-    if len(kept) > MOST_POINTS:
-        kept = np.random.default_rng(20261122).choice(kept, MOST_POINTS, replace=False)
-    x, y = x[kept], law(x[kept]) + said[kept] / other[kept]
-    std = std[kept] / size[kept]
+    at = _points(_sayable(std, other))
+    x, y, std = x[at], law(x[at]) + said[at] / other[at], std[at] / np.abs(other[at])
     ends = np.linspace(float(x.min()), float(x.max()), LINE)
     inner = "·".join(f.shape.text(f.variable.symbol, [f"{n:g}" for n in f.numbers]) for f in others)
     of, unit = site.symbol, site.unit
@@ -108,10 +101,30 @@ def _curve(
         of = f"{of}/({inner})" if "·" in inner else f"{of}/{inner}"
         divided = type(first.amplitude)(tuple(others)).unit()
         unit = unit if divided == "1" else f"{unit}/({divided})"
-    return Curve(
-        site.words, of, unit, name, v.unit,
-        x, y, std, binned(x, y, std), np.vstack([ends, law(ends)]),
-    )  # fmt: skip
+    return _over(site, of, unit, v, order, x, y, std, np.vstack([ends, law(ends)]))
+
+
+def _sayable(std: Floats, divisor: Floats) -> Bools:
+    """(N,) which readings say something of a motion that is divided by the other factors."""
+    size = np.abs(divisor)
+    return np.asarray(np.isfinite(std) & (size > LEAST * float(size.max())))
+
+
+def _points(kept: Bools) -> Ints:
+    """Return which readings are drawn: all of those kept, or some at random."""
+    at = np.flatnonzero(kept)
+    if len(at) <= MOST_POINTS:
+        return at
+    return np.random.default_rng(20261122).choice(at, MOST_POINTS, replace=False)
+
+
+def _over(
+    site: Site, of: str, unit: str, v: Variable, order: float, x: Floats, y: Floats, std: Floats,
+    line: Floats,
+) -> Curve:  # fmt: skip
+    """Return a curve over a quantity, within a period of a wave of high order."""
+    name = f"{v.symbol} within a period of 2π/{order:g}" if order > HARMONICS else v.symbol
+    return Curve(site.words, of, unit, name, v.unit, x, y, std, binned(x, y, std), line)
 
 
 def said_by_readings(after: Fit, motion: Floats) -> tuple[Floats, Floats]:
@@ -219,29 +232,22 @@ def _drawn_curve(
 ) -> Curve:
     s = fit.solution.prediction.situation
     said, std = said_by_readings(fit, motion)
-    seen = np.isfinite(std)
     tried: list[tuple[float, int, Variable, Variable | None, Floats, Bools, Floats]] = []
     for v, g in ways:
         divisor = np.ones(len(law)) if g is None else g.read(s)
-        kept = seen & (np.abs(divisor) > LEAST * float(np.abs(divisor).max()))
+        kept = _sayable(std, divisor)
         x = _folded(v.read(s), _order(v, effect.summary))
         rough = _roughness(x[kept], law[kept] / divisor[kept])
         tried.append((rough, len(tried), v, g, divisor, kept, x))
     rough, _, v, g, divisor, kept, x = min(tried, key=lambda t: (t[0] > SMOOTH, t[:2]))
-    at = np.flatnonzero(kept)
-    if len(at) > MOST_POINTS:
-        at = np.random.default_rng(20261122).choice(at, MOST_POINTS, replace=False)
-    x, told = x[at], law[at] / divisor[at]
-    y, error = told + said[at] / divisor[at], std[at] / np.abs(divisor[at])
-    line = _line(x, told) if rough <= SMOOTH else binned(x, told, error)[:2]
-    period = _order(v, effect.summary)
-    name = f"{v.symbol} within a period of 2π/{period:g}" if period > HARMONICS else v.symbol
+    at = _points(kept)
+    x, known = x[at], law[at] / divisor[at]
+    y, error = known + said[at] / divisor[at], std[at] / np.abs(divisor[at])
+    line = _line(x, known) if rough <= SMOOTH else binned(x, known, error)[:2]
     of, unit = site.symbol, site.unit
     if g is not None:
         of, unit = f"{of}/{g.symbol}", unit if g.unit == "1" else f"{unit}/({g.unit})"
-    return Curve(
-        site.words, of, unit, name, v.unit, x, y, error, binned(x, y, error), line,
-    )  # fmt: skip
+    return _over(site, of, unit, v, _order(v, effect.summary), x, y, error, line)
 
 
 def _line(x: Floats, y: Floats) -> Floats:

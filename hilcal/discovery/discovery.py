@@ -31,7 +31,7 @@ from hilcal.discovery.law import Again, Coefficient, Form, Law, form_of, source_
 from hilcal.discovery.problem import SearchProblem
 from hilcal.discovery.refit import exact, refine
 from hilcal.discovery.screen import LawTerm, Screen, screen
-from hilcal.discovery.search import LEAST, MOST_TERMS, Selection, search
+from hilcal.discovery.search import LEAST, Selection, search
 from hilcal.discovery.structures import Structure, averaged, pareto, structure_of, structures
 from hilcal.effects.from_file import effects_of
 from hilcal.errors import CannotAnswerError, HilcalError, InputError
@@ -152,7 +152,7 @@ def discover(
         answer = Discovery(fit, "catalogue", catalogue=instead.names, candidates=found.candidates)
         return replace(answer, unfitted=instead.unfitted)
     say("repeating the search without each fold of poses")
-    folds = search_by_folds(found, MOST_TERMS)
+    folds = search_by_folds(found)
     if not folds.sure or folds.share < LEAST_SHARE:
         answer = _silent(fit, found, say, folds.share)
     else:
@@ -212,9 +212,8 @@ def _laws(
             continue
         left = left_out_by_pose(after)
         share = float(np.clip((before.sum() - left.sum()) / misfit, -1.0, 1.0))
-        law = _law(problem, s, form, name, coefficients, share, after, folds, known)
+        law = _law(problem, s, form, name, coefficients, share, after, folds, known, chance[kind])
         kinds.append(kind)
-        law = replace(law, probability=chance[kind])
         evidence = (
             f"It explains {100 * share:.0f} % of the misfit on poses left out; p-value "
             f"{law.p_value:.1g}, the search\npaid for. The probability of its structure, of those "
@@ -249,7 +248,7 @@ def _laws(
 def _law(
     problem: SearchProblem, s: Selection, form: Form, name: str,
     coefficients: tuple[Coefficient, ...], share: float, after: Fit, folds: FoldSearch,
-    known: KnownEffects,
+    known: KnownEffects, probability: float,
 ) -> Law:  # fmt: skip
     linear = problem.screen.linear
     x = np.hstack([problem.columns(t) for t in s.terms])
@@ -266,8 +265,9 @@ def _law(
         ranges.append((symbol, float(values.min()), float(values.max()), v.unit))
     return Law(
         name=name, form=form, parameters=coefficients, p_value=p_value, odds=s.total,
-        holdout_share=share, left=after.variance_factor, probability=0.0, resembles=near[:3],
-        ranges=tuple(ranges), again=found_again(problem.screen, folds, s.terms),
+        holdout_share=share, left=after.variance_factor, probability=probability,
+        resembles=near[:3], ranges=tuple(ranges),
+        again=found_again(problem.screen, folds, s.terms),
     )  # fmt: skip
 
 
@@ -275,7 +275,7 @@ FOLDS = 5  # As in the regression of the residual; a choice
 RIDGE = 1e-6
 
 
-def search_by_folds(screen: Screen, most: int) -> FoldSearch:
+def search_by_folds(screen: Screen) -> FoldSearch:
     """Repeat the search without each fold of poses."""
     linear = screen.linear
     fit = linear.fit
@@ -285,7 +285,7 @@ def search_by_folds(screen: Screen, most: int) -> FoldSearch:
     for f in range(int(fold.max()) + 1):
         out = fold == f
         problem = SearchProblem(screen, ~out)
-        selections = search(problem, most, beam=1)
+        selections = search(problem, beam=1)
         chosen = max(selections, key=lambda s: s.total, default=None)
         found.append(chosen)
         before[out] = predicted(problem, None, out)
@@ -425,20 +425,15 @@ NAME = "found"
 
 
 class LawSearch:
-    """Searches laws for one refinement, and keeps what it found.
-
-    Attributes:
-        found: the searches, in order.
-        files: of laws that stayed, by name; see `write`.
-    """
+    """Searches laws for one refinement, and keeps what it found."""
 
     def __init__(self, folder: Path, name: str = NAME, replacing: bool = False) -> None:
         """Laws are named after the files that they will be; old ones may be replaced."""
         if replacing:
             for k in range(1, MOST_SEARCHES + 1):
                 (folder / f"{_numbered(name, k)}.py").unlink(missing_ok=True)
-        self.found: list[Discovery] = []
-        self.files: dict[str, Path] = {}
+        self.found: list[Discovery] = []  # the searches, in order
+        self.files: dict[str, Path] = {}  # of laws that stayed, by name; see `write`
         self._folder, self._name = folder, name
         self._sources: dict[str, str] = {}
 

@@ -1,11 +1,9 @@
 """A law in readable form: where it acts, its formula, its parameters, what speaks for it."""
 
-import hashlib
 import re
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from types import ModuleType
+from pathlib import Path
 
 import numpy as np
 
@@ -13,6 +11,7 @@ from hilcal.discovery.amplitudes import Amplitude, Factor, unit_of
 from hilcal.discovery.screen import LawTerm, Screen
 from hilcal.discovery.sites import ORDINARY, Site
 from hilcal.effects.check import NAME
+from hilcal.effects.from_file import effects_of
 from hilcal.effects.protocol import Effect, Situation
 from hilcal.errors import InputError
 from hilcal.names import escaped, quoted
@@ -23,25 +22,6 @@ _JOINT = re.compile(r"s\.(angle|torque)\[:, (\d+)(?::(\d+))?\](\.sum\(axis=1\))?
 _FORCE = re.compile(r"np\.linalg\.norm\(s\.states\.wrench\[:, 0:3\], axis=1\)")
 _RECORDED = re.compile(r"s\.states\.(time|air)(?:_temperature)?|np\.")
 _OTHER = re.compile(r"\bs\.|\brecorded\(|\bwhere\(|\bhypot\(|\[")
-
-
-def expressions(law: "Law") -> dict[str, str]:
-    """Return the value of a law by site, in its unit, where plain arithmetic says it.
-
-    E.g. {"dq_3": "0.0002*(sin(3 * q4))"}. Quantities are `q1` ... (rad), `tau1` ... (torques of the
-    drives, N·m), `force` (of the load, N), `time` (s) and `air` (air temperature, °C); operators
-    are Python's, functions have numpy's names, but for `max`. Other sites are left out.
-    """
-    terms: dict[str, list[str]] = {}
-    for p in law.form.parts:
-        value = law.parameters[p.coefficient].value
-        terms.setdefault(p.site.symbol, []).append(f"{value!r}*({p.amplitude.code()})")
-    plain = {}
-    for symbol, own in terms.items():
-        text = " + ".join(own).replace("np.ones(len(s.angle))", "1.0").replace("np.maximum", "max")
-        text = _FORCE.sub("force", _JOINT.sub(_joints, text))
-        plain[symbol] = _RECORDED.sub(lambda m: m[1] or "", text)
-    return {symbol: text for symbol, text in plain.items() if not _OTHER.search(text)}
 
 
 def _joints(m: re.Match[str]) -> str:
@@ -175,14 +155,6 @@ def with_coefficients(form: Form, kept: Sequence[int]) -> Form:
     return Form(tuple(parts))
 
 
-def ordinary(form: Form) -> Floats:
-    """(P,) motions that one unit of the whitened columns' coefficients stands for."""
-    out = np.ones(form.count)
-    for p in form.parts:
-        out[p.coefficient] = ORDINARY[p.site.unit]
-    return out
-
-
 @dataclass(frozen=True, slots=True)
 class Coefficient:
     """A parameter of a law."""
@@ -195,7 +167,9 @@ class Coefficient:
 
 def coefficients(form: Form, step: Floats, std: Floats) -> tuple[Coefficient, ...]:
     """Return the coefficients of a law, SI, from (P,) means and uncertainties, ordinary motions."""
-    size = ordinary(form)
+    size = np.ones(form.count)
+    for p in form.parts:
+        size[p.coefficient] = ORDINARY[p.site.unit]
     return tuple(
         Coefficient(LETTERS[k], float(v), float(e), form.unit(k))
         for k, (v, e) in enumerate(zip(step * size, std * size, strict=True))
@@ -242,8 +216,23 @@ class Law:
 
     @property
     def expressions(self) -> dict[str, str]:
-        """Its value at each site as arithmetic of named quantities; see `expressions`."""
-        return expressions(self)
+        """Its value by site, in the site's unit, where plain arithmetic says it.
+
+        E.g. {"dq_3": "0.0002*(sin(3 * q4))"}. Quantities are `q1` ... (rad), `tau1` ... (torques
+        of the drives, N·m), `force` (of the load, N), `time` (s) and `air` (air temperature, °C);
+        operators are Python's, functions have numpy's names, but for `max`. Other sites are left
+        out.
+        """
+        terms: dict[str, list[str]] = {}
+        for p in self.form.parts:
+            value = self.parameters[p.coefficient].value
+            terms.setdefault(p.site.symbol, []).append(f"{value!r}*({p.amplitude.code()})")
+        plain = {}
+        for symbol, own in terms.items():
+            text = " + ".join(own).replace("np.ones(len(s.angle))", "1.0")
+            text = _JOINT.sub(_joints, text.replace("np.maximum", "max"))
+            plain[symbol] = _RECORDED.sub(lambda m: m[1] or "", _FORCE.sub("force", text))
+        return {symbol: text for symbol, text in plain.items() if not _OTHER.search(text)}
 
     @property
     def acts_on(self) -> tuple[str, ...]:
@@ -342,7 +331,8 @@ def source_of_form(
     source = _HEAD.format(
         name=name, formula=form.text(), file=_in_docstring(quoted(file)),
         evidence="\n".join(map(_in_docstring, evidence.split("\n"))),
-        imports=", Response" if form.elastic else "", class_name=class_name(name),
+        imports=", Response" if form.elastic else "",
+        class_name="".join(part.capitalize() for part in name.split("_")),
         attributes="".join(attributes), parameters="\n".join(_parameters(form, found)),
         columns="\n".join(_moving(form)),
     )  # fmt: skip
@@ -361,23 +351,9 @@ def _in_docstring(line: str) -> str:
     return escaped(line).replace("\\", "\\\\").replace('"', '\\"')
 
 
-def class_name(name: str) -> str:
-    """Return the name of the class of an effect."""
-    return "".join(part.capitalize() for part in name.split("_"))
-
-
 def effect_class(source: str, name: str) -> type[Effect]:
     """Return the effect of a source, as a file with it would give it."""
-    hashed = hashlib.sha256(source.encode()).hexdigest()[:16]
-    module = ModuleType(f"law_{hashed}")
-    module.__file__ = f"<law {name}>"
-    sys.modules[module.__name__] = module
-    try:
-        exec(compile(source, module.__file__, "exec"), module.__dict__)  # noqa: S102 - made above
-    finally:
-        del sys.modules[module.__name__]
-    found: type[Effect] = module.__dict__[class_name(name)]
-    return found
+    return effects_of(source.encode(), Path(f"<law {name}>")).effects[0]
 
 
 def _parameters(form: Form, found: tuple[Coefficient, ...]) -> Iterator[str]:

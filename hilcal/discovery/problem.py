@@ -12,7 +12,8 @@ from functools import cached_property
 import numpy as np
 
 from hilcal.discovery.compose import composed_terms, grown
-from hilcal.discovery.screen import LawTerm, Scored, Screen, ScreenedTerm, Screening
+from hilcal.discovery.screen import LawTerm, Scored, Screen, ScreenedTerm
+from hilcal.identification.linearisation import Linearisation
 from hilcal.regression.evidence import FamilyScore, score_family
 from hilcal.regression.projection import Projection, projection
 from hilcal.types import Bools, Floats, Ints
@@ -26,6 +27,13 @@ LOG_ZERO = 2 * LOG2  # Price of a free zero of one of two factors: for having on
 LEAST_RIDGE = 1e-6  # of the model's directions, not all of which some rows determine; a choice
 
 
+def _refitted(linear: Linearisation, rows: Bools) -> tuple[Projection, Floats]:
+    """Return the model's projection in some rows (R,), and the residual of a fit to these."""
+    ridge = np.maximum(linear.projection.ridge, LEAST_RIDGE)
+    model = projection(linear.rows[rows], ridge)
+    return model, model.residual(linear.fit.white[rows], linear.fit.solution.coordinates())
+
+
 class SearchProblem:
     """The search on some of the rows."""
 
@@ -33,64 +41,46 @@ class SearchProblem:
         """Refit the model to some of the rows (R,); all by default."""
         linear = screen.linear
         self.screen = screen
-        every = np.ones(len(linear.residual), dtype=np.bool_)
-        self.rows = every if rows is None else rows
-        used = self.rows
-        if rows is None:
-            self.model: Projection = linear.projection
-            self.residual = linear.residual
-        else:
-            ridge = np.maximum(linear.projection.ridge, LEAST_RIDGE)
-            self.model = projection(linear.rows[used], ridge)
-            z = linear.fit.solution.coordinates()
-            self.residual = self.model.residual(linear.fit.white[used], z)
+        self.rows = np.ones(len(linear.residual), dtype=np.bool_) if rows is None else rows
+        self.model: Projection = linear.projection
+        self.residual = linear.residual
+        if rows is not None:
+            self.model, self.residual = _refitted(linear, rows)
         self.rss = float(self.residual @ self.residual)
-        lost = (1.0 - used.mean()) * len(used)
-        self.dof = max(linear.fit.dof - lost, 1.0)
-        share = float(used.mean())
-        self.square = share * screen.square
-        self.across = share * screen.across
-        self.across_one = share * screen.across_one
-        self.share = share
+        self.share = float(self.rows.mean())
+        self.dof = max(linear.fit.dof - (1.0 - self.share) * len(self.rows), 1.0)
+        self.square = self.share * screen.square
+        self.across = self.share * screen.across
+        self.across_one = self.share * screen.across_one
         # The screening uses some of these rows only where readings are many.
-        self.screened = used & screen.rows
-        self.seen = float(self.screened.sum() / used.sum())
+        self.screened = self.rows & screen.rows
+        self.seen = float(self.screened.sum() / self.rows.sum())
         self._thin, self._thin_residual = self.model, self.residual
-        self._scored: dict[tuple[tuple[tuple[tuple[int, int], ...], bool], ...], list[Scored]] = {}
         if self.seen < 1.0:
-            ridge = np.maximum(linear.projection.ridge, LEAST_RIDGE)
-            self._thin = projection(linear.rows[self.screened], ridge)
-            z = linear.fit.solution.coordinates()
-            self._thin_residual = self._thin.residual(linear.fit.white[self.screened], z)
+            self._thin, self._thin_residual = _refitted(linear, self.screened)
+        self._scored: dict[tuple[tuple[tuple[tuple[int, int], ...], bool], ...], list[Scored]] = {}
+
+    @cached_property
+    def thin(self) -> Floats:
+        """The residual in the rows of the screening (R',)."""
+        return self._thinned(self._thin_residual)
 
     @cached_property
     def slope(self) -> Floats:
         """(S, F) xᵀ r in the rows that are screened."""
-        return self._inner(self._thin_residual)
+        return self.screen.inner(self.thin)
 
-    def thinned(self, v: Floats) -> Floats:
+    def _thinned(self, v: Floats) -> Floats:
         """Rows of the screening (R',) of those of this problem that are screened."""
         whole = np.zeros(len(self.rows))
         whole[self.screened] = v
         return np.asarray(whole[self.screen.rows], dtype=np.float32)
 
-    @cached_property
-    def thin(self) -> Floats:
-        """The residual likewise."""
-        return self.thinned(self._thin_residual)
-
-    def _inner(self, v: Floats) -> Floats:
-        """(S, F) xᵀ v, v of the rows that are screened."""
-        whole = np.zeros(len(self.rows))
-        whole[self.screened] = v
-        return self.screen.inner(whole)
-
     def shadows(self, x: Floats) -> tuple[list[Floats], Floats, list[Floats]]:
         """What columns (R', P) of chosen terms take: (S, F) xᵀ u of directions u, uᵀ r, and u."""
-        x = x[self.screened[self.rows]]
-        u = orthonormal(self._thin, x)
-        told = u.T @ self._thin_residual
-        return [self._inner(d) for d in u.T], told, [self.thinned(d) for d in u.T]
+        directions = orthonormal(self._thin, x[self.screened[self.rows]])
+        units = [self._thinned(u) for u in directions.T]
+        return [self.screen.inner(u) for u in units], directions.T @ self._thin_residual, units
 
     def columns(self, term: LawTerm) -> Floats:
         """(R', P) whitened columns of a term in the rows that are used."""
@@ -134,9 +124,12 @@ class Beside:
         _, told, units = self._shadows
         yield from zip(told.tolist(), units, strict=True)
 
-    @cached_property
-    def screened(self) -> "Screening":
-        """All candidates beside the model and the chosen terms."""
+    def _screened(self) -> tuple[Floats, Floats, Floats, Floats]:
+        """Products of all candidates beside the model and the chosen terms, as in `Screen`.
+
+        (S, F) each: xᵀ r; xᵀ M x, zero where little of a column is left; xᵀ M x' with the partner,
+        and with a constant at the site.
+        """
         p = self.problem
         slope, square, across, across_one = p.slope, p.square, p.across, p.across_one
         partner, one = p.screen.grammar.partner, p.screen.one
@@ -147,7 +140,7 @@ class Beside:
             across_one = across_one - own * own[:, [one]]
         if self.chosen:
             square = np.where(square > LEFT * p.square, square, np.float32(0.0))
-        return Screening(slope, square, across, across_one)
+        return slope, square, across, across_one
 
     @cached_property
     def _known(self) -> tuple[frozenset[int], frozenset[str]]:
@@ -201,7 +194,8 @@ class Beside:
         and "pc" for both; "1" and "2" for the zero of the first and of the second factor of a
         product.
         """
-        p, all_ = self.problem, self.screened
+        p = self.problem
+        slopes, squares, across, across_one = self._screened()
         words, one = p.screen.grammar, p.screen.one
         partner = words.partner
         has = np.flatnonzero(partner >= 0)
@@ -209,7 +203,7 @@ class Beside:
         found: dict[str, list[ScreenedTerm]] = {k: [] for k in ("", "p", "c", "pc", "1", "2")}
         for s in range(len(p.screen.sites)):
             price = self._prices(s).astype(np.float32)
-            a, g, h = all_.square[s], all_.slope[s], all_.across[s]
+            a, g, h = squares[s], slopes[s], across[s]
             for constant in (False, True):
                 own = ""
                 seen = a > 0
@@ -217,12 +211,12 @@ class Beside:
                 if constant:
                     if not seen[one]:
                         break
-                    own, c = "c", all_.across_one[s]
+                    own, c = "c", across_one[s]
                     gain0 = float(g[one] ** 2 / a[one])
                     h = h - c * (c[partner] / a[one])
                     g = g - c * (g[one] / a[one])
                     a = a - c * (c / a[one])
-                    seen = seen & (a > LEFT * all_.square[s])
+                    seen = seen & (a > LEFT * squares[s])
                 safe = np.where(seen, a, 1.0)
                 gain = np.where(seen, g * g / safe, 0.0)
                 odds = self.evidence(gain + gain0, 1 + constant) - price - LOG2 * constant
@@ -231,7 +225,7 @@ class Beside:
                 odds = self.evidence(both + gain0, 2 + constant)
                 odds = odds - price[has] - LOG2 * (1 + constant)
                 keep_largest(found["p" + own], np.where(both > 0, odds, -np.inf), s, has)
-            a, g = all_.square[s], all_.slope[s]
+            a, g = squares[s], slopes[s]
             for key, less, h in zip("12", words.less, p.screen.across_less[:, s], strict=True):
                 h = np.float32(p.share) * h
                 for told in (shadow[s] for shadow in self._shadows[0]):

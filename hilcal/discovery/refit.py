@@ -27,6 +27,7 @@ from hilcal.effects.check import check_effect
 from hilcal.effects.protocol import Effect, Situation
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.fit import Fit, fit
+from hilcal.identification.linearisation import Linearisation
 from hilcal.types import Floats
 
 WORTH = 3.0  # Gain in log likelihood that a refined number needs, beside ½ ln ν; 20 : 1
@@ -75,15 +76,19 @@ def left_by(screen: Screen, form: Form, s: Situation) -> float:
     x = form.columns(screen, s)
     if not np.isfinite(x).all():
         return np.inf
-    step = np.linalg.lstsq(linear.information(x), x.T @ linear.residual, rcond=SPANNED)[0]
-    return linear.rss - float(x.T @ linear.residual @ step)
+    return linear.rss - float(x.T @ linear.residual @ _step(linear, x))
+
+
+def _step(linear: Linearisation, x: Floats) -> Floats:
+    """(P,) coefficients of columns (R, P) by algebra."""
+    found = np.linalg.lstsq(linear.information(x), x.T @ linear.residual, rcond=SPANNED)
+    return np.asarray(found[0], dtype=float)
 
 
 def at_linearisation(screen: Screen, form: Form) -> tuple[Coefficient, ...]:
     """Return the coefficients by algebra, without their uncertainties."""
-    x, linear = form.columns(screen, screen.linear.fit.solution.prediction.situation), screen.linear
-    step = np.linalg.lstsq(linear.information(x), x.T @ linear.residual, rcond=SPANNED)[0]
-    return coefficients(form, np.asarray(step, dtype=float), np.full(len(step), np.nan))
+    x = form.columns(screen, screen.linear.fit.solution.prediction.situation)
+    return coefficients(form, _step(screen.linear, x), np.full(form.count, np.nan))
 
 
 def exact(

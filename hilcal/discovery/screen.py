@@ -69,16 +69,6 @@ class ScreenedTerm:
     odds: float
 
 
-@dataclass(frozen=True, eq=False)
-class Screening:
-    """All candidates beside some columns, as in `Screen`."""
-
-    slope: Floats  # (S, F) xᵀ r
-    square: Floats  # (S, F) xᵀ M x; zero where little of a column is left
-    across: Floats  # (S, F) xᵀ M x' with the partner
-    across_one: Floats  # (S, F) xᵀ M x' with a constant at the site
-
-
 MOST_READINGS = 400  # that the screening uses; a choice, by time: it takes their square
 SEEN = 1e-4  # share of a column's square that must be left, for single precision
 ALIKE = 1 - 1e-9  # Cosine of two sites' motions from which on they are the same; rounding
@@ -169,8 +159,8 @@ class Screen:
         return int(np.count_nonzero(self.square))
 
     def inner(self, v: Floats) -> Floats:
-        """(S, F) xᵀ v of all candidates, v (R,), in single precision."""
-        by_reading = np.einsum("srn,r->sn", self.form, v[self.rows].astype(np.float32))
+        """(S, F) xᵀ v of all candidates, v (R',) of the rows of the screening, single precision."""
+        by_reading = np.einsum("srn,r->sn", self.form, v)
         return np.asarray(by_reading @ self.values)
 
     def columns(self, which: list[tuple[int, int]]) -> Floats:

@@ -44,7 +44,7 @@ def search(problem: SearchProblem, most: int = MOST_TERMS, beam: int = BEAM) -> 
     A longer one is returned only where odds of 20 : 1 ask for it beside every shorter one.
     """
     found = _ordered(problem)
-    if not found or not _sure(found[0], problem):
+    if not found or not _sure(found[0]):
         return []
     starts = _distinct(problem, found, beam)
     best: dict[int, Selection] = {}
@@ -143,7 +143,7 @@ def _better(problem: SearchProblem, s: Selection, other: Selection) -> bool:
     return _extent(problem, s.terms) < _extent(problem, other.terms)
 
 
-def _sure(c: Scored, problem: SearchProblem) -> bool:
+def _sure(c: Scored) -> bool:
     return c.odds > LEAST and np.log(max(c.score.p_value, 1e-300)) + c.term.price < np.log(
         FALSE_ALARM
     )

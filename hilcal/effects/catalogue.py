@@ -54,15 +54,10 @@ BUILT_IN: tuple[type[Effect], ...] = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Catalogue:
-    """The effects that a model can have.
+    """The effects that a model can have."""
 
-    Attributes:
-        effects: classes, each of another name.
-        files: the files that some of them are from.
-    """
-
-    effects: tuple[type[Effect], ...]
-    files: tuple[EffectFile, ...] = ()
+    effects: tuple[type[Effect], ...]  # classes, each of another name
+    files: tuple[EffectFile, ...] = ()  # the files that some of them are from
 
     @property
     def names(self) -> tuple[str, ...]:

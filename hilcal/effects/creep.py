@@ -6,8 +6,8 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.effects.options import Options, choice
-from hilcal.effects.per_joint import COMMON, EACH, PerJoint
-from hilcal.effects.protocol import Columns, Parameter, Response, Situation
+from hilcal.effects.per_joint import COMMON, EACH, TorqueLaw
+from hilcal.effects.protocol import Columns, Parameter, Situation
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.types import Floats
@@ -15,7 +15,7 @@ from hilcal.types import Floats
 SECOND = 1.0  # Unit of time of the law, s
 
 
-class Creep(PerJoint):
+class Creep(TorqueLaw):
     """dq_j = k c_j τ_j log10(1 + t/1 s), t the time under the present load [1 per decade].
 
     c_j is the joint's compliance: the model's `joint_compliance`, or where the model has
@@ -28,8 +28,6 @@ class Creep(PerJoint):
     unit, size, meaning = "1", 0.02, "creep of {joint} per decade of time"
     summary = "dq_j = k c_j τ_j log10(1 + t/1 s): joints go on giving way under the load"
     plausible = 10.0  # 20 % per decade of time: polymers; metals creep by less than 2 %. A choice.
-    elastic = True
-    local_response = True
     needs = ("load_time",)
     usual_joints = COMMON
     option_help: ClassVar = {
@@ -59,14 +57,10 @@ class Creep(PerJoint):
         assert s.states.load_time is not None  # noqa: S101 - checked at construction
         return np.asarray(np.log10(1 + s.states.load_time / SECOND))[:, None]
 
-    def columns(self, s: Situation) -> tuple[Columns, ...]:
-        """Elastic twist times decades: ∂dq_j/∂k = c_j τ_j log10(1 + t/1 s)."""
-        return (self.joint_columns("dq", s.compliance * s.torque * self._decades(s)),)
-
-    def response(self, theta: Floats, s: Situation, change: Floats) -> Response:
-        """Return k c_j log10(1 + t/1 s) dτ_j."""
-        slope = self.of_joints(theta) * s.compliance * self._decades(s)
-        return Response(dq=s.along(change) * slope[:, None, :])
+    def of_torque(self, s: Situation) -> tuple[Floats, Floats]:
+        """Return c_j τ_j log10(1 + t/1 s), and c_j log10(1 + t/1 s)."""
+        decades = self._decades(s)
+        return s.compliance * s.torque * decades, s.compliance * decades
 
     def compliance_columns(self, theta: Floats, s: Situation) -> tuple[Columns, ...]:
         """Return ∂dq_j/∂c_j = k τ_j log10(1 + t/1 s)."""

@@ -29,6 +29,7 @@ class ForceSensorEffect(Effect):
     Errors of several kinds each act on the recorded wrench; their products are left out.
     """
 
+    of_setup = True
     option_help: ClassVar = {
         "rotvec_rad": "the sensor's axes as configured in flange axes, a rotation vector; unless "
         "given, the flange's own."

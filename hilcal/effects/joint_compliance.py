@@ -1,12 +1,14 @@
 """`joint_compliance`: the drive train twists under torque."""
 
-from hilcal.effects.options import ordinary_give, rated_torques
-from hilcal.effects.per_joint import PerJoint, joint_change
-from hilcal.effects.protocol import Columns, Response, Situation
+import numpy as np
+
+from hilcal.effects.options import ordinary_give
+from hilcal.effects.per_joint import TorqueLaw, joint_change
+from hilcal.effects.protocol import Situation
 from hilcal.types import Floats
 
 
-class JointCompliance(PerJoint):
+class JointCompliance(TorqueLaw):
     """dq_j = c_j τ_j, a compliance of each joint [rad/(N·m)]; of a slide c_j f_j [m/N]."""
 
     name = "joint_compliance"
@@ -15,21 +17,15 @@ class JointCompliance(PerJoint):
     change = joint_change("compliance", "wear, crash or repair?", listed=True, with_others=True)
     plausible = 10.0  # 30 mrad at the rated torque; gears state 1 to 5. A choice.
     spread = 0.5  # Springs and oil of one type of gear scatter by a third; a choice
-    elastic = True
-    local_response = True
     role = "baseline"
 
     def ordinary(self) -> Floats:
         """3 mrad (0.1 mm) at the rated torque (force)."""
-        return ordinary_give(self.cell) / rated_torques(self.cell)
+        return ordinary_give(self.cell) / self.cell.arm.ratings
 
-    def columns(self, s: Situation) -> tuple[Columns, ...]:
-        """Torques: ∂dq_j/∂c_j = τ_j."""
-        return (self.joint_columns("dq", s.torque),)
-
-    def response(self, theta: Floats, s: Situation, change: Floats) -> Response:
-        """Return dq_j = c_j dτ_j."""
-        return Response(dq=s.along(change) * self.of_joints(theta))
+    def of_torque(self, s: Situation) -> tuple[Floats, Floats]:
+        """Return τ_j, and 1."""
+        return s.torque, np.ones((1, self.cell.arm.n))
 
     def compliance(self, theta: Floats) -> Floats:
         """Return c itself: `creep` builds on it."""

@@ -57,11 +57,6 @@ def choice(effect: str, options: Options, key: str, valid: tuple[str, ...]) -> s
     return value
 
 
-def rated_torques(cell: Cell) -> Floats:
-    """(n,) rated torques, of slides forces; 150 N·m and 1500 N where unknown."""
-    return cell.arm.ratings
-
-
 def rated_moments(cell: Cell) -> Floats:
     """(n,) moments that joints are built for; of a slide its rated force at half a metre, N·m."""
     return np.asarray(cell.arm.ratings * np.where(cell.arm.slides, LEVER, 1.0))
@@ -74,7 +69,7 @@ def ordinary_give(cell: Cell) -> Floats:
 
 def typical_compliances(cell: Cell) -> Floats:
     """(n,) joint compliances where nothing is known of them, rad/(N·m); of slides m/N."""
-    return np.where(cell.arm.slides, TYPICAL_SHIFT, TYPICAL_TWIST) / rated_torques(cell)
+    return np.where(cell.arm.slides, TYPICAL_SHIFT, TYPICAL_TWIST) / cell.arm.ratings
 
 
 def prior_of_units(effect: str, options: Options, units: Sequence[str]) -> Floats | None:

@@ -2,6 +2,7 @@
 
 import math
 import re
+from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
@@ -9,7 +10,14 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from hilcal.effects.options import Options
-from hilcal.effects.protocol import Changeable, Columns, Effect, Parameter
+from hilcal.effects.protocol import (
+    Changeable,
+    Columns,
+    Effect,
+    Parameter,
+    Response,
+    Situation,
+)
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.types import Floats, Ints
@@ -212,3 +220,23 @@ class PerJoint(Effect):
         """(N, J, ...) values of the joints that have a parameter, of (N, n, ...)."""
         joint = self.shared.joint
         return values if len(joint) == self.cell.arm.n else values[:, joint]
+
+
+class TorqueLaw(PerJoint):
+    """dq_j = θ_j f_j(τ_j) with τ_j the static torque of joint j; f_j may depend on the state."""
+
+    elastic = True
+    local_response = True
+
+    @abstractmethod
+    def of_torque(self, s: Situation) -> tuple[Floats, Floats]:
+        """(N, n) values of f_j(τ_j), and (N or 1, n) of its derivative by τ_j."""
+
+    def columns(self, s: Situation) -> tuple[Columns, ...]:
+        """Return ∂dq_j/∂θ_j = f_j(τ_j)."""
+        return (self.joint_columns("dq", self.of_torque(s)[0]),)
+
+    def response(self, theta: Floats, s: Situation, change: Floats) -> Response:
+        """Return θ_j f_j'(τ_j) dτ_j."""
+        slope = self.of_joints(theta) * self.of_torque(s)[1]
+        return Response(dq=s.along(change) * slope[:, None, :])

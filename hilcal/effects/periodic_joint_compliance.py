@@ -4,7 +4,6 @@ from typing import ClassVar
 
 import numpy as np
 
-from hilcal.effects.options import rated_torques
 from hilcal.effects.per_joint import PerJoint
 from hilcal.effects.protocol import Columns, Parameter, Response, Situation
 from hilcal.errors import InputError
@@ -52,7 +51,7 @@ class PeriodicJointCompliance(PerJoint):
         """Two per joint and order; a fifth of an ordinary compliance."""
         kinds = {f".{w}{k}": f"{w} {k} q" for k in self.orders for w in ("cos", "sin")}
         meaning = "part of the compliance of {joint} that goes with {kind}"
-        ordinary = np.where(self.cell.arm.slides, 2e-5, 6e-4) / rated_torques(self.cell)
+        ordinary = np.where(self.cell.arm.slides, 2e-5, 6e-4) / self.cell.arm.ratings
         return self.group_parameters("rad/(N·m)", ordinary, meaning, kinds)
 
     def _waves(self, s: Situation) -> Floats:

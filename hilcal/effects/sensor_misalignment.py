@@ -14,7 +14,6 @@ class SensorMisalignment(ForceSensorEffect):
     name = "sensor_misalignment"
     summary = "acting = R exp(δ) Rᵀ wrench: the force sensor's axes are turned by δ"
     plausible = 20.0  # 0.2 rad: bolted on by eye. A choice.
-    of_setup = True
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

@@ -14,7 +14,6 @@ class WrenchBias(ForceSensorEffect):
     summary = "wrench read = true + b: the force sensor has a constant offset, in its own axes"
     change = Changeable("setup", "force sensor", "the zero of the force sensor")
     plausible = 30.0  # 30 N, 3 N·m: a sensor that was not zeroed with its tool. A choice.
-    of_setup = True
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

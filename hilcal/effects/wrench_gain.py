@@ -19,7 +19,6 @@ class WrenchGain(ForceSensorEffect):
     summary = "wrench read = (1 + g) true per axis: the force sensor has a gain error"
     change = Changeable("setup", "force sensor", "the gain of the force sensor")
     plausible = 50.0  # 50 %: a wrong calibration matrix, a channel that hardly reads. A choice.
-    of_setup = True
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

@@ -20,11 +20,11 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.identification.fit import Fit
-from hilcal.identification.full_covariance import joint_factors
+from hilcal.identification.full_covariance import joint_factors, whitened_blocks
 from hilcal.model.model import Model
 from hilcal.readings.covariance import scatter_alone, with_scatter
 from hilcal.readings.readings import ArmScatter, Readings, ScatterKind
-from hilcal.readings.whitening import Whitening, covariance_blocks, whitening
+from hilcal.readings.whitening import Whitening, whitening
 from hilcal.regression.variance_components import (
     BlockRows,
     VarianceComponents,
@@ -35,17 +35,12 @@ from hilcal.types import Floats, Ints
 MOST_ROWS = 4000
 """Whitened rows that are used at most, of poses chosen at random, for speed; a choice: a σ of
 hundreds of arrivals is known to a few per cent."""
+SEED = 20250304  # of these poses
 KINDS: tuple[ScatterKind, ...] = ("joints", "each joint", "isotropic")
 
 
 def factors(cell: Cell, readings: Readings, kind: ScatterKind) -> tuple[Floats, ...]:
-    """Return F (N, m, k) for unit σ of each component.
-
-    Args:
-        cell: with the registration and the targets as the model has them.
-        readings: N readings.
-        kind: of the scatter.
-    """
+    """Return F (N, m, k) for unit σ of each component, with the frames as they are in the cell."""
     m = readings.m
     if kind == "isotropic":
         out = np.tile(np.eye(m)[:, :3], (len(readings), 1, 1))
@@ -56,13 +51,7 @@ def factors(cell: Cell, readings: Readings, kind: ScatterKind) -> tuple[Floats, 
 
 
 def with_arm_scatter(cell: Cell, readings: Readings, scatter: ArmScatter) -> Readings:
-    """Return the readings with an estimated scatter in their covariance.
-
-    Args:
-        cell: as for `factors`.
-        readings: with the stated covariance.
-        scatter: the estimate.
-    """
+    """Return readings of a stated covariance with an estimated scatter in it; see `factors`."""
     parts = zip(factors(cell, readings, scatter.kind), scatter.std, strict=True)
     f = np.concatenate([std * factor for factor, std in parts], axis=2)
     return replace(with_scatter(readings, f), stated=readings.covariance, arm_scatter=scatter)
@@ -101,12 +90,6 @@ class _Whitened:
             at = stop
         return out
 
-    def component(self, factor: Floats) -> list[Floats]:
-        """Whitened covariance of each bucket (G, S, S) by a factor F (N, m, k)."""
-        of = scatter_alone(self.readings, factor)
-        parts = zip(self.w.buckets, covariance_blocks(of, self.w), strict=True)
-        return [b.factor @ c @ np.swapaxes(b.factor, 1, 2) for b, c in parts]
-
     def instrument(self) -> list[Floats]:
         """The same for the stated covariance itself."""
         seen = [np.any(b.factor != 0, axis=2) for b in self.w.buckets]
@@ -114,10 +97,9 @@ class _Whitened:
 
 
 def estimate_arm_scatter(fit: Fit) -> ArmScatter | None:
-    """Estimate the arm's scatter from a gc-scaled fit; None where the residual shows none.
+    """Estimate the arm's scatter; None where the residual shows none.
 
-    Args:
-        fit: to readings with their stated covariance alone.
+    The fit is gc-scaled, to readings with their stated covariance alone.
     """
     data, ridge = _whitened(fit), fit.solution.equations.basis.prior_precision
     cell, price = fit.model.cell, 0.5 * float(np.log(fit.dof))
@@ -125,7 +107,8 @@ def estimate_arm_scatter(fit: Fit) -> ArmScatter | None:
     def maximised(kind: ScatterKind | None) -> VarianceComponents:
         if kind is None:  # a noisier instrument
             return variance_components(data.blocks([data.instrument()]), ridge)
-        parts = [data.component(f) for f in factors(cell, data.readings, kind)]
+        each = (scatter_alone(data.readings, f) for f in factors(cell, data.readings, kind))
+        parts = [whitened_blocks(of, data.w) for of in each]
         return variance_components(data.blocks(parts), ridge)
 
     found, noisier = {kind: maximised(kind) for kind in KINDS}, maximised(None)
@@ -157,29 +140,22 @@ def _whitened(fit: Fit) -> _Whitened:
     live = np.flatnonzero(s.estimated)
     if kept.states.target is not None and kept.common is None:
         kept = replace(kept, common=np.zeros((len(kept), kept.m, fit.model.cell.arm.n)))
-    chosen = _some_poses(kept, fit.white.size)
+    chosen = some_poses(kept, MOST_ROWS / max(fit.white.size, 1), SEED)
     some = kept[chosen]
     w = whitening(some, fit.mode, "gc")
     place = np.zeros(len(kept), dtype=np.int64)
     place[fit.whitening.reading] = np.arange(len(fit.raw))
     white = w.whiten(fit.raw[place[chosen[w.reading]]]).reshape(-1)
-    rows = _rows(fit, w, chosen, live)
+    jacobian = fit.model.jacobian(s.prediction, s.theta, w.m, live)[chosen]
+    rows = w.whiten(w.raw(jacobian)).reshape(w.m * len(w), len(live)) @ s.transform[live]
     return _Whitened(some, w, white + rows @ s.coordinates(), rows)
 
 
-def _rows(fit: Fit, w: Whitening, chosen: Ints, live: Ints) -> Floats:
-    """Columns (R, K) of a fit, by its identifiable coordinates, in some readings."""
-    s = fit.solution
-    jacobian = fit.model.jacobian(s.prediction, s.theta, w.m, live)[chosen]
-    white = w.whiten(w.raw(jacobian)).reshape(w.m * len(w), len(live))
-    return np.asarray(white @ s.transform[live])
-
-
-def _some_poses(readings: Readings, size: int) -> Ints:
-    """Rows of the readings: all, or those of poses chosen at random for `MOST_ROWS` of `size`."""
-    if size <= MOST_ROWS:
+def some_poses(readings: Readings, share: float, seed: int, fewest: int = 1) -> Ints:
+    """Rows of the readings: all, or those of poses chosen at random for a share below 1."""
+    if share >= 1.0:
         return np.arange(len(readings))
     poses = np.unique(readings.pose)
-    count = max(int(MOST_ROWS / size * len(poses)), 1)
-    chosen = np.random.default_rng(20250304).choice(poses, count, replace=False)
+    count = max(int(share * len(poses)), fewest)
+    chosen = np.random.default_rng(seed).choice(poses, count, replace=False)
     return np.flatnonzero(np.isin(readings.pose, chosen))

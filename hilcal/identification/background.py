@@ -25,6 +25,7 @@ from hilcal.identification.mixed_fit import (
     SCATTER_RAD,
     MixedFit,
     mixed_fit,
+    mixed_fit_at,
     mixed_fit_of,
 )
 from hilcal.model.model import Model
@@ -39,6 +40,9 @@ MOST_ROWS_OF_LINES = 2000
 UNSURE = 2.0
 """Factor to which few readings tell a standard deviation: it may be so much more than plausible; a
 choice."""
+
+WIDTH = 1.96
+"""Standard errors of log s that a 95 % interval reaches on either side."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,15 +64,10 @@ class BackgroundPart:
 
 @dataclass(frozen=True, slots=True)
 class Background:
-    """What a background moves; effects that the readings do not tell apart can cancel in it.
+    """What a background moves; effects that the readings do not tell apart can cancel in it."""
 
-    Attributes:
-        rms_m: of all its effects together, m.
-        parts: of each, what moves most first.
-    """
-
-    rms_m: float
-    parts: tuple[BackgroundPart, ...]
+    rms_m: float  # of all its effects together, m
+    parts: tuple[BackgroundPart, ...]  # of each, what moves most first
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -105,6 +104,64 @@ def _rms(moves: Floats) -> float:
     return float(np.sqrt(np.mean(np.sum(moves.sum(axis=2) ** 2, axis=1))))
 
 
+@dataclass(frozen=True, slots=True)
+class FamilySize:
+    """The size of a family: the standard deviation of its parameters, SI."""
+
+    name: str  # of the family
+    effect: str  # of its effect
+    named: bool  # whether the readings prove the effect
+    std: float  # root of the mean square over the parameters
+    low: float  # lower end of its 95 % interval
+    high: float  # upper end
+    ordinary: float  # the same of an ordinary arm
+    unit: str
+    moves_m: float  # rms of what its estimated parameters move the measured positions by, m
+
+    def to_json(self) -> dict[str, object]:
+        """Return the attributes by name, SI."""
+        return asdict(self)
+
+
+def family_sizes(fit: Fit) -> tuple[FamilySize, ...]:
+    """Return the size of each family of a fit with a background; what moves most comes first.
+
+    It is estimated with those of all others (see `mixed.variances`); the curvature of the log
+    posterior gives its interval.
+    """
+    model = fit.model
+    if not model.background:
+        return ()
+    kept = fit.readings[~fit.outlier].as_stated()
+    found = mixed_fit_at(model, kept, fit.mode, fit.theta)
+    problem, log_std = found.equations.problem, found.log_std
+    error = np.sqrt(np.diag(found.covariance))
+    jacobian = model.jacobian(fit.solution.prediction, fit.theta, 3)
+    moves = fit.whitening.raw(jacobian) * fit.theta
+    units = [p.unit for e in model.effects for p in e.parameters]
+    roles = {e.name: e.role for e in model.effects}
+    out = []
+    for k, f in enumerate(problem.families.random):
+        if roles[f.effect] in FRAME_ROLES:
+            continue
+        magnitude = float(np.sqrt(np.mean(f.magnitude**2)))
+        low, middle, high = np.exp(log_std[k] + WIDTH * error[k] * np.array([-1.0, 0.0, 1.0]))
+        out.append(
+            FamilySize(
+                name=f.name,
+                effect=f.effect,
+                named=f.effect not in model.background,
+                std=float(middle) * magnitude,
+                low=float(low) * magnitude,
+                high=float(high) * magnitude,
+                ordinary=float(np.exp(f.prior.mean)) * magnitude,
+                unit=units[int(f.parameters[0])],
+                moves_m=_rms(moves[:, :, f.parameters]),
+            )
+        )
+    return tuple(sorted(out, key=lambda s: -s.moves_m))
+
+
 def allows_background(of: Fit) -> bool:
     """Whether the readings are few enough for a background, and no other campaign is the prior.
 
@@ -127,11 +184,8 @@ def with_background(of: Fit, named: Collection[str]) -> Fit | None:
 
     The noise is as the mixed model estimates it: the arm's scatter is in the covariance, and a
     factor of the instrument's makes the standard deviations of the effects smaller by as much,
-    which is the same fit. Readings that were set aside as gross errors stay so.
-
-    Args:
-        of: a fit that allows it.
-        named: effects that are not of the background.
+    which is the same fit. Readings that were set aside as gross errors stay so. The `named` effects
+    are not of the background.
     """
     readings = of.readings.as_stated()
     try:

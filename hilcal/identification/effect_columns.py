@@ -34,11 +34,6 @@ class EffectColumns:
         """(R, P) whitened columns."""
         return self.together[:, self.within]
 
-    @property
-    def numbers(self) -> int:
-        """How many numbers are kept."""
-        return self.of_readings.size
-
     @cached_property
     def motion(self) -> Floats:
         """(D, 3, P) displacement of each measured position, m."""

@@ -19,7 +19,7 @@ from hilcal.readings.covariance import (
     with_scatter,
 )
 from hilcal.readings.readings import Readings
-from hilcal.readings.whitening import inverse_root
+from hilcal.readings.whitening import Whitening, covariance_blocks, inverse_root
 from hilcal.tables.uncertainty import rounding_variance, with_rounding
 from hilcal.types import Floats
 
@@ -113,6 +113,12 @@ def _scatter(cell: Cell, readings: Readings, joint_std: Floats) -> Floats | None
     except CannotAnswerError:
         return None
     return joint_factors(registered, readings, joint_std)
+
+
+def whitened_blocks(readings: Readings, w: Whitening) -> list[Floats]:
+    """Return the covariance (G, S, S) of each bucket of a scaling, whitened by it."""
+    parts = zip(w.buckets, covariance_blocks(readings, w), strict=True)
+    return [b.factor @ c @ np.swapaxes(b.factor, 1, 2) for b, c in parts]
 
 
 def joint_factors(cell: Cell, readings: Readings, joint_std: Floats) -> Floats:

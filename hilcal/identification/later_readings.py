@@ -31,7 +31,7 @@ from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.arm_scatter import with_arm_scatter
 from hilcal.identification.baseline import ARM
 from hilcal.identification.fit import Fit
-from hilcal.identification.predictive import Predictive, predictive
+from hilcal.identification.predictive import Predictive, predictive_of
 from hilcal.identification.priors import scales_of
 from hilcal.identification.registration import register, targets_as_fitted
 from hilcal.identification.residual import residual
@@ -70,11 +70,9 @@ def earlier_fit(fit: Fit) -> EarlierFit:
             f"the earlier fit has scaling {fit.scaling}; a comparison needs gc: run hilcal "
             "identify again"
         )
-    kept, w = fit.readings[~fit.outlier], fit.whitening
-    sigma = float(np.sqrt(np.sum(w.whiten(fit.left_out) ** 2) / w.rank))
-    knows = predictive(fit.model, fit.theta, fit.solution.prior, kept, fit.mode, sigma)
+    knows = predictive_of(fit)
     beyond = max(knows.factor * knows.scatter - 1.0, 0.0)
-    shared = beyond * _shared(fit, knows, kept)
+    shared = beyond * _shared(fit, knows, fit.readings[~fit.outlier])
     root = _root(knows.factor * knows.covariance)
     return EarlierFit(fit, knows, root, 1.0 + beyond - shared, shared)
 

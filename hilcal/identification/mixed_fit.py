@@ -13,7 +13,7 @@ import numpy as np
 from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.effects.spec import EffectSpec
 from hilcal.errors import CannotAnswerError
-from hilcal.identification.full_covariance import joint_factors
+from hilcal.identification.full_covariance import joint_factors, whitened_blocks
 from hilcal.identification.residual import residual
 from hilcal.mixed.equations import Equations
 from hilcal.mixed.families import Families, LogStdPrior, families_of
@@ -22,7 +22,7 @@ from hilcal.mixed.variances import Variances, coordinates_covariance, estimate_v
 from hilcal.model.model import Model
 from hilcal.readings.covariance import scatter_alone
 from hilcal.readings.readings import Readings, States
-from hilcal.readings.whitening import Mode, Whitening, covariance_blocks, whitening
+from hilcal.readings.whitening import Mode, Whitening, whitening
 from hilcal.types import Floats
 
 HARMONICS = 64
@@ -49,40 +49,24 @@ NOISE_SPREAD = 1.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NoisePart:
-    """A part of the noise of N readings.
+    """A part of the noise of N readings."""
 
-    Attributes:
-        name: of it.
-        covariance: (N, m, m) of a part of ordinary size.
-        prior: of the log of the standard deviation, in that size.
-        common: (N, m, n) F of what readings of one arrival have in common; see `Readings.common`.
-    """
-
-    name: str
-    covariance: Floats
-    prior: LogStdPrior
+    name: str  # of it
+    covariance: Floats  # (N, m, m) of a part of ordinary size
+    prior: LogStdPrior  # of the log of the standard deviation, in that size
+    # (N, m, n) F of what readings of one arrival have in common; see `Readings.common`
     common: Floats | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class MixedFit:
-    """All effects at once, fitted to readings.
+    """All effects at once, fitted to readings."""
 
-    Attributes:
-        model: with all effects.
-        readings: that it was fitted to.
-        w: their whitening, by the stated covariance.
-        theta: (P,) parameters.
-        variances: those of the families and of the noise, at the last linearisation.
-        covariance: (K, K) of the errors of the coordinates.
-    """
-
-    model: Model
-    readings: Readings
-    w: Whitening
-    theta: Floats
-    variances: Variances
-    covariance: Floats
+    model: Model  # with all effects
+    readings: Readings  # that it was fitted to
+    theta: Floats  # (P,) parameters
+    variances: Variances  # those of the families and of the noise, at the last linearisation
+    covariance: Floats  # (K, K) of the errors of the coordinates
 
     @property
     def problem(self) -> MixedProblem:
@@ -99,30 +83,6 @@ class MixedFit:
         for f, log_std in zip(self.problem.families.random, self.variances.log_std, strict=False):
             out[f.parameters] = np.exp(log_std) * f.magnitude
         return out
-
-    def predict(self, states: States, m: int) -> tuple[Floats, Floats]:
-        """Predict what the sensor reads in N states.
-
-        Args:
-            states: joints, wrenches and what else the effects need.
-            m: 3 for positions, 6 for poses (the last three are the errors' rotation vector).
-
-        Returns:
-            (N, 3) positions, and (N, m, m) covariance of the prediction, without that of the
-            reading's noise.
-        """
-        prediction = self.model.predict(states, self.theta)
-        x = self.problem.coordinates(self.model.jacobian(prediction, self.theta, m))
-        spread = x @ self.covariance @ np.swapaxes(x, 1, 2)
-        return prediction.observation.position, spread
-
-    def noise(self, readings: Readings) -> Floats:
-        """(N, m, m) covariance of absolute readings by instrument and arm, as estimated."""
-        total = self.std(INSTRUMENT) ** 2 * readings.covariance
-        if SCATTER in self.problem.names:
-            f = _scatter_factors(self.model, readings)
-            total = total + self.std(SCATTER) ** 2 * (f @ np.swapaxes(f, 1, 2))
-        return np.asarray(total)
 
 
 def with_all_effects(model: Model, states: States, harmonics: int = HARMONICS) -> Model:
@@ -158,17 +118,7 @@ def with_all_harmonics(model: Model, states: States, harmonics: int = HARMONICS)
 
 
 def mixed_fit(model: Model, readings: Readings, mode: Mode) -> MixedFit:
-    """Fit all effects of the catalogue at once.
-
-    Args:
-        model: frames, and effects that have to be in it.
-        readings: without gross errors.
-        mode: "deflection" or "absolute".
-
-    Raises:
-        CannotAnswerError: no static equilibrium, or no likelihood.
-        InputError: a deflection without its unloaded reading.
-    """
+    """Fit all effects of the catalogue at once, beside those of a model; see `mixed_fit_of`."""
     return mixed_fit_of(with_all_effects(model, readings.states), readings, mode)
 
 
@@ -176,17 +126,10 @@ def mixed_fit_of(
     model: Model,
     readings: Readings,
     mode: Mode,
-    flat: Collection[str] = (),
-    lines: Collection[str] = (),
+    flat: Collection[str] = (),  # effects whose parameters have no prior
+    lines: Collection[str] = (),  # effects of which each group has a size of its own
 ) -> MixedFit:
-    """Fit the effects of a model at once.
-
-    Args:
-        model: frames and effects.
-        readings: without gross errors.
-        mode: "deflection" or "absolute".
-        flat: effects whose parameters have no prior.
-        lines: effects of which each group has a size of its own.
+    """Fit the effects of a model at once, to readings without gross errors.
 
     Raises:
         CannotAnswerError: no static equilibrium, or no likelihood.
@@ -194,17 +137,13 @@ def mixed_fit_of(
     """
     w = whitening(readings, mode, "gc")
     found, theta = _iterated(model, readings, w, families_of(model, flat, lines))
-    return MixedFit(model, readings, w, theta, found, coordinates_covariance(found))
+    return MixedFit(model, readings, theta, found, coordinates_covariance(found))
 
 
 def mixed_fit_at(model: Model, readings: Readings, mode: Mode, theta: Floats) -> Variances:
     """Estimate the variances of a model's effects at parameters theta (P,), without moving them.
 
-    Args:
-        model: with all effects that take part.
-        readings: without gross errors, with their stated covariance.
-        mode: "deflection" or "absolute".
-        theta: where the model is linearised.
+    The readings are without gross errors, with their stated covariance.
     """
     problem = linearised_problem(model, readings, mode, theta)
     return estimate_variances(problem, sizes_at(problem, model, theta))
@@ -238,15 +177,8 @@ def variances_with_noise(
 ) -> tuple[Variances, Floats]:
     """Estimate the variances of effects, of parts of the instrument's noise and of the arm's.
 
-    Args:
-        model: with all effects that take part.
-        readings: without gross errors, with the covariance of the instrument.
-        mode: "deflection" or "absolute".
-        instrument: parts that add up to that covariance.
-        arm: its scatter.
-
-    Returns:
-        The variances, the components of the noise last, and the parameters (P,) predicted.
+    The readings, without gross errors, have the covariance of the instrument, which its parts add
+    up to. The parameters (P,) that the variances predict are returned with them.
     """
     return _iterated(model, readings, whitening(readings, mode, "gc"), None, (*instrument, arm))
 
@@ -288,15 +220,10 @@ def _iterated(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Linearised:
-    """A linear problem at some parameters.
+    """A linear problem at some parameters."""
 
-    Attributes:
-        problem: of it.
-        white: (R,) residual there, in the rows of the problem.
-    """
-
-    problem: MixedProblem
-    white: Floats
+    problem: MixedProblem  # of it
+    white: Floats  # (R,) residual there, in the rows of the problem
 
     def penalised(self, theta: Floats, at: Equations) -> float:
         """Squares of the residual and of the parameters (P,), each in its standard deviations."""
@@ -346,17 +273,11 @@ def _noise(
         whole = np.concatenate([s.reshape(-1) for s in seen]).astype(np.float64)
         return rows, [Noise(INSTRUMENT, whole, prior)]
     of = scatter_alone(readings, _scatter_factors(model, readings))
-    turned, instrument, scatter, start = np.empty_like(rows), [], [], 0
-    for b, c, s in zip(w.buckets, covariance_blocks(of, w), seen, strict=True):
-        u, variance = independent_rows(b.factor @ c @ np.swapaxes(b.factor, 1, 2), s)
-        stop = start + s.size
-        block = rows[start:stop].reshape(*s.shape, -1)
-        turned[start:stop] = (np.swapaxes(u, 1, 2) @ block).reshape(s.size, -1)
-        instrument.append((variance > UNSEEN).reshape(-1).astype(np.float64))
-        scatter.append(np.maximum(variance, 0.0).reshape(-1))
-        start = stop
-    components = ((INSTRUMENT, instrument), (SCATTER, scatter))
-    return turned, [Noise(name, np.concatenate(v), prior) for name, v in components]
+    blocks = zip(whitened_blocks(of, w), seen, strict=True)
+    bases, variances = zip(*(independent_rows(c, s) for c, s in blocks), strict=True)
+    variance = np.concatenate([v.reshape(-1) for v in variances])
+    instrument = Noise(INSTRUMENT, (variance > UNSEEN).astype(np.float64), prior)
+    return _turned(rows, bases), [instrument, Noise(SCATTER, np.maximum(variance, 0.0), prior)]
 
 
 def _noise_of(
@@ -368,29 +289,35 @@ def _noise_of(
     eigenvectors; of the arm's, the last one, what is correlated between two of these parts is left
     out.
     """
-    blocks = [
-        covariance_blocks(
-            replace(readings, covariance=p.covariance, common=p.common, serial=None), w
-        )
+    of_parts = [
+        whitened_blocks(replace(readings, covariance=p.covariance, common=p.common, serial=None), w)
         for p in parts
     ]
-    turned, start = np.empty_like(rows), 0
+    bases = []
     variances: list[list[Floats]] = [[] for _ in parts]
-    for k, b in enumerate(w.buckets):
-        *instrument, arm = (b.factor @ of[k] @ np.swapaxes(b.factor, 1, 2) for of in blocks)
+    for blocks in zip(*of_parts, strict=True):
+        *instrument, arm = blocks
         size = max(float(np.abs(arm).max(initial=0.0)), 1e-300)
         apart = sum((j * x for j, x in enumerate(instrument, 1)), LITTLE * arm / size)
         u = np.linalg.eigh(apart)[1]
-        stop = start + u.shape[0] * u.shape[1]
-        block = rows[start:stop].reshape(*u.shape[:2], -1)
-        turned[start:stop] = (np.swapaxes(u, 1, 2) @ block).reshape(stop - start, -1)
-        for of_part, x in zip(variances, (*instrument, arm), strict=True):
+        bases.append(u)
+        for of_part, x in zip(variances, blocks, strict=True):
             of_part.append(np.einsum("gij,gik,gkj->gj", u, x, u).reshape(-1))
-        start = stop
-    return turned, [
+    return _turned(rows, bases), [
         Noise(p.name, np.maximum(np.concatenate(v), 0.0), p.prior)
         for p, v in zip(parts, variances, strict=True)
     ]
+
+
+def _turned(rows: Floats, bases: Sequence[Floats]) -> Floats:
+    """Rows (R, ...) by the axes U (G, S, S) of each bucket."""
+    out, start = np.empty_like(rows), 0
+    for u in bases:
+        stop = start + u.shape[0] * u.shape[1]
+        block = rows[start:stop].reshape(*u.shape[:2], -1)
+        out[start:stop] = (np.swapaxes(u, 1, 2) @ block).reshape(stop - start, -1)
+        start = stop
+    return out
 
 
 def scatter_part(model: Model, readings: Readings) -> NoisePart:

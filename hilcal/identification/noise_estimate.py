@@ -33,6 +33,7 @@ from hilcal.cell import Cell
 from hilcal.config import CellConfig, Tracker
 from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.errors import HilcalError, InputError
+from hilcal.identification.arm_scatter import some_poses
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.identification.full_covariance import with_joint_scatter, with_noise_of
@@ -187,21 +188,12 @@ def _components(readings: Readings, cell: Cell, config: CellConfig) -> _Componen
     """Return the components of the noise, estimated; None as of `with_estimated_noise`."""
     if len(np.unique(readings.pose)) < FEWEST_POSES or readings.scalar.any():
         return None
-    readings, mode = _some(readings), usual_mode(readings)
+    mode, share = usual_mode(readings), MOST_ROWS / readings.value.size
+    readings = readings[some_poses(readings, share, SEED, FEWEST_POSES)]
     try:
         return _estimated(baseline(cell, readings, mode), readings, config)
     except (HilcalError, np.linalg.LinAlgError):  # said where it is fitted
         return None
-
-
-def _some(readings: Readings) -> Readings:
-    """All readings, or those of poses chosen at random for `MOST_ROWS`."""
-    if readings.value.size <= MOST_ROWS:
-        return readings
-    poses = np.unique(readings.pose)
-    count = max(int(MOST_ROWS / readings.value.size * len(poses)), FEWEST_POSES)
-    chosen = np.random.default_rng(SEED).choice(poses, count, replace=False)
-    return readings[np.isin(readings.pose, chosen)]
 
 
 def _estimated(model: Model, readings: Readings, config: CellConfig) -> _Components | None:

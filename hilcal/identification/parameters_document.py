@@ -39,8 +39,9 @@ def covariance_of(fit: Fit) -> Floats:
     posterior under the stated noise.
     """
     solution, u = fit.solution, fit.uncertainty
-    transform = solution.equations.basis.transform
+    transform, space = solution.transform, solution.space
     formal = transform @ solution.equations.inverse(solution.beta) @ transform.T
+    formal[space.index, space.index] += space.rest / solution.beta
     size = np.sqrt(np.maximum(np.diag(formal), 1e-300))
     std = np.where(np.isfinite(u.std) & u.identifiable, u.std, np.nan)
     found = std[:, None] * (formal / np.outer(size, size)) * std

@@ -32,6 +32,17 @@ MOVES_M = 0.005
 """The arm has to move a target by so much before that is asked, m; geometric errors are less."""
 
 
+@dataclass(slots=True, eq=False)
+class _Sighting:
+    """A reading, as far as it tells where the tracker stands."""
+
+    held: Floats  # (3,) where the nominal arm held the target, base axes, m
+    position: Floats  # (3,) where the tracker saw it, sensor axes, m
+    target: int
+    step: Step | None
+    doubted: bool = False
+
+
 class RoughRegistration:
     """The registration T_sensor_base as far as it is known while a campaign is measured.
 
@@ -41,11 +52,7 @@ class RoughRegistration:
 
     def __init__(self, cell: Cell) -> None:
         self._cell = cell
-        self._held: list[Floats] = []
-        self._seen: list[Floats] = []
-        self._target: list[int] = []
-        self._step: list[Step | None] = []
-        self._doubted: list[int] = []
+        self._sightings: list[_Sighting] = []
         self._repeated: list[tuple[Step, str]] = []
 
     def add(self, q: Floats, position: Floats, target: int = 0, step: Step | None = None) -> None:
@@ -54,12 +61,8 @@ class RoughRegistration:
         One that repeats an earlier one is left out; older versions stored such.
         """
         held = self._positions(q)[target]
-        if self._stuck(held, position, target) is not None:
-            return
-        self._held.append(held)
-        self._seen.append(np.asarray(position))
-        self._target.append(target)
-        self._step.append(step)
+        if self._stuck(held, position, target) is None:
+            self._sightings.append(_Sighting(held, np.asarray(position), target, step))
 
     def late_doubts(self) -> list[tuple[Step, str]]:
         """Return the stored readings that may not be of their target, each once, and why.
@@ -69,30 +72,26 @@ class RoughRegistration:
         """
         pose = self.pose()
         if pose is None:
-            told, self._repeated = self._repeated, []
-            return told
-        far = _far(pose, np.array(self._held), np.array(self._seen))
+            repeated, self._repeated = self._repeated, []
+            return repeated
         out = []
-        for k, step in enumerate(self._step):
-            known = self._cell.known_targets[self._target[k]]
-            if far[k] > PLAUSIBLE_M and known and k not in self._doubted:
-                self._doubted.append(k)
-                why = (
-                    f"its target was {far[k]:.3g} m from where the arm held it; another reflector?"
-                )
-                out += [] if step is None else [(step, why)]
+        for one in self._sightings:
+            far = float(_far(pose, one.held[None], one.position[None])[0])
+            if far > PLAUSIBLE_M and self._cell.known_targets[one.target] and not one.doubted:
+                one.doubted = True
+                why = f"its target was {far:.3g} m from where the arm held it; another reflector?"
+                out += [] if one.step is None else [(one.step, why)]
         return out
 
     def doubt_repeated(self, q: Floats, position: Floats, target: int = 0) -> None:
         """Doubt the reading that a refused one repeats, unless the tracker's place is known."""
         if self._stuck(self._positions(q)[target], position, target) is None or self.pose():
             return
-        last = max(k for k, t in enumerate(self._target) if t == target)
-        step = self._step[last]
-        if step is not None and last not in self._doubted:
-            self._doubted.append(last)
+        last = self._last(target)
+        if last is not None and last.step is not None and not last.doubted:
+            last.doubted = True
             why = "the next reading saw the same place from another pose; a reflector at rest?"
-            self._repeated.append((step, why))
+            self._repeated.append((last.step, why))
 
     def pose(self) -> tuple[Floats, Floats] | None:
         """Return rotation (3, 3) and translation (3,) of T_sensor_base; None while unknown.
@@ -103,9 +102,7 @@ class RoughRegistration:
         known = self._cell.registration
         if self._cell.registration_known:
             return known[:3, :3], known[:3, 3]
-        held, seen = (
-            np.delete(np.array(x), self._doubted, axis=0) for x in (self._held, self._seen)
-        )
+        held, seen = self._places()
         if len(held) < ENOUGH:
             return None
         whole = _kabsch(held, seen)
@@ -150,12 +147,11 @@ class RoughRegistration:
 
     def _stuck(self, held: Floats, position: Floats, target: int) -> str | None:
         """Why a reading is the one before it, or of something at rest; or None."""
-        same = np.flatnonzero(np.array(self._target) == target)
-        if not len(same):
+        last = self._last(target)
+        if last is None:
             return None
-        last = int(same[-1])
-        moved = float(np.linalg.norm(held - self._held[last]))
-        seen = float(np.linalg.norm(position - self._seen[last]))
+        moved = float(np.linalg.norm(held - last.held))
+        seen = float(np.linalg.norm(position - last.position))
         known = self._cell.known_targets[target]
         limit = max(STUCK_M, STUCK_SHARE * moved if known else 0.0)
         if moved <= MOVES_M or seen > limit:
@@ -171,14 +167,21 @@ class RoughRegistration:
 
         Zero with fewer than two, of which one may be wrong itself.
         """
-        if len(self._held) - len(self._doubted) < WITNESSES:
+        places, positions = self._places()
+        if len(places) < WITNESSES:
             return 0.0
-        others = (np.delete(np.array(x), self._doubted, axis=0) for x in (self._held, self._seen))
-        moved, seen = (
-            np.linalg.norm(x - y, axis=1) for x, y in zip(others, (held, position), strict=True)
-        )
+        moved = np.linalg.norm(places - held, axis=1)
+        seen = np.linalg.norm(positions - position, axis=1)
         off = np.sort(np.abs(seen - moved))
         return float(off[(len(off) - 1) // 2])
+
+    def _last(self, target: int) -> _Sighting | None:
+        return next((x for x in reversed(self._sightings) if x.target == target), None)
+
+    def _places(self) -> tuple[Floats, Floats]:
+        """(K, 3) where the arm held the targets, and where they were seen, without doubted ones."""
+        kept = [x for x in self._sightings if not x.doubted]
+        return np.array([x.held for x in kept]), np.array([x.position for x in kept])
 
     def repeatability(self, q: Floats, joint_std: Floats) -> Floats:
         """Return the (3, 3) covariance that the joints' scatter adds to a position, sensor axes.

@@ -1,6 +1,7 @@
 """What must not touch, nor stand in the beam: arm, tool, obstacles, hanging loads and cables."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -20,21 +21,22 @@ _AT_TARGET, _AT_LOAD = "tool at the target", "tool at the load point"
 _TINY = 1e-18  # m², below which a segment is a point
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class Clearance:
-    """The cell's shapes. Base axes, m; `clearance_of` makes it."""
+    """The cell's shapes, base axes, m."""
 
-    cell: Cell
-    config: CellConfig
-    scene: Scene
-    _at_hook: dict[float, frozenset[str]] = field(init=False, repr=False)
-    """What is as good as touched at the load point, by the radius of what is there, m."""
+    def __init__(self, cell: Cell, config: CellConfig) -> None:
+        """Build the shapes once."""
+        self.cell, self.config = cell, config
+        self.scene = Scene(cell.arm, _tool(cell), config.obstacles)
+        # What is as good as touched at the load point, by the radius of what is there, m.
+        radii = {CABLE_RADIUS, *(load.radius_m for load in config.loads)}
+        self._at_hook = {radius: self.near(cell.load_point, radius) for radius in radii}
 
-    def __post_init__(self) -> None:
-        """Find what is at the load point, which is the same in every state."""
-        radii = {CABLE_RADIUS, *(load.radius_m for load in self.config.loads)}
-        found = {radius: self.near(self.cell.load_point, radius) for radius in radii}
-        object.__setattr__(self, "_at_hook", found)
+    @cached_property
+    def sight(self) -> "LineOfSight | None":
+        """The tracker's view; None where its place is not known."""
+        place = tracker_place(self.cell, self.config)
+        return None if place is None else LineOfSight(self, place)
 
     def load(self, name: str) -> CellLoad | None:
         """Return a load by name; None unloaded, and for a name that the cell lacks."""
@@ -83,11 +85,6 @@ class Clearance:
         )
 
 
-def clearance_of(cell: Cell, config: CellConfig) -> Clearance:
-    """Return the shapes of a cell."""
-    return Clearance(cell, config, Scene(cell.arm, _tool(cell), config.obstacles))
-
-
 def _tool(cell: Cell) -> tuple[Capsule, ...]:
     """The ways from flange to load point and targets; a rough place counts as well."""
     names = [f" {name}" for name in cell.target_names] or [""]
@@ -119,8 +116,7 @@ class LineOfSight:
         A beam ends shortly before its target. Not in its way are what of the tool is next to the
         target, whose shape is not known, and obstacles that the tracker stands in or on.
         """
-        targets = range(len(self.clearance.cell.all_targets))
-        return np.asarray(np.all([self.sees(q, load, k) for k in targets], axis=0))
+        return np.asarray(np.all([self.sees(q, load, k) for k in self._targets], axis=0))
 
     def sees(self, q: Floats, load: str, target: int) -> Bools:
         """Return (N,) in which states the beam to one target is free."""
@@ -156,7 +152,7 @@ class LineOfSight:
                 f"incidence_max_rad is {most:g}"
             )
         hidden = self.hidden(q, load)
-        if len(hidden) == len(self.clearance.cell.all_targets):  # a hidden one is a reading less
+        if len(hidden) == len(self._targets):  # a hidden one is a reading less
             found = self.clearance.scene.free.named(q, 0.0, self.beam(q))
             names = tuple(dict.fromkeys(name for name, _ in found))
             names += tuple(x.name for x in self.clearance.segments(q, load) if not names)
@@ -166,8 +162,11 @@ class LineOfSight:
 
     def hidden(self, q: Floats, load: str) -> tuple[int, ...]:
         """Return the numbers of the targets that the tracker does not see in one state (1, n)."""
-        targets = range(len(self.clearance.cell.all_targets))
-        return tuple(k for k in targets if not self.sees(q, load, k).all())
+        return tuple(k for k in self._targets if not self.sees(q, load, k).all())
+
+    @property
+    def _targets(self) -> range:
+        return range(len(self.clearance.cell.all_targets))
 
     def beam(self, q: Floats, number: int = 0) -> Segment:
         """Return the beam to a target in N states (N, n)."""
@@ -180,27 +179,21 @@ class LineOfSight:
         gap = np.minimum(_SHY * (TOOL_RADIUS + radius), 0.5 * length)
         end = target - gap * way / np.where(length > 0.0, length, 1.0)
         start = np.broadcast_to(self.tracker, end.shape)
-        stands = [x.name for x in config.obstacles if _holds(x, self.tracker, radius)]
+        stands = [x.name for x in config.obstacles if holds(x, self.tracker, radius)]
         near = self.clearance.near(offset, radius)
         return Segment("beam", start, end, max(radius, 1e-4), near.union(stands))
 
 
-def sight_of(clearance: Clearance) -> LineOfSight | None:
-    """Return the tracker's view; None where its place is not known."""
-    place = tracker_place(clearance.cell, clearance.config)
-    return None if place is None else LineOfSight(clearance, place)
-
-
-def _holds(thing: Obstacle, point: Floats, margin: float) -> bool:
-    """Whether a point is in an obstacle, or closer to it than `margin` along each axis."""
+def holds(thing: Obstacle, points: Floats, margin: float = 0.0) -> Bools:
+    """Return which of some points (..., 3) an obstacle holds, made larger by `margin`, m."""
     if thing.center_m is not None and thing.size_m is not None:
-        off = np.abs(point - np.array(thing.center_m)) - 0.5 * np.array(thing.size_m)
-        return bool(np.all(off <= margin))
+        off = np.abs(points - np.array(thing.center_m)) - 0.5 * np.array(thing.size_m)
+        return np.asarray(np.all(off <= margin, axis=-1))
     if thing.bottom_m is None or thing.radius_m is None or thing.height_m is None:
-        return False
-    off = point - np.array(thing.bottom_m)
-    upright = -margin <= off[2] <= thing.height_m + margin
-    return bool(upright and np.hypot(off[0], off[1]) <= thing.radius_m + margin)
+        return np.zeros(points.shape[:-1], dtype=np.bool_)
+    off = points - np.array(thing.bottom_m)
+    upright = (off[..., 2] >= -margin) & (off[..., 2] <= thing.height_m + margin)
+    return np.asarray(upright & (np.hypot(off[..., 0], off[..., 1]) <= thing.radius_m + margin))
 
 
 def segment_distance(a: Floats, b: Floats, c: Floats, d: Floats) -> Floats:

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from importlib.metadata import EntryPoint, entry_points
+from operator import methodcaller
 from typing import Any
 
 from hilcal.cell import Cell
@@ -120,45 +121,39 @@ def connect(config: CellConfig) -> tuple[Rig | None, tuple[ConnectionResult, ...
         parts.append(("force sensor", devices.FORCE_SENSORS, sensor, "[force_sensor] driver"))
     factories = [driver(group, name, key) for _, group, name, key in parts]
     with ThreadPoolExecutor(len(parts)) as pool:
-        opened = list(pool.map(lambda factory: _open(factory, config), factories))
-    made = dict(zip((part for part, *_ in parts), (device for device, _ in opened), strict=True))
-    answers = tuple(
-        _answer(part, name or "", device, why)
-        for (part, _, name, _), (device, why) in zip(parts, opened, strict=True)
-    )
-    wrong = [why for _, why in opened if isinstance(why, InputError)]
-    if wrong or any(answer.failure for answer in answers):
-        for device in made.values():
-            if device is not None:
-                device.close()
-        if wrong:
-            raise wrong[0]
-        return None, answers
-    rig = Rig(made["arm"], made["tracker"], made.get("force sensor"), made["operator"])
-    return rig, answers
+        opened = list(pool.map(lambda factory: _tried(factory, config), factories))
+    made: dict[str, Any] = {}
+    answers: list[ConnectionResult] = []
+    for (part, _, name, _), (device, error) in zip(parts, opened, strict=True):
+        made[part] = device
+        report, why = (None, error) if error is not None else _tried(methodcaller("report"), device)
+        failure = "" if why is None else _failure(part, why)
+        answers.append(ConnectionResult(part, name or "", report, failure))
+    if not any(answer.failure for answer in answers):
+        rig = Rig(made["arm"], made["tracker"], made.get("force sensor"), made["operator"])
+        return rig, tuple(answers)
+    for device in made.values():
+        if device is not None:
+            device.close()
+    for _, error in opened:
+        if isinstance(error, InputError):
+            raise error
+    return None, tuple(answers)
 
 
-def _open(factory: Factory, config: CellConfig) -> tuple[Any, Exception | None]:
+def _tried(do: Callable[..., Any], *given: object) -> tuple[Any, Exception | None]:
+    """Return what a driver answers, or its error: one of somebody else's may fail in any way."""
     try:
-        return factory(config), None
-    except Exception as error:  # a driver of somebody else's may fail in any way
+        return do(*given), None
+    except Exception as error:
         return None, error
 
 
-def _answer(device: str, driver: str, made: Any, why: Exception | None) -> ConnectionResult:
-    try:
-        if why is None:
-            return ConnectionResult(device, driver, made.report())
-    except Exception as error:  # as above
-        why = error
+def _failure(device: str, why: Exception) -> str:
     words = str(why)
     if not isinstance(why, HilcalError):
         words = f"{type(why).__name__}: {' '.join(words.split())}"
-    said = words if words.startswith(device) else f"{device}: {words}"
-    return ConnectionResult(device, driver, None, said)
-
-
-WHAT = "its kinematics"
+    return words if words.startswith(device) else f"{device}: {words}"
 
 
 def told_by(answers: tuple[ConnectionResult, ...]) -> FactoryKinematics | None:
@@ -184,17 +179,21 @@ def nominal_arm(cell: Cell) -> Arm:
     return load_arm(robot.model, cell.base_dir, base_link=robot.base_link, tip_link=robot.tip_link)
 
 
-def _compared(report: Report, told: FactoryKinematics, cell: Cell) -> Report:
-    robot = cell.configured().robot
+def _compared(report: Report, held: FactoryKinematics, cell: Cell) -> Report:
+    """Add how the kinematics that the controller holds differ from the cell's."""
+    robot, what = cell.configured().robot, "its kinematics"
     problems = list(report.problems)
     try:
         nominal = nominal_arm(cell)
-        ours = with_factory(nominal, told)
+        ours = with_factory(nominal, held)
     except InputError as error:  # an arm with other joints, or a campaign without its file
-        return replace(report, facts=(*report.facts, (WHAT, str(error))))
+        return replace(report, facts=(*report.facts, (what, str(error))))
     rms, most = flange_difference(ours, nominal)
-    what = "measured by the factory" if told.status == LINEARISED else "not measured by the factory"
-    words = f"{what}: the flange is {1e3 * rms:.2f} mm (rms; most {1e3 * most:.2f} mm) from nominal"
+    measured = "measured" if held.status == LINEARISED else "not measured"
+    words = (
+        f"{measured} by the factory: the flange is {1e3 * rms:.2f} mm (rms; most "
+        f"{1e3 * most:.2f} mm) from nominal"
+    )
     off = 0.0
     if cell.factory is not None:
         off = flange_difference(ours, with_factory(nominal, cell.factory))[1]
@@ -212,7 +211,7 @@ def _compared(report: Report, told: FactoryKinematics, cell: Cell) -> Report:
     names = ("kinematics_from_nominal_rms_m", "kinematics_from_nominal_max_m")
     return replace(
         report,
-        facts=(*report.facts, (WHAT, words)),
+        facts=(*report.facts, (what, words)),
         problems=tuple(problems),
         fields=(*report.fields, *zip(names, (rms, most), strict=True)),
     )

@@ -7,8 +7,8 @@ from functools import cached_property
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.config import CellConfig
-from hilcal.measuring.clearance import clearance_of, sight_of
+from hilcal.config import CellConfig, ForceSensor
+from hilcal.measuring.clearance import Clearance
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.robot.body import body_poses, is_known
@@ -84,8 +84,12 @@ class Feasibility:
         """Build the shapes once."""
         self.cell, self.config = cell, config
         self.margins = Margins() if margins is None else margins
-        self.shapes = clearance_of(cell, config)
-        self.sight = sight_of(self.shapes)
+        self.shapes = Clearance(cell, config)
+        self.sight = self.shapes.sight
+        known = is_known(cell.arm)
+        self._guessed = (
+            "" if known else f"the shape of {cell.arm.name} is not known: its links are guessed"
+        )
         low, high = config.limits.workspace_min_m, config.limits.workspace_max_m
         self._floor = low is None
         self._box = (low or (-np.inf, -np.inf, 0.0), high or (np.inf, np.inf, np.inf))
@@ -95,8 +99,7 @@ class Feasibility:
     @property
     def remarks(self) -> tuple[str, ...]:
         """What is guessed."""
-        guessed = self._guessed
-        return (guessed,) if guessed else ()
+        return (self._guessed,) if self._guessed else ()
 
     # states
 
@@ -204,14 +207,12 @@ class Feasibility:
         if kind == JOINTS:
             yield self._joints(q)
         elif kind == WORKSPACE:
-            poses = body_poses(self.cell.arm, q, at.chain)[:, self._body]
-            ends = poses[:, :, None, :3, :3] @ self._ends[..., None]
-            places = ends[..., 0] + poses[:, :, None, :3, 3]
+            places = self._places(body_poses(self.cell.arm, q, at.chain), slice(None))
             yield self._inside(self._names, places, self._radius, self._held, self._rates)
         elif kind == TORQUE:
             yield self._torque(at.chain, load)
-        elif kind == SENSOR and self.config.force_sensor is not None:
-            yield self._moment(at.chain, load)
+        elif kind == SENSOR and (sensor := self.config.force_sensor) is not None:
+            yield self._moment(sensor, at.chain, load)
         elif kind == ITSELF:
             yield _Touch(scene.itself, q, margins.itself, scene.itself.rates, guessed=self._guessed)
         elif kind == OBSTACLE:
@@ -232,7 +233,7 @@ class Feasibility:
         low, high = arm.q_min + kept, arm.q_max - kept
         more = self.margins.joint
 
-        def told(k: int, over: float, state: int) -> Violation:
+        def violation(k: int, state: int) -> Violation:
             return Violation(
                 JOINTS, arm.joint_names[k], UNLOADED,
                 f"{arm.joint_names[k]} is at {q[state, k]:.4g} {arm.unit(k)}; usable are "
@@ -240,7 +241,7 @@ class Feasibility:
             )  # fmt: skip
 
         over = np.maximum(low - q, q - high) + more
-        return _Bounds(over, np.zeros((arm.n, arm.n)), np.zeros(arm.n), told)
+        return _Bounds(over, np.zeros((arm.n, arm.n)), np.zeros(arm.n), violation)
 
     def _inside(
         self, names: list[str], places: Floats, radius: Floats, held: Bools, rates: Floats
@@ -251,9 +252,9 @@ class Feasibility:
         body, side = np.nonzero(held)
         margin = self.margins.inside
 
-        def told(k: int, over: float, state: int) -> Violation:
+        def violation(k: int, state: int) -> Violation:
             name, (axis, below) = names[body[k]], _SIDES[side[k]]
-            far, limit = over - margin, self._box[0 if below else 1][axis]
+            far, limit = chosen[state, k] - margin, self._box[0 if below else 1][axis]
             if below and self._floor:
                 text = (
                     f"{name} is {far:.3g} m below the mounting plane z = 0; where the arm may go "
@@ -267,7 +268,7 @@ class Feasibility:
             return Violation(WORKSPACE, f"{name} {axis} {below}", UNLOADED, text)
 
         chosen = over.reshape(len(over), len(names), len(_SIDES))[:, body, side] + margin
-        return _Bounds(chosen, rates[body], np.full(len(body), BETWEEN_M), told)
+        return _Bounds(chosen, rates[body], np.full(len(body), BETWEEN_M), violation)
 
     def _torque(self, chain: Chain, load: str) -> "_Bounds":
         cell, arm, share = self.cell, self.cell.arm, self.config.limits.torque_share
@@ -278,7 +279,7 @@ class Feasibility:
         usable = share * np.asarray(arm.torque_max, dtype=float)
         slides = arm.slides
 
-        def told(k: int, over: float, state: int) -> Violation:
+        def violation(k: int, state: int) -> Violation:
             name = arm.joint_names[k]
             text = (
                 f"{name} bears {torque[state, k]:.4g} {'N' if slides[k] else 'N·m'}; usable are "
@@ -298,12 +299,10 @@ class Feasibility:
         rates = np.where(slides[:, None] | slides, force, rates)
         drive = np.eye(arm.n) if arm.drive is None else np.abs(arm.drive)
         limit = self.margins.bear * usable
-        return _Bounds(torque - limit, drive.T @ rates, BETWEEN_SHARE * usable, told)
+        return _Bounds(torque - limit, drive.T @ rates, BETWEEN_SHARE * usable, violation)
 
-    def _moment(self, chain: Chain, load: str) -> "_Bounds":
-        sensor, cell, pull = self.config.force_sensor, self.cell, self._pull(load)
-        if sensor is None:
-            raise ValueError("the cell has no force sensor")
+    def _moment(self, sensor: ForceSensor, chain: Chain, load: str) -> "_Bounds":
+        cell, pull = self.cell, self._pull(load)
         at = np.asarray(sensor.origin_m)
         weight, origin = cell.tool_mass * cell.gravity, chain.point(at)
         moment = pull[3:] + se3.cross(chain.point(cell.load_point) - origin, pull[:3])
@@ -311,7 +310,7 @@ class Feasibility:
         size = np.linalg.norm(moment, axis=1)[:, None]
         most = sensor.max_moment_Nm
 
-        def told(k: int, over: float, state: int) -> Violation:
+        def violation(k: int, state: int) -> Violation:
             text = f"{size[state, k]:.4g} N·m on the force sensor; max_moment_Nm is {most:g}"
             return Violation(SENSOR, "moment", load, text)
 
@@ -319,15 +318,9 @@ class Feasibility:
         rate = sum(float(np.linalg.norm(a) * np.linalg.norm(f)) for a, f in levers)
         rates = np.full((1, cell.arm.n), rate)
         limit = self.margins.bear * most
-        return _Bounds(size - limit, rates, np.array([BETWEEN_SHARE * most]), told)
+        return _Bounds(size - limit, rates, np.array([BETWEEN_SHARE * most]), violation)
 
     # helpers
-
-    @property
-    def _guessed(self) -> str:
-        arm = self.cell.arm
-        known = is_known(arm)
-        return "" if known else f"the shape of {arm.name} is not known: its links are guessed"
 
     def _set_bodies(self) -> None:
         """Which capsules are held to which sides of the workspace, and how they move."""
@@ -346,9 +339,7 @@ class Feasibility:
         first = float(arm.q_min[0]) if slides else -np.pi
         last = float(arm.q_max[0]) if slides else np.pi
         turns[:, 0] = np.linspace(first, last, len(turns))
-        poses = body_poses(arm, turns)[:, self._body[mount]]
-        ends = (poses[:, :, None, :3, :3] @ self._ends[mount][..., None])[..., 0]
-        ends = ends + poses[:, :, None, :3, 3]
+        ends = self._places(body_poses(arm, turns), mount)
         everywhere = np.ones((int(mount.sum()), len(_SIDES)), dtype=np.bool_)
         names = [self._names[k] for k in np.flatnonzero(mount)]
         fixed = self._inside(names, ends, self._radius[mount], everywhere, self._rates[mount])
@@ -371,6 +362,12 @@ class Feasibility:
                 for i in range(1, arm.n + 1)
             ]
         )
+
+    def _places(self, poses: Floats, which: Bools | slice) -> Floats:
+        """(N, B, 2, 3) ends of some capsules, by the poses (N, n + 1, 4, 4) of all bodies."""
+        at = poses[:, self._body[which]]
+        ends = at[:, :, None, :3, :3] @ self._ends[which][..., None]
+        return np.asarray(ends[..., 0] + at[:, :, None, :3, 3])
 
     def _always(self, q: Floats) -> Bools:
         return np.ones(len(q), dtype=np.bool_)
@@ -399,8 +396,7 @@ class _Bounds:
     over: Floats  # (N, K)
     rates: Floats  # (K, n) they change by no more than this per radian of a joint of the chain
     fine: Floats  # (K,) by how much they may be over zero between the samples of a motion
-    told: Callable[[int, float, int], Violation]
-    """The finding of column k, with its number, in a state."""
+    violation: Callable[[int, int], Violation]  # of column k in a state
 
     def beyond(self, rows: Ints, turn: Floats | None) -> Bools:
         """(R,) whether states are over zero, or might be within turns (R, n)."""
@@ -410,15 +406,14 @@ class _Bounds:
         return np.asarray(~np.all(over <= _ROUNDING, axis=1))  # what is not a number is beyond
 
     def findings(self, kind: str) -> Iterator[Violation]:
-        worst = self.over.argmax(axis=0)
-        told: dict[str, tuple[float, Violation]] = {}
-        for k, state in enumerate(worst.tolist()):
+        worst: dict[str, tuple[float, Violation]] = {}
+        for k, state in enumerate(self.over.argmax(axis=0).tolist()):
             over = float(self.over[state, k])
             if not over <= _ROUNDING:
-                found = self.told(k, over, state)
-                if found.of not in told or told[found.of][0] < over:
-                    told[found.of] = over, found
-        yield from (found for _, found in told.values())
+                broken = self.violation(k, state)
+                if broken.of not in worst or worst[broken.of][0] < over:
+                    worst[broken.of] = over, broken
+        yield from (broken for _, broken in worst.values())
 
 
 @dataclass(frozen=True, slots=True, eq=False)

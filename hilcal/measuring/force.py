@@ -39,7 +39,6 @@ class ToolLoad:
     gravity: Floats  # (3,) base axes, m/s²
     chi2: float  # sum of squared whitened residuals
     dof: int  # its degrees of freedom; 0 after a tare
-    poses: int  # number of readings used
 
     @property
     def com(self) -> Floats:
@@ -124,7 +123,6 @@ def identify_tool_load(
         gravity=gravity,
         chi2=float(residual @ residual),
         dof=len(y) - PARAMETERS,
-        poses=len(wrench),
     )
 
 
@@ -140,7 +138,7 @@ def tare(
     tool = design(rotation, gravity)[:, 6:] @ np.concatenate([[mass], moment])
     cov = np.zeros((PARAMETERS, PARAMETERS))
     cov[:6, :6] = covariance
-    return ToolLoad(wrench - tool, float(mass), moment, cov, gravity, chi2=0.0, dof=0, poses=1)
+    return ToolLoad(wrench - tool, float(mass), moment, cov, gravity, chi2=0.0, dof=0)
 
 
 def shift(wrench: Floats, arm: Floats) -> Floats:
@@ -196,7 +194,16 @@ def _check_orientations(rotation: Floats, gravity: Floats) -> None:
 
 
 MOMENT_LEVER_M = 0.1  # lever by which a tolerance in N becomes one in N·m
-STANDARD_GRAVITY = np.array([0.0, 0.0, -9.80665])
+
+
+def judged_part(expected: Floats) -> tuple[slice, str, float]:
+    """Return by what a load (6,) is judged: elements of its wrench, their unit, and N to the unit.
+
+    By its force; a load that is a moment alone by its moment, acting at `MOMENT_LEVER_M`.
+    """
+    if expected[3:].any() and not expected[:3].any():
+        return slice(3, 6), "N·m", MOMENT_LEVER_M
+    return slice(0, 3), "N", 1.0
 
 
 def compare(
@@ -205,21 +212,18 @@ def compare(
     std: Floats,
     tolerance_N: float,
     tolerance_share: float,
-    gravity: Floats = STANDARD_GRAVITY,
+    gravity: Floats,
 ) -> tuple[bool, str]:
     """Return whether the load is the one asked for, and the finding in one line.
 
     It is, where |f - f_expected| <= max(tolerance_N, tolerance_share |f_expected|); three sigma
-    of the measurement have to fit into that too. A load that is a moment alone is judged by its
-    moment, with tolerance_N acting at `MOMENT_LEVER_M`. Wrenches are at one point, base axes.
+    of the measurement have to fit into that too; of a moment see `judged_part`. Wrenches are at one
+    point, base axes.
     """
-    force, moment = (float(np.linalg.norm(part)) for part in (expected[:3], expected[3:]))
-    if force == 0.0 and moment > 0.0:
-        part, asked, unit, limit = slice(3, 6), moment, "N·m", tolerance_N * MOMENT_LEVER_M
-    else:
-        part, asked, unit, limit = slice(0, 3), force, "N", tolerance_N
-    e, f = np.asarray(expected)[part], np.asarray(measured)[part]
-    felt, limit = float(np.linalg.norm(f)), max(limit, tolerance_share * asked)
+    part, unit, lever = judged_part(expected)
+    e, f = expected[part], measured[part]
+    asked, felt = float(np.linalg.norm(e)), float(np.linalg.norm(f))
+    limit = max(tolerance_N * lever, tolerance_share * asked)
     words = f"asked for {_asked(e, unit, gravity)}, felt {felt:.1f} {unit}"
     if not np.all(np.isfinite([*f, *std[part]])):
         return False, f"{words}: the sensor gives no number"
@@ -310,7 +314,7 @@ class ForceMeter:
         self._tared_down: Floats | None = None
         nothing = np.zeros((PARAMETERS, PARAMETERS))
         moment = cell.tool_mass * self._com
-        self.tool = ToolLoad(np.zeros(6), cell.tool_mass, moment, nothing, cell.gravity, 0.0, 0, 0)
+        self.tool = ToolLoad(np.zeros(6), cell.tool_mass, moment, nothing, cell.gravity, 0.0, 0)
 
     def felt(self) -> Floats:
         """Return the present wrench (6,) against the zero, sensor axes."""

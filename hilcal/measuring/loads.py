@@ -16,7 +16,6 @@ from hilcal.measuring.progress import Answered, Phase, Question, Remark
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Floats
 
-Wrong = Callable[[], str]  # returns what is wrong, in one line; empty where nothing is
 TRIES = 3
 SWINGING_S = 2.0  # a load that seems wrong is weighed once more after so long, cell seconds
 
@@ -40,10 +39,11 @@ class Hook:
         self._arm, self._operator, self._meter = setup.rig.arm, setup.rig.operator, meter
         self._cell, self._config, self._mover = setup.cell, setup.config, mover
         self._clock, self._watcher = setup.clock, setup.watcher
+        self._loads = {load.name: load for load in setup.config.loads}
 
     def load(self, name: str) -> CellLoad | None:
         """Return a load by name, None for the unloaded state."""
-        return next((load for load in self._config.loads if load.name == name), None)
+        return self._loads.get(name)
 
     def begin(self) -> None:
         """Have every load taken off before anything moves, for what hangs is unknown."""
@@ -118,13 +118,14 @@ class Hook:
     def _ask(
         self,
         load: CellLoad | None,
-        wrong: Wrong,
+        wrong: Callable[[], str],
         why: str = "",
         answered: Callable[[CellLoad | None], None] | None = None,
     ) -> None:
         """Ask until nothing is wrong, `TRIES` times; an arm moved meanwhile is put back.
 
-        `answered` is told what hangs after each answer, before anything moves.
+        `wrong` returns what is wrong in one line, empty where nothing is. `answered` is told what
+        hangs after each answer, before anything moves.
         """
         what = "take everything off" if load is None else f"hang {load.name}"
         for _ in range(TRIES):

@@ -154,9 +154,7 @@ class SettleWindow:
     """Collects samples after the arm has stopped, and tests whether they are at rest."""
 
     def __init__(self, count: int) -> None:
-        """Start empty; 3 samples or more are judged."""
-        if count < 3:
-            raise ValueError(f"count = {count}: a trend takes at least 3 samples")
+        """Start empty; `count` samples or more are judged, at least 3 for a trend."""
         self._count = count
         self._samples: list[TrackerSample] = []
         self._settled = self._has_drifted = False

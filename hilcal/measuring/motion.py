@@ -11,7 +11,7 @@ from hilcal.errors import DeviceError
 from hilcal.measuring.connect import Setup
 from hilcal.measuring.devices import ArmSample, LoadChangedError
 from hilcal.measuring.feasibility import Feasibility, Margins
-from hilcal.measuring.force import MOMENT_LEVER_M, ForceMeter, TaredWrench
+from hilcal.measuring.force import ForceMeter, TaredWrench, judged_part
 from hilcal.measuring.progress import ArmAt
 from hilcal.measuring.route import Stop, duration, on_route
 from hilcal.store.plan import UNLOADED
@@ -99,9 +99,9 @@ class LoadWatch:
     """Compares the force that the sensor feels with tool and load, at every look and reading.
 
     d = |R (f - f_tool) - f_load| with f the force felt, sensor axes, f_tool that of the tool and R
-    the sensor's orientation. A load that is a moment alone is compared by its moment, acting at
-    `MOMENT_LEVER_M`. The limit is `ALLOWED` times the one of `[operator]` when a load is hung, and
-    more for a pull (`PULL`) and in motion for what swings to the side (`SWING`) and is accelerated.
+    the sensor's orientation; of a load that is a moment alone see `judged_part`. The limit is
+    `ALLOWED` times the one of `[operator]` when a load is hung, and more for a pull (`PULL`) and in
+    motion for what swings to the side (`SWING`) and is accelerated.
     A tool that is not weighed yet may differ from [tool] by `UNKNOWN_KG`: the tare holds that at
     its pose, so the limit grows by how far the sensor has turned against gravity since.
     """
@@ -151,12 +151,10 @@ class LoadWatch:
         A weight that swings pulls to the side; its vertical force is compared by itself in motion.
         """
         load, operator, cell = self._load, self._config.operator, self._cell
-        hung = np.zeros(6) if load is None else load.wrench(cell.gravity)
+        hung = self._hung()
         beyond = self._meter.load_wrench(tared) - hung
-        size, unlike = float(np.linalg.norm(hung[:3])), float(np.linalg.norm(beyond[:3]))
-        if size == 0.0 and hung[3:].any():
-            size = float(np.linalg.norm(hung[3:])) / MOMENT_LEVER_M
-            unlike = float(np.linalg.norm(beyond[3:])) / MOMENT_LEVER_M
+        part, _, lever = judged_part(hung)
+        size, unlike = (float(np.linalg.norm(w[part])) / lever for w in (hung, beyond))
         pulled = load is not None and any((*load.force_N, *load.moment_Nm))
         share = max(ALLOWED * operator.tolerance_share, PULL if pulled else 0.0)
         limit = max(ALLOWED * operator.tolerance_N, share * size)
@@ -176,12 +174,14 @@ class LoadWatch:
                 return down, lifted
         return unlike, limit
 
+    def _hung(self) -> Floats:
+        """(6,) wrench of what should hang, at the load point, base axes."""
+        return np.zeros(6) if self._load is None else self._load.wrench(self._cell.gravity)
+
     def _words(self, tared: TaredWrench) -> str:
         """What is felt and what should hang, in one line."""
-        hung = np.zeros(6) if self._load is None else self._load.wrench(self._cell.gravity)
-        felt = self._meter.load_wrench(tared)
-        moment = hung[3:].any() and not hung[:3].any()
-        part, unit = (slice(3, 6), "N·m") if moment else (slice(0, 3), "N")
+        hung, felt = self._hung(), self._meter.load_wrench(tared)
+        part, unit, _ = judged_part(hung)
         what = "nothing" if self._load is None else self._load.name
         words = (
             f"the force sensor feels {np.linalg.norm(felt[part]):.1f} {unit} where {what} should "
@@ -277,12 +277,7 @@ class Mover:
         Where it does not stand where it was `left`, that is asked first, and checked anew after.
         """
         while True:
-            sample = self._arm.sample()
-            unfit = self.guard.state(sample)
-            if unfit is not None:
-                raise DeviceError(unfit)
-            q = sample.q
-            self.check_way(q, goal, name)
+            q = self.free_way(goal, name).q
             joint, off = self._worst(q - left)
             if off <= MOVED_RAD:
                 return q
@@ -291,6 +286,15 @@ class Mover:
                 f"way from there to {name} has been checked. It goes there next"
             )
             left = q
+
+    def free_way(self, goal: Floats, name: str) -> ArmSample:
+        """Return a sample of an arm in good order, whose way to a goal (n,) is free."""
+        sample = self._arm.sample()
+        unfit = self.guard.state(sample)
+        if unfit is not None:
+            raise DeviceError(unfit)
+        self.check_way(sample.q, goal, name)
+        return sample
 
     def put_back(self, ask: Callable[[str], None]) -> None:
         """Have an arm that was moved during a question go back; see `agreed`."""

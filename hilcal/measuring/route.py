@@ -128,11 +128,16 @@ def dry_run(cell: Cell, config: CellConfig, plan: Plan) -> DryRun:
     stops = route(plan, cell.arm, config.limits.joint_margin_rad)
     problems += on_route(limits, stops)
     moves = [(a, b) for a, b in pairwise(stops) if not np.array_equal(a.q, b.q)]
+    motion = config.motion
+    pace = motion.speed_rad_s, motion.acceleration_rad_s2
+    moving = sum(duration(a.q, b.q, *pace) for a, b in moves)
     changes = sum(stop.change_to is not None for stop in stops)
     return DryRun(
         tuple(dict.fromkeys(problems)),
-        (*_remarks(plan, config.fitted), *_unseen(limits), *limits.remarks),
-        _duration(config, stops, changes, len(plan.steps)),
+        (*_remarks(plan, limits), *limits.remarks),
+        moving
+        + changes * config.planning.load_change_s
+        + len(plan.steps) * seconds_at_rest(config),
         len(moves),
         changes,
     )
@@ -192,18 +197,12 @@ def on_route(limits: Feasibility, stops: tuple[Stop, ...]) -> list[str]:
     return list(dict.fromkeys(lines))
 
 
-def _unseen(limits: Feasibility) -> tuple[str, ...]:
-    """A line where incidence is configured and cannot be checked."""
-    asked = limits.config.sight.target_normal is not None
-    return (TRACKER_UNKNOWN,) if asked and limits.sight is None else ()
-
-
-def _remarks(plan: Plan, mode: str) -> tuple[str, ...]:
+def _remarks(plan: Plan, limits: Feasibility) -> list[str]:
     out = []
     tests = "purpose" in plan.about  # of a model: what it is compared with may be in another file
     unloaded = {(s.pose, s.cycle) for s in plan.steps if s.load == UNLOADED}
     lacking = [s for s in plan.steps if (s.pose, s.cycle) not in unloaded]
-    if lacking and not tests and mode == "deflection":
+    if lacking and not tests and limits.config.fitted == "deflection":
         first = Step(lacking[0].pose, UNLOADED, lacking[0].cycle)
         out.append(
             f"{len(lacking)} loaded readings have no unloaded one of the same pose and cycle, "
@@ -214,18 +213,9 @@ def _remarks(plan: Plan, mode: str) -> tuple[str, ...]:
             f'no pose has the name "{REFERENCE}": loads are changed at {home(plan)}, and drift '
             "is not checked"
         )
-    return tuple(out)
-
-
-def _duration(config: CellConfig, stops: tuple[Stop, ...], changes: int, readings: int) -> float:
-    """Roughly how long a route takes, cell seconds."""
-    motion = config.motion
-    moving = sum(
-        duration(a.q, b.q, motion.speed_rad_s, motion.acceleration_rad_s2)
-        for a, b in pairwise(stops)
-    )
-    each = seconds_at_rest(config)
-    return moving + changes * config.planning.load_change_s + readings * each
+    if limits.config.sight.target_normal is not None and limits.sight is None:
+        out.append(TRACKER_UNKNOWN)
+    return out
 
 
 def seconds_at_rest(config: CellConfig) -> float:
@@ -253,10 +243,11 @@ def way_home(
     hanging = here.hanging if here.change_to is None else here.change_to
     to = Stop(base, q_home, hanging, change_to=None if hanging == UNLOADED else UNLOADED)
     way: list[Stop] = []
+    limits = Feasibility(cell, config)
     for stop in reversed(behind):
         at = Stop(stop.name, stop.q, hanging)
         way.append(at)
-        if np.array_equal(at.q, q_home) or not route_problems(cell, config, (at, to)):
+        if np.array_equal(at.q, q_home) or not on_route(limits, (at, to)):
             break
     way = [*way[1:], to]
     returned = here.step is not None and (here.step.pose, here.step.load) == (base, UNLOADED)

@@ -62,15 +62,18 @@ class Session:
     ) -> None:
         """Read what earlier sessions stored; no device is used yet."""
         self.in_control = False
-        self._rig, self._cell, self._config = setup.rig, setup.cell, setup.config
+        self._rig, self._cell, self._config = rig, cell, config = (
+            setup.rig,
+            setup.cell,
+            setup.config,
+        )
         self._clock, self._watcher = setup.clock, setup.watcher
         self._plan, self._store, self._live, self._wall = plan, store, live, wall
         self._rule = goal
         self._goal: GoalStatus | None = None
-        rig, cell, config, clock = self._rig, self._cell, self._config, self._clock
         self._meter: ForceMeter | None = None
         if rig.force is not None and config.force_sensor is not None:
-            window = clock.real(config.acquire.force_window_s)
+            window = setup.clock.real(config.acquire.force_window_s)
             self._meter = ForceMeter(rig.force, config.force_sensor, cell, window)
         self._mover = Mover(setup, self._meter)
         self._hook = Hook(setup, self._meter, self._mover)
@@ -86,7 +89,8 @@ class Session:
         self._tared = False
         now = wall()
         self._epoch = now if epoch is None else epoch
-        self._begun, self._elapsed = clock.now(), (now - self._epoch) * clock.scale
+        self._begun = setup.clock.now()
+        self._elapsed = (now - self._epoch) * setup.clock.scale
         self._remember()
 
     # earlier sessions
@@ -191,14 +195,10 @@ class Session:
         the arm may be moved by hand meanwhile. In a campaign that goes on, people are asked where
         it does not stand where it was read last.
         """
-        sample = self._rig.arm.sample()
-        unfit = self._mover.guard.state(sample)
-        if unfit is not None:
-            raise DeviceError(unfit)
+        first, last = start[0], self._state.last_q
+        sample = self._mover.free_way(first.q, first.name)
         if self._temperatures is None:
             self._temperatures = bool(np.isfinite(sample.joint_temperature).all())
-        first, last = start[0], self._state.last_q
-        self._mover.check_way(sample.q, first.q, first.name)
         self._hook.begin()
         left = sample.q if last is None else last
         self._mover.goal = self._mover.agreed(first.q, first.name, left, self._hook.confirm)
@@ -284,7 +284,7 @@ class Session:
                 "mass_kg": float(tool.mass),
                 "com_m": self._meter.to_flange(tool.com).tolist(),
                 "bias": tool.bias.tolist(),
-                "variance_factor": tool.chi2 / max(tool.dof, 1),
+                "variance_factor": tool.variance_factor,
                 "readings": self._identified,
                 "left_out": list(left_out),
             },

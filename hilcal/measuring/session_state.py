@@ -48,12 +48,12 @@ class RepeatabilityEstimate:
 
     def words(self, configured: Floats) -> str:
         """Return it for people, beside the configured standard deviations (n,), rad."""
-        told = float(np.sqrt(np.mean(configured**2)))
+        stated = float(np.sqrt(np.mean(configured**2)))
         joints = f"is about {self.joint_std:.1g}" if self.shown else "does not show beside it"
         return (
             f"{self.dof} returns to {self.poses} poses scatter by {1e6 * self.scatter:.0f} µm, "
             f"the instrument alone by {1e6 * self.instrument:.0f} µm: joint_std_rad {joints}, "
-            f"configured {told:.1g}"
+            f"configured {stated:.1g}"
         )
 
 

@@ -68,28 +68,21 @@ class Prediction(Brief):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Model(Brief):
-    """Robot and effects.
-
-    Attributes:
-        effects: its effects, each of another name.
-        catalogue: the effects that it could have.
-        readings: those that effects are set up for when they are added by name; None where the
-            model was made without.
-        prior: what another campaign taught of the arm; None for nothing. It is of those parameters
-            that have the same names.
-        random: by effect, the standard deviations (q,) of its parameters where they are random with
-            a mean of zero, SI (see `hilcal.mixed`).
-        background: names of effects that predict with all others, and that the readings do not
-            prove one by one. They are among `random`.
-    """
+    """Robot and effects."""
 
     cell: Cell
-    effects: tuple[Effect, ...]
-    catalogue: Catalogue = field(default_factory=installed)
+    effects: tuple[Effect, ...]  # each of another name
+    catalogue: Catalogue = field(default_factory=installed)  # the effects that it could have
     readings: Readings | None = None
+    """those that effects are set up for when they are added by name; None if it was made without"""
     prior: "CarriedPrior | None" = None
+    """what another campaign taught of the arm's parameters of the same names; None for nothing"""
     random: Mapping[str, Floats] = field(default_factory=dict)
+    """by effect, the standard deviations (q,) of its parameters where they are random with a mean
+    of zero, SI (see `hilcal.mixed`)"""
     background: frozenset[str] = frozenset()
+    """names of effects, among `random`, that predict with all others, and that the readings do not
+    prove one by one"""
     _slices: tuple[slice, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:

@@ -145,27 +145,27 @@ def decision_report(
     yield f"{reasons[d.reason]}\n"
 
 
-def validation_lines(found: Acceptance) -> Iterator[str]:
+def validation_lines(test: Acceptance) -> Iterator[str]:
     """Yield how well the model predicts readings that were never fitted."""
-    e = found.everything
+    e = test.everything
     yield (
         f"{e.count} measurements that nothing was fitted to are predicted to "
         f"{length(e.rms_m)} rms, {length(e.max_m)} at most; the fit states "
-        f"{length(e.stated_m)}, noise alone would leave {length(found.noise_m)}. "
+        f"{length(e.stated_m)}, noise alone would leave {length(test.noise_m)}. "
         f"{100 * e.within:.0f} % lie inside of their 95 % region.\n"
     )
 
 
-def improvement_report(found: Improvement, limit_m: float | None) -> Iterator[Block]:
+def improvement_report(gain: Improvement, limit_m: float | None) -> Iterator[Block]:
     """Yield the error before and after the correction, as measured, and whether a limit is kept."""
     heads = ("load", "error", "mean", "rms", "max", "95 % within", "inside")
-    parts = (*found.by_load, *([found.everything] if len(found.by_load) > 1 else []))
+    parts = (*gain.by_load, *([gain.everything] if len(gain.by_load) > 1 else []))
     yield table(*heads, rows=(row for part in parts for row in _rows(part)), left=(0, 1))
     goal = (
         "A point is where the nominal arm has the tool, in the tracker's frame by the fitted "
         "registration."
     )
-    if found.mode == "deflection":
+    if gain.mode == "deflection":
         goal = (
             "A point is where the unloaded arm was measured at the same nominal joint values: the "
             f"correction removes what the load does; {UNCALIBRATED}."
@@ -175,23 +175,23 @@ def improvement_report(found: Improvement, limit_m: float | None) -> Iterator[Bl
         "repeatability would leave; 95 % within: the largest distance that was predicted for 95 % "
         "of such readings, noise included; inside: points within their own.\n"
     )
-    e, removed = found.everything, ""
+    e, removed = gain.everything, ""
     if e.removed is not None:
         removed = f"; of what exceeded the noise {100 * e.removed:.1f} % is gone"
-    left = len(found.left_out)
+    left = len(gain.left_out)
     without = f" {left} points could not be corrected." if left else ""
     yield (
         f"At the corrected joint targets the arm is off by {length(e.after.mean_m)} (mean) "
         f"instead of {length(e.before.mean_m)}, measured by the tracker at {e.count} points"
         f"{removed}. {e.inside} of {e.count} lie within their predicted 95 % band.{without}"
     )
-    for name, why in found.left_out[:MOST_LEFT]:
+    for name, why in gain.left_out[:MOST_LEFT]:
         yield f"left out: {name}: {why}"
     if left > MOST_LEFT:
         yield f"left out: {left - MOST_LEFT} more"
     if limit_m is not None:
-        over, size, largest = found.over(limit_m), length(limit_m), length(e.after.max_m)
-        of = " for deflections" if found.mode == "deflection" else ""
+        over, size, largest = gain.over(limit_m), length(limit_m), length(e.after.max_m)
+        of = " for deflections" if gain.mode == "deflection" else ""
         at = f"{'FAILED' if over else 'PASSED'}{of}: {over or 'no'}"
         yield (
             f"{at} of {e.count} errors at the corrected targets are over {size}; the largest is "
@@ -210,11 +210,11 @@ def _rows(part: Improved) -> Iterator[tuple[str, ...]]:
     yield ("", "noise alone", "", length(part.noise_m), "", "", "")
 
 
-def limit_failure(found: Improvement, limit_m: float) -> str:
+def limit_failure(gain: Improvement, limit_m: float) -> str:
     """Return the one line on a limit that is not kept."""
-    e = found.everything
+    e = gain.everything
     line = (
-        f"{found.over(limit_m)} of {e.count} errors at the corrected targets are over the limit of "
+        f"{gain.over(limit_m)} of {e.count} errors at the corrected targets are over the limit of "
         f"{length(limit_m)}, the largest is {length(e.after.max_m)}"
     )
     if limit_m < e.noise_m:
@@ -338,11 +338,11 @@ def waypoints_table(found: Sequence[Fate]) -> Iterator[Block]:
         yield "Of a blended waypoint the corner of the path is corrected; the radius stays."
 
 
-def opening(judged: Judged, found: Validation) -> Iterator[str]:
+def opening(judged: Judged, test: Validation) -> Iterator[str]:
     """Yield how many of the readings were fitted, and how far the others are off."""
-    error = f"{length(found.error.rms_m)} rms"
-    noise = f"noise alone would leave {length(found.noise_floor)}.\n"
-    count = f"{len(found.raw)} {judged.what}"
+    error = f"{length(test.error.rms_m)} rms"
+    noise = f"noise alone would leave {length(test.noise_floor)}.\n"
+    count = f"{len(test.raw)} {judged.what}"
     if not judged.unseen:
         every = "All" if judged.fitted == judged.readings else f"{judged.fitted} of the"
         yield (
@@ -359,20 +359,20 @@ def opening(judged: Judged, found: Validation) -> Iterator[str]:
     yield f"{count} that were never fitted are predicted to {error}; {noise}"
 
 
-def validation_report(judged: Judged, found: Validation, beyond: Extrapolation) -> Iterator[Block]:
+def validation_report(judged: Judged, test: Validation, beyond: Extrapolation) -> Iterator[Block]:
     """Yield the errors, inside and outside of what was measured, and where outside is."""
-    out = table(error_words(found.readings), "rms", "mean", "largest", "rms in σ", "stated", "z")
+    out = table(error_words(test.readings), "rms", "mean", "largest", "rms in σ", "stated", "z")
     inside, outside = beyond.inside_error, beyond.outside_error
     every = np.ones(len(beyond.z), dtype=np.bool_)
-    rows = [("never fitted" if judged.unseen else "fitted", found.error, every)]
+    rows = [("never fitted" if judged.unseen else "fitted", test.error, every)]
     if inside is not None and outside is not None:
         rows.append(("inside", inside, ~beyond.outside))
         rows.append(("outside", outside, beyond.outside))
-    for name, e, mine in rows:
+    for name, e, some in rows:
         sizes = map(length, (e.rms_m, e.mean_m, e.max_m))
-        stated, z = length(_rms(beyond.stated_m[mine])), f"{_rms(beyond.z[mine]):.2f}"
+        stated, z = length(_rms(beyond.stated_m[some])), f"{_rms(beyond.z[some]):.2f}"
         out.add(name, *sizes, f"{e.rms_sigma:.2f}", stated, z)
-    out.add("noise alone", length(found.noise_floor), "", "", "1.00", "", "")
+    out.add("noise alone", length(test.noise_floor), "", "", "1.00", "", "")
     yield out
     yield note(
         "stated: standard deviation that the fit states for these readings, what it does not know "
@@ -402,36 +402,36 @@ def _beyond(v: Beyond) -> str:
     return f"{v.variable}: {v.count}, by up to {most} (measured: {low} to {high})"
 
 
-def shares_report(found: Acceptance) -> Iterator[Block]:
+def shares_report(test: Acceptance) -> Iterator[Block]:
     """Yield errors by load, the worst poses, and whether a limit is kept."""
-    yield from loads_report(found)
-    yield from (worst_table(found), "")
-    if found.limit_m is None:
+    yield from loads_report(test)
+    yield from (worst_table(test), "")
+    if test.limit_m is None:
         return
-    size, a, worst = length(found.limit_m), found.everything, found.poses[0]
+    size, a, worst = length(test.limit_m), test.everything, test.poses[0]
     largest = f"the largest error is {length(a.max_m)}, at {_place(worst)}"
-    if found.passed:
+    if test.passed:
         yield f"PASSED: no error is over the limit of {size}; {largest}.\n"
         return
-    poses = sum(not s.passes(found.limit_m) for s in found.poses)
+    poses = sum(not s.passes(test.limit_m) for s in test.poses)
     yield (
-        f"FAILED: {found.over} of {a.count} errors are over the limit of {size}, at {poses} of "
-        f"{len(found.poses)} poses; {largest}.\n"
+        f"FAILED: {test.over} of {a.count} errors are over the limit of {size}, at {poses} of "
+        f"{len(test.poses)} poses; {largest}.\n"
     )
 
 
-def loads_report(found: Acceptance) -> Iterator[Block]:
+def loads_report(test: Acceptance) -> Iterator[Block]:
     """Yield errors by load."""
-    every = () if len(found.loads) == 1 else (found.everything,)
-    yield _shares_table("load", "at", (*found.loads, *every), found.limit_m)
+    every = () if len(test.loads) == 1 else (test.everything,)
+    yield _shares_table("load", "at", (*test.loads, *every), test.limit_m)
     yield note(
         f"in 95 %: share of the readings inside of their stated {100 * REGION:.0f} % region.\n"
     )
 
 
-def worst_table(found: Acceptance) -> Table:
+def worst_table(test: Acceptance) -> Table:
     """Return the errors of the worst poses."""
-    return _shares_table("worst poses", "load", found.poses[:WORST], found.limit_m)
+    return _shares_table("worst poses", "load", test.poses[:WORST], test.limit_m)
 
 
 def _shares_table(of: str, at: str, shares: Iterable[Share], limit: float | None) -> Table:
@@ -450,18 +450,18 @@ def _place(worst: Share) -> str:
     return f"{worst.name} {load_name(worst.worst, 'under ')}"
 
 
-def validation_failure(found: Acceptance, judged: Judged) -> str:
+def validation_failure(test: Acceptance, judged: Judged) -> str:
     """Return the one line on a limit that is not kept."""
-    worst = found.poses[0]
+    worst = test.poses[0]
     head = (
-        f"the limit of {length(found.limit_m or 0.0)} is not kept: {found.over} of "
-        f"{found.everything.count} {judged.what} are further off, {_place(worst)} by "
+        f"the limit of {length(test.limit_m or 0.0)} is not kept: {test.over} of "
+        f"{test.everything.count} {judged.what} are further off, {_place(worst)} by "
         f"{length(worst.max_m)}"
     )
-    if not found.undecided:
+    if not test.undecided:
         return head
     return (
-        f"{head}; but noise alone leaves {length(found.noise_m)} rms, so that these "
+        f"{head}; but noise alone leaves {length(test.noise_m)} rms, so that these "
         "readings cannot tell: measure with less noise, or give a limit above it"
     )
 
@@ -470,53 +470,53 @@ def _rms(x: Floats) -> float:
     return float(np.sqrt(np.mean(x**2)))
 
 
-def bootstrap_report(found: Bootstrap) -> Iterator[Block]:
+def bootstrap_report(draws: Bootstrap) -> Iterator[Block]:
     """Yield all that people want to know of a bootstrap."""
-    fit, ends = found.fit, found.interval()
+    fit, ends = draws.fit, draws.interval()
     yield heading(f"Model: {model_name(fit.model.named)}")
     yield (
-        f"Fitted to {kind(fit)}; {len(found.theta)} times to {found.poses} poses drawn from its "
-        f"{found.poses}, with replacement.\n"
+        f"Fitted to {kind(fit)}; {len(draws.theta)} times to {draws.poses} poses drawn from its "
+        f"{draws.poses}, with replacement.\n"
     )
     heads = ("parameter", "value", "± stated", "± drawn", "ratio", "95 % of the draws", "unit")
     out = table(*heads, left=(0, 6))
     units = [p.unit for e in fit.model.effects for p in e.parameters]
     for k, name in enumerate(names_of(fit.model)):
-        if not found.compared[k]:
+        if not draws.compared[k]:
             continue
         theta, std = float(fit.theta[k]), float(fit.uncertainty.std[k])
         unit, factor = numbers.unit_for(units[k], [theta])
         value, stated = numbers.with_std(factor * theta, factor * std)
-        drawn = numbers.with_std(0.0, factor * float(found.std[k]))[1]
+        drawn = numbers.with_std(0.0, factor * float(draws.std[k]))[1]
         places = len(stated.partition(".")[2])
         between = " to ".join(f"{factor * float(end[k]):.{places}f}" for end in ends)
-        out.add(name, value, stated, drawn, f"{found.ratio[k]:.2f}", between, unit)
+        out.add(name, value, stated, drawn, f"{draws.ratio[k]:.2f}", between, unit)
     if out.rows:
         yield out
         yield note(
             "± stated: standard uncertainty of the fit. ± drawn: standard deviation over the draws."
             "\n"
         )
-    yield from bootstrap_remarks(found)
+    yield from bootstrap_remarks(draws)
 
 
-def bootstrap_remarks(found: Bootstrap) -> Iterator[str]:
+def bootstrap_remarks(draws: Bootstrap) -> Iterator[str]:
     """Yield what the draws say of the stated standard uncertainties."""
-    known, solution = found.ratio[found.compared], found.fit.solution
+    known, solution = draws.ratio[draws.compared], draws.fit.solution
     if len(known):
         yield (
             f"Over the draws the parameters scatter {known.min():.2f} to {known.max():.2f} times "
             f"as far as is stated (median {np.median(known):.2f})."
         )
-    wide = sorted(np.flatnonzero(found.ratio > WIDER), key=lambda k: -found.ratio[k])
+    wide = sorted(np.flatnonzero(draws.ratio > WIDER), key=lambda k: -draws.ratio[k])
     if wide:
-        of = names_of(found.fit.model)
-        listed = numbers.few([f"{of[k]} ({found.ratio[k]:.1f} times)" for k in wide], 5)
-        if solution.effective > CROWDED * found.poses:
+        of = names_of(draws.fit.model)
+        listed = numbers.few([f"{of[k]} ({draws.ratio[k]:.1f} times)" for k in wide], 5)
+        if solution.effective > CROWDED * draws.poses:
             yield (
                 f"Wider than stated: {listed}. This does not show that the stated ones are too "
                 f"small: the fit spends {solution.effective:.0f} degrees of freedom on "
-                f"{found.poses} poses, and draws, which have 63 % of the poses, scatter too much "
+                f"{draws.poses} poses, and draws, which have 63 % of the poses, scatter too much "
                 "then. More poses tell."
             )
         else:
@@ -524,7 +524,7 @@ def bootstrap_remarks(found: Bootstrap) -> Iterator[str]:
                 f"Stated too small, or few poses carry it: {listed}. Take the drawn one, and "
                 "measure more poses that move these parameters."
             )
-    elif found.fit.uncertainty.inflated:
+    elif draws.fit.uncertainty.inflated:
         yield (
             "The residuals are larger than the noise. What neighbouring poses then have in common "
             "is chance for draws of single poses; the stated ones, found by leaving out regions of "
@@ -532,13 +532,13 @@ def bootstrap_remarks(found: Bootstrap) -> Iterator[str]:
         )
     elif len(known):
         yield f"None scatters more than {WIDER:g} times as far: the stated ones can be used."
-    if other := int((solution.estimated & ~found.compared).sum()):
+    if other := int((solution.estimated & ~draws.compared).sum()):
         yield (
             f"{other} parameters are not compared: the readings do not determine them, or they "
             "are of a family that shrinks its parameters towards zero."
         )
-    if found.failed:
+    if draws.failed:
         yield (
-            f"{found.failed} further draws are left out: their poses do not determine the "
+            f"{draws.failed} further draws are left out: their poses do not determine the "
             "parameters. What is said of the others is too good by that."
         )

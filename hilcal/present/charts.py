@@ -17,8 +17,9 @@ from scipy.stats import chi2, norm
 from hilcal import numbers
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.effect_ranking import LEAST_SHARE
-from hilcal.identification.family_sizes import FamilySize
+from hilcal.identification.background import FamilySize
 from hilcal.identification.fit import Fit
+from hilcal.identification.priors import names_of
 from hilcal.names import escaped
 from hilcal.present.document import load_name
 from hilcal.present.fit import CERTAIN, follows
@@ -28,6 +29,7 @@ from hilcal.present.story import (
     DependenceCurve,
     Story,
     StoryRevision,
+    round_factor,
     worst_and_even,
 )
 from hilcal.store.plan import UNLOADED
@@ -198,11 +200,11 @@ class ChartReadings:
         level = self.revision.level[self.index]
         yield from ((int(k), level == k) for k in np.unique(level))
 
-    def named(self, mine: Bools | slice = slice(None)) -> list[str]:
+    def named(self, members: Bools | slice = slice(None)) -> list[str]:
         """Return some, or all, in words: pose, load, target where there are several, distance."""
         story, size, sigma = self.story, self.revision.size_m, self.revision.sigma
         out = []
-        for i in self.index[mine].tolist():
+        for i in self.index[members].tolist():
             words = f"{story.pose_name(i)}, {load_name(story.load_names[i])}"
             if story.target is not None and len(story.target_names) > 1:
                 words += f", {story.target_names[int(story.target[i])]}"
@@ -210,10 +212,10 @@ class ChartReadings:
             out.append(f"{label(words)}: {distance}")
         return out
 
-    def marks(self, x: Floats, y: Floats, level: int, mine: Bools, **more: Any) -> go.Scatter:
+    def marks(self, x: Floats, y: Floats, level: int, members: Bools, **more: Any) -> go.Scatter:
         """Return some (K,) as points of a level at x, y (K,)."""
-        at = x[mine], y[mine], LEVELS[level], SYMBOLS[level]
-        more |= {"name": LEVEL_NAMES[level], "text": self.named(mine)}
+        at = x[members], y[members], LEVELS[level], SYMBOLS[level]
+        more |= {"name": LEVEL_NAMES[level], "text": self.named(members)}
         return marks(*at, **more, hovertemplate="%{text}<extra></extra>")
 
 
@@ -236,9 +238,9 @@ def residual_by_load(story: Story, revision: StoryRevision) -> go.Figure:
     d = drawn(story, revision)
     loads = list(dict.fromkeys(story.load_names))
     of = np.array([loads.index(name) for name in story.load_names], dtype=float)
-    # beside each other within a load, so that points do not hide each other
-    beside = np.random.default_rng(0).uniform(-0.3, 0.3, len(of))
-    out = _residuals(d, (of + beside)[d.index], "load", _by(story, revision, "load"))
+    # scattered within a load, so that points do not hide each other
+    jitter = np.random.default_rng(0).uniform(-0.3, 0.3, len(of))
+    out = _residuals(d, (of + jitter)[d.index], "load", _by(story, revision, "load"))
     names = [label(load_name(name)) for name in loads]
     return out.update_xaxes(tickvals=list(range(len(names))), ticktext=names)
 
@@ -253,7 +255,7 @@ def residual_over(
     high = x > np.median(x)
     says = f"{name} is the same for all readings."
     if high.any():
-        low, beyond = (_rms(revision.sigma[mine] / 3**0.5) for mine in (~high, high))
+        low, beyond = (_rms(revision.sigma[members] / 3**0.5) for members in (~high, high))
         at = f"{np.median(x):.0f}{unit if unit == '°' else f' {unit}'}".strip()
         says = (
             f"Residual over {name}: {low:.2g} times the noise rms up to {at}, "
@@ -300,7 +302,9 @@ def _by(story: Story, revision: StoryRevision, what: str) -> str:
 
 def _residuals(d: ChartReadings, x: Floats, title: str, words: str) -> go.Figure:
     """Draw residuals over x (K,); each point carries the number of its reading."""
-    traces = [d.marks(x, d.sigma, k, mine, customdata=d.index[mine]) for k, mine in d.by_level()]
+    traces = [
+        d.marks(x, d.sigma, k, members, customdata=d.index[members]) for k, members in d.by_level()
+    ]
     out = figure(words + d.note, x=title, y="residual [σ]", traces=traces, height=320)
     for limit, color in zip(SIGMA_LIMITS, (AMBER, RED), strict=True):
         out.add_hline(limit, line={"color": color, "dash": "dot", "width": 1})
@@ -341,15 +345,15 @@ def workspace(
     axes = ["xyz".index(a) for a in plane]
     at, residual = story.anchor[d.index][:, axes], revision.residual[d.index][:, axes]
     largest = float(revision.size_m.max(initial=0.0))
-    times = magnification(largest)
+    times = round_factor(LONGEST / largest, _NICE) if largest > 0 else 1.0
     traces: list[object] = []
-    for k, mine in d.by_level():
-        worst = np.flatnonzero(mine)[np.argsort(-d.sigma[mine])][:MOST_ARROWS]
+    for k, members in d.by_level():
+        worst = np.flatnonzero(members)[np.argsort(-d.sigma[members])][:MOST_ARROWS]
         start, end = at[worst], at[worst] + times * residual[worst]
         gap = np.full_like(start, np.nan)  # between one line and the next
         lines = np.stack([start, end, gap], axis=1).reshape(-1, 2)
         traces.append(line(lines[:, 0], lines[:, 1], color=LEVELS[k]))
-        traces.append(d.marks(at[:, 0], at[:, 1], k, mine, size=5, showlegend=False))
+        traces.append(d.marks(at[:, 0], at[:, 1], k, members, size=5, showlegend=False))
     outside = int((revision.level == len(LEVELS) - 1).sum())
     says = (
         f"Targets with their errors, {times:g} times enlarged: {outside} of {len(story)} readings "
@@ -361,15 +365,6 @@ def workspace(
     out = figure(says, x=x, y=y, traces=traces, height=280)
     out.update_yaxes(scaleanchor="x", constrain="domain")
     return out.update_xaxes(constrain="domain")
-
-
-def magnification(largest_m: float) -> float:
-    """Return the factor, 1, 2 or 5 times a power of ten, by which residuals are drawn longer."""
-    if largest_m <= 0:
-        return 1.0
-    wanted = LONGEST / largest_m
-    power = 10.0 ** np.floor(np.log10(wanted))
-    return float(max(f for f in _NICE if f * power <= wanted * (1 + 1e-9)) * power)
 
 
 def added_variable(r: DependenceCurve, effect: str) -> go.Figure:
@@ -426,7 +421,7 @@ def parameter_correlations(fit: Fit) -> tuple[list[str], Floats]:
     """Return names and correlations (K, K) of identifiable parameters: Cov(θ) = T H⁻¹ Tᵀ."""
     s = fit.solution
     covariance = s.transform @ s.equations.inverse(s.beta) @ s.transform.T
-    names = [f"{e.name}.{p.name}" for e in fit.model.effects for p in e.parameters]
+    names = names_of(fit.model)
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     keep = np.flatnonzero(fit.uncertainty.identifiable & s.estimated & (std > 0))
     of = covariance[np.ix_(keep, keep)] / np.outer(std[keep], std[keep])

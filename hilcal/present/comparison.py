@@ -14,7 +14,7 @@ from hilcal.present.fit import error_words, measurements
 if TYPE_CHECKING:
     from hilcal.transfer.fleet import Fleet
     from hilcal.transfer.members import TypeSize
-    from hilcal.transfer.pooled import DiagnosedEffect, Odd, Pooled
+    from hilcal.transfer.pooled import Odd, Pooled
 
 MOST_PARAMETERS, MOST_ROWS = 6, 12  # parameters of a change, and of both fits, that are listed
 CLEAR = 2.0  # standard deviations from which one of several parameters of a change is listed
@@ -312,7 +312,9 @@ def type_report(t: "Pooled") -> Iterator[Block]:
             yield f"  {name}: {value} ± {std} {unit} a year"
     if t.seen:
         yield "Effects that the diagnoses added:"
-        yield from (f"  {_diagnosed(s)}" for s in t.seen)
+        for s in t.seen:
+            who = f": {', '.join(s.arms)}" if s.kind == "defect" else ""
+            yield f"  {s.effect}: on {len(s.arms)} of {s.of} arms{KINDS[s.kind]}{who}"
     yield from (*size_lines(t.sizes), "")
 
 
@@ -332,8 +334,3 @@ def unlike_words(o: "Odd") -> str:
     off = f"{'+' if o.off > 0 else '−'}{numbers.digits(factor * abs(o.off))} {unit}"
     who = f"{o.arm} has changed by {o.campaign}" if o.campaign else o.arm
     return f"{who}: {o.parameter} {off} ({o.sigma:.1f} σ)"
-
-
-def _diagnosed(s: "DiagnosedEffect") -> str:
-    who = f": {', '.join(s.arms)}" if s.kind == "defect" else ""
-    return f"{s.effect}: on {len(s.arms)} of {s.of} arms{KINDS[s.kind]}{who}"

@@ -9,8 +9,8 @@ from hilcal import numbers
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.effect_ranking import FALSE_ALARM, LEAST_SHARE, Suspect
 from hilcal.diagnosis.live_model import LEAST
-from hilcal.diagnosis.misfit_breakdown import ROW_ORDER
 from hilcal.diagnosis.noise import PureError
+from hilcal.diagnosis.recorded import ROW_ORDER
 from hilcal.diagnosis.residual_regression import Dependence
 from hilcal.diagnosis.stepwise import predicts_better
 from hilcal.discovery.curve import Curve
@@ -49,7 +49,7 @@ how far it misses. While it is fitted to few poses, and lacks what is hidden, th
 
 def verdict_line(d: Diagnosis) -> Words:
     """Return the verdict with its message; names of the catalogue keep their spelling."""
-    words = numbers.sentence(message(d), d.fit.model.catalogue.names)
+    words = message(d)
     tone: Tone = "good" if d.verdict == "adequate" else "doubt"
     return Words(f"Verdict: {headline(d)}.\n{words}", tone, headline(d))
 
@@ -284,7 +284,7 @@ def step_report(number: int, change: str, d: Diagnosis) -> Iterator[Block]:
         yield follows(d.misfit_breakdown)
     if d.significant:
         yield from ("", suspects_table(d))
-    yield from (numbers.sentence(message(d), d.fit.model.catalogue.names), "")
+    yield from (message(d), "")
 
 
 @dataclass(frozen=True, slots=True)

@@ -203,7 +203,7 @@ def remarks(fit: Fit) -> Iterator[Block]:
     if (scatter := fit.readings.arm_scatter) is not None:
         yield f"The covariance has the arm's scatter as estimated: {sigmas(scatter)}."
     if (serial := fit.readings.serial) is not None:
-        yield numbers.sentence(correlated(serial))
+        yield correlated(serial)
     yield _scaling_remark(fit)
     if null := fit.uncertainty.null:
         what = "directions, parameters that move together," if len(null) > 1 else "direction"

@@ -65,17 +65,13 @@ _ROOT = Path(__file__).resolve().parents[2]
 
 
 class LiveViewer:
-    """Tells the viewer's process what happens; no method waits for it but `start` and `close`.
-
-    Attributes:
-        url: what a viewer opens; None where nothing is served.
-        dropped: messages that were not passed on because the process did not keep up.
-    """
+    """Tells the viewer's process what happens; no method waits for it but `start` and `close`."""
 
     def __init__(self, record: Path, say: Say, port: int = PORT) -> None:
         """Start nothing; `say` is told of problems from another thread, `port` is tried first."""
-        self.record, self.dropped = record, 0
-        self.url: str | None = None
+        self.record = record
+        self.dropped = 0  # messages that were not passed on because the process did not keep up
+        self.url: str | None = None  # what a viewer opens; None where nothing is served
         self._say, self._port = say, port
         self._queue: queue.Queue[tuple[float, object] | None] = queue.Queue(MOST)
         self._process: subprocess.Popen[bytes] | None = None

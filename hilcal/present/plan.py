@@ -251,27 +251,27 @@ def brief_plan(s: PlanSummary) -> str:
     )
 
 
-def next_report(found: Next, poses: int, readings: int, details: bool = True) -> Iterator[Block]:
+def next_report(plan: Next, poses: int, readings: int, details: bool = True) -> Iterator[Block]:
     """Yield the powers of the pairs, now and then; without `details` each suspect's weakest."""
     yield heading("Telling the suspects apart")
-    yield power_table(found.powers if details else _weakest(found.powers))
+    yield power_table(plan.powers if details else _weakest(plan.powers))
     yield note(
         "now, then: where the first effect is there, the chance that the readings so far, and with "
         "those planned as well, reject a fit with the second in its place (test at 1 %).\n"
     )
-    yield f"{powers_summary(found.powers, poses, readings)} {_difference(found)}\n"
-    yield from (f"note: {remark}" for remark in found.notes)
+    yield f"{powers_summary(plan.powers, poses, readings)} {_difference(plan)}\n"
+    yield from (f"note: {remark}" for remark in plan.notes)
 
 
-def poses_report(found: Next, poses: int, readings: int, details: bool = True) -> Iterator[Block]:
+def poses_report(plan: Next, poses: int, readings: int, details: bool = True) -> Iterator[Block]:
     """Yield what further poses tell of a misfit of the pose alone; arguments of `next_report`."""
     yield heading("Poses where nothing was read yet")
     yield (
         f"The misfit is the same under every load of a pose, so that loads tell nothing of it: "
         f"{readings} unloaded readings at {poses} poses, spread over the joints' range.\n"
     )
-    if found.powers:
-        some = found.powers if details else _weakest(found.powers)
+    if plan.powers:
+        some = plan.powers if details else _weakest(plan.powers)
         yield power_table(some, "and this is fitted")
         yield note(
             "now, then: chance that it passes every test of a missing effect, poses left out "
@@ -330,17 +330,17 @@ def powers_summary(powers: Sequence[PairPower], poses: int, readings: int) -> st
     )
 
 
-def _difference(found: Next) -> str:
+def _difference(plan: Next) -> str:
     """Say which loads and poses make the difference."""
-    by = sorted(found.shares.items(), key=lambda pair: -pair[1])
+    by = sorted(plan.shares.items(), key=lambda pair: -pair[1])
     named = [
         f"{'the unloaded readings' if load == UNLOADED else load} ({numbers.percent(share)})"
         for load, share in by[:_MOST_LOADS]
         if share >= _LEAST_SHARE
     ]
     words = f"What separates the weakest pair comes from {numbers.names(named)}"
-    if found.reach_ratio > _STRETCHED:
+    if plan.reach_ratio > _STRETCHED:
         words += ", most of it with the arm stretched out"
-    elif found.reach_ratio < 1 / _STRETCHED:
+    elif plan.reach_ratio < 1 / _STRETCHED:
         words += ", most of it with the arm drawn in"
     return f"{words}."

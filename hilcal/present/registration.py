@@ -17,7 +17,7 @@ from hilcal.identification.torques import ARM, TOOL, TorqueCheck, TorqueFactor
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode
 from hilcal.robot import se3
-from hilcal.types import Bools, Floats
+from hilcal.types import Floats
 
 PLACES = 5, 4  # decimals of a position in m and of an angle in degrees. A choice
 ALONG = 0.98
@@ -40,20 +40,21 @@ WORDS: dict[CovarianceParts, str] = {
 }
 
 
-def registration_lines(found: Registration) -> Iterator[str]:
+def registration_lines(registration: Registration) -> Iterator[str]:
     """Yield where the nominal arm's base and target are, and how well the readings fit."""
-    if found.estimated:
-        turn = "" if found.turn_rms is None else f" and {np.degrees(found.turn_rms):.3g}°"
-        cell = found.cell
+    if registration.estimated:
+        rad = registration.turn_rms
+        turn = "" if rad is None else f" and {np.degrees(rad):.3g}°"
+        cell = registration.cell
         base = f"the base is {_at(cell.registration)}"
         if cell.observers and np.array_equal(cell.registration, np.eye(4)):
             base = "positions are in the axes of the base, which nothing else fixes"
         places = "".join(f"; {_observer(o)}" for o in cell.observers if o.free)
         yield (
             f"Registered: {base}; {_targets(cell)}{places}. "
-            f"The nominal arm leaves {numbers.length(found.rms)}{turn} rms."
+            f"The nominal arm leaves {numbers.length(registration.rms)}{turn} rms."
         )
-    yield from undetermined_lines(found)
+    yield from undetermined_lines(registration)
 
 
 def observed_words(readings: Readings) -> str:
@@ -75,12 +76,12 @@ def _observer(o: Observer) -> str:
     return f"{o.name} stands at {_place(inverse)}"
 
 
-def other_arm_line(found: OtherArm) -> str:
+def other_arm_line(other: OtherArm) -> str:
     """Return what to write where the readings are those of another arm of the catalogue."""
     return (
-        f"These data fit the {found.name} better: {numbers.length(found.rms)} → "
-        f"{numbers.length(found.rms_with)} rms after registration; in CELL.toml: "
-        f'[robot] model = "{found.name}".'
+        f"These data fit the {other.name} better: {numbers.length(other.rms)} → "
+        f"{numbers.length(other.rms_with)} rms after registration; in CELL.toml: "
+        f'[robot] model = "{other.name}".'
     )
 
 
@@ -94,25 +95,33 @@ def fitted_lines(fit: Fit) -> Iterator[str]:
         yield from undetermined_lines(register(fit.model.cell, fit.readings))
 
 
-def base_line(cell: Cell, found: RobotFrames, mode: Mode = "absolute") -> str:
+def base_line(cell: Cell, frames: RobotFrames, mode: Mode = "absolute") -> str:
     """Return where the robot's base is; of deflections the nominal arm's, to 1 mm."""
-    if np.array_equal(found.base, np.eye(4)) and found.base_stated:
+    if np.array_equal(frames.base, np.eye(4)) and frames.base_stated:
         return "The robot's base: the axes that the positions are given in."
     why, places = "as the cell states it", PLACES
-    if not found.base_stated:
+    if not frames.base_stated:
         why = "the nominal arm on it has the axis of joint 1 where the readings have it"
         if mode == "deflection":
             why, places = f"{why}; deflections tell it no better", (3, 2)
-    return f"The robot's base: {_at(found.base, places)}; {why}."
+    return f"The robot's base: {_at(frames.base, places)}; {why}."
 
 
-def undetermined_lines(found: Registration) -> Iterator[str]:
+def undetermined_lines(registration: Registration) -> Iterator[str]:
     """Yield a sentence for each direction of the frames that the poses do not determine."""
-    names = found.cell.target_names if found.cell.targets is not None else ()
-    for u in found.undetermined:
+    names = registration.cell.target_names if registration.cell.targets is not None else ()
+    still = [int(k) + 1 for k in np.flatnonzero(registration.still)]
+    why = "the tool hardly changed its orientation, or turned about one axis only"
+    if len(still) == 1:
+        why = f"joint {still[0]} never turned"
+    elif still and still == list(range(still[0], still[-1] + 1)):
+        why = f"joints {still[0]} to {still[-1]} never turned"
+    elif still:
+        why = f"joints {numbers.names(list(map(str, still)))} never turned"
+    for u in registration.undetermined:
         what = _undetermined(u, names)
         verb = "separate" if " from " in what else "determine"
-        yield f"The poses cannot {verb} {what}{_why(found.still)}; it stays near the start."
+        yield f"The poses cannot {verb} {what}: {why}; it stays near the start."
 
 
 def _undetermined(u: Undetermined, names: tuple[str, ...]) -> str:
@@ -143,18 +152,6 @@ def _axis_words(v: Floats, axes: str) -> str:
     if abs(unit[k]) > ALONG:
         return f"{axes} {'xyz'[k]}"
     return f"{axes} direction ({', '.join(f'{x:.2f}' for x in unit)})"
-
-
-def _why(still: Bools) -> str:
-    """Say which joints never turned, where some did not."""
-    which = [int(k) + 1 for k in np.flatnonzero(still)]
-    if not which:
-        return ": the tool hardly changed its orientation, or turned about one axis only"
-    if len(which) == 1:
-        return f": joint {which[0]} never turned"
-    if which == list(range(which[0], which[-1] + 1)):
-        return f": joints {which[0]} to {which[-1]} never turned"
-    return f": joints {numbers.names(list(map(str, which)))} never turned"
 
 
 def _at(t: Floats, places: tuple[int, int] = PLACES) -> str:
@@ -199,18 +196,18 @@ def covariance_words(parts: CovarianceParts, noise: NoiseEstimate | None = None)
     )
 
 
-def torque_lines(found: TorqueCheck | None) -> Iterator[str]:
+def torque_lines(check: TorqueCheck | None) -> Iterator[str]:
     """Yield a sentence for each described mass that the torques contradict, else one for all."""
-    if found is None:
+    if check is None:
         return
-    if not found.factors:
+    if not check.factors:
         yield "Measured joint torques: the poses tell neither a load nor a mass by them."
-    for f in found.factors:
+    for f in check.factors:
         if f.differs:
             yield f"Measured joint torques: {_differs(f)}."
-    if right := [_size(f) for f in found.factors if not f.differs]:
+    if right := [_size(f) for f in check.factors if not f.differs]:
         yield f"Measured joint torques agree with the description: {'; '.join(right)}."
-    left = ", ".join(numbers.digits(x, 2) for x in found.std_Nm)
+    left = ", ".join(numbers.digits(x, 2) for x in check.std_Nm)
     yield f"Measured joint torques scatter about that by {left} N·m, joint by joint (friction)."
 
 

@@ -1,6 +1,7 @@
 """A campaign as charts and viewer draw it: readings and the revisions of its model, base axes."""
 
 import itertools
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -254,6 +255,17 @@ def of_left_out(revision: StoryRevision, fit: Fit) -> StoryRevision:
     return replace(revision, residual=residual, predicted=predicted, whitened_norm2=norm2)
 
 
+def round_factor(wanted: float, steps: Sequence[float]) -> float:
+    """Return the largest of `steps` (1 to 10) times a power of ten that is at most `wanted`.
+
+    It is 1 where nothing, or something infinite, is wanted.
+    """
+    if not (math.isfinite(wanted) and wanted > 0):
+        return 1.0
+    power = 10.0 ** math.floor(math.log10(wanted))
+    return float(max(f for f in steps if f * power <= wanted * (1 + 1e-9)) * power)
+
+
 def pose_numbers(names: Sequence[str]) -> Ints:
     """Number of each pose, by which the viewer orders them.
 
@@ -277,7 +289,7 @@ def _revision(c: Chapter, e: FullPrediction, residual: Floats, measured: Floats)
     verdict: list[Block] = [f"{UNDIAGNOSED.capitalize()}: run hilcal diagnose for a verdict."]
     details: list[Block] = [misses(c.fit)]
     if d is not None:
-        verdict = [numbers.sentence(message(d), d.fit.model.catalogue.names)]
+        verdict = [message(d)]
         verdict += [suspects_table(d, MOST_SUSPECTS)] if d.significant else []
         details = list(diagnosis_report(d))
         if drawn is not None:

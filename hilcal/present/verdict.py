@@ -1,4 +1,4 @@
-"""A diagnosis in one sentence; the `message` of JSON documents and files."""
+"""A diagnosis in a few short sentences; the `message` of JSON documents and files."""
 
 from collections.abc import Mapping
 
@@ -16,15 +16,14 @@ from hilcal.diagnosis.noise import (
     instrument_instead,
     separated,
 )
-from hilcal.diagnosis.pose_alone import PoseAlone
 from hilcal.diagnosis.wrong_figures import WrongFigure
 from hilcal.identification.full_prediction import disagreement_words
-from hilcal.numbers import few, length, p_equals, sizes
+from hilcal.numbers import few, length, p_equals, percent, sizes
 from hilcal.readings.readings import ArmScatter, SerialNoise
 from hilcal.robot.arm import Arm
 
 MOST_LIKELY, MOST_HIDDEN = 4, 4
-"""Effects of a background, and effects that the readings cannot show, that the sentence names."""
+"""Effects of a background, and effects that the readings cannot show, that the message names."""
 HEADLINES: Mapping[Verdict, str] = {
     "adequate": "adequate: the residual is noise",
     "missing_effect": "an effect is missing",
@@ -46,51 +45,48 @@ def headline(d: Diagnosis) -> str:
 
 
 def message(d: Diagnosis) -> str:
-    """Return the verdict in a sentence; the effect that it names is the first suspect."""
+    """Return the verdict in a few sentences; the effect that it names is the first suspect."""
     serial = d.fit.readings.serial
-    return _verdict(d) if serial is None else f"{_verdict(d)}; {correlated(serial)}"
+    return " ".join([*_verdict(d), *([] if serial is None else [correlated(serial)])])
 
 
-def _verdict(d: Diagnosis) -> str:
-    if d.wrong_figures:  # any one of several explains the misfit
-        figures = "; or, as well: ".join(map(_figure, d.wrong_figures))
-        return f"{figures}. Until that is settled no effect is looked for"
-    if d.reason == "one_suspect":
-        s = d.suspects[0]
-        if not s.coarse:
-            return f"{s.effect} is missing: it {_explains(s)}"
-        return (
-            f"let joints differ: {s.effect} {_explains(s)}; the model has one {s.coarse} for "
-            "several joints"
-        )
+def _verdict(d: Diagnosis) -> list[str]:
+    if d.wrong_figures:
+        return _figures(d.wrong_figures)
     if d.reason == "readings_disagree":
-        return disagreement_words(d.fit)
-    others = {
+        return [numbers.sentence(disagreement_words(d.fit))]
+    of_reason = {
+        "one_suspect": _one_suspect,
         "inseparable_suspects": _inseparable,
         "insufficient_catalogue": _insufficient,
         "no_suspect": _no_suspect,
         "misjudged_noise": _misjudged,
         "background": _background,
         "arm_scatter": _left_to_the_arm,
+        "pose_alone": _pose_alone,
     }
-    if d.reason in others:
-        return others[d.reason](d)
-    if d.pose_alone is not None:
-        return _pose_alone(d, d.pose_alone)
-    adequate = (
-        f"Residuals are what the noise explains: variance factor {d.fit.variance_factor:.2f}; "
-        f"{_nothing_missing(d)}{_noise_place(d.pure_error)}"
-    )
+    if d.reason in of_reason:
+        return of_reason[d.reason](d)
     if d.scatter is not None:
         adequate = _left_to_the_arm(d)
-    if d.reason in ("residual_is_noise", "serial_or_effect"):
+    else:
+        factor = f"variance factor {d.fit.variance_factor:.2f}"
+        adequate = [f"Residuals are what the noise explains: {factor}.", *_nothing_missing(d)]
+        adequate += _noise_place(d.pure_error)
+    doubts = [_alternative(a) for a in d.alternatives if a.inseparable]
+    if d.reason != "inseparable_addition":
         return adequate
-    doubts = "; ".join(_alternative(a) for a in d.alternatives if a.inseparable)
-    return f"{adequate}; but {doubts}: measure what separates them"
+    return [*adequate, f"But {'; '.join(doubts)}. Measure what separates them."]
 
 
-def _share(share: float) -> str:
-    return f"{100 * share:.0f} %"
+def _figures(found: tuple[WrongFigure, ...]) -> list[str]:
+    """Say which figures of the cell may be wrong: any one of several explains the misfit."""
+    first, *rest = (_figure(f) for f in found)
+    return [
+        numbers.sentence(first),
+        *(f"Or else {other}." for other in rest),
+        "Until that is settled no effect is looked for.",
+    ]
 
 
 def _figure(f: WrongFigure) -> str:
@@ -115,37 +111,50 @@ def _figure(f: WrongFigure) -> str:
     )
 
 
-def _nothing_missing(d: Diagnosis) -> str:
+def _nothing_missing(d: Diagnosis) -> list[str]:
     """Say that no effect is missing, of those that such readings show at a plausible size."""
     if d.fit.mode == "deflection":
-        return (
-            f"no effect that deflections show is missing; {UNCALIBRATED}: what is the same under "
-            "every load cancels in them, and hilcal refine --readings absolute shows it"
-        )
+        return [
+            "No effect that deflections show is missing.",
+            f"{UNCALIBRATED.capitalize()}: what is the same under every load cancels in "
+            "deflections, and hilcal refine --readings absolute shows it.",
+        ]
     if hidden := few(d.not_shown, MOST_HIDDEN):
-        return f"no effect that these readings could show is missing (they cannot show {hidden})"
-    return "no effect of the catalogue is missing"
+        return [f"No effect that these readings could show is missing (they cannot show {hidden})."]
+    return ["No effect of the catalogue is missing."]
 
 
-def _background(d: Diagnosis) -> str:
+def _background(d: Diagnosis) -> list[str]:
     """Say which effects of the background are likely, and what to measure."""
     likely = [b for b in d.background if b.p_value < LIKELY][:MOST_LIKELY]
     names = ", ".join(f"{b.effect} ({p_equals(b.p_value)})" for b in likely)
-    noise = ""
+    noise = []
     if d.noise is not None and d.noise.misjudged:
         times = d.fit.variance_factor**0.5
-        noise = f"; what they leave is {times:.1f} times the stated noise: repeat some readings"
-    return (
+        noise = [f"What they leave is {times:.1f} times the stated noise: repeat some readings."]
+    return [
         f"{len(d.background)} effects of the catalogue together predict what the named ones leave, "
-        "and these readings prove none of them by itself; "
-        f"{f'likeliest: {names}' if likely else 'none stands out'}: all are predicted with; more "
-        f"poses, spread over all joints, tell which are there{noise}"
-    )
+        "but these readings prove none of them by itself.",
+        f"Likeliest are {names}." if likely else "None stands out.",
+        "All of them take part in predictions.",
+        "More poses, spread over all joints, tell which are there.",
+        *noise,
+    ]
+
+
+def _one_suspect(d: Diagnosis) -> list[str]:
+    s = d.suspects[0]
+    if not s.coarse:
+        return [f"{s.effect} is missing: it {_explains(s)}."]
+    return [
+        f"Let joints differ: {s.effect} {_explains(s)}.",
+        f"The model has one {s.coarse} for several joints.",
+    ]
 
 
 def _explains(s: Suspect) -> str:
     return (
-        f"explains {_share(s.share)} of the misfit, {_share(max(s.holdout_share, 0))} on "
+        f"explains {percent(s.share)} of the misfit, {percent(max(s.holdout_share, 0))} on "
         f"poses left out ({p_equals(s.score.p_value)})"
     )
 
@@ -159,18 +168,19 @@ def implausible(s: Suspect) -> str:
 
 def broken(s: Suspect) -> str:
     """Say how much the exact model keeps of what the linearisation promised."""
-    return f"the exact model keeps {_share(max(s.kept, 0.0))} of what its linearisation promises"
+    return f"the exact model keeps {percent(max(s.kept, 0.0))} of what its linearisation promises"
 
 
-def _inseparable(d: Diagnosis) -> str:
+def _inseparable(d: Diagnosis) -> list[str]:
     lead, rivals = d.suspects[0], d.separability
-    advice = "hilcal next plans what separates them, or add one and judge on new poses"
+    advice = "Run hilcal next: it plans what separates them. Or add one and judge on new poses."
     if not any(r.possible for r in rivals):
-        advice = "add one; readings of this kind are predicted as well with any of them"
-    return (
-        f"{lead.effect} {_explains(lead)}, but these readings do not separate it from "
-        f"{', '.join(map(_separable, rivals))}; {advice}"
-    )
+        advice = "Add one: readings of this kind are predicted as well with any of them."
+    return [
+        f"{lead.effect} {_explains(lead)}.",
+        f"These readings do not separate it from {', '.join(map(_separable, rivals))}.",
+        advice,
+    ]
 
 
 def _separable(r: Separability) -> str:
@@ -184,25 +194,26 @@ def _separable(r: Separability) -> str:
 
 def _alternative(a: Alternative) -> str:
     """Name the effects that could replace one of the model."""
-    several = [" and ".join(a.others)] if len(a.others) > 1 and a.as_good else []
-    return f"{a.effect} could as well be {' or '.join((*a.same_as, *several))}"
+    several = [f"{numbers.names(a.others)} together"] if len(a.others) > 1 and a.as_good else []
+    return f"{a.effect} could as well be {', or '.join((*a.same_as, *several))}"
 
 
-def _insufficient(d: Diagnosis) -> str:
+def _insufficient(d: Diagnosis) -> list[str]:
     lead, i = d.suspects[0], d.insufficiency
     if i is None:
         raise ValueError("a diagnosis of an insufficient catalogue without what it leaves")
-    follows = f", which follows {' and '.join(d.follows)}" if d.follows else ""
-    return (
-        f"{lead.effect} explains {_share(lead.share)} of the misfit, but all effects of the "
-        f"catalogue together leave {_share(i.share)} of it, "
-        f"{i.variance_factor**0.5:.2g} times the stated noise{follows}: {lead.effect} may only "
-        f"resemble the missing effect{_repeats_scatter_less(i.noise, d.pure_error)}"
-    )
+    follows = f", and follow {' and '.join(d.follows)}" if d.follows else ""
+    return [
+        f"{lead.effect} explains {percent(lead.share)} of the misfit, but all effects of the "
+        f"catalogue together leave {percent(i.share)} of it.",
+        f"The residuals are then {i.variance_factor**0.5:.2g} times the stated noise{follows}.",
+        f"So {lead.effect} may only resemble the missing effect.",
+        *_repeats_scatter_less(i.noise, d.pure_error),
+    ]
 
 
-def _no_suspect(d: Diagnosis) -> str:
-    none = f"no effect of the catalogue explains {_share(LEAST_SHARE)} of it or more"
+def _no_suspect(d: Diagnosis) -> list[str]:
+    none = f"No effect of the catalogue explains {percent(LEAST_SHARE)} of it or more."
     if d.suspects and d.suspects[0].explains:
         best = d.suspects[0]
         tried = best.effect in d.history.rejected
@@ -212,60 +223,75 @@ def _no_suspect(d: Diagnosis) -> str:
         elif not best.keeps:
             but = broken(best)
         none = (
-            f"the best effect of the catalogue, {best.effect}, explains {_share(best.share)} "
-            f"of it, but {but}"
+            f"The best effect of the catalogue, {best.effect}, explains {percent(best.share)} "
+            f"of it, but {but}."
         )
     repeats, share = _repeats_scatter_less(d.noise, d.pure_error), d.predictable_share
     if share < LEAST_SHARE and repeats:
-        return (
-            f"Residuals are {_spread(d)} and follow nothing recorded, but "
-            f"{_share(d.repeated_share)} of the misfit is the same when a pose is repeated: "
-            f"the pose itself predicts it{repeats}; {none}"
-        )
+        return [
+            f"Residuals are {_spread(d)} and follow nothing recorded.",
+            f"But {percent(d.repeated_share)} of the misfit is the same when a pose is repeated: "
+            "the pose itself predicts it.",
+            *repeats,
+            none,
+        ]
     if repeats:
-        repeats = f"{repeats}: {_share(d.repeated_share)} of the misfit is the same in them"
-    percent = _share(share) if share >= 0.005 else f"{100 * share:.1g} %"
+        repeats += [f"{percent(d.repeated_share)} of the misfit is the same in them."]
+    predicted = percent(share) if share >= 0.005 else f"{100 * share:.1g} %"
     follows = f"; it follows {' and '.join(d.follows)}" if d.follows else ""
-    return (
-        f"Residuals are {_spread(d)}, {percent} of the misfit is predicted on poses left out, and "
-        f"{none}{follows}{repeats}"
-    )
+    return [
+        f"Residuals are {_spread(d)}.",
+        f"{predicted} of the misfit is predicted on poses left out{follows}.",
+        none,
+        *repeats,
+    ]
 
 
-def _pose_alone(d: Diagnosis, a: PoseAlone) -> str:
+def _pose_alone(d: Diagnosis) -> list[str]:
+    a = d.pose_alone
+    if a is None:
+        raise ValueError("a diagnosis of a misfit by pose without its share")
     first, *rest = a.effects
-    chance = "" if a.chance is None else f" with a chance of {_share(a.chance)}"
+    chance = "" if a.chance is None else f" with a chance of {percent(a.chance)}"
     others = f", or {' or '.join(rest[:2])}," if rest else ""
-    return (
-        f"Residuals are {_spread(d)}, and {_share(a.share)} of the misfit is the same under "
-        f"every load of a pose: it depends on the pose alone. {first} finer than {a.poses} poses "
-        f"can resolve{others} would do that, and so would an arm that repeats worse than stated, "
-        f"where each pose was arrived at once; {a.more} more poses tell{chance}"
-    )
+    return [
+        f"Residuals are {_spread(d)}.",
+        f"{percent(a.share)} of the misfit is the same under every load of a pose: it depends on "
+        "the pose alone.",
+        f"{first} finer than {a.poses} poses can resolve{others} would do that.",
+        "So would an arm that repeats worse than stated, where each pose was arrived at once.",
+        f"{a.more} more poses tell{chance}.",
+    ]
 
 
-def _misjudged(d: Diagnosis) -> str:
+def _misjudged(d: Diagnosis) -> list[str]:
     if d.noise is None:
         raise ValueError("a diagnosis of misjudged noise without a judgement of the noise")
     repeats = d.pure_error
     if d.scatter is not None and d.fit.readings.arm_scatter is None:
-        why = _no_repeatability(d.scatter, d.fit.model.cell.arm)
-        return f"Residuals are {_spread(d)} and nothing predicts them; {why}"
+        return [
+            f"Residuals are {_spread(d)} and nothing predicts them.",
+            *_no_repeatability(d.scatter, d.fit.model.cell.arm),
+        ]
     if d.noise.reason == "repeats" and repeats is not None:
         compared = "less" if d.fit.variance_factor < 1 else "more"
-        return (
+        return [
             f"Repeated readings scatter {repeats.factor**0.5:.2g} times as much as stated, and "
             f"the residuals no {compared} than the repeats: scale the covariance by "
-            f"{repeats.factor:.2g}; no effect is missing{_noise_place(repeats)}"
-        )
+            f"{repeats.factor:.2g}.",
+            "No effect is missing.",
+            *_noise_place(repeats),
+        ]
     if d.noise.reason == "too_large":
-        place = _noise_place(repeats)
-        return f"Residuals are only {_spread(d)}: the stated covariance is too large{place}"
-    few = "without repeated readings" if repeats is None else "with so few repeated readings"
-    return (
-        f"Residuals are {_spread(d)} and nothing predicts them; {few} it cannot be known whether "
-        "the noise is larger than stated: repeat some readings"
-    )
+        return [
+            f"Residuals are only {_spread(d)}: the stated covariance is too large.",
+            *_noise_place(repeats),
+        ]
+    few = "Without repeated readings" if repeats is None else "With so few repeated readings"
+    return [
+        f"Residuals are {_spread(d)} and nothing predicts them.",
+        f"{few} it cannot be known whether the noise is larger than stated: repeat some readings.",
+    ]
 
 
 def _spread(d: Diagnosis) -> str:
@@ -273,74 +299,77 @@ def _spread(d: Diagnosis) -> str:
     return f"{d.fit.variance_factor**0.5:.2g} times the {noise} noise"
 
 
-def _repeats_scatter_less(noise: NoiseVerdict | None, repeats: PureError | None) -> str:
-    """Return the end of a sentence on repeats that scatter less than the residuals."""
+def _repeats_scatter_less(noise: NoiseVerdict | None, repeats: PureError | None) -> list[str]:
+    """Return a sentence where repeats scatter less than the residuals."""
     if noise is None or noise.reason != "lack_of_fit" or repeats is None:
-        return ""
-    return f"; repeated readings scatter only {repeats.factor**0.5:.2g} times what is stated"
+        return []
+    return [f"Repeated readings scatter only {repeats.factor**0.5:.2g} times what is stated."]
 
 
-def _noise_place(repeats: PureError | None) -> str:
-    """Return the end of a sentence on where the noise differs most from what is stated."""
+def _noise_place(repeats: PureError | None) -> list[str]:
+    """Return a sentence on where the noise differs most from what is stated."""
     if repeats is None or repeats.where is None:
-        return ""
+        return []
     w = repeats.where
     of = "of unloaded readings" if w.name == "unloaded" else f"under {w.name}"
     place = {"axis": w.name, "joint": f"along the motion of {w.name}"}.get(w.kind, of)
-    return (
-        f"; it differs most {place}, where the repeats scatter {w.factor**0.5:.2g} times as much "
-        "as stated"
-    )
+    return [
+        f"The noise differs most {place}: the repeats scatter {w.factor**0.5:.2g} times as much "
+        "there as stated."
+    ]
 
 
-def _left_to_the_arm(d: Diagnosis) -> str:
+def _left_to_the_arm(d: Diagnosis) -> list[str]:
     """Say that what is left is the arm's repeatability, and that no effect is missing."""
     s = d.scatter
     if s is None:
         raise ValueError("a diagnosis of the arm's scatter without an estimate of it")
-    alone, predicted = "is predictable by nothing recorded (0 % on poses left out) and ", ""
+    predicted = "Nothing recorded predicts it (0 % on poses left out)."
     if s.predicted_share >= 0.005:
         by = " and ".join(s.predicted_by) or "what was recorded"
         size = length(s.predicted_share**0.5 * s.size_m)
-        alone, predicted = (
-            "",
-            (
-                f"; {_share(s.predicted_share)} of it, {size} rms, follows {by} on poses left out, "
-                "which is negligible beside the rest"
-            ),
+        predicted = (
+            f"{percent(s.predicted_share)} of it, {size} rms, follows {by} on poses left out, "
+            "which is negligible beside the rest."
         )
-    doubt = large = ""
+    doubt = []
     if not separated(s):
-        doubt = (
-            "; these readings cannot separate it from an instrument "
-            f"{s.instrument_factor:.2g} times as noisy as stated"
-        )
-    estimated = d.fit.readings.arm_scatter is not None
-    if estimated and d.noise is not None and d.noise.reason == "too_large":
-        large = (
-            f"; with it the residuals are {d.fit.variance_factor**0.5:.2g} times the noise, so the "
-            "instrument's is stated too large in some of its elements"
-        )
-    return (
-        f"What is left, {length(s.size_m)} rms, {alone}is of the size of the arm's "
-        f"repeatability: {sigmas(s)}{_maker(s, d.fit.model.cell.arm)}{predicted}; "
-        f"{_nothing_missing(d)}{doubt}{large}"
-    )
+        doubt = [
+            "These readings cannot separate it from an instrument "
+            f"{s.instrument_factor:.2g} times as noisy as stated."
+        ]
+    if (
+        d.fit.readings.arm_scatter is not None
+        and d.noise is not None
+        and d.noise.reason == "too_large"
+    ):
+        doubt += [
+            f"With it the residuals are {d.fit.variance_factor**0.5:.2g} times the noise: the "
+            "instrument's is stated too large in some of its elements."
+        ]
+    return [
+        f"What is left, {length(s.size_m)} rms, is of the size of the arm's "
+        f"repeatability{_maker(s, d.fit.model.cell.arm)}.",
+        numbers.sentence(sigmas(s)),
+        predicted,
+        *_nothing_missing(d),
+        *doubt,
+    ]
 
 
-def _no_repeatability(s: ArmScatter, arm: Arm) -> str:
+def _no_repeatability(s: ArmScatter, arm: Arm) -> list[str]:
     """Say why what is left is not the arm's repeatability; the start of it is said already."""
     if instrument_instead(s):
-        return (
-            f"they are as if the instrument were {s.instrument_factor:.2g} times as noisy as "
+        return [
+            f"They are as if the instrument were {s.instrument_factor:.2g} times as noisy as "
             "stated, and not as if the arm scattered: mend the stated noise, or repeat some "
-            "readings to be sure"
-        )
-    return (
-        f"the arm would have to scatter by {length(s.size_m)} rms{_maker(s, arm)}, more "
+            "readings to be sure."
+        ]
+    return [
+        f"The arm would have to scatter by {length(s.size_m)} rms{_maker(s, arm)}, more "
         "than an arm's repeatability: the instrument is noisier than stated, or the arm or the "
-        "target was loose"
-    )
+        "target was loose."
+    ]
 
 
 def sigmas(s: ArmScatter) -> str:
@@ -381,15 +410,15 @@ def repeatability_source(source: ScatterSource, arm: Arm) -> str:
 def correlated(n: SerialNoise) -> str:
     """Say that the readings are correlated along their order, and what it does."""
     unit = "s" if n.clock == "time" else "readings"
-    share = "" if n.share > 0.95 else f" in {_share(n.share)} of their variance"
+    share = "" if n.share > 0.95 else f" in {percent(n.share)} of their variance"
     doubt = ""
     if not n.proved:
         others = " and ".join(n.instead) or "effects of the catalogue"
-        doubt = f"; or not, since {others} would explain the readings as well: repeat them"
+        doubt = f" Or they are not: {others} would explain the readings as well. Repeat them."
     low, high = n.wider
     return (
-        f"readings are correlated along their order{share}: "
+        f"Readings are correlated along their order{share}: "
         f"ρ = {' ± '.join(numbers.with_std(n.rho, n.rho_error))} from one to the "
-        f"next, half-time {n.half:.2g} {unit}; standard uncertainties are {low:.2g} to {high:.2g} "
-        f"times as large for it{doubt}"
+        f"next, half-time {n.half:.2g} {unit}. Standard uncertainties are {low:.2g} to {high:.2g} "
+        f"times as large for it.{doubt}"
     )

@@ -23,7 +23,7 @@ from hilcal.identification.fit import Fit
 from hilcal.names import quoted
 from hilcal.present.progress import Say
 from hilcal.procedure.state import Settings, duration_of, reference_in
-from hilcal.procedure.validation_plan import RECORDED
+from hilcal.procedure.validation_plan import recorded
 from hilcal.readings.readings import States
 from hilcal.robot.chain import evaluate
 from hilcal.store.plan import Plan
@@ -252,24 +252,46 @@ class Decision:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Question:
-    """Whether to measure more, after a diagnosis."""
+class FurtherMeasuring:
+    """Whether to measure more, after a refinement."""
 
     cell: Cell
     config: CellConfig
     settings: Settings
     d: Diagnosis  # of the last fit
-    error: PredictedError
-    reference: Floats | None  # (n,) joints of the reference pose of the plans so far, rad
+    plans: tuple[Plan, ...]  # those so far
+    reference: Floats | None  # (n,) joints of their reference pose, rad
     rng: np.random.Generator
     say: Say
 
-    def separating(self) -> Decision | None:
+    def decide(self) -> Decision:
+        """Decide whether to measure more, and what.
+
+        A doubt between effects comes first; then a predicted error above the goal. A further plan
+        is measured where it would tell more and the time allows it.
+        """
+        d, settings = self.d, self.settings
+        error = predicted_error(Calibration.of(d.fit), d.fit.readings.states, self.config)
+        further = self._separating(error)
+        if further is None or not further.measures:
+            sharper = self._sharpening(error)
+            if sharper is not None and (further is None or sharper.measures):
+                further = sharper
+        if further is None:
+            reached = settings.goal_m is not None and d.verdict == "adequate"
+            return Decision("goal_met" if reached else d.verdict, d.verdict, error)
+        if not further.measures:
+            return further
+        if sum(map(duration_of, self.plans)) + further.seconds > settings.max_time_s:
+            return replace(further, reason="time")
+        return replace(further, reason="plans") if len(self.plans) >= MOST_PLANS else further
+
+    def _separating(self, error: PredictedError) -> Decision | None:
         """Return what would settle a doubt; None where there is none."""
         doubt = doubt_of(self.d, self.say)
         if doubt is None:
             return None
-        nothing = Decision("inseparable", self.d.verdict, self.error, suspects=doubt.suspects)
+        nothing = Decision("inseparable", self.d.verdict, error, suspects=doubt.suspects)
         poses, site = self.settings.poses, (self.cell, self.config)
         try:
             found = separating(*site, doubt, None, self.rng, self.say, self.reference, poses)
@@ -282,9 +304,9 @@ class _Question:
         seconds = duration_of(plan)
         return replace(nothing, reason="doubt", power=power, plan=plan, seconds=seconds)
 
-    def sharpening(self) -> Decision | None:
+    def _sharpening(self, error: PredictedError) -> Decision | None:
         """Return what would lower the predicted error; None where it is as wanted."""
-        goal, error = self.settings.goal_m, self.error
+        goal = self.settings.goal_m
         if goal is None or error.now_m <= goal:
             return None
         decision = Decision("no_gain", self.d.verdict, error)
@@ -313,39 +335,6 @@ class _Question:
         return replace(decision, reason="goal", then_m=then, plan=plan, seconds=seconds)
 
 
-def decide(
-    cell: Cell,
-    config: CellConfig,
-    settings: Settings,
-    d: Diagnosis,
-    plans: tuple[Plan, ...],
-    reference: Floats | None,
-    rng: np.random.Generator,
-    say: Say = lambda words: None,
-) -> Decision:
-    """Decide whether to measure more, and what.
-
-    A doubt between effects comes first; then a predicted error above the goal. A further plan is
-    measured where it would tell more and the time allows it. `d` is the diagnosis of the last fit,
-    `plans` are those so far, `reference` (n,) the joints of their reference pose, rad.
-    """
-    error = predicted_error(Calibration.of(d.fit), d.fit.readings.states, config)
-    question = _Question(cell, config, settings, d, error, reference, rng, say)
-    further = question.separating()
-    if further is None or not further.measures:
-        sharper = question.sharpening()
-        if sharper is not None and (further is None or sharper.measures):
-            further = sharper
-    if further is None:
-        reached = settings.goal_m is not None and d.verdict == "adequate"
-        return Decision("goal_met" if reached else d.verdict, d.verdict, error)
-    if not further.measures:
-        return further
-    if sum(map(duration_of, plans)) + further.seconds > settings.max_time_s:
-        return replace(further, reason="time")
-    return replace(further, reason="plans") if len(plans) >= MOST_PLANS else further
-
-
 def predicted_error(calibration: Calibration, fitted: States, config: CellConfig) -> PredictedError:
     """Predict the error after compensation where the robot will work.
 
@@ -353,8 +342,7 @@ def predicted_error(calibration: Calibration, fitted: States, config: CellConfig
     loads of the readings: the distance that 95 % of all these points are within.
     """
     states = _work(fitted, config)
-    columns = {k: v for k in RECORDED if (v := getattr(states, k)) is not None}
-    told = calibration.predict(states.q, states.wrench, recorded=columns)
+    told = calibration.predict(states.q, states.wrench, recorded=recorded(states))
     assert told.covariance is not None  # noqa: S101  (asked for by default)
     of = tool_of(calibration.model, calibration.theta, None)
     chain = evaluate(calibration.model.cell.arm, states.q)

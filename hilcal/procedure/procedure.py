@@ -25,7 +25,7 @@ from hilcal.calibration.improvement import Improvement, improvement
 from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.design.planner import Request, make
+from hilcal.design.planner import Planned, Request, make
 from hilcal.design.summary import CheckedPlan, about, checked, remarks, summarise
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue, installed
@@ -37,7 +37,12 @@ from hilcal.identification.carried import CarriedPrior
 from hilcal.identification.full_covariance import full_readings
 from hilcal.identification.validation import Acceptance, acceptance, extrapolation
 from hilcal.present.progress import Say
-from hilcal.procedure.next_plan import Decision, PredictedError, decide, predicted_error
+from hilcal.procedure.next_plan import (
+    Decision,
+    FurtherMeasuring,
+    PredictedError,
+    predicted_error,
+)
 from hilcal.procedure.state import (
     BEGUN,
     DECIDED,
@@ -57,7 +62,7 @@ from hilcal.procedure.state import (
     reference_of,
     settings_of,
 )
-from hilcal.procedure.validation_plan import corrected_plan, expected_of, paired, validation_plan
+from hilcal.procedure.validation_plan import corrected_plan, left_out_of, paired, validation_plan
 from hilcal.readings.covariance import COVERS, INSTRUMENT
 from hilcal.readings.readings import ArmScatter, Readings
 from hilcal.readings.same_readings import already
@@ -152,13 +157,8 @@ class Procedure:
 
     def plan(self, say: Say = lambda words: None) -> CheckedPlan:
         """Choose the first plan; nothing is stored yet. A cell may leave too few poses."""
-        rng, config, asked = self._rng(_FIRST), self._planned(), Request(self.settings.poses)
-        chosen = make(self.cell, config, asked, rng, None, say, self.catalogue)
-        known = {**about(chosen), "remarks": list(remarks(chosen))}
-        plan = replace(chosen.ordered.plan, about=known)
-        summary = summarise(chosen, config, rng, say, compare=False)
-        say("checking every motion in a dry run")
-        return checked(self.cell, config, plan, summary)
+        rng, config = self._rng(_FIRST), self._planned()
+        return checked_plan(self.cell, config, self.settings.poses, rng, self.catalogue, say)
 
     def begin(self, plan: Plan, config: CellConfig, *, covers: str = INSTRUMENT) -> None:
         """Make the campaign file with its first plan.
@@ -254,9 +254,8 @@ class Procedure:
                 d = diagnose(o.restore(record), o.history(record.number), say)
             rng = self._rng(_FURTHER, len(run.plans))
             reference = reference_of(run.plans[0])
-            found = decide(
-                self.cell, self._planned(), self.settings, d, run.plans, reference, rng, say
-            )
+            asked = (self.cell, self._planned(), self.settings)
+            found = FurtherMeasuring(*asked, d, run.plans, reference, rng, say).decide()
             plan = found.plan if found.measures else None
             if plan is not None:
                 plan = run.with_new_names(plan)  # `run` checks every motion of it
@@ -388,7 +387,7 @@ class Procedure:
             calibration, record = self._calibration(o)
             first, last = (self._readings(o, record, file) for file in (unseen, moved))
             before, after = paired(first, last, calibration.mode)
-            _, left_out = expected_of(read_plan(moved.about(PLAN) or "", f"{moved.path}, its plan"))
+            left_out = left_out_of(read_plan(moved.about(PLAN) or "", f"{moved.path}, its plan"))
             p = o.predictive(record, *o.restore_model(record))
             found = improvement(calibration, p, before, after, before.states, left_out)
             if log.last(IMPROVED) is None:
@@ -445,6 +444,26 @@ class Procedure:
     def _source(self, what: str = "") -> str:
         how = "measured" if self.settings.hide is None else "rehearsed in a simulated cell"
         return f"{what}{how} by hilcal calibrate"
+
+
+def with_origin(chosen: Planned) -> Plan:
+    """Return a plan that says where it is from."""
+    return replace(chosen.ordered.plan, about={**about(chosen), "remarks": list(remarks(chosen))})
+
+
+def checked_plan(
+    cell: Cell,
+    config: CellConfig,
+    poses: int,
+    rng: np.random.Generator,
+    catalogue: Catalogue,
+    say: Say,
+) -> CheckedPlan:
+    """Choose a plan of so many poses, each under every load that it bears; check all motions."""
+    chosen = make(cell, config, Request(poses), rng, None, say, catalogue)
+    summary = summarise(chosen, config, rng, say, compare=False)
+    say("checking every motion in a dry run")
+    return checked(cell, config, with_origin(chosen), summary)
 
 
 def continued(run: Path, cell: Cell, config: CellConfig, catalogue: Catalogue) -> Procedure:

@@ -34,10 +34,14 @@ DRAWN = 4
 far from all that was measured."""
 LEAST_RANGE = 1e-4
 """Range that a joint which stood still in the campaign has here, rad; a choice."""
-RECORDED = ("time", "load_time", "air_temperature", "joint_temperature", "approach")
-"""Columns of a state that a model may need beside joint angles and wrench."""
 DRAWS = 4
 """Orders that are drawn; a choice: drift is no matter here, only time."""
+
+
+def recorded(states: States) -> dict[str, Floats]:
+    """Return the columns that a model may need beside joint angles and wrench, by name."""
+    names = ("time", "load_time", "air_temperature", "joint_temperature", "approach")
+    return {name: v for name in names if (v := getattr(states, name)) is not None}
 
 
 def validation_plan(
@@ -90,17 +94,25 @@ def validation_plan(
             "all are beyond the cell's limits, out of sight, or not reached from the reference pose"
         )
     say("ordering the readings")
-    names = {k: f"v{i}" for i, (k, _) in enumerate(wanted, start=1)}
     also = (UNLOADED,) if calibration.mode == "deflection" else ()
-    chosen = [Chosen(names[k], (*also, name)) for k, name in wanted]
-    q = found.q[[k for k, _ in wanted]]
-    how = Ordering(repeats=0, draws=DRAWS)
-    plan = order_plan(
-        space.cell, own, list(names.values()), q, base, chosen, space.passable, rng, how
-    ).plan
-    plan = fewer_returns(plan, space, own)
+    chosen = [Chosen(f"v{i}", (*also, name)) for i, (_, name) in enumerate(wanted, start=1)]
+    plan = _ordered(space, own, chosen, found.q[[k for k, _ in wanted]], base, rng)
     refuse(dry_run(cell, config, plan), "the validation plan")
     return replace(plan, about={**plan.about, "purpose": "validation"})
+
+
+def _ordered(
+    space: Space,
+    config: CellConfig,
+    chosen: Sequence[Chosen],
+    q: Floats,
+    reference: Floats,
+    rng: np.random.Generator,
+) -> Plan:
+    """Put the chosen poses in order, at joint values (P, n), from the reference pose (n,)."""
+    names, how = [c.pose for c in chosen], Ordering(repeats=0, draws=DRAWS)
+    found = order_plan(space.cell, config, names, q, reference, chosen, space.passable, rng, how)
+    return fewer_returns(found.plan, space, config)
 
 
 def fewer_returns(plan: Plan, space: Space, config: CellConfig) -> Plan:
@@ -146,16 +158,14 @@ def _within(cell: Cell, config: CellConfig, q: Floats) -> Cell:
 
 def _far(calibration: Calibration, states: States, wrench: Floats) -> Bools:
     """(N,) which states lie far from all that was measured, whatever the temperature."""
-    columns = {k: v for k in RECORDED if (v := getattr(states, k)) is not None}
-    told = calibration.predict(states.q, wrench, recorded=columns)
+    told = calibration.predict(states.q, wrench, recorded=recorded(states))
     far = np.zeros(len(states), dtype=np.bool_)
     for o in told.outside:
         far |= o.points & ("temperature" not in o.of.variable)
     return far
 
 
-POINTS, LEFT_OUT = "points", "left_out"
-"""Keys of a plan's file: what was expected of each point, and which are missing."""
+LEFT_OUT = "left_out"  # Key of a plan's file: which points are missing, and why
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -222,7 +232,8 @@ def corrected_plan(
         keep = np.array([k for k, name in enumerate(of.names) if name not in left], dtype=int)
         if not len(keep):
             break
-        plan = _ordered(space, config, of, keep, q, reference, rng)
+        chosen = [Chosen(of.names[k], (of.loads[k],)) for k in keep]
+        plan = _ordered(space, config, chosen, q[keep], reference, rng)
         order = np.array([of.names.index(s.pose) for s in plan.steps if s.pose != REFERENCE])
         wrenches = {of.names[k]: validation.states.wrench[of.rows[k]] for k in keep}
         wrench = np.array([wrenches.get(s.pose, np.zeros(6)) for s in plan.steps])
@@ -241,30 +252,10 @@ def corrected_plan(
     raise CannotAnswerError(f"no validation pose can be corrected: {words}")
 
 
-def _ordered(
-    space: Space,
-    config: CellConfig,
-    of: CorrectedPoints,
-    keep: Ints,
-    q: Floats,
-    reference: Floats,
-    rng: np.random.Generator,
-) -> Plan:
-    """Order the points at the joint values that they have so far."""
-    names = [of.names[k] for k in keep]
-    chosen = [Chosen(of.names[k], (of.loads[k],)) for k in keep]
-    how = Ordering(repeats=0, draws=DRAWS)
-    plan = order_plan(
-        space.cell, config, names, q[keep], reference, chosen, space.passable, rng, how
-    ).plan
-    return fewer_returns(plan, space, config)
-
-
 def _compensated(
     calibration: Calibration, states: States, validation: Readings, of: CorrectedPoints, order: Ints
 ) -> Compensation:
     """Correct the points for the states that are expected, in the order of the plan."""
-    columns = {k: v for k in RECORDED if (v := getattr(states, k)) is not None}
     nominal = validation.states[of.rows[order]].q
     wanted = None
     if calibration.mode == "deflection":
@@ -273,7 +264,7 @@ def _compensated(
         free = replace(validation.states[of.unloaded[order]], target=None)
         rotation, position = tool_poses(tool, tool.model.predict(free, tool.theta))
         wanted = se3.matrix(rotation, position)
-    return calibration.compensate(nominal, states.wrench, wanted=wanted, recorded=columns)
+    return calibration.compensate(nominal, states.wrench, wanted=wanted, recorded=recorded(states))
 
 
 def _blocked(space: Space, q: Floats, reference: Floats, loads: Sequence[str]) -> dict[int, str]:
@@ -301,7 +292,7 @@ def _with_targets(
     about = {
         **plan.about,
         "purpose": "corrected",
-        POINTS: [
+        "points": [
             {"pose": of.names[k], "load": of.loads[k], "expected_before_m": off, "band_m": band}
             for k, off, band in expected
         ],
@@ -333,10 +324,9 @@ def paired(validation: Readings, corrected: Readings, mode: str) -> tuple[Readin
     return Readings.joined([free, before]), Readings.joined([free, moved])
 
 
-def expected_of(plan: Plan) -> tuple[list[dict[str, Any]], list[tuple[str, str]]]:
-    """Return what a plan's file says of its points, and of those that are left out."""
-    left = [(str(x["point"]), str(x["why"])) for x in plan.about.get(LEFT_OUT, [])]
-    return list(plan.about.get(POINTS, [])), left
+def left_out_of(plan: Plan) -> list[tuple[str, str]]:
+    """Return the points that a plan leaves out, as its file says, each with the reason."""
+    return [(str(x["point"]), str(x["why"])) for x in plan.about.get(LEFT_OUT, [])]
 
 
 def expected_states(

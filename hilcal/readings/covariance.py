@@ -80,7 +80,7 @@ def tracker_noise(section: Tracker) -> TrackerNoise:
 def tracker_covariance(
     position: Floats,  # (N, 3) positions in the frame of `station`, m
     noise: TrackerNoise,
-    station: Floats | Sequence[float] = (0.0, 0.0, 0.0),  # (3,) where the beam starts, m
+    station: Floats | Sequence[float] | None = None,  # (3,) where the beam starts, m; else 0
     m: int = 3,  # 3 for positions, 6 for poses
 ) -> Floats:
     """Instrument covariance (N, m, m) of one sample: an ellipsoid that turns with the beam.
@@ -92,7 +92,8 @@ def tracker_covariance(
     where the angles' errors are equal across the beam: d σ_el = d cos(el) σ_az = c + e d. The
     rotation of a pose (m = 6) has the covariance σ_o² I.
     """
-    beam = np.asarray(position, dtype=float) - np.asarray(station, dtype=float)
+    beam = np.asarray(position, dtype=float)
+    beam = beam if station is None else beam - np.asarray(station, dtype=float)
     distance = np.linalg.norm(beam, axis=1)
     if np.any(distance == 0):
         k = int(np.argmin(distance))

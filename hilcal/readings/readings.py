@@ -17,12 +17,13 @@ noise).
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 
 from hilcal.errors import InputError
+from hilcal.robot.batch import by_field
 from hilcal.shown import Brief, Tabular
 from hilcal.types import Bools, Floats, Ints
 
@@ -73,15 +74,12 @@ class States(Brief):
 
     def __getitem__(self, rows: Ints | Bools | slice) -> "States":
         """Return the chosen states."""
-        given = {f.name: a for f in fields(self) if (a := getattr(self, f.name)) is not None}
-        return replace(self, **{name: a[rows] for name, a in given.items()})
+        return by_field([self], lambda given: given[0][rows])
 
     @staticmethod
     def joined(parts: Sequence["States"]) -> "States":
         """Put states with the same columns one after the other."""
-        given = [f.name for f in fields(parts[0]) if getattr(parts[0], f.name) is not None]
-        columns = {name: np.concatenate([getattr(p, name) for p in parts]) for name in given}
-        return replace(parts[0], **columns)
+        return by_field(parts, np.concatenate)
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,9 +126,7 @@ class ArmScatter:
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> "ArmScatter":
         """Return what `to_json` wrote."""
-        given: dict[str, Any] = dict(content)
-        lists = given.keys() & {"std", "std_error", "predicted_by"}
-        return cls(**{**given, **{k: tuple(given[k]) for k in lists}})
+        return cls(**_with_tuples(content))
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,9 +175,12 @@ class SerialNoise:
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> "SerialNoise":
         """Return what `to_json` wrote."""
-        given: dict[str, Any] = {name: x for name, x in content.items() if name != "half"}
-        lists = given.keys() & {"instead", "wider"}
-        return cls(**{**given, **{name: tuple(given[name]) for name in lists}})
+        return cls(**_with_tuples({name: x for name, x in content.items() if name != "half"}))
+
+
+def _with_tuples(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return fields that JSON holds, its lists as tuples."""
+    return {name: tuple(x) if isinstance(x, list) else x for name, x in content.items()}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -240,31 +239,17 @@ class Readings(Tabular):
 
     def __getitem__(self, rows: Ints | Bools | slice) -> "Readings":
         """Return the chosen readings; names are kept."""
-        return replace(
-            self, states=self.states[rows], pose=self.pose[rows], load=self.load[rows],
-            cycle=self.cycle[rows], value=self.value[rows], covariance=self.covariance[rows],
-            common=None if self.common is None else self.common[rows],
-            stated=None if self.stated is None else self.stated[rows],
-            along=None if self.along is None else self.along[rows],
-        )  # fmt: skip
+        chosen = by_field([self], lambda given: given[0][rows])
+        return replace(chosen, states=self.states[rows])
 
     @staticmethod
     def joined(parts: Sequence["Readings"]) -> "Readings":
         """Put readings with the same names and columns one after the other."""
         if len(parts) == 1:
             return parts[0]
-        return replace(
-            parts[0],
-            states=States.joined([p.states for p in parts]),
-            pose=np.concatenate([p.pose for p in parts]),
-            load=np.concatenate([p.load for p in parts]),
-            cycle=np.concatenate([p.cycle for p in parts]),
-            value=np.concatenate([p.value for p in parts]),
-            covariance=np.concatenate([p.covariance for p in parts]),
-            common=None,
-            serial=None,
-            along=None,
-        )
+        states = States.joined([p.states for p in parts])
+        whole = by_field(parts, np.concatenate)
+        return replace(whole, states=states, common=None, serial=None, along=None)
 
     def as_stated(self) -> "Readings":
         """Return the readings without an estimated scatter of the arm."""

@@ -62,8 +62,8 @@ def shared(campaigns: Sequence[Floats]) -> tuple[int, int] | None:
         if len(rows) < 2:
             continue
         tree = cKDTree(rows)
-        told = tree.query(rows, k=2, p=np.inf, distance_upper_bound=1.0 + 1e-9)
-        here, (distance, nearest) = np.arange(len(rows)), map(np.asarray, told)
+        neighbours = tree.query(rows, k=2, p=np.inf, distance_upper_bound=1.0 + 1e-9)
+        here, (distance, nearest) = np.arange(len(rows)), map(np.asarray, neighbours)
         second = (nearest[:, 0] == here).astype(int)  # one of the two is the reading itself
         distance, nearest = distance[here, second], nearest[here, second]
         found = np.isfinite(distance)

@@ -30,16 +30,15 @@ def missing(
     out = [] if weighed else [NO_MASSES.format(file)]
     if unlimited:
         out.append(f"no limits in {file} for {', '.join(unlimited)}: ±360° is assumed")
-    if weak:
-        out.append(
-            f"no torque limit in {file} for {', '.join(weak)}: plans have none there, and "
-            "what compliance counts as ordinary is taken from 150 N·m"
-        )
-    if forceless:
-        out.append(
-            f"no force limit in {file} for {', '.join(forceless)}: plans have none there, and "
-            "what compliance counts as ordinary is taken from 1500 N"
-        )
+    for joints, kind, usual in (
+        (weak, "torque", f"{UNKNOWN_TORQUE:g} N·m"),
+        (forceless, "force", f"{UNKNOWN_FORCE:g} N"),
+    ):
+        if joints:
+            out.append(
+                f"no {kind} limit in {file} for {', '.join(joints)}: plans have none there, and "
+                f"what compliance counts as ordinary is taken from {usual}"
+            )
     return tuple(out)
 
 

@@ -129,7 +129,6 @@ def _of_ur(arm: Arm, figures: Figures) -> tuple[Capsule, ...]:
     r1, r2, r3, r4 = figures.housings
     upper, fore = figures.tubes
     d1, d4 = (float(arm.links[k][2, 3]) for k in (1, 4))
-    at = _Along
     x2, x3 = arm.links[2][:3, 3], arm.links[3][:3, 3]
     inner, outer = figures.elbow, figures.shoulder
     between = 0.5 * (inner + outer)
@@ -138,18 +137,18 @@ def _of_ur(arm: Arm, figures: Figures) -> tuple[Capsule, ...]:
     spin = arm.links[4][:3, 2]  # the second wrist's axis, in the frame of body 4
     d5 = float(arm.links[5][2, 3])
     out = [
-        at(BASE, 0, np.zeros(3), 0.0, 0.6 * d1, r1).capsule(),
+        _housing(BASE, 0, np.zeros(3), 0.0, 0.6 * d1, r1),
         Capsule("shoulder", 1, 0.6 * top, top, r1),
         Capsule("shoulder", 1, top, top + 0.5 * outer * lift, r2),
-        at("upper arm", 2, np.zeros(3), 0.5 * outer, outer + r2, r2).capsule(),
+        _housing("upper arm", 2, np.zeros(3), 0.5 * outer, outer + r2, r2),
         Capsule("upper arm", 2, outer * _Z, x2 + outer * _Z, upper),
-        at("upper arm", 2, x2, between, outer + r3, r3).capsule(),
-        at("forearm", 3, np.zeros(3), inner - r3, between, r3).capsule(),
+        _housing("upper arm", 2, x2, between, outer + r3, r3),
+        _housing("forearm", 3, np.zeros(3), inner - r3, between, r3),
         Capsule("forearm", 3, inner * _Z, x3 + inner * _Z, fore),
-        at("forearm", 3, x3, inner - r4, inner + r4, r4).capsule(),
-        at("wrist 1", 4, np.zeros(3), inner + r4, d4 + r4, r4).capsule(),
+        _housing("forearm", 3, x3, inner - r4, inner + r4, r4),
+        _housing("wrist 1", 4, np.zeros(3), inner + r4, d4 + r4, r4),
         Capsule("wrist 1", 4, d4 * _Z, d4 * _Z + 0.4 * d5 * spin, r4),
-        at("wrist 2", 5, np.zeros(3), 0.4 * d5, d5 + r4, r4).capsule(),
+        _housing("wrist 2", 5, np.zeros(3), 0.4 * d5, d5 + r4, r4),
         Capsule("wrist 3", 6, np.zeros(3), arm.links[6][:3, 3] - _RIM * r4 * _Z, r4),
     ]
     return tuple(out)
@@ -158,22 +157,15 @@ def _of_ur(arm: Arm, figures: Figures) -> tuple[Capsule, ...]:
 _Z = np.array([0.0, 0.0, 1.0])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Along:
-    """A housing about an axis along z through `origin`, from `low` to `high`."""
+def _housing(
+    name: str, body: int, origin: Floats, low: float, high: float, radius: float
+) -> Capsule:
+    """Capsule in a housing about an axis along z through `origin`, from `low` to `high`.
 
-    name: str
-    body: int
-    origin: Floats
-    low: float
-    high: float
-    radius: float
-
-    def capsule(self) -> Capsule:
-        """Capsule in the housing: its segment ends half a radius within, or in its middle."""
-        rim = min(_RIM * self.radius, 0.5 * (self.high - self.low))
-        ends = self.origin + np.array([[self.low + rim], [self.high - rim]]) * _Z
-        return Capsule(self.name, self.body, ends[0], ends[1], self.radius)
+    Its segment ends half a radius within, or in its middle.
+    """
+    rim = min(_RIM * radius, 0.5 * (high - low))
+    return Capsule(name, body, origin + (low + rim) * _Z, origin + (high - rim) * _Z, radius)
 
 
 def _of_any(arm: Arm) -> tuple[Capsule, ...]:

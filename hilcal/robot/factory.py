@@ -84,12 +84,12 @@ def of_rows(
     return FactoryKinematics(links, rows, status, checksum, source)
 
 
-def of_dict(told: Any, source: str) -> FactoryKinematics:
+def of_dict(content: Any, source: str) -> FactoryKinematics:
     """Return the kinematics that `FactoryKinematics.to_dict` has written."""
     try:
-        rows = np.array([told[key] for key in _KEYS], dtype=float)
-        checksum = tuple(map(int, told["joint_checksum"]))
-        return of_rows(rows, source, int(told["calibration_status"]), checksum)
+        rows = np.array([content[key] for key in _KEYS], dtype=float)
+        checksum = tuple(map(int, content["joint_checksum"]))
+        return of_rows(rows, source, int(content["calibration_status"]), checksum)
     except (ValueError, KeyError, TypeError) as error:
         words = " ".join(str(error).split())
         raise InputError(f"{source}: not the kinematics of an arm ({words})") from None

@@ -77,17 +77,16 @@ class Scene:
         self, arm: Arm, carried: Sequence[Capsule] = (), obstacles: Sequence[Obstacle] = ()
     ) -> None:
         """Build the shapes."""
+        self.arm, self.model = arm, pinocchio_model(arm)
         self.parts = (*capsules(arm), *carried)
-        self._arm, self._model = arm, pinocchio_model(arm)
-        self._data = self._model.createData()
-        self._things = [(thing.name, *_obstacle(thing)) for thing in obstacles]
+        self.things = [(thing.name, *_obstacle(thing)) for thing in obstacles]
         joints = range(1, arm.n + 1)  # bounds on how far parts are from their axes
         ends = [(part.body, np.array([part.start, part.end])) for part in self.parts]
         far = np.array([[from_axis(arm, body, end, i) for i in joints] for body, end in ends])
         bodies = np.array([part.body for part in self.parts])
         self.rates = np.where(np.arange(1, arm.n + 1) <= bodies[:, None], far, 0.0)
         count = len(self.parts)
-        last = count + len(self._things)
+        last = count + len(self.things)
         reach = [
             (a, b)
             for a in range(count)
@@ -98,9 +97,9 @@ class Scene:
             (a, b) for a in range(count) if self.parts[a].body > 1 for b in range(count, last)
         ]
         own = self._not_always(reach)
-        self.itself = self._pairs(own, [self._apart(a, b, far) for a, b in own])
-        self.around = self._pairs(around, [self.rates[a] for a, _ in around])
-        self.free = self._pairs([(a, last) for a in range(last)])
+        self.itself = Pairs(self, own, [self._apart(a, b, far) for a, b in own])
+        self.around = Pairs(self, around, [self.rates[a] for a, _ in around])
+        self.free = Pairs(self, [(a, last) for a in range(last)])
 
     def towards(self, point: Floats) -> Floats:
         """Return (P + obstacles, n) how fast all near what hangs from a point of the flange, m/rad.
@@ -108,7 +107,7 @@ class Scene:
         It moves with the point and does not turn. A joint that turns a part turns the point with
         it, so that they near each other by no more than their distance per radian.
         """
-        arm, fixed = self._arm, len(self._things)
+        arm, fixed = self.arm, len(self.things)
         at = on_flange(arm, point)
         moves = np.array([from_axis(arm, arm.n, at[None], i) for i in range(1, arm.n + 1)])
         out = np.tile(moves, (len(self.parts) + fixed, 1))
@@ -124,42 +123,17 @@ class Scene:
     def _apart(self, a: int, b: int, far: Floats) -> Floats:
         """(n,) how fast two parts near each other by a joint between them, m/rad."""
         low, high = sorted((self.parts[a].body, self.parts[b].body))
-        joint = np.arange(1, self._arm.n + 1)
+        joint = np.arange(1, self.arm.n + 1)
         between = (joint > low) & (joint <= high)
         return np.where(between, np.minimum(far[a], far[b]), 0.0)
 
-    def _pairs(self, pairs: Sequence[tuple[int, int]], rates: Sequence[Floats] = ()) -> "Pairs":
-        import pinocchio as pin
-
-        geometry = pin.GeometryModel()
-        names = []
-        for part in self.parts:
-            shape, place = _capsule(part.start, part.end, part.radius)
-            names.append(part.name)
-            geometry.addGeometryObject(
-                pin.GeometryObject(f"part {len(names)}", part.body, 0, place, shape)
-            )
-        for name, shape, place in self._things:
-            names.append(name)
-            geometry.addGeometryObject(
-                pin.GeometryObject(f"thing {len(names)}", 0, 0, place, shape)
-            )
-        free = pin.coal.Capsule(1.0, 1.0)
-        geometry.addGeometryObject(pin.GeometryObject("free", 0, 0, pin.SE3.Identity(), free))
-        for a, b in pairs:
-            geometry.addCollisionPair(pin.CollisionPair(a, b))
-        parts = (*names, "free")
-        speed = np.reshape(rates, (-1, self._arm.n))
-        return Pairs(self._arm, self._model, self._data, geometry, parts, tuple(pairs), speed)
-
     def _not_always(self, pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
         """Leave out what touches in many states, whatever the arm does."""
-        arm = self._arm
-        drawn = _spread(_SAMPLES, arm.n)
-        low, high = arm.usual_range
-        q, of = low + drawn * (high - low), self._pairs(pairs)
+        drawn = _spread(_SAMPLES, self.arm.n)
+        low, high = self.arm.usual_range
+        q, of = low + drawn * (high - low), Pairs(self, pairs)
         often = of.how_often(q)
-        near = np.zeros(len(pairs)) if is_known(arm) else of.how_often(q, _NEAR)
+        near = np.zeros(len(pairs)) if is_known(self.arm) else of.how_often(q, _NEAR)
         kept = (often < _ALWAYS) & (near < 1.0)
         return [pair for pair, keep in zip(pairs, kept, strict=True) if keep]
 
@@ -168,15 +142,25 @@ class Pairs:
     """Pairs of shapes that are checked together; `rates` (K, n): how fast they near, m/rad."""
 
     def __init__(
-        self, arm: Arm, model: Any, data: Any, geometry: Any, names: tuple[str, ...],
-        pairs: tuple[tuple[int, int], ...], rates: Floats,
-    ) -> None:  # fmt: skip
-        """Take shapes and pairs from `Scene`, which makes these."""
-        self.rates = rates
-        self._arm, self._model, self._data, self._geometry = arm, model, data, geometry
-        self._state = geometry.createData()
-        self._names, self._pairs = names, pairs
-        self._free = len(names) - 1
+        self, scene: Scene, pairs: Sequence[tuple[int, int]], rates: Sequence[Floats] = ()
+    ) -> None:
+        """Build the shapes of a scene: its parts, its obstacles, and a segment that is free."""
+        import pinocchio as pin
+
+        self.rates = np.reshape(rates, (-1, scene.arm.n))
+        self._arm, self._model, self._pairs = scene.arm, scene.model, tuple(pairs)
+        self._data, self._geometry = scene.model.createData(), pin.GeometryModel()
+        free = "free", pin.coal.Capsule(1.0, 1.0), pin.SE3.Identity()
+        parts = ((p.name, p.body, *_capsule(p.start, p.end, p.radius)) for p in scene.parts)
+        fixed = ((name, 0, shape, place) for name, shape, place in (*scene.things, free))
+        names = []
+        for k, (name, body, shape, place) in enumerate((*parts, *fixed)):
+            names.append(name)
+            self._geometry.addGeometryObject(pin.GeometryObject(f"{k}", body, 0, place, shape))
+        for a, b in pairs:
+            self._geometry.addCollisionPair(pin.CollisionPair(a, b))
+        self._state = self._geometry.createData()
+        self._names, self._free = names, len(names) - 1
         self._margins: list[float] = []
 
     def touching(

@@ -27,7 +27,6 @@ from hilcal.toml import suggest
 from hilcal.types import Bools, Floats
 
 _WHOLE_TURN = 2.0 * math.pi
-DEFAULTS = (("multiplier", "1"), ("offset", "0"))
 
 
 def arm_from_urdf(path: Path, base_link: str | None = None, tip_link: str | None = None) -> Arm:
@@ -41,7 +40,7 @@ def arm_from_urdf(path: Path, base_link: str | None = None, tip_link: str | None
     joint of the chain that mimics another turns by multiplier · q_i + offset: that is a coupling of
     the arm, and the joint has no value of its own (`Arm.mimic`).
     """
-    model = _read(path)
+    model, mimics = _read(path)
     names = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
     base, tip = base_link or names[0], tip_link or _only_leaf(model, path)
     for key, name in (("base_link", base), ("tip_link", tip)):
@@ -54,7 +53,7 @@ def arm_from_urdf(path: Path, base_link: str | None = None, tip_link: str | None
     others = [joint for joint in range(1, model.njoints) if joint not in chain]
     reduced = pin.buildReducedModel(model, others, pin.neutral(model))
     arm = _arm(reduced, _link(reduced, base).placement, _link(reduced, tip).placement, path)
-    return with_mimics(arm, mimics(path), path.name)
+    return with_mimics(arm, mimics, path.name)
 
 
 def _arm(model: pin.Model, base: pin.SE3, tip: pin.SE3, path: Path) -> Arm:
@@ -172,14 +171,30 @@ def _only_leaf(model: pin.Model, path: Path) -> str:
     return leaves[0]
 
 
-@limits.bounded
-def _read(path: Path) -> pin.Model:
-    joints = moving = 0
+@dataclass(frozen=True, slots=True)
+class Mimic:
+    """What a joint follows: q = multiplier · q of `joint` + offset."""
 
-    def start(tag: str, attributes: dict[str, str]) -> None:
+    joint: str  # name of the joint that it follows
+    multiplier: str  # 1 where it is not written
+    offset: str  # 0 where it is not written, rad or m
+
+
+@limits.bounded
+def _read(path: Path) -> tuple[pin.Model, dict[str, Mimic]]:
+    """Return Pinocchio's model, and the joints with a `<mimic>` element and what they follow."""
+    joints = moving = 0
+    within, mimics = [""], dict[str, Mimic]()
+
+    def start(tag: str, given: dict[str, str]) -> None:
         nonlocal joints, moving
-        joints += tag == "joint"
-        moving += tag == "joint" and attributes.get("type") != "fixed"
+        if tag == "joint":
+            within.append(given.get("name", ""))
+            joints += 1
+            moving += given.get("type") != "fixed"
+        elif tag == "mimic":
+            factor, offset = given.get("multiplier", "1"), given.get("offset", "0")
+            mimics[within[-1]] = Mimic(given.get("joint", ""), factor, offset)
         # Pinocchio calls itself for each joint, and needs memory by the third power of the moving.
         if joints > limits.DESCRIBED or moving > limits.MOVING:
             raise InputError(
@@ -187,8 +202,12 @@ def _read(path: Path) -> pin.Model:
                 f"{limits.MOVING} of them not fixed"
             )
 
+    def end(tag: str) -> None:
+        if tag == "joint":
+            within.pop()
+
     parser = expat.ParserCreate()
-    parser.StartElementHandler = start
+    parser.StartElementHandler, parser.EndElementHandler = start, end
     try:
         parser.Parse(limits.read_bytes(path, limits.PROGRAM), True)
     except OSError as error:
@@ -197,7 +216,7 @@ def _read(path: Path) -> pin.Model:
         raise InputError(f"{path.name}: not XML: {error}; expected a URDF file") from None
     with _captured_stderr() as log:
         try:
-            return pin.buildModelFromUrdf(str(path))
+            return pin.buildModelFromUrdf(str(path)), mimics
         except (ValueError, RuntimeError, IndexError) as error:
             log.seek(0)
             reasons = re.findall(r"Error:\s*(.+)", log.read())
@@ -219,37 +238,6 @@ def _captured_stderr() -> Iterator[IO[str]]:
             os.close(saved)
 
 
-@dataclass(frozen=True, slots=True)
-class Mimic:
-    """What a joint follows: q = multiplier · q of `joint` + offset."""
-
-    joint: str  # name of the joint that it follows
-    multiplier: float  # 1 where it is not written
-    offset: float  # 0 where it is not written, rad or m
-
-
-def mimics(path: Path) -> dict[str, Mimic]:
-    """Return the joints of a valid URDF with a `<mimic>` element, and what they follow."""
-    found: dict[str, Mimic] = {}
-    within: list[str] = []
-
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        if tag == "joint":
-            within.append(attributes.get("name", ""))
-        elif tag == "mimic" and within:
-            factor, offset = (attributes.get(k, v) for k, v in DEFAULTS)
-            found[within[-1]] = Mimic(attributes.get("joint", ""), float(factor), float(offset))
-
-    def end(tag: str) -> None:
-        if tag == "joint" and within:
-            within.pop()
-
-    parser = expat.ParserCreate()
-    parser.StartElementHandler, parser.EndElementHandler = start, end
-    parser.Parse(path.read_bytes(), True)
-    return found
-
-
 def with_mimics(arm: Arm, given: Mapping[str, Mimic], where: str) -> Arm:
     """Return the arm whose joints follow others as a URDF says, turned along by their motors."""
     names, n = list(arm.joint_names), arm.n
@@ -268,9 +256,9 @@ def with_mimics(arm: Arm, given: Mapping[str, Mimic], where: str) -> Arm:
             )
         i = names.index(m.joint)
         turns[j], values[j] = 0.0, 0.0
-        turns[j, i] = values[j, i] = m.multiplier
-        values[j, n] = m.offset
+        turns[j, i] = values[j, i] = float(m.multiplier)
+        values[j, n] = offset = float(m.offset)
         if arm.slides[i] != arm.slides[j]:
             raise InputError(f"{said}, of which one slides and one turns; valid: two of a kind")
-        links[j] = links[j] @ se3.screw(2, *((0.0, m.offset) if arm.slides[j] else (m.offset,)))
+        links[j] = links[j] @ se3.screw(2, *((0.0, offset) if arm.slides[j] else (offset,)))
     return replace(arm, links=links, coupling=turns, drive=turns, mimic=values)

@@ -27,7 +27,7 @@ def robot_file_of(config_json: str, base_dir: str) -> dict[str, str]:
     """Return what to keep of the robot of a configuration; no model for one of the catalogue."""
     out: dict[str, str] = {}
     for key, name in KEYS.items():
-        path = Path(base_dir) / _told(config_json, name)
+        path = Path(base_dir) / _robot_value(config_json, name)
         out |= text_of(path, key) if path.suffix else {}
     return out
 
@@ -36,12 +36,12 @@ def check_robot(
     path: Path, config_json: str, kept: str | None, calibration: str | None = None
 ) -> None:
     """Refuse a campaign whose robot is in a file outside of it: whoever made it chose the path."""
-    if calibration is None and (file := _told(config_json, "calibration")):
+    if calibration is None and (file := _robot_value(config_json, "calibration")):
         raise InputError(
             f"{path}: its robot's kinematics are in a file that it does not hold, {file!r}, and "
             "which is not read; valid: a campaign that was made where that file was"
         )
-    model = _told(config_json, "model")
+    model = _robot_value(config_json, "model")
     if kept is None and Path(model).suffix.lower() in _KINDS:
         raise InputError(
             f"{path}: its robot is in a file that it does not hold, {model!r}, and which is not "
@@ -60,7 +60,7 @@ def text_of(path: Path, key: str = ROBOT_FILE) -> dict[str, str]:
         return {}
 
 
-def _told(config_json: str, key: str) -> str:
+def _robot_value(config_json: str, key: str) -> str:
     content = json.loads(config_json)
     robot = content.get("robot") if isinstance(content, dict) else None
     return str(robot.get(key) or "") if isinstance(robot, dict) else ""

@@ -26,9 +26,9 @@ class MeasuringDevice:
 
     device: str  # part of the cell, e.g. "tracker"
     driver: str
-    name: str  # as it told it
-    serial_number: str | None  # None where it told none
-    facts: Mapping[str, str]  # what else it told, by name
+    name: str  # as it answered
+    serial_number: str | None  # None where it gave none
+    facts: Mapping[str, str]  # what else it answered, by name
     utc: str  # when it answered first, ISO 8601
 
 
@@ -86,20 +86,17 @@ def overview(file: CampaignFile) -> Overview:
     """Return what a campaign file holds."""
     log = None if file.about(PLAN) is None else RunLog(file)
     events = () if log is None else tuple(log.events())
-    readings = file.readings() if file.n_readings else None
+    r = file.readings() if file.n_readings else None
     revisions, accepted = file.revisions(), file.accepted()
-    several = readings is not None and readings.states.target is not None
     return Overview(
         created=file.created,
         program_version=file.about("program_version") or "",
         source=file.source,
         command=file.about(COMMAND) or "",
         config=CellConfig.from_json(file.config_json),
-        readings=readings,
-        loads={} if readings is None else _count(readings.load.tolist(), readings.load_names),
-        targets=_count(readings.target.tolist(), readings.target_names)
-        if readings is not None and several
-        else {},
+        readings=r,
+        loads={} if r is None else _count(r.load.tolist(), r.load_names),
+        targets={} if r is None else _count(r.target.tolist(), r.target_names),
         planned=None if log is None else len(log.plan.steps),
         measured=0 if log is None else len(log.done()),
         plans=0 if log is None else len(log.plans),

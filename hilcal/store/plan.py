@@ -168,15 +168,15 @@ def with_new_names(plan: Plan, before: Plan, number: int) -> Plan:
         has = "the plan" if REFERENCE in plan.pose_names else "the campaign"
         raise InputError(f'only {has} has a pose "{REFERENCE}"; valid: both or none')
     known = dict(zip(before.pose_names, before.q, strict=True))
-    taken = {*known, *plan.pose_names}
+    used = {*known, *plan.pose_names}
     names, q = [], []
     for name, joints in zip(plan.pose_names, plan.q, strict=True):
         if name == REFERENCE:
             joints = known[name]
         elif name in known and np.abs(joints - known[name]).max() > SAME_POSE:
             free = (f"{name}-{number}{f'-{k}' * (k > 1)}" for k in itertools.count(1))
-            name = next(new for new in free if new not in taken)
-            taken.add(name)
+            name = next(new for new in free if new not in used)
+            used.add(name)
         elif name in known:
             joints = known[name]
         names.append(name)

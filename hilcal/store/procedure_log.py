@@ -64,8 +64,8 @@ class ProcedureLog:
             if log is not None and plan is not None:
                 key = f"{PLAN} {len(log.plans) + 1}"
                 rows.insert_meta(connection, key, plan.to_json())
-            told = {**content, "revisions": list(stored)} if stored else content
-            rows.insert_meta(connection, ENTRY.format(number), entry(kind, told))
+            whole = {**content, "revisions": list(stored)} if stored else content
+            rows.insert_meta(connection, ENTRY.format(number), entry(kind, whole))
         return stored
 
 

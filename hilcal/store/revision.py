@@ -78,8 +78,8 @@ class RevisionRecord:
     @property
     def scatter_alone(self) -> bool:
         """Whether it changed the covariance alone, by the arm's scatter as estimated."""
-        taken = self.parameters_json.get("arm_scatter") is not None
-        return taken and self.added is None and self.removed is None
+        scatter = self.parameters_json.get("arm_scatter") is not None
+        return scatter and self.added is None and self.removed is None
 
 
 def change(added: str | None, removed: str | None, scatter: bool = False) -> str:

@@ -78,7 +78,6 @@ class Reduced:
 
     triangles: dict[int, Floats]
     """(P + 1, P + 1) of the columns of all parameters and of the residual, by fold."""
-    readings: int  # number of readings that they are of
     rank: int  # number of whitened rows that carry information
 
 
@@ -109,7 +108,7 @@ def reduce_group(group: int, work: PassTask, theta: Floats) -> Reduced:
     """Reduce the whitened rows of a row group at parameters (P,)."""
     every, size = np.arange(work.model.size), work.model.size + 1
     found: dict[int, Triangle] = {}
-    count = rank = 0
+    rank = 0
     for c in _chunks(group, work, theta):
         rows = whitened_jacobian(work.model, c.prediction, theta, c.w, every)
         right = c.w.whiten(c.raw).reshape(-1)
@@ -118,9 +117,9 @@ def reduce_group(group: int, work: PassTask, theta: Floats) -> Reduced:
             mine = kept & np.repeat(c.fold == fold, c.w.m)
             some = slice(None) if mine.all() else mine
             found.setdefault(int(fold), Triangle(size)).add(rows[some], right[some])
-        count += int(c.kept.sum())
-        rank += _rank(c)
-    return Reduced({fold: t.r for fold, t in found.items()}, count, rank)
+        full = np.count_nonzero(np.any(c.w.buckets[0].factor != 0, axis=-1), axis=-1)
+        rank += int(full[c.kept].sum())
+    return Reduced({fold: t.r for fold, t in found.items()}, rank)
 
 
 def errors_of_group(
@@ -183,12 +182,6 @@ def _chunks(group: int, work: PassTask, theta: Floats) -> Iterator[_Chunk]:
         row += len(readings)
 
 
-def _rank(c: _Chunk) -> int:
-    """Number of whitened rows of the readings that are not set aside."""
-    full = np.count_nonzero(np.any(c.w.buckets[0].factor != 0, axis=-1), axis=-1)
-    return int(full[c.kept].sum())
-
-
 Result = TypeVar("Result")
 SAMPLE = 2000
 """Readings that registration, starting model and starting values are taken from; a choice: enough
@@ -210,8 +203,6 @@ class _StreamPoint(NewtonPoint):
 
     folds: Mapping[int, Floats]
     triangle: Floats
-    readings: int
-    rank: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -227,7 +218,15 @@ class _Stream(NewtonProblem[_StreamPoint]):
 
     def at(self, y: Floats) -> _StreamPoint:
         theta = self.coordinates.theta(y)
-        return _point(y, theta, self.over(partial(reduce_group, work=self.work, theta=theta)))
+        parts = self.over(partial(reduce_group, work=self.work, theta=theta))
+        size = len(theta) + 1
+        folds = {
+            k: combined([part.triangles[k] for part in parts if k in part.triangles], size)
+            for k in sorted({fold for part in parts for fold in part.triangles})
+        }
+        triangle = combined(folds.values(), size)
+        rss = float(triangle[:, -1] @ triangle[:, -1])
+        return _StreamPoint(y, theta, rss, sum(part.rank for part in parts), folds, triangle)
 
     def over(self, run: Callable[[int], Result]) -> tuple[Result, ...]:
         """Return a function of each row group: one pass."""
@@ -238,7 +237,7 @@ class _Stream(NewtonProblem[_StreamPoint]):
         live = np.flatnonzero(prior > 0)
         a = self.coordinates.columns(point.triangle[:, :-1])[:, live]
         white = point.triangle[:, -1]
-        return linear_problem(point, prior, a, white, point.rank, 1.0, whitened=True)
+        return linear_problem(point, prior, a, white, point.elements, 1.0, whitened=True)
 
 
 def _over(
@@ -247,20 +246,6 @@ def _over(
     groups = range(len(stream.rows))
     with counting(f"pass {k}, row groups", len(groups)) as advance:
         return engine.map(run, groups, advance=advance)
-
-
-def _point(y: Floats, theta: Floats, parts: tuple[Reduced, ...]) -> _StreamPoint:
-    size = len(theta) + 1
-    numbers = sorted({fold for part in parts for fold in part.triangles})
-    folds = {
-        k: combined([part.triangles[k] for part in parts if k in part.triangles], size)
-        for k in numbers
-    }
-    triangle = combined(folds.values(), size)
-    rss = float(triangle[:, -1] @ triangle[:, -1])
-    rank = sum(part.rank for part in parts)
-    count = sum(part.readings for part in parts)
-    return _StreamPoint(y, theta, rss, rank, folds, triangle, count, rank)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -388,7 +373,7 @@ class _StreamMinimum:
         covariance[space.index, space.index] += space.rest / by.beta
         formal = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         spent = spent_parameters(self.equations, by.beta, groups)
-        dof = max(point.rank - spent, 1.0)
+        dof = max(point.elements - spent, 1.0)
         inflated = bool(chi2.sf(point.rss, dof) < MISFIT_CHANCE)
         std = formal
         if inflated:
@@ -448,10 +433,10 @@ def _solved(problem: _Stream, theta: Floats) -> _StreamMinimum:
     space = problem.coordinates
     found = minimum(problem, space.of_theta(theta), None)
     point, by, converged = found.point, found.by, found.converged
-    if point.rank <= by.basis.structural:
+    if point.elements <= by.basis.structural:
         raise CannotAnswerError(
-            f"{point.rank} measured elements for {by.basis.structural} parameters: nothing is left "
-            "to judge the model by"
+            f"{point.elements} measured elements for {by.basis.structural} parameters: nothing is "
+            "left to judge the model by"
         )
     live = np.flatnonzero(by.prior > 0)
     basis = over_all_parameters(by.basis, live, len(theta))

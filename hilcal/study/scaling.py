@@ -175,6 +175,8 @@ def _correlation(covariance: Floats) -> Floats:
     return np.asarray(out)
 
 
+# Correlation ρ, whether unloaded readings are shared, and the generator of the noise.
+_Experiment = tuple[float, bool, np.random.Generator]
 LEVEL = 0.95
 CORRELATIONS = (0.0, 0.3, 0.6, 0.9, 0.99)
 # Name, and what a length in m and an angle in rad are multiplied by.
@@ -244,13 +246,13 @@ class ScalingStudy:
         """Return the study as plain values, with a summary per scaling."""
         summary = {}
         for scaling in SCALINGS:
-            mine = [c for c in self.cells if c.scaling == scaling]
+            cells = [c for c in self.cells if c.scaling == scaling]
             summary[scaling] = {
-                "error_over_bound_min": min(c.error_over_bound for c in mine),
-                "error_over_bound_max": max(c.error_over_bound for c in mine),
-                "coverage_min": min(c.coverage for c in mine),
-                "coverage_max": max(c.coverage for c in mine),
-                "unit_shift_max": max(c.unit_shift for c in mine),
+                "error_over_bound_min": min(c.error_over_bound for c in cells),
+                "error_over_bound_max": max(c.error_over_bound for c in cells),
+                "coverage_min": min(c.coverage for c in cells),
+                "coverage_max": max(c.coverage for c in cells),
+                "unit_shift_max": max(c.unit_shift for c in cells),
             }
         return asdict(self) | {"level": LEVEL, "summary": summary}
 
@@ -303,15 +305,6 @@ def experiments(correlations: Sequence[float] = CORRELATIONS) -> int:
     return 2 * len(correlations)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Experiment:
-    """Correlation ρ, whether unloaded readings are shared, and the generator of the noise."""
-
-    rho: float
-    shared: bool
-    rng: np.random.Generator
-
-
 def _experiments(
     rng: np.random.Generator, design: StudyDesign, correlations: Sequence[float], runs: int
 ) -> list[_Experiment]:
@@ -321,34 +314,25 @@ def _experiments(
     """
     out = []
     for shared in (False, True):
-        for rho in correlations:
-            out.append(_Experiment(float(rho), shared, deepcopy(rng)))
-            _drawn(rng, make_readings(design, design.covariance(float(rho)), shared), runs)
+        for rho in map(float, correlations):
+            out.append((rho, shared, deepcopy(rng)))
+            _noise(rng, make_readings(design, design.covariance(rho), shared), runs)
     return out
 
 
-def _drawn(rng: np.random.Generator, readings: Readings, runs: int) -> Floats:
+def _noise(rng: np.random.Generator, readings: Readings, runs: int) -> Floats:
     """(N, 6, R) standard normal numbers: for every element of N readings in R runs."""
     return rng.standard_normal((len(readings), 6, runs))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Fit:
-    """Errors of all runs (n, R), half widths of their intervals, mean χ²/dof."""
-
-    error: Floats
-    half_width: Floats
-    variance_factor: float | None
-
-
 def _cells(of: _Experiment, design: StudyDesign, runs: int) -> list[StudyCell]:
-    """All scalings and units on the same noise."""
-    rho, shared = of.rho, of.shared
+    """All scalings and units on the same noise; `_mc` are from the spread of the runs."""
+    rho, shared, rng = of
     covariance = design.covariance(rho)
     limit = np.sqrt(np.diagonal(bound(design, covariance, shared)))[:, None]
     readings = make_readings(design, covariance, shared)
     # A copy, so that the same experiment can be computed again, as after a worker's death.
-    noise = np.linalg.cholesky(covariance)[readings.pose] @ _drawn(deepcopy(of.rng), readings, runs)
+    noise = np.linalg.cholesky(covariance)[readings.pose] @ _noise(deepcopy(rng), readings, runs)
     cells = []
     for scaling in SCALINGS:
         first: Floats | None = None
@@ -358,18 +342,34 @@ def _cells(of: _Experiment, design: StudyDesign, runs: int) -> list[StudyCell]:
             w = whitening(scaled, "deflection", scaling)
             # Row 0 of the loads is "none", so measurement d belongs to wrench load - 1.
             blocks = design.observation[scaled.pose[w.reading], scaled.load[w.reading] - 1]
-            fit = _fit(w, u[:, None] * blocks, w.raw(u[:, None] * noise))
-            first = fit.error if first is None else first
-            shift = float(np.abs((fit.error - first) / limit).max())
-            cells.append(_cell(fit, limit, scaling, rho, unit, shared, shift))
+            error, half, factor = _fit(w, u[:, None] * blocks, w.raw(u[:, None] * noise))
+            first = error if first is None else first
+            square, inside = (error / limit) ** 2, np.abs(error) <= half
+            square_run, inside_run = square.mean(axis=0), inside.mean(axis=0)
+            rms = float(np.sqrt(square_run.mean()))
+            cells.append(
+                StudyCell(
+                    scaling=scaling,
+                    correlation=rho,
+                    unit=unit,
+                    shared_unloaded=shared,
+                    error_over_bound=rms,
+                    error_over_bound_mc=float(stats.sem(square_run)) / (2 * rms),
+                    coverage=float(inside_run.mean()),
+                    coverage_mc=float(stats.sem(inside_run)),
+                    variance_factor=factor,
+                    parameter_error_over_bound=tuple(np.sqrt(square.mean(axis=1)).tolist()),
+                    parameter_coverage=tuple(inside.mean(axis=1).tolist()),
+                    unit_shift=float(np.abs((error - first) / limit).max()),
+                )
+            )
     return cells
 
 
-def _fit(w: Whitening, blocks: Floats, noise: Floats) -> _Fit:
-    """Least squares of the scaled regression for all runs at once.
+def _fit(w: Whitening, blocks: Floats, noise: Floats) -> tuple[Floats, Floats, float | None]:
+    """Return errors of all runs (n, R), half widths of their intervals (n, R), and mean χ²/dof.
 
-    Args:
-        noise: (D, 6, R) errors of the deflections.
+    `noise` (D, 6, R) are the errors of the deflections.
     """
     a = w.whiten(blocks).reshape(-1, blocks.shape[-1])
     e = w.whiten(noise).reshape(-1, noise.shape[-1])
@@ -380,36 +380,9 @@ def _fit(w: Whitening, blocks: Floats, noise: Floats) -> _Fit:
     dof = w.rank - len(r)
     factor = (np.sum(e * e, axis=0) - np.sum(projected * projected, axis=0)) / dof
     if w.scaling == "none":  # no noise is stated: the residual's own variance
-        half = stats.t.ppf((1 + LEVEL) / 2, dof) * spread * np.sqrt(factor)
-        return _Fit(error, half, None)
+        return error, stats.t.ppf((1 + LEVEL) / 2, dof) * spread * np.sqrt(factor), None
     half = np.broadcast_to(stats.norm.ppf((1 + LEVEL) / 2) * spread, error.shape)
-    return _Fit(error, half, float(factor.mean()))
-
-
-def _cell(
-    fit: _Fit, limit: Floats, scaling: Scaling, rho: float, unit: str, shared: bool, shift: float
-) -> StudyCell:
-    """Figures of one cell, with the Monte-Carlo's own uncertainty from the runs' spread."""
-    square = (fit.error / limit) ** 2
-    per_run = square.mean(axis=0)
-    rms = float(np.sqrt(per_run.mean()))
-    inside = np.abs(fit.error) <= fit.half_width
-    inside_run = inside.mean(axis=0)
-    root = np.sqrt(len(per_run))
-    return StudyCell(
-        scaling=scaling,
-        correlation=rho,
-        unit=unit,
-        shared_unloaded=shared,
-        error_over_bound=rms,
-        error_over_bound_mc=float(per_run.std(ddof=1) / root / (2 * rms)),
-        coverage=float(inside_run.mean()),
-        coverage_mc=float(inside_run.std(ddof=1) / root),
-        variance_factor=fit.variance_factor,
-        parameter_error_over_bound=tuple(np.sqrt(square.mean(axis=1)).tolist()),
-        parameter_coverage=tuple(inside.mean(axis=1).tolist()),
-        unit_shift=shift,
-    )
+    return error, half, float(factor.mean())
 
 
 def _off_diagonal(correlation: Floats) -> float:

@@ -294,15 +294,15 @@ def observer_columns(readings: Readings) -> dict[str, list[str] | Floats]:
     if stations and stations != [MAIN]:
         out[columns.STATION] = _of(name, kind == "station")
     for one in KINDS:
-        mine = kind == one
-        if not mine.any():
+        of_kind = kind == one
+        if not of_kind.any():
             continue
         value, of, variance = columns.ONE[one]
-        out[of] = _of(name, mine)
-        out[value] = np.where(mine, readings.value[:, 0], np.nan)
-        out[variance] = np.where(mine, readings.covariance[:, 0, 0], np.nan)
+        out[of] = _of(name, of_kind)
+        out[value] = np.where(of_kind, readings.value[:, 0], np.nan)
+        out[variance] = np.where(of_kind, readings.covariance[:, 0, 0], np.nan)
     return out
 
 
 def _of(names: list[str], rows: Bools) -> list[str]:
-    return [name if mine else "" for name, mine in zip(names, rows.tolist(), strict=True)]
+    return [name if of_kind else "" for name, of_kind in zip(names, rows.tolist(), strict=True)]

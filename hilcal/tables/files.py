@@ -63,7 +63,7 @@ def open_grid(path: str | Path, how: FileFormat, check: Check | None = None) -> 
     """Open one file as a table of cells; `check` is given the names of its columns."""
     name, content = str(path), content_of(path)
     kind = kind_of(name, content)
-    with _undamaged(name, "what its first bytes say"):
+    with undamaged(name, "damaged, or not what its first bytes say"):
         match kind:
             case "XLSX":
                 return _xlsx(name, content, how, check)
@@ -107,19 +107,16 @@ def is_parquet(path: Path) -> bool:
 
 
 @contextmanager
-def _undamaged(path: str, what: str) -> Iterator[None]:
+def undamaged(path: str | Path, what: str) -> Iterator[None]:
     """Say in one line what a reader makes of a damaged file, which is not documented."""
     try:
         yield
     except (InputError, MemoryError):
         raise
     except Exception as e:
-        raise InputError(f"{path}: damaged, or not {what} ({_short(e)})") from e
-
-
-def _short(error: Exception) -> str:
-    words = " ".join(str(error).split()) or type(error).__name__
-    return words if len(words) <= 80 else words[:77] + "..."
+        words = " ".join(str(e).split()) or type(e).__name__
+        short = words if len(words) <= 80 else words[:77] + "..."
+        raise InputError(f"{path}: {what} ({short})") from e
 
 
 def package(path: str | Path, name: str, what: str) -> Any:
@@ -200,7 +197,7 @@ def _check_xml(path: str, name: str, stream: IO[bytes]) -> None:
 
 def sheet_names(path: str, content: bytes) -> list[str]:
     """Names of the sheets of an XLSX file."""
-    with _undamaged(path, "an XLSX file"):
+    with undamaged(path, "damaged, or not an XLSX file"):
         names = list(_book(path, content).sheetnames)
     if len(names) > limits.SHEETS:
         raise InputError(f"{path}: {len(names)} sheets; valid: at most {limits.SHEETS}")
@@ -213,7 +210,7 @@ def sheet_rows(
     """Rows of a sheet that are neither empty nor comments, with their numbers from 1."""
     found: list[tuple[int, list[Cell]]] = []
     cells = 0
-    with _undamaged(path, "an XLSX file"):
+    with undamaged(path, "damaged, or not an XLSX file"):
         read = _book(path, content)[sheet]
         read.reset_dimensions()  # what the file says of its size would pad every row
         for row, given in enumerate(read.iter_rows(values_only=True), start=1):

@@ -99,10 +99,10 @@ def guess_by_values(g: Guesser) -> None:
     Neighbouring columns are tried: positions vary by hundreds (mm) or stay small (m), joint
     angles stay within one turn. Where several choices are as good, that is said.
     """
-    told = words.NOMINAL | words.STD | words.TIME | words.TEMPERATURE | words.LOAD | words.MASS
+    named = words.NOMINAL | words.STD | words.TIME | words.TEMPERATURE | words.LOAD | words.MASS
     free = []
     for name, c in g.free.items():
-        if g.number(name) and c.axis is None and not c.has(told | words.POSE):
+        if g.number(name) and c.axis is None and not c.has(named | words.POSE):
             values = g.block([name])[:, 0]
             counts = len(values) > 2 and np.all(np.diff(values) == 1)  # the rows
             if not counts and np.ptp(values[np.isfinite(values)]) > 0:
@@ -166,9 +166,14 @@ def _orientation_by_values(g: Guesser, free: list[str]) -> None:
     for k in range(len(free) - 3):
         names = free[k : k + 4]
         if is_quaternion(g.block(names)):
-            g.take("orientation", names, "quaternion, w first", convention="quaternion-wxyz")
-            g.proposal.open_convention = True
+            _take_quaternion(g, names)
             return
+
+
+def _take_quaternion(g: Guesser, names: list[str]) -> None:
+    """Take four numbers for a quaternion; which of them is w is a guess."""
+    g.take("orientation", names, "quaternion, w first", convention="quaternion-wxyz")
+    g.proposal.open_convention = True
 
 
 def _kind(c: ColumnName) -> str:
@@ -335,8 +340,7 @@ def _four_numbers(g: Guesser) -> bool:
     for by_number in groups.values():
         names = [by_number[k] for k in sorted(by_number)]
         if len(names) == 4 and is_quaternion(g.block(names)):
-            g.take("orientation", names, "quaternion, w first", convention="quaternion-wxyz")
-            g.proposal.open_convention = True
+            _take_quaternion(g, names)
             return True
     return False
 
@@ -363,12 +367,10 @@ def _forces(g: Guesser, whole: Group) -> None:
     if force is None:
         return
     names = [force[axis] for axis in "xyz"]
-    unit = g.unit(names)
-    section: dict[str, object] = {"unit": unit if unit in FORCES else "N"}
+    section: dict[str, object] = {"unit": g.unit(names, FORCES) or "N"}
     if moment is not None:
         turning = [moment[axis] for axis in "xyz"]
-        stated = g.unit(turning)
-        section["moment_unit"] = stated if stated in MOMENTS else "Nm"
+        section["moment_unit"] = g.unit(turning, MOMENTS) or "Nm"
         names += turning
     g.unsure("wrench", 'base axes, and of = "load" (exerted on the tool), or "reaction"?')
     g.take("wrench", names, ", ".join(map(str, section.values())), **section)
@@ -383,14 +385,12 @@ def _std(g: Guesser, whole: Group, stem: tuple[object, ...], position_unit: str)
         return
     names = [axes[axis] for axis in "xyz"] if axes is not None else single[:1]
     first = parse(names[0])
-    stated = g.unit(names)
-    section: dict[str, object] = {"unit": stated if stated in LENGTHS else position_unit}
+    section: dict[str, object] = {"unit": g.unit(names, LENGTHS) or position_unit}
     turned = _like(whole.get("std_angle", {}), stem)
     orientation = g.proposal.sections.get("orientation")
     if axes is not None and turned is not None and orientation is not None:
         names += [turned[axis] for axis in "xyz"]
-        stated = g.unit(names[3:])
-        section["angle_unit"] = stated or orientation.get("unit", "rad")
+        section["angle_unit"] = g.unit(names[3:]) or orientation.get("unit", "rad")
     kind = "std"
     if first.has(words.EXPANDED):
         kind, section["k"] = "expanded", 2.0

@@ -13,13 +13,9 @@ from hilcal.readings.readings import ObserverName, Readings
 from hilcal.robot.arm import Arm
 from hilcal.store.plan import UNLOADED
 from hilcal.tables.mapped import import_mapped
-from hilcal.tables.mapping import Mapping, find_mapping, mapping_names
+from hilcal.tables.mapping import TABLE, Mapping, find_mapping
 from hilcal.tables.table import FROM_TRACKER, ImportResult, import_table
 from hilcal.tables.uncertainty import rounding_variance
-from hilcal.toml import suggest
-from hilcal.types import Bools
-
-TABLE = "table"  # The exchange table: the format that is read without a mapping
 
 
 def import_readings(
@@ -32,7 +28,10 @@ def import_readings(
             program, the path of a mapping file, or a mapping.
         second: the second file of a mapping that is for two.
     """
-    mapping = form if isinstance(form, Mapping) else _mapping(form)
+    if isinstance(form, Mapping):
+        mapping: Mapping | None = form
+    else:
+        mapping = None if str(form) == TABLE else find_mapping(form, Mapping)
     tracker, gravity = config.tracker, config.robot.gravity_m_s2
     noise, station = tracker_noise(tracker), tracker.station_m
     targets, std = [target.name for target in config.tool.targets], _std(config)
@@ -47,10 +46,11 @@ def import_readings(
     notes = tuple(note + where * (note == FROM_TRACKER) for note in result.notes)
     stated = FROM_TRACKER not in result.notes
     covers = WHOLE if stated and config.repeatability.in_tables else result.covers
-    copied = _copies(result.readings)
-    notes += _copies_note(result.readings, copied)
-    kept, named = _named_loads(result.readings[~copied], config)
-    return ImportResult(kept, (*notes, *named), covers, stated or tracker.states_noise, not stated)
+    kept, copies = _without_copies(result.readings)
+    kept, named = _named_loads(kept, config)
+    return ImportResult(
+        kept, (*notes, *copies, *named), covers, stated or tracker.states_noise, not stated
+    )
 
 
 def _std(config: CellConfig) -> dict[ObserverName, float]:
@@ -58,18 +58,6 @@ def _std(config: CellConfig) -> dict[ObserverName, float]:
     points = {ObserverName("point", k): p.std_m for k, p in config.points.items()}
     gauges = {ObserverName("gauge", k): g.std_m for k, g in config.gauges.items()}
     return {name: std for name, std in (points | gauges).items() if std is not None}
-
-
-def _mapping(form: str | Path) -> Mapping | None:
-    if str(form) == TABLE:
-        return None
-    names = (TABLE, *mapping_names())
-    if str(form) not in names and Path(form).suffix.lower() != ".toml":
-        raise InputError(
-            f"--format {form} is unknown{suggest(str(form), names)}; valid: {', '.join(names)}, "
-            f"or the path of a mapping file (.toml)"
-        )
-    return find_mapping(form, Mapping)
 
 
 def _named_loads(readings: Readings, config: CellConfig) -> tuple[Readings, tuple[str, ...]]:
@@ -95,8 +83,8 @@ def _named_loads(readings: Readings, config: CellConfig) -> tuple[Readings, tupl
     return replace(readings, states=replace(s, wrench=wrench)), tuple(notes)
 
 
-def _copies(readings: Readings) -> Bools:
-    """(N,) rows that repeat an earlier one to the last digit: copies, not readings made again.
+def _without_copies(readings: Readings) -> tuple[Readings, tuple[str, ...]]:
+    """Leave out rows that repeat an earlier one to the last digit: copies, not made again; a note.
 
     A measurement that is repeated scatters. Where positions are rounded to more than their noise,
     or are those of another cycle, equal ones may be readings, and stay; so do rows whose pose has
@@ -105,9 +93,8 @@ def _copies(readings: Readings) -> Bools:
     s, value = readings.states, readings.value
     rounding = np.sqrt(12.0 * rounding_variance(value[:, :3], 1.0))
     noise = np.sqrt(np.median(readings.covariance[:, range(3), range(3)], axis=0))
-    none = np.zeros(len(readings), dtype=bool)
     if s.time is None and np.any(rounding > noise):
-        return none
+        return readings, ()
     given = [s.time, s.load_time, s.air_temperature]
     columns = [s.q, s.wrench, value, *(x[:, None] for x in given if x is not None)]
     names = np.stack([readings.load, readings.cycle, readings.line], axis=1)
@@ -116,17 +103,14 @@ def _copies(readings: Readings) -> Bools:
     copied = first[of.reshape(-1)] != np.arange(len(readings))
     same = readings.pose == readings.pose[first[of.reshape(-1)]]
     whole = ~np.isin(readings.pose, readings.pose[~copied])
-    return np.asarray(copied & (same | whole))
-
-
-def _copies_note(readings: Readings, copied: Bools) -> tuple[str, ...]:
-    """Say how many rows are copies, and name the first."""
+    copied &= same | whole
     if not copied.any():
-        return ()
+        return readings, ()
     k = int(np.argmax(copied))
     name = f"{readings.pose_names[readings.pose[k]]}/{readings.load_names[readings.load[k]]}"
-    return (
+    note = (
         f"{int(copied.sum())} of {len(copied)} rows are copies of others to the last digit (the "
         f"first is of {name}): each is counted once, since a reading that is made again scatters; "
-        "take them out of the table",
+        "take them out of the table"
     )
+    return readings[~copied], (note,)

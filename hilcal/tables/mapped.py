@@ -144,11 +144,11 @@ def import_mapped(
     mapping, grid, table, notes = of.mapping, of.grid, of.table, of.notes
     q = _joint_units(mapping.joints, arm) * _block(of.raw, grid, mapping.joints.columns)
     noise = noise if mapping.instrument is None else mapping.instrument.noise()
-    covariance, rounding, told, position = None, None, tuple[str, ...](), np.zeros((len(q), 0))
+    covariance, rounding, stated, position = None, None, tuple[str, ...](), np.zeros((len(q), 0))
     if mapping.position is not None:
         position = table.matrix(columns.POSITION)
         whole = np.asarray(np.isfinite(position).all(axis=1))
-        covariance, told = mapped_covariance(
+        covariance, stated = mapped_covariance(
             table.taken(whole),
             grid.rows_with(whole),
             mapping,
@@ -164,13 +164,12 @@ def import_mapped(
     if mapping.rows is not None and mapping.rows.plausible_only:
         scatter = readings.covariance
         if noise is not None and mapping.std is not None and mapping.std.add_instrument:
-            origin = np.zeros(3) if station is None else np.asarray(station, dtype=float)
-            scatter = scatter - tracker_covariance(position, noise, origin, readings.m)
+            scatter = scatter - tracker_covariance(position, noise, station, readings.m)
         readings, left_out = _plausible(readings, scatter, grid.rows, arm.reach + TOOL)
         notes += left_out
     else:
         notes += _stale(grid, position, q)
-    notes += [*(told or result.notes[:1]), *result.notes[1:]]
+    notes += [*(stated or result.notes[:1]), *result.notes[1:]]
     unit, name = units.ANGLES[mapping.joints.unit], mapping.joints.unit
     names = own_columns(columns.joint_columns(arm.units), q.shape[1], arm)
     q = q[:, [k for k, column in enumerate(names) if column.endswith("_rad")]]

@@ -39,6 +39,7 @@ _UNLOADED = (
 UNLOADED = tuple(_UNLOADED.split("|"))
 """Names that mean "no load" unless the mapping lists others, in small letters; a choice."""
 
+TABLE = "table"  # The exchange table: the format that is read without a mapping
 _COLUMN = "the name of a column, or its number from 1"
 _LENGTH = 'a unit of length: "m", "mm", "um" or "in"'
 _ANGLE = 'a unit of angles: "rad", "mrad", "deg" or "arcsec"'
@@ -497,17 +498,14 @@ def mapping_names() -> tuple[str, ...]:
 
 
 def find_mapping(name: str | Path, kind: type[M]) -> M:
-    """Load a mapping by the name of one that comes with the program, or by a file's path.
-
-    Raises:
-        InputError: no such mapping (lists the valid names), or a bad file.
-    """
+    """Load a mapping by the name of one that comes with the program, or by a file's path."""
     if str(name) in mapping_names():
         return load_mapping(configs_dir() / "mappings" / f"{name}.toml", kind)
     if Path(name).suffix.lower() != ".toml":
+        names = (TABLE, *mapping_names())
         raise InputError(
-            f"format '{name}' is unknown{suggest(str(name), mapping_names())}; valid: "
-            f"{', '.join(mapping_names())}, or the path of a mapping file (.toml)"
+            f"--format {name} is unknown{suggest(str(name), names)}; valid: {', '.join(names)}, "
+            f"or the path of a mapping file (.toml)"
         )
     return load_mapping(Path(name), kind)
 

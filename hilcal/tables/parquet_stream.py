@@ -6,7 +6,7 @@ reading that stands alone. A row group of the file is what one worker reads; it 
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +19,10 @@ from hilcal.readings.readings import Readings
 from hilcal.robot.arm import Arm
 from hilcal.robot.batch import CHUNK
 from hilcal.tables import checks, columns
-from hilcal.tables.files import is_plain, package
+from hilcal.tables.files import is_plain, package, undamaged
 from hilcal.tables.grid import ColumnTable
-from hilcal.tables.table import check_covers, instrument_covariance, measured_of, stated_covariance
-from hilcal.tables.uncertainty import floored, rounding_variance, with_rounding
+from hilcal.tables.table import check_covers, covariances_of, measured_of
+from hilcal.tables.uncertainty import rounding_variance
 from hilcal.types import Floats
 
 NAMES = ("pose", "load", "cycle")
@@ -41,7 +41,8 @@ class ReadingStream:
     columns: tuple[str, ...]
     rows: tuple[int, ...]  # number of rows of each row group
     covers: str = INSTRUMENT  # what its covariances cover, `INSTRUMENT` or `WHOLE`
-    rounding: Floats | None = None  # (3,) variance of the positions' rounding, m²
+    rounding: Floats = field(default_factory=lambda: np.zeros(3))
+    """(3,) variance of the positions' rounding that is added, m²."""
 
     def __len__(self) -> int:
         """Return the number of readings."""
@@ -69,14 +70,8 @@ class ReadingStream:
         count = len(rows)
         alone, none = np.arange(count), np.zeros(count, dtype=np.int64)
         checks.check_wrenches(table, states.wrench, none, ["as recorded"], self.arm)
-        stated = stated_covariance(table, value.shape[1])
-        if stated is None:
-            covariance = instrument_covariance(table, value, self.noise, self.station)
-        else:
-            checks.check_covariances(table, stated)
-            covariance = floored(table, stated, None)[0]
-        if self.rounding is not None:
-            covariance = with_rounding(covariance, self.rounding)[0]
+        of = self.noise, self.station, None, self.rounding
+        covariance, *_ = covariances_of(table, value, *of)
         return Readings(states, alone, none, none, value, covariance, ("as recorded",), ())
 
 
@@ -121,14 +116,11 @@ def _opened(path: Path) -> Any:
     parquet = package(path, "pyarrow.parquet", "Parquet")
     if not path.is_file():
         raise InputError(f"{path}: no such file")
-    try:
+    last = "its last part is written when recording ends: was it interrupted?"
+    with undamaged(path, f"not a whole Parquet file; {last}"):
         # pages are read as they are needed: a row group may be larger than the memory
-        return parquet.ParquetFile(path, buffer_size=1 << 20, pre_buffer=False)
-    except Exception as e:  # what a reader makes of a damaged file is not documented
-        raise InputError(
-            f"{path}: not a whole Parquet file ({_words(e)}); its last part is written when "
-            "recording ends: was it interrupted?"
-        ) from e
+        file = parquet.ParquetFile(path, buffer_size=1 << 20, pre_buffer=False)
+    return file
 
 
 def _tables(path: Path, group: int, names: tuple[str, ...], count: int = CHUNK) -> Iterator[Any]:
@@ -136,21 +128,12 @@ def _tables(path: Path, group: int, names: tuple[str, ...], count: int = CHUNK) 
     left = file.metadata.row_group(group).num_rows
     batches = file.iter_batches(count, row_groups=[group], columns=list(names))
     while left > 0:
-        try:
-            with limits.memory(str(path)):
-                batch = next(batches, None)
-        except InputError:
-            raise
-        except Exception as e:  # as above
-            raise InputError(f"{path}: damaged in row group {group + 1} ({_words(e)})") from e
+        with undamaged(path, f"damaged in row group {group + 1}"), limits.memory(str(path)):
+            batch = next(batches, None)
         if batch is None:
             raise InputError(f"{path}: damaged in row group {group + 1} ({left} rows are missing)")
         left -= batch.num_rows
         yield batch.select(list(names))
-
-
-def _words(error: Exception) -> str:
-    return " ".join(str(error).split())[:80]
 
 
 def _covers(path: Path, group: int) -> str:

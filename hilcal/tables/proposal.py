@@ -2,16 +2,18 @@
 
 import re
 import unicodedata
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from hilcal.config.reference import inline
 from hilcal.errors import InputError
 from hilcal.names import escaped
 from hilcal.tables.grid import Grid
 from hilcal.tables.mapping import M
+from hilcal.tables.units import ANGLES, LENGTHS
 from hilcal.toml import check_section
 from hilcal.types import Floats
 
@@ -120,7 +122,7 @@ class ColumnName:
 def parse(name: str, unit_cell: str = "") -> ColumnName:
     """Take a column's name apart."""
     rest, unit = _unit(name)
-    told = UNITS.get(unit_cell.strip(" []()<>").replace("µ", "u").replace("μ", "u").lower())
+    stated = UNITS.get(unit_cell.strip(" []()<>").replace("µ", "u").replace("μ", "u").lower())
     for sign, word in CHINESE.items():
         rest = rest.replace(sign, word)
     rest = re.sub(r"(?<=[a-zµ])(?=[A-Z])", " ", rest)
@@ -150,7 +152,7 @@ def parse(name: str, unit_cell: str = "") -> ColumnName:
             words.append(letters[1:])
         else:
             words.append(letters)
-    return ColumnName(name, tuple(words), axis, tuple(numbers), told or unit)
+    return ColumnName(name, tuple(words), axis, tuple(numbers), stated or unit)
 
 
 def _unit(name: str) -> tuple[str, str | None]:
@@ -221,22 +223,18 @@ class Proposal:
             lines.append("")
             lines += [f"# check: {words}" for about, words in self.unsure if about == name]
             lines.append(f"[{name}]")
-            lines += [f"{key} = {_value(value)}" for key, value in section.items()]
+            lines += [f"{key} = {inline(_escaped(value))}" for key, value in section.items()]
         if self.unused:
             lines += ["", "# not used:"]
             lines += [f"#   {name} ({why})" for name, why in self.unused]
         return "\n".join(map(escaped, lines)) + "\n"
 
 
-def _value(value: Any) -> str:
-    """Return a value as TOML."""
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        return '"' + escaped(value).replace("\\", "\\\\").replace('"', '\\"') + '"'
+def _escaped(value: Any) -> Any:
+    """Return a value with its texts escaped."""
     if isinstance(value, list | tuple):
-        return f"[{', '.join(map(_value, value))}]"
-    return repr(value)
+        return [_escaped(v) for v in value]
+    return escaped(value) if isinstance(value, str) else value
 
 
 class Guesser:
@@ -287,17 +285,18 @@ class Guesser:
         if self.free.pop(name, None) is not None:
             self.proposal.unused.append((name, why))
 
-    def unit(self, names: Sequence[str]) -> str | None:
-        """Return the unit that the names of columns, or the row of units, state."""
+    def unit(self, names: Sequence[str], known: Collection[str] | None = None) -> str | None:
+        """Return the unit that the names of columns, or the row of units, state: a known one."""
         found = {self.columns[self.grid.names.index(name)].unit for name in names}
-        return found.pop() if len(found) == 1 else None
+        unit = found.pop() if len(found) == 1 else None
+        return unit if known is None or unit in known else None
 
 
 def angle_unit(g: Guesser, what: str, names: Sequence[str]) -> str:
     """Return the unit of angles by name, else by size."""
-    stated = g.unit(names)
+    stated = g.unit(names, ANGLES)
     largest = float(np.nanmax(np.abs(g.block(names))))
-    if stated in ("rad", "mrad", "deg", "arcsec"):
+    if stated is not None:
         if stated == "rad" and largest > TURN:
             g.unsure(what, f"named rad, but up to {largest:.4g}: read as degrees")
             return "deg"
@@ -310,8 +309,7 @@ def angle_unit(g: Guesser, what: str, names: Sequence[str]) -> str:
 
 def length_unit(g: Guesser, what: str, names: Sequence[str]) -> str:
     """Return the unit of positions by name, else by size."""
-    stated = g.unit(names)
-    if stated in ("m", "mm", "um", "in"):
+    if (stated := g.unit(names, LENGTHS)) is not None:
         return stated
     largest = float(np.nanmax(np.abs(g.block(names))))
     unit = "mm" if largest > FAR else "m"

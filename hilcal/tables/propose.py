@@ -200,11 +200,11 @@ def _per_joint(g: Guesser, first: ColumnName, names: list[str]) -> None:
     """Torques, temperatures and sides of approach of the joints."""
     values = g.block(names)
     if (first.has(words.TORQUE) or first.unit in MOMENTS) and not first.has(words.NOMINAL):
-        unit = g.unit(names)
-        if unit not in MOMENTS:
+        unit = g.unit(names, MOMENTS)
+        if unit is None:
             g.unsure("torques", "no unit stated; read as Nm")
             unit = "Nm"
-        g.take("torques", names, str(unit), unit=unit)
+        g.take("torques", names, unit, unit=unit)
         g.unsure("torques", 'do they hold against the load? Where they are its: of = "load"')
         return
     if first.has(words.TEMPERATURE) or first.unit == "degC" or first.has({"degc"}):

@@ -102,10 +102,10 @@ def readings_of(
     checks.check_wrenches(table, states.wrench, load, load_names, arm)
     cov, notes, covers = np.zeros((len(value), 3, 3)), tuple[str, ...](), _covers(table)[0]
     if whole.all():
-        cov, notes, covers = _covariance(table, value, noise, station, covariance, rounding)
+        cov, notes, covers = covariances_of(table, value, noise, station, covariance, rounding)
     elif whole.any():
         some = table.taken(whole), value[whole]
-        cov[whole], notes, covers = _covariance(*some, noise, station, covariance, rounding)
+        cov[whole], notes, covers = covariances_of(*some, noise, station, covariance, rounding)
     if observed is not None:
         value, cov = observed.put(table, value, cov, std or {})
     readings = Readings(
@@ -123,7 +123,7 @@ def readings_of(
     return ImportResult(readings, notes, covers)
 
 
-def _covariance(
+def covariances_of(
     table: ColumnTable,
     value: Floats,
     noise: TrackerNoise | None,
@@ -132,16 +132,16 @@ def _covariance(
     rounding: Floats | None,
 ) -> tuple[Floats, tuple[str, ...], str]:
     """Covariances (N, m, m) of positions or poses, notes on them, and what they cover."""
-    stated = stated_covariance(table, value.shape[1]) if covariance is None else covariance
+    stated = _stated_covariance(table, value.shape[1]) if covariance is None else covariance
     notes: tuple[str, ...]
     if stated is None:
-        cov = instrument_covariance(table, value, noise, station)
+        cov = _instrument_covariance(table, value, noise, station)
         notes, covers, included = (FROM_TRACKER,), INSTRUMENT, False
     else:
         checks.check_covariances(table, stated)
         tiny = np.any(np.diagonal(stated, axis1=1, axis2=2) < min(LEAST) ** 2)
         known = bool(tiny) and noise is not None
-        spec = instrument_covariance(table, value, noise, station) if known else None
+        spec = _instrument_covariance(table, value, noise, station) if known else None
         cov, more = floored(table, stated, spec)
         notes, (covers, included) = (FROM_TABLE, *more), _covers(table)
     if rounding is None:
@@ -249,8 +249,8 @@ def measured_of(table: ColumnTable, arm: Arm, whole: Bools | None = None) -> tup
     value = table.matrix(columns.POSITION)
     station = np.array(table.text.get(columns.STATION, [""] * len(value)))
     for name in dict.fromkeys(station.tolist()):
-        mine = station == name
-        checks.check_positions(table.taken(mine), value[mine], states.q[mine], arm)
+        own = station == name
+        checks.check_positions(table.taken(own), value[own], states.q[own], arm)
     if columns.ROTATION[0] in table.number:
         rotation = table.matrix(columns.ROTATION)
         checks.check_rotations(table, rotation)
@@ -321,7 +321,7 @@ def _cycles(table: ColumnTable) -> Ints:
     return cycle[:, 0].astype(np.int64)
 
 
-def stated_covariance(table: ColumnTable, m: int) -> Floats | None:
+def _stated_covariance(table: ColumnTable, m: int) -> Floats | None:
     """Covariances (N, m, m) that the table states, None where it states none."""
     names = columns.covariance_columns(m)
     if names[0] not in table.number:
@@ -332,7 +332,7 @@ def stated_covariance(table: ColumnTable, m: int) -> Floats | None:
     return cov
 
 
-def instrument_covariance(
+def _instrument_covariance(
     table: ColumnTable,
     value: Floats,
     noise: TrackerNoise | None,

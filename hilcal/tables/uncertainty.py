@@ -49,14 +49,13 @@ def mapped_covariance(
     the table states none; m² and rad².
     """
     m = 3 if angles is None else 6
-    origin = np.zeros(3) if station is None else np.asarray(station, dtype=float)
     if mapping.std is not None:
         cov, words = _of_std(grid, mapping, mapping.std, len(position))
     elif mapping.covariance is not None:
         cov, words = _of_matrix(grid, mapping.covariance), "covariance: from the table"
     else:
         return None, ()
-    instrument = None if noise is None else tracker_covariance(position, noise, origin, m)
+    instrument = None if noise is None else tracker_covariance(position, noise, station, m)
     known = cov.shape[1]
     source = "[tracker]" if mapping.instrument is None else "[instrument] of the mapping"
     if known < m:

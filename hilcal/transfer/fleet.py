@@ -117,7 +117,20 @@ def _type(
 def to_json(fleet: Fleet, priors: Mapping[str, str]) -> dict[str, object]:
     """Return a fleet as JSON, SI."""
     return {
-        "types": [{**_type_json(t), "prior": priors.get(t.type)} for t in fleet.types],
+        "types": [
+            {
+                "type": t.type,
+                "arms": list(t.arms),
+                "n_campaigns": len(t.campaigns),
+                "parameters": [asdict(p) for p in t.parameters],
+                "unlike": [asdict(o) for o in t.odd],
+                "effects_added": [asdict(s) for s in t.seen],
+                "wear": list(t.wear),
+                "sizes": [asdict(s) for s in t.sizes],
+                "prior": priors.get(t.type),
+            }
+            for t in fleet.types
+        ],
         "campaigns": [
             {
                 "name": m.name,
@@ -132,17 +145,4 @@ def to_json(fleet: Fleet, priors: Mapping[str, str]) -> dict[str, object]:
             for m in fleet.members
         ],
         "failed": [asdict(f) for f in fleet.failures],
-    }
-
-
-def _type_json(t: Pooled) -> dict[str, object]:
-    return {
-        "type": t.type,
-        "arms": list(t.arms),
-        "n_campaigns": len(t.campaigns),
-        "parameters": [asdict(p) for p in t.parameters],
-        "unlike": [asdict(o) for o in t.odd],
-        "effects_added": [asdict(s) for s in t.seen],
-        "wear": list(t.wear),
-        "sizes": [asdict(s) for s in t.sizes],
     }

@@ -36,7 +36,7 @@ from hilcal.workbench.elements import (
     soft,
     title,
 )
-from hilcal.workbench.session import Snapshot, WorkbenchSession
+from hilcal.workbench.session import Snapshot
 
 if TYPE_CHECKING:
     from hilcal.workbench.page import View
@@ -80,9 +80,9 @@ def snapshot(view: View, d: Snapshot) -> None:
     with ui.element("div").classes("two"):
         _fails(view, d)
         _missing(view, d)
-        view.readings, view.evidence = (ui.column().classes("part") for _ in range(2))
-    view.draw_readings()
-    view.draw_evidence()
+        for name in ("readings", "evidence"):
+            view.places[name] = ui.column().classes("part")
+            view.redraw(name)
     with ui.element("div").classes("two"):
         with ui.column().classes("stack"):
             with _part("How the error fell"):
@@ -106,7 +106,7 @@ def snapshot(view: View, d: Snapshot) -> None:
             for file, name in DOWNLOADS.items():
                 button(view, name, partial(view.download, file), "outline")
         answer(view, "download")
-    view.draw_plan()
+    view.redraw("planned")
 
 
 def _verdict(view: View, d: Snapshot) -> None:
@@ -117,7 +117,7 @@ def _verdict(view: View, d: Snapshot) -> None:
         part.props("data-part=verdict")
         words = plain(numbers.sentence(headline(judged)))
         ui.html(f"<h2 class='verdict {kind}'>{mark} {words}</h2>", sanitize=False)
-        ui.label(numbers.sentence(message(judged), fit.model.catalogue.names))
+        ui.label(message(judged))
         low, high = fit.variance_factor_interval
         with ui.element("div").classes("numbers"):
             number("error on poses left out", numbers.length(fit.holdout.rms_m))
@@ -243,7 +243,7 @@ def readings(view: View, d: Snapshot) -> None:
     if picked is None:
         soft("Click a point: the readings of its pose, and what sets them apart.")
         return
-    ui.label(f"{view.tab.told}:").style("font-weight: 500")
+    ui.label(f"{view.tab.picked_title}:").style("font-weight: 500")
     clear = [difference(x) for x in view.session.differences(d, np.array(picked)) if x.clear]
     said = "Nothing recorded sets them apart from the others."
     if clear:
@@ -263,8 +263,8 @@ def difference(x: Difference) -> str:
     """Write how picked readings differ from the others."""
     if x.variable.startswith("load "):
         name = "unloaded" if x.variable == f"load {UNLOADED}" else x.variable
-        mine, others = numbers.percent(x.picked), numbers.percent(x.others)
-        return f"{name}: {mine} of them, {others} of the others"
+        picked, others = numbers.percent(x.picked), numbers.percent(x.others)
+        return f"{name}: {picked} of them, {others} of the others"
     unit, factor = numbers.angle_or(x.unit)
     a, b = (numbers.digits(factor * value) for value in (x.picked, x.others))
     return f"{x.variable} {a} {unit}, the others {b} {unit}".replace(" ,", ",").rstrip()
@@ -348,7 +348,7 @@ def _laws(view: View, d: Snapshot) -> None:
             chart(view, charts.curve_chart(law)).props("data-part=law")
 
 
-def viewer(view: View) -> None:
+def viewer(view: View, d: Snapshot) -> None:
     """Draw the 3-D view, or what opens it."""
     with ui.column().classes("part").style("margin: 16px 0 32px"):
         title("The arm and its readings in space")
@@ -405,19 +405,19 @@ def _next_measurement(view: View, d: Snapshot) -> None:
 
         button(view, "Plan the next measurements", plan, "unelevated")
         answer(view, "next")
-        view.planned = ui.column().style("width: 100%; gap: 8px")
+        view.places["planned"] = ui.column().style("width: 100%; gap: 8px")
 
 
-def planned(session: WorkbenchSession) -> None:
-    """Draw the next measurements."""
-    if session.planned is None:
+def planned(view: View, d: Snapshot) -> None:
+    """Draw the next measurements, where they are planned."""
+    if view.session.planned is None:
         return
-    next_, path = session.planned
+    next_, path = view.session.planned
     summary, powers = next_.made.summary, next_.found.powers
     words = powers_summary(powers, summary.poses, summary.readings)
     ui.label(words).props("data-part=planned")
     for effect, rival, now, then in power_rows(powers):
         soft(f"If {effect} is there, {rival} is ruled out: {now} now, {then} then.")
     ui.label(f"The plan is in {path.name}. Measure it into the same campaign with:")
-    ui.label(session.run_line()).classes("code")
+    ui.label(view.session.run_line()).classes("code")
     soft("Then read the file again here.")

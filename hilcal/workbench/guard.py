@@ -78,19 +78,21 @@ class AccessGuard:
             return
         why = self._stranger(scope)
         if why is not None:
-            await _refuse(scope, send, 403, why)
+            await self._refuse(scope, send, 403, why)
         elif self._has_cookie(scope):
             if scope["path"] != "/" and not scope["path"].startswith(PATHS):
-                await _refuse(scope, send, 404, "nothing here")
+                await self._refuse(scope, send, 404, "nothing here")
             elif scope["path"] == "/" and scope["query_string"]:
                 await self._answer(send, 303, (b"location", b"/"))
             else:
                 await self.app(scope, receive, self._marked(send))
         elif not self._knows(scope):
-            await _refuse(scope, send, 403, "open the address that hilcal workbench printed")
+            await self._refuse(scope, send, 403, "open the address that hilcal workbench printed")
         elif self.entered or self.abandoned:
             why = "has been opened" if self.entered else "was left unused for too long"
-            await _refuse(scope, send, 403, f"this address {why}; start hilcal workbench again")
+            await self._refuse(
+                scope, send, 403, f"this address {why}; start hilcal workbench again"
+            )
         else:
             self.entered = True
             cookie = f"{self._cookie}={self._secret}; HttpOnly; SameSite=Strict; Path=/"
@@ -142,6 +144,13 @@ class AccessGuard:
         await send({**head, "headers": [*heads, *self._headers]})
         await send({"type": "http.response.body", "body": body})
 
+    async def _refuse(self, scope: Scope, send: Send, status: int, why: str) -> None:
+        if scope["type"] == "websocket":
+            await send({"type": "websocket.close", "code": 1008, "reason": why})
+            return
+        kind = (b"content-type", b"text/plain; charset=utf-8")
+        await self._answer(send, status, kind, body=f"{why}\n".encode())
+
     def _marked(self, send: Send) -> Send:
         async def marked(message: Message) -> None:
             if message["type"] == "http.response.start":
@@ -158,15 +167,3 @@ def _heads(scope: Scope, name: bytes) -> list[str]:
 
 def _same(a: str, b: str) -> bool:
     return secrets.compare_digest(a.encode(), b.encode())
-
-
-async def _refuse(scope: Scope, send: Send, status: int, why: str) -> None:
-    if scope["type"] == "websocket":
-        await send({"type": "websocket.close", "code": 1008, "reason": why})
-        return
-    heads = [
-        (b"content-type", b"text/plain; charset=utf-8"),
-        (b"x-content-type-options", b"nosniff"),
-    ]
-    await send({"type": "http.response.start", "status": status, "headers": heads})
-    await send({"type": "http.response.body", "body": f"{why}\n".encode()})

@@ -33,7 +33,7 @@ class Tab:
     suspect: str | None = None  # the missing effect whose evidence is shown
     variable: str | None = None  # over which residuals are drawn; None for the pose
     picked: list[int] | None = None  # measurements of the story that were clicked
-    told: str = ""  # what they are, in words
+    picked_title: str = ""  # what they are, in words
     dark: bool = False  # whether the browser asks for a dark page
     texts: dict[tuple[str, str], str] = field(default_factory=dict)
     """Values of the cell by section and key, as they were typed and not used yet."""
@@ -71,10 +71,10 @@ def install(app: FastAPI, session: WorkbenchSession) -> None:
         await ui.context.client.connected()
         view.begin(dark=bool(await ui.run_javascript(DARK, timeout=5.0)))
 
-    bench.on_startup(lambda: _read(shared))
+    bench.on_startup(lambda: read_file(shared))
 
 
-def _read(shared: TabsShared) -> None:
+def read_file(shared: TabsShared) -> None:
     """Begin to read the file."""
 
     def read(say: Say) -> str:
@@ -90,10 +90,9 @@ class View:
 
     def __init__(self, shared: TabsShared, address: str) -> None:
         """Begin with what is there; `address` is this server's, as the browser calls it."""
-        self.shared, self.address, self.tab = shared, address, Tab()
-        self.readings: ui.column | None = None
-        self.evidence: ui.column | None = None
-        self.planned: ui.column | None = None
+        self.shared, self.session, self.work = shared, shared.session, shared.work
+        self.address, self.tab = address, Tab()
+        self.places: dict[str, ui.column] = {}  # of the parts that are drawn alone, see `REDRAWN`
         self.adder: ui.button | None = None
         self.answers: dict[str, ui.label] = {}
         self._drawn = -1, False
@@ -101,23 +100,13 @@ class View:
         self._file: tuple[str, bytes] | None = None
         self._planned: object = None
 
-    @property
-    def session(self) -> WorkbenchSession:
-        """The session."""
-        return self.shared.session
-
-    @property
-    def work(self) -> Work:
-        """The work."""
-        return self.shared.work
-
     def build(self) -> None:
         """Make the parts that stay, and look for changes from time to time."""
         ui.colors(primary="#1f6f9f", positive="#00785a", negative="#c0274b", warning="#8a5a00")
         ui.add_css(CSS)
         ui.add_body_html(f"<script>{SCRIPT.read_text(encoding='utf-8')}</script>")
         self.status = Status(self)
-        self.body, self.below = (ui.column().classes("bench") for _ in range(2))
+        self.body, self.places["viewer"] = (ui.column().classes("bench") for _ in range(2))
         ui.timer(TICK, self.tick)
         ui.timer(LOOK, self.look)
 
@@ -141,14 +130,14 @@ class View:
             self.draw()
         self._drawn = state
         if self.session.planned is not self._planned:
-            self.draw_plan()
+            self.redraw("planned")
         drawing = self.shared.drawing
         asked = self.tab.looks and not self.tab.viewer
         if asked and drawing is not None and drawing[0] is self.tab.snapshot:
             at = f"{self.address}viewer/"
             files = "".join(f"&url={at}{name}" for name in drawing[1])
             self.tab.viewer = f"{at}?persist=0&notebook=0&theme=dark{files}"
-            self.draw_below()
+            self.redraw("viewer")
 
     def show_answers(self) -> None:
         """Show at each place what is being done there, or what came of it."""
@@ -179,33 +168,18 @@ class View:
                 cards.waiting(self)
             else:
                 cards.snapshot(self, snapshot)
-        self.draw_below()
+        self.redraw("viewer")
         self.show_answers()
 
-    def _redraw(self, place: ui.column | None, card: Callable[["View", Snapshot], None]) -> None:
-        """Draw a part alone, where it is there."""
-        if place is not None:
+    def redraw(self, name: str) -> None:
+        """Draw one of the parts `REDRAWN` alone, where it is there."""
+        if name == "planned":
+            self._planned = self.session.planned
+        if (place := self.places.get(name)) is not None:
             place.clear()
             with place:
                 if self.tab.snapshot is not None:
-                    card(self, self.tab.snapshot)
-
-    def draw_below(self) -> None:
-        """Draw the 3-D view alone."""
-        self._redraw(self.below, lambda view, d: cards.viewer(view))
-
-    def draw_readings(self) -> None:
-        """Draw the readings that were picked."""
-        self._redraw(self.readings, cards.readings)
-
-    def draw_evidence(self) -> None:
-        """Draw the evidence of the chosen suspect."""
-        self._redraw(self.evidence, cards.evidence)
-
-    def draw_plan(self) -> None:
-        """Draw the next measurements, where they are planned."""
-        self._planned = self.session.planned
-        self._redraw(self.planned, lambda view, d: cards.planned(view.session))
+                    REDRAWN[name](self, self.tab.snapshot)
 
     def _do(self, place: str, what: str, act: Callable[[Snapshot, Say], object]) -> None:
         """Begin something on this tab's snapshot; the text that `act` returns stays there."""
@@ -259,7 +233,7 @@ class View:
 
     def again(self) -> None:
         """Read the file again."""
-        _read(self.shared)
+        read_file(self.shared)
 
     def fit_anew(self) -> None:
         """Fit the model of the revision in use to all readings."""
@@ -322,7 +296,7 @@ class View:
             if self.adder is not None:
                 self.adder.set_text(f"Add {effect}")
                 self.adder.set_visibility(True)
-            self.draw_evidence()
+            self.redraw("evidence")
 
     def pick_variable(self, name: str) -> None:
         """Show the residuals over a variable, and its readings that are furthest off."""
@@ -335,10 +309,19 @@ class View:
         snapshot = self.tab.snapshot
         if snapshot is not None and 0 <= measurement < len(snapshot.story):
             story = snapshot.story
-            mine = np.flatnonzero(story.pose == story.pose[measurement]).tolist()
-            self._pick(mine, f"The readings of pose {story.pose_name(measurement)}")
+            readings = np.flatnonzero(story.pose == story.pose[measurement]).tolist()
+            self._pick(readings, f"The readings of pose {story.pose_name(measurement)}")
 
-    def _pick(self, measurements: list[int], told: str) -> None:
+    def _pick(self, measurements: list[int], title: str) -> None:
         """Show some readings, and what distinguishes them."""
-        self.tab.picked, self.tab.told = measurements, told
-        self.draw_readings()
+        self.tab.picked, self.tab.picked_title = measurements, title
+        self.redraw("readings")
+
+
+REDRAWN: dict[str, Callable[[View, Snapshot], None]] = {
+    "readings": cards.readings,
+    "evidence": cards.evidence,
+    "planned": cards.planned,
+    "viewer": cards.viewer,
+}
+"""The parts of the page that change without the rest."""

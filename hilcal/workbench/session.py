@@ -27,7 +27,6 @@ from hilcal.config.changes import (
 )
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.distinguish import Difference, Recorded, distinguish, recorded_values
-from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.written import read_effects_text
 from hilcal.errors import InputError
@@ -142,21 +141,15 @@ class WorkbenchSession:
 
     Every method that takes a snapshot raises InputError where that is outdated; `say` takes
     progress, one line each.
-
-    Attributes:
-        snapshot: what is shown; None before `load`.
-        changed: what the last change did; None before any, and after another revision was chosen.
-        planned: the next measurements that were planned last, and their file.
-        count: grows whenever another snapshot is shown.
     """
 
     def __init__(self, path: str | Path, catalogue: Catalogue | None = None) -> None:
         """Take a file; nothing is read yet."""
         self.path, self._catalogue = Path(path), catalogue
-        self.snapshot: Snapshot | None = None
-        self.changed: Changed | None = None
-        self.planned: tuple[NextPlan, Path] | None = None
-        self.count = 0
+        self.snapshot: Snapshot | None = None  # what is shown; None before `load`
+        self.changed: Changed | None = None  # by the last change; None where another was chosen
+        self.planned: tuple[NextPlan, Path] | None = None  # the last plan, and its file
+        self.count = 0  # of the snapshots that were shown
         self._known: dict[int, Chapter] = {}
         self._hash = ""
 
@@ -271,15 +264,11 @@ class WorkbenchSession:
     ) -> NextPlan:
         """Plan the measurements that settle what the shown diagnosis leaves open, and save them.
 
-        Args:
-            snapshot: what is shown.
-            poses: as many readings as so many poses take; what the doubt needs where None.
-            output: the plan's file; it must not exist.
-            say: takes progress.
-            quick: without comparing criteria and numbers of poses, as `hilcal next` does.
+        `poses` is what the doubt needs where None; `quick` compares no criteria, nor numbers of
+        poses, as `hilcal next` does.
 
         Raises:
-            InputError: a file that cannot be written, or a plan that may not be run.
+            InputError: a file that exists or cannot be written, or a plan that may not be run.
             CannotAnswerError: nothing is in doubt, or no measurement would settle it.
         """
         if output.exists():
@@ -349,30 +338,19 @@ class WorkbenchSession:
             )
 
     def _chapters(self, o: Campaign, revision: int | None, say: Say) -> tuple[Chapter, ...]:
-        record = o.in_use(revision)
+        """Return a revision and those that it was made from; they are judged where not known."""
+        record, numbers = o.in_use(revision), [0]
         if record is None:
             refuse_fitting(o.file)
-            if 0 not in self._known:
-                _, baseline = o.fit_in_use(say)
-                say("diagnosing the baseline")
-                self._known[0] = Chapter(1, None, baseline, diagnose(baseline, say=say))
-            return (self._known[0],)
-        o = o.at(record.cell)
-        out = [self._chapter(o, r, say) for r in chain_in_cell(o.file.revisions(), record.number)]
+        else:
+            o = o.at(record.cell)
+            numbers = [r.number for r in chain_in_cell(o.file.revisions(), record.number)]
+        if not self._known.keys() >= set(numbers):
+            self._known |= zip(numbers, o.chapters(say, revision), strict=True)
+        out = tuple(self._known[number] for number in numbers)
         if out[-1].diagnosis is None:
             o.require_gc(out[-1].number, out[-1].fit.scaling, "judging")
-        return tuple(out)
-
-    def _chapter(self, o: Campaign, record: RevisionRecord, say: Say) -> Chapter:
-        number = record.number
-        if number not in self._known:
-            say(f"restoring revision {number}")
-            fit, judged = o.restore(record), None
-            if fit.scaling == "gc":
-                say(f"diagnosing revision {number}")
-                judged = diagnose(fit, o.history(number), say)
-            self._known[number] = Chapter(number, record.added, fit, judged, record.removed)
-        return self._known[number]
+        return out
 
     def _forget_others(self, o: Campaign) -> None:
         """Forget what was fitted to other readings than the file has now."""

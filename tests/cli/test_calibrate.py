@@ -126,14 +126,6 @@ def test_what_fits_refuses_a_validation_campaign(there, capsys):
         path.write_bytes(kept)
 
 
-def test_another_campaign_is_no_calibration(there, cell, capsys):
-    path = there.procedure.files.validation
-    line = refused(
-        capsys, 2, "calibrate", path.with_name("cell.toml"), "-o", path, "--resume", "--yes"
-    )
-    assert "not a campaign of hilcal calibrate" in line
-
-
 def test_a_rehearsal_goes_on_as_one(there, capsys):
     path = there.procedure.run
     command = ("calibrate", path.with_name("cell.toml"), "-o", path, "--resume", "--rehearse")

@@ -1,6 +1,5 @@
 """The commands from import to view: exit codes, documents, words, one verdict everywhere."""
 
-import csv
 import json
 import sys
 from dataclasses import replace
@@ -20,29 +19,14 @@ from hilcal.identification.baseline import baseline
 from hilcal.present.story import build_story
 from hilcal.present.verdict import message
 from hilcal.refinement import refine
-from hilcal.robot.catalogue import configs_dir
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.tables.table import read_table
 from studies.diagnosis import judgement
 from studies.serial_noise import serial_readings
 from studies.study_cases import study_case
-from tests.support.cli_cases import CELL, ok, refused, rehearsal, run, table
+from tests.support.cli_cases import CELL, ok, refused, rehearsal, run, stored_readings
 from tests.support.next_cases import SMALL, doubtful
 
 ERROR = {"rms_m", "mean_m", "max_m", "rms_sigma"}
-VERDICTS = {"adequate", "missing_effect", "ambiguous", "unknown_effect", "noise_misjudged"}
-
-
-@pytest.fixture(scope="module")
-def hysteresis_table(tmp_path_factory):
-    return table(tmp_path_factory.mktemp("tables") / "hysteresis.csv", "hysteresis")
-
-
-@pytest.fixture
-def campaign(hysteresis_table, tmp_path, capsys):
-    path = tmp_path / "run.hilcal"
-    ok(capsys, "import", hysteresis_table, "--config", CELL, "-o", path)
-    return path
 
 
 def test_import_says_what_was_read(hysteresis_table, tmp_path, capsys):
@@ -247,33 +231,19 @@ def test_what_is_stored_already_is_not_stored_again(campaign, capsys):
 
 
 @pytest.mark.long
-def test_validate_predicts_what_was_never_fitted(campaign, tmp_path, capsys):
+def test_validate_finds_the_place_of_a_tracker_that_was_set_up_anew(campaign, tmp_path, capsys):
     ok(capsys, "refine", campaign)
     r = rehearsal("hysteresis")
     seen, rng = r.readings, np.random.default_rng(3)
     state = seen.states, seen.pose, seen.load, seen.cycle, seen.load_names
-    half = seen.pose < 7  # measured again: the same cell and tracker, half of the poses
-    other = tmp_path / "other.hilcal"
-    with CampaignFile.create(other, r.config.to_json(), str(tmp_path), "test") as file:
-        file.append_readings(simulate(r.world, *state, rng)[half])
-    d = ok(capsys, "validate", campaign, other, "--json").document
-    assert (d["n_readings"], d["n_fitted"]) == (int(half.sum()), 0)
-    assert d["never_fitted"] is True
-    assert set(d["error"]) == ERROR
-    assert d["error"]["rms_sigma"] < 1.3
-    assert d["registered"] is False
-    # The same arm, but the tracker stands elsewhere.
     moved = np.eye(4)
     moved[:3, :3] = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
     moved[:3, 3] = 2.0, 1.5, -0.4
     there = replace(r.world, registration=moved)
-    readings = simulate(there, *state, rng)
-    far = tmp_path / "far.hilcal"
-    with CampaignFile.create(far, r.config.to_json(), str(tmp_path), "test") as file:
-        file.append_readings(readings)
-    wrong = ok(capsys, "validate", campaign, far)
-    assert "--register" in wrong.out
+    far = stored_readings(tmp_path / "far.hilcal", simulate(there, *state, rng), r.config)
+    assert "--register" in ok(capsys, "validate", campaign, far).out
     again = ok(capsys, "validate", campaign, far, "--register", "--json").document
+    assert set(again["error"]) == ERROR
     assert again["registered"] is True
     assert again["error"]["rms_sigma"] < 1.3
 
@@ -290,23 +260,6 @@ def test_view_writes_a_recording_that_can_be_read(campaign, tmp_path, capsys):
     assert reader.recordings()
     missing = tmp_path / "nowhere" / "story.rrd"
     assert "no folder" in refused(capsys, 2, "view", campaign, "--record", missing)
-
-
-def test_export_writes_tables_that_go_in_again(campaign, tmp_path, capsys):
-    readings, parameters = tmp_path / "readings.csv", tmp_path / "parameters.csv"
-    assert "revision" in refused(capsys, 2, "export", campaign, "--parameters", parameters)
-    assert "--table" in refused(capsys, 2, "export", campaign)
-    ok(capsys, "refine", campaign)
-    ok(capsys, "export", campaign, "--table", readings, "--parameters", parameters)
-    refused(capsys, 2, "export", campaign, "--table", readings)
-    with CampaignFile.open(campaign) as stored:
-        again = read_table(readings, rehearsal("nothing").cell.arm, None)
-        assert (again.value == stored.readings().value).all()
-    with parameters.open(encoding="utf-8", newline="") as stream:
-        rows = list(csv.DictReader(stream))
-    j2 = next(row for row in rows if row["name"] == "hysteresis.j2")
-    assert float(j2["value"]) > 0
-    assert j2["unit"] == "rad"
 
 
 def test_effects_lists_the_catalogue(capsys):
@@ -334,14 +287,6 @@ def test_a_scheduler_that_anybody_can_reach_is_said(capsys):
     assert error.startswith("error: ")
 
 
-@pytest.mark.long
-def test_json_leaves_words_to_stderr(campaign, capsys):
-    for command in (["identify"], ["compare"], ["diagnose"], ["refine"]):
-        result = ok(capsys, *command, campaign, "--json")
-        json.loads(result.out)
-        assert "noise alone" in result.err
-
-
 def test_version(capsys):
     assert ok(capsys, "--version").out == f"hilcal {__version__}\n"
 
@@ -353,17 +298,9 @@ def test_without_a_command_help_is_shown(capsys):
     assert "Traceback" not in result.err
 
 
-CELLS = str(configs_dir() / "cells")
 UR5E = load_config(CELL).model_copy(
     update={"robot": load_config(CELL).robot.model_copy(update={"model": "ur5e"})}
 )
-
-
-def stored(path, config, readings, mode):
-    """A campaign file with its readings alone."""
-    with CampaignFile.create(path, config.to_json(), CELLS, "a test") as file:
-        file.append_readings(readings)
-    return path
 
 
 def study(mode, *hidden, seed=1, **options):
@@ -376,27 +313,25 @@ def correlated():
     return UR5E, serial_readings(c, 0.9, np.random.default_rng(3))
 
 
+def doubtful_at_first():
+    return SMALL, doubtful("base_compliance", 2).rehearsal.readings
+
+
+LOADS, POSITIONS = "deflection", "absolute"
 CASES = {
-    "missing": ("deflection", lambda: study("deflection", "creep", n_poses=12)),
-    "ambiguous": ("absolute", lambda: (SMALL, doubtful("base_compliance", 2).rehearsal.readings)),
-    "unknown": ("absolute", lambda: study("absolute", "swaying bench")),
+    "missing": (LOADS, "missing_effect", lambda: study(LOADS, "creep", n_poses=12)),
+    "ambiguous": (POSITIONS, "ambiguous", doubtful_at_first),
+    "unknown": (POSITIONS, "unknown_effect", lambda: study(POSITIONS, "swaying bench")),
     "unknown although tried": (
-        "deflection",
-        lambda: study("deflection", "relaxing bench", n_poses=12),
+        LOADS,
+        "unknown_effect",
+        lambda: study(LOADS, "relaxing bench", n_poses=12),
     ),
-    "adequate": ("deflection", lambda: study("deflection")),
-    "noise": ("deflection", lambda: study("deflection", stated=0.5, cycles=2)),
-    "correlated": ("absolute", lambda: correlated()),
+    "adequate": (LOADS, "adequate", lambda: study(LOADS)),
+    "noise": (LOADS, "noise_misjudged", lambda: study(LOADS, stated=0.5, cycles=2)),
+    "correlated": (POSITIONS, "adequate", correlated),
 }
-FIRST = {
-    "missing": "missing_effect",
-    "ambiguous": "ambiguous",
-    "unknown": "unknown_effect",
-    "unknown although tried": "unknown_effect",
-    "adequate": "adequate",
-    "noise": "noise_misjudged",
-    "correlated": "adequate",
-}
+"""By case: kind of readings, the verdict on the baseline, and what makes cell and readings."""
 
 
 def check_document(d):
@@ -464,11 +399,12 @@ FAST = ("missing", "unknown although tried")
     [pytest.param(c, marks=pytest.mark.long if c in FAST else pytest.mark.slow) for c in CASES],
 )
 def test_one_verdict_through_every_door(case, tmp_path, capsys):
-    mode, make = CASES[case]
-    path = stored(tmp_path / "run.hilcal", *make(), mode)
+    mode, verdict, make = CASES[case]
+    config, readings = make()
+    path = stored_readings(tmp_path / "run.hilcal", readings, config)
     ok(capsys, "identify", path, "--readings", mode)
     first = ok(capsys, "diagnose", path, "--json").document
-    assert first["verdict"] == FIRST[case], first["message"]
+    assert first["verdict"] == verdict, first["message"]
     check_doors(path, first, capsys, tmp_path)
 
     refined = ok(capsys, "refine", path, "--readings", mode, "--json").document
@@ -486,7 +422,8 @@ def test_one_verdict_through_every_door(case, tmp_path, capsys):
 
 
 def test_adding_gives_the_verdict_that_is_stored_and_diagnosed(tmp_path, capsys):
-    path = stored(tmp_path / "run.hilcal", *study("deflection", "creep", n_poses=12), "deflection")
+    config, readings = study("deflection", "creep", n_poses=12)
+    path = stored_readings(tmp_path / "run.hilcal", readings, config)
     ok(capsys, "identify", path)
     for name in ("creep", "hysteresis"):
         d = ok(capsys, "add", path, name, "--json").document

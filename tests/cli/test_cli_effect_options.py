@@ -5,19 +5,7 @@ import shutil
 import pytest
 
 from hilcal.store.campaign_file import CampaignFile
-from tests.support.cli_cases import CELL, ok, refused, table
-
-
-@pytest.fixture(scope="module")
-def measured(tmp_path_factory):
-    return table(tmp_path_factory.mktemp("tables") / "hysteresis.csv", "hysteresis")
-
-
-@pytest.fixture
-def campaign(measured, tmp_path, capsys):
-    path = tmp_path / "run.hilcal"
-    ok(capsys, "import", measured, "--config", CELL, "-o", path)
-    return path
+from tests.support.cli_cases import ok, refused
 
 
 def names_of(result, effect):
@@ -148,7 +136,7 @@ def test_joints_that_differ_are_let_differ(campaign, tmp_path, capsys):
     found = ok(capsys, "diagnose", campaign, "--json").document
     assert found["suspects"][0]["effect"] == finer
     assert found["suspects"][0]["finer_than"] == "joint_compliance"
-    assert found["message"].startswith(f"let joints differ: {finer} explains")
+    assert found["message"].startswith(f"Let joints differ: {finer} explains")
     assert found["tests"]["each"] == found["tests"]["level"] / found["tests"]["count"]
     refused_ = refused(capsys, 4, "next", campaign, "-o", tmp_path / "next.json")
     assert f"hilcal add {campaign} '{finer}'" in refused_

@@ -3,16 +3,13 @@
 import signal
 import socket
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from hilcal.errors import InputError
-from hilcal.readings.readings import Readings
-from hilcal.store.campaign_file import CampaignFile
-from tests.support.cli_cases import CELL, ok, refused, rehearsal, run, start, table
+from tests.support.cli_cases import CELL, ok, refused, rehearsal, run, start, stored_readings, table
 
 Capsys = pytest.CaptureFixture[str]
 Rows = list[list[str]]
@@ -134,41 +131,17 @@ def test_usage_errors_are_one_line(campaign, capsys):
     assert "--frobnicate" in refused(capsys, 2, "refine", campaign, "--frobnicate")
 
 
-def test_diagnosis_needs_the_full_scaling(campaign, capsys):
-    ok(capsys, "identify", campaign, "--scaling", "gu")
-    assert "gc" in refused(capsys, 2, "diagnose", campaign)
-    assert "gc" in refused(capsys, 2, "compare", campaign)
-
-
 def test_fewer_readings_than_parameters(tmp_path, capsys):
     r = rehearsal("nothing", poses=4)
-    path = tmp_path / "few.hilcal"
-    unloaded = r.readings.unloaded
-    with CampaignFile.create(path, r.config.to_json(), str(tmp_path), "test") as file:
-        file.append_readings(r.readings[unloaded])
+    unloaded = r.readings[r.readings.unloaded]
+    path = stored_readings(tmp_path / "few.hilcal", unloaded, r.config)
     line = refused(
         capsys, 4, "identify", path, "--effects", "encoder_offset,link_geometry", "--readings",
         "absolute",
     )  # fmt: skip
     assert "measure" in line
-    two = tmp_path / "two.hilcal"
-    with CampaignFile.create(two, r.config.to_json(), str(tmp_path), "test") as file:
-        file.append_readings(r.readings[r.readings.pose < 2])
+    two = stored_readings(tmp_path / "two.hilcal", r.readings[r.readings.pose < 2], r.config)
     assert "poses" in refused(capsys, 4, "identify", two)
-
-
-def test_readings_appended_after_a_fit(campaign, capsys):
-    ok(capsys, "identify", campaign)
-    more: Readings = rehearsal("nothing", seed=2, poses=2).readings
-    with CampaignFile.open(campaign) as file:
-        names = tuple(f"new{k}" for k in range(2))
-        file.append_readings(type(more)(**{**_fields(more), "pose_names": names}))
-    line = refused(capsys, 2, "compare", campaign)
-    assert "identify again" in line
-
-
-def _fields(readings):
-    return {name: getattr(readings, name) for name in readings.__dataclass_fields__}
 
 
 def test_a_busy_port_is_refused(campaign, capsys):
@@ -200,16 +173,6 @@ def refused_with_notice(capsys, campaign):
     assert result.code == 1
     assert "Traceback" not in result.err
     return result.err.splitlines()[-1]
-
-
-def test_an_interrupt_ends_quietly(monkeypatch, campaign, capsys):
-    def interrupted(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("hilcal.cli.comparing.misfit_breakdown", interrupted)
-    result = run(capsys, "compare", campaign)
-    assert result.code == 130
-    assert result.err.splitlines()[-1] == "error: interrupted"
 
 
 def test_numerical_warnings_do_not_reach_the_user(monkeypatch, campaign, capsys):
@@ -257,22 +220,6 @@ def free_port():
         return int(probe.getsockname()[1])
 
 
-def test_a_kill_leaves_every_committed_revision(campaign, capsys):
-    ok(capsys, "identify", campaign)
-    process = start("refine", campaign)
-    time.sleep(0.3)  # anywhere: whatever it is doing, the file stays whole
-    process.kill()
-    process.communicate()
-    with CampaignFile.open(campaign) as stored:
-        assert len(stored.revisions()) >= 1
-    assert ok(capsys, "refine", campaign, "--json").document["verdict"] == "adequate"
-
-
-def test_a_program_without_a_place_to_write(good, tmp_path, capsys):
-    line = refused(capsys, 2, "import", good, "--config", CELL, "-o", tmp_path / "no" / "x.hilcal")
-    assert "written" in line
-
-
 @pytest.mark.parametrize(("no_wheel", "said"), [
     ((3, 0), "has no wheel for Python 3.{}; use Python 3.11 or 3.12 for the cell's computer"),
     ((4, 0), "is not installed; pip install ur-rtde")])  # fmt: skip
@@ -298,7 +245,7 @@ def test_what_cannot_be_hidden_is_refused_before_anything_is_planned(
     def planned(*_: object) -> None:
         raise AssertionError("it plans first")
 
-    for name in ("make_plan", "make_checked"):
+    for name in ("make_plan", "checked_plan"):
         monkeypatch.setattr(f"hilcal.cli.running.{name}", planned)
     path, words = tmp_path / "CELL.toml", CELL.read_text(encoding="utf-8")
     path.write_text(words.replace("[simulation]", '[simulation]\nhide = "foo"'), encoding="utf-8")

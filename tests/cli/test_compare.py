@@ -1,9 +1,10 @@
 """`compare A B`: what has changed on an arm; `report`."""
 
 import hashlib
+import html
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
@@ -13,15 +14,14 @@ import hilcal as hc
 from hilcal.config import CellConfig, Repeatability, load_config
 from hilcal.drivers.simulated.world import World, stand
 from hilcal.identification.full_covariance import joint_factors
-from hilcal.readings.covariance import COVERS, INSTRUMENT
+from hilcal.readings.covariance import INSTRUMENT
 from hilcal.readings.readings import Readings
 from hilcal.robot.catalogue import configs_dir
-from hilcal.store.campaign_file import CampaignFile
 from studies.change import StudiedArm, measured, remeasured, studied_arm
 from studies.study_cases import with_study_loads
 from tests.support.campaigns import campaign as simulated
 from tests.support.campaigns import cell_of, configuration
-from tests.support.cli_cases import ok, refused
+from tests.support.cli_cases import ok, refused, stored_readings
 from tests.support.report_pages import write_campaign
 
 CONFIG = load_config(configs_dir() / "cells" / "demo_ur10e.toml")
@@ -40,10 +40,7 @@ class Site:
         return self.folder / "a.hilcal"
 
     def store(self, name: str, readings: Readings, config: CellConfig | None = None) -> Path:
-        path, told = self.folder / name, config or self.config
-        with CampaignFile.create(path, told.to_json(), str(self.folder), "test") as file:
-            file.append_readings(readings)
-        return path
+        return stored_readings(self.folder / name, readings, config or self.config)
 
     def measured(self, seed: int, zeros: Sequence[float] = (0.0,) * 6) -> Readings:
         """Fifteen readings with other zeros of the joints, by a tracker that stands elsewhere."""
@@ -181,11 +178,10 @@ def test_two_campaigns_of_one_arm_have_a_page_that_says_what_has_changed(campaig
     world = simulated("joint_tilt_compliance", "deflection", poses=6, strength=8.0).world
     compliance = world.physics.joint_compliance * [1, 2, 1, 1, 1, 1]
     worn = replace(world, physics=world.physics.with_effect("joint_compliance", compliance))
-    config, later = configuration(), campaign.with_name("later.hilcal")
+    config = configuration()
     loads = [(load.name, load.wrench(cell_of().gravity)) for load in config.loads]
-    base = str(configs_dir() / "cells")
-    with CampaignFile.create(later, config.to_json(), base, "test") as file:
-        file.append_readings(measured(worn, loads, 4, np.random.default_rng(8)))
+    readings = measured(worn, loads, 4, np.random.default_rng(8))
+    later = stored_readings(campaign.with_name("later.hilcal"), readings, config)
     page = campaign.with_name("both.html")
     found = ok(capsys, "report", campaign, later, "-o", page, "--json").document
     assert found["headline"] == "Something has changed: joint 2"
@@ -211,10 +207,9 @@ def test_the_certificate_never_takes_the_arm_to_come_back_exactly(tmp_path, caps
     r, true = site.readings, replace(site.cell, registration=site.world.registration)
     f = joint_factors(true, r, site.world.joint_std)
     r = replace(r, covariance=r.covariance - f @ np.swapaxes(f, 1, 2))
-    run, base = tmp_path / "run.hilcal", str(configs_dir() / "cells")
     config = configuration().model_copy(update={"repeatability": Repeatability()})
-    with CampaignFile.create(run, config.to_json(), base, "t", more={COVERS: INSTRUMENT}) as file:
-        file.append_readings(r[(r.cycle == 0) | (r.load == r.load_names.index("none"))])
+    kept = r[(r.cycle == 0) | (r.load == r.load_names.index("none"))]
+    run = stored_readings(tmp_path / "run.hilcal", kept, config, INSTRUMENT)
     ok(capsys, "report", run)
     text = run.with_suffix(".html").read_text(encoding="utf-8")
     assert "taken as zero" not in text
@@ -230,11 +225,9 @@ def test_deflection_and_absolute_revisions_stand_in_no_column_together(tmp_path,
     for kind in ("deflection", "absolute", "deflection"):
         ok(capsys, "identify", run, "--readings", kind, "--effects", "joint_compliance")
     ok(capsys, "report", run, "--appendix")
-    found = Tables()
-    found.feed(run.with_suffix(".html").read_text(encoding="utf-8"))
     kinds = {"1": "deflection", "2": "absolute", "3": "deflection"}
     seen = []
-    for heads, rows in found.tables:
+    for heads, rows in tables(run.with_suffix(".html").read_text(encoding="utf-8")):
         if "left out" in heads or "poses left out" in heads:
             own = {kinds[row[0].removeprefix("→ ")] for row in rows}
             assert len(own) == 1, (heads, rows)
@@ -242,27 +235,12 @@ def test_deflection_and_absolute_revisions_stand_in_no_column_together(tmp_path,
     assert sorted(seen) == ["absolute", "deflection", "deflection"]  # the story, then the file
 
 
-class Tables(HTMLParser):
-    """Headings and rows of the tables of a page, as text."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.tables: list[tuple[list[str], list[list[str]]]] = []
-        self.rows: list[list[str]] | None = None
-
-    def handle_starttag(self, tag: str, attrs: object) -> None:
-        if tag == "table":
-            self.rows = []
-        elif self.rows is not None and tag == "tr":
-            self.rows.append([])
-        elif self.rows is not None and tag in ("th", "td"):
-            self.rows[-1].append("")
-
-    def handle_endtag(self, tag: str) -> None:
-        if tag == "table" and self.rows is not None:
-            self.tables.append((self.rows[0], self.rows[1:]))
-            self.rows = None
-
-    def handle_data(self, data: str) -> None:
-        if self.rows and self.rows[-1]:
-            self.rows[-1][-1] += data.strip()
+def tables(page):
+    """Yield headings and rows of the tables of a page, as text."""
+    for table in re.findall(r"<table.*?</table>", page, re.DOTALL):
+        rows = [
+            re.findall(r"<t[hd][^>]*>(.*?)</t[hd]>", row, re.DOTALL)
+            for row in re.findall(r"<tr.*?</tr>", table, re.DOTALL)
+        ]
+        heads, *others = [[html.unescape(cell).strip() for cell in row] for row in rows]
+        yield heads, others

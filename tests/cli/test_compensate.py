@@ -8,14 +8,12 @@ import pytest
 
 import hilcal as hc
 from hilcal.calibration.urscript import waypoints
-from hilcal.config import load_config
-from hilcal.readings.covariance import COVERS, WHOLE
+from hilcal.readings.covariance import WHOLE
 from hilcal.readings.readings import States
 from hilcal.robot.chain import evaluate
 from hilcal.robot.factory import with_factory
 from hilcal.robot.se3 import matrix, of_six, rotation, six
-from hilcal.store.campaign_file import CampaignFile
-from tests.support.cli_cases import CELL, ok, refused, rehearsal
+from tests.support.cli_cases import CELL, ok, refused, rehearsal, stored_readings
 from tests.support.factory_cases import factory_of
 
 JOINTS = "q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg"
@@ -23,17 +21,13 @@ JOINTS = "q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg"
 
 def made(path):
     """Write a campaign without any revision."""
-    config = load_config(CELL).to_json()
-    path.unlink(missing_ok=True)
-    with CampaignFile.create(path, config, str(CELL.parent), "made", more={COVERS: WHOLE}) as file:
-        file.append_readings(rehearsal("nothing").readings)
+    return stored_readings(path, rehearsal("nothing").readings, covers=WHOLE)
 
 
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory):
     """A campaign with one revision."""
-    path = tmp_path_factory.mktemp("compensate") / "run.hilcal"
-    made(path)
+    path = made(tmp_path_factory.mktemp("compensate") / "run.hilcal")
     with hc.Campaign.open(path) as run:
         model = hc.baseline(run.cell, run.readings, "absolute")
         run.append(hc.fit(model, run.readings, "absolute"))
@@ -163,16 +157,6 @@ def test_a_name_is_neither_a_line_of_a_program_nor_a_formula(capsys, fitted, tmp
     assert [point["name"] for point in told["points"]] == ["w0", "=1+1", "w2"]
 
 
-def test_the_corrected_geometry_is_handed_over(capsys, fitted, tmp_path):
-    paths = [tmp_path / name for name in ("a.urdf", "a.yaml", "f.json")]
-    options = zip(("--urdf", "--ur-kinematics", "--frames"), paths, strict=True)
-    given = [word for pair in options for word in pair]
-    shown = ok(capsys, "export", fitted, *given)
-    assert "Not in it, since not constant: joint_compliance" in shown.out
-    assert all(path.stat().st_size > 100 for path in paths)
-    assert "--force" in refused(capsys, 2, "export", fitted, *given)
-
-
 def test_points_outside_are_refused_by_name_unless_told_otherwise(capsys, fitted, tmp_path):
     points = table(
         tmp_path, fitted, fx_N="0", fy_N="0", fz_N="-400", mx_Nm="0", my_Nm="0", mz_Nm="0"
@@ -206,8 +190,7 @@ def test_what_is_no_campaign_or_no_table_is_refused(capsys, fitted, tmp_path):
     existing = tmp_path / "o.csv"
     existing.write_text("mine")
     assert "--force" in refused(capsys, 2, "compensate", fitted, points, "-o", existing)
-    bare = tmp_path / "bare.hilcal"
-    made(bare)
+    bare = made(tmp_path / "bare.hilcal")
     assert "no revision yet" in refused(capsys, 2, "compensate", bare, points)
 
 

@@ -24,9 +24,9 @@ from hilcal.effects.from_file import read_effects
 from hilcal.readings.covariance import WHOLE
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.tables.table import write_table
-from studies.random_campaigns import rehearsal_states, rehearse
+from studies.random_campaigns import rehearsal_states
 from studies.unmodelled_laws import UnmodelledLaw, shift
-from tests.support.cli_cases import CELL, ok, run
+from tests.support.cli_cases import CELL, ok, rehearsal, run, stored_readings
 
 SITUATION = example_situation(example_cell(), example_states(example_cell()))
 VARIABLES = {v.symbol: v for v in variables(SITUATION)}
@@ -38,10 +38,7 @@ BASELINE = ["base_frame", "joint_compliance"]
 @pytest.fixture(scope="module")
 def campaign(tmp_path_factory):
     path = tmp_path_factory.mktemp("discover") / "run.hilcal"
-    config = load_config(CELL)
-    with CampaignFile.create(path, config.to_json(), str(CELL.parent), "test") as file:
-        file.append_readings(rehearse(config, "nothing", 3, 10).readings)
-    return path
+    return stored_readings(path, rehearsal("nothing", 3, 10).readings)
 
 
 def test_where_nothing_is_left_to_explain_it_says_so_and_exits_4(campaign, tmp_path, capsys):
@@ -132,10 +129,7 @@ def test_a_law_with_a_name_of_its_own_is_an_effect_everywhere(campaign, tmp_path
     judged = ok(capsys, "diagnose", run_file, *own, "--json").document
     assert judged["model"][-1] == "forearm_hose"
     assert "forearm_hose" in run(capsys, "diagnose", run_file).err  # refused by name
-    other = tmp_path / "other.hilcal"
-    config = load_config(CELL)
-    with CampaignFile.create(other, config.to_json(), str(CELL.parent), "test") as file:
-        file.append_readings(rehearse(config, "nothing", 5, 6).readings)
+    other = stored_readings(tmp_path / "other.hilcal", rehearsal("nothing", 5, 6).readings)
     validated = ok(capsys, "validate", run_file, other, *own, "--json")
     assert validated.document
     calibration = tmp_path / "cal.json"

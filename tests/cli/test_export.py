@@ -11,31 +11,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import hilcal as hc
-from hilcal.config import load_config
 from hilcal.identification.parameters_document import covariance_of, read
-from hilcal.readings.covariance import COVERS, INSTRUMENT, WHOLE
+from hilcal.readings.covariance import INSTRUMENT, WHOLE
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate
-from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.rows import content_hash
 from hilcal.tables.table import import_table, with_what_rounding_does, write_table
-from tests.support.cli_cases import CELL, ok, refused, rehearsal
+from tests.support.cli_cases import CELL, ok, refused, rehearsal, stored_readings
 from tests.support.readings_cases import make_arm, simple
-
-
-def made(path, readings, covers=INSTRUMENT):
-    """Write a campaign without any revision."""
-    path.unlink(missing_ok=True)
-    config = load_config(CELL).to_json()
-    with CampaignFile.create(path, config, str(CELL.parent), "made", more={COVERS: covers}) as file:
-        file.append_readings(readings)
-    return path
 
 
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory):
     """A campaign with one revision of corrected geometry."""
-    path = made(tmp_path_factory.mktemp("export") / "run.hilcal", rehearsal("nothing").readings)
+    path = tmp_path_factory.mktemp("export") / "run.hilcal"
+    stored_readings(path, rehearsal("nothing").readings, covers=INSTRUMENT)
     with hc.Campaign.open(path) as run:
         model = hc.baseline(run.cell, run.readings, "absolute") + hc.effect("encoder_offset")
         run.append(hc.fit(model, run.readings, "absolute"))
@@ -47,7 +37,8 @@ def fitted(tmp_path_factory):
 def test_a_campaign_imports_what_another_exported(capsys, tmp_path, kind, covers):
     readings = rehearsal("nothing").readings
     rounded = np.round(readings.value, 4)  # a reader adds the rounding's variance to others
-    first = made(tmp_path / "a.hilcal", replace(readings, value=rounded), covers)
+    rounded = replace(readings, value=rounded)
+    first = stored_readings(tmp_path / "a.hilcal", rounded, covers=covers)
     table, cell, again = tmp_path / f"r.{kind}", tmp_path / "CELL.toml", tmp_path / "b.hilcal"
     ok(capsys, "export", first, "--readings", table, "--cell", cell)
     told = ok(capsys, "import", table, "--config", cell, "-o", again, "--json").document
@@ -125,7 +116,7 @@ def test_other_programs_find_units_and_origin(capsys, fitted, tmp_path):
 
 
 def test_deflections_leave_unloaded_readings_without_residual(capsys, tmp_path):
-    run = made(tmp_path / "d.hilcal", rehearsal("nothing").readings, WHOLE)
+    run = stored_readings(tmp_path / "d.hilcal", rehearsal("nothing").readings, covers=WHOLE)
     ok(capsys, "identify", run)
     ok(capsys, "export", run, "--residuals", tmp_path / "e.csv")
     with (tmp_path / "e.csv").open() as stream:
@@ -186,8 +177,8 @@ def test_a_parquet_file_that_cannot_be_readings_is_refused(capsys, tmp_path):
     import pyarrow
 
     path, run = tmp_path / "t.parquet", tmp_path / "run.hilcal"
-    made(tmp_path / "a.hilcal", rehearsal("nothing").readings)
-    ok(capsys, "export", tmp_path / "a.hilcal", "--readings", path)
+    first = stored_readings(tmp_path / "a.hilcal", rehearsal("nothing").readings)
+    ok(capsys, "export", first, "--readings", path)
     good = parquet.read_table(path)
     holed = good.set_column(3, "q1_rad", pyarrow.array([None, *good["q1_rad"].to_pylist()[1:]]))
     parquet.write_table(holed.rename_columns(good.column_names), tmp_path / "holed.parquet")

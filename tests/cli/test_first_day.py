@@ -324,7 +324,7 @@ def test_the_table_of_a_colleague_tells_the_same(day):
     # Each of these readings is a mean, and the cell states the noise of one measurement.
     one, mean = (measurement_noise(config, n).range_std[0] for n in (1, config.acquire.samples))
     assert "the noise is not what was stated" in refined.text
-    factor = refined.number(r"scale the covariance by ([\d.]+);")
+    factor = refined.number(r"scale the covariance by ([\d.]*\d)")
     with hc.Campaign.open(day.home / "theirs.hilcal", read_only=True) as run:
         repeats = hc.diagnose(run.fit()).pure_error
     low, high = chi2.ppf([0.001, 0.999], repeats.dof) / repeats.dof  # they tell the factor

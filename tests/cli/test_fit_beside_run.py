@@ -10,25 +10,23 @@ import numpy as np
 import pytest
 
 import hilcal as hc
-from hilcal.config import load_config
 from hilcal.errors import InputError
-from hilcal.readings.covariance import COVERS, WHOLE
+from hilcal.readings.covariance import WHOLE
 from hilcal.store import rows, schema
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.revision import STORED, fitted_to, from_text, to_text
 from hilcal.store.rows import content_hash
 from tests.support.appending import again, appending
-from tests.support.cli_cases import CELL, ok, refused, rehearsal
+from tests.support.cli_cases import CELL, ok, refused, rehearsal, stored_readings
 from tests.support.unguarded import unguarded
 
 
 @pytest.fixture(scope="module")
 def fresh(tmp_path_factory):
     """A campaign without revisions."""
-    path, config = tmp_path_factory.mktemp("fresh") / "run.hilcal", load_config(CELL).to_json()
-    with CampaignFile.create(path, config, str(CELL.parent), "made", more={COVERS: WHOLE}) as file:
-        file.append_readings(rehearsal("nothing", poses=8).readings)
-    return path.read_bytes()
+    path = tmp_path_factory.mktemp("fresh") / "run.hilcal"
+    readings = rehearsal("nothing", poses=8).readings
+    return stored_readings(path, readings, covers=WHOLE).read_bytes()
 
 
 @pytest.fixture(scope="module")

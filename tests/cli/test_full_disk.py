@@ -10,11 +10,9 @@ from pathlib import Path
 import pytest
 
 import hilcal as hc
-from hilcal.config import load_config
-from hilcal.readings.covariance import COVERS, WHOLE
-from hilcal.store.campaign_file import CampaignFile
+from hilcal.readings.covariance import WHOLE
 from hilcal.tables.table import write_table
-from tests.support.cli_cases import CELL, ok, rehearsal, run
+from tests.support.cli_cases import CELL, ok, rehearsal, run, stored_readings
 from tests.support.paths import ROOT
 from tests.support.rows import first
 
@@ -29,9 +27,7 @@ def fitted(tmp_path_factory):
     """A folder with a campaign of one revision, points and a table."""
     folder = tmp_path_factory.mktemp("full")
     readings = rehearsal("nothing").readings
-    path, config = folder / "run.hilcal", load_config(CELL).to_json()
-    with CampaignFile.create(path, config, str(CELL.parent), "made", more={COVERS: WHOLE}) as file:
-        file.append_readings(readings)
+    path = stored_readings(folder / "run.hilcal", readings, covers=WHOLE)
     with hc.Campaign.open(path) as opened:
         model = hc.baseline(opened.cell, opened.readings, "absolute")
         opened.append(hc.fit(model, opened.readings, "absolute"))

@@ -26,7 +26,7 @@ from hilcal.store.plan import Plan, Step
 from hilcal.store.run_log import RunLog, check_same_cell, create_run
 from hilcal.write_report import Asked, content_of
 from tests.support.campaigns import campaign, configuration
-from tests.support.cli_cases import CELL, ok, refused, rehearsal, table
+from tests.support.cli_cases import CELL, ok, refused, rehearsal, stored_readings, table
 from tests.unit.discovery.test_discover import campaign as simulated
 
 
@@ -173,12 +173,11 @@ def test_a_campaign_that_holds_nothing_yet(tmp_path, capsys):
 
 @pytest.fixture
 def run(tmp_path):
-    content = json.loads(configuration().to_json())
-    content["limits"]["accuracy_m"] = 2e-4
-    path = tmp_path / "my run.hilcal"
-    with CampaignFile.create(path, json.dumps(content), str(configs_dir() / "cells"), "x") as file:
-        file.append_readings(campaign("none", "deflection", poses=6).readings)
-    return path
+    config = configuration()
+    limits = config.limits.model_copy(update={"accuracy_m": 2e-4})
+    readings = campaign("none", "deflection", poses=6).readings
+    config = config.model_copy(update={"limits": limits})
+    return stored_readings(tmp_path / "my run.hilcal", readings, config)
 
 
 @pytest.mark.long

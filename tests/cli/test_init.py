@@ -102,19 +102,6 @@ def test_units_are_read_as_people_write_them(words, tmp_path, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("options", "poses"), [(OPTIONS, 6), (("--robot", "ur5e"), 6)], ids=["whole", "least"]
-)
-def test_the_file_is_planned_without_an_edit(options, poses, tmp_path, capsys):
-    path = tmp_path / "CELL.toml"
-    ok(capsys, "init", path, *options)
-    arguments = ("--poses", str(poses), "--quick", "--json")
-    d = ok(capsys, "plan", path, "-o", tmp_path / "plan.json", *arguments).document
-    assert d["efficiency"] > 0
-    assert (tmp_path / "plan.json").is_file()
-
-
-@pytest.mark.slow
 def test_the_steps_that_it_names(tmp_path, capsys):
     path, plan, out = (tmp_path / n for n in ("CELL.toml", "plan.json", "rehearsal.hilcal"))
     said = " ".join(ok(capsys, "init", path, "--robot", "ur3").out.split())

@@ -1,10 +1,7 @@
 """`next`, a further plan in the same campaign, and `demo --ambiguous`."""
 
-import os
 import re
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -24,27 +21,23 @@ from hilcal.effects.catalogue import installed
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
-from hilcal.robot.catalogue import configs_dir
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import REFERENCE, Plan, Step, joined, load_plan, with_new_names
 from hilcal.store.run_log import RunLog
 from hilcal.workbench.session import WorkbenchSession
 from tests.cli.test_until_goal import site
 from tests.support.campaigns import configuration
-from tests.support.cli_cases import CELL, ok, refused, table
+from tests.support.cli_cases import CELL, ok, refused, stored_readings, table
 from tests.support.next_cases import SMALL, doubtful
 from tests.unit.data.test_run_log import MADE, STEPS, _campaign, _reading
 from tests.unit.design.test_next import fine_error
 
 TILT, LINK, BASE = "joint_tilt_compliance", "link_compliance", "base_compliance"
-CELLS = str(configs_dir() / "cells")
 
 
 def stored(path, effect, seed):
     """Write a small campaign, as `hilcal import` would."""
-    with CampaignFile.create(path, SMALL.to_json(), CELLS, "a test", overwrite=True) as campaign:
-        campaign.append_readings(doubtful(effect, seed).rehearsal.readings)
-    return path
+    return stored_readings(path, doubtful(effect, seed).rehearsal.readings, SMALL)
 
 
 @pytest.fixture
@@ -125,9 +118,7 @@ def test_an_effect_that_was_added_in_doubt_is_in_doubt_still(ambiguous, tmp_path
 
 @pytest.mark.long
 def test_a_misfit_of_the_pose_alone_asks_for_new_poses(tmp_path, capsys):
-    path = tmp_path / "run.hilcal"
-    with CampaignFile.create(path, configuration().to_json(), CELLS, "a test") as campaign:
-        campaign.append_readings(fine_error()[1])
+    path = stored_readings(tmp_path / "run.hilcal", fine_error()[1], configuration())
     ok(capsys, "identify", path, "--readings", "absolute")
     plan = tmp_path / "next.json"
     result = ok(capsys, "next", path, "-o", plan, "--poses", "10", "--json")
@@ -157,35 +148,6 @@ def test_four_suspects_fit_one_screen(tmp_path, capsys, monkeypatch):
     for heading in ("Predicted standard uncertainty", "Comparison of criteria", "Sample-size"):
         assert heading in full
         assert heading not in brief
-
-
-@pytest.mark.long
-def test_named_suspects_need_no_diagnosis(tmp_path, capsys):
-    path = stored(tmp_path / "run.hilcal", "nothing", 1)
-    arguments = ("--suspects", f"{TILT},load_point", "--quick", "--poses", "3", "--json")
-    d = ok(capsys, "next", path, "-o", tmp_path / "n.json", *arguments).document
-    assert d["suspects"] == [TILT, "load_point"]
-    assert all(p > 0.5 for _, _, p in d["separates"])
-
-
-@pytest.mark.long
-def test_nothing_in_doubt_is_said_so(tmp_path, capsys):
-    plan = tmp_path / "next.json"
-    path = stored(tmp_path / "run.hilcal", "nothing", 1)
-    line = refused_after(capsys, "next", path, "-o", plan)
-    assert "the model is adequate" in line
-    assert "--after" in line
-    assert doubtful("sensor_misalignment", 1).suspects == ("sensor_misalignment",)
-    path = stored(tmp_path / "one.hilcal", "sensor_misalignment", 1)
-    line = refused_after(capsys, "next", path, "-o", plan)
-    assert "hilcal add" in line
-    assert not plan.exists()
-
-
-def refused_after(capsys, *arguments):
-    """The line of a refusal with exit 4, of a campaign that has its baseline."""
-    ok(capsys, "identify", arguments[1])
-    return refused(capsys, 4, *arguments)
 
 
 def test_pairs_that_nothing_separates_are_refused(tmp_path, capsys):
@@ -235,13 +197,6 @@ def test_the_demo_settles_a_doubt(tmp_path, capsys):
     assert 0 < int(told[1]) < int(told[2]) == len(readings)
     viewed = ok(capsys, "view", path, "--record", tmp_path / "demo.rrd", "--json").document
     assert viewed["revisions"] == [2, 3]
-
-
-@pytest.mark.slow
-def test_a_demo_without_devices_can_be_viewed(tmp_path, capsys):
-    path = tmp_path / "demo.hilcal"
-    ok(capsys, "demo", "--without-devices", "--hide", "nothing", "--poses", "6", "-o", path)
-    ok(capsys, "view", path, "--record", tmp_path / "demo.rrd", "--json")
 
 
 def rehearsal_of(seed, path):
@@ -358,35 +313,6 @@ def test_what_was_not_measured_before_is_given_up(tmp_path):
         assert log.plan.steps == (*STEPS[:3], *fitted.steps)
         assert log.plan.without(log.done()).steps == fitted.steps
         assert log.plan.pose_names == ("p1-2", "p7", "p1", "p2")
-
-
-_KILLED = """
-import os, sys
-from pathlib import Path
-from tests.cli.test_next_cli import made
-from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.run_log import RunLog
-with CampaignFile.open(Path(sys.argv[1])) as campaign:
-    log = RunLog(campaign)
-    log.append(log.with_new_names(made("p8", "p9")))
-    os._exit(9)
-"""
-
-
-@pytest.mark.long
-def test_an_appended_plan_survives_a_kill(tmp_path):
-    path = tmp_path / "run.hilcal"
-    _campaign(path).close()
-    search = str(ROOT)
-    child = subprocess.run(
-        [sys.executable, "-c", _KILLED, path],
-        env={**os.environ, "PYTHONPATH": search},
-        timeout=60,
-        check=False,
-    )
-    assert child.returncode == 9
-    with CampaignFile.open(path) as campaign:
-        assert RunLog(campaign).plans[1].pose_names == ("p8", "p9")
 
 
 # the command

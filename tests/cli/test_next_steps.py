@@ -30,22 +30,16 @@ def follow(capsys, said, step, **places):
     return ok(capsys, *chosen[1:])
 
 
-def imported(capsys, path, hidden="hysteresis", seed=1):
-    """A campaign without revisions, the name of which must be quoted."""
-    ok(
-        capsys,
-        "import",
-        table(path.with_suffix(".csv"), hidden, seed, 8),
-        "--config",
-        CELL,
-        "-o",
-        path,
-    )
+def imported(capsys, path, hidden="hysteresis", seed=1, poses=8):
+    """A campaign without revisions."""
+    csv = table(path.with_suffix(".csv"), hidden, seed, poses)
+    ok(capsys, "import", csv, "--config", CELL, "-o", path)
     return path
 
 
 @pytest.fixture
 def run(tmp_path, capsys):
+    """Its name must be quoted."""
     return imported(capsys, tmp_path / "a run.hilcal")
 
 
@@ -125,8 +119,7 @@ def test_deflections_lack_the_unloaded_arm(run, tmp_path, capsys):
 
 @pytest.mark.long
 def test_nothing_to_carry_over(run, tmp_path, capsys):
-    table(csv := tmp_path / "later.csv", "hysteresis", 1, 9)
-    ok(capsys, "import", csv, "--config", CELL, "-o", later := tmp_path / "later.hilcal")
+    later = imported(capsys, tmp_path / "later.hilcal", poses=9)
     ok(capsys, "identify", run, "--readings", "absolute", "--effects", "base_frame")
     said = refused(capsys, 4, "identify", later, "--prior", run)
     assert "run hilcal refine first" in said
@@ -163,8 +156,7 @@ def test_what_next_says(tmp_path, capsys):
 
 @pytest.mark.long
 def test_what_a_comparison_says(run, tmp_path, capsys):
-    table(csv := tmp_path / "later.csv", "creep", 1, 9)
-    ok(capsys, "import", csv, "--config", CELL, "-o", later := tmp_path / "later.hilcal")
+    later = imported(capsys, tmp_path / "later.hilcal", "creep", poses=9)
     ok(capsys, "identify", run)
     said = command(capsys, "compare", run, later).out
     follow(capsys, said, f"hilcal refine {later} --prior '{run}'")
@@ -305,7 +297,7 @@ TAKEN: dict[str, dict[str, str]] = {
     "present/story": {"run hilcal diagnose for a verdict": f"{RARE}what_a_recording_names",
         "run hilcal identify first": f"{RARE}what_a_recording_names"},
     "present/verdict": {
-        "hilcal next plans": "tests/cli/test_next_cli.py::test_next_in_json_and_in_words",
+        "Run hilcal next": "tests/cli/test_next_cli.py::test_next_in_json_and_in_words",
         "hilcal refine --readings absolute": f"{HERE}deflections_lack_the_unloaded_arm",
     },
     "present/viewer/live": {"`hilcal refine` does": f"{RARE}what_a_recording_names",

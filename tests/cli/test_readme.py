@@ -46,8 +46,12 @@ def test_the_blocks_are_one_cell(tmp_path):
     assert tomllib.loads(readme.cell())["tracker"]["driver"] == "geocom"
 
 
-def test_every_command_is_one_of_the_program():
-    used = {words[0] for words in readme.commands()}
+def test_every_command_and_option_is_one_of_the_program(capsys):
+    used = set()
+    for words in readme.commands(options=True):
+        shown = run(capsys, words[0], "--help").out
+        assert all(word in shown for word in words if word.startswith("--")), words
+        used.add(words[0])
     assert used <= set(COMMANDS)
     assert {"check", "plan", "run", "import", "identify", "refine", "next", "validate"} <= used
 

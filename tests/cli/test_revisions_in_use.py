@@ -4,8 +4,6 @@ import hashlib
 import re
 import subprocess
 import sys
-from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 
@@ -22,7 +20,6 @@ from tests.support.cli_cases import run as command
 from tests.support.paths import ROOT
 
 Capsys = pytest.CaptureFixture[str]
-Made = Callable[[Path, Capsys], str]
 BASE = ["base_frame", "joint_compliance"]
 
 
@@ -277,41 +274,6 @@ def test_what_is_said_of_an_accepted_revision_that_will_not_do_leads_on(
         assert o.in_use() == o.latest()
         assert o.fit().scaling == "gc"
         assert len(o.fit().readings) == len(o.readings)
-
-
-@pytest.mark.parametrize("asked", [
-    ("accept", "{run}"),
-    ("export", "{run}", "--urdf", "{out}/arm.urdf"),
-    ("report", "{run}", "-o", "{out}/r.html"),
-    ("compensate", "{run}", "{out}/points.csv"),
-    pytest.param(("next", "{run}", "-o", "{out}/p.json"), marks=pytest.mark.long),
-    ("view", "{run}", "--record", "{out}/v.rrd")], ids=lambda x: x[0])  # fmt: skip
-def test_every_step_that_is_named_leads_on(fresh, cell, tmp_path, capsys, asked):
-    """From a campaign without a fit: the step is taken until the command is done, or a plan is."""
-    run = tmp_path / "run.hilcal"
-    run.write_bytes(fresh)
-    (tmp_path / "points.csv").write_text(
-        "q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg\n0,-80,90,-90,-80,5\n"
-    )
-    arguments = [part.format(run=run, out=tmp_path) for part in asked]
-    said: list[str] = []
-    for _ in range(4):
-        result = command(capsys, *arguments)
-        if result.code == 0:
-            return
-        said.append(result.err.splitlines()[-1])
-        assert said.count(said[-1]) == 1, "the step changes nothing"
-        steps = re.findall(r"hilcal ([a-z]+)((?: (?!or |first|again)[^\s,;]+)*)", said[-1])
-        assert steps or "--allow-outside" in said[-1], said
-        if not steps:
-            arguments.append("--allow-outside")
-            continue
-        name, rest = steps[0]
-        rest = rest.replace("CELL.toml", str(cell)).replace("PLAN.json", f"{tmp_path}/p.json")
-        ok(capsys, name, *(rest.replace("RUN", str(run)).split() or [run]))
-        if name == "plan":
-            return
-    pytest.fail(f"no end: {said}")
 
 
 def test_what_cannot_be_accepted_is_refused(run, fresh, capsys):

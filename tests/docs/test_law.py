@@ -1,26 +1,12 @@
 """Formulas of docstrings as MathML: what is one, what is not, and what it looks like."""
 
-import importlib.util
 import re
-from types import ModuleType
 
 import pytest
 
-from tests.support.paths import ROOT
+from tests.support.hooks import hook
 
-
-def loaded() -> ModuleType:
-    """The module of the build; docs/hooks is no package."""
-    path = ROOT / "docs" / "hooks" / "law.py"
-    spec = importlib.util.spec_from_file_location("law", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-LAW = loaded()
+LAW = hook("law")
 
 
 def seen(markup: str) -> str:

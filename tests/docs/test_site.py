@@ -11,7 +11,6 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
-from html.parser import HTMLParser
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
@@ -23,6 +22,7 @@ from hilcal.cli.commands import COMMANDS
 from hilcal.config import reference
 from hilcal.effects.catalogue import BUILT_IN
 from tests.support.browser import DESKTOP, PHONE, needs_chromium, open_browser
+from tests.support.outline import Outline
 from tests.support.paths import ROOT
 
 pytestmark = pytest.mark.slow
@@ -31,33 +31,23 @@ pytest.importorskip("mkdocs", reason='no mkdocs found: pip install "hilcal[docs]
 NAMES = [name for name in hc.__all__ if not name.startswith("_")]
 
 
-class Parsed(HTMLParser):
-    """Links, loaded files, anchors and words of a page."""
+class Parsed(Outline):
+    """A page with its links, the files that it loads, and its anchors."""
 
     def __init__(self, text: str) -> None:
-        super().__init__()
-        self.links: list[str] = []
-        self.loaded: list[str] = []
-        self.anchors: set[str] = set()
-        self.words: list[str] = []
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        given = {key: value or "" for key, value in attrs}
-        self.anchors |= {given[key] for key in ("id", "name") if key in given}
-        if tag == "a" and "href" in given:
-            self.links.append(given["href"])
-        if tag == "link" and given.get("rel") not in ("prev", "next", "canonical"):
-            self.loaded.append(given["href"])
-        if tag in ("script", "img", "iframe", "source", "video") and given.get("src"):
-            self.loaded.append(given["src"])
-
-    def handle_data(self, data: str) -> None:
-        self.words.append(data)
-
-    @property
-    def text(self) -> str:
-        return " ".join("".join(self.words).split())
+        super().__init__(text)
+        self.links = [a["href"] for tag, a in self.found if tag == "a" and "href" in a]
+        self.anchors = {a[key] for _, a in self.found for key in ("id", "name") if key in a}
+        self.loaded = [
+            a["href"]
+            for tag, a in self.found
+            if tag == "link" and a.get("rel") not in ("prev", "next", "canonical")
+        ]
+        self.loaded += [
+            a["src"]
+            for tag, a in self.found
+            if tag in ("script", "img", "iframe", "source", "video") and a.get("src")
+        ]
 
 
 @pytest.fixture(scope="module")

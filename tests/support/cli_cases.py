@@ -13,8 +13,10 @@ import pytest
 from hilcal.cli import main
 from hilcal.config import CellConfig, load_config
 from hilcal.drivers.simulated.rehearsal import Rehearsal
-from hilcal.readings.covariance import WHOLE
+from hilcal.readings.covariance import COVERS, WHOLE
+from hilcal.readings.readings import Readings
 from hilcal.robot.catalogue import configs_dir
+from hilcal.store.campaign_file import CampaignFile
 from hilcal.tables.table import write_table
 from studies.__main__ import main as studies
 from studies.random_campaigns import rehearse
@@ -89,6 +91,18 @@ def start(*arguments: str | Path, **options: Any) -> "subprocess.Popen[str]":
 
 def rehearsal(hidden: str, seed: int = 1, poses: int = POSES) -> Rehearsal:
     return rehearse(load_config(CELL), hidden, seed, poses)
+
+
+def stored_readings(
+    path: Path, readings: Readings, config: CellConfig | None = None, covers: str | None = None
+) -> Path:
+    """Write a campaign file that holds readings alone; in the cell of the demo unless given."""
+    content, base_dir = (config or load_config(CELL)).to_json(), str(CELL.parent)
+    more = {} if covers is None else {COVERS: covers}
+    CampaignFile.create(
+        path, content, base_dir, "a test", overwrite=True, more=more, readings=readings
+    ).close()
+    return path
 
 
 def table(path: Path, hidden: str, seed: int = 1, poses: int = POSES) -> Path:

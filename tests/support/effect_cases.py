@@ -21,8 +21,6 @@ effect_class = installed().__getitem__
 ALL_NAMES = tuple(e.name for e in BUILT_IN if e.role != "observer")  # see test_observers
 NAMES = tuple(e.name for e in BUILT_IN if e.applies(cell_of()) and e.role != "observer")
 """Those that an arm without slides can have."""
-ELASTIC = tuple(e.name for e in BUILT_IN if e.elastic)
-FIELDS = ("dq", "twist", "base", "station", "target", "scale")
 
 
 def some_states(cell: Cell, count: int = 9, seed: int = 1) -> States:

@@ -1,6 +1,7 @@
 """A bench in memory: devices that share one small world, cell, plans, and a store."""
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -30,6 +31,7 @@ from hilcal.measuring.devices import (
     TrackerSample,
     WrenchSample,
 )
+from hilcal.measuring.progress import Remark
 from hilcal.measuring.run import run
 from hilcal.readings.readings import Readings
 from hilcal.robot import chain as chains
@@ -461,12 +463,50 @@ class Bench:
         self.clock = FakeClock(world=self.world)
 
 
+def before(device: Any, call: str, do: Callable[..., None]) -> None:
+    """Have something done before each call of a device, with what the call is given."""
+    real = getattr(device, call)
+
+    def first(*given: Any) -> Any:
+        do(*given)
+        return real(*given)
+
+    setattr(device, call, first)
+
+
+def changed(device: Any, call: str, by: Callable[[Any], Any]) -> None:
+    """Have something else returned by each call of a device, made of what it returns."""
+    real = getattr(device, call)
+    setattr(device, call, lambda *given: by(real(*given)))
+
+
+def asked_for(b: Bench) -> list[str]:
+    """Names of the loads that were asked for, in order."""
+    return [name for name, _ in b.operator.asked]
+
+
+def remarks(b: Bench, words: str = "") -> list[str]:
+    """Remarks that hold some words."""
+    return [note.text for note in b.notes.of(Remark) if words in note.text]
+
+
 def measure(b: Bench, plan: Plan | None = None, **more: Any) -> Readings:
     """Run a plan (the usual one if None) to its end; returns all readings."""
     run(b.rig, b.cell, b.config, plan or usual_plan(), b.store, b.clock, b.notes, **more)
     readings = b.store.readings()
     assert readings is not None
     return readings
+
+
+def interrupt(b: Bench, stored: int, plan: Plan | None = None, **more: Any) -> None:
+    """Kill a run when so many readings are stored, and start the program anew."""
+    b.world.kill_after = ("store.recorded", stored)
+    try:
+        measure(b, plan, **more)
+    except Killed:
+        b.world.again()
+    else:
+        raise AssertionError("the run came to its end")
 
 
 def rows(readings: Readings, load: str) -> Bools:

@@ -242,3 +242,11 @@ def unfilter(kind: int, line: np.ndarray, above: np.ndarray, step: int) -> np.nd
             guess = min((left, up, diagonal), key=lambda c: abs(p - c))
         done.append((value + guess) & 255)
     return np.array(done[step:], dtype=np.uint8)
+
+
+def contrast(a: Sequence[int], b: Sequence[int]) -> float:
+    """Ratio of relative luminances of two colours (0 to 255), as WCAG 2 defines it."""
+    c = np.array([a, b]) / 255.0
+    linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+    low, high = sorted(linear @ [0.2126, 0.7152, 0.0722] + 0.05)
+    return float(high / low)

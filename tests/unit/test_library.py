@@ -19,11 +19,10 @@ from hilcal.config import load_config
 from hilcal.config.reference import to_toml
 from hilcal.readings.covariance import WHOLE
 from hilcal.robot.catalogue import configs_dir
-from hilcal.store.campaign_file import CampaignFile
 from hilcal.tables.table import write_table
 from studies.change import measured
 from studies.random_campaigns import rehearse
-from tests.support.cli_cases import quickly_planned
+from tests.support.cli_cases import quickly_planned, stored_readings
 from tests.support.paths import ROOT
 
 CELL = configs_dir() / "cells" / "demo_ur10e.toml"
@@ -53,8 +52,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
         (run, readings),
         (later, measured(worn, loads, 4, np.random.default_rng(8))),
     ):
-        with CampaignFile.create(path, config.to_json(), str(CELL.parent), "test") as file:
-            file.append_readings(content)
+        stored_readings(path, content, config)
     cell = folder / "CELL.toml"
     cell.write_text(to_toml(quickly_planned(config)), encoding="utf-8")
     return SimpleNamespace(table=table, run=run, later=later, cell=cell, folder=folder)
@@ -141,16 +139,6 @@ def test_the_public_names_are_documented_and_typed() -> None:
         if inspect.isfunction(thing):
             signature = inspect.signature(thing)
             assert signature.return_annotation is not inspect.Signature.empty, name
-
-
-def test_fit_diagnosis_and_residuals_in_eight_lines(site: SimpleNamespace) -> None:
-    """What docs/how-to/use-the-library.md promises."""
-    with hc.Campaign.open(site.run) as run:
-        fit = hc.fit(hc.baseline(run.cell, run.readings), run.readings)
-        diagnosis = hc.diagnose(fit)
-        residuals = fit.residuals(frame="base")
-    assert diagnosis.suspects[0].effect == "joint_tilt_compliance"
-    assert residuals.shape == (40, 3)
 
 
 def test_wrong_words_are_refused_with_the_valid_ones(site: SimpleNamespace) -> None:

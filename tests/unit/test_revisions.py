@@ -2,11 +2,14 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.revisions import chain, restore, restore_model, to_record
+from hilcal.config import load_config
 from hilcal.diagnosis.document import to_json as diagnosis_json
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.drivers.simulated.rehearsal import Rehearsal
@@ -14,11 +17,13 @@ from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.fit_document import plain, to_json
+from hilcal.readings.covariance import WHOLE
 from hilcal.readings.whitening import usual_mode
 from hilcal.refinement import add
+from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.revision import RevisionRecord, from_text, to_text
 from hilcal.store.rows import content_hash
-from tests.support.cli_cases import rehearsal
+from tests.support.cli_cases import CELL, rehearsal, stored_readings
 
 
 def baseline_fit(r: Rehearsal) -> Fit:
@@ -71,11 +76,39 @@ def test_a_gross_error_stays_set_aside() -> None:
     assert gross["sigma"] > 50
 
 
-def test_other_readings_are_refused() -> None:
+def test_other_readings_are_refused(tmp_path: Path) -> None:
     r = rehearsal("nothing")
-    record = record_of(r, baseline_fit(r))
+    found = baseline_fit(r)
+    record = record_of(r, found)
     with pytest.raises(InputError, match="identify again"):
         restore(record, r.cell, r.readings[:-1])
+    moved = replace(r.readings, value=r.readings.value + 1e-6)
+    with Campaign.open(stored_readings(tmp_path / "run.hilcal", moved, r.config)) as run:
+        with pytest.raises(InputError, match="other readings"):
+            run.append(found)
+        assert run.latest() is None
+
+
+def test_a_file_that_cannot_be_used_is_closed_again(tmp_path: Path) -> None:
+    path = tmp_path / "empty.hilcal"
+    CampaignFile.create(path, load_config(CELL).to_json(), str(CELL.parent), "test").close()
+    with pytest.raises(InputError, match="no readings"):
+        Campaign.open(path)
+    path.unlink()
+
+
+def test_a_revision_is_found_again_on_a_machine_that_rounds_otherwise(tmp_path: Path) -> None:
+    """The arm's scatter in the covariances is computed, and its last bits differ."""
+    readings = rehearsal("nothing").readings
+    path = stored_readings(tmp_path / "run.hilcal", readings, covers=WHOLE)
+    with Campaign.open(path) as run:
+        run.append(fit(baseline(run.cell, run.readings, run.mode()), run.readings, run.mode()))
+        other = replace(run.readings, covariance=run.readings.covariance * (1 + 1e-15))
+        elsewhere = replace(run, readings=other)
+        np.testing.assert_allclose(elsewhere.fit().theta, run.fit().theta, rtol=1e-6, atol=1e-12)
+        run.file.append_readings(readings[:1])
+        with pytest.raises(InputError, match="before readings were appended"):
+            replace(run, readings=run.file.readings()).fit()
 
 
 def test_parameters_of_another_program_are_refused() -> None:

@@ -12,9 +12,11 @@ import numpy as np
 from hilcal.calibration.handover import origin_of
 from hilcal.calibration.own_files.chain_text import (
     LEFT,
+    TURNING,
     ChainPlace,
     Document,
     Edits,
+    LinkTree,
     Node,
     moved,
     not_between,
@@ -156,35 +158,11 @@ def sdf_chain(document: Document, base: str | None, tip: str | None) -> SdfModel
     if not models:
         raise InputError(f"{document.name}: no <model>; valid: an SDF with the arm")
     model = SdfModel(document, models[0])
-    leads = {model.ends(j)[1]: j for j in model.ordered() if model.ends(j)[0] != "world"}
-    turning = [j for j in leads.values() if j.attributes.get("type") in ("revolute", "continuous")]
-    if not turning:
-        raise InputError(f"{document.name}: no revolute joint; valid: an SDF with the arm")
-
-    def up(link: str) -> list[Node]:
-        out = []
-        while link in leads:
-            out.append(leads[link])
-            link = model.ends(leads[link])[0]
-        return out
-
-    used = {model.ends(j)[0] for j in leads.values()}
-    ends = [c for c in leads if c not in used and any(j in turning for j in up(c))]
-    for name in (base, tip):
-        if name is not None and (name not in model.nodes or model.nodes[name].tag != "link"):
-            valid = ", ".join(escaped(n) for n, node in model.nodes.items() if node.tag == "link")
-            raise InputError(f"{document.name}: no link '{escaped(name)}'; valid: {valid}")
-    if tip is None and len(ends) != 1:
-        raise InputError(
-            f"{document.name}: give --tip-link, the flange; its last links: {', '.join(ends)}"
-        )
-    joints = up(tip or ends[0])
-    if base is not None:
-        names = [model.ends(j)[0] for j in joints]
-        if base not in names:
-            raise InputError(f"{document.name}: no chain from '{base}' to '{tip or ends[0]}'")
-        joints = joints[: names.index(base) + 1]
-    model.chain = joints[::-1]
+    ends = {joint: model.ends(joint) for joint in model.joints}
+    leads = {child: (parent, j) for j, (parent, child) in ends.items() if parent != "world"}
+    back, model.chain = LinkTree(document, leads).chain(base, tip)
+    if back:
+        raise InputError(f"{document.name}: no chain from '{base}' down to its tip")
     model.steps = [_step(model, j) for j in model.chain]
     return model
 
@@ -204,7 +182,7 @@ def _step(model: SdfModel, joint: Node) -> ChainPlace:
     parent, child = model.ends(joint)
     place = se3.inverse(model.place(parent)) @ model.place(child)
     turn = None
-    if kind in ("revolute", "continuous"):
+    if kind in TURNING:
         xyz, other = model.axis(joint)
         along = model.document.numbers(xyz or joint, model.text(xyz) or "0 0 1", 3)
         along, at = model.document.direction(xyz or joint, along), model.place(name)

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from hilcal.calibration.programs.program import (
+    DECIMAL,
     JOINTS,
     UNSTATED,
     Language,
@@ -28,16 +29,14 @@ from hilcal.calibration.programs.program import (
     controller_frames,
     line_of,
     of_wpr,
-    read_text,
     to_wpr,
 )
 from hilcal.errors import InputError
 from hilcal.types import Floats, Ints
 
-_NUMBER = r"[ \t]*[-+]?(?:\d+\.?\d*|\.\d+)"
 _POSITION = re.compile(r'P\s*\[\s*(\d+)\s*(?::\s*"[^"]*"\s*)?\]\s*\{(.*?)\}\s*;', re.DOTALL)
 _GROUP = re.compile(r"GP1\s*:(.*?)(?=GP\d\s*:|\Z)", re.DOTALL)
-_FIELD = re.compile(rf"\b([XYZWPR]|[JE]\d)\s*=({_NUMBER})\s*(mm|deg)")
+_FIELD = re.compile(rf"\b([XYZWPR]|[JE]\d)\s*=([ \t]*{DECIMAL})\s*(mm|deg)")
 _FRAME, _TOOL = (re.compile(rf"\b{word}\s*:\s*(\w+)") for word in ("UF", "UT"))
 _CONFIG = re.compile(r"CONFIG\s*:\s*'([A-Z ]*)((?:,\s*-?\d+\s*)*)'")
 _MOTION = re.compile(r"^\s*\d*\s*:?\s*([JLCAS])\s+(?=P(R)?\s*\[)(.*)", re.DOTALL)
@@ -72,7 +71,7 @@ LS = Language(
 
 def read_ls(path: Path, frames_file: Path | None, tool: Floats | None) -> Program:
     """Read a program."""
-    reader = _FanucReader(path, controller_frames(frames_file, LS, tool), *read_text(path))
+    reader = _FanucReader(path, controller_frames(frames_file, LS, tool))
     begin = re.search(r"^/POS\b", reader.text, re.M)
     if begin is None or not re.search(r"^/MN\b", reader.text, re.M):
         raise InputError(f"{path.name}: no sections /MN and /POS; valid: a TP program as text")

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from hilcal.calibration.programs.program import (
+    DECIMAL,
     JOINTS,
     UNSTATED,
     Language,
@@ -25,14 +26,13 @@ from hilcal.calibration.programs.program import (
     Span,
     controller_frames,
     of_wpr,
-    read_text,
     to_wpr,
 )
 from hilcal.errors import InputError
 from hilcal.types import Floats, Ints
 
 _POINT = re.compile(r"^\s*(C|P|BC|BP|EC|EX)(\d+)\s*=\s*(.*?)\s*$", re.IGNORECASE)
-_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)")
+_NUMBER = re.compile(DECIMAL)
 _MOTION = re.compile(r"^\s*(MOV[JLCS]|IMOV)\s+(.*)$", re.IGNORECASE)
 _NAME = re.compile(r"\b([CP])(\d+)\b", re.IGNORECASE)
 _REFUSED = re.compile(r"^\s*(SFTON|MFRAME|CNVSET|SYSTART|REFP|SETTOOL)\b", re.IGNORECASE)
@@ -59,7 +59,7 @@ INFORM = Language(
 
 def read_jbi(path: Path, frames_file: Path | None, tool: Floats | None) -> Program:
     """Read a job."""
-    reader = _InformReader(path, controller_frames(frames_file, INFORM, tool), *read_text(path))
+    reader = _InformReader(path, controller_frames(frames_file, INFORM, tool))
     if "//POS" not in reader.text or "//INST" not in reader.text:
         raise InputError(f"{path.name}: no sections //POS and //INST; valid: a job as text")
     return reader.read()

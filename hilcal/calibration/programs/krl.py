@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from hilcal.calibration.programs.program import (
+    DECIMAL,
     JOINTS,
     UNSTATED,
     ControllerFrames,
@@ -41,9 +42,8 @@ from hilcal.types import Floats, Ints
 POSE, AXES, TURN = ("X", "Y", "Z", "A", "B", "C"), tuple(f"A{k}" for k in range(1, 7)), "T"
 OVERHEAD, ELBOW = 1, 2
 """Bits of S."""
-_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _FIELD = re.compile(
-    rf"\b([A-Za-z]\w*)\s+({_NUMBER}|'[BbHh][0-9A-Fa-f]+'|#\w+|\"[^\"]*\"|TRUE|FALSE)"
+    rf"\b([A-Za-z]\w*)\s+({DECIMAL}(?:[eE][-+]?\d+)?|'[BbHh][0-9A-Fa-f]+'|#\w+|\"[^\"]*\"|TRUE|FALSE)"
 )
 _TEXT = re.compile(r'"[^"]*"|;.*')
 _DATA = re.compile(
@@ -116,7 +116,8 @@ def read_krl(path: Path, frames_file: Path | None, tool: Floats | None) -> Progr
         texts = tuple(p.read_bytes().decode(encoding) for p in paths)
     config = frames_file is not None and frames_file.suffix.lower() == ".dat"
     known = controller_frames(None if config else frames_file, KRL, tool)
-    reader = _KrlReader(path, known, texts[0], encoding)
+    reader = _KrlReader(path, known)
+    reader.text, reader.encoding = texts[0], encoding
     reader.files = [p.name for p in paths]
     for k, text in enumerate(texts):
         reader.collect(text, k)
@@ -195,8 +196,8 @@ class _Block:
 class _KrlReader(ProgramReader):
     """Goes through the statements of a `.src` file in the order of its text."""
 
-    def __init__(self, path: Path, known: ControllerFrames, text: str, encoding: str):
-        super().__init__(path, known, text, encoding)
+    def __init__(self, path: Path, known: ControllerFrames):
+        super().__init__(path, known)
         self.files: list[str] = []
         self.data: dict[str, list[_Value]] = {}
         self.state = _State()

@@ -30,6 +30,8 @@ from hilcal.toml import Number, Section, load_section
 from hilcal.types import Floats, Ints
 
 JOINTS = 6
+DECIMAL = r"[-+]?(?:\d+\.?\d*|\.\d+)"
+"""Pattern of a number without exponent."""
 UNSTATED = -99
 """A flag of a configuration that is not stated."""
 SAME_M, SAME_RAD = 2e-9, 2e-9
@@ -331,9 +333,10 @@ def controller_frames(
 class ProgramReader:
     """What the readers of all makers do alike: they go through the text and take its points."""
 
-    def __init__(self, path: Path, known: ControllerFrames, text: str, encoding: str):
-        """Begin without points."""
-        self.path, self.known, self.text, self.encoding = path, known, text, encoding
+    def __init__(self, path: Path, known: ControllerFrames):
+        """Read the text; no point is taken yet."""
+        self.path, self.known = path, known
+        self.text, self.encoding = read_text(path)
         self.found: dict[str, ProgramPoint] = {}
         self.otherwise: dict[str, int] = {}
         """Points that statements use which are no motions to them, with the line."""

@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from hilcal.calibration.programs.program import (
+    DECIMAL,
     JOINTS,
     UNSTATED,
     Language,
@@ -68,7 +69,7 @@ _ASSIGNED = re.compile(r"\b([A-Za-z]\w*)(?:\.\w+|\{[^}]*\})*\s*:=")
 _NO_ASSIGNMENT = re.compile(r"(\b(CONST|PERS|VAR)\s[^;]*|\\\s*)$", re.IGNORECASE)
 _MADE = re.compile(r"^(Offs|RelTool)\s*\((.*)\)$", re.IGNORECASE | re.DOTALL)
 _NAME = re.compile(r"[A-Za-z]\w*")
-_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+_NUMBER = re.compile(rf"{DECIMAL}(?:[eE][-+]?\d+)?")
 _COMPUTED = "the point '{}' is computed while the program runs"
 
 
@@ -113,7 +114,7 @@ def read_rapid(path: Path, frames_file: Path | None, tool: Floats | None) -> Pro
     module = frames_file is not None and frames_file.suffix.lower() != ".toml"
     known = controller_frames(None if module else frames_file, RAPID, tool)
     more = read_text(frames_file)[0] if frames_file is not None and module else ""
-    return _RapidReader(path, known, *read_text(path)).read(more)
+    return _RapidReader(path, known).read(more)
 
 
 def _statements(text: str) -> list[tuple[int, str]]:

@@ -13,6 +13,7 @@ with needed_by("pages"):
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
     from plotly.offline import get_plotlyjs
+    from plotly.utils import PlotlyJSONEncoder
 
 from hilcal.names import escaped
 from hilcal.present import charts as style
@@ -40,14 +41,12 @@ class FirstScreen:
     cards: tuple[Card, ...]  # before and after
     limit: str = ""  # "PASSED" or "FAILED" and why; empty without a limit
     passed: bool | None = None  # whether the limit is kept; None without one
+    verdict: str | None = None  # of the diagnosis; None where nothing was diagnosed
 
 
 def render(title: str, about: str, first: FirstScreen, parts: tuple[PageSection, ...]) -> str:
     """Return a page of sections below a first screen; `about` is what it is of, in one line."""
-    looks = {
-        name: json.loads(json.dumps(style.template(dark).to_plotly_json(), default=_plain))
-        for name, dark in (("light", False), ("dark", True))
-    }
+    looks = {"light": style.template(dark=False), "dark": style.template(dark=True)}
     return (
         _environment()
         .get_template("page.html")
@@ -57,7 +56,7 @@ def render(title: str, about: str, first: FirstScreen, parts: tuple[PageSection,
             first=first,
             sections=[replace(s, blocks=captioned(s.blocks)) for s in parts],
             figure=_figure,
-            looks=Markup(in_script(json.dumps(looks))),  # noqa: S704  (escaped by in_script)
+            looks=Markup(in_script(json.dumps(looks, cls=PlotlyJSONEncoder))),  # noqa: S704  (escaped by in_script)
             config=Markup(in_script(json.dumps(style.CONFIG))),  # noqa: S704
             plotly=Markup(get_plotlyjs()),  # noqa: S704  (the library's own text)
             css=Markup((HERE / "style.css").read_text(encoding="utf-8")),  # noqa: S704
@@ -87,13 +86,6 @@ def _figure(chart: Chart) -> dict[str, object]:
         "says": says(chart.figure),
         "height": int(bare.layout.height),
     }
-
-
-def _plain(value: object) -> object:
-    to_json = getattr(value, "to_plotly_json", None)
-    if to_json is None:
-        raise TypeError(f"{type(value)} is no JSON")
-    return to_json()
 
 
 def _shown(value: object) -> object:

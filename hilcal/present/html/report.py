@@ -12,7 +12,7 @@ from hilcal.calibration.scatter import COVERAGE, budget
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.effect_ranking import LEAST_SHARE, Suspect
 from hilcal.diagnosis.noise import classes
-from hilcal.identification.family_sizes import family_sizes
+from hilcal.identification.background import family_sizes
 from hilcal.identification.fit import Fit
 from hilcal.identification.full_covariance import CovarianceParts
 from hilcal.identification.full_prediction import error_before, names
@@ -126,7 +126,9 @@ def first_screen(m: ReportContent) -> FirstScreen:
         ("Where is it wrong?", where_wrong(m)),
         ("What is missing?", _missing(m.diagnosis)),
     )
-    return FirstScreen(*_headline(m.diagnosis), answers, tuple(_cards(m)), *limit_words(m))
+    verdict = None if m.diagnosis is None else m.diagnosis.verdict
+    cards = tuple(_cards(m))
+    return FirstScreen(*_headline(m.diagnosis), answers, cards, *limit_words(m), verdict)
 
 
 def _headline(d: Diagnosis | None) -> tuple[str, str]:
@@ -182,7 +184,7 @@ def _missing(d: Diagnosis | None) -> str:
         return "Not judged; hilcal identify --scaling gc, then hilcal diagnose, say it."
     if d.verdict == "adequate":
         return "Nothing that these readings could show."
-    words = numbers.sentence(message(d), d.significant)
+    words = message(d)
     if d.lead is None or d.wrong_figures:
         return words
     name = d.lead.coarse or d.lead.effect
@@ -353,10 +355,10 @@ def _by_load(m: ReportContent) -> Table:
     heads = ("load", "n", "rms", "largest", "at pose", *limit)
     out = table(*heads, caption="Error of poses left out, by load")
     for k in np.unique(kept.load):
-        mine = np.flatnonzero(kept.load == k)
-        worst = mine[int(np.argmax(error[mine]))]
-        rms, most = (length(float(x)) for x in (np.sqrt(np.mean(error[mine] ** 2)), error[worst]))
-        row = [load_name(fit.readings.load_names[k]), str(len(mine)), rms, most]
+        under = np.flatnonzero(kept.load == k)
+        worst = under[int(np.argmax(error[under]))]
+        rms, most = (length(float(x)) for x in (np.sqrt(np.mean(error[under] ** 2)), error[worst]))
+        row = [load_name(fit.readings.load_names[k]), str(len(under)), rms, most]
         row.append(fit.readings.pose_names[kept.pose[worst]])
         if m.limit_m is not None:
             row.append("kept" if error[worst] <= m.limit_m else "over")
@@ -491,7 +493,7 @@ def _evidence(m: ReportContent) -> PageSection:
         return PageSection("evidence", title, (words,))
     parts: list[Block] = []
     if d.verdict == "adequate":  # else the first screen has it
-        parts.append(numbers.sentence(message(d)))
+        parts.append(message(d))
     parts.append(_suspects_table(d.suspects[:MOST_LISTED], "Suspects, best first"))
     parts += [*doubtful(d), *redundant_line(d)]
     parts += _added_variables(d, [s for s in d.suspects if s.passes][:MOST_CURVES])

@@ -5,6 +5,6 @@ from hilcal.optional import needed_by
 with needed_by("the viewer"):
     import rerun  # noqa: F401 - all modules here need it
 
-from hilcal.present.viewer.campaign import Served, record, save, serve
+from hilcal.present.viewer.campaign import save, serve
 
-__all__ = ["Served", "record", "save", "serve"]
+__all__ = ["save", "serve"]

@@ -2,7 +2,6 @@
 
 import contextlib
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -21,6 +20,7 @@ from hilcal.present.story import (
     Story,
     StoryRevision,
     levels,
+    round_factor,
     worst_and_even,
 )
 from hilcal.present.viewer import recording, style
@@ -73,23 +73,6 @@ it, over the recorded variable that carries most of it; *Details* names both axe
 """
 
 
-@dataclass(frozen=True, slots=True)
-class Served:
-    """A recording that viewers can open at `url` for as long as it is served."""
-
-    url: str
-
-
-def record(story: Story, *sinks: recording.Sink) -> rr.RecordingStream:
-    """Send a story to sinks, flushed after each revision; they end when the stream is dropped."""
-    rec = _opened(story)
-    rec.set_sinks(*sinks)
-    # Active, too: a viewer that has shown another recording would keep the layout of that one.
-    rec.send_blueprint(blueprint(story), make_active=True, make_default=True)
-    tell(rec, story)
-    return rec
-
-
 def save(story: Story, path: Path) -> None:
     """Write a story as a recording file, whole or not at all; an existing file is replaced.
 
@@ -102,10 +85,11 @@ def save(story: Story, path: Path) -> None:
 
 
 @contextlib.contextmanager
-def serve(story: Story, ip: str = "127.0.0.1", port: int = PORT) -> Iterator[Served]:
-    """Serve a story to viewers until the block ends; viewers may join late and rejoin.
+def serve(story: Story, ip: str = "127.0.0.1", port: int = PORT) -> Iterator[str]:
+    """Serve a story at the address that is yielded until the block ends.
 
-    The operator opens `rerun <url>`. The viewer's analytics are switched off for this user.
+    Viewers, as `rerun ADDRESS`, may join late and rejoin; their analytics are switched off for
+    this user.
 
     Raises:
         InputError: the port is taken.
@@ -118,11 +102,15 @@ def serve(story: Story, ip: str = "127.0.0.1", port: int = PORT) -> Iterator[Ser
     except (OSError, OverflowError) as error:
         raise InputError(f"{at}: {error}; choose a free port of this machine") from error
     try:
-        rec = record(story, rr.GrpcServerSink(bind_ip=ip, port=port))
+        rec = _opened(story)
+        rec.set_sinks(rr.GrpcServerSink(bind_ip=ip, port=port))
+        # Active, too: a viewer that has shown another recording would keep the layout of that one.
+        rec.send_blueprint(blueprint(story), make_active=True, make_default=True)
+        tell(rec, story)
     except (OSError, RuntimeError) as error:
         raise HilcalError(f"{at}: {error}") from error
     try:
-        yield Served(f"rerun+http://{ip}:{port}/proxy")
+        yield f"rerun+http://{ip}:{port}/proxy"
     finally:
         rec.disconnect()
 
@@ -240,7 +228,7 @@ def _view3d(story: Story, name: str, without: str) -> rrb.Spatial3DView:
     far = [worst(r) for r in story.revisions]
     stands = story.bodies[story.row[far], :, :3, 3].reshape(-1, 3)
     points = np.vstack([story.anchor, stands, story.anchor[far] + _LABEL_ABOVE])
-    middle, size = style.center(story.anchor, story.arm.reach)
+    middle, size = style.center(story.anchor, 0.3 * story.arm.reach)
     place = style.near(middle, style.EYE * size, points)
     contents = ["+ $origin/**", f"- $origin/{without}/**", "- $origin/live/**"]
     return style.view3d("world", name, place, middle, contents)
@@ -293,9 +281,10 @@ def _pose_bars(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
     """Log the worst reading of each pose, or of a few, in σ, one series per level."""
     _, left, width, height = _bar_places(story, r)
     for i, name in enumerate(style.LEVEL_NAMES):
-        mine = levels(height**2) == i
-        some = mine if mine.any() else np.arange(len(height)) == 0  # else a bar without a height
-        color, tall = style.LEVEL_COLORS[i].tolist(), np.where(mine, height, 0.0)[some]
+        members = levels(height**2) == i
+        # a level without members has a bar without a height
+        some = members if members.any() else np.arange(len(height)) == 0
+        color, tall = style.LEVEL_COLORS[i].tolist(), np.where(members, height, 0.0)[some]
         bar = rr.BarChart(tall, abscissa=left[some], widths=width[some], color=color)
         rec.log(f"bars/{name}", bar)
 
@@ -378,14 +367,14 @@ def log_line(story: Story, r: StoryRevision) -> str:
 def residual_scale(story: Story) -> float:
     """Return the m that are drawn per m of residual."""
     sigma = float(np.sqrt(np.median(np.trace(story.covariance, axis1=1, axis2=2)) / 3))
-    return style.nice(SIGMA_LENGTH / sigma) if sigma > 0 else 1.0
+    return round_factor(SIGMA_LENGTH / sigma, style.FACTORS) if sigma > 0 else 1.0
 
 
 def deflection_scale(story: Story) -> float:
     """Return the m that are drawn per m of deflection."""
     moved = np.linalg.norm(story.deviation(story.measured), axis=1)
     typical = float(np.quantile(moved, 0.95))
-    return style.nice(DEFLECTION_LENGTH / typical) if typical > 0 else 1.0
+    return round_factor(DEFLECTION_LENGTH / typical, style.FACTORS) if typical > 0 else 1.0
 
 
 def noise_balls(story: Story, rows: Ints) -> tuple[Floats, Floats]:
@@ -419,22 +408,9 @@ def _scene(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
     """Log one revision at the recording's current time: arrows, balls, the arm at its worst."""
     far, drawn, balls = worst(r), shown(story, r), balled(story, r)
     style.stand(rec, story.bodies[story.row[far]])
-    level = r.level[drawn]
-    arrows_ = rr.Arrows3D(
-        origins=story.anchor[drawn],
-        vectors=arrows(story, r, drawn),
-        colors=style.LEVEL_COLORS[level],
-        radii=np.where(level > 0, 0.0055, 0.0035),
-    )
-    rec.log("world/residual/arrows", arrows_)
-    half, quaternions = noise_balls(story, balls)
-    noise = rr.Ellipsoids3D(
-        centers=story.anchor[balls],
-        half_sizes=half,
-        quaternions=quaternions,
-        colors=[(*style.NOISE, 46)],
-        fill_mode="solid",
-    )
+    of = story.anchor[drawn], arrows(story, r, drawn), r.level[drawn]
+    rec.log("world/residual/arrows", style.residual_arrows(*of))
+    noise = style.noise_balls(story.anchor[balls], *noise_balls(story, balls))
     rec.log("world/residual/noise", noise)
     at, words = story.anchor[far], f"worst: pose {story.pose_name(far)}, {_words(story, r, far)}"
     rec.log("world/residual/worst", style.labels([at + _LABEL_ABOVE], [words]))

@@ -73,10 +73,10 @@ class DrawnType:
 def drawn_type(t: "Pooled", members: "tuple[Member, ...]") -> DrawnType:
     """Derive what the views of a type need."""
     names, arms = [p.parameter for p in t.parameters], list(t.arms)
-    mine = [m for m in members if m.type == t.type and m.name in t.campaigns]
-    mine.sort(key=lambda m: (arms.index(m.arm), seconds_of(m.date)))
-    campaigns = np.full((len(mine), len(names)), np.nan)
-    for row, m in zip(campaigns, mine, strict=True):
+    of_type = [m for m in members if m.type == t.type and m.name in t.campaigns]
+    of_type.sort(key=lambda m: (arms.index(m.arm), seconds_of(m.date)))
+    campaigns = np.full((len(of_type), len(names)), np.nan)
+    for row, m in zip(campaigns, of_type, strict=True):
         p = m.posterior
         for name, value, std in zip(p.names, p.mean, p.std, strict=True):
             if name in names and np.isfinite(std):
@@ -88,8 +88,8 @@ def drawn_type(t: "Pooled", members: "tuple[Member, ...]") -> DrawnType:
     n = len(t.prior.links) - 1  # an arm that has the links of the type, and nothing else
     none, wide, joints = np.zeros(n), np.full(n, np.inf), tuple(f"j{k + 1}" for k in range(n))
     arm = Arm(t.type, t.prior.links, none, np.zeros((n, 3)), -wide, wide, wide, 0.0, joints, "")
-    owner = tuple(arms.index(m.arm) for m in mine)
-    return DrawnType(t, arm, odd, owner, np.array([seconds_of(m.date) for m in mine]), campaigns)
+    owner = tuple(arms.index(m.arm) for m in of_type)
+    return DrawnType(t, arm, odd, owner, np.array([seconds_of(m.date) for m in of_type]), campaigns)
 
 
 def places(d: DrawnType) -> Floats:
@@ -160,15 +160,15 @@ def _drift(rec: rr.RecordingStream, path: str, d: DrawnType) -> None:
     owner = np.array(d.owner)
     for k in _rows(d):
         for a, arm in enumerate(d.pooled.arms):
-            mine = (owner == a) & np.isfinite(d.campaigns[:, k])
-            if not mine.any():
+            known = (owner == a) & np.isfinite(d.campaigns[:, k])
+            if not known.any():
                 continue
             odd = bool(d.odd[a, k])
             entity = f"{path}/{k}/{'zunlike' if odd else 'like'}/{a}"
             color, width = (style.RED, 3.0) if odd else (style.GREY, 1.2)
             fixed(rec, entity, *style.series(arm, color, width, 2 * width))
-            time = rr.TimeColumn("date", timestamp=d.seconds[mine])
-            along(rec, entity, time, rr.Scalars.columns(scalars=d.campaigns[mine, k]))
+            time = rr.TimeColumn("date", timestamp=d.seconds[known])
+            along(rec, entity, time, rr.Scalars.columns(scalars=d.campaigns[known, k]))
 
 
 def record_fleet(fleet: "Fleet", path: Path) -> None:

@@ -218,7 +218,7 @@ def live_blueprint(d: LiveTally, world: str, series: str) -> rrb.Blueprint:
     ever, now = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()
     every = archetypes.VisibleTimeRanges(timeline=TIMELINE, start=ever, end=now)
     of = "Residual of each reading," if d.group == 1 else f"Worst of every {d.group} residuals,"
-    middle, size = style.center(d.targets, d.measured.arm.reach)
+    middle, size = style.center(d.targets, 0.3 * d.measured.arm.reach)
     points = np.vstack([d.targets, d.bodies[0, :, :3, 3]])
     scene = style.view3d(
         "world",
@@ -385,10 +385,13 @@ class LiveScene:
         if arrows:
             rec.log(f"{self._world}/arrows", _arrows(arrows))
         if balls:
-            rec.log(f"{self._world}/balls", _balls(balls))
+            rec.log(f"{self._world}/balls", style.noise_balls(balls, [[BALL] * 3] * len(balls)))
         if now and d.group > 1:  # the last reading, drawn until the next one comes
             rec.log(f"{self._world}/now/arrow", _arrows(now))
-            rec.log(f"{self._world}/now/ball", _balls([at for at, *_ in now]))
+            rec.log(
+                f"{self._world}/now/ball",
+                style.noise_balls([at for at, *_ in now], [[BALL] * 3] * len(now)),
+            )
         if d.judged > before and not (self._batches and before):
             rec.log(f"{self._series}/limit", rr.Scalars(LIMIT))
         target, _, worst = max(read, key=lambda r: -1.0 if r[2] is None else r[2].norm2)
@@ -424,15 +427,7 @@ class LiveScene:
 
 def _arrows(of: Sequence[tuple[Floats, Floats, int]]) -> rr.Arrows3D:
     """Return arrows that begin at places, m, with their levels."""
-    starts, vectors, levels = zip(*of, strict=True)
-    colors = [style.LEVEL_COLORS[level] for level in levels]
-    radii = [0.0055 if level else 0.0035 for level in levels]
-    return rr.Arrows3D(origins=starts, vectors=vectors, colors=colors, radii=radii)
-
-
-def _balls(at: Sequence[Floats]) -> rr.Ellipsoids3D:
-    size, color = [(BALL, BALL, BALL)] * len(at), [(*style.NOISE, 46)]
-    return rr.Ellipsoids3D(centers=at, half_sizes=size, colors=color, fill_mode="solid")
+    return style.residual_arrows(*zip(*of, strict=True))
 
 
 def follow(messages: BinaryIO, reply: Callable[..., None], record: Path, port: int) -> None:

@@ -17,7 +17,7 @@ from hilcal.design.run_order import pace, timeline
 from hilcal.design.summary import PlanSummary
 from hilcal.errors import InputError
 from hilcal.measuring.clearance import TRACKER_UNKNOWN as NO_TRACKER
-from hilcal.measuring.clearance import Clearance, LineOfSight, clearance_of, sight_of
+from hilcal.measuring.clearance import Clearance, LineOfSight
 from hilcal.measuring.route import route
 from hilcal.present import plan as plan_blocks
 from hilcal.present.document import Block, Words, heading, load_name, pairs, table
@@ -110,11 +110,11 @@ class PlanView:
     @cached_property
     def shapes(self) -> Clearance:
         """Shapes of arm, tool, obstacles and loads, as collisions are checked."""
-        return clearance_of(self.cell, self.config)
+        return Clearance(self.cell, self.config)
 
     @cached_property
     def _view(self) -> LineOfSight | None:
-        return sight_of(self.shapes)
+        return self.shapes.sight
 
     @property
     def tracker(self) -> Floats | None:
@@ -122,14 +122,10 @@ class PlanView:
         return None if self._view is None else self._view.tracker
 
     @cached_property
-    def loads(self) -> tuple[str, ...]:
-        """Names of the loads, in the order in which they are hung."""
-        return self.plan.loads
-
-    @cached_property
     def load(self) -> Ints:
-        """(S,) index into `loads`."""
-        return np.array([self.loads.index(s.load) for s in self.plan.steps], dtype=np.int64)
+        """(S,) index into the loads of the plan."""
+        names = self.plan.loads
+        return np.array([names.index(s.load) for s in self.plan.steps], dtype=np.int64)
 
     @cached_property
     def pose(self) -> Ints:
@@ -163,7 +159,7 @@ class PlanView:
         if self._view is None:
             return np.full(len(self), UNKNOWN)
         free = np.zeros(len(self), dtype=np.bool_)
-        for k, name in enumerate(self.loads):
+        for k, name in enumerate(self.plan.loads):
             free[self.load == k] = self._view.free(self.q[self.load == k], name)
         angle, most = self.incidence, self.config.sight.incidence_max_rad
         turned = np.zeros(len(self), dtype=np.bool_) if angle is None else angle > most
@@ -178,7 +174,7 @@ class PlanView:
         """Return why the target is not seen at a step; empty where it is."""
         if self._view is None or self.sight[step] == SEEN:
             return ""
-        q, load = self.q[step : step + 1], self.loads[self.load[step]]
+        q, load = self.q[step : step + 1], self.plan.loads[self.load[step]]
         problems = self._view.problems(q, load, "")
         if words := "; ".join(line.removeprefix(": ") for line in problems):
             return words
@@ -229,9 +225,9 @@ class PlanView:
     @cached_property
     def colors(self) -> "np.ndarray[tuple[int, ...], np.dtype[np.uint8]]":
         """(L, 3) a colour of each load; beyond seven, the same again and darker."""
-        hung = [name for name in self.loads if name != UNLOADED]
+        hung = [name for name in self.plan.loads if name != UNLOADED]
         rgb = {n: _LOADS[k % 7] * _FADED ** (k // 7) for k, n in enumerate(hung)}
-        each = [rgb.get(n, np.array(_UNLOADED)) for n in self.loads]
+        each = [rgb.get(n, np.array(_UNLOADED)) for n in self.plan.loads]
         return np.array(each).round().astype(np.uint8)
 
 
@@ -371,7 +367,7 @@ def _loads(rec: rr.RecordingStream, d: PlanView) -> None:
     forces = {x.name: np.array(x.force_N) for x in d.config.loads}
     most = max((float(np.linalg.norm(f)) for f in forces.values()), default=0.0)
     hook = chains.evaluate(d.cell.arm, d.q).point(d.cell.load_point)
-    for k, (name, color) in enumerate(zip(d.loads, d.colors, strict=True)):
+    for k, (name, color) in enumerate(zip(d.plan.loads, d.colors, strict=True)):
         steps = np.flatnonzero(d.load == k)
         hung = d.shapes.segments(d.q[steps], name)
         force = forces.get(name, np.zeros(3))
@@ -483,7 +479,7 @@ def _schedule(rec: rr.RecordingStream, d: PlanView) -> None:
     """Send the minute of each reading along `step`, one series per load; load changes are jumps."""
     series = [
         (f"load{k}", load_name(name), d.load == k, tuple(d.colors[k]), "circle", _DOT)
-        for k, name in enumerate(d.loads)
+        for k, name in enumerate(d.plan.loads)
     ]
     if d.unseen.any():
         name = "not seen by the tracker"
@@ -503,12 +499,11 @@ def _schedule(rec: rr.RecordingStream, d: PlanView) -> None:
 
 def blueprint(d: PlanView) -> rrb.Blueprint:
     """Left: 3-D over the schedule. Right: the plan in words over its tables."""
-    points, turn = [np.zeros((1, 3)), d.target], float(np.deg2rad(-52.0))
+    points, turn = [d.target], float(np.deg2rad(-52.0))
     if d.tracker is not None:  # a far one counts less
         far = float(np.linalg.norm(d.tracker))
         points.append((d.tracker * min(1.0, 1.6 * d.reach / max(far, 1e-9)))[None])
-    lo, hi = np.vstack(points).min(0), np.vstack(points).max(0)
-    middle, size = (lo + hi) / 2, max(float(np.linalg.norm(hi - lo)) / 2, 0.35 * d.reach)
+    middle, size = style.center(np.vstack(points), 0.35 * d.reach)
     if d.tracker is not None:  # look across the beam
         beam = d.tracker - middle
         turn = float(np.arctan2(beam[1], beam[0]) - np.deg2rad(62.0))

@@ -20,7 +20,6 @@ from hilcal.whole_file import replace_file
 APPLICATION = "hilcal"
 _FLUSH_TIMEOUT = 10.0
 _LOG = logging.getLogger(__name__)
-Sink = rr.FileSink | rr.GrpcServerSink
 
 
 def bind(ip: str, port: int) -> None:

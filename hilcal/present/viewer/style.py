@@ -1,6 +1,5 @@
 """What all views share: colours, shapes of the arm, labels, words as markdown, frames and eyes."""
 
-import math
 import re
 from collections.abc import Iterable, Sequence
 from typing import Any, Literal
@@ -12,6 +11,7 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from hilcal.config import Obstacle
+from hilcal.measuring.clearance import holds
 from hilcal.present import story
 from hilcal.present.document import Block, Chart, Items, Table, Words, says
 from hilcal.present.viewer.recording import along, fixed
@@ -43,7 +43,7 @@ EYE = np.array([1.05, -1.35, 0.55])
 BACKGROUND = rrb.Background(color=(22, 24, 29), kind=rrb.BackgroundKind.SolidColor)
 GRID = rrb.LineGrid3D(visible=True, spacing=0.25, stroke_width=0.7, color=(120, 124, 132, 70))
 
-_NICE = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)
+FACTORS = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)  # by which lengths are enlarged, times 10^k
 # Greek letters and these signs are in the viewer's fonts; a missing glyph ends the viewer.
 _SIGNS = "■●▲→µ²³±×√Δ✓✗⚠°"
 _BARS = str.maketrans("", "", "▁▂▃▄▅▆▇█")  # of tables on a terminal; not in the viewer's fonts
@@ -67,14 +67,6 @@ def safe(text: str) -> str:
 def escaped(text: str) -> str:
     """Text made safe, on one line, and without any meaning in markdown."""
     return _MARKDOWN.sub(r"\\\1", safe(" ".join(text.translate(_BARS).split())))
-
-
-def nice(value: float) -> float:
-    """Largest of 1, 1.5, 2, 3, 4, 5, 6, 8 times a power of ten that is at most `value`."""
-    if not (math.isfinite(value) and value > 0):
-        return 1.0
-    power = 10.0 ** math.floor(math.log10(value))
-    return float(max(f for f in _NICE if f * power <= value * (1 + 1e-9)) * power)
 
 
 def markdown(blocks: Iterable[Block]) -> str:
@@ -173,6 +165,19 @@ def _arrays(of: Shapes) -> tuple[Floats, Floats, Floats, "np.ndarray[Any, np.dty
     return start, end, radius, np.array(colors, dtype=np.uint8)
 
 
+def residual_arrows(at: Any, vectors: Any, level: Any) -> rr.Arrows3D:
+    """Return residuals at places (K, 3) in the colours of their levels (K,), outside ones bold."""
+    of = np.asarray(level)
+    colors, radii = LEVEL_COLORS[of], np.where(of > 0, 0.0055, 0.0035)
+    return rr.Arrows3D(origins=at, vectors=vectors, colors=colors, radii=radii)
+
+
+def noise_balls(at: Any, half: Any, turn: Floats | None = None) -> rr.Ellipsoids3D:
+    """Return balls at places (K, 3) with half axes (K, 3), m, turned by quaternions (K, 4)."""
+    shape = {"centers": at, "half_sizes": half, "quaternions": turn}
+    return rr.Ellipsoids3D(**shape, colors=[(*NOISE, 46)], fill_mode="solid")
+
+
 class MovingArm:
     """The arm with its targets as one entity, so that a place of it is one small message."""
 
@@ -203,8 +208,8 @@ class MovingArm:
 def log_shapes(rec: rr.RecordingStream, of: Shapes) -> None:
     """Log the shapes of every body at `world/arm/bodyI`."""
     for i in sorted({p.body for p, _ in of}):
-        mine = _arrays([shape for shape in of if shape[0].body == i])
-        fixed(rec, f"world/arm/body{i}", drawn_capsules(*mine))
+        of_body = _arrays([shape for shape in of if shape[0].body == i])
+        fixed(rec, f"world/arm/body{i}", drawn_capsules(*of_body))
 
 
 def quaternions_of(rotation: Floats) -> Floats:
@@ -250,15 +255,9 @@ def hidden(eye: Floats, points: Floats, things: tuple[Obstacle, ...]) -> Bools:
     """Return (K,) which of the points (K, 3) an obstacle hides from an eye (3,), m."""
     at = eye + _SAMPLES[:, None] * (points - eye)[:, None]
     out = np.zeros(len(points), dtype=np.bool_)
-    for x in things:
-        if x.center_m is not None and x.size_m is not None:
-            off = np.abs(at - np.array(x.center_m)) <= 0.5 * np.array(x.size_m)
-            out |= off.all(axis=2).any(axis=1)
-        elif x.bottom_m is not None and x.radius_m is not None and x.height_m is not None:
-            off = at - np.array(x.bottom_m)
-            inside = np.hypot(off[..., 0], off[..., 1]) <= x.radius_m
-            out |= (inside & (off[..., 2] >= 0.0) & (off[..., 2] <= x.height_m)).any(axis=1)
-    return np.asarray(out)
+    for thing in things:
+        out |= holds(thing, at).any(axis=1)
+    return out
 
 
 def direction(
@@ -283,11 +282,11 @@ def in_view(eye: Floats, look: Floats, points: Floats) -> Bools:
     return np.asarray((depth > 0.0) & (upright < half) & (np.abs(way @ right) < _ASPECT * half))
 
 
-def center(points: Floats, reach: float) -> tuple[Floats, float]:
-    """Middle of points (K, 3) and the origin, and half their size: where the eye looks, m."""
+def center(points: Floats, least: float) -> tuple[Floats, float]:
+    """Middle of points (K, 3) and the origin, and half their size, at least so much, m."""
     points = np.vstack([points, np.zeros((1, 3))])
     lo, hi = points.min(0), points.max(0)
-    return (lo + hi) / 2, max(float(np.linalg.norm(hi - lo)) / 2, 0.3 * reach)
+    return (lo + hi) / 2, max(float(np.linalg.norm(hi - lo)) / 2, least)
 
 
 def near(look: Floats, way: Floats, points: Floats) -> Floats:

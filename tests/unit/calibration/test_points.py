@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from hilcal.calibration.points import on_branch, read_points
-from hilcal.calibration.urscript import movej_program, program_points, waypoints, with_joints
+from hilcal.calibration.urscript import movej_program, program_points, waypoints
 from hilcal.errors import InputError
 from hilcal.robot import se3
 from hilcal.robot.catalogue import load_arm
@@ -22,16 +22,6 @@ LOADS = {"10kg": np.array([0.0, 0.0, -98.0665, 0.0, 0.0, 0.0])}
 Q = np.array([[0.1, -1.2, 1.5, -1.0, -1.4, 0.3], [0.3, -1.1, 1.4, -0.9, -1.5, 0.4]])
 TOOL = se3.matrix(se3.rotation(np.array([0.1, 0.2, -0.3])), np.array([0.05, 0.0, 0.12]))
 JOINTS = "q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad"
-PROGRAM = """def prog():
-  set_tcp(p[0,0,0.1,0,0,0])
-  global A_p=p[.1,-.5,.3,0,3.14,0]
-  global A_q=[-1.6, -1.7, -2.0, -.8, 1.6, 0]
-  movej([0,-1.57,1.57,0,1.57,0], a=1.4, v=1.05) # movej([1,2,3,4,5,6])
-  movej(get_inverse_kin(A_p, qnear=A_q), a=1.3)
-  textmsg("movel(p[1,2,3,4,5,6])")
-  movel(A_p, a=1.2, v=0.25, r=0.01)
-end
-"""
 
 
 def written(tmp_path: Path, text: str, name: str = "p.csv") -> Path:
@@ -199,26 +189,6 @@ def test_tables_that_cannot_be_used_are_refused(
     with pytest.raises(InputError) as error:
         read_points(written(tmp_path, given), ARM, LOADS)
     check(case, str(error.value).replace(f"{tmp_path}/", ""))
-
-
-def test_waypoints_of_a_program_are_found_and_replaced(tmp_path: Path) -> None:
-    text, found, p, tool = program_points(written(tmp_path, PROGRAM, "p.script"))
-    assert [w.line for w in found] == [5, 6, 8]
-    assert tool is not None
-    np.testing.assert_allclose(tool[:3, 3], [0, 0, 0.1])
-    np.testing.assert_allclose(p.q[0], [0, -1.57, 1.57, 0, 1.57, 0])
-    np.testing.assert_allclose(p.q[1], [-1.6, -1.7, -2.0, -0.8, 1.6, 0])
-    assert np.isnan(p.q[2]).all()
-    assert p.wanted is not None
-    assert np.isnan(p.wanted[0]).all()
-    np.testing.assert_allclose(p.wanted[2, :3, 3], [0.1, -0.5, 0.3])
-    new = np.arange(18.0).reshape(3, 6)
-    again = with_joints(text, found, new)
-    assert "  movej([6.000000000, 7.000000000" in again
-    assert "11.000000000], a=1.3)" in again
-    assert "17.000000000], a=1.2, v=0.25, r=0.01)" in again
-    assert again.count("textmsg") == again.count("# movej([1,2,3,4,5,6])") == 1
-    np.testing.assert_allclose([w.q for w in waypoints(again)], new)
 
 
 def test_a_program_of_moves_has_them_as_waypoints() -> None:

@@ -152,12 +152,6 @@ def test_json_round_trip(target, mass, loads, joint_std, base):  # type: ignore[
     assert CellConfig.from_json(config.to_json()) == config
 
 
-def test_a_configuration_cannot_be_changed(tmp_path):
-    config = load(tmp_path, ROBOT)
-    with pytest.raises(ValueError, match="frozen"):
-        config.tool.mass_kg = 1.0
-
-
 LOAD = '[[loads]]\nname = "a"\nmass_kg = 1.0\n'
 
 
@@ -179,7 +173,10 @@ def test_what_is_not_toml_is_told_by_its_place(tmp_path, text, place):
 
 
 @pytest.mark.parametrize(("text", "message"), [
-    ('[robot]\nmodel = "ur11"\n', r'unknown robot "ur11".*valid: .*ur10, ur10e, ur12e, ur15'),
+    (
+        '[robot]\nmodel = "ur11"\n',
+        r'unknown robot "ur11" \(did you mean "ur1.*valid: .*ur10, ur10e, ur12e, ur15',
+    ),
     ('[robot]\nmodel = "none.urdf"\n', r"none\.urdf: No such file"),
     ('[robot]\nmodel = "none.toml"\n', r"none\.toml: no such file"),
     (ROBOT + "base_link = 'a'\n", r'base_link = "a" is only for a URDF'),
@@ -253,24 +250,6 @@ incidence_max_rad = 0.7
 clearance_m = 0.02
 """
 )
-
-
-def test_defaults(tmp_path):
-    config = load(tmp_path, ROBOT)
-    planning, sight = config.planning, config.sight
-    assert planning.model == ("joint_compliance",)
-    assert (planning.readings, planning.against, planning.criterion) == (
-        "deflection",
-        "catalogue",
-        None,
-    )
-    assert planning.work_q_rad == ()
-    assert planning.work_min_m is planning.work_max_m is planning.reading_s is None
-    assert (planning.work_load, planning.load_change_s) == ("none", 60.0)
-    assert (planning.candidates, planning.singularity) == (2000, 0.05)
-    assert config.obstacles == ()
-    assert sight.tracker_m is sight.target_normal is None
-    assert (sight.incidence_max_rad, sight.clearance_m) == (0.5, 0.03)
 
 
 def test_everything_is_taken_over_and_written_back(tmp_path):

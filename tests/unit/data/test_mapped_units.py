@@ -162,7 +162,8 @@ def test_correlations(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("convention", "order"), [("kuka", "ZYX"), ("fanuc", "xyz"), ("kawasaki", "ZYZ")]
+    ("convention", "order"),
+    [("kuka", "ZYX"), ("fanuc", "xyz"), ("kawasaki", "ZYZ"), ("staubli", "XYZ")],
 )
 def test_standard_deviations_of_angles_turn_into_those_of_rotations(convention, order, tmp_path):
     """Against the spread of rotations whose angles scatter."""

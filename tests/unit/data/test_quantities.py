@@ -22,15 +22,14 @@ from tests.support.campaigns import cell_of
 
 
 @pytest.mark.parametrize(
-    ("text", "metres"), [("0.1 mm", 1e-4), ("100um", 1e-4), ("100 µm", 1e-4), (" 2e-3 m ", 2e-3)]
+    ("parse", "text", "number"),
+    [
+        *((parse_length, text, 1e-4) for text in ("0.1 mm", "100um", "100 µm", " 1e-4 m ")),
+        *((parse_duration, text, 5400) for text in ("90 min", "1.5h", "5400 s")),
+    ],
 )
-def test_a_length(text, metres):
-    assert math.isclose(parse_length(text, "--limit"), metres)
-
-
-@pytest.mark.parametrize(("text", "seconds"), [("90 min", 5400), ("1.5h", 5400), ("20 s", 20)])
-def test_a_duration(text, seconds):
-    assert math.isclose(parse_duration(text, "--max-time"), seconds)
+def test_a_length_or_a_duration(parse, text, number):
+    assert math.isclose(parse(text, "--option"), number)
 
 
 @pytest.mark.parametrize(
@@ -209,18 +208,6 @@ def test_a_table_without_the_column(tmp_path):
         read_table(path, cell_of().arm, NOISE, targets=NAMES)
 
 
-@pytest.mark.parametrize(("old", "new", "message"), [
-    ('name = "R2"', 'name = "R1"', r'two \[\[tool.targets\]\] have the name "R1"'),
-    ("[[tool.targets]]", "[tool]\ntarget_m = [0, 0, 0]\n[[tool.targets]]", "target_m together"),
-    ("[0.06, 0.02, 0.12]", "[60.0, 20.0, 120.0]", r"over 5 m off the flange; is it in m"),
-    ('name = "R2"', 'nam = "R2"', r'has no key "nam"')])  # fmt: skip
-def test_wrong_targets(tmp_path, old, new, message):
-    (tmp_path / "cell.toml").write_text(CELL.replace(old, new, 1))
-    with pytest.raises(InputError, match=message) as raised:
-        Cell.load(tmp_path / "cell.toml")
-    assert "\n" not in str(raised.value)
-
-
 LOADS = 3
 NOISE_M = 5e-6
 
@@ -270,12 +257,8 @@ def test_a_copy_is_known_whatever_it_went_through(m):
     )
     assert already(copy, r).all()
     assert already(r, copy).all()
-
-
-def test_positions_alone_are_compared_with_positions():
-    r = campaign(6)
-    alone = replace(r, value=r.value[:, :3], covariance=r.covariance[:, :3, :3])
-    assert already(alone, r).all()
+    positions = replace(r, value=r.value[:, :3], covariance=r.covariance[:, :3, :3])
+    assert already(positions, r).all()
 
 
 def test_what_was_measured_again_is_another_reading():

@@ -1,11 +1,7 @@
 """What a run writes: readings with their details, steps exactly once, events, durable."""
 
 import gc
-import os
 import sqlite3
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -95,52 +91,6 @@ def test_a_full_database_stores_all_or_nothing(tmp_path):
         assert campaign.n_readings == len(RunLog(campaign).done()) == stored
 
 
-_FILL = """
-import resource, sys
-from pathlib import Path
-from tests.unit.data.test_run_log import _reading
-from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.plan import Step
-from hilcal.store.run_log import RunLog
-from hilcal.errors import DeviceError
-path = Path(sys.argv[1])
-with CampaignFile.open(path) as campaign:
-    log = RunLog(campaign)
-    limit = path.stat().st_size + 8192
-    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
-    try:
-        for k in range(100):
-            step = Step("p1", "none", k)
-            log.record(_reading(step), step, {"filler": "x" * 300})
-            print(k, flush=True)
-    except DeviceError as error:
-        print(error, file=sys.stderr)
-        sys.exit(error.exit_code)
-"""
-
-
-def test_a_write_that_the_system_refuses_loses_nothing(tmp_path):
-    """A file-size limit of the process: writes fail in the system, as on a full disk."""
-    path = tmp_path / "run.hilcal"
-    _campaign(path).close()
-    root = Path(__file__).resolve().parents[3]
-    done = subprocess.run(
-        [sys.executable, "-c", _FILL, path],
-        cwd=root,
-        env={**os.environ, "PYTHONPATH": str(root)},
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-    assert done.returncode == 3
-    assert "make room on the disk" in done.stderr
-    stored = len(done.stdout.split())
-    assert stored > 0
-    with CampaignFile.open(path) as campaign:
-        assert campaign.n_readings == len(RunLog(campaign).done()) == stored
-
-
 names = st.text(min_size=1, max_size=6).filter(lambda name: escaped(name) == name)
 
 
@@ -159,33 +109,29 @@ def test_a_plan_is_read_back_as_written(poses, rows, angle):
     assert again.about == {"note": 1}
 
 
+def edited(old, new):
+    return MADE.to_json().replace(old, new, 1)
+
+
 @pytest.mark.parametrize(("text", "message"), [
     ("{", "not JSON"),
     ("[]", "not a plan"),
     ('{"format": "hilcal-plan", "version": 9}', "version 9"),
     ('{"format": "hilcal-plan", "version": 1, "poses": []}', '"poses" must be a list'),
+    (edited('"name": "p2"', '"name": "p1"'), "two poses have the name 'p1'"),
+    (edited('"pose": "p3"', '"pose": "p9"'), "there is no pose 'p9'"),
+    (edited('"load": "5kg"', '"load": 5'), "load 5 must be a name"),
+    (edited('"cycle": 0', '"cycle": -1'), "must be a whole number"),
+    (edited('"load": "5kg"', '"load": "none"'), "are the same"),
+    (edited('"cycle": 0', '"cycel": 0'), 'must have "pose" and "load"'),
+    (edited("0.1,", '"a",'), "finite numbers"),
 ])  # fmt: skip
-def test_what_is_not_a_plan_is_refused_in_one_line(text, message):
-    with pytest.raises(InputError, match=message) as raised:
-        read_plan(text, "p.json")
-    assert "\n" not in str(raised.value)
-
-
-@pytest.mark.parametrize(("old", "new", "message"), [
-    ('"name": "p2"', '"name": "p1"', "two poses have the name 'p1'"),
-    ('"pose": "p3"', '"pose": "p9"', "there is no pose 'p9'"),
-    ('"load": "5kg"', '"load": 5', "load 5 must be a name"),
-    ('"cycle": 0', '"cycle": -1', "must be a whole number"),
-    ('"load": "5kg"', '"load": "none"', "are the same"),
-    ('"cycle": 0', '"cycel": 0', 'must have "pose" and "load"'),
-    ("0.1,", '"a",', "finite numbers")])  # fmt: skip
-def test_a_wrong_edit_of_a_plan_is_named(tmp_path, old, new, message):
+def test_what_is_not_a_plan_is_refused_in_one_line(tmp_path, text, message):
     path = tmp_path / "plan.json"
-    path.write_text(MADE.to_json().replace(old, new, 1))
-    with pytest.raises(InputError, match=message) as raised:
+    path.write_text(text)
+    with pytest.raises(InputError, match=rf"plan\.json.*{message}") as raised:
         load_plan(path)
     assert "\n" not in str(raised.value)
-    assert "plan.json" in str(raised.value)
 
 
 def test_a_missing_plan_names_the_command(tmp_path):

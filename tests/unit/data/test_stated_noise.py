@@ -134,15 +134,6 @@ def test_repeatability_is_added_to_an_imported_table(table, tmp_path, capsys):
     assert "[repeatability]" in ok(capsys, "identify", run, "--details").out
 
 
-def test_what_was_exported_is_not_added_again(table, tmp_path, capsys):
-    first, again, out = tmp_path / "a.hilcal", tmp_path / "b.hilcal", tmp_path / "out.csv"
-    ok(capsys, "import", table, "--config", CELL, "-o", first)
-    ok(capsys, "export", first, "--table", out)
-    told = ok(capsys, "import", out, "--config", CELL, "-o", again, "--json").document
-    assert told["covariance"] == "instrument and arm as stated"
-    np.testing.assert_allclose(covariances(again)[1], covariances(first)[1], rtol=1e-9)
-
-
 def test_the_cell_may_say_that_tables_include_it(table, tmp_path, capsys):
     cell, run = tmp_path / "cell.toml", tmp_path / "run.hilcal"
     text = CELL.read_text(encoding="utf-8")

@@ -50,21 +50,14 @@ def test_it_is_the_first_order_covariance_of_azimuth_elevation_and_range():
     )
 
 
-def test_pose_covariance_adds_the_rotation_block():
-    p = np.array([[1.0, 2.0, 3.0], [0.0, -1.0, 0.0]])
-    cov = tracker_covariance(p, NOISE, m=6)
-    np.testing.assert_array_equal(cov[:, :3, :3], tracker_covariance(p, NOISE))
-    np.testing.assert_array_equal(cov[:, 3:, 3:], np.tile(1e-8 * np.eye(3), (2, 1, 1)))
-    assert not cov[:, :3, 3:].any()
-
-
 def test_what_no_instrument_has_is_refused():
-    with pytest.raises(InputError, match="range_std = -1"):
-        TrackerNoise(-1.0, 0.0, 1e-5, 0.0)
-    with pytest.raises(InputError, match="transverse_std"):
-        TrackerNoise(1e-5, 0.0, 0.0, 0.0)
-    with pytest.raises(InputError, match="orientation_std = nan"):
-        TrackerNoise(1e-5, 0.0, 1e-5, 0.0, float("nan"))
+    for figures, words in (
+        ((-1.0, 0.0, 1e-5, 0.0), "range_std = -1"),
+        ((1e-5, 0.0, 0.0, 0.0), "transverse_std"),
+        ((1e-5, 0.0, 1e-5, 0.0, float("nan")), "orientation_std = nan"),
+    ):
+        with pytest.raises(InputError, match=words):
+            TrackerNoise(*figures)
     with pytest.raises(InputError, match="reading 2 lies at the tracker's station"):
         tracker_covariance(np.array([[1.0, 0, 0], [1.0, 1, 1]]), NOISE, (1.0, 1.0, 1.0))
     with pytest.raises(InputError, match="orientation_std is 0"):
@@ -158,11 +151,6 @@ def test_gu_divides_by_the_standard_deviations(seed, k):
     white = (inverse_root(v, "gu") @ eps[:, :, None])[:, :, 0]
     std = np.sqrt(np.stack([np.diag(one) for one in v]))
     np.testing.assert_allclose(white, eps / std, rtol=1e-14)
-
-
-def test_none_leaves_everything_as_it_is():
-    v = spd(np.random.default_rng(0), 2, 6)
-    np.testing.assert_array_equal(inverse_root(v, "none"), np.tile(np.eye(6), (2, 1, 1)))
 
 
 def estimate(factor, a, y):

@@ -221,14 +221,14 @@ def test_what_was_ambiguous_is_decided() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("effect", [TILT, LINK, "base_compliance"])
 def test_most_doubts_are_settled(effect: str) -> None:
-    """Of the first ten campaigns those with a doubt; the hidden effect leads alone after it."""
-    seeds = [s for s in range(1, 11) if len(doubtful(effect, s).suspects) > 1]
+    """Of the first twenty campaigns those with a doubt; the hidden effect leads alone after it."""
+    seeds = [s for s in range(1, 21) if len(doubtful(effect, s).suspects) > 1]
     assert len(seeds) >= 3
     alone = []
     for seed in seeds:
         d, _ = settled(doubtful(effect, seed))
         alone.append(d.suspects[0].effect == effect and not d.suspects[0].same_as)
-    print(f"\n{effect}: in doubt {len(seeds)} of 10, settled {sum(alone)}")
+    print(f"\n{effect}: in doubt {len(seeds)} of 20, settled {sum(alone)}")
     assert np.mean(alone) >= 0.75
 
 

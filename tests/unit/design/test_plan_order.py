@@ -1,7 +1,6 @@
 """The order of a plan: all readings, each load once, clear motions, little time, random time."""
 
 from collections import Counter
-from dataclasses import replace
 from functools import cache
 from itertools import combinations, pairwise
 
@@ -15,7 +14,7 @@ from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig
 from hilcal.design import tour
 from hilcal.design.run_order import Chosen, Ordered, Ordering, order_plan, pace, timeline
-from hilcal.errors import CannotAnswerError, InputError
+from hilcal.errors import CannotAnswerError
 from hilcal.measuring.route import dry_run, route
 from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step
 from hilcal.types import Bools, Floats
@@ -282,28 +281,6 @@ def test_a_pose_that_is_not_reached_is_named() -> None:
     world.free[LOADS[1]][:, 4] = False
     with pytest.raises(CannotAnswerError, match=f"pose p4 .* under {LOADS[1]}"):
         world.ordered(everything(world), 0)
-
-
-@pytest.mark.parametrize(
-    ("chosen", "words"),
-    [
-        ([], "no reading is chosen"),
-        ([Chosen("p9", (UNLOADED,))], "no pose 'p9'"),
-        ([Chosen("p0", ("lead",))], "valid: .*none"),
-        ([Chosen("p0", (UNLOADED, UNLOADED))], "pose 'p0': loads"),
-        ([Chosen("p0", (UNLOADED,), 0)], "count 0"),
-    ],
-)
-def test_wrong_choices_are_refused(chosen: list[Chosen], words: str) -> None:
-    with pytest.raises(InputError, match=words):
-        World(3, 0.0, 0).ordered(chosen, 0)
-
-
-def test_wrong_settings_are_refused() -> None:
-    world = World(3, 0.0, 0)
-    for how in (replace(Ordering(), slack=-0.1), replace(Ordering(), reference_every_s=0.0)):
-        with pytest.raises(InputError, match="valid: 0 or more"):
-            world.ordered(everything(world), 0, how)
 
 
 def _held_karp(w: Floats) -> float:

@@ -147,16 +147,6 @@ def test_a_common_factor_has_no_direction(mode):
 # --- the rule -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("factor", [0.5, 2.0])
-def test_repeats_that_scatter_as_much_blame_the_noise(mode, factor):
-    r = Repeated(mode, 8)
-    f = r.fit(with_noise(r.clean, np.random.default_rng(0), factor))
-    verdict = judge_noise(f, pure_error(f), False)
-    assert verdict.misjudged
-    assert verdict.reason == "repeats"
-
-
 def test_repeats_that_scatter_less_blame_the_model():
     r = Repeated("absolute", 10, effect="encoder_offset")
     f = r.fit(with_noise(r.clean, np.random.default_rng(0), 2.0))
@@ -164,21 +154,3 @@ def test_repeats_that_scatter_less_blame_the_model():
     assert verdict.off
     assert not verdict.misjudged
     assert verdict.reason == "lack_of_fit"
-
-
-def test_without_repeats_it_cannot_be_known():
-    r = Repeated("absolute", 12, cycles=1, missing=0.0)
-    f = r.fit(with_noise(r.clean, np.random.default_rng(0), 2.0))
-    assert pure_error(f) is None
-    verdict = judge_noise(f, None, False)
-    assert verdict.misjudged
-    assert verdict.reason == "unknown"
-    assert not judge_noise(f, None, True).misjudged
-
-
-def test_right_noise_is_not_blamed():
-    r = Repeated("absolute", 8)
-    f = r.fit(with_noise(r.clean, np.random.default_rng(0)))
-    verdict = judge_noise(f, pure_error(f), True)
-    assert not verdict.off
-    assert not verdict.misjudged

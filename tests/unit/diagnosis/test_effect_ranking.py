@@ -8,7 +8,6 @@ import pytest
 from hilcal.config import load_config
 from hilcal.diagnosis.document import suspect_json
 from hilcal.diagnosis.effect_ranking import (
-    LEAST_KEPT,
     beyond_geometry,
     candidates,
     geometry_columns,
@@ -112,18 +111,6 @@ def test_true_effects_keep_their_promise(effect: str) -> None:
     assert kept_by_refit(found, add(found, effect), s.score) == pytest.approx(1.0, abs=0.15)
 
 
-def test_a_refit_that_changes_nothing_keeps_nothing() -> None:
-    c = campaign("joint_tilt_compliance", "deflection", 1)
-    found = fitted(c)
-    p = linearise(found)
-    (e,) = (e for e in candidates(found) if e.name == "joint_tilt_compliance")
-    (s,) = rank_suspects(p, [e], refit=lambda before, effect: before)
-    assert s.keeps
-    assert kept_by_refit(found, found, s.score) == 0.0
-    far = replace(s.score, step=100 * s.score.step)
-    assert kept_by_step(p, effect_columns(found, e), far) < LEAST_KEPT
-
-
 POSES = 30
 
 
@@ -151,14 +138,14 @@ def test_a_stiff_arm_with_a_wrong_geometry_is_not_compliant() -> None:
         geometry = geometry_columns(p, effects)
         for e in effects:
             if e.name in elastic:
-                assert not beyond_geometry(p, effect_columns(found, e), geometry, 3.0), e.name
+                assert not beyond_geometry(p, effect_columns(found, e), geometry), e.name
 
 
 def test_gravity_tells_of_a_compliant_arm() -> None:
     found = without_loads(0, stiff=False)
     p, effects = linearise(found), candidates(found)
     (e,) = (e for e in effects if e.name == "joint_compliance")
-    assert beyond_geometry(p, effect_columns(found, e), geometry_columns(p, effects), 3.0)
+    assert beyond_geometry(p, effect_columns(found, e), geometry_columns(p, effects))
     assert "joint_compliance" in {s.effect for s in rank_suspects(p, effects) if s.passes}
 
 
@@ -169,21 +156,6 @@ def test_it_is_named_in_absolute_readings(seed: int) -> None:
     assert d.verdict == "missing_effect"
     assert d.suspects[0].effect == "joint_coupling"
     assert d.suspects[0].same_as == ()
-
-
-def test_deflections_do_not_show_it() -> None:
-    """Ten times the noise in positions cancels: the same commanded angles stand on both sides."""
-    c = campaign("joint_coupling", "absolute", 1, poses=20, strength=10.0)
-    d = diagnose(fitted(replace(c, mode="deflection")))
-    assert "joint_coupling" not in d.significant
-    assert d.verdict == "adequate"
-
-
-@pytest.mark.parametrize("effect", ["encoder_offset", "transmission_error"])
-def test_others_are_not_taken_for_it(effect: str) -> None:
-    c = campaign(effect, "absolute", 1, poses=30, strength=2.0)
-    d = diagnose(fitted(c))
-    assert d.suspects[0].effect == effect
 
 
 EACH = "joint_compliance(joints=each)"
@@ -208,7 +180,7 @@ def test_the_verdict_is_to_let_joints_differ(arm, joints):
     assert d.significant[0] == EACH
     lead = d.suspects[0]
     assert lead.share > 0.95
-    assert message(d).startswith(f"let joints differ: {EACH} explains")
+    assert message(d).startswith(f"Let joints differ: {EACH} explains")
     assert suspect_json(lead)["finer_than"] == "joint_compliance"
     assert list(finer(d)) == [
         "Let joints differ: joint_compliance has one parameter for several joints; to give each "

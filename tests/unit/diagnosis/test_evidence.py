@@ -8,17 +8,14 @@ import pytest
 from scipy.stats import chi2, multivariate_normal
 
 from hilcal.config import load_config
-from hilcal.diagnosis import residual_regression as regression
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.document import to_json
 from hilcal.diagnosis.effect_ranking import candidates, most, rank_suspects, unloaded_readings
 from hilcal.diagnosis.evidence import (
-    insufficiency,
     spoken_against,
     whole_catalogue,
 )
 from hilcal.diagnosis.noise import MISFIT_ALARM
-from hilcal.diagnosis.residual_regression import Regressions, residual_regression
 from hilcal.diagnosis.stepwise import add
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification import effect_columns as columns_module
@@ -28,7 +25,7 @@ from hilcal.identification.drift import carried_effects, evidence_of_carried
 from hilcal.identification.effect_columns import columns_of_each, effect_columns
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.gauss_newton import whitened_jacobian
-from hilcal.identification.linearisation import Linearisation, linearise
+from hilcal.identification.linearisation import linearise
 from hilcal.identification.posterior import Posterior
 from hilcal.identification.priors import names_of
 from hilcal.present.verdict import message
@@ -123,24 +120,6 @@ def test_noise_that_repeats_show_is_not_an_unknown_effect() -> None:
     assert d.verdict in ("missing_effect", "ambiguous")
 
 
-def test_no_refit_is_made_where_algebra_leaves_noise_and_at_most_two_elsewhere() -> None:
-    made: list[str] = []
-
-    def counted(before: Fit, effect: str) -> Fit:
-        made.append(effect)
-        return add(before, effect)
-
-    explained = studied("deflection", "link_compliance")
-    _, square, dof = whole_catalogue(explained)
-    assert chi2.sf(square, dof) >= MISFIT_ALARM
-    assert insufficiency(explained, counted) is None
-    assert made == []
-    unknown = insufficiency(studied("absolute", "swaying bench"), counted)
-    assert unknown is not None
-    assert unknown.effects[: unknown.refitted] == tuple(made)
-    assert 1 <= len(made) <= 2
-
-
 def test_a_fit_that_is_not_quite_at_rest_credits_no_effect_with_its_own_step() -> None:
     at_rest = studied("absolute")
     s = at_rest.solution
@@ -194,27 +173,6 @@ def test_scores_of_a_catalogue_are_those_of_each_effect_by_itself(shared: Fit) -
         assert together.log_evidence == pytest.approx(score.log_evidence, rel=1e-9, abs=1e-9)
         assert together.gain == pytest.approx(score.gain, rel=1e-9, abs=1e-9)
         assert together.p_value == pytest.approx(score.p_value, rel=1e-6)
-
-
-def test_the_residual_of_a_fit_is_regressed_once(
-    shared: Fit, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    alone = residual_regression(linearise(shared))
-    grown: list[float] = []
-    trees = regression.tree_share
-
-    def counted(p: Linearisation, beyond: float) -> float:
-        grown.append(beyond)
-        return trees(p, beyond)
-
-    monkeypatch.setattr(regression, "tree_share", counted)
-    made = Regressions()
-    first = made.of(linearise(shared))
-    assert (first.share, len(first.dependences)) == (alone.share, len(alone.dependences))
-    assert made.of(linearise(shared)) is first
-    assert made.tree_share(linearise(shared), 0.5) == made.tree_share(linearise(shared), 0.5)
-    assert len(grown) == len(set(grown))
-    assert 0.5 in grown
 
 
 HIDDEN = "joint_tilt_compliance"

@@ -10,6 +10,7 @@ from hilcal.identification.effect_columns import effect_columns
 from hilcal.identification.fit import Fit
 from hilcal.identification.linearisation import linearise
 from hilcal.present.diagnosis import could_have_been_seen
+from hilcal.regression.evidence import spectrum
 from tests.support.campaigns import campaign
 from tests.support.diagnosis_cases import fitted
 
@@ -30,7 +31,9 @@ def test_a_family_is_seen_from_where_poses_left_out_show_it_and_not_finer_than_p
     (s,) = rank_suspects(p, [e])
     of = effect_columns(f, e)
     units = tuple(q.unit for q in e.parameters)
-    alone = least_strength(p.information(of.white), of.motion, of.scale, units, f.dof, 1.0, 1e-3)
+    known = p.information(of.white)
+    rank = spectrum(known).rank
+    alone = least_strength(known, of.motion, of.scale, units, f.dof, 1.0, 1e-3, rank)
     assert s.least.visible
     assert s.least.displacement_m > alone.displacement_m
     assert s.least.finest_m == np.inf

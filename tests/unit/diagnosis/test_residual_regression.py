@@ -96,21 +96,17 @@ def right(name: str, found: ResidualRegression) -> bool:
     return bool({v.variable for v in found.dependences[:2]} & LAWS[name][2])
 
 
-@pytest.mark.parametrize(("name", "mode"), first(4, HIDDEN))
-def test_its_variable_is_among_the_first_two(name, mode):
-    for seed in range(2):
-        found = told(hidden(name, mode, seed))
-        assert right(name, found), [v.variable for v in found.dependences]
-        assert found.share > 0.5
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("name", "mode"), HIDDEN)
-def test_its_variable_is_among_the_first_two_in_most_campaigns(name, mode):
-    seeds = 30
-    hits = sum(right(name, told(hidden(name, mode, 100 + seed))) for seed in range(seeds))
-    print(f"{name} ({mode}): {hits} of {seeds}")
-    assert hits >= 0.9 * seeds
+@pytest.mark.parametrize(
+    ("name", "mode", "seeds"),
+    [
+        *first(4, [(*each, range(2)) for each in HIDDEN]),
+        *(pytest.param(*each, range(100, 130), marks=pytest.mark.slow) for each in HIDDEN),
+    ],
+)
+def test_its_variable_is_among_the_first_two(name, mode, seeds):
+    found = [told(hidden(name, mode, seed)) for seed in seeds]
+    assert sum(right(name, each) for each in found) >= 0.9 * len(seeds)
+    assert np.median([each.share for each in found]) > 0.5
 
 
 def test_shares_of_the_variables_add_up_to_the_whole():

@@ -1,6 +1,5 @@
 """Noise that is correlated along the order: found, said, carried, and not taken for an effect."""
 
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -56,19 +55,6 @@ def test_white_noise_is_left_as_it_is(mode: Mode) -> None:
     for seed in range(5):
         white = fitted(*campaign(0.0, mode, seed), mode)
         assert with_serial_noise(white) is white
-
-
-@pytest.mark.parametrize("hidden", ["", "joint_tilt_compliance"])
-@pytest.mark.parametrize("mode", MODES)
-def test_no_likelihood_is_climbed_for_white_noise_or_a_plain_effect(
-    mode: Mode, hidden: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def climbed(*_: object, **__: object) -> None:
-        raise AssertionError
-
-    white = fitted(*campaign(0.0, mode, 0, hidden, poses=20), mode)
-    monkeypatch.setattr(sys.modules[serial_noise.__module__]._SerialProblem, "climbed", climbed)
-    assert serial_noise(white) is None
 
 
 @pytest.mark.parametrize("mode", first(1, ["deflection", "absolute"]))

@@ -34,9 +34,9 @@ def judged(cell: Cell, readings: Readings, mode: Mode) -> hc.Diagnosis:
 @pytest.mark.parametrize(
     ("load", "hidden", "said", "true"),
     [
-        ("5kg", NOTHING, "load '5kg' seems to weigh", 5.0),
-        ("10kg", "backlash", "load '10kg' seems to weigh", 10.0),
-        ("pull x", NOTHING, "load 'pull x' seems to pull with", 80.0),
+        ("5kg", NOTHING, "Load '5kg' seems to weigh", 5.0),
+        ("10kg", "backlash", "Load '10kg' seems to weigh", 10.0),
+        ("pull x", NOTHING, "Load 'pull x' seems to pull with", 80.0),
     ],
 )
 def test_a_load_at_twice_its_weight_is_named(
@@ -92,7 +92,7 @@ def test_a_tool_at_twice_its_mass_is_named_and_refine_adds_nothing() -> None:
     found = refine(baseline(cell, c.readings, "absolute"), c.readings, "absolute")
     (step,) = found.steps
     assert found.verdict == "ambiguous"
-    assert message(step.diagnosis).startswith("the tool seems to weigh 0.8")
+    assert message(step.diagnosis).startswith("The tool seems to weigh 0.8")
     assert "correct [tool] mass_kg" in message(step.diagnosis)
     (figure,) = to_json(step.diagnosis)["wrong_figures"]
     assert (figure["kind"], figure["unit"]) == ("tool_mass", "kg")

@@ -58,7 +58,6 @@ def test_a_law_outside_of_the_catalogue_is_found_with_its_site_and_variables() -
     assert law.formula == "dq_3 = a·cos(q_4)·τ_3"
     assert law.name == "bent"
     after = found().after
-    assert after is not None
     assert after.model.names[-1] == "bent"
     assert law.acts_on == ("joint 3",)
     assert set(law.variables) == {"joint 4 angle", "joint 3 torque"}
@@ -94,7 +93,6 @@ def test_a_refinement_adds_the_law_and_its_file_gives_it_back(
     laws.write(r.names)
     again = installed().with_file(tmp_path / "bent.py")
     stored = r.fit.model.catalogue.file_of("bent")
-    assert stored is not None
     assert again.files[0].sha256 == stored.sha256
     states = before.readings.states
     model = before.model + again.make("bent", before.model.cell, states)
@@ -103,7 +101,7 @@ def test_a_refinement_adds_the_law_and_its_file_gives_it_back(
     told = "\n".join(str(part) for part in refined_laws(laws))
     assert "dq_3 = a·cos(q_4)·τ_3" in told
     assert str(tmp_path / "bent.py") in told
-    (document,) = laws_json(laws)["discover"]  # type: ignore[misc]
+    (document,) = laws_json(laws)["discover"]
     assert document["written"] == str(tmp_path / "bent.py")
 
 
@@ -167,7 +165,7 @@ def test_a_drift_of_readings_without_times_is_said_to_need_them(
     assert (d.reason, d.carried[0].variable) == ("no_law", "row order")
     assert "whose times are missing" in silence(d)
     assert "row order carries" in "".join(map(str, discovery_report(d)))
-    assert discovery_json(d)["carried_by"][0]["variable"] == "row order"  # type: ignore[index]
+    assert discovery_json(d)["carried_by"][0]["variable"] == "row order"
 
 
 @cache
@@ -224,7 +222,7 @@ def test_what_is_told_of_a_law_names_all_that_speaks_for_it() -> None:
     assert "dq_3 = a·cos(q_4)·τ_3" in told
     assert "acts on      joint 3" in told
     assert "µrad/(N·m)" in told
-    (law,) = discovery_json(found())["laws"][:1]  # type: ignore[index]
+    (law,) = discovery_json(found())["laws"][:1]
     asked = ("name", "formula", "acts_on", "parameters", "holdout_share", "p_value", "variables")
     assert {*asked} <= {*law}
     assert law["latex"] == r"\delta q_3 = a\,\cos(q_4)\,\tau_3"
@@ -245,7 +243,7 @@ def test_the_curve_of_a_law_lies_where_the_readings_are() -> None:
         assert np.all(np.abs(y - np.interp(x, *c.line)) < 5 * std)
     told = "".join(str(part) for part in discovery_report(found()))
     assert "seen for" in told
-    drawn = discovery_json(found())["curves"][0]  # type: ignore[index]
+    drawn = discovery_json(found())["curves"][0]
     assert drawn["binned"][0]["readings"] == by_angle.binned[3][0]
 
 

@@ -104,12 +104,10 @@ def test_a_site_whose_law_depends_on_what_has_no_name_is_left_out(symbol: str) -
     assert list(both.expressions) == ["dq_1"]
 
 
-SITUATION = example_situation(example_cell(), example_states(example_cell()))
-KNOWN = {v.symbol: v for v in variables(SITUATION)}
-JOINT = sites(6)[2]
-Q5 = Factor(KNOWN["q_5"], shapes.COS, (1.0,))
-PRODUCT = Form((LawPart(JOINT, Amplitude((Q5, Factor(KNOWN["τ_3"], shapes.LINEAR))), 0),))
-DRAWN = Form((LawPart(JOINT, Amplitude((Factor(KNOWN["q_3"], shapes.COS, (96.0,)),)), 0),))
+Q5 = Factor(NAMED["q_5"], shapes.COS, (1.0,))
+TWISTS = Amplitude((Q5, Factor(NAMED["τ_3"], shapes.LINEAR)))
+PRODUCT = Form((LawPart(site("dq_3"), TWISTS, 0),))
+DRAWN = Form((LawPart(site("dq_3"), of("q_3", shapes.COS, 96.0), 0),))
 
 
 @cache

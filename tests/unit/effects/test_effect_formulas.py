@@ -10,8 +10,6 @@ from hilcal.config.sections import Conventions, Coupling
 from hilcal.drivers.simulated import truth
 from hilcal.effects.link_compliance import long_links
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.baseline import baseline, with_effects
-from hilcal.identification.fit import fit
 from hilcal.model.model import Model
 from hilcal.robot import chain as chains
 from hilcal.robot.catalogue import robot_names
@@ -19,10 +17,8 @@ from hilcal.robot.chain import evaluate
 from hilcal.robot.conventions import as_counted
 from hilcal.types import Floats
 from tests.support.arm_cases import arm_of
-from tests.support.campaigns import campaign
 from tests.support.effect_cases import (
     CELLS,
-    SOFT,
     TURN,
     joints,
     make,
@@ -62,26 +58,6 @@ def test_compliance_that_changes_with_the_angle_repeats_as_often_as_it_says():
             for k in (1, 3)
         )
         np.testing.assert_allclose(dq[:, j], s.torque[:, j] * wave, rtol=1e-12)
-    usual = make("periodic_joint_compliance", cell, s.states)
-    assert [p.name for p in usual.parameters[:4]] == ["j1.cos2", "j1.sin2", "j2.cos2", "j2.sin2"]
-    half = replace(s, angle=s.angle + np.pi)
-    np.testing.assert_allclose(
-        usual.deviation(theta[:12], half).dq, usual.deviation(theta[:12], s).dq, rtol=0, atol=1e-12
-    )
-
-
-@pytest.mark.parametrize("form", ["common", "each"])
-def test_joints_creep_by_the_decade_as_they_are_compliant(form):
-    cell = CELLS["ur10e"]
-    states = replace(some_states(cell), load_time=np.array([0.0, 9, 99, 999, 0, 9, 99, 999, 0]))
-    model = soft(cell, states, "creep", {"form": form})
-    c = SOFT * np.arange(1.0, 7.0)
-    k = np.array([0.03]) if form == "common" else 0.01 * np.arange(1.0, 7.0)
-    found = model.predict(states, np.concatenate([c, k]))
-    decades = np.array([0.0, 1, 2, 3, 0, 1, 2, 3, 0])[:, None]
-    expected = c * found.situation.torque * (1 + k * decades)
-    # The torques are those of the last step, which moved the flange by 1e-13 m.
-    np.testing.assert_allclose(found.deviation.dq, expected, rtol=0, atol=1e-12)
 
 
 def test_creep_without_a_compliance_in_the_model_takes_a_typical_one():
@@ -175,24 +151,6 @@ def test_other_pairs_are_refused_with_what_would_be_valid(given):
     with pytest.raises(InputError, match=r"pairs = .*; valid: pairs of joints 1 to 7") as caught:
         make("joint_coupling", ODD, some_states(ODD), {"pairs": given})
     assert "\n" not in str(caught.value)
-
-
-def test_hidden_factors_are_estimated_within_their_uncertainty():
-    c = campaign("joint_coupling", "absolute", 0, strength=3.0)
-    names = ("joint_compliance", "joint_coupling")
-    found = fit(with_effects(c.cell, c.readings, "absolute", names), c.readings, "absolute")
-    z = [
-        (p.value - c.world.truth[p.name]) / p.std
-        for p in found.parameters
-        if p.name.startswith("joint_coupling")
-    ]
-    assert len(z) == 6
-    assert np.sqrt(np.mean(np.square(z))) < 2.0  # chi-square of 6: 24 has a chance of 5e-4
-    assert (
-        found.variance_factor
-        < 1.2
-        < fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute").variance_factor
-    )
 
 
 def acting(wrench: Floats, flange: Floats, name: str, theta: Floats, turn: Floats) -> Floats:

@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 
 from hilcal.effects.joint_compliance import JointCompliance
-from hilcal.effects.protocol import Effect, Response
+from hilcal.effects.protocol import Response
 from hilcal.model.model import Model
-from hilcal.robot.statics import Load, slot_wrenches
-from tests.support.arm_cases import slope
 from tests.support.effect_cases import (
     ALL_NAMES,
     CELLS,
@@ -20,7 +18,6 @@ from tests.support.effect_cases import (
     numeric_slopes,
     options_of,
     random_theta,
-    situation,
     some_states,
 )
 
@@ -96,15 +93,6 @@ def test_each_effect_with_compliant_joints(name, options, arm):
     assert_slope(model, states, theta, 3)
 
 
-@pytest.mark.parametrize("name", [n for n in NAMES if n != "joint_compliance"])
-def test_each_effect_alone(name):
-    cell = CELLS["ur10e"]
-    states = some_states(cell, 4)
-    model = Model(cell, (make(name, cell, states, SHORT.get(name, options_of(name))),))
-    theta = random_theta(model.effects, np.random.default_rng(7))
-    assert_slope(model, states, theta, 6)
-
-
 class Coupled(JointCompliance):
     """dq_j = c_j τ_{j+1}: each joint yields to the torque of the next; the first to the last's."""
 
@@ -150,6 +138,25 @@ def test_jacobian_of_some_parameters_is_a_part_of_that_of_all():
     np.testing.assert_array_equal(model.jacobian(prediction, theta, 6, live), whole[:, :, live])
 
 
+def test_an_effect_of_many_parameters_moves_the_readings_as_one_of_few():
+    """80 amplitudes of a joint are written at once, those of few harmonics one by one."""
+    cell = CELLS["odd"]
+    states = some_states(cell, 4)
+    many, few = (make("transmission_error", cell, states, {"harmonics": k}) for k in (40, 3))
+    model = Model(cell, (make("joint_compliance", cell, states),))
+    theta = random_theta(model.effects, np.random.default_rng(2))
+    at = model.predict(states, theta)
+    names = [p.name for p in many.parameters]
+    kept = [names.index(p.name) for p in few.parameters]
+    scale = np.random.default_rng(3).uniform(0.5, 2.0, len(names))
+    found = model.jacobian_of((many,), at, theta, 6, scale=scale)
+    expected = model.jacobian_of((few,), at, theta, 6) * scale[kept]
+    np.testing.assert_allclose(found[:, :, kept], expected, rtol=1e-12, atol=1e-14)
+    some = np.arange(30, len(names) - 7)
+    part = model.jacobian_of((many,), at, theta, 6, some, scale)
+    np.testing.assert_allclose(part, found[:, :, some], rtol=1e-12, atol=1e-14)
+
+
 def test_jacobian_of_an_effect_that_is_not_in_the_model_is_that_at_zero():
     cell = CELLS["ur10e"]
     states = some_states(cell)
@@ -166,53 +173,3 @@ def test_jacobian_of_an_effect_that_is_not_in_the_model_is_that_at_zero():
         inside = larger.jacobian(larger.predict(states, full), full, 3)[:, :, len(theta) :]
         # The two equilibria may differ by their tolerance of 1e-13 m.
         np.testing.assert_allclose(outside, inside, rtol=1e-11, atol=1e-11, err_msg=name)
-
-
-# --- derivatives ----------------------------------------------------------------------------
-
-
-USUAL_LOADS = tuple((name, options_of(name, 6)) for name in NAMES)
-
-
-def some(cases, chosen):
-    """The cases of some effects, as pytest takes them."""
-    return [pytest.param(n, o, id=f"{n}{o or ''}") for n, o in cases if n in chosen]
-
-
-CHANGERS = tuple(n for n in NAMES if effect_class(n).wrench_columns is not Effect.wrench_columns)
-
-
-@pytest.mark.parametrize("arm", CELLS)
-@pytest.mark.parametrize(("name", "options"), some(USUAL_LOADS + VARIANTS, CHANGERS))
-def test_wrench_columns_are_the_derivative_of_the_slot_wrenches(name, options, arm):
-    """At a fixed configuration, together with another change of the load."""
-    cell = CELLS[arm]
-    s = situation(cell)
-    effect = make(name, cell, s.states, options)
-    theta = random_theta((effect,), np.random.default_rng(5))
-
-    def load(theta):
-        told, change = effect.load_change(theta), effect.wrench_change(theta, s)
-        point = cell.load_point + np.array([0.02, -0.01, 0.03])
-        point = point if told is None or told.point is None else point + told.point
-        moments = None if told is None else told.first_moment
-        wrench = s.states.wrench if change is None else s.states.wrench + change
-        return Load(wrench, point, cell.tool_mass, cell.tool_com, cell.gravity, moments)
-
-    derived = effect.wrench_columns(theta, replace(s, load=load(theta)))
-    for p, parameter in enumerate(effect.parameters):
-
-        def wrench(h, p=p, size=parameter.scale):
-            moved = theta + h * size * np.eye(len(theta))[p]
-            return slot_wrenches(cell.arm, s.chain, load(moved))
-
-        numeric = slope(wrench, 0.1)
-        size = np.abs(wrench(0.0)).max()
-        # Rounding, and what the difference leaves out where a law bends, h⁴/30 of the fifth
-        # derivative: of 1/(1 + g) that is 120 times the fifth power of a hundredth.
-        np.testing.assert_allclose(
-            derived[:, p] * parameter.scale, numeric, rtol=0, atol=1e-13 * size
-        )
-
-
-# --- a user's own ---------------------------------------------------------------------------

@@ -8,7 +8,6 @@ import pytest
 from hilcal.cell import Cell
 from hilcal.drivers.simulated.truth import Truth
 from hilcal.drivers.simulated.world import SimulatedNoise, World
-from hilcal.effects.protocol import Situation
 from hilcal.model.model import Model
 from hilcal.readings.readings import States
 from tests.support.campaigns import followed, true_parameters
@@ -124,63 +123,12 @@ def test_prediction_is_what_the_world_shows(names, arm):
         assert moved > 1e-9  # a hundred times the tolerance
 
 
-@pytest.mark.parametrize("arm", CELLS)
-def test_errors_of_the_force_sensor_add_but_for_their_products(arm):
-    """What two of them leave out is one as a share of what the other moves."""
-    cell = CELLS[arm]
-    states = some_states(cell, 6)
-    for scale in (1.0, 1e-2):
-        b = both(("joint_compliance", *SENSOR), cell, states, scale)
-        joints = Model(cell, b.model.effects[:1])
-        true = joints.predict(states, b.theta[: cell.arm.n]).observation.position
-        all_of_them = b.model.predict(states, b.theta).observation.position - true
-        bias, gain, turn = (b.theta[at] for at in b.model.slices()[1:])
-        loaded = states.wrench[np.any(states.wrench != 0, axis=1)]
-        least = [np.linalg.norm(loaded[:, part], axis=1).min() for part in (slice(3), slice(3, 6))]
-        share = np.linalg.norm(bias[:3]) / least[0] + np.linalg.norm(bias[3:]) / least[1]
-        share += np.abs(gain).max() + np.linalg.norm(turn)
-        moved = np.linalg.norm(all_of_them, axis=1).max()
-        # Every error alone moves at most what its share of the wrench does to soft joints.
-        soft = np.linalg.norm(true - rigid_position(cell, states), axis=1).max()
-        assert apart(b, states)[0] <= 3 * share**2 * soft + 1e-11
-        assert 3 * share**2 * soft < moved or scale == 1.0
-        assert moved > 1e-6 * scale**2
-
-
-def rigid_position(cell: Cell, states: States) -> np.ndarray:
-    return Model(cell, ()).predict(states, np.zeros(0)).observation.position
-
-
-def test_harmonics_and_sides_are_what_they_say():
-    cell = CELLS["ur10e"]
-    s = situation(cell)
-    effect = make("transmission_error", cell, s.states, {"harmonics": 4})
-    theta = np.random.default_rng(0).normal(size=48)
-    by_name = {p.name: t for p, t in zip(effect.parameters, theta, strict=True)}
-    dq = effect.deviation(theta, s).dq
-    for j in range(6):
-        q = s.angle[:, j]
-        expected = sum(
-            by_name[f"j{j + 1}.cos{k}"] * np.cos(k * q)
-            + by_name[f"j{j + 1}.sin{k}"] * np.sin(k * q)
-            for k in range(1, 5)
-        )
-        np.testing.assert_allclose(dq[:, j], expected, rtol=0, atol=1e-13)
-    h = np.arange(1.0, 7.0)
-    dq = make("hysteresis", cell, s.states).deviation(h, s).dq
-    np.testing.assert_array_equal(dq, h * s.states.approach)
-
-
 def test_drift_starts_at_its_reference_time():
     cell = CELLS["ur10e"]
-    states = some_states(cell)
+    states = situation(cell).states
     rate = 1e-8 * np.arange(1.0, 7.0)
     for reference, start in ((None, states.time.min()), (100.0, 100.0)):
         given = {} if reference is None else {"reference_s": reference}
         effect = make("tracker_drift", cell, states, given)
-        station = effect.deviation(rate, situation_of(cell, states)).station
+        station = effect.deviation(rate, situation(cell)).station
         np.testing.assert_allclose(station, (states.time - start)[:, None] * rate, rtol=1e-13)
-
-
-def situation_of(cell: Cell, states: States) -> Situation:
-    return Model(cell, ()).predict(states, np.zeros(0)).situation

@@ -2,7 +2,6 @@
 
 import re
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -10,12 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hilcal.effects.catalogue import BUILT_IN, installed
-from hilcal.effects.check import check_effect
-from hilcal.effects.protocol import Columns, Effect, Parameter, Response, Situation
 from hilcal.effects.written import chosen_options, option_defaults, read_effects_text, write_effect
 from hilcal.errors import InputError
 from hilcal.model.model import Model
-from hilcal.types import Floats
 from tests.support.effect_cases import (
     CELLS,
     NAMES,
@@ -301,12 +297,6 @@ def test_options_are_explained_and_defaults_are_valid(kind):
     assert kind(cell, states, known).options == usual.options
 
 
-def test_help_is_that_of_the_class_before_that_of_its_base():
-    assert "Unless given, each." in installed()["hysteresis"].option_help["joints"]
-    assert "given, common." in installed()["creep"].option_help["joints"]
-    assert {"joints", "crossing"} == set(installed()["backlash"].option_help)
-
-
 def test_a_default_that_follows_from_the_readings_is_not_told():
     cell = CELLS["ur10e"]
     states = some_states(cell, 60)
@@ -314,57 +304,3 @@ def test_a_default_that_follows_from_the_readings_is_not_told():
     assert drift == {"joints": "each", "reference_degC": None}
     assert option_defaults(installed()["transmission_error"], cell, states)["harmonics"] is None
     assert option_defaults(installed()["creep"], cell, states) == {"joints": "common"}
-
-
-class Neighbour(Effect):
-    """dq_j = a_j τ_{j−1}: each joint follows the torque of the one before it."""
-
-    name = "neighbour"
-    summary = "dq_j = a_j τ_{j−1}"
-    elastic = True
-
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        return tuple(Parameter(f"j{j + 1}", "rad/(N·m)", 1e-6) for j in range(self.cell.arm.n))
-
-    def columns(self, s: Situation) -> tuple[Columns, ...]:
-        joints = np.arange(self.cell.arm.n)
-        return (Columns("dq", joints, joints, np.roll(s.torque, 1, axis=1)),)
-
-    def response(self, theta: Floats, s: Situation, change: Floats) -> Response:
-        return Response(dq=theta * np.roll(change[:, :, :-1, 5], 1, axis=2))
-
-
-class Declared(Neighbour):
-    """The same, declared to be local."""
-
-    local_response = True
-
-
-class PerState(Neighbour):
-    """dq_j = a_j sin(q_j) τ_j, whose response takes no (1, P, n + 1, 6)."""
-
-    local_response = True
-
-    def columns(self, s: Situation) -> tuple[Columns, ...]:
-        joints = np.arange(self.cell.arm.n)
-        return (Columns("dq", joints, joints, np.sin(s.angle) * s.torque),)
-
-    def response(self, theta: Floats, s: Situation, change: Floats) -> Response:
-        out: Any = np.empty((len(change), change.shape[1], self.cell.arm.n))
-        out[:] = (theta * np.sin(s.angle))[: len(change), None, :] * change[:, :, :-1, 5]
-        return Response(dq=out)
-
-
-def test_an_effect_that_couples_slots_is_accepted_where_it_says_so() -> None:
-    check_effect(Neighbour)
-
-
-def test_one_that_is_declared_local_and_couples_slots_is_refused() -> None:
-    with pytest.raises(InputError, match=r"moves other slots than 0 .* set local_response = False"):
-        check_effect(Declared)
-
-
-def test_one_whose_response_does_not_take_equal_changes_is_refused() -> None:
-    with pytest.raises(InputError, match=r"changes \(1, P, n \+ 1, 6\) has another dq"):
-        check_effect(PerState)

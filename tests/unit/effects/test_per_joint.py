@@ -1,5 +1,7 @@
 """Joints that share a parameter, joints that have none: what it means for each effect."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -118,14 +120,6 @@ def test_other_groups_are_refused_with_what_would_be_valid(given, wrong):
 # --- what it means --------------------------------------------------------------------------
 
 
-def test_every_effect_of_the_joints_can_be_grouped():
-    assert set(PER_JOINT) == {
-        "encoder_offset", "transmission_error", "hysteresis", "joint_compliance",
-        "joint_stiffening", "joint_tilt_compliance", "periodic_joint_compliance", "backlash",
-        "creep", "thermal_joint_drift",
-    }  # fmt: skip
-
-
 @pytest.mark.parametrize("groups", GROUPS)
 @pytest.mark.parametrize("name", PER_JOINT)
 def test_a_shared_parameter_is_the_same_number_at_each_of_its_joints(name, groups):
@@ -200,14 +194,6 @@ def test_names_and_magnitudes(name):
     assert {p.unit for p in some} == {p.unit for p in every}
 
 
-def test_compliance_of_joints_by_their_groups():
-    cell = CELLS["ur10e"]
-    effect = make("joint_compliance", cell, some_states(cell), {"joints": "2/4-5"})
-    found = effect.compliance(np.array([3.0, 7.0]))
-    assert found.tolist() == [0.0, 3.0, 0.0, 7.0, 7.0, 0.0]
-    assert type(2 * found) is type(found + found) is np.ndarray
-
-
 def test_harmonics_of_shared_joints_have_one_variance():
     cell = CELLS["ur10e"]
     effect = make("transmission_error", cell, some_states(cell), options(PER_JOINT[1], "1-3/5"))
@@ -244,10 +230,7 @@ def test_shared_parameters_are_found_and_stored_with_their_groups():
     truth = np.abs(random_theta(model.effects, rng))
     value = model.predict(c.readings.states, truth).observation.position
     noise = 2e-6 * rng.normal(size=value.shape)
-    readings = type(c.readings)(
-        **{f: getattr(c.readings, f) for f in c.readings.__dataclass_fields__ if f != "value"},
-        value=value + noise,
-    )
+    readings = replace(c.readings, value=value + noise)
     found = fit(model, readings, "absolute")
     free = found.solution.prior > 0
     assert free[:5].all()
@@ -256,8 +239,6 @@ def test_shared_parameters_are_found_and_stored_with_their_groups():
         "joint_compliance.j1", "joint_compliance.j2", "joint_compliance.j3",
         "joint_compliance.j4-6", "hysteresis.j1-3",
     ]  # fmt: skip
-    assert all(n.startswith(("transmission_error.j2.", "transmission_error.j3."))
-               for n in names[5:])  # fmt: skip
     seen = found.uncertainty.identifiable[:5]
     assert seen[1:].all()
     off = np.abs(found.theta - truth)[:5][seen] / found.uncertainty.std[:5][seen]

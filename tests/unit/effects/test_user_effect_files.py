@@ -32,6 +32,8 @@ ELASTIC = CLASS.replace(COLUMNS, "values = s.torque[:, :1] ** 3").replace(
     @property""",
 )
 
+LOCAL = ELASTIC.replace("elastic = True", "elastic = local_response = True")
+
 BAD: dict[str, tuple[str, str]] = {
     "not Python": ("class Mine(:\n", ", line 1: not Python: invalid syntax"),
     "does not import": ("import no_such_module\n", ", line 1: ModuleNotFoundError"),
@@ -101,6 +103,14 @@ BAD: dict[str, tuple[str, str]] = {
     "wrong response": (
         ELASTIC.replace("dq[:, :, 1] = 3", "dq[:, :, 1] = 2"),
         ": effect mine: response is not the derivative of columns by the wrenches: dq",
+    ),
+    "declared local and moves another joint": (
+        LOCAL.replace(" ** 3", "").replace("3 * theta[0] * s.torque[:, :1] ** 2", "theta[0]"),
+        ": effect mine: response moves other slots than 0 by its wrench; set local_response = F",
+    ),
+    "declared local and does not take equal changes": (
+        LOCAL.replace("s.torque[:, :1] ** 2", "s.torque[: len(change), :1] ** 2"),
+        ": effect mine: response to changes (1, P, n + 1, 6) has another dq",
     ),
     "response of a wrong shape": (
         ELASTIC.replace("dq=dq)", "dq=dq[:, 0])"),

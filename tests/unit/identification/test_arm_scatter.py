@@ -184,8 +184,8 @@ def judged(mode: Mode, std: float, **more: float) -> tuple[Diagnosis, str]:
 def test_what_is_left_to_the_arm_is_adequate_and_says_how_much(mode: Mode) -> None:
     d, words = judged(mode, 2e-5)
     assert (d.verdict, d.reason) == ("adequate", "arm_scatter")
-    assert "predictable by nothing recorded" in words
-    assert "each joint scatters by σ_q =" in words
+    assert "Nothing recorded predicts it" in words
+    assert "Each joint scatters by σ_q =" in words
     assert "the maker states 0.050 mm" in words
     assert d.scatter.size_m == pytest.approx(27e-6, rel=0.2)
 
@@ -252,7 +252,7 @@ def test_refine_ends_with_the_scatter_in_the_fit_and_the_file_keeps_it(tmp_path:
         assert (first.diagnosis.reason, last.diagnosis.verdict) == ("arm_scatter", "adequate")
         assert last.added is None
         assert last.fit.variance_factor == pytest.approx(1, abs=0.15)
-        assert "predictable by nothing" in str(last.diagnosis.to_dict()["message"])
+        assert "Nothing recorded predicts it" in str(last.diagnosis.to_dict()["message"])
         assert content_hash(last.fit.readings) == content_hash(run.readings)
         run.append(found)
     with hc.Campaign.open(path) as run:

@@ -14,9 +14,8 @@ from hilcal.config import load_config
 from hilcal.diagnosis.stepwise import add, remove
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.errors import InputError
-from hilcal.identification.background import background_of, with_pooled_lines
+from hilcal.identification.background import background_of, family_sizes, with_pooled_lines
 from hilcal.identification.baseline import baseline
-from hilcal.identification.family_sizes import family_sizes
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.mixed_fit import mixed_fit
 from hilcal.identification.predictive import predictive_of
@@ -245,7 +244,9 @@ def test_a_hidden_effect_is_predicted_at_fresh_poses_and_has_the_evidence() -> N
     _, loads = with_study_loads(CONFIG, "ur10e")
     fresh, *_ = rehearsal_states(case.cell, 20, loads, np.random.default_rng(2))
     true = case.world.sight(fresh).position
-    position, spread = found.predict(fresh, 3)
+    prediction = found.model.predict(fresh, found.theta)
+    x = found.problem.coordinates(found.model.jacobian(prediction, found.theta, 3))
+    position, spread = prediction.observation.position, x @ found.covariance @ np.swapaxes(x, 1, 2)
     error = np.linalg.norm(true - position, axis=1).mean()
     assert error < 0.5 * np.linalg.norm(true - without.predict(fresh).position, axis=1).mean()
     std = np.sqrt(np.diagonal(spread, axis1=1, axis2=2))

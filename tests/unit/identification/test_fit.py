@@ -1,7 +1,6 @@
 """Fits: exact without noise, free of units, honest about what the data cannot see; as values."""
 
 import re
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +17,7 @@ from hilcal.model.model import Model
 from hilcal.readings.readings import Readings, States
 from hilcal.readings.whitening import SCALINGS
 from hilcal.robot import se3
-from tests.support.campaigns import campaign, cell_of, noiseless, plan, true_parameters, with_noise
+from tests.support.campaigns import campaign, noiseless, plan, with_noise
 from tests.support.effect_cases import make
 from tests.support.fit_cases import MODES, based, compliances, named, predicted
 
@@ -182,16 +181,6 @@ def test_an_over_complete_model_predicts_what_the_world_shows_elsewhere():
     assert off.max() < 0.05 * sigma
 
 
-def test_redundant_effects_share_one_direction():
-    """The first zero is the base's turn about z; both cannot be told."""
-    c = campaign(plan_seed=0)
-    found = based(c.cell, c.readings, "absolute", ("joint_compliance", "encoder_offset"))
-    (null,) = found.uncertainty.null
-    unseen = {n for n, (_, std) in named(found).items() if np.isinf(std)}
-    assert unseen == {"base_frame.rz", "encoder_offset.j1"}
-    assert all(name in null for name in unseen)
-
-
 @pytest.mark.parametrize("count", [1, 2])
 @pytest.mark.parametrize("mode", MODES)
 def test_no_more_elements_than_parameters_cannot_answer(mode, count):
@@ -206,23 +195,6 @@ def test_no_more_elements_than_parameters_cannot_answer(mode, count):
     assert 3 * int(re.search(told, str(caught.value))[1]) > 6
     assert caught.value.exit_code == 4
     assert "\n" not in str(caught.value)
-
-
-def test_true_parameters_lie_within_their_uncertainty():
-    """A check of the whole way on one campaign of the world, at 5 σ of 12 parameters."""
-    c = campaign(plan_seed=0, target_known=False, poses=20)
-    found = based(c.cell, c.readings, "absolute")
-    rows = found.model.slices()[2]
-    off = found.theta[rows] - true_parameters(c.world, "joint_compliance")
-    assert np.abs(off / found.uncertainty.std[rows]).max() < 5
-    assert found.variance_factor == pytest.approx(1, abs=5 * np.sqrt(2 / found.dof))
-
-
-def test_noise_of_a_known_factor_shows_in_the_variance_factor():
-    c = campaign(plan_seed=0, registration_known=True)
-    noisy = with_noise(noiseless(c.world, plan()), np.random.default_rng(5), 2.0)
-    found = based(cell_of(registration_known=True), noisy, "absolute")
-    assert found.variance_factor == pytest.approx(4, abs=4 * 5 * np.sqrt(2 / found.dof))
 
 
 # --- as a value for scripts -----------------------------------------------------------------
@@ -246,14 +218,6 @@ def test_parameters_are_those_of_the_document_and_of_the_data_frame(found: Fit) 
     assert frame.loc["joint_compliance.j2", "std"] == second.std
     with pytest.raises(InputError, match=r"did you mean .*joint_compliance.j2"):
         found.parameters["joint_complience.j2"]
-
-
-def test_without_pandas_the_data_frame_names_it(
-    found: Fit, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(InputError, match="the package pandas is not installed: pip install pandas"):
-        found.parameters.to_frame()
 
 
 def test_the_summary_has_every_parameter_and_both_errors(found: Fit) -> None:

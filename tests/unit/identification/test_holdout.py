@@ -21,7 +21,7 @@ from hilcal.identification.folds import (
 from hilcal.identification.gauss_newton import solve
 from hilcal.identification.residual import residual
 from hilcal.readings.readings import Readings
-from hilcal.readings.whitening import MODES, Mode, whitening
+from hilcal.readings.whitening import MODES, Mode
 from hilcal.robot.catalogue import configs_dir
 from studies.study_cases import study_case
 from tests.support.campaigns import campaign
@@ -154,14 +154,6 @@ def test_folds_are_of_equal_size_and_whole_poses(poses):
     assert all(max(each) - min(each) <= 1 for each in sizes[:2])
     np.testing.assert_array_equal(random_folds(pose), random_folds(pose))
     assert np.all(np.diff(block_folds(pose)) >= 0)
-
-
-def test_readings_left_out_in_deflections_are_whole_groups():
-    found = fitted("deflection")
-    w = whitening(found.readings, "deflection")
-    fold = random_folds(found.pose)
-    for p in np.unique(w.group):
-        assert len(np.unique(fold[w.group == p])) == 1
 
 
 def test_what_one_pose_alone_shows_of_an_effect_does_not_spoil_the_others() -> None:

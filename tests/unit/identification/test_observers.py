@@ -285,10 +285,3 @@ def test_a_cell_names_its_gauges(tmp_path: Path) -> None:
     )
     with pytest.raises(InputError, match="origin_m without direction"):
         Cell.load(tmp_path / "cell.toml")
-
-
-def test_one_tracker_stays_as_it_was() -> None:
-    """A table of one station, named or not, is stored as readings by one tracker."""
-    readings: Readings = observed(["S1"], 1).readings
-    assert readings.observers
-    assert replace(readings, states=replace(readings.states, observer=None)).line.max() == 0

@@ -5,23 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilcal.effects.catalogue import installed
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.predictive import (
     Excess,
-    Predictive,
     excess,
     left_out_variances,
-    parameter_factor,
-    position_factor,
     predictive_of,
 )
 from hilcal.identification.robot_frames import whole_turns
 from hilcal.identification.validation import Extrapolation, Validation, extrapolation, validate
-from hilcal.readings.readings import Readings, States
+from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import whitening
 from hilcal.types import Floats
+from studies.random_descriptions import readings_of
 from tests.support.campaigns import campaign
 from tests.support.fit_cases import based
 
@@ -46,20 +43,6 @@ def test_left_out_folds_are_as_far_off_as_dense_algebra_has_it(size: int) -> Non
     root = vectors * np.sqrt(NOISE_FACTOR / (np.maximum(values, 0.0) + NOISE_FACTOR))
     found = left_out_variances(a, fold, ((a, fold), (other, points)), root, NOISE_FACTOR)
     assert found == pytest.approx([rows / count, other_rows / len(other)], rel=1e-3)
-
-
-def test_the_stated_mean_square_is_what_was_found_and_never_less_than_the_fit_has() -> None:
-    c = campaign("none", "absolute", plan_seed=0)
-    model = with_effects(c.cell, c.readings, "absolute", (), {}, installed())
-    none = np.zeros(0)
-    p = Predictive(
-        model, none, none[:, None], none, Excess(), 1.0, 1.0, 1.0, none, 1.0, 3.0, 25e-10, 75e-10
-    )  # fmt: skip
-    for sigma, metres in ((2.0, 1e-4), (4.0, 2e-4)):
-        by_v, by_position = parameter_factor(p, sigma), position_factor(p, metres)
-        assert p.scatter + by_v * p.left_out == pytest.approx(sigma**2)
-        assert p.scatter_m2 + by_position * p.left_out_m2 == pytest.approx(metres**2)
-    assert parameter_factor(p, 1.5) == position_factor(p, 9e-5) == 1.0
 
 
 @pytest.mark.parametrize("seed", [1, 3])
@@ -93,17 +76,8 @@ def readings(rng: np.random.Generator) -> Readings:
     turn = np.zeros((COUNT, M, M))
     turn[:, :3, :3], turn[:, 3:, 3:] = axes, np.eye(3)
     covariance = turn * NOISE**2 @ np.swapaxes(turn, 1, 2)
-    each = np.arange(COUNT)
-    return Readings(
-        states=States(q=rng.normal(size=(COUNT, 6)), wrench=np.zeros((COUNT, 6))),
-        pose=each,
-        load=np.zeros(COUNT, dtype=int),
-        cycle=np.zeros(COUNT, dtype=int),
-        value=np.zeros((COUNT, M)),
-        covariance=covariance,
-        load_names=("none",),
-        pose_names=tuple(f"p{k}" for k in each),
-    )
+    made = readings_of(rng.normal(size=(COUNT, 6)), np.zeros((COUNT, M)), NOISE)
+    return replace(made, covariance=covariance)
 
 
 def drawn(extra_m: float, factor: float, parameters: int = 0) -> tuple[Excess, Readings]:
@@ -126,22 +100,17 @@ def drawn(extra_m: float, factor: float, parameters: int = 0) -> tuple[Excess, R
     return excess(raw, w, wide, rows, root), r
 
 
-def test_stated_noise_has_no_excess() -> None:
-    assert drawn(0.0, 1.0)[0].none
-
-
-@pytest.mark.parametrize("parameters", [0, 300])
-def test_both_are_found_in_their_size_beside_fitted_parameters(parameters: int) -> None:
-    found, _ = drawn(30e-6, 2.0, parameters)
+@pytest.mark.parametrize(
+    ("extra_m", "factor", "parameters"),
+    [(0.0, 1.0, 0), (30e-6, 1.0, 0), (0.0, 3.0, 0), (30e-6, 2.0, 0), (30e-6, 2.0, 300)],
+)
+def test_an_excess_is_found_in_its_size_and_its_part(
+    extra_m: float, factor: float, parameters: int
+) -> None:
+    found, _ = drawn(extra_m, factor, parameters)
     # 1200 elements: good to 1/sqrt(600).
-    assert np.sqrt(found.position) == pytest.approx(30e-6, rel=0.08)
-    assert found.attitude == pytest.approx(2.0, rel=0.15)
-
-
-def test_one_does_not_make_the_other() -> None:
-    position, attitude = (drawn(*true)[0] for true in ((30e-6, 1.0), (0.0, 3.0)))
-    assert (position.position > 0, position.attitude) == (True, 1.0)
-    assert (attitude.position, attitude.attitude > 2.5) == (0.0, True)
+    assert np.sqrt(found.position) == pytest.approx(extra_m, rel=0.08)
+    assert found.attitude == (1.0 if factor == 1.0 else pytest.approx(factor, rel=0.15))
 
 
 def test_a_deflection_has_it_once() -> None:

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hilcal.config import CellLoad, ForceSensor, Limits, Motion, Tool
-from hilcal.measuring.clearance import clearance_of
+from hilcal.config import CellLoad, ForceSensor, Limits, Tool
+from hilcal.measuring.clearance import Clearance
 from hilcal.measuring.feasibility import BETWEEN_M
 from hilcal.measuring.route import APPROACH_RAD, dry_run, duration, home, route
 from hilcal.robot.catalogue import load_arm
@@ -74,7 +74,7 @@ def test_reference_at_a_joint_limit_is_approached_from_within(side: int) -> None
 
 def box(bench: Bench, q: Any) -> tuple[Any, Any]:
     """The smallest box around forearm, wrists and tool in all states."""
-    parts = clearance_of(bench.cell, bench.config).scene.parts
+    parts = Clearance(bench.cell, bench.config).scene.parts
     return reached(bench.cell, parts, np.asarray(q))
 
 
@@ -104,22 +104,6 @@ def test_workspace_is_checked_along_the_whole_path(axis: int, side: str) -> None
         assert all(f"whose {'xyz'[axis]} ends" in line for line in found)
 
 
-def test_a_path_between_good_poses_may_be_bad() -> None:
-    """From one side to the other over a wall that only the path touches."""
-    bench = Bench(limits=WIDE)
-    poses = {
-        "reference": (0.6, -1.2, 1.5, -1.5, -1.5, 0.0),
-        "far": (-0.6, -1.2, 1.5, -1.5, -1.5, 0.0),
-    }
-    plan = plan_of(("far", "none", 0), poses=poses)
-    reach = box(bench, list(poses.values()))[0][0]  # the arm points to -x at these poses
-    limits = Limits(workspace_min_m=(reach - 0.03, -3, -3), workspace_max_m=(3, 3, 3))
-    bench.config = bench.config.model_copy(update={"limits": limits})
-    found = problems(bench, plan)
-    assert found
-    assert all(line.startswith("between reference and far") for line in found)
-
-
 def test_torque_under_load_names_pose_load_joint_and_limit() -> None:
     bench = Bench(
         limits=WIDE,
@@ -136,13 +120,6 @@ def test_torque_under_load_names_pose_load_joint_and_limit() -> None:
     found = [line for line in problems(bench, heavy) if "bears" in line]
     assert any("stretched under pull" in line and "shoulder_lift" in line for line in found)
     assert any("0.9 of 330" in line for line in found)
-
-
-@pytest.mark.parametrize(("share", "wrong"), [(1.0, False), (0.2, True)])
-def test_torque_share(share: float, wrong: bool) -> None:
-    bench = Bench(limits=WIDE.model_copy(update={"torque_share": share}))
-    found = [p for p in problems(bench, usual_plan()) if "bears" in p]
-    assert bool(found) is wrong
 
 
 @pytest.mark.parametrize(("mass", "wrong"), [(12.5 - 0.8, False), (12.5 - 0.8 + 1e-3, True)])
@@ -162,14 +139,6 @@ def test_a_pull_is_no_payload() -> None:
 def test_tool_alone_over_the_payload() -> None:
     bench = Bench(tool=Tool(mass_kg=13.0))
     assert any("the tool is 13 kg" in p for p in problems(bench, plan_of(("p1", "none", 0))))
-
-
-def test_speed_over_the_limit() -> None:
-    limits = Limits(joint_speed_rad_s=0.3)
-    bench = Bench(motion=Motion(speed_rad_s=0.4), limits=limits)
-    found = problems(bench, plan_of(("p1", "none", 0)))
-    assert len(found) == 1
-    assert "speed_rad_s = 0.4" in found[0]
 
 
 def test_force_sensor_would_be_overloaded() -> None:
@@ -257,8 +226,6 @@ def test_whatever_passes_keeps_every_limit_on_its_whole_way(drawn: list[tuple[fl
     way = all_of(plan, bench, 101)
     low, high = box(bench, way)
     limits = bench.config.limits
-    assert limits.workspace_min_m is not None
-    assert limits.workspace_max_m is not None
     over = max((limits.workspace_min_m - low).max(), (high - limits.workspace_max_m).max())
     outside = [line for line in problems(bench, plan) if "workspace" in line]
     if over > BETWEEN_M:

@@ -11,11 +11,12 @@ import pytest
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig, CellLoad, ForceSensor, Limits
 from hilcal.design.feasible import Space
-from hilcal.measuring.clearance import clearance_of
+from hilcal.measuring.clearance import Clearance
 from hilcal.measuring.devices import ArmSample
 from hilcal.measuring.motion import SLACK_M, Guard
 from hilcal.measuring.route import dry_run
 from hilcal.store.plan import UNLOADED, Plan, Step
+from hilcal.types import Floats
 from tests.support.arm_cases import ODD, arm_of
 from tests.support.cli_cases import Capsys, refused, run
 from tests.support.fake_bench import POSES, Bench
@@ -36,58 +37,43 @@ def bench() -> Bench:
 
 def sample(bench: Bench, **changes: object) -> ArmSample:
     bench.world.q = np.array(POSES["p1"])
-    return replace(bench.rig.arm.sample(), **changes)  # type: ignore[arg-type]
+    return replace(bench.rig.arm.sample(), **changes)
 
 
-def test_all_is_well(bench: Bench) -> None:
-    assert Guard(bench.cell, bench.config).check(sample(bench), np.zeros(6)) is None
+def test_all_is_well_with_and_without_a_force_sensor(bench: Bench) -> None:
+    guard = Guard(bench.cell, bench.config)
+    assert guard.check(sample(bench), np.zeros(6)) is None
+    assert guard.check(sample(bench)) is None
 
 
-def test_without_a_force_sensor_no_wrench_is_asked(bench: Bench) -> None:
-    assert Guard(bench.cell, bench.config).check(sample(bench)) is None
-
-
-def test_safety_state_is_told_in_the_makers_words(bench: Bench) -> None:
-    said = Guard(bench.cell, bench.config).check(sample(bench, safety="protective stop"))
-    assert said is not None
-    assert "protective stop" in said
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [({"safety": "protective stop"}, "protective stop"), ({"q": np.zeros(7)}, "7 joints")],
+)
+def test_a_sample_of_an_arm_that_is_not_ready(
+    bench: Bench, change: dict[str, object], word: str
+) -> None:
+    assert word in str(Guard(bench.cell, bench.config).check(sample(bench, **change)))
 
 
 @pytest.mark.parametrize("joint", range(6))
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_speed_of_every_joint(bench: Bench, joint: int, sign: float) -> None:
-    guard = Guard(bench.cell, bench.config)
-    qd = np.zeros(6)
-    qd[joint] = sign * 0.999
-    assert guard.check(sample(bench, qd=qd)) is None
-    qd[joint] = sign * 1.001
-    said = guard.check(sample(bench, qd=qd))
-    assert said is not None
-    assert bench.cell.arm.joint_names[joint] in said
+    guard, one = Guard(bench.cell, bench.config), sign * np.eye(6)[joint]
+    assert guard.check(sample(bench, qd=0.999 * one)) is None
+    assert bench.cell.arm.joint_names[joint] in str(guard.check(sample(bench, qd=1.001 * one)))
 
 
-@pytest.mark.parametrize("axis", range(6))
-def test_force_and_moment(bench: Bench, axis: int) -> None:
-    guard = Guard(bench.cell, bench.config)
-    limit = 100.0 if axis < 3 else 10.0
-    felt = np.zeros(6)
-    felt[axis] = -0.999 * limit
-    assert guard.check(sample(bench), felt) is None
-    felt[axis] = -1.001 * limit
-    said = guard.check(sample(bench), felt)
-    assert said is not None
-    assert ("max_force_N" if axis < 3 else "max_moment_Nm") in said
-
-
-@pytest.mark.parametrize(("part", "key"), [(0, "max_force_N"), (3, "max_moment_Nm")])
-def test_force_and_moment_are_the_lengths_of_their_vectors(
-    bench: Bench, part: int, key: str
+@pytest.mark.parametrize(
+    "way", [*np.eye(6), np.repeat([3**-0.5, 0.0], 3), np.repeat([0.0, 3**-0.5], 3)]
+)
+def test_force_and_moment_are_limited_by_the_lengths_of_their_vectors(
+    bench: Bench, way: Floats
 ) -> None:
-    felt = np.zeros(6)
-    felt[part : part + 3] = 70.0 if part == 0 else 7.0  # the limits are 100 N and 10 N·m
-    said = Guard(bench.cell, bench.config).check(sample(bench), felt)
-    assert said is not None
-    assert key in said
+    guard = Guard(bench.cell, bench.config)
+    limit, key = (100.0, "max_force_N") if way[:3].any() else (10.0, "max_moment_Nm")
+    assert guard.check(sample(bench), -0.999 * limit * way) is None
+    assert key in str(guard.check(sample(bench), -1.001 * limit * way))
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
@@ -98,22 +84,14 @@ def test_what_is_not_a_number_is_never_well(bench: Bench, bad: float) -> None:
     assert guard.check(sample(bench, q=q)) is not None
     assert guard.check(sample(bench, qd=np.full(6, bad))) is not None
     for axis in range(6):
-        felt = np.zeros(6)
-        felt[axis] = bad
-        assert guard.check(sample(bench), felt) is not None, axis
-
-
-def test_wrong_number_of_joints(bench: Bench) -> None:
-    said = Guard(bench.cell, bench.config).check(sample(bench, q=np.zeros(7)))
-    assert said is not None
-    assert "7 joints" in said
+        assert guard.check(sample(bench), np.where(np.arange(6) == axis, bad, 0.0)) is not None
 
 
 @pytest.mark.parametrize("side", ["min", "max"])
 @pytest.mark.parametrize("axis", range(3))
 def test_workspace_of_the_actual_pose(bench: Bench, side: str, axis: int) -> None:
     """A box that ends where forearm, wrists and tool do, less and more than the slack."""
-    parts = clearance_of(bench.cell, bench.config).scene.parts
+    parts = Clearance(bench.cell, bench.config).scene.parts
     low, high = reached(bench.cell, parts, np.array([POSES["p1"]]))
     edge = (low if side == "min" else high)[axis]
     inwards = 1.0 if side == "min" else -1.0
@@ -134,8 +112,7 @@ def test_what_hangs_stops_the_arm_when_it_is_told() -> None:
     bench = Bench(loads=(load,), limits=Limits(), force_sensor=None)
     guard, here = Guard(bench.cell, bench.config), sample(bench, q=np.array(POSES["reference"]))
     assert guard.check(here) is None
-    said = guard.check(here, hanging="long")
-    assert said is not None
+    said = str(guard.check(here, hanging="long"))
     assert "what hangs (long)" in said
     assert "mounting plane" in said
 
@@ -144,8 +121,7 @@ def test_arm_and_obstacles_that_touch_stop_the_arm() -> None:
     folded = (0.0, -1.5, 3.0, -1.5, -1.5, 0.0)
     bench = Bench(limits=Limits(workspace_min_m=(-2, -2, -2)))
     said = Guard(bench.cell, bench.config).check(sample(bench, q=np.array(folded)))
-    assert said is not None
-    assert "shoulder and forearm collide" in said
+    assert "shoulder and forearm collide" in str(said)
 
 
 HOME = (0.0, -1.2, 1.5, -1.5, -1.5, 0.0)
@@ -173,12 +149,6 @@ def planned(config: CellConfig, q: Any) -> bool:
 GEOMETRY = ("joint limits", "workspace", "self-collision", "obstacle")
 
 
-def elbow(height: float) -> tuple[float, ...]:
-    """The elbow's joint of a UR10e at a height above the mounting plane, m."""
-    lift = float(np.arcsin((0.1807 - height) / 0.6127))
-    return (0.0, lift, -lift - 1.0, -1.0, -1.5, 0.0)
-
-
 def with_targets(*more: Any, **limits: Any) -> CellConfig:
     targets = [
         {"name": f"t{k}", "target_m": at} for k, at in enumerate(([0.0, 0.0, 0.1], *more), start=1)
@@ -189,9 +159,6 @@ def with_targets(*more: Any, **limits: Any) -> CellConfig:
 CASES = {
     "the tool 0.86 m below the mounting plane, no workspace given": (
         cell(), BELOW, "mounting plane",
-    ),
-    "the elbow 17 mm above a floor at 0": (
-        cell(limits={"workspace_min_m": [-3.0, -3.0, 0.0]}), elbow(0.017), "forearm",
     ),
     "a second target 0.39 m outside": (
         with_targets([0.0, 0.0, 0.7], workspace_min_m=[-3.0, -3.0, 0.17]), HOME, "t2",
@@ -206,9 +173,7 @@ def test_what_the_planner_refuses_is_refused_and_stops_the_arm(
     assert not planned(config, q)
     found = refused_lines(config, q)
     assert any(word in line for line in found), found
-    said = stopped(config, q)
-    assert said is not None
-    assert word in said
+    assert word in str(stopped(config, q))
 
 
 def test_run_and_check_refuse_it_before_anything_moves(tmp_path: Path, capsys: Capsys) -> None:
@@ -226,43 +191,11 @@ def test_run_and_check_refuse_it_before_anything_moves(tmp_path: Path, capsys: C
     assert any("pose low: wrist 3 is" in problem for problem in checked["problems"])
 
 
-@pytest.mark.parametrize("axis", range(3))
-def test_the_upper_arm_keeps_the_sides_that_leave_the_shoulder_room(axis: int) -> None:
-    """A side 0.45 m from the axis: lying towards it, the upper arm alone is outside."""
-    most = [3.0, 3.0, 3.0]
-    most[axis] = 0.45
-    lift, turn = (-1.57, 0.0) if axis == 2 else (0.0, np.pi if axis == 0 else -np.pi / 2)
-    q = (turn, lift, 2.6 if axis == 2 else -2.6, 0.0, -1.5, 0.0)
-    limits = {"workspace_min_m": [-3.0, -3.0, -3.0], "workspace_max_m": most}
-    found = refused_lines(cell(limits=limits), HOME, q)
-    assert any("pose p1: upper arm is" in line and "outside" in line for line in found), found
-
-
 def test_the_shape_of_an_unknown_arm_is_said_to_be_guessed() -> None:
     config = cell()
     unknown = replace(cell_from_config(config), arm=arm_of(ODD))
     q = np.zeros((1, unknown.arm.n))
-    dry = dry_run(unknown, config, Plan(("reference",), q, (Step("reference", UNLOADED),)))
+    checked = dry_run(unknown, config, Plan(("reference",), q, (Step("reference", UNLOADED),)))
     said = "the shape of odd is not known: its links are guessed"
-    assert said in dry.remarks
+    assert said in checked.remarks
     assert said in Space(unknown, config).remarks
-
-
-def test_guessed_links_are_held_to_each_other_by_planner_dry_run_and_guard() -> None:
-    """States of an arm of unknown shape in which it touches nothing but itself."""
-    config = cell(limits={"workspace_min_m": [-9.0, -9.0, -9.0]}, loads=[])
-    unknown = replace(cell_from_config(config), arm=arm_of(ODD))
-    space, guard = Space(unknown, config), Guard(unknown, config)
-    drawn = np.random.default_rng(0).uniform(-2.0, 2.0, (200, unknown.arm.n))
-    overlap = [q for q in drawn if space.shapes.scene.itself.distance(q) < 0.0]
-    assert len(overlap) > 20
-    for q in overlap[:20]:
-        assert not space.allowed(q[None], UNLOADED, ("self-collision",)).all()
-        plan = Plan(("reference",), q[None], (Step("reference", UNLOADED),))
-        found = [x for x in dry_run(unknown, config, plan).problems if "collide" in x]
-        assert found
-        assert all("its links are guessed" in x for x in found)
-        here = replace(Bench().rig.arm.sample(), q=q, qd=np.zeros(len(q)))
-        said = guard.check(here)
-        assert said is not None
-        assert "collide" in said

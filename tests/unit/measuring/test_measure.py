@@ -36,9 +36,8 @@ def covered(rng, count, windows, share=0.0, worse=1.0):
         common = rng.multivariate_normal(np.zeros(3), share * V)
         values = drawn(rng, count, (1 - share) * worse**2 * V) + common
         mean = average(samples_of(values), share)
-        value, covariance = mean.value, mean.covariance
-        off = value - PLACE
-        inside += off @ np.linalg.solve(covariance, off) < stats.chi2.ppf(0.95, 3)
+        off = mean.value - PLACE
+        inside += off @ np.linalg.solve(mean.covariance, off) < stats.chi2.ppf(0.95, 3)
     return inside / windows
 
 
@@ -47,18 +46,16 @@ def covered(rng, count, windows, share=0.0, worse=1.0):
 
 def test_samples_that_agree_have_the_posterior_covariance():
     mean = average(samples_of([PLACE] * 5))
-    value, covariance = mean.value, mean.covariance
-    assert value == pytest.approx(PLACE, abs=1e-15)
-    assert covariance == pytest.approx(20 / 24 * V / 5, rel=1e-12)
+    assert mean.value == pytest.approx(PLACE, abs=1e-15)
+    assert mean.covariance == pytest.approx(20 / 24 * V / 5, rel=1e-12)
 
 
 def test_scatter_enters_with_its_weight_against_the_prior():
     off = np.array([10e-6, -20e-6, 5e-6])
     values = [PLACE + off, PLACE - off, PLACE]
     mean = average(samples_of(values))
-    value, covariance = mean.value, mean.covariance
-    assert value == pytest.approx(PLACE, abs=1e-15)
-    assert covariance == pytest.approx((20 * V + 2 * np.outer(off, off)) / 22 / 3, rel=1e-9)
+    assert mean.value == pytest.approx(PLACE, abs=1e-15)
+    assert mean.covariance == pytest.approx((20 * V + 2 * np.outer(off, off)) / 22 / 3, rel=1e-9)
 
 
 def test_systematic_share_is_not_averaged_away():
@@ -119,10 +116,9 @@ def test_rotations_average_on_the_sphere_also_across_the_half_turn():
     values = np.hstack([drawn(rng, 50), turns.as_rotvec()])
     assert np.ptp(values[:, 5]) > 6  # both signs occur
     mean = average(samples_of(values, V6))
-    value, covariance = mean.value, mean.covariance
-    off = (Rotation.from_rotvec(value[3:]) * middle.inv()).as_rotvec()
+    off = (Rotation.from_rotvec(mean.value[3:]) * middle.inv()).as_rotvec()
     assert np.linalg.norm(off) < 4 * 8e-5 / np.sqrt(50) * np.sqrt(3)
-    assert np.trace(covariance[3:, 3:]) == pytest.approx(3 * 8e-5**2 / 50, rel=0.3)
+    assert np.trace(mean.covariance[3:, 3:]) == pytest.approx(3 * 8e-5**2 / 50, rel=0.3)
 
 
 def test_deviations_of_poses_turn_with_the_sensor_axes():
@@ -153,17 +149,15 @@ def test_gross_outlier_is_left_out_and_named():
     assert result.covariance == pytest.approx(clean.covariance, rel=1e-12)
 
 
-@pytest.mark.parametrize(("count", "bad"), [(3, 1), (5, 1), (10, 2), (20, 4)])
-def test_one_in_five_may_be_left_out(count, bad):
+@pytest.mark.parametrize(
+    ("count", "bad"), [(3, 1), (5, 1), (5, 2), (10, 2), (10, 3), (20, 4), (20, 5)]
+)
+def test_one_in_five_may_be_left_out_and_more_is_no_reading(count, bad):
     values = drawn(np.random.default_rng(count), count)
     values[:bad] += [[1e-3, 0, 0]] * np.arange(1, bad + 1)[:, None]
-    assert average(samples_of(values)).left_out == tuple(range(bad))
-
-
-@pytest.mark.parametrize(("count", "bad"), [(5, 2), (10, 3), (20, 5)])
-def test_more_than_one_in_five_is_no_reading(count, bad):
-    values = drawn(np.random.default_rng(count), count)
-    values[:bad] += [[1e-3, 0, 0]] * np.arange(1, bad + 1)[:, None]
+    if bad <= max(1, count // 5):
+        assert average(samples_of(values)).left_out == tuple(range(bad))
+        return
     with pytest.raises(DeviceError, match=f"readings scatter: {bad} of {count}"):
         average(samples_of(values))
 
@@ -269,21 +263,8 @@ def test_poses_are_judged_by_their_turning_too():
     assert not turning.settled()
 
 
-def test_nothing_is_settled_before_the_window_is_full():
-    window = SettleWindow(5)
-    for k in range(5):
-        assert not window.settled()
-        window.add(sample(k * DT, STD * (-1) ** k))
-    assert window.settled()
-
-
 def test_samples_without_time_between_them_tell_nothing():
     window = SettleWindow(3)
     for _ in range(9):
         window.add(sample(1.0, STD))
     assert not window.settled()
-
-
-def test_window_of_two_is_refused():
-    with pytest.raises(ValueError, match="3"):
-        SettleWindow(2)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hilcal.cell import Cell
-from hilcal.config import Acquire, CellLoad, ForceSensor, Limits
+from hilcal.config import Acquire, ForceSensor, Limits
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.arrival import RoughRegistration
 from hilcal.measuring.progress import ReadingStored
@@ -18,12 +18,16 @@ from hilcal.measuring.run import HOW_ON, run
 from hilcal.robot import chain as chains
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.plan import Plan, Step
+from hilcal.types import Floats
 from tests.support.fake_bench import (
     POSES,
     STD,
     Bench,
     FakeClock,
     Killed,
+    asked_for,
+    before,
+    changed,
     measure,
     plan_of,
     usual_plan,
@@ -108,8 +112,6 @@ def check_fault(fault: BaseException, k: int) -> None:
     assert [step for step, _, _ in b.store.rows][: len(before)] == before
     assert each_once(b, plan), k
     readings = b.store.readings()
-    assert readings is not None
-    assert readings.states.time is not None
     assert np.all(np.diff(readings.states.time) > 0), k
 
 
@@ -152,49 +154,49 @@ def test_a_refused_row_keeps_its_kind_of_error(monkeypatch: pytest.MonkeyPatch) 
     assert b.world.calls[-2] == "arm.stop"
 
 
-def test_an_arm_that_does_not_stop_is_told_loudly(monkeypatch: pytest.MonkeyPatch) -> None:
-    b = bench()
-
-    def stop() -> None:
-        raise DeviceError("arm: no answer to stop")
-
-    monkeypatch.setattr(b.rig.arm, "stop", stop)
-    b.world.fail[120] = KeyboardInterrupt()
-    with pytest.raises(DeviceError, match=r"THE ARM MAY STILL MOVE.*no answer.*emergency stop"):
-        run_once(b, small_plan())
-    assert b.store.last("interrupted")["arm_not_stopped"] == "arm: no answer to stop"
-
-
-def test_an_error_that_asks_for_the_emergency_stop_asks_once(
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize(
+    ("fault", "stop", "said"),
+    [
+        (
+            KeyboardInterrupt(),
+            "arm: no answer to stop",
+            r"THE ARM MAY STILL MOVE \(arm: no answer to stop\): press the emergency stop",
+        ),
+        (
+            DeviceError("arm: its link broke; press the emergency stop. Unplugged?"),
+            "arm: not sure that it stands: press the emergency stop if it moves",
+            r"Unplugged\? ",
+        ),
+    ],
+)
+def test_an_arm_that_does_not_stop_is_told_loudly_and_once(
+    fault: BaseException, stop: str, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     b = bench()
 
-    def stop() -> None:
-        raise DeviceError("arm: not sure that it stands: press the emergency stop if it moves")
+    def fails() -> None:
+        raise DeviceError(stop)
 
-    monkeypatch.setattr(b.rig.arm, "stop", stop)
-    b.world.fail[120] = DeviceError("arm: its link broke; press the emergency stop. Unplugged?")
-    with pytest.raises(DeviceError) as raised:
+    monkeypatch.setattr(b.rig.arm, "stop", fails)
+    b.world.fail[120] = fault
+    with pytest.raises(DeviceError, match=said) as raised:
         run_once(b, small_plan())
-    said = str(raised.value)
-    assert said.count("emergency stop") == 1
-    assert said.endswith(f"Unplugged? {HOW_ON}")
+    assert str(raised.value).count("emergency stop") == 1
+    assert str(raised.value).endswith(HOW_ON)
+    assert b.store.events[-1][1]["arm_not_stopped"] == stop
 
 
-def test_impatience_does_not_keep_the_arm_from_stopping(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_impatience_does_not_keep_the_arm_from_stopping() -> None:
     """Ctrl-C while the arm is being stopped: it is stopped again."""
     b = bench()
-    stops = []
-    real = b.rig.arm.stop
+    stops: list[int] = []
 
     def stop() -> None:
         stops.append(1)
         if len(stops) == 1:
             raise KeyboardInterrupt
-        real()
 
-    monkeypatch.setattr(b.rig.arm, "stop", stop)
+    before(b.rig.arm, "stop", stop)
     b.world.fail[120] = DeviceError("tracker: silent")
     with pytest.raises(DeviceError, match=r"tracker: silent.*--resume$"):
         run_once(b, small_plan())
@@ -220,17 +222,29 @@ def test_nothing_is_stopped_before_the_arm_is_ours() -> None:
     assert "arm.stop" not in b.world.calls
 
 
+def held(
+    rng: np.random.Generator,
+    count: int,
+    spread: float = 0.7,
+    *,
+    known: bool = True,
+    off_m: float = 0.0,
+) -> tuple[Cell, Floats, Floats]:
+    """A cell of an unknown registration, joints (K, n), and what the tracker sees of its target."""
+    cell = Cell.load(configs_dir() / "cells" / "demo_ur10e.toml")
+    cell = replace(cell, registration_known=False, target_known=known)
+    joints = np.array([0.0, -1.2, 1.4, -1.7, -1.5, 0.0]) + rng.uniform(-spread, spread, (count, 6))
+    at = chains.evaluate(cell.arm, joints).point(cell.target[:3, 3] + [off_m, 0.0, 0.0])
+    return cell, joints, at @ cell.registration[:3, :3].T
+
+
 def test_another_reflector_is_noticed_before_the_registration_is_known() -> None:
     """By distances from two readings that agree; one alone may be the one that is wrong."""
-    cell = Cell.load(configs_dir() / "cells" / "demo_ur10e.toml")
-    cell = replace(cell, registration_known=False, target_known=True)
     rng = np.random.default_rng(0)
     noticed = 0
     for _ in range(40):
+        cell, joints, places = held(rng, 3, 0.5)
         known = RoughRegistration(cell)
-        joints = np.array([0.0, -1.2, 1.4, -1.7, -1.5, 0.0]) + rng.uniform(-0.5, 0.5, (3, 6))
-        chain = chains.evaluate(cell.arm, joints)
-        places = chain.point(cell.target[:3, 3]) @ cell.registration[:3, :3].T
         known.add(joints[0], places[0])
         stray = places[1] + 0.3 * rng.standard_normal(3)
         assert known.implausible(joints[1], stray) is None  # a run must not end by that
@@ -245,24 +259,19 @@ def test_another_reflector_is_noticed_before_the_registration_is_known() -> None
 
 def test_a_reading_of_another_reflector_is_told_as_soon_as_the_tracker_has_its_place() -> None:
     """0.2 m off on the sphere about the first position, where distances cannot tell it."""
-    cell = Cell.load(configs_dir() / "cells" / "demo_ur10e.toml")
-    cell = replace(cell, registration_known=False, target_known=True)
     rng = np.random.default_rng(3)
     for _ in range(10):
+        cell, joints, places = held(rng, 9)
         known = RoughRegistration(cell)
-        joints = np.array([0.0, -1.2, 1.4, -1.7, -1.5, 0.0]) + rng.uniform(-0.7, 0.7, (9, 6))
-        chain = chains.evaluate(cell.arm, joints)
-        places = chain.point(cell.target[:3, 3]) @ cell.registration[:3, :3].T
         way = places[1] - places[0]
         aside = np.cross(way, rng.standard_normal(3))
         stray = places[1] + 0.25 * aside / np.linalg.norm(aside)
-        told = []
+        doubted = []
         for k, q in enumerate(joints):
             known.add(q, stray if k == 1 else places[k], step=Step(f"p{k}", "none"))
-            told += [str(step) for step, _ in known.late_doubts()]
-        assert told == ["p1, none, cycle 0"]
+            doubted += [str(step) for step, _ in known.late_doubts()]
+        assert doubted == ["p1, none, cycle 0"]
         pose = known.pose()
-        assert pose is not None
         assert np.allclose(pose[0], cell.registration[:3, :3], atol=1e-9)
 
 
@@ -271,12 +280,7 @@ def test_a_target_that_is_not_where_it_is_said_refuses_no_reading(
     known: bool, off_m: float
 ) -> None:
     """Its place is estimated later, or was measured with a ruler."""
-    cell = Cell.load(configs_dir() / "cells" / "demo_ur10e.toml")
-    cell = replace(cell, registration_known=False, target_known=known)
-    joints = np.array([0.0, -1.2, 1.4, -1.7, -1.5, 0.0])
-    joints = joints + np.random.default_rng(1).uniform(-0.7, 0.7, (40, 6))
-    chain = chains.evaluate(cell.arm, joints)
-    places = chain.point(cell.target[:3, 3] + [off_m, 0.0, 0.0]) @ cell.registration[:3, :3].T
+    cell, joints, places = held(np.random.default_rng(1), 40, known=known, off_m=off_m)
     rough = RoughRegistration(cell)
     for k, (q, x) in enumerate(zip(joints, places, strict=True)):
         assert rough.implausible(q, x) is None
@@ -306,19 +310,19 @@ def test_order_of_the_start() -> None:
 
 def test_payload_is_set_before_a_weight_is_hung_and_after_it_is_off() -> None:
     b = Bench()
-    told: list[tuple[str, float, str]] = []
+    given: list[tuple[str, float, str]] = []
 
     def payload(mass: float, com: Any) -> None:
-        told.append((b.world.load, mass, str(np.round(com, 6).tolist())))
+        given.append((b.world.load, mass, str(np.round(com, 6).tolist())))
 
-    b.rig.arm.set_payload = payload  # type: ignore[method-assign]
+    before(b.rig.arm, "set_payload", payload)
     plan = plan_of(
         ("p1", "none", 0), ("p1", "3kg", 0), ("p1", "6kg", 0), ("p1", "3kg", 1), ("p1", "pull", 0)
     )
     measure(b, plan)
     com = {m: np.round((0.8 * b.cell.tool_com + (m - 0.8) * b.cell.load_point) / m, 6).tolist()
            for m in (3.8, 6.8)}  # fmt: skip
-    assert told == [
+    assert given == [
         ("none", 3.8, str(com[3.8])),
         ("3kg", 6.8, str(com[6.8])),
         ("3kg", 3.8, str(com[3.8])),  # the 6 kg are off
@@ -328,17 +332,11 @@ def test_payload_is_set_before_a_weight_is_hung_and_after_it_is_off() -> None:
 
 def test_loads_change_only_at_the_reference_and_motions_carry_them() -> None:
     b = Bench()
-    where: list[tuple[str, Any]] = []
-    hang = b.operator.hang
-
-    def noted(load: CellLoad | None, why: str) -> None:
-        where.append(("none" if load is None else load.name, b.world.q.copy()))
-        hang(load, why)
-
-    b.operator.hang = noted  # type: ignore[method-assign]
+    where: list[Any] = []
+    before(b.operator, "hang", lambda *_: where.append(b.world.q.copy()))
     measure(b)
-    assert [name for name, _ in where] == ["none", "3kg", "none", "pull", "none"]
-    for _, q in where[1:]:
+    assert asked_for(b) == ["none", "3kg", "none", "pull", "none"]
+    for q in where[1:]:
         assert np.allclose(q, POSES["reference"])
     assert {load for _, load in b.world.at_start} == {"none", "3kg", "pull"}
 
@@ -367,46 +365,42 @@ def test_an_arm_that_stands_outside_its_workspace_is_not_moved() -> None:
 
 
 @pytest.mark.parametrize(
-    ("what", "change", "said"),
+    ("change", "said"),
     [
-        ("force", {"extra": np.array([130.0, 0, 0, 0, 0, 0])}, "max_force_N is 120"),
-        ("speed", {"extra_speed": 2.5}, "joint_speed_rad_s is 2"),
-        ("safety", {"safety": "protective stop"}, "protective stop"),
+        ({"extra": np.array([130.0, 0, 0, 0, 0, 0])}, "max_force_N is 120"),
+        ({"extra_speed": 2.5}, "joint_speed_rad_s is 2"),
+        ({"safety": "protective stop"}, "protective stop"),
     ],
 )
-def test_limits_are_enforced_in_motion(what: str, change: dict[str, Any], said: str) -> None:
+def test_limits_are_enforced_in_motion(change: dict[str, Any], said: str) -> None:
     """The limit is exceeded in the middle of the fourth motion: the arm stops within a look."""
     b = Bench(force_sensor=LIMIT)
-    moving = b.rig.arm.moving
-    seen: list[float] = []
+    since: list[float] = []
 
-    def noted() -> bool:
-        still = moving()
+    def exceeds(still: bool) -> bool:
         if b.world.calls.count("arm.start_move") == 4 and still:
             for name, value in change.items():
                 setattr(b.world, name, value)
-            seen.append(b.world.time)
+            since.append(b.world.time)
         return still
 
-    b.rig.arm.moving = noted  # type: ignore[method-assign]
+    changed(b.rig.arm, "moving", exceeds)
     with pytest.raises(DeviceError, match=said):
         measure(b)
     assert b.world.calls[-2:] == ["arm.stop", "store.event"]
     assert not b.world.is_moving
-    assert b.world.time - seen[0] <= 0.05
+    assert b.world.time - since[0] <= 0.05
     assert said in b.store.last("failed")["reason"]
 
 
 def test_limits_are_enforced_at_rest() -> None:
     b = Bench(force_sensor=LIMIT)
-    take = b.rig.tracker.measure
 
-    def noted() -> Any:
+    def pushes() -> None:
         if len(b.store.rows) == 2:
             b.world.extra = np.array([0, 130.0, 0, 0, 0, 0])
-        return take()
 
-    b.rig.tracker.measure = noted  # type: ignore[method-assign]
+    before(b.rig.tracker, "measure", pushes)
     with pytest.raises(DeviceError, match="max_force_N"):
         measure(b)
     assert len(b.store.rows) == 2
@@ -420,7 +414,7 @@ def test_an_arm_that_does_not_arrive() -> None:
     def short(q: Any, speed: float, acceleration: float) -> None:
         real(q - 0.002, speed, acceleration)
 
-    b.rig.arm.start_move = short  # type: ignore[method-assign]
+    b.rig.arm.start_move = short
     with pytest.raises(DeviceError, match=r"stands 0\.002 rad off"):
         measure(b)
 
@@ -428,7 +422,7 @@ def test_an_arm_that_does_not_arrive() -> None:
 @pytest.mark.long
 def test_a_motion_that_never_ends_is_given_up() -> None:
     b = Bench()
-    b.rig.arm.moving = lambda: True  # type: ignore[method-assign]
+    b.rig.arm.moving = lambda: True
     with pytest.raises(DeviceError, match="not finished after"):
         measure(b)
     assert b.world.calls[-2] == "arm.stop"
@@ -460,12 +454,11 @@ def test_a_target_that_stays_lost_ends_the_run(lost: int) -> None:
 def test_another_reflector_is_not_believed() -> None:
     b = Bench()
 
-    def other() -> None:
+    def other(*_: object) -> None:
         if len(b.store.rows) == 5:
             b.world.shift = np.array([0.0, 0.3, 0.0])
 
-    before = b.store.event
-    b.store.event = lambda kind, content: (other(), before(kind, content))[1]  # type: ignore
+    before(b.store, "event", other)
     with pytest.raises(DeviceError, match="another reflector"):
         measure(b)
     assert len(b.store.rows) == 5
@@ -487,22 +480,21 @@ def test_readings_that_drift_are_waited_for_and_given_up() -> None:
 @pytest.mark.long
 def test_drift_that_ends_is_waited_for() -> None:
     b, few = Bench(), plan_of(("p1", "none", 0), ("p2", "none", 0), ("p2", "3kg", 0))
-    real = b.world.position
     arrived: dict[tuple[float, ...], float] = {}
 
-    def position() -> Any:
+    def settles(place: Any) -> Any:
         """The target comes to rest with a time constant of 0.5 s after each arrival."""
         since = arrived.setdefault((*b.world.joints(), len(b.world.at_start)), b.world.time)
-        return real() + 1e-3 * np.exp(-(b.world.time - since) / 0.5)
+        return place + 1e-3 * np.exp(-(b.world.time - since) / 0.5)
 
-    b.world.position = position  # type: ignore[method-assign]
+    changed(b.world, "position", settles)
     measure(b, few)
     taken = b.notes.of(ReadingStored)
     assert min(t.settling for t in taken) > 1.0
     quiet = Bench()
     measure(quiet, few)
     assert max(t.settling for t in quiet.notes.of(ReadingStored)) < 1.0
-    away = b.store.readings().value - quiet.store.readings().value  # type: ignore[union-attr]
+    away = b.store.readings().value - quiet.store.readings().value
     assert np.abs(away).max() < 6 * STD
 
 
@@ -517,18 +509,14 @@ def test_an_arm_that_trembles_is_measured_again_and_given_up() -> None:
 @pytest.mark.long
 def test_somebody_who_jogs_the_arm_meanwhile_spoils_the_reading() -> None:
     b = Bench()
-    real = b.rig.force
-    assert real is not None
-    average = real.average
     jogged: list[int] = []
 
-    def jog(seconds: float) -> Any:
+    def jog(seconds: float) -> None:
         if len(b.world.at_start) == 3 and not jogged:
             jogged.append(1)
             b.world.q = b.world.q + 3e-4
-        return average(seconds)
 
-    real.average = jog  # type: ignore[method-assign]
+    before(b.rig.force, "average", jog)
     measure(b)
     assert "measured again: arm: it moved by 0.0003" in b.store.rows[1][2]
     assert len(b.store.rows) == len(usual_plan().steps)
@@ -548,7 +536,7 @@ def test_everything_is_looked_at_twenty_times_a_second_in_motion(scale: float) -
     b = Bench()
     b.world.hurry = 1.0
     b.clock = FakeClock(scale=scale, world=b.world)
-    call, gaps = b.world.call, {"arm.moving": 0.0, "arm.sample": 0.0, "force.latest": 0.0}
+    gaps = {"arm.moving": 0.0, "arm.sample": 0.0, "force.latest": 0.0}
     last: dict[str, float] = {}
     looks = 0
 
@@ -561,9 +549,8 @@ def test_everything_is_looked_at_twenty_times_a_second_in_motion(scale: float) -
             last[name] = b.world.time
         elif name == "arm.start_move":
             last.clear()
-        call(name)
 
-    b.world.call = noted  # type: ignore[method-assign]
+    before(b.world, "call", noted)
     measure(b, plan_of(("p1", "none", 0), ("p1", "3kg", 0)))
     assert looks > 30
     assert max(gaps.values()) <= 0.05, gaps

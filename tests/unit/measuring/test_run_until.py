@@ -8,13 +8,13 @@ import pytest
 
 from hilcal.config import Limits, Obstacle
 from hilcal.errors import DeviceError
-from hilcal.measuring.progress import GoalMet, GoalStatus, ReadingStored, Remark
+from hilcal.measuring.progress import GoalMet, GoalStatus, ReadingStored
 from hilcal.measuring.route import Stop, route_problems, way_home
 from hilcal.present.progress import met_words
 from hilcal.readings.readings import Readings
 from hilcal.robot.chain import evaluate
 from hilcal.store.plan import Plan, Step
-from tests.support.fake_bench import POSES, Bench, Killed, measure, plan_of, usual_plan
+from tests.support.fake_bench import POSES, Bench, Killed, asked_for, measure, plan_of, usual_plan
 from tests.support.rows import first
 
 HOME = POSES["reference"]
@@ -41,10 +41,6 @@ def is_home(b: Bench) -> bool:
     return b.world.load == "none" and np.allclose(b.world.q, HOME) and not b.world.is_moving
 
 
-def remarks(b: Bench) -> list[str]:
-    return [note.text for note in b.notes.of(Remark)]
-
-
 # the way home
 
 
@@ -54,8 +50,7 @@ def test_a_goal_that_is_met_under_a_load() -> None:
     measure(b, goal=Enough(7))
     assert steps(b) == [*plan.steps[:7], Step("reference", "none", 1)]
     assert is_home(b)
-    assert [name for name, _ in b.operator.asked] == ["none", "3kg", "none"]
-    assert b.world.payload is not None
+    assert asked_for(b) == ["none", "3kg", "none"]
     assert b.world.payload[0] == b.cell.tool_mass
     kinds = b.store.kinds()
     assert kinds[kinds.index("goal") :] == [
@@ -63,23 +58,10 @@ def test_a_goal_that_is_met_under_a_load() -> None:
     ]  # fmt: skip
     goal = b.store.last("goal")
     assert (goal["met"], goal["readings"], goal["planned"]) == (True, 7, len(plan.steps))
+    assert [t.goal.std for t in b.notes.of(ReadingStored)[:3]] == [1.0, 2.0, 3.0]
     (event,) = b.notes.of(GoalMet)
     assert (event.status.std, event.readings, event.planned) == (7.0, 7, 15)
     assert met_words(event) == "goal met after 7 of 15 readings: j2 std 7.0 %"
-
-
-@pytest.mark.long
-def test_progress_tells_the_goal_and_what_is_left_of_the_way() -> None:
-    b = Bench()
-    measure(b, goal=Enough(7))
-    taken = b.notes.of(ReadingStored)
-    assert [t.goal.std for t in taken[:3]] == [1.0, 2.0, 3.0]
-    change, reading = 20.0, 10.0  # the person, and about what else is done
-    assert taken[6].left_cell < change + 2 * reading < taken[5].left_cell
-    assert taken[-1].left_cell == 0.0
-    plain = Bench()
-    measure(plain)
-    assert {t.goal for t in plain.notes.of(ReadingStored)} == {None}
 
 
 @pytest.mark.parametrize(
@@ -155,7 +137,7 @@ def test_resuming_towards_a_farther_goal() -> None:
     b.operator.asked.clear()
     measure(b, goal=Enough(12))  # is met already
     assert len(steps(b)) == 12
-    assert [name for name, _ in b.operator.asked] == ["none"]
+    assert asked_for(b) == ["none"]
     assert is_home(b)
 
 

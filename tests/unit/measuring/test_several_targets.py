@@ -11,7 +11,7 @@ from hilcal.config.cell import Target
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.connect import Rig
 from hilcal.measuring.devices import TargetLostError, TrackerSample, WrenchSample
-from hilcal.measuring.progress import ReadingStored, Remark
+from hilcal.measuring.progress import ReadingStored
 from hilcal.measuring.run import run
 from hilcal.present.campaign import event_words
 from hilcal.readings.readings import Readings
@@ -27,6 +27,9 @@ from tests.support.fake_bench import (
     FakeTracker,
     Killed,
     World,
+    before,
+    changed,
+    remarks,
     usual_plan,
 )
 from tests.support.reflector_cases import NAMES, OFFSETS
@@ -110,14 +113,12 @@ def test_each_target_is_read_at_each_stop(tmp_path: Path) -> None:
     stops = len(plan.steps)
     assert r.target.tolist() == [0] * BOOTSTRAP + [0, 1, 2] * (stops - BOOTSTRAP)
     assert len(np.unique(r.arrivals)) == stops
-    told = [e.text for e in b.notes.of(Remark) if "only target R1" in e.text]
-    assert len(told) == 1
+    assert len(remarks(b, "only target R1")) == 1
     assert [e.done for e in b.notes.of(ReadingStored)] == list(range(1, stops + 1))
     chain = chains.evaluate(b.cell.arm, r.states.q)
     held = chain.point(OFFSETS[r.target]) + SAG * r.states.wrench[:, :3]
     seen = held @ REGISTRATION[:3, :3].T + REGISTRATION[:3, 3]
     assert np.abs(r.value - seen).max() < 6 * STD
-    assert r.states.time is not None
     assert np.all(np.diff(r.states.time) > 0)
 
 
@@ -133,8 +134,9 @@ def test_a_hidden_reflector_is_a_missing_reading_with_a_word(tmp_path: Path) -> 
     assert lost
     later = {key for key in by_key(r) if key[:3] in {(s.pose, s.load, s.cycle) for s in steps}}
     assert later == wanted - lost
-    words = [e.text for e in b.notes.of(Remark) if "R2 is not read" in e.text]
-    assert words == ["p4: target R2 is not read: tracker: no target in sight"] * len(lost)
+    assert remarks(b, "R2 is not read") == [
+        "p4: target R2 is not read: tracker: no target in sight"
+    ] * len(lost)
     b, tracker = bench()
     tracker.hidden = {(angle, k) for k in range(3)}
     with pytest.raises(DeviceError, match=r"p4: .*all others.* run again with --resume"):
@@ -146,27 +148,25 @@ def test_a_neighbour_is_not_taken_for_a_target(tmp_path: Path) -> None:
     tracker.misled = True
     r = measure(b, tmp_path / "r.hilcal")
     assert set(r.target.tolist()) == {0, 2}
-    assert any(
-        "R2 is not read: tracker: it sees R1 in its place" in e.text for e in b.notes.of(Remark)
-    )
+    assert remarks(b, "R2 is not read: tracker: it sees R1 in its place")
 
 
 @pytest.mark.long
 def test_all_targets_of_an_arrival_that_was_leaned_on_are_kept_as_doubted(tmp_path: Path) -> None:
     b, _ = bench()
-    force = b.rig.force
-    assert force is not None
-    average, leaned = force.average, []
+    leaned: list[float] = []
 
-    def leans(seconds: float) -> WrenchSample:
+    def leans(seconds: float) -> None:
         wanted = len(b.notes.of(ReadingStored)) == BOOTSTRAP and not leaned
         leaned.extend([seconds] * wanted)
         b.world.extra = np.array([0, 60.0 * wanted, 0, 0, 0, 0])
-        sample = average(seconds)
+
+    def lets_go(sample: WrenchSample) -> WrenchSample:
         b.world.extra = np.zeros(6)
         return sample
 
-    force.average = leans  # type: ignore[method-assign]
+    before(b.rig.force, "average", leans)
+    changed(b.rig.force, "average", lets_go)
     r = measure(b, tmp_path / "r.hilcal")
     assert len(by_key(r)) == len(r) == BOOTSTRAP + 3 * (len(usual_plan().steps) - BOOTSTRAP)
     with CampaignFile.open(tmp_path / "r.hilcal") as file:

@@ -70,7 +70,7 @@ def test_without_noise_everything_is_recovered(seed, mass, com, poses):
     assert found.mass == pytest.approx(mass, abs=1e-8)
     assert found.moment == pytest.approx(mass * np.array(com), abs=1e-8)
     assert found.chi2 == pytest.approx(0.0, abs=1e-8)
-    assert (found.dof, found.poses) == (6 * poses - 10, poses)
+    assert found.dof == 6 * poses - 10
     if mass > 0.5:
         assert found.com == pytest.approx(np.array(com), abs=1e-6)
     assert found.load_wrench(wrench, R) == pytest.approx(np.zeros((poses, 6)), abs=1e-6)
@@ -96,15 +96,6 @@ def test_estimates_scatter_as_their_covariance_says(rng):
     assert np.mean(chi2 > chi2_law.ppf(0.95, 6 * K - 10)) == pytest.approx(0.05, abs=0.023)
     com = np.array([f.com for f in found])
     assert com.std(axis=0) == pytest.approx(found[0].com_std, rel=0.1)
-
-
-def test_the_least_certain_readings_weigh_least(rng):
-    R, cov = rotations(10, rng), covariances(10, rng)
-    wrench = reading(R)
-    wrench[0] += 50.0
-    cov[0] *= 1e10
-    found = identify_tool_load(wrench, cov, R, GRAVITY)
-    assert found.mass == pytest.approx(MASS, abs=1e-4)
 
 
 def test_a_wrong_model_shows_in_the_variance_factor(rng):
@@ -148,12 +139,11 @@ def test_values_that_are_no_numbers_are_refused(what, rng):
         identify_tool_load(**given, gravity=GRAVITY)
 
 
-def test_covariances_that_weigh_nothing_are_refused(rng):
+@pytest.mark.parametrize("value", [0.0, 1.0])
+def test_covariances_that_weigh_nothing_are_refused(value, rng):
     R = rotations(6, rng)
     with pytest.raises(InputError, match="not positive definite; average over more frames"):
-        identify_tool_load(reading(R), np.zeros((6, 6, 6)), R, GRAVITY)
-    with pytest.raises(InputError, match="not positive definite"):
-        identify_tool_load(reading(R), np.ones((6, 6, 6)), R, GRAVITY)
+        identify_tool_load(reading(R), np.full((6, 6, 6), value), R, GRAVITY)
 
 
 def test_a_massless_tool_has_its_centre_of_mass_nowhere(rng):
@@ -199,13 +189,15 @@ PULL = np.array([50.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 STD = np.full(6, 0.1)
 
 
+def compared(expected, measured, std=STD, share=0.05):
+    return compare(expected, measured, std, 3.0, share, GRAVITY)
+
+
 def test_the_right_load_is_accepted():
     measured = WEIGHT + np.array([1.0, -1.0, 1.0, 5.0, -3.0, 1.0])
-    assert compare(WEIGHT, measured, STD, 3.0, 0.0) == (
-        True,
-        "asked for 10 kg (98.1 N), felt 97.1 N",
-    )
-    assert compare(np.zeros(6), np.full(6, 0.5), STD, 3.0, 0.05)[0]
+    right, text = compared(WEIGHT, measured, share=0.0)
+    assert (right, text) == (True, "asked for 10 kg (98.1 N), felt 97.1 N")
+    assert compared(np.zeros(6), np.full(6, 0.5))[0]
 
 
 @given(size=st.floats(0.1, 300.0), share=st.floats(0.0, 0.3), off=st.floats(0.0, 2.0))
@@ -213,7 +205,7 @@ def test_a_load_is_right_within_newtons_or_its_share(size, share, off):
     expected = np.array([0.0, 0.0, -size, 0.0, 0.0, 0.0])
     limit = max(3.0, share * size)
     measured = expected + np.array([off * limit, 0.0, 0.0, 0.0, 0.0, 0.0])
-    right, text = compare(expected, measured, STD, 3.0, share)
+    right, text = compared(expected, measured, share=share)
     if abs(off - 1.0) > 1e-9:
         assert right == (off < 1.0)
     assert "\n" not in text
@@ -236,20 +228,20 @@ def test_a_load_is_right_within_newtons_or_its_share(size, share, off):
     ],
 )  # fmt: skip
 def test_a_wrong_load_is_told_in_words(expected, measured, text):
-    right, said = compare(expected, measured, STD, 3.0, 0.05)
+    right, said = compared(expected, measured)
     assert not right
     assert said.startswith(text)
 
 
 def test_a_load_that_cannot_be_told_from_the_noise_is_not_right():
-    right, text = compare(WEIGHT, WEIGHT, np.full(6, 2.0), 3.0, 0.05)
+    right, text = compared(WEIGHT, WEIGHT, np.full(6, 2.0))
     assert not right
     assert "± 6.0 N: too uncertain to tell" in text
 
 
 def test_a_pure_moment_is_judged_by_its_moment():
     expected = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 10.0])
-    assert compare(expected, expected, STD / 10, 3.0, 0.05)[0]
-    right, text = compare(expected, 0.5 * expected, STD / 10, 3.0, 0.05)
+    assert compared(expected, expected, STD / 10)[0]
+    right, text = compared(expected, 0.5 * expected, STD / 10)
     assert not right
     assert text == "asked for 10.0 N·m, felt 5.0 N·m: that is 50 % of it, 0° off its direction"

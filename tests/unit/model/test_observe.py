@@ -1,15 +1,13 @@
-"""What the sensor reads, against matrix products, and its motions against differences."""
+"""What the sensor reads, against matrix products."""
 
 import numpy as np
 import pytest
 
-from hilcal.model.observe import Observation, ReadingDerivative, motion, observe
+from hilcal.model.observe import observe
 from hilcal.robot.chain import Deviation, evaluate
-from hilcal.robot.statics import Load
 from tests.support.arm_cases import arm_of, cell_of, displacement, slots_of, twisted
 
 COUNT = 5
-NO_LOAD = Load(np.zeros((COUNT, 6)), np.zeros(3), 0.0, np.zeros(3), np.zeros(3))
 CELL = cell_of(arm_of("ur10e"))
 RNG = np.random.default_rng(8)
 Q = RNG.uniform(-np.pi, np.pi, (COUNT, 6))
@@ -27,21 +25,11 @@ SENSOR = ("base", "station", "target")
 DEVIATIONS = [NONE, *ONES, FULL]
 
 
-def read(d: Deviation) -> Observation:
-    return observe(CELL, evaluate(CELL.arm, Q, d), d)
-
-
-def motion_of(d: Deviation, m: int = 6) -> ReadingDerivative:
-    chain = evaluate(CELL.arm, Q, d)
-    return motion(CELL, observe(CELL, chain, d), chain, d, m)
-
-
 @pytest.mark.parametrize("d", DEVIATIONS)
 def test_reading_is_the_product_of_its_displacements(d: Deviation) -> None:
     d = d + Deviation(dq=FULL.dq)
-    o = read(d)
+    o = observe(CELL, evaluate(CELL.arm, Q, d), d)
     given = {k: np.zeros((COUNT, 6)) if getattr(d, k) is None else getattr(d, k) for k in SENSOR}
-    assert d.dq is not None
     for i in range(COUNT):
         target = np.eye(4)
         target[:3, 3] = CELL.target[:3, 3] + given["target"][i, :3]

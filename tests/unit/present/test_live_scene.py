@@ -12,7 +12,7 @@ from hilcal.present.live_viewer import Revised
 from hilcal.present.viewer import live, style
 from hilcal.present.viewer.live import BALL, FLUENT, GROUPS, LIMIT, MANY, LiveTally, judged
 from tests.support.live_story import BLIND, events, measuring, plan, residual
-from tests.support.picture import Shot, pictures, vulkan_available
+from tests.support.picture import Shot, contrast, pictures, vulkan_available
 from tests.support.recordings import chunks, values
 from tests.support.viewer_story import story
 
@@ -193,14 +193,6 @@ def test_other_readings_begin_another_story(tmp_path):
     assert len(values(path, "/errors/fit", "BarChart:values")) == 5
     tables = [row[0] for row in values(path, "/words/revisions", "TextDocument:text")]
     assert tables[-1].count("\n|") < tables[-2].count("\n|")
-
-
-def contrast(a, b) -> float:
-    """Ratio of relative luminances, as WCAG 2 defines it."""
-    c = np.array([a, b]) / 255.0
-    linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
-    low, high = sorted(linear @ [0.2126, 0.7152, 0.0722] + 0.05)
-    return float(high / low)
 
 
 def test_words_in_pictures_are_legible_in_both_themes(refined):

@@ -8,14 +8,7 @@ import pytest
 
 from hilcal.design.discriminated_pairs import not_ruled_out
 from hilcal.design.next import PairPower
-from hilcal.design.run_order import Confounding, Duration
-from hilcal.design.summary import (
-    CriterionResult,
-    CurvePoint,
-    DetectableEffect,
-    PlanSummary,
-    PredictedParameter,
-)
+from hilcal.design.summary import PredictedParameter
 from hilcal.present.plan import (
     certified,
     enough,
@@ -29,38 +22,7 @@ from hilcal.robot.chain import evaluate
 from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step
 from hilcal.tables.table import read_table
 from hilcal.tables.write import plan_csv
-
-ORDER = Confounding(60, 0.0251**0.5, "fz", -3.6, 1000.0, 20e-6 / 3600, 5.7e-6, -2e-8, 17e-6 / 3600)
-SUMMARY = PlanSummary(
-    poses=18,
-    readings=93,
-    loads={UNLOADED: 33, "mass-5kg": 20, "mass-10kg": 20, "pull-x-50N": 20},
-    duration=Duration(842.0, 1111.5, 240.0),
-    criterion="D",
-    efficiency=0.98768,
-    parameters=(
-        PredictedParameter("joint_compliance.j1", 4e-8, 4.2e-6, "rad/(N·m)"),
-        PredictedParameter("joint_compliance.j6", 6e-7, 1.6e-5, "rad/(N·m)"),
-        PredictedParameter("base_frame.x", 1.2e-5, None, "m"),
-        PredictedParameter("target_offset.x", 2.2e-5, 0.0, "m"),
-    ),
-    position_std_m=11.4e-6,
-    position="deflection under mass-5kg at 100 poses",
-    criteria=(
-        CriterionResult("D", 11.4e-6, 15.1e-6, 0.038, 132.0, 0.021, 4.1, 0.98768),
-        CriterionResult("I", 9.1e-6, None, None, 110.0, 0.016, 3.3, None),
-    ),
-    curve=tuple(CurvePoint(*p) for p in ((6, 31e-6), (12, 12e-6), (18, 11.4e-6), (36, 11.2e-6))),
-    detectable=(
-        DetectableEffect("hysteresis", 6e-6),
-        DetectableEffect("joint_tilt", 3e-6),
-        DetectableEffect("tracker_drift", None),
-    ),
-    longer=0.032,
-    confounding=ORDER,
-    shortest=replace(ORDER, correlation=0.41**0.5),
-    remarks=("only 3 candidates are left of load mass-10kg.",),
-)
+from tests.support.viewer_plan import BARE, SUMMARY
 
 
 @pytest.fixture
@@ -75,28 +37,27 @@ def test_everything_is_told_and_fits(shown, width: int) -> None:
     assert "…" not in text  # nothing is cut off
     words = " ".join(text.split())
     for told in (
-        "18 and the reference",
-        "93: unloaded 33, mass-5kg 20, mass-10kg 20, pull-x-50N 20",
-        "37 min",
-        "motion 14 min, readings 19 min, 4 load changes by hand 4 min",
+        "3 and the reference",
+        "10: unloaded 6, 10kg 2, pull x 2",
+        "6 min",
+        "motion 60 s, readings 90 s, 3 load changes by hand 3 min",
         "efficiency of the plan: at least 98.7 % (certified lower bound); not accuracy",
-        "deflection ± 11.4 µm, predicted for the deflection under mass-5kg at 100 poses",
+        "deflection ± 12.0 µm, predicted for the deflection under each load at 100 feasible poses",
         "it is not the accuracy of the robot: geometry, registration, repeatability and effects "
         "outside of the model are not in it",
-        "joint_compliance.j6 0.60 16.0 µrad/(N·m) 3.8 %",
+        "joint_compliance.j2 0.60 6.00 µrad/(N·m) 10.0 %",
         "base_frame.x 12 µm",
-        "D (this) 11.4 µm 15.1 µm 3.8 % 132 0.021 4.10 98.7 %",
-        "I 9.10 µm - - 110 0.016 3.30 -",
+        "D (this) 12.0 µm 24.0 µm 3.8 % 132 0.020 4.00 98.7 %",
+        "I 9.00 µm 30.0 µm - 66.0 0.010 2.00 -",
         "These readings cannot detect tracker_drift.",
-        "note: only 3 candidates are left of load mass-10kg.",
+        "note: only 3 candidates are left of load 10kg.",
     ):
         assert told in words
     assert text.index("joint_tilt") < text.index("hysteresis  ")  # the best seen comes first
 
 
 def test_what_is_absent_is_not_told(shown) -> None:
-    bare = PlanSummary(1, 2, {UNLOADED: 2}, Duration(1.0, 2.0, 0.0), "made by hand", None, (), None)
-    text = shown(bare)
+    text = shown(BARE)
     assert "made by hand" in text
     assert "0 load changes" in text
     absent = ["efficiency", "certified", "position", "Comparison", "enough", "drift", "nan", "None"]
@@ -105,9 +66,9 @@ def test_what_is_absent_is_not_told(shown) -> None:
 
 def test_other_poses_than_asked_for_and_parameters_left_open_are_explained(shown) -> None:
     words = " ".join(shown(replace(SUMMARY, asked_poses=24)).split())
-    fewer = "18 and the reference: the cell leaves no more of 24, so that some are read again"
+    fewer = "3 and the reference: the cell leaves no more of 24, so that some are read again"
     assert fewer in words
-    assert "the cell leaves" not in shown(replace(SUMMARY, asked_poses=18))
+    assert "the cell leaves" not in shown(replace(SUMMARY, asked_poses=3))
     lost = PredictedParameter("joint_compliance.j1", np.inf, 4.2e-6, "rad/(N·m)")
     summary = replace(SUMMARY, parameters=(lost,))
     assert "joint_compliance.j1 not determined 4.20 µrad" in " ".join(shown(summary).split())
@@ -133,23 +94,24 @@ def test_bars_are_as_long_as_what_they_show_and_the_plan_is_marked(shown) -> Non
     sizes = np.array([line.count("█") for line in lines])
     values = np.array([point.position_std_m for point in SUMMARY.curve])
     np.testing.assert_allclose(sizes / sizes[0], values / values[0], atol=0.02)
-    assert ["this plan" in line for line in lines] == [False, False, True, False]
-    from_12 = "From 12 to 36 poses the prediction's uncertainty falls by 7 % only."
-    assert enough(SUMMARY.curve) == from_12
-    assert enough(SUMMARY.curve[:2]) == "More than 12 poses still improve the prediction."
+    assert ["this plan" in line for line in lines] == [False, True, False]
+    falls = "From 3 to 6 poses the prediction's uncertainty falls by 4 % only."
+    assert enough(SUMMARY.curve) == falls
+    assert enough(SUMMARY.curve[:2]) == "More than 3 poses still improve the prediction."
 
 
 def test_the_order_is_stated_with_its_cost_and_what_it_saves() -> None:
-    words = order_remark(SUMMARY)
+    order = replace(SUMMARY.confounding, drift_std=17e-6 / 3600)
+    words = order_remark(replace(SUMMARY, confounding=order))
     for told in (
-        "3.2 % longer",
-        "up to about 3 % of a parameter's information (41 % in the shortest order)",
-        "a drift of 20 µm/h shifts deflections by 5.70 µm rms",
+        "3.0 % longer",
+        "up to about 2 % of a parameter's information (40 % in the shortest order)",
+        "a drift of 18 µm/h shifts deflections by 5.00 µm rms",
         "and less than 0.1 µm on average",
         "determine it to ± 17 µm/h",
     ):
         assert told in words
-    order = replace(ORDER, bias_m=5e-6, drift_std=None)
+    order = replace(order, bias_m=5e-6, drift_std=None)
     plain = order_remark(replace(SUMMARY, longer=0.0, confounding=order))
     assert plain.startswith("The order is the shortest one. ")
     assert "5.00 µm on average." in plain

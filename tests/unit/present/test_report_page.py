@@ -7,7 +7,6 @@ import shutil
 import subprocess
 from collections.abc import Iterator
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +30,7 @@ from hilcal.present.story import Chapter
 from hilcal.refinement import Refinement, RefinementStep
 from hilcal.store.overview import MeasuringDevice
 from tests.support.browser import DESKTOP, PHONE, needs_chromium, open_browser
+from tests.support.outline import Outline
 from tests.support.picture import pixels
 from tests.support.report_pages import EVIL, opened, small_content
 
@@ -99,22 +99,6 @@ def large(m: ReportContent) -> ReportContent:
     return replace(plain(m), story=story, overview=overview)
 
 
-class Outline(HTMLParser):
-    """The tags of a page with their attributes."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.found: list[tuple[str, dict[str, str | None]]] = []
-        self.feed(text)
-        self.tags = [tag for tag, _ in self.found]
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.found.append((tag, dict(attrs)))
-
-    def of(self, tag: str, key: str) -> list[str | None]:
-        return [attrs[key] for name, attrs in self.found if name == tag]
-
-
 def test_the_page_is_one_file_with_its_headings_tables_and_sentences(text) -> None:
     outline = Outline(text)
     assert outline.tags.count("h1") == 1
@@ -123,7 +107,7 @@ def test_the_page_is_one_file_with_its_headings_tables_and_sentences(text) -> No
     for name, found in outline.found:
         assert not (name in ("script", "img", "iframe") and "src" in found)
         if found.get("class") == "chart":
-            assert len(str(found["aria-label"])) > 20
+            assert len(found["aria-label"]) > 20
             assert found["role"] == "img"
     assert set(outline.of("th", "scope")) <= {"row", "col"}
     assert set(outline.of("link", "href")) == {"data:,"}

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from hilcal.diagnosis.diagnosis import Diagnosis
-from hilcal.diagnosis.effect_ranking import Later as LeftOut
 from hilcal.diagnosis.residual_regression import Dependence
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.errors import InputError
@@ -101,8 +100,7 @@ def test_an_unknown_effect_has_a_curve_in_units_for_people() -> None:
 @pytest.mark.parametrize(("explains", "curves"), [(0.03, True), (0.6, False)])
 def test_a_suspect_that_explains_little_leaves_the_picture_to_the_variable(explains, curves):
     d = unknown()
-    left_out = LeftOut(lambda: HeldOut(explains, True))
-    lead = replace(d.suspects[1], left_out=left_out, explains=True)
+    lead = replace(d.suspects[1], left_out=lambda: HeldOut(explains, True), explains=True)
     named = replace(d, reason="one_suspect", suspects=(lead, d.suspects[0]))
     r = build_story([Chapter(1, None, d.fit, named)]).revisions[0]
     assert r.follows.title == ("joint 4 angle" if curves else lead.effect)
@@ -139,11 +137,15 @@ def test_gross_errors_are_shown_as_well() -> None:
     story = build_story([Chapter(1, None, found, None)])
     assert len(story) == len(value)
     assert int(np.argmax(story.revisions[0].whitened_norm2)) == 17
-    left = of_left_out(story.revisions[0], found).size_m
+    apart = of_left_out(story.revisions[0], found)
+    np.testing.assert_allclose(story.measured - apart.predicted, apart.residual, atol=1e-12)
+    assert apart.whitened_norm2.sum() > story.revisions[0].whitened_norm2.sum()
+    left = apart.size_m
     assert int(np.argmax(left)) == 17
     kept = left_out_errors(found)
     np.testing.assert_allclose(np.sort(left[~found.outlier]), np.sort(kept), rtol=1e-9)
     assert kept.max() == pytest.approx(found.holdout.max_m)
+    assert np.sqrt(np.mean(kept**2)) == pytest.approx(found.holdout.rms_m, rel=1e-9)
 
 
 def test_other_readings_do_not_make_one_story() -> None:

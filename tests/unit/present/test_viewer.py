@@ -16,10 +16,10 @@ from scipy.spatial.transform import Rotation
 
 from hilcal.errors import InputError
 from hilcal.present.document import table
-from hilcal.present.story import levels, worst_and_even
+from hilcal.present.story import levels
 from hilcal.present.viewer import campaign, save, serve, style
 from hilcal.present.viewer.recording import executable
-from hilcal.robot.body import body_poses, capsules
+from hilcal.robot.body import body_poses
 from tests.support.paths import ROOT
 from tests.support.picture import Shot, pictures, pixels, vulkan_available
 from tests.support.recordings import rows, same, texts
@@ -81,26 +81,22 @@ def test_every_revision_has_its_errors_in_micrometres(told, recording):
             assert ((numbers - 0.5 < left) & (right < numbers + 0.5)).all()
 
 
-def test_a_curve_is_drawn_by_bars_about_its_values(tmp_path):
+ONE = replace(ANGLE, x=np.ones(1), y=np.zeros(1), error=np.zeros(1))
+
+
+@pytest.mark.parametrize(("curve", "width"), [(ANGLE, None), (LOAD, 1.0), (ONE, 1.0)])
+def test_a_curve_is_drawn_by_bars_about_its_values(tmp_path, curve, width):
     told, path = doubtful(), tmp_path / "doubt.rrd"
-    save(told, path)
+    revisions = (replace(told.revisions[2], follows=curve), told.revisions[3])
+    save(replace(told, revisions=revisions), path)
     left, right, height = bars(path, "/follows/mean", 2)
-    np.testing.assert_allclose(height, ANGLE.y)
-    assert ((left < ANGLE.x) & (ANGLE.x < right)).all()
+    np.testing.assert_allclose(height, curve.y)
     np.testing.assert_allclose(left[1:], right[:-1], rtol=1e-5)  # side by side
+    at = np.arange(len(curve.x)) if curve.names else curve.x
+    assert ((left < at) & (at < right)).all()
+    if width is not None:
+        np.testing.assert_allclose(right - left, width)
     assert 3 not in rows(path, "/follows/mean", "BarChart:values", "revision")  # nothing follows
-
-
-@pytest.mark.parametrize(
-    ("curve", "height"),
-    [(LOAD, LOAD.y), (replace(ANGLE, x=np.ones(1), y=np.zeros(1), error=np.zeros(1)), [0.0])],
-)
-def test_loads_and_a_single_bin_have_bars_of_width_one(tmp_path, curve, height):
-    told, path = doubtful(), tmp_path / "load.rrd"
-    save(replace(told, revisions=(replace(told.revisions[2], follows=curve),)), path)
-    left, right, drawn = bars(path, "/follows/mean", 2)
-    np.testing.assert_allclose(drawn, height)
-    np.testing.assert_allclose(right - left, 1.0)
 
 
 def test_readings_over_a_suspect_are_drawn_by_their_mean(told, recording):
@@ -229,14 +225,6 @@ def test_thousands_of_readings_stay_small_and_say_what_they_show(tmp_path):
     assert len(rows(path, "/world/arm/body3", "Transform3D:translation", "pose")) == 3000
 
 
-def test_subsample_keeps_the_worst():
-    badness = np.random.default_rng(0).random(1000)
-    chosen = worst_and_even(badness, 50)
-    assert len(chosen) <= 50
-    assert set(np.argsort(-badness)[:10]) <= set(chosen.tolist())
-    assert np.diff(chosen).max() < 100
-
-
 def test_noise_balls_give_the_covariance_back():
     a = 1e-5 * np.random.default_rng(3).standard_normal((12, 3, 3))
     told = replace(story(poses=4, loads=3), covariance=a @ a.transpose(0, 2, 1) + 1e-10 * np.eye(3))
@@ -251,20 +239,6 @@ def test_levels_hold_the_share_of_noise_they_name():
     norm2 = np.random.default_rng(4).chisquare(3, 200_000)
     share = np.bincount(levels(norm2), minlength=3) / len(norm2)
     assert share[1:] == pytest.approx([0.0099, 0.0001], abs=0.001)
-
-
-def test_the_arm_is_drawn_as_its_capsules(told, recording):
-    for i in range(told.arm.n + 1):
-        own = [c for c in capsules(told.arm) if c.body == i]
-        start, radius, length, turn = (
-            np.array(rows(recording, f"/world/arm/body{i}", f"Capsules3D:{name}")[0])
-            for name in ("translations", "radii", "lengths", "quaternions")
-        )
-        assert len(own) >= 1
-        np.testing.assert_allclose(start, [c.start for c in own], atol=1e-6)
-        np.testing.assert_allclose(radius, [c.radius for c in own], atol=1e-6)
-        end = start + length[:, None] * Rotation.from_quat(turn).apply([0.0, 0.0, 1.0])
-        np.testing.assert_allclose(end, [c.end for c in own], atol=1e-6)
 
 
 def test_arm_of_another_shape_is_drawn(tmp_path):
@@ -336,20 +310,15 @@ def test_every_view_is_drawn_without_a_report(told, recording, tmp_path):
 # where a recording goes
 
 
-def test_missing_folder_is_refused(told, tmp_path):
-    with pytest.raises(InputError, match="no folder"):
-        save(told, tmp_path / "none" / "x.rrd")
-
-
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")
 def test_a_viewer_that_joins_late_gets_the_whole_story(told, tmp_path, monkeypatch, free_port):
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
     late = tmp_path / "late.rrd"
-    with serve(told, port=free_port) as served:
-        assert served.url == f"rerun+http://127.0.0.1:{free_port}/proxy"
+    with serve(told, port=free_port) as url:
+        assert url == f"rerun+http://127.0.0.1:{free_port}/proxy"
         client = subprocess.Popen(
-            [executable(), "--port", "auto", "--save", str(late), served.url],
+            [executable(), "--port", "auto", "--save", str(late), url],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )

@@ -14,7 +14,8 @@ from hilcal import numbers
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.document import to_json as diagnosis_json
 from hilcal.diagnosis.effect_ranking import FALSE_ALARM
-from hilcal.diagnosis.misfit_breakdown import ROW_ORDER, MisfitShare, misfit_breakdown
+from hilcal.diagnosis.misfit_breakdown import MisfitShare, misfit_breakdown
+from hilcal.diagnosis.recorded import ROW_ORDER
 from hilcal.diagnosis.residual_regression import Dependence
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.options import typical_compliances
@@ -94,10 +95,8 @@ def test_units_follow_the_largest_value(unit: str, values: list[float], expected
     assert numbers.unit_for(unit, values) == expected
 
 
-def test_sentences_keep_the_spelling_of_effects() -> None:
+def test_lists_and_sentences() -> None:
     assert numbers.sentence("residuals are noise") == "Residuals are noise."
-    kept = numbers.sentence("hysteresis is missing: it", {"hysteresis"})
-    assert kept == "hysteresis is missing: it."
     assert numbers.names(["a"]) == "a"
     assert numbers.names(["a", "b", "c"]) == "a, b and c"
     assert numbers.few(["a", "b", "c", "d"]) == "a, b and 2 more"
@@ -160,39 +159,29 @@ def test_before_of_positions_is_the_rigid_arm_in_frames_of_its_own(absolute, sho
     assert to_json(absolute)["error"]["before"] == before.to_json()
 
 
-def test_a_p_value_reads_the_same_wherever_it_stands(absolute, judged, shown):
-    lead = judged.suspects[0]
+def test_p_values_and_how_many_were_tested_read_the_same_wherever_they_stand(
+    absolute, judged, shown
+):
+    lead, tests = judged.suspects[0], diagnosis_json(judged)["tests"]
     value, equals = (f(lead.score.p_value) for f in (numbers.chance, numbers.p_equals))
     assert equals in message(judged)
     assert re.search(rf"{lead.effect} .*{re.escape(value)}", shown(suspects_table(judged)))
+    assert all(s.score.p_value * judged.tested < FALSE_ALARM for s in judged.suspects if s.passes)
+    assert tests["count"] == sum(s.score.rank > 0 for s in judged.suspects)
+    assert tests["each"] == pytest.approx(FALSE_ALARM / tests["count"])
+    report, tested = shown(*diagnosis_report(judged)), f"{tests['count']} effects were tested"
+    assert f"{tested}: one counts from p < " in report
+    assert f"which is 0.001 / {tests['count']}" in report
+    kinds = [v for v in judged.misfit_breakdown if v.group not in ("pose", "direction")]
+    assert f"{len(kinds)} variables were tested" in report
     story = build_story([Chapter(1, None, absolute, judged)])
     revision = story.revisions[0]
     escaped = value.replace("<", "\\<")
     assert f"| {escaped} |" in viewer.verdict(story, revision)
     assert equals in str(revision.panels["verdict"][0])
-    assert all(s.score.p_value * judged.tested < FALSE_ALARM for s in judged.suspects if s.passes)
-
-
-def test_how_many_were_tested_stands_where_p_values_do(absolute, judged, shown):
-    tests = diagnosis_json(judged)["tests"]
-    assert tests["count"] == sum(s.score.rank > 0 for s in judged.suspects)
-    assert tests["each"] == pytest.approx(FALSE_ALARM / tests["count"])
-    report = shown(*diagnosis_report(judged))
-    assert f"{tests['count']} effects were tested: one counts from p < " in report
-    assert f"which is 0.001 / {tests['count']}" in report
-    kinds = [v for v in judged.misfit_breakdown if v.group not in ("pose", "direction")]
-    assert f"{len(kinds)} variables were tested" in report
-    story = build_story([Chapter(1, None, absolute, judged)])
-    details = viewer.details(story, story.revisions[0])
-    assert f"{tests['count']} effects were tested" in details
-
-
-def test_terminal_and_viewer_call_the_worst_pose_by_its_name(absolute):
+    details = viewer.details(story, revision)
+    assert tested in details
     worst = worst_poses(full_prediction(absolute))[0]
-    story = build_story([Chapter(1, None, absolute, None)])
-    assert worst.pose in absolute.readings.pose_names
-    assert story.pose_name(viewer.worst(story.revisions[0])) == worst.pose
-    details = viewer.details(story, story.revisions[0])
     assert f"Worst: pose {worst.pose}, load {worst.load}," in details
 
 

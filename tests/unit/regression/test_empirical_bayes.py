@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hilcal.identification.baseline import baseline, with_effects
+from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.gauss_newton import effective_parameters
 from hilcal.identification.uncertainty import (
@@ -21,7 +21,7 @@ from hilcal.regression.empirical_bayes import (
 )
 from hilcal.regression.projection import projection
 from hilcal.regression.schur import eliminate
-from tests.support.campaigns import campaign, measured, noiseless, plan
+from tests.support.campaigns import campaign, measured, plan
 from tests.support.effect_cases import make
 
 
@@ -67,16 +67,6 @@ def test_the_noise_factor_is_found_but_never_below_the_stated_one(noise):
     assert found.beta == pytest.approx(noise**2, rel=4 * np.sqrt(2 / 1147))
     quiet, _ = linear([5.0], 50, noise=0.1)
     assert quiet.beta == 1.0
-
-
-def test_an_empty_family_leaves_the_rest():
-    rng = np.random.default_rng(0)
-    a = rng.normal(size=(50, 4))
-    y = rng.normal(size=50)
-    none = np.zeros(0)
-    found = maximise_evidence(a.T @ a, a.T @ y, float(y @ y), 50, 4, none.astype(np.int64), none)
-    assert found.effective == 0
-    assert len(found.std) == 0
 
 
 def with_harmonics(effect: str, seed: int, hidden: int, **options) -> tuple[Fit, np.ndarray]:
@@ -135,16 +125,6 @@ def test_nothing_there_leaves_almost_nothing_and_costs_less_than_two_percent():
     assert np.mean(determined) < 0.1 * 72
     # Of 36 groups of two, noise keeps those with χ² > 2, each of which spends 2 to 2.7.
     assert np.mean(effective) < 36 * np.exp(-1) * 2.7
-
-
-def test_without_noise_shrinkage_costs_no_accuracy():
-    """Strong data overrule the prior."""
-    c = campaign("transmission_error", "absolute", 0, plan_seed=0, poses=40, strength=30.0)
-    clean = noiseless(c.world, plan(40))
-    model = with_effects(c.cell, clean, "absolute", ("joint_compliance", "transmission_error"))
-    found = fit(model, clean, "absolute")
-    sigma = np.sqrt(np.trace(clean.covariance, axis1=1, axis2=2).mean())
-    assert found.error.rms_m < 0.2 * sigma
 
 
 def test_a_dropped_harmonic_is_not_counted_nor_listed():
@@ -322,29 +302,6 @@ def test_a_strong_group_is_hardly_widened_and_a_flat_parameter_not_at_all():
     factor = hyperparameter_factors(covariance, theta, prior, groups)
     np.testing.assert_allclose(factor, 1.0, atol=2e-3)
     assert factor[2] == 1.0
-
-
-def test_a_change_of_units_changes_nothing():
-    rng = np.random.default_rng(1)
-    a = rng.normal(size=(4, 3))
-    covariance = np.linalg.inv(a.T @ a + np.eye(3) / 0.5**2)
-    theta, prior, groups = rng.normal(size=3), np.full(3, 0.5), np.zeros(3, dtype=np.int64)
-    plain = hyperparameter_factors(covariance, theta, prior, groups)
-    scaled = hyperparameter_factors(1e-10 * covariance, 1e-5 * theta, 1e-5 * prior, groups)
-    np.testing.assert_allclose(plain, scaled, rtol=1e-9)
-    assert (plain > 1.0).any()
-
-
-def test_groups_are_taken_one_by_one():
-    covariance = np.diag([0.3, 0.2, 0.4, 0.1])
-    theta, prior = np.array([0.5, 0.4, 1.0, -0.8]), np.array([0.7, 0.7, 1.1, 1.1])
-    together = hyperparameter_factors(covariance, theta, prior, np.array([0, 0, 1, 1]))
-    first = hyperparameter_factors(covariance[:2, :2], theta[:2], prior[:2], np.array([0, 0]))
-    np.testing.assert_allclose(together[:2], first)
-    dropped = hyperparameter_factors(
-        covariance, theta, np.where([1, 1, 0, 0], prior, 0.0), np.array([0, 0, 1, 1])
-    )
-    np.testing.assert_allclose(dropped[2:], 1.0)
 
 
 def test_what_a_dropped_group_could_do_widens_what_it_is_confused_with():

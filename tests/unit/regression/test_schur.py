@@ -78,13 +78,6 @@ def test_the_inverse_root_is_one_of_the_pseudoinverse(singular: bool) -> None:
     assert not y[:, INTEREST].any()
 
 
-def test_without_nuisance_it_is_the_matrix() -> None:
-    a = columns(singular=False)
-    m = a.T @ a
-    assert differentiable_schur_complement(m, None).matrix is m
-    np.testing.assert_array_equal(schur_complement(m, np.arange(8)), m)
-
-
 def test_its_derivatives_by_the_information() -> None:
     a = columns(singular=False)
     m = a.T @ a
@@ -202,7 +195,3 @@ def test_groups_and_their_numbers_are_those_of_a_graph() -> None:
         near = np.all(np.abs(points[:, None] - points) <= distance, axis=2)
         expected = connected_components(near, directed=False)[1]
         assert np.array_equal(groups_within(points, distance), expected)
-
-
-def test_nothing_is_in_no_group() -> None:
-    assert len(groups_within(np.zeros((0, 6)), 1.0)) == 0

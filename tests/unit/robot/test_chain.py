@@ -42,27 +42,13 @@ def pinocchio_flange(arm: Arm, q: Floats) -> pin.SE3:
 
 
 @pytest.mark.parametrize("name", ARMS)
-@pytest.mark.parametrize("size", [0.0, 1e-3])
-def test_joints_agree_with_pinocchio(name: str, size: float) -> None:
-    arm = arm_of(name)
-    q, dq = angles(arm), size * np.random.default_rng(3).normal(size=(COUNT, arm.n))
-    chain = evaluate(arm, q, Deviation(dq=dq) if size else None)
-    for i in range(COUNT):
-        flange = pinocchio_flange(arm, q[i] + dq[i])
-        np.testing.assert_allclose(
-            chain.position[-1, i], flange.translation, rtol=0, atol=TOLERANCE
-        )
-        np.testing.assert_allclose(chain.rotation[-1, i], flange.rotation, rtol=0, atol=TOLERANCE)
-
-
-@pytest.mark.parametrize("name", ARMS)
-@pytest.mark.parametrize("size", [1e-9, 1e-3, 0.5])
-def test_twisted_links_agree_with_pinocchio(name: str, size: float) -> None:
+@pytest.mark.parametrize("size", [0.0, 1e-9, 1e-3, 0.5])
+def test_flange_is_where_pinocchio_has_it(name: str, size: float) -> None:
     arm = arm_of(name)
     q, d = angles(arm), random_deviation(arm, size)
     assert d.dq is not None
     assert d.twist is not None
-    chain = evaluate(arm, q, d)
+    chain = evaluate(arm, q, d if size else None)
     for i in range(COUNT):
         flange = pinocchio_flange(twisted(arm, d.twist[i]), q[i] + d.dq[i])
         np.testing.assert_allclose(
@@ -255,20 +241,6 @@ def test_torques_are_those_that_pinocchio_holds_against(name: str, gravity: str)
         held = pin.computeGeneralizedGravity(model, data, angle)
         torque = jacobian.T @ load.wrench[i] - held
         np.testing.assert_allclose(arm.along(found)[i], torque, rtol=0, atol=1e-10)
-
-
-def test_a_weight_on_a_lever_turns_it_down() -> None:
-    # One joint about −y, a lever of 0.5 m along x with 3 kg at its end: it falls by +τ.
-    arm = Arm(
-        name="lever", links=np.array([displacement([0, 0, 0, np.pi / 2, 0, 0]), np.eye(4)]),
-        masses=np.array([3.0]), coms=np.array([[0.5, 0.0, 0.0]]), q_min=np.array([-np.pi]),
-        q_max=np.array([np.pi]), torque_max=np.array([100.0]), payload=1.0, joint_names=("j1",),
-        source="made up",
-    )  # fmt: skip
-    load = Load(np.zeros((1, 6)), np.zeros(3), 0.0, np.zeros(3), np.array([0, 0, -10.0]))
-    wrench = slot_wrenches(arm, evaluate(arm, np.zeros((1, 1))), load)
-    np.testing.assert_allclose(wrench[0, 0], [0, -30, 0, 0, 0, -15], rtol=0, atol=1e-13)
-    np.testing.assert_allclose(wrench[0, 1], 0.0, rtol=0, atol=1e-13)
 
 
 @pytest.mark.parametrize("name", ["ur10e", ODD])

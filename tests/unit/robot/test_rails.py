@@ -20,7 +20,6 @@ from hilcal.config import CellConfig
 from hilcal.drivers.simulated.rehearsal import Rehearsal, case_of_plan, read_plan
 from hilcal.effects.catalogue import installed
 from hilcal.errors import InputError
-from hilcal.model.model import Model
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import configs_dir, load_arm
 from hilcal.robot.chain import evaluate
@@ -371,26 +370,6 @@ joint_std_rad = 1e-5
     points.write_text("pose,q1_m,q2_rad\na,1,0\n")
     said = refused(capsys, 2, "compensate", run, points)
     assert "column 'q3_rad' is missing beside its group" in said
-
-
-@pytest.mark.long
-def test_the_jacobian_of_a_fitted_rail_is_the_difference_of_predictions(tmp_path: Path) -> None:
-    r, cell = campaign(tmp_path, "guide_error", 1, 6)
-    states = r.readings.states
-    names = ("joint_compliance", "joint_tilt_compliance", "guide_error", "transmission_error")
-    model = Model(cell, tuple(installed().make(n, cell, states) for n in names))
-    scale = np.array([p.scale for e in model.effects for p in e.parameters])
-    theta = scale * np.random.default_rng(4).normal(size=model.size)
-    theta[:7] = np.abs(theta[:7])
-    derived = model.jacobian(model.predict(states, theta), theta, 3) * scale
-    for k in range(model.size):
-        h = np.zeros(model.size)
-        h[k] = 0.1 * scale[k]
-        ends = [model.predict(states, theta + s * h).observation.position for s in (1, -1)]
-        numeric = (ends[0] - ends[1]) / 0.2
-        np.testing.assert_allclose(
-            derived[:, :, k], numeric, rtol=0, atol=1e-6 * np.abs(derived).max()
-        )
 
 
 def plain_table(folder: Path, header: list[str], mirrored: bool = False) -> Path:

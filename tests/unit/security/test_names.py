@@ -43,7 +43,6 @@ from hilcal.calibration.points import read_points
 from hilcal.calibration.urscript import movej_program, waypoints
 from hilcal.cli import Failures, Watched
 from hilcal.cli.compensating import _csv
-from hilcal.cli.exporting import _write_parameters
 from hilcal.cli.terminal import Terminal
 from hilcal.config import load_config
 from hilcal.config.reference import cell_text
@@ -166,7 +165,7 @@ def test_csv(name: str) -> None:
     rows = to_csv(dh_rows(ARM, "standard"), arm)
     the_same_cells(rows, [[None] * 5, *[[name, *[None] * 4]] * 6])
     row = {"name": name, "value": -1.0, "std": None, "unit": "m", "identifiable": True}
-    _write_parameters(folder / "p.csv", [row])
+    write_columns(folder / "p.csv", {key: [value] for key, value in row.items()}, {})
     the_same_cells((folder / "p.csv").read_bytes().decode(), [[None] * 5, [name, *[None] * 4]])
     if escaped(name) == name:
         assert from_csv(csv_text(name)) == name
