@@ -22,7 +22,7 @@ from hilcal.errors import DeviceError, InputError
 from hilcal.robot.arm import Arm
 from hilcal.types import Floats
 
-START_TIMEOUT = 60.0  # real time in which every simulated device has to be ready, s; busy machines
+START_TIMEOUT = 60.0  # s; the simulated devices are ready by then on a busy machine, too
 UR_PORTS = (29999, 30001, 30003, 30004)
 UR_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 EMSCON_PORT = 7000  # of the simulated tracker: the real one, 700, is for the administrator alone
