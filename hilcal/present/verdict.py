@@ -414,7 +414,7 @@ def correlated(n: SerialNoise) -> str:
     doubt = ""
     if not n.proved:
         others = " and ".join(n.instead) or "effects of the catalogue"
-        doubt = f" Or they are not: {others} would explain the readings as well. Repeat them."
+        doubt = f" This is in doubt: {others} would explain the readings as well. Repeat them."
     low, high = n.wider
     return (
         f"Readings are correlated along their order{share}: "
