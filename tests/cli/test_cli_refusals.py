@@ -3,12 +3,14 @@
 import signal
 import socket
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from hilcal.errors import InputError
+from hilcal.store.campaign_file import CampaignFile
 from tests.support.cli_cases import CELL, ok, refused, rehearsal, run, start, stored_readings, table
 
 Capsys = pytest.CaptureFixture[str]
@@ -218,6 +220,17 @@ def free_port():
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
+
+
+def test_a_kill_leaves_every_committed_revision(campaign, capsys):
+    ok(capsys, "identify", campaign)
+    process = start("refine", campaign)
+    time.sleep(0.3)  # anywhere: whatever it is doing, the file stays whole
+    process.kill()
+    process.communicate()
+    with CampaignFile.open(campaign) as stored:
+        assert len(stored.revisions()) >= 1
+    assert ok(capsys, "refine", campaign, "--json").document["verdict"] == "adequate"
 
 
 @pytest.mark.parametrize(("no_wheel", "said"), [
