@@ -32,7 +32,6 @@ from tests.cli.test_until_goal import site
 from tests.support.campaigns import configuration
 from tests.support.cli_cases import CELL, ok, refused, stored_readings, table
 from tests.support.next_cases import SMALL, doubtful
-from tests.support.paths import ROOT
 from tests.unit.data.test_run_log import MADE, STEPS, _campaign, _reading
 from tests.unit.design.test_next import fine_error
 
