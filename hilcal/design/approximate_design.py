@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 import scipy.linalg as sl
@@ -22,7 +21,6 @@ from hilcal.types import Bools, Floats, Ints
 _STEPS = 80
 _BACK = 0.995  # share of the way to the boundary
 _CENTRAL = 1.0  # square of Newton's decrement at which μ may fall
-_KEPT = 20_000_000  # elements of products that are kept, 160 MB
 _CLAMP = 1e4  # how far a dual may be from μ / w
 
 
@@ -44,23 +42,7 @@ class BarrierProgram:
         """Return (P, P) Σ w_k A_kᵀA_k; weights of either sign."""
         rows = self.units.rows
         flat = rows.reshape(-1, rows.shape[2])
-        if self._grams is None:
-            return np.asarray((flat * np.repeat(weight, rows.shape[1])[:, None]).T @ flat)
-        out = np.zeros((flat.shape[1], flat.shape[1]))
-        up, across = np.triu_indices(len(out))
-        out[up, across] = out[across, up] = weight @ self._grams
-        return out
-
-    @cached_property
-    def _grams(self) -> Floats | None:
-        """(n, P (P + 1) / 2) upper triangles of A_kᵀA_k; None where they are too large to keep."""
-        up, across = np.triu_indices(self.units.size)
-        if len(self.units) * len(up) > _KEPT:
-            return None
-        out = np.empty((len(self.units), len(up)))
-        for k, a in enumerate(self.units.rows):
-            out[k] = (a.T @ a)[up, across]
-        return out
+        return np.asarray((flat * np.repeat(weight, rows.shape[1])[:, None]).T @ flat)
 
     def scan(self, smooth: Smooth) -> tuple[Floats, float]:
         """Return tr(Z A_kᵀA_k) of all units, and the bound of φ over them."""
@@ -86,16 +68,19 @@ class BarrierProgram:
 
 def _product(rows: Floats, x: Floats, y: Floats) -> Floats:
     """Return (n, n) tr(X H_k Y H_l) of (n, R, P) rows, for X and Y by their roots (P, r)."""
-    n, size = rows.shape[:2]
-    flat = rows.reshape(n * size, -1)
-    left = flat @ x
-    right = left if y is x else flat @ y
-    if 2 * size * size <= min(left.shape[1], right.shape[1]):  # by the rows
-        seen = left @ left.T
-        seen *= seen if y is x else right @ right.T
-        return np.asarray(seen.reshape(n, size, n, size).sum(axis=3).sum(axis=1))
+    left = rows @ x
+    right = left if y is x else rows @ y
+    size = rows.shape[1]
+    if 2 * size * size <= min(left.shape[2], right.shape[2]):  # by the rows
+        out = np.zeros((len(rows), len(rows)))
+        for i in range(size):
+            for j in range(i + 1):
+                seen = left[:, i] @ left[:, j].T
+                seen *= seen if y is x else right[:, i] @ right[:, j].T
+                out += seen if i == j else seen + seen.T
+        return out
     # By the matrices T_k = L_xᵀ H_k L_y: the sum of T_k ∘ T_l.
-    t = np.matmul(left.reshape(n, size, -1).transpose(0, 2, 1), right.reshape(n, size, -1))
+    n, t = len(rows), np.matmul(left.transpose(0, 2, 1), right)
     if y is x:  # symmetric: half of each does
         up, across = np.triu_indices(t.shape[1])
         half = np.take(t.reshape(n, -1), up * t.shape[1] + across, axis=1)
@@ -252,6 +237,7 @@ KINKED_TOLERANCE = 1e-3  # the same with kinks, where the bound closes slowly; a
 _ROUNDS = 200
 _STALE = 4  # rounds in which the gap must fall; this and the next two are choices
 _SHORT = 2000  # units among which the first ones are sought
+_LEFT = 0.9  # share of the weight with which an optimum is worth starting from; a choice
 _WARM = 12  # multiplicative steps that find where the weight goes
 
 
@@ -272,11 +258,14 @@ class ApproximateDesign:
         return self.bound / self.value - 1.0 if self.value > 0.0 else np.inf
 
     def among(self, kept: Bools) -> "ApproximateDesign | None":
-        """Return the same optimum over some (K,) of the units; None where one of weight is lost."""
-        if not kept[self.index].all():
+        """Return the same over some (K,) of the units; None where too much weight is lost."""
+        place, whole = np.cumsum(kept) - 1, kept[self.index]
+        if float(self.weight[whole].sum()) < _LEFT * float(self.weight.sum()):
             return None
-        place = np.cumsum(kept) - 1
-        return replace(self, index=place[self.index], price=self.price[kept])
+        return replace(
+            self, index=place[self.index[whole]], weight=self.weight[whole], price=self.price[kept],
+            value=self.value if whole.all() else 0.0,
+        )  # fmt: skip
 
 
 def relax(
@@ -311,7 +300,9 @@ def relax(
         )
     most_spent = (1.0 - 1e-9) * cap * float(units.cost.sum())
     whole = BarrierProgram(criterion, units, min(budget, most_spent), cap, prior)
-    if start is None:
+    if start is None or not criterion.value(
+        prior + units.information(start.weight, start.index)
+    ) > 0.0:  # fmt: skip
         active, weight = _first(whole, spread)
         order = 0.3
     else:
@@ -364,7 +355,7 @@ def _solved(
 
 def _feasible(weight: Floats, cost: Floats, budget: float, cap: float) -> Floats:
     """Return weights over 0 and under the cap that spend the budget."""
-    w = np.clip(weight, 1e-9 * budget / float(cost.sum()), 0.95 * cap)
+    w = np.clip(weight, 1e-2 * budget / float(cost.sum()), 0.95 * cap)
     spent = float(w @ cost)
     if spent >= budget or not np.isfinite(cap):
         return np.asarray(w * (budget / spent))

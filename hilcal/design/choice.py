@@ -28,9 +28,9 @@ from hilcal.errors import CannotAnswerError, InputError
 from hilcal.types import Bools, Floats, Ints
 
 CRITERIA = ("D", "A", "E", "K", "I", "separate")
-LOOSE = 3e-3  # Relative gap at which sets of loads are compared. A choice.
+LOOSE = 1e-2  # relative gap of the bound of a plan, and of the comparison of loads; a choice
 EFFORT = 200  # of the exchange search: 98 % of the bound of the demo's plan in a second
-SAMPLE = 150  # Poses by which sets of loads are compared. A choice.
+SAMPLE = 75  # Poses by which sets of loads are compared. A choice.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,47 +110,76 @@ def choose(
     )  # fmt: skip
 
 
-def choose_poses(
-    asked: Objective,
-    problem: DesignProblem,
-    usable: Bools,  # (K,) which units there are to choose from
-    poses: int,
-    rng: np.random.Generator,
-    effort: int = EFFORT,
-) -> Design:
-    """Return the exact design of so many poses, each read once under all that it bears.
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseUnits:
+    """Candidate poses as units, each with all readings that it bears."""
 
-    Where the cell leaves fewer poses, some are read again. The bound is that of as many readings at
-    any number of poses, under any loads.
-    """
-    free, index = only(asked, usable), np.flatnonzero(usable)
+    units: CandidateSet  # of the poses
+    poses: Ints  # (N,) their numbers
+    members: tuple[Ints, ...]  # of each, the units of the problem
+
+
+def pose_units(asked: Objective, problem: DesignProblem) -> PoseUnits:
+    """Return the poses of a design problem as units of cost 1."""
     of: dict[int, list[int]] = {}
-    for k, unit in enumerate(index):  # a deflection's unit with all loads holds the others
-        pose, loads = problem.what[unit]
+    for k, (pose, loads) in enumerate(problem.what):
         mine = of.setdefault(pose, [])
-        if problem.mode == "deflection" and mine:
-            if len(loads) <= len(problem.what[index[mine[0]]][1]):
+        if problem.mode == "deflection" and mine:  # a unit with all loads holds the others
+            if len(loads) <= len(problem.what[mine[0]][1]):
                 continue
             mine.clear()
         mine.append(k)
-    members = list(of.values())
-    height = max(map(len, members)) * free.units.rows.shape[1]
-    rows = np.zeros((len(members), height, free.units.rows.shape[2]))
-    for out, mine in zip(rows, members, strict=True):
-        stacked = free.units.rows[mine].reshape(-1, rows.shape[2])
+    _, height, size = asked.units.rows.shape
+    rows = np.zeros((len(of), max(map(len, of.values())) * height, size))
+    for out, mine in zip(rows, of.values(), strict=True):
+        stacked = asked.units.rows[mine].reshape(-1, size)
         out[: len(stacked)] = stacked
-    units = CandidateSet(rows, np.ones(len(members)))
+    members = tuple(np.array(mine) for mine in of.values())
+    return PoseUnits(CandidateSet(rows, np.ones(len(of))), np.array(list(of)), members)
+
+
+def choose_poses(
+    asked: Objective,
+    of: PoseUnits,
+    usable: Bools,  # (N,) which poses there are to choose from
+    poses: int,
+    rng: np.random.Generator,
+    effort: int = EFFORT,
+    start: ApproximateDesign | None = None,  # the optimum over poses (N,) at an earlier choice
+) -> tuple[Ints, ApproximateDesign]:
+    """Return how often each unit (K,) is taken, and the optimum over poses (N,).
+
+    So many poses are each read once under all that they bear; where the cell leaves fewer, some are
+    read again.
+    """
+    units = CandidateSet(of.units.rows[usable], of.units.cost[usable])
     found = best(
         units, asked.criterion, float(poses), asked.prior, rng,
-        most=-(-poses // max(len(members), 1)), names=asked.names, effort=effort,
+        most=-(-poses // max(len(units), 1)), names=asked.names, effort=effort,
+        relaxed=None if start is None else start.among(usable),
     )  # fmt: skip
-    counts = np.zeros(len(index), dtype=np.int64)
-    for mine, count in zip(members, found.counts.tolist(), strict=True):
-        counts[mine] = count
-    cost = float(counts @ free.units.cost)
-    relaxed = free.relaxed(cost)
-    bound = max(relaxed.bound, found.value)
-    return replace(found, counts=counts, bound=bound, cost=cost, relaxed=relaxed)
+    counts = np.zeros(len(asked.units), dtype=np.int64)
+    index = np.flatnonzero(usable)
+    for k, count in zip(index, found.counts.tolist(), strict=True):
+        counts[of.members[k]] = count
+    price = np.zeros(len(usable))
+    price[usable] = found.relaxed.price
+    return counts, replace(found.relaxed, index=index[found.relaxed.index], price=price)
+
+
+def certified(
+    asked: Objective, counts: Ints, usable: Bools, start: ApproximateDesign | None = None
+) -> Design:
+    """Return the design of (K,) counts among usable units, with a bound of as many readings.
+
+    The bound holds for any number of poses, under any loads.
+    """
+    free, taken = only(asked, usable), counts[usable]
+    cost = float(taken @ free.units.cost)
+    information = asked.prior + free.units.information(taken.astype(float))
+    value = float(asked.criterion.value(information))
+    relaxed = free.relaxed(cost, start=None if start is None else start.among(usable))
+    return Design(taken, value, max(relaxed.bound, value), information, cost, relaxed)
 
 
 def promising(asked: Objective, budget: float) -> tuple[Ints, ApproximateDesign]:

@@ -12,7 +12,7 @@ from hilcal.design.criterion import CandidateSet, Criterion, best_first
 from hilcal.errors import CannotAnswerError
 from hilcal.types import Floats, Ints
 
-TOLERANCE = 1e-4  # relative gap of the continuous optimum: whole numbers lose 1 to 5 % anyway
+TOLERANCE = 1e-3  # relative gap of the continuous optimum: whole numbers lose 1 to 5 % anyway
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,7 +42,7 @@ def best(
     most: int | None = None,  # how often a unit may be taken; any number of times by default
     names: Sequence[str] | None = None,
     effort: int | None = None,  # units put into a plan before the search ends; by default `EFFORT`
-    relaxed: ApproximateDesign | None = None,  # the continuous optimum, where it is known
+    relaxed: ApproximateDesign | None = None,  # the continuous optimum, or a start near it
 ) -> Design:
     """Return a plan with Σ n_k c_k ≤ B whose φ(M0 + Σ n_k A_kᵀA_k) is nearly the largest.
 
@@ -55,8 +55,9 @@ def best(
     tolerance = KINKED_TOLERANCE if criterion.kinked else TOLERANCE
     if relaxed is None or relaxed.gap > tolerance:
         relaxed = relax(
-            units, criterion, budget, prior, most=most, names=names, tolerance=tolerance
-        )
+            units, criterion, budget, prior, most=most, names=names, tolerance=tolerance,
+            start=relaxed,
+        )  # fmt: skip
     known = given_prior(units, budget, prior)
     felt = criterion.relevant(units, known, budget)
     search = _Search(units, felt, budget, known, relaxed, most)

@@ -9,15 +9,18 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
+from hilcal.design.approximate_design import ApproximateDesign
 from hilcal.design.choice import (
     EFFORT,
     Objective,
     canonical,
+    certified,
     choose,
     choose_poses,
     compound_objective,
     costly_loads,
     only,
+    pose_units,
     promising,
 )
 from hilcal.design.criterion import CandidateSet
@@ -226,16 +229,23 @@ def make(
     pose_of = np.array([pose for pose, _ in of.what])
     first, relaxed = promising(asked, budget)
     usable = ~np.isin(pose_of, _unreachable(space, of, home, first))
+    by_pose = pose_units(asked, of) if whole else None
     reached: set[int] = set()
+    over_poses: ApproximateDesign | None = None
     for left in reversed(range(ROUNDS)):
         if not left:  # of those that were chosen before, enough are reached
             usable &= np.isin(pose_of, [*reached])
-        if whole:
-            design = choose_poses(asked, of, usable, request.poses, rng, request.effort)
+        if by_pose is not None:
+            among = np.isin(by_pose.poses, pose_of[usable])
+            counts, over_poses = choose_poses(
+                asked, by_pose, among, request.poses, rng, request.effort, over_poses
+            )
         else:
-            optimum = relaxed.among(usable)
-            design = choose(only(asked, usable), budget, rng, request.effort, optimum)
-        units = np.flatnonzero(usable)[np.flatnonzero(design.counts)]
+            start = relaxed.among(usable)
+            design = choose(only(asked, usable), budget, rng, request.effort, start)
+            counts = np.zeros(len(usable), dtype=np.int64)
+            counts[usable] = design.counts
+        units = np.flatnonzero(counts)
         lost = _unreachable(space, of, home, units)
         if not len(lost):
             break
@@ -246,6 +256,8 @@ def make(
             f"after {ROUNDS} rounds there are still poses that no clear straight motion from the "
             "reference pose reaches; widen the workspace"
         )
+    if whole:
+        design = certified(asked, counts, usable, relaxed)
     visited = len({of.what[k][0] for k in units}) + 1
     if not cell.registration_known and known is None and visited < MIN_POSES:
         raise CannotAnswerError(
@@ -253,8 +265,6 @@ def make(
             f"needs at least {MIN_POSES}: ask for more {'poses' if whole else 'readings'}"
         )
     say("ordering the readings")
-    counts = np.zeros(len(usable), dtype=np.int64)
-    counts[np.flatnonzero(usable)] = design.counts
     repeats = max(2, (visited - 1) // 10)
     some = of.candidates[slice(0, SAMPLE)].states()
     covariance = reading_covariance(

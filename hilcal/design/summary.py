@@ -11,7 +11,15 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.design.choice import choose, choose_poses, compound_objective, only, unknown
+from hilcal.design.choice import (
+    certified,
+    choose,
+    choose_poses,
+    compound_objective,
+    only,
+    pose_units,
+    unknown,
+)
 from hilcal.design.information import DesignProblem, reading_derivatives
 from hilcal.design.planner import Planned, Say
 from hilcal.design.predicted import predicted
@@ -27,7 +35,7 @@ from hilcal.types import Floats
 from hilcal.whole_file import replace_file
 
 COMPARED = ("D", "A", "E", "K", "I")  # all but T-optimality, which needs suspects
-SHARES = (0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)  # budgets of the curve by the plan's; a choice
+SHARES = (0.5, 1.0, 1.5, 2.0, 3.0)  # budgets of the curve by the plan's; a choice
 WORTH = 0.9  # Efficiency of a plan below which it is said what another one would give; a choice
 _LEFT_OUT = {
     "deflection": "geometry, registration, repeatability and effects outside of the model",
@@ -279,6 +287,9 @@ def _criteria(
     planned: Planned, config: CellConfig, rng: np.random.Generator
 ) -> Iterator[CriterionResult]:
     of = planned.problem
+    usable_poses = [
+        pose for (pose, _), usable in zip(of.what, planned.usable, strict=True) if usable
+    ]
     for name in dict.fromkeys((*COMPARED, planned.criterion)):
         if name == planned.criterion:
             yield _result(planned, name, planned.counts, planned.design.efficiency)
@@ -286,13 +297,16 @@ def _criteria(
         try:
             asked = compound_objective(of, config, name, planned.work, planned.budget, rng)
             if planned.asked_poses is not None:
-                design = choose_poses(asked, of, planned.usable, planned.asked_poses, rng, 1)
+                whole = pose_units(asked, of)
+                among = np.isin(whole.poses, usable_poses)
+                taken, _ = choose_poses(asked, whole, among, planned.asked_poses, rng, 1)
+                design = certified(asked, taken, planned.usable)
             else:
                 design = choose(only(asked, planned.usable), planned.budget, rng, 1)
         except CannotAnswerError:
             continue
         counts = np.zeros(len(of.units))
-        counts[np.flatnonzero(planned.usable)] = design.counts
+        counts[planned.usable] = design.counts
         yield _result(planned, name, counts, design.efficiency)
 
 
@@ -332,7 +346,7 @@ def _curve(planned: Planned) -> Iterator[CurvePoint]:
     of = planned.problem
     asked, usable = only(planned.asked, planned.usable), np.flatnonzero(planned.usable)
     own = len({of.what[k][0] for k in np.flatnonzero(planned.counts)})
-    last, before = None, 0
+    last, before = planned.design.relaxed, 0
     for share in SHARES:
         budget, poses = share * planned.budget, max(1, round(share * own))
         if budget < asked.units.cost.max() or poses == before:
