@@ -1,12 +1,10 @@
 """The design problem: information and cost of each unit of measurement.
 
-Potential terms: effects that the model lacks, and a plan should still be able to find.
-
-Their parameters get a prior N(0, τ²), with τ so that the family's RMS strength over the
-candidates is one σ of a reading: as much as could be there without being known. A plan is then
-judged on all parameters together, so that it keeps power against what is missing. Source:
-DuMouchel and Jones, *A simple Bayesian modification of D-optimal designs to reduce dependence
-on an assumed model*, Technometrics 36 (1994) 37-47.
+Potential terms: effects that the model lacks, and a plan should still be able to find. Their
+parameters have the prior N(0, s²) of the mixed model, with s what arms of any kind have
+(`mixed.families`). A plan is then judged on all parameters together, so that it keeps power against
+what is missing. Source: DuMouchel and Jones, *A simple Bayesian modification of D-optimal designs
+to reduce dependence on an assumed model*, Technometrics 36 (1994) 37-47.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -20,6 +18,7 @@ from hilcal.design.criterion import CandidateSet
 from hilcal.design.nominal_model import (
     NominalModel,
     build,
+    expected_std,
     nominal_states,
     potential_names,
     random_columns,
@@ -200,25 +199,16 @@ PAIRS_UP_TO = 4  # pairs of loads are units of their own up to so many loads; a 
 MOST_BYTES = 600_000_000  # Memory that the rows of all units may take. A choice.
 MOST_PARAMETERS = 200
 SAMPLE = 300  # Candidate poses by which strengths are judged. A choice.
-MOST_ORDINARY = 5.0  # ordinary magnitudes with which a family has to reach one σ; a choice
+MOST_TIMES = 5.0  # its expected size with which a family has to reach one σ; a choice
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Potential:
-    """Families with τ in ordinary magnitudes, and what was left out, one line each."""
+    """Families with the sizes that arms have, and what was left out, one line each."""
 
     effects: tuple[Effect, ...]
-    tau: tuple[float, ...]
+    std: Floats  # (F,) standard deviation of each parameter, SI
     notes: tuple[str, ...]
-
-    @property
-    def scale(self) -> Floats:
-        """(F,) what τ is for each parameter, SI."""
-        parts = [
-            tau * np.array([p.scale for p in e.parameters])
-            for e, tau in zip(self.effects, self.tau, strict=True)
-        ]
-        return np.concatenate([np.zeros(0), *parts])
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,7 +218,7 @@ class DesignTerm:
     effect: str  # canonical name of its effect
     name: str  # as identification prints it, e.g. "joint_compliance.j1".
     unit: str  # physical unit, SI
-    scale: float  # of one unit of the problem's, SI: an ordinary magnitude, or τ if potential
+    scale: float  # of one unit of the problem's, SI: an ordinary magnitude, or s if potential
     value: float  # at which it is assumed, SI
     potential: bool  # whether it belongs to an effect that is not in the model
 
@@ -295,7 +285,7 @@ def problem(
     if allowed is None:
         allowed = np.ones((len(q), len(loads)), dtype=np.bool_)
     of = Candidates(np.asarray(q, dtype=float), loads, np.array([np.zeros(6), *pulls]), allowed)
-    against = potential(nominal, config, of) if len(of) else Potential((), (), ())
+    against = potential(nominal, config, of) if len(of) else Potential((), np.zeros(0), ())
     terms = _terms(nominal, against)
     scale = np.array([t.scale for t in terms])
     what, height, layout_notes = _layout(of, mode, nominal.elements, len(terms))
@@ -325,8 +315,8 @@ def _terms(nominal: NominalModel, against: Potential) -> tuple[DesignTerm, ...]:
     ]
     extra = [(e.name, p) for e in against.effects for p in e.parameters]
     return tuple(known) + tuple(
-        DesignTerm(effect, f"{effect}.{p.name}", p.unit, float(tau), 0.0, True)
-        for (effect, p), tau in zip(extra, against.scale, strict=True)
+        DesignTerm(effect, f"{effect}.{p.name}", p.unit, float(std), 0.0, True)
+        for (effect, p), std in zip(extra, against.std, strict=True)
     )
 
 
@@ -416,21 +406,21 @@ def readings_of(what: tuple[int, tuple[str, ...]], mode: Mode) -> tuple[str, ...
 
 
 def potential(nominal: NominalModel, config: CellConfig, of: Candidates) -> Potential:
-    """Choose the families of `[planning] against` and how strong they could be."""
+    """Choose the families of `[planning] against`, with the sizes that arms have."""
     names = potential_names(config, nominal.model)
     known = nominal.model.catalogue
     families = tuple(build(known, name, nominal.cell, nominal.m) for name in names)
-    strength = _strengths(nominal, config, of, families)
-    chosen: list[tuple[Effect, float]] = []
+    std = expected_std(nominal.model, families)
+    strength = _strengths(nominal, config, of, families, std)
+    chosen: list[int] = []
     notes = [*random_columns(families)]
     room = MOST_PARAMETERS - len(nominal.live)
-    order = sorted(range(len(families)), key=lambda k: len(families[k].parameters))
-    for k in order:
+    for k in sorted(range(len(families)), key=lambda k: len(families[k].parameters)):
         family, rms = families[k], strength[k]
-        if rms * MOST_ORDINARY < 1.0:
+        if rms * MOST_TIMES < 1.0:
             notes.append(
-                f"{family.name}: not planned for; with {MOST_ORDINARY:g} times its ordinary "
-                f"magnitude it would change these readings by {MOST_ORDINARY * rms:.2g} σ"
+                f"{family.name}: not planned for; {MOST_TIMES:g} times as large as arms have it, "
+                f"it would change these readings by {MOST_TIMES * rms:.2g} σ"
             )
         elif len(family.parameters) > room:
             notes.append(
@@ -439,24 +429,30 @@ def potential(nominal: NominalModel, config: CellConfig, of: Candidates) -> Pote
             )
         else:
             room -= len(family.parameters)
-            chosen.append((family, 1.0 / rms))
-    chosen.sort(key=lambda pair: names.index(pair[0].name))
-    return Potential(tuple(e for e, _ in chosen), tuple(t for _, t in chosen), tuple(notes))
+            chosen.append(k)
+    place = np.cumsum([0, *(len(e.parameters) for e in families)])
+    kept = [std[place[k] : place[k + 1]] for k in sorted(chosen)]
+    return Potential(
+        tuple(families[k] for k in sorted(chosen)),
+        np.concatenate([np.zeros(0), *kept]),
+        tuple(notes),
+    )
 
 
 def _strengths(
-    nominal: NominalModel, config: CellConfig, of: Candidates, families: tuple[Effect, ...]
+    nominal: NominalModel,
+    config: CellConfig,
+    of: Candidates,
+    families: tuple[Effect, ...],
+    std: Floats,  # (F,) of the families' parameters
 ) -> list[float]:
-    """RMS of each family's whitened readings (single deflections) at ordinary magnitudes."""
+    """RMS of each family's whitened readings (single deflections) at its expected size."""
     if not families:
         return []
     sample = of[slice(None, None, -(-len(of) // SAMPLE))]
-    ordinary = np.array(
-        [p.scale for e in (*nominal.model.effects, *families) for p in e.parameters]
-    )
-    live = np.concatenate([nominal.live, nominal.model.size + np.arange(sizes(families))])
-    squares, count = np.zeros(len(live)), 0
-    for part in reading_derivatives(nominal, config, sample, families, ordinary[live]):
+    scale = np.concatenate([scales_of(nominal.model)[nominal.live], std])
+    squares, count = np.zeros(len(scale)), 0
+    for part in reading_derivatives(nominal, config, sample, families, scale):
         allowed = sample.allowed[part.rows]
         if config.planning.readings == "absolute":
             rows = [absolute_rows(part)[allowed]]

@@ -19,7 +19,7 @@ Statistical Science 10 (1995) 273-304.
 """
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
@@ -32,11 +32,10 @@ from hilcal.design.information import (
     reading_derivatives,
     unit_rows,
 )
-from hilcal.design.nominal_model import NominalModel, build, potential_names
+from hilcal.design.nominal_model import NominalModel, build, expected_std, potential_names
 from hilcal.design.predicted import PredictionPoses, position_derivative
 from hilcal.effects.protocol import Effect
 from hilcal.identification.mixed_fit import HARMONICS, SCATTER_RAD
-from hilcal.mixed.families import families_of
 from hilcal.types import Bools, Floats, Ints
 
 DIRECTIONS = 150  # most of Q; a choice: of a real UR10 (920) the others move 0.5 σ (rms)
@@ -119,11 +118,7 @@ def other_effects(nominal: NominalModel, config: CellConfig) -> tuple[tuple[Effe
     more = tuple(
         build(known, name, nominal.cell, nominal.m, finest.get(name, {})) for name in names
     )
-    alone = replace(model, effects=more, random={}, background=frozenset(), prior=None)
-    std = np.zeros(alone.size)
-    for f in families_of(alone).random:
-        std[f.parameters] = np.exp(f.prior.mean) * f.magnitude
-    return more, std
+    return more, expected_std(model, more)
 
 
 def _with_scatter(nominal: NominalModel, config: CellConfig) -> CellConfig:

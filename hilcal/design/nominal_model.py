@@ -15,6 +15,7 @@ from hilcal.identification.carried import CarriedPrior, check_arm, coordinates_o
 from hilcal.identification.drift import least
 from hilcal.identification.fit import Fit
 from hilcal.identification.priors import prior_of, scales_of
+from hilcal.mixed.families import families_of
 from hilcal.model.model import Model
 from hilcal.readings.readings import ObserverKind, ObserverName, States
 from hilcal.robot import se3
@@ -243,6 +244,18 @@ def potential_names(config: CellConfig, model: Model) -> tuple[str, ...]:
     else:
         names = known_effects(asked, "[planning] against", model.catalogue)
     return tuple(name for name in names if name not in model.names)
+
+
+def expected_std(model: Model, effects: tuple[Effect, ...]) -> Floats:
+    """Return the standard deviations (F,) that parameters of arms have, of effects beside a model.
+
+    Those of the mixed model's families, SI.
+    """
+    alone = replace(model, effects=effects, random={}, background=frozenset(), prior=None)
+    std = np.zeros(alone.size)
+    for f in families_of(alone).random:
+        std[f.parameters] = np.exp(f.prior.mean) * f.magnitude
+    return std
 
 
 def nominal_tracker_place(cell: Cell, config: CellConfig) -> tuple[Floats, bool]:

@@ -246,11 +246,11 @@ def remarks(planned: Planned) -> tuple[str, ...]:
         what = planned.work.what.split(" ")[0]
         best = (
             f"; as many readings, spread over as many poses and loads as tell most (--readings "
-            f"{readings}), to no less than {std * np.sqrt(efficiency):.3g} um"
+            f"{readings}), to no less than {std * np.sqrt(efficiency):.3g} µm"
         )
         omitted += (
             f"with every effect of the catalogue as large as arms have it, the {what} is predicted "
-            f"to {std:.3g} um (rms){best if worth else ''}",
+            f"to {std:.3g} µm (rms){best if worth else ''}",
         )
     elif worth:
         omitted += (

@@ -320,7 +320,8 @@ def test_information_beside_the_model_and_power_beside_model_and_rival(mode: Mod
         planned = schur_complement(so_far, of.of_effect(name), model)
         tested = linear.information(white)
         np.testing.assert_allclose(planned, tested, rtol=0, atol=1e-12 * np.abs(tested).max())
-    beta = np.full(x[TILT].shape[1], 0.5)
+    half = 0.5 / np.sqrt(np.mean(np.sum(x[TILT] ** 2, axis=1)))  # of a σ
+    beta = np.full(x[TILT].shape[1], half)
     ridge = np.concatenate([linear.projection.ridge, np.zeros(x[LINK].shape[1])])
     with_rival = projection(np.hstack([linear.rows, x[LINK]]), ridge)
     promised = power(pair_of(of, (TILT, LINK), beta), so_far)

@@ -263,7 +263,10 @@ def test_errors_are_those_predicted_and_shrink_as_predicted(robot: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("robot", ["ur10e", "ur5e"])
 def test_half_of_the_readings_of_random_plans_do(robot: str) -> None:
-    """50 campaigns each, registration unknown; each plan in the measure that it was made for."""
+    """50 campaigns each, registration unknown; each plan in the measure that it was made for.
+
+    With all effects as large as arms have them it is two thirds: what is known of arms serves both.
+    """
     study = studied(with_robot(configured(robust=True), robot), 50)
     for line in study.lines:
         assert as_predicted(line.result.spread) != "no", line.kind
@@ -272,4 +275,4 @@ def test_half_of_the_readings_of_random_plans_do(robot: str) -> None:
     assert all(as_predicted(s.agreement) != "no" for s in study.shrinkage())
     assert needs_at_most_half(study, TEST)
     needs = study.of("test, robust").random_readings_open
-    assert needs is None or needs >= 2 * study.readings
+    assert needs is None or needs >= 1.5 * study.readings
