@@ -482,7 +482,7 @@ class GeoComTracker:
         return PolarReading(answer.host_ns, hz, v, distance, std, (cross, length), warning)
 
     def _simple(self, until: float, measuring: float) -> PolarReading:
-        """Measurement without a word on its accuracy, as older instruments know it."""
+        """Measurement that does not state its accuracy, as older instruments know it."""
         answer = self._link.ask(
             MEASURE_DISTANCE_ANGLE,
             (_DISTANCE_PROGRAM,),

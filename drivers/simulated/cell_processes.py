@@ -84,7 +84,7 @@ class DeviceProcess:
         if self._process is None or not self.ended:
             return
         words = self.log.read_text(encoding="utf-8", errors="replace").split("\n")
-        last = next((line.strip() for line in reversed(words) if line.strip()), "without a word")
+        last = next((line.strip() for line in reversed(words) if line.strip()), "no message")
         raise DeviceError(
             f"simulated {self.name}: ended with exit code {self._process.returncode}: {last}"
         )

@@ -1,7 +1,7 @@
 """Asks the controller over RTDE what it is, before the client library meets it.
 
 The library waits for ever, and with the interpreter locked, for a controller that is mute; and
-an output that the controller does not have shifts all later fields without a word. So both are
+an output that the controller does not have shifts all later fields silently. So both are
 found out here first, with a deadline; each question raises LinkError where nobody answers as a
 controller does. Frames: big-endian size (u16, header included), type
 (u8), body. Source: Universal Robots, "Real-Time Data Exchange (RTDE) Guide", protocol 2.

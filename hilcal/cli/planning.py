@@ -70,7 +70,7 @@ def write(
 
 @command(f"""
     readings | --readings | Or so many readings, repeats not counted, at as many poses and under
-        those loads that tell most.
+        those loads that are most informative.
     criterion | --criterion {"|".join(CRITERIA)} | The optimality criterion.
     after | --after RUN.hilcal | Plan on from what it knows already.
     unloaded_first | --unloaded-first | All unloaded readings before the loads: for run --until; a

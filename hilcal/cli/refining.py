@@ -317,7 +317,7 @@ def revisions_json(chapters: Iterable[Chapter], stored: str = "") -> list[dict[s
     output | -o --output F.py | The effect, to be edited.
     against | --against MODEL | Beside this model instead of the revision in use: effects A,B;
         baseline; or the file of an exported calibration, whose effects are fitted to this run.
-    alternatives | --alternatives | Also write laws that these readings do not tell from it:
+    alternatives | --alternatives | Also write laws that these readings do not distinguish from it:
         F_or_1.py; hilcal next plans what separates them.
     """)
 def discover(

@@ -235,7 +235,7 @@ def _parameters(planned: Planned) -> tuple[PredictedParameter, ...]:
 def remarks(planned: Planned) -> tuple[str, ...]:
     """Return assumptions and omissions of a plan, one sentence each."""
     omitted = tuple(
-        f'load "{name}" costs more than it tells: without it the same time would make the plan '
+        f'load "{name}" is not worth its time: without it the same time would make the plan '
         f"{100 * gain:.0f} % more efficient"
         for name, gain in planned.costly
     )
@@ -245,7 +245,7 @@ def remarks(planned: Planned) -> tuple[str, ...]:
         std = 1e6 / np.sqrt(planned.design.value)
         what = planned.work.what.split(" ")[0]
         best = (
-            f"; as many readings, spread over as many poses and loads as tell most (--readings "
+            f"; as many readings, at the most informative poses and loads (--readings "
             f"{readings}), to no less than {std * np.sqrt(efficiency):.3g} µm"
         )
         omitted += (
@@ -254,7 +254,7 @@ def remarks(planned: Planned) -> tuple[str, ...]:
         )
     elif worth:
         omitted += (
-            f"as many readings, spread over as many poses and loads as tell most (--readings "
+            f"as many readings, at the most informative poses and loads (--readings "
             f"{readings}), are up to {100 / efficiency - 100:.0f} % more efficient",
         )
     without = tuple(u.remark for u in planned.undetermined)

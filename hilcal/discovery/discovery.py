@@ -167,7 +167,7 @@ def rival_sources(d: Discovery) -> dict[str, str]:
     law, out = d.laws[0], {}
     for k, x in enumerate(alternatives(d, law)[:MOST_RIVALS], start=1):
         own = f"{law.name}_or_{k}"
-        evidence = f"These readings do not tell it from {law.name}: {law.formula}"
+        evidence = f"These readings do not distinguish it from {law.name}: {law.formula}"
         out[own] = source_of_form(x.form, own, x.parameters, evidence, f"{own}.py")
     return out
 
@@ -216,8 +216,8 @@ def _laws(
         kinds.append(kind)
         evidence = (
             f"It explains {100 * share:.0f} % of the misfit on poses left out; p-value "
-            f"{law.p_value:.1g}, the search\npaid for. The probability of its structure, of those "
-            f"that were met, is {law.probability:.2f}."
+            f"{law.p_value:.1g}, corrected\nfor the size of the search. Among the structures that "
+            f"the search met, its own has the probability {law.probability:.2f}."
         )
         source = source_of_form(form, name, coefficients, evidence, f"{name}.py")
         made.append((law, after, left, source))

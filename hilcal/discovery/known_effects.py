@@ -148,7 +148,7 @@ def resembling(
 
 
 def tells_more(problem: SearchProblem, s: Selection, known: KnownEffects, effect: str) -> bool:
-    """Whether odds of 20 : 1, the search paid for, ask for a law beside an effect near it."""
+    """Whether odds of 20 : 1, corrected for the search, ask for a law beside an effect near it."""
     x, columns = known.white, known.columns
     law = np.hstack([problem.columns(t) for t in s.terms])
     both = np.hstack([x[:, columns[effect]], law])

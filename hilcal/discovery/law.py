@@ -201,7 +201,7 @@ class Law:
     form: Form  # where it acts, and how
     parameters: tuple[Coefficient, ...]
     p_value: float  # of the joint test of its columns, times the number of candidates
-    odds: float  # logarithm of the odds against no law, the search paid for
+    odds: float  # logarithm of the odds against no law, corrected for the size of the search
     holdout_share: float  # share of the misfit that it explains on poses left out
     left: float  # variance factor that is left
     probability: float  # posterior, of its structure

@@ -1,4 +1,4 @@
-"""Forward selection of laws with backward pruning, the size of the search paid for.
+"""Forward selection of laws with backward pruning, corrected for the size of the search.
 
 At each step the term with the best odds beside those that are chosen is added (see `problem`), and
 terms are taken out again where the others make them needless. Of terms that odds of 20 : 1 do not
@@ -20,7 +20,7 @@ from hilcal.types import Floats
 BEAM = 3  # First terms with which selections are begun; a choice
 MOST_TERMS = 3  # Terms of a law at most; a choice
 MOST_COEFFICIENTS = 8  # Coefficients of a law at most; a choice: more is no law that one reads
-LEAST = 3.0  # Logarithm of the odds, the search paid for, that a further term needs: 20 : 1
+LEAST = 3.0  # Logarithm of the odds, corrected for the search, that a further term needs: 20 : 1
 FALSE_ALARM = 1e-3  # Chance of a first term where nothing is hidden, over the whole search
 SAME = 0.98  # Correlation of two projected columns from which on they count as the same law
 

@@ -45,7 +45,7 @@ class ClusterError(HilcalError):
 def deadly(where: str) -> ClusterError:
     """Return the error of an item that ended every worker that computed it."""
     return ClusterError(
-        f"{where}: one computation ended {DEATHS + 1} workers, each time without a word (out of "
+        f"{where}: one computation ended {DEATHS + 1} workers, each time without a message (out of "
         "memory?); start fewer workers, or larger ones"
     )
 

@@ -281,7 +281,7 @@ class Measurer:
                 return measured
             repeats += 1
             if repeats == AGAIN:
-                raise DeviceError(f"{name}: measured {AGAIN} times in vain: {why}")
+                raise DeviceError(f"{name}: measured {AGAIN} times without success: {why}")
             remarks.append(f"measured again: {why}")
             self._watcher.notify(Remark(f"{name}: {why}; measuring again"))
 

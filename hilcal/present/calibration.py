@@ -517,7 +517,7 @@ def bootstrap_remarks(draws: Bootstrap) -> Iterator[str]:
                 f"Wider than stated: {listed}. This does not show that the stated ones are too "
                 f"small: the fit spends {solution.effective:.0f} degrees of freedom on "
                 f"{draws.poses} poses, and draws, which have 63 % of the poses, scatter too much "
-                "then. More poses tell."
+                "then. More poses would decide."
             )
         else:
             yield (

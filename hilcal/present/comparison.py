@@ -123,7 +123,7 @@ def _changes(c: Comparison) -> Iterator[Block]:
         yield sentence(change)
         if change.same_as:
             others = numbers.names([words_of(o) for o in change.same_as], "or")
-            yield f"  These readings do not tell it from {others}."
+            yield f"  These readings do not distinguish it from {others}."
     yield from ("", _table(found.found))
     if named := dict.fromkeys(words_of(x.candidate) for x in found.found if not x.candidate.of_arm):
         yield f"Not of the arm: {numbers.names(list(named))}."

@@ -400,7 +400,7 @@ def _law(law: Law, d: Discovery, first: bool) -> Iterator[Block]:
         share += f", {percent(min(law.holdout_share / d.attainable, 1.0))} of what can be"
     yield f"  explains     {share}"
     yield f"  left         variance factor {law.left:.2f}, before {d.fit.variance_factor:.2f}"
-    yield f"  chance       {numbers.p_equals(law.p_value)}, the search paid for"
+    yield f"  chance       {numbers.p_equals(law.p_value)}, corrected for the size of the search"
     yield "  found again  in the searches without some poses:"
     for a in law.again:
         causes = f" by {', '.join(a.variables)}" if a.variables else ""

@@ -201,7 +201,7 @@ def torque_lines(check: TorqueCheck | None) -> Iterator[str]:
     if check is None:
         return
     if not check.factors:
-        yield "Measured joint torques: the poses tell neither a load nor a mass by them."
+        yield "Measured joint torques: they determine neither a load nor a mass at these poses."
     for f in check.factors:
         if f.differs:
             yield f"Measured joint torques: {_differs(f)}."

@@ -260,7 +260,7 @@ def _pose_alone(d: Diagnosis) -> list[str]:
         "the pose alone.",
         f"{first} finer than {a.poses} poses can resolve{others} would do that.",
         "So would an arm that repeats worse than stated, where each pose was arrived at once.",
-        f"{a.more} more poses tell{chance}.",
+        f"{a.more} more poses would decide{chance}.",
     ]
 
 

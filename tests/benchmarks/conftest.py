@@ -32,7 +32,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Refuse what `make bench` would skip without a word."""
+    """Refuse what `make bench` would skip silently."""
     for item in items:
         mine = item.path.parent == Path(__file__).parent
         if mine and "benchmark" not in getattr(item, "fixturenames", ()):

@@ -75,7 +75,7 @@ def test_a_transmission_error_too_fine_for_thirty_poses_is_ambiguous(seed: int) 
     assert (d.pose_alone.poses, d.pose_alone.more) == (30, 130)
     assert "the same under every load of a pose" in message(d)
     assert d.pose_alone.chance > 0.9
-    assert "130 more poses tell with a chance of" in message(d)
+    assert "130 more poses would decide with a chance of" in message(d)
     assert in_doubt(d)[:2] == ("transmission_error", "link_geometry")
     assert to_json(d)["pose_alone"]["more"] == 130
 

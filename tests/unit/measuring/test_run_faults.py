@@ -501,7 +501,7 @@ def test_drift_that_ends_is_waited_for() -> None:
 def test_an_arm_that_trembles_is_measured_again_and_given_up() -> None:
     b = Bench()
     b.world.jitter = 1e-4
-    with pytest.raises(DeviceError, match=r"measured 3 times in vain: arm: it moved by"):
+    with pytest.raises(DeviceError, match=r"measured 3 times without success: arm: it moved by"):
         measure(b)
     assert b.store.rows == []
 
