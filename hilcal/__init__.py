@@ -2,9 +2,8 @@
 
     import hilcal as hc
 
-    with hc.Campaign.open("run.hilcal") as run:
-        model = hc.baseline(run.cell, run.readings)
-        found = hc.fit(model, run.readings)
+    with hc.Campaign("run.hilcal") as run:
+        found = hc.fit(hc.baseline(run), run)
         print(found.summary())
         print(hc.diagnose(found).verdict)
 
@@ -41,7 +40,7 @@ _PLACES = {
     "bootstrap": "hilcal.library",
     "check_effect": "hilcal.effects.check",
     "compare": "hilcal.transfer.compare",
-    "diagnose": "hilcal.diagnosis.verdict",
+    "diagnose": "hilcal.library",
     "discover": "hilcal.discovery.discovery",
     "effect": "hilcal.effects.spec",
     "fit": "hilcal.library",
@@ -66,7 +65,6 @@ if TYPE_CHECKING:
     from hilcal.cell import Cell as Cell
     from hilcal.diagnosis.comparison import Comparison as Comparison
     from hilcal.diagnosis.diagnosis import Diagnosis as Diagnosis
-    from hilcal.diagnosis.verdict import diagnose as diagnose
     from hilcal.discovery.discovery import discover as discover
     from hilcal.effects.catalogue import Catalogue as Catalogue
     from hilcal.effects.catalogue import installed as installed
@@ -82,6 +80,7 @@ if TYPE_CHECKING:
     from hilcal.identification.table_preview import preview_table as preview_table
     from hilcal.library import baseline as baseline
     from hilcal.library import bootstrap as bootstrap
+    from hilcal.library import diagnose as diagnose
     from hilcal.library import fit as fit
     from hilcal.library import fit_stream as fit_stream
     from hilcal.library import load_posterior as load_posterior

@@ -1,6 +1,6 @@
 """The functions of `import hilcal`: thin, with defaults that suit a script."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -8,9 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hilcal.campaign.campaign import Campaign
+from hilcal.campaign.campaign import Campaign, opened
 from hilcal.cell import Cell
+from hilcal.diagnosis.diagnosis import Diagnosis, History
 from hilcal.diagnosis.serial_noise import with_serial_noise
+from hilcal.diagnosis.verdict import NOTHING
+from hilcal.diagnosis.verdict import diagnose as judge_fit
 from hilcal.discovery.discovery import LawSearch
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.effects.options import Options
@@ -136,8 +139,8 @@ def bootstrap(
 
 
 def baseline(
-    cell: Cell,
-    data: Readings,
+    cell: Cell | Campaign,
+    data: Readings | Campaign | None = None,
     readings: str | None = None,
     catalogue: Catalogue | None = None,
     prior: Posterior | CarriedPrior | None = None,
@@ -151,8 +154,12 @@ def baseline(
     >>> model = hc.baseline(cell, hc.read_table(TABLE, cell))
     >>> (model + "base_compliance" + hc.effect("creep", joints="each")).names
     ('base_frame', 'joint_compliance', 'base_compliance', 'creep')
+    >>> hc.baseline(hc.Campaign(RUN)).names
+    ('base_frame', 'joint_compliance')
 
     Args:
+        cell: the cell; or a campaign, which has its cell, its readings and its catalogue.
+        data: the readings, where `cell` is no campaign.
         readings: "deflection" or "absolute"; as the cell plans and the data allow where None.
         catalogue: the effects that a model can have; the installed ones where None.
         prior: what another campaign taught of this arm, from `load_posterior`; its effects are in
@@ -162,8 +169,17 @@ def baseline(
         InputError: another kind of readings, or a prior that is not one of these readings.
         CannotAnswerError: the readings do not determine an unknown frame.
     """
-    known = _carried(prior, catalogue)
+    if isinstance(cell, Campaign):
+        data, catalogue = cell.readings if data is None else data, catalogue or cell.catalogue
+        cell = cell.cell
+    if data is None:
+        raise InputError("a cell without readings; valid: baseline(cell, readings), baseline(run)")
+    data, known = _readings(data), _carried(prior, catalogue)
     return starting_models.baseline(cell, data, _mode(readings, data, cell), catalogue, known)
+
+
+def _readings(data: Readings | Campaign) -> Readings:
+    return data.readings if isinstance(data, Campaign) else data
 
 
 def _with_prior(model: Model, data: Readings, prior: Posterior | CarriedPrior) -> Model:
@@ -183,10 +199,12 @@ def _carried(
 
 def fit(
     model: Model,
-    data: Readings,
+    data: Readings | Campaign,
     readings: str | None = None,
     scaling: str = "gc",
     prior: Posterior | CarriedPrior | Floats | None = None,
+    *,
+    mode: str | None = None,
 ) -> Fit:
     """Fit a model to readings by whitened Gauss-Newton.
 
@@ -200,18 +218,21 @@ def fit(
     True
 
     Args:
+        data: the readings, or their campaign.
         readings: "deflection" or "absolute"; as the cell plans and the data allow where None.
         scaling: "none", "gu" or "gc" (whitened by the full covariance).
         prior: what another campaign taught of this arm, for those effects that the model has in
             common with it (`baseline` adds the others); or (P,) standard deviations of zero-mean
             priors, infinite for flat ones, zero for parameters held at zero; where None, those of
             the effects.
+        mode: the same as `readings`, by its name in what is returned.
 
     Raises:
         InputError: another kind of readings or of scaling, or a deflection without its unloaded
             reading.
         CannotAnswerError: fewer measured elements than identifiable parameters.
     """
+    data, readings = _readings(data), _either(readings, mode)
     std: Floats | None = None
     if isinstance(prior, Posterior | CarriedPrior):
         model = _with_prior(model, data, prior)
@@ -222,6 +243,31 @@ def fit(
         raise InputError(f"scaling {scaling!r} is unknown; valid: {', '.join(SCALINGS)}")
     found = fits.fit(model, data, _mode(readings, data, model.cell), scaling, prior=std)
     return with_serial_noise(found, std)
+
+
+def diagnose(
+    fit: Fit | Campaign, history: History = NOTHING, say: Callable[[str], None] = lambda text: None
+) -> Diagnosis:
+    """Judge a fit.
+
+    >>> with hc.Campaign.open(RUN) as run:
+    ...     found = hc.fit(hc.baseline(run), run)
+    >>> d = hc.diagnose(found)
+    >>> d.verdict, d.suspects[0].effect
+    ('missing_effect', 'joint_tilt_compliance')
+
+    Args:
+        fit: the fit; or a campaign, of which the revision in use is judged.
+        history: how its model was reached; of a campaign, as it tells.
+        say: takes progress, one line each.
+
+    Raises:
+        InputError: for a fit whose residual is not whitened, or of too many readings; a campaign
+            without a revision.
+    """
+    if isinstance(fit, Campaign):
+        return judge_fit(fit.fit(), fit.history(), say)
+    return judge_fit(fit, history, say)
 
 
 def load_posterior(path: str | Path, catalogue: Catalogue | None = None) -> Posterior:
@@ -254,12 +300,14 @@ def load_posterior(path: str | Path, catalogue: Catalogue | None = None) -> Post
 
 
 def refine(
-    model: Model,
-    data: Readings,
+    model: Model | Campaign,
+    data: Readings | Campaign | None = None,
     readings: str | None = None,
     prior: Posterior | CarriedPrior | None = None,
     discover: str | Path | None = None,
     background: bool = True,
+    *,
+    mode: str | None = None,
 ) -> Refinement:
     """Fit, diagnose, add the leading suspect, and repeat until the model is adequate.
 
@@ -270,26 +318,36 @@ def refine(
     [None, 'joint_tilt_compliance']
 
     Args:
+        model: the starting model; or a campaign alone, from its baseline on.
+        data: the readings, or their campaign.
         readings: "deflection" or "absolute"; as the cell plans and the data allow where None.
         prior: as for `fit`.
         discover: a folder; a law is then searched where no effect explains the misfit, as by
             `hilcal refine --discover`, and the files of laws that stay are written there.
         background: whether all effects of the catalogue predict together where the named ones
             leave more than noise.
+        mode: the same as `readings`.
 
     Raises:
         InputError: another kind of readings, a prior that is not one of them, or no such folder.
         CannotAnswerError: fewer measured elements than identifiable parameters.
     """
+    asked = _either(readings, mode)
+    if isinstance(model, Campaign):
+        data = model.readings if data is None else data
+        model = baseline(model, data, asked, prior=prior)
+    elif data is None:
+        raise InputError("a model without readings; valid: refine(model, readings), refine(run)")
+    data = _readings(data)
     if prior is not None:
         model = _with_prior(model, data, prior)
-    mode = _mode(readings, data, model.cell)
+    kind = _mode(asked, data, model.cell)
     if discover is None:
-        return refine_model(model, data, mode, background=background)
+        return refine_model(model, data, kind, background=background)
     if not Path(discover).is_dir():
         raise InputError(f"discover={str(discover)!r}: no such folder; valid: one for laws' files")
     laws = LawSearch(Path(discover))
-    found = refine_model(model, data, mode, laws=laws, background=background)
+    found = refine_model(model, data, kind, laws=laws, background=background)
     laws.write(found.names)
     return found
 
@@ -382,7 +440,7 @@ def simulate(
 
 
 @contextmanager
-def view(run: Campaign, port: int = 9877) -> Iterator[str]:
+def view(run: Campaign | str | Path, port: int = 9877) -> Iterator[str]:
     """Serve the story of a campaign's revision in use to rerun viewers while the block lasts.
 
     >>> with hc.Campaign.open(RUN) as run, hc.view(run, port=PORT) as url:
@@ -391,8 +449,15 @@ def view(run: Campaign, port: int = 9877) -> Iterator[str]:
     """
     from hilcal.present.viewer import serve
 
-    with serve(build_story(run.chapters()), port=port) as url:
+    with opened(run) as campaign, serve(build_story(campaign.chapters()), port=port) as url:
         yield url
+
+
+def _either(readings: str | None, mode: str | None) -> str | None:
+    """Return the kind of readings, by either of its names."""
+    if readings is not None and mode is not None and readings != mode:
+        raise InputError(f"readings = {readings!r} and mode = {mode!r}; valid: one of both")
+    return mode if readings is None else readings
 
 
 def _mode(asked: str | None, data: Readings, cell: Cell) -> Mode:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import hilcal
-from hilcal.campaign.campaign import Campaign
+from hilcal.campaign.campaign import Campaign, opened
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.fit import Fit, fit
 from hilcal.names import quoted
@@ -40,8 +40,8 @@ class Asked:
 
 
 def report(
-    run: Campaign,
-    path: str | Path,
+    run: Campaign | str | Path,
+    path: str | Path | None = None,
     *,
     later: Campaign | None = None,
     validation: Campaign | None = None,
@@ -59,8 +59,8 @@ def report(
     '.html'
 
     Args:
-        run: the campaign; without a revision the baseline is fitted, and not kept.
-        path: of the page; a file that is there is replaced.
+        run: the campaign, or its path; without a revision the baseline is fitted, and not kept.
+        path: of the page; a file that is there is replaced. RUN.html beside the campaign if None.
         later: a later campaign of the same arm: the page compares the two.
         validation: a campaign that was never fitted: the page says how well it is predicted; where
             None, the one that `calibrate` has put beside the campaign, if there is one.
@@ -77,8 +77,10 @@ def report(
         CannotAnswerError: the readings do not determine the baseline, or see `validate`.
     """
     asked = Asked(later, validation, limit_m, operator, revision, appendix)
-    write_report(run, Path(path), asked, say)
-    return Path(path)
+    with opened(run) as campaign:
+        page = campaign.path.with_suffix(".html") if path is None else Path(path)
+        write_report(campaign, page, asked, say)
+    return page
 
 
 def write_report(

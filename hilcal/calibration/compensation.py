@@ -24,6 +24,7 @@ from hilcal.readings.readings import States
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.robot.chain import Chain, evaluate, joint_jacobian
+from hilcal.shown import Brief
 from hilcal.types import Bools, Floats, Ints
 
 if TYPE_CHECKING:
@@ -44,7 +45,7 @@ Pose = tuple[Floats, Floats, Chain]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Inverse:
+class Inverse(Brief):
     """The solution for N points."""
 
     q: Floats  # (N, n) joint values
@@ -129,7 +130,7 @@ class ErrorSize:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ToolPoses:
+class ToolPoses(Brief):
     """Where the tool is at N points, base axes."""
 
     position: Floats  # (N, 3) m
@@ -186,7 +187,7 @@ def band(covariance: Floats) -> Floats:
 
 
 @dataclass(frozen=True, eq=False)
-class Compensation:
+class Compensation(Brief):
     """Joint values that put the tool where it was asked to be, and what follows from them."""
 
     inverse: Inverse  # joint values, and what is left
@@ -197,6 +198,14 @@ class Compensation:
     _std: bool
     untold: tuple[str, ...] = ()
     """Columns of `States` that the model needs and the points did not have."""
+
+    def _brief(self) -> dict[str, str]:
+        return {
+            "points": f"{len(self.q)}, of which {np.count_nonzero(self.usable)} can be used",
+            "q": f"array {self.q.shape}, rad, of joints that slide m",
+            "error before": f"{1e3 * ErrorSize.of(self.before.error_m).rms_m:.3g} mm rms",
+            "more": "q, before, after, usable, inside, limits, singular",
+        }
 
     @property
     def q(self) -> Floats:

@@ -1,7 +1,8 @@
 """A campaign: its readings with their full covariance, and the fits that were stored in it."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -52,7 +53,7 @@ from hilcal.types import Floats
 Say = Callable[[str], None]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, init=False)
 class Campaign(Brief):
     """An open campaign file; close it, or use it in a `with` statement.
 
@@ -80,10 +81,9 @@ class Campaign(Brief):
     changes: Changes
     noise: NoiseEstimate | None
 
-    @classmethod
-    def open(
-        cls, path: str | Path, catalogue: Catalogue | None = None, *, read_only: bool = False
-    ) -> Self:
+    def __init__(
+        self, path: str | Path, catalogue: Catalogue | None = None, *, read_only: bool = False
+    ) -> None:
         """Open a campaign file; its cell is that of the revision in use.
 
         Args:
@@ -97,10 +97,28 @@ class Campaign(Brief):
         try:
             number, records = file.accepted(), file.revisions()
             used = records[-1:] if number is None else records[number - 1 : number]
-            return cls._of(file, catalogue or installed(), used[0].cell if used else {})
+            self._set(file, catalogue or installed(), used[0].cell if used else {})
         except BaseException:
             file.close()
             raise
+
+    @classmethod
+    def open(
+        cls, path: str | Path, catalogue: Catalogue | None = None, *, read_only: bool = False
+    ) -> Self:
+        """Open a campaign file: the same as `Campaign(path)`."""
+        return cls(path, catalogue, read_only=read_only)
+
+    def _brief(self) -> dict[str, str]:
+        used = self.in_use()
+        poses = len(np.unique(self.readings.pose))
+        return {
+            "file": str(self.path),
+            "arm": self.cell.arm.name,
+            "readings": f"{len(self.readings)} at {poses} poses ({self.mode()} readings)",
+            "in use": "no revision yet" if used is None else f"revision {used.number}",
+            "more": "readings.to_frame(), fit(), calibration(), append()",
+        }
 
     def _repr_html_(self) -> str:
         from hilcal.present.campaign import info_report  # notebooks alone need them
@@ -110,8 +128,8 @@ class Campaign(Brief):
         covariance = covariance_words(self.covariance_parts, self.noise)
         return fragment(info_report(overview(self.file), self.path.name, covariance))
 
-    @classmethod
-    def _of(cls, file: CampaignFile, catalogue: Catalogue, changes: Changes) -> Self:
+    def _set(self, file: CampaignFile, catalogue: Catalogue, changes: Changes) -> None:
+        """Set the attributes from an open file, and what is changed in its cell."""
         config = CellConfig.from_json(file.config_json)
         try:
             config = changed(config, changes)
@@ -126,11 +144,17 @@ class Campaign(Brief):
         readings = replace(
             full_readings(readings, covers, cell, config), noise_stated=noise is None
         )
-        return cls(file, config, cell, readings, catalogue, changes, noise)
+        values = (file, config, cell, readings, catalogue, changes, noise)
+        for field, value in zip(fields(self), values, strict=True):
+            object.__setattr__(self, field.name, value)
 
     def at(self, changes: Changes) -> Self:
         """Return the campaign with what a revision changed in the cell, on the same open file."""
-        return self if changes == self.changes else self._of(self.file, self.catalogue, changes)
+        if changes == self.changes:
+            return self
+        other = object.__new__(type(self))
+        other._set(self.file, self.catalogue, changes)
+        return other
 
     def with_cell(self, changes: Changes) -> Self:
         """Return the campaign with a cell that is changed further; the file keeps what it has.
@@ -550,3 +574,13 @@ def _restates(file: CampaignFile, changes: Changes) -> bool:
     if file.about(NOISE) is not None:
         return not keys.isdisjoint(INSTRUMENT_NOISE)
     return file.about(FROM) == TRACKER and not keys.isdisjoint((*INSTRUMENT_NOISE, "station_m"))
+
+
+@contextmanager
+def opened(run: Campaign | str | Path) -> Iterator[Campaign]:
+    """Yield a campaign, or that of a path, which is closed again."""
+    if isinstance(run, Campaign):
+        yield run
+        return
+    with Campaign(run) as campaign:
+        yield campaign

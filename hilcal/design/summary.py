@@ -398,6 +398,17 @@ class CheckedPlan(Shown, Tabular):
     dry: DryRun
     summary: PlanSummary  # cost, predicted precision and efficiency
 
+    def _brief(self) -> dict[str, str]:
+        s, efficiency = self.summary, self.efficiency
+        return {
+            "poses": f"{s.poses} and the reference",
+            "readings": f"{s.readings}, in {self.dry.duration / 60:.0f} min",
+            "loads": ", ".join(f"{name} {count}" for name, count in s.loads.items()),
+            "criterion": s.criterion,
+            "efficiency": "not certified" if efficiency is None else f"at least {efficiency:.3f}",
+            "more": "summary, to_frame(), save()",
+        }
+
     @property
     def efficiency(self) -> float | None:
         """Certified lower bound of the efficiency; None without a certificate."""

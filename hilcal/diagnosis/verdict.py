@@ -88,12 +88,6 @@ def diagnose(
 ) -> Diagnosis:
     """Judge a fit.
 
-    >>> with hc.Campaign.open(RUN) as run:
-    ...     found = hc.fit(hc.baseline(run.cell, run.readings), run.readings)
-    >>> d = hc.diagnose(found)
-    >>> d.verdict, d.suspects[0].effect
-    ('missing_effect', 'joint_tilt_compliance')
-
     Args:
         fit: the fit.
         history: how its model was reached.

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal, overload
+from typing import TYPE_CHECKING, Any, Literal, overload
 
 import numpy as np
 
@@ -256,11 +256,39 @@ class Fit(WithVarianceFactor, Tabular):
         lines.append(f"  variance factor {self.variance_factor:.3g} [{low:.3g}, {high:.3g}]")
         return "\n".join([*lines, *self.parameters.lines()])
 
-    def residuals(self, frame: Frame = "sensor") -> Floats:
-        """Residuals (D, m), measured − predicted, m and rad.
+    @property
+    def residuals(self) -> "Residuals":
+        """Residuals, measured − predicted: `residuals()` are an array, `to_frame()` a table."""
+        return Residuals(self)
 
-        They are of `readings[~outlier][whitening.reading]`: of deflections the loaded readings,
-        which are not in the order of the campaign.
+    @cached_property
+    def frames(self) -> RobotFrames:
+        """Base and flange of the robot."""
+        return robot_frames(self.model, self.theta)
+
+    def predict(self, at: States | Readings) -> Observation:
+        """Predict what the sensor reads in N states, or in those of readings.
+
+        Raises:
+            InputError: no static equilibrium.
+        """
+        states = at.states if isinstance(at, Readings) else at
+        return self.model.predict(states, self.theta).observation
+
+
+class Residuals(Sequence[Floats]):
+    """Residuals of a fit, measured − predicted, m and rad.
+
+    They are of `readings[~outlier][whitening.reading]`: of deflections the loaded readings, which
+    are not in the order of the campaign. Also a sequence and an array (D, m) in sensor axes.
+    """
+
+    def __init__(self, of: Fit) -> None:
+        """Take the fit."""
+        self._fit = of
+
+    def __call__(self, frame: Frame = "sensor") -> Floats:
+        """Return them as an array (D, m).
 
         Args:
             frame: axes that they are given in: "sensor", or "base" of the arm.
@@ -268,21 +296,38 @@ class Fit(WithVarianceFactor, Tabular):
         Raises:
             InputError: another frame.
         """
+        raw = self._fit.raw
         if frame == "sensor":
-            return self.raw
+            return raw
         if frame != "base":
             raise InputError(f"frame {frame!r} is unknown; valid: sensor, base")
-        parts = self.raw.reshape(len(self.raw), -1, 3)
-        return np.asarray((parts @ self.frames.base[:3, :3]).reshape(self.raw.shape))
+        parts = raw.reshape(len(raw), -1, 3)
+        return np.asarray((parts @ self._fit.frames.base[:3, :3]).reshape(raw.shape))
 
-    @cached_property
-    def frames(self) -> RobotFrames:
-        """Base and flange of the robot."""
-        return robot_frames(self.model, self.theta)
+    def to_frame(self) -> "pd.DataFrame":
+        """Return a row for each reading: pose, load, residual, and residual without its pose."""
+        return self._fit.to_frame()
 
-    def predict(self, states: States) -> Observation:
-        """Predict what the sensor reads in N states, if there is a static equilibrium."""
-        return self.model.predict(states, self.theta).observation
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> Floats:
+        """Return the array in sensor axes."""
+        return np.array(self._fit.raw, dtype=dtype, copy=copy)
+
+    def __len__(self) -> int:
+        """Return the number of measurements D."""
+        return len(self._fit.raw)
+
+    @overload
+    def __getitem__(self, key: int) -> Floats: ...
+    @overload
+    def __getitem__(self, key: slice) -> Sequence[Floats]: ...
+    def __getitem__(self, key: int | slice) -> Any:
+        """Return that of one measurement (m,), or of some."""
+        return self._fit.raw[key]
+
+    def __repr__(self) -> str:
+        """Return their number and size."""
+        rms = 1e6 * self._fit.error.rms_m
+        return f"Residuals({len(self)} of {self._fit.mode} readings: {rms:.1f} µm rms)"
 
 
 def mahalanobis2(raw: Floats, covariance: Floats) -> Floats:

@@ -321,6 +321,16 @@ class CampaignValidation(Shown):
     beyond: Extrapolation  # what the fit states of them, and which lie outside
     shares: Acceptance  # errors by load and by pose, and against a limit
 
+    def _brief(self) -> dict[str, str]:
+        error, noise = self.prediction.error, self.prediction.noise_floor
+        return {
+            "model": " + ".join(self.model.named),
+            "readings": f"{len(self.prediction.raw)} predicted",
+            "error": f"{1e6 * error.rms_m:.1f} µm rms, noise alone {1e6 * noise:.1f} µm",
+            "variance factor": f"{self.prediction.variance_factor:.3g}",
+            "more": "judged, prediction, beyond, shares",
+        }
+
 
 def acceptance(
     found: Validation, beyond: Extrapolation, limit_m: float | None = None

@@ -95,6 +95,16 @@ class Model(Brief):
             if names.count(name) > 1:
                 raise InputError(f"effect {name} is in the model already: {', '.join(names)}")
 
+    def _brief(self) -> dict[str, str]:
+        behind = f" and {len(self.background)} in the background" if self.background else ""
+        return {
+            "arm": self.cell.arm.name,
+            "effects": f"{' + '.join(self.named) or 'none, the nominal arm'}{behind}",
+            "parameters": f"{self.size}",
+            "prior": "none" if self.prior is None else "of another campaign",
+            "more": 'model + "creep", hc.fit(model, readings)',
+        }
+
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the effects, in order."""

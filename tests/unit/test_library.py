@@ -68,9 +68,7 @@ def names() -> list[str]:
 )
 def test_the_examples_of_a_docstring_run(name: str, site: SimpleNamespace) -> None:
     thing = getattr(hc, name)
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = _free_port()
     known = {"hc": hc, "np": np, "CELL": site.cell, "TABLE": site.table, "RUN": site.run}
     known["LATER"] = site.later
     known["PORT"] = port
@@ -151,6 +149,51 @@ def test_wrong_words_are_refused_with_the_valid_ones(site: SimpleNamespace) -> N
         hc.fit(model, readings, readings="relative")
 
 
+def test_what_a_stranger_guesses_works(site: SimpleNamespace, tmp_path: Path) -> None:
+    path = tmp_path / "run.hilcal"
+    with hc.Campaign(site.run, read_only=True) as other:
+        stored_readings(path, other.file.readings(), load_config(CELL))
+    with hc.Campaign(path) as run:
+        model = hc.baseline(run)
+        assert model.names == hc.baseline(run.cell, run.readings).names
+        fit = hc.fit(model, run, mode="deflection")
+        same = hc.fit(model, run.readings, readings="deflection")
+        np.testing.assert_array_equal(fit.theta, same.theta)
+        np.testing.assert_array_equal(
+            fit.predict(run.readings).position, fit.predict(run.readings.states).position
+        )
+        np.testing.assert_array_equal(np.asarray(fit.residuals), fit.residuals())
+        assert len(fit.residuals) == len(fit.residuals()) > len(fit.residuals[:3]) == 3
+        assert fit.residuals.to_frame().equals(fit.to_frame())
+        with pytest.raises(hc.InputError, match="no revision yet"):
+            hc.diagnose(run)
+        found = hc.refine(run)
+        assert found.fit.model.names == hc.refine(model, run.readings).fit.model.names
+        run.append(found)
+        assert hc.diagnose(run).verdict == found.verdict
+    assert hc.report(path) == tmp_path / "run.html"
+    with hc.view(path, port=_free_port()) as url:
+        assert url.startswith("rerun+http")
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def test_what_is_missing_or_said_twice_is_refused_in_a_line(site: SimpleNamespace) -> None:
+    cell = hc.Cell.load(site.cell)
+    readings = hc.read_table(site.table, cell)
+    model = hc.baseline(cell, readings)
+    with pytest.raises(hc.InputError, match=r"valid: baseline\(cell, readings\)"):
+        hc.baseline(cell)
+    with pytest.raises(hc.InputError, match=r"valid: refine\(model, readings\)"):
+        hc.refine(model)
+    with pytest.raises(hc.InputError, match="valid: one of both"):
+        hc.fit(model, readings, readings="deflection", mode="absolute")
+
+
 def test_what_a_console_prints_of_a_value_is_at_most_fifteen_lines(site: SimpleNamespace) -> None:
     with hc.Campaign.open(site.run, read_only=True) as run:
         model = hc.baseline(run.cell, run.readings)
@@ -158,6 +201,9 @@ def test_what_a_console_prints_of_a_value_is_at_most_fifteen_lines(site: SimpleN
         fit, judged = found.fit, found.diagnosis
         values = [run, run.cell, run.cell.arm, run.readings, run.readings.states, model, fit]
         values += [fit.parameters, fit.predict(run.readings.states), judged, judged.suspects[0]]
+        calibration, q = hc.Calibration.of(fit), run.readings.states.q
+        values += [fit.residuals, hc.plan(run.cell, poses=3), hc.validate(run, run), calibration]
+        values += [calibration.predict(q), calibration.compensate(q)]
         for value in (*values, found, found.steps[0]):
             text = repr(value)
             assert text.count("\n") < 15, text
