@@ -1,10 +1,11 @@
 """Prediction of another campaign's readings: what was fitted is left out, the rest is judged."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
-from hilcal.campaign.campaign import Campaign
+from hilcal.campaign.campaign import Campaign, opened
 from hilcal.campaign.revisions import mode_of
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification import validation
@@ -14,8 +15,8 @@ from hilcal.store.revision import RevisionRecord
 
 
 def validate(
-    run: Campaign,
-    other: Campaign,
+    run: Campaign | str | Path,
+    other: Campaign | str | Path,
     revision: int | RevisionRecord | None = None,
     limit_m: float | None = None,
     *,
@@ -34,8 +35,9 @@ def validate(
     (50, False)
 
     Args:
-        run: has the revision; without any, the baseline is fitted and not kept.
-        other: has the readings.
+        run: has the revision; without any, the baseline is fitted and not kept. A campaign, or its
+            path.
+        other: has the readings; the same.
         revision: its number, or a record; the one in use where None.
         limit_m: the largest 3-D position error that is allowed, m; that of the configuration of
             `run`, [limits] accuracy_m, where None.
@@ -48,6 +50,9 @@ def validate(
         CannotAnswerError: a limit, and all readings were fitted; or the registration does not
             settle.
     """
+    if not isinstance(run, Campaign) or not isinstance(other, Campaign):
+        with opened(run) as one, opened(other) as two:
+            return validate(one, two, revision, limit_m, register=register, say=say)
     if run.cell.arm.name != other.cell.arm.name:
         raise InputError(
             f"{other.path}: robot {other.cell.arm.name}; the model of {run.path} is of "

@@ -1,11 +1,12 @@
 """Two campaigns of one arm: the error of the earlier calibration today, and what has changed."""
 
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hilcal.campaign.campaign import Campaign
+from hilcal.campaign.campaign import Campaign, opened
 from hilcal.campaign.revisions import mode_of
 from hilcal.diagnosis.change import changing, find_changes
 from hilcal.diagnosis.comparison import Comparison, completed, error_today
@@ -22,8 +23,8 @@ from hilcal.store.revision import CARRIED, RevisionRecord
 
 
 def compare(
-    run: Campaign,
-    later: Campaign,
+    run: Campaign | str | Path,
+    later: Campaign | str | Path,
     revision: int | None = None,
     *,
     same_setup: bool | None = None,
@@ -39,6 +40,7 @@ def compare(
     (('joint_tilt_compliance',), True)
 
     Args:
+        run: the earlier campaign, or its path.
         later: the later one; 15 readings will do.
         revision: of the earlier campaign; the one in use where None, and the baseline without any.
         same_setup: whether tracker and base stand as they did; where None, only if both cells
@@ -51,6 +53,9 @@ def compare(
         CannotAnswerError: the earlier revision was fitted to all later readings; or they do not
             determine the tracker's place.
     """
+    if not isinstance(run, Campaign) or not isinstance(later, Campaign):
+        with opened(run) as first, opened(later) as second:
+            return compare(first, second, revision, same_setup=same_setup, say=say)
     if run.cell.arm.name != later.cell.arm.name:
         raise InputError(
             f"{later.path}: another arm ({later.cell.arm.name}) than that of {run.path} "

@@ -171,6 +171,7 @@ def test_what_a_stranger_guesses_works(site: SimpleNamespace, tmp_path: Path) ->
         assert found.fit.model.names == hc.refine(model, run.readings).fit.model.names
         run.append(found)
         assert hc.diagnose(run).verdict == found.verdict
+    assert hc.validate(path, site.later).judged.unseen
     assert hc.report(path) == tmp_path / "run.html"
     with hc.view(path, port=_free_port()) as url:
         assert url.startswith("rerun+http")
