@@ -13,20 +13,18 @@ from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import linearise
 from hilcal.model.model import Model
 from hilcal.present.verdict import message
-from hilcal.readings.readings import Readings
-from hilcal.refinement import MOST_REVISIONS, Refinement, add, refine
+from hilcal.refinement import MOST_REVISIONS, add, refine
 from hilcal.regression.leave_out import LEAST_GAIN
 from tests.support.campaigns import campaign, cell_of, measured, plan, world_of
 from tests.support.diagnosis_cases import fitted
 from tests.support.effect_cases import make
 
 
-def check_steps(r: Refinement) -> None:
+def check_steps(r):
     """What holds of every refinement."""
     assert 1 <= len(r.steps) <= MOST_REVISIONS
     assert r.steps[0].added is None
     for before, after in zip(r.steps, r.steps[1:], strict=False):
-        assert after.added is not None
         assert after.fit.model.names == (*before.fit.model.names, after.added)
         assert after.added in before.diagnosis.significant
         held = [s.fit.holdout.rms_sigma for s in (before, after)]
@@ -40,7 +38,7 @@ def check_steps(r: Refinement) -> None:
 )
 def test_a_hidden_effect_is_added_and_the_error_falls_to_the_noise(effect, mode):
     c = campaign(effect, mode, 1, poses=30)
-    said: list[str] = []
+    said = []
     r = refine(baseline(c.cell, c.readings, mode), c.readings, mode, said.append)
     check_steps(r)
     assert effect in r.steps[-1].fit.model.names
@@ -76,7 +74,7 @@ def test_nothing_hidden_adds_nothing():
     assert r.diagnosis is r.steps[0].diagnosis
 
 
-def with_pose_errors(readings: Readings, seed: int) -> Readings:
+def with_pose_errors(readings, seed):
     """Readings with an error per pose that follows nothing: no effect explains it elsewhere."""
     rng = np.random.default_rng(seed)
     off = 1e-4 * rng.normal(size=(len(readings.pose_names), 3))[readings.pose]

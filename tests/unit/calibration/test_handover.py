@@ -15,7 +15,7 @@ from tests.unit.calibration.test_calibration import calibrated, fresh
 
 
 @pytest.mark.parametrize("effect", ["link_geometry", "encoder_offset"])
-def test_constant_effects_are_in_the_transforms_exactly(effect: str) -> None:
+def test_constant_effects_are_in_the_transforms_exactly(effect):
     c = calibrated(effect)
     found = corrected(c)
     assert found.within == (effect,)
@@ -33,7 +33,7 @@ def test_constant_effects_are_in_the_transforms_exactly(effect: str) -> None:
 
 
 @pytest.mark.parametrize("effect", ["joint_tilt_compliance", "transmission_error"])
-def test_what_is_not_constant_is_named_and_left_out(effect: str) -> None:
+def test_what_is_not_constant_is_named_and_left_out(effect):
     c = calibrated(effect)
     found = corrected(c)
     assert effect in found.beyond
@@ -42,7 +42,7 @@ def test_what_is_not_constant_is_named_and_left_out(effect: str) -> None:
 
 
 @pytest.mark.parametrize("name", [n for n in robot_names() if n.startswith("ur")])
-def test_the_nominal_arms_have_the_origins_of_ur_description(name: str) -> None:
+def test_the_nominal_arms_have_the_origins_of_ur_description(name):
     arm = load_arm(name)
     text, rest = ur_kinematics(arm, arm)
     np.testing.assert_allclose(rest, np.eye(4), atol=1e-12)
@@ -54,7 +54,7 @@ def test_the_nominal_arms_have_the_origins_of_ur_description(name: str) -> None:
     assert re.search(r"hash: calib_\d+", text)
 
 
-def test_deflections_and_foreign_arms_are_refused_in_words() -> None:
+def test_deflections_and_foreign_arms_are_refused_in_words():
     with pytest.raises(CannotAnswerError, match="--readings absolute"):
         corrected(calibrated("none", "deflection"))
     arm = load_arm("ur10e")

@@ -135,7 +135,7 @@ LOAD_NAME = st.text(min_size=1).filter(lambda name: escaped(name) == name)
     joint_std=st.floats(0, 1e-3) | st.tuples(*[st.floats(0, 1e-3)] * 6),
     base=st.none() | st.tuples(vector, vector),
 )
-def test_json_round_trip(target, mass, loads, joint_std, base):  # type: ignore[no-untyped-def]
+def test_json_round_trip(target, mass, loads, joint_std, base):
     tracker = {} if base is None else {"base_xyz_m": base[0], "base_rotvec_rad": base[1]}
     config = CellConfig.model_validate(
         {
@@ -150,9 +150,6 @@ def test_json_round_trip(target, mass, loads, joint_std, base):  # type: ignore[
         }
     )
     assert CellConfig.from_json(config.to_json()) == config
-
-
-LOAD = '[[loads]]\nname = "a"\nmass_kg = 1.0\n'
 
 
 @refusals("cell")

@@ -556,9 +556,7 @@ def test_a_newer_version_is_refused_in_words(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("command", ["info", "identify", "export"])
-def test_changed_readings_are_found_by_their_hash(
-    command: str, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
+def test_changed_readings_are_found_by_their_hash(command, tmp_path, capsys):
     """One coordinate moved by 1 µm, and its checksum mended."""
     path = unpacked(HASHED, tmp_path)
     with sqlite3.connect(path) as db, unguarded(db):

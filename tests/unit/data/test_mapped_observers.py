@@ -1,7 +1,6 @@
 """Foreign tables of distances, heights, stations and torques, by a mapping and by its proposal."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +24,7 @@ JOINTS = [f"Achse {k} [°]" for k in range(1, 7)]
 MOMENTS = [f"Drehmoment A{k} [Nmm]" for k in range(1, 7)]
 POSITION = ["X [mm]", "Y [mm]", "Z [mm]"]
 TORQUES = {"columns": MOMENTS, "unit": "Nmm", "of": "load"}
-BAR: dict[str, Any] = {
+BAR = {
     "file": {"separator": ";", "decimal": ","},
     "joints": {"columns": JOINTS, "unit": "deg"},
     "pose": {"column": "Messpunkt"},

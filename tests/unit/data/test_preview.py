@@ -1,8 +1,6 @@
 """The guess of a mapping: for typical files it is the mapping that a person would write."""
 
-from collections.abc import Callable
 from datetime import datetime, timedelta
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,8 +16,6 @@ N = len(C.q)
 DEG = np.rad2deg(C.q)
 MM = 1e3 * C.position
 SIGMA = np.random.default_rng(1).uniform(0.01, 0.03, (N, 6))
-
-Case = tuple[str, dict[str, Any]]
 
 
 def joints(names, unit):
@@ -200,7 +196,7 @@ def ros():
     }  # fmt: skip
 
 
-CASES: dict[str, Callable[[], Case]] = {
+CASES = {
     f.__name__: f
     for f in (
         german, kuka, fanuc, abb, rtde, with_units_row, expanded, forces, without_header,

@@ -53,7 +53,6 @@ def test_what_was_recorded_comes_back_after_reopening(tmp_path):
         assert [(e["kind"], e["why"]) for e in log.events()] == [("stopped", "test")]
         assert log.plan.without(log.done()).steps == STEPS[3:]
         readings = log.readings()
-        assert readings is not None
         assert len(readings) == 3
 
 
@@ -143,7 +142,7 @@ def test_an_interrupt_between_a_transaction_s_begin_and_its_block_leaves_nothing
     tmp_path, monkeypatch
 ):
     """The block is never entered: nobody ends the transaction but the next one, or the close."""
-    complaints: list[object] = []
+    complaints = []
     monkeypatch.setattr("sys.unraisablehook", complaints.append)
     connection = sqlite3.connect(tmp_path / "x", isolation_level=None)
     connection.execute("CREATE TABLE t (x)")

@@ -5,7 +5,6 @@ import pickle
 import sys
 import zipfile
 from datetime import datetime, timedelta
-from typing import Any
 
 import numpy as np
 import openpyxl
@@ -77,7 +76,6 @@ def test_a_spreadsheet(tmp_path, arm):
     x = read(path, found, arm)
     np.testing.assert_allclose(x.states.q, C.q, atol=1e-12)
     np.testing.assert_allclose(x.value, C.position, atol=1e-12)
-    assert x.states.time is not None
     np.testing.assert_allclose(x.states.time, 30 * np.arange(12))
     assert x.load_names == ("5", "none")
     with pytest.raises(InputError, match=r"no sheet 'Date' \(did you mean \"Data\"\?\); it has"):
@@ -124,7 +122,7 @@ def test_a_mat_file(tmp_path, arm):
 
 def test_parquet(tmp_path, arm):
     path = tmp_path / "t.parquet"
-    columns: dict[str, Any] = {n: np.rad2deg(C.q[:, k]) for k, n in enumerate(NAMES)}
+    columns = {n: np.rad2deg(C.q[:, k]) for k, n in enumerate(NAMES)}
     columns |= {n: 1e3 * C.position[:, k] for k, n in enumerate("XYZ")}
     columns["pose"] = [f"P{k}" for k in range(12)]
     columns["raw"] = [[1.0, 2.0]] * 12

@@ -2,9 +2,7 @@
 
 import csv
 import sqlite3
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,8 +15,6 @@ from tests.support.readings_cases import assert_same, make_arm, readings, simple
 
 ARM = make_arm()
 NOISE = TrackerNoise(10e-6, 0.3e-6, 15e-6, 6e-6)
-Table = list[dict[str, str]]
-Write = Callable[[Table], Path]
 
 per_example_file = settings(
     deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture]
@@ -128,7 +124,7 @@ def test_repeats_blank_lines_and_order_of_columns_do_not_matter(write):
     np.testing.assert_array_equal(x.value[6:], x.value[:2])
 
 
-BAD: dict[str, tuple[Table, str]] = {
+BAD = {
     "misspelled": (renamed(good(), "q3_rad", "q3_rda"),
         r"unknown column 'q3_rda'; did you mean 'q3_rad'"),
     "capital": (renamed(good(), "y_m", "Y_m"), r"unknown column 'Y_m'; did you mean 'y_m'"),

@@ -3,7 +3,6 @@
 import json
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +16,6 @@ from hilcal.config.sections import Gauge, Point
 from hilcal.design.information import (
     MOST_ORDINARY,
     MOST_PARAMETERS,
-    DesignProblem,
     problem,
     reading_covariance,
 )
@@ -26,7 +24,7 @@ from hilcal.design.predicted import predicted, prediction_poses
 from hilcal.effects.catalogue import installed
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.baseline import baseline, with_effects
-from hilcal.identification.carried import CarriedPrior, carried_prior
+from hilcal.identification.carried import carried_prior
 from hilcal.identification.fit import fit
 from hilcal.identification.full_covariance import with_joint_scatter
 from hilcal.identification.posterior import Posterior
@@ -34,7 +32,7 @@ from hilcal.measuring.clearance import Clearance, LineOfSight
 from hilcal.measuring.devices import TrackerSample
 from hilcal.measuring.measure import average
 from hilcal.measuring.route import seconds_at_rest
-from hilcal.readings.whitening import MODES, Mode
+from hilcal.readings.whitening import MODES
 from hilcal.robot.chain import evaluate
 from tests.support.arm_cases import ARMS, arm_of
 from tests.support.arm_cases import cell_of as odd_cell
@@ -49,7 +47,7 @@ from tests.support.campaigns import (
     world_of,
 )
 from tests.support.cli_cases import CELL as DEMO
-from tests.support.cli_cases import Capsys, ok
+from tests.support.cli_cases import ok
 from tests.support.fit_cases import named
 from tests.support.fit_cases import predicted as read
 from tests.support.observer_cases import NORMAL, POINTS, STD, observed
@@ -339,7 +337,6 @@ def test_potential_terms_only_add_uncertainty():
     work = prediction_poses(problems[0].nominal, config_of("deflection"), poses_of(5, 9))
     mine, bare = (predicted(p, everything_once(p), work=work) for p in problems)
     assert mine.std == pytest.approx(bare.std, rel=1e-9)
-    assert bare.position is not None
     assert bare.position_open == pytest.approx(bare.position, rel=1e-9)
     assert mine.position_open > bare.position
 
@@ -409,13 +406,13 @@ CARRIED = ("joint_compliance", "joint_tilt_compliance")
 
 
 @cache
-def learnt() -> Posterior:
+def learnt():
     c = campaign("joint_tilt_compliance", "absolute", 1, poses=30, registration_known=True)
     found = fit(with_effects(c.cell, c.readings, "absolute", CARRIED), c.readings, "absolute")
     return Posterior.of(found)
 
 
-def problem_with(prior: CarriedPrior | None, names: tuple[str, ...] = CARRIED) -> DesignProblem:
+def problem_with(prior, names=CARRIED):
     config = configuration()
     planning = config.planning.model_copy(update={"model": names, "against": ()})
     config = config.model_copy(update={"planning": planning})
@@ -423,11 +420,11 @@ def problem_with(prior: CarriedPrior | None, names: tuple[str, ...] = CARRIED) -
     return problem(nominal, config, np.unique(plan(4, 5).states.q, axis=0))
 
 
-def std(of: DesignProblem) -> dict[str, float]:
+def std(of):
     return predicted(of, np.ones(len(of.units))).by_name()
 
 
-def test_what_is_known_is_in_the_prediction() -> None:
+def test_what_is_known_is_in_the_prediction():
     alone, known = std(problem_with(None)), std(problem_with(carried_prior(learnt())))
     assert known.keys() == alone.keys()
     own = dict(zip(learnt().names, learnt().std, strict=True))
@@ -435,19 +432,19 @@ def test_what_is_known_is_in_the_prediction() -> None:
         assert known[name] < min(alone[name], own[name])
 
 
-def test_effects_that_only_the_prior_knows_are_planned_for() -> None:
+def test_effects_that_only_the_prior_knows_are_planned_for():
     found = problem_with(carried_prior(learnt()), CARRIED[:1])
     assert "joint_tilt_compliance" in found.nominal.model.names
 
 
-def test_a_prior_that_knows_nothing_changes_no_prediction() -> None:
+def test_a_prior_that_knows_nothing_changes_no_prediction():
     p = learnt()
     nothing = carried_prior(replace(p, information=np.zeros_like(p.information)))
     alone, known = std(problem_with(None)), std(problem_with(nothing))
     np.testing.assert_allclose(list(known.values()), list(alone.values()), rtol=1e-9)
 
 
-def test_of_another_arm_is_refused() -> None:
+def test_of_another_arm_is_refused():
     p = learnt()
     with pytest.raises(InputError, match="nominal links"):
         problem_with(carried_prior(replace(p, links=1.01 * p.links)))
@@ -460,7 +457,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("what", CASES)
-def test_predicted_uncertainties_are_those_of_a_fit(what: str) -> None:
+def test_predicted_uncertainties_are_those_of_a_fit(what):
     who, points, gauges = CASES[what]
     config = configuration()
     tracker = config.tracker.model_copy(update={"frame": "base", "observes": what})
@@ -493,7 +490,7 @@ def test_predicted_uncertainties_are_those_of_a_fit(what: str) -> None:
 
 
 @pytest.mark.long
-def test_a_cell_of_distances_is_planned(tmp_path: Path, capsys: Capsys) -> None:
+def test_a_cell_of_distances_is_planned(tmp_path, capsys):
     text = DEMO.read_text().replace("candidates = 250", "candidates = 60\nagainst = []")
     text = text.replace('frame = "tracker"', 'frame = "base"\nobserves = "distance"')
     (tmp_path / "cell.toml").write_text(text + "\n[points.A]\nstd_m = 1e-5\n[points.B]\n")
@@ -502,7 +499,7 @@ def test_a_cell_of_distances_is_planned(tmp_path: Path, capsys: Capsys) -> None:
     assert len({step["pose"] for step in json.loads(out.read_text())["steps"]}) >= 8
 
 
-def test_devices_read_positions(tmp_path: Path) -> None:
+def test_devices_read_positions(tmp_path):
     text = DEMO.read_text().replace(
         'frame = "tracker"', 'driver = "geocom"\nport = "x"\nobserves = "distance"'
     )
@@ -512,7 +509,7 @@ def test_devices_read_positions(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_prediction_is_what_identification_states_of_several_targets(mode: Mode) -> None:
+def test_prediction_is_what_identification_states_of_several_targets(mode):
     config = config_of(mode)
     scatter = config.repeatability.model_copy(update={"joint_std_rad": 5e-5})
     config = config.model_copy(update={"repeatability": scatter})
@@ -531,7 +528,7 @@ def test_prediction_is_what_identification_states_of_several_targets(mode: Mode)
         assert foreseen[name] == pytest.approx(stated[name], rel=0.05), name
 
 
-def test_sight_and_time_of_each_target() -> None:
+def test_sight_and_time_of_each_target():
     config = config_of()
     tool = config.tool.model_copy(
         update={

@@ -15,7 +15,6 @@ from hilcal.robot import chain as chains
 from hilcal.robot.catalogue import robot_names
 from hilcal.robot.chain import evaluate
 from hilcal.robot.conventions import as_counted
-from hilcal.types import Floats
 from tests.support.arm_cases import arm_of
 from tests.support.effect_cases import (
     CELLS,
@@ -153,7 +152,7 @@ def test_other_pairs_are_refused_with_what_would_be_valid(given):
     assert "\n" not in str(caught.value)
 
 
-def acting(wrench: Floats, flange: Floats, name: str, theta: Floats, turn: Floats) -> Floats:
+def acting(wrench, flange, name, theta, turn):
     """What acts where a sensor says `wrench`, state by state: said = error(true) in its axes."""
     out = np.zeros_like(wrench)
     for i, w in enumerate(wrench):

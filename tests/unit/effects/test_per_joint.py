@@ -7,7 +7,6 @@ import pytest
 
 from hilcal.campaign.revisions import restore_model, to_record
 from hilcal.effects.per_joint import PerJoint, joint_groups
-from hilcal.effects.protocol import Effect
 from hilcal.errors import InputError
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.fit import fit
@@ -31,7 +30,7 @@ CREEPS = ("common", "each", "2-3/5+6")
 GROUPS = ("common", "2/3/4-6", "1+4/2-3", "5")
 
 
-def membership(groups: str, count: int) -> np.ndarray:
+def membership(groups, count):
     """(n, G) 1 where a joint belongs to a group; written out by hand, not read."""
     known = {
         "common": [range(count)],
@@ -48,12 +47,12 @@ def membership(groups: str, count: int) -> np.ndarray:
     return out
 
 
-def options(name: str, groups: str) -> dict[str, object]:
+def options(name, groups):
     few = {"harmonics": 2} if name == "transmission_error" else options_of(name)
     return {**few, "joints": groups}
 
 
-def spread(effect: Effect, groups: str) -> np.ndarray:
+def spread(effect, groups):
     """(P each, P groups) parameters of every joint by those of the groups."""
     member = membership(groups, effect.cell.arm.n)
     return np.kron(member, np.eye(len(effect.parameters) // member.shape[1]))

@@ -8,11 +8,10 @@ import pytest
 from hilcal.effects.catalogue import BUILT_IN
 from hilcal.effects.check import check_effect
 from hilcal.effects.from_file import read_effects
-from hilcal.effects.protocol import Effect
 from hilcal.model.model import Model
 from tests.support.campaigns import campaign as simulated
 from tests.support.campaigns import plan
-from tests.support.cli_cases import Capsys, ok, refused
+from tests.support.cli_cases import ok, refused
 from tests.support.user_effect_cases import CLASS, COLUMNS, HEAD
 
 NAME = "soft_side"
@@ -34,7 +33,7 @@ ELASTIC = CLASS.replace(COLUMNS, "values = s.torque[:, :1] ** 3").replace(
 
 LOCAL = ELASTIC.replace("elastic = True", "elastic = local_response = True")
 
-BAD: dict[str, tuple[str, str]] = {
+BAD = {
     "not Python": ("class Mine(:\n", ", line 1: not Python: invalid syntax"),
     "does not import": ("import no_such_module\n", ", line 1: ModuleNotFoundError"),
     "fails": ("a = 1\nb = a / 0\n", ", line 2: ZeroDivisionError: division by zero"),
@@ -142,7 +141,7 @@ BAD: dict[str, tuple[str, str]] = {
 
 
 @pytest.mark.parametrize("kind", BAD)
-def test_a_bad_file_is_one_clear_line(kind: str, tmp_path: Path, capsys: Capsys) -> None:
+def test_a_bad_file_is_one_clear_line(kind, tmp_path, capsys):
     content, said = BAD[kind]
     path = tmp_path / "mine.py"
     path.write_text(content, encoding="utf-8")
@@ -151,15 +150,13 @@ def test_a_bad_file_is_one_clear_line(kind: str, tmp_path: Path, capsys: Capsys)
 
 
 @pytest.mark.parametrize("content", [CLASS, ELASTIC], ids=["rigid", "elastic"])
-def test_what_the_bad_files_were_made_from_is_good(
-    content: str, tmp_path: Path, capsys: Capsys
-) -> None:
+def test_what_the_bad_files_were_made_from_is_good(content, tmp_path, capsys):
     path = tmp_path / "mine.py"
     path.write_text(content, encoding="utf-8")
     ok(capsys, "effects", "--effects-from", path)
 
 
-def test_what_a_file_prints_is_not_in_the_document(tmp_path: Path, capsys: Capsys) -> None:
+def test_what_a_file_prints_is_not_in_the_document(tmp_path, capsys):
     path = tmp_path / "mine.py"
     law = f"print('here')\n        {COLUMNS}"
     path.write_text("print('there')\n" + CLASS.replace(COLUMNS, law), encoding="utf-8")
@@ -169,7 +166,7 @@ def test_what_a_file_prints_is_not_in_the_document(tmp_path: Path, capsys: Capsy
     assert "here" in result.err
 
 
-def test_one_parameter_may_move_every_joint(tmp_path: Path) -> None:
+def test_one_parameter_may_move_every_joint(tmp_path):
     path = tmp_path / "mine.py"
     every = CLASS.replace("s.angle[:, :1]", "s.angle").replace(
         "np.array([0]), np.array([1])", "np.zeros(6, int), np.arange(6)"
@@ -184,14 +181,14 @@ def test_one_parameter_may_move_every_joint(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", BUILT_IN, ids=lambda kind: kind.name)
-def test_what_is_built_in_passes_the_check(kind: type[Effect]) -> None:
+def test_what_is_built_in_passes_the_check(kind):
     check_effect(kind)
 
 
 # --- the file to begin with -----------------------------------------------------------------
 
 
-def test_new_writes_an_effect_that_works(tmp_path: Path, capsys: Capsys) -> None:
+def test_new_writes_an_effect_that_works(tmp_path, capsys):
     path = tmp_path / "response.py"
     d = ok(capsys, "effects", "new", "response", "-o", path, "--json").document
     assert d == {"written": str(path), "effect": "response"}
@@ -204,9 +201,7 @@ def test_new_writes_an_effect_that_works(tmp_path: Path, capsys: Capsys) -> None
         assert word in content
 
 
-def test_new_goes_into_the_folder_one_is_in(
-    tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_new_goes_into_the_folder_one_is_in(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert "soft_side.py" in ok(capsys, "effects", "new", NAME).out
     there = Path("soft_side.py").read_bytes()
@@ -215,15 +210,13 @@ def test_new_goes_into_the_folder_one_is_in(
 
 
 @pytest.mark.parametrize("name", ["2x", "My", "a-b", "", "class", "é", "a/b"])
-def test_new_refuses_a_bad_name(
-    name: str, tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_new_refuses_a_bad_name(name, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert "valid: lower-case letters" in refused(capsys, 2, "effects", "new", name)
     assert not list(tmp_path.iterdir())
 
 
-def test_new_refuses_what_is_there_already(tmp_path: Path, capsys: Capsys) -> None:
+def test_new_refuses_what_is_there_already(tmp_path, capsys):
     out = tmp_path / "mine.py"
     said = refused(capsys, 2, "effects", "new", "hysteresis", "-o", out)
     assert "in the catalogue already" in said

@@ -40,11 +40,11 @@ STEPS = list(enumerate(PLAN.steps, start=1))
 
 
 @pytest.fixture(scope="module")
-def d(shadowed) -> PlanView:
+def d(shadowed):
     return PlanView(*shadowed, PLAN, SUMMARY)
 
 
-def words(path, of: str = "plan") -> str:
+def words(path, of="plan"):
     return rows(path, f"/words/{of}", "TextDocument:text")[0][0].replace("\\", "")
 
 
@@ -291,7 +291,7 @@ def test_what_does_not_fit_is_refused(shadowed, tmp_path):
 # the eye
 
 
-def eye_place(path) -> np.ndarray:
+def eye_place(path):
     """Where the eye of the first view stands, as the recording says."""
     reader = RrdReader(path)
     (blueprint,) = reader.blueprints()

@@ -10,7 +10,6 @@ from hilcal.drivers.simulated.mechanics import rotation_vector
 from hilcal.drivers.simulated.truth import Truth
 from hilcal.drivers.simulated.ur_state import GRAVITY, Kinematics
 from hilcal.drivers.simulated.world import SimulatedNoise, World
-from hilcal.effects.protocol import Situation
 from hilcal.identification.full_covariance import joint_factors
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
@@ -164,7 +163,7 @@ def test_the_situation_says_whose_angles_they_are():
     for mechanical in (True, False):
         cell = coupled_cell(mechanical)
         states = some_states(cell, 3)
-        s: Situation = Model(cell, ()).predict(states, np.zeros(0)).situation
+        s = Model(cell, ()).predict(states, np.zeros(0)).situation
         expected = states.q if mechanical else drawn_angles(states.q) * SIGN
         np.testing.assert_allclose(s.angle, expected, atol=1e-12)
         np.testing.assert_array_equal(s.values, states.q)

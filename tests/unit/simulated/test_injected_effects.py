@@ -17,7 +17,6 @@ from hilcal.drivers.simulated.injected_effects import (
     nothing_hidden,
 )
 from hilcal.drivers.simulated.truth import Truth
-from hilcal.drivers.simulated.world import World
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from studies.random_campaigns import dead_weights, rehearsal_states
@@ -29,7 +28,7 @@ STATES, POSE, LOAD, CYCLE = rehearsal_states(CELL, 10, WEIGHTS, np.random.defaul
 VISIBLE = [(e, "absolute") for e in EFFECTS] + [(e, "deflection") for e in DEFLECTION_EFFECTS]
 
 
-def without(world: World, effect: str) -> World:
+def without(world, effect):
     """The same world where the effect is gone."""
     gone = np.zeros_like(getattr(world.physics, effect))
     return replace(world, physics=world.physics.with_effect(effect, gone))

@@ -8,7 +8,7 @@ import pytest
 from hilcal.diagnosis.stepwise import add
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.drivers.simulated.injected_effects import ALL_EFFECTS, nothing_hidden
-from hilcal.drivers.simulated.own_law import OwnLaw, own_law, own_names
+from hilcal.drivers.simulated.own_law import own_law, own_names
 from hilcal.drivers.simulated.rehearsal import case_of_plan, check_choice, read_plan
 from hilcal.drivers.simulated.world_server import read_world, write_world
 from hilcal.effects.catalogue import installed
@@ -30,11 +30,11 @@ def file(tmp_path):
 
 
 @pytest.fixture
-def law(file) -> OwnLaw:
+def law(file):
     return own_law(installed().with_file(file), "mine", cell_of(), plan(6).states)
 
 
-def world_with(law: OwnLaw, theta: float):
+def world_with(law, theta):
     world = nothing_hidden(cell_of(), np.random.default_rng(1))
     return world, replace(world, own=replace(law, theta=np.array([theta])))
 

@@ -6,7 +6,7 @@ from studies.carried_bands import band_cases
 from studies.carried_bands_command import _figures
 
 
-def test_an_arm_is_measured_twice_and_predicted() -> None:
+def test_an_arm_is_measured_twice_and_predicted():
     """Errors of poses not fitted are near the noise; even seeds lack nothing."""
     config = load_config(configs_dir() / "cells" / "demo_ur10e.toml")
     found = band_cases(0, config=config, robot="ur10e", numbers=[20], first=60)

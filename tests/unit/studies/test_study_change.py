@@ -14,7 +14,7 @@ CONFIG = load_config(configs_dir() / "cells" / "demo_ur10e.toml")
 
 
 @pytest.mark.long
-def test_a_case_says_how_visible_its_change_was_and_what_was_named() -> None:
+def test_a_case_says_how_visible_its_change_was_and_what_was_named():
     arm = studied_arm(CONFIG, "ur10e", 0, poses=20)
     found = case(arm, "zero", 3, True, 7)
     assert found.found
@@ -30,7 +30,7 @@ def test_a_case_says_how_visible_its_change_was_and_what_was_named() -> None:
     assert again.z == found.z
 
 
-def test_figures_count_what_was_found_missed_and_claimed() -> None:
+def test_figures_count_what_was_found_missed_and_claimed():
     good = Case(
         "ur10e", "zero", 3, False, 1, 1e-3, strength=20.0, limit=5.0, parts="joint 3", z=(1.0,)
     )

@@ -193,7 +193,7 @@ def test_arm_too_weak_is_said():
     ({"correlations": (float("nan"),)}, "correlation nan: must be")])  # fmt: skip
 def test_wrong_options_are_named(options, message):
     with pytest.raises(InputError, match=message) as caught:
-        scaling_study(np.random.default_rng(0), **options)  # type: ignore[arg-type]
+        scaling_study(np.random.default_rng(0), **options)
     assert "\n" not in str(caught.value)
 
 

@@ -1,7 +1,6 @@
 """The workbench without a page: what is shown is the library's, and nothing is appended twice."""
 
 import os
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,32 +15,32 @@ from hilcal.identification.carried import carried_prior
 from hilcal.present.campaign import left_out_m, two_revisions, verdict_of
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.whole_file import replace_file
-from hilcal.workbench.session import Snapshot, WorkbenchSession
+from hilcal.workbench.session import WorkbenchSession
 from tests.support.bench_cases import BASE, few_effects, stored
 from tests.support.campaigns import campaign, configuration
 
 
 @pytest.fixture
-def run(tmp_path: Path) -> Path:
+def run(tmp_path):
     return stored(tmp_path / "run.hilcal")
 
 
 @pytest.fixture
-def session(run: Path) -> WorkbenchSession:
+def session(run):
     return WorkbenchSession(run, few_effects())
 
 
 @pytest.fixture
-def snapshot(session: WorkbenchSession) -> Snapshot:
+def snapshot(session):
     return session.load()
 
 
-def revisions(path: Path) -> list[tuple[str | None, str | None, int | None]]:
+def revisions(path):
     with Campaign.open(path, read_only=True) as o:
         return [(r.added, r.removed, r.made_from) for r in o.file.revisions()]
 
 
-def test_an_operator_adds_removes_and_goes_back(run: Path, session) -> None:
+def test_an_operator_adds_removes_and_goes_back(run, session):
     before = run.read_bytes()
     snapshot = session.load()
     assert (run.read_bytes(), list(run.parent.iterdir())) == (before, [run])  # only looked at
@@ -102,7 +101,7 @@ def test_an_operator_adds_removes_and_goes_back(run: Path, session) -> None:
         session.load()
 
 
-def test_a_changed_cell_keeps_how_the_model_was_reached(run: Path, session, snapshot) -> None:
+def test_a_changed_cell_keeps_how_the_model_was_reached(run, session, snapshot):
     """A verdict that doubts an addition doubts it in another cell, too, also when read again."""
     mass = {("tool", "mass_kg"): "1.4"}
     with pytest.raises(InputError, match="no value differs from what is used already"):
@@ -125,7 +124,7 @@ def test_a_changed_cell_keeps_how_the_model_was_reached(run: Path, session, snap
     assert two_revisions(*again.records[:2]).rows[0][3] == f"+ {BASE}"
 
 
-def test_a_calibration_is_of_a_revision_that_is_kept(run: Path, session, snapshot) -> None:
+def test_a_calibration_is_of_a_revision_that_is_kept(run, session, snapshot):
     name, content = session.document(snapshot, "calibration")
     assert name == "run-calibration.json"
     assert (session.snapshot.number, revisions(run)) == (1, [(None, None, None)])
@@ -133,7 +132,7 @@ def test_a_calibration_is_of_a_revision_that_is_kept(run: Path, session, snapsho
     assert Calibration.load(run.with_name(name)).source["revision"] == 1
 
 
-def test_readings_that_came_later_are_fitted_anew(run: Path, session, snapshot) -> None:
+def test_readings_that_came_later_are_fitted_anew(run, session, snapshot):
     with Campaign.open(run, few_effects()) as o:
         o.append(snapshot.fit)
         o.file.append_readings(o.file.readings()[:6])
@@ -147,7 +146,7 @@ def test_readings_that_came_later_are_fitted_anew(run: Path, session, snapshot) 
 
 
 @pytest.mark.long
-def test_fitting_anew_keeps_the_prior_of_another_campaign(run: Path) -> None:
+def test_fitting_anew_keeps_the_prior_of_another_campaign(run):
     earlier, later = run.with_name("earlier.hilcal"), run.with_name("later.hilcal")
     found = campaign(BASE, "deflection", poses=16).readings
     for path, part in ((earlier, found.pose < 8), (later, found.pose >= 8)):
@@ -165,7 +164,7 @@ def test_fitting_anew_keeps_the_prior_of_another_campaign(run: Path) -> None:
         assert o.fit(2).model.prior is not None
 
 
-def test_a_plan_names_what_it_separates_or_why_there_is_none(run: Path, session, snapshot) -> None:
+def test_a_plan_names_what_it_separates_or_why_there_is_none(run, session, snapshot):
     exists = run.with_name("there.json")
     exists.touch()
     with pytest.raises(InputError, match="the file exists; choose another name"):
@@ -176,7 +175,7 @@ def test_a_plan_names_what_it_separates_or_why_there_is_none(run: Path, session,
         session.plan(kept, None, run.with_name("plan.json"))
 
 
-def test_the_readings_that_were_picked_are_told_apart(run: Path, session, snapshot) -> None:
+def test_the_readings_that_were_picked_are_told_apart(run, session, snapshot):
     story = snapshot.story
     pulled = np.flatnonzero(np.array(story.load_names) == "pull y")
     told = {d.variable: d for d in session.differences(snapshot, pulled)}
