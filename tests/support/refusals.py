@@ -2,19 +2,26 @@
 
     == name of the case
     what is given, on as many lines as it has
-    -> the line
+    -> the line, or its beginning and … where Python or a library words the rest
+
+A given text that begins with `in NAME` is the text of that name, in which the lines that begin with
+- are replaced, once, by those with + after them.
 
 After a wanted change of words `HILCAL_REFUSALS=write pytest ...` writes the lines anew.
 """
 
 import os
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from hilcal.errors import InputError
+
 FOLDER = Path(__file__).resolve().parents[1] / "data" / "refusals"
 BLOCK = re.compile(r"^== (.*)\n((?:(?!== |-> ).*\n)*)-> (.*)\n", re.MULTILINE)
+EDIT = re.compile(r"((?:^-.*\n)+)((?:^\+.*\n)*)", re.MULTILINE)
 
 
 def refusals(name: str) -> pytest.MarkDecorator:
@@ -25,13 +32,38 @@ def refusals(name: str) -> pytest.MarkDecorator:
     return pytest.mark.parametrize(("case", "given"), rows)
 
 
+def edited(given: str, **texts: str) -> str:
+    """What a case gives: itself, or one of the texts with its edits."""
+    if not given.startswith("in "):
+        return given
+    name, _, edits = given[3:].partition("\n")
+    text = texts[name]
+    for blocks in EDIT.findall(edits):
+        old, new = ("\n".join(line[2:] for line in block.splitlines()) for block in blocks)
+        assert old in text
+        text = text.replace(old, new, 1)
+    return text
+
+
+def refuses(case: tuple[str, str], call: Callable[[], object], path: Path | None = None) -> str:
+    """Compare the line that a call is refused with; a path in it is known by its name alone."""
+    with pytest.raises(InputError) as raised:
+        call()
+    assert raised.value.exit_code == 2
+    line = str(raised.value)
+    line = line if path is None else line.replace(str(path), path.name)
+    check(case, line)
+    return line
+
+
 def check(case: tuple[str, str], line: str) -> None:
     """Compare the line that a case was refused with to the one that is kept, or keep it."""
     path = FOLDER / f"{case[0]}.txt"
     text = path.read_text(encoding="utf-8")
     assert "\n" not in line
     (found,) = (m for m in BLOCK.finditer(text) if m[1] == case[1])
-    if os.environ.get("HILCAL_REFUSALS") == "write":
+    begun = found[3].endswith("…") and line.startswith(found[3][:-1])
+    if os.environ.get("HILCAL_REFUSALS") == "write" and not begun:
         path.write_text(text[: found.start(3)] + line + text[found.end(3) :], encoding="utf-8")
     else:
-        assert line == found[3]
+        assert begun or line == found[3]

@@ -18,6 +18,7 @@ from hilcal.robot.catalogue import load_arm
 from hilcal.robot.conventions import with_conventions
 from tests.support.description_files import MJCF, SDF
 from tests.support.maker_arms import maker_arm, urdf_of
+from tests.support.refusals import edited, refusals, refuses
 from tests.unit.calibration.other_eyes import by_pinocchio, flanges, turned
 
 Q = np.random.default_rng(1).uniform(-2, 2, (12, 6))
@@ -233,31 +234,11 @@ def test_a_matlab_function_builds_the_arm(arm):
     np.testing.assert_allclose(place, poses(changed(arm)), atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        (urdf_of("rapid"), "line 10: the axis of j1 lies 0 µm and 180°"),
-        (
-            urdf_of("krl").replace("0.61 0 0", "0.68 0 0"),
-            "line 12: the axis of j3 lies 70.0 mm and 0° from that of joint 3",
-        ),
-        (urdf_of("krl").replace("'revolute'", "'prismatic'", 1), "joint 'j1' is prismatic"),
-        (urdf_of("krl").replace("0.61 0 0", "0.61 0"), "has '0.61 0'; valid: 3 numbers"),
-        (urdf_of("krl").replace("'flange' type='fixed'", "'f' type='floating'"), "is floating"),
-        ("<robot>", "no XML"),
-        ("<html/>", "an XML file of <html>; valid: a URDF"),
-        ("<!DOCTYPE r [<!ENTITY a 'b'>]><robot>&a;</robot>", "entities of its own"),
-        (MJCF.replace("a6", "a6' type='slide", 1).replace("'", '"'), "is no hinge"),
-        (SDF.replace('a6" type="revolute"', 'a6" type="screw"'), "joint 'a6' is screw"),
-        (SDF.replace('relative_to="l6"', 'relative_to="nowhere"'), "frame 'nowhere' is not there"),
-    ],
-)
-def test_other_files_are_refused_by_line(text, words, arm, tmp_path):
+@refusals("own_files")
+def test_other_files_are_refused_by_line(case, given, arm, tmp_path):
     path = tmp_path / "mine.xml"
+    text = edited(given, krl=urdf_of("krl"), rapid=urdf_of("rapid"), MJCF=MJCF, SDF=SDF)
     path.write_text(text)
     tip = "flange" if "mujoco" in text else "tool0"
     base = "base" if "<mujoco" in text or "<sdf" in text else "base_link"
-    with pytest.raises(InputError) as error:
-        correct(path, arm, changed(arm), base, tip)
-    assert words in str(error.value)
-    assert "mine.xml" in str(error.value)
+    refuses(case, lambda: correct(path, arm, changed(arm), base, tip), path)

@@ -1,6 +1,6 @@
 """What is refused of effects and their options, in one line; and what options choose."""
 
-import re
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -23,6 +23,7 @@ from tests.support.effect_cases import (
     situation,
     some_states,
 )
+from tests.support.refusals import refusals, refuses
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -34,45 +35,11 @@ def test_an_unknown_option_is_refused_with_the_valid_ones(name):
     assert all(option in str(caught.value) for option in valid)
 
 
-@pytest.mark.parametrize(
-    ("name", "options", "message"),
-    [
-        ("transmission_error", {"harmonics": 0}, "harmonics = 0; valid: 1 to 1000"),
-        ("transmission_error", {"harmonics": 2.5}, "harmonics = 2.5"),
-        ("transmission_error", {"harmonics": True}, "harmonics = True"),
-        ("target_offset", {"rotation": "yes"}, "rotation = 'yes'; valid: true, false"),
-        ("tracker_drift", {"reference_s": "noon"}, "reference_s = 'noon'; valid: a finite number"),
-        ("tracker_drift", {"reference_s": float("nan")}, "reference_s = nan"),
-        ("tracker_drift", {"span_s": 0.0}, "span_s"),
-        ("base_frame", {"prior_m": 1.0}, "prior_m alone"),
-        ("base_frame", {"prior_m": 1.0, "prior_rad": -1.0}, "must be positive"),
-        ("base_frame", {"prior_m": "wide", "prior_rad": 1.0}, "prior_m = 'wide'"),
-        ("periodic_joint_compliance", {"orders": 2}, "orders = 2; valid: a list of different"),
-        ("periodic_joint_compliance", {"orders": []}, "orders = []"),
-        ("periodic_joint_compliance", {"orders": [2, 2]}, "orders = [2, 2]"),
-        ("periodic_joint_compliance", {"orders": [0]}, "orders = [0]"),
-        ("periodic_joint_compliance", {"orders": [True]}, "orders = [True]"),
-        ("backlash", {"crossing": 0}, "crossing = 0; valid: more than 0"),
-        ("creep", {"form": "joint"}, "form = 'joint'; valid: common, each"),
-        ("creep", {"joints": "joint"}, "joints = 'joint', 'joint' is no joint and no range; valid"),
-        ("hysteresis", {"joints": "5-7"}, "joints = '5-7', there is no joint 7; valid: each"),
-        ("transmission_error", {"joints": 2.5}, "joints = 2.5; valid: each, common, or joints 1"),
-        ("thermal_growth", {"links": 3}, "links = 3; valid: common, each"),
-        ("thermal_growth", {"temperature": "oil"}, "temperature = 'oil'; valid: air, joints"),
-        ("thermal_growth", {"reference_degC": None}, "reference_degC = None"),
-        ("thermal_joint_drift", {"reference_degC": [20.0]}, "has 1 values; valid: 1 or 6"),
-        ("thermal_joint_drift", {"reference_degC": ["a"] * 6}, "reference_degC = 'a'"),
-        ("wrench_bias", {"rotvec_rad": [0.0, 1.0]}, "rotvec_rad has 2 values; valid: 1 or 3"),
-        ("wrench_gain", {"rotvec_rad": "z"}, "rotvec_rad = 'z'; valid: a finite number"),
-        ("sensor_misalignment", {"rotvec_rad": [0, 0, 1e999]}, "rotvec_rad = inf"),
-    ],
-)
-def test_an_impossible_option_is_refused(name, options, message):
+@refusals("options")
+def test_an_impossible_option_is_refused(case, given):
     cell = CELLS["ur10e"]
-    with pytest.raises(InputError, match=re.escape(message)) as caught:
-        make(name, cell, some_states(cell), options).prior_std()
-    assert f"effect {name}: " in str(caught.value)
-    assert "\n" not in str(caught.value)
+    name, options = given.split(maxsplit=1)
+    refuses(case, lambda: make(name, cell, some_states(cell), json.loads(options)).prior_std())
 
 
 @pytest.mark.parametrize(
@@ -200,42 +167,14 @@ def test_what_is_typed_is_what_is_read(text, expected):
             assert type(found[name][key]) is type(value)
 
 
-@pytest.mark.parametrize(
-    ("text", "wrong"),
-    [
-        ("histeresis", "unknown effect 'histeresis'"),
-        ("histeresis(joints=1)", "unknown effect 'histeresis'"),
-        ("creep,creep(joints=1)", "creep is there twice"),
-        ("creep(joints=1", ") is missing at the end"),
-        ("creep(orders=[1)", "closes nothing"),
-        ("creep joints=1)", ") at character 15 closes nothing"),
-        ("creep(joints='1)", "' is missing at the end"),
-        ("creep(joints=1)x", "is not an effect with its options"),
-        ("creep(joints=1)(joints=2)", "creep: ) at character 9 closes nothing"),
-        ("creep((joints=1))", "is not an option with a value"),
-        ("creep(joints)", "'joints' is not an option with a value"),
-        ("creep(=1)", "'=1' is not an option with a value"),
-        ("creep(a b=1)", "is not an option with a value"),
-        ("creep(joints=)", "joints = nothing; valid: a number"),
-        ("creep(joints=1 2)", "joints = 1 2; valid: a number"),
-        ("creep(joints==1)", "joints = =1; valid: a number"),
-        ("creep(joints=1e999)", "joints = 1e999; valid: a number"),
-        (f"creep(joints={'9' * 5000})", "valid: a number"),
-        ("creep(joints='a'b)", "valid: a number"),
-        ("creep(joints=[1, [2]])", "valid: a number"),
-        ("creep(joints=1; joints=2)", "option joints is there twice"),
-        ("creep(joints=\n)", "valid: a number"),
-        ("creep\nhysteresis", "unknown effect"),
-        ("(joints=1)", "unknown effect ''"),
-    ],
-)
-def test_what_cannot_be_read_is_refused_in_one_line(text, wrong):
-    with pytest.raises(InputError) as caught:
-        read_effects_text(text, "--effects", installed())
-    line = str(caught.value)
-    assert wrong in line
-    assert "\n" not in line
-    assert "valid" in line or "twice" in line
+@refusals("typed_effects")
+def test_what_cannot_be_read_is_refused_in_one_line(case, given):
+    refuses(case, lambda: read_effects_text(given[:-1], "--effects", installed()))
+
+
+def test_a_number_of_many_digits_is_refused():
+    with pytest.raises(InputError, match="valid: a number"):
+        read_effects_text(f"creep(joints={'9' * 5000})", "--effects", installed())
 
 
 values = st.one_of(

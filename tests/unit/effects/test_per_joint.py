@@ -1,5 +1,6 @@
 """Joints that share a parameter, joints that have none: what it means for each effect."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -23,6 +24,7 @@ from tests.support.effect_cases import (
     random_theta,
     some_states,
 )
+from tests.support.refusals import refusals, refuses
 from tests.unit.effects.test_effect_jacobian import assert_slope
 
 PER_JOINT = tuple(name for name in NAMES if issubclass(effect_class(name), PerJoint))
@@ -85,35 +87,9 @@ def test_groups_are_read_and_written_in_one_way(given, text, labels, joint, grou
     assert (again.joint.tolist(), again.group.tolist()) == (joint, group)
 
 
-@pytest.mark.parametrize(
-    ("given", "wrong"),
-    [
-        ("", "'' is no joint"),
-        ("all", "'all' is no joint"),
-        ("1/", "'' is no joint"),
-        ("1,2", "'1,2' is no joint"),
-        ("1--3", "'1--3' is no joint"),
-        ("²", "'²' is no joint"),
-        ("0", "there is no joint 0"),
-        ("5-8", "there is no joint 7"),
-        ("999", "there is no joint 999"),
-        ("3-1", "3-1 runs backwards"),
-        ("1-3/3", "joint 3 is there twice"),
-        ("2+2", "joint 2 is there twice"),
-        (2.5, "joints = 2.5; valid"),
-        (True, "joints = True; valid"),
-        (None, "joints = None; valid"),
-        ([1, 2], "joints = [1, 2]; valid"),
-    ],
-)
-def test_other_groups_are_refused_with_what_would_be_valid(given, wrong):
-    with pytest.raises(InputError) as caught:
-        joint_groups("hysteresis", {"joints": given}, 6)
-    line = str(caught.value)
-    assert line.startswith("effect hysteresis: joints = ")
-    assert wrong in line
-    assert "valid: each, common, or joints 1 to 6 in groups, as 2/3/4-6" in line
-    assert "\n" not in line
+@refusals("joints")
+def test_other_groups_are_refused_with_what_would_be_valid(case, given):
+    refuses(case, lambda: joint_groups("hysteresis", {"joints": json.loads(given)}, 6))
 
 
 # --- what it means --------------------------------------------------------------------------

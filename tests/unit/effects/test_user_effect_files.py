@@ -12,7 +12,8 @@ from hilcal.model.model import Model
 from tests.support.campaigns import campaign as simulated
 from tests.support.campaigns import plan
 from tests.support.cli_cases import ok, refused
-from tests.support.user_effect_cases import CLASS, COLUMNS, HEAD
+from tests.support.refusals import check, edited, refusals
+from tests.support.user_effect_cases import CLASS, COLUMNS
 
 NAME = "soft_side"
 
@@ -31,122 +32,13 @@ ELASTIC = CLASS.replace(COLUMNS, "values = s.torque[:, :1] ** 3").replace(
     @property""",
 )
 
-LOCAL = ELASTIC.replace("elastic = True", "elastic = local_response = True")
 
-BAD = {
-    "not Python": ("class Mine(:\n", ", line 1: not Python: invalid syntax"),
-    "does not import": ("import no_such_module\n", ", line 1: ModuleNotFoundError"),
-    "fails": ("a = 1\nb = a / 0\n", ", line 2: ZeroDivisionError: division by zero"),
-    "ends the program": ("raise SystemExit(0)\n", ", line 1: SystemExit"),
-    "no effect": (HEAD, ": defines no effect"),
-    "only a private one": (CLASS.replace("class Mine", "class _Mine"), ": defines no effect"),
-    "abstract": (CLASS.replace("def columns", "def column"), ": class Mine lacks columns"),
-    "no name": (CLASS.replace('    name = "mine"\n', ""), ": class Mine has name = None; valid:"),
-    "bad name": (CLASS.replace('"mine"', '"My law"'), ": class Mine has name = 'My law'; valid:"),
-    "no summary": (CLASS.replace("summary =", "law ="), ": class Mine has summary = None"),
-    "needs no tuple": (
-        CLASS.replace("    @prop", '    needs = ("time")\n\n    @prop'),
-        ": class Mine has needs = 'time'; valid: a tuple of some of time,",
-    ),
-    "needs unknown": (
-        CLASS.replace("    @prop", '    needs = ("humidity",)\n\n    @prop'),
-        ": class Mine has needs = ('humidity',)",
-    ),
-    "canonical name": (
-        CLASS.replace('"mine"', '"hysteresis"'),
-        ": class Mine: effect hysteresis is in the catalogue already",
-    ),
-    "twice": (
-        CLASS + CLASS.replace("class Mine", "class Other"),
-        ": class Other: effect mine is in the catalogue already",
-    ),
-    "bad scale": (CLASS.replace("1e-5", "0.0"), ": effect mine: parameters a: scale = 0.0"),
-    "no parameters": (
-        CLASS.replace('(Parameter("a", "rad", 1e-5),)', "()"),
-        ": effect mine: parameters are ()",
-    ),
-    "raises": (
-        CLASS.replace(COLUMNS, "values = s.angel[:, :1]"),
-        ", line 13: effect mine: columns raises AttributeError: 'Situation' object has no",
-    ),
-    "wrong shape": (
-        CLASS.replace("s.angle[:, :1]", "s.angle"),
-        ": effect mine: columns has dq values of shape (30, 6); expected (30, 1) or (1, 1)",
-    ),
-    "not finite": (
-        CLASS.replace("np.sin(2 * ", "np.sqrt("),
-        ": effect mine: columns has dq values of which some are not finite",
-    ),
-    "no such field": (
-        CLASS.replace('"dq", np', '"joint", np'),
-        ": effect mine: columns has the field 'joint'; valid: dq, twist",
-    ),
-    "no such joint": (
-        CLASS.replace("np.array([1])", "np.array([9])"),
-        ": effect mine: columns has element = [9]; valid: 0 to 5",
-    ),
-    "no tuple": (
-        CLASS.replace("values),)", "values))"),
-        ": effect mine: columns returns Columns; expected a tuple of Columns",
-    ),
-    "not elastic": (
-        CLASS.replace(COLUMNS, "values = s.torque[:, :1]"),
-        ": effect mine: columns follow the wrenches; set elastic = True and give response",
-    ),
-    "no response": (
-        CLASS.replace(COLUMNS, "values = s.torque[:, :1]").replace(
-            "    @prop", "    elastic = True\n\n    @prop"
-        ),
-        ": effect mine: response is not the derivative of columns by the wrenches: dq",
-    ),
-    "wrong response": (
-        ELASTIC.replace("dq[:, :, 1] = 3", "dq[:, :, 1] = 2"),
-        ": effect mine: response is not the derivative of columns by the wrenches: dq",
-    ),
-    "declared local and moves another joint": (
-        LOCAL.replace(" ** 3", "").replace("3 * theta[0] * s.torque[:, :1] ** 2", "theta[0]"),
-        ": effect mine: response moves other slots than 0 by its wrench; set local_response = F",
-    ),
-    "declared local and does not take equal changes": (
-        LOCAL.replace("s.torque[:, :1] ** 2", "s.torque[: len(change), :1] ** 2"),
-        ": effect mine: response to changes (1, P, n + 1, 6) has another dq",
-    ),
-    "response of a wrong shape": (
-        ELASTIC.replace("dq=dq)", "dq=dq[:, 0])"),
-        ": effect mine: response has dq of shape (30, 6); expected (30, 2, 6)",
-    ),
-    "uses what it does not name": (
-        CLASS.replace(COLUMNS, "values = s.states.load_time[:, None] * 1e-3"),
-        ': effect mine: uses load_time; name it: needs = ("load_time",)',
-    ),
-    "one state depends on the others": (
-        CLASS.replace(COLUMNS, "values = s.angle[:, :1] - s.angle[:, :1].mean()"),
-        ": effect mine: columns of a state depend on the other states",
-    ),
-    "changes what it is given": (
-        CLASS.replace(COLUMNS, "values = s.angle[:, :1]; values *= 2.0"),
-        ", line 13: effect mine: columns raises ValueError: output array is read-only",
-    ),
-    "load without its derivative": (
-        CLASS + "\n    def wrench_change(self, theta, s):\n"
-        "        return theta[0] * s.states.wrench\n",
-        ": effect mine: wrench_columns is not the derivative",
-    ),
-    "not linear": (
-        CLASS + "\n    def deviation(self, theta, s):\n"
-        "        return super().deviation(theta**2, s)\n",
-        ": class Mine overrides deviation; give columns",
-    ),
-}
-
-
-@pytest.mark.parametrize("kind", BAD)
-def test_a_bad_file_is_one_clear_line(kind, tmp_path, capsys):
-    content, said = BAD[kind]
+@refusals("user_effects")
+def test_a_bad_file_is_one_clear_line(case, given, tmp_path, capsys):
     path = tmp_path / "mine.py"
-    path.write_text(content, encoding="utf-8")
+    path.write_text(edited(given, CLASS=CLASS, ELASTIC=ELASTIC), encoding="utf-8")
     line = refused(capsys, 2, "effects", "--effects-from", path)
-    assert line.startswith(f"error: {path}{said}")
+    check(case, line.removeprefix("error: ").replace(str(path), path.name))
 
 
 @pytest.mark.parametrize("content", [CLASS, ELASTIC], ids=["rigid", "elastic"])

@@ -14,6 +14,7 @@ from hilcal.robot.chain import evaluate
 from hilcal.robot.scene import pinocchio_model
 from hilcal.robot.statics import Load, slot_wrenches
 from hilcal.robot.urdf import arm_from_urdf
+from tests.support.refusals import edited, refusals, refuses
 
 PI2 = math.pi / 2
 ALPHA = [PI2, 0.0, 0.0, PI2, -PI2, 0.0]
@@ -251,26 +252,11 @@ def test_dh_rows_alone_are_an_arm(tmp_path):
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        (
-            "mass_kg = 3.761",
-            "mass_kg = -1.0",
-            r"\[\[joints\]\] number 1 mass_kg = -1.0 is not valid",
-        ),
-        ("q_min_deg = -360.0", "q_min_deg = 400.0", "q_min_deg = 400.0 must be less than"),
-        ("a_m = 0.0", "a_mm = 0.0", r'number 1 has no key "a_mm".*did you mean "a_m".*d_m'),
-        ("d_m = 0.1625", "", 'lacks "d_m"'),
-        ("q_min_deg = -360.0", "", "q_min_deg and q_max_deg: give both or neither"),
-    ],
-)
-def test_a_wrong_dh_table_is_refused(tmp_path, old, new, message):
+@refusals("dh_tables")
+def test_a_wrong_dh_table_is_refused(case, given, tmp_path):
     text = (configs_dir() / "robots" / "ur5e.toml").read_text()
-    assert old in text
-    (tmp_path / "mine.toml").write_text(text.replace(old, new, 1))
-    with pytest.raises(InputError, match=message):
-        load_arm("mine.toml", tmp_path)
+    (tmp_path / "mine.toml").write_text(edited(given, ur5e=text))
+    refuses(case, lambda: load_arm("mine.toml", tmp_path))
 
 
 # URDF
@@ -424,25 +410,9 @@ def test_a_chain_that_is_no_arm_is_refused(tmp_path, extra, base, tip, message):
         arm_from_urdf(write(tmp_path, extra), base_link=base, tip_link=tip)
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ("", "not XML"),
-        ("robot", "not XML.*line 1"),
-        ("<robot><link></robot>", "not XML: mismatched tag: line 1"),
-        ("<world/>", "Could not find the 'robot' element"),
-        ('<robot name="x"><link name="a"/></robot>', "no moving joint"),
-        (
-            '<robot name="x"><link name="a"/><link name="b"/><joint name="j" type="revolute">'
-            '<parent link="a"/><child link="b"/></joint></robot>',
-            r"Joint \[j\] is of type REVOLUTE but it does not specify limits",
-        ),
-    ],
-)
-def test_not_a_urdf(tmp_path, capfd, content, message):
+@refusals("urdfs")
+def test_not_a_urdf(case, given, tmp_path, capfd):
     path = tmp_path / "arm.urdf"
-    path.write_text(content)
-    with pytest.raises(InputError, match=message) as raised:
-        arm_from_urdf(path)
-    assert "\n" not in str(raised.value)
+    path.write_text(given.rstrip("\n"))
+    refuses(case, lambda: arm_from_urdf(path), path)
     assert capfd.readouterr() == ("", "")  # the C++ parser's own output is in the message

@@ -19,6 +19,7 @@ from hilcal.robot.factory import (
     with_factory,
 )
 from tests.support.factory_cases import UR5E_YAML, factory_of, measured_arm
+from tests.support.refusals import edited, refusals, refuses
 
 CONF = """\
 [mounting]
@@ -104,24 +105,11 @@ def test_a_file_of_our_own_comes_back(tmp_path):
     np.testing.assert_array_equal(of_dict(found.to_dict(), "kept").rows, made.rows)
 
 
-@pytest.mark.parametrize(
-    ("name", "text", "words"),
-    [
-        ("x.txt", "", "valid: a calibration.conf"),
-        ("x.conf", "delta_a = 1", "not the kinematics"),
-        ("x.conf", "[mounting]\ndelta_theta = [1, 2]\n", "not the kinematics"),
-        ("x.conf", CONF.format(*["[0,0,0,0,0,nan]"] * 4), "not four times"),
-        ("x.yaml", "kinematics:\n  shoulder:\n    x: 0\n", "not the kinematics"),
-        ("x.yaml", UR5E_YAML.replace("0.1627122445743823", "far"), "not the kinematics"),
-        ("x.toml", "a_m = 1", "not the kinematics"),
-        ("x.toml", "= =", "not the kinematics"),
-    ],
-)
-def test_other_files_are_refused_in_one_line(tmp_path, name, text, words):
-    (tmp_path / name).write_text(text)
-    with pytest.raises(InputError, match=words) as refused:
-        read_factory(tmp_path / name, load_arm("ur5e"))
-    assert "\n" not in str(refused.value)
+@refusals("factory")
+def test_other_files_are_refused_in_one_line(case, given, tmp_path):
+    name, _, text = given.partition("\n")
+    (tmp_path / name).write_text(edited(text, UR5E_YAML=UR5E_YAML))
+    refuses(case, lambda: read_factory(tmp_path / name, load_arm("ur5e")), tmp_path / name)
 
 
 def test_the_kinematics_of_another_arm_are_refused(tmp_path):

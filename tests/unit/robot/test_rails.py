@@ -25,6 +25,7 @@ from hilcal.robot.urdf import arm_from_urdf
 from hilcal.store.plan import Plan, Step
 from hilcal.tables.table import read_table, write_table
 from tests.support.cli_cases import ok, refused
+from tests.support.refusals import edited, refusals, refuses
 
 TRACK = """title = "UR10e on a track"
 payload_kg = 12.5
@@ -78,10 +79,10 @@ LIFT = """<robot name="lift"><link name="base_link"/>
 """A column of two stages, of which the upper one is taken along."""
 
 
-def track(folder, change=("", "")):
+def track(folder, change="in track"):
     rows = (configs_dir() / "robots" / "ur10e.toml").read_text()
     text = TRACK + rows[rows.index("[[joints]]") :]
-    (folder / "track.toml").write_text(text.replace(*change, 1) if change[0] else text)
+    (folder / "track.toml").write_text(edited(change, track=text))
     return load_arm("track.toml", folder)
 
 
@@ -148,24 +149,9 @@ def test_exports_are_the_arm_again(tmp_path, kind):
         np.testing.assert_allclose(again.torque_max, arm.torque_max)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (("q_max_m = 3.0\n", ""), "q_min_m and q_max_m are missing; a prismatic joint needs both"),
-        (("q_max_m = 3.0", "q_max_m = -1.0"), "q_min_m = 0.0 must be less than q_max_m = -1.0"),
-        (("force_max_N", "torque_max_Nm"), "torque_max_Nm of a prismatic joint; valid: q_min_m"),
-        (('type = "prismatic"\n', ""), "q_min_m of a revolute joint; valid: q_min_deg"),
-        (('"prismatic"', '"sliding"'), "type"),
-        (("payload", "joint_offset_deg = [5, 0, 0, 0, 0, 0, 0]\npayload"), "of joint 1, which sl"),
-        (
-            ("payload", "joint_coupling = [{ joint = 2, follows = 1 }]\npayload"),
-            "of joints 2 and 1 one slides and one turns",
-        ),
-    ],
-)
-def test_a_wrong_slide_is_refused(tmp_path, change, message):
-    with pytest.raises(InputError, match=message):
-        track(tmp_path, change)
+@refusals("slides")
+def test_a_wrong_slide_is_refused(case, given, tmp_path):
+    refuses(case, lambda: track(tmp_path, given))
 
 
 def test_an_effect_of_slides_needs_one():
