@@ -10,7 +10,7 @@ from types import ModuleType
 import pytest
 
 import hilcal as hc
-from hilcal.config import CellConfig, load_config
+from hilcal.config import CellConfig
 from hilcal.config.reference import to_toml
 from hilcal.effects.catalogue import ENTRY_POINT_GROUP
 from hilcal.measuring.devices import TRACKERS
@@ -23,7 +23,8 @@ from hilcal.toml import check_section
 from studies.page_figures import NAMES
 from studies.random_campaigns import rehearse
 from tests.support import readme
-from tests.support.cli_cases import CELL, ok, quickly_planned, stored_readings
+from tests.support.campaigns import configuration
+from tests.support.cli_cases import ok, quickly_planned, stored_readings
 from tests.support.paths import ROOT
 
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -56,7 +57,7 @@ def campaign_of(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
     def make(effect, poses, config=None):
-        config = config or load_config(CELL)
+        config = config or configuration()
         stored_readings(Path("run.hilcal"), rehearse(config, effect, 3, poses).readings, config)
 
     return make
@@ -73,7 +74,7 @@ def test_the_effect_of_the_guide_is_a_working_effect():
 
 @pytest.mark.long
 def test_the_guide_to_the_library_runs_as_it_stands(campaign_of, monkeypatch):
-    config = quickly_planned(load_config(CELL))
+    config = quickly_planned(configuration())
     campaign_of("creep", 10, config)
     Path("CELL.toml").write_text(to_toml(config), encoding="utf-8")
     with CampaignFile.open("run.hilcal") as file:
@@ -198,7 +199,7 @@ def test_the_driver_of_the_guide_opens_and_reports():
     (code,) = blocks(HOW_TO / "add-a-device.md")
     known = {"__name__": "mytracker"}
     exec(dedent(code), known)
-    tracker = known["open_tracker"](load_config(CELL))
+    tracker = known["open_tracker"](configuration())
     assert tracker.report().device == "tracker"
 
 

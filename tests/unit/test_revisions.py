@@ -8,12 +8,9 @@ import pytest
 
 from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.revisions import chain, restore, restore_model, to_record
-from hilcal.config import load_config
 from hilcal.diagnosis.document import to_json as diagnosis_json
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.errors import InputError
-from hilcal.identification.baseline import baseline
-from hilcal.identification.fit import fit
 from hilcal.identification.fit_document import plain, to_json
 from hilcal.readings.covariance import WHOLE
 from hilcal.readings.whitening import usual_mode
@@ -21,11 +18,13 @@ from hilcal.refinement import add
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.revision import from_text, to_text
 from hilcal.store.rows import content_hash
+from tests.support.campaigns import configuration
 from tests.support.cli_cases import CELL, rehearsal, stored_readings
+from tests.support.fit_cases import based
 
 
 def baseline_fit(r):
-    return fit(baseline(r.cell, r.readings, r.mode), r.readings, r.mode)
+    return based(r.cell, r.readings, r.mode)
 
 
 def record_of(r, found, added=None):
@@ -63,7 +62,7 @@ def test_a_gross_error_stays_set_aside():
     value = r.readings.value.copy()
     value[17] += 0.004
     readings = replace(r.readings, value=value)
-    found = fit(baseline(r.cell, readings, "absolute"), readings, "absolute")
+    found = based(r.cell, readings, "absolute")
     assert np.flatnonzero(found.outlier).tolist() == [17]
     record = to_record(found, None, None, content_hash(readings))
     assert record.parameters_json["outliers"] == [17]
@@ -89,7 +88,7 @@ def test_other_readings_are_refused(tmp_path):
 
 def test_a_file_that_cannot_be_used_is_closed_again(tmp_path):
     path = tmp_path / "empty.hilcal"
-    CampaignFile.create(path, load_config(CELL).to_json(), str(CELL.parent), "test").close()
+    CampaignFile.create(path, configuration().to_json(), str(CELL.parent), "test").close()
     with pytest.raises(InputError, match="no readings"):
         Campaign.open(path)
     path.unlink()
@@ -100,7 +99,7 @@ def test_a_revision_is_found_again_on_a_machine_that_rounds_otherwise(tmp_path):
     readings = rehearsal("nothing").readings
     path = stored_readings(tmp_path / "run.hilcal", readings, covers=WHOLE)
     with Campaign.open(path) as run:
-        run.append(fit(baseline(run.cell, run.readings, run.mode()), run.readings, run.mode()))
+        run.append(based(run.cell, run.readings, run.mode()))
         other = replace(run.readings, covariance=run.readings.covariance * (1 + 1e-15))
         elsewhere = replace(run, readings=other)
         np.testing.assert_allclose(elsewhere.fit().theta, run.fit().theta, rtol=1e-6, atol=1e-12)

@@ -12,12 +12,11 @@ from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.dh_table import dh_rows, to_toml
 from hilcal.calibration.handover import corrected, frames, ur_kinematics, urdf
 from hilcal.calibration.own_files.correct import correct_file
-from hilcal.identification.baseline import with_effects
-from hilcal.identification.fit import fit
 from hilcal.identification.fit_document import frames_to_json
 from hilcal.robot import se3
 from hilcal.robot.catalogue import load_arm
 from tests.support.campaigns import campaign, measured, plan
+from tests.support.fit_cases import based
 from tests.unit.calibration.other_eyes import by_pinocchio, by_ur, flanges, urdf_model
 
 POSES = 24
@@ -37,7 +36,7 @@ def site(effect, registration, target):
 def fitted(effect, registration, target):
     c = site(effect, registration, target)
     names = ["joint_compliance", *([] if effect == "none" else [effect])]
-    found = fit(with_effects(c.cell, c.readings, "absolute", names), c.readings, "absolute")
+    found = based(c.cell, c.readings, "absolute", names)
     return Calibration.of(found, {"campaign": "made"})
 
 
@@ -119,7 +118,7 @@ def test_every_export_puts_the_tool_where_the_tracker_finds_it(registration, tar
     stiff = replace(c.world.physics, joint_compliance=0 * c.world.physics.joint_compliance)
     world = replace(c.world, physics=stiff)
     readings = measured(world, plan(POSES, 1000), np.random.default_rng(0))
-    found = fit(with_effects(c.cell, readings, "absolute", ["link_geometry"]), readings, "absolute")
+    found = based(c.cell, readings, "absolute", ["link_geometry"])
     cal = Calibration.of(found, {"campaign": "made"})
     told, states = document(cal), fresh(0)
     base, tool = pose(told["base_in_tracker"]), pose(told["tool_on_flange"])

@@ -9,11 +9,10 @@ from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.scatter import budget
 from hilcal.config import Repeatability
 from hilcal.diagnosis.noise import RP_PER_RMS
-from hilcal.identification.baseline import baseline
-from hilcal.identification.fit import fit
 from hilcal.identification.full_covariance import joint_factors
 from hilcal.readings.readings import Readings
 from tests.support.campaigns import campaign
+from tests.support.fit_cases import based
 
 TRUE = 1e-5
 """rad; what the simulated arm scatters by."""
@@ -31,7 +30,7 @@ def fitted(c, mode, readings, rp=5e-5):
     """Fit a cell that says nothing of its repeatability."""
     config = c.cell.configured().model_copy(update={"repeatability": Repeatability()})
     cell = replace(c.cell, config=config, arm=replace(c.cell.arm, repeatability=rp))
-    return fit(baseline(cell, readings, mode), readings, mode)
+    return based(cell, readings, mode)
 
 
 def once(readings):
@@ -89,5 +88,5 @@ def test_repeats_below_the_noise_say_how_much_it_can_be():
 
 def test_what_the_fit_or_the_cell_states_goes_first():
     c = campaign(poses=16, cycles=3)
-    found = fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute")
+    found = based(c.cell, c.readings, "absolute")
     assert Calibration.of(found).scatter.source == "stated"

@@ -11,6 +11,7 @@ from hilcal.config.reference import to_toml
 from hilcal.errors import InputError
 from hilcal.names import escaped
 from hilcal.robot.catalogue import configs_dir
+from tests.support.campaigns import configuration
 from tests.support.refusals import refusals, refuses
 
 ROBOT = '[robot]\nmodel = "ur10e"\n'
@@ -116,7 +117,7 @@ def test_example_cells(path):
 
 
 def test_the_demo_cell_stays_within_the_payload():
-    config = load_config(configs_dir() / "cells" / "demo_ur10e.toml")
+    config = configuration()
     cell = cell_from_config(config)
     for load in config.loads:
         force = np.linalg.norm(load.wrench(cell.gravity)[:3])

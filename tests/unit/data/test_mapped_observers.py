@@ -7,8 +7,6 @@ import pytest
 
 from hilcal.config import load_config
 from hilcal.errors import InputError
-from hilcal.identification.baseline import baseline
-from hilcal.identification.fit import fit
 from hilcal.identification.full_covariance import with_joint_scatter
 from hilcal.identification.table_preview import preview_table
 from hilcal.identification.torques import check_torques
@@ -17,7 +15,7 @@ from hilcal.tables.mapping import Mapping
 from hilcal.toml import check_section
 from tests.support.campaigns import cell_of, configuration, true_parameters
 from tests.support.cli_cases import CELL, ok
-from tests.support.fit_cases import named
+from tests.support.fit_cases import based, named
 from tests.support.observer_cases import observed
 
 JOINTS = [f"Achse {k} [°]" for k in range(1, 7)]
@@ -91,7 +89,7 @@ def test_a_ball_bars_table_gives_the_true_compliances(seed, tmp_path):
     wrench = replace(found.states, wrench=c.readings.states.wrench)  # of a load named alone
     joint_std = configuration().repeatability.per_joint(6)
     readings = with_joint_scatter(c.cell, replace(found, states=wrench), joint_std)
-    fitted = fit(baseline(c.cell, readings, "absolute"), readings, "absolute")
+    fitted = based(c.cell, readings, "absolute")
     truth = true_parameters(c.world, "joint_compliance")
     told = [v for k, v in named(fitted).items() if k.startswith("joint_compliance")]
     z = np.array([(value - t) / std for (value, std), t in zip(told, truth, strict=True)])

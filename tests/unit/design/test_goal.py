@@ -5,9 +5,8 @@ import pytest
 
 from hilcal.design.goal import figures, parse_goal
 from hilcal.errors import InputError
-from hilcal.identification.baseline import baseline
-from hilcal.identification.fit import fit
 from tests.support.campaigns import campaign
+from tests.support.fit_cases import based
 from tests.support.refusals import refusals, refuses
 
 UNITS = {"joint_compliance.j1": "rad/(N·m)", "joint_compliance.j3": "rad/(N·m)"}
@@ -65,7 +64,7 @@ def test_a_goal_must_fit_the_model():
 
 def test_a_fit_is_judged_by_what_it_states():
     c = campaign(mode="deflection", poses=8, registration_known=True)
-    found = fit(baseline(c.cell, c.readings, "deflection"), c.readings, "deflection")
+    found = based(c.cell, c.readings, "deflection")
     stds, values = figures(found)
     share = max(stds[n] / abs(values[n]) for n in stds if n.startswith("joint_compliance"))
     assert parse_goal(f"joint std < {101 * share:.6f} %").met(stds, values).met

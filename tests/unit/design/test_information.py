@@ -23,7 +23,7 @@ from hilcal.design.nominal_model import after, nominal_model, nominal_states
 from hilcal.design.predicted import predicted, prediction_poses
 from hilcal.effects.catalogue import installed
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.baseline import baseline, with_effects
+from hilcal.identification.baseline import baseline
 from hilcal.identification.carried import carried_prior
 from hilcal.identification.fit import fit
 from hilcal.identification.full_covariance import with_joint_scatter
@@ -48,7 +48,7 @@ from tests.support.campaigns import (
 )
 from tests.support.cli_cases import CELL as DEMO
 from tests.support.cli_cases import ok
-from tests.support.fit_cases import named
+from tests.support.fit_cases import based, named
 from tests.support.fit_cases import predicted as read
 from tests.support.observer_cases import NORMAL, POINTS, STD, observed
 from tests.support.plan_cases import config_of, everything_once, poses_in, poses_of
@@ -66,7 +66,7 @@ def test_prediction_is_what_identification_states(mode, known):
     # An unknown registration is planned with the tracker about where it stands.
     c = campaign(mode=mode, poses=16, seed=3, registration_known=known)
     config = config_of(mode)
-    found = fit(baseline(c.cell, c.readings, mode), c.readings, mode)
+    found = based(c.cell, c.readings, mode)
     if not known:
         r = c.world.registration
         place = tuple(float(x) for x in -r[:3, :3].T @ r[:3, 3])
@@ -143,7 +143,7 @@ def test_a_deflection_unit_is_a_pose_whose_place_is_unknown(name, seed):
 @pytest.mark.parametrize("mode", MODES)
 def test_what_was_measured_is_known_exactly(mode):
     c = campaign(mode=mode, poses=12, seed=1, target_known=False)
-    found = fit(baseline(c.cell, c.readings, mode), c.readings, mode)
+    found = based(c.cell, c.readings, mode)
     config = config_of(mode)
     p = problem(after(found, config), config, poses_of(3))
     mine = predicted(p)
@@ -163,14 +163,14 @@ def test_planning_on_predicts_the_fit_to_all_readings():
     first = readings[readings.pose < 8]
     config = config_of("absolute", against=("joint_stiffening",))
     effects = ("joint_compliance", "encoder_offset")
-    begun = fit(with_effects(cell, first, "absolute", effects), first, "absolute")
+    begun = based(cell, first, "absolute", effects)
     later = problem(after(begun, config), config, poses_of(20, 8)[8:])
     expected = predicted(later, everything_once(later))
-    found = fit(with_effects(cell, readings, "absolute", effects), readings, "absolute")
+    found = based(cell, readings, "absolute", effects)
     assert expected.std == pytest.approx(found.uncertainty.formal, rel=0.02)
     # The potential terms were measured as well: what is known of all together.
     wider = (*effects, "joint_stiffening")
-    whole = fit(with_effects(cell, readings, "absolute", wider), readings, "absolute")
+    whole = based(cell, readings, "absolute", wider)
     mine = later.information(everything_once(later))
     mine[np.arange(12, 18), np.arange(12, 18)] -= 1.0
     std = np.sqrt(np.diag(np.linalg.inv(mine))) * later.scale
@@ -408,7 +408,7 @@ CARRIED = ("joint_compliance", "joint_tilt_compliance")
 @cache
 def learnt():
     c = campaign("joint_tilt_compliance", "absolute", 1, poses=30, registration_known=True)
-    found = fit(with_effects(c.cell, c.readings, "absolute", CARRIED), c.readings, "absolute")
+    found = based(c.cell, c.readings, "absolute", CARRIED)
     return Posterior.of(found)
 
 
@@ -471,7 +471,7 @@ def test_predicted_uncertainties_are_those_of_a_fit(what):
     c = observed(who, 7, cell=cell, base=True)
     joint_std = config.repeatability.per_joint(6)
     readings = with_joint_scatter(cell, c.readings, joint_std)
-    f = fit(baseline(cell, readings, "absolute"), readings, "absolute")
+    f = based(cell, readings, "absolute")
 
     _, first = np.unique(readings.pose, return_index=True)
     of = problem(nominal_model(cell, config), config, readings.states.q[first])
@@ -514,7 +514,7 @@ def test_prediction_is_what_identification_states_of_several_targets(mode):
     scatter = config.repeatability.model_copy(update={"joint_std_rad": 5e-5})
     config = config.model_copy(update={"repeatability": scatter})
     c = reflectors(poses=14, joint_std=5e-5, known=(True, False, True), registration_known=True)
-    found = fit(baseline(c.cell, c.readings, mode), c.readings, mode)
+    found = based(c.cell, c.readings, mode)
     p = problem(nominal_model(c.cell, config), config, poses_in(c.readings))
     foreseen = predicted(p, everything_once(p)).by_name()
     names = [t.name for t in p.terms if not t.potential]

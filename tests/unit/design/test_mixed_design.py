@@ -19,9 +19,8 @@ from hilcal.design.information import (
 from hilcal.design.mixed_design import balanced, mixed_design, other_effects
 from hilcal.design.nominal_model import after, nominal_model
 from hilcal.design.predicted import position_derivative, prediction_poses
-from hilcal.identification.baseline import baseline
-from hilcal.identification.fit import fit
 from tests.support.campaigns import campaign, cell_of
+from tests.support.fit_cases import based
 from tests.support.plan_cases import config_of, poses_of
 from tests.support.rows import first
 
@@ -39,7 +38,7 @@ def scene(mode, *, fitted):
     known = config(mode)
     if fitted:
         c = campaign(mode=mode, poses=8, seed=3, registration_known=True)
-        nominal = after(fit(baseline(c.cell, c.readings, mode), c.readings, mode), known)
+        nominal = after(based(c.cell, c.readings, mode), known)
     else:
         nominal = nominal_model(cell_of(registration_known=True), known)
     of = problem(nominal, known, poses_of(6))

@@ -31,7 +31,7 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.effect_columns import effect_columns
 from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import linearise
-from hilcal.refinement import add, refine
+from hilcal.refinement import add
 from hilcal.regression.evidence import family_power
 from hilcal.regression.projection import projection
 from hilcal.regression.schur import schur_complement
@@ -46,6 +46,7 @@ from tests.support.campaigns import (
     true_parameters,
     with_noise,
 )
+from tests.support.fit_cases import based, refined
 from tests.support.next_cases import SMALL, doubtful, settled
 from tests.support.plan_cases import config_of, poses_of
 
@@ -87,7 +88,7 @@ def test_the_power_is_the_share_of_rejections_in_the_simulated_world():
     p = plan(8, 21)
     clean = noiseless(c.world, p)
     config = config_of("deflection", against=(TILT, LINK))
-    first = fit(baseline(c.cell, c.readings, "deflection"), c.readings, "deflection")
+    first = based(c.cell, c.readings, "deflection")
     of = problem(after(first, config), config, poses_of(8, 21))
     where = of.of_effect(TILT)
     nuisance = np.concatenate([np.arange(of.model_size), of.of_effect(LINK)])
@@ -143,7 +144,7 @@ def test_the_powers_of_a_plan_are_shares_of_rejections():
 
 def told(effect, strength, seed=2):
     c = campaign(effect, "deflection", seed, poses=10, strength=strength)
-    found = fit(baseline(c.cell, c.readings, "deflection"), c.readings, "deflection")
+    found = based(c.cell, c.readings, "deflection")
     config = config_of("deflection", against=(effect, LINK))
     of = problem(after(found, config), config, poses_of(10, 1000 + seed))
     return found, true_parameters(c.world, effect), of
@@ -244,7 +245,7 @@ def fine_error():
 def test_the_poses_that_are_planned_end_in_the_effect_that_is_there():
     """Ambiguous at first, named when measured as planned: so it was with all seven of ten seeds."""
     c, before = fine_error()
-    first = fit(baseline(c.cell, before, "absolute"), before, "absolute")
+    first = based(c.cell, before, "absolute")
     alone = diagnose(first).pose_alone
     assert alone.effects[0] == "transmission_error"
     config = configuration()
@@ -254,7 +255,7 @@ def test_the_poses_that_are_planned_end_in_the_effect_that_is_there():
     after = simulate(c.world, states.states, number, states.load, states.cycle, before.load_names,
                      np.random.default_rng(7))  # fmt: skip
     every = joined(before, after, tuple(f"next {name}" for name in made.pose_names))
-    found = refine(baseline(c.cell, every, "absolute"), every, "absolute")
+    found = refined(c.cell, every, "absolute")
     assert found.diagnosis.verdict == "adequate"
     assert [s.added for s in found.steps[1:]] == ["transmission_error"]
     assert found.fit.variance_factor == pytest.approx(1.0, abs=0.2)
@@ -263,7 +264,7 @@ def test_the_poses_that_are_planned_end_in_the_effect_that_is_there():
 @pytest.mark.long
 def test_each_pose_is_a_new_one_and_read_unloaded():
     c, before = fine_error()
-    first = fit(baseline(c.cell, before, "absolute"), before, "absolute")
+    first = based(c.cell, before, "absolute")
     made = measure_poses(c.cell, configuration(), first, 12, np.random.default_rng(1)).ordered.plan
     assert len({s.pose for s in made.steps} - {REFERENCE}) == 12
     assert {s.load for s in made.steps} == {UNLOADED}
@@ -276,7 +277,7 @@ def test_each_pose_is_a_new_one_and_read_unloaded():
 
 def test_the_chance_of_telling_it_from_a_rival_grows():
     c = campaign("transmission_error", "absolute", 0, **FINE)
-    first = fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute")
+    first = based(c.cell, c.readings, "absolute")
     (told,) = pose_powers(first, ("transmission_error", "encoder_offset"), 140)
     assert (told.effect, told.rival) == ("transmission_error", "encoder_offset")
     assert told.now < 0.3 < 0.8 < told.then

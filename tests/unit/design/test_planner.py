@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from hilcal.cell import cell_from_config
-from hilcal.config import load_config
 from hilcal.config.reference import to_toml
 from hilcal.config.sections import CellLoad
 from hilcal.design.choice import CRITERIA, costly_loads, objective_of
@@ -32,7 +31,8 @@ from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import REFERENCE, UNLOADED, load_plan, read_plan, with_new_names
 from hilcal.store.run_log import PLAN
 from hilcal.tables.table import write_table
-from tests.support.cli_cases import CELL, ok, quickly_planned, refused, rehearsal, run
+from tests.support.campaigns import configuration
+from tests.support.cli_cases import ok, quickly_planned, refused, rehearsal, run
 from tests.support.plan_cases import config_of, poses_of
 
 SMALL = {"candidates": 60, "against": ("joint_tilt_compliance",)}
@@ -40,7 +40,7 @@ SMALL = {"candidates": 60, "against": ("joint_tilt_compliance",)}
 
 def small(**planning):
     """The demo's cell with few candidates and one effect to look out for."""
-    config = load_config(CELL)
+    config = configuration()
     changed = config.planning.model_copy(update={**SMALL, **planning})
     return config.model_copy(update={"planning": changed})
 
@@ -227,7 +227,7 @@ def test_the_command(tmp_path, capsys):
 
 @pytest.mark.long
 def test_a_run_without_a_plan_keeps_the_same_rule(tmp_path, capsys):
-    cell = cell_file(tmp_path, quickly_planned(load_config(CELL)))
+    cell = cell_file(tmp_path, quickly_planned(configuration()))
     result = run(capsys, "run", cell, "-o", tmp_path / "run.hilcal", "--yes")
     assert "driver is missing, so there is no arm" in result.err  # after the plan
     words = " ".join(result.out.split())

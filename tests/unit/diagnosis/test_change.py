@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import hilcal as hc
-from hilcal.config import load_config
 from hilcal.diagnosis.change import candidates, find_changes
 from hilcal.drivers.simulated.injected_effects import nothing_hidden
 from hilcal.drivers.simulated.rehearsal import measurement_noise
@@ -15,11 +14,11 @@ from hilcal.effects.spec import effect
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.later_readings import earlier_fit, setting
-from hilcal.robot.catalogue import configs_dir
 from studies.change import measured, remeasured, studied_arm
+from tests.support.campaigns import configuration
 from tests.support.rows import first
 
-CONFIG = load_config(configs_dir() / "cells" / "demo_ur10e.toml")
+CONFIG = configuration()
 
 
 @pytest.fixture(scope="module")

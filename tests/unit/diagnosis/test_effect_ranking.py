@@ -24,7 +24,7 @@ from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.catalogue import BUILT_IN
 from hilcal.effects.joint_compliance import JointCompliance
 from hilcal.errors import InputError
-from hilcal.identification.baseline import baseline, with_effects
+from hilcal.identification.baseline import with_effects
 from hilcal.identification.effect_columns import effect_columns
 from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import linearise
@@ -34,6 +34,7 @@ from hilcal.refinement import refine
 from studies.study_cases import study_case
 from tests.support.campaigns import NOTHING, campaign, configuration, measured, plan
 from tests.support.diagnosis_cases import fitted
+from tests.support.fit_cases import based
 from tests.support.paths import ROOT
 
 SECOND_ORDER = {"link_geometry", "encoder_offset", "joint_coupling", "link_mass"}
@@ -48,7 +49,7 @@ def unmodelled(law, robot):
         3.0,
         seed=0,
     )
-    return fit(baseline(case.cell, case.readings, "deflection"), case.readings, "deflection")
+    return based(case.cell, case.readings, "deflection")
 
 
 @pytest.mark.parametrize(
@@ -123,7 +124,7 @@ def without_loads(seed, stiff):
         world = replace(world, physics=world.physics.with_effect("joint_compliance", 1e-6 * given))
         r = measured(world, plan(POSES, 0), np.random.default_rng(seed))
     r = r[r.load == 0]
-    return fit(baseline(c.cell, r, "absolute"), r, "absolute")
+    return based(c.cell, r, "absolute")
 
 
 def test_a_stiff_arm_with_a_wrong_geometry_is_not_compliant():

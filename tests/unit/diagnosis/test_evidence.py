@@ -18,7 +18,7 @@ from hilcal.diagnosis.noise import MISFIT_ALARM
 from hilcal.diagnosis.stepwise import add
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification import effect_columns as columns_module
-from hilcal.identification.baseline import baseline, with_effects
+from hilcal.identification.baseline import baseline
 from hilcal.identification.carried import carried_prior
 from hilcal.identification.drift import carried_effects, evidence_of_carried
 from hilcal.identification.effect_columns import columns_of_each, effect_columns
@@ -33,6 +33,7 @@ from hilcal.robot.catalogue import configs_dir
 from studies.study_cases import study_case
 from tests.support.campaigns import campaign, measured, plan
 from tests.support.diagnosis_cases import fitted
+from tests.support.fit_cases import based
 
 CELL = configs_dir() / "cells" / "demo_ur10e.toml"
 
@@ -41,7 +42,7 @@ def studied(mode, *hidden, seed=1, strength=3.0, stated=1.0, cycles=1):
     c = study_case(
         load_config(CELL), "ur5e", mode, hidden, strength, seed, stated=stated, cycles=cycles
     )
-    return fit(baseline(c.cell, c.readings, mode), c.readings, mode)
+    return based(c.cell, c.readings, mode)
 
 
 @pytest.mark.parametrize("seeds", [(0,), pytest.param((1, 2, 3), marks=pytest.mark.slow)])
@@ -172,7 +173,7 @@ NAMES = ("joint_compliance", HIDDEN)
 def before():
     """A campaign of an arm whose joints tilt, and what it taught."""
     c = campaign(HIDDEN, "absolute", 1, poses=20, registration_known=True)
-    found = fit(with_effects(c.cell, c.readings, "absolute", NAMES), c.readings, "absolute")
+    found = based(c.cell, c.readings, "absolute", NAMES)
     return c, carried_prior(Posterior.of(found))
 
 

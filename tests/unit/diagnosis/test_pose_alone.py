@@ -17,6 +17,7 @@ from hilcal.identification.linearisation import linearise
 from hilcal.present.verdict import message
 from tests.support.campaigns import campaign, measured, plan
 from tests.support.diagnosis_cases import fitted
+from tests.support.fit_cases import based
 
 
 def dense(p):
@@ -58,7 +59,7 @@ def fine_error(seed, first):
     waves *= np.sqrt(size / np.sum(waves**2))
     world = replace(c.world, physics=replace(c.world.physics, transmission_error=waves))
     r = measured(world, plan(30, seed), np.random.default_rng(seed))
-    return diagnose(fit(baseline(c.cell, r, "absolute"), r, "absolute"))
+    return diagnose(based(c.cell, r, "absolute"))
 
 
 @pytest.mark.parametrize("seed", [2, *(pytest.param(k, marks=pytest.mark.slow) for k in (0, 6))])

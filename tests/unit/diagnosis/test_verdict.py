@@ -7,7 +7,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hilcal.config import load_config
 from hilcal.diagnosis.background_evidence import background_evidence, p_value_of_others, proved
 from hilcal.diagnosis.diagnosis import (
     LARGEST,
@@ -24,9 +23,9 @@ from hilcal.identification.fit import fit
 from hilcal.present.verdict import message
 from hilcal.refinement import refine
 from studies.study_cases import study_case
-from tests.support.campaigns import campaign
-from tests.support.cli_cases import CELL
+from tests.support.campaigns import campaign, configuration
 from tests.support.diagnosis_cases import fitted
+from tests.support.fit_cases import based, refined
 from tests.support.reflector_cases import reflectors
 
 
@@ -113,7 +112,7 @@ def test_an_unknown_scatter_is_found_and_not_taken_for_a_cause(mode, seed):
     """Taken for independent, these readings name a cause: transmission_error in the second."""
     c = reflectors(seed=seed, poses=20, known=KNOWN, joint_std=STD)
     readings = unstated(c)
-    found = fit(baseline(c.cell, readings, mode), readings, mode)
+    found = based(c.cell, readings, mode)
     d = diagnose(found)
     assert found.variance_factor > 4
     assert (d.verdict, d.reason, d.significant) == ("adequate", "arm_scatter", ())
@@ -128,7 +127,7 @@ def test_an_unknown_scatter_is_found_and_not_taken_for_a_cause(mode, seed):
 def test_a_hidden_effect_is_found_beside_an_unknown_scatter(effect, mode):
     c = reflectors(effect, mode=mode, poses=20, known=KNOWN, joint_std=STD)
     readings = unstated(c)
-    path = refine(baseline(c.cell, readings, mode), readings, mode)
+    path = refined(c.cell, readings, mode)
     assert [s.added for s in path.steps] == [None, effect, None]
     assert path.steps[-1].diagnosis.verdict == "adequate"
     assert 0.8 < path.fit.variance_factor < 1.25
@@ -178,19 +177,19 @@ def test_no_evidence_is_a_certainty():
 
 def test_a_refinement_says_what_is_hidden():
     c = campaign("encoder_offset", "absolute", 1, poses=30)
-    path = refine(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute")
+    path = refined(c.cell, c.readings, "absolute")
     p = path.probabilities(["encoder_offset", "backlash", "tracker_drift"])
     assert p["encoder_offset"] > 0.5 > max(p["backlash"], p["tracker_drift"])
 
 
 def case_of(mode, hidden, strength):
-    return study_case(load_config(CELL), "ur10e", mode, hidden, strength, 0)
+    return study_case(configuration(), "ur10e", mode, hidden, strength, 0)
 
 
 def test_gears_that_all_give_in_one_direction_are_no_scale_of_the_tracker():
     # Their zero mean leaves what a scale of some per cent would explain; ordinary ones have 1e-5.
     case = case_of("deflection", ("joint_stiffening",), 1.0)
-    first = fit(baseline(case.cell, case.readings, "deflection"), case.readings, "deflection")
+    first = based(case.cell, case.readings, "deflection")
     found = with_background(first, first.model.names)
     tested = {b.effect: b for b in background_evidence(found)}
     assert tested["tracker_scale"].p_value < 0.001
@@ -199,7 +198,7 @@ def test_gears_that_all_give_in_one_direction_are_no_scale_of_the_tracker():
 
 def test_a_model_with_pooled_lines_is_refined_further():
     case = case_of("absolute", ("transmission_error",), 3.0)
-    found = refine(baseline(case.cell, case.readings, "absolute"), case.readings, "absolute")
+    found = refined(case.cell, case.readings, "absolute")
     assert "transmission_error" in found.fit.model.random
     assert p_value_of_others(found.fit) > 0.01  # nothing else is there
     again = refine(found.fit.model, case.readings, "absolute")

@@ -12,8 +12,8 @@ from hilcal.diagnosis.wrong_figures import wrong_figures
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.baseline import baseline
 from hilcal.present.verdict import message
-from hilcal.refinement import refine
 from tests.support.campaigns import NOTHING, campaign
+from tests.support.fit_cases import refined
 from tests.support.rows import first
 
 
@@ -84,7 +84,7 @@ def test_a_figure_without_an_equilibrium_explains_nothing(monkeypatch):
 def test_a_tool_at_twice_its_mass_is_named_and_refine_adds_nothing():
     c = campaign(NOTHING, "absolute", 1, poses=20)
     cell = replace(c.cell, tool_mass=2 * c.cell.tool_mass)
-    found = refine(baseline(cell, c.readings, "absolute"), c.readings, "absolute")
+    found = refined(cell, c.readings, "absolute")
     (step,) = found.steps
     assert found.verdict == "ambiguous"
     assert message(step.diagnosis).startswith("The tool seems to weigh 0.8")

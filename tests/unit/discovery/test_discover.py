@@ -20,13 +20,13 @@ from hilcal.discovery.sites import ORDINARY
 from hilcal.effects.catalogue import installed
 from hilcal.effects.check import check_effect
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.baseline import baseline
 from hilcal.identification.effect_columns import effect_columns
 from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import linearise
 from hilcal.present.diagnosis import discovery_report, refined_laws, silence
 from hilcal.refinement import refine
 from studies.unmodelled_laws import law_named, shift
+from tests.support.fit_cases import based
 from tests.support.rehearsed import rehearsed
 
 LAW = "compliance by another joint"
@@ -43,7 +43,7 @@ def campaign(law="", stated=1.0, seed=4):
             drawn, of.world, readings.states, 6.0, "deflection", of.pose, of.cycle
         )
     readings = replace(readings, value=value, covariance=stated**2 * readings.covariance)
-    return fit(baseline(cell, readings, "deflection"), readings, "deflection")
+    return based(cell, readings, "deflection")
 
 
 @cache
@@ -152,7 +152,7 @@ def test_a_drift_of_readings_without_times_is_said_to_need_them(monkeypatch):
     value = of.readings.value.copy()
     value[:, 0] += 400e-6 * np.maximum(np.linspace(-1.0, 1.0, len(value)), 0.0)
     readings = replace(of.readings, states=timeless, value=value)
-    before = fit(baseline(of.model.cell, readings, "absolute"), readings, "absolute")
+    before = based(of.model.cell, readings, "absolute")
     monkeypatch.setattr(sys.modules[Discovery.__module__], "search", lambda problem: [])
     d = discover(before)
     assert (d.reason, d.carried[0].variable) == ("no_law", "row order")

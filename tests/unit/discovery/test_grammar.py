@@ -17,11 +17,10 @@ from hilcal.discovery.refit import exact, left_by, refine
 from hilcal.discovery.screen import screen
 from hilcal.discovery.sites import sites
 from hilcal.effects.check import check_effect, example_cell, example_situation, example_states
-from hilcal.identification.baseline import baseline
-from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import linearise
 from hilcal.readings.whitening import whitening
 from studies.law_scene import scene
+from tests.support.fit_cases import based
 from tests.support.rehearsed import rehearsed
 
 
@@ -160,7 +159,7 @@ def campaign():
     w = whitening(readings, "deflection")
     moved = moved * (SIGMA / np.sqrt(np.mean(w.whiten(w.raw(moved)) ** 2)))
     readings = replace(readings, value=readings.value + moved)
-    return fit(baseline(cell, readings, "deflection"), readings, "deflection"), moved
+    return based(cell, readings, "deflection"), moved
 
 
 @cache

@@ -19,12 +19,11 @@ from hilcal.discovery.sites import sites
 from hilcal.discovery.structures import Structure, averaged, pareto, posterior
 from hilcal.effects.check import check_effect
 from hilcal.errors import CannotAnswerError
-from hilcal.identification.baseline import baseline
-from hilcal.identification.fit import fit
 from hilcal.identification.residual import residual
 from hilcal.readings.whitening import whitening
 from hilcal.regression.evidence import STRENGTHS, score_family
 from hilcal.robot import se3
+from tests.support.fit_cases import based
 from tests.unit.discovery.test_discover import LAW, campaign, found, screened
 
 
@@ -229,7 +228,7 @@ def misread():
     wrench = states.wrench.copy()
     wrench[:, :3] += se3.apply(turn, more)
     readings = replace(of.readings, states=replace(states, wrench=wrench))
-    return fit(baseline(of.model.cell, readings, of.mode), readings, of.mode)
+    return based(of.model.cell, readings, of.mode)
 
 
 @cache

@@ -13,6 +13,7 @@ from tests.support.effect_cases import (
     ALL_NAMES,
     CELLS,
     NAMES,
+    UR10E,
     make,
     options_of,
     situation,
@@ -122,11 +123,10 @@ def test_prediction_is_what_the_world_shows(names, arm):
 
 
 def test_drift_starts_at_its_reference_time():
-    cell = CELLS["ur10e"]
-    states = situation(cell).states
+    states = situation(UR10E).states
     rate = 1e-8 * np.arange(1.0, 7.0)
     for reference, start in ((None, states.time.min()), (100.0, 100.0)):
         given = {} if reference is None else {"reference_s": reference}
-        effect = make("tracker_drift", cell, states, given)
-        station = effect.deviation(rate, situation(cell)).station
+        effect = make("tracker_drift", UR10E, states, given)
+        station = effect.deviation(rate, situation(UR10E)).station
         np.testing.assert_allclose(station, (states.time - start)[:, None] * rate, rtol=1e-13)

@@ -18,6 +18,7 @@ from tests.support.campaigns import campaign
 from tests.support.effect_cases import (
     CELLS,
     NAMES,
+    UR10E,
     effect_class,
     make,
     options_of,
@@ -152,10 +153,9 @@ def test_a_shared_compliance_shows_more_where_the_joints_creep(groups, creeps):
 
 @pytest.mark.parametrize("name", PER_JOINT)
 def test_names_and_magnitudes(name):
-    cell = CELLS["ur10e"]
-    states = some_states(cell)
-    every = make(name, cell, states, options(name, "each")).parameters
-    some = make(name, cell, states, options(name, "1+4-5/2/3")).parameters
+    states = some_states(UR10E)
+    every = make(name, UR10E, states, options(name, "each")).parameters
+    some = make(name, UR10E, states, options(name, "1+4-5/2/3")).parameters
     kinds = len(every) // 6
     assert len(some) == 3 * kinds
     heads = [p.name.split(".")[0] for p in some[::kinds]]
@@ -170,23 +170,21 @@ def test_names_and_magnitudes(name):
 
 
 def test_harmonics_of_shared_joints_have_one_variance():
-    cell = CELLS["ur10e"]
-    effect = make("transmission_error", cell, some_states(cell), options(PER_JOINT[1], "1-3/5"))
+    effect = make("transmission_error", UR10E, some_states(UR10E), options(PER_JOINT[1], "1-3/5"))
     assert effect.groups().tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
-    assert effect.for_scoring(some_states(cell)).options == effect.options
+    assert effect.for_scoring(some_states(UR10E)).options == effect.options
 
 
 def test_creep_takes_the_older_name_of_its_groups():
-    cell = CELLS["ur10e"]
-    states = some_states(cell)
+    states = some_states(UR10E)
     for form in ("common", "each"):
-        old = make("creep", cell, states, {"form": form})
-        new = make("creep", cell, states, {"joints": form})
+        old = make("creep", UR10E, states, {"form": form})
+        new = make("creep", UR10E, states, {"joints": form})
         assert old.parameters == new.parameters
         assert old.options == new.options == {"joints": form}
-    assert [p.name for p in make("creep", cell, states).parameters] == ["k"]
+    assert [p.name for p in make("creep", UR10E, states).parameters] == ["k"]
     with pytest.raises(InputError, match="form and joints; valid: joints alone"):
-        make("creep", cell, states, {"form": "each", "joints": "each"})
+        make("creep", UR10E, states, {"form": "each", "joints": "each"})
 
 
 # --- fits -----------------------------------------------------------------------------------

@@ -9,7 +9,6 @@ from scipy.stats import chi2
 from hilcal.calibration.scatter import budget
 from hilcal.campaign.revisions import restore, to_record
 from hilcal.cell import Cell
-from hilcal.config import load_config
 from hilcal.diagnosis.stepwise import add, remove
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.errors import InputError
@@ -29,8 +28,8 @@ from studies.diagnosis import Asked
 from studies.diagnosis_command import simulate
 from studies.random_campaigns import rehearsal_states
 from studies.study_cases import study_case, with_study_loads
-from tests.support.cli_cases import CELL
-from tests.support.fit_cases import based
+from tests.support.campaigns import configuration
+from tests.support.fit_cases import based, refined
 
 UR10 = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")
 
@@ -131,7 +130,7 @@ def test_bands_do_not_depend_on_how_large_the_noise_is_stated(series):
     test, sizes = series[500:700], []
     for by in (1.0, 9.0):
         some = replace(series[:40], covariance=by * series[:40].covariance, scatter_stated=True)
-        fit = refine(baseline(UR10, some, "absolute"), some, "absolute").fit
+        fit = refined(UR10, some, "absolute").fit
         assert fit.model.background
         assert fit.readings.arm_scatter is None
         known = predictive_of(fit)
@@ -153,11 +152,11 @@ HIDDEN = (
 
 @pytest.mark.long
 def test_an_arm_that_errs_in_many_ways_is_predicted_from_few_poses():
-    config = load_config(CELL)
+    config = configuration()
     case = study_case(config, "ur10e", "absolute", HIDDEN, 20.0, 1, n_poses=25)
     some = case.readings[case.readings.load == 0]
     assert len(some) == 25
-    found = refine(baseline(case.cell, some, "absolute"), some, "absolute")
+    found = refined(case.cell, some, "absolute")
     added = [step.added for step in found.steps]
     alone = found.steps[added.index(BACKGROUND) - 1]
     _, loads = with_study_loads(config, "ur10e")
@@ -180,7 +179,7 @@ def test_effects_of_implausible_size_do_not_stand_in_for_an_unknown_law():
     law = "compliance by another joint"  # link lengths of 14 mm would predict it
     asked = Asked("outside", "ur3e", "deflection", (law,), 3.0, 0)
     case = simulate(asked)
-    found = refine(baseline(case.cell, case.readings, asked.mode), case.readings, asked.mode)
+    found = refined(case.cell, case.readings, asked.mode)
     assert found.verdict == "unknown_effect"
     assert not found.fit.model.background
 
@@ -189,13 +188,13 @@ def test_effects_of_implausible_size_do_not_stand_in_for_an_unknown_law():
 def test_noise_that_is_stated_too_small_is_no_background():
     asked = Asked("noise", "ur3e", "absolute", (), 0.0, 0, 0.5, cycles=2)
     case = simulate(asked)
-    found = refine(baseline(case.cell, case.readings, asked.mode), case.readings, asked.mode)
+    found = refined(case.cell, case.readings, asked.mode)
     assert found.verdict == "noise_misjudged"
     assert not found.fit.model.background
 
 
 def test_waves_of_gears_in_pools_predict_better_than_line_by_line():
-    config, ratios = load_config(CELL), []
+    config, ratios = configuration(), []
     for seed in (1, 2, 3):
         case = study_case(
             config, "ur10e", "absolute", ("transmission_error",), 3.0, seed, n_poses=30
@@ -221,12 +220,12 @@ def test_waves_of_gears_in_pools_predict_better_than_line_by_line():
 
 
 def test_without_shrunk_effects_there_are_no_lines():
-    case = study_case(load_config(CELL), "ur10e", "absolute", (), 0.0, 1, n_poses=12)
+    case = study_case(configuration(), "ur10e", "absolute", (), 0.0, 1, n_poses=12)
     plain = based(case.cell, case.readings, "absolute")
     assert with_pooled_lines(plain) is None
 
 
-CONFIG = load_config(CELL)
+CONFIG = configuration()
 TILT = "joint_tilt_compliance"
 
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.stats import binom, poisson
 
-from hilcal.config import load_config
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
@@ -24,16 +23,14 @@ from hilcal.identification.misdescription import examine
 from hilcal.identification.registration import register
 from hilcal.present.verdict import message
 from hilcal.readings.whitening import MODES, inverse_root, whitening
-from hilcal.refinement import refine
-from hilcal.robot.catalogue import configs_dir
 from studies.gross_errors import Spoilt, count, spoil
 from studies.study_cases import study_case
-from tests.support.campaigns import campaign, noiseless, plan, with_noise
-from tests.support.fit_cases import based
+from tests.support.campaigns import campaign, configuration, noiseless, plan, with_noise
+from tests.support.fit_cases import based, refined
 from tests.support.reflector_cases import reflectors
 from tests.support.rows import first
 
-CONFIG = load_config(configs_dir() / "cells" / "demo_ur10e.toml")
+CONFIG = configuration()
 C = campaign(plan_seed=0, poses=30, registration_known=True)
 
 
@@ -253,7 +250,7 @@ def test_refine_finds_them_beside_an_effect_and_in_few_poses(seed, share):
 def test_more_than_can_be_told_is_said(mode):
     c = twelve(mode)
     readings, _ = spoil(c.readings, 0.6, 5e-3, np.random.default_rng(0))
-    found = refine(baseline(c.cell, readings, mode), readings, mode)
+    found = refined(c.cell, readings, mode)
     assert found.verdict == "unknown_effect"
     assert "More than 45 % of the readings disagree" in message(found.diagnosis)
     assert not found.fit.outlier.any()

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilcal.config import load_config
 from hilcal.diagnosis.stepwise import add, predicts_better
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.fit import fit
@@ -21,9 +20,8 @@ from hilcal.identification.folds import (
 from hilcal.identification.gauss_newton import solve
 from hilcal.identification.residual import residual
 from hilcal.readings.whitening import MODES
-from hilcal.robot.catalogue import configs_dir
 from studies.study_cases import study_case
-from tests.support.campaigns import campaign
+from tests.support.campaigns import campaign, configuration
 from tests.support.fit_cases import based
 
 
@@ -157,7 +155,7 @@ def test_folds_are_of_equal_size_and_whole_poses(poses):
 
 def test_what_one_pose_alone_shows_of_an_effect_does_not_spoil_the_others():
     """Without pose 19 nothing tells a combination of the backlashes; flat, it erred by 42 σ."""
-    config = load_config(configs_dir() / "cells" / "demo_ur10e.toml")
+    config = configuration()
     c = study_case(config, "ur5e", "deflection", ("backlash",), 2.0, 901)
     before = based(c.cell, c.readings, "deflection")
     found = add(before, "backlash")

@@ -10,7 +10,6 @@ import pytest
 import hilcal as hc
 from hilcal.calibration.calibration import Calibration
 from hilcal.campaign.revisions import restore, to_record
-from hilcal.config import load_config
 from hilcal.diagnosis.stepwise import add, remove
 from hilcal.drivers.simulated.world import stand
 from hilcal.effects.catalogue import installed
@@ -23,12 +22,12 @@ from hilcal.identification.parameters_document import covariance_of
 from hilcal.identification.posterior import Posterior, Source, parameter_differences
 from hilcal.identification.posterior_document import read, write
 from hilcal.identification.predictive import predictive
-from hilcal.robot.catalogue import configs_dir, load_arm
+from hilcal.robot.catalogue import load_arm
 from hilcal.store.revision import from_text, to_text
 from hilcal.store.rows import content_hash
 from studies.change import measured as measured_again
 from studies.change import studied_arm
-from tests.support.campaigns import campaign, measured, noiseless, plan, with_noise
+from tests.support.campaigns import campaign, configuration, measured, noiseless, plan, with_noise
 from tests.support.fit_cases import based
 
 
@@ -133,7 +132,7 @@ def test_every_effect_says_whose_it_is():
 @pytest.fixture(scope="module")
 def arm():
     """An arm without errors of its links, so that two small models hold all there is."""
-    config = load_config(configs_dir() / "cells" / "demo_ur10e.toml")
+    config = configuration()
     arm = studied_arm(config, "ur10e", 3, poses=10)
     physics = arm.world.physics
     for name in ("link_geometry", "transmission_error"):

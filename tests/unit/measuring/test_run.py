@@ -63,9 +63,8 @@ def test_readings_are_what_the_world_is(ran):
     assert np.all(ratio < 1.3)
 
 
-def test_wrench_is_measured_for_pulls_and_told_for_weights():
+def test_wrench_is_measured_for_pulls_and_told_for_weights(b):
     """The rope pulls 5 % less than asked for, and the weight is 1 % too heavy."""
-    b = Bench()
     loads = (CellLoad(name="3kg", mass_kg=3.03), CellLoad(name="pull", force_N=(38.0, 0.0, 0.0)))
     b.world.config = b.config.model_copy(update={"loads": loads})
     readings = measure(b)
@@ -87,9 +86,8 @@ def test_use_of_the_force_sensor(use, force):
     assert np.allclose(loaded[:, 2], -force * 9.80665, atol=1e-6)
 
 
-def test_wrench_is_that_at_the_load_point_wherever_the_sensor_sits():
+def test_wrench_is_that_at_the_load_point_wherever_the_sensor_sits(b):
     """A sensor that is off and turned, and a tool that is not the configured one."""
-    b = Bench()
     b.world.tool_mass = 0.75
     turned = (0.3, -0.2, 0.9)
     origin = (0.01, -0.02, 0.04)
@@ -176,8 +174,7 @@ def _time_of(b, done):
     return json.loads(b.store.rows[done - 1][2])["tracker"][-1]["host_ns"] * 1e-9
 
 
-def test_the_judge_sees_all_readings_and_may_not_know():
-    b = Bench()
+def test_the_judge_sees_all_readings_and_may_not_know(b):
     seen = []
 
     def judge(readings):
@@ -193,8 +190,7 @@ def test_the_judge_sees_all_readings_and_may_not_know():
     assert taken[-1].live.sigma == 0.5
 
 
-def test_drift_of_the_reference_pose_is_told():
-    b = Bench()
+def test_drift_of_the_reference_pose_is_told(b):
 
     def shift(*_):
         if len(b.store.rows) == 6:
@@ -281,8 +277,7 @@ def test_a_cell_without_a_tool():
 # loads
 
 
-def test_a_wrong_load_is_asked_for_again_with_the_reason():
-    b = Bench()
+def test_a_wrong_load_is_asked_for_again_with_the_reason(b):
     b.world.wrong = ["none", "6kg"]  # the first answer is that to "take everything off"
     readings = measure(b)
     assert len(readings) == len(usual_plan().steps)
@@ -293,8 +288,7 @@ def test_a_wrong_load_is_asked_for_again_with_the_reason():
 
 
 @pytest.mark.long
-def test_three_wrong_loads_end_the_run():
-    b = Bench()
+def test_three_wrong_loads_end_the_run(b):
     b.world.wrong = ["none", "6kg", "none", "6kg"]
     with pytest.raises(DeviceError, match=r"asked 3 times to hang 3kg.*--resume$"):
         measure(b)
@@ -304,8 +298,7 @@ def test_three_wrong_loads_end_the_run():
     assert len(measure(b)) == len(usual_plan().steps)
 
 
-def test_a_load_that_is_not_taken_off_is_noticed():
-    b = Bench()
+def test_a_load_that_is_not_taken_off_is_noticed(b):
     b.world.wrong = ["none", "3kg", "3kg"]
     measure(b)
     assert asked_for(b) == ["none", "3kg", "none", "none", "pull", "none"]
@@ -313,8 +306,7 @@ def test_a_load_that_is_not_taken_off_is_noticed():
 
 
 @pytest.mark.long
-def test_a_swinging_load_is_weighed_twice():
-    b = Bench()
+def test_a_swinging_load_is_weighed_twice(b):
     times = []
 
     def swinging(seconds):
@@ -338,8 +330,7 @@ def test_without_a_force_sensor_the_person_is_believed():
     assert json.loads(b.store.rows[0][2])["force"] is None
 
 
-def test_the_tool_is_identified_and_compared_with_the_configuration():
-    b = Bench()
+def test_the_tool_is_identified_and_compared_with_the_configuration(b):
     b.world.tool_mass = 1.4
     measure(b)
     assert b.store.kinds().index("tool") < b.store.kinds().index("load")
@@ -349,9 +340,8 @@ def test_the_tool_is_identified_and_compared_with_the_configuration():
     assert remarks(b, "[tool] says 0.8 kg")
 
 
-def test_unloaded_poses_that_do_not_tell_the_tool_are_no_failure():
+def test_unloaded_poses_that_do_not_tell_the_tool_are_no_failure(b):
     """Turned about the vertical only: gravity never turns in the sensor."""
-    b = Bench()
     poses = {f"p{k}": (0.2 * k, *POSES["reference"][1:]) for k in range(4)}
     plan = plan_of(
         *((p, load, 0) for load in ("none", "3kg") for p in poses),
@@ -410,8 +400,7 @@ def test_a_load_that_still_hangs_at_a_resume_is_noticed():
     assert [s for s, _, _ in b.store.rows] == list(plan.steps)
 
 
-def test_a_load_left_on_at_the_very_beginning_is_asked_about_said_and_found_in_motion():
-    b = Bench()
+def test_a_load_left_on_at_the_very_beginning_is_asked_about_said_and_found_in_motion(b):
     b.world.load, b.world.wrong = "3kg", ["3kg", "3kg"]  # both answers are wrong
     with pytest.raises(DeviceError, match="take everything off"):
         measure(b)
@@ -420,8 +409,7 @@ def test_a_load_left_on_at_the_very_beginning_is_asked_about_said_and_found_in_m
     assert {step for step, *_ in b.store.rows} <= {Step("reference", "none", 0)}
 
 
-def test_a_finished_campaign_touches_nothing():
-    b = Bench()
+def test_a_finished_campaign_touches_nothing(b):
     measure(b)
     b.world.calls.clear()
     measure(b)
@@ -445,8 +433,7 @@ def test_the_tool_is_known_from_an_earlier_session_after_the_sensor_was_off():
 LOST = "no longer tells the torques"
 
 
-def test_torques_are_averaged_over_the_reading():
-    b = Bench()
+def test_torques_are_averaged_over_the_reading(b):
     b.world.torques = np.inf
     torque = measure(b).states.torque
     # means of at least three samples that scatter by 0.1 N·m
@@ -455,8 +442,7 @@ def test_torques_are_averaged_over_the_reading():
     assert b.store.details()[0]["torque"] == torque[0].tolist()
 
 
-def test_a_lost_link_is_said_once_and_readings_go_on(tmp_path):
-    b = Bench()
+def test_a_lost_link_is_said_once_and_readings_go_on(b, tmp_path):
     b.world.torques = 60
     readings = measure(b)
     torque = readings.states.torque
@@ -490,8 +476,7 @@ def test_a_lost_link_is_said_once_and_readings_go_on(tmp_path):
 
 
 @pytest.mark.parametrize("first", [0, np.inf])
-def test_a_campaign_goes_on_as_it_began(first):
-    b = Bench()
+def test_a_campaign_goes_on_as_it_began(b, first):
     b.world.torques = first
     interrupt(b, 4)
     b.world.torques = -1 if first else np.inf

@@ -282,9 +282,8 @@ LIMIT = ForceSensor(driver="fake", port="nowhere", max_force_N=120.0)
 # order and safety
 
 
-def test_order_of_the_start():
+def test_order_of_the_start(b):
     """The hook is cleared before anything moves, the tare comes before the first reading."""
-    b = Bench()
     measure(b)
     first = {name: b.world.calls.index(name) for name in set(b.world.calls)}
     assert first["operator.hang"] < first["arm.take_control"] < first["arm.start_move"]
@@ -295,8 +294,7 @@ def test_order_of_the_start():
     assert b.store.kinds()[:2] == ["start", "tare"]
 
 
-def test_payload_is_set_before_a_weight_is_hung_and_after_it_is_off():
-    b = Bench()
+def test_payload_is_set_before_a_weight_is_hung_and_after_it_is_off(b):
     given = []
 
     def payload(mass, com):
@@ -317,8 +315,7 @@ def test_payload_is_set_before_a_weight_is_hung_and_after_it_is_off():
     ]
 
 
-def test_loads_change_only_at_the_reference_and_motions_carry_them():
-    b = Bench()
+def test_loads_change_only_at_the_reference_and_motions_carry_them(b):
     where = []
     before(b.operator, "hang", lambda *_: where.append(b.world.q.copy()))
     measure(b)
@@ -394,8 +391,7 @@ def test_limits_are_enforced_at_rest():
     assert b.world.calls[-2] == "arm.stop"
 
 
-def test_an_arm_that_does_not_arrive():
-    b = Bench()
+def test_an_arm_that_does_not_arrive(b):
     real = b.rig.arm.start_move
 
     def short(q, speed, acceleration):
@@ -407,8 +403,7 @@ def test_an_arm_that_does_not_arrive():
 
 
 @pytest.mark.long
-def test_a_motion_that_never_ends_is_given_up():
-    b = Bench()
+def test_a_motion_that_never_ends_is_given_up(b):
     b.rig.arm.moving = lambda: True
     with pytest.raises(DeviceError, match="not finished after"):
         measure(b)
@@ -418,8 +413,7 @@ def test_a_motion_that_never_ends_is_given_up():
 # the target
 
 
-def test_a_lost_target_is_found_again():
-    b = Bench()
+def test_a_lost_target_is_found_again(b):
     b.world.lost = 3  # at both stops of the approach, where nothing is read, and at the reading
     readings = measure(b)
     assert len(readings) == len(usual_plan().steps)
@@ -428,8 +422,7 @@ def test_a_lost_target_is_found_again():
 
 
 @pytest.mark.parametrize("lost", [5, 1000])
-def test_a_target_that_stays_lost_ends_the_run(lost):
-    b = Bench()
+def test_a_target_that_stays_lost_ends_the_run(b, lost):
     b.world.lost, b.world.not_found = lost, 0 if lost == 5 else 1000
     with pytest.raises(DeviceError, match=r"line of sight.*--resume$"):
         measure(b)
@@ -438,8 +431,7 @@ def test_a_target_that_stays_lost_ends_the_run(lost):
     assert b.world.calls[-2] == "arm.stop"
 
 
-def test_another_reflector_is_not_believed():
-    b = Bench()
+def test_another_reflector_is_not_believed(b):
 
     def other(*_):
         if len(b.store.rows) == 5:
@@ -485,8 +477,7 @@ def test_drift_that_ends_is_waited_for():
     assert np.abs(away).max() < 6 * STD
 
 
-def test_an_arm_that_trembles_is_measured_again_and_given_up():
-    b = Bench()
+def test_an_arm_that_trembles_is_measured_again_and_given_up(b):
     b.world.jitter = 1e-4
     with pytest.raises(DeviceError, match=r"measured 3 times in vain: arm: it moved by"):
         measure(b)
@@ -494,8 +485,7 @@ def test_an_arm_that_trembles_is_measured_again_and_given_up():
 
 
 @pytest.mark.long
-def test_somebody_who_jogs_the_arm_meanwhile_spoils_the_reading():
-    b = Bench()
+def test_somebody_who_jogs_the_arm_meanwhile_spoils_the_reading(b):
     jogged = []
 
     def jog(seconds):
@@ -518,9 +508,8 @@ def test_at_least_twenty_frames_whatever_the_clock():
 
 
 @pytest.mark.parametrize("scale", [1.0, 20.0])
-def test_everything_is_looked_at_twenty_times_a_second_in_motion(scale):
+def test_everything_is_looked_at_twenty_times_a_second_in_motion(b, scale):
     """Real seconds: a fast world's motions are short, and looked at as often as others."""
-    b = Bench()
     b.world.hurry = 1.0
     b.clock = FakeClock(scale=scale, world=b.world)
     gaps = {"arm.moving": 0.0, "arm.sample": 0.0, "force.latest": 0.0}

@@ -81,17 +81,15 @@ def test_a_goal_that_is_met_elsewhere(count, more):
     assert b.store.kinds()[-1] == "finished"
 
 
-def test_a_plan_without_returns_ends_at_the_reference_too():
-    b = Bench()
+def test_a_plan_without_returns_ends_at_the_reference_too(b):
     plan = plan_of(("p1", "none", 0), ("p1", "3kg", 0), ("p2", "3kg", 0), ("p2", "none", 0))
     measure(b, plan, goal=Enough(2))
     assert steps(b) == list(plan.steps[:2])
     assert is_home(b)
 
 
-def test_the_way_home_is_clear():
+def test_the_way_home_is_clear(b):
     """A post stands between p2 and the reference pose: the arm goes back by where it came."""
-    b = Bench()
     q = {"reference": HOME, "via": np.add(POSES["p2"], [0.0, -0.5, 0.3, 0.0, 0.0, 0.0]),
          "p2": POSES["p2"]}  # fmt: skip
     half = (np.array(q["p2"]) + np.array(HOME)) / 2

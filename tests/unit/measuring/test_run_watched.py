@@ -67,8 +67,7 @@ SHORT = plan_of(("p1", "none", 0), ("p1", "3kg", 0), ("reference", "none", 1))
 
 
 @pytest.mark.parametrize("load", ["none", "3kg"])
-def test_an_arm_jogged_into_a_blocked_place_during_a_question_is_not_moved(load):
-    b = Bench()
+def test_an_arm_jogged_into_a_blocked_place_during_a_question_is_not_moved(b, load):
     jogged(b, load, FOLDED)
     with pytest.raises(DeviceError, match=r"outside the workspace.*drive it by hand.*--resume$"):
         measure(b)
@@ -76,8 +75,7 @@ def test_an_arm_jogged_into_a_blocked_place_during_a_question_is_not_moved(load)
     assert ("arm.take_control" in b.world.calls) is (load == "3kg")
 
 
-def test_an_arm_jogged_to_a_free_place_is_asked_for_and_the_way_checked_from_there():
-    b = Bench()
+def test_an_arm_jogged_to_a_free_place_is_asked_for_and_the_way_checked_from_there(b):
     jogged(b, "none", FREE)
     measure(b)
     (asked,) = confirmed(b)
@@ -86,8 +84,7 @@ def test_an_arm_jogged_to_a_free_place_is_asked_for_and_the_way_checked_from_the
 
 
 @pytest.mark.long
-def test_an_arm_that_is_moved_while_it_is_asked_for_is_asked_for_again():
-    b = Bench()
+def test_an_arm_that_is_moved_while_it_is_asked_for_is_asked_for_again(b):
     jogged(b, "none", FREE)
     places = [FREE + 0.1, FREE + 0.1]
 
@@ -100,8 +97,7 @@ def test_an_arm_that_is_moved_while_it_is_asked_for_is_asked_for_again():
     assert len(confirmed(b)) == 2
 
 
-def test_an_arm_jogged_while_control_is_taken_is_not_moved():
-    b = Bench()
+def test_an_arm_jogged_while_control_is_taken_is_not_moved(b):
     before(b.rig.arm, "take_control", lambda *_: setattr(b.world, "q", FREE.copy()))
     with pytest.raises(DeviceError, match=r"has commanded it since.*0\.5 rad"):
         measure(b)
@@ -109,8 +105,7 @@ def test_an_arm_jogged_while_control_is_taken_is_not_moved():
 
 
 @pytest.mark.parametrize(("load", "after"), [("3kg", 0), ("none", 1)])
-def test_an_arm_moved_while_a_load_is_changed_goes_back_once_that_is_agreed(load, after):
-    b = Bench()
+def test_an_arm_moved_while_a_load_is_changed_goes_back_once_that_is_agreed(b, load, after):
     away = np.array(POSES["reference"]) + 0.2 * np.eye(6)[0]
     jogged(b, load, away, after=after)
     motions = carried(b)
@@ -124,8 +119,7 @@ def test_an_arm_moved_while_a_load_is_changed_goes_back_once_that_is_agreed(load
     assert set(motions) <= KNOWN
 
 
-def test_an_operator_who_cannot_be_asked_is_not_taken_to_agree():
-    b = Bench()
+def test_an_operator_who_cannot_be_asked_is_not_taken_to_agree(b):
     jogged(b, "none", FREE)
 
     class Silent:
@@ -158,8 +152,7 @@ def test_a_campaign_that_goes_on_says_that_the_arm_stands_elsewhere_and_asks():
         ({"q": 0.02}, "somebody has moved it"),
     ],
 )
-def test_an_arm_that_is_moved_at_rest_is_named_at_the_next_look(change, said):
-    b = Bench()
+def test_an_arm_that_is_moved_at_rest_is_named_at_the_next_look(b, change, said):
     begun = []
 
     def moved(here):
@@ -201,8 +194,7 @@ def in_motion(b, change, motion=4):
         (("timestamp",), "its clock has stood still"),
     ],
 )
-def test_feedback_that_stands_still_in_motion_is_named_within_a_second(names, said):
-    b = Bench()
+def test_feedback_that_stands_still_in_motion_is_named_within_a_second(b, names, said):
     kept = []
 
     def frozen(here):
@@ -217,8 +209,7 @@ def test_feedback_that_stands_still_in_motion_is_named_within_a_second(names, sa
     assert b.world.time - begun[0] < 1.0
 
 
-def test_an_arm_that_leaves_its_straight_way_is_stopped():
-    b = Bench()
+def test_an_arm_that_leaves_its_straight_way_is_stopped(b):
     begun = in_motion(b, lambda here: replace(here, q=here.q + 0.06 * np.eye(6)[3]))
     with pytest.raises(DeviceError, match="wrist_1 has left the straight way"):
         measure(b)
@@ -226,8 +217,7 @@ def test_an_arm_that_leaves_its_straight_way_is_stopped():
 
 
 @pytest.mark.long
-def test_a_motion_at_the_slowest_slider_does_not_stand_still():
-    b = Bench()
+def test_a_motion_at_the_slowest_slider_does_not_stand_still(b):
     near = np.array(POSES["reference"]) + 0.02
     b.world.hurry = 0.02
     changed(b.rig.arm, "sample", lambda here: replace(here, speed_scaling=0.02))
@@ -255,8 +245,7 @@ def falls_in_motion(b, *wrong):
     return fell
 
 
-def test_a_load_that_falls_off_in_motion_stops_the_arm_and_is_asked_for_again():
-    b = Bench()
+def test_a_load_that_falls_off_in_motion_stops_the_arm_and_is_asked_for_again(b):
     payloads = []
     stopped = []
     fell, motions = falls_in_motion(b), carried(b)
@@ -294,9 +283,8 @@ def assert_true(b):
         assert np.linalg.norm(reading.value[0] - b.world.position()) < 1e-4
 
 
-def test_a_load_that_falls_off_between_readings_leaves_no_reading_without_it():
+def test_a_load_that_falls_off_between_readings_leaves_no_reading_without_it(b):
     """It falls while the tracker measures: the reading is kept as doubted, and taken again."""
-    b = Bench()
     falls_at_rest(b, "3kg", 7)
     measure(b)
     assert asked_for(b)[1:3] == ["3kg", "3kg"]
@@ -304,8 +292,7 @@ def test_a_load_that_falls_off_between_readings_leaves_no_reading_without_it():
 
 
 @pytest.mark.parametrize("load", first(1, ["none", "3kg"]))
-def test_leaning_on_the_tool_during_a_reading_is_kept_as_doubted_and_measured_again(load):
-    b = Bench()
+def test_leaning_on_the_tool_during_a_reading_is_kept_as_doubted_and_measured_again(b, load):
     leaned = []
 
     def leans(seconds):
@@ -355,9 +342,8 @@ def leans_in_phase(b, phase, number):
     ("phase", "number"), first(1, [("moving to beside", 1), ("taring", 2), ("taring", 3)])
 )
 def test_leaning_in_the_first_motion_or_during_a_tare_is_asked_for_and_not_tared_away(
-    phase, number
+    b, phase, number
 ):
-    b = Bench()
     b.world.hurry = 1.0
     leans_in_phase(b, phase, number)
     measure(b, SHORT)
@@ -367,8 +353,7 @@ def test_leaning_in_the_first_motion_or_during_a_tare_is_asked_for_and_not_tared
 
 
 @pytest.mark.long
-def test_a_first_tare_that_was_leaned_on_ends_the_run_and_says_so():
-    b = Bench()
+def test_a_first_tare_that_was_leaned_on_ends_the_run_and_says_so(b):
     leans_in_phase(b, "taring", 1)
     with pytest.raises(DeviceError, match=r"the tool was touched while the sensor was tared"):
         measure(b, SHORT)
@@ -376,8 +361,7 @@ def test_a_first_tare_that_was_leaned_on_ends_the_run_and_says_so():
     measure(b, SHORT)  # with a tare of its own
 
 
-def test_leaning_in_most_samples_of_a_reading_and_not_at_its_end_is_measured_again(monkeypatch):
-    b = Bench()
+def test_leaning_in_most_samples_of_a_reading_and_not_at_its_end_is_measured_again(b, monkeypatch):
     taken = []
     averaged = Measurer._averaged
 
@@ -402,8 +386,7 @@ def test_leaning_in_most_samples_of_a_reading_and_not_at_its_end_is_measured_aga
     assert_true(b)
 
 
-def test_a_tool_far_from_its_configuration_is_refused_before_it_is_measured_with():
-    b = Bench()
+def test_a_tool_far_from_its_configuration_is_refused_before_it_is_measured_with(b):
     b.world.tool_mass = 4.0  # [tool] says 0.8 kg, which the controller is told
     with pytest.raises(DeviceError, match=r"asked 3 times") as raised:
         measure(b)
@@ -411,9 +394,8 @@ def test_a_tool_far_from_its_configuration_is_refused_before_it_is_measured_with
 
 
 @pytest.mark.long
-def test_unloaded_readings_that_were_leaned_on_do_not_spoil_the_tool():
+def test_unloaded_readings_that_were_leaned_on_do_not_spoil_the_tool(b):
     """Below what is noticed at once: 5 N to one side in one of five."""
-    b = Bench()
 
     def leans(seconds):
         b.world.extra = np.array([0, 5.0 * (len(b.store.rows) == 2), 0, 0, 0, 0])
@@ -425,8 +407,7 @@ def test_unloaded_readings_that_were_leaned_on_do_not_spoil_the_tool():
 
 
 @pytest.mark.long
-def test_a_load_that_swings_a_little_in_motion_is_let_swing():
-    b = Bench()
+def test_a_load_that_swings_a_little_in_motion_is_let_swing(b):
 
     def swings(one):
         b.world.hurry = 1.0 if b.world.load == "3kg" else 20.0
@@ -440,9 +421,8 @@ def test_a_load_that_swings_a_little_in_motion_is_let_swing():
 
 
 @pytest.mark.long
-def test_who_bears_a_part_of_a_heavy_load_in_motion_is_noticed_though_it_may_swing():
+def test_who_bears_a_part_of_a_heavy_load_in_motion_is_noticed_though_it_may_swing(b):
     """30 N from below a weight of 59 N: less than it may pull to the side while it swings."""
-    b = Bench()
     borne = []
 
     def bears(one):
@@ -461,8 +441,7 @@ def test_who_bears_a_part_of_a_heavy_load_in_motion_is_noticed_though_it_may_swi
 
 
 @pytest.mark.long
-def test_a_load_that_stays_wrong_ends_the_run():
-    b = Bench()
+def test_a_load_that_stays_wrong_ends_the_run(b):
     falls_in_motion(b, "none", "none", "none")
     with pytest.raises(DeviceError, match=r"asked 3 times to hang 3kg.*--resume$"):
         measure(b)
@@ -472,8 +451,7 @@ def test_a_load_that_stays_wrong_ends_the_run():
 # devices that repeat themselves
 
 
-def test_a_tracker_whose_target_does_not_move_with_the_arm_is_named_before_any_reading():
-    b = Bench()
+def test_a_tracker_whose_target_does_not_move_with_the_arm_is_named_before_any_reading(b):
     still = b.world.position()
     b.world.position = lambda: still
     with pytest.raises(DeviceError, match="repeats an old reading, or follows a reflector"):
@@ -481,8 +459,7 @@ def test_a_tracker_whose_target_does_not_move_with_the_arm_is_named_before_any_r
     assert b.store.rows == []
 
 
-def test_a_tracker_that_repeats_one_measurement_is_named():
-    b = Bench()
+def test_a_tracker_that_repeats_one_measurement_is_named(b):
     kept = []
 
     def repeats(one):
@@ -498,9 +475,8 @@ def test_a_tracker_that_repeats_one_measurement_is_named():
 
 
 @pytest.mark.parametrize("good", first(1, [2, 8]))
-def test_a_tracker_that_keeps_to_the_place_of_the_last_pose_is_named(good):
+def test_a_tracker_that_keeps_to_the_place_of_the_last_pose_is_named(b, good):
     """The reading that it repeats is doubted too, until the tracker's place vouches for it."""
-    b = Bench()
     kept = []
 
     def stuck(place):
@@ -518,9 +494,8 @@ def test_a_tracker_that_keeps_to_the_place_of_the_last_pose_is_named(good):
 
 
 @pytest.mark.long
-def test_stored_readings_of_a_stuck_tracker_do_not_keep_a_campaign_from_going_on():
+def test_stored_readings_of_a_stuck_tracker_do_not_keep_a_campaign_from_going_on(b):
     """As older versions stored them: four right ones, then three at one and the same place."""
-    b = Bench()
     plan = usual_plan()
     interrupt(b, 7, plan)
     step, reading, _ = b.store.rows[3]
@@ -530,8 +505,7 @@ def test_stored_readings_of_a_stuck_tracker_do_not_keep_a_campaign_from_going_on
     assert len(measure(b, plan)) == len(plan.steps)
 
 
-def test_a_force_sensor_that_repeats_itself_is_named():
-    b = Bench()
+def test_a_force_sensor_that_repeats_itself_is_named(b):
     changed(b.rig.force, "average", lambda one: replace(one, covariance=np.zeros((6, 6))))
     with pytest.raises(DeviceError, match="frames are the same to the last digit"):
         measure(b)

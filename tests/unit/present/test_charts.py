@@ -9,14 +9,13 @@ import pytest
 from hilcal import numbers
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification.background import FamilySize
-from hilcal.identification.baseline import baseline
-from hilcal.identification.fit import fit
 from hilcal.present import charts
 from hilcal.present import charts as style
 from hilcal.present.charts import MOST_FAMILIES
 from hilcal.present.document import says
 from hilcal.present.story import LEVEL_NAMES, regressor, round_factor
 from tests.support.campaigns import campaign
+from tests.support.fit_cases import based
 from tests.support.picture import contrast
 from tests.support.viewer_story import ANGLE, LOAD, story
 
@@ -24,7 +23,7 @@ from tests.support.viewer_story import ANGLE, LOAD, story
 @cache
 def judged():
     made = campaign("joint_tilt_compliance", "deflection", poses=12, strength=6.0)
-    return diagnose(fit(baseline(made.cell, made.readings, made.mode), made.readings, made.mode))
+    return diagnose(based(made.cell, made.readings, made.mode))
 
 
 @pytest.fixture(scope="module")

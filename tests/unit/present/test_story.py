@@ -9,8 +9,6 @@ import pytest
 from hilcal.diagnosis.residual_regression import Dependence
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.errors import InputError
-from hilcal.identification.baseline import baseline
-from hilcal.identification.fit import fit
 from hilcal.identification.full_prediction import full_prediction
 from hilcal.identification.linearisation import HeldOut
 from hilcal.present.html.report import left_out_errors
@@ -18,18 +16,15 @@ from hilcal.present.story import Chapter, build_story, curve, of_left_out, pose_
 from hilcal.refinement import add
 from hilcal.robot.chain import evaluate
 from tests.support.cli_cases import rehearsal
+from tests.support.fit_cases import based
 from tests.unit.diagnosis.test_residual_regression import hidden
-
-
-def fitted(cell, readings, mode):
-    return fit(baseline(cell, readings, mode), readings, mode)
 
 
 @cache
 def told(effect):
     """A rehearsed campaign before and after its hidden effect is added."""
     r = rehearsal(effect)
-    first = fitted(r.cell, r.readings, r.mode)
+    first = based(r.cell, r.readings, r.mode)
     second = add(first, r.hidden)
     return build_story(
         [Chapter(4, None, first, diagnose(first)), Chapter(5, r.hidden, second, diagnose(second))]
@@ -60,7 +55,7 @@ def test_a_story_holds_together_and_the_right_suspect_lies_on_the_line_of_slope_
 
 def test_vectors_are_in_base_axes():
     r, story = rehearsal("hysteresis"), told("hysteresis")
-    whitening = full_prediction(fitted(r.cell, r.readings, r.mode)).whitening
+    whitening = full_prediction(based(r.cell, r.readings, r.mode)).whitening
     expected = whitening.raw(r.readings.value) @ r.world.registration[:3, :3]
     # Deflections leave the base's turning open by what the closed form knows, some mrad.
     off = np.linalg.norm(story.measured - expected, axis=1)
@@ -79,7 +74,7 @@ def test_arrows_start_at_the_nominal_target():
 @cache
 def unknown():
     c = hidden("dq2 = sin 3 q4", "absolute", 0, 1.5)
-    return diagnose(fitted(c.cell, c.readings, c.mode))
+    return diagnose(based(c.cell, c.readings, c.mode))
 
 
 def test_an_unknown_effect_has_a_curve_in_units_for_people():
@@ -130,7 +125,7 @@ def test_gross_errors_are_shown_as_well():
     r = rehearsal("nothing")
     value = r.readings.value.copy()
     value[17] += 0.004
-    found = fitted(r.cell, replace(r.readings, value=value), "absolute")
+    found = based(r.cell, replace(r.readings, value=value), "absolute")
     assert found.outlier.any()
     story = build_story([Chapter(1, None, found, None)])
     assert len(story) == len(value)
@@ -149,7 +144,7 @@ def test_gross_errors_are_shown_as_well():
 def test_other_readings_do_not_make_one_story():
     r = rehearsal("nothing")
     modes = ("absolute", "deflection")
-    chapters = [Chapter(1, None, fitted(r.cell, r.readings, mode), None) for mode in modes]
+    chapters = [Chapter(1, None, based(r.cell, r.readings, mode), None) for mode in modes]
     with pytest.raises(InputError, match="other readings"):
         build_story(chapters)
     with pytest.raises(InputError, match="identify"):

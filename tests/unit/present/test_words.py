@@ -18,8 +18,6 @@ from hilcal.diagnosis.recorded import ROW_ORDER
 from hilcal.diagnosis.residual_regression import Dependence
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.options import typical_compliances
-from hilcal.identification.baseline import baseline
-from hilcal.identification.fit import fit
 from hilcal.identification.fit_document import to_json
 from hilcal.identification.full_prediction import error_before, full_prediction
 from hilcal.identification.linearisation import linearise
@@ -29,6 +27,7 @@ from hilcal.present.story import Chapter, build_story
 from hilcal.present.verdict import message
 from hilcal.present.viewer import campaign as viewer
 from tests.support.campaigns import campaign, cell_of, noiseless, plan, with_noise, world_of
+from tests.support.fit_cases import based
 
 # numbers
 
@@ -116,7 +115,7 @@ def test_a_small_p_value_is_written_in_one_way(p, written):
 @cache
 def fitted(mode, effect="transmission_error"):
     c = campaign(effect, mode, 1, poses=12, strength=3.0)
-    return fit(baseline(c.cell, c.readings, c.mode), c.readings, c.mode)
+    return based(c.cell, c.readings, c.mode)
 
 
 @pytest.fixture(scope="module")
@@ -228,7 +227,7 @@ def drifting(strength):
     along = np.linspace(-1, 1, len(r))[:, None] * np.array([0.0, 0.0, strength])
     states = replace(r.states, time=None, load_time=None)
     r = replace(r, value=r.value + along, states=states)
-    return diagnose(fit(baseline(cell, r, "absolute"), r, "absolute"))
+    return diagnose(based(cell, r, "absolute"))
 
 
 def test_row_order_stands_for_the_time_where_there_is_none():
@@ -239,7 +238,7 @@ def test_row_order_stands_for_the_time_where_there_is_none():
     assert order.share > 0.5
     assert order.group == "time and air"
     c = campaign(plan_seed=0)
-    timed = fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute")
+    timed = based(c.cell, c.readings, "absolute")
     assert ROW_ORDER not in {v.variable for v in misfit_breakdown(linearise(timed))}
 
 
@@ -259,7 +258,7 @@ def test_what_the_pose_alone_predicts_is_said_so(shown):
     kind = r.pose * 10 + r.load  # so that only repeats have the error in common
     off = 1e-4 * rng.standard_normal((int(kind.max()) + 1, 3))[kind]
     r = replace(r, value=r.value + off)
-    d = diagnose(fit(baseline(cell, r, "absolute"), r, "absolute"))
+    d = diagnose(based(cell, r, "absolute"))
     assert d.verdict == "unknown_effect"
     assert d.repeated_share > 0.9
     same = f"{100 * d.repeated_share:.0f} % of the misfit is the same"

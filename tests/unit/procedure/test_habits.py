@@ -4,16 +4,15 @@ from dataclasses import replace
 
 import pytest
 
-from hilcal.config import load_config
 from hilcal.config.cell import Target, Tool
 from hilcal.config.sections import Obstacle
-from hilcal.robot.catalogue import configs_dir
 from hilcal.store.campaign_file import CampaignFile
+from tests.support.campaigns import configuration
 from tests.support.procedure_cases import drawn, small
 
 
 def weights():
-    loads = load_config(configs_dir() / "cells" / "demo_ur10e.toml").loads
+    loads = configuration().loads
     hung = tuple(load for load in loads if load.mass_kg)
     return small().model_copy(update={"loads": hung, "force_sensor": None})
 

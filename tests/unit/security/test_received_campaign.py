@@ -10,13 +10,13 @@ from dataclasses import replace
 import pytest
 
 from hilcal.calibration.handover import urdf
-from hilcal.config import load_config
 from hilcal.errors import InputError
 from hilcal.readings.covariance import COVERS, WHOLE
 from hilcal.robot.catalogue import load_arm
 from hilcal.store import rows
 from hilcal.store.campaign_file import CampaignFile
-from tests.support.cli_cases import CELL, ok, refused, rehearsal
+from tests.support.campaigns import configuration
+from tests.support.cli_cases import ok, refused, rehearsal
 from tests.support.cli_cases import run as run_of
 from tests.unit.data.test_campaign import REVISION
 
@@ -60,7 +60,7 @@ def make(path, config, base=""):
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory):
     path = tmp_path_factory.mktemp("plain") / "run.hilcal"
-    return make(path, load_config(CELL).to_json()).read_bytes()
+    return make(path, configuration().to_json()).read_bytes()
 
 
 @pytest.fixture
@@ -164,7 +164,7 @@ def test_a_pipe_in_the_place_of_a_campaign_is_not_waited_for(tmp_path, capsys):
 
 
 def own_robot(tmp_path, model):
-    config = json.loads(load_config(CELL).to_json())
+    config = json.loads(configuration().to_json())
     config["robot"]["model"] = model
     return make(tmp_path / "run.hilcal", json.dumps(config), str(tmp_path / "gone"))
 

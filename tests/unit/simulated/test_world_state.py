@@ -29,6 +29,11 @@ from tests.support.living_cell import (
 )
 
 
+@pytest.fixture
+def cell(tmp_path):
+    return life(tmp_path)
+
+
 @pytest.mark.parametrize(("load", "wrench"), [(None, np.zeros(6)), ("5kg", WEIGHT), ("pull", PULL)])
 def test_the_truth_is_the_equilibrium_of_the_state(tmp_path, load, wrench):
     rng = np.random.default_rng(11)
@@ -62,8 +67,7 @@ def test_the_encoders_see_neither_slip_nor_elasticity(tmp_path):
     assert abs(spread / 2e-6 - 1.0) < 5.0 / np.sqrt(2 * read.size)
 
 
-def test_a_resting_arm_is_not_computed_anew_but_its_encoders_are_read(tmp_path):
-    cell = life(tmp_path)
+def test_a_resting_arm_is_not_computed_anew_but_its_encoders_are_read(cell, tmp_path):
     first = cell.rest_at(Q)
     second = cell.look()
     assert same(first["target"], second["target"])
@@ -90,8 +94,7 @@ def slip_of(cell):
 # repeatability
 
 
-def test_the_slip_stays_until_the_next_arrival_and_comes_new_with_it(tmp_path):
-    cell = life(tmp_path)
+def test_the_slip_stays_until_the_next_arrival_and_comes_new_with_it(cell, tmp_path):
     first = cell.rest_at(Q)["flange"].copy()
     cell.board.write("arm", moving=1.0, q=Q + 0.1)
     on_the_way = cell.look()["flange"]
@@ -153,8 +156,7 @@ def test_the_sensor_feels_the_weight_of_tool_and_load_in_its_own_axes(tmp_path):
 # what the people in the cell do
 
 
-def test_hanging_is_true_at_once_and_dated(tmp_path):
-    cell = life(tmp_path)
+def test_hanging_is_true_at_once_and_dated(cell, tmp_path):
     up = cell.rest_at(Q)["flange"][2, 3]
     assert cell.living.hang("5kg") == "5kg"
     truth = cell.board.read("truth")
@@ -166,8 +168,7 @@ def test_hanging_is_true_at_once_and_dated(tmp_path):
     assert cell.board.read("truth")["flange"][2, 3] == up
 
 
-def test_a_mistake_is_made_once_and_told(tmp_path):
-    cell = life(tmp_path)
+def test_a_mistake_is_made_once_and_told(cell, tmp_path):
     cell.living.mistake("pull")
     assert cell.living.hang("5kg") == "pull"
     assert cell.board.read("truth")["load"] == 2
@@ -182,8 +183,7 @@ def test_a_mistake_is_made_once_and_told(tmp_path):
     ]
 
 
-def test_pushing_adds_to_the_load(tmp_path):
-    cell = life(tmp_path)
+def test_pushing_adds_to_the_load(cell, tmp_path):
     cell.living.hang("5kg")
     lean = np.array([5.0, -7.0, 9.0, 1.0, 2.0, -1.0])
     cell.living.push(lean.tolist())
@@ -239,8 +239,7 @@ def test_a_pose_without_equilibrium_is_logged_and_the_world_lives_on(tmp_path):
 @pytest.mark.parametrize(
     "wrong", [[1.0], [np.nan] * 6, [0.0, 0.0, 1e9, 0.0, 0.0, 0.0], [[0.0] * 6]]
 )
-def test_what_nobody_can_push_is_refused(tmp_path, wrong):
-    cell = life(tmp_path)
+def test_what_nobody_can_push_is_refused(cell, tmp_path, wrong):
     with pytest.raises(InputError, match="valid: six numbers"):
         cell.living.push(wrong)
     with pytest.raises(InputError, match="valid: six numbers"):
@@ -249,15 +248,13 @@ def test_what_nobody_can_push_is_refused(tmp_path, wrong):
         cell.living.swing([1.0] * 6, period=1.0, decay=0.0)
 
 
-def test_an_unknown_load_is_refused_with_the_known_ones(tmp_path):
-    cell = life(tmp_path)
+def test_an_unknown_load_is_refused_with_the_known_ones(cell, tmp_path):
     for refused in (cell.living.hang, cell.living.mistake):
         with pytest.raises(InputError, match=r'no load \'5 kg\' \(did you mean "5kg"\?\); valid: '):
             refused("5 kg")
 
 
-def test_a_load_swings_for_a_while_and_rests_where_it_should(tmp_path):
-    cell = life(tmp_path)
+def test_a_load_swings_for_a_while_and_rests_where_it_should(cell, tmp_path):
     cell.rest_at(Q)
     cell.living.swing([0.0, 0.0, 20.0, 0.0, 0.0, 0.0], period=1e-3, decay=0.2)  # world s
     cell.living.hang("5kg")

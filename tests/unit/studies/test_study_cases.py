@@ -9,8 +9,6 @@ from hilcal.config import load_config
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.drivers.simulated.injected_effects import EFFECTS
 from hilcal.errors import InputError
-from hilcal.identification.baseline import baseline
-from hilcal.identification.fit import fit
 from hilcal.readings.whitening import whitening
 from hilcal.robot.catalogue import configs_dir
 from studies.diagnosis import intervals
@@ -23,6 +21,7 @@ from studies.study_cases import (
 from studies.study_more import measure_more, suspects
 from studies.unmodelled_laws import LAWS, law_named, shift
 from tests.support.effect_cases import make
+from tests.support.fit_cases import based
 
 
 def config():
@@ -134,7 +133,7 @@ def test_true_parameters_have_the_program_s_names():
 
 def test_intervals_hold_true_parameters_and_no_others():
     c = study_case(config(), "ur10e", "absolute", (), 0.0, 1)
-    f = fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute")
+    f = based(c.cell, c.readings, "absolute")
     (told,) = intervals(f, c.world.truth)
     assert (told.effect, told.parameters) == ("joint_compliance", 6)
     assert told.inside >= 4
@@ -144,7 +143,7 @@ def test_intervals_hold_true_parameters_and_no_others():
 
 
 def diagnosed(c):
-    return diagnose(fit(baseline(c.cell, c.readings, "deflection"), c.readings, "deflection"))
+    return diagnose(based(c.cell, c.readings, "deflection"))
 
 
 @pytest.mark.long

@@ -5,12 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilcal.config import load_config
-from hilcal.robot.catalogue import configs_dir
 from studies.change import Case, case, studied_arm
 from studies.change_command import figures_of
+from tests.support.campaigns import configuration
 
-CONFIG = load_config(configs_dir() / "cells" / "demo_ur10e.toml")
+CONFIG = configuration()
 
 
 @pytest.mark.long

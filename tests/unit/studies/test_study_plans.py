@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from hilcal.cell import cell_from_config
-from hilcal.config import load_config
 from hilcal.design.information import reading_covariance
 from hilcal.engine.engine import open_engine
 from studies.plans import DOUBLE, GRID, PARAMETERS, RANDOM, TEST, plans_study
@@ -15,14 +14,15 @@ from studies.plans_errors import Errors, readings_asked
 from studies.plans_kinds import at_random, grid, matching, optimal, scene
 from studies.plans_statistics import Measured, summary
 from studies.plans_table import as_predicted, halved
-from tests.support.cli_cases import CELL, run
+from tests.support.campaigns import configuration
+from tests.support.cli_cases import run
 
 KNOWN = {"base_xyz_m": (-3.0, 0.5, -0.6), "base_rotvec_rad": (0.0, 0.0, 0.4)}
 
 
 def configured(mode="deflection", *, known=False, robust=False):
     """The demo's cell."""
-    config = load_config(CELL)
+    config = configuration()
     planning = {"readings": mode, **({} if robust else {"against": ()})}
     update = {"planning": config.planning.model_copy(update=planning)}
     if known:
