@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 
 from hilcal.errors import DeviceError, InputError
 from hilcal.names import escaped
-from hilcal.readings.readings import Readings, States
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan, Step, load_plan, read_plan
 from hilcal.store.run_log import PLAN, RunLog
 from hilcal.store.schema import transaction
+from tests.support.readings_cases import made
 from tests.support.refusals import edited, refusals, refuses
 
 STEPS = tuple(Step(pose, load, 0) for pose in ("p1", "p2", "p3") for load in ("none", "5kg"))
@@ -22,16 +22,9 @@ MADE = Plan(("p1", "p2", "p3"), np.arange(18.0).reshape(3, 6) / 10, STEPS, {"see
 
 
 def _reading(step):
-    return Readings(
-        states=States(q=MADE.joints(step.pose)[None], wrench=np.zeros((1, 6))),
-        pose=np.zeros(1, dtype=np.int64),
-        load=np.zeros(1, dtype=np.int64),
-        cycle=np.array([step.cycle]),
-        value=np.ones((1, 3)),
-        covariance=1e-10 * np.eye(3)[None],
-        load_names=(step.load,),
-        pose_names=(step.pose,),
-    )
+    names = {"load_names": (step.load,), "pose_names": (step.pose,)}
+    q = MADE.joints(step.pose)[None]
+    return made(q, np.ones((1, 3)), cycle=np.array([step.cycle]), **names)
 
 
 def _campaign(path):

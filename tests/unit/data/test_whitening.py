@@ -14,9 +14,9 @@ from hilcal.readings.covariance import (
     joint_scatter,
     tracker_covariance,
 )
-from hilcal.readings.readings import Readings, States
 from hilcal.readings.whitening import MANY, MODES, inverse_root, measured, whitening
 from hilcal.robot import se3
+from tests.support.readings_cases import made
 
 NOISE = TrackerNoise(10e-6, 0.3e-6, 15e-6, 6e-6, 1e-4)
 
@@ -104,17 +104,8 @@ def random_units(rng, k):
 
 def make_readings(pose, cycle, load, value, covariance):
     """Readings with load 0 the unloaded state."""
-    count = len(pose)
-    return Readings(
-        states=States(q=np.zeros((count, 6)), wrench=np.zeros((count, 6))),
-        pose=pose,
-        load=load,
-        cycle=cycle,
-        value=value,
-        covariance=covariance,
-        load_names=("none", *(f"w{k}" for k in range(1, int(load.max(initial=0)) + 1))),
-        pose_names=tuple(f"P{k}" for k in range(int(pose.max(initial=0)) + 1)),
-    )
+    q = np.zeros((len(pose), 6))
+    return made(q, value, pose=pose, cycle=cycle, load=load, covariance=covariance)
 
 
 def random_readings(rng, m, decades=3.0):

@@ -15,12 +15,13 @@ from hilcal.identification.priors import scales_of
 from hilcal.identification.residual import residual
 from hilcal.identification.solver import minimise, shortened
 from hilcal.model.model import Model
-from hilcal.readings.readings import Readings, States
+from hilcal.readings.readings import States
 from hilcal.readings.whitening import whitening
 from hilcal.regression.normal_equations import TALL
 from hilcal.types import Floats
 from tests.support.campaigns import cell_of
 from tests.support.effect_cases import make
+from tests.support.readings_cases import made
 from tests.support.rows import first
 
 SIGMA = 2e-5
@@ -44,17 +45,8 @@ def case(seed, names, soft=5.0):
     value = model.predict(states, theta).observation.position
     value = value + 2 * SIGMA * np.repeat(rng.normal(size=(POSES, 3)), LOADS, axis=0)
     value = value + SIGMA * rng.normal(size=value.shape)
-    count = len(value)
-    return model, Readings(
-        states=states,
-        pose=np.repeat(np.arange(POSES), LOADS),
-        load=np.tile(np.arange(LOADS), POSES),
-        cycle=np.zeros(count, dtype=np.int64),
-        value=value,
-        covariance=np.tile(SIGMA**2 * np.eye(3), (count, 1, 1)),
-        load_names=("none", *(f"pull {k}" for k in range(1, LOADS))),
-        pose_names=tuple(str(k) for k in range(POSES)),
-    )
+    pose, load = np.divmod(np.arange(len(value)), LOADS)
+    return model, made(q, value, wrench=states.wrench, pose=pose, load=load, std=SIGMA)
 
 
 def slope(found):

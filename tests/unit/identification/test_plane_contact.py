@@ -12,13 +12,14 @@ from hilcal.effects.catalogue import installed
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.identification.full_covariance import with_joint_scatter
-from hilcal.readings.readings import ObserverName, Readings, States
+from hilcal.readings.readings import ObserverName, States
 from hilcal.robot import se3
 from hilcal.robot.chain import evaluate
 from hilcal.tables.table import write_table
 from tests.support.campaigns import cell_of, configuration, plan, true_parameters, world_of
 from tests.support.cli_cases import CELL, ok
 from tests.support.fit_cases import named
+from tests.support.readings_cases import made
 
 STD = 1e-5
 PLATES = {  # a point, and the normal, base axes
@@ -83,17 +84,16 @@ def touched(names, poses, seed, effect=""):
         step = height[:, None] * slope / np.sum(slope**2, axis=1, keepdims=True)
         states = replace(states, q=states.q - step)
     assert np.abs(heights(states.q) - late).max() < 1e-9
-    count, cov = len(q), np.zeros((len(q), 3, 3))
+    cov = np.zeros((len(q), 3, 3))
     cov[:, 0, 0] = STD**2
-    readings = Readings(
-        states=replace(states, observer=plate),
-        pose=np.arange(count),
+    readings = made(
+        states.q,
+        np.zeros((len(q), 3)),
+        wrench=states.wrench,
+        observer=plate,
         load=np.tile(np.arange(3), poses),
-        cycle=np.zeros(count, dtype=np.int64),
-        value=np.zeros((count, 3)),
         covariance=cov,
         load_names=("none", "5kg", "10kg"),
-        pose_names=tuple(f"p{k}" for k in range(count)),
         observers=tuple(ObserverName("gauge", name) for name in names),
     )
     return cell, world, readings
