@@ -20,6 +20,7 @@ from hilcal.tables.table import read_table, write_table
 from hilcal.tables.units import parse_duration, parse_length
 from tests.support.campaigns import cell_of
 from tests.support.readings_cases import made
+from tests.support.refusals import refusals, refuses
 
 
 @pytest.mark.parametrize(
@@ -33,22 +34,9 @@ def test_a_length_or_a_duration(parse, text, number):
     assert math.isclose(parse(text, "--option"), number)
 
 
-@pytest.mark.parametrize(
-    ("text", "why"),
-    [
-        ("0.1", 'has no unit; valid: a length over 0 in m, mm, um, e.g. "0.1 mm"'),
-        ("2 inch", 'has the unit "inch"'),
-        ("short", "is not understood"),
-        ("-1 mm", "is not over 0"),
-        ("0 mm", "is not over 0"),
-        ("1.2.3 mm", "is not understood"),
-        ("1e999 mm", "is not over 0"),  # infinite
-    ],
-)
-def test_anything_else_is_refused_with_its_reason(text, why):
-    with pytest.raises(InputError, match="--limit") as refused:
-        parse_length(text, "--limit")
-    assert why in str(refused.value)
+@refusals("lengths")
+def test_anything_else_is_refused_with_its_reason(case, given):
+    refuses(case, lambda: parse_length(given[:-1], "--limit"))
 
 
 MEASURED = Range("joint 1 angle", "rad", np.radians(-176.0), np.radians(168.0))

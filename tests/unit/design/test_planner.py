@@ -24,7 +24,7 @@ from hilcal.design.planner import (
 from hilcal.design.predicted import predicted
 from hilcal.design.summary import remarks, summarise
 from hilcal.effects.catalogue import installed
-from hilcal.errors import CannotAnswerError, InputError
+from hilcal.errors import CannotAnswerError
 from hilcal.measuring.route import dry_run
 from hilcal.readings.covariance import WHOLE
 from hilcal.store.campaign_file import CampaignFile
@@ -34,6 +34,7 @@ from hilcal.tables.table import write_table
 from tests.support.campaigns import configuration
 from tests.support.cli_cases import ok, quickly_planned, refused, rehearsal, run
 from tests.support.plan_cases import config_of, poses_of
+from tests.support.refusals import check, refusals, refuses
 
 SMALL = {"candidates": 60, "against": ("joint_tilt_compliance",)}
 
@@ -274,18 +275,10 @@ def test_a_plan_after_a_measured_campaign_starts_from_its_reference_pose(tmp_pat
     assert np.array_equal(load_plan(further).joints(REFERENCE), measured.joints(REFERENCE))
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("--criterion", "best"), "valid: D, A, E, K, I, separate"),
-        (("--poses", "0"), "valid: a whole number from 1"),
-        (("--readings", "0"), "valid: a whole number from 1"),
-        (("--seed", "-1"), "0 or more"),
-    ],
-)
-def test_numbers_and_names_that_cannot_be(arguments, words, tmp_path, capsys):
+@refusals("plan_arguments")
+def test_numbers_and_names_that_cannot_be(case, given, tmp_path, capsys):
     cell = cell_file(tmp_path, small())
-    assert words in refused(capsys, 2, "plan", cell, "-o", tmp_path / "p.json", *arguments)
+    check(case, refused(capsys, 2, "plan", cell, "-o", tmp_path / "p.json", *given.split()))
 
 
 @pytest.mark.long
@@ -381,16 +374,7 @@ def test_options_are_those_of_identify():
     assert named == ["j2", "j3", "j4-6"]
 
 
-@pytest.mark.parametrize(
-    ("model", "why"),
-    [
-        (("joint_compliance(joints=2",), r"\[planning\] model: .*missing at the end"),
-        (("joint_compliance(joints=9)",), "there is no joint 9"),
-        (("ghost(joints=2)",), r"\[planning\] model: unknown effect 'ghost'"),
-        (("creep", "creep"), r"\[planning\] model: .*there twice"),
-    ],
-)
-def test_options_that_cannot_be(model, why):
-    config = cell_with(WEIGHT, model=model)
-    with pytest.raises(InputError, match=why):
-        nominal_model(cell_from_config(config), config)
+@refusals("planned_models")
+def test_options_that_cannot_be(case, given):
+    config = cell_with(WEIGHT, model=tuple(given[:-1].split(", ")))
+    refuses(case, lambda: nominal_model(cell_from_config(config), config))

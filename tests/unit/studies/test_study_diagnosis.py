@@ -34,6 +34,7 @@ from studies.diagnosis_rates import (
 from studies.diagnosis_table import report
 from studies.study_cases import effects_shown, laws_shown
 from tests.support.cli_cases import ok, refused
+from tests.support.refusals import check, refusals
 
 
 def asked(**given):
@@ -269,19 +270,6 @@ def test_the_command_gives_the_same_on_any_number_of_processes(capsys):
     assert {c["kind"] for c in one["claims"]} == {"hidden", "nothing"}
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("everything",), "valid: hidden, nothing"),
-        (("--robot", "ur99"), "ur10e"),
-        (("--effect", "hysterisis"), "hysteresis"),
-        (("--readings", "deflection", "--effect", "encoder_offset"), "valid: "),
-        (("--readings", "both"), "deflection, absolute"),
-        (("--strength", "0"), "over 0"),
-        (("--seeds", "0"), "from 1"),
-        (("--jobs", "0"), "from 1"),
-        (("--first-seed", "-1"), "from 0"),
-    ],
-)
-def test_wrong_input_is_refused_in_one_line(capsys, arguments, words):
-    assert words in refused(capsys, 2, "studies", "diagnosis", *arguments)
+@refusals("study_arguments")
+def test_wrong_input_of_a_study_is_refused_in_one_line(case, given, capsys):
+    check(case, refused(capsys, 2, "studies", *given.split()))

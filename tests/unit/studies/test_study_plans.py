@@ -207,22 +207,6 @@ def test_the_command_gives_one_document(capsys):
         assert {s["as_predicted"], s["half"]} <= {"yes", "no", "unclear"}
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("--campaigns", "1"), "at least 2 campaigns"),
-        (("--candidates", "0"), "--candidates 0"),
-        (("--robot", "nobody"), "nobody"),
-        (("nowhere.toml",), "nowhere.toml"),
-    ],
-)
-def test_wrong_input_is_one_line(arguments, words, capsys):
-    done = run(capsys, "studies", "plans", *arguments)
-    assert done.code == 2
-    assert words in done.err
-    assert len(done.err.strip().splitlines()) == 1
-
-
 def studied(config, campaigns):
     cell = cell_from_config(config)
     return plans_study(cell, config, arms(0), campaigns=campaigns, candidates=400)
