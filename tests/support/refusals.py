@@ -14,10 +14,11 @@ import os
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from hilcal.errors import InputError
+from hilcal.errors import HilcalError, InputError
 
 FOLDER = Path(__file__).resolve().parents[1] / "data" / "refusals"
 BLOCK = re.compile(r"^== (.*)\n((?:(?!== |-> ).*\n)*)-> (.*)\n", re.MULTILINE)
@@ -47,12 +48,31 @@ def edited(given: str, **texts: str) -> str:
 
 def refuses(case: tuple[str, str], call: Callable[[], object], path: Path | None = None) -> str:
     """Compare the line that a call is refused with; a path in it is known by its name alone."""
-    with pytest.raises(InputError) as raised:
-        call()
-    assert raised.value.exit_code == 2
-    line = str(raised.value)
+    line = refusal(".", call)
     line = line if path is None else line.replace(str(path), path.name)
     check(case, line)
+    return line
+
+
+def refusal(words: str, call: Callable[..., object], /, *given: Any, **more: Any) -> str:
+    """Call with what is given, which is wrong input: the one line that says so, with these words.
+
+    Args:
+        words: a pattern in the line.
+        call: what is called.
+    """
+    return refusal_of(InputError, words, call, *given, **more)
+
+
+def refusal_of(
+    kind: type[HilcalError], words: str, call: Callable[..., object], /, *given: Any, **more: Any
+) -> str:
+    """The same where another kind of error is to be raised."""
+    with pytest.raises(kind, match=words) as raised:
+        call(*given, **more)
+    assert raised.value.exit_code == kind.exit_code
+    line = str(raised.value)
+    assert "\n" not in line
     return line
 
 

@@ -24,6 +24,7 @@ from studies.change import measured
 from studies.random_campaigns import rehearse
 from tests.support.cli_cases import quickly_planned, stored_readings
 from tests.support.paths import ROOT
+from tests.support.refusals import refusal
 
 CELL = configs_dir() / "cells" / "demo_ur10e.toml"
 WITHOUT_EXAMPLE = {
@@ -144,10 +145,8 @@ def test_wrong_words_are_refused_with_the_valid_ones(site):
     cell = hc.Cell.load(site.cell)
     readings = hc.read_table(site.table, cell)
     model = hc.baseline(cell, readings)
-    with pytest.raises(hc.InputError, match="valid: none, gu, gc"):
-        hc.fit(model, readings, scaling="gx")
-    with pytest.raises(hc.InputError, match="valid: deflection, absolute"):
-        hc.fit(model, readings, readings="relative")
+    refusal("valid: none, gu, gc", hc.fit, model, readings, scaling="gx")
+    refusal("valid: deflection, absolute", hc.fit, model, readings, readings="relative")
 
 
 def test_what_a_console_prints_of_a_value_is_at_most_fifteen_lines(site):

@@ -7,7 +7,6 @@ import pytest
 
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
 from hilcal.drivers.simulated.injected_effects import hide
-from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import linearise
@@ -19,6 +18,7 @@ from tests.support.campaigns import campaign, cell_of, measured, plan, world_of
 from tests.support.diagnosis_cases import fitted
 from tests.support.effect_cases import make
 from tests.support.fit_cases import based, refined
+from tests.support.refusals import refusal
 
 
 def check_steps(r):
@@ -127,12 +127,9 @@ def test_an_effect_cannot_be_added_twice_nor_without_its_columns_nor_unknown():
     c = campaign(plan_seed=0)
     readings = replace(c.readings, states=replace(c.readings.states, approach=None))
     found = based(c.cell, readings, "absolute")
-    with pytest.raises(InputError, match="joint_compliance is in the model already"):
-        add(found, "joint_compliance")
-    with pytest.raises(InputError, match="unknown effect 'gear_wear'"):
-        add(found, "gear_wear")
-    with pytest.raises(InputError, match="hysteresis needs approach"):
-        add(found, "hysteresis")
+    refusal("joint_compliance is in the model already", add, found, "joint_compliance")
+    refusal("unknown effect 'gear_wear'", add, found, "gear_wear")
+    refusal("hysteresis needs approach", add, found, "hysteresis")
 
 
 def test_it_starts_from_any_model():

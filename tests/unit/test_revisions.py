@@ -21,6 +21,7 @@ from hilcal.store.rows import content_hash
 from tests.support.campaigns import configuration
 from tests.support.cli_cases import CELL, rehearsal, stored_readings
 from tests.support.fit_cases import based
+from tests.support.refusals import refusal
 
 
 def baseline_fit(r):
@@ -77,20 +78,17 @@ def test_other_readings_are_refused(tmp_path):
     r = rehearsal("nothing")
     found = baseline_fit(r)
     record = record_of(r, found)
-    with pytest.raises(InputError, match="identify again"):
-        restore(record, r.cell, r.readings[:-1])
+    refusal("identify again", restore, record, r.cell, r.readings[:-1])
     moved = replace(r.readings, value=r.readings.value + 1e-6)
     with Campaign.open(stored_readings(tmp_path / "run.hilcal", moved, r.config)) as run:
-        with pytest.raises(InputError, match="other readings"):
-            run.append(found)
+        refusal("other readings", run.append, found)
         assert run.latest() is None
 
 
 def test_a_file_that_cannot_be_used_is_closed_again(tmp_path):
     path = tmp_path / "empty.hilcal"
     CampaignFile.create(path, configuration().to_json(), str(CELL.parent), "test").close()
-    with pytest.raises(InputError, match="no readings"):
-        Campaign.open(path)
+    refusal("no readings", Campaign.open, path)
     path.unlink()
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from hilcal.errors import InputError
 from hilcal.whole_file import replace_file, replacing
 from tests.support.paths import ROOT
+from tests.support.refusals import refusal
 
 STRAIGHT = {
     "hilcal/whole_file.py": "it is what all others use",
@@ -119,8 +119,7 @@ def test_a_file_that_could_not_be_written_is_as_it_was(tmp_path):
     for before in (None, "old"):
         if before is not None:
             path.write_text(before)
-        with pytest.raises(InputError, match=r"a\.csv: cannot be written \(No space"):
-            fill()
+        refusal(r"a\.csv: cannot be written \(No space", fill)
         assert [p.name for p in tmp_path.iterdir()] == ([] if before is None else ["a.csv"])
         assert before is None or path.read_text() == before
 
@@ -162,13 +161,10 @@ def test_what_cannot_be_written_is_one_line(tmp_path):
     loop = tmp_path / "loop"
     loop.symlink_to(loop)
     for place in (tmp_path, tmp_path / "none" / "a", loop, tmp_path / ("a" * 300)):
-        with pytest.raises(InputError, match="cannot be written"):
-            replace_file(place, "x")
-    with pytest.raises(InputError, match="not valid Unicode"):
-        replace_file(tmp_path / "a", "\ud800")
+        refusal("cannot be written", replace_file, place, "x")
+    refusal("not valid Unicode", replace_file, tmp_path / "a", "\ud800")
     replace_file(tmp_path / "a", "first", must_be_new=True)
-    with pytest.raises(InputError, match="exists; choose another name"):
-        replace_file(tmp_path / "a", "second", must_be_new=True)
+    refusal("exists; choose another name", replace_file, tmp_path / "a", "second", must_be_new=True)
     assert (tmp_path / "a").read_text() == "first"
 
 
@@ -177,6 +173,5 @@ def test_a_file_that_may_not_be_written_is_not_replaced(tmp_path):
     path = tmp_path / "a"
     path.write_text("kept")
     path.chmod(0o444)
-    with pytest.raises(InputError, match="Permission denied"):
-        replace_file(path, "x")
+    refusal("Permission denied", replace_file, path, "x")
     assert path.read_text() == "kept"

@@ -15,7 +15,6 @@ from hilcal.calibration.measured import Measured
 from hilcal.calibration.scatter import Scatter
 from hilcal.calibration.storage import from_json, to_json
 from hilcal.calibration.tool import tool_poses
-from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.identification.robot_frames import one_of_each
@@ -25,6 +24,7 @@ from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate
 from hilcal.robot.conventions import with_conventions
 from tests.support.campaigns import campaign, cell_of, plan
+from tests.support.refusals import refusal
 
 POSES = 24
 
@@ -173,11 +173,9 @@ def test_a_file_of_another_kind_is_refused_in_words(tmp_path):
         (json.dumps({k: v for k, v in good.items() if k != "arm"}), "damaged"),
     ]:
         path.write_text(content)
-        with pytest.raises(InputError, match=r"c\.json") as error:
-            Calibration.load(path)
-        assert words in str(error.value)
-    with pytest.raises(InputError, match=r"none\.json"):
-        Calibration.load(tmp_path / "none.json")
+        error = refusal(r"c\.json", Calibration.load, path)
+        assert words in error
+    refusal(r"none\.json", Calibration.load, tmp_path / "none.json")
 
 
 @pytest.mark.parametrize(("effect", "untold"), [("hysteresis", "approach"), ("creep", "load_time")])
@@ -217,8 +215,7 @@ def test_wrong_input_is_refused_in_words():
         (lambda: c.predict(np.zeros(6), tool=np.zeros((4, 4))), "tool is no"),
         (lambda: c.predict(np.zeros(6), std=False).std_m, "std=True"),
     ]:
-        with pytest.raises(InputError, match=words):
-            call()
+        refusal(words, call)
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-320, 1e-200, 1e-12])

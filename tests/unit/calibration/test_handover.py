@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from hilcal.calibration.handover import corrected, ur_kinematics
-from hilcal.errors import CannotAnswerError, InputError
+from hilcal.errors import CannotAnswerError
 from hilcal.robot.catalogue import load_arm, robot_names
 from hilcal.robot.chain import Deviation
+from tests.support.refusals import refusal, refusal_of
 from tests.unit.calibration.other_eyes import flanges, ur_origins
 from tests.unit.calibration.test_calibration import calibrated, fresh
 
@@ -55,9 +56,9 @@ def test_the_nominal_arms_have_the_origins_of_ur_description(name):
 
 
 def test_deflections_and_foreign_arms_are_refused_in_words():
-    with pytest.raises(CannotAnswerError, match="--readings absolute"):
-        corrected(calibrated("none", "deflection"))
+    refusal_of(
+        CannotAnswerError, "--readings absolute", corrected, calibrated("none", "deflection")
+    )
     arm = load_arm("ur10e")
     foreign = replace(arm, name="kr6")
-    with pytest.raises(InputError, match="kr6: UR's kinematics file is for UR arms"):
-        ur_kinematics(foreign, foreign)
+    refusal("kr6: UR's kinematics file is for UR arms", ur_kinematics, foreign, foreign)

@@ -18,7 +18,7 @@ from hilcal.robot.catalogue import load_arm
 from hilcal.robot.conventions import with_conventions
 from tests.support.description_files import MJCF, SDF
 from tests.support.maker_arms import maker_arm, urdf_of
-from tests.support.refusals import edited, refusals, refuses
+from tests.support.refusals import edited, refusal, refusals, refuses
 from tests.unit.calibration.other_eyes import by_pinocchio, flanges, turned
 
 Q = np.random.default_rng(1).uniform(-2, 2, (12, 6))
@@ -214,8 +214,7 @@ def test_ur_s_calibration_conf_makes_the_controller_s_rows_the_arm(tmp_path):
         place = place @ turn @ moved @ bend
     np.testing.assert_allclose(place, poses(new), atol=1e-8)  # d of hundreds of metres cancel
     other = replace(nominal, name="kr10")
-    with pytest.raises(InputError, match="is for UR arms, the campaign has kr10"):
-        correct(path, other, new)
+    refusal("is for UR arms, the campaign has kr10", correct, path, other, new)
 
 
 def test_a_matlab_function_builds_the_arm(arm):

@@ -7,12 +7,10 @@ from datetime import datetime, timedelta
 from typing import Any
 
 import numpy as np
-import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from hilcal.errors import InputError
 from hilcal.readings.covariance import TrackerNoise, tracker_covariance
 from hilcal.robot.se3 import rotation
 from hilcal.tables.mapped import import_mapped
@@ -21,6 +19,7 @@ from hilcal.tables.propose import propose
 from hilcal.tables.sniff import sniff
 from hilcal.toml import check_section
 from tests.support.readings_cases import make_arm
+from tests.support.refusals import refusal
 
 ARM = make_arm()
 NOISE = TrackerNoise(10e-6, 0.3e-6, 15e-6, 6e-6, 1e-4)
@@ -222,8 +221,7 @@ def test_three_targets_side_by_side(tmp_path):
     found = propose(path).proposal.sections
     assert found["position"]["columns"] == names
     assert found["position"]["targets"] == ["1", "2", "3"]
-    with pytest.raises(InputError, match=r"\[\[tool.targets\]\]"):
-        mapped(path, mapping)
+    refusal(r"\[\[tool.targets\]\]", mapped, path, mapping)
 
 
 def test_angles_that_the_encoders_reported(tmp_path):
@@ -238,8 +236,7 @@ def test_angles_that_the_encoders_reported(tmp_path):
         "joints": {"columns": Q, "unit": "rad"},
         "pose": {"column": "pose"},
     }
-    with pytest.raises(InputError, match="row 3: pose 'P0' commands joint 1"):
-        mapped(path, mapping)
+    refusal("row 3: pose 'P0' commands joint 1", mapped, path, mapping)
     mapping["joints"]["reported"] = True
     states = mapped(path, mapping).readings.states
     np.testing.assert_allclose(states.q, q[np.arange(12) // 2 * 2], atol=1e-9)

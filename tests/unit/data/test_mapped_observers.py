@@ -17,6 +17,7 @@ from tests.support.campaigns import cell_of, configuration, true_parameters
 from tests.support.cli_cases import CELL, ok
 from tests.support.fit_cases import based, named
 from tests.support.observer_cases import observed
+from tests.support.refusals import refusal
 
 JOINTS = [f"Achse {k} [°]" for k in range(1, 7)]
 MOMENTS = [f"Drehmoment A{k} [Nmm]" for k in range(1, 7)]
@@ -114,8 +115,7 @@ def test_stations_and_heights_beside_distances(tmp_path):
     same(found, c.readings)
     np.testing.assert_allclose(found.covariance[found.scalar, 0, 0], 1e-10, rtol=1e-6)
     np.testing.assert_allclose(found.covariance[~found.scalar][:, 1, 1], 9e-10, rtol=1e-6)
-    with pytest.raises(InputError, match=r"nothing states the noise of gauge G"):
-        imported(tmp_path / "t.csv", BAR | more)
+    refusal(r"nothing states the noise of gauge G", imported, tmp_path / "t.csv", BAR | more)
 
 
 @pytest.mark.parametrize("who", [["A", "B", "C"], ["S1", "S2", "A", "G"]])
@@ -158,5 +158,4 @@ def test_rows_without_a_reading_are_left_out_and_a_negative_deviation_is_named(t
     assert len(imported(tmp_path / "t.csv", BAR)) == len(c.readings) - 1
     lines[5] = ";".join([*cells[:-1], "-3"])
     (tmp_path / "t.csv").write_text("\n".join(lines))
-    with pytest.raises(InputError, match=r"row 6, column 'Abstand .*deviation is below 0"):
-        imported(tmp_path / "t.csv", BAR)
+    refusal(r"row 6, column 'Abstand .*deviation is below 0", imported, tmp_path / "t.csv", BAR)

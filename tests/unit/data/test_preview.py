@@ -5,12 +5,12 @@ from datetime import datetime, timedelta
 import numpy as np
 import pytest
 
-from hilcal.errors import InputError
 from hilcal.tables.mapping import Mapping, load_mapping
 from hilcal.tables.propose import propose
 from hilcal.toml import check_section, read_toml
 from tests.support.foreign_tables import campaign, lines, write
 from tests.support.paths import ROOT
+from tests.support.refusals import refusal
 
 C = campaign()
 N = len(C.q)
@@ -142,5 +142,4 @@ def test_lines_that_are_no_readings(tmp_path):
 
 def test_only_text(tmp_path):
     path = write(tmp_path / "t.csv", "name,colour\nbob,red\n")
-    with pytest.raises(InputError, match="no columns of numbers"):
-        propose(path)
+    refusal("no columns of numbers", propose, path)

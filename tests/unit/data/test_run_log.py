@@ -15,7 +15,7 @@ from hilcal.store.plan import Plan, Step, load_plan, read_plan
 from hilcal.store.run_log import PLAN, RunLog
 from hilcal.store.schema import transaction
 from tests.support.readings_cases import made
-from tests.support.refusals import edited, refusals, refuses
+from tests.support.refusals import edited, refusal, refusal_of, refusals, refuses
 
 STEPS = tuple(Step(pose, load, 0) for pose in ("p1", "p2", "p3") for load in ("none", "5kg"))
 MADE = Plan(("p1", "p2", "p3"), np.arange(18.0).reshape(3, 6) / 10, STEPS, {"seed": 3})
@@ -76,8 +76,7 @@ def test_a_full_database_stores_all_or_nothing(tmp_path):
             for step in (Step("p1", "none", k) for k in range(100)):
                 log.record(_reading(step), step, {"filler": "x" * 300})
 
-        with pytest.raises(DeviceError, match="make room on the disk"):
-            fill()
+        refusal_of(DeviceError, "make room on the disk", fill)
         stored = campaign.n_readings
     assert 0 < stored < 100
     with CampaignFile.open(path) as campaign:
@@ -110,8 +109,7 @@ def test_what_is_not_a_plan_is_refused_in_one_line(case, given, tmp_path):
 
 
 def test_a_missing_plan_names_the_command(tmp_path):
-    with pytest.raises(InputError, match="hilcal plan"):
-        load_plan(tmp_path / "no.json")
+    refusal("hilcal plan", load_plan, tmp_path / "no.json")
 
 
 def test_an_interrupt_between_a_transaction_s_begin_and_its_block_leaves_nothing(

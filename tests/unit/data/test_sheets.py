@@ -23,6 +23,7 @@ from hilcal.tables.propose import propose
 from hilcal.tables.table import import_table
 from hilcal.toml import check_section
 from tests.support.foreign_tables import campaign
+from tests.support.refusals import refusal
 
 C = campaign(12)
 NOISE = TrackerNoise(10e-6, 0.3e-6, 15e-6, 6e-6, 1e-4)
@@ -116,8 +117,7 @@ def test_a_mat_file(tmp_path, arm):
     np.testing.assert_allclose(x.states.q, C.q)
     np.testing.assert_allclose(x.value[:, :3], C.position)
     np.testing.assert_allclose(x.value[:, 3:], C.attitude.as_rotvec(), atol=1e-9)
-    with pytest.raises(InputError, match="no variable 'Q'"):
-        open_grid(path, FileFormat(variable="Q"))
+    refusal("no variable 'Q'", open_grid, path, FileFormat(variable="Q"))
 
 
 def test_parquet(tmp_path, arm):
@@ -140,8 +140,7 @@ def test_a_missing_package_is_named(name, tmp_path, monkeypatch):
     else:
         parquet.write_table(pyarrow.table({"X": [1.0]}), path)
     monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(InputError, match=r"\w+ is not installed: pip install .hilcal\[tables\]"):
-        open_grid(path, FileFormat())
+    refusal(r"\w+ is not installed: pip install .hilcal\[tables\]", open_grid, path, FileFormat())
 
 
 def _zip(**members):
@@ -167,9 +166,7 @@ def test_what_is_no_table(content, message, tmp_path):
     path = tmp_path / "t.bin"
     path.write_bytes(content)
     for attempt in (lambda: open_grid(path, FileFormat()), lambda: propose(path)):
-        with pytest.raises(InputError, match=message) as error:
-            attempt()
-        assert "\n" not in str(error.value)
+        refusal(message, attempt)
 
 
 def test_an_exchange_table_may_be_a_sheet(tmp_path, arm):
@@ -187,5 +184,4 @@ def test_an_exchange_table_may_be_a_sheet(tmp_path, arm):
     assert one.pose_names == other.pose_names
     out.active.cell(3, 9, "abc")
     out.save(sheet)
-    with pytest.raises(InputError, match=r"t.xlsx: row 3, column 'x_m': 'abc' is not a number"):
-        import_table(sheet, arm, NOISE)
+    refusal(r"t.xlsx: row 3, column 'x_m': 'abc' is not a number", import_table, sheet, arm, NOISE)

@@ -13,7 +13,7 @@ from hilcal.errors import InputError
 from hilcal.readings.covariance import TrackerNoise, tracker_covariance
 from hilcal.tables.table import read_table, write_table
 from tests.support.readings_cases import assert_same, make_arm, readings, simple
-from tests.support.refusals import refusals, refuses
+from tests.support.refusals import refusal, refusals, refuses
 
 ARM = make_arm()
 NOISE = TrackerNoise(10e-6, 0.3e-6, 15e-6, 6e-6)
@@ -110,16 +110,14 @@ def test_covariance_comes_from_the_instrument_when_the_table_has_none(write):
     station = np.array([3.0, 0.0, 0.0])
     x = read_table(path, ARM, NOISE, station)
     np.testing.assert_array_equal(x.covariance, tracker_covariance(x.value, NOISE, station))
-    with pytest.raises(InputError, match=r"no covariance columns .* and no noise"):
-        read_table(path, ARM, None)
+    refusal(r"no covariance columns .* and no noise", read_table, path, ARM, None)
     posed = without(good(), *COVARIANCE)
     path = write([row | {"rx_rad": "0.1", "ry_rad": "0", "rz_rad": "-1"} for row in posed])
     six = replace(NOISE, orientation_std=1e-4)
     x = read_table(path, ARM, six, station)
     expected = tracker_covariance(x.value[:, :3], six, station, m=6)
     np.testing.assert_array_equal(x.covariance, expected)
-    with pytest.raises(InputError, match="orientation_std is 0"):
-        read_table(path, ARM, NOISE, station)
+    refusal("orientation_std is 0", read_table, path, ARM, NOISE, station)
 
 
 def test_repeats_blank_lines_and_order_of_columns_do_not_matter(write):
@@ -140,8 +138,7 @@ def test_bad_tables_are_refused_by_name(case, given, write):
 def test_positions_that_do_not_move_with_the_joints(tmp_path):
     x = simple(20)
     write_table(replace(x, value=1.0 + 1e-4 * x.value), tmp_path / "t.csv")
-    with pytest.raises(InputError, match="all positions lie within"):
-        read_table(tmp_path / "t.csv", ARM, None)
+    refusal("all positions lie within", read_table, tmp_path / "t.csv", ARM, None)
 
 
 def test_row_numbers_count_blank_lines_and_all_blocks(tmp_path):
@@ -150,8 +147,7 @@ def test_row_numbers_count_blank_lines_and_all_blocks(tmp_path):
     lines[8000] = lines[8000].replace(",", ",oops,", 1)
     lines.insert(10, "")
     (tmp_path / "t.csv").write_text("\n".join(lines))
-    with pytest.raises(InputError, match="row 8002 has"):
-        read_table(tmp_path / "t.csv", ARM, None)
+    refusal("row 8002 has", read_table, tmp_path / "t.csv", ARM, None)
 
 
 @pytest.mark.parametrize(("content", "message"), [
@@ -169,25 +165,20 @@ def test_row_numbers_count_blank_lines_and_all_blocks(tmp_path):
 def test_files_of_another_format(tmp_path, content, message):
     path = tmp_path / "t.csv"
     path.write_bytes(content)
-    with pytest.raises(InputError, match=message):
-        read_table(path, ARM, None)
+    refusal(message, read_table, path, ARM, None)
 
 
 def test_other_things_than_a_table(tmp_path, write):
-    with pytest.raises(InputError, match="no such file"):
-        read_table(tmp_path / "absent.csv", ARM, None)
-    with pytest.raises(InputError, match="cannot be read"):
-        read_table(tmp_path, ARM, None)
+    refusal("no such file", read_table, tmp_path / "absent.csv", ARM, None)
+    refusal("cannot be read", read_table, tmp_path, ARM, None)
     base = tmp_path / "base.db"
     connection = sqlite3.connect(base)
     connection.execute("CREATE TABLE t (a)")
     connection.close()
-    with pytest.raises(InputError, match="SQLite"):
-        read_table(base, ARM, None)
+    refusal("SQLite", read_table, base, ARM, None)
     path = write(good())
     path.write_text(path.read_text().splitlines()[0])
-    with pytest.raises(InputError, match="no readings below row 1"):
-        read_table(path, ARM, None)
+    refusal("no readings below row 1", read_table, path, ARM, None)
 
 
 @pytest.mark.parametrize(
@@ -198,6 +189,5 @@ def test_other_things_than_a_table(tmp_path, write):
     ],
 )
 def test_names_that_a_table_cannot_hold_are_not_written(tmp_path, names, message):
-    with pytest.raises(InputError, match=message):
-        write_table(replace(simple(2), **names), tmp_path / "t.csv")
+    refusal(message, write_table, replace(simple(2), **names), tmp_path / "t.csv")
     assert not list(tmp_path.iterdir())

@@ -17,6 +17,7 @@ from hilcal.readings.covariance import (
 from hilcal.readings.whitening import MANY, MODES, inverse_root, measured, whitening
 from hilcal.robot import se3
 from tests.support.readings_cases import made
+from tests.support.refusals import refusal
 
 NOISE = TrackerNoise(10e-6, 0.3e-6, 15e-6, 6e-6, 1e-4)
 
@@ -56,8 +57,7 @@ def test_what_no_instrument_has_is_refused():
         ((1e-5, 0.0, 0.0, 0.0), "transverse_std"),
         ((1e-5, 0.0, 1e-5, 0.0, float("nan")), "orientation_std = nan"),
     ):
-        with pytest.raises(InputError, match=words):
-            TrackerNoise(*figures)
+        refusal(words, TrackerNoise, *figures)
     with pytest.raises(InputError, match="reading 2 lies at the tracker's station"):
         tracker_covariance(np.array([[1.0, 0, 0], [1.0, 1, 1]]), NOISE, (1.0, 1.0, 1.0))
     with pytest.raises(InputError, match="orientation_std is 0"):

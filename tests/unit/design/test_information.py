@@ -53,6 +53,7 @@ from tests.support.fit_cases import predicted as read
 from tests.support.observer_cases import NORMAL, POINTS, STD, observed
 from tests.support.plan_cases import config_of, everything_once, poses_in, poses_of
 from tests.support.reflector_cases import NAMES, OFFSETS, reflectors
+from tests.support.refusals import refusal
 from tests.support.rows import first
 
 
@@ -180,8 +181,7 @@ def test_planning_on_predicts_the_fit_to_all_readings():
 def test_a_fit_that_is_not_whitened_is_refused():
     c = campaign(mode="absolute", poses=8, registration_known=True)
     found = fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute", "none")
-    with pytest.raises(InputError, match="scaling gc, this one has none"):
-        after(found, config_of())
+    refusal("scaling gc, this one has none", after, found, config_of())
 
 
 @pytest.mark.parametrize("m", first(1, [3, 6]))
@@ -247,8 +247,7 @@ def test_problems_that_cannot_be():
     with pytest.raises(CannotAnswerError, match="no candidate pose may be taken"):
         problem(a, config, np.empty((0, 6)))
     bare = config.model_copy(update={"loads": ()})
-    with pytest.raises(InputError, match=r"needs \[\[loads\]\]"):
-        problem(a, bare, poses_of(3))
+    refusal(r"needs \[\[loads\]\]", problem, a, bare, poses_of(3))
     with pytest.raises(InputError, match=r"model: unknown effect 'joint_complience'.*valid:"):
         nominal_model(cell, config_of(model=("joint_complience",)))
     wrong = config_of(against=("ghost",))
@@ -388,8 +387,7 @@ def test_named_work_and_a_box():
     a = nominal_model(CELL, named)
     assert prediction_poses(a, named, poses_of(9, 3)).q == pytest.approx(q)
     short = config_of("absolute", work_q_rad=((0.0, 1.0),))
-    with pytest.raises(InputError, match="2 values; ur10e has 6 joints"):
-        prediction_poses(a, short, q)
+    refusal("2 values; ur10e has 6 joints", prediction_poses, a, short, q)
     low, high = (0.3, -0.6, 0.2), (1.0, 0.6, 0.9)
     box = config_of("absolute", work_min_m=low, work_max_m=high)
     work = prediction_poses(a, box, np.empty((0, 6)), lambda x: x[:, 0] > 0.1)
@@ -446,8 +444,7 @@ def test_a_prior_that_knows_nothing_changes_no_prediction():
 
 def test_of_another_arm_is_refused():
     p = learnt()
-    with pytest.raises(InputError, match="nominal links"):
-        problem_with(carried_prior(replace(p, links=1.01 * p.links)))
+    refusal("nominal links", problem_with, carried_prior(replace(p, links=1.01 * p.links)))
 
 
 CASES = {
@@ -504,8 +501,7 @@ def test_devices_read_positions(tmp_path):
         'frame = "tracker"', 'driver = "geocom"\nport = "x"\nobserves = "distance"'
     )
     (tmp_path / "cell.toml").write_text(text)
-    with pytest.raises(InputError, match=r'observes = "distance" together with driver'):
-        load_config(tmp_path / "cell.toml")
+    refusal(r'observes = "distance" together with driver', load_config, tmp_path / "cell.toml")
 
 
 @pytest.mark.parametrize("mode", MODES)

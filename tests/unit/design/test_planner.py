@@ -34,7 +34,7 @@ from hilcal.tables.table import write_table
 from tests.support.campaigns import configuration
 from tests.support.cli_cases import ok, quickly_planned, refused, rehearsal, run
 from tests.support.plan_cases import config_of, poses_of
-from tests.support.refusals import check, refusals, refuses
+from tests.support.refusals import check, refusal_of, refusals, refuses
 
 SMALL = {"candidates": 60, "against": ("joint_tilt_compliance",)}
 
@@ -339,8 +339,7 @@ def test_confounded_parameters_are_named_together():
 
 def test_a_cell_that_determines_nothing_is_refused():
     config = cell_with(WEIGHT, model=("joint_compliance(joints=1)",))
-    with pytest.raises(CannotAnswerError, match="side pull"):
-        without_undetermined(problem_of(config))
+    refusal_of(CannotAnswerError, "side pull", without_undetermined, problem_of(config))
 
 
 def test_other_parameters_have_plain_words():

@@ -16,6 +16,7 @@ from hilcal.identification.baseline import with_effects
 from hilcal.identification.later_readings import earlier_fit, setting
 from studies.change import measured, remeasured, studied_arm
 from tests.support.campaigns import configuration
+from tests.support.refusals import refusal_of
 from tests.support.rows import first
 
 CONFIG = configuration()
@@ -119,8 +120,7 @@ def test_what_could_not_have_been_seen_is_larger_with_fewer_readings(arm):
 
 def test_too_few_readings_are_refused(arm):
     readings = remeasured(arm.world, arm.loads, 15, np.random.default_rng(1))
-    with pytest.raises(CannotAnswerError, match="measure at least"):
-        setting(arm.earlier, readings[:3], anew=True)
+    refusal_of(CannotAnswerError, "measure at least", setting, arm.earlier, readings[:3], anew=True)
 
 
 def test_columns_that_the_later_readings_lack_are_named(arm):

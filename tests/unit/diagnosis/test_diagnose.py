@@ -12,7 +12,6 @@ from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.drivers.simulated.injected_effects import DEFLECTION_EFFECTS
 from hilcal.effects.catalogue import BUILT_IN
-from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import linearise
@@ -21,6 +20,7 @@ from hilcal.present.verdict import headline, message
 from hilcal.refinement import add
 from tests.support.campaigns import campaign, noiseless, plan, with_noise
 from tests.support.diagnosis_cases import fitted
+from tests.support.refusals import refusal
 
 MODES = ("absolute", "deflection")
 NAMES = tuple(
@@ -174,8 +174,7 @@ def test_where_names_each_variable_once_and_in_order():
 def test_a_diagnosis_needs_whitened_residuals():
     c = campaign(plan_seed=0)
     found = fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute", "none")
-    with pytest.raises(InputError, match="needs scaling gc, this fit has none"):
-        diagnose(found)
+    refusal("needs scaling gc, this fit has none", diagnose, found)
 
 
 def test_effects_that_need_missing_columns_are_no_suspects():

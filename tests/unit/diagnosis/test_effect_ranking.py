@@ -36,6 +36,7 @@ from tests.support.campaigns import NOTHING, campaign, configuration, measured, 
 from tests.support.diagnosis_cases import fitted
 from tests.support.fit_cases import based
 from tests.support.paths import ROOT
+from tests.support.refusals import refusal
 
 SECOND_ORDER = {"link_geometry", "encoder_offset", "joint_coupling", "link_mass"}
 
@@ -82,8 +83,7 @@ def test_the_cell_may_allow_more():
 
     assert largest({}) == pytest.approx(3.0)
     assert largest({"link_geometry": 4.0}) == pytest.approx(12.0)
-    with pytest.raises(InputError, match=r"\[plausible\] gremlins: no such effect"):
-        largest({"gremlins": 2.0})
+    refusal(r"\[plausible\] gremlins: no such effect", largest, {"gremlins": 2.0})
 
 
 def test_unloaded_readings_bound_what_geometry_may_do_to_deflections():
@@ -221,8 +221,7 @@ def test_only_what_is_finer_takes_the_place_of_an_effect(arm):
         "joints": "1/2/3/4-6"
     }
     for other in ("joint_compliance", "joint_compliance(joints=common)"):
-        with pytest.raises(InputError, match="joint_compliance is in the model already"):
-            add(halves, other)
+        refusal("joint_compliance is in the model already", add, halves, other)
     with pytest.raises(InputError, match="joint_compliance is in the model already"):
         add(halves, "joint_compliance", {"joints": "1-2/3-6"})
 

@@ -18,6 +18,7 @@ from hilcal.identification.fit import fit
 from hilcal.model.model import Model
 from tests.support.campaigns import campaign
 from tests.support.effect_cases import NAMES
+from tests.support.refusals import refusal
 
 CONFIGURATION = "config"
 """Holds defaults and examples that a person would write: effects by name."""
@@ -85,8 +86,7 @@ def test_what_a_model_could_have_is_what_its_catalogue_holds():
     bare = Model(c.cell, (), mine, c.readings) + effect("joint_compliance") + effect("base_frame")
     found = fit(bare, c.readings, "absolute")
     assert "sag" in {e.name for e in candidates(found)}
-    with pytest.raises(InputError, match="class Sag: effect sag is in the catalogue already"):
-        mine.with_effects(Sag)
+    refusal("class Sag: effect sag is in the catalogue already", mine.with_effects, Sag)
 
 
 class Fails(Sag):

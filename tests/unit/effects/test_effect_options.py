@@ -24,7 +24,7 @@ from tests.support.effect_cases import (
     situation,
     some_states,
 )
-from tests.support.refusals import refusals, refuses
+from tests.support.refusals import refusal, refusals, refuses
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -53,8 +53,7 @@ def test_an_impossible_option_is_refused(case, given):
 def test_a_missing_column_is_named(name, column):
     states = replace(some_states(UR10E), **{column: None})
     assert not effect_class(name).computable(states)
-    with pytest.raises(InputError, match=f"{name} needs {column}"):
-        make(name, UR10E, states)
+    refusal(f"{name} needs {column}", make, name, UR10E, states)
 
 
 # --- temperatures ---------------------------------------------------------------------------

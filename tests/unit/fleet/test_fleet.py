@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilcal.errors import CannotAnswerError, InputError
+from hilcal.errors import CannotAnswerError
 from hilcal.identification import posterior_document
 from hilcal.identification.baseline import baseline
 from hilcal.identification.carried import carried_prior
@@ -20,6 +20,7 @@ from hilcal.transfer.pooled import effects_seen, pooled
 from tests.support.calibrate_process import CELL
 from tests.support.campaigns import cell_of, configuration, noiseless, plan, with_noise, world_of
 from tests.support.cli_cases import ok, refused
+from tests.support.refusals import refusal, refusal_of
 
 SPREAD = 0.15
 """Standard deviation of the arms' joint compliances, relative."""
@@ -108,8 +109,7 @@ def test_the_page_shows_who_is_unlike(one):
 
 
 def test_two_arms_have_no_spread(one):
-    with pytest.raises(CannotAnswerError, match="at least 3 arms"):
-        pooled(members(one, 3)[:4], ())
+    refusal_of(CannotAnswerError, "at least 3 arms", pooled, members(one, 3)[:4], ())
 
 
 def error_of(readings, factors, prior):
@@ -220,11 +220,9 @@ def test_the_list_beside_the_campaigns_names_arms_and_dates(tmp_path):
     assert isinstance(failed, Failure)
     assert failed.name == "x.hilcal"
     (tmp_path / "arms.csv").write_text("campaign,arm,date\nx.hilcal,left,March\n")
-    with pytest.raises(InputError, match=r"row 2, column 'date': 'March'"):
-        entries(tmp_path)
+    refusal(r"row 2, column 'date': 'March'", entries, tmp_path)
     (tmp_path / "arms.csv").write_text("campaign,arm\ny.hilcal,left\n")
-    with pytest.raises(InputError, match=r"y\.hilcal: no such campaign"):
-        entries(tmp_path)
+    refusal(r"y\.hilcal: no such campaign", entries, tmp_path)
 
 
 def test_a_directory_without_campaigns_is_refused(capsys, tmp_path):

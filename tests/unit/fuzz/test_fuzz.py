@@ -8,7 +8,7 @@ import pytest
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.urscript import program_points
 from hilcal.config import CellConfig
-from hilcal.errors import HilcalError, InputError
+from hilcal.errors import HilcalError
 from hilcal.identification import parameters_document, posterior_document
 from hilcal.identification.registration import inverse_roots
 from hilcal.readings.covariance import is_covariance
@@ -16,6 +16,7 @@ from hilcal.store.plan import load_plan, read_plan
 from hilcal.tables.mapping import Mapping, load_mapping
 from tests.fuzz import files, harness, stored, wire
 from tests.fuzz.bench import Bench
+from tests.support.refusals import refusal
 
 FEW = {
     "chain": 2,
@@ -81,8 +82,7 @@ DEEP = "[" * 100_000 + "]" * 100_000
 def test_documents_nested_too_deeply(text, read, tmp_path):
     path = tmp_path / "deep"
     path.write_text(text)
-    with pytest.raises(InputError, match="nested too deeply"):
-        read(path)
+    refusal("nested too deeply", read, path)
 
 
 def test_a_prior_whose_number_of_columns_is_infinite(tmp_path):
@@ -90,8 +90,7 @@ def test_a_prior_whose_number_of_columns_is_infinite(tmp_path):
     path, content = tmp_path / "prior.json", json.loads(Bench(tmp_path).documents["posterior"])
     content["prints"]["columns"] = float("inf")
     path.write_text(json.dumps(content).replace("Infinity", "1e999"))
-    with pytest.raises(InputError, match="a damaged prior"):
-        posterior_document.read(path)
+    refusal("a damaged prior", posterior_document.read, path)
 
 
 def test_correlations_that_have_no_eigenvalues():

@@ -11,7 +11,6 @@ from hilcal.campaign.revisions import restore, to_record
 from hilcal.cell import Cell
 from hilcal.diagnosis.stepwise import add, remove
 from hilcal.diagnosis.verdict import diagnose
-from hilcal.errors import InputError
 from hilcal.identification.background import background_of, family_sizes, with_pooled_lines
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
@@ -30,6 +29,7 @@ from studies.random_campaigns import rehearsal_states
 from studies.study_cases import study_case, with_study_loads
 from tests.support.campaigns import configuration
 from tests.support.fit_cases import based, refined
+from tests.support.refusals import refusal
 
 UR10 = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")
 
@@ -80,8 +80,7 @@ def test_it_is_stored_and_found_again(found, series):
     assert diagnose(again).verdict == found.verdict
     stored = dict(record.parameters_json)
     stored["random"] = {**stored["random"], "std": {"joint_compliance": [1.0]}}
-    with pytest.raises(InputError, match="is damaged"):
-        restore(replace(record, parameters_json=stored), UR10, some)
+    refusal("is damaged", restore, replace(record, parameters_json=stored), UR10, some)
 
 
 def test_naming_keeps_the_prediction_and_removing_does_not(found, series):

@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig, load_config
-from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.misdescription import (
     BEYOND_NOISE,
@@ -26,6 +25,7 @@ from studies.random_descriptions import draw, judge, read
 from studies.random_descriptions import readings_of as table_of
 from tests.support import foreign_tables
 from tests.support.campaigns import configuration
+from tests.support.refusals import refusal
 from tests.support.rows import first
 from tests.unit.identification.test_registration import BASE, CELL, OFFSET, pose_of, told
 
@@ -90,9 +90,7 @@ def test_a_gauge_is_not_proposed(joint):
     ],
 )
 def test_the_reason_is_named_with_the_line_to_write(change, said):
-    with pytest.raises(InputError, match=said) as refused:
-        baseline(PLAIN, readings_of(change), "absolute")
-    assert "\n" not in str(refused.value)
+    refusal(said, baseline, PLAIN, readings_of(change), "absolute")
 
 
 def test_millimetres_and_swapped_rows_are_named():

@@ -27,7 +27,7 @@ from tests.support.cli_cases import CELL, ok
 from tests.support.effect_cases import numeric_slopes, random_theta, some_states
 from tests.support.fit_cases import based, named
 from tests.support.observer_cases import NORMAL, POINTS, base_cell, observed, stated
-from tests.support.refusals import refusals, refuses
+from tests.support.refusals import refusal, refusals, refuses
 from tests.support.rows import first
 
 KNOWN = replace(base_cell(stated("ABC")), registration_known=True)
@@ -254,5 +254,4 @@ def test_a_cell_names_its_gauges(tmp_path):
     (tmp_path / "cell.toml").write_text(
         CELL.read_text() + "\n[gauges.G]\norigin_m = [0.0, 0.0, 1.0]\n"
     )
-    with pytest.raises(InputError, match="origin_m without direction"):
-        Cell.load(tmp_path / "cell.toml")
+    refusal("origin_m without direction", Cell.load, tmp_path / "cell.toml")

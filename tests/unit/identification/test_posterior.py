@@ -13,7 +13,7 @@ from hilcal.campaign.revisions import restore, to_record
 from hilcal.diagnosis.stepwise import add, remove
 from hilcal.drivers.simulated.world import stand
 from hilcal.effects.catalogue import installed
-from hilcal.errors import CannotAnswerError, InputError
+from hilcal.errors import CannotAnswerError
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.carried import carried_prior
 from hilcal.identification.fit import fit
@@ -29,6 +29,7 @@ from studies.change import measured as measured_again
 from studies.change import studied_arm
 from tests.support.campaigns import campaign, configuration, measured, noiseless, plan, with_noise
 from tests.support.fit_cases import based
+from tests.support.refusals import refusal
 
 
 def of_links(seed=2):
@@ -111,13 +112,11 @@ def test_what_is_no_posterior_is_refused():
     with pytest.raises(CannotAnswerError, match="no effect of the arm"):
         Posterior.of(based(c.cell, c.readings, "absolute", ()))
     model = with_effects(c.cell, c.readings, "absolute", ("joint_compliance",))
-    with pytest.raises(InputError, match="scaling gc"):
-        Posterior.of(fit(model, c.readings, "absolute", "none"))
+    refusal("scaling gc", Posterior.of, fit(model, c.readings, "absolute", "none"))
     p = Posterior.of(fitted("joint_compliance")).to_json()
     damaged = {"version 9": {**p, "version": 9}, "damaged": {**p, "mean": [1.0]}, "format": {}}
     for words, content in damaged.items():
-        with pytest.raises(InputError, match=words):
-            Posterior.from_json(content)
+        refusal(words, Posterior.from_json, content)
 
 
 def test_every_effect_says_whose_it_is():
@@ -322,16 +321,14 @@ def test_priors_that_cannot_be_are_refused():
         (p, ur3e, later, "other"),
         (fewer, c.cell, later, "joints"),
     ):
-        with pytest.raises(InputError, match=words):
-            baseline(cell, readings, "absolute", prior=carried_prior(of))
+        refusal(words, baseline, cell, readings, "absolute", prior=carried_prior(of))
     foreign = replace(p, effects=(replace(p.effects[0], name="cable_pull"),))
     for of, given, words in (
         (p, {"relation": "cousin"}, "arm, type"),
         (p, {"stated": {"creep": 1.0}}, "drift of creep"),
         (foreign, {}, "--effects-from"),
     ):
-        with pytest.raises(InputError, match=words):
-            carried_prior(of, **given)
+        refusal(words, carried_prior, of, **given)
 
 
 def test_a_calibration_is_surer_with_a_prior():

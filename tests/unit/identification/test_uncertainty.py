@@ -19,6 +19,7 @@ from hilcal.readings.whitening import MODES, whitening
 from tests.support.campaigns import campaign, noiseless, plan, with_noise
 from tests.support.effect_cases import make
 from tests.support.fit_cases import based
+from tests.support.refusals import refusal, refusal_of
 from tests.support.rows import first
 
 
@@ -219,10 +220,8 @@ def test_two_names_of_one_pose_are_drawn_together():
 
 def test_what_it_refuses():
     found = fitted(poses=12)
-    with pytest.raises(InputError, match="draws 5, seed 0; valid: at least 20"):
-        drawn(found, 5)
-    with pytest.raises(CannotAnswerError, match=r"8 distinct poses .* at least 10"):
-        drawn(fitted(poses=8))
+    refusal("draws 5, seed 0; valid: at least 20", drawn, found, 5)
+    refusal_of(CannotAnswerError, r"8 distinct poses .* at least 10", drawn, fitted(poses=8))
     with pytest.raises(InputError, match="level 2; valid: between 0 and 1"):
         drawn(found, 20).interval(2)
 

@@ -10,6 +10,7 @@ from hilcal.config import load_config
 from hilcal.errors import InputError
 from hilcal.measuring.connect import connect, driver
 from hilcal.measuring.devices import TRACKERS
+from tests.support.refusals import refusal
 
 FOREIGN = """
 from hilcal.measuring.devices import Report
@@ -128,6 +129,4 @@ def test_an_unknown_driver_is_answered_with_the_valid_ones(foreign):
 
 
 def test_a_driver_that_cannot_be_loaded_is_one_line(foreign):
-    with pytest.raises(InputError, match="their_devices:no_such_function") as raised:
-        driver(TRACKERS, "not_there", "[tracker] driver")
-    assert "\n" not in str(raised.value)
+    refusal("their_devices:no_such_function", driver, TRACKERS, "not_there", "[tracker] driver")

@@ -35,6 +35,7 @@ from tests.support.fake_bench import (
     rows,
     usual_plan,
 )
+from tests.support.refusals import refusal_of
 
 
 @pytest.fixture(scope="module")
@@ -290,8 +291,7 @@ def test_a_wrong_load_is_asked_for_again_with_the_reason(b):
 @pytest.mark.long
 def test_three_wrong_loads_end_the_run(b):
     b.world.wrong = ["none", "6kg", "none", "6kg"]
-    with pytest.raises(DeviceError, match=r"asked 3 times to hang 3kg.*--resume$"):
-        measure(b)
+    refusal_of(DeviceError, r"asked 3 times to hang 3kg.*--resume$", measure, b)
     assert len(b.store.rows) == 5
     assert b.world.calls[-2] == "arm.stop"
     b.world.again()
@@ -402,8 +402,7 @@ def test_a_load_that_still_hangs_at_a_resume_is_noticed():
 
 def test_a_load_left_on_at_the_very_beginning_is_asked_about_said_and_found_in_motion(b):
     b.world.load, b.world.wrong = "3kg", ["3kg", "3kg"]  # both answers are wrong
-    with pytest.raises(DeviceError, match="take everything off"):
-        measure(b)
+    refusal_of(DeviceError, "take everything off", measure, b)
     assert remarks(b, "answered twice that nothing hangs")
     # where gravity has not turned in the sensor since its tare, a load is a zero
     assert {step for step, *_ in b.store.rows} <= {Step("reference", "none", 0)}

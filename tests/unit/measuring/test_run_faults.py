@@ -30,6 +30,7 @@ from tests.support.fake_bench import (
     plan_of,
     usual_plan,
 )
+from tests.support.refusals import refusal, refusal_of
 from tests.support.rows import first
 
 FAULTS = (
@@ -129,8 +130,7 @@ def check_stopped(b, k):
 def test_disk_full_stops_the_arm_and_says_what_to_do():
     b, plan = bench(), small_plan()
     b.store.full_at = 2
-    with pytest.raises(DeviceError, match=r"disk is full.*--resume$"):
-        run_once(b, plan)
+    refusal_of(DeviceError, r"disk is full.*--resume$", run_once, b, plan)
     assert b.world.calls[-2:] == ["arm.stop", "store.event"]
     assert len(b.store.rows) == 2
     b.store.full_at = None
@@ -147,8 +147,7 @@ def test_a_refused_row_keeps_its_kind_of_error(monkeypatch):
         raise InputError("run.hilcal: the readings differ from those before")
 
     monkeypatch.setattr(b.store, "record", refuse)
-    with pytest.raises(InputError, match=r"differ from those before\. .*--resume$"):
-        run_once(b, small_plan())
+    refusal(r"differ from those before\. .*--resume$", run_once, b, small_plan())
     assert b.world.calls[-2] == "arm.stop"
 
 
@@ -175,10 +174,9 @@ def test_an_arm_that_does_not_stop_is_told_loudly_and_once(fault, stop, said, mo
 
     monkeypatch.setattr(b.rig.arm, "stop", fails)
     b.world.fail[120] = fault
-    with pytest.raises(DeviceError, match=said) as raised:
-        run_once(b, small_plan())
-    assert str(raised.value).count("emergency stop") == 1
-    assert str(raised.value).endswith(HOW_ON)
+    raised = refusal_of(DeviceError, said, run_once, b, small_plan())
+    assert raised.count("emergency stop") == 1
+    assert raised.endswith(HOW_ON)
     assert b.store.events[-1][1]["arm_not_stopped"] == stop
 
 
@@ -194,8 +192,7 @@ def test_impatience_does_not_keep_the_arm_from_stopping():
 
     before(b.rig.arm, "stop", stop)
     b.world.fail[120] = DeviceError("tracker: silent")
-    with pytest.raises(DeviceError, match=r"tracker: silent.*--resume$"):
-        run_once(b, small_plan())
+    refusal_of(DeviceError, r"tracker: silent.*--resume$", run_once, b, small_plan())
     assert len(stops) == 2
     assert not b.world.is_moving
 
@@ -212,8 +209,7 @@ def test_nothing_is_stopped_before_the_arm_is_ours():
     """A fault before `take_control`: somebody else's program may be running."""
     b = bench()
     b.world.fail[2] = DeviceError("force sensor: silent")
-    with pytest.raises(DeviceError, match="silent"):
-        run_once(b, small_plan())
+    refusal_of(DeviceError, "silent", run_once, b, small_plan())
     assert "arm.take_control" not in b.world.calls
     assert "arm.stop" not in b.world.calls
 
@@ -328,9 +324,8 @@ def test_loads_change_only_at_the_reference_and_motions_carry_them(b):
 def test_an_unsafe_plan_is_refused_before_any_device_is_asked():
     b = Bench(limits=Limits(workspace_min_m=(-3, -3, 0.9)))
     plan = plan_of(("p1", "none", 0), ("p1", "brick", 0))
-    with pytest.raises(InputError, match="not safe") as raised:
-        measure(b, plan)
-    words = str(raised.value)
+    raised = refusal("not safe", measure, b, plan)
+    words = raised
     assert "\n" not in words  # one line says the first problem, and how to see the others
     assert "brick" in words
     assert "more: hilcal check --plan" in words
@@ -342,8 +337,7 @@ def test_an_arm_that_stands_outside_its_workspace_is_not_moved():
     b = Bench(limits=Limits(workspace_min_m=(-1.2, -0.5, 0.05), workspace_max_m=(1.2, 1.2, 1.5)))
     b.world.q = np.array([1.5, -1.3, 1.6, -1.4, -1.4, 0.1])  # beyond y = -0.5
     plan = plan_of(("reference", "none", 0), poses={"reference": POSES["reference"]})
-    with pytest.raises(DeviceError, match=r"outside the workspace.*drive it by hand"):
-        measure(b, plan)
+    refusal_of(DeviceError, r"outside the workspace.*drive it by hand", measure, b, plan)
     assert "arm.start_move" not in b.world.calls
     assert "arm.take_control" not in b.world.calls
 
@@ -369,8 +363,7 @@ def test_limits_are_enforced_in_motion(change, said):
         return still
 
     changed(b.rig.arm, "moving", exceeds)
-    with pytest.raises(DeviceError, match=said):
-        measure(b)
+    refusal_of(DeviceError, said, measure, b)
     assert b.world.calls[-2:] == ["arm.stop", "store.event"]
     assert not b.world.is_moving
     assert b.world.time - since[0] <= 0.05
@@ -385,8 +378,7 @@ def test_limits_are_enforced_at_rest():
             b.world.extra = np.array([0, 130.0, 0, 0, 0, 0])
 
     before(b.rig.tracker, "measure", pushes)
-    with pytest.raises(DeviceError, match="max_force_N"):
-        measure(b)
+    refusal_of(DeviceError, "max_force_N", measure, b)
     assert len(b.store.rows) == 2
     assert b.world.calls[-2] == "arm.stop"
 
@@ -398,15 +390,13 @@ def test_an_arm_that_does_not_arrive(b):
         real(q - 0.002, speed, acceleration)
 
     b.rig.arm.start_move = short
-    with pytest.raises(DeviceError, match=r"stands 0\.002 rad off"):
-        measure(b)
+    refusal_of(DeviceError, r"stands 0\.002 rad off", measure, b)
 
 
 @pytest.mark.long
 def test_a_motion_that_never_ends_is_given_up(b):
     b.rig.arm.moving = lambda: True
-    with pytest.raises(DeviceError, match="not finished after"):
-        measure(b)
+    refusal_of(DeviceError, "not finished after", measure, b)
     assert b.world.calls[-2] == "arm.stop"
 
 
@@ -424,8 +414,7 @@ def test_a_lost_target_is_found_again(b):
 @pytest.mark.parametrize("lost", [5, 1000])
 def test_a_target_that_stays_lost_ends_the_run(b, lost):
     b.world.lost, b.world.not_found = lost, 0 if lost == 5 else 1000
-    with pytest.raises(DeviceError, match=r"line of sight.*--resume$"):
-        measure(b)
+    refusal_of(DeviceError, r"line of sight.*--resume$", measure, b)
     assert b.store.rows == []
     assert b.world.calls.count("tracker.find_target") == 2
     assert b.world.calls[-2] == "arm.stop"
@@ -438,8 +427,7 @@ def test_another_reflector_is_not_believed(b):
             b.world.shift = np.array([0.0, 0.3, 0.0])
 
     before(b.store, "event", other)
-    with pytest.raises(DeviceError, match="another reflector"):
-        measure(b)
+    refusal_of(DeviceError, "another reflector", measure, b)
     assert len(b.store.rows) == 5
 
 
@@ -450,8 +438,7 @@ def test_readings_that_drift_are_waited_for_and_given_up():
     b = Bench(acquire=Acquire(samples=3, settle_s=0.2, settle_timeout_s=20.0))
     b.world.creep = 1e-3
     begun = b.world.time
-    with pytest.raises(DeviceError, match="not settled within 20 s: the readings drift"):
-        measure(b)
+    refusal_of(DeviceError, "not settled within 20 s: the readings drift", measure, b)
     assert b.store.rows == []
     assert b.world.time - begun < 120.0
 
@@ -479,8 +466,7 @@ def test_drift_that_ends_is_waited_for():
 
 def test_an_arm_that_trembles_is_measured_again_and_given_up(b):
     b.world.jitter = 1e-4
-    with pytest.raises(DeviceError, match=r"measured 3 times in vain: arm: it moved by"):
-        measure(b)
+    refusal_of(DeviceError, r"measured 3 times in vain: arm: it moved by", measure, b)
     assert b.store.rows == []
 
 

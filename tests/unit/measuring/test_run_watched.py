@@ -23,6 +23,7 @@ from tests.support.fake_bench import (
     rows,
     usual_plan,
 )
+from tests.support.refusals import refusal_of
 from tests.support.rows import first
 
 FOLDED = np.array([3.0, -1.3, 2.9, -1.4, -1.4, 0.1])  # the forearm lies on the column
@@ -69,8 +70,7 @@ SHORT = plan_of(("p1", "none", 0), ("p1", "3kg", 0), ("reference", "none", 1))
 @pytest.mark.parametrize("load", ["none", "3kg"])
 def test_an_arm_jogged_into_a_blocked_place_during_a_question_is_not_moved(b, load):
     jogged(b, load, FOLDED)
-    with pytest.raises(DeviceError, match=r"outside the workspace.*drive it by hand.*--resume$"):
-        measure(b)
+    refusal_of(DeviceError, r"outside the workspace.*drive it by hand.*--resume$", measure, b)
     assert load not in [hung for _, hung in b.world.at_start]
     assert ("arm.take_control" in b.world.calls) is (load == "3kg")
 
@@ -99,8 +99,7 @@ def test_an_arm_that_is_moved_while_it_is_asked_for_is_asked_for_again(b):
 
 def test_an_arm_jogged_while_control_is_taken_is_not_moved(b):
     before(b.rig.arm, "take_control", lambda *_: setattr(b.world, "q", FREE.copy()))
-    with pytest.raises(DeviceError, match=r"has commanded it since.*0\.5 rad"):
-        measure(b)
+    refusal_of(DeviceError, r"has commanded it since.*0\.5 rad", measure, b)
     assert "arm.start_move" not in b.world.calls
 
 
@@ -129,8 +128,7 @@ def test_an_operator_who_cannot_be_asked_is_not_taken_to_agree(b):
             self.report, self.hang, self.close = asks.report, asks.hang, asks.close
 
     b.rig = replace(b.rig, operator=Silent(b.operator))
-    with pytest.raises(DeviceError, match="does not stand where it was left"):
-        measure(b)
+    refusal_of(DeviceError, "does not stand where it was left", measure, b)
     assert "arm.start_move" not in b.world.calls
 
 
@@ -162,8 +160,7 @@ def test_an_arm_that_is_moved_at_rest_is_named_at_the_next_look(b, change, said)
         return replace(here, **{name: getattr(here, name) + by for name, by in change.items()})
 
     changed(b.rig.arm, "sample", moved)
-    with pytest.raises(DeviceError, match=said):
-        measure(b)
+    refusal_of(DeviceError, said, measure, b)
     assert b.world.time - begun[0] < 1.0
     assert b.world.calls[-2] == "arm.stop"
 
@@ -204,15 +201,13 @@ def test_feedback_that_stands_still_in_motion_is_named_within_a_second(b, names,
         )
 
     begun = in_motion(b, frozen)
-    with pytest.raises(DeviceError, match=said):
-        measure(b)
+    refusal_of(DeviceError, said, measure, b)
     assert b.world.time - begun[0] < 1.0
 
 
 def test_an_arm_that_leaves_its_straight_way_is_stopped(b):
     begun = in_motion(b, lambda here: replace(here, q=here.q + 0.06 * np.eye(6)[3]))
-    with pytest.raises(DeviceError, match="wrist_1 has left the straight way"):
-        measure(b)
+    refusal_of(DeviceError, "wrist_1 has left the straight way", measure, b)
     assert b.world.time - begun[0] < 0.1
 
 
@@ -355,8 +350,7 @@ def test_leaning_in_the_first_motion_or_during_a_tare_is_asked_for_and_not_tared
 @pytest.mark.long
 def test_a_first_tare_that_was_leaned_on_ends_the_run_and_says_so(b):
     leans_in_phase(b, "taring", 1)
-    with pytest.raises(DeviceError, match=r"the tool was touched while the sensor was tared"):
-        measure(b, SHORT)
+    refusal_of(DeviceError, r"the tool was touched while the sensor was tared", measure, b, SHORT)
     assert b.store.rows == []
     measure(b, SHORT)  # with a tare of its own
 
@@ -443,8 +437,7 @@ def test_who_bears_a_part_of_a_heavy_load_in_motion_is_noticed_though_it_may_swi
 @pytest.mark.long
 def test_a_load_that_stays_wrong_ends_the_run(b):
     falls_in_motion(b, "none", "none", "none")
-    with pytest.raises(DeviceError, match=r"asked 3 times to hang 3kg.*--resume$"):
-        measure(b)
+    refusal_of(DeviceError, r"asked 3 times to hang 3kg.*--resume$", measure, b)
     assert len(b.store.rows) == 7
 
 
@@ -454,8 +447,7 @@ def test_a_load_that_stays_wrong_ends_the_run(b):
 def test_a_tracker_whose_target_does_not_move_with_the_arm_is_named_before_any_reading(b):
     still = b.world.position()
     b.world.position = lambda: still
-    with pytest.raises(DeviceError, match="repeats an old reading, or follows a reflector"):
-        measure(b)
+    refusal_of(DeviceError, "repeats an old reading, or follows a reflector", measure, b)
     assert b.store.rows == []
 
 
@@ -469,8 +461,7 @@ def test_a_tracker_that_repeats_one_measurement_is_named(b):
         return one
 
     changed(b.rig.tracker, "measure", repeats)
-    with pytest.raises(DeviceError, match="the same to the last digit"):
-        measure(b)
+    refusal_of(DeviceError, "the same to the last digit", measure, b)
     assert len(b.store.rows) == 3
 
 
@@ -485,8 +476,7 @@ def test_a_tracker_that_keeps_to_the_place_of_the_last_pose_is_named(b, good):
         return kept[0]
 
     changed(b.world, "position", stuck)
-    with pytest.raises(DeviceError, match="repeats an old reading"):
-        measure(b)
+    refusal_of(DeviceError, "repeats an old reading", measure, b)
     assert len(b.store.rows) == good
     assert "why" in b.store.last("doubted")
     doubted = [content["reading"] for _, content in b.store.events if content.get("stored")]
@@ -507,6 +497,5 @@ def test_stored_readings_of_a_stuck_tracker_do_not_keep_a_campaign_from_going_on
 
 def test_a_force_sensor_that_repeats_itself_is_named(b):
     changed(b.rig.force, "average", lambda one: replace(one, covariance=np.zeros((6, 6))))
-    with pytest.raises(DeviceError, match="frames are the same to the last digit"):
-        measure(b)
+    refusal_of(DeviceError, "frames are the same to the last digit", measure, b)
     assert b.store.rows == []

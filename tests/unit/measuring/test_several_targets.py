@@ -8,7 +8,7 @@ import pytest
 
 from hilcal.config import Tool
 from hilcal.config.cell import Target
-from hilcal.errors import DeviceError, InputError
+from hilcal.errors import DeviceError
 from hilcal.measuring.connect import Rig
 from hilcal.measuring.devices import TargetLostError, TrackerSample
 from hilcal.measuring.progress import ReadingStored
@@ -30,6 +30,7 @@ from tests.support.fake_bench import (
     usual_plan,
 )
 from tests.support.reflector_cases import NAMES, OFFSETS
+from tests.support.refusals import refusal
 
 TOOL = Tool(
     targets=tuple(
@@ -192,10 +193,8 @@ def test_a_killed_run_goes_on_with_whole_arrivals(tmp_path, call):
 
 def test_what_cannot_be_pointed_is_refused(tmp_path):
     b = Bench(tool=TOOL)
-    with pytest.raises(InputError, match=r"driver cannot be told which .* no method `aim`"):
-        measure(b, tmp_path / "r.hilcal")
+    refusal(r"driver cannot be told which .* no method `aim`", measure, b, tmp_path / "r.hilcal")
     rough = TOOL.targets[1].model_copy(update={"target_m": None})
     tool = TOOL.model_copy(update={"targets": (TOOL.targets[0], rough)})
     b = Bench(tool=tool)
-    with pytest.raises(InputError, match=r'target "R2" has no target_m: .* estimate = true'):
-        measure(b, tmp_path / "s.hilcal")
+    refusal(r'target "R2" has no target_m: .* estimate = true', measure, b, tmp_path / "s.hilcal")

@@ -16,6 +16,7 @@ from hilcal.robot.chain import evaluate
 from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step
 from tests.support.picture import Shot, pictures, vulkan_available
 from tests.support.recordings import entities, rows, same, texts
+from tests.support.refusals import refusal
 from tests.support.viewer_plan import (
     BARE,
     PLAN,
@@ -283,8 +284,7 @@ def test_no_character_without_a_glyph_reaches_the_viewer(tmp_path):
 def test_what_does_not_fit_is_refused(shadowed, tmp_path):
     with pytest.raises(InputError, match="5 joint angles per pose; ur10e has 6"):
         record_plan(*shadowed, replace(PLAN, q=Q[:, :5]), SUMMARY, tmp_path / "x.rrd")
-    with pytest.raises(InputError, match="no folder"):
-        record_plan(*shadowed, PLAN, SUMMARY, tmp_path / "none" / "x.rrd")
+    refusal("no folder", record_plan, *shadowed, PLAN, SUMMARY, tmp_path / "none" / "x.rrd")
     assert list(tmp_path.iterdir()) == []
 
 

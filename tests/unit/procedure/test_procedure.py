@@ -9,7 +9,6 @@ import hilcal as hc
 from hilcal.calibration.improvement import Improvement
 from hilcal.config.cell import Repeatability
 from hilcal.config.reference import to_toml
-from hilcal.errors import InputError
 from hilcal.identification.carried import carried_prior
 from hilcal.library import load_posterior
 from hilcal.procedure.state import DECIDED, FROZEN
@@ -20,6 +19,7 @@ from hilcal.store.procedure_log import ProcedureLog, purpose_of, release
 from hilcal.store.run_log import RunLog
 from tests.support.paths import ROOT
 from tests.support.procedure_cases import Drawn, KilledError, again, drawn, small
+from tests.support.refusals import refusal
 from tests.unit.test_docs import blocks
 
 ALL = [
@@ -124,11 +124,9 @@ def test_a_validation_campaign_is_frozen(done):
         assert frozen["readings_sha256"] == test.data_hash()
         assert purpose_of(test) == "validation"
     with hc.Campaign.open(files.validation) as o:
-        with pytest.raises(InputError, match=r"a validation campaign of run\.hilcal"):
-            o.fit_in_use()
+        refusal(r"a validation campaign of run\.hilcal", o.fit_in_use)
         found = hc.fit(hc.baseline(o.cell, o.readings), o.readings)
-        with pytest.raises(InputError, match="never to be fitted"):
-            o.append(found)
+        refusal("never to be fitted", o.append, found)
         assert o.latest() is None
 
 
@@ -141,8 +139,7 @@ def test_another_validation_campaign_is_refused(done):
             readings = test.readings()
             release(test, "a test")
             test.append_readings(readings[:1])
-        with pytest.raises(InputError, match="other readings than when it was frozen"):
-            d.procedure.compare()
+        refusal("other readings than when it was frozen", d.procedure.compare)
         with hc.Campaign.open(files.validation) as o:
             assert o.fit_in_use()[0] is None  # released: it may be fitted, and the file says so
     finally:

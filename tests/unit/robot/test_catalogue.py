@@ -8,13 +8,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hilcal.errors import InputError
 from hilcal.robot.catalogue import UNPUBLISHED, configs_dir, load_arm, robot_names
 from hilcal.robot.chain import evaluate
 from hilcal.robot.scene import pinocchio_model
 from hilcal.robot.statics import Load, slot_wrenches
 from hilcal.robot.urdf import arm_from_urdf
-from tests.support.refusals import edited, refusals, refuses
+from tests.support.refusals import edited, refusal, refusals, refuses
 
 PI2 = math.pi / 2
 ALPHA = [PI2, 0.0, 0.0, PI2, -PI2, 0.0]
@@ -222,8 +221,7 @@ def test_masses_and_limits_are_plausible(name):
 
 @pytest.mark.parametrize("name", UNPUBLISHED)
 def test_an_arm_without_published_figures_is_refused_by_name(name):
-    with pytest.raises(InputError, match=f"{name}.*not published.*DH rows"):
-        load_arm(name)
+    refusal(f"{name}.*not published.*DH rows", load_arm, name)
 
 
 def test_a_dh_table_of_ones_own(tmp_path):
@@ -406,8 +404,7 @@ ENDLESS = FINGER.replace('lower="0" upper="0.1"', 'lower="0" upper="0"')
     ],
 )
 def test_a_chain_that_is_no_arm_is_refused(tmp_path, extra, base, tip, message):
-    with pytest.raises(InputError, match=message):
-        arm_from_urdf(write(tmp_path, extra), base_link=base, tip_link=tip)
+    refusal(message, arm_from_urdf, write(tmp_path, extra), base_link=base, tip_link=tip)
 
 
 @refusals("urdfs")

@@ -7,7 +7,6 @@ import pytest
 
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig
-from hilcal.errors import InputError
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate
 from hilcal.robot.factory import (
@@ -19,7 +18,7 @@ from hilcal.robot.factory import (
     with_factory,
 )
 from tests.support.factory_cases import UR5E_YAML, factory_of, measured_arm
-from tests.support.refusals import edited, refusals, refuses
+from tests.support.refusals import edited, refusal, refusals, refuses
 
 CONF = """\
 [mounting]
@@ -114,10 +113,8 @@ def test_other_files_are_refused_in_one_line(case, given, tmp_path):
 
 def test_the_kinematics_of_another_arm_are_refused(tmp_path):
     (tmp_path / "x.yaml").write_text(UR5E_YAML)
-    with pytest.raises(InputError, match="another arm than ur10e"):
-        read_factory(tmp_path / "x.yaml", load_arm("ur10e"))
-    with pytest.raises(InputError, match="four times 6"):
-        of_rows(np.zeros((4, 7)), "rows")
+    refusal("another arm than ur10e", read_factory, tmp_path / "x.yaml", load_arm("ur10e"))
+    refusal("four times 6", of_rows, np.zeros((4, 7)), "rows")
 
 
 def test_a_cell_counts_from_what_the_configuration_says(tmp_path):

@@ -18,6 +18,7 @@ from hilcal.store.campaign_file import CampaignFile
 from tests.support.campaigns import configuration
 from tests.support.cli_cases import ok, refused, rehearsal
 from tests.support.cli_cases import run as run_of
+from tests.support.refusals import refusal
 from tests.unit.data.test_campaign import REVISION
 
 FOREVER = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT"
@@ -149,8 +150,7 @@ def test_nothing_is_said_to_be_stored_that_is_not(what, run):
             else:
                 file.append_readings(x if what == "readings" else new)
 
-        with pytest.raises(InputError, match="not stored"):
-            store()
+        refusal("not stored", store)
         assert file.n_readings == count
 
 

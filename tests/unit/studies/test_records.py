@@ -2,12 +2,10 @@
 
 import json
 
-import pytest
-
-from hilcal.errors import InputError
 from studies.records import Figure, keep, page
 from tests.support.cli_cases import ok
 from tests.support.paths import ROOT
+from tests.support.refusals import refusal
 
 MEASURED = ROOT / "docs" / "measured"
 
@@ -37,11 +35,9 @@ def test_a_study_keeps_its_figures(tmp_path, capsys):
 
 
 def test_a_folder_without_records_and_a_wrong_file_are_named(tmp_path):
-    with pytest.raises(InputError, match=r"no \*.json"):
-        page(tmp_path)
+    refusal(r"no \*.json", page, tmp_path)
     (tmp_path / "x.json").write_text("{}")
-    with pytest.raises(InputError, match=r"x\.json: not a record"):
-        page(tmp_path)
+    refusal(r"x\.json: not a record", page, tmp_path)
 
 
 def test_the_command_that_is_kept_is_the_one_without_the_file(tmp_path, monkeypatch):

@@ -22,6 +22,7 @@ from studies.study_more import measure_more, suspects
 from studies.unmodelled_laws import LAWS, law_named, shift
 from tests.support.effect_cases import make
 from tests.support.fit_cases import based
+from tests.support.refusals import refusal
 
 
 def config():
@@ -100,17 +101,13 @@ def test_a_law_outside_of_the_catalogue_acts_at_the_strength_asked(law):
 
 
 def test_laws_and_effects_that_do_not_fit_are_refused():
-    with pytest.raises(InputError, match="crossed gear"):
-        law_named("crossed gears")
-    with pytest.raises(InputError, match="absolute"):
-        case("crossed gear", mode="deflection")
-    with pytest.raises(InputError, match="cancels in deflections"):
-        case("encoder_offset", mode="deflection")
+    refusal("crossed gear", law_named, "crossed gears")
+    refusal("absolute", case, "crossed gear", mode="deflection")
+    refusal("cancels in deflections", case, "encoder_offset", mode="deflection")
     c = case()
     still = c.readings.states
     law, none = law_named("base that turns"), np.zeros(3, dtype=np.int64)
-    with pytest.raises(InputError, match="no loaded reading"):
-        shift(law, c.world, still[none], 3.0, "deflection", none, none)
+    refusal("no loaded reading", shift, law, c.world, still[none], 3.0, "deflection", none, none)
     with pytest.raises(InputError, match="no unloaded reading"):
         shift(law, c.world, still[none + 1], 3.0, "deflection", none, none)
     with pytest.raises(InputError, match="changes nothing"):

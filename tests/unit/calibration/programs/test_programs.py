@@ -31,7 +31,7 @@ from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate
 from hilcal.types import Floats
 from tests.support.maker_arms import EXAMPLES, maker_arm, urdf_of
-from tests.support.refusals import check, refusals
+from tests.support.refusals import check, refusal, refusals
 from tests.support.rows import first
 
 DELTA = 1e-3 * np.array([0.7, -0.4, 0.9, -1.1, 0.5, -0.8])
@@ -264,8 +264,7 @@ def test_a_joint_that_passes_zero_changes_its_turn(arms, tmp_path):
     inform = read("inform", arms)
     q = inform.q.copy()
     q[3, 3] = np.radians(89.0)  # no flip becomes flip
-    with pytest.raises(InputError, match=r"C00003 \(line 17\): .* another configuration"):
-        inform.corrected(q)
+    refusal(r"C00003 \(line 17\): .* another configuration", inform.corrected, q)
 
 
 @refusals("makers")
@@ -307,15 +306,13 @@ def test_frames_on_some_ways_only_are_not_known(arms, tmp_path):
         tmp_path,
         lambda t: t.replace("PTP home1", "IF $IN[1] THEN\r\n$BASE = $NULLFRAME\r\nENDIF"),
     )
-    with pytest.raises(InputError, match="block that ends in line 39 sets them on some ways only"):
-        read("krl", arms, tmp_path)
+    refusal("block that ends in line 39 sets them on some ways only", read, "krl", arms, tmp_path)
     copied(
         "krl",
         tmp_path,
         lambda t: t.replace("PTP home1", "LOOP").replace("$OUT[7]=TRUE", "BAS(#BASE,0)\r\nENDLOOP"),
     )
-    with pytest.raises(InputError, match="the loop of line 37 sets them later"):
-        read("krl", arms, tmp_path)
+    refusal("the loop of line 37 sets them later", read, "krl", arms, tmp_path)
 
 
 def test_an_arm_of_another_form_has_its_branches_from_the_point_before(tmp_path):
