@@ -106,11 +106,11 @@ def made(q: Floats, value: Floats, **more: Any) -> Readings:
         more: fields of readings and of states; `std` of every element in place of a covariance.
     """
     count, m = value.shape
-    told = {"wrench": np.zeros((count, 6))} | more
+    told: dict[str, Any] = {"wrench": np.zeros((count, 6))} | more
     states = {name: told.pop(name) for name in States.__dataclass_fields__ if name in told}
-    pose, load = (told.pop(key, usual) for key, usual in (("pose", np.arange(count)), ("load", 0)))
-    load = np.broadcast_to(load, count).astype(np.int64)
-    usual = {
+    pose = told.pop("pose", np.arange(count))
+    load = np.broadcast_to(told.pop("load", 0), count).astype(np.int64)
+    usual: dict[str, Any] = {
         "cycle": np.zeros(count, dtype=np.int64),
         "covariance": np.tile(told.pop("std", 1e-5) ** 2 * np.eye(m), (count, 1, 1)),
         "load_names": ("none", *(f"load {k}" for k in range(1, load.max(initial=0) + 1))),

@@ -175,11 +175,7 @@ def test_what_could_change_a_waypoint_refuses_the_program_by_line(case, given, t
 def test_odd_signs_and_sizes_refuse_the_program_by_line(program, line, words, tmp_path):
     path = tmp_path / "p.script"
     path.write_bytes(program.encode())
-    with pytest.raises(InputError) as error:
-        program_points(path, leave=True)
-    assert f"line {line}: " in str(error.value)
-    assert words in str(error.value)
-    assert "\n" not in str(error.value)
+    assert words in refusal(f"line {line}: ", program_points, path, leave=True)
 
 
 def test_values_that_double_and_chains_of_variables_take_no_time():
