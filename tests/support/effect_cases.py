@@ -80,6 +80,7 @@ def situation(cell: Cell, seed: int = 2) -> Situation:
 
 
 CELLS = {name: odd_cell(arm_of(name)) for name in ("odd", RAILS)} | {"ur10e": cell_of()}
+UR10E = CELLS["ur10e"]
 
 
 def random_theta(effects, rng, elastic=1.0):

@@ -11,6 +11,7 @@ from hilcal.identification.fit import Fit, fit
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode
+from hilcal.refinement import Refinement, refine
 from hilcal.robot import se3
 
 MODES = ("absolute", "deflection")
@@ -39,3 +40,8 @@ def predicted(model: Model, readings: Readings, theta: np.ndarray) -> Readings:
     o = model.predict(readings.states, theta).observation
     turn = se3.rotation_vector(o.rotation)
     return replace(readings, value=np.hstack([o.position, turn])[:, : readings.m])
+
+
+def refined(cell: Cell, readings: Readings, mode: Mode) -> Refinement:
+    """The baseline of readings, refined."""
+    return refine(baseline(cell, readings, mode), readings, mode)

@@ -1,5 +1,7 @@
 """An arm and readings for the tests of what goes in and out."""
 
+from typing import Any
+
 import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -95,24 +97,33 @@ def first_seen(numbers: list[int]) -> np.ndarray:
     return np.array([order[k] for k in numbers], dtype=np.int64)
 
 
+def made(q: Floats, value: Floats, **more: Any) -> Readings:
+    """Readings of joint values, each of a pose of its own and unloaded unless more is said.
+
+    Args:
+        q: (N, n).
+        value: (N, m).
+        more: fields of readings and of states; `std` of every element in place of a covariance.
+    """
+    count, m = value.shape
+    told: dict[str, Any] = {"wrench": np.zeros((count, 6))} | more
+    states = {name: told.pop(name) for name in States.__dataclass_fields__ if name in told}
+    pose = told.pop("pose", np.arange(count))
+    load = np.broadcast_to(told.pop("load", 0), count).astype(np.int64)
+    usual: dict[str, Any] = {
+        "cycle": np.zeros(count, dtype=np.int64),
+        "covariance": np.tile(told.pop("std", 1e-5) ** 2 * np.eye(m), (count, 1, 1)),
+        "load_names": ("none", *(f"load {k}" for k in range(1, load.max(initial=0) + 1))),
+        "pose_names": tuple(f"p{k}" for k in range(pose.max(initial=-1) + 1)),
+    }
+    return Readings(States(q, **states), pose=pose, load=load, value=value, **usual | told)
+
+
 def simple(count: int, m: int = 3, seed: int = 0) -> Readings:
     """Readings of `count` poses without a load."""
     rng = np.random.default_rng(seed)
-    zero = np.zeros(count, dtype=np.int64)
-    return Readings(
-        states=States(
-            q=rng.uniform(-3, 3, (count, 6)),
-            wrench=np.zeros((count, 6)),
-            time=np.arange(count, dtype=float),
-        ),
-        pose=np.arange(count),
-        load=zero,
-        cycle=zero.copy(),
-        value=rng.uniform(-1, 1, (count, m)),
-        covariance=np.tile(1e-9 * np.eye(m), (count, 1, 1)),
-        load_names=("none",),
-        pose_names=tuple(f"p{k}" for k in range(count)),
-    )
+    q, time = rng.uniform(-3, 3, (count, 6)), np.arange(count, dtype=float)
+    return made(q, rng.uniform(-1, 1, (count, m)), time=time, std=1e-9**0.5)
 
 
 def assert_same(a: Readings, b: Readings) -> None:

@@ -2,19 +2,27 @@
 
     == name of the case
     what is given, on as many lines as it has
-    -> the line
+    -> the line, or its beginning and … where Python or a library words the rest
+
+A given text that begins with `in NAME` is the text of that name, in which the lines that begin with
+- are replaced, once, by those with + after them.
 
 After a wanted change of words `HILCAL_REFUSALS=write pytest ...` writes the lines anew.
 """
 
 import os
 import re
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from hilcal.errors import HilcalError, InputError
+
 FOLDER = Path(__file__).resolve().parents[1] / "data" / "refusals"
 BLOCK = re.compile(r"^== (.*)\n((?:(?!== |-> ).*\n)*)-> (.*)\n", re.MULTILINE)
+EDIT = re.compile(r"((?:^-.*\n)+)((?:^\+.*\n)*)", re.MULTILINE)
 
 
 def refusals(name: str) -> pytest.MarkDecorator:
@@ -25,13 +33,57 @@ def refusals(name: str) -> pytest.MarkDecorator:
     return pytest.mark.parametrize(("case", "given"), rows)
 
 
+def edited(given: str, **texts: str) -> str:
+    """What a case gives: itself, or one of the texts with its edits."""
+    if not given.startswith("in "):
+        return given
+    name, _, edits = given[3:].partition("\n")
+    text = texts[name]
+    for blocks in EDIT.findall(edits):
+        old, new = ("\n".join(line[2:] for line in block.splitlines()) for block in blocks)
+        assert old in text
+        text = text.replace(old, new, 1)
+    return text
+
+
+def refuses(case: tuple[str, str], call: Callable[[], object], path: Path | None = None) -> str:
+    """Compare the line that a call is refused with; a path in it is known by its name alone."""
+    line = refusal(".", call)
+    line = line if path is None else line.replace(str(path), path.name)
+    check(case, line)
+    return line
+
+
+def refusal(words: str, call: Callable[..., object], /, *given: Any, **more: Any) -> str:
+    """Call with what is given, which is wrong input: the one line that says so, with these words.
+
+    Args:
+        words: a pattern in the line.
+        call: what is called.
+    """
+    return refusal_of(InputError, words, call, *given, **more)
+
+
+def refusal_of(
+    kind: type[HilcalError], words: str, call: Callable[..., object], /, *given: Any, **more: Any
+) -> str:
+    """The same where another kind of error is to be raised."""
+    with pytest.raises(kind, match=words) as raised:
+        call(*given, **more)
+    assert raised.value.exit_code == kind.exit_code
+    line = str(raised.value)
+    assert "\n" not in line
+    return line
+
+
 def check(case: tuple[str, str], line: str) -> None:
     """Compare the line that a case was refused with to the one that is kept, or keep it."""
     path = FOLDER / f"{case[0]}.txt"
     text = path.read_text(encoding="utf-8")
     assert "\n" not in line
     (found,) = (m for m in BLOCK.finditer(text) if m[1] == case[1])
-    if os.environ.get("HILCAL_REFUSALS") == "write":
+    begun = found[3].endswith("…") and line.startswith(found[3][:-1])
+    if os.environ.get("HILCAL_REFUSALS") == "write" and not begun:
         path.write_text(text[: found.start(3)] + line + text[found.end(3) :], encoding="utf-8")
     else:
-        assert line == found[3]
+        assert begun or line == found[3]

@@ -1,28 +1,28 @@
 """A cell that is changed after the readings were taken: a new revision, never other readings."""
 
 import csv
+import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.changes import change_cell
-from hilcal.config.changes import Changes, changed, read_value, write_value
+from hilcal.config.changes import changed, read_value, write_value
 from hilcal.config.reference import to_toml
-from hilcal.errors import InputError
 from hilcal.import_campaign import import_campaign
 from hilcal.robot.se3 import rotation_vector
 from hilcal.tables.table import write_table
 from hilcal.whole_file import replace_file
 from tests.support.bench_cases import BASE, few_effects
 from tests.support.campaigns import NOTHING, campaign, configuration
+from tests.support.refusals import refusal, refusals, refuses
 
-COARSE: Changes = {"tracker": {"range_std_m": 4e-5, "transverse_std_m": 9e-5}}
+COARSE = {"tracker": {"range_std_m": 4e-5, "transverse_std_m": 9e-5}}
 
 
-def cell_file(folder: Path, name: str, changes: Changes, noise: bool = True) -> Path:
+def cell_file(folder, name, changes, noise=True):
     """CELL.toml of the campaigns here, with changes; without the noise where that is not stated."""
     config = changed(configuration(), changes)
     if noise:  # as stated, though it is the default
@@ -33,7 +33,7 @@ def cell_file(folder: Path, name: str, changes: Changes, noise: bool = True) -> 
     return folder / name
 
 
-def table(folder: Path, stated: bool = False, effect: str = BASE) -> Path:
+def table(folder, stated=False, effect=BASE):
     """Readings as somebody else's program writes them, with or without their covariances."""
     path = folder / "t.csv"
     write_table(campaign(effect, "deflection", poses=12).readings, path)
@@ -46,7 +46,7 @@ def table(folder: Path, stated: bool = False, effect: str = BASE) -> Path:
     return path
 
 
-def imported(folder: Path, name: str, changes: Changes | None = None, **kinds: bool) -> Path:
+def imported(folder, name, changes=None, **kinds):
     noise, stated = kinds.get("noise", True), kinds.get("stated", False)
     out = folder / f"{name}.hilcal"
     cell = cell_file(folder, f"{name}.toml", changes or {}, noise)
@@ -55,11 +55,11 @@ def imported(folder: Path, name: str, changes: Changes | None = None, **kinds: b
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run(tmp_path_factory):
     return imported(tmp_path_factory.mktemp("run"), "run")
 
 
-def test_a_stated_noise_is_that_of_a_new_import(tmp_path: Path) -> None:
+def test_a_stated_noise_is_that_of_a_new_import(tmp_path):
     """Whether the noise was stated before, or had been estimated."""
     for name, stated in (("stated", True), ("estimated", False)):
         run = imported(tmp_path, name, noise=stated)
@@ -78,7 +78,7 @@ def test_a_stated_noise_is_that_of_a_new_import(tmp_path: Path) -> None:
             assert there.data_hash == o.data_hash
 
 
-def test_a_change_is_a_revision_and_can_be_taken_back(tmp_path: Path) -> None:
+def test_a_change_is_a_revision_and_can_be_taken_back(tmp_path):
     run, catalogue = imported(tmp_path, "run"), few_effects()
     with Campaign.open(run, catalogue) as o:
         before, stored = o.fit_in_use()[1], o.file.readings()
@@ -92,8 +92,7 @@ def test_a_change_is_a_revision_and_can_be_taken_back(tmp_path: Path) -> None:
         assert np.array_equal(o.file.readings().covariance, stored.covariance)
         assert o.fit().variance_factor == pytest.approx(found.fit.variance_factor, rel=1e-6)
         assert [c.number for c in o.chapters()] == [2]
-        with pytest.raises(InputError, match=r"fitted in a cell that .* hilcal accept .* 1$"):
-            o.fit(1)
+        refusal(r"fitted in a cell that .* hilcal accept .* 1$", o.fit, 1)
         kept = o.store(o.fit_in_use()[1])
         assert o.file.revision(kept).cell == COARSE
         o.accept(1)
@@ -102,7 +101,7 @@ def test_a_change_is_a_revision_and_can_be_taken_back(tmp_path: Path) -> None:
         assert o.fit().variance_factor == pytest.approx(before.variance_factor, rel=1e-6)
 
 
-def test_the_tools_figures_and_frames_are_those_of_the_change(tmp_path: Path) -> None:
+def test_the_tools_figures_and_frames_are_those_of_the_change(tmp_path):
     run = imported(tmp_path, "run")
     with Campaign.open(run, few_effects()) as o:
         before = o.fit_in_use()[1]
@@ -111,7 +110,7 @@ def test_the_tools_figures_and_frames_are_those_of_the_change(tmp_path: Path) ->
             "base_xyz_m": place[:3, 3].tolist(),
             "base_rotvec_rad": rotation_vector(place[:3, :3]).tolist(),
         }
-        change: Changes = {"tool": {"mass_kg": 2.5}, "tracker": known}
+        change = {"tool": {"mass_kg": 2.5}, "tracker": known}
         there, _, found = change_cell(o, None, before, change, lambda words: None)
         assert there.cell.tool_mass == 2.5
         assert set(before.model.named) - set(found.fit.model.named) == {"base_frame"}
@@ -120,64 +119,43 @@ def test_the_tools_figures_and_frames_are_those_of_the_change(tmp_path: Path) ->
         assert back.changes["tool"] == {"mass_kg": 2.5}
 
 
-@pytest.mark.parametrize(
-    ("changes", "why"),
-    [
-        ({"tool": {"mass_kg": -1.0}}, r"\[tool\] mass_kg = -1.0 is not valid: it must be a mass"),
-        ({"tool": {"mass_kg": None}}, r"\[tool\] mass_kg = null is not valid"),
-        ({"tool": {"com_m": [0.0, 0.0, 80.0]}}, r"lies over 5 m off the flange; is it in m\?"),
-        ({"tracker": {"range_std_m": 20.0}}, r"is over 0.1 m; is it in m\?"),
-        ({"tracker": {"frame": "base"}}, r"\[tracker\] frame cannot be changed .*valid: \[tracker"),
-        ({"robot": {"model": "ur5e"}}, r"\[robot\] model cannot be changed once there are read"),
-        ({"tool": {"targets": [{"name": "B"}]}}, "targets"),
-        ({"repeatability": {"joint_std_rad": [1e-5, 1e-5]}}, "must be one number or 6"),
-        ({"tracker": {"base_xyz_m": [1.0, 0.0, 0.0]}}, "base_xyz_m alone"),
-    ],
-)
-def test_a_change_is_checked_as_cell_toml_is(changes: Changes, why: str, run: Path) -> None:
-    with Campaign.open(run) as o, pytest.raises(InputError, match=why) as told:
-        o.with_cell(changes)
-    assert len(str(told.value).splitlines()) == 1
+@refusals("changes")
+def test_a_change_is_checked_as_cell_toml_is(case, given, run):
+    with Campaign.open(run) as o:
+        refuses(case, lambda: o.with_cell(json.loads(given)), run)
 
 
-def test_a_received_campaign_with_a_cell_that_cannot_be(tmp_path: Path) -> None:
+def test_a_received_campaign_with_a_cell_that_cannot_be(tmp_path):
     run = imported(tmp_path, "run")
     with Campaign.open(run, few_effects()) as o:
         record = o.record(o.fit_in_use()[1])
         for cell in ({"tool": {"mass_kg": "heavy"}}, {"robot": {"model": "/etc/passwd"}}):
             o.file.append_revision(replace(record, options={**record.options, "cell": cell}))
-            with pytest.raises(
-                InputError, match=r"run.hilcal: a revision is damaged \(the cell: \["
-            ):
-                Campaign.open(run)
+            refusal(r"run.hilcal: a revision is damaged \(the cell: \[", Campaign.open, run)
         o.file.append_revision(replace(record, options={**record.options, "cell": [1]}))
-        with pytest.raises(InputError, match="damaged at revision 3"):
-            Campaign.open(run)
+        refusal("damaged at revision 3", Campaign.open, run)
 
 
-def test_what_readings_do_not_use_is_not_changed(tmp_path: Path) -> None:
+def test_what_readings_do_not_use_is_not_changed(tmp_path):
     with Campaign.open(imported(tmp_path, "run", stated=True)) as o:
-        with pytest.raises(InputError, match="range_std_m cannot be changed: the covariances of"):
-            o.with_cell(COARSE)
+        refusal("range_std_m cannot be changed: the covariances of", o.with_cell, COARSE)
         assert ("tracker", "range_std_m") in o.unchangeable()
         larger = o.with_cell({"repeatability": {"joint_std_rad": 9e-5}})
         assert np.all(
             np.trace(larger.readings.covariance - o.readings.covariance, axis1=1, axis2=2)
         )
-    nothing: Changes = {"repeatability": {"joint_std_rad": 0.0}}
+    nothing = {"repeatability": {"joint_std_rad": 0.0}}
     with Campaign.open(imported(tmp_path, "other", nothing, noise=False)) as o:
         assert o.noise is not None  # the arm's scatter was estimated with the noise
-        scatter: Changes = {"repeatability": {"joint_std_rad": 9e-5}}
-        with pytest.raises(InputError, match=r"state the noise in \[tracker\], too"):
-            o.with_cell(scatter)
+        scatter = {"repeatability": {"joint_std_rad": 9e-5}}
+        refusal(r"state the noise in \[tracker\], too", o.with_cell, scatter)
         assert o.with_cell({**COARSE, **scatter}).covariance_parts == "instrument and repeatability"
 
 
-def test_values_are_read_and_written_as_in_cell_toml() -> None:
+def test_values_are_read_and_written_as_in_cell_toml():
     for text in ("1.5e-05", "[0.1, 0, -0.2]", '[{name = "R1", target_m = [0, 0, 0.1]}]'):
         assert write_value(read_value("tool", "targets", text)) == text
     assert read_value("tool", "mass_kg", "  ") is None
     for text in ("one kilo", "1\n[tracker]", "1\nmass = 2", "[0.1, 0.2", "= 3", '"""'):
-        with pytest.raises(InputError, match="is not valid: it must be a mass in kg") as told:
-            read_value("tool", "mass_kg", text)
-        assert len(str(told.value).splitlines()) == 1
+        told = refusal("is not valid: it must be a mass in kg", read_value, "tool", "mass_kg", text)
+        assert len(told.splitlines()) == 1

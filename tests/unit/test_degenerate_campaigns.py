@@ -8,24 +8,20 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import hilcal as hc
-from hilcal.cell import Cell
 from hilcal.diagnosis.diagnosis import VERDICTS
 from hilcal.errors import HilcalError
-from hilcal.readings.readings import Readings
-from hilcal.readings.whitening import Mode
-from hilcal.types import Floats
 from tests.support.campaigns import cell_of, noiseless, plan, with_noise, world_of
 
 EXTRA = ("joint_tilt_compliance", "link_compliance", "transmission_error", "link_geometry")
 
 
 @st.composite
-def odd_campaigns(draw: st.DrawFn) -> tuple[Readings, Cell, Mode]:
+def odd_campaigns(draw):
     """A campaign with something missing, constant or out of scale."""
     cell = cell_of(registration_known=draw(st.booleans()), target_known=draw(st.booleans()))
     rng, m = np.random.default_rng(draw(st.integers(0, 9))), draw(st.sampled_from([3, 6]))
     whole = with_noise(noiseless(world_of(cell, rng), plan(10, 3), m), rng)
-    mode: Mode = draw(st.sampled_from(["absolute", "deflection"]))
+    mode = draw(st.sampled_from(["absolute", "deflection"]))
     kept = whole.pose < draw(st.sampled_from([1, 2, 3, 5, 10]))
     if draw(st.booleans()):
         kept &= whole.unloaded | (whole.load == 1)
@@ -62,7 +58,7 @@ def odd_campaigns(draw: st.DrawFn) -> tuple[Readings, Cell, Mode]:
     return odd[twice] if draw(st.booleans()) else odd, cell, mode
 
 
-def _values(kind: str, value: Floats) -> Floats:
+def _values(kind, value):
     out = value.copy()
     if kind == "equal":
         out[:] = out[0]
@@ -71,7 +67,7 @@ def _values(kind: str, value: Floats) -> Floats:
     return out
 
 
-def judged_or_refused(of: tuple[Readings, Cell, Mode], extra: str | None) -> None:
+def judged_or_refused(of, extra):
     readings, cell, mode = of
     refused = ""
     try:
@@ -89,16 +85,12 @@ def judged_or_refused(of: tuple[Readings, Cell, Mode], extra: str | None) -> Non
 @pytest.mark.long
 @settings(max_examples=6, suppress_health_check=list(HealthCheck))
 @given(odd_campaigns(), st.sampled_from(EXTRA))
-def test_odd_campaigns_are_judged_or_refused_in_words(
-    of: tuple[Readings, Cell, Mode], extra: str
-) -> None:
+def test_odd_campaigns_are_judged_or_refused_in_words(of, extra):
     judged_or_refused(of, extra)
 
 
 @pytest.mark.slow
 @settings(max_examples=300, suppress_health_check=list(HealthCheck), derandomize=False)
 @given(odd_campaigns(), st.sampled_from([None, *EXTRA]))
-def test_many_odd_campaigns_are_judged_or_refused_in_words(
-    of: tuple[Readings, Cell, Mode], extra: str | None
-) -> None:
+def test_many_odd_campaigns_are_judged_or_refused_in_words(of, extra):
     judged_or_refused(of, extra)

@@ -3,16 +3,14 @@
 import re
 import sys
 import tomllib
-from collections.abc import Callable
 from pathlib import Path
 from textwrap import dedent
 from types import ModuleType
-from typing import Any
 
 import pytest
 
 import hilcal as hc
-from hilcal.config import CellConfig, load_config
+from hilcal.config import CellConfig
 from hilcal.config.reference import to_toml
 from hilcal.effects.catalogue import ENTRY_POINT_GROUP
 from hilcal.measuring.devices import TRACKERS
@@ -25,14 +23,15 @@ from hilcal.toml import check_section
 from studies.page_figures import NAMES
 from studies.random_campaigns import rehearse
 from tests.support import readme
-from tests.support.cli_cases import CELL, Capsys, ok, quickly_planned, stored_readings
+from tests.support.campaigns import configuration
+from tests.support.cli_cases import ok, quickly_planned, stored_readings
 from tests.support.paths import ROOT
 
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.py"))
 
 
-def blocks(path: Path, language: str = "python") -> list[str]:
+def blocks(path, language="python"):
     """Fenced code of a document."""
     return re.findall(
         rf"^ *```{language}\n(.*?)^ *```$", path.read_text(), re.DOTALL | re.MULTILINE
@@ -40,55 +39,52 @@ def blocks(path: Path, language: str = "python") -> list[str]:
 
 
 @pytest.mark.parametrize("path", [*DOCUMENTS, *TUTORIALS], ids=lambda p: str(p.relative_to(ROOT)))
-def test_links_lead_to_files_of_the_tree(path: Path) -> None:
+def test_links_lead_to_files_of_the_tree(path):
     links = re.findall(r"\]\(([^)#:]+)\)", path.read_text())
     drawn = {ROOT / "docs" / name for name in NAMES}  # in the build of the site
     places = [(path.parent / link).resolve() for link in links]
     assert [place for place in places if not place.exists() and place not in drawn] == []
 
 
-def test_each_figure_that_is_drawn_is_on_a_page() -> None:
+def test_each_figure_that_is_drawn_is_on_a_page():
     text = "".join(path.read_text() for path in DOCUMENTS)
     assert [name for name in NAMES if f"/{name})" not in text] == []
 
 
 @pytest.fixture
-def campaign_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+def campaign_of(tmp_path, monkeypatch):
     """Go to a folder, and make run.hilcal of so many poses with an effect there."""
     monkeypatch.chdir(tmp_path)
 
-    def make(effect: str, poses: int, config: CellConfig | None = None) -> None:
-        config = config or load_config(CELL)
+    def make(effect, poses, config=None):
+        config = config or configuration()
         stored_readings(Path("run.hilcal"), rehearse(config, effect, 3, poses).readings, config)
 
     return make
 
 
-def test_the_effect_of_the_guide_is_a_working_effect() -> None:
+def test_the_effect_of_the_guide_is_a_working_effect():
     code = blocks(ROOT / "docs" / "how-to" / "add-an-effect.md")
-    known: dict[str, object] = {"__name__": "cable_pull"}
+    known = {"__name__": "cable_pull"}
     exec(code[0], known)
     effect = known["CablePull"]
-    assert isinstance(effect, type)
     assert issubclass(effect, hc.Effect)
     hc.check_effect(effect)
 
 
 @pytest.mark.long
-def test_the_guide_to_the_library_runs_as_it_stands(
-    campaign_of: Callable[..., None], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config = quickly_planned(load_config(CELL))
+def test_the_guide_to_the_library_runs_as_it_stands(campaign_of, monkeypatch):
+    config = quickly_planned(configuration())
     campaign_of("creep", 10, config)
     Path("CELL.toml").write_text(to_toml(config), encoding="utf-8")
     with CampaignFile.open("run.hilcal") as file:
         write_table(file.readings(), Path("readings.csv"), WHOLE)
     pyplot = ModuleType("matplotlib.pyplot")
-    drawn: list[object] = []
+    drawn = []
     monkeypatch.setattr(pyplot, "plot", lambda *given: drawn.append(given), raising=False)
     monkeypatch.setitem(sys.modules, "matplotlib", ModuleType("matplotlib"))
     monkeypatch.setitem(sys.modules, "matplotlib.pyplot", pyplot)
-    known: dict[str, object] = {}
+    known = {}
     for code in blocks(ROOT / "docs" / "how-to" / "use-the-library.md"):
         exec(code, known)
     assert len(drawn) == 1
@@ -97,9 +93,7 @@ def test_the_guide_to_the_library_runs_as_it_stands(
         assert "creep" in run.fit().model.names
 
 
-def test_the_python_of_the_readme_runs_as_it_stands(
-    campaign_of: Callable[..., None], capsys: Capsys
-) -> None:
+def test_the_python_of_the_readme_runs_as_it_stands(campaign_of, capsys):
     section = (ROOT / "README.md").read_text().split("\n## From Python\n")[1].split("\n## ")[0]
     code = "\n".join(line[4:] for line in section.splitlines() if line.startswith("    "))
     campaign_of("joint_tilt_compliance", 10)
@@ -109,9 +103,7 @@ def test_the_python_of_the_readme_runs_as_it_stands(
         assert "joint_tilt_compliance" in run.fit().model.names
 
 
-def test_the_guide_to_compensation_runs_as_it_stands(
-    campaign_of: Callable[..., None], capsys: Capsys
-) -> None:
+def test_the_guide_to_compensation_runs_as_it_stands(campaign_of, capsys):
     guide = ROOT / "docs" / "how-to" / "compensate.md"
     campaign_of("nothing", 20)
     given = ("--effects", "joint_compliance,encoder_offset")
@@ -128,9 +120,7 @@ def test_the_guide_to_compensation_runs_as_it_stands(
     assert "e-0" in capsys.readouterr().out
 
 
-def test_the_guide_to_handing_over_runs_as_it_stands(
-    campaign_of: Callable[..., None], capsys: Capsys
-) -> None:
+def test_the_guide_to_handing_over_runs_as_it_stands(campaign_of, capsys):
     guide = ROOT / "docs" / "how-to" / "hand-over.md"
     campaign_of("nothing", 20)
     given = ("--effects", "joint_compliance,encoder_offset")
@@ -145,9 +135,7 @@ def test_the_guide_to_handing_over_runs_as_it_stands(
     assert "tracker_in_base_mm_rad" in Path("frames.json").read_text()
 
 
-def test_the_guide_to_imports_is_what_the_commands_do(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capsys
-) -> None:
+def test_the_guide_to_imports_is_what_the_commands_do(tmp_path, monkeypatch, capsys):
     guide = ROOT / "docs" / "how-to" / "import-a-table.md"
     monkeypatch.chdir(tmp_path)
     Path("CELL.toml").write_bytes((configs_dir() / "cells" / "demo_ur10e.toml").read_bytes())
@@ -164,8 +152,6 @@ def test_the_guide_to_imports_is_what_the_commands_do(
     assert (len(readings), readings.m, readings.load_names) == (8, 6, ("none", "5 kg"))
     joints = {"columns": [f"A{k} [°]" for k in range(1, 7)], "unit": "deg"}
     bars = check_section({"joints": joints, **tomllib.loads(more)}, Mapping, "block")
-    assert bars.distance is not None
-    assert bars.torques is not None
     used = {*bars.joints.columns, *bars.torques.columns, bars.distance.column}
     used |= {bars.distance.name_column, bars.distance.std_column}
     assert used <= set(bar.strip().split(";"))
@@ -174,13 +160,13 @@ def test_the_guide_to_imports_is_what_the_commands_do(
 HOW_TO = ROOT / "docs" / "how-to"
 
 
-def in_a_cell(text: str) -> CellConfig:
+def in_a_cell(text):
     """The README's cell with the sections of a block in place of its own."""
-    cell: dict[str, Any] = tomllib.loads(readme.cell())
+    cell = tomllib.loads(readme.cell())
     return check_section({**cell, **tomllib.loads(text)}, CellConfig, "block")
 
 
-def test_the_cells_of_the_guides_are_accepted() -> None:
+def test_the_cells_of_the_guides_are_accepted():
     urdf, _, _, signs, factory = blocks(HOW_TO / "add-a-robot.md", "toml")
     assert in_a_cell(factory).robot.kinematics == "factory"
     assert in_a_cell(urdf).robot.tip_link == "tool0"
@@ -192,7 +178,7 @@ def test_the_cells_of_the_guides_are_accepted() -> None:
     assert [t.name for t in in_a_cell("\n".join(lines)).tool.targets] == ["R1", "R2", "R3"]
 
 
-def test_the_arm_of_the_guide_is_an_arm(tmp_path: Path) -> None:
+def test_the_arm_of_the_guide_is_an_arm(tmp_path):
     path = tmp_path / "my_arm.toml"
     _, arm, track, *_ = blocks(HOW_TO / "add-a-robot.md", "toml")
     path.write_text(arm, encoding="utf-8")
@@ -201,7 +187,7 @@ def test_the_arm_of_the_guide_is_an_arm(tmp_path: Path) -> None:
     assert load_arm(str(path)).units == ("rad", "m")
 
 
-def test_the_entry_points_of_the_guides_are_those_that_are_read() -> None:
+def test_the_entry_points_of_the_guides_are_those_that_are_read():
     found = {}
     for page in ("add-a-device.md", "add-an-effect.md"):
         for text in blocks(HOW_TO / page, "toml"):
@@ -209,19 +195,15 @@ def test_the_entry_points_of_the_guides_are_those_that_are_read() -> None:
     assert set(found) == {TRACKERS, ENTRY_POINT_GROUP}
 
 
-def test_the_driver_of_the_guide_opens_and_reports() -> None:
+def test_the_driver_of_the_guide_opens_and_reports():
     (code,) = blocks(HOW_TO / "add-a-device.md")
-    known: dict[str, Any] = {"__name__": "mytracker"}
+    known = {"__name__": "mytracker"}
     exec(dedent(code), known)
-    tracker = known["open_tracker"](load_config(CELL))
+    tracker = known["open_tracker"](configuration())
     assert tracker.report().device == "tracker"
 
 
-def test_the_commands_of_the_guide_to_effects(
-    campaign_of: Callable[..., None],
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: Capsys,
-) -> None:
+def test_the_commands_of_the_guide_to_effects(campaign_of, monkeypatch, capsys):
     guide = HOW_TO / "add-an-effect.md"
     campaign_of("nothing", 6)
     lines = guide.read_text(encoding="utf-8").splitlines()
@@ -235,6 +217,6 @@ def test_the_commands_of_the_guide_to_effects(
     law, check, *_ = blocks(guide)
     exec(law, module.__dict__)
     monkeypatch.setitem(sys.modules, "cable_pull", module)
-    known: dict[str, Any] = {}
+    known = {}
     exec(check, known)
     known["test_the_law_is_consistent"]()

@@ -19,15 +19,15 @@ ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 
 
-def test_every_directory_with_code_is_a_package() -> None:
+def test_every_directory_with_code_is_a_package():
     modules = [path for top in ("hilcal", "drivers") for path in (ROOT / top).rglob("*.py")]
     missing = {path.parent for path in modules if not (path.parent / "__init__.py").is_file()}
     assert not missing  # setup.py would leave them out
 
 
-def test_a_class_has_a_name_of_its_own() -> None:
+def test_a_class_has_a_name_of_its_own():
     """In the whole tree, so that a reader finds it by its name alone."""
-    places: dict[str, list[str]] = {}
+    places = {}
     for top in ("hilcal", "drivers"):
         for path in (ROOT / top).rglob("*.py"):
             for node in ast.parse(path.read_text(encoding="utf-8")).body:
@@ -36,7 +36,7 @@ def test_a_class_has_a_name_of_its_own() -> None:
     assert {name: at for name, at in places.items() if len(at) > 1} == {}
 
 
-def _pinned(lock: str) -> set[str]:
+def _pinned(lock):
     text = (ROOT / lock).read_text(encoding="utf-8")
     entries = [line for line in text.splitlines() if line and not line.startswith(("#", " "))]
     assert all("==" in entry and entry.endswith("\\") for entry in entries)
@@ -45,7 +45,7 @@ def _pinned(lock: str) -> set[str]:
     return {entry.split("==")[0].lower() for entry in entries}
 
 
-def test_the_locks_pin_every_dependency_with_hashes_and_name_no_host() -> None:
+def test_the_locks_pin_every_dependency_with_hashes_and_name_no_host():
     pinned, added = _pinned("requirements.lock"), _pinned("requirements-docs.lock")
     assert not pinned & added
     project = PROJECT["project"]
@@ -73,7 +73,7 @@ NOT_TRACKED = shutil.ignore_patterns(
 )
 
 
-def _built(what: str, source: Path) -> Path:
+def _built(what, source):
     """Build an sdist or a wheel from a folder, as tools for packages do, and return it."""
     done = subprocess.run(
         [sys.executable, "-c", BUILD, what],
@@ -86,12 +86,12 @@ def _built(what: str, source: Path) -> Path:
     return source / "dist" / done.stdout.splitlines()[-1]
 
 
-def _sha256(path: Path) -> str:
+def _sha256(path):
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 @pytest.mark.slow
-def test_two_builds_are_the_same_and_bring_what_they_should(tmp_path: Path) -> None:
+def test_two_builds_are_the_same_and_bring_what_they_should(tmp_path):
     sources = [tmp_path / "one", tmp_path / "elsewhere" / "other"]
     for source, mode in zip(sources, (0o644, 0o664), strict=True):
         shutil.copytree(
@@ -143,7 +143,7 @@ def test_two_builds_are_the_same_and_bring_what_they_should(tmp_path: Path) -> N
 
 @pytest.mark.slow
 @pytest.mark.parametrize("home", ["", "https://example.org/hilcal"])
-def test_the_address_of_the_project_is_one_setting(home: str, tmp_path: Path) -> None:
+def test_the_address_of_the_project_is_one_setting(home, tmp_path):
     source = tmp_path / "source"
     shutil.copytree(ROOT, source, symlinks=True, ignore=NOT_TRACKED)
     settings = (source / "pyproject.toml").read_text(encoding="utf-8")

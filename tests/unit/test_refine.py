@@ -7,26 +7,25 @@ import pytest
 
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
 from hilcal.drivers.simulated.injected_effects import hide
-from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import linearise
 from hilcal.model.model import Model
 from hilcal.present.verdict import message
-from hilcal.readings.readings import Readings
-from hilcal.refinement import MOST_REVISIONS, Refinement, add, refine
+from hilcal.refinement import MOST_REVISIONS, add, refine
 from hilcal.regression.leave_out import LEAST_GAIN
 from tests.support.campaigns import campaign, cell_of, measured, plan, world_of
 from tests.support.diagnosis_cases import fitted
 from tests.support.effect_cases import make
+from tests.support.fit_cases import based, refined
+from tests.support.refusals import refusal
 
 
-def check_steps(r: Refinement) -> None:
+def check_steps(r):
     """What holds of every refinement."""
     assert 1 <= len(r.steps) <= MOST_REVISIONS
     assert r.steps[0].added is None
     for before, after in zip(r.steps, r.steps[1:], strict=False):
-        assert after.added is not None
         assert after.fit.model.names == (*before.fit.model.names, after.added)
         assert after.added in before.diagnosis.significant
         held = [s.fit.holdout.rms_sigma for s in (before, after)]
@@ -40,7 +39,7 @@ def check_steps(r: Refinement) -> None:
 )
 def test_a_hidden_effect_is_added_and_the_error_falls_to_the_noise(effect, mode):
     c = campaign(effect, mode, 1, poses=30)
-    said: list[str] = []
+    said = []
     r = refine(baseline(c.cell, c.readings, mode), c.readings, mode, said.append)
     check_steps(r)
     assert effect in r.steps[-1].fit.model.names
@@ -60,7 +59,7 @@ def test_two_hidden_effects_are_found_one_after_the_other():
     for effect in ("hysteresis", "encoder_offset"):
         world = hide(effect, cell, p.states, 3.0, "absolute", rng, world=world)
     readings = measured(world, p, rng)
-    r = refine(baseline(cell, readings, "absolute"), readings, "absolute")
+    r = refined(cell, readings, "absolute")
     check_steps(r)
     assert {s.added for s in r.steps[1:]} == {"hysteresis", "encoder_offset"}
     assert r.verdict == "adequate", message(r.diagnosis)
@@ -69,14 +68,14 @@ def test_two_hidden_effects_are_found_one_after_the_other():
 
 def test_nothing_hidden_adds_nothing():
     c = campaign(seed=2, poses=15)
-    r = refine(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute")
+    r = refined(c.cell, c.readings, "absolute")
     assert len(r.steps) == 1
     assert r.verdict == "adequate"
     assert r.rejected == ()
     assert r.diagnosis is r.steps[0].diagnosis
 
 
-def with_pose_errors(readings: Readings, seed: int) -> Readings:
+def with_pose_errors(readings, seed):
     """Readings with an error per pose that follows nothing: no effect explains it elsewhere."""
     rng = np.random.default_rng(seed)
     off = 1e-4 * rng.normal(size=(len(readings.pose_names), 3))[readings.pose]
@@ -91,7 +90,7 @@ def test_what_no_effect_predicts_is_never_called_adequate(poses, seed):
     """A large family can reproduce any error of few poses; poses left out tell."""
     c = campaign(seed=3, plan_seed=0, poses=poses)
     readings = with_pose_errors(c.readings, seed)
-    r = refine(baseline(c.cell, readings, "absolute"), readings, "absolute")
+    r = refined(c.cell, readings, "absolute")
     check_steps(r)
     assert r.steps[-1].fit.holdout.rms_sigma > 3
     # Few poses cannot tell an error of each pose from a family with many parameters.
@@ -102,7 +101,7 @@ def test_shares_on_poses_left_out_are_what_a_refit_reaches_there():
     """Random errors of each pose: a family of many columns explains them, but nowhere else."""
     c = campaign(seed=3, plan_seed=0, poses=15)
     readings = with_pose_errors(c.readings, 1)
-    before = fit(baseline(c.cell, readings, "absolute"), readings, "absolute")
+    before = based(c.cell, readings, "absolute")
     p = linearise(before)
     some = ("transmission_error", "link_geometry", "encoder_offset")
     suspects = [s for s in rank_suspects(p, candidates(p.fit)) if s.effect in some]
@@ -127,13 +126,10 @@ def test_adding_starts_where_the_fit_stands():
 def test_an_effect_cannot_be_added_twice_nor_without_its_columns_nor_unknown():
     c = campaign(plan_seed=0)
     readings = replace(c.readings, states=replace(c.readings.states, approach=None))
-    found = fit(baseline(c.cell, readings, "absolute"), readings, "absolute")
-    with pytest.raises(InputError, match="joint_compliance is in the model already"):
-        add(found, "joint_compliance")
-    with pytest.raises(InputError, match="unknown effect 'gear_wear'"):
-        add(found, "gear_wear")
-    with pytest.raises(InputError, match="hysteresis needs approach"):
-        add(found, "hysteresis")
+    found = based(c.cell, readings, "absolute")
+    refusal("joint_compliance is in the model already", add, found, "joint_compliance")
+    refusal("unknown effect 'gear_wear'", add, found, "gear_wear")
+    refusal("hysteresis needs approach", add, found, "hysteresis")
 
 
 def test_it_starts_from_any_model():

@@ -8,21 +8,19 @@ from scipy.spatial.transform import Rotation
 
 from hilcal.calibration.handover import UR_JOINTS
 from hilcal.robot import se3
-from hilcal.robot.arm import Arm
-from hilcal.robot.chain import Deviation, evaluate
-from hilcal.types import Floats
+from hilcal.robot.chain import evaluate
 
 
-def flanges(arm: Arm, q: Floats, deviation: Deviation | None = None) -> Floats:
+def flanges(arm, q, deviation=None):
     chain = evaluate(arm, q, deviation)
     return se3.matrix(chain.rotation[-1], chain.position[-1])
 
 
-def urdf_model(text: str) -> pin.Model:
+def urdf_model(text):
     return pin.buildModelFromXML(text.partition("\n")[2])
 
 
-def by_pinocchio(model: pin.Model, q: Floats, tip: str = "tool0", base: str = "") -> Floats:
+def by_pinocchio(model, q, tip="tool0", base=""):
     data, out = model.createData(), []
     for row in q:
         pin.framesForwardKinematics(model, data, row)
@@ -31,13 +29,13 @@ def by_pinocchio(model: pin.Model, q: Floats, tip: str = "tool0", base: str = ""
     return np.stack([place.homogeneous for place in out])
 
 
-def turned(axis: str, angle: Floats | float) -> Floats:
+def turned(axis, angle):
     """(..., 4, 4) turns about an axis."""
     r = Rotation.from_euler(axis, angle).as_matrix()
     return se3.matrix(r, np.zeros(r.shape[:-1]))
 
 
-def ur_origins(text: str) -> Floats:
+def ur_origins(text):
     """(6, 4, 4) origins of UR's kinematics file."""
     out = []
     for joint in UR_JOINTS:
@@ -50,7 +48,7 @@ def ur_origins(text: str) -> Floats:
     return np.stack(out)
 
 
-def by_ur(text: str, q: Floats) -> Floats:
+def by_ur(text, q):
     place = np.broadcast_to(np.eye(4), (len(q), 4, 4))
     for origin, angle in zip(ur_origins(text), q.T, strict=True):
         place = place @ origin @ turned("z", angle[:, None])

@@ -4,7 +4,6 @@ import json
 from dataclasses import replace
 from functools import cache
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,15 +12,11 @@ from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.dh_table import dh_rows, to_toml
 from hilcal.calibration.handover import corrected, frames, ur_kinematics, urdf
 from hilcal.calibration.own_files.correct import correct_file
-from hilcal.drivers.simulated.world import World
-from hilcal.identification.baseline import with_effects
-from hilcal.identification.fit import fit
 from hilcal.identification.fit_document import frames_to_json
-from hilcal.readings.readings import States
 from hilcal.robot import se3
 from hilcal.robot.catalogue import load_arm
-from hilcal.types import Floats
-from tests.support.campaigns import Campaign, campaign, measured, plan
+from tests.support.campaigns import campaign, measured, plan
+from tests.support.fit_cases import based
 from tests.unit.calibration.other_eyes import by_pinocchio, by_ur, flanges, urdf_model
 
 POSES = 24
@@ -31,43 +26,41 @@ OTHER = se3.matrix(se3.rotation(np.array([0.2, 0.0, -0.4])), np.array([0.0, 0.1,
 
 
 @cache
-def site(effect: str, registration: bool, target: bool) -> Campaign:
+def site(effect, registration, target):
     return campaign(
         effect, poses=POSES, strength=30.0, registration_known=registration, target_known=target
     )
 
 
 @cache
-def fitted(effect: str, registration: bool, target: bool) -> Calibration:
+def fitted(effect, registration, target):
     c = site(effect, registration, target)
     names = ["joint_compliance", *([] if effect == "none" else [effect])]
-    found = fit(with_effects(c.cell, c.readings, "absolute", names), c.readings, "absolute")
+    found = based(c.cell, c.readings, "absolute", names)
     return Calibration.of(found, {"campaign": "made"})
 
 
-def document(c: Calibration) -> dict[str, object]:
+def document(c):
     rest = ur_kinematics(c.model.cell.arm, corrected(c).arm)[1]
     return dict(json.loads(frames(c, corrected(c), rest)))
 
 
-def pose(six: object) -> Floats:
+def pose(six):
     return se3.of_six(np.array(six, dtype=float).tolist())
 
 
-def fresh(load: int) -> States:
+def fresh(load):
     p = plan(40, 5000)
     return p.states[np.flatnonzero(p.load == load)]
 
 
-def seen(world: World, states: States, base: Floats) -> Floats:
+def seen(world, states, base):
     """(N, 3) where the tracker, without its noise, has the target, in axes of the base."""
     return np.asarray((world.sight(states).value(3) - base[:3, 3]) @ base[:3, :3])
 
 
 @pytest.mark.parametrize(("effect", "registration", "target"), CASES)
-def test_a_request_is_where_the_tracker_finds_the_tool(
-    effect: str, registration: bool, target: bool
-) -> None:
+def test_a_request_is_where_the_tracker_finds_the_tool(effect, registration, target):
     """Request, corrected joints, tracker, request; and with another tool."""
     c, world = fitted(effect, registration, target), site(effect, registration, target).world
     states, told = fresh(1), document(c)
@@ -93,7 +86,7 @@ def test_a_request_is_where_the_tracker_finds_the_tool(
 
 
 @pytest.mark.parametrize("target", [True, False])
-def test_the_base_is_the_worlds_where_no_geometry_is_wrong(target: bool) -> None:
+def test_the_base_is_the_worlds_where_no_geometry_is_wrong(target):
     """The nominal arm fits best elsewhere, since it sags: by a millimetre here."""
     c, world = fitted("none", False, target), site("none", False, target).world
     told = document(c)
@@ -109,7 +102,7 @@ def test_the_base_is_the_worlds_where_no_geometry_is_wrong(target: bool) -> None
     np.testing.assert_allclose(corrected(c).arm.links, c.model.cell.arm.links, atol=1e-12)
 
 
-def test_a_stated_base_is_the_base() -> None:
+def test_a_stated_base_is_the_base():
     c = fitted("link_geometry", True, True)
     told = document(c)
     np.testing.assert_allclose(pose(told["base_in_tracker"]), c.model.cell.registration, atol=1e-9)
@@ -119,15 +112,13 @@ def test_a_stated_base_is_the_base() -> None:
 
 
 @pytest.mark.parametrize(("registration", "target"), [(r, t) for _, r, t in CASES[4:]])
-def test_every_export_puts_the_tool_where_the_tracker_finds_it(
-    registration: bool, target: bool, tmp_path: Path
-) -> None:
+def test_every_export_puts_the_tool_where_the_tracker_finds_it(registration, target, tmp_path):
     """An arm that does not yield: constant transforms are all of it."""
     c = site("link_geometry", registration, target)
     stiff = replace(c.world.physics, joint_compliance=0 * c.world.physics.joint_compliance)
     world = replace(c.world, physics=stiff)
     readings = measured(world, plan(POSES, 1000), np.random.default_rng(0))
-    found = fit(with_effects(c.cell, readings, "absolute", ["link_geometry"]), readings, "absolute")
+    found = based(c.cell, readings, "absolute", ["link_geometry"])
     cal = Calibration.of(found, {"campaign": "made"})
     told, states = document(cal), fresh(0)
     base, tool = pose(told["base_in_tracker"]), pose(told["tool_on_flange"])

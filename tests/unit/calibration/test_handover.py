@@ -7,15 +7,16 @@ import numpy as np
 import pytest
 
 from hilcal.calibration.handover import corrected, ur_kinematics
-from hilcal.errors import CannotAnswerError, InputError
+from hilcal.errors import CannotAnswerError
 from hilcal.robot.catalogue import load_arm, robot_names
 from hilcal.robot.chain import Deviation
+from tests.support.refusals import refusal, refusal_of
 from tests.unit.calibration.other_eyes import flanges, ur_origins
 from tests.unit.calibration.test_calibration import calibrated, fresh
 
 
 @pytest.mark.parametrize("effect", ["link_geometry", "encoder_offset"])
-def test_constant_effects_are_in_the_transforms_exactly(effect: str) -> None:
+def test_constant_effects_are_in_the_transforms_exactly(effect):
     c = calibrated(effect)
     found = corrected(c)
     assert found.within == (effect,)
@@ -33,7 +34,7 @@ def test_constant_effects_are_in_the_transforms_exactly(effect: str) -> None:
 
 
 @pytest.mark.parametrize("effect", ["joint_tilt_compliance", "transmission_error"])
-def test_what_is_not_constant_is_named_and_left_out(effect: str) -> None:
+def test_what_is_not_constant_is_named_and_left_out(effect):
     c = calibrated(effect)
     found = corrected(c)
     assert effect in found.beyond
@@ -42,7 +43,7 @@ def test_what_is_not_constant_is_named_and_left_out(effect: str) -> None:
 
 
 @pytest.mark.parametrize("name", [n for n in robot_names() if n.startswith("ur")])
-def test_the_nominal_arms_have_the_origins_of_ur_description(name: str) -> None:
+def test_the_nominal_arms_have_the_origins_of_ur_description(name):
     arm = load_arm(name)
     text, rest = ur_kinematics(arm, arm)
     np.testing.assert_allclose(rest, np.eye(4), atol=1e-12)
@@ -54,10 +55,10 @@ def test_the_nominal_arms_have_the_origins_of_ur_description(name: str) -> None:
     assert re.search(r"hash: calib_\d+", text)
 
 
-def test_deflections_and_foreign_arms_are_refused_in_words() -> None:
-    with pytest.raises(CannotAnswerError, match="--readings absolute"):
-        corrected(calibrated("none", "deflection"))
+def test_deflections_and_foreign_arms_are_refused_in_words():
+    refusal_of(
+        CannotAnswerError, "--readings absolute", corrected, calibrated("none", "deflection")
+    )
     arm = load_arm("ur10e")
     foreign = replace(arm, name="kr6")
-    with pytest.raises(InputError, match="kr6: UR's kinematics file is for UR arms"):
-        ur_kinematics(foreign, foreign)
+    refusal("kr6: UR's kinematics file is for UR arms", ur_kinematics, foreign, foreign)

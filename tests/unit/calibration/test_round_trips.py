@@ -19,14 +19,12 @@ from hilcal.calibration.handover import ur_kinematics, urdf
 from hilcal.calibration.measured import Measured
 from hilcal.calibration.scatter import Scatter
 from hilcal.calibration.storage import from_json, to_json
-from hilcal.effects.protocol import Columns, Parameter, Situation
+from hilcal.effects.protocol import Columns, Parameter
 from hilcal.identification.robot_frames import one_of_each
 from hilcal.model.model import Model
 from hilcal.robot import se3
-from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm, robot_names
 from hilcal.robot.chain import evaluate, joint_jacobian
-from hilcal.types import Floats
 from tests.support.campaigns import cell_of
 from tests.unit.calibration.other_eyes import by_pinocchio, by_ur, flanges, urdf_model
 
@@ -37,27 +35,27 @@ NM = 1e-9
 EFFECTS = [e.name for e in hc.installed().effects if e.name != "guide_error"]
 
 
-def moved_arm(name: str, seed: int, size: float) -> Arm:
+def moved_arm(name, seed, size):
     """An arm of the catalogue with links that are displaced and turned."""
     rng, arm = np.random.default_rng(seed), load_arm(name)
     moved = se3.matrix(*se3.exp(size * rng.standard_normal((arm.n + 1, 6))))
     return replace(arm, links=arm.links @ moved)
 
 
-def joints(seed: int, count: int = 10) -> Floats:
+def joints(seed, count=10):
     return np.random.default_rng(seed).uniform(-3, 3, (count, 6))
 
 
 @ROUND
 @given(ARMS, SEEDS, st.sampled_from([0.0, 1e-6, 1e-3, 0.3]))
-def test_pinocchio_has_the_urdf_s_flange_to_a_nanometre(name: str, seed: int, size: float) -> None:
+def test_pinocchio_has_the_urdf_s_flange_to_a_nanometre(name, seed, size):
     arm, q = moved_arm(name, seed, size), joints(seed)
     made = by_pinocchio(urdf_model(urdf(arm)), q)
     np.testing.assert_allclose(made, flanges(arm, q), atol=NM)
 
 
 @pytest.mark.parametrize("pitch", [np.pi / 2, -np.pi / 2, np.pi / 2 - 1e-8, np.pi / 2 - 1e-5])
-def test_a_urdf_is_exact_where_roll_and_yaw_are_one(pitch: float) -> None:
+def test_a_urdf_is_exact_where_roll_and_yaw_are_one(pitch):
     arm = load_arm("ur5e")
     links = arm.links.copy()
     links[2, :3, :3] = Rotation.from_euler("xyz", [0.4, pitch, -1.1]).as_matrix()
@@ -69,9 +67,7 @@ def test_a_urdf_is_exact_where_roll_and_yaw_are_one(pitch: float) -> None:
 
 @ROUND
 @given(ARMS, SEEDS, st.sampled_from([0.0, 1e-9, 1e-3, 0.03]))
-def test_ur_s_file_and_its_tool_are_the_arm_to_a_nanometre(
-    name: str, seed: int, size: float
-) -> None:
+def test_ur_s_file_and_its_tool_are_the_arm_to_a_nanometre(name, seed, size):
     arm, q = moved_arm(name, seed, size), joints(seed)
     text, rest = ur_kinematics(load_arm(name), arm, "by a test")
     np.testing.assert_allclose(by_ur(text, q) @ rest, flanges(arm, q), atol=NM)
@@ -81,9 +77,7 @@ def test_ur_s_file_and_its_tool_are_the_arm_to_a_nanometre(
 
 @ROUND
 @given(ARMS, SEEDS, st.sampled_from([0.0, 1e-12, 1e-7, 1e-3, 0.3]), st.sampled_from(CONVENTIONS))
-def test_a_dh_table_is_the_arm_to_what_it_states(
-    tmp_path_factory, name: str, seed: int, size: float, convention
-) -> None:
+def test_a_dh_table_is_the_arm_to_what_it_states(tmp_path_factory, name, seed, size, convention):
     arm, q = moved_arm(name, seed, size), joints(seed)
     rows, there = dh_rows(arm, convention), flanges(arm, q)
     assert rows.disagreement < NM
@@ -104,12 +98,12 @@ def test_a_dh_table_is_the_arm_to_what_it_states(
 
 
 @cache
-def model_of(names: tuple[str, ...], target_known: bool) -> Model:
+def model_of(names, target_known):
     cell, known = cell_of(target_known=target_known), hc.installed()
     return Model(cell, tuple(known.make(name, cell, one_of_each(cell)) for name in names), known)
 
 
-def random_calibration(names: tuple[str, ...], seed: int) -> Calibration:
+def random_calibration(names, seed):
     """A model with parameters of ordinary size, which nobody fitted."""
     rng = np.random.default_rng(seed)
     model = model_of(names, "target_offset" not in names)
@@ -130,7 +124,7 @@ def random_calibration(names: tuple[str, ...], seed: int) -> Calibration:
     )
 
 
-def surroundings(rng: np.random.Generator, count: int) -> dict[str, Floats]:
+def surroundings(rng, count):
     return {
         "time": rng.uniform(0, 3600, count),
         "load_time": rng.uniform(0, 600, count),
@@ -140,7 +134,7 @@ def surroundings(rng: np.random.Generator, count: int) -> dict[str, Floats]:
     }
 
 
-def regular(c: Calibration, q: Floats) -> Floats:
+def regular(c, q):
     """Joint values away from singular poses, in whatever branch they are."""
     chain, arm = evaluate(c.model.cell.arm, q), c.model.cell.arm
     jacobian = joint_jacobian(chain, chain.position[-1])
@@ -150,7 +144,7 @@ def regular(c: Calibration, q: Floats) -> Floats:
 
 
 @pytest.mark.parametrize("effect", EFFECTS)
-def test_predicting_what_was_inverted_is_the_target_to_a_nanometre(effect: str) -> None:
+def test_predicting_what_was_inverted_is_the_target_to_a_nanometre(effect):
     names = tuple(dict.fromkeys(("base_frame", "joint_compliance", effect)))
     seed = EFFECTS.index(effect)
     c, rng = random_calibration(names, seed), np.random.default_rng(seed)
@@ -171,7 +165,7 @@ def test_predicting_what_was_inverted_is_the_target_to_a_nanometre(effect: str) 
 
 @ROUND
 @given(SEEDS, st.lists(st.sampled_from(EFFECTS), min_size=1, max_size=4, unique=True))
-def test_a_calibration_file_says_the_same_in_every_bit(seed: int, names: list[str]) -> None:
+def test_a_calibration_file_says_the_same_in_every_bit(seed, names):
     c, rng = random_calibration(tuple(names), seed), np.random.default_rng(seed)
     again = from_json(json.loads(json.dumps(to_json(c), allow_nan=False)))
     q = regular(c, rng.uniform(-2.8, 2.8, (12, 6)))
@@ -194,15 +188,15 @@ class Sagging(hc.Effect):
     plausible = 10.0
 
     @property
-    def parameters(self) -> tuple[Parameter, ...]:
+    def parameters(self):
         return (Parameter("k", "rad", 1e-4),)
 
-    def columns(self, s: Situation) -> tuple[Columns, ...]:
+    def columns(self, s):
         wave = np.cos(s.angle[:, 1] + s.angle[:, 2])
         return (Columns("dq", np.zeros(1, dtype=int), np.ones(1, dtype=int), wave[:, None]),)
 
 
-def test_an_effect_without_a_compiled_form_is_named_and_inverted_all_the_same() -> None:
+def test_an_effect_without_a_compiled_form_is_named_and_inverted_all_the_same():
     c = random_calibration(("base_frame", "joint_compliance"), 3)
     model = replace(
         c.model, effects=(*c.model.effects, Sagging(c.model.cell, one_of_each(c.model.cell)))

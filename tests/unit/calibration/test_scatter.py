@@ -9,18 +9,16 @@ from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.scatter import budget
 from hilcal.config import Repeatability
 from hilcal.diagnosis.noise import RP_PER_RMS
-from hilcal.identification.baseline import baseline
-from hilcal.identification.fit import Fit, fit
 from hilcal.identification.full_covariance import joint_factors
 from hilcal.readings.readings import Readings
-from hilcal.readings.whitening import Mode
-from tests.support.campaigns import Campaign, campaign
+from tests.support.campaigns import campaign
+from tests.support.fit_cases import based
 
 TRUE = 1e-5
 """rad; what the simulated arm scatters by."""
 
 
-def instrument(c: Campaign) -> Readings:
+def instrument(c):
     """Readings with the covariance of the instrument alone."""
     true = replace(c.cell, registration=c.world.registration)
     f = joint_factors(true, c.readings, np.full(6, TRUE))
@@ -28,21 +26,21 @@ def instrument(c: Campaign) -> Readings:
     return replace(c.readings, covariance=alone, scatter_stated=False)
 
 
-def fitted(c: Campaign, mode: Mode, readings: Readings, rp: float | None = 5e-5) -> Fit:
+def fitted(c, mode, readings, rp=5e-5):
     """Fit a cell that says nothing of its repeatability."""
     config = c.cell.configured().model_copy(update={"repeatability": Repeatability()})
     cell = replace(c.cell, config=config, arm=replace(c.cell.arm, repeatability=rp))
-    return fit(baseline(cell, readings, mode), readings, mode)
+    return based(cell, readings, mode)
 
 
-def once(readings: Readings) -> Readings:
+def once(readings):
     """The first reading of each state."""
     _, first = np.unique(np.stack([readings.pose, readings.load]), axis=1, return_index=True)
     return readings[np.sort(first)]
 
 
 @pytest.mark.parametrize("mode", ["absolute", "deflection"])
-def test_repeats_show_the_scatter(mode: Mode) -> None:
+def test_repeats_show_the_scatter(mode):
     c = campaign(poses=16, cycles=3)
     found = Calibration.of(fitted(c, mode, instrument(c)))
     assert found.scatter.source == "repeats"
@@ -51,7 +49,7 @@ def test_repeats_show_the_scatter(mode: Mode) -> None:
 
 @pytest.mark.parametrize("mode", ["absolute", "deflection"])
 @pytest.mark.parametrize(("rp", "source"), [(5e-5, "maker"), (None, "industry")])
-def test_without_repeats_it_is_the_makers(mode: Mode, rp: float | None, source: str) -> None:
+def test_without_repeats_it_is_the_makers(mode, rp, source):
     c = campaign(poses=16)
     found = fitted(c, mode, once(instrument(c)), rp)
     b = budget(found)
@@ -63,7 +61,7 @@ def test_without_repeats_it_is_the_makers(mode: Mode, rp: float | None, source: 
 
 @pytest.mark.parametrize("poses", [8, 12, 24])
 @pytest.mark.parametrize("mode", ["absolute", "deflection"])
-def test_the_budget_is_never_below_what_poses_left_out_show(mode: Mode, poses: int) -> None:
+def test_the_budget_is_never_below_what_poses_left_out_show(mode, poses):
     """An effect that the model lacks, and few poses: fitted ones are nearer than new ones are."""
     c = campaign("joint_tilt_compliance", mode, poses=poses, strength=8.0)
     found = fitted(c, mode, c.readings)
@@ -71,7 +69,7 @@ def test_the_budget_is_never_below_what_poses_left_out_show(mode: Mode, poses: i
     assert found.holdout.rms_m > found.error.rms_m
 
 
-def test_identical_rows_are_no_repeats() -> None:
+def test_identical_rows_are_no_repeats():
     """Rows that were copied say that the arm does not scatter at all."""
     c = campaign(poses=16)
     one = once(instrument(c))
@@ -79,7 +77,7 @@ def test_identical_rows_are_no_repeats() -> None:
     assert Calibration.of(fitted(c, "absolute", twice)).scatter.source == "maker"
 
 
-def test_repeats_below_the_noise_say_how_much_it_can_be() -> None:
+def test_repeats_below_the_noise_say_how_much_it_can_be():
     c = campaign(poses=16, cycles=3)
     own = instrument(c)
     noisy = replace(own, covariance=100.0 * own.covariance)
@@ -88,7 +86,7 @@ def test_repeats_below_the_noise_say_how_much_it_can_be() -> None:
     assert TRUE < scatter.joint_std[0] < 10 * TRUE
 
 
-def test_what_the_fit_or_the_cell_states_goes_first() -> None:
+def test_what_the_fit_or_the_cell_states_goes_first():
     c = campaign(poses=16, cycles=3)
-    found: Fit = fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute")
+    found = based(c.cell, c.readings, "absolute")
     assert Calibration.of(found).scatter.source == "stated"

@@ -1,7 +1,7 @@
 """`hilcal config` and its page in the documents: every key, with what a reader needs."""
 
 import tomllib
-from typing import Annotated, Any, get_args
+from typing import Annotated, get_args
 
 import pytest
 from pydantic import TypeAdapter
@@ -50,7 +50,7 @@ def numeric(annotation):
 def test_every_key_has_unit_default_and_an_example_that_is_valid(section, key, field):
     found = key_of(section, key)
     assert found.valid == field.description
-    adapter: TypeAdapter[Any] = TypeAdapter(Annotated[field.annotation, *field.metadata, field])
+    adapter = TypeAdapter(Annotated[field.annotation, *field.metadata, field])
     value = tomllib.loads(found.example)
     assert list(value) == [key]
     adapter.validate_python(value[key])

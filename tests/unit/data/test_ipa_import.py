@@ -14,9 +14,6 @@ from tests.support.readings_cases import make_arm
 
 ARM = make_arm()
 MAPPING = find_mapping("ipa-ur10", Mapping)
-assert MAPPING.instrument is not None
-assert MAPPING.std is not None
-assert MAPPING.orientation is not None
 TRACKER = MAPPING.instrument.noise()
 JOINTS = tuple(map(str, MAPPING.joints.columns))
 MEASURED = (*map(str, MAPPING.position.columns), *map(str, MAPPING.orientation.columns))
@@ -28,11 +25,9 @@ SERIES = {
 }
 HEADER = ("Timestamp", "Goal x", *COLUMNS)
 
-Row = dict[str, float | str]
-
 
 def row(q, p_mm, angles):
-    cells: Row = {"Timestamp": "2,02011E+13", "Goal x": 0.4}
+    cells = {"Timestamp": "2,02011E+13", "Goal x": 0.4}
     cells |= dict(zip(JOINTS, q, strict=True))
     cells["measurement_temperature"] = 21.5
     for k, e in enumerate(("x", "y", "z")):
@@ -174,5 +169,4 @@ def test_the_measured_series(series):
     # 3-D standard deviation of a typical position: tens of micrometres
     std = np.sqrt(np.trace(x.covariance[:, :3, :3], axis1=1, axis2=2))
     assert 20e-6 < np.median(std) < 60e-6
-    assert x.states.approach is not None
     assert set(np.unique(x.states.approach)) == {-1.0, 1.0}

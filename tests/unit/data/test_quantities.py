@@ -12,13 +12,15 @@ from scipy.spatial.transform import Rotation
 from hilcal.cell import Cell
 from hilcal.errors import InputError
 from hilcal.readings.covariance import TrackerNoise
-from hilcal.readings.readings import Range, Readings, States
+from hilcal.readings.readings import Range
 from hilcal.readings.same_readings import already, never_fitted
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.rows import content_hash
 from hilcal.tables.table import read_table, write_table
 from hilcal.tables.units import parse_duration, parse_length
 from tests.support.campaigns import cell_of
+from tests.support.readings_cases import made
+from tests.support.refusals import refusals, refuses
 
 
 @pytest.mark.parametrize(
@@ -32,22 +34,9 @@ def test_a_length_or_a_duration(parse, text, number):
     assert math.isclose(parse(text, "--option"), number)
 
 
-@pytest.mark.parametrize(
-    ("text", "why"),
-    [
-        ("0.1", 'has no unit; valid: a length over 0 in m, mm, um, e.g. "0.1 mm"'),
-        ("2 inch", 'has the unit "inch"'),
-        ("short", "is not understood"),
-        ("-1 mm", "is not over 0"),
-        ("0 mm", "is not over 0"),
-        ("1.2.3 mm", "is not understood"),
-        ("1e999 mm", "is not over 0"),  # infinite
-    ],
-)
-def test_anything_else_is_refused_with_its_reason(text, why):
-    with pytest.raises(InputError, match="--limit") as refused:
-        parse_length(text, "--limit")
-    assert why in str(refused.value)
+@refusals("lengths")
+def test_anything_else_is_refused_with_its_reason(case, given):
+    refuses(case, lambda: parse_length(given[:-1], "--limit"))
 
 
 MEASURED = Range("joint 1 angle", "rad", np.radians(-176.0), np.radians(168.0))
@@ -99,19 +88,9 @@ def readings_of(target, names=NAMES, seed=0):
     """Readings of two poses in turn, one for each number of a target."""
     rng, count = np.random.default_rng(seed), len(target)
     pose = np.arange(count) % 2
-    zero = np.zeros(count, dtype=np.int64)
-    q = rng.uniform(-1.5, 1.5, (2, 6))
-    return Readings(
-        states=States(q[pose], np.zeros((count, 6)), target=np.array(target)),
-        pose=pose,
-        load=zero,
-        cycle=zero,
-        value=rng.uniform(-0.5, 0.5, (count, 3)),
-        covariance=np.tile(1e-10 * np.eye(3), (count, 1, 1)),
-        load_names=("none",),
-        pose_names=("p1", "p2"),
-        target_names=names,
-    )
+    q, value = rng.uniform(-1.5, 1.5, (2, 6))[pose], rng.uniform(-0.5, 0.5, (count, 3))
+    own = {"pose_names": ("p1", "p2"), "covariance": np.tile(1e-10 * np.eye(3), (count, 1, 1))}
+    return made(q, value, target=np.array(target), pose=pose, target_names=names, **own)
 
 
 def table_of(path, *targets):
@@ -216,21 +195,12 @@ def campaign(m=3, poses=40, seed=0):
     """Poses with an unloaded and two loaded readings each."""
     rng = np.random.default_rng(seed)
     n = poses * LOADS
-    pose = np.repeat(np.arange(poses), LOADS)
-    load = np.tile(np.arange(LOADS), poses)
+    pose, load = np.divmod(np.arange(n), LOADS)
     value = rng.normal(size=(n, m))
     if m == 6:
         value[:, 3:] = Rotation.random(n, random_state=1).as_rotvec()
-    return Readings(
-        states=States(rng.uniform(-3, 3, (poses, 6))[pose], rng.normal(size=(n, 6))),
-        pose=pose,
-        load=load,
-        cycle=np.zeros(n, dtype=np.int64),
-        value=value,
-        covariance=np.tile(np.eye(m) * NOISE_M**2, (n, 1, 1)),
-        load_names=("none", "5kg", "10kg"),
-        pose_names=tuple(f"p{k}" for k in range(poses)),
-    )
+    q, wrench = rng.uniform(-3, 3, (poses, 6))[pose], rng.normal(size=(n, 6))
+    return made(q, value, wrench=wrench, pose=pose, load=load, std=NOISE_M)
 
 
 @pytest.mark.parametrize("m", [3, 6])

@@ -5,7 +5,6 @@ import pickle
 import sys
 import zipfile
 from datetime import datetime, timedelta
-from typing import Any
 
 import numpy as np
 import openpyxl
@@ -24,6 +23,7 @@ from hilcal.tables.propose import propose
 from hilcal.tables.table import import_table
 from hilcal.toml import check_section
 from tests.support.foreign_tables import campaign
+from tests.support.refusals import refusal
 
 C = campaign(12)
 NOISE = TrackerNoise(10e-6, 0.3e-6, 15e-6, 6e-6, 1e-4)
@@ -77,7 +77,6 @@ def test_a_spreadsheet(tmp_path, arm):
     x = read(path, found, arm)
     np.testing.assert_allclose(x.states.q, C.q, atol=1e-12)
     np.testing.assert_allclose(x.value, C.position, atol=1e-12)
-    assert x.states.time is not None
     np.testing.assert_allclose(x.states.time, 30 * np.arange(12))
     assert x.load_names == ("5", "none")
     with pytest.raises(InputError, match=r"no sheet 'Date' \(did you mean \"Data\"\?\); it has"):
@@ -118,13 +117,12 @@ def test_a_mat_file(tmp_path, arm):
     np.testing.assert_allclose(x.states.q, C.q)
     np.testing.assert_allclose(x.value[:, :3], C.position)
     np.testing.assert_allclose(x.value[:, 3:], C.attitude.as_rotvec(), atol=1e-9)
-    with pytest.raises(InputError, match="no variable 'Q'"):
-        open_grid(path, FileFormat(variable="Q"))
+    refusal("no variable 'Q'", open_grid, path, FileFormat(variable="Q"))
 
 
 def test_parquet(tmp_path, arm):
     path = tmp_path / "t.parquet"
-    columns: dict[str, Any] = {n: np.rad2deg(C.q[:, k]) for k, n in enumerate(NAMES)}
+    columns = {n: np.rad2deg(C.q[:, k]) for k, n in enumerate(NAMES)}
     columns |= {n: 1e3 * C.position[:, k] for k, n in enumerate("XYZ")}
     columns["pose"] = [f"P{k}" for k in range(12)]
     columns["raw"] = [[1.0, 2.0]] * 12
@@ -142,8 +140,7 @@ def test_a_missing_package_is_named(name, tmp_path, monkeypatch):
     else:
         parquet.write_table(pyarrow.table({"X": [1.0]}), path)
     monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(InputError, match=r"\w+ is not installed: pip install .hilcal\[tables\]"):
-        open_grid(path, FileFormat())
+    refusal(r"\w+ is not installed: pip install .hilcal\[tables\]", open_grid, path, FileFormat())
 
 
 def _zip(**members):
@@ -169,9 +166,7 @@ def test_what_is_no_table(content, message, tmp_path):
     path = tmp_path / "t.bin"
     path.write_bytes(content)
     for attempt in (lambda: open_grid(path, FileFormat()), lambda: propose(path)):
-        with pytest.raises(InputError, match=message) as error:
-            attempt()
-        assert "\n" not in str(error.value)
+        refusal(message, attempt)
 
 
 def test_an_exchange_table_may_be_a_sheet(tmp_path, arm):
@@ -189,5 +184,4 @@ def test_an_exchange_table_may_be_a_sheet(tmp_path, arm):
     assert one.pose_names == other.pose_names
     out.active.cell(3, 9, "abc")
     out.save(sheet)
-    with pytest.raises(InputError, match=r"t.xlsx: row 3, column 'x_m': 'abc' is not a number"):
-        import_table(sheet, arm, NOISE)
+    refusal(r"t.xlsx: row 3, column 'x_m': 'abc' is not a number", import_table, sheet, arm, NOISE)

@@ -14,9 +14,10 @@ from hilcal.readings.covariance import (
     joint_scatter,
     tracker_covariance,
 )
-from hilcal.readings.readings import Readings, States
 from hilcal.readings.whitening import MANY, MODES, inverse_root, measured, whitening
 from hilcal.robot import se3
+from tests.support.readings_cases import made
+from tests.support.refusals import refusal
 
 NOISE = TrackerNoise(10e-6, 0.3e-6, 15e-6, 6e-6, 1e-4)
 
@@ -56,8 +57,7 @@ def test_what_no_instrument_has_is_refused():
         ((1e-5, 0.0, 0.0, 0.0), "transverse_std"),
         ((1e-5, 0.0, 1e-5, 0.0, float("nan")), "orientation_std = nan"),
     ):
-        with pytest.raises(InputError, match=words):
-            TrackerNoise(*figures)
+        refusal(words, TrackerNoise, *figures)
     with pytest.raises(InputError, match="reading 2 lies at the tracker's station"):
         tracker_covariance(np.array([[1.0, 0, 0], [1.0, 1, 1]]), NOISE, (1.0, 1.0, 1.0))
     with pytest.raises(InputError, match="orientation_std is 0"):
@@ -104,17 +104,8 @@ def random_units(rng, k):
 
 def make_readings(pose, cycle, load, value, covariance):
     """Readings with load 0 the unloaded state."""
-    count = len(pose)
-    return Readings(
-        states=States(q=np.zeros((count, 6)), wrench=np.zeros((count, 6))),
-        pose=pose,
-        load=load,
-        cycle=cycle,
-        value=value,
-        covariance=covariance,
-        load_names=("none", *(f"w{k}" for k in range(1, int(load.max(initial=0)) + 1))),
-        pose_names=tuple(f"P{k}" for k in range(int(pose.max(initial=0)) + 1)),
-    )
+    q = np.zeros((len(pose), 6))
+    return made(q, value, pose=pose, cycle=cycle, load=load, covariance=covariance)
 
 
 def random_readings(rng, m, decades=3.0):

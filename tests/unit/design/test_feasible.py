@@ -1,27 +1,23 @@
 """Candidate poses and motions: none ever breaks a limit, and what leaves nothing is named."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hilcal.cell import Cell, cell_from_config, tracker_place
-from hilcal.config import CellConfig
+from hilcal.cell import cell_from_config, tracker_place
 from hilcal.design.feasible import REASONS, Space, draw
 from hilcal.errors import CannotAnswerError
-from hilcal.measuring.clearance import Clearance
 from hilcal.measuring.feasibility import BETWEEN_M, STATE, Feasibility, Margins
 from hilcal.measuring.motion import SLACK, SLACK_M, Guard
 from hilcal.measuring.route import Stop, dry_run, route_problems
-from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm
 from hilcal.store.plan import UNLOADED, Plan, Step
-from hilcal.types import Floats
 from tests.support.arm_cases import ODD, arm_of
 from tests.support.fake_bench import Bench
+from tests.support.refusals import refusal_of
 from tests.support.space_cases import (
     TABLE,
     along,
@@ -84,7 +80,7 @@ cells = st.fixed_dictionaries(
 
 @settings(max_examples=12, deadline=None)
 @given(cells, st.integers(0, 99))
-def test_no_candidate_ever_breaks_a_limit(sections: dict[str, Any], seed: int) -> None:
+def test_no_candidate_ever_breaks_a_limit(sections, seed):
     """Each limit is looked at by other means than the planner's."""
     config = cell(**sections)
     space = space_of(config)
@@ -101,7 +97,7 @@ def test_no_candidate_ever_breaks_a_limit(sections: dict[str, Any], seed: int) -
                 _under_load(config, space, q, name)
 
 
-def _geometry(config: CellConfig, space: Space, q: np.ndarray) -> None:
+def _geometry(config, space, q):
     arm, limits, the_cell = space.cell.arm, config.limits, space.cell
     low, high = arm.q_min + limits.joint_margin_rad, arm.q_max - limits.joint_margin_rad
     assert np.all(q >= low)
@@ -129,7 +125,7 @@ def _geometry(config: CellConfig, space: Space, q: np.ndarray) -> None:
         assert np.arccos(cosine) <= config.sight.incidence_max_rad + 1e-9
 
 
-def _under_load(config: CellConfig, space: Space, q: np.ndarray, name: str) -> None:
+def _under_load(config, space, q, name):
     arm, the_cell = space.cell.arm, space.cell
     at, parts = frames(arm, q), space.shapes.scene.parts
     load = next((x for x in config.loads if x.name == name), None)
@@ -159,7 +155,7 @@ def _under_load(config: CellConfig, space: Space, q: np.ndarray, name: str) -> N
                 assert gap(placed(part, at), points) > part.radius + radius + 0.02 - 1e-9
 
 
-def test_enough_candidates_under_every_load_the_same_again_from_the_seed() -> None:
+def test_enough_candidates_under_every_load_the_same_again_from_the_seed():
     config = cell(obstacles=[TABLE])
     drawn = drawn_of(config, 300)
     assert drawn.q.shape == (300, 6)
@@ -174,7 +170,7 @@ def test_enough_candidates_under_every_load_the_same_again_from_the_seed() -> No
     assert np.all(spread > 0.1)
 
 
-def test_reasons_are_told_one_by_one_in_order() -> None:
+def test_reasons_are_told_one_by_one_in_order():
     config = cell(obstacles=[TABLE], sight={"tracker_m": [-3.0, 0.0, 1.0]})
     space = space_of(config)
     q = np.random.default_rng(0).uniform(-3.0, 3.0, (300, 6))
@@ -242,20 +238,17 @@ NOTHING = {
 
 
 @pytest.mark.parametrize(("sections", "message"), NOTHING.values(), ids=NOTHING.keys())
-def test_what_leaves_nothing_is_named(sections: dict[str, Any], message: str) -> None:
-    with pytest.raises(CannotAnswerError, match=message) as raised:
-        drawn_of(cell(**sections))
-    assert raised.value.exit_code == 4
-    assert "\n" not in str(raised.value)
+def test_what_leaves_nothing_is_named(sections, message):
+    refusal_of(CannotAnswerError, message, lambda: drawn_of(cell(**sections)))
 
 
-def test_too_few_is_told_by_what_takes_most() -> None:
+def test_too_few_is_told_by_what_takes_most():
     sight = {"tracker_m": [3, 0, 0.5], "target_normal": [0, 0, 1], "incidence_max_rad": 0.05}
     with pytest.raises(CannotAnswerError, match=r"only \d+ poses, 5,000 are needed: .* turn the t"):
         drawn_of(cell(sight=sight), 5000, least=5000, most=1 << 16)
 
 
-def test_one_load_that_cannot_be_hung_is_a_remark() -> None:
+def test_one_load_that_cannot_be_hung_is_a_remark():
     loads = [{"name": "20kg", "mass_kg": 20.0}, {"name": "2kg", "mass_kg": 2.0}]
     drawn = drawn_of(cell(loads=loads), 30)
     assert not drawn.allowed[:, 1].any()
@@ -263,7 +256,7 @@ def test_one_load_that_cannot_be_hung_is_a_remark() -> None:
     assert any('load "20kg": tool and load are 20.8 kg' in line for line in drawn.remarks)
 
 
-def test_where_the_tracker_stands() -> None:
+def test_where_the_tracker_stands():
     """Of a registration: T_sensor_base maps base into tracker coordinates."""
     known = {"base_xyz_m": [2.0, 1.0, -0.5], "base_rotvec_rad": [0.0, 0.0, np.pi / 2]}
     config = cell(tracker=known)
@@ -284,18 +277,18 @@ def test_where_the_tracker_stands() -> None:
     assert any("tracker's place is not known" in line for line in drawn_of(cell(), 5).remarks)
 
 
-def test_a_tripod_under_the_tracker_is_not_in_its_way() -> None:
+def test_a_tripod_under_the_tracker_is_not_in_its_way():
     tripod = {"name": "tripod", "bottom_m": [2.5, 0.0, -1.0], "radius_m": 0.4, "height_m": 1.8}
     config = cell(obstacles=[TABLE, tripod], sight={"tracker_m": [2.5, 0.0, 0.8]})
     assert len(drawn_of(config, 30).q) == 30
 
 
-def plan_of(q: np.ndarray, *steps: tuple[str, str]) -> Plan:
+def plan_of(q, *steps):
     names = ("reference", *(f"p{k}" for k in range(1, len(q))))
     return Plan(names, q, tuple(Step(*step) for step in steps))
 
 
-def problems(config: CellConfig, *states: Any, load: str = UNLOADED) -> tuple[str, ...]:
+def problems(config, *states, load=UNLOADED):
     plan = plan_of(np.array(states, dtype=float), ("p1", load))
     return dry_run(cell_from_config(config), config, plan).problems
 
@@ -303,7 +296,7 @@ def problems(config: CellConfig, *states: Any, load: str = UNLOADED) -> tuple[st
 HOME = (0.0, -1.2, 1.5, -1.5, -1.5, 0.0)
 
 
-def test_an_edited_plan_that_collides_is_refused_by_name() -> None:
+def test_an_edited_plan_that_collides_is_refused_by_name():
     config = cell(obstacles=[TABLE])
     assert problems(config, HOME, (0.5, -1.0, 1.4, -1.2, -1.2, 0.3)) == ()
     folded = problems(config, HOME, (0.0, -1.5, 3.0, -1.5, -1.5, 0.0))
@@ -320,7 +313,7 @@ def test_an_edited_plan_that_collides_is_refused_by_name() -> None:
     assert any("and post collide: they overlap by" in line for line in between)
 
 
-def test_what_hangs_is_seen_by_the_dry_run() -> None:
+def test_what_hangs_is_seen_by_the_dry_run():
     limits = {"workspace_min_m": [-3.0, -3.0, 0.0]}
     config = cell(obstacles=[TABLE], limits=limits)
     up = (0.0, -1.2, 1.5, -1.9, 1.57, 0.0)  # the load point above the wrist
@@ -332,7 +325,7 @@ def test_what_hangs_is_seen_by_the_dry_run() -> None:
     assert any("what hangs (5kg) is" in line and "outside the workspace" in line for line in found)
 
 
-def test_what_the_tracker_would_not_see_is_seen_by_the_dry_run() -> None:
+def test_what_the_tracker_would_not_see_is_seen_by_the_dry_run():
     sight = {"tracker_m": [3.0, 0.0, 0.6]}
     config = cell(sight=sight)
     away = (np.pi, *HOME[1:])  # the tool on the tracker's side
@@ -348,11 +341,11 @@ URDF = "urdf"
 """Six joints, a shape that nobody knows."""
 
 
-def arm(name: str) -> Arm:
+def arm(name):
     return load_arm("lab.urdf", text=_urdf()) if name == URDF else arm_of(name)
 
 
-def _urdf() -> str:
+def _urdf():
     rows = [("0 0 0.2", "0 0 1"), ("0 0.1 0", "0 1 0"), ("0 -0.1 0.5", "0 1 0"),
             ("0 0 0.45", "0 1 0"), ("0 0.1 0", "0 0 1"), ("0 0 0.1", "0 1 0")]  # fmt: skip
     links = "".join(
@@ -370,9 +363,9 @@ def _urdf() -> str:
 
 
 @st.composite
-def cells_of_same_feasibility(draw: Any) -> tuple[Cell, CellConfig]:
+def cells_of_same_feasibility(draw):
     """Any arm with targets, loads, obstacles and a workspace, or without."""
-    limits: dict[str, Any] = {"joint_margin_rad": draw(st.sampled_from([0.0, 0.3]))}
+    limits = {"joint_margin_rad": draw(st.sampled_from([0.0, 0.3]))}
     if draw(st.booleans()):
         sides = [-draw(st.floats(0.2, 1.5)) for _ in range(2)]
         limits["workspace_min_m"] = [*sides, draw(st.floats(-0.6, 0.3))]
@@ -382,7 +375,7 @@ def cells_of_same_feasibility(draw: Any) -> tuple[Cell, CellConfig]:
     size = st.tuples(*[st.floats(0.02, 0.4)] * 3)
     things = draw(st.lists(st.tuples(place, size), max_size=2))
     offsets = draw(st.lists(st.tuples(*[st.floats(-0.3, 0.3)] * 3), min_size=1, max_size=3))
-    tool: dict[str, Any] = {
+    tool = {
         "load_point_m": draw(st.tuples(*[st.floats(-0.15, 0.15)] * 3)),
         "mass_kg": 1.0,
     }
@@ -413,14 +406,14 @@ SEED = st.integers(0, 10_000)
 LOAD = st.sampled_from([UNLOADED, "weight", "pull"])
 
 
-def states(c: Cell, seed: int, count: int) -> Floats:
+def states(c, seed, count):
     """States (N, n) about a usual pose, of which some keep all and some do not."""
     rng = np.random.default_rng(seed)
     usual = np.resize([0.0, -1.2, 1.5, -1.5, -1.5, 0.0, 0.0], c.arm.n)
     return np.asarray(usual + rng.uniform(-1.2, 1.2, (count, c.arm.n)))
 
 
-def gaps(shapes: Clearance, q: Floats, load: str) -> tuple[float, float]:
+def gaps(shapes, q, load):
     """How far a state (n,) stays within the workspace, and from obstacles, by other means, m."""
     c, config = shapes.cell, shapes.config
     parts, at = shapes.scene.parts, frames(c.arm, q)
@@ -445,7 +438,7 @@ def gaps(shapes: Clearance, q: Floats, load: str) -> tuple[float, float]:
     return inside, min(apart, default=np.inf)
 
 
-def stopped(guard: Guard, q: Floats, load: str) -> str | None:
+def stopped(guard, q, load):
     here = replace(SAMPLE, q=q, qd=np.zeros(len(q)))
     return guard.check(here, None, load)
 
@@ -453,9 +446,7 @@ def stopped(guard: Guard, q: Floats, load: str) -> str | None:
 @pytest.mark.long
 @settings(max_examples=20, deadline=None)
 @given(cells_of_same_feasibility(), SEED, LOAD)
-def test_a_state_is_refused_by_all_or_by_none(
-    made: tuple[Cell, CellConfig], seed: int, load: str
-) -> None:
+def test_a_state_is_refused_by_all_or_by_none(made, seed, load):
     c, config = made
     space, guard = Space(c, config, Margins()), Guard(c, config)
     for q in states(c, seed, 4):
@@ -475,9 +466,7 @@ def test_a_state_is_refused_by_all_or_by_none(
 
 @settings(max_examples=20, deadline=None)
 @given(cells_of_same_feasibility(), SEED, LOAD)
-def test_all_checks_together_find_what_each_finds_alone(
-    made: tuple[Cell, CellConfig], seed: int, load: str
-) -> None:
+def test_all_checks_together_find_what_each_finds_alone(made, seed, load):
     """The checks share one evaluation of the states; it is another for every state."""
     c, config = made
     limits, q = Feasibility(c, config, SLACK), states(c, seed, 6)
@@ -494,9 +483,7 @@ def test_all_checks_together_find_what_each_finds_alone(
 @pytest.mark.long
 @settings(max_examples=20, deadline=None)
 @given(cells_of_same_feasibility(), SEED, LOAD)
-def test_a_motion_that_is_planned_passes_and_touches_nothing(
-    made: tuple[Cell, CellConfig], seed: int, load: str
-) -> None:
+def test_a_motion_that_is_planned_passes_and_touches_nothing(made, seed, load):
     """What the planner allows the dry run allows; what that allows the guard allows."""
     c, config = made
     space, guard = Space(c, config), Guard(c, config)
@@ -521,9 +508,7 @@ def test_a_motion_that_is_planned_passes_and_touches_nothing(
 @pytest.mark.long
 @settings(max_examples=8, deadline=None)
 @given(st.sampled_from(["ur3e", "ur10e", URDF]), SEED, st.floats(0.05, 0.95), LOAD)
-def test_nothing_small_is_passed_between_two_samples(
-    name: str, seed: int, share: float, load: str
-) -> None:
+def test_nothing_small_is_passed_between_two_samples(name, seed, share, load):
     """A cube of 4 mm where hook, elbow or what hangs comes by, and a side that they just pass."""
     free = cell(limits={"workspace_min_m": [-9.0, -9.0, -9.0], "joint_margin_rad": 0.0})
     c = replace(cell_from_config(free), arm=arm(name))
@@ -545,5 +530,5 @@ def test_nothing_small_is_passed_between_two_samples(
         assert route_problems(c, cell(limits=box), _way(start, end, load))
 
 
-def _way(start: Floats, end: Floats, load: str) -> tuple[Stop, Stop]:
+def _way(start, end, load):
     return Stop("a", start, load), Stop("b", end, load)

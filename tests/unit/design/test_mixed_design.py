@@ -5,27 +5,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilcal.config import CellConfig
 from hilcal.design import mixed_design as condensing
 from hilcal.design.approximate_design import relax
 from hilcal.design.choice import choose, objective_of
 from hilcal.design.criteria import MeanVariance
 from hilcal.design.information import (
-    DesignProblem,
     absolute_rows,
     deflection_rows,
     information_of,
     problem,
     reading_derivatives,
 )
-from hilcal.design.mixed_design import MixedDesign, balanced, mixed_design, other_effects
+from hilcal.design.mixed_design import balanced, mixed_design, other_effects
 from hilcal.design.nominal_model import after, nominal_model
-from hilcal.design.predicted import PredictionPoses, position_derivative, prediction_poses
-from hilcal.identification.baseline import baseline
-from hilcal.identification.fit import fit
-from hilcal.readings.whitening import Mode
-from hilcal.types import Floats
+from hilcal.design.predicted import position_derivative, prediction_poses
 from tests.support.campaigns import campaign, cell_of
+from tests.support.fit_cases import based
 from tests.support.plan_cases import config_of, poses_of
 from tests.support.rows import first
 
@@ -33,26 +28,24 @@ AGAINST = ("joint_tilt_compliance", "link_geometry", "transmission_error")
 STD_RAD = 2e-5
 
 
-def config(mode: Mode) -> CellConfig:
+def config(mode):
     found = config_of(mode, against=AGAINST, work_load="none" if mode == "absolute" else "10kg")
     scatter = found.repeatability.model_copy(update={"joint_std_rad": STD_RAD})
     return found.model_copy(update={"repeatability": scatter})
 
 
-def scene(mode: Mode, *, fitted: bool) -> tuple[DesignProblem, PredictionPoses]:
+def scene(mode, *, fitted):
     known = config(mode)
     if fitted:
         c = campaign(mode=mode, poses=8, seed=3, registration_known=True)
-        nominal = after(fit(baseline(c.cell, c.readings, mode), c.readings, mode), known)
+        nominal = after(based(c.cell, c.readings, mode), known)
     else:
         nominal = nominal_model(cell_of(registration_known=True), known)
     of = problem(nominal, known, poses_of(6))
     return of, prediction_poses(of.nominal, known, poses_of(5, 9))
 
 
-def mean_variance_of_all(
-    of: DesignProblem, work: PredictionPoses, mode: Mode, counts: Floats
-) -> float:
+def mean_variance_of_all(of, work, mode, counts):
     """tr(C M⁻¹) by all parameters as they are."""
     known, nominal = config(mode), of.nominal
     more, std = other_effects(nominal, known)
@@ -74,9 +67,7 @@ def mean_variance_of_all(
 
 @pytest.mark.parametrize("fitted", [False, True])
 @pytest.mark.parametrize("mode", first(1, ["deflection", "absolute"]))
-def test_with_all_directions_the_mean_variance_is_that_of_all_parameters(
-    monkeypatch: pytest.MonkeyPatch, mode: Mode, fitted: bool
-) -> None:
+def test_with_all_directions_the_mean_variance_is_that_of_all_parameters(monkeypatch, mode, fitted):
     monkeypatch.setattr(condensing, "DIRECTIONS", 10_000)
     monkeypatch.setattr(condensing, "LEAST", 0.0)
     of, work = scene(mode, fitted=fitted)
@@ -90,14 +81,12 @@ def test_with_all_directions_the_mean_variance_is_that_of_all_parameters(
         assert variance_of(asked, counts) == pytest.approx(every, rel=1e-5)
 
 
-def variance_of(asked: MixedDesign, counts: Floats) -> float:
+def variance_of(asked, counts):
     m = asked.prior + asked.units.information(counts)
     return float(np.trace(asked.c @ np.linalg.inv(m)))
 
 
-def test_directions_that_are_left_out_are_noise_and_nothing_is_learnt_of_them(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_directions_that_are_left_out_are_noise_and_nothing_is_learnt_of_them(monkeypatch):
     """Of one unit: what is predicted of the kept directions is as uncertain as by all of them."""
     monkeypatch.setattr(condensing, "DIRECTIONS", 10_000)
     monkeypatch.setattr(condensing, "LEAST", 0.0)
@@ -115,7 +104,7 @@ def test_directions_that_are_left_out_are_noise_and_nothing_is_learnt_of_them(
         assert of_few == pytest.approx(of_all[np.ix_(kept, kept)], rel=1e-6, abs=1e-9)
 
 
-def test_what_is_known_very_well_does_not_hide_what_a_reading_tells() -> None:
+def test_what_is_known_very_well_does_not_hide_what_a_reading_tells():
     """After many readings: the same mean variance in balanced coordinates, and a plan is found."""
     of, work = scene("absolute", fitted=True)
     plain = mixed_design(of, config("absolute"), work)
@@ -140,7 +129,7 @@ def test_what_is_known_very_well_does_not_hide_what_a_reading_tells() -> None:
 
 
 @pytest.mark.long
-def test_a_plan_for_predictions_is_better_than_random_poses_and_certified() -> None:
+def test_a_plan_for_predictions_is_better_than_random_poses_and_certified():
     known = config("absolute").model_copy(update={"loads": []})
     nominal = nominal_model(cell_of(registration_known=False), known)
     nominal = replace(nominal, live=nominal.live[:-6])  # no load tells the compliance

@@ -18,7 +18,7 @@ from hilcal.design.discriminated_pairs import (
     power,
     supported_parameters,
 )
-from hilcal.design.information import DesignProblem, problem
+from hilcal.design.information import problem
 from hilcal.design.next import DRAWS, measure_next, measure_poses
 from hilcal.design.nominal_model import after
 from hilcal.design.planner import Request
@@ -29,19 +29,15 @@ from hilcal.drivers.simulated.rehearsal import planned_states, simulate
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.effect_columns import effect_columns
-from hilcal.identification.fit import Fit, fit
+from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import linearise
-from hilcal.readings.readings import Readings
-from hilcal.readings.whitening import Mode
-from hilcal.refinement import add, refine
+from hilcal.refinement import add
 from hilcal.regression.evidence import family_power
 from hilcal.regression.projection import projection
 from hilcal.regression.schur import schur_complement
 from hilcal.store.plan import REFERENCE, UNLOADED
-from hilcal.types import Floats
 from studies.study_more import joined
 from tests.support.campaigns import (
-    Campaign,
     campaign,
     configuration,
     measured,
@@ -50,13 +46,14 @@ from tests.support.campaigns import (
     true_parameters,
     with_noise,
 )
+from tests.support.fit_cases import based, refined
 from tests.support.next_cases import SMALL, doubtful, settled
 from tests.support.plan_cases import config_of, poses_of
 
 TILT, LINK = "joint_tilt_compliance", "link_compliance"
 
 
-def share_is(count: int, total: int, promised: float) -> bool:
+def share_is(count, total, promised):
     """Whether a share of trials is what was promised, to 4 standard errors."""
     error = np.sqrt(max(promised * (1 - promised), 0.01) / total)
     return bool(abs(count / total - promised) < 4 * error)
@@ -66,7 +63,7 @@ def share_is(count: int, total: int, promised: float) -> bool:
 
 
 @pytest.mark.parametrize("size", [0.0, 2.0, 4.0])
-def test_the_power_is_the_share_of_rejections_in_linear_problems(size: float) -> None:
+def test_the_power_is_the_share_of_rejections_in_linear_problems(size):
     """An effect of three columns, a model of four and a rival of two, which it resembles."""
     rng = np.random.default_rng(5)
     a = rng.standard_normal((60, 9))
@@ -85,13 +82,13 @@ def test_the_power_is_the_share_of_rejections_in_linear_problems(size: float) ->
 
 
 @pytest.mark.long
-def test_the_power_is_the_share_of_rejections_in_the_simulated_world() -> None:
+def test_the_power_is_the_share_of_rejections_in_the_simulated_world():
     """Tilting joints are there and bending links are fitted; 100 campaigns of the same poses."""
     c = campaign(TILT, "deflection", 3, poses=8, strength=1.3, plan_seed=21)
     p = plan(8, 21)
     clean = noiseless(c.world, p)
     config = config_of("deflection", against=(TILT, LINK))
-    first = fit(baseline(c.cell, c.readings, "deflection"), c.readings, "deflection")
+    first = based(c.cell, c.readings, "deflection")
     of = problem(after(first, config), config, poses_of(8, 21))
     where = of.of_effect(TILT)
     nuisance = np.concatenate([np.arange(of.model_size), of.of_effect(LINK)])
@@ -114,7 +111,7 @@ def test_the_power_is_the_share_of_rejections_in_the_simulated_world() -> None:
 
 
 @pytest.mark.long
-def test_the_powers_of_a_plan_are_shares_of_rejections() -> None:
+def test_the_powers_of_a_plan_are_shares_of_rejections():
     """Of what is known and planned for, with the parameters that the readings support."""
     first = doubtful("base_compliance", 2)
     rng, trials = np.random.default_rng(3), 2000
@@ -145,18 +142,17 @@ def test_the_powers_of_a_plan_are_shares_of_rejections() -> None:
 # how strong suspects are
 
 
-def told(effect: str, strength: float, seed: int = 2) -> tuple[Fit, Floats, DesignProblem]:
+def told(effect, strength, seed=2):
     c = campaign(effect, "deflection", seed, poses=10, strength=strength)
-    found = fit(baseline(c.cell, c.readings, "deflection"), c.readings, "deflection")
+    found = based(c.cell, c.readings, "deflection")
     config = config_of("deflection", against=(effect, LINK))
     of = problem(after(found, config), config, poses_of(10, 1000 + seed))
     return found, true_parameters(c.world, effect), of
 
 
-def test_an_estimate_holds_the_true_parameters() -> None:
+def test_an_estimate_holds_the_true_parameters():
     found, true, of = told(TILT, 4.0)
     made = estimate(linearise(found), next(e for e in of.families if e.name == TILT))
-    assert made is not None
     assert made.supported
     off = made.mean - true
     distance2 = off @ np.linalg.solve(made.root @ made.root.T, off)
@@ -167,10 +163,9 @@ def test_an_estimate_holds_the_true_parameters() -> None:
     np.testing.assert_allclose(spread, stated, rtol=0.06)
 
 
-def test_readings_that_do_not_speak_for_an_effect_tell_no_strength() -> None:
+def test_readings_that_do_not_speak_for_an_effect_tell_no_strength():
     found, _, of = told("hysteresis", 0.0)
     made = estimate(linearise(found), of.families[0])
-    assert made is not None
     assert not made.supported
     blind = replace(found.solution.prediction.situation.states, approach=None)
     situation = replace(found.solution.prediction.situation, states=blind)
@@ -183,7 +178,7 @@ def test_readings_that_do_not_speak_for_an_effect_tell_no_strength() -> None:
 # the plan
 
 
-def test_pairs_that_no_measurement_separates_are_said_so() -> None:
+def test_pairs_that_no_measurement_separates_are_said_so():
     """In deflections a scale of the tracker is a common factor on all compliances."""
     first = doubtful(TILT, 1)
     rng = np.random.default_rng(0)
@@ -197,7 +192,7 @@ def test_pairs_that_no_measurement_separates_are_said_so() -> None:
 
 
 @pytest.mark.parametrize("suspects", [(TILT,), (TILT, TILT)])
-def test_one_suspect_is_refused(suspects: tuple[str, ...]) -> None:
+def test_one_suspect_is_refused(suspects):
     first = doubtful(TILT, 1)
     with pytest.raises(InputError, match="two or more"):
         measure_next(
@@ -205,7 +200,7 @@ def test_one_suspect_is_refused(suspects: tuple[str, ...]) -> None:
         )
 
 
-def test_what_was_ambiguous_is_decided() -> None:
+def test_what_was_ambiguous_is_decided():
     first = doubtful("base_compliance", 2)
     assert "base_compliance" in first.suspects
     assert len(first.suspects) > 1
@@ -220,7 +215,7 @@ def test_what_was_ambiguous_is_decided() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("effect", [TILT, LINK, "base_compliance"])
-def test_most_doubts_are_settled(effect: str) -> None:
+def test_most_doubts_are_settled(effect):
     """Of the first twenty campaigns those with a doubt; the hidden effect leads alone after it."""
     seeds = [s for s in range(1, 21) if len(doubtful(effect, s).suspects) > 1]
     assert len(seeds) >= 3
@@ -235,7 +230,7 @@ def test_most_doubts_are_settled(effect: str) -> None:
 FINE = {"plan_seed": 0, "poses": 30, "strength": 2.0, "harmonics": 21}
 
 
-def fine_error() -> tuple[Campaign, Readings]:
+def fine_error():
     """Thirty poses with a transmission error of harmonics 3 to 21 at 2 σ."""
     c = campaign("transmission_error", "absolute", 0, **FINE)
     waves = c.world.physics.transmission_error.copy()
@@ -247,12 +242,11 @@ def fine_error() -> tuple[Campaign, Readings]:
 
 
 @pytest.mark.slow
-def test_the_poses_that_are_planned_end_in_the_effect_that_is_there() -> None:
+def test_the_poses_that_are_planned_end_in_the_effect_that_is_there():
     """Ambiguous at first, named when measured as planned: so it was with all seven of ten seeds."""
     c, before = fine_error()
-    first = fit(baseline(c.cell, before, "absolute"), before, "absolute")
+    first = based(c.cell, before, "absolute")
     alone = diagnose(first).pose_alone
-    assert alone is not None
     assert alone.effects[0] == "transmission_error"
     config = configuration()
     made = measure_poses(c.cell, config, first, alone.more, np.random.default_rng(1)).ordered.plan
@@ -260,17 +254,17 @@ def test_the_poses_that_are_planned_end_in_the_effect_that_is_there() -> None:
     number = states.pose + len(before.pose_names)
     after = simulate(c.world, states.states, number, states.load, states.cycle, before.load_names,
                      np.random.default_rng(7))  # fmt: skip
-    every: Readings = joined(before, after, tuple(f"next {name}" for name in made.pose_names))
-    found = refine(baseline(c.cell, every, "absolute"), every, "absolute")
+    every = joined(before, after, tuple(f"next {name}" for name in made.pose_names))
+    found = refined(c.cell, every, "absolute")
     assert found.diagnosis.verdict == "adequate"
     assert [s.added for s in found.steps[1:]] == ["transmission_error"]
     assert found.fit.variance_factor == pytest.approx(1.0, abs=0.2)
 
 
 @pytest.mark.long
-def test_each_pose_is_a_new_one_and_read_unloaded() -> None:
+def test_each_pose_is_a_new_one_and_read_unloaded():
     c, before = fine_error()
-    first = fit(baseline(c.cell, before, "absolute"), before, "absolute")
+    first = based(c.cell, before, "absolute")
     made = measure_poses(c.cell, configuration(), first, 12, np.random.default_rng(1)).ordered.plan
     assert len({s.pose for s in made.steps} - {REFERENCE}) == 12
     assert {s.load for s in made.steps} == {UNLOADED}
@@ -281,18 +275,18 @@ def test_each_pose_is_a_new_one_and_read_unloaded() -> None:
     np.testing.assert_array_equal(again.joints(REFERENCE), home)
 
 
-def test_the_chance_of_telling_it_from_a_rival_grows() -> None:
+def test_the_chance_of_telling_it_from_a_rival_grows():
     c = campaign("transmission_error", "absolute", 0, **FINE)
-    first = fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute")
+    first = based(c.cell, c.readings, "absolute")
     (told,) = pose_powers(first, ("transmission_error", "encoder_offset"), 140)
     assert (told.effect, told.rival) == ("transmission_error", "encoder_offset")
     assert told.now < 0.3 < 0.8 < told.then
 
 
-MODES: tuple[Mode, ...] = ("deflection", "absolute")
+MODES = ("deflection", "absolute")
 
 
-def case(mode: Mode) -> tuple[Fit, DesignProblem]:
+def case(mode):
     """A fit without tilting joints, which are there, and the design problem after it."""
     c = campaign(TILT, mode, 3, poses=10, strength=2.0, plan_seed=21)
     model = baseline(c.cell, c.readings, mode)
@@ -304,14 +298,14 @@ def case(mode: Mode) -> tuple[Fit, DesignProblem]:
     return found, problem(after(found, config), config, poses_of(8, 21))
 
 
-def columns(of: DesignProblem, found: Fit) -> dict[str, Floats]:
+def columns(of, found):
     """Whitened columns of the families in the units of the design problem."""
     each = {e.name: effect_columns(found, e) for e in of.families}
     return {n: c.white * (of.scale[of.of_effect(n)] / c.scale) for n, c in each.items()}
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_information_beside_the_model_and_power_beside_model_and_rival(mode: Mode) -> None:
+def test_information_beside_the_model_and_power_beside_model_and_rival(mode):
     found, of = case(mode)
     linear, x = linearise(found), columns(of, found)
     so_far = discriminated_pairs(of).prior
@@ -332,13 +326,12 @@ def test_information_beside_the_model_and_power_beside_model_and_rival(mode: Mod
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_evidence_and_estimates_of_suspects(mode: Mode) -> None:
+def test_evidence_and_estimates_of_suspects(mode):
     found, of = case(mode)
     linear = linearise(found)
     ranked = {s.effect: s.score for s in rank_suspects(linear, candidates(found))}
     for family in of.families:
         made, score = estimate(linear, family), ranked[family.name]
-        assert made is not None
         assert made.log_evidence == pytest.approx(score.log_evidence, rel=1e-12)
         scale = np.array([p.scale for p in family.parameters])
         np.testing.assert_allclose(made.mean, scale * score.step, rtol=1e-10)

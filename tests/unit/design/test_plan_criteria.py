@@ -8,23 +8,23 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hilcal.design.approximate_design import ApproximateDesign, BarrierProgram, relax
+from hilcal.design.approximate_design import BarrierProgram, relax
 from hilcal.design.criteria import D, E, K, MeanVariance, Pair, Separate
-from hilcal.design.criterion import CandidateSet, Criterion, require_determined
+from hilcal.design.criterion import CandidateSet, require_determined
 from hilcal.design.optimum import best
-from hilcal.errors import CannotAnswerError, InputError
-from hilcal.types import Floats
+from hilcal.errors import CannotAnswerError
+from tests.support.refusals import refusal, refusal_of
 
 P = 6
 
 
-def few_poses() -> Floats:
+def few_poses():
     """Of rank 2, as that of few test poses is."""
     root = np.random.default_rng(5).normal(size=(2, P))
     return root.T @ root
 
 
-def pairs() -> tuple[Pair, ...]:
+def pairs():
     return (
         Pair(np.array([0, 1]), np.array([1.0, -0.5]), np.array([2, 3, 4])),
         Pair(np.array([4]), np.array([2.0]), np.array([2, 3, 0, 1])),
@@ -32,7 +32,7 @@ def pairs() -> tuple[Pair, ...]:
     )
 
 
-def compound_variance() -> MeanVariance:
+def compound_variance():
     """Of prediction poses at which the first four of the parameters count."""
     root = np.random.default_rng(6).normal(size=(2, 4))
     c = np.zeros((P, P))
@@ -40,7 +40,7 @@ def compound_variance() -> MeanVariance:
     return MeanVariance(0.7 * c, "A", 1.9 * c[:4, :4])
 
 
-CRITERIA: dict[str, Criterion] = {
+CRITERIA = {
     "D": D(),
     "A": MeanVariance(np.eye(P) / P, "A"),
     "A of some": MeanVariance(np.diag([1.0, 0.0, 1.0, 0.0, 0.0, 1.0]) / 3, "A"),
@@ -56,13 +56,13 @@ seeds = st.integers(0, 10**6)
 every = pytest.mark.parametrize("name", CRITERIA)
 
 
-def information(rng: np.random.Generator, rows: int = 12) -> Floats:
+def information(rng, rows=12):
     """A regular information matrix of parameters of different size."""
     a = rng.normal(size=(rows, P)) * np.exp(rng.uniform(-1, 1, P))
     return np.asarray(a.T @ a)
 
 
-def test_compound_criteria_are_means_of_both_efficiencies() -> None:
+def test_compound_criteria_are_means_of_both_efficiencies():
     m = information(np.random.default_rng(4))
     volume = np.sqrt(np.linalg.det(m) ** (1 / P) * np.linalg.det(m[:4, :4]) ** (1 / 4))
     assert float(D(4).value(m)) == pytest.approx(volume)
@@ -75,13 +75,12 @@ def test_compound_criteria_are_means_of_both_efficiencies() -> None:
 
 @pytest.mark.parametrize("name", CRITERIA)
 @given(seeds, st.floats(1e-4, 1.0))
-def test_bound_holds_for_any_information(name: str, seed: int, order: float) -> None:
+def test_bound_holds_for_any_information(name, seed, order):
     """Also for singular matrices, whatever the surrogate's order."""
     criterion = CRITERIA[name]
     rng = np.random.default_rng(seed)
     m = information(rng)
     s = criterion.surrogate(m, order)(m)
-    assert s is not None
     for rows in (3, 7, 30):
         n = information(rng, rows)
         bound = np.sum(s.above * n)
@@ -93,19 +92,17 @@ def test_bound_holds_for_any_information(name: str, seed: int, order: float) -> 
 
 
 @every
-def test_gradient_and_curvature_are_differences_of_the_surrogate(name: str) -> None:
+def test_gradient_and_curvature_are_differences_of_the_surrogate(name):
     units = random_units(3, 6, P)
     program = BarrierProgram(CRITERIA[name], units, 9.0, np.inf, np.eye(P))
     w, step = np.linspace(0.5, 1.5, 6), 1e-5
     surrogate = program.criterion.surrogate(program.information(w), 0.2)
 
-    def slopes(weight: Floats) -> tuple[float, Floats]:
+    def slopes(weight):
         smooth = surrogate(program.information(weight))
-        assert smooth is not None
         return smooth.value, np.sum(units.rows @ smooth.gradient * units.rows, axis=(1, 2))
 
     here = surrogate(program.information(w))
-    assert here is not None
     gradient, curvature = slopes(w)[1], program.curvature(here)
     for k, change in enumerate(step * np.eye(6)):
         (a, up), (b, down) = slopes(w + change), slopes(w - change)
@@ -115,7 +112,7 @@ def test_gradient_and_curvature_are_differences_of_the_surrogate(name: str) -> N
 
 
 @every
-def test_values_of_many_are_the_values_of_each(name: str) -> None:
+def test_values_of_many_are_the_values_of_each(name):
     criterion = CRITERIA[name]
     rng = np.random.default_rng(2)
     stack = np.array([information(rng) for _ in range(5)] + [information(rng, 3)])
@@ -126,7 +123,7 @@ def test_values_of_many_are_the_values_of_each(name: str) -> None:
         assert abs(single[-1]) <= 1e-12 * min(single[:-1])
 
 
-def test_test_poses_give_the_variance_of_their_position() -> None:
+def test_test_poses_give_the_variance_of_their_position():
     rng = np.random.default_rng(4)
     m = information(rng)
     v = rng.normal(size=(7, 3, P))  # Jacobians of the position at 7 poses
@@ -136,7 +133,7 @@ def test_test_poses_give_the_variance_of_their_position() -> None:
 
 
 @pytest.mark.parametrize("twice", [False, True])
-def test_separation_is_what_a_fit_leaves(twice: bool) -> None:
+def test_separation_is_what_a_fit_leaves(twice):
     """The sum of squares that a fit of the nuisance leaves; also where it is not unique."""
     rng = np.random.default_rng(8)
     a = rng.normal(size=(20, P))
@@ -155,29 +152,28 @@ def test_separation_is_what_a_fit_leaves(twice: bool) -> None:
         assert np.sum((a @ u) ** 2) == pytest.approx(expected, rel=1e-8)
 
 
-def test_says_which_parameters_nothing_determines() -> None:
+def test_says_which_parameters_nothing_determines():
     rng = np.random.default_rng(0)
     a = rng.normal(size=(30, 3)) * [1.0, 1e3, 1e-3]
     names = ("j1", "j2", "offset")
     require_determined(a.T @ a, names)  # differences in size are no matter
     blind = a * [1, 0, 1]
-    with pytest.raises(CannotAnswerError, match="changes with j2;"):
-        require_determined(blind.T @ blind, names)
+    refusal_of(CannotAnswerError, "changes with j2;", require_determined, blind.T @ blind, names)
     same = a.copy()
     same[:, 2] = 1e-4 * same[:, 0]
     with pytest.raises(CannotAnswerError, match=r"separates (j1, offset|offset, j1);"):
         require_determined(same.T @ same, names)
-    with pytest.raises(CannotAnswerError, match="parameter 2"):
-        require_determined(blind.T @ blind)
+    refusal_of(CannotAnswerError, "parameter 2", require_determined, blind.T @ blind)
     alike = Separate((Pair(np.array([0]), np.ones(1), np.array([1, 2]), "backlash from drift"),))
-    with pytest.raises(CannotAnswerError, match="separates backlash from drift"):
-        alike.require(same.T @ same, names)
+    refusal_of(
+        CannotAnswerError, "separates backlash from drift", alike.require, same.T @ same, names
+    )
     alike.require(a.T @ a, names)
 
 
 OF_TWO = np.array([[2.0, 0.5, 0.0], [0.5, 1.0, 0.0], [0.0, 0.0, 0.0]])
 """Of two parameters, with a third that may be there."""
-OF_THREE: dict[str, Criterion] = {
+OF_THREE = {
     "D": D(),
     "A": MeanVariance(np.eye(3) / 3, "A"),
     "A of some": MeanVariance(np.diag([0.5, 0.5, 0.0]), "A"),
@@ -203,33 +199,33 @@ every_of_three = pytest.mark.parametrize(
 )
 
 
-def polynomial(degree: int, points: Floats) -> CandidateSet:
+def polynomial(degree, points):
     """Readings of a polynomial at points, one row each."""
     return CandidateSet(
         np.vander(points, degree + 1, increasing=True)[:, None, :], np.ones(len(points))
     )
 
 
-def random_units(seed: int, count: int, size: int = 3, costs: bool = False) -> CandidateSet:
+def random_units(seed, count, size=3, costs=False):
     rng = np.random.default_rng(seed)
     rows = rng.normal(size=(count, 2, size))
     rows[rng.random(count) < 0.3, 1] = 0.0  # units of fewer rows
     return CandidateSet(rows, rng.integers(1, 4, count).astype(float) if costs else np.ones(count))
 
 
-def at(points: Floats, found: ApproximateDesign) -> dict[float, float]:
+def at(points, found):
     """Shares of the weight by point, without what is near 0."""
     total = found.weight.sum()
     shares = {float(points[k]): w / total for k, w in zip(found.index, found.weight, strict=True)}
     return {x: w for x, w in shares.items() if w > 1e-3}
 
 
-def prior_of(seed: int, size: int = 3) -> Floats:
+def prior_of(seed, size=3):
     root = np.random.default_rng(seed + 1).normal(size=(2, size))
     return root.T @ root
 
 
-def largest(criterion: Criterion, units: CandidateSet, weights: Floats, prior: Floats) -> float:
+def largest(criterion, units, weights, prior):
     """The best of many plans (N, K)."""
     each = np.swapaxes(units.rows, 1, 2) @ units.rows
     return float(criterion.value(prior + np.tensordot(weights, each, axes=1)).max())
@@ -262,13 +258,13 @@ LEGENDRE = np.sort(np.concatenate([GRID, [-np.sqrt(0.2), np.sqrt(0.2)]]))
         ),
     ],
 )
-def test_known_optima(criterion: Criterion, degree: int, expected: dict[float, float]) -> None:
+def test_known_optima(criterion, degree, expected):
     """Pukelsheim (1993), ch. 9; Fedorov (1972)."""
     found = relax(polynomial(degree, LEGENDRE), criterion, 10.0, tolerance=1e-8)
     shares = at(LEGENDRE, found)
     assert sorted(shares) == pytest.approx(sorted(expected), abs=1e-9)
     for x, share in expected.items():
-        near = min(shares, key=lambda y, x=x: abs(y - x))  # type: ignore[misc]
+        near = min(shares, key=lambda y, x=x: abs(y - x))
         assert shares[near] == pytest.approx(share, abs=2e-3)
     exact_value = float(
         criterion.value(
@@ -283,7 +279,7 @@ def test_known_optima(criterion: Criterion, degree: int, expected: dict[float, f
 
 
 @every_of_three
-def test_small_problems_against_all_shares(name: str) -> None:
+def test_small_problems_against_all_shares(name):
     """Four units of three parameters: all shares in steps of 1/16, with a prior and without."""
     criterion = OF_THREE[name]
     steps = 16
@@ -316,9 +312,7 @@ def test_small_problems_against_all_shares(name: str) -> None:
     known=st.booleans(),
     most=st.sampled_from([None, 1, 2]),
 )
-def test_no_plan_exceeds_the_bound(
-    name: str, seed: int, costs: bool, known: bool, most: int | None
-) -> None:
+def test_no_plan_exceeds_the_bound(name, seed, costs, known, most):
     """Random plans, and the planner's own."""
     criterion = OF_THREE[name]
     units = random_units(seed, 15, costs=costs)
@@ -349,14 +343,14 @@ def test_no_plan_exceeds_the_bound(
 
 
 @cache
-def all_plans(most: int, units: int, total: int) -> Floats:
+def all_plans(most, units, total):
     """(N, units) plans of at most `most` of each unit and `total` of all (a unit costs 1)."""
     plans = np.indices((most + 1,) * units).reshape(units, -1).T
     return plans[plans.sum(axis=1) <= total].astype(float)
 
 
 @every_of_three
-def test_tiny_plans_against_all_plans(name: str) -> None:
+def test_tiny_plans_against_all_plans(name):
     """The exchange finds the best of all plans of whole numbers, or nearly."""
     criterion = OF_THREE[name]
     shares = []
@@ -379,7 +373,7 @@ def test_tiny_plans_against_all_plans(name: str) -> None:
 
 
 @pytest.mark.parametrize("most", [None, 1])
-def test_many_units(most: int | None) -> None:
+def test_many_units(most):
     """Columns are generated until the equivalence theorem holds for all units."""
     units = random_units(3, 20_000, 8)
     found = relax(units, D(), 40.0, most=most)
@@ -394,13 +388,13 @@ def test_many_units(most: int | None) -> None:
         assert found.value * top / 8 <= found.value * (1 + 1e-5)
 
 
-def test_the_plan_depends_on_the_generator_alone() -> None:
+def test_the_plan_depends_on_the_generator_alone():
     units = random_units(5, 300, 6)
     one, two = (best(units, D(), 9.0, None, np.random.default_rng(3)).counts for _ in range(2))
     np.testing.assert_array_equal(one, two)
 
 
-def test_scale_of_a_parameter_does_not_matter_to_d() -> None:
+def test_scale_of_a_parameter_does_not_matter_to_d():
     units = random_units(5, 100, 6)
     factor = 10.0 ** np.arange(-6, 6, 2)
     scaled = CandidateSet(units.rows * factor, units.cost)
@@ -412,16 +406,14 @@ def test_scale_of_a_parameter_does_not_matter_to_d() -> None:
     assert two.bound == pytest.approx(one.bound * np.prod(factor) ** (2 / 6), rel=1e-5)
 
 
-def test_budget_too_small_for_the_parameters() -> None:
+def test_budget_too_small_for_the_parameters():
     units = random_units(9, 50, 6)
-    with pytest.raises(CannotAnswerError, match="budget of 2 takes 2 units, too few"):
-        best(units, D(), 2.0)
+    refusal_of(CannotAnswerError, "budget of 2 takes 2 units, too few", best, units, D(), 2.0)
     for criterion in (MeanVariance(np.eye(6) / 6), E(), K()):
-        with pytest.raises(CannotAnswerError, match="raise the budget"):
-            best(units, criterion, 2.0, effort=50)
+        refusal_of(CannotAnswerError, "raise the budget", best, units, criterion, 2.0, effort=50)
 
 
-def test_names_what_no_candidate_determines() -> None:
+def test_names_what_no_candidate_determines():
     units = random_units(9, 50, 4)
     units.rows[:, :, 2] = 0.0
     with pytest.raises(CannotAnswerError, match="changes with wrist"):
@@ -429,11 +421,9 @@ def test_names_what_no_candidate_determines() -> None:
     prior = np.diag([0.0, 0.0, 1.0, 0.0])
     assert best(units, D(), 9.0, prior).efficiency > 0.9  # known from elsewhere
     units.rows[:, :, 2] = units.rows[:, :, 0] - units.rows[:, :, 1]
-    with pytest.raises(CannotAnswerError, match="parameter 1") as caught:
-        relax(units, E(), 9.0)
-    assert "parameter 4" not in str(caught.value)
+    caught = refusal_of(CannotAnswerError, "parameter 1", relax, units, E(), 9.0)
+    assert "parameter 4" not in caught
 
 
-def test_a_budget_below_the_least_cost_is_refused() -> None:
-    with pytest.raises(InputError, match="at least 1, the least cost"):
-        best(random_units(1, 10), D(), 0.5)
+def test_a_budget_below_the_least_cost_is_refused():
+    refusal("at least 1, the least cost", best, random_units(1, 10), D(), 0.5)

@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, kstest
 
-from hilcal.diagnosis.noise import PureError, classes, contrasts, judge_noise, pure_error
+from hilcal.diagnosis.noise import classes, contrasts, judge_noise, pure_error
 from hilcal.identification.baseline import baseline
-from hilcal.identification.fit import Fit, fit
-from hilcal.model.model import Model
+from hilcal.identification.fit import fit
 from hilcal.model.observe import motion
-from hilcal.readings.readings import Readings
 from tests.support.campaigns import campaign, noiseless, plan, with_noise
 
 MODES = ("absolute", "deflection")
@@ -25,23 +23,21 @@ class Repeated:
                      registration_known=True)  # fmt: skip
         clean = noiseless(c.world, plan(poses, 0, cycles), m)
         kept = np.random.default_rng(5).random(len(clean)) >= missing
-        self.clean: Readings = clean[kept | clean.unloaded]
+        self.clean = clean[kept | clean.unloaded]
         self.mode = mode
-        self.model: Model = baseline(c.cell, self.clean, mode)
+        self.model = baseline(c.cell, self.clean, mode)
 
-    def fit(self, readings: Readings) -> Fit:
+    def fit(self, readings):
         return fit(self.model, readings, self.mode)
 
-    def motion(self) -> np.ndarray:
+    def motion(self):
         p = self.model.predict(self.clean.states, np.zeros(self.model.size))
         cell, chain = self.model.cell, p.situation.chain
         return motion(cell, p.observation, chain, p.deviation, self.clean.m).dq
 
 
-def found(r: Repeated, readings: Readings) -> PureError:
-    result = pure_error(r.fit(readings))
-    assert result is not None
-    return result
+def found(r, readings):
+    return pure_error(r.fit(readings))
 
 
 # --- what repeats say is exact --------------------------------------------------------------
@@ -105,7 +101,7 @@ def test_drift_and_friction_between_repeats_are_not_noise():
 # --- where ----------------------------------------------------------------------------------
 
 
-def spoilt(r: Repeated, what: str, rng: np.random.Generator) -> Readings:
+def spoilt(r, what, rng):
     read = with_noise(r.clean, rng)
     value, v = read.value.copy(), r.clean.covariance[:, :3, :3]
     draw = rng.standard_normal(len(value))[:, None]
@@ -126,7 +122,6 @@ def spoilt(r: Repeated, what: str, rng: np.random.Generator) -> Readings:
 def test_the_direction_that_scatters_is_named(mode, what):
     r = Repeated(mode, 20, missing=0.0)
     e = found(r, spoilt(r, what, np.random.default_rng(0)))
-    assert e.where is not None
     assert e.where.name == what
     assert e.where.p_value < 1e-3
     assert e.where.interval[0] > 1.5

@@ -5,18 +5,16 @@ from functools import cache
 import numpy as np
 import pytest
 
-from hilcal.config import CellConfig
 from hilcal.diagnosis.live_model import LiveModel
 from hilcal.measuring.progress import LiveResidual, ReadingStored
 from hilcal.present.progress import figures
-from hilcal.readings.readings import Readings
 from hilcal.store.plan import Step
 from tests.support.campaigns import campaign, cell_of, configuration
 
 SEEDS = range(5)
 
 
-def quiet() -> CellConfig:
+def quiet():
     """The demo's cell, for readings whose covariances count the arm's repeatability already."""
     config = configuration()
     scatter = config.repeatability.model_copy(update={"joint_std_rad": 0.0})
@@ -24,7 +22,7 @@ def quiet() -> CellConfig:
 
 
 @cache
-def told(seed: int) -> list[tuple[LiveResidual, Readings, float]]:
+def told(seed):
     """Each reading's judgement, itself, and its true deflection against the reference.
 
     Load by load, half of the unloaded readings after all of them, as in a plan against drift.

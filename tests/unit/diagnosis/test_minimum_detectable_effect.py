@@ -7,7 +7,6 @@ from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
 from hilcal.diagnosis.minimum_detectable_effect import least_strength
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification.effect_columns import effect_columns
-from hilcal.identification.fit import Fit
 from hilcal.identification.linearisation import linearise
 from hilcal.present.diagnosis import could_have_been_seen
 from hilcal.regression.evidence import spectrum
@@ -17,14 +16,12 @@ from tests.support.diagnosis_cases import fitted
 ERROR = "transmission_error"
 
 
-def found(poses: int) -> Fit:
+def found(poses):
     c = campaign("none", "absolute", 0, poses=poses, plan_seed=0)
     return fitted(c)
 
 
-def test_a_family_is_seen_from_where_poses_left_out_show_it_and_not_finer_than_poses_resolve() -> (
-    None
-):
+def test_a_family_is_seen_from_where_poses_left_out_show_it_and_not_finer_than_poses_resolve():
     f = found(12)
     p = linearise(f)
     (e,) = (e for e in candidates(f) if e.name == ERROR)
@@ -42,7 +39,7 @@ def test_a_family_is_seen_from_where_poses_left_out_show_it_and_not_finer_than_p
     assert f"A {ERROR} finer than these poses resolve would be seen at no size.\n" in said
 
 
-def test_more_poses_show_smaller_ones() -> None:
+def test_more_poses_show_smaller_ones():
     sizes = []
     for poses in (12, 30):
         f = found(poses)

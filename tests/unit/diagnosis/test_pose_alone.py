@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilcal.diagnosis.diagnosis import Diagnosis, in_doubt
+from hilcal.diagnosis.diagnosis import in_doubt
 from hilcal.diagnosis.document import to_json
 from hilcal.diagnosis.effect_ranking import candidates
 from hilcal.diagnosis.misfit_breakdown import pose_constants
@@ -13,15 +13,14 @@ from hilcal.diagnosis.pose_alone import chance
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import fit
-from hilcal.identification.linearisation import Linearisation, linearise
+from hilcal.identification.linearisation import linearise
 from hilcal.present.verdict import message
-from hilcal.readings.whitening import Mode
-from hilcal.types import Floats
 from tests.support.campaigns import campaign, measured, plan
 from tests.support.diagnosis_cases import fitted
+from tests.support.fit_cases import based
 
 
-def dense(p: Linearisation) -> Floats:
+def dense(p):
     """Orthonormal basis (R, K) of the constants beside the model."""
     f, w = p.fit, p.fit.whitening
     poses = int(f.pose.max()) + 1
@@ -36,13 +35,12 @@ def dense(p: Linearisation) -> Floats:
 
 @pytest.mark.parametrize("mode", ["absolute", "deflection"])
 @pytest.mark.parametrize("effects", [None, ("transmission_error", "joint_compliance")])
-def test_equal_to_dense_columns(mode: Mode, effects: tuple[str, ...] | None) -> None:
+def test_equal_to_dense_columns(mode, effects):
     c = campaign("creep", mode, 0, poses=12)
     some = baseline(c.cell, c.readings, mode)
     model = some if effects is None else with_effects(c.cell, c.readings, mode, effects)
     p = linearise(fit(model, c.readings, mode))
     found, u = pose_constants(p), dense(p)
-    assert found is not None
     assert found.rank == u.shape[1]
     if mode == "absolute" and effects is None:  # a shift of the base is one of all poses
         assert found.rank < 36
@@ -51,7 +49,7 @@ def test_equal_to_dense_columns(mode: Mode, effects: tuple[str, ...] | None) -> 
     assert found.square(x) == pytest.approx(float(np.sum((u.T @ x) ** 2)), rel=1e-6)
 
 
-def fine_error(seed: int, first: int) -> Diagnosis:
+def fine_error(seed, first):
     """Thirty poses; a transmission error of 2 σ with the harmonics from `first` to 21."""
     options = {"plan_seed": seed, "poses": 30, "strength": 2.0, "harmonics": 21}
     c = campaign("transmission_error", "absolute", seed, **options)
@@ -61,14 +59,13 @@ def fine_error(seed: int, first: int) -> Diagnosis:
     waves *= np.sqrt(size / np.sum(waves**2))
     world = replace(c.world, physics=replace(c.world.physics, transmission_error=waves))
     r = measured(world, plan(30, seed), np.random.default_rng(seed))
-    return diagnose(fit(baseline(c.cell, r, "absolute"), r, "absolute"))
+    return diagnose(based(c.cell, r, "absolute"))
 
 
 @pytest.mark.parametrize("seed", [2, *(pytest.param(k, marks=pytest.mark.slow) for k in (0, 6))])
-def test_a_transmission_error_too_fine_for_thirty_poses_is_ambiguous(seed: int) -> None:
+def test_a_transmission_error_too_fine_for_thirty_poses_is_ambiguous(seed):
     d = fine_error(seed, 3)
     assert (d.verdict, d.reason) == ("ambiguous", "pose_alone")
-    assert d.pose_alone is not None
     assert d.pose_alone.share > 0.95
     assert d.pose_alone.effects[:2] == ("transmission_error", "link_geometry")
     # 2 · 40 harmonics of six joints, three elements per pose.
@@ -80,7 +77,7 @@ def test_a_transmission_error_too_fine_for_thirty_poses_is_ambiguous(seed: int) 
     assert to_json(d)["pose_alone"]["more"] == 130
 
 
-def test_the_chance_grows_with_the_poses() -> None:
+def test_the_chance_grows_with_the_poses():
     """Thirty poses hardly ever tell, many do."""
     options = {"plan_seed": 0, "poses": 30, "strength": 2.0, "harmonics": 21}
     c = campaign("transmission_error", "absolute", 0, **options)

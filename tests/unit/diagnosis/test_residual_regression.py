@@ -1,6 +1,5 @@
 """An effect outside of the catalogue: how much is predictable, by what, and how; by trees."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -11,32 +10,26 @@ from hilcal.diagnosis import residual_regression as module
 from hilcal.diagnosis.residual_regression import (
     LEAF,
     PRECISE,
-    Dependence,
-    ResidualRegression,
     TreePrediction,
     predicted,
     residual_regression,
 )
 from hilcal.identification.linearisation import linearise
-from hilcal.readings.readings import States
-from hilcal.types import Floats, Ints
-from tests.support.campaigns import Campaign, campaign, plan
+from tests.support.campaigns import campaign, plan
 from tests.support.diagnosis_cases import fitted
 from tests.support.rows import first
 
-Law = Callable[[States], np.ndarray]
 
-
-def elapsed(s: States) -> np.ndarray:
+def elapsed(s):
     return (s.time - s.time.min()) / np.ptp(s.time)
 
 
-def pull(s: States) -> np.ndarray:
+def pull(s):
     return np.linalg.norm(s.wrench[:, :3], axis=1)
 
 
 # Name: what errs (a joint, or a direction of the target), how, and what carries it.
-LAWS: dict[str, tuple[int | tuple[float, ...], Law, set[str]]] = {
+LAWS = {
     "dq2 = sin 3 q4": (1, lambda s: np.sin(3 * s.q[:, 3]), {"joint 4 angle"}),
     "dq1 = cos 2 q3": (0, lambda s: np.cos(2 * s.q[:, 2]), {"joint 3 angle"}),
     "dq3 = tanh t": (2, lambda s: np.tanh(4 * (elapsed(s) - 0.5)), {"time"}),
@@ -47,7 +40,7 @@ LAWS: dict[str, tuple[int | tuple[float, ...], Law, set[str]]] = {
 HIDDEN = [(name, "absolute") for name in LAWS] + [("dq2 = F sin q1", "deflection")]
 
 
-def warm(s: States, seed: int) -> States:
+def warm(s, seed):
     """Joints that warm up each in its own way, and air that drifts."""
     rng, t = np.random.default_rng(seed), elapsed(s)
     rise = rng.uniform(5, 20, 6) * (1 - np.exp(-t[:, None] / rng.uniform(0.1, 0.8, 6)))
@@ -59,7 +52,7 @@ def warm(s: States, seed: int) -> States:
     )
 
 
-def hidden(name: str, mode: str, seed: int, strength: float = 3.0, poses: int = 30) -> Campaign:
+def hidden(name, mode, seed, strength=3.0, poses=30):
     """Readings moved by an invented law, in base axes, at so many σ."""
     c = campaign("none", mode, seed, poses=poses, registration_known=True)
     p = plan(poses, 1000 + seed)
@@ -69,14 +62,14 @@ def hidden(name: str, mode: str, seed: int, strength: float = 3.0, poses: int = 
     at = c.world.sight(p.states).position
     axes = c.cell.registration[:3, :3]
 
-    def moved(a: float) -> np.ndarray:
+    def moved(a):
         if isinstance(way, tuple):
             return a * np.outer(size, axes @ np.array(way))
         off = np.zeros_like(s.q)
         off[:, way] = a * size
         return c.world.sight(replace(p.states, q=s.q + off)).position - at
 
-    def strong(shift: np.ndarray) -> float:
+    def strong(shift):
         v = c.readings.covariance
         if mode == "deflection":  # each pose begins unloaded
             first = np.searchsorted(p.pose, p.pose)
@@ -88,14 +81,14 @@ def hidden(name: str, mode: str, seed: int, strength: float = 3.0, poses: int = 
     return replace(c, readings=replace(c.readings, states=s, value=c.readings.value + moved(a)))
 
 
-def told(c: Campaign) -> ResidualRegression:
+def told(c):
     return residual_regression(linearise(fitted(c)))
 
 
 QUICK = range(2)  # seeds
 
 
-def right(name: str, found: ResidualRegression) -> bool:
+def right(name, found):
     return bool({v.variable for v in found.dependences[:2]} & LAWS[name][2])
 
 
@@ -129,7 +122,7 @@ def test_noise_is_not_predictable(mode):
         assert found.dependences == ()
 
 
-def curve_of(name: str, variable: str) -> tuple[Campaign, Dependence]:
+def curve_of(name, variable):
     c = hidden(name, "absolute", 1, strength=6.0, poses=40)
     return c, next(v for v in told(c).dependences if v.variable == variable)
 
@@ -159,7 +152,7 @@ def test_a_curve_of_the_target_has_a_direction_in_base_axes():
 POSES, LOADS, FEATURES, FOLDS = 40, 3, 6, 5
 
 
-def table(seed: int, size: float) -> tuple[Floats, Floats, Ints]:
+def table(seed, size):
     """Features, target and folds of whole poses; a law of two features, of a size in σ."""
     rng = np.random.default_rng(seed)
     pose = np.repeat(np.arange(POSES), LOADS)
@@ -170,7 +163,7 @@ def table(seed: int, size: float) -> tuple[Floats, Floats, Ints]:
     return x, y, rng.permutation(POSES)[pose] % FOLDS
 
 
-def of_large_forest(x: Floats, y: Floats, fold: Ints, trees: int = 300) -> float:
+def of_large_forest(x, y, fold, trees=300):
     """The share by many trees, their mean, scikit-learn's own forest."""
     left = y.copy()
     for f in range(FOLDS):

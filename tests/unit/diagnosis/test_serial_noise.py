@@ -6,107 +6,91 @@ import numpy as np
 import pytest
 
 from hilcal.campaign.revisions import restore, to_record
-from hilcal.cell import Cell
 from hilcal.cli.demo import CELL
 from hilcal.config import load_config
 from hilcal.diagnosis.diagnosis import VERDICTS
 from hilcal.diagnosis.document import to_json
 from hilcal.diagnosis.serial_noise import MOST_READINGS, serial_noise, with_serial_noise
 from hilcal.diagnosis.verdict import diagnose
-from hilcal.identification.baseline import baseline
-from hilcal.identification.fit import Fit, fit
 from hilcal.present.verdict import message
 from hilcal.readings.covariance import symmetric_root
-from hilcal.readings.readings import Readings
-from hilcal.readings.whitening import MODES, Mode
-from hilcal.refinement import refine
+from hilcal.readings.whitening import MODES
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.rows import content_hash
 from studies.serial_noise import serial_readings
 from studies.study_cases import study_case
+from tests.support.fit_cases import based, refined
 from tests.support.rows import first
 
 
-def campaign(
-    rho: float, mode: Mode = "absolute", seed: int = 0, hidden: str = "", poses: int = 10
-) -> tuple[Cell, Readings]:
+def campaign(rho, mode="absolute", seed=0, hidden="", poses=10):
     config = load_config(configs_dir() / "cells" / CELL)
     names = (hidden,) if hidden else ()
     case = study_case(config, "ur10e", mode, names, 2.0, seed, n_poses=poses)
     return case.cell, serial_readings(case, rho, np.random.default_rng([seed, 1]))
 
 
-def fitted(cell: Cell, readings: Readings, mode: Mode) -> Fit:
-    return fit(baseline(cell, readings, mode), readings, mode)
-
-
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("rho", first(1, [0.9, 0.7, 0.99]))
-def test_the_correlation_comes_out(mode: Mode, rho: float) -> None:
-    found = serial_noise(fitted(*campaign(rho, mode), mode))
-    assert found is not None
+def test_the_correlation_comes_out(mode, rho):
+    found = serial_noise(based(*campaign(rho, mode), mode))
     assert found.proved
     # In deflections half of the noise is of unloaded readings: less is known of it.
     assert abs(np.log1p(-found.rho) - np.log1p(-rho)) < (0.6 if mode == "absolute" else 1.2)
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_white_noise_is_left_as_it_is(mode: Mode) -> None:
+def test_white_noise_is_left_as_it_is(mode):
     for seed in range(5):
-        white = fitted(*campaign(0.0, mode, seed), mode)
+        white = based(*campaign(0.0, mode, seed), mode)
         assert with_serial_noise(white) is white
 
 
 @pytest.mark.parametrize("mode", first(1, ["deflection", "absolute"]))
-def test_nothing_is_named_for_it_and_it_is_said(mode: Mode) -> None:
+def test_nothing_is_named_for_it_and_it_is_said(mode):
     cell, readings = campaign(0.9, mode, 3)
-    found = refine(baseline(cell, readings, mode), readings, mode)
+    found = refined(cell, readings, mode)
     serial = found.fit.readings.serial
-    assert serial is not None
     assert found.fit.model.names == ("base_frame", "joint_compliance")
     assert found.verdict == "adequate"
     said = message(found.diagnosis)
     assert "correlated along their order" in said
     assert "half-time" in said
     document = to_json(found.diagnosis)["serial_noise"]
-    assert isinstance(document, dict)
     assert document["rho"] == serial.rho
     assert document["half"] == pytest.approx(serial.length * np.log(2))
 
 
-def test_intervals_of_a_frame_are_wider_and_of_differences_narrower() -> None:
-    white = fitted(*campaign(0.9), "absolute")
+def test_intervals_of_a_frame_are_wider_and_of_differences_narrower():
+    white = based(*campaign(0.9), "absolute")
     found = with_serial_noise(white)
-    assert found.readings.serial is not None
     low, high = found.readings.serial.wider
     assert low < 0.7
     assert high > 1.5
     before, after = white.parameters["base_frame.x"].std, found.parameters["base_frame.x"].std
-    assert before is not None
-    assert after is not None
     assert after > 1.5 * before
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("rho", [0.0, 0.5])
-def test_a_drift_is_named_as_one(rho: float) -> None:
+def test_a_drift_is_named_as_one(rho):
     cell, readings = campaign(rho, hidden="tracker_drift", seed=1, poses=20)
-    found = refine(baseline(cell, readings, "absolute"), readings, "absolute")
+    found = refined(cell, readings, "absolute")
     assert found.fit.model.names[2:] == ("tracker_drift",)
     assert (found.fit.readings.serial is None) == (rho == 0.0)
 
 
 @pytest.mark.long
-def test_an_effect_is_named_beside_it() -> None:
+def test_an_effect_is_named_beside_it():
     cell, readings = campaign(0.9, hidden="link_geometry", seed=2, poses=12)
-    found = refine(baseline(cell, readings, "absolute"), readings, "absolute")
+    found = refined(cell, readings, "absolute")
     assert "link_geometry" in found.fit.model.names
     assert found.fit.readings.serial is not None
 
 
-def test_a_fit_with_it_is_found_again() -> None:
+def test_a_fit_with_it_is_found_again():
     cell, readings = campaign(0.9, "deflection")
-    found = with_serial_noise(fitted(cell, readings, "deflection"))
+    found = with_serial_noise(based(cell, readings, "deflection"))
     record = to_record(found, None, None, content_hash(found.readings))
     again = restore(record, cell, readings)
     assert again.readings.serial == found.readings.serial
@@ -114,10 +98,9 @@ def test_a_fit_with_it_is_found_again() -> None:
     np.testing.assert_allclose(again.uncertainty.std, found.uncertainty.std, rtol=1e-4)
 
 
-def test_what_effects_explain_as_well_is_in_doubt() -> None:
-    found = with_serial_noise(fitted(*campaign(0.9), "absolute"))
+def test_what_effects_explain_as_well_is_in_doubt():
+    found = with_serial_noise(based(*campaign(0.9), "absolute"))
     serial = found.readings.serial
-    assert serial is not None
     doubt = replace(serial, proved=False, instead=("tracker_drift",))
     d = diagnose(replace(found, readings=found.readings.with_serial(doubt)))
     assert d.reason == "serial_or_effect"
@@ -126,25 +109,24 @@ def test_what_effects_explain_as_well_is_in_doubt() -> None:
 
 
 @pytest.mark.long
-def test_times_tell_a_pause() -> None:
+def test_times_tell_a_pause():
     """Of readings in pairs, far apart in time, the order alone would miss the correlation."""
     cell, readings = campaign(0.0, poses=12)
     rng, count = np.random.default_rng(5), len(readings)
     time = 1000.0 * (np.arange(count) // 2) + 5.0 * (np.arange(count) % 2)
-    clean = fitted(cell, readings, "absolute").solution.prediction.observation.position
+    clean = based(cell, readings, "absolute").solution.prediction.observation.position
     z = rng.standard_normal((count, 3))
     z[1::2] = 0.95 * z[::2] + np.sqrt(1 - 0.95**2) * z[1::2]
     root = symmetric_root(readings.covariance)
     value = clean + np.einsum("nij,nj->ni", root, z)
     told = replace(readings, value=value, states=replace(readings.states, time=time))
-    found = serial_noise(fitted(cell, told, "absolute"))
-    assert found is not None
+    found = serial_noise(based(cell, told, "absolute"))
     assert found.clock == "time"
     assert 5.0 < found.length < 500.0
 
 
-def test_a_few_readings_and_very_many_are_not_judged() -> None:
-    white = fitted(*campaign(0.9), "absolute")
+def test_a_few_readings_and_very_many_are_not_judged():
+    white = based(*campaign(0.9), "absolute")
     few = replace(white, raw=white.raw[:11])
     many = replace(white, raw=np.zeros((MOST_READINGS + 1, 3)))
     assert serial_noise(few) is None

@@ -7,26 +7,23 @@ import numpy as np
 import pytest
 
 import hilcal as hc
-from hilcal.cell import Cell
 from hilcal.diagnosis.document import to_json
 from hilcal.diagnosis.wrong_figures import wrong_figures
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.baseline import baseline
 from hilcal.present.verdict import message
-from hilcal.readings.readings import Readings
-from hilcal.readings.whitening import Mode
-from hilcal.refinement import refine
 from tests.support.campaigns import NOTHING, campaign
+from tests.support.fit_cases import refined
 from tests.support.rows import first
 
 
-def doubled(readings: Readings, load: str) -> Readings:
+def doubled(readings, load):
     wrench = readings.states.wrench.copy()
     wrench[readings.load == readings.load_names.index(load)] *= 2
     return replace(readings, states=replace(readings.states, wrench=wrench))
 
 
-def judged(cell: Cell, readings: Readings, mode: Mode) -> hc.Diagnosis:
+def judged(cell, readings, mode):
     return hc.diagnose(hc.fit(baseline(cell, readings, mode), readings, mode))
 
 
@@ -39,9 +36,7 @@ def judged(cell: Cell, readings: Readings, mode: Mode) -> hc.Diagnosis:
         ("pull x", NOTHING, "Load 'pull x' seems to pull with", 80.0),
     ],
 )
-def test_a_load_at_twice_its_weight_is_named(
-    mode: Mode, load: str, hidden: str, said: str, true: float
-) -> None:
+def test_a_load_at_twice_its_weight_is_named(mode, load, hidden, said, true):
     """Also where all its readings were taken for gross errors, and beside a hidden effect."""
     c = campaign(hidden, mode, 1, poses=20)
     d = judged(c.cell, doubled(c.readings, load), mode)
@@ -55,7 +50,7 @@ def test_a_load_at_twice_its_weight_is_named(
 
 @pytest.mark.parametrize("load", ["5kg", "pull x"])
 @pytest.mark.parametrize("factor", first(1, [0.5, 2.0]))
-def test_a_single_load_is_told_by_the_weight_of_the_arm(load: str, factor: float) -> None:
+def test_a_single_load_is_told_by_the_weight_of_the_arm(load, factor):
     """Not of deflections: there it is a common factor of all compliances."""
     c = campaign("backlash", "absolute", 1, poses=20)
     number = c.readings.load_names.index(load)
@@ -69,14 +64,14 @@ def test_a_single_load_is_told_by_the_weight_of_the_arm(load: str, factor: float
     assert not judged(c.cell, wrong, "deflection").wrong_figures
 
 
-def test_a_figure_without_an_equilibrium_explains_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_figure_without_an_equilibrium_explains_nothing(monkeypatch):
     """A trial that does not settle ends no diagnosis."""
     c = campaign(NOTHING, "absolute", 1, poses=20)
     spoilt = doubled(c.readings, "5kg")
     found = hc.fit(baseline(c.cell, spoilt, "absolute"), spoilt, "absolute")
     tried = []
 
-    def unsettled(*args: object, **more: object) -> None:
+    def unsettled(*args, **more):
         tried.append(args)
         raise CannotAnswerError("no static equilibrium")
 
@@ -86,10 +81,10 @@ def test_a_figure_without_an_equilibrium_explains_nothing(monkeypatch: pytest.Mo
 
 
 @pytest.mark.long
-def test_a_tool_at_twice_its_mass_is_named_and_refine_adds_nothing() -> None:
+def test_a_tool_at_twice_its_mass_is_named_and_refine_adds_nothing():
     c = campaign(NOTHING, "absolute", 1, poses=20)
     cell = replace(c.cell, tool_mass=2 * c.cell.tool_mass)
-    found = refine(baseline(cell, c.readings, "absolute"), c.readings, "absolute")
+    found = refined(cell, c.readings, "absolute")
     (step,) = found.steps
     assert found.verdict == "ambiguous"
     assert message(step.diagnosis).startswith("The tool seems to weigh 0.8")
@@ -98,7 +93,7 @@ def test_a_tool_at_twice_its_mass_is_named_and_refine_adds_nothing() -> None:
     assert (figure["kind"], figure["unit"]) == ("tool_mass", "kg")
 
 
-def test_a_tool_elsewhere_than_stated_is_named() -> None:
+def test_a_tool_elsewhere_than_stated_is_named():
     c = campaign(NOTHING, "absolute", 1, poses=20)
     shift = np.array([0.0, 0.3, 0.0])
     d = judged(replace(c.cell, tool_com=c.cell.tool_com + shift), c.readings, "absolute")
@@ -116,7 +111,7 @@ def test_a_tool_elsewhere_than_stated_is_named() -> None:
         ("joint_stiffening", "absolute"),
     ],
 )
-def test_effects_are_no_wrong_figures(effect: str, mode: Mode) -> None:
+def test_effects_are_no_wrong_figures(effect, mode):
     """Of 63 campaigns with 19 effects of 3 and 6 σ, none was one, nor on the way to the model."""
     c = campaign(effect, mode, 1, poses=16)
     d = judged(c.cell, c.readings, mode)

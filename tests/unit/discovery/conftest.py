@@ -1,7 +1,5 @@
 """Fixtures of the tests of discovered laws."""
 
-from collections.abc import Iterator
-
 import pytest
 
 from hilcal.discovery import compose
@@ -9,7 +7,7 @@ from hilcal.discovery import grammar as products
 
 
 @pytest.fixture(autouse=True, scope="module")
-def short_products() -> Iterator[None]:
+def short_products():
     """Products of two simple functions at most, for speed; studies search all."""
     most, grown = products.MOST, compose.MOST
     products.MOST = compose.MOST = 2

@@ -14,18 +14,18 @@ from hilcal.discovery.screen import LawTerm, screen
 from hilcal.discovery.search import LEAST, Selection
 from hilcal.effects.spec import EffectSpec
 from hilcal.errors import CannotAnswerError
-from hilcal.identification.fit import Fit, fit
+from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import linearise
 from hilcal.present.diagnosis import silence
 from tests.unit.discovery.test_discover import campaign
 
 
 @cache
-def problem() -> SearchProblem:
+def problem():
     return SearchProblem(screen(linearise(campaign())))
 
 
-def term(p: SearchProblem, power: float) -> LawTerm:
+def term(p, power):
     """A displacement of joint 2 by a power of its torque."""
     (f,) = (
         k
@@ -38,9 +38,7 @@ def term(p: SearchProblem, power: float) -> LawTerm:
 
 
 @pytest.mark.parametrize(("power", "size", "more"), [(3.0, 300.0, False), (0.5, 300.0, True)])
-def test_a_law_is_told_beside_an_effect_only_where_it_is_another(
-    power: float, size: float, more: bool
-) -> None:
+def test_a_law_is_told_beside_an_effect_only_where_it_is_another(power, size, more):
     """The cube is what `joint_stiffening` describes; a root of the torque is not."""
     p = problem()
     own = term(p, power)
@@ -56,7 +54,7 @@ def test_a_law_is_told_beside_an_effect_only_where_it_is_another(
 
 
 @pytest.mark.parametrize(("shift", "named"), [(0.5, ("load_point",)), (0.2, ())])
-def test_a_large_effect_is_named_by_its_exact_refit(shift: float, named: tuple[str, ...]) -> None:
+def test_a_large_effect_is_named_by_its_exact_refit(shift, named):
     """What a load half a metre off does beyond the linearisation is no law of its own.
 
     By algebra the law is likelier by 20 in the logarithm of the odds, in either case.
@@ -69,10 +67,10 @@ def test_a_large_effect_is_named_by_its_exact_refit(shift: float, named: tuple[s
     assert instead_of_law(fitted, p, law, known) == Instead(named)
 
 
-def test_no_refit_fails_in_silence(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_refit_fails_in_silence(monkeypatch):
     """An effect that cannot be refitted is named; a law that cannot is not preferred to effects."""
 
-    def fails(*_: object) -> None:
+    def fails(*_):
         raise CannotAnswerError("it finds no equilibrium")
 
     fitted = _with_load_off(0.2)
@@ -95,7 +93,7 @@ def test_no_refit_fails_in_silence(monkeypatch: pytest.MonkeyPatch) -> None:
     ]
 
 
-def _with_load_off(shift: float) -> Fit:
+def _with_load_off(shift):
     """Deflections as the model would read them with the load off by so much along z, and noise."""
     before = campaign()
     model = before.model + EffectSpec("load_point")

@@ -3,7 +3,6 @@
 import sys
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,20 +20,20 @@ from hilcal.discovery.sites import ORDINARY
 from hilcal.effects.catalogue import installed
 from hilcal.effects.check import check_effect
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.baseline import baseline
 from hilcal.identification.effect_columns import effect_columns
-from hilcal.identification.fit import Fit, fit
+from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import linearise
 from hilcal.present.diagnosis import discovery_report, refined_laws, silence
 from hilcal.refinement import refine
 from studies.unmodelled_laws import law_named, shift
+from tests.support.fit_cases import based
 from tests.support.rehearsed import rehearsed
 
 LAW = "compliance by another joint"
 
 
 @cache
-def campaign(law: str = "", stated: float = 1.0, seed: int = 4) -> Fit:
+def campaign(law="", stated=1.0, seed=4):
     """Deflections of 14 poses under two weights, with a law that no effect describes."""
     of = rehearsed(14, seed)
     cell, readings, value = of.cell, of.readings, of.readings.value
@@ -44,15 +43,15 @@ def campaign(law: str = "", stated: float = 1.0, seed: int = 4) -> Fit:
             drawn, of.world, readings.states, 6.0, "deflection", of.pose, of.cycle
         )
     readings = replace(readings, value=value, covariance=stated**2 * readings.covariance)
-    return fit(baseline(cell, readings, "deflection"), readings, "deflection")
+    return based(cell, readings, "deflection")
 
 
 @cache
-def found() -> Discovery:
+def found():
     return discover(campaign(LAW), name="bent")
 
 
-def test_a_law_outside_of_the_catalogue_is_found_with_its_site_and_variables() -> None:
+def test_a_law_outside_of_the_catalogue_is_found_with_its_site_and_variables():
     law = found().laws[0]
     assert found().reason == "law"
     assert law.formula == "dq_3 = a·cos(q_4)·τ_3"
@@ -66,7 +65,7 @@ def test_a_law_outside_of_the_catalogue_is_found_with_its_site_and_variables() -
     assert law.holdout_share > 0.8
 
 
-def test_what_is_written_is_an_effect_that_lowers_the_error() -> None:
+def test_what_is_written_is_an_effect_that_lowers_the_error():
     d, before = found(), campaign(LAW)
     kind = effect_class(d.source, "bent")
     check_effect(kind)
@@ -79,9 +78,7 @@ def test_what_is_written_is_an_effect_that_lowers_the_error() -> None:
     )
 
 
-def test_a_refinement_adds_the_law_and_its_file_gives_it_back(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_refinement_adds_the_law_and_its_file_gives_it_back(tmp_path, monkeypatch):
     before, laws = campaign(LAW), LawSearch(tmp_path, "bent")
     monkeypatch.setattr(
         sys.modules[LawSearch.__module__], "discover", lambda fit, say, name: found()
@@ -105,7 +102,7 @@ def test_a_refinement_adds_the_law_and_its_file_gives_it_back(
     assert document["written"] == str(tmp_path / "bent.py")
 
 
-def test_nothing_is_searched_where_the_model_is_adequate(tmp_path: Path) -> None:
+def test_nothing_is_searched_where_the_model_is_adequate(tmp_path):
     before, laws = campaign(), LawSearch(tmp_path)
     assert refine(before.model, before.readings, before.mode, laws=laws).verdict == "adequate"
     assert laws.found == []
@@ -115,13 +112,11 @@ def test_nothing_is_searched_where_the_model_is_adequate(tmp_path: Path) -> None
         hc.refine(before.model, before.readings, discover=tmp_path / "nowhere")
 
 
-def test_a_law_takes_a_name_and_a_file_that_are_free(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_law_takes_a_name_and_a_file_that_are_free(tmp_path, monkeypatch):
     (tmp_path / "found.py").write_text("mine", encoding="utf-8")
-    asked: list[str] = []
+    asked = []
 
-    def silent(fit: Fit, say: object, name: str) -> Discovery:
+    def silent(fit, say, name):
         asked.append(name)
         return Discovery(fit, "no_law")
 
@@ -139,27 +134,25 @@ def test_a_law_takes_a_name_and_a_file_that_are_free(
 
 
 @cache
-def searched() -> list[Selection]:
+def searched():
     return search(SearchProblem(screen(linearise(campaign(LAW)))))
 
 
 @pytest.mark.parametrize("stated", [0.5, 2.0])
-def test_noise_that_is_misjudged_is_no_law(stated: float) -> None:
+def test_noise_that_is_misjudged_is_no_law(stated):
     d = discover(campaign(stated=stated))
     assert d.laws == ()
     assert d.reason in ("adequate", "unpredictable", "catalogue", "no_law")
     assert silence(d).startswith("no law")
 
 
-def test_a_drift_of_readings_without_times_is_said_to_need_them(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_drift_of_readings_without_times_is_said_to_need_them(monkeypatch):
     of = campaign()
     timeless = replace(of.readings.states, time=None, load_time=None)
     value = of.readings.value.copy()
     value[:, 0] += 400e-6 * np.maximum(np.linspace(-1.0, 1.0, len(value)), 0.0)
     readings = replace(of.readings, states=timeless, value=value)
-    before = fit(baseline(of.model.cell, readings, "absolute"), readings, "absolute")
+    before = based(of.model.cell, readings, "absolute")
     monkeypatch.setattr(sys.modules[Discovery.__module__], "search", lambda problem: [])
     d = discover(before)
     assert (d.reason, d.carried[0].variable) == ("no_law", "row order")
@@ -169,11 +162,11 @@ def test_a_drift_of_readings_without_times_is_said_to_need_them(
 
 
 @cache
-def screened() -> Screen:
+def screened():
     return screen(linearise(campaign(LAW)))
 
 
-def test_screening_is_what_the_columns_themselves_give() -> None:
+def test_screening_is_what_the_columns_themselves_give():
     s = screened()
     problem = SearchProblem(s)
     rng = np.random.default_rng(0)
@@ -188,7 +181,7 @@ def test_screening_is_what_the_columns_themselves_give() -> None:
 
 
 @pytest.mark.long
-def test_a_screening_of_some_of_the_poses_finds_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_screening_of_some_of_the_poses_finds_the_same(monkeypatch):
     monkeypatch.setattr(sys.modules[Screen.__module__], "MOST_READINGS", 27)
     thinned = screen(linearise(campaign(LAW)))
     assert len(thinned.readings) <= 27
@@ -199,7 +192,7 @@ def test_a_screening_of_some_of_the_poses_finds_the_same(monkeypatch: pytest.Mon
     assert first.total == pytest.approx(known.total, rel=1e-6)
 
 
-def test_columns_of_the_written_effect_are_those_of_the_search() -> None:
+def test_columns_of_the_written_effect_are_those_of_the_search():
     s, f = screened(), campaign(LAW)
     situation = f.solution.prediction.situation
     rng = np.random.default_rng(2)
@@ -213,11 +206,11 @@ def test_columns_of_the_written_effect_are_those_of_the_search() -> None:
         )
 
 
-def unit_motion(form: Form) -> float:
+def unit_motion(form):
     return ORDINARY[form.parts[0].site.unit]
 
 
-def test_what_is_told_of_a_law_names_all_that_speaks_for_it() -> None:
+def test_what_is_told_of_a_law_names_all_that_speaks_for_it():
     told = "\n".join(str(part) for part in discovery_report(found()))
     assert "dq_3 = a·cos(q_4)·τ_3" in told
     assert "acts on      joint 3" in told
@@ -228,7 +221,7 @@ def test_what_is_told_of_a_law_names_all_that_speaks_for_it() -> None:
     assert law["latex"] == r"\delta q_3 = a\,\cos(q_4)\,\tau_3"
 
 
-def test_the_curve_of_a_law_lies_where_the_readings_are() -> None:
+def test_the_curve_of_a_law_lies_where_the_readings_are():
     by_angle, by_torque = found().curves
     assert (by_angle.site, by_angle.quantity, by_angle.of) == ("joint 3", "q_4", "dq_3/τ_3")
     assert (by_torque.quantity, by_torque.unit) == ("τ_3", "rad")
@@ -247,7 +240,7 @@ def test_the_curve_of_a_law_lies_where_the_readings_are() -> None:
     assert drawn["binned"][0]["readings"] == by_angle.binned[3][0]
 
 
-def test_a_longer_law_has_to_be_more_likely_than_every_shorter_one() -> None:
+def test_a_longer_law_has_to_be_more_likely_than_every_shorter_one():
     one, two, three = (
         Selection((LawTerm(((0, 0),), 0.0),) * k, odds)
         for k, odds in ((1, (182.3,)), (2, (171.9, 9.0)), (3, (171.9, 9.0, 5.0)))
@@ -256,7 +249,7 @@ def test_a_longer_law_has_to_be_more_likely_than_every_shorter_one() -> None:
     assert worth_their_length([one, two]) == [one]
 
 
-def with_zero(symbol: str, *more: LawPart) -> Form:
+def with_zero(symbol, *more):
     """A law a·cos(q_4)·τ_3, and b times a quantity at the same site."""
     s = screened().linear.fit.solution.prediction.situation
     known = {v.symbol: v for v in variables(s)}
@@ -267,7 +260,7 @@ def with_zero(symbol: str, *more: LawPart) -> Form:
     return Form((*both, *more))
 
 
-def test_a_number_that_the_model_absorbs_is_dropped() -> None:
+def test_a_number_that_the_model_absorbs_is_dropped():
     """The zero of a compliance that is no constant: the model has one already."""
     form = with_zero("τ_3")
     assert form.text() == "dq_3 = a·τ_3 + b·cos(q_4)·τ_3"
@@ -280,8 +273,8 @@ def test_a_number_that_the_model_absorbs_is_dropped() -> None:
 
 
 @pytest.mark.long
-def test_a_law_whose_refit_fails_is_named_with_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails(*_: object) -> None:
+def test_a_law_whose_refit_fails_is_named_with_the_reason(monkeypatch):
+    def fails(*_):
         raise CannotAnswerError("it finds no equilibrium")
 
     module = sys.modules[discover.__module__]

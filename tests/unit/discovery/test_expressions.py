@@ -3,22 +3,20 @@
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from hilcal.discovery import shapes
-from hilcal.discovery.amplitudes import Amplitude, Factor, Variable, composed, variables
+from hilcal.discovery.amplitudes import Amplitude, Factor, composed, variables
 from hilcal.discovery.curve import drawn_laws
 from hilcal.discovery.law import Coefficient, Form, Law, LawPart, source_of_form
-from hilcal.discovery.sites import Site, sites
+from hilcal.discovery.sites import sites
 from hilcal.effects.catalogue import installed
 from hilcal.effects.check import example_cell, example_situation, example_states
 from hilcal.effects.from_file import effects_of
-from hilcal.effects.protocol import Situation
 from hilcal.identification.baseline import with_effects
-from hilcal.identification.fit import Fit, fit
+from hilcal.identification.fit import fit
 from hilcal.present.charts import curve_chart
 from hilcal.present.document import says
 from hilcal.present.story import Chapter, build_story
@@ -30,7 +28,7 @@ from tests.support.recordings import rows
 CELL = example_cell()
 
 
-def situation() -> Situation:
+def situation():
     states = example_states(CELL)
     n = len(states)
     more = {"time": 30.0 * np.arange(n), "air_temperature": 20.0 + np.linspace(-1.0, 2.0, n)}
@@ -38,8 +36,8 @@ def situation() -> Situation:
 
 
 S = situation()
-NAMED: dict[str, Variable] = {v.symbol: v for v in variables(S)}
-COLUMNS: dict[str, Any] = {
+NAMED = {v.symbol: v for v in variables(S)}
+COLUMNS = {
     **{f"q{j + 1}": S.angle[:, j] for j in range(6)},
     **{f"tau{j + 1}": S.torque[:, j] for j in range(6)},
     "force": np.linalg.norm(S.states.wrench[:, :3], axis=1),
@@ -48,18 +46,18 @@ COLUMNS: dict[str, Any] = {
 }
 
 
-def site(symbol: str) -> Site:
+def site(symbol):
     return next(s for s in sites(CELL.arm.n) if s.symbol == symbol)
 
 
-def law(*parts: tuple[str, float, Amplitude]) -> Law:
+def law(*parts):
     """A law with a coefficient of each part."""
     form = Form(tuple(LawPart(site(at), a, k) for k, (at, _, a) in enumerate(parts)))
     numbers = tuple(Coefficient("abc"[k], value, 0.0, "1") for k, (_, value, _) in enumerate(parts))
     return Law("law_1", form, numbers, 0.0, 9.0, 0.9, 1.0, 1.0, (), ())
 
 
-def of(symbol: str, shape: shapes.Shape = shapes.LINEAR, *numbers: float) -> Amplitude:
+def of(symbol, shape=shapes.LINEAR, *numbers):
     return Amplitude((Factor(NAMED[symbol], shape, numbers),))
 
 
@@ -85,13 +83,13 @@ BEND = Amplitude((Factor(composed(((1.0, of("q_1")), (-0.5, of("q_5")))), shapes
     ],
     ids=lambda a: a.text() or "constant",
 )
-def test_an_expression_has_the_value_of_the_law(amplitude: Amplitude) -> None:
+def test_an_expression_has_the_value_of_the_law(amplitude):
     text = law(("dq_3", 2e-4, amplitude)).expressions["dq_3"]
     value = Formula.parse(text, COLUMNS).value(COLUMNS)
     np.testing.assert_allclose(value + 0.0 * S.angle[:, 0], 2e-4 * amplitude.values(S), rtol=1e-12)
 
 
-def test_each_site_has_the_sum_of_its_terms() -> None:
+def test_each_site_has_the_sum_of_its_terms():
     found = law(
         ("dq_3", 2e-4, of("q_3")), ("base_z", 1e-3, of("t")), ("dq_3", -1e-4, of("τ_1"))
     ).expressions
@@ -99,7 +97,7 @@ def test_each_site_has_the_sum_of_its_terms() -> None:
 
 
 @pytest.mark.parametrize("symbol", ["f_x", "ρ", "z", "mF_x", "gF_z"])
-def test_a_site_whose_law_depends_on_what_has_no_name_is_left_out(symbol: str) -> None:
+def test_a_site_whose_law_depends_on_what_has_no_name_is_left_out(symbol):
     both = law(("dq_1", 1e-4, of("q_2")), ("dq_2", 1e-4, of(symbol)))
     assert list(both.expressions) == ["dq_1"]
 
@@ -111,7 +109,7 @@ DRAWN = Form((LawPart(site("dq_3"), of("q_3", shapes.COS, 96.0), 0),))
 
 
 @cache
-def fitted(form: Form) -> Fit:
+def fitted(form):
     """A fit with a law that is not there, to readings of 12 poses."""
     found = campaign(NOTHING, "deflection", poses=12)
     source = source_of_form(form, "twisted").encode()
@@ -126,7 +124,7 @@ def fitted(form: Form) -> Fit:
     ("form", "of", "over"),
     [(PRODUCT, "dq_3/τ_3", "q_5"), (DRAWN, "dq_3", "q_3 within a period of 2π/96")],
 )
-def test_a_law_is_drawn_over_what_its_formula_names(form: Form, of: str, over: str) -> None:
+def test_a_law_is_drawn_over_what_its_formula_names(form, of, over):
     made = fitted(form)
     (found,) = drawn_laws(made)
     assert (found.name, found.formula, found.acts_on) == ("twisted", form.text(), ("joint 3",))
@@ -140,7 +138,7 @@ def test_a_law_is_drawn_over_what_its_formula_names(form: Form, of: str, over: s
     assert np.abs(inside - truth).max() < 0.1 * abs(a)
 
 
-def test_a_law_is_seen_on_the_page_and_in_the_viewer(tmp_path: Path) -> None:
+def test_a_law_is_seen_on_the_page_and_in_the_viewer(tmp_path):
     made = fitted(PRODUCT)
     before = replace(made.model, effects=made.model.effects[:-1])
     chapters = [
@@ -159,7 +157,7 @@ def test_a_law_is_seen_on_the_page_and_in_the_viewer(tmp_path: Path) -> None:
     assert set(law) == {2}
 
 
-def test_a_model_of_the_catalogue_has_no_laws() -> None:
+def test_a_model_of_the_catalogue_has_no_laws():
     made = fitted(DRAWN)
     plain = replace(made.model, effects=made.model.effects[:-1], catalogue=installed())
     assert drawn_laws(fit(plain, made.readings, made.mode)) == ()

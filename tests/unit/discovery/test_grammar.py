@@ -8,49 +8,45 @@ import pytest
 
 from hilcal.discovery import grammar as products
 from hilcal.discovery import shapes
-from hilcal.discovery.amplitudes import Amplitude, Composed, Factor, Variable, composed, variables
+from hilcal.discovery.amplitudes import Amplitude, Composed, Factor, composed, variables
 from hilcal.discovery.curve import curves
-from hilcal.discovery.discovery import Discovery, agreement, discover
+from hilcal.discovery.discovery import agreement, discover
 from hilcal.discovery.grammar import grammar
 from hilcal.discovery.law import Form, LawPart, effect_class, source_of_form
 from hilcal.discovery.refit import exact, left_by, refine
 from hilcal.discovery.screen import screen
-from hilcal.discovery.shapes import Shape
 from hilcal.discovery.sites import sites
 from hilcal.effects.check import check_effect, example_cell, example_situation, example_states
-from hilcal.effects.protocol import Situation
-from hilcal.identification.baseline import baseline
-from hilcal.identification.fit import Fit, fit
 from hilcal.identification.linearisation import linearise
 from hilcal.readings.whitening import whitening
-from hilcal.types import Floats
 from studies.law_scene import scene
+from tests.support.fit_cases import based
 from tests.support.rehearsed import rehearsed
 
 
-def example() -> Situation:
+def example():
     cell = example_cell()
     return example_situation(cell, example_states(cell))
 
 
-def named(s: Situation) -> dict[str, Variable]:
+def named(s):
     return {v.symbol: v for v in variables(s)}
 
 
-def product(*factors: Factor) -> Amplitude:
+def product(*factors):
     return Amplitude(factors)
 
 
-def waved(v: Variable) -> Factor:
+def waved(v):
     return Factor(v, shapes.COS, (1.0,))
 
 
-def accept(*parts: LawPart) -> None:
+def accept(*parts):
     """A law is an effect that keeps to the protocol, with its derivatives."""
     check_effect(effect_class(source_of_form(Form(parts), "tried"), "tried"))
 
 
-FUNCTIONS: tuple[tuple[Shape, tuple[float, ...]], ...] = (
+FUNCTIONS = (
     (shapes.LINEAR, ()), (shapes.ODD, (2.0, 0.0)), (shapes.ODD, (0.5, 0.3)),
     (shapes.EVEN, (1.0, 0.0)), (shapes.EVEN, (1.7, 0.3)), (shapes.EVEN, (0.6, 0.3)),
     (shapes.THRESHOLD, (5.0,)), (shapes.PLUS, ()), (shapes.MINUS, ()),
@@ -58,7 +54,7 @@ FUNCTIONS: tuple[tuple[Shape, tuple[float, ...]], ...] = (
 )  # fmt: skip
 
 
-def test_every_function_is_an_effect_with_its_derivative() -> None:
+def test_every_function_is_an_effect_with_its_derivative():
     known = {v.kind: v for v in variables(example())}
     places = sites(6)
     for k, (shape, numbers) in enumerate(FUNCTIONS):
@@ -81,17 +77,13 @@ def test_every_function_is_an_effect_with_its_derivative() -> None:
         (shapes.SATURATION, (0.05,)),
     ],
 )
-def test_a_one_sided_law_is_an_effect_also_where_nothing_hangs(
-    shape: Shape, numbers: tuple[float, ...], joint: int
-) -> None:
+def test_a_one_sided_law_is_an_effect_also_where_nothing_hangs(shape, numbers, joint):
     """Joint 1 of an unloaded arm has no torque: the states are at the bend itself."""
     torque = named(example())[f"τ_{joint}"]
     accept(LawPart(sites(6)[joint - 1], product(Factor(torque, shape, numbers)), 0))
 
 
-def test_fine_waves_are_tried_up_to_the_number_of_poses_and_in_no_product(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_fine_waves_are_tried_up_to_the_number_of_poses_and_in_no_product(monkeypatch):
     monkeypatch.setattr(products, "MOST", 3)
     s = example()
     words = grammar([v for v in variables(s) if v.kind == "angle"][:2], s, 14)
@@ -119,9 +111,7 @@ SIGMA = 6.0
         (shapes.STEP, (-1.0, 7.0)),
     ],
 )
-def test_a_function_of_a_sum_of_products_is_an_effect_with_its_derivative(
-    shape: Shape, numbers: tuple[float, ...]
-) -> None:
+def test_a_function_of_a_sum_of_products_is_an_effect_with_its_derivative(shape, numbers):
     known = named(example())
     u = composed(
         (
@@ -136,7 +126,7 @@ def test_a_function_of_a_sum_of_products_is_an_effect_with_its_derivative(
     accept(LawPart(places[1], product(bent), 0), other)
 
 
-def test_a_bend_with_a_fractional_power_has_its_unit_and_its_formula() -> None:
+def test_a_bend_with_a_fractional_power_has_its_unit_and_its_formula():
     known = named(example())
     u = composed(((1.0, product(Factor(known["τ_2"], shapes.LINEAR), waved(known["q_5"]))),))
     form = Form((LawPart(sites(6)[2], product(Factor(u, shapes.ABOVE_POWER, (5.0, 1.5))), 0),))
@@ -147,7 +137,7 @@ def test_a_bend_with_a_fractional_power_has_its_unit_and_its_formula() -> None:
     assert form.elastic
 
 
-def test_a_sum_is_written_with_its_weights_and_reads_what_its_products_read() -> None:
+def test_a_sum_is_written_with_its_weights_and_reads_what_its_products_read():
     s = example()
     known = named(s)
     u = composed(((1.0, product(waved(known["q_5"]))), (-0.25, product(waved(known["q_6"])))))
@@ -159,7 +149,7 @@ def test_a_sum_is_written_with_its_weights_and_reads_what_its_products_read() ->
 
 
 @cache
-def campaign() -> tuple[Fit, Floats]:
+def campaign():
     """Deflections with a joint that gives way where two quantities together pass a level."""
     of = rehearsed(30, seed=11)
     cell, readings, states = of.cell, of.readings, of.readings.states
@@ -169,16 +159,16 @@ def campaign() -> tuple[Fit, Floats]:
     w = whitening(readings, "deflection")
     moved = moved * (SIGMA / np.sqrt(np.mean(w.whiten(w.raw(moved)) ** 2)))
     readings = replace(readings, value=readings.value + moved)
-    return fit(baseline(cell, readings, "deflection"), readings, "deflection"), moved
+    return based(cell, readings, "deflection"), moved
 
 
 @cache
-def found() -> Discovery:
+def found():
     return discover(campaign()[0], name="beyond")
 
 
 @pytest.mark.long
-def test_a_bend_of_a_product_is_found_with_its_site_and_quantities() -> None:
+def test_a_bend_of_a_product_is_found_with_its_site_and_quantities():
     law = found().laws[0]
     assert law.acts_on == ("joint 3",)
     assert set(law.variables) == {"joint 2 torque", "joint 5 angle"}
@@ -187,7 +177,7 @@ def test_a_bend_of_a_product_is_found_with_its_site_and_quantities() -> None:
 
 
 @pytest.mark.long
-def test_the_effect_of_a_bend_does_what_was_hidden() -> None:
+def test_the_effect_of_a_bend_does_what_was_hidden():
     before, moved = campaign()
     d = found()
     assert agreement(before, d.after, moved) > 0.99
@@ -198,7 +188,7 @@ def test_the_effect_of_a_bend_does_what_was_hidden() -> None:
     assert drawn.line[0, 0] < drawn.line[0, -1]
 
 
-def test_levels_weights_and_exponents_are_refined_together() -> None:
+def test_levels_weights_and_exponents_are_refined_together():
     at = screen(linearise(campaign()[0]))
     s = at.linear.fit.solution.prediction.situation
     known = {v.symbol: v for v in at.grammar.known}

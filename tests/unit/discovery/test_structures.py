@@ -3,7 +3,6 @@
 from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,22 +13,21 @@ from hilcal.discovery.curve import curves
 from hilcal.discovery.discovery import Discovery, alternatives, discover, discovery_json
 from hilcal.discovery.law import Form, LawPart, effect_class
 from hilcal.discovery.problem import SearchProblem
-from hilcal.discovery.screen import LawTerm, Screen
+from hilcal.discovery.screen import LawTerm
 from hilcal.discovery.search import search
 from hilcal.discovery.sites import sites
 from hilcal.discovery.structures import Structure, averaged, pareto, posterior
 from hilcal.effects.check import check_effect
 from hilcal.errors import CannotAnswerError
-from hilcal.identification.baseline import baseline
-from hilcal.identification.fit import Fit, fit
 from hilcal.identification.residual import residual
 from hilcal.readings.whitening import whitening
 from hilcal.regression.evidence import STRENGTHS, score_family
 from hilcal.robot import se3
+from tests.support.fit_cases import based
 from tests.unit.discovery.test_discover import LAW, campaign, found, screened
 
 
-def test_probabilities_sum_to_one_with_that_of_no_law() -> None:
+def test_probabilities_sum_to_one_with_that_of_no_law():
     """Two members of one structure, one of another, no law: weights 3 + 1, 4 and 1 of 9."""
     told = posterior({"a": [np.log(3.0), 0.0], "b": [np.log(4.0)]})
     assert told["a"] == pytest.approx(4 / 9, rel=1e-12)
@@ -37,14 +35,14 @@ def test_probabilities_sum_to_one_with_that_of_no_law() -> None:
     assert posterior({"a": [2000.0], "b": [1990.0]})["b"] == pytest.approx(np.exp(-10), rel=1e-3)
 
 
-def columns(rng: np.random.Generator) -> np.ndarray[Any, Any]:
+def columns(rng):
     """Five causes of which no two are told apart for sure: correlation 0.9."""
     common = rng.standard_normal((30, 1))
     x = 0.9**0.5 * common + 0.1**0.5 * rng.standard_normal((30, 5))
     return np.asarray(x)
 
 
-def told(x: np.ndarray[Any, Any], y: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+def told(x, y):
     rss = float(y @ y)
     odds = {}
     for k in range(x.shape[1]):
@@ -54,7 +52,7 @@ def told(x: np.ndarray[Any, Any], y: np.ndarray[Any, Any]) -> np.ndarray[Any, An
     return np.array([chance[k] for k in range(x.shape[1])])
 
 
-def test_probabilities_are_frequencies_where_laws_are_drawn_from_the_priors() -> None:
+def test_probabilities_are_frequencies_where_laws_are_drawn_from_the_priors():
     """400 draws of none or one of five causes, its size log-uniform over the prior's range.
 
     What is said sums to the number of right ones to within its binomial error, in each third.
@@ -76,7 +74,7 @@ def test_probabilities_are_frequencies_where_laws_are_drawn_from_the_priors() ->
         assert abs(hit[mine].sum() - p[mine].sum()) < 3 * spread
 
 
-def test_probabilities_are_those_of_bayes_rule_by_integration() -> None:
+def test_probabilities_are_those_of_bayes_rule_by_integration():
     """Known noise and size τ: p(y | k) = N(y; 0, 1 + τ² x xᵀ), integrated over the same τ."""
     rng = np.random.default_rng(3)
     x = np.vstack([columns(rng) for _ in range(20)])  # 600 rows: the noise is known well
@@ -90,7 +88,7 @@ def test_probabilities_are_those_of_bayes_rule_by_integration() -> None:
     assert np.argmax(exact) == 2
 
 
-def listed(*rows: tuple[int, float]) -> list[Structure]:
+def listed(*rows):
     empty = np.zeros(0)
     return [
         Structure(k, SimpleNamespace(complexity=size), 0.1, share, empty, empty, empty)
@@ -98,7 +96,7 @@ def listed(*rows: tuple[int, float]) -> list[Structure]:
     ]
 
 
-def test_the_pareto_list_has_what_no_other_one_beats() -> None:
+def test_the_pareto_list_has_what_no_other_one_beats():
     of = listed((3, 0.9), (2, 0.5), (4, 0.9), (2, 0.4), (6, 0.95), (7, 0.2))
     assert [(x.form.complexity, x.holdout_share) for x in pareto(of)] == [
         (2, 0.5), (3, 0.9), (6, 0.95)
@@ -112,7 +110,7 @@ def test_the_pareto_list_has_what_no_other_one_beats() -> None:
 
 
 @pytest.mark.long
-def test_a_discovery_says_how_likely_its_laws_are() -> None:
+def test_a_discovery_says_how_likely_its_laws_are():
     d = found()
     (law,) = [x for x in d.structures if x.law]
     assert law.form.text() == d.laws[0].formula == "dq_3 = a·cos(q_4)·τ_3"
@@ -135,7 +133,7 @@ def test_a_discovery_says_how_likely_its_laws_are() -> None:
 
 
 @pytest.mark.long
-def test_the_average_of_one_law_is_its_fit_and_more_laws_spread_it() -> None:
+def test_the_average_of_one_law_is_its_fit_and_more_laws_spread_it():
     d = found()
     readings = d.fit.readings
     w = whitening(readings, d.fit.mode)
@@ -156,12 +154,12 @@ def test_the_average_of_one_law_is_its_fit_and_more_laws_spread_it() -> None:
     assert np.sqrt(np.mean((again - mean) ** 2)) < 0.1 * size
 
 
-def test_nothing_is_averaged_without_a_law() -> None:
+def test_nothing_is_averaged_without_a_law():
     with pytest.raises(CannotAnswerError, match="no law was found"):
         Discovery(campaign(LAW), "no_law").average(campaign(LAW).readings)
 
 
-def products(s: Screen, count: int) -> list[tuple[int, int]]:
+def products(s, count):
     """Sites and products, of which the model explains neither these nor their factors alone."""
     words = s.grammar
     seen = s.square > 0
@@ -177,7 +175,7 @@ def products(s: Screen, count: int) -> list[tuple[int, int]]:
     raise AssertionError("too few products")
 
 
-def test_a_pair_is_found_of_which_neither_part_explains_anything_alone() -> None:
+def test_a_pair_is_found_of_which_neither_part_explains_anything_alone():
     """As where a temperature is far from its zero all the time: T d and d are nearly the same."""
     s = screened()
     place, f, less, direction = _nearly_alike(s)
@@ -195,7 +193,7 @@ def test_a_pair_is_found_of_which_neither_part_explains_anything_alone() -> None
     assert {at for at, _ in best.parts} == {place}
 
 
-def _nearly_alike(s: Screen) -> tuple[int, int, int, np.ndarray]:
+def _nearly_alike(s):
     """A product of a site, a factor of it alone, and the unit direction between their columns."""
     for place, f in products(s, 1000):
         for less in s.grammar.less[:, f].tolist():
@@ -213,12 +211,12 @@ SHARE = 0.3
 
 
 @pytest.fixture(autouse=True, scope="module")
-def short_products() -> None:
+def short_products():
     """All products, other than in the other files of this folder: the law is one of the longer."""
 
 
 @cache
-def misread() -> Fit:
+def misread():
     """The same arm with nothing hidden, read by a force sensor that is wrong on one side."""
     of = campaign()
     assert not of.outlier.any()
@@ -230,16 +228,16 @@ def misread() -> Fit:
     wrench = states.wrench.copy()
     wrench[:, :3] += se3.apply(turn, more)
     readings = replace(of.readings, states=replace(states, wrench=wrench))
-    return fit(baseline(of.model.cell, readings, of.mode), readings, of.mode)
+    return based(of.model.cell, readings, of.mode)
 
 
 @cache
-def sensor_law() -> Discovery:
+def sensor_law():
     return discover(misread())
 
 
 @pytest.mark.long
-def test_a_one_sided_force_sensor_is_found_with_its_size() -> None:
+def test_a_one_sided_force_sensor_is_found_with_its_size():
     d = sensor_law()
     law = d.laws[0]
     assert law.acts_on == ("force sensor, force along z",)
@@ -251,7 +249,7 @@ def test_a_one_sided_force_sensor_is_found_with_its_size() -> None:
 
 
 @pytest.mark.long
-def test_what_is_written_is_an_effect_of_the_setup_with_its_derivative() -> None:
+def test_what_is_written_is_an_effect_of_the_setup_with_its_derivative():
     d = sensor_law()
     kind = effect_class(d.source, d.laws[0].name)
     assert kind.of_setup
@@ -259,7 +257,7 @@ def test_what_is_written_is_an_effect_of_the_setup_with_its_derivative() -> None
 
 
 @pytest.mark.long
-def test_the_curve_of_the_law_is_drawn_beside_the_readings() -> None:
+def test_the_curve_of_the_law_is_drawn_beside_the_readings():
     d = sensor_law()
     curve = curves(d.after, d.laws[0].form)[0]
     assert (curve.of, curve.unit, curve.quantity) == ("sensor_fz", "N", "fS_z")
@@ -271,7 +269,7 @@ def test_the_curve_of_the_law_is_drawn_beside_the_readings() -> None:
     ("quantities", "unit"),
     [(("S_z",), "1"), (("S_z", "S_z"), "1/N"), (("S_x", "t"), "1/s"), (("t",), "N/s")],
 )
-def test_units_of_the_sensors_own_quantities_cancel(quantities: tuple[str, ...], unit: str) -> None:
+def test_units_of_the_sensors_own_quantities_cancel(quantities, unit):
     known = variables(misread().solution.prediction.situation)
     named = {v.symbol.removeprefix("f").partition(" ")[0].strip("("): v for v in known}
     factors = tuple(Factor(named[q], shapes.LINEAR) for q in quantities)

@@ -4,7 +4,6 @@ import os
 import pty
 import socket
 import sys
-from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from hilcal.doctor.computer import NATIVE, clock, disk, load, packages
 from hilcal.doctor.ports import System, reachable, serial_ports
 
 
-def test_packages_are_told_with_their_versions_and_those_that_lack() -> None:
+def test_packages_are_told_with_their_versions_and_those_that_lack():
     there, lacking, later, optional = packages(
         [
             "numpy>=2.0",
@@ -35,9 +34,7 @@ def test_packages_are_told_with_their_versions_and_those_that_lack() -> None:
     assert "hilcal[tables]" in optional.mend
 
 
-def test_a_package_that_does_not_load_is_a_problem(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_package_that_does_not_load_is_a_problem(tmp_path, monkeypatch):
     (tmp_path / "numba_of_another.py").write_text("raise OSError('wrong processor')")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setitem(NATIVE, "numba", "numba_of_another")
@@ -55,15 +52,13 @@ def test_a_package_that_does_not_load_is_a_problem(
         (1970, 0, "problem", "never set"),
     ],
 )
-def test_the_clock(year: int, status: int | None, state: str, said: str) -> None:
+def test_the_clock(year, status, state, said):
     found = clock(lambda: datetime(year, 5, 1, tzinfo=UTC), lambda: status)
     assert found.state == state
     assert said in found.said
 
 
-def test_a_folder_that_can_be_measured_into_and_others(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_that_can_be_measured_into_and_others(tmp_path, monkeypatch):
     space, *_, writing = disk(tmp_path)
     assert "GB free" in space.said
     assert writing.state in ("ok", "warning")
@@ -71,7 +66,7 @@ def test_a_folder_that_can_be_measured_into_and_others(
     (lacking,) = disk(tmp_path / "no")
     assert lacking.state == "problem"
 
-    def fails(folder: Path) -> float:
+    def fails(folder):
         raise PermissionError("Read-only file system")
 
     monkeypatch.setattr(machine, "_durable_write", fails)
@@ -80,7 +75,7 @@ def test_a_folder_that_can_be_measured_into_and_others(
     assert "Read-only file system" in writing.said
 
 
-def test_the_file_system_is_that_of_the_nearest_mount(tmp_path: Path) -> None:
+def test_the_file_system_is_that_of_the_nearest_mount(tmp_path):
     mounts = tmp_path / "mounts"
     mounts.write_text(
         f"/dev/sda1 / ext4 rw 0 0\nserver:/x {tmp_path} nfs4 rw 0 0\nother /else cifs rw 0 0\n"
@@ -90,7 +85,7 @@ def test_the_file_system_is_that_of_the_nearest_mount(tmp_path: Path) -> None:
     assert machine._file_system(tmp_path, tmp_path / "none") == ""
 
 
-def test_a_busy_computer_is_a_warning() -> None:
+def test_a_busy_computer_is_a_warning():
     assert load(lambda: (0.0, 0.0, 0.0)).state == "ok"
     busy = load(lambda: (99.0, 0.0, 0.0))
     assert busy.state == "warning"
@@ -98,7 +93,7 @@ def test_a_busy_computer_is_a_warning() -> None:
 
 
 @pytest.fixture
-def port() -> Iterator[str]:
+def port():
     """A real character device that nobody else has open."""
     here, there = pty.openpty()
     yield os.ttyname(there)
@@ -107,10 +102,10 @@ def port() -> Iterator[str]:
 
 
 @pytest.fixture
-def system(tmp_path: Path, port: str) -> Callable[..., System]:
+def system(tmp_path, port):
     """Make a kernel that shows one adapter."""
 
-    def made(latency: int | None = None) -> System:
+    def made(latency=None):
         by_id = tmp_path / "dev" / "serial" / "by-id"
         by_id.mkdir(parents=True)
         (by_id / "usb-FTDI_tracker").symlink_to(port)
@@ -124,7 +119,7 @@ def system(tmp_path: Path, port: str) -> Callable[..., System]:
     return made
 
 
-def test_a_port_is_told_by_its_lasting_name(port, system) -> None:
+def test_a_port_is_told_by_its_lasting_name(port, system):
     (found,) = serial_ports({"tracker": port}, {port: "USB Serial"}, system(latency=1))
     assert found.state == "ok"
     assert found.name.startswith("tracker: ")
@@ -132,7 +127,7 @@ def test_a_port_is_told_by_its_lasting_name(port, system) -> None:
     assert "USB Serial" in found.said
 
 
-def test_a_slow_adapter_is_told_with_the_line_that_mends_it(port, system) -> None:
+def test_a_slow_adapter_is_told_with_the_line_that_mends_it(port, system):
     (found,) = serial_ports({}, {port: "USB Serial"}, system(latency=16))
     assert found.state == "warning"
     assert "up to 16 ms" in found.said
@@ -140,7 +135,7 @@ def test_a_slow_adapter_is_told_with_the_line_that_mends_it(port, system) -> Non
     assert found.mend.endswith("/latency_timer")
 
 
-def test_a_port_of_the_cell_that_is_not_there(port, system, tmp_path: Path) -> None:
+def test_a_port_of_the_cell_that_is_not_there(port, system, tmp_path):
     at = system()
     found = serial_ports({"tracker": str(tmp_path / "ttyUSB7")}, {port: "USB Serial"}, at)
     assert found[0].state == "problem"
@@ -150,8 +145,8 @@ def test_a_port_of_the_cell_that_is_not_there(port, system, tmp_path: Path) -> N
 
 
 def test_a_port_without_the_right_to_use_it_and_a_file_that_is_none(
-    port, system, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    port, system, tmp_path, monkeypatch
+):
     at, path = system(), tmp_path / "notes.txt"
     path.write_text("")
     (wrong,) = serial_ports({"tracker": str(path)}, {}, at)
@@ -165,7 +160,7 @@ def test_a_port_without_the_right_to_use_it_and_a_file_that_is_none(
     assert other.state == "warning"  # no device of the cell
 
 
-def test_who_has_a_port_open_and_who_meddles(port, system) -> None:
+def test_who_has_a_port_open_and_who_meddles(port, system):
     at = system()
     for number, name in ((4242, "minicom"), (4243, "ModemManager")):
         folder = at.proc / str(number) / "fd"
@@ -178,7 +173,7 @@ def test_who_has_a_port_open_and_who_meddles(port, system) -> None:
     assert meddler.name == "ModemManager"
 
 
-def test_services_and_hosts_that_answer_and_that_do_not() -> None:
+def test_services_and_hosts_that_answer_and_that_do_not():
     here = ("127.0.0.1", 0)
     with socket.create_server(here) as server, socket.create_server(here) as closed:
         open_port, closed_port = (s.getsockname()[1] for s in (server, closed))

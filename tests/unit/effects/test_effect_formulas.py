@@ -15,11 +15,11 @@ from hilcal.robot import chain as chains
 from hilcal.robot.catalogue import robot_names
 from hilcal.robot.chain import evaluate
 from hilcal.robot.conventions import as_counted
-from hilcal.types import Floats
 from tests.support.arm_cases import arm_of
 from tests.support.effect_cases import (
     CELLS,
     TURN,
+    UR10E,
     joints,
     make,
     position,
@@ -45,9 +45,8 @@ def test_an_arm_without_long_links_has_one_to_the_flange():
 
 
 def test_compliance_that_changes_with_the_angle_repeats_as_often_as_it_says():
-    cell = CELLS["ur10e"]
-    s = situation(cell)
-    effect = make("periodic_joint_compliance", cell, s.states, {"orders": [3, 1]})
+    s = situation(UR10E)
+    effect = make("periodic_joint_compliance", UR10E, s.states, {"orders": [3, 1]})
     theta = np.random.default_rng(0).normal(size=24)
     named = {p.name: t for p, t in zip(effect.parameters, theta, strict=True)}
     dq = effect.deviation(theta, s).dq
@@ -61,10 +60,9 @@ def test_compliance_that_changes_with_the_angle_repeats_as_often_as_it_says():
 
 
 def test_creep_without_a_compliance_in_the_model_takes_a_typical_one():
-    cell = CELLS["ur10e"]
-    states = some_states(cell)
-    alone = Model(cell, (make("creep", cell, states),)).predict(states, np.array([0.1]))
-    typical = 2e-3 / cell.arm.torque_max
+    states = some_states(UR10E)
+    alone = Model(UR10E, (make("creep", UR10E, states),)).predict(states, np.array([0.1]))
+    typical = 2e-3 / UR10E.arm.torque_max
     decades = np.log10(1 + states.load_time)[:, None]
     expected = 0.1 * decades * typical * alone.situation.torque
     np.testing.assert_allclose(alone.deviation.dq, expected, rtol=0, atol=1e-12)
@@ -153,7 +151,7 @@ def test_other_pairs_are_refused_with_what_would_be_valid(given):
     assert "\n" not in str(caught.value)
 
 
-def acting(wrench: Floats, flange: Floats, name: str, theta: Floats, turn: Floats) -> Floats:
+def acting(wrench, flange, name, theta, turn):
     """What acts where a sensor says `wrench`, state by state: said = error(true) in its axes."""
     out = np.zeros_like(wrench)
     for i, w in enumerate(wrench):
@@ -216,11 +214,10 @@ def test_a_load_that_only_turns_is_a_load_too():
 
 
 def test_a_gain_that_no_sensor_has_is_said_in_words():
-    cell = CELLS["ur10e"]
-    states = some_states(cell)
-    model = soft(cell, states, "wrench_gain")
+    states = some_states(UR10E)
+    model = soft(UR10E, states, "wrench_gain")
     with pytest.raises(CannotAnswerError, match=r"wrench_gain: a gain error of -120 %") as caught:
-        position(model, states, joints(cell), np.array([0, 0, -1.2, 0, 0, 0]))
+        position(model, states, joints(UR10E), np.array([0, 0, -1.2, 0, 0, 0]))
     assert "\n" not in str(caught.value)
 
 

@@ -12,6 +12,7 @@ from tests.support.effect_cases import (
     ALL_NAMES,
     CELLS,
     NAMES,
+    UR10E,
     VARIANTS,
     effect_class,
     make,
@@ -118,12 +119,11 @@ def test_a_law_that_joins_the_wrench_of_one_slot_to_the_deviation_of_another():
 
 def test_a_state_that_yields_much_among_many_that_do_not():
     """The terms of the series are counted for all states of a chunk together."""
-    cell = CELLS["ur10e"]
-    states = some_states(cell, 40)
+    states = some_states(UR10E, 40)
     wrench = 1e-3 * states.wrench
     wrench[7] = [200.0, -150.0, 180.0, 20.0, 10.0, -15.0]
     states = replace(states, wrench=wrench)
-    model = Model(cell, tuple(make(n, cell, states) for n in ("joint_compliance", "link_mass")))
+    model = Model(UR10E, tuple(make(n, UR10E, states) for n in ("joint_compliance", "link_mass")))
     assert_slope(model, states, random_theta(model.effects, np.random.default_rng(3), 2.0), 3)
 
 
@@ -158,15 +158,14 @@ def test_an_effect_of_many_parameters_moves_the_readings_as_one_of_few():
 
 
 def test_jacobian_of_an_effect_that_is_not_in_the_model_is_that_at_zero():
-    cell = CELLS["ur10e"]
-    states = some_states(cell)
-    model = Model(cell, (make("joint_compliance", cell, states),))
+    states = some_states(UR10E)
+    model = Model(UR10E, (make("joint_compliance", UR10E, states),))
     theta = random_theta(model.effects, np.random.default_rng(0))
     prediction = model.predict(states, theta)
     for name in NAMES[1:]:
         if name in model.names:
             continue
-        effect = make(name, cell, states, options_of(name))
+        effect = make(name, UR10E, states, options_of(name))
         outside = model.jacobian_of((effect,), prediction, theta, 3)
         larger = model + effect
         full = np.concatenate([theta, np.zeros(len(effect.parameters))])

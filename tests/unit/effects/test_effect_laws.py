@@ -5,16 +5,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from hilcal.cell import Cell
 from hilcal.drivers.simulated.truth import Truth
 from hilcal.drivers.simulated.world import SimulatedNoise, World
 from hilcal.model.model import Model
-from hilcal.readings.readings import States
 from tests.support.campaigns import followed, true_parameters
 from tests.support.effect_cases import (
     ALL_NAMES,
     CELLS,
     NAMES,
+    UR10E,
     make,
     options_of,
     situation,
@@ -33,7 +32,7 @@ class Both:
     theta: np.ndarray
 
 
-def truth_of(name: str, cell: Cell, rng: np.random.Generator, scale: float) -> np.ndarray:
+def truth_of(name, cell, rng, scale):
     """Random parameters, shaped as in the world."""
     zero = getattr(Truth.rigid(cell.arm, 3), name)
     effect = make(name, cell, some_states(cell), options_of(name))
@@ -47,7 +46,7 @@ def truth_of(name: str, cell: Cell, rng: np.random.Generator, scale: float) -> n
     return (scale * ordinary * drawn).reshape(zero.shape)
 
 
-def both(names: tuple[str, ...], cell: Cell, states: States, scale: float) -> Both:
+def both(names, cell, states, scale):
     rng = np.random.default_rng(11)
     truth = Truth.rigid(cell.arm)
     for name in names:
@@ -60,14 +59,14 @@ def both(names: tuple[str, ...], cell: Cell, states: States, scale: float) -> Bo
     return Both(world, model, theta)
 
 
-def apart(b: Both, states: States) -> tuple[float, float]:
+def apart(b, states):
     """Largest distance, m, and angle, rad, of the model's readings from the world's."""
     seen, told = b.model.predict(states, b.theta).observation, b.world.sight(states)
     turn = np.abs(seen.rotation - told.rotation).max()
     return float(np.linalg.norm(seen.position - told.position, axis=1).max()), float(turn)
 
 
-def order_of_turns(b: Both, states: States) -> float:
+def order_of_turns(b, states):
     """Sum of the tilts times the sum of all small rotations, rad²: what their order can make out.
 
     A tilt is one small rotation about the moment's axis in the program and two successive
@@ -124,11 +123,10 @@ def test_prediction_is_what_the_world_shows(names, arm):
 
 
 def test_drift_starts_at_its_reference_time():
-    cell = CELLS["ur10e"]
-    states = situation(cell).states
+    states = situation(UR10E).states
     rate = 1e-8 * np.arange(1.0, 7.0)
     for reference, start in ((None, states.time.min()), (100.0, 100.0)):
         given = {} if reference is None else {"reference_s": reference}
-        effect = make("tracker_drift", cell, states, given)
-        station = effect.deviation(rate, situation(cell)).station
+        effect = make("tracker_drift", UR10E, states, given)
+        station = effect.deviation(rate, situation(UR10E)).station
         np.testing.assert_allclose(station, (states.time - start)[:, None] * rate, rtol=1e-13)

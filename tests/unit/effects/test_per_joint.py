@@ -1,5 +1,6 @@
 """Joints that share a parameter, joints that have none: what it means for each effect."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -7,7 +8,6 @@ import pytest
 
 from hilcal.campaign.revisions import restore_model, to_record
 from hilcal.effects.per_joint import PerJoint, joint_groups
-from hilcal.effects.protocol import Effect
 from hilcal.errors import InputError
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.fit import fit
@@ -18,12 +18,14 @@ from tests.support.campaigns import campaign
 from tests.support.effect_cases import (
     CELLS,
     NAMES,
+    UR10E,
     effect_class,
     make,
     options_of,
     random_theta,
     some_states,
 )
+from tests.support.refusals import refusals, refuses
 from tests.unit.effects.test_effect_jacobian import assert_slope
 
 PER_JOINT = tuple(name for name in NAMES if issubclass(effect_class(name), PerJoint))
@@ -31,7 +33,7 @@ CREEPS = ("common", "each", "2-3/5+6")
 GROUPS = ("common", "2/3/4-6", "1+4/2-3", "5")
 
 
-def membership(groups: str, count: int) -> np.ndarray:
+def membership(groups, count):
     """(n, G) 1 where a joint belongs to a group; written out by hand, not read."""
     known = {
         "common": [range(count)],
@@ -48,12 +50,12 @@ def membership(groups: str, count: int) -> np.ndarray:
     return out
 
 
-def options(name: str, groups: str) -> dict[str, object]:
+def options(name, groups):
     few = {"harmonics": 2} if name == "transmission_error" else options_of(name)
     return {**few, "joints": groups}
 
 
-def spread(effect: Effect, groups: str) -> np.ndarray:
+def spread(effect, groups):
     """(P each, P groups) parameters of every joint by those of the groups."""
     member = membership(groups, effect.cell.arm.n)
     return np.kron(member, np.eye(len(effect.parameters) // member.shape[1]))
@@ -86,35 +88,9 @@ def test_groups_are_read_and_written_in_one_way(given, text, labels, joint, grou
     assert (again.joint.tolist(), again.group.tolist()) == (joint, group)
 
 
-@pytest.mark.parametrize(
-    ("given", "wrong"),
-    [
-        ("", "'' is no joint"),
-        ("all", "'all' is no joint"),
-        ("1/", "'' is no joint"),
-        ("1,2", "'1,2' is no joint"),
-        ("1--3", "'1--3' is no joint"),
-        ("²", "'²' is no joint"),
-        ("0", "there is no joint 0"),
-        ("5-8", "there is no joint 7"),
-        ("999", "there is no joint 999"),
-        ("3-1", "3-1 runs backwards"),
-        ("1-3/3", "joint 3 is there twice"),
-        ("2+2", "joint 2 is there twice"),
-        (2.5, "joints = 2.5; valid"),
-        (True, "joints = True; valid"),
-        (None, "joints = None; valid"),
-        ([1, 2], "joints = [1, 2]; valid"),
-    ],
-)
-def test_other_groups_are_refused_with_what_would_be_valid(given, wrong):
-    with pytest.raises(InputError) as caught:
-        joint_groups("hysteresis", {"joints": given}, 6)
-    line = str(caught.value)
-    assert line.startswith("effect hysteresis: joints = ")
-    assert wrong in line
-    assert "valid: each, common, or joints 1 to 6 in groups, as 2/3/4-6" in line
-    assert "\n" not in line
+@refusals("joints")
+def test_other_groups_are_refused_with_what_would_be_valid(case, given):
+    refuses(case, lambda: joint_groups("hysteresis", {"joints": json.loads(given)}, 6))
 
 
 # --- what it means --------------------------------------------------------------------------
@@ -177,10 +153,9 @@ def test_a_shared_compliance_shows_more_where_the_joints_creep(groups, creeps):
 
 @pytest.mark.parametrize("name", PER_JOINT)
 def test_names_and_magnitudes(name):
-    cell = CELLS["ur10e"]
-    states = some_states(cell)
-    every = make(name, cell, states, options(name, "each")).parameters
-    some = make(name, cell, states, options(name, "1+4-5/2/3")).parameters
+    states = some_states(UR10E)
+    every = make(name, UR10E, states, options(name, "each")).parameters
+    some = make(name, UR10E, states, options(name, "1+4-5/2/3")).parameters
     kinds = len(every) // 6
     assert len(some) == 3 * kinds
     heads = [p.name.split(".")[0] for p in some[::kinds]]
@@ -195,23 +170,21 @@ def test_names_and_magnitudes(name):
 
 
 def test_harmonics_of_shared_joints_have_one_variance():
-    cell = CELLS["ur10e"]
-    effect = make("transmission_error", cell, some_states(cell), options(PER_JOINT[1], "1-3/5"))
+    effect = make("transmission_error", UR10E, some_states(UR10E), options(PER_JOINT[1], "1-3/5"))
     assert effect.groups().tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
-    assert effect.for_scoring(some_states(cell)).options == effect.options
+    assert effect.for_scoring(some_states(UR10E)).options == effect.options
 
 
 def test_creep_takes_the_older_name_of_its_groups():
-    cell = CELLS["ur10e"]
-    states = some_states(cell)
+    states = some_states(UR10E)
     for form in ("common", "each"):
-        old = make("creep", cell, states, {"form": form})
-        new = make("creep", cell, states, {"joints": form})
+        old = make("creep", UR10E, states, {"form": form})
+        new = make("creep", UR10E, states, {"joints": form})
         assert old.parameters == new.parameters
         assert old.options == new.options == {"joints": form}
-    assert [p.name for p in make("creep", cell, states).parameters] == ["k"]
+    assert [p.name for p in make("creep", UR10E, states).parameters] == ["k"]
     with pytest.raises(InputError, match="form and joints; valid: joints alone"):
-        make("creep", cell, states, {"form": "each", "joints": "each"})
+        make("creep", UR10E, states, {"form": "each", "joints": "each"})
 
 
 # --- fits -----------------------------------------------------------------------------------

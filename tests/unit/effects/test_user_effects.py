@@ -13,13 +13,12 @@ import pytest
 from hilcal.effects.catalogue import installed
 from hilcal.model.model import Model
 from hilcal.readings.covariance import WHOLE
-from hilcal.readings.readings import Readings
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.tables.table import write_table
 from hilcal.types import Floats
 from tests.support.campaigns import campaign as simulated
 from tests.support.campaigns import plan
-from tests.support.cli_cases import CELL, Capsys, ok, refused
+from tests.support.cli_cases import CELL, ok, refused
 from tests.support.rows import first
 from tests.support.user_effect_cases import CLASS, COLUMNS
 
@@ -36,7 +35,7 @@ class Case:
     truth: Floats
 
 
-def with_the_law(amplitude: Floats, plan_seed: int, noise_seed: int) -> Readings:
+def with_the_law(amplitude, plan_seed, noise_seed):
     """Readings of a simulated arm with dq_j = a_j sin(q_j) τ_j beside its joint compliance."""
     c = simulated(seed=noise_seed, plan_seed=plan_seed, poses=POSES)
     p = plan(POSES, plan_seed)
@@ -49,7 +48,7 @@ def with_the_law(amplitude: Floats, plan_seed: int, noise_seed: int) -> Readings
 
 
 @pytest.fixture(scope="module")
-def case(tmp_path_factory: pytest.TempPathFactory) -> Case:
+def case(tmp_path_factory):
     folder = tmp_path_factory.mktemp("tables")
     truth = 2e-6 * np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
     for k, name in enumerate(("fitted", "unseen")):
@@ -58,7 +57,7 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> Case:
 
 
 @pytest.fixture
-def file(tmp_path: Path, capsys: Capsys) -> Path:
+def file(tmp_path, capsys):
     path = tmp_path / "effects" / "mine.py"
     path.parent.mkdir()
     ok(capsys, "effects", "new", NAME, "-o", path)
@@ -66,7 +65,7 @@ def file(tmp_path: Path, capsys: Capsys) -> Path:
 
 
 @pytest.fixture
-def run_file(case: Case, tmp_path: Path, capsys: Capsys) -> Path:
+def run_file(case, tmp_path, capsys):
     path = tmp_path / "run.hilcal"
     ok(capsys, "import", case.fitted, "--config", CELL, "-o", path)
     return path
@@ -77,8 +76,8 @@ def run_file(case: Case, tmp_path: Path, capsys: Capsys) -> Path:
 
 @pytest.mark.long
 def test_a_missing_law_is_named_added_and_the_error_falls_to_the_noise(
-    case: Case, run_file: Path, file: Path, tmp_path: Path, capsys: Capsys
-) -> None:
+    case, run_file, file, tmp_path, capsys
+):
     mine = ("--effects-from", file)
     without = ok(capsys, "refine", run_file, "--json").document
     assert NAME not in json.dumps(without)
@@ -120,7 +119,7 @@ def test_a_missing_law_is_named_added_and_the_error_falls_to_the_noise(
     assert v["error"]["rms_sigma"] < 1.2
 
 
-def test_it_can_be_fitted_and_added_by_name(run_file: Path, file: Path, capsys: Capsys) -> None:
+def test_it_can_be_fitted_and_added_by_name(run_file, file, capsys):
     mine = ("--effects-from", file)
     chosen = f"joint_compliance,{NAME}"
     d = ok(capsys, "identify", run_file, "--effects", chosen, *mine, "--json").document
@@ -136,9 +135,7 @@ def test_it_can_be_fitted_and_added_by_name(run_file: Path, file: Path, capsys: 
 
 
 @pytest.mark.long
-def test_a_process_of_its_own_and_an_installed_package(
-    run_file: Path, file: Path, tmp_path: Path, capsys: Capsys
-) -> None:
+def test_a_process_of_its_own_and_an_installed_package(run_file, file, tmp_path, capsys):
     shown = ok(capsys, "effects", "--effects-from", file, "--json").document
     assert NAME in [e["name"] for e in shown["effects"]]
 
@@ -164,9 +161,7 @@ def test_a_process_of_its_own_and_an_installed_package(
         pytest.param("mine:No", "cannot be loaded (AttributeError", marks=pytest.mark.slow),
     ],
 )
-def test_a_broken_package_is_one_clear_line(
-    point: str, said: str, file: Path, tmp_path: Path
-) -> None:
+def test_a_broken_package_is_one_clear_line(point, said, file, tmp_path):
     package = package_of(tmp_path / "site", file.read_text(encoding="utf-8"), point)
     code, out, err = hilcal(package, "effects")
     assert (code, out) == (2, "")
@@ -175,7 +170,7 @@ def test_a_broken_package_is_one_clear_line(
     assert err.count("\n") == 1
 
 
-def package_of(site: Path, content: str, point: str) -> Path:
+def package_of(site, content, point):
     """Install a module with an effect into a folder."""
     about = site / "mine-1.0.dist-info"
     about.mkdir(parents=True)
@@ -185,7 +180,7 @@ def package_of(site: Path, content: str, point: str) -> Path:
     return site
 
 
-def hilcal(site: Path, *arguments: str | Path) -> tuple[int, str, str]:
+def hilcal(site, *arguments):
     """Run the program in a process that has the folder among its packages."""
     root = Path(__file__).resolve().parents[3]
     done = subprocess.run(
@@ -200,7 +195,7 @@ def hilcal(site: Path, *arguments: str | Path) -> tuple[int, str, str]:
 
 
 @pytest.mark.long
-def test_a_plan_is_made_against_it(file: Path, tmp_path: Path, capsys: Capsys) -> None:
+def test_a_plan_is_made_against_it(file, tmp_path, capsys):
     cell = tmp_path / "cell.toml"
     text = CELL.read_text(encoding="utf-8")
     assert "[planning]" in text
@@ -215,7 +210,7 @@ def test_a_plan_is_made_against_it(file: Path, tmp_path: Path, capsys: Capsys) -
 
 
 @pytest.mark.long
-def test_a_revision_says_which_file_it_needs(run_file: Path, file: Path, capsys: Capsys) -> None:
+def test_a_revision_says_which_file_it_needs(run_file, file, capsys):
     mine = ("--effects-from", file)
     ok(capsys, "identify", run_file, "--effects", f"joint_compliance,{NAME}", *mine)
     for command in (["diagnose"], ["compare"], ["refine", "--from-latest"], ["view"]):
@@ -236,7 +231,7 @@ def test_a_revision_says_which_file_it_needs(run_file: Path, file: Path, capsys:
     ok(capsys, "diagnose", run_file, *mine)
 
 
-def test_nothing_of_it_outlives_a_command(file: Path, capsys: Capsys) -> None:
+def test_nothing_of_it_outlives_a_command(file, capsys):
     before = installed().names
     assert NAME in ok(capsys, "effects", "--effects-from", file).out
     assert NAME not in ok(capsys, "effects").out
@@ -267,9 +262,7 @@ def test_nothing_of_it_outlives_a_command(file: Path, capsys: Capsys) -> None:
     ],
     ids=lambda command: command[0],
 )
-def test_every_command_with_models_reads_it_first(
-    command: list[str], tmp_path: Path, capsys: Capsys
-) -> None:
+def test_every_command_with_models_reads_it_first(command, tmp_path, capsys):
     missing = tmp_path / "nothing.py"
     said = refused(capsys, 2, *command, "--effects-from", missing)
     assert said == f"error: {missing}: no such file; expected a Python file of effects"
@@ -292,9 +285,7 @@ def test_every_command_with_models_reads_it_first(
         ],
     ),
 )
-def test_a_law_that_fails_on_the_readings_is_one_clear_line(
-    law: str, said: str, run_file: Path, tmp_path: Path, capsys: Capsys
-) -> None:
+def test_a_law_that_fails_on_the_readings_is_one_clear_line(law, said, run_file, tmp_path, capsys):
     path = tmp_path / "mine.py"
     path.write_text(CLASS.replace(COLUMNS, f"values = {law}"), encoding="utf-8")
     ok(capsys, "effects", "--effects-from", path)  # 30 states

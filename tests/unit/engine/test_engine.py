@@ -47,7 +47,7 @@ def test_a_cluster_gives_the_same_bits_though_a_worker_is_killed():
         with running(*start) as doomed, running(*start), open_engine(scheduler=address) as engine:
             assert isinstance(engine.workers, Cluster)
             engine.workers.client.wait_for_workers(2, timeout=60)
-            done: list[int] = []
+            done = []
 
             def advance(step):
                 done.append(step)

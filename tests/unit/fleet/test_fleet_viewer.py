@@ -1,17 +1,14 @@
 """A fleet in rerun: the odd arm is red, in its joint, and stands by its dates."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import rerun as rr
 
-from hilcal.identification.posterior import Posterior
 from hilcal.present.viewer import style
 from hilcal.present.viewer.fleet import drawn_type, places, record_fleet
 from hilcal.robot.body import capsules
 from hilcal.transfer.fleet import Fleet
-from hilcal.transfer.pooled import Pooled, pooled
+from hilcal.transfer.pooled import pooled
 from tests.support.picture import Shot, pictures, vulkan_available
 from tests.support.recordings import chunks, entities, rows
 from tests.support.viewer_plan import rgb
@@ -19,18 +16,18 @@ from tests.unit.fleet.test_fleet import ARMS, ODD, members, posterior_of, readin
 
 
 @pytest.fixture(scope="module")
-def one() -> Posterior:
+def one():
     return posterior_of(readings_of(np.ones(6), 1))
 
 
-def fleet(one: Posterior, odd: float) -> tuple[Fleet, Pooled]:
+def fleet(one, odd):
     """30 arms in January and March, of which one may have a soft joint 3."""
     mine = members(one, 3, odd=odd)
     of = pooled(mine, ())
     return Fleet((of,), tuple(mine), ()), of
 
 
-def recorded(one: Posterior, path: Path, odd: float) -> Path:
+def recorded(one, path, odd):
     rr.set_strict_mode(True)
     try:
         record_fleet(fleet(one, odd)[0], path)
@@ -39,7 +36,7 @@ def recorded(one: Posterior, path: Path, odd: float) -> Path:
     return path
 
 
-def test_campaigns_are_as_far_from_the_type_as_their_arm(one: Posterior) -> None:
+def test_campaigns_are_as_far_from_the_type_as_their_arm(one):
     whole, of = fleet(one, 1.5)
     d = drawn_type(of, whole.members)
     assert np.argwhere(d.odd).tolist() == [[ODD, d.names.index("joint_compliance.j3")]]
@@ -57,7 +54,7 @@ def test_campaigns_are_as_far_from_the_type_as_their_arm(one: Posterior) -> None
 
 
 @pytest.mark.long
-def test_the_odd_joint_alone_is_red_and_its_arm_framed(one: Posterior, tmp_path: Path) -> None:
+def test_the_odd_joint_alone_is_red_and_its_arm_framed(one, tmp_path):
     path = recorded(one, tmp_path / "fleet.rrd", 1.5)
     d = drawn_type(fleet(one, 1.5)[1], fleet(one, 1.5)[0].members)
     shapes = capsules(d.arm)
@@ -74,7 +71,7 @@ def test_the_odd_joint_alone_is_red_and_its_arm_framed(one: Posterior, tmp_path:
     assert sum(b.num_rows for b in told if "date" in b.schema.names) == 2
 
 
-def test_an_ordinary_fleet_has_nothing_red(one: Posterior, tmp_path: Path) -> None:
+def test_an_ordinary_fleet_has_nothing_red(one, tmp_path):
     path = recorded(one, tmp_path / "fleet.rrd", 0.0)
     colors = [rgb(c) for c in rows(path, "/arms0/arms", "Capsules3D:colors")[0]]
     assert style.RED not in colors
@@ -84,7 +81,7 @@ def test_an_ordinary_fleet_has_nothing_red(one: Posterior, tmp_path: Path) -> No
 
 @pytest.mark.slow
 @pytest.mark.skipif(not vulkan_available(), reason="no Vulkan driver installed")
-def test_the_viewer_draws_it_without_a_complaint(one: Posterior, tmp_path: Path) -> None:
+def test_the_viewer_draws_it_without_a_complaint(one, tmp_path):
     path = recorded(one, tmp_path / "fleet.rrd", 1.5)
     told = pictures(path, [Shot(tmp_path / "fleet.png")], (960, 540), 480)
     assert {v.name: v.problems for v in told if v.problems} == {}

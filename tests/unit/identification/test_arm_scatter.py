@@ -2,15 +2,13 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.stats import chi2, kstest
 
 import hilcal as hc
-from hilcal.cell import Cell
-from hilcal.diagnosis.diagnosis import Diagnosis, History
+from hilcal.diagnosis.diagnosis import History
 from hilcal.diagnosis.effect_ranking import candidates
 from hilcal.diagnosis.evidence import Evidence
 from hilcal.diagnosis.misfit_breakdown import MisfitShare
@@ -23,12 +21,11 @@ from hilcal.identification.linearisation import linearise
 from hilcal.identification.registration import register
 from hilcal.present.verdict import message
 from hilcal.readings.covariance import COVERS, INSTRUMENT
-from hilcal.readings.readings import ArmScatter, Readings, ScatterKind
-from hilcal.readings.whitening import Mode, whitening
+from hilcal.readings.readings import ArmScatter
+from hilcal.readings.whitening import whitening
 from hilcal.robot import se3
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.rows import content_hash
-from hilcal.types import Floats
 from tests.support.campaigns import cell_of, configuration, noiseless, plan, with_noise, world_of
 from tests.support.fit_cases import MODES, based
 from tests.support.reflector_cases import reflectors
@@ -38,7 +35,7 @@ STD = 1e-4
 """The arm's scatter, rad: several times the noise of the tracker."""
 
 
-def dense(readings: Readings) -> Floats:
+def dense(readings):
     """(N·m, N·m) covariance of all readings, entry by entry."""
     n, m, arrival = len(readings), readings.m, readings.arrivals
     out = np.zeros((n, m, n, m))
@@ -53,7 +50,7 @@ def dense(readings: Readings) -> Floats:
 
 @pytest.mark.parametrize("m", [3, 6])
 @BOTH
-def test_whitening_is_the_root_of_the_full_covariance(mode: Mode, m: int) -> None:
+def test_whitening_is_the_root_of_the_full_covariance(mode, m):
     whole, rng = (
         reflectors(joint_std=STD, m=m, poses=3, cycles=2).readings,
         np.random.default_rng(0),
@@ -77,7 +74,7 @@ def test_whitening_is_the_root_of_the_full_covariance(mode: Mode, m: int) -> Non
 
 
 @BOTH
-def test_p_values_and_standard_errors(mode: Mode) -> None:
+def test_p_values_and_standard_errors(mode):
     """With the scatter in common χ² is χ² and errors are as stated; taken apart they are not."""
     p_values, z, apart = [], [], []
     for seed in range(12):
@@ -94,7 +91,7 @@ def test_p_values_and_standard_errors(mode: Mode) -> None:
     assert np.sqrt(np.mean(np.square(apart))) > 1.3
 
 
-def test_repeatability_is_common_to_an_arrival() -> None:
+def test_repeatability_is_common_to_an_arrival():
     c = reflectors(joint_std=STD, poses=6)
     bare = replace(c.readings, covariance=c.readings.covariance * 0.0, common=None)
     made = with_joint_scatter(c.cell, bare, np.full(6, STD))
@@ -104,7 +101,7 @@ def test_repeatability_is_common_to_an_arrival() -> None:
     np.testing.assert_allclose(made.covariance, square, atol=1e-18)
 
 
-def test_stated_covariances_that_include_the_scatter() -> None:
+def test_stated_covariances_that_include_the_scatter():
     c = reflectors(joint_std=STD, poses=6)
     stated = replace(c.readings, common=None)
     made, more = (with_common_scatter(c.cell, stated, np.full(6, k * STD)) for k in (1, 10))
@@ -116,7 +113,7 @@ def test_stated_covariances_that_include_the_scatter() -> None:
     assert with_common_scatter(c.cell, one, np.full(6, STD)).common is None
 
 
-def test_a_hidden_reflector_is_a_missing_reading() -> None:
+def test_a_hidden_reflector_is_a_missing_reading():
     c = reflectors("base_compliance", strength=5.0, joint_std=1e-5, known=(False, False, True))
     r = c.readings
     third = (r.target == 2) & (r.pose == 3)
@@ -132,15 +129,7 @@ def test_a_hidden_reflector_is_a_missing_reading() -> None:
 # --- where nothing states it ------------------------------------------------------------------
 
 
-def scattering(
-    std: Floats | float = 2e-5,
-    m: int = 3,
-    seed: int = 0,
-    noise: float = 1.0,
-    poses: int = 16,
-    loads: int = 3,
-    law: float = 0.0,
-) -> tuple[Cell, Readings]:
+def scattering(std=2e-5, m=3, seed=0, noise=1.0, poses=16, loads=3, law=0.0):
     """Each reading is an arrival with joints off by `std` (n,), by the world's own kinematics.
 
     Joint 2 is off by `law` sin 3 q4 as well, which no effect of the catalogue describes.
@@ -156,7 +145,7 @@ def scattering(
 
 @BOTH
 @pytest.mark.parametrize("m", [3, 6])
-def test_the_scatter_comes_out_as_it_is(mode: Mode, m: int) -> None:
+def test_the_scatter_comes_out_as_it_is(mode, m):
     truth, z = 2e-5, []
     for seed in range(3):
         s = estimate_arm_scatter(based(*scattering(truth, m, seed), mode))
@@ -167,7 +156,7 @@ def test_the_scatter_comes_out_as_it_is(mode: Mode, m: int) -> None:
     assert np.sqrt(np.mean(np.square(z))) < 2.2
 
 
-def test_joints_are_told_apart_where_the_readings_do() -> None:
+def test_joints_are_told_apart_where_the_readings_do():
     truth = np.array([6.0, 0.0, 6.0, 0.0, 0.0, 0.0]) * 1e-5
     s = estimate_arm_scatter(based(*scattering(truth), "absolute"))
     assert s.kind == "each joint"
@@ -175,13 +164,13 @@ def test_joints_are_told_apart_where_the_readings_do() -> None:
     assert np.all(np.abs(off) < 4)
 
 
-def judged(mode: Mode, std: float, **more: float) -> tuple[Diagnosis, str]:
+def judged(mode, std, **more):
     d = diagnose(based(*scattering(std, **more), mode))
     return d, str(d.to_dict()["message"])
 
 
 @BOTH
-def test_what_is_left_to_the_arm_is_adequate_and_says_how_much(mode: Mode) -> None:
+def test_what_is_left_to_the_arm_is_adequate_and_says_how_much(mode):
     d, words = judged(mode, 2e-5)
     assert (d.verdict, d.reason) == ("adequate", "arm_scatter")
     assert "Nothing recorded predicts it" in words
@@ -192,7 +181,7 @@ def test_what_is_left_to_the_arm_is_adequate_and_says_how_much(mode: Mode) -> No
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("law", "reason"), [(1.2e-5, "arm_scatter"), (4e-5, "unknown_effect")])
-def test_a_predictable_part_counts_from_a_third_of_the_rest_on(law: float, reason: str) -> None:
+def test_a_predictable_part_counts_from_a_third_of_the_rest_on(law, reason):
     """The rest moves the target by 27 µm rms, a joint 2 off by 12 µrad by about 6 µm."""
     d, _ = judged("absolute", 2e-5, poses=500, loads=0, law=law)
     assert reason in (d.reason, d.verdict)
@@ -200,7 +189,7 @@ def test_a_predictable_part_counts_from_a_third_of_the_rest_on(law: float, reaso
 
 
 @pytest.mark.parametrize(("share", "reason"), [(0.09, "arm_scatter"), (0.11, "no_suspect")])
-def test_a_negligible_part_that_is_predictable_is_said(share: float, reason: str) -> None:
+def test_a_negligible_part_that_is_predictable_is_said(share, reason):
     e = Evidence(based(*scattering(), "absolute"))
     vars(e)["misfit_breakdown"] = (MisfitShare("joint 4 angle", share, 1e-9),)
     d = judge(e, History())
@@ -212,20 +201,20 @@ def test_a_negligible_part_that_is_predictable_is_said(share: float, reason: str
 
 
 @BOTH
-def test_a_noisier_instrument_is_not_the_arm(mode: Mode) -> None:
+def test_a_noisier_instrument_is_not_the_arm(mode):
     d, words = judged(mode, 0.0, noise=2.0)
     assert d.verdict == "noise_misjudged"
     assert d.scatter.instrument_factor == pytest.approx(2, rel=0.15)
     assert "and not as if the arm scattered" in words
 
 
-def test_no_arm_scatters_by_half_a_millimetre() -> None:
+def test_no_arm_scatters_by_half_a_millimetre():
     d, words = judged("absolute", 4e-4)
     assert d.verdict == "noise_misjudged"
     assert "the arm or the target was loose" in words
 
 
-def test_scatter_that_is_stated_is_not_estimated() -> None:
+def test_scatter_that_is_stated_is_not_estimated():
     cell, readings = scattering()
     d = diagnose(based(cell, replace(readings, scatter_stated=True), "absolute"))
     assert d.verdict == "noise_misjudged"
@@ -233,7 +222,7 @@ def test_scatter_that_is_stated_is_not_estimated() -> None:
 
 
 @pytest.mark.long
-def test_refine_ends_with_the_scatter_in_the_fit_and_the_file_keeps_it(tmp_path: Path) -> None:
+def test_refine_ends_with_the_scatter_in_the_fit_and_the_file_keeps_it(tmp_path):
     cell, readings = scattering()
     config = configuration()
     base = {
@@ -266,7 +255,7 @@ def test_refine_ends_with_the_scatter_in_the_fit_and_the_file_keeps_it(tmp_path:
 
 
 @pytest.mark.parametrize("kind", ["joints", "each joint", "isotropic"])
-def test_an_estimate_goes_through_json(kind: ScatterKind) -> None:
+def test_an_estimate_goes_through_json(kind):
     count = 6 if kind == "each joint" else 1
     s = ArmScatter(kind, (1e-5,) * count, (1e-6,) * count, 2e-5, 4.0, 1.5, 0.01)
     assert ArmScatter.from_json(s.to_json()) == s
@@ -279,7 +268,7 @@ def test_an_estimate_goes_through_json(kind: ScatterKind) -> None:
 
 
 @pytest.mark.parametrize("seeds", [12, pytest.param(300, marks=pytest.mark.slow)])
-def test_p_values_stay_uniform_with_an_estimated_covariance(seeds: int) -> None:
+def test_p_values_stay_uniform_with_an_estimated_covariance(seeds):
     """Those of an effect that is not there, with the covariance as estimated each time."""
     p_values = []
     for seed in range(seeds):
@@ -293,7 +282,7 @@ def test_p_values_stay_uniform_with_an_estimated_covariance(seeds: int) -> None:
 
 
 @BOTH
-def test_targets_of_one_arrival_have_it_in_common(mode: Mode) -> None:
+def test_targets_of_one_arrival_have_it_in_common(mode):
     c = reflectors(joint_std=3e-5, poses=8)
     true = replace(c.cell, registration=c.world.registration)
     (f,) = factors(true, c.readings, "joints")
@@ -311,7 +300,7 @@ def test_targets_of_one_arrival_have_it_in_common(mode: Mode) -> None:
     assert found.variance_factor == pytest.approx(1, abs=0.25)
 
 
-def test_an_orientation_stated_too_noisy_does_not_hide_the_arm() -> None:
+def test_an_orientation_stated_too_noisy_does_not_hide_the_arm():
     cell, readings = scattering(4e-5, m=6)
     covariance = readings.covariance.copy()
     covariance[:, 3:, 3:] *= 9.0

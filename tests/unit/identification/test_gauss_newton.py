@@ -9,18 +9,19 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from hilcal.errors import CannotAnswerError
-from hilcal.identification.fit import Fit, fit
+from hilcal.identification.fit import fit
 from hilcal.identification.gauss_newton import Acceleration, NewtonPoint, linear_problem, regularise
 from hilcal.identification.priors import scales_of
 from hilcal.identification.residual import residual
 from hilcal.identification.solver import minimise, shortened
 from hilcal.model.model import Model
-from hilcal.readings.readings import Readings, States
+from hilcal.readings.readings import States
 from hilcal.readings.whitening import whitening
 from hilcal.regression.normal_equations import TALL
 from hilcal.types import Floats
 from tests.support.campaigns import cell_of
 from tests.support.effect_cases import make
+from tests.support.readings_cases import made
 from tests.support.rows import first
 
 SIGMA = 2e-5
@@ -28,7 +29,7 @@ POSES, LOADS = 30, 6
 STEPS = 8
 
 
-def case(seed: int, names: tuple[str, ...], soft: float = 5.0) -> tuple[Model, Readings]:
+def case(seed, names, soft=5.0):
     """Absolute readings of a soft UR10e, off by 2 σ in a way of its own at each pose."""
     rng = np.random.default_rng(seed)
     cell = cell_of(registration_known=True)
@@ -44,25 +45,16 @@ def case(seed: int, names: tuple[str, ...], soft: float = 5.0) -> tuple[Model, R
     value = model.predict(states, theta).observation.position
     value = value + 2 * SIGMA * np.repeat(rng.normal(size=(POSES, 3)), LOADS, axis=0)
     value = value + SIGMA * rng.normal(size=value.shape)
-    count = len(value)
-    return model, Readings(
-        states=states,
-        pose=np.repeat(np.arange(POSES), LOADS),
-        load=np.tile(np.arange(LOADS), POSES),
-        cycle=np.zeros(count, dtype=np.int64),
-        value=value,
-        covariance=np.tile(SIGMA**2 * np.eye(3), (count, 1, 1)),
-        load_names=("none", *(f"pull {k}" for k in range(1, LOADS))),
-        pose_names=tuple(str(k) for k in range(POSES)),
-    )
+    pose, load = np.divmod(np.arange(len(value)), LOADS)
+    return model, made(q, value, wrench=states.wrench, pose=pose, load=load, std=SIGMA)
 
 
-def slope(found: Fit) -> np.ndarray:
+def slope(found):
     """Difference quotient of ½ ‖r‖² by each z, where a unit of z moves all data by 1 σ."""
     w = whitening(found.readings, "absolute")
     steps = found.solution.equations.basis.transform
 
-    def cost(theta: np.ndarray) -> float:
+    def cost(theta):
         p = found.model.predict(found.readings.states, theta)
         return 0.5 * float(np.sum(w.whiten(residual(found.readings, p, w)) ** 2))
 
@@ -76,7 +68,7 @@ def slope(found: Fit) -> np.ndarray:
 @pytest.mark.parametrize(
     "more", [(), ("joint_tilt_compliance",), ("link_compliance", "target_offset")]
 )
-def test_a_misfit_does_not_hinder(seed: int, more: tuple[str, ...]) -> None:
+def test_a_misfit_does_not_hinder(seed, more):
     model, readings = case(seed, ("joint_compliance", "encoder_offset", *more))
     found = fit(model, readings, "absolute")
     assert found.solution.converged
@@ -86,7 +78,7 @@ def test_a_misfit_does_not_hinder(seed: int, more: tuple[str, ...]) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_sideways_pulls_separate_the_first_joints_offset_from_the_registration(seed: int) -> None:
+def test_sideways_pulls_separate_the_first_joints_offset_from_the_registration(seed):
     """Turned with the arm or not, a sideways pull deflects otherwise: both are determined.
 
     Under weights alone, along the axis of the first joint, they are one gauge freedom.
@@ -108,7 +100,7 @@ def test_sideways_pulls_separate_the_first_joints_offset_from_the_registration(s
     assert not down.uncertainty.identifiable[pair].any()
 
 
-def test_steps_that_shrink_by_constant_factors_lead_to_their_limit() -> None:
+def test_steps_that_shrink_by_constant_factors_lead_to_their_limit():
     """Anderson's combination of steps x → x* + D (x − x*), D diagonal with two factors."""
     rng = np.random.default_rng(0)
     limit, factor = rng.normal(size=8), np.where(np.arange(8) < 4, -0.55, 0.6)
@@ -128,18 +120,18 @@ class Valley:
     y: float
 
     @property
-    def residual(self) -> Floats:
+    def residual(self):
         return np.array([1 - self.x, 10 * (self.y - self.x**2), 0.3 + self.y])
 
-    def jacobian(self) -> Floats:
+    def jacobian(self):
         return np.array([[1.0, 0.0], [20 * self.x, -10.0], [0.0, -1.0]])
 
-    def moved(self, step: Floats) -> "Valley":
+    def moved(self, step):
         return Valley(self.x + step[0], self.y + step[1])
 
 
 @pytest.mark.parametrize("start", [(-1.2, 1.0), (0.5, -3.0)])
-def test_the_minimum_is_that_of_scipy(start: tuple[float, float]) -> None:
+def test_the_minimum_is_that_of_scipy(start):
     found = minimise(Valley(*start), steps=100)
     expected = least_squares(lambda x: Valley(*x).residual, start, xtol=1e-14, ftol=1e-14).x
     np.testing.assert_allclose([found.x, found.y], expected, atol=1e-5)
@@ -154,19 +146,19 @@ class Turned:
     turn: Rotation
 
     @property
-    def residual(self) -> Floats:
+    def residual(self):
         return (self.others - self.turn.apply(self.vectors)).reshape(-1)
 
-    def jacobian(self) -> Floats:
+    def jacobian(self):
         each = [np.cross(axis, self.turn.apply(self.vectors)) for axis in np.eye(3)]
         return np.stack(each, axis=2).reshape(-1, 3)
 
-    def moved(self, step: Floats) -> "Turned":
+    def moved(self, step):
         return replace(self, turn=Rotation.from_rotvec(step) * self.turn)
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_rotations_are_found_from_far_off(seed: int) -> None:
+def test_rotations_are_found_from_far_off(seed):
     rng = np.random.default_rng(seed)
     vectors, true = rng.normal(size=(10, 3)), Rotation.from_rotvec(rng.uniform(-1.2, 1.2, 3))
     others = true.apply(vectors) + 1e-3 * rng.normal(size=(10, 3))
@@ -175,8 +167,8 @@ def test_rotations_are_found_from_far_off(seed: int) -> None:
     assert (found * expected.inv()).magnitude() < 1e-7
 
 
-def test_a_step_is_shortened_until_it_can_be_taken() -> None:
-    def moved(step: Floats) -> float:
+def test_a_step_is_shortened_until_it_can_be_taken():
+    def moved(step):
         if step[0] > 1.0:
             raise CannotAnswerError("too far")
         return float(step[0])
@@ -187,7 +179,7 @@ def test_a_step_is_shortened_until_it_can_be_taken() -> None:
     assert shortened(moved, step, 2) is None
 
 
-def nearly_dependent(condition: float, columns: int) -> Floats:
+def nearly_dependent(condition, columns):
     """Rows (2 TALL, P) of that condition number, whose columns have units over eight decades."""
     rng = np.random.default_rng(5)
     q = np.linalg.qr(rng.standard_normal((2 * TALL, columns)))[0]
@@ -195,7 +187,7 @@ def nearly_dependent(condition: float, columns: int) -> Floats:
     return np.asarray(q * np.geomspace(1e8, 1e8 / condition, columns) @ turn)
 
 
-def solved(a: Floats, white: Floats, scale: Floats) -> Floats:
+def solved(a, white, scale):
     """Step of Gauss-Newton from zero, all parameters without a prior."""
     columns = a.shape[1]
     start, prior = np.zeros(columns), np.full(columns, np.inf)
@@ -208,7 +200,7 @@ def solved(a: Floats, white: Floats, scale: Floats) -> Floats:
 
 
 @pytest.mark.parametrize("condition", [1e2, 1e5, 1e8])
-def test_errors_are_those_of_lapacks_qr(condition: float) -> None:
+def test_errors_are_those_of_lapacks_qr(condition):
     """At 1e8 the normal equations AᵀA have no correct digit."""
     rng = np.random.default_rng(6)
     columns = 8

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.stats import binom, poisson
 
-from hilcal.config import load_config
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
@@ -17,41 +16,36 @@ from hilcal.identification.data_snooping import (
     linearised,
     site_columns,
 )
-from hilcal.identification.fit import Fit, fit
+from hilcal.identification.fit import fit
 from hilcal.identification.fit_document import notes, outliers
 from hilcal.identification.least_trimmed_squares import FALSE_ALARMS, ReadingModel, bulk, limit
 from hilcal.identification.misdescription import examine
 from hilcal.identification.registration import register
-from hilcal.model.model import Model
 from hilcal.present.verdict import message
-from hilcal.readings.readings import Readings
-from hilcal.readings.whitening import MODES, Mode, inverse_root, whitening
-from hilcal.refinement import refine
-from hilcal.robot.catalogue import configs_dir
-from hilcal.types import Floats
+from hilcal.readings.whitening import MODES, inverse_root, whitening
 from studies.gross_errors import Spoilt, count, spoil
 from studies.study_cases import study_case
-from tests.support.campaigns import Campaign, campaign, noiseless, plan, with_noise
-from tests.support.fit_cases import based
+from tests.support.campaigns import campaign, configuration, noiseless, plan, with_noise
+from tests.support.fit_cases import based, refined
 from tests.support.reflector_cases import reflectors
 from tests.support.rows import first
 
-CONFIG = load_config(configs_dir() / "cells" / "demo_ur10e.toml")
+CONFIG = configuration()
 C = campaign(plan_seed=0, poses=30, registration_known=True)
 
 
-def twelve(mode: Mode = "absolute", **given: object) -> Campaign:
+def twelve(mode="absolute", **given):
     return campaign(mode=mode, plan_seed=0, poses=12, **given)
 
 
-def spoilt(readings: Readings, rows: list[int], size: float) -> Readings:
+def spoilt(readings, rows, size):
     value, rng = readings.value.copy(), np.random.default_rng(3)
     direction = rng.normal(size=(len(rows), readings.m))
     value[rows] += size * direction / np.linalg.norm(direction, axis=1, keepdims=True)
     return replace(readings, value=value)
 
 
-def shifted(readings: Readings, rows: slice, shift: Floats) -> Readings:
+def shifted(readings, rows, shift):
     value = readings.value.copy()
     value[rows, :3] += shift
     return replace(readings, value=value)
@@ -161,7 +155,7 @@ def test_a_true_effect_is_not_mistaken_for_gross_errors():
 # --- as campaigns spoil their readings ------------------------------------------------------
 
 
-def gross(r: Readings, rng: np.random.Generator, share: float = 0.05) -> tuple[Readings, dict]:
+def gross(r, rng, share=0.05):
     """Far off by 10 to 1000 σ, the load not hung, or the reading before once more."""
     value, what = r.value.copy(), {}
     for row in np.sort(rng.choice(np.arange(1, len(r)), int(share * len(r)), replace=False)):
@@ -181,11 +175,11 @@ def gross(r: Readings, rng: np.random.Generator, share: float = 0.05) -> tuple[R
     return replace(r, value=value), what
 
 
-def check_verdict(effect: str, mode: Mode, seed: int) -> None:
+def check_verdict(effect, mode, seed):
     c = campaign(effect, mode, seed, poses=30)
     r = c.readings
 
-    def judged(readings: Readings) -> tuple:
+    def judged(readings):
         d = diagnose(based(c.cell, readings, mode))
         return d.verdict, d.significant[:1]
 
@@ -223,7 +217,7 @@ def test_a_twentieth_of_gross_errors_changes_no_verdict(effect, mode, seeds):
 @pytest.mark.parametrize("m", first(1, [3, 6]))
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize(("share", "size"), [(0.2, 5e-3), (0.4, 5e-3), (0.4, 1e-3), (0.3, 5e-2)])
-def test_all_of_many_gross_errors_are_found(share: float, size: float, mode: Mode, m: int) -> None:
+def test_all_of_many_gross_errors_are_found(share, size, mode, m):
     c = twelve(mode, m=m)
     r = c.readings
     readings, wrong = spoil(r, share, size, np.random.default_rng(0))
@@ -243,7 +237,7 @@ def test_all_of_many_gross_errors_are_found(share: float, size: float, mode: Mod
 @pytest.mark.parametrize(
     ("seed", "share"), first(1, [(13, 0.4), (22, 0.4), (24, 0.4), (33, 0.4), (5, 0.2)])
 )
-def test_refine_finds_them_beside_an_effect_and_in_few_poses(seed: int, share: float) -> None:
+def test_refine_finds_them_beside_an_effect_and_in_few_poses(seed, share):
     """24 to 180 readings, nothing or an unmodelled effect of 10 to 20 σ."""
     found = count(CONFIG, Spoilt(share, 5e-3, seed))
     assert found.found == found.wrong
@@ -253,17 +247,17 @@ def test_refine_finds_them_beside_an_effect_and_in_few_poses(seed: int, share: f
 
 @pytest.mark.long
 @pytest.mark.parametrize("mode", MODES)
-def test_more_than_can_be_told_is_said(mode: Mode) -> None:
+def test_more_than_can_be_told_is_said(mode):
     c = twelve(mode)
     readings, _ = spoil(c.readings, 0.6, 5e-3, np.random.default_rng(0))
-    found = refine(baseline(c.cell, readings, mode), readings, mode)
+    found = refined(c.cell, readings, mode)
     assert found.verdict == "unknown_effect"
     assert "More than 45 % of the readings disagree" in message(found.diagnosis)
     assert not found.fit.outlier.any()
 
 
 @pytest.mark.parametrize("of_tool", [False, True])
-def test_a_block_off_alike_is_said_and_not_set_aside(of_tool: bool) -> None:
+def test_a_block_off_alike_is_said_and_not_set_aside(of_tool):
     """From one reading to another the shift is the same in the sensor's, or the target's axes."""
     c, rows, shift = twelve(), slice(12, 30), np.array([5e-3, 0.0, 0.0])
     if of_tool:
@@ -272,12 +266,11 @@ def test_a_block_off_alike_is_said_and_not_set_aside(of_tool: bool) -> None:
         shift = axes[rows] @ shift
     found = based(c.cell, shifted(c.readings, rows, shift), "absolute")
     assert not found.outlier.any()
-    assert found.disagreement is not None
     np.testing.assert_array_equal(found.disagreement.rows, np.arange(12, 30))
     assert any("are off by the same shift" in note for note in notes(found))
 
 
-def test_a_block_is_not_taken_for_random_errors_among_such() -> None:
+def test_a_block_is_not_taken_for_random_errors_among_such():
     c = twelve()
     readings, wrong = spoil(c.readings, 0.1, 5e-3, np.random.default_rng(1))
     found = based(c.cell, shifted(readings, slice(20, 32), np.array([0, 0, -8e-3])), "absolute")
@@ -287,7 +280,7 @@ def test_a_block_is_not_taken_for_random_errors_among_such() -> None:
     assert found.outlier[20:32].sum() <= inside.sum()
 
 
-def test_an_unloaded_reading_that_several_deflections_share() -> None:
+def test_an_unloaded_reading_that_several_deflections_share():
     c = twelve("deflection")
     rows, value = np.flatnonzero(c.readings.unloaded)[::4], c.readings.value.copy()
     value[rows] += 5e-3 * np.random.default_rng(0).normal(size=(len(rows), 3))
@@ -297,25 +290,24 @@ def test_an_unloaded_reading_that_several_deflections_share() -> None:
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_readings_of_several_targets(mode: Mode) -> None:
+def test_readings_of_several_targets(mode):
     c = reflectors(poses=10)
     readings, wrong = spoil(c.readings, 0.3, 5e-3, np.random.default_rng(0))
     assert based(c.cell, readings, mode).outlier[wrong].all()
 
 
-def test_a_registration_does_not_follow_errors_of_centimetres() -> None:
+def test_a_registration_does_not_follow_errors_of_centimetres():
     c = twelve()
     readings, wrong = spoil(c.readings, 0.4, 5e-2, np.random.default_rng(0))
     found = register(c.cell, readings)
     np.testing.assert_array_equal(np.flatnonzero(found.far), np.sort(wrong))
     assert found.rms < 1.1 * register(c.cell, c.readings).rms + 1e-4
     finding = examine(found, readings)
-    assert finding is not None
     assert not finding.refused
 
 
 @pytest.mark.long
-def test_a_block_off_by_centimetres_is_refused() -> None:
+def test_a_block_off_by_centimetres_is_refused():
     readings = shifted(twelve().readings, slice(12, 30), np.array([0.05, 0.0, 0.0]))
     with pytest.raises(InputError, match=r"rows do not fit|Nothing that was tried"):
         baseline(twelve().cell, readings, "absolute")
@@ -326,17 +318,17 @@ def test_a_block_off_by_centimetres_is_refused() -> None:
 APART = np.arange(400)
 
 
-def directions(rng: np.random.Generator, *shape: int) -> Floats:
+def directions(rng, *shape):
     x = rng.normal(size=shape)
     return x / np.linalg.norm(x, axis=1, keepdims=True)
 
 
-def drawn(rng: np.random.Generator, number: int, size: float) -> tuple[Floats, Floats]:
+def drawn(rng, number, size):
     """Shifts of a size in random directions, and those of ten sites."""
     return size * directions(rng, number, 3), directions(rng, number, 3, 10)
 
 
-def test_random_errors_are_along_no_site() -> None:
+def test_random_errors_are_along_no_site():
     rng, tried = np.random.default_rng(0), 400
     wrong = sum(
         bool(along_one_site(*drawn(rng, number, size), APART[:number]).any())
@@ -347,7 +339,7 @@ def test_random_errors_are_along_no_site() -> None:
 
 
 @pytest.mark.parametrize("sizes", [[100.0] * 6, [100, 50, -100, 60, 30, -80]])
-def test_one_pose_is_no_law(sizes: list[float]) -> None:
+def test_one_pose_is_no_law(sizes):
     """One wrong reference there, or errors along an axis of the sensor that is a site's as well."""
     rng = np.random.default_rng(2)
     columns = np.repeat(directions(rng, 1, 3, 10), 6, axis=0)
@@ -356,7 +348,7 @@ def test_one_pose_is_no_law(sizes: list[float]) -> None:
     assert not along_one_site(shift, columns, np.zeros(6, dtype=int)).any()
 
 
-def one_sided(model: Model, readings: Readings, size: float, joint: int) -> Readings:
+def one_sided(model, readings, size, joint):
     """Return readings of an arm with one joint that yields to torques of one sign alone."""
     theta = np.zeros(model.size)
     p = model.predict(readings.states, theta)
@@ -368,14 +360,14 @@ def one_sided(model: Model, readings: Readings, size: float, joint: int) -> Read
 
 
 @pytest.mark.parametrize("joint", [1, 2, 3])
-def test_a_law_of_one_joint_is_not_set_aside(joint: int) -> None:
+def test_a_law_of_one_joint_is_not_set_aside(joint):
     c = twelve("deflection")
     model = baseline(c.cell, c.readings, "deflection")
     found = fit(model, one_sided(model, c.readings, 1e-3, joint), "deflection")
     assert not found.outlier.any()
 
 
-def test_gross_errors_beside_such_a_law_are_found() -> None:
+def test_gross_errors_beside_such_a_law_are_found():
     c = twelve("deflection")
     model = baseline(c.cell, c.readings, "deflection")
     r, wrong = spoil(one_sided(model, c.readings, 60e-6, 1), 0.2, 5e-3, np.random.default_rng(0))
@@ -388,7 +380,7 @@ def test_gross_errors_beside_such_a_law_are_found() -> None:
 # --- the linear model of single readings ----------------------------------------------------
 
 
-def random_model(mode: Mode, rng: np.random.Generator) -> ReadingModel:
+def random_model(mode, rng):
     """30 readings; as deflections in groups of an unloaded and four or five loaded ones."""
     n, m, k = 30, 3, 4
     covariance = rng.normal(size=(n, m, m))
@@ -406,7 +398,7 @@ def random_model(mode: Mode, rng: np.random.Generator) -> ReadingModel:
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_distances_are_those_of_least_squares_without_the_reading(mode: Mode) -> None:
+def test_distances_are_those_of_least_squares_without_the_reading(mode):
     rng = np.random.default_rng(1)
     of = random_model(mode, rng)
     used = of.tested & (rng.random(len(of)) < 0.7)
@@ -429,10 +421,10 @@ def test_distances_are_those_of_least_squares_without_the_reading(mode: Mode) ->
 
 @pytest.mark.parametrize("m", [3, 6])
 @pytest.mark.parametrize("mode", MODES)
-def test_a_step_of_the_linear_model_is_that_of_the_fit(mode: Mode, m: int) -> None:
+def test_a_step_of_the_linear_model_is_that_of_the_fit(mode, m):
     """At the minimum of a fit the step is zero, deflections through their offset as well."""
     c = campaign("none", mode, poses=12, m=m)
-    found: Fit = based(c.cell, c.readings, mode)
+    found = based(c.cell, c.readings, mode)
     y = found.solution.y
     of = linearised(Snooping(found.model, c.readings, mode, found.solution, y), y).linear
     delta, covariance = of.fitted(of.tested)

@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilcal.config import load_config
 from hilcal.diagnosis.stepwise import add, predicts_better
 from hilcal.identification.baseline import with_effects
-from hilcal.identification.fit import Fit, fit
+from hilcal.identification.fit import fit
 from hilcal.identification.folds import (
     block_folds,
     changes,
@@ -20,15 +19,13 @@ from hilcal.identification.folds import (
 )
 from hilcal.identification.gauss_newton import solve
 from hilcal.identification.residual import residual
-from hilcal.readings.readings import Readings
-from hilcal.readings.whitening import MODES, Mode
-from hilcal.robot.catalogue import configs_dir
+from hilcal.readings.whitening import MODES
 from studies.study_cases import study_case
-from tests.support.campaigns import campaign
+from tests.support.campaigns import campaign, configuration
 from tests.support.fit_cases import based
 
 
-def fitted(mode: Mode, m: int = 3, effect: str = "none", **options) -> Fit:
+def fitted(mode, m=3, effect="none", **options):
     c = campaign(effect, mode, plan_seed=0, m=m, target_known=mode == "deflection", **options)
     model = with_effects(c.cell, c.readings, mode, ("joint_compliance", "hysteresis"))
     return fit(model, c.readings, mode)
@@ -102,7 +99,7 @@ def test_the_error_on_poses_left_out_exceeds_that_of_the_fit_by_what_parameters_
 # --- which readings belong together ---------------------------------------------------------
 
 
-def repeated(readings: Readings) -> Readings:
+def repeated(readings):
     """The same poses once more, a little off and under other names."""
     rng = np.random.default_rng(0)
     states = readings.states
@@ -156,9 +153,9 @@ def test_folds_are_of_equal_size_and_whole_poses(poses):
     assert np.all(np.diff(block_folds(pose)) >= 0)
 
 
-def test_what_one_pose_alone_shows_of_an_effect_does_not_spoil_the_others() -> None:
+def test_what_one_pose_alone_shows_of_an_effect_does_not_spoil_the_others():
     """Without pose 19 nothing tells a combination of the backlashes; flat, it erred by 42 σ."""
-    config = load_config(configs_dir() / "cells" / "demo_ur10e.toml")
+    config = configuration()
     c = study_case(config, "ur5e", "deflection", ("backlash",), 2.0, 901)
     before = based(c.cell, c.readings, "deflection")
     found = add(before, "backlash")

@@ -1,20 +1,17 @@
 """Readings that do not fit the description, or are of another arm; conventions of orientations."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hilcal.cell import Cell, cell_from_config
+from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig, load_config
-from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.misdescription import (
     BEYOND_NOISE,
     Described,
-    DescriptionFinding,
     Hypothesis,
     examine,
     other_arm,
@@ -22,41 +19,39 @@ from hilcal.identification.misdescription import (
 )
 from hilcal.identification.registration import register
 from hilcal.identification.table_preview import clearly_best, rank_conventions
-from hilcal.readings.readings import Readings
-from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm, robot_names
 from hilcal.robot.conventions import as_counted
-from hilcal.types import Floats
 from studies.random_descriptions import draw, judge, read
 from studies.random_descriptions import readings_of as table_of
 from tests.support import foreign_tables
 from tests.support.campaigns import configuration
+from tests.support.refusals import refusal
 from tests.support.rows import first
 from tests.unit.identification.test_registration import BASE, CELL, OFFSET, pose_of, told
 
 PLAIN = told(BASE, np.eye(4), False, False)
 
 
-def readings_of(change: Hypothesis | None = None, m: int = 3) -> Readings:
+def readings_of(change=None, m=3):
     """Readings by an arm that is otherwise than the catalogue's, at the same joint values."""
     q = np.random.default_rng(2).uniform(-2, 2, (40, 6))
     nothing = Described(CELL.arm, q, q[:, :3], None, True, True)
     return by_arm(CELL.arm if change is None else change.applied(nothing).arm, q, m)
 
 
-def by_arm(arm: Arm, q: Floats, m: int = 3) -> Readings:
+def by_arm(arm, q, m=3):
     value = read(arm, q, BASE, pose_of(np.eye(3), OFFSET), m)
     noise = 5e-5 * np.random.default_rng(3).normal(size=value.shape)
     return table_of(q, value + noise, np.full(m, 5e-5))
 
 
-def found_in(readings: Readings, cell: Cell = PLAIN) -> tuple[DescriptionFinding | None, str]:
+def found_in(readings, cell=PLAIN):
     """What is wrong, and in words."""
     finding = examine(register(cell, readings), readings)
     return finding, "" if finding is None else finding.words(cell, readings)
 
 
-def moved(rows: list[int], order: list[int]) -> Readings:
+def moved(rows, order):
     good = readings_of()
     value = good.value.copy()
     value[rows] = value[order]
@@ -95,9 +90,7 @@ def test_a_gauge_is_not_proposed(joint):
     ],
 )
 def test_the_reason_is_named_with_the_line_to_write(change, said):
-    with pytest.raises(InputError, match=said) as refused:
-        baseline(PLAIN, readings_of(change), "absolute")
-    assert "\n" not in str(refused.value)
+    refusal(said, baseline, PLAIN, readings_of(change), "absolute")
 
 
 def test_millimetres_and_swapped_rows_are_named():
@@ -154,7 +147,7 @@ def test_random_arms_register_or_are_refused_for_the_right_reason(seed):
     assert outcome.named is not False
 
 
-def test_another_arm_counts_its_joints_as_the_cell_says() -> None:
+def test_another_arm_counts_its_joints_as_the_cell_says():
     """The controller's signs are the cell's, whatever arm it is."""
     config = configuration()
     robot = config.robot.model_copy(update={"joint_sign": (1, 1, -1, 1, 1, 1)})
@@ -177,10 +170,7 @@ def rotation(rng, angle=None):
     return Rotation.from_rotvec(a * axis / np.linalg.norm(axis)).as_matrix()
 
 
-def measured(
-    name: str, seed: int, off: float, poses: int = 30, noise: float = NOISE,
-    errs: Callable[[Floats], Floats] = np.zeros_like,
-) -> Readings:  # fmt: skip
+def measured(name, seed, off, poses=30, noise=NOISE, errs=np.zeros_like):
     """Positions of an arm each of whose links is off by `off` mm and mrad, by matrix products.
 
     Its joints err by `errs` (poses, n) of their angles.
@@ -196,7 +186,7 @@ def measured(
     return table_of(q, x + noise * rng.standard_normal((poses, 3)), np.full(3, noise))
 
 
-def cell(name: str, known: bool = False, **robot: object) -> Cell:
+def cell(name, known=False, **robot):
     tool = {"target_m": TARGET.tolist()} if known else {}
     return cell_from_config(
         CellConfig.model_validate({"robot": {"model": name, **robot}, "tool": tool})
@@ -205,7 +195,7 @@ def cell(name: str, known: bool = False, **robot: object) -> Cell:
 
 @pytest.mark.parametrize("known", [True, False])
 @pytest.mark.parametrize(("true", "told"), [("ur10", "ur10e"), ("ur10e", "ur10")])
-def test_the_other_generation_is_noticed(true: str, told: str, known: bool) -> None:
+def test_the_other_generation_is_noticed(true, told, known):
     """Of 100 such arms, off by 1 mm and mrad, 97 were."""
     named = []
     for seed in range(4):
@@ -219,7 +209,7 @@ def test_the_other_generation_is_noticed(true: str, told: str, known: bool) -> N
 
 @pytest.mark.parametrize("off", first(1, [3.0, 1.0]))
 @pytest.mark.parametrize("name", robot_names())
-def test_an_arm_before_calibration_is_not_taken_for_another(name: str, off: float) -> None:
+def test_an_arm_before_calibration_is_not_taken_for_another(name, off):
     for seed in range(2):
         readings = measured(name, 100 + seed, off, (12, 40)[seed])
         registered = register(cell(name, known=bool(seed)), readings)
@@ -227,16 +217,15 @@ def test_an_arm_before_calibration_is_not_taken_for_another(name: str, off: floa
         assert other_arm(registered, readings) is None
 
 
-def test_joints_count_as_the_cell_says() -> None:
+def test_joints_count_as_the_cell_says():
     sign = [1, 1, 1, -1, 1, 1]
     right = measured("ur10", 0, 1.0)
     counted = replace(right, states=replace(right.states, q=right.states.q * sign))
     found = other_arm_of(cell("ur10e", joint_sign=sign), counted)
-    assert found is not None
     assert found.name == "ur10"
 
 
-def test_too_few_poses_say_nothing() -> None:
+def test_too_few_poses_say_nothing():
     assert other_arm_of(cell("ur10e"), measured("ur10", 0, 1.0, poses=3)) is None
 
 
@@ -247,7 +236,7 @@ ATTITUDE = C.attitude * Rotation.from_rotvec(1e-3 * np.random.default_rng(2).nor
 
 
 @pytest.mark.parametrize("order", ["XYZ", "ZYX", "xyz", "zyx", "ZYZ", "zxz", "YZX"])
-def test_three_angles(order: str) -> None:
+def test_three_angles(order):
     ranked = rank_conventions(ARM, C.q, C.position, ATTITUDE.as_euler(order), 1.0)
     kind = "intrinsic" if order.isupper() else "fixed"
     assert clearly_best(ranked) == f"{kind}-{order.lower()}"
@@ -255,7 +244,7 @@ def test_three_angles(order: str) -> None:
     assert ranked[0].position < 1e-3
 
 
-def test_rotation_vectors_and_quaternions() -> None:
+def test_rotation_vectors_and_quaternions():
     ranked = rank_conventions(ARM, C.q, C.position, ATTITUDE.as_rotvec(degrees=True), np.pi / 180)
     assert clearly_best(ranked) == "rotation-vector"
     for shift, name in ((0, "quaternion-xyzw"), (1, "quaternion-wxyz")):
@@ -264,7 +253,7 @@ def test_rotation_vectors_and_quaternions() -> None:
         assert clearly_best(ranked) == name
 
 
-def test_one_axis_tells_nothing() -> None:
+def test_one_axis_tells_nothing():
     """All conventions turn about z in the same way."""
     angle = np.linspace(-1, 1, 12)
     q = np.zeros((12, 6))
@@ -274,7 +263,7 @@ def test_one_axis_tells_nothing() -> None:
     assert clearly_best(ranked) is None
 
 
-def test_what_is_no_orientation_is_not_decided() -> None:
+def test_what_is_no_orientation_is_not_decided():
     noise = np.random.default_rng(0).uniform(-3, 3, (30, 3))
     ranked = rank_conventions(ARM, C.q, C.position, noise, 1.0)
     assert clearly_best(ranked) is None

@@ -1,13 +1,11 @@
 """A noise that nobody states is estimated: it is no effect, and no effect is noise."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 import hilcal as hc
-from hilcal.cell import Cell
 from hilcal.cli.running import estimate_noise
 from hilcal.cli.terminal import terminal
 from hilcal.config import Tracker
@@ -15,11 +13,9 @@ from hilcal.errors import DeviceError
 from hilcal.measuring.devices import TrackerSample
 from hilcal.measuring.measure import average
 from hilcal.readings.covariance import tracker_covariance, tracker_noise
-from hilcal.readings.readings import Readings
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan, Step
 from hilcal.store.run_log import create_run
-from hilcal.types import Floats
 from tests.support.cli_cases import ok
 from tests.support.rows import first
 from tests.unit.identification.test_misdescription import measured
@@ -28,7 +24,7 @@ OFF = 0.3
 """mm and mrad of each link: an ordinary arm."""
 
 
-def tabled(readings: Readings, path: Path, noise: str = "") -> tuple[Path, Path]:
+def tabled(readings, path, noise=""):
     """Write readings without covariances, and a cell that says nothing but the arm's name."""
     names = [*(f"q{j}_rad" for j in range(1, 7)), "x_m", "y_m", "z_m"]
     rows = np.hstack([readings.states.q, readings.value])
@@ -39,23 +35,23 @@ def tabled(readings: Readings, path: Path, noise: str = "") -> tuple[Path, Path]
     return table, cell
 
 
-def read(readings: Readings, path: Path, noise: str = "") -> tuple[Cell, Readings]:
+def read(readings, path, noise=""):
     table, cell = tabled(readings, path, noise)
     known = hc.Cell.load(cell)
     return known, hc.read_table(table, known)
 
 
-def judged(cell: Cell, readings: Readings) -> hc.Diagnosis:
+def judged(cell, readings):
     return hc.diagnose(hc.fit(hc.baseline(cell, readings) + hc.effect("link_geometry"), readings))
 
 
-def size(readings: Readings) -> float:
+def size(readings):
     """Root of the mean variance of a coordinate, m."""
     return float(np.sqrt(np.trace(readings.covariance, axis1=1, axis2=2).mean() / 3))
 
 
 @pytest.mark.parametrize("sigma", [5e-6, 2e-5, 2e-4])
-def test_white_noise_of_any_size_is_noise(tmp_path: Path, sigma: float) -> None:
+def test_white_noise_of_any_size_is_noise(tmp_path, sigma):
     cell, readings = read(measured("ur5", 3, OFF, 60, sigma), tmp_path)
     assert not readings.noise_stated
     assert size(readings) == pytest.approx(sigma, rel=0.3)
@@ -63,14 +59,14 @@ def test_white_noise_of_any_size_is_noise(tmp_path: Path, sigma: float) -> None:
 
 
 @pytest.mark.long
-def test_gross_errors_are_not_noise(tmp_path: Path) -> None:
+def test_gross_errors_are_not_noise(tmp_path):
     of = measured("ur5", 1, OFF, 60, 2e-5)
     of.value[[5, 17], 0] += 3e-3
     of.value[30, 1] += 8e-4
     assert size(read(of, tmp_path)[1]) == pytest.approx(2e-5, rel=0.3)
 
 
-def test_effects_are_not_noise(tmp_path: Path) -> None:
+def test_effects_are_not_noise(tmp_path):
     """Where the readings show several, the default stays: they are suspects, or unknown."""
     of = measured("ur5", 2, OFF, 60, 1e-5, lambda q: 4e-5 * np.sin(q + 1))
     cell, readings = read(of, tmp_path)
@@ -79,7 +75,7 @@ def test_effects_are_not_noise(tmp_path: Path) -> None:
     assert d.verdict in ("missing_effect", "ambiguous")
     law = np.eye(6)[2] * 2e-4
 
-    def crossed(q: np.ndarray) -> np.ndarray:
+    def crossed(q):
         return (np.cos(q[:, 1] + 0.3) * np.sin(q[:, 4] + 1))[:, None] * law
 
     d = judged(*read(measured("ur5", 4, OFF, 60, 1e-5, crossed), tmp_path))
@@ -87,7 +83,7 @@ def test_effects_are_not_noise(tmp_path: Path) -> None:
     assert set(d.follows) == {"joint 2 angle", "joint 5 angle"}
 
 
-def test_a_stated_noise_is_taken_as_stated(tmp_path: Path) -> None:
+def test_a_stated_noise_is_taken_as_stated(tmp_path):
     noise = "[tracker]\nrange_std_m = 1e-4\ntransverse_std_m = 1e-4\n"
     cell, readings = read(measured("ur5", 3, OFF, 60, 2e-5), tmp_path, noise)
     assert readings.noise_stated
@@ -95,7 +91,7 @@ def test_a_stated_noise_is_taken_as_stated(tmp_path: Path) -> None:
     assert judged(cell, readings).verdict == "noise_misjudged"
 
 
-def test_import_and_info_say_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_import_and_info_say_it(tmp_path, capsys):
     table, cell = tabled(measured("ur5", 3, OFF, 40, 2e-5), tmp_path)
     run = str(tmp_path / "r.hilcal")
     for args in (["import", str(table), "--config", str(cell), "-o", run], ["info", run]):
@@ -103,12 +99,11 @@ def test_import_and_info_say_it(tmp_path: Path, capsys: pytest.CaptureFixture[st
         assert "neither the table nor [tracker] states the noise; it was estimated" in said
 
 
-Capsys = pytest.CaptureFixture[str]
 SAMPLES = 5
 STATED = "range_std_m = 5e-6\ntransverse_std_m = 7.5e-6\n"
 
 
-def sampled(seed: int, sigma: float | None, between: float) -> Readings:
+def sampled(seed, sigma, between):
     """Readings of an ordinary arm, each the mean of samples with the default's covariance.
 
     Args:
@@ -125,9 +120,7 @@ def sampled(seed: int, sigma: float | None, between: float) -> Readings:
     return replace(r, value=value, covariance=covariance)
 
 
-def of_samples(
-    x: Floats, v: Floats, root: Floats, rng: np.random.Generator
-) -> tuple[Floats, Floats]:
+def of_samples(x, v, root, rng):
     """The mean of samples and its covariance; samples that scatter too much are taken again."""
     while True:
         drawn = x + rng.standard_normal((SAMPLES, 3)) @ root.T
@@ -138,7 +131,7 @@ def of_samples(
         return mean.value, mean.covariance
 
 
-def run_of(readings: Readings, path: Path, tracker: str = "", arm: str = "") -> Path:
+def run_of(readings, path, tracker="", arm=""):
     """A campaign as `run` leaves it."""
     text = f'[robot]\nmodel = "ur5"\n[tracker]\n{tracker}{arm}'
     (path / "CELL.toml").write_text(text)
@@ -164,9 +157,7 @@ def run_of(readings: Readings, path: Path, tracker: str = "", arm: str = "") -> 
         ],
     ),
 )
-def test_another_instrument_is_noise(
-    tmp_path: Path, capsys: Capsys, sigma: float, between: float, arm: str
-) -> None:
+def test_another_instrument_is_noise(tmp_path, capsys, sigma, between, arm):
     readings = sampled(3, sigma, between)
     path = run_of(readings, tmp_path, arm=arm)
     assert "[tracker] does not state the noise" in " ".join(capsys.readouterr().err.split())
@@ -179,7 +170,7 @@ def test_another_instrument_is_noise(
 
 
 @pytest.mark.parametrize("tracker", ["", STATED])
-def test_what_the_samples_show_or_the_cell_states_stays(tmp_path: Path, tracker: str) -> None:
+def test_what_the_samples_show_or_the_cell_states_stays(tmp_path, tracker):
     """The default's own noise; or a stated one that the readings contradict."""
     readings = sampled(3, 5e-6, 2e-5) if tracker else sampled(3, None, 0.0)
     with hc.Campaign.open(run_of(readings, tmp_path, tracker)) as run:
@@ -189,9 +180,7 @@ def test_what_the_samples_show_or_the_cell_states_stays(tmp_path: Path, tracker:
             assert judged(run.cell, run.readings).verdict == "adequate"
 
 
-def test_an_estimate_does_not_outlive_the_readings_that_it_is_of(
-    tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_estimate_does_not_outlive_the_readings_that_it_is_of(tmp_path, capsys, monkeypatch):
     path = run_of(sampled(3, 5e-6, 1e-4), tmp_path)
     cell = hc.Cell.load(tmp_path / "CELL.toml")
     monkeypatch.setattr("hilcal.cli.running.measured_noise", lambda *_: None)

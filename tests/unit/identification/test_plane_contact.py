@@ -2,27 +2,24 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from hilcal.cell import Cell
 from hilcal.drivers.simulated.injected_effects import hide
-from hilcal.drivers.simulated.world import World
 from hilcal.effects.catalogue import installed
 from hilcal.identification.baseline import baseline
-from hilcal.identification.fit import Fit, fit
+from hilcal.identification.fit import fit
 from hilcal.identification.full_covariance import with_joint_scatter
-from hilcal.readings.readings import ObserverName, Readings, States
+from hilcal.readings.readings import ObserverName, States
 from hilcal.robot import se3
 from hilcal.robot.chain import evaluate
 from hilcal.tables.table import write_table
-from hilcal.types import Floats
 from tests.support.campaigns import cell_of, configuration, plan, true_parameters, world_of
-from tests.support.cli_cases import CELL, Capsys, ok
+from tests.support.cli_cases import CELL, ok
 from tests.support.fit_cases import named
+from tests.support.readings_cases import made
 
 STD = 1e-5
 PLATES = {  # a point, and the normal, base axes
@@ -32,7 +29,7 @@ PLATES = {  # a point, and the normal, base axes
 }
 
 
-def placed(cell: Cell, name: str, rng: np.random.Generator) -> Floats:
+def placed(cell, name, rng):
     """(6,) joints of the nominal arm with its target on a plate, the tool about against it."""
     at, normal = (np.array(x) for x in PLATES[name])
     n = normal / np.linalg.norm(normal)
@@ -43,7 +40,7 @@ def placed(cell: Cell, name: str, rng: np.random.Generator) -> Floats:
     x /= np.linalg.norm(x)
     turn, offset = np.stack([x, np.cross(z, x), z], axis=1), cell.all_targets[0, :3, 3]
 
-    def off(q: Floats) -> Floats:
+    def off(q):
         chain = evaluate(cell.arm, q[None])
         r, p = chain.rotation[-1, 0], chain.position[-1, 0]
         return np.concatenate(
@@ -57,9 +54,7 @@ def placed(cell: Cell, name: str, rng: np.random.Generator) -> Floats:
             return q
 
 
-def touched(
-    names: list[str], poses: int, seed: int, effect: str = ""
-) -> tuple[Cell, World, Readings]:
+def touched(names, poses, seed, effect=""):
     """Every pose unloaded and with two weights: the mechanics' own arm is led until it touches."""
     cell, rng = cell_of(), np.random.default_rng(seed)
     world = world_of(cell, rng)
@@ -77,7 +72,7 @@ def touched(
     at, n = (np.array([PLATES[name][k] for name in names])[plate] for k in (0, 1))
     n = n / np.linalg.norm(n, axis=1, keepdims=True)
 
-    def heights(q: Floats) -> Floats:
+    def heights(q):
         return np.sum((world.sight(replace(states, q=q), slip).position - at) * n, axis=1)
 
     late = STD * rng.standard_normal(len(q))
@@ -89,23 +84,22 @@ def touched(
         step = height[:, None] * slope / np.sum(slope**2, axis=1, keepdims=True)
         states = replace(states, q=states.q - step)
     assert np.abs(heights(states.q) - late).max() < 1e-9
-    count, cov = len(q), np.zeros((len(q), 3, 3))
+    cov = np.zeros((len(q), 3, 3))
     cov[:, 0, 0] = STD**2
-    readings = Readings(
-        states=replace(states, observer=plate),
-        pose=np.arange(count),
+    readings = made(
+        states.q,
+        np.zeros((len(q), 3)),
+        wrench=states.wrench,
+        observer=plate,
         load=np.tile(np.arange(3), poses),
-        cycle=np.zeros(count, dtype=np.int64),
-        value=np.zeros((count, 3)),
         covariance=cov,
         load_names=("none", "5kg", "10kg"),
-        pose_names=tuple(f"p{k}" for k in range(count)),
         observers=tuple(ObserverName("gauge", name) for name in names),
     )
     return cell, world, readings
 
 
-def fitted(cell: Cell, readings: Readings, effect: str = "") -> Fit:
+def fitted(cell, readings, effect=""):
     joint_std = configuration().repeatability.per_joint(6)
     readings = with_joint_scatter(cell, readings, joint_std)
     model = baseline(cell, readings, "absolute")
@@ -120,9 +114,7 @@ CASES = {"one": ["granite"], "three": list(PLATES)}
 @pytest.mark.long
 @pytest.mark.parametrize("plates", CASES)
 @pytest.mark.parametrize("effect", ["", "encoder_offset"])
-def test_what_heights_of_0_determine_is_right_and_the_rest_is_named(
-    plates: str, effect: str
-) -> None:
+def test_what_heights_of_0_determine_is_right_and_the_rest_is_named(plates, effect):
     """A horizontal plate sees no turn about the vertical; three unknown ones turn with the base."""
     names, z, factors = ["joint_compliance", *[effect] * bool(effect)], [], []
     for seed in range(8):
@@ -141,7 +133,7 @@ def test_what_heights_of_0_determine_is_right_and_the_rest_is_named(
     assert 0.8 < np.mean(factors) < 1.2  # eight of 80 degrees of freedom or more: 0.055
 
 
-def test_commands_name_what_the_plate_does_not_see(tmp_path: Path, capsys: Capsys) -> None:
+def test_commands_name_what_the_plate_does_not_see(tmp_path, capsys):
     _, world, readings = touched(["granite"], 20, 3)
     write_table(readings, tmp_path / "t.csv")
     (tmp_path / "cell.toml").write_text(CELL.read_text())

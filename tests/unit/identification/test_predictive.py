@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hilcal.identification.baseline import with_effects
-from hilcal.identification.fit import Fit, fit
+from hilcal.identification.fit import fit
 from hilcal.identification.predictive import (
     Excess,
     excess,
@@ -14,10 +14,8 @@ from hilcal.identification.predictive import (
     predictive_of,
 )
 from hilcal.identification.robot_frames import whole_turns
-from hilcal.identification.validation import Extrapolation, Validation, extrapolation, validate
-from hilcal.readings.readings import Readings
+from hilcal.identification.validation import extrapolation, validate
 from hilcal.readings.whitening import whitening
-from hilcal.types import Floats
 from studies.random_descriptions import readings_of
 from tests.support.campaigns import campaign
 from tests.support.fit_cases import based
@@ -26,7 +24,7 @@ NOISE_FACTOR, FOLDS, EACH = 1.7, 10, 12
 
 
 @pytest.mark.parametrize("size", [60, 300])
-def test_left_out_folds_are_as_far_off_as_dense_algebra_has_it(size: int) -> None:
+def test_left_out_folds_are_as_far_off_as_dense_algebra_has_it(size):
     """Few readings of wide priors: single folds tell almost all of some directions."""
     rng = np.random.default_rng(size)
     count = FOLDS * EACH
@@ -46,7 +44,7 @@ def test_left_out_folds_are_as_far_off_as_dense_algebra_has_it(size: int) -> Non
 
 
 @pytest.mark.parametrize("seed", [1, 3])
-def test_scatter_beyond_the_stated_noise_is_told_from_what_many_parameters_take(seed: int) -> None:
+def test_scatter_beyond_the_stated_noise_is_told_from_what_many_parameters_take(seed):
     """120 coordinates, 144 parameters of a family and others: half of the residual is fitted away.
 
     Taken by the stated noise alone, the parameters seem to have taken nearly all of it. Of 30 µm
@@ -71,7 +69,7 @@ COUNT, M = 400, 6
 NOISE = np.array([5e-6, 20e-6, 20e-6, 9e-5, 9e-5, 9e-5])
 
 
-def readings(rng: np.random.Generator) -> Readings:
+def readings(rng):
     axes = np.linalg.qr(rng.normal(size=(COUNT, 3, 3)))[0]
     turn = np.zeros((COUNT, M, M))
     turn[:, :3, :3], turn[:, 3:, 3:] = axes, np.eye(3)
@@ -80,7 +78,7 @@ def readings(rng: np.random.Generator) -> Readings:
     return replace(made, covariance=covariance)
 
 
-def drawn(extra_m: float, factor: float, parameters: int = 0) -> tuple[Excess, Readings]:
+def drawn(extra_m, factor, parameters=0):
     """Draw residuals, with some directions fitted away, and return what is found of them."""
     rng = np.random.default_rng(3)
     r = readings(rng)
@@ -92,7 +90,7 @@ def drawn(extra_m: float, factor: float, parameters: int = 0) -> tuple[Excess, R
     wide = whitening(true.of_readings(r, "absolute"), "absolute", "gc")
     jacobian = rng.normal(size=(COUNT, M, parameters)) * NOISE[:, None]
     rows = wide.whiten(jacobian) if parameters else np.zeros((COUNT * M, 1))
-    root: Floats = np.zeros((1, 1))
+    root = np.zeros((1, 1))
     if parameters:
         root = np.linalg.cholesky(np.linalg.inv(rows.T @ rows))
         step = np.linalg.lstsq(rows, wide.whiten(raw).reshape(-1), rcond=None)[0]
@@ -104,16 +102,14 @@ def drawn(extra_m: float, factor: float, parameters: int = 0) -> tuple[Excess, R
     ("extra_m", "factor", "parameters"),
     [(0.0, 1.0, 0), (30e-6, 1.0, 0), (0.0, 3.0, 0), (30e-6, 2.0, 0), (30e-6, 2.0, 300)],
 )
-def test_an_excess_is_found_in_its_size_and_its_part(
-    extra_m: float, factor: float, parameters: int
-) -> None:
+def test_an_excess_is_found_in_its_size_and_its_part(extra_m, factor, parameters):
     found, _ = drawn(extra_m, factor, parameters)
     # 1200 elements: good to 1/sqrt(600).
     assert np.sqrt(found.position) == pytest.approx(extra_m, rel=0.08)
     assert found.attitude == (1.0 if factor == 1.0 else pytest.approx(factor, rel=0.15))
 
 
-def test_a_deflection_has_it_once() -> None:
+def test_a_deflection_has_it_once():
     _, r = drawn(0.0, 1.0)
     more = Excess(1e-10, 4.0)
     wide = more.of_readings(r, "deflection")
@@ -125,7 +121,7 @@ def test_a_deflection_has_it_once() -> None:
     assert not Excess().near(more)
 
 
-def split(seed: int, joint: int | None) -> tuple[Fit, Validation, Extrapolation]:
+def split(seed, joint):
     """A fit to half of the unloaded readings, by joint angle or at random, and the other half."""
     c = campaign(
         "transmission_error", "absolute", seed, plan_seed=5, poses=100, harmonics=8, strength=3.0
@@ -139,12 +135,12 @@ def split(seed: int, joint: int | None) -> tuple[Fit, Validation, Extrapolation]
     return found, other, extrapolation(predictive_of(found), found.readings, other)
 
 
-def rms(z: np.ndarray) -> float:
+def rms(z):
     return float(np.sqrt(np.mean(z**2)))
 
 
 @pytest.mark.parametrize("joint", [0, 1])
-def test_half_against_half_of_a_joint_is_outside_and_its_error_is_stated(joint: int) -> None:
+def test_half_against_half_of_a_joint_is_outside_and_its_error_is_stated(joint):
     z = []
     for seed in range(2):
         found, other, x = split(seed, joint)
@@ -159,7 +155,7 @@ def test_half_against_half_of_a_joint_is_outside_and_its_error_is_stated(joint: 
     assert 0.5 < rms(np.array(z)) < 1.15
 
 
-def test_of_two_random_halves_few_are_outside() -> None:
+def test_of_two_random_halves_few_are_outside():
     z = []
     for seed in range(2):
         found, other, x = split(seed, None)
@@ -173,14 +169,14 @@ def test_of_two_random_halves_few_are_outside() -> None:
 @pytest.mark.parametrize(
     ("effect", "same"), [("transmission_error", True), ("joint_coupling", False)]
 )
-def test_waves_of_whole_turns_are_the_same_and_couplings_are_not(effect: str, same: bool) -> None:
+def test_waves_of_whole_turns_are_the_same_and_couplings_are_not(effect, same):
     c = campaign()
     model = with_effects(c.cell, c.readings, "absolute", ["joint_compliance", effect])
     theta = 1e-4 * np.ones(model.size)
     assert bool(whole_turns(model, theta)[1]) is same
 
 
-def test_a_joint_that_turned_on_is_validated_as_inside() -> None:
+def test_a_joint_that_turned_on_is_validated_as_inside():
     c = campaign(poses=16)
     found = based(c.cell, c.readings, "absolute")
     q = c.readings.states.q.copy()

@@ -3,7 +3,6 @@
 import json
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,16 +12,15 @@ from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.torques import check_torques
 from hilcal.readings.covariance import WHOLE
-from hilcal.readings.readings import Readings
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.rows import content_hash
 from hilcal.tables.table import read_table, write_table
 from tests.support.campaigns import cell_of, measured, plan, true_parameters, world_of
-from tests.support.cli_cases import CELL, Capsys, ok
+from tests.support.cli_cases import CELL, ok
 from tests.support.fit_cases import based, compliances
 
 
-def campaign(seed: int, hung: float = 1.0, friction: float = 2.0) -> Readings:
+def campaign(seed, hung=1.0, friction=2.0):
     """Readings of the mechanics' own arm: all loads are `hung` times as large as they are told.
 
     Friction is up to `friction` N·m of either sign at each drive, which nothing records.
@@ -37,7 +35,7 @@ def campaign(seed: int, hung: float = 1.0, friction: float = 2.0) -> Readings:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_load_that_is_not_what_it_is_said_to_be(seed: int) -> None:
+def test_a_load_that_is_not_what_it_is_said_to_be(seed):
     found = check_torques(cell_of(), campaign(seed, hung=0.49))
     factors = {f.of: f for f in found.factors}
     for name, stated in (("5kg", 5.0), ("10kg", 10.0)):
@@ -50,7 +48,7 @@ def test_a_load_that_is_not_what_it_is_said_to_be(seed: int) -> None:
     np.testing.assert_array_less(found.std_Nm, 2.0)
 
 
-def test_right_masses_are_not_accused_and_intervals_keep_their_rate() -> None:
+def test_right_masses_are_not_accused_and_intervals_keep_their_rate():
     inside, accused, count = 0, 0, 0
     for seed in range(25):
         found = check_torques(cell_of(), campaign(seed))
@@ -61,7 +59,7 @@ def test_right_masses_are_not_accused_and_intervals_keep_their_rate() -> None:
     assert accused == 0
 
 
-def test_compliances_by_measured_torques_do_not_need_the_loads() -> None:
+def test_compliances_by_measured_torques_do_not_need_the_loads():
     """With loads half of what is told, the modelled torques are wrong by 2; the measured right."""
     told = campaign(3, hung=0.5, friction=0.0)
     truth = true_parameters(world_of(cell_of(), np.random.default_rng(3)), "joint_compliance")
@@ -78,7 +76,7 @@ def test_compliances_by_measured_torques_do_not_need_the_loads() -> None:
     np.testing.assert_allclose(found["measured"], 1.0, atol=0.02)
 
 
-def test_tables_and_files_keep_the_torques(tmp_path: Path) -> None:
+def test_tables_and_files_keep_the_torques(tmp_path):
     readings, arm = campaign(0), cell_of().arm
     write_table(readings, tmp_path / "t.csv", WHOLE)
     back = read_table(tmp_path / "t.csv", arm, None)
@@ -92,7 +90,7 @@ def test_tables_and_files_keep_the_torques(tmp_path: Path) -> None:
         read_table(tmp_path / "t.csv", arm, None)
 
 
-def test_commands_say_what_the_load_weighs(tmp_path: Path, capsys: Capsys) -> None:
+def test_commands_say_what_the_load_weighs(tmp_path, capsys):
     write_table(campaign(1, hung=0.49, friction=0.3), tmp_path / "t.csv", WHOLE)
     config = tmp_path / "cell.toml"
     config.write_text(CELL.read_text())
@@ -106,7 +104,7 @@ def test_commands_say_what_the_load_weighs(tmp_path: Path, capsys: Capsys) -> No
     assert document["torques"]["factors"][0]["differs"]
 
 
-def test_measured_torques_that_are_not_there(tmp_path: Path) -> None:
+def test_measured_torques_that_are_not_there(tmp_path):
     config = tmp_path / "cell.toml"
     text = CELL.read_text().replace('model = "ur10e"', 'model = "ur10e"\ntorques = "measured"')
     config.write_text(text)

@@ -8,25 +8,26 @@ from scipy.stats import chi2
 
 from hilcal.engine.engine import open_engine
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.bootstrap import Bootstrap, again, bootstrap
-from hilcal.identification.fit import Fit, fit
+from hilcal.identification.bootstrap import again, bootstrap
+from hilcal.identification.fit import fit
 from hilcal.identification.folds import distinct_poses
 from hilcal.identification.priors import prior_of
 from hilcal.model.model import Model
 from hilcal.present.calibration import bootstrap_remarks
 from hilcal.readings.readings import Readings
-from hilcal.readings.whitening import MODES, Mode, whitening
+from hilcal.readings.whitening import MODES, whitening
 from tests.support.campaigns import campaign, noiseless, plan, with_noise
 from tests.support.effect_cases import make
 from tests.support.fit_cases import based
+from tests.support.refusals import refusal, refusal_of
 from tests.support.rows import first
 
 
-def rms(x: np.ndarray) -> float:
+def rms(x):
     return float(np.sqrt(np.mean(np.square(x))))
 
 
-def design(mode: Mode) -> tuple[Model, Readings, np.ndarray]:
+def design(mode):
     """Frames, where known with their prior, and compliances; readings of the truth."""
     c = campaign(plan_seed=0, registration_known=True, target_known=True)
     known = {"prior_m": 1e-4, "prior_rad": 2e-4} if mode == "deflection" else {}
@@ -35,7 +36,7 @@ def design(mode: Mode) -> tuple[Model, Readings, np.ndarray]:
     return model, c.readings, np.append(np.zeros(9), c.world.physics.joint_compliance)
 
 
-def read(model: Model, readings: Readings, theta: np.ndarray) -> Readings:
+def read(model, readings, theta):
     clean = model.predict(readings.states, theta).observation.position
     return replace(readings, value=clean)
 
@@ -94,7 +95,7 @@ def test_a_prior_is_learnt_from_or_marked_as_unseen():
     assert u.identifiable[9:].all()
 
 
-def halves(effect: str, mode: Mode, strength: float, seeds: range) -> tuple[np.ndarray, ...]:
+def halves(effect, mode, strength, seeds):
     """Differences of compliances between two halves over their stated and formal uncertainty."""
     stated, formal, inflated = [], [], []
     for seed in seeds:
@@ -140,22 +141,22 @@ POSES = 40
 COMPLIANCE = slice(6, 12)  # behind the base's frame
 
 
-def fitted(readings: Readings | None = None, poses: int = POSES) -> Fit:
+def fitted(readings=None, poses=POSES):
     c = campaign("none", "absolute", poses=poses)
     return based(c.cell, c.readings if readings is None else readings, "absolute")
 
 
-def drawn(found: Fit, draws: int = 100, seed: int = 0) -> Bootstrap:
+def drawn(found, draws=100, seed=0):
     with open_engine(1) as engine:
         return bootstrap(found, engine, draws, seed)
 
 
-def remarks(of: Bootstrap) -> str:
+def remarks(of):
     return "\n".join(bootstrap_remarks(of))
 
 
 @pytest.mark.long
-def test_its_spread_is_that_of_repeated_campaigns() -> None:
+def test_its_spread_is_that_of_repeated_campaigns():
     clean = noiseless(campaign("none", "absolute", poses=POSES).world, plan(POSES, 1000))
     repeated = [fitted(with_noise(clean, np.random.default_rng(s))) for s in range(40)]
     true = np.std([f.theta[COMPLIANCE] for f in repeated], axis=0, ddof=1)
@@ -165,7 +166,7 @@ def test_its_spread_is_that_of_repeated_campaigns() -> None:
 
 
 @pytest.mark.long
-def test_it_notices_readings_of_a_pose_that_are_not_independent() -> None:
+def test_it_notices_readings_of_a_pose_that_are_not_independent():
     clean = noiseless(campaign("none", "absolute", poses=POSES).world, plan(POSES, 1000))
     root, found = np.linalg.cholesky(clean.covariance), []
     for seed in range(2):  # noise of the stated size that all readings of a pose have in common
@@ -183,7 +184,7 @@ def test_it_notices_readings_of_a_pose_that_are_not_independent() -> None:
 
 
 @pytest.mark.long
-def test_the_bits_depend_on_the_seed_and_not_on_the_workers() -> None:
+def test_the_bits_depend_on_the_seed_and_not_on_the_workers():
     found, told = fitted(poses=12), list[int]()
     one = drawn(found, 23)
     with open_engine(2) as engine:
@@ -196,7 +197,7 @@ def test_the_bits_depend_on_the_seed_and_not_on_the_workers() -> None:
     assert not np.array_equal(drawn(found, 20, seed=1).theta, one.theta[:20])
 
 
-def test_a_draw_has_whole_poses_each_copy_with_its_own_unloaded_reading() -> None:
+def test_a_draw_has_whole_poses_each_copy_with_its_own_unloaded_reading():
     readings = campaign("none", "deflection", poses=12).readings
     found = again(readings, distinct_poses(readings), np.random.default_rng(4))
     size, count = len(readings) // 12, np.bincount(found.pose)
@@ -209,7 +210,7 @@ def test_a_draw_has_whole_poses_each_copy_with_its_own_unloaded_reading() -> Non
     assert len(whitening(found, "deflection")) == 12 * (size - 1)
 
 
-def test_two_names_of_one_pose_are_drawn_together() -> None:
+def test_two_names_of_one_pose_are_drawn_together():
     readings = campaign("none", "deflection", poses=12).readings
     twice = Readings.joined([readings, replace(readings, pose=readings.pose + 12)])
     twice = replace(twice, pose_names=tuple(f"p{k}" for k in range(24)))
@@ -217,21 +218,18 @@ def test_two_names_of_one_pose_are_drawn_together() -> None:
     assert {f"p{(int(n[1:]) + 12) % 24}" for n in names} == names
 
 
-def test_what_it_refuses() -> None:
+def test_what_it_refuses():
     found = fitted(poses=12)
-    with pytest.raises(InputError, match="draws 5, seed 0; valid: at least 20"):
-        drawn(found, 5)
-    with pytest.raises(CannotAnswerError, match=r"8 distinct poses .* at least 10"):
-        drawn(fitted(poses=8))
+    refusal("draws 5, seed 0; valid: at least 20", drawn, found, 5)
+    refusal_of(CannotAnswerError, r"8 distinct poses .* at least 10", drawn, fitted(poses=8))
     with pytest.raises(InputError, match="level 2; valid: between 0 and 1"):
         drawn(found, 20).interval(2)
 
 
-def test_its_document_says_which_parameters_are_compared() -> None:
+def test_its_document_says_which_parameters_are_compared():
     c = campaign("transmission_error", "absolute", poses=20)
     found = drawn(based(c.cell, c.readings, "absolute"), 20)
     rows = found.to_dict()["parameters"]
-    assert isinstance(rows, list)
     assert [r["name"] for r in rows][:2] == ["base_frame.x", "base_frame.y"]
     for r in rows:
         assert r["interval"][0] <= r["interval"][1]

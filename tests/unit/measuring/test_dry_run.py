@@ -1,7 +1,6 @@
 """The dry run: finds everything that a plan must not do, and lets the rest pass."""
 
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,11 +19,11 @@ from tests.support.space_cases import reached
 WIDE = Limits(workspace_min_m=(-3, -3, -3), workspace_max_m=(3, 3, 3))
 
 
-def problems(bench: Bench, plan: Plan) -> tuple[str, ...]:
+def problems(bench, plan):
     return dry_run(bench.cell, bench.config, plan).problems
 
 
-def test_a_good_plan_passes() -> None:
+def test_a_good_plan_passes():
     bench = Bench()
     checked = dry_run(bench.cell, bench.config, usual_plan())
     assert checked.problems == ()
@@ -36,7 +35,7 @@ def test_a_good_plan_passes() -> None:
     assert checked.duration > 4 * 60.0
 
 
-def test_number_of_joints_and_names_of_loads_at_once() -> None:
+def test_number_of_joints_and_names_of_loads_at_once():
     bench = Bench()
     plan = Plan(("a",), np.zeros((1, 7)), (Step("a", "none"), Step("a", "3 kg")))
     found = problems(bench, plan)
@@ -48,7 +47,7 @@ def test_number_of_joints_and_names_of_loads_at_once() -> None:
 
 @pytest.mark.parametrize("side", [-1, 1])
 @pytest.mark.parametrize("joint", range(6))
-def test_joint_limit_with_margin(joint: int, side: int) -> None:
+def test_joint_limit_with_margin(joint, side):
     bench = Bench(limits=WIDE)
     arm, margin = bench.cell.arm, bench.config.limits.joint_margin_rad
     limit = (arm.q_max if side > 0 else arm.q_min)[joint] - side * margin
@@ -61,7 +60,7 @@ def test_joint_limit_with_margin(joint: int, side: int) -> None:
 
 
 @pytest.mark.parametrize("side", [-1, 1])
-def test_reference_at_a_joint_limit_is_approached_from_within(side: int) -> None:
+def test_reference_at_a_joint_limit_is_approached_from_within(side):
     bench = Bench(limits=WIDE)
     arm, margin = bench.cell.arm, bench.config.limits.joint_margin_rad
     q = np.array(POSES["reference"])
@@ -72,13 +71,13 @@ def test_reference_at_a_joint_limit_is_approached_from_within(side: int) -> None
     assert beside.q[5] == pytest.approx(q[5] - side * APPROACH_RAD)
 
 
-def box(bench: Bench, q: Any) -> tuple[Any, Any]:
+def box(bench, q):
     """The smallest box around forearm, wrists and tool in all states."""
     parts = Clearance(bench.cell, bench.config).scene.parts
     return reached(bench.cell, parts, np.asarray(q))
 
 
-def all_of(plan: Plan, bench: Bench, points_per_leg: int) -> Any:
+def all_of(plan, bench, points_per_leg):
     """Joint angles along the whole route."""
     stops = route(plan, bench.cell.arm)
     share = np.linspace(0.0, 1.0, points_per_leg)[:, None]
@@ -87,7 +86,7 @@ def all_of(plan: Plan, bench: Bench, points_per_leg: int) -> Any:
 
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("side", ["min", "max"])
-def test_workspace_is_checked_along_the_whole_path(axis: int, side: str) -> None:
+def test_workspace_is_checked_along_the_whole_path(axis, side):
     """A box that is just wide enough passes; one narrower by 5 mm does not."""
     bench, plan = Bench(), plan_of(*((p, "none", 0) for p in ("p1", "p2", "p3", "p4")))
     low, high = box(bench, all_of(plan, bench, 60))
@@ -104,7 +103,7 @@ def test_workspace_is_checked_along_the_whole_path(axis: int, side: str) -> None
         assert all(f"whose {'xyz'[axis]} ends" in line for line in found)
 
 
-def test_torque_under_load_names_pose_load_joint_and_limit() -> None:
+def test_torque_under_load_names_pose_load_joint_and_limit():
     bench = Bench(
         limits=WIDE,
         loads=(
@@ -123,25 +122,25 @@ def test_torque_under_load_names_pose_load_joint_and_limit() -> None:
 
 
 @pytest.mark.parametrize(("mass", "wrong"), [(12.5 - 0.8, False), (12.5 - 0.8 + 1e-3, True)])
-def test_payload_counts_tool_and_load(mass: float, wrong: bool) -> None:
+def test_payload_counts_tool_and_load(mass, wrong):
     sensor = ForceSensor(driver="x", port="y", max_force_N=1e3, max_moment_Nm=1e3)
     bench = Bench(loads=(CellLoad(name="heavy", mass_kg=mass),), force_sensor=sensor)
     found = problems(bench, plan_of(("p1", "none", 0), ("p1", "heavy", 0)))
     assert any("payload" in line and "heavy" in line for line in found) is wrong
 
 
-def test_a_pull_is_no_payload() -> None:
+def test_a_pull_is_no_payload():
     bench = Bench(loads=(CellLoad(name="pull", force_N=(150.0, 0.0, 0.0)),), limits=WIDE)
     found = problems(bench, plan_of(("p1", "none", 0), ("p1", "pull", 0)))
     assert not any("payload" in line for line in found)
 
 
-def test_tool_alone_over_the_payload() -> None:
+def test_tool_alone_over_the_payload():
     bench = Bench(tool=Tool(mass_kg=13.0))
     assert any("the tool is 13 kg" in p for p in problems(bench, plan_of(("p1", "none", 0))))
 
 
-def test_force_sensor_would_be_overloaded() -> None:
+def test_force_sensor_would_be_overloaded():
     sensor = ForceSensor(driver="x", port="y", max_force_N=50.0, max_moment_Nm=3.0)
     bench = Bench(force_sensor=sensor)
     found = problems(bench, plan_of(("p1", "none", 0), ("p1", "6kg", 0)))
@@ -149,7 +148,7 @@ def test_force_sensor_would_be_overloaded() -> None:
     assert any("max_moment_Nm is 3" in line and "p1 under 6kg" in line for line in found)
 
 
-def test_lacking_unloaded_readings_and_reference_are_remarks() -> None:
+def test_lacking_unloaded_readings_and_reference_are_remarks():
     bench = Bench()
     poses = {name: q for name, q in POSES.items() if name != "reference"}
     plan = plan_of(("p1", "3kg", 0), ("p1", "none", 1), poses=poses)
@@ -160,7 +159,7 @@ def test_lacking_unloaded_readings_and_reference_are_remarks() -> None:
     assert home(plan) == "p1"
 
 
-def test_all_problems_at_once_and_each_once() -> None:
+def test_all_problems_at_once_and_each_once():
     limits = Limits(workspace_min_m=(-3, -3, 0.6), joint_speed_rad_s=0.1, torque_share=0.05)
     bench = Bench(limits=limits)
     plan = plan_of(*((p, load, 0) for load in ("none", "6kg", "brick") for p in POSES))
@@ -182,7 +181,7 @@ steps = st.lists(
 
 
 @given(steps)
-def test_route_reads_each_step_once_under_its_load(chosen: list[tuple[str, str, int]]) -> None:
+def test_route_reads_each_step_once_under_its_load(chosen):
     """Loads change only at the reference pose, and every stop is reached under what hangs."""
     plan = plan_of(*chosen)
     stops = route(plan, load_arm("ur10e"))
@@ -205,9 +204,7 @@ def test_route_reads_each_step_once_under_its_load(chosen: list[tuple[str, str, 
 @given(
     st.floats(0.02, 3.0), st.floats(0.05, 2.0), st.floats(0.05, 10.0), st.floats(-1, 1, width=32)
 )
-def test_duration_is_that_of_the_leading_joint(
-    way: float, speed: float, acceleration: float, other: float
-) -> None:
+def test_duration_is_that_of_the_leading_joint(way, speed, acceleration, other):
     """Against the integral of the speed's trapezoid."""
     end = np.array([way, other * way])
     lasts = duration(np.zeros(2), end, speed, acceleration)
@@ -218,7 +215,7 @@ def test_duration_is_that_of_the_leading_joint(
 
 @settings(max_examples=10, deadline=None)
 @given(st.lists(st.tuples(*[st.floats(-3.0, 3.0)] * 6), min_size=2, max_size=4, unique=True))
-def test_whatever_passes_keeps_every_limit_on_its_whole_way(drawn: list[tuple[float, ...]]) -> None:
+def test_whatever_passes_keeps_every_limit_on_its_whole_way(drawn):
     """No random plan that passes leaves the box anywhere by more than what is said."""
     bench = Bench(limits=Limits(workspace_min_m=(-0.9, -0.9, 0.0), workspace_max_m=(0.9, 0.9, 1.4)))
     poses = {f"p{k}": q for k, q in enumerate(drawn)}

@@ -2,29 +2,25 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from hilcal.cell import cell_from_config
-from hilcal.config import CellConfig, CellLoad, ForceSensor, Limits
+from hilcal.config import CellLoad, ForceSensor, Limits
 from hilcal.design.feasible import Space
 from hilcal.measuring.clearance import Clearance
-from hilcal.measuring.devices import ArmSample
 from hilcal.measuring.motion import SLACK_M, Guard
 from hilcal.measuring.route import dry_run
 from hilcal.store.plan import UNLOADED, Plan, Step
-from hilcal.types import Floats
 from tests.support.arm_cases import ODD, arm_of
-from tests.support.cli_cases import Capsys, refused, run
+from tests.support.cli_cases import refused, run
 from tests.support.fake_bench import POSES, Bench
 from tests.support.space_cases import cell, reached
 
 
 @pytest.fixture
-def bench() -> Bench:
+def bench():
     return Bench(
         limits=Limits(
             joint_speed_rad_s=1.0, workspace_min_m=(-2, -2, 0.0), workspace_max_m=(2, 2, 2)
@@ -35,12 +31,12 @@ def bench() -> Bench:
     )
 
 
-def sample(bench: Bench, **changes: object) -> ArmSample:
+def sample(bench, **changes):
     bench.world.q = np.array(POSES["p1"])
     return replace(bench.rig.arm.sample(), **changes)
 
 
-def test_all_is_well_with_and_without_a_force_sensor(bench: Bench) -> None:
+def test_all_is_well_with_and_without_a_force_sensor(bench):
     guard = Guard(bench.cell, bench.config)
     assert guard.check(sample(bench), np.zeros(6)) is None
     assert guard.check(sample(bench)) is None
@@ -50,15 +46,13 @@ def test_all_is_well_with_and_without_a_force_sensor(bench: Bench) -> None:
     ("change", "word"),
     [({"safety": "protective stop"}, "protective stop"), ({"q": np.zeros(7)}, "7 joints")],
 )
-def test_a_sample_of_an_arm_that_is_not_ready(
-    bench: Bench, change: dict[str, object], word: str
-) -> None:
+def test_a_sample_of_an_arm_that_is_not_ready(bench, change, word):
     assert word in str(Guard(bench.cell, bench.config).check(sample(bench, **change)))
 
 
 @pytest.mark.parametrize("joint", range(6))
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_speed_of_every_joint(bench: Bench, joint: int, sign: float) -> None:
+def test_speed_of_every_joint(bench, joint, sign):
     guard, one = Guard(bench.cell, bench.config), sign * np.eye(6)[joint]
     assert guard.check(sample(bench, qd=0.999 * one)) is None
     assert bench.cell.arm.joint_names[joint] in str(guard.check(sample(bench, qd=1.001 * one)))
@@ -67,9 +61,7 @@ def test_speed_of_every_joint(bench: Bench, joint: int, sign: float) -> None:
 @pytest.mark.parametrize(
     "way", [*np.eye(6), np.repeat([3**-0.5, 0.0], 3), np.repeat([0.0, 3**-0.5], 3)]
 )
-def test_force_and_moment_are_limited_by_the_lengths_of_their_vectors(
-    bench: Bench, way: Floats
-) -> None:
+def test_force_and_moment_are_limited_by_the_lengths_of_their_vectors(bench, way):
     guard = Guard(bench.cell, bench.config)
     limit, key = (100.0, "max_force_N") if way[:3].any() else (10.0, "max_moment_Nm")
     assert guard.check(sample(bench), -0.999 * limit * way) is None
@@ -77,7 +69,7 @@ def test_force_and_moment_are_limited_by_the_lengths_of_their_vectors(
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_what_is_not_a_number_is_never_well(bench: Bench, bad: float) -> None:
+def test_what_is_not_a_number_is_never_well(bench, bad):
     guard = Guard(bench.cell, bench.config)
     q = np.array(POSES["p1"])
     q[2] = bad
@@ -89,7 +81,7 @@ def test_what_is_not_a_number_is_never_well(bench: Bench, bad: float) -> None:
 
 @pytest.mark.parametrize("side", ["min", "max"])
 @pytest.mark.parametrize("axis", range(3))
-def test_workspace_of_the_actual_pose(bench: Bench, side: str, axis: int) -> None:
+def test_workspace_of_the_actual_pose(bench, side, axis):
     """A box that ends where forearm, wrists and tool do, less and more than the slack."""
     parts = Clearance(bench.cell, bench.config).scene.parts
     low, high = reached(bench.cell, parts, np.array([POSES["p1"]]))
@@ -106,7 +98,7 @@ def test_workspace_of_the_actual_pose(bench: Bench, side: str, axis: int) -> Non
             assert f"is {2 * SLACK_M:.3g} m outside the workspace, whose {'xyz'[axis]}" in said
 
 
-def test_what_hangs_stops_the_arm_when_it_is_told() -> None:
+def test_what_hangs_stops_the_arm_when_it_is_told():
     """At 0.45 m a weight that hangs 0.5 m low is through the floor, and nothing else is."""
     load = CellLoad(name="long", mass_kg=2.0, hang_m=0.5)
     bench = Bench(loads=(load,), limits=Limits(), force_sensor=None)
@@ -117,7 +109,7 @@ def test_what_hangs_stops_the_arm_when_it_is_told() -> None:
     assert "mounting plane" in said
 
 
-def test_arm_and_obstacles_that_touch_stop_the_arm() -> None:
+def test_arm_and_obstacles_that_touch_stop_the_arm():
     folded = (0.0, -1.5, 3.0, -1.5, -1.5, 0.0)
     bench = Bench(limits=Limits(workspace_min_m=(-2, -2, -2)))
     said = Guard(bench.cell, bench.config).check(sample(bench, q=np.array(folded)))
@@ -129,19 +121,19 @@ BELOW = (0.0, 0.5, 0.9, -1.5, -1.5, 0.0)
 """The tool of a UR10e is 0.86 m below the plane that it is mounted on."""
 
 
-def refused_lines(config: CellConfig, *states: Any, load: str = UNLOADED) -> tuple[str, ...]:
+def refused_lines(config, *states, load=UNLOADED):
     names = ("reference", *(f"p{k}" for k in range(1, len(states))))
     plan = Plan(names, np.array(states, dtype=float), (Step(names[-1], load),))
     return dry_run(cell_from_config(config), config, plan).problems
 
 
-def stopped(config: CellConfig, q: Any) -> str | None:
+def stopped(config, q):
     joints = np.array(q, dtype=float)
     here = replace(Bench().rig.arm.sample(), q=joints, qd=np.zeros(len(joints)))
     return Guard(cell_from_config(config), config).check(here)
 
 
-def planned(config: CellConfig, q: Any) -> bool:
+def planned(config, q):
     space = Space(cell_from_config(config), config)
     return bool(space.allowed(np.array([q], dtype=float), UNLOADED, GEOMETRY).all())
 
@@ -149,7 +141,7 @@ def planned(config: CellConfig, q: Any) -> bool:
 GEOMETRY = ("joint limits", "workspace", "self-collision", "obstacle")
 
 
-def with_targets(*more: Any, **limits: Any) -> CellConfig:
+def with_targets(*more, **limits):
     targets = [
         {"name": f"t{k}", "target_m": at} for k, at in enumerate(([0.0, 0.0, 0.1], *more), start=1)
     ]
@@ -167,16 +159,14 @@ CASES = {
 
 
 @pytest.mark.parametrize(("config", "q", "word"), CASES.values(), ids=CASES.keys())
-def test_what_the_planner_refuses_is_refused_and_stops_the_arm(
-    config: CellConfig, q: tuple[float, ...], word: str
-) -> None:
+def test_what_the_planner_refuses_is_refused_and_stops_the_arm(config, q, word):
     assert not planned(config, q)
     found = refused_lines(config, q)
     assert any(word in line for line in found), found
     assert word in str(stopped(config, q))
 
 
-def test_run_and_check_refuse_it_before_anything_moves(tmp_path: Path, capsys: Capsys) -> None:
+def test_run_and_check_refuse_it_before_anything_moves(tmp_path, capsys):
     toml, plan = tmp_path / "cell.toml", tmp_path / "plan.json"
     arm, tracker = 'driver = "ur"\nhost = "127.0.0.1"', 'driver = "geocom"\nport = "/dev/null"'
     toml.write_text(f'[robot]\nmodel = "ur10e"\n{arm}\n[tracker]\n{tracker}\n', encoding="utf-8")
@@ -191,7 +181,7 @@ def test_run_and_check_refuse_it_before_anything_moves(tmp_path: Path, capsys: C
     assert any("pose low: wrist 3 is" in problem for problem in checked["problems"])
 
 
-def test_the_shape_of_an_unknown_arm_is_said_to_be_guessed() -> None:
+def test_the_shape_of_an_unknown_arm_is_said_to_be_guessed():
     config = cell()
     unknown = replace(cell_from_config(config), arm=arm_of(ODD))
     q = np.zeros((1, unknown.arm.n))

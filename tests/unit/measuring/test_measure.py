@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from hilcal.errors import DeviceError
 from hilcal.measuring.devices import TrackerSample
 from hilcal.measuring.measure import SettleWindow, average, deviations
+from tests.support.refusals import refusal_of
 from tests.support.rows import first
 
 AXES = Rotation.from_rotvec([0.4, -0.2, 0.9]).as_matrix()
@@ -158,8 +159,7 @@ def test_one_in_five_may_be_left_out_and_more_is_no_reading(count, bad):
     if bad <= max(1, count // 5):
         assert average(samples_of(values)).left_out == tuple(range(bad))
         return
-    with pytest.raises(DeviceError, match=f"readings scatter: {bad} of {count}"):
-        average(samples_of(values))
+    refusal_of(DeviceError, f"readings scatter: {bad} of {count}", average, samples_of(values))
 
 
 def test_good_samples_are_never_left_out():

@@ -3,8 +3,6 @@
 import json
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +12,6 @@ from hilcal.errors import CannotAnswerError, DeviceError, InputError
 from hilcal.identification.torques import check_torques, require_torques
 from hilcal.measuring.progress import LiveResidual, Phase, ReadingStored
 from hilcal.measuring.session_state import UnloadedVisit, repeatability
-from hilcal.readings.readings import Readings
 from hilcal.robot import chain as chains
 from hilcal.robot import se3
 from hilcal.store.campaign_file import CampaignFile
@@ -38,10 +35,11 @@ from tests.support.fake_bench import (
     rows,
     usual_plan,
 )
+from tests.support.refusals import refusal_of
 
 
 @pytest.fixture(scope="module")
-def ran() -> Bench:
+def ran():
     """A usual campaign at its end, to look at."""
     b = Bench()
     measure(b)
@@ -51,7 +49,7 @@ def ran() -> Bench:
 # what is stored
 
 
-def test_readings_are_what_the_world_is(ran: Bench) -> None:
+def test_readings_are_what_the_world_is(ran):
     b, plan, readings = ran, usual_plan(), ran.store.readings()
     assert [s for s, _, _ in b.store.rows] == list(plan.steps)
     q = np.array([plan.joints(s.pose) for s in plan.steps])
@@ -66,9 +64,8 @@ def test_readings_are_what_the_world_is(ran: Bench) -> None:
     assert np.all(ratio < 1.3)
 
 
-def test_wrench_is_measured_for_pulls_and_told_for_weights() -> None:
+def test_wrench_is_measured_for_pulls_and_told_for_weights(b):
     """The rope pulls 5 % less than asked for, and the weight is 1 % too heavy."""
-    b = Bench()
     loads = (CellLoad(name="3kg", mass_kg=3.03), CellLoad(name="pull", force_N=(38.0, 0.0, 0.0)))
     b.world.config = b.config.model_copy(update={"loads": loads})
     readings = measure(b)
@@ -80,7 +77,7 @@ def test_wrench_is_measured_for_pulls_and_told_for_weights() -> None:
 
 
 @pytest.mark.parametrize(("use", "force"), [("all", 3.03), ("verify", 3.0), ("pulls", 3.0)])
-def test_use_of_the_force_sensor(use: str, force: float) -> None:
+def test_use_of_the_force_sensor(use, force):
     settings = ForceSensor(driver="fake", port="nowhere", use=use)
     b = Bench(force_sensor=settings)
     loads = (CellLoad(name="3kg", mass_kg=3.03),)
@@ -90,9 +87,8 @@ def test_use_of_the_force_sensor(use: str, force: float) -> None:
     assert np.allclose(loaded[:, 2], -force * 9.80665, atol=1e-6)
 
 
-def test_wrench_is_that_at_the_load_point_wherever_the_sensor_sits() -> None:
+def test_wrench_is_that_at_the_load_point_wherever_the_sensor_sits(b):
     """A sensor that is off and turned, and a tool that is not the configured one."""
-    b = Bench()
     b.world.tool_mass = 0.75
     turned = (0.3, -0.2, 0.9)
     origin = (0.01, -0.02, 0.04)
@@ -101,7 +97,7 @@ def test_wrench_is_that_at_the_load_point_wherever_the_sensor_sits() -> None:
     )
     b.config = b.config.model_copy(update={"force_sensor": settings})
 
-    def at_the_sensor(flange: Any) -> Any:
+    def at_the_sensor(flange):
         f, m = np.split(flange - b.world.offset, 2)
         m = m - np.cross(np.array(origin), f)
         axes = se3.rotation(np.array(turned))
@@ -115,7 +111,7 @@ def test_wrench_is_that_at_the_load_point_wherever_the_sensor_sits() -> None:
         )
 
 
-def test_approach_sides_are_those_of_the_motions(ran: Bench) -> None:
+def test_approach_sides_are_those_of_the_motions(ran):
     b, readings = ran, ran.store.readings()
     side = np.zeros(6)
     expected = {}
@@ -132,7 +128,7 @@ def test_approach_sides_are_those_of_the_motions(ran: Bench) -> None:
             assert np.array_equal(readings.states.approach[k], expected[pose, load])
 
 
-def test_times_and_temperatures(ran: Bench) -> None:
+def test_times_and_temperatures(ran):
     readings = ran.store.readings()
     s = readings.states
     assert np.all(np.diff(s.time) > 0)
@@ -146,7 +142,7 @@ def test_times_and_temperatures(ran: Bench) -> None:
     assert np.allclose(s.q_actual, s.q)
 
 
-def test_nothing_moves_between_measuring_and_storing(ran: Bench) -> None:
+def test_nothing_moves_between_measuring_and_storing(ran):
     b = ran
     calls = b.world.calls
     stored = [k for k, name in enumerate(calls) if name == "store.record"]
@@ -159,7 +155,7 @@ def test_nothing_moves_between_measuring_and_storing(ran: Bench) -> None:
 # people
 
 
-def test_progress(ran: Bench) -> None:
+def test_progress(ran):
     b, plan = ran, usual_plan()
     taken = b.notes.of(ReadingStored)
     assert [t.done for t in taken] == list(range(1, len(plan.steps) + 1))
@@ -175,15 +171,14 @@ def test_progress(ran: Bench) -> None:
     assert taken[9].left_cell == pytest.approx(ended - _time_of(b, 10), rel=0.5)
 
 
-def _time_of(b: Bench, done: int) -> float:
+def _time_of(b, done):
     return json.loads(b.store.rows[done - 1][2])["tracker"][-1]["host_ns"] * 1e-9
 
 
-def test_the_judge_sees_all_readings_and_may_not_know() -> None:
-    b = Bench()
-    seen: list[int] = []
+def test_the_judge_sees_all_readings_and_may_not_know(b):
+    seen = []
 
-    def judge(readings: Readings) -> LiveResidual:
+    def judge(readings):
         seen.append(len(readings))
         if len(readings) == 2:
             raise CannotAnswerError("too few readings")
@@ -196,10 +191,9 @@ def test_the_judge_sees_all_readings_and_may_not_know() -> None:
     assert taken[-1].live.sigma == 0.5
 
 
-def test_drift_of_the_reference_pose_is_told() -> None:
-    b = Bench()
+def test_drift_of_the_reference_pose_is_told(b):
 
-    def shift(*_: object) -> None:
+    def shift(*_):
         if len(b.store.rows) == 6:
             b.world.shift = np.array([0.0, 0.0, 4e-4])
 
@@ -212,7 +206,7 @@ def test_drift_of_the_reference_pose_is_told() -> None:
     assert any(word in said[0] for word in ("by 39", "by 40", "by 41"))
 
 
-def test_what_is_as_configured_is_not_remarked(ran: Bench) -> None:
+def test_what_is_as_configured_is_not_remarked(ran):
     b = ran
     drifts = [content for kind, content in b.store.events if kind == "drift"]
     assert [d["over"] for d in drifts] == [False, False]
@@ -221,13 +215,13 @@ def test_what_is_as_configured_is_not_remarked(ran: Bench) -> None:
 
 
 @pytest.mark.long
-def test_repeatability_is_estimated_at_the_end() -> None:
+def test_repeatability_is_estimated_at_the_end():
     """The joints miss by 5e-5 rad from arrival to arrival; the estimate finds that."""
     b = Bench(repeatability=Repeatability(joint_std_rad=5e-5))
-    arrived: dict[int, Any] = {}
+    arrived = {}
     rng = np.random.default_rng(3)
 
-    def position() -> Any:
+    def position():
         key = len(b.world.at_start)
         slip = arrived.setdefault(key, 5e-5 * rng.standard_normal(6))
         q = b.world.joints() + slip
@@ -247,7 +241,7 @@ def test_repeatability_is_estimated_at_the_end() -> None:
     assert f"joint_std_rad is about {found['joint_std']:.1g}" in said
 
 
-def test_repeatability_law() -> None:
+def test_repeatability_law():
     """Unbiased: over many sets of visits the mean of its square is the truth."""
     rng = np.random.default_rng(1)
     squares = []
@@ -264,7 +258,7 @@ def test_repeatability_law() -> None:
     assert repeatability([UnloadedVisit("a", np.zeros(3), np.eye(3), 1.0)]) is None
 
 
-def test_an_arm_that_does_not_scatter_is_seldom_said_to() -> None:
+def test_an_arm_that_does_not_scatter_is_seldom_said_to():
     rng, said = np.random.default_rng(1), 0
     for _ in range(200):
         at = rng.normal(0.0, 1e-5, (8, 3))
@@ -274,7 +268,7 @@ def test_an_arm_that_does_not_scatter_is_seldom_said_to() -> None:
     assert said < 12
 
 
-def test_a_cell_without_a_tool() -> None:
+def test_a_cell_without_a_tool():
     b = Bench(tool=Tool(target_m=(0.0, 0.0, 0.1)))
     b.world.tool_mass = 0.0
     measure(b)
@@ -284,8 +278,7 @@ def test_a_cell_without_a_tool() -> None:
 # loads
 
 
-def test_a_wrong_load_is_asked_for_again_with_the_reason() -> None:
-    b = Bench()
+def test_a_wrong_load_is_asked_for_again_with_the_reason(b):
     b.world.wrong = ["none", "6kg"]  # the first answer is that to "take everything off"
     readings = measure(b)
     assert len(readings) == len(usual_plan().steps)
@@ -296,19 +289,16 @@ def test_a_wrong_load_is_asked_for_again_with_the_reason() -> None:
 
 
 @pytest.mark.long
-def test_three_wrong_loads_end_the_run() -> None:
-    b = Bench()
+def test_three_wrong_loads_end_the_run(b):
     b.world.wrong = ["none", "6kg", "none", "6kg"]
-    with pytest.raises(DeviceError, match=r"asked 3 times to hang 3kg.*--resume$"):
-        measure(b)
+    refusal_of(DeviceError, r"asked 3 times to hang 3kg.*--resume$", measure, b)
     assert len(b.store.rows) == 5
     assert b.world.calls[-2] == "arm.stop"
     b.world.again()
     assert len(measure(b)) == len(usual_plan().steps)
 
 
-def test_a_load_that_is_not_taken_off_is_noticed() -> None:
-    b = Bench()
+def test_a_load_that_is_not_taken_off_is_noticed(b):
     b.world.wrong = ["none", "3kg", "3kg"]
     measure(b)
     assert asked_for(b) == ["none", "3kg", "none", "none", "pull", "none"]
@@ -316,11 +306,10 @@ def test_a_load_that_is_not_taken_off_is_noticed() -> None:
 
 
 @pytest.mark.long
-def test_a_swinging_load_is_weighed_twice() -> None:
-    b = Bench()
-    times: list[float] = []
+def test_a_swinging_load_is_weighed_twice(b):
+    times = []
 
-    def swinging(seconds: float) -> None:
+    def swinging(seconds):
         times.append(b.world.time)
         b.world.extra = np.zeros(6)
         if b.world.load == "3kg" and len(b.operator.asked) == 2 and len(b.store.rows) == 5:
@@ -332,7 +321,7 @@ def test_a_swinging_load_is_weighed_twice() -> None:
     assert asked_for(b) == ["none", "3kg", "none", "pull", "none"]
 
 
-def test_without_a_force_sensor_the_person_is_believed() -> None:
+def test_without_a_force_sensor_the_person_is_believed():
     b = Bench(force_sensor=None)
     b.world.wrong = ["none", "6kg"]
     readings = measure(b)
@@ -341,8 +330,7 @@ def test_without_a_force_sensor_the_person_is_believed() -> None:
     assert json.loads(b.store.rows[0][2])["force"] is None
 
 
-def test_the_tool_is_identified_and_compared_with_the_configuration() -> None:
-    b = Bench()
+def test_the_tool_is_identified_and_compared_with_the_configuration(b):
     b.world.tool_mass = 1.4
     measure(b)
     assert b.store.kinds().index("tool") < b.store.kinds().index("load")
@@ -352,9 +340,8 @@ def test_the_tool_is_identified_and_compared_with_the_configuration() -> None:
     assert remarks(b, "[tool] says 0.8 kg")
 
 
-def test_unloaded_poses_that_do_not_tell_the_tool_are_no_failure() -> None:
+def test_unloaded_poses_that_do_not_tell_the_tool_are_no_failure(b):
     """Turned about the vertical only: gravity never turns in the sensor."""
-    b = Bench()
     poses = {f"p{k}": (0.2 * k, *POSES["reference"][1:]) for k in range(4)}
     plan = plan_of(
         *((p, load, 0) for load in ("none", "3kg") for p in poses),
@@ -367,11 +354,11 @@ def test_unloaded_poses_that_do_not_tell_the_tool_are_no_failure() -> None:
 # going on
 
 
-def test_resume_measures_exactly_what_is_missing_and_time_goes_on() -> None:
+def test_resume_measures_exactly_what_is_missing_and_time_goes_on():
     b, plan = Bench(), usual_plan()
     day = [1000.0]
 
-    def wall() -> float:
+    def wall():
         return day[0] + b.world.time
 
     interrupt(b, 7, plan, wall=wall)
@@ -390,7 +377,7 @@ def test_resume_measures_exactly_what_is_missing_and_time_goes_on() -> None:
 
 
 @pytest.mark.long
-def test_time_never_goes_back_whatever_the_clock_on_the_wall_does() -> None:
+def test_time_never_goes_back_whatever_the_clock_on_the_wall_does():
     b, plan = Bench(), usual_plan()
     interrupt(b, 4, plan, wall=lambda: 5000.0 + b.world.time)
     readings = measure(b, plan, wall=lambda: 1000.0 + b.world.time)
@@ -398,7 +385,7 @@ def test_time_never_goes_back_whatever_the_clock_on_the_wall_does() -> None:
 
 
 @pytest.mark.long
-def test_a_load_that_still_hangs_at_a_resume_is_noticed() -> None:
+def test_a_load_that_still_hangs_at_a_resume_is_noticed():
     b, plan = Bench(), usual_plan()
     interrupt(b, 7, plan)
     assert b.world.load == "3kg"
@@ -413,18 +400,15 @@ def test_a_load_that_still_hangs_at_a_resume_is_noticed() -> None:
     assert [s for s, _, _ in b.store.rows] == list(plan.steps)
 
 
-def test_a_load_left_on_at_the_very_beginning_is_asked_about_said_and_found_in_motion() -> None:
-    b = Bench()
+def test_a_load_left_on_at_the_very_beginning_is_asked_about_said_and_found_in_motion(b):
     b.world.load, b.world.wrong = "3kg", ["3kg", "3kg"]  # both answers are wrong
-    with pytest.raises(DeviceError, match="take everything off"):
-        measure(b)
+    refusal_of(DeviceError, "take everything off", measure, b)
     assert remarks(b, "answered twice that nothing hangs")
     # where gravity has not turned in the sensor since its tare, a load is a zero
     assert {step for step, *_ in b.store.rows} <= {Step("reference", "none", 0)}
 
 
-def test_a_finished_campaign_touches_nothing() -> None:
-    b = Bench()
+def test_a_finished_campaign_touches_nothing(b):
     measure(b)
     b.world.calls.clear()
     measure(b)
@@ -433,7 +417,7 @@ def test_a_finished_campaign_touches_nothing() -> None:
 
 
 @pytest.mark.long
-def test_the_tool_is_known_from_an_earlier_session_after_the_sensor_was_off() -> None:
+def test_the_tool_is_known_from_an_earlier_session_after_the_sensor_was_off():
     """Another bias in the second session: the pulls are measured right nevertheless."""
     b, plan = Bench(), usual_plan()
     b.world.tool_mass = 1.4
@@ -448,8 +432,7 @@ def test_the_tool_is_known_from_an_earlier_session_after_the_sensor_was_off() ->
 LOST = "no longer tells the torques"
 
 
-def test_torques_are_averaged_over_the_reading() -> None:
-    b = Bench()
+def test_torques_are_averaged_over_the_reading(b):
     b.world.torques = np.inf
     torque = measure(b).states.torque
     # means of at least three samples that scatter by 0.1 N·m
@@ -458,8 +441,7 @@ def test_torques_are_averaged_over_the_reading() -> None:
     assert b.store.details()[0]["torque"] == torque[0].tolist()
 
 
-def test_a_lost_link_is_said_once_and_readings_go_on(tmp_path: Path) -> None:
-    b = Bench()
+def test_a_lost_link_is_said_once_and_readings_go_on(b, tmp_path):
     b.world.torques = 60
     readings = measure(b)
     torque = readings.states.torque
@@ -493,8 +475,7 @@ def test_a_lost_link_is_said_once_and_readings_go_on(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("first", [0, np.inf])
-def test_a_campaign_goes_on_as_it_began(first: float) -> None:
-    b = Bench()
+def test_a_campaign_goes_on_as_it_began(b, first):
     b.world.torques = first
     interrupt(b, 4)
     b.world.torques = -1 if first else np.inf

@@ -4,7 +4,6 @@ import json
 from collections import Counter
 from dataclasses import replace
 from functools import cache
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,8 +16,7 @@ from hilcal.measuring.progress import ReadingStored
 from hilcal.measuring.run import HOW_ON, run
 from hilcal.robot import chain as chains
 from hilcal.robot.catalogue import configs_dir
-from hilcal.store.plan import Plan, Step
-from hilcal.types import Floats
+from hilcal.store.plan import Step
 from tests.support.fake_bench import (
     POSES,
     STD,
@@ -32,6 +30,7 @@ from tests.support.fake_bench import (
     plan_of,
     usual_plan,
 )
+from tests.support.refusals import refusal, refusal_of
 from tests.support.rows import first
 
 FAULTS = (
@@ -42,7 +41,7 @@ FAULTS = (
 )
 
 
-def small_plan() -> Plan:
+def small_plan():
     """Every kind of motion and change of load, in few calls."""
     return plan_of(
         ("reference", "none", 0),
@@ -53,20 +52,20 @@ def small_plan() -> Plan:
     )
 
 
-def bench() -> Bench:
+def bench():
     return Bench(limits=Limits())
 
 
-def run_once(b: Bench, plan: Plan) -> None:
+def run_once(b, plan):
     run(b.rig, b.cell, b.config, plan, b.store, b.clock, b.notes)
 
 
-def each_once(b: Bench, plan: Plan) -> bool:
+def each_once(b, plan):
     return Counter(step for step, _, _ in b.store.rows) == Counter(plan.steps)
 
 
 @cache
-def calls_of_a_whole_run() -> int:
+def calls_of_a_whole_run():
     b = bench()
     run_once(b, small_plan())
     assert each_once(b, small_plan())
@@ -78,7 +77,7 @@ IDS = [type(f).__name__ for f in FAULTS]
 
 
 @pytest.mark.parametrize("kind", first(1, KINDS), ids=IDS)
-def test_fault_at_some_calls(kind: int) -> None:
+def test_fault_at_some_calls(kind):
     """Every 97th call, other ones for each kind of fault; all of them in the slow suite."""
     for k in range(1 + 10 * kind, calls_of_a_whole_run() + 1, 97):
         check_fault(FAULTS[kind], k)
@@ -86,12 +85,12 @@ def test_fault_at_some_calls(kind: int) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS, ids=IDS)
-def test_fault_at_every_call(kind: int) -> None:
+def test_fault_at_every_call(kind):
     for k in range(1, calls_of_a_whole_run() + 1):
         check_fault(FAULTS[kind], k)
 
 
-def check_fault(fault: BaseException, k: int) -> None:
+def check_fault(fault, k):
     """Fail at the k-th call, look what was done about it, resume, and count."""
     b, plan = bench(), small_plan()
     if isinstance(fault, Killed):
@@ -115,7 +114,7 @@ def check_fault(fault: BaseException, k: int) -> None:
     assert np.all(np.diff(readings.states.time) > 0), k
 
 
-def check_stopped(b: Bench, k: int) -> None:
+def check_stopped(b, k):
     """Once the arm is ours, the call after the fault is its stop; then only an event is stored."""
     world = b.world
     after = world.calls[k:]
@@ -128,11 +127,10 @@ def check_stopped(b: Bench, k: int) -> None:
         assert after == ["store.event"], (k, after)
 
 
-def test_disk_full_stops_the_arm_and_says_what_to_do() -> None:
+def test_disk_full_stops_the_arm_and_says_what_to_do():
     b, plan = bench(), small_plan()
     b.store.full_at = 2
-    with pytest.raises(DeviceError, match=r"disk is full.*--resume$"):
-        run_once(b, plan)
+    refusal_of(DeviceError, r"disk is full.*--resume$", run_once, b, plan)
     assert b.world.calls[-2:] == ["arm.stop", "store.event"]
     assert len(b.store.rows) == 2
     b.store.full_at = None
@@ -141,16 +139,15 @@ def test_disk_full_stops_the_arm_and_says_what_to_do() -> None:
     assert each_once(b, plan)
 
 
-def test_a_refused_row_keeps_its_kind_of_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_refused_row_keeps_its_kind_of_error(monkeypatch):
     """What the store refuses as wrong input stays that (exit code 2), and stops the arm."""
     b = bench()
 
-    def refuse(*_: object) -> None:
+    def refuse(*_):
         raise InputError("run.hilcal: the readings differ from those before")
 
     monkeypatch.setattr(b.store, "record", refuse)
-    with pytest.raises(InputError, match=r"differ from those before\. .*--resume$"):
-        run_once(b, small_plan())
+    refusal(r"differ from those before\. .*--resume$", run_once, b, small_plan())
     assert b.world.calls[-2] == "arm.stop"
 
 
@@ -169,42 +166,38 @@ def test_a_refused_row_keeps_its_kind_of_error(monkeypatch: pytest.MonkeyPatch) 
         ),
     ],
 )
-def test_an_arm_that_does_not_stop_is_told_loudly_and_once(
-    fault: BaseException, stop: str, said: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_arm_that_does_not_stop_is_told_loudly_and_once(fault, stop, said, monkeypatch):
     b = bench()
 
-    def fails() -> None:
+    def fails():
         raise DeviceError(stop)
 
     monkeypatch.setattr(b.rig.arm, "stop", fails)
     b.world.fail[120] = fault
-    with pytest.raises(DeviceError, match=said) as raised:
-        run_once(b, small_plan())
-    assert str(raised.value).count("emergency stop") == 1
-    assert str(raised.value).endswith(HOW_ON)
+    raised = refusal_of(DeviceError, said, run_once, b, small_plan())
+    assert raised.count("emergency stop") == 1
+    assert raised.endswith(HOW_ON)
     assert b.store.events[-1][1]["arm_not_stopped"] == stop
 
 
-def test_impatience_does_not_keep_the_arm_from_stopping() -> None:
+def test_impatience_does_not_keep_the_arm_from_stopping():
     """Ctrl-C while the arm is being stopped: it is stopped again."""
     b = bench()
-    stops: list[int] = []
+    stops = []
 
-    def stop() -> None:
+    def stop():
         stops.append(1)
         if len(stops) == 1:
             raise KeyboardInterrupt
 
     before(b.rig.arm, "stop", stop)
     b.world.fail[120] = DeviceError("tracker: silent")
-    with pytest.raises(DeviceError, match=r"tracker: silent.*--resume$"):
-        run_once(b, small_plan())
+    refusal_of(DeviceError, r"tracker: silent.*--resume$", run_once, b, small_plan())
     assert len(stops) == 2
     assert not b.world.is_moving
 
 
-def test_unexpected_errors_are_one_line_and_their_trace_is_stored() -> None:
+def test_unexpected_errors_are_one_line_and_their_trace_is_stored():
     b = bench()
     b.world.fail[150] = ZeroDivisionError("of a driver of somebody else's")
     with pytest.raises(DeviceError, match=r"unexpected ZeroDivisionError: of a driver.*--resume"):
@@ -212,24 +205,16 @@ def test_unexpected_errors_are_one_line_and_their_trace_is_stored() -> None:
     assert "Traceback" in b.store.last("failed")["trace"]
 
 
-def test_nothing_is_stopped_before_the_arm_is_ours() -> None:
+def test_nothing_is_stopped_before_the_arm_is_ours():
     """A fault before `take_control`: somebody else's program may be running."""
     b = bench()
     b.world.fail[2] = DeviceError("force sensor: silent")
-    with pytest.raises(DeviceError, match="silent"):
-        run_once(b, small_plan())
+    refusal_of(DeviceError, "silent", run_once, b, small_plan())
     assert "arm.take_control" not in b.world.calls
     assert "arm.stop" not in b.world.calls
 
 
-def held(
-    rng: np.random.Generator,
-    count: int,
-    spread: float = 0.7,
-    *,
-    known: bool = True,
-    off_m: float = 0.0,
-) -> tuple[Cell, Floats, Floats]:
+def held(rng, count, spread=0.7, *, known=True, off_m=0.0):
     """A cell of an unknown registration, joints (K, n), and what the tracker sees of its target."""
     cell = Cell.load(configs_dir() / "cells" / "demo_ur10e.toml")
     cell = replace(cell, registration_known=False, target_known=known)
@@ -238,7 +223,7 @@ def held(
     return cell, joints, at @ cell.registration[:3, :3].T
 
 
-def test_another_reflector_is_noticed_before_the_registration_is_known() -> None:
+def test_another_reflector_is_noticed_before_the_registration_is_known():
     """By distances from two readings that agree; one alone may be the one that is wrong."""
     rng = np.random.default_rng(0)
     noticed = 0
@@ -257,7 +242,7 @@ def test_another_reflector_is_noticed_before_the_registration_is_known() -> None
     assert noticed > 25
 
 
-def test_a_reading_of_another_reflector_is_told_as_soon_as_the_tracker_has_its_place() -> None:
+def test_a_reading_of_another_reflector_is_told_as_soon_as_the_tracker_has_its_place():
     """0.2 m off on the sphere about the first position, where distances cannot tell it."""
     rng = np.random.default_rng(3)
     for _ in range(10):
@@ -276,9 +261,7 @@ def test_a_reading_of_another_reflector_is_told_as_soon_as_the_tracker_has_its_p
 
 
 @pytest.mark.parametrize(("known", "off_m"), [(False, 0.15), (True, 0.03)])
-def test_a_target_that_is_not_where_it_is_said_refuses_no_reading(
-    known: bool, off_m: float
-) -> None:
+def test_a_target_that_is_not_where_it_is_said_refuses_no_reading(known, off_m):
     """Its place is estimated later, or was measured with a ruler."""
     cell, joints, places = held(np.random.default_rng(1), 40, known=known, off_m=off_m)
     rough = RoughRegistration(cell)
@@ -295,9 +278,8 @@ LIMIT = ForceSensor(driver="fake", port="nowhere", max_force_N=120.0)
 # order and safety
 
 
-def test_order_of_the_start() -> None:
+def test_order_of_the_start(b):
     """The hook is cleared before anything moves, the tare comes before the first reading."""
-    b = Bench()
     measure(b)
     first = {name: b.world.calls.index(name) for name in set(b.world.calls)}
     assert first["operator.hang"] < first["arm.take_control"] < first["arm.start_move"]
@@ -308,11 +290,10 @@ def test_order_of_the_start() -> None:
     assert b.store.kinds()[:2] == ["start", "tare"]
 
 
-def test_payload_is_set_before_a_weight_is_hung_and_after_it_is_off() -> None:
-    b = Bench()
-    given: list[tuple[str, float, str]] = []
+def test_payload_is_set_before_a_weight_is_hung_and_after_it_is_off(b):
+    given = []
 
-    def payload(mass: float, com: Any) -> None:
+    def payload(mass, com):
         given.append((b.world.load, mass, str(np.round(com, 6).tolist())))
 
     before(b.rig.arm, "set_payload", payload)
@@ -330,9 +311,8 @@ def test_payload_is_set_before_a_weight_is_hung_and_after_it_is_off() -> None:
     ]
 
 
-def test_loads_change_only_at_the_reference_and_motions_carry_them() -> None:
-    b = Bench()
-    where: list[Any] = []
+def test_loads_change_only_at_the_reference_and_motions_carry_them(b):
+    where = []
     before(b.operator, "hang", lambda *_: where.append(b.world.q.copy()))
     measure(b)
     assert asked_for(b) == ["none", "3kg", "none", "pull", "none"]
@@ -341,12 +321,11 @@ def test_loads_change_only_at_the_reference_and_motions_carry_them() -> None:
     assert {load for _, load in b.world.at_start} == {"none", "3kg", "pull"}
 
 
-def test_an_unsafe_plan_is_refused_before_any_device_is_asked() -> None:
+def test_an_unsafe_plan_is_refused_before_any_device_is_asked():
     b = Bench(limits=Limits(workspace_min_m=(-3, -3, 0.9)))
     plan = plan_of(("p1", "none", 0), ("p1", "brick", 0))
-    with pytest.raises(InputError, match="not safe") as raised:
-        measure(b, plan)
-    words = str(raised.value)
+    raised = refusal("not safe", measure, b, plan)
+    words = raised
     assert "\n" not in words  # one line says the first problem, and how to see the others
     assert "brick" in words
     assert "more: hilcal check --plan" in words
@@ -354,12 +333,11 @@ def test_an_unsafe_plan_is_refused_before_any_device_is_asked() -> None:
     assert b.store.events == []
 
 
-def test_an_arm_that_stands_outside_its_workspace_is_not_moved() -> None:
+def test_an_arm_that_stands_outside_its_workspace_is_not_moved():
     b = Bench(limits=Limits(workspace_min_m=(-1.2, -0.5, 0.05), workspace_max_m=(1.2, 1.2, 1.5)))
     b.world.q = np.array([1.5, -1.3, 1.6, -1.4, -1.4, 0.1])  # beyond y = -0.5
     plan = plan_of(("reference", "none", 0), poses={"reference": POSES["reference"]})
-    with pytest.raises(DeviceError, match=r"outside the workspace.*drive it by hand"):
-        measure(b, plan)
+    refusal_of(DeviceError, r"outside the workspace.*drive it by hand", measure, b, plan)
     assert "arm.start_move" not in b.world.calls
     assert "arm.take_control" not in b.world.calls
 
@@ -372,12 +350,12 @@ def test_an_arm_that_stands_outside_its_workspace_is_not_moved() -> None:
         ({"safety": "protective stop"}, "protective stop"),
     ],
 )
-def test_limits_are_enforced_in_motion(change: dict[str, Any], said: str) -> None:
+def test_limits_are_enforced_in_motion(change, said):
     """The limit is exceeded in the middle of the fourth motion: the arm stops within a look."""
     b = Bench(force_sensor=LIMIT)
-    since: list[float] = []
+    since = []
 
-    def exceeds(still: bool) -> bool:
+    def exceeds(still):
         if b.world.calls.count("arm.start_move") == 4 and still:
             for name, value in change.items():
                 setattr(b.world, name, value)
@@ -385,54 +363,47 @@ def test_limits_are_enforced_in_motion(change: dict[str, Any], said: str) -> Non
         return still
 
     changed(b.rig.arm, "moving", exceeds)
-    with pytest.raises(DeviceError, match=said):
-        measure(b)
+    refusal_of(DeviceError, said, measure, b)
     assert b.world.calls[-2:] == ["arm.stop", "store.event"]
     assert not b.world.is_moving
     assert b.world.time - since[0] <= 0.05
     assert said in b.store.last("failed")["reason"]
 
 
-def test_limits_are_enforced_at_rest() -> None:
+def test_limits_are_enforced_at_rest():
     b = Bench(force_sensor=LIMIT)
 
-    def pushes() -> None:
+    def pushes():
         if len(b.store.rows) == 2:
             b.world.extra = np.array([0, 130.0, 0, 0, 0, 0])
 
     before(b.rig.tracker, "measure", pushes)
-    with pytest.raises(DeviceError, match="max_force_N"):
-        measure(b)
+    refusal_of(DeviceError, "max_force_N", measure, b)
     assert len(b.store.rows) == 2
     assert b.world.calls[-2] == "arm.stop"
 
 
-def test_an_arm_that_does_not_arrive() -> None:
-    b = Bench()
+def test_an_arm_that_does_not_arrive(b):
     real = b.rig.arm.start_move
 
-    def short(q: Any, speed: float, acceleration: float) -> None:
+    def short(q, speed, acceleration):
         real(q - 0.002, speed, acceleration)
 
     b.rig.arm.start_move = short
-    with pytest.raises(DeviceError, match=r"stands 0\.002 rad off"):
-        measure(b)
+    refusal_of(DeviceError, r"stands 0\.002 rad off", measure, b)
 
 
 @pytest.mark.long
-def test_a_motion_that_never_ends_is_given_up() -> None:
-    b = Bench()
+def test_a_motion_that_never_ends_is_given_up(b):
     b.rig.arm.moving = lambda: True
-    with pytest.raises(DeviceError, match="not finished after"):
-        measure(b)
+    refusal_of(DeviceError, "not finished after", measure, b)
     assert b.world.calls[-2] == "arm.stop"
 
 
 # the target
 
 
-def test_a_lost_target_is_found_again() -> None:
-    b = Bench()
+def test_a_lost_target_is_found_again(b):
     b.world.lost = 3  # at both stops of the approach, where nothing is read, and at the reading
     readings = measure(b)
     assert len(readings) == len(usual_plan().steps)
@@ -441,48 +412,43 @@ def test_a_lost_target_is_found_again() -> None:
 
 
 @pytest.mark.parametrize("lost", [5, 1000])
-def test_a_target_that_stays_lost_ends_the_run(lost: int) -> None:
-    b = Bench()
+def test_a_target_that_stays_lost_ends_the_run(b, lost):
     b.world.lost, b.world.not_found = lost, 0 if lost == 5 else 1000
-    with pytest.raises(DeviceError, match=r"line of sight.*--resume$"):
-        measure(b)
+    refusal_of(DeviceError, r"line of sight.*--resume$", measure, b)
     assert b.store.rows == []
     assert b.world.calls.count("tracker.find_target") == 2
     assert b.world.calls[-2] == "arm.stop"
 
 
-def test_another_reflector_is_not_believed() -> None:
-    b = Bench()
+def test_another_reflector_is_not_believed(b):
 
-    def other(*_: object) -> None:
+    def other(*_):
         if len(b.store.rows) == 5:
             b.world.shift = np.array([0.0, 0.3, 0.0])
 
     before(b.store, "event", other)
-    with pytest.raises(DeviceError, match="another reflector"):
-        measure(b)
+    refusal_of(DeviceError, "another reflector", measure, b)
     assert len(b.store.rows) == 5
 
 
 # settling
 
 
-def test_readings_that_drift_are_waited_for_and_given_up() -> None:
+def test_readings_that_drift_are_waited_for_and_given_up():
     b = Bench(acquire=Acquire(samples=3, settle_s=0.2, settle_timeout_s=20.0))
     b.world.creep = 1e-3
     begun = b.world.time
-    with pytest.raises(DeviceError, match="not settled within 20 s: the readings drift"):
-        measure(b)
+    refusal_of(DeviceError, "not settled within 20 s: the readings drift", measure, b)
     assert b.store.rows == []
     assert b.world.time - begun < 120.0
 
 
 @pytest.mark.long
-def test_drift_that_ends_is_waited_for() -> None:
+def test_drift_that_ends_is_waited_for():
     b, few = Bench(), plan_of(("p1", "none", 0), ("p2", "none", 0), ("p2", "3kg", 0))
-    arrived: dict[tuple[float, ...], float] = {}
+    arrived = {}
 
-    def settles(place: Any) -> Any:
+    def settles(place):
         """The target comes to rest with a time constant of 0.5 s after each arrival."""
         since = arrived.setdefault((*b.world.joints(), len(b.world.at_start)), b.world.time)
         return place + 1e-3 * np.exp(-(b.world.time - since) / 0.5)
@@ -498,20 +464,17 @@ def test_drift_that_ends_is_waited_for() -> None:
     assert np.abs(away).max() < 6 * STD
 
 
-def test_an_arm_that_trembles_is_measured_again_and_given_up() -> None:
-    b = Bench()
+def test_an_arm_that_trembles_is_measured_again_and_given_up(b):
     b.world.jitter = 1e-4
-    with pytest.raises(DeviceError, match=r"measured 3 times without success: arm: it moved by"):
-        measure(b)
+    refusal_of(DeviceError, r"measured 3 times without success: arm: it moved by", measure, b)
     assert b.store.rows == []
 
 
 @pytest.mark.long
-def test_somebody_who_jogs_the_arm_meanwhile_spoils_the_reading() -> None:
-    b = Bench()
-    jogged: list[int] = []
+def test_somebody_who_jogs_the_arm_meanwhile_spoils_the_reading(b):
+    jogged = []
 
-    def jog(seconds: float) -> None:
+    def jog(seconds):
         if len(b.world.at_start) == 3 and not jogged:
             jogged.append(1)
             b.world.q = b.world.q + 3e-4
@@ -522,7 +485,7 @@ def test_somebody_who_jogs_the_arm_meanwhile_spoils_the_reading() -> None:
     assert len(b.store.rows) == len(usual_plan().steps)
 
 
-def test_at_least_twenty_frames_whatever_the_clock() -> None:
+def test_at_least_twenty_frames_whatever_the_clock():
     """The window of a fast clock is too short for a real line of 100 Hz."""
     b = Bench(acquire=Acquire(samples=3, settle_s=0.2, force_window_s=0.05))
     measure(b, plan_of(("p1", "none", 0), ("p2", "none", 0)))
@@ -531,16 +494,15 @@ def test_at_least_twenty_frames_whatever_the_clock() -> None:
 
 
 @pytest.mark.parametrize("scale", [1.0, 20.0])
-def test_everything_is_looked_at_twenty_times_a_second_in_motion(scale: float) -> None:
+def test_everything_is_looked_at_twenty_times_a_second_in_motion(b, scale):
     """Real seconds: a fast world's motions are short, and looked at as often as others."""
-    b = Bench()
     b.world.hurry = 1.0
     b.clock = FakeClock(scale=scale, world=b.world)
     gaps = {"arm.moving": 0.0, "arm.sample": 0.0, "force.latest": 0.0}
-    last: dict[str, float] = {}
+    last = {}
     looks = 0
 
-    def noted(name: str) -> None:
+    def noted(name):
         nonlocal looks
         if name in gaps and b.world.is_moving:
             looks += 1

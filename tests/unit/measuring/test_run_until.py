@@ -11,9 +11,8 @@ from hilcal.errors import DeviceError
 from hilcal.measuring.progress import GoalMet, GoalStatus, ReadingStored
 from hilcal.measuring.route import Stop, route_problems, way_home
 from hilcal.present.progress import met_words
-from hilcal.readings.readings import Readings
 from hilcal.robot.chain import evaluate
-from hilcal.store.plan import Plan, Step
+from hilcal.store.plan import Step
 from tests.support.fake_bench import POSES, Bench, Killed, asked_for, measure, plan_of, usual_plan
 from tests.support.rows import first
 
@@ -27,24 +26,24 @@ class Enough:
     count: int
     asked: list[tuple[int, bool]] = field(default_factory=list)
 
-    def __call__(self, readings: Readings, last: bool) -> GoalStatus:
+    def __call__(self, readings, last):
         self.asked.append((len(readings), last))
         met = 0 < self.count <= len(readings)
         return GoalStatus("j2 std < 5 %", met, "j2", float(len(readings)), unit="%")
 
 
-def steps(b: Bench) -> list[Step]:
+def steps(b):
     return [step for step, _, _ in b.store.rows]
 
 
-def is_home(b: Bench) -> bool:
+def is_home(b):
     return b.world.load == "none" and np.allclose(b.world.q, HOME) and not b.world.is_moving
 
 
 # the way home
 
 
-def test_a_goal_that_is_met_under_a_load() -> None:
+def test_a_goal_that_is_met_under_a_load():
     """The load is taken off at the reference pose, and the drift of so far is read."""
     b, plan = Bench(), usual_plan()
     measure(b, goal=Enough(7))
@@ -73,7 +72,7 @@ def test_a_goal_that_is_met_under_a_load() -> None:
         (15, []),  # with the last reading of the plan
     ],
 )
-def test_a_goal_that_is_met_elsewhere(count: int, more: list[Step]) -> None:
+def test_a_goal_that_is_met_elsewhere(count, more):
     b, plan = Bench(), usual_plan()
     measure(b, goal=Enough(count))
     assert steps(b) == [*plan.steps[:count], *more]
@@ -82,17 +81,15 @@ def test_a_goal_that_is_met_elsewhere(count: int, more: list[Step]) -> None:
     assert b.store.kinds()[-1] == "finished"
 
 
-def test_a_plan_without_returns_ends_at_the_reference_too() -> None:
-    b = Bench()
+def test_a_plan_without_returns_ends_at_the_reference_too(b):
     plan = plan_of(("p1", "none", 0), ("p1", "3kg", 0), ("p2", "3kg", 0), ("p2", "none", 0))
     measure(b, plan, goal=Enough(2))
     assert steps(b) == list(plan.steps[:2])
     assert is_home(b)
 
 
-def test_the_way_home_is_clear() -> None:
+def test_the_way_home_is_clear(b):
     """A post stands between p2 and the reference pose: the arm goes back by where it came."""
-    b = Bench()
     q = {"reference": HOME, "via": np.add(POSES["p2"], [0.0, -0.5, 0.3, 0.0, 0.0, 0.0]),
          "p2": POSES["p2"]}  # fmt: skip
     half = (np.array(q["p2"]) + np.array(HOME)) / 2
@@ -116,7 +113,7 @@ def test_the_way_home_is_clear() -> None:
 
 
 @pytest.mark.long
-def test_what_was_left_out_is_measured_on_resuming() -> None:
+def test_what_was_left_out_is_measured_on_resuming():
     b, plan = Bench(), usual_plan()
     measure(b, goal=Enough(7))
     b.world.again()
@@ -125,7 +122,7 @@ def test_what_was_left_out_is_measured_on_resuming() -> None:
     assert steps(b)[-1] == plan.steps[-1]  # the campaign still ends with a look at the drift
 
 
-def test_resuming_towards_a_farther_goal() -> None:
+def test_resuming_towards_a_farther_goal():
     b, plan = Bench(), usual_plan()
     measure(b, goal=Enough(7))
     b.world.again()
@@ -141,7 +138,7 @@ def test_resuming_towards_a_farther_goal() -> None:
     assert is_home(b)
 
 
-def test_a_goal_that_is_never_met() -> None:
+def test_a_goal_that_is_never_met():
     b, plan = Bench(), usual_plan()
     rule = Enough(0)
     measure(b, goal=rule)
@@ -156,7 +153,7 @@ def test_a_goal_that_is_never_met() -> None:
 # interrupted on the way home
 
 
-def short() -> tuple[Bench, Plan]:
+def short():
     b = Bench(limits=Limits())
     return b, plan_of(
         ("reference", "none", 0),
@@ -171,7 +168,7 @@ def short() -> tuple[Bench, Plan]:
 @pytest.mark.parametrize(
     "fault", first(1, [DeviceError("arm: the line is dead"), KeyboardInterrupt(), Killed()])
 )
-def test_interrupted_on_the_way_home(fault: BaseException) -> None:
+def test_interrupted_on_the_way_home(fault):
     """At some calls after the goal: the arm stands, and resuming brings it home, once."""
     b, plan = short()
     measure(b, plan, goal=Enough(3))

@@ -1,14 +1,12 @@
 """A person beside the arm: it is moved, leaned on, a load falls; and devices that repeat."""
 
 from dataclasses import asdict, replace
-from typing import Any
 
 import numpy as np
 import pytest
 
 from hilcal.config import CellLoad
 from hilcal.errors import DeviceError
-from hilcal.measuring.devices import ArmSample, TrackerSample, WrenchSample
 from hilcal.measuring.measure import Measurer
 from hilcal.measuring.progress import Phase
 from hilcal.robot.chain import evaluate
@@ -25,17 +23,18 @@ from tests.support.fake_bench import (
     rows,
     usual_plan,
 )
+from tests.support.refusals import refusal_of
 from tests.support.rows import first
 
 FOLDED = np.array([3.0, -1.3, 2.9, -1.4, -1.4, 0.1])  # the forearm lies on the column
 FREE = np.array([0.6, -1.3, 1.6, -1.4, -1.4, 0.1])
 
 
-def jogged(b: Bench, at: str, q: Any, *, after: int = 0) -> None:
+def jogged(b, at, q, *, after=0):
     """Move the arm by hand during the question after `after` others for a load or none."""
-    moves: list[str] = []
+    moves = []
 
-    def moved(answer: None) -> None:
+    def moved(answer):
         name = asked_for(b)[-1]
         if name == at and len(b.operator.asked) > after and not moves:
             moves.append(name)
@@ -44,16 +43,16 @@ def jogged(b: Bench, at: str, q: Any, *, after: int = 0) -> None:
     changed(b.operator, "hang", moved)
 
 
-def confirmed(b: Bench) -> list[str]:
+def confirmed(b):
     """What the operator was asked besides loads."""
     return [words for name, words in b.operator.asked if name == "confirm"]
 
 
-def carried(b: Bench) -> list[tuple[str, float]]:
+def carried(b):
     """What hangs at the start of each motion, and the payload that the controller knows, kg."""
     found = []
 
-    def noted(*_: object) -> None:
+    def noted(*_):
         found.append((b.world.load, b.world.payload[0]))
 
     before(b.rig.arm, "start_move", noted)
@@ -69,17 +68,14 @@ SHORT = plan_of(("p1", "none", 0), ("p1", "3kg", 0), ("reference", "none", 1))
 
 
 @pytest.mark.parametrize("load", ["none", "3kg"])
-def test_an_arm_jogged_into_a_blocked_place_during_a_question_is_not_moved(load: str) -> None:
-    b = Bench()
+def test_an_arm_jogged_into_a_blocked_place_during_a_question_is_not_moved(b, load):
     jogged(b, load, FOLDED)
-    with pytest.raises(DeviceError, match=r"outside the workspace.*drive it by hand.*--resume$"):
-        measure(b)
+    refusal_of(DeviceError, r"outside the workspace.*drive it by hand.*--resume$", measure, b)
     assert load not in [hung for _, hung in b.world.at_start]
     assert ("arm.take_control" in b.world.calls) is (load == "3kg")
 
 
-def test_an_arm_jogged_to_a_free_place_is_asked_for_and_the_way_checked_from_there() -> None:
-    b = Bench()
+def test_an_arm_jogged_to_a_free_place_is_asked_for_and_the_way_checked_from_there(b):
     jogged(b, "none", FREE)
     measure(b)
     (asked,) = confirmed(b)
@@ -88,12 +84,11 @@ def test_an_arm_jogged_to_a_free_place_is_asked_for_and_the_way_checked_from_the
 
 
 @pytest.mark.long
-def test_an_arm_that_is_moved_while_it_is_asked_for_is_asked_for_again() -> None:
-    b = Bench()
+def test_an_arm_that_is_moved_while_it_is_asked_for_is_asked_for_again(b):
     jogged(b, "none", FREE)
     places = [FREE + 0.1, FREE + 0.1]
 
-    def again(question: str) -> None:
+    def again(question):
         if places:
             b.world.q = places.pop()
 
@@ -102,19 +97,14 @@ def test_an_arm_that_is_moved_while_it_is_asked_for_is_asked_for_again() -> None
     assert len(confirmed(b)) == 2
 
 
-def test_an_arm_jogged_while_control_is_taken_is_not_moved() -> None:
-    b = Bench()
+def test_an_arm_jogged_while_control_is_taken_is_not_moved(b):
     before(b.rig.arm, "take_control", lambda *_: setattr(b.world, "q", FREE.copy()))
-    with pytest.raises(DeviceError, match=r"has commanded it since.*0\.5 rad"):
-        measure(b)
+    refusal_of(DeviceError, r"has commanded it since.*0\.5 rad", measure, b)
     assert "arm.start_move" not in b.world.calls
 
 
 @pytest.mark.parametrize(("load", "after"), [("3kg", 0), ("none", 1)])
-def test_an_arm_moved_while_a_load_is_changed_goes_back_once_that_is_agreed(
-    load: str, after: int
-) -> None:
-    b = Bench()
+def test_an_arm_moved_while_a_load_is_changed_goes_back_once_that_is_agreed(b, load, after):
     away = np.array(POSES["reference"]) + 0.2 * np.eye(6)[0]
     jogged(b, load, away, after=after)
     motions = carried(b)
@@ -128,24 +118,22 @@ def test_an_arm_moved_while_a_load_is_changed_goes_back_once_that_is_agreed(
     assert set(motions) <= KNOWN
 
 
-def test_an_operator_who_cannot_be_asked_is_not_taken_to_agree() -> None:
-    b = Bench()
+def test_an_operator_who_cannot_be_asked_is_not_taken_to_agree(b):
     jogged(b, "none", FREE)
 
     class Silent:
         """A driver of others, from before the question."""
 
-        def __init__(self, asks: Any) -> None:
+        def __init__(self, asks):
             self.report, self.hang, self.close = asks.report, asks.hang, asks.close
 
     b.rig = replace(b.rig, operator=Silent(b.operator))
-    with pytest.raises(DeviceError, match="does not stand where it was left"):
-        measure(b)
+    refusal_of(DeviceError, "does not stand where it was left", measure, b)
     assert "arm.start_move" not in b.world.calls
 
 
 @pytest.mark.long
-def test_a_campaign_that_goes_on_says_that_the_arm_stands_elsewhere_and_asks() -> None:
+def test_a_campaign_that_goes_on_says_that_the_arm_stands_elsewhere_and_asks():
     for moved, questions in ((False, 0), (True, 1)):
         b = Bench()
         interrupt(b, 1, SHORT)
@@ -162,21 +150,17 @@ def test_a_campaign_that_goes_on_says_that_the_arm_stands_elsewhere_and_asks() -
         ({"q": 0.02}, "somebody has moved it"),
     ],
 )
-def test_an_arm_that_is_moved_at_rest_is_named_at_the_next_look(
-    change: dict[str, float], said: str
-) -> None:
-    b = Bench()
-    begun: list[float] = []
+def test_an_arm_that_is_moved_at_rest_is_named_at_the_next_look(b, change, said):
+    begun = []
 
-    def moved(here: ArmSample) -> ArmSample:
+    def moved(here):
         if b.world.calls.count("tracker.measure") < 20:
             return here
         begun.append(b.world.time)
         return replace(here, **{name: getattr(here, name) + by for name, by in change.items()})
 
     changed(b.rig.arm, "sample", moved)
-    with pytest.raises(DeviceError, match=said):
-        measure(b)
+    refusal_of(DeviceError, said, measure, b)
     assert b.world.time - begun[0] < 1.0
     assert b.world.calls[-2] == "arm.stop"
 
@@ -184,16 +168,16 @@ def test_an_arm_that_is_moved_at_rest_is_named_at_the_next_look(
 # in motion
 
 
-def in_motion(b: Bench, change: Any, motion: int = 4) -> list[float]:
+def in_motion(b, change, motion=4):
     """Change samples of the arm from the first look on of a motion; returns when that began."""
-    begun: list[float] = []
+    begun = []
 
-    def later(here: ArmSample) -> ArmSample:
+    def later(here):
         b.world.hurry = 20.0 if len(b.world.at_start) < motion - 1 else 1.0
         if len(b.world.at_start) < motion or not (begun or b.world.is_moving):
             return here
         begun.append(b.world.time)
-        return change(here)  # type: ignore[no-any-return]
+        return change(here)
 
     changed(b.rig.arm, "sample", later)
     return begun
@@ -207,35 +191,28 @@ def in_motion(b: Bench, change: Any, motion: int = 4) -> list[float]:
         (("timestamp",), "its clock has stood still"),
     ],
 )
-def test_feedback_that_stands_still_in_motion_is_named_within_a_second(
-    names: tuple[str, ...], said: str
-) -> None:
-    b = Bench()
-    kept: list[ArmSample] = []
+def test_feedback_that_stands_still_in_motion_is_named_within_a_second(b, names, said):
+    kept = []
 
-    def frozen(here: ArmSample) -> ArmSample:
+    def frozen(here):
         kept.append(here)
         return replace(
             here, **{name: getattr(kept[0], name.removesuffix("_target")) for name in names}
         )
 
     begun = in_motion(b, frozen)
-    with pytest.raises(DeviceError, match=said):
-        measure(b)
+    refusal_of(DeviceError, said, measure, b)
     assert b.world.time - begun[0] < 1.0
 
 
-def test_an_arm_that_leaves_its_straight_way_is_stopped() -> None:
-    b = Bench()
+def test_an_arm_that_leaves_its_straight_way_is_stopped(b):
     begun = in_motion(b, lambda here: replace(here, q=here.q + 0.06 * np.eye(6)[3]))
-    with pytest.raises(DeviceError, match="wrist_1 has left the straight way"):
-        measure(b)
+    refusal_of(DeviceError, "wrist_1 has left the straight way", measure, b)
     assert b.world.time - begun[0] < 0.1
 
 
 @pytest.mark.long
-def test_a_motion_at_the_slowest_slider_does_not_stand_still() -> None:
-    b = Bench()
+def test_a_motion_at_the_slowest_slider_does_not_stand_still(b):
     near = np.array(POSES["reference"]) + 0.02
     b.world.hurry = 0.02
     changed(b.rig.arm, "sample", lambda here: replace(here, speed_scaling=0.02))
@@ -246,14 +223,14 @@ def test_a_motion_at_the_slowest_slider_does_not_stand_still() -> None:
 # loads
 
 
-def falls_in_motion(b: Bench, *wrong: str) -> list[float]:
+def falls_in_motion(b, *wrong):
     """Let the 3 kg fall in the motion after the seventh reading; returns when they fell.
 
     `wrong` are the loads that are hung instead afterwards.
     """
-    fell: list[float] = []
+    fell = []
 
-    def falls() -> None:
+    def falls():
         b.world.hurry = 1.0 if len(b.store.rows) in (6, 7) else 20.0
         if b.world.load == "3kg" and len(b.store.rows) == 7 and b.world.is_moving and not fell:
             b.world.load, b.world.wrong = "none", list(wrong)
@@ -263,10 +240,9 @@ def falls_in_motion(b: Bench, *wrong: str) -> list[float]:
     return fell
 
 
-def test_a_load_that_falls_off_in_motion_stops_the_arm_and_is_asked_for_again() -> None:
-    b = Bench()
-    payloads: list[tuple[str, float]] = []
-    stopped: list[float] = []
+def test_a_load_that_falls_off_in_motion_stops_the_arm_and_is_asked_for_again(b):
+    payloads = []
+    stopped = []
     fell, motions = falls_in_motion(b), carried(b)
     before(b.rig.arm, "set_payload", lambda mass, com: payloads.append((b.world.load, mass)))
     before(b.rig.arm, "stop", lambda: stopped.append(b.world.time))
@@ -282,11 +258,11 @@ def test_a_load_that_falls_off_in_motion_stops_the_arm_and_is_asked_for_again() 
     assert np.allclose(readings.states.wrench[loaded, 2], -3.0 * 9.80665, atol=0.01)
 
 
-def falls_at_rest(b: Bench, load: str, rows: int) -> None:
+def falls_at_rest(b, load, rows):
     """Let a load fall while the tracker measures, after so many readings."""
-    fell: list[str] = []
+    fell = []
 
-    def falls() -> None:
+    def falls():
         if b.world.load == load and len(b.store.rows) == rows and not fell:
             b.world.load = "none"
             fell.append(load)
@@ -294,7 +270,7 @@ def falls_at_rest(b: Bench, load: str, rows: int) -> None:
     before(b.rig.tracker, "measure", falls)
 
 
-def assert_true(b: Bench) -> None:
+def assert_true(b):
     """Every stored reading is where its load and its joints hold the target."""
     b.world.is_moving, b.world.extra, b.world.shift = False, np.zeros(6), np.zeros(3)
     for _, reading, _ in b.store.rows:
@@ -302,9 +278,8 @@ def assert_true(b: Bench) -> None:
         assert np.linalg.norm(reading.value[0] - b.world.position()) < 1e-4
 
 
-def test_a_load_that_falls_off_between_readings_leaves_no_reading_without_it() -> None:
+def test_a_load_that_falls_off_between_readings_leaves_no_reading_without_it(b):
     """It falls while the tracker measures: the reading is kept as doubted, and taken again."""
-    b = Bench()
     falls_at_rest(b, "3kg", 7)
     measure(b)
     assert asked_for(b)[1:3] == ["3kg", "3kg"]
@@ -312,13 +287,10 @@ def test_a_load_that_falls_off_between_readings_leaves_no_reading_without_it() -
 
 
 @pytest.mark.parametrize("load", first(1, ["none", "3kg"]))
-def test_leaning_on_the_tool_during_a_reading_is_kept_as_doubted_and_measured_again(
-    load: str,
-) -> None:
-    b = Bench()
-    leaned: list[float] = []
+def test_leaning_on_the_tool_during_a_reading_is_kept_as_doubted_and_measured_again(b, load):
+    leaned = []
 
-    def leans(seconds: float) -> None:
+    def leans(seconds):
         ready = len(b.store.rows) == (4 if load == "none" else 7)
         b.world.extra = np.zeros(6)
         if ready and b.world.load == load and not leaned:
@@ -336,7 +308,7 @@ def test_leaning_on_the_tool_during_a_reading_is_kept_as_doubted_and_measured_ag
     assert remarks(b, "somebody touch the tool")
 
 
-def test_a_light_load_that_falls_before_the_tool_is_weighed_is_noticed() -> None:
+def test_a_light_load_that_falls_before_the_tool_is_weighed_is_noticed():
     """Two unloaded readings do not weigh the tool; the tare holds it where the arm turns little."""
     load = "2kg"
     b = Bench(loads=(CellLoad(name=load, mass_kg=2.0, hang_m=0.1),))
@@ -348,11 +320,11 @@ def test_a_light_load_that_falls_before_the_tool_is_weighed_is_noticed() -> None
     assert f"where {load} should hang" in b.operator.asked[-1][1]
 
 
-def leans_in_phase(b: Bench, phase: str, number: int) -> None:
+def leans_in_phase(b, phase, number):
     """Lean on the tool with 60 N during one phase of a run, until somebody is asked."""
-    times: list[str] = []
+    times = []
 
-    def leans(event: object) -> None:
+    def leans(event):
         if isinstance(event, Phase):
             times.extend([event.text] * (phase in event.text))
             now = phase in event.text and len(times) == number
@@ -365,9 +337,8 @@ def leans_in_phase(b: Bench, phase: str, number: int) -> None:
     ("phase", "number"), first(1, [("moving to beside", 1), ("taring", 2), ("taring", 3)])
 )
 def test_leaning_in_the_first_motion_or_during_a_tare_is_asked_for_and_not_tared_away(
-    phase: str, number: int
-) -> None:
-    b = Bench()
+    b, phase, number
+):
     b.world.hurry = 1.0
     leans_in_phase(b, phase, number)
     measure(b, SHORT)
@@ -377,34 +348,29 @@ def test_leaning_in_the_first_motion_or_during_a_tare_is_asked_for_and_not_tared
 
 
 @pytest.mark.long
-def test_a_first_tare_that_was_leaned_on_ends_the_run_and_says_so() -> None:
-    b = Bench()
+def test_a_first_tare_that_was_leaned_on_ends_the_run_and_says_so(b):
     leans_in_phase(b, "taring", 1)
-    with pytest.raises(DeviceError, match=r"the tool was touched while the sensor was tared"):
-        measure(b, SHORT)
+    refusal_of(DeviceError, r"the tool was touched while the sensor was tared", measure, b, SHORT)
     assert b.store.rows == []
     measure(b, SHORT)  # with a tare of its own
 
 
-def test_leaning_in_most_samples_of_a_reading_and_not_at_its_end_is_measured_again(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    b = Bench()
-    taken: list[int] = []
+def test_leaning_in_most_samples_of_a_reading_and_not_at_its_end_is_measured_again(b, monkeypatch):
+    taken = []
     averaged = Measurer._averaged
 
-    def settled(*arguments: Any) -> Any:
+    def settled(*arguments):
         taken.extend([0] * (len(b.store.rows) == 1))
         return averaged(*arguments)
 
     monkeypatch.setattr(Measurer, "_averaged", settled)
 
-    def leans() -> None:
+    def leans():
         taken.extend([0] * bool(taken))
         now = len(taken) in (3, 4)  # the second and the third of three
         b.world.extra, b.world.shift = 60.0 * now * np.eye(6)[1], 1.2e-3 * now * np.eye(3)[1]
 
-    def lets_go(seconds: float) -> None:
+    def lets_go(seconds):
         b.world.extra, b.world.shift = np.zeros(6), np.zeros(3)
 
     before(b.rig.tracker, "measure", leans)
@@ -414,8 +380,7 @@ def test_leaning_in_most_samples_of_a_reading_and_not_at_its_end_is_measured_aga
     assert_true(b)
 
 
-def test_a_tool_far_from_its_configuration_is_refused_before_it_is_measured_with() -> None:
-    b = Bench()
+def test_a_tool_far_from_its_configuration_is_refused_before_it_is_measured_with(b):
     b.world.tool_mass = 4.0  # [tool] says 0.8 kg, which the controller is told
     with pytest.raises(DeviceError, match=r"asked 3 times") as raised:
         measure(b)
@@ -423,11 +388,10 @@ def test_a_tool_far_from_its_configuration_is_refused_before_it_is_measured_with
 
 
 @pytest.mark.long
-def test_unloaded_readings_that_were_leaned_on_do_not_spoil_the_tool() -> None:
+def test_unloaded_readings_that_were_leaned_on_do_not_spoil_the_tool(b):
     """Below what is noticed at once: 5 N to one side in one of five."""
-    b = Bench()
 
-    def leans(seconds: float) -> None:
+    def leans(seconds):
         b.world.extra = np.array([0, 5.0 * (len(b.store.rows) == 2), 0, 0, 0, 0])
 
     before(b.rig.force, "average", leans)
@@ -437,10 +401,9 @@ def test_unloaded_readings_that_were_leaned_on_do_not_spoil_the_tool() -> None:
 
 
 @pytest.mark.long
-def test_a_load_that_swings_a_little_in_motion_is_let_swing() -> None:
-    b = Bench()
+def test_a_load_that_swings_a_little_in_motion_is_let_swing(b):
 
-    def swings(one: WrenchSample) -> WrenchSample:
+    def swings(one):
         b.world.hurry = 1.0 if b.world.load == "3kg" else 20.0
         if b.world.load == "3kg" and b.world.is_moving:
             one.wrench[:3] += 6.0 * np.sin(2 * np.pi * b.world.time / 0.8)
@@ -452,12 +415,11 @@ def test_a_load_that_swings_a_little_in_motion_is_let_swing() -> None:
 
 
 @pytest.mark.long
-def test_who_bears_a_part_of_a_heavy_load_in_motion_is_noticed_though_it_may_swing() -> None:
+def test_who_bears_a_part_of_a_heavy_load_in_motion_is_noticed_though_it_may_swing(b):
     """30 N from below a weight of 59 N: less than it may pull to the side while it swings."""
-    b = Bench()
-    borne: list[float] = []
+    borne = []
 
-    def bears(one: WrenchSample) -> WrenchSample:
+    def bears(one):
         b.world.hurry = 1.0 if b.world.load == "6kg" else 20.0
         if b.world.load == "6kg" and b.world.is_moving and asked_for(b).count("6kg") == 1:
             borne.append(b.world.time)
@@ -473,56 +435,48 @@ def test_who_bears_a_part_of_a_heavy_load_in_motion_is_noticed_though_it_may_swi
 
 
 @pytest.mark.long
-def test_a_load_that_stays_wrong_ends_the_run() -> None:
-    b = Bench()
+def test_a_load_that_stays_wrong_ends_the_run(b):
     falls_in_motion(b, "none", "none", "none")
-    with pytest.raises(DeviceError, match=r"asked 3 times to hang 3kg.*--resume$"):
-        measure(b)
+    refusal_of(DeviceError, r"asked 3 times to hang 3kg.*--resume$", measure, b)
     assert len(b.store.rows) == 7
 
 
 # devices that repeat themselves
 
 
-def test_a_tracker_whose_target_does_not_move_with_the_arm_is_named_before_any_reading() -> None:
-    b = Bench()
+def test_a_tracker_whose_target_does_not_move_with_the_arm_is_named_before_any_reading(b):
     still = b.world.position()
     b.world.position = lambda: still
-    with pytest.raises(DeviceError, match="repeats an old reading, or follows a reflector"):
-        measure(b)
+    refusal_of(DeviceError, "repeats an old reading, or follows a reflector", measure, b)
     assert b.store.rows == []
 
 
-def test_a_tracker_that_repeats_one_measurement_is_named() -> None:
-    b = Bench()
-    kept: list[TrackerSample] = []
+def test_a_tracker_that_repeats_one_measurement_is_named(b):
+    kept = []
 
-    def repeats(one: TrackerSample) -> TrackerSample:
+    def repeats(one):
         if len(b.store.rows) == 3:
             kept.append(one)
             return replace(one, value=kept[0].value)
         return one
 
     changed(b.rig.tracker, "measure", repeats)
-    with pytest.raises(DeviceError, match="the same to the last digit"):
-        measure(b)
+    refusal_of(DeviceError, "the same to the last digit", measure, b)
     assert len(b.store.rows) == 3
 
 
 @pytest.mark.parametrize("good", first(1, [2, 8]))
-def test_a_tracker_that_keeps_to_the_place_of_the_last_pose_is_named(good: int) -> None:
+def test_a_tracker_that_keeps_to_the_place_of_the_last_pose_is_named(b, good):
     """The reading that it repeats is doubted too, until the tracker's place vouches for it."""
-    b = Bench()
-    kept: list[Any] = []
+    kept = []
 
-    def stuck(place: Any) -> Any:
+    def stuck(place):
         if len(b.store.rows) < good:
             kept[:] = [place]
         return kept[0]
 
     changed(b.world, "position", stuck)
-    with pytest.raises(DeviceError, match="repeats an old reading"):
-        measure(b)
+    refusal_of(DeviceError, "repeats an old reading", measure, b)
     assert len(b.store.rows) == good
     assert "why" in b.store.last("doubted")
     doubted = [content["reading"] for _, content in b.store.events if content.get("stored")]
@@ -530,9 +484,8 @@ def test_a_tracker_that_keeps_to_the_place_of_the_last_pose_is_named(good: int) 
 
 
 @pytest.mark.long
-def test_stored_readings_of_a_stuck_tracker_do_not_keep_a_campaign_from_going_on() -> None:
+def test_stored_readings_of_a_stuck_tracker_do_not_keep_a_campaign_from_going_on(b):
     """As older versions stored them: four right ones, then three at one and the same place."""
-    b = Bench()
     plan = usual_plan()
     interrupt(b, 7, plan)
     step, reading, _ = b.store.rows[3]
@@ -542,9 +495,7 @@ def test_stored_readings_of_a_stuck_tracker_do_not_keep_a_campaign_from_going_on
     assert len(measure(b, plan)) == len(plan.steps)
 
 
-def test_a_force_sensor_that_repeats_itself_is_named() -> None:
-    b = Bench()
+def test_a_force_sensor_that_repeats_itself_is_named(b):
     changed(b.rig.force, "average", lambda one: replace(one, covariance=np.zeros((6, 6))))
-    with pytest.raises(DeviceError, match="frames are the same to the last digit"):
-        measure(b)
+    refusal_of(DeviceError, "frames are the same to the last digit", measure, b)
     assert b.store.rows == []

@@ -8,17 +8,15 @@ import pytest
 
 from hilcal.config import Tool
 from hilcal.config.cell import Target
-from hilcal.errors import DeviceError, InputError
+from hilcal.errors import DeviceError
 from hilcal.measuring.connect import Rig
-from hilcal.measuring.devices import TargetLostError, TrackerSample, WrenchSample
+from hilcal.measuring.devices import TargetLostError, TrackerSample
 from hilcal.measuring.progress import ReadingStored
 from hilcal.measuring.run import run
 from hilcal.present.campaign import event_words
-from hilcal.readings.readings import Readings
 from hilcal.robot import chain as chains
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.run_log import RunLog, create_run
-from hilcal.types import Floats
 from tests.support.fake_bench import (
     REGISTRATION,
     SAG,
@@ -26,13 +24,13 @@ from tests.support.fake_bench import (
     Bench,
     FakeTracker,
     Killed,
-    World,
     before,
     changed,
     remarks,
     usual_plan,
 )
 from tests.support.reflector_cases import NAMES, OFFSETS
+from tests.support.refusals import refusal
 
 TOOL = Tool(
     targets=tuple(
@@ -47,7 +45,7 @@ BOOTSTRAP = 3
 these readings tell where the tracker stands."""
 
 
-def places(world: World) -> Floats:
+def places(world):
     """(3, 3) where the reflectors are, sensor axes."""
     chain = chains.evaluate(world.cell.arm, world.joints()[None])
     at = np.array([chain.point(offset)[0] for offset in OFFSETS]) + SAG * world.pull()[:3]
@@ -62,11 +60,11 @@ class PointedTracker(FakeTracker):
     hidden: set[tuple[float, int]] = field(default_factory=set)  # first joint's angle, number
     misled: bool = False
 
-    def _seen(self, k: int) -> bool:
+    def _seen(self, k):
         q = float(self.world.joints()[0])
         return not any(abs(q - at) < 1e-6 and k == number for at, number in self.hidden)
 
-    def aim(self, position: Floats, radius: float) -> None:
+    def aim(self, position, radius):
         self.world.call("tracker.aim")
         away = np.linalg.norm(places(self.world) - position, axis=1)
         k = int(np.argmin(away))
@@ -75,7 +73,7 @@ class PointedTracker(FakeTracker):
         assert away[k] < radius
         self.held = 0 if self.misled and k == 1 else k
 
-    def measure(self) -> TrackerSample:
+    def measure(self):
         self.world.call("tracker.measure")
         self.world.time += 0.1
         if not self._seen(self.held):
@@ -84,14 +82,14 @@ class PointedTracker(FakeTracker):
         return TrackerSample(int(self.world.time * 1e9), value, STD**2 * np.eye(3))
 
 
-def bench() -> tuple[Bench, PointedTracker]:
+def bench():
     b = Bench(tool=TOOL)
     tracker = PointedTracker(b.world)
     b.rig = Rig(b.rig.arm, tracker, b.rig.force, b.rig.operator)
     return b, tracker
 
 
-def measure(b: Bench, path: Path) -> Readings:
+def measure(b, path):
     plan = usual_plan()
     made = CampaignFile.open(path) if path.exists() else create_run(path, b.config, Path(), plan)
     with made as file:
@@ -99,14 +97,14 @@ def measure(b: Bench, path: Path) -> Readings:
         return file.readings()
 
 
-def by_key(r: Readings) -> dict[tuple[str, str, int, str], Floats]:
+def by_key(r):
     return {
         (r.pose_names[p], r.load_names[load], int(c), r.target_names[t]): value
         for p, load, c, t, value in zip(r.pose, r.load, r.cycle, r.target, r.value, strict=True)
     }
 
 
-def test_each_target_is_read_at_each_stop(tmp_path: Path) -> None:
+def test_each_target_is_read_at_each_stop(tmp_path):
     b, _ = bench()
     r = measure(b, tmp_path / "r.hilcal")
     plan = usual_plan()
@@ -123,7 +121,7 @@ def test_each_target_is_read_at_each_stop(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_hidden_reflector_is_a_missing_reading_with_a_word(tmp_path: Path) -> None:
+def test_a_hidden_reflector_is_a_missing_reading_with_a_word(tmp_path):
     b, tracker = bench()
     angle = float(usual_plan().joints("p4")[0])
     tracker.hidden = {(angle, 1)}
@@ -143,7 +141,7 @@ def test_a_hidden_reflector_is_a_missing_reading_with_a_word(tmp_path: Path) -> 
         measure(b, tmp_path / "none.hilcal")
 
 
-def test_a_neighbour_is_not_taken_for_a_target(tmp_path: Path) -> None:
+def test_a_neighbour_is_not_taken_for_a_target(tmp_path):
     b, tracker = bench()
     tracker.misled = True
     r = measure(b, tmp_path / "r.hilcal")
@@ -152,16 +150,16 @@ def test_a_neighbour_is_not_taken_for_a_target(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_all_targets_of_an_arrival_that_was_leaned_on_are_kept_as_doubted(tmp_path: Path) -> None:
+def test_all_targets_of_an_arrival_that_was_leaned_on_are_kept_as_doubted(tmp_path):
     b, _ = bench()
-    leaned: list[float] = []
+    leaned = []
 
-    def leans(seconds: float) -> None:
+    def leans(seconds):
         wanted = len(b.notes.of(ReadingStored)) == BOOTSTRAP and not leaned
         leaned.extend([seconds] * wanted)
         b.world.extra = np.array([0, 60.0 * wanted, 0, 0, 0, 0])
 
-    def lets_go(sample: WrenchSample) -> WrenchSample:
+    def lets_go(sample):
         b.world.extra = np.zeros(6)
         return sample
 
@@ -177,7 +175,7 @@ def test_all_targets_of_an_arrival_that_was_leaned_on_are_kept_as_doubted(tmp_pa
 
 
 @pytest.mark.parametrize("call", [("tracker.aim", 8), ("tracker.measure", 60)])
-def test_a_killed_run_goes_on_with_whole_arrivals(tmp_path: Path, call: tuple[str, int]) -> None:
+def test_a_killed_run_goes_on_with_whole_arrivals(tmp_path, call):
     b, _ = bench()
     b.world.kill_after = call
     with pytest.raises(Killed):
@@ -193,12 +191,10 @@ def test_a_killed_run_goes_on_with_whole_arrivals(tmp_path: Path, call: tuple[st
     assert len(by_key(r)) == len(r) == BOOTSTRAP + 3 * (len(usual_plan().steps) - BOOTSTRAP)
 
 
-def test_what_cannot_be_pointed_is_refused(tmp_path: Path) -> None:
+def test_what_cannot_be_pointed_is_refused(tmp_path):
     b = Bench(tool=TOOL)
-    with pytest.raises(InputError, match=r"driver cannot be told which .* no method `aim`"):
-        measure(b, tmp_path / "r.hilcal")
+    refusal(r"driver cannot be told which .* no method `aim`", measure, b, tmp_path / "r.hilcal")
     rough = TOOL.targets[1].model_copy(update={"target_m": None})
     tool = TOOL.model_copy(update={"targets": (TOOL.targets[0], rough)})
     b = Bench(tool=tool)
-    with pytest.raises(InputError, match=r'target "R2" has no target_m: .* estimate = true'):
-        measure(b, tmp_path / "s.hilcal")
+    refusal(r'target "R2" has no target_m: .* estimate = true', measure, b, tmp_path / "s.hilcal")

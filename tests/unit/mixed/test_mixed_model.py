@@ -8,20 +8,17 @@ from scipy.stats import kstest
 
 from hilcal.mixed.equations import _ByColumns, _ByRows, equations, left_out
 from hilcal.mixed.families import Families, Family, LogStdPrior
-from hilcal.mixed.problem import MixedProblem, Noise, independent_rows, mixed_problem
+from hilcal.mixed.problem import Noise, independent_rows, mixed_problem
 from hilcal.mixed.variances import estimate_variances, evidence, predict
-from hilcal.types import Floats
 
 FLAT = LogStdPrior(0.0, 3.0)
 
 
-def family(name: str, start: int, count: int, prior: LogStdPrior = FLAT) -> Family:
+def family(name, start, count, prior=FLAT):
     return Family(name, name, np.arange(start, start + count), np.linspace(0.5, 2.0, count), prior)
 
 
-def problem(
-    rng: np.random.Generator, groups: int = 12, *, scatter: bool = True, over: int = 0
-) -> MixedProblem:
+def problem(rng, groups=12, *, scatter=True, over=0):
     """A small problem: frames of four columns of which three count, families of 3 and 5 + over."""
     rows = 3 * groups
     jacobian = rng.standard_normal((rows, 12 + over))
@@ -35,11 +32,11 @@ def problem(
     return mixed_problem(y, jacobian, families, noise)
 
 
-def instrument(rows: int, spread: float = 1.5) -> Noise:
+def instrument(rows, spread=1.5):
     return Noise("instrument", np.ones(rows), LogStdPrior(0.0, spread))
 
 
-def dense(p: MixedProblem, x: Floats) -> tuple[float, Floats, Floats, Floats]:
+def dense(p, x):
     """ℓ from V = Σ s² Z D Zᵀ + R itself, BLUP coordinates, P, and their errors' covariance."""
     q, z = p.x[:, : p.flat], p.x[:, p.flat :]
     scale = np.exp(x)[p.family]
@@ -59,7 +56,7 @@ def dense(p: MixedProblem, x: Floats) -> tuple[float, Floats, Floats, Floats]:
 
 @pytest.mark.parametrize(("over", "form"), [(0, _ByColumns), (60, _ByRows)])
 @pytest.mark.parametrize("scatter", [True, False])
-def test_they_are_those_of_the_whole_covariance(scatter: bool, over: int, form: type) -> None:
+def test_they_are_those_of_the_whole_covariance(scatter, over, form):
     rng = np.random.default_rng(1)
     p = problem(rng, scatter=scatter, over=over)
     at = [0.3 * rng.standard_normal(len(p.priors)) for _ in range(3)]
@@ -79,12 +76,12 @@ def test_they_are_those_of_the_whole_covariance(scatter: bool, over: int, form: 
 
 @pytest.mark.parametrize("over", [0, 60])
 @pytest.mark.parametrize("scatter", [True, False])
-def test_slopes_are_finite_differences(scatter: bool, over: int) -> None:
+def test_slopes_are_finite_differences(scatter, over):
     rng = np.random.default_rng(2)
     p = problem(rng, scatter=scatter, over=over)
     x, step = 0.3 * rng.standard_normal(len(p.priors)), 1e-5
 
-    def along(value: str) -> list[Floats]:
+    def along(value):
         out = []
         for k in range(len(x)):
             ends = []
@@ -101,7 +98,7 @@ def test_slopes_are_finite_differences(scatter: bool, over: int) -> None:
     np.testing.assert_allclose(e.sensitivity, moved, rtol=1e-4, atol=1e-6)
 
 
-def test_the_average_information_is_the_mean_of_observed_and_expected() -> None:
+def test_the_average_information_is_the_mean_of_observed_and_expected():
     rng = np.random.default_rng(3)
     p = problem(rng, over=0)
     x = 0.3 * rng.standard_normal(len(p.priors))
@@ -115,15 +112,7 @@ def test_the_average_information_is_the_mean_of_observed_and_expected() -> None:
             assert equations(p, x).information[i, j] == pytest.approx(expected, rel=1e-8)
 
 
-def drawn(
-    rng: np.random.Generator,
-    stds: tuple[float, float],
-    noise: float,
-    groups: int,
-    prior: LogStdPrior = FLAT,
-    *,
-    turned: bool = False,
-) -> tuple[MixedProblem, Floats, Floats]:
+def drawn(rng, stds, noise, groups, prior=FLAT, *, turned=False):
     """A problem with families of known standard deviations, fresh rows, and what they truly are."""
     rows = rng.standard_normal((3 * groups + 40, 27))
     rows[:, 3] = rows[:, 0] + rows[:, 1]
@@ -139,7 +128,7 @@ def drawn(
     return made, fresh, true[-40:, None]
 
 
-def test_standard_deviations_are_found_where_the_rows_tell_them() -> None:
+def test_standard_deviations_are_found_where_the_rows_tell_them():
     rng = np.random.default_rng(4)
     found = np.array(
         [estimate_variances(drawn(rng, (1.0, 0.5), 0.3, 60)[0]).log_std for _ in range(40)]
@@ -151,7 +140,7 @@ def test_standard_deviations_are_found_where_the_rows_tell_them() -> None:
 
 
 @pytest.mark.parametrize("groups", [8, 12])
-def test_bands_hold_what_they_say_with_few_rows(groups: int) -> None:
+def test_bands_hold_what_they_say_with_few_rows(groups):
     rng = np.random.default_rng(5)
     inside = total = 0
     for _ in range(60):
@@ -162,7 +151,7 @@ def test_bands_hold_what_they_say_with_few_rows(groups: int) -> None:
     assert 0.92 < inside / total < 0.98
 
 
-def test_p_values_are_uniform_where_nothing_is_there_and_small_where_it_is() -> None:
+def test_p_values_are_uniform_where_nothing_is_there_and_small_where_it_is():
     rng = np.random.default_rng(6)
     null = [evidence(drawn(rng, (1.0, 0.0), 0.3, 20)[0], 1, rng).p_value for _ in range(100)]
     there = [evidence(drawn(rng, (1.0, 0.5), 0.3, 20)[0], 1, rng).p_value for _ in range(5)]
@@ -172,7 +161,7 @@ def test_p_values_are_uniform_where_nothing_is_there_and_small_where_it_is() -> 
     assert abs(len(below) / len(null) - 0.4) < 0.13
 
 
-def test_a_family_that_others_span_has_no_evidence_of_its_own() -> None:
+def test_a_family_that_others_span_has_no_evidence_of_its_own():
     rng = np.random.default_rng(7)
     p = problem(rng, scatter=False)
     jacobian = np.hstack([p.x, p.x[:, :2]])
@@ -182,7 +171,7 @@ def test_a_family_that_others_span_has_no_evidence_of_its_own() -> None:
     assert (evidence(again, 1, rng).ratio, evidence(again, 1, rng).rank) == (0.0, 0)
 
 
-def test_the_outcome_does_not_depend_on_the_order_of_families() -> None:
+def test_the_outcome_does_not_depend_on_the_order_of_families():
     (one, fresh, _), (two, _, _) = (
         drawn(np.random.default_rng(8), (1.0, 0.5), 0.3, 15, turned=t) for t in (False, True)
     )
@@ -193,7 +182,7 @@ def test_the_outcome_does_not_depend_on_the_order_of_families() -> None:
 
 
 @pytest.mark.parametrize("over", [0, 60])
-def test_the_likelihood_of_one_size_is_exact(over: int) -> None:
+def test_the_likelihood_of_one_size_is_exact(over):
     rng = np.random.default_rng(9)
     p = problem(rng, scatter=True, over=over)
     at = 0.3 * rng.standard_normal(len(p.priors))
@@ -209,7 +198,7 @@ def test_the_likelihood_of_one_size_is_exact(over: int) -> None:
 
 
 @pytest.mark.parametrize("over", [0, 60])
-def test_rows_left_out_are_predicted_by_the_others(over: int) -> None:
+def test_rows_left_out_are_predicted_by_the_others(over):
     """Against the equations of the other rows, at the same variances."""
     rng = np.random.default_rng(12)
     p = problem(rng, scatter=True, over=over)
@@ -225,7 +214,7 @@ def test_rows_left_out_are_predicted_by_the_others(over: int) -> None:
         np.testing.assert_allclose(variance[mine], own + spread, rtol=1e-6)
 
 
-def test_a_family_does_not_stay_small_where_the_iteration_began() -> None:
+def test_a_family_does_not_stay_small_where_the_iteration_began():
     """At a size of e⁻⁷ the likelihood has hardly a slope."""
     made, *_ = drawn(np.random.default_rng(10), (1.0, 0.5), 0.3, 60)
     usual = estimate_variances(made)
@@ -235,7 +224,7 @@ def test_a_family_does_not_stay_small_where_the_iteration_began() -> None:
     np.testing.assert_allclose(found.log_std, usual.log_std, atol=0.05)
 
 
-def test_rows_are_turned_so_that_blocks_of_noise_are_diagonal() -> None:
+def test_rows_are_turned_so_that_blocks_of_noise_are_diagonal():
     rng = np.random.default_rng(11)
     half = rng.standard_normal((4, 5, 2))  # of a rank below that of the rows
     half[1, 3:] = half[2, :1] = 0.0

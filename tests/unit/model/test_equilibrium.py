@@ -6,16 +6,14 @@ import numpy as np
 import pytest
 import scipy.optimize as so
 
-from hilcal.cell import Cell
 from hilcal.effects.catalogue import installed
 from hilcal.errors import CannotAnswerError
-from hilcal.model.model import Model, Prediction
+from hilcal.model.model import Model
 from hilcal.readings.readings import States
 from hilcal.robot import batch
 from hilcal.robot.arm import Arm
 from hilcal.robot.chain import Deviation
 from hilcal.robot.statics import Load, slot_wrenches
-from hilcal.types import Floats
 from tests.support.arm_cases import ODD, arm_of, cell_of, displacement
 
 COUNT = 10
@@ -26,7 +24,7 @@ ALL = (
 )
 
 
-def states_of(arm: Arm, count: int = COUNT, load: float = 1.0) -> States:
+def states_of(arm, count=COUNT, load=1.0):
     rng = np.random.default_rng(11)
     return States(
         q=rng.uniform(-np.pi, np.pi, (count, arm.n)),
@@ -35,11 +33,11 @@ def states_of(arm: Arm, count: int = COUNT, load: float = 1.0) -> States:
     )
 
 
-def model_of(cell: Cell, states: States, names: tuple[str, ...] = ALL) -> Model:
+def model_of(cell, states, names=ALL):
     return Model(cell, tuple(installed().make(name, cell, states) for name in names))
 
 
-def ordinary(model: Model, seed: int = 12) -> Floats:
+def ordinary(model, seed=12):
     """Parameters of ordinary magnitude; compliances are positive."""
     rng = np.random.default_rng(seed)
     values = []
@@ -50,14 +48,14 @@ def ordinary(model: Model, seed: int = 12) -> Floats:
     return np.concatenate(values)
 
 
-def case(name: str = "ur10e", count: int = COUNT) -> tuple[Model, States, Floats]:
+def case(name="ur10e", count=COUNT):
     arm = arm_of(name)
     states = states_of(arm, count)
     model = model_of(cell_of(arm), states)
     return model, states, ordinary(model)
 
 
-def deviation_at(model: Model, p: Prediction, states: States, theta: Floats) -> Deviation:
+def deviation_at(model, p, states, theta):
     """The effects evaluated anew at the configuration of a prediction."""
     cell, s = model.cell, p.situation
     shift = sum(
@@ -72,7 +70,7 @@ def deviation_at(model: Model, p: Prediction, states: States, theta: Floats) -> 
 
 
 @pytest.mark.parametrize("name", ["ur10e", "ur3", ODD])
-def test_effects_at_the_equilibrium_give_its_deviation(name: str) -> None:
+def test_effects_at_the_equilibrium_give_its_deviation(name):
     model, states, theta = case(name)
     p = model.predict(states, theta)
     again = deviation_at(model, p, states, theta)
@@ -84,7 +82,7 @@ def test_effects_at_the_equilibrium_give_its_deviation(name: str) -> None:
     assert largest > 1e-3  # the case is worth converging
 
 
-def test_elastic_pendulum_hangs_where_its_torques_balance() -> None:
+def test_elastic_pendulum_hangs_where_its_torques_balance():
     # One horizontal joint of compliance c carries m g at a lever l: dq = c m g l cos(q + dq).
     turned, lever = [0, 0, 0, -np.pi / 2, 0, 0], [0.8, 0, 0, 0, 0, 0]
     arm = Arm(
@@ -115,7 +113,7 @@ def test_elastic_pendulum_hangs_where_its_torques_balance() -> None:
         assert abs(p.situation.chain.position[-1, i, 2] - height) < 1e-12
 
 
-def test_laws_see_the_joints_that_the_encoders_report() -> None:
+def test_laws_see_the_joints_that_the_encoders_report():
     model, states, theta = case()
     off = 1e-2 * np.random.default_rng(13).normal(size=states.q.shape)
     told = model.predict(replace(states, q=states.q + 1.0, q_actual=states.q + off), theta)
@@ -123,13 +121,13 @@ def test_laws_see_the_joints_that_the_encoders_report() -> None:
     np.testing.assert_array_equal(told.observation.position, meant.observation.position)
 
 
-def test_no_equilibrium_is_said_in_words() -> None:
+def test_no_equilibrium_is_said_in_words():
     model, states, theta = case()
     with pytest.raises(CannotAnswerError, match=r"no static equilibrium.*joint_compliance"):
         model.predict(states, 3000 * theta)
 
 
-def everything(model: Model, states: States, theta: Floats) -> dict[str, Floats]:
+def everything(model, states, theta):
     """All that a prediction says, states first."""
     p = model.predict(states, theta)
     s = p.situation
@@ -147,12 +145,12 @@ def everything(model: Model, states: States, theta: Floats) -> dict[str, Floats]
     }
 
 
-def assert_all_close(a: dict[str, Floats], b: dict[str, Floats]) -> None:
+def assert_all_close(a, b):
     for key, value in a.items():
         np.testing.assert_allclose(value, b[key], rtol=0, atol=1e-12, err_msg=key)
 
 
-def test_one_state_at_a_time_gives_the_same_numbers() -> None:
+def test_one_state_at_a_time_gives_the_same_numbers():
     model, states, theta = case()
     together = everything(model, states, theta)
     for i in range(COUNT):
@@ -161,14 +159,14 @@ def test_one_state_at_a_time_gives_the_same_numbers() -> None:
 
 
 @pytest.mark.parametrize("size", [1, 3, COUNT])
-def test_chunks_give_the_same_numbers(size: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_chunks_give_the_same_numbers(size, monkeypatch):
     model, states, theta = case()
     together = everything(model, states, theta)
     monkeypatch.setattr(batch, "CHUNK", size)
     assert_all_close(everything(model, states, theta), together)
 
 
-def test_no_states() -> None:
+def test_no_states():
     model, states, theta = case()
     p = model.predict(states[:0], theta)
     assert p.observation.position.shape == (0, 3)

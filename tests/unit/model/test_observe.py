@@ -26,7 +26,7 @@ DEVIATIONS = [NONE, *ONES, FULL]
 
 
 @pytest.mark.parametrize("d", DEVIATIONS)
-def test_reading_is_the_product_of_its_displacements(d: Deviation) -> None:
+def test_reading_is_the_product_of_its_displacements(d):
     d = d + Deviation(dq=FULL.dq)
     o = observe(CELL, evaluate(CELL.arm, Q, d), d)
     given = {k: np.zeros((COUNT, 6)) if getattr(d, k) is None else getattr(d, k) for k in SENSOR}

@@ -2,7 +2,6 @@
 
 import io
 import socket
-from collections.abc import Callable, Iterator
 
 import pytest
 import rerun as rr
@@ -10,7 +9,7 @@ from rich.console import Console
 
 
 @pytest.fixture
-def free_port() -> int:
+def free_port():
     """A port that nobody listens at."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -18,7 +17,7 @@ def free_port() -> int:
 
 
 @pytest.fixture
-def strict() -> Iterator[None]:
+def strict():
     """Let rerun raise where it would only complain."""
     rr.set_strict_mode(True)
     yield
@@ -26,10 +25,10 @@ def strict() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def printed() -> Callable[..., str]:
+def printed():
     """What a terminal of some width shows of blocks."""
 
-    def shown(*blocks: object, width: int = 200, color: bool = False) -> str:
+    def shown(*blocks, width=200, color=False):
         stream = io.StringIO()
         console = Console(file=stream, width=width, force_terminal=color)
         for block in blocks:

@@ -7,25 +7,23 @@ import numpy as np
 import pytest
 
 from hilcal import numbers
-from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification.background import FamilySize
-from hilcal.identification.baseline import baseline
-from hilcal.identification.fit import fit
 from hilcal.present import charts
 from hilcal.present import charts as style
 from hilcal.present.charts import MOST_FAMILIES
 from hilcal.present.document import says
 from hilcal.present.story import LEVEL_NAMES, regressor, round_factor
 from tests.support.campaigns import campaign
+from tests.support.fit_cases import based
 from tests.support.picture import contrast
 from tests.support.viewer_story import ANGLE, LOAD, story
 
 
 @cache
-def judged() -> Diagnosis:
+def judged():
     made = campaign("joint_tilt_compliance", "deflection", poses=12, strength=6.0)
-    return diagnose(fit(baseline(made.cell, made.readings, made.mode), made.readings, made.mode))
+    return diagnose(based(made.cell, made.readings, made.mode))
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +36,7 @@ def first(told):
     return told, told.revisions[0]
 
 
-def points(figure, axis: str) -> np.ndarray:
+def points(figure, axis):
     """Sorted values of the points that have a name."""
     values = [np.asarray(getattr(t, axis), float) for t in figure.data if t.text]
     return np.sort(np.concatenate(values))
@@ -56,7 +54,7 @@ def test_each_revision_has_a_bar_for_both_errors_and_the_noise_is_shown(told):
 
 
 @pytest.mark.parametrize("mode", ["deflection", "absolute"])
-def test_measured_over_predicted_differs_by_the_residual(mode: str):
+def test_measured_over_predicted_differs_by_the_residual(mode):
     told = story(mode=mode)
     r = told.revisions[0]
     line, *axes = charts.measured_predicted(told, r).data
@@ -93,7 +91,7 @@ def test_residuals_are_mahalanobis_distances_with_their_names_colours_and_marks(
 
 
 @pytest.mark.parametrize("plane", ["xy", "xz"])
-def test_arrows_are_the_residuals_enlarged(plane: str, first):
+def test_arrows_are_the_residuals_enlarged(plane, first):
     told, r = first
     largest = float(r.size_m.max())
     times = round_factor(charts.LONGEST / largest, (1, 2, 5))
@@ -179,7 +177,7 @@ def test_the_noise_check_counts_every_element():
 
 @pytest.mark.parametrize("color", [style.MEASURED, style.NOISE, style.HOLDOUT, *style.LEVELS])
 @pytest.mark.parametrize("paper", [style.LIGHT, style.DARK])
-def test_colours_stand_out_on_both_papers(color: str, paper: str):
+def test_colours_stand_out_on_both_papers(color, paper):
     rgb = (tuple(bytes.fromhex(c.removeprefix("#"))) for c in (color, paper))
     assert contrast(*rgb) >= 3.0
 

@@ -4,7 +4,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hilcal.present.document import (
-    Block,
     Table,
     Words,
     captioned,
@@ -21,11 +20,11 @@ NUMBER = st.floats(-1e4, 1e4).map(lambda x: f"{x:.3g} µm")
 ROW = st.tuples(WORD, WORDS, NUMBER, NUMBER, WORDS)
 
 
-def captions(*blocks: Block, caption: str = "") -> list[str]:
+def captions(*blocks, caption=""):
     return [b.caption for b in captioned(blocks, caption) if isinstance(b, Table)]
 
 
-def test_a_caption_is_its_own_or_the_heading_above_or_what_is_given() -> None:
+def test_a_caption_is_its_own_or_the_heading_above_or_what_is_given():
     plain = table("effect", "share")
     assert captions(heading("Suspects"), plain) == ["Suspects"]
     assert captions(heading("Suspects"), table("a", caption="Its own")) == ["Its own"]
@@ -33,18 +32,18 @@ def test_a_caption_is_its_own_or_the_heading_above_or_what_is_given() -> None:
     assert captions(plain, plain, caption="Errors") == ["Errors", "Errors: effect"]
 
 
-def test_a_page_has_a_paragraph_for_each_line() -> None:
+def test_a_page_has_a_paragraph_for_each_line():
     found = captioned(["first\n  second\n", "", note("small\n")])
     assert found == (Words("first"), Words("second"), Words("small", "note"))
 
 
-def test_the_stressed_part_of_words_has_their_tone(printed) -> None:
+def test_the_stressed_part_of_words_has_their_tone(printed):
     shown = printed(Words("Verdict: adequate.\nNoise.", "good", "adequate"), color=True)
     assert shown.startswith("Verdict: \x1b[1;32madequate\x1b[0m.")
     assert printed(Words("told", indent=4)).startswith("    told")
 
 
-def test_pairs_stand_in_two_columns_and_a_rule_parts_groups_of_rows(printed) -> None:
+def test_pairs_stand_in_two_columns_and_a_rule_parts_groups_of_rows(printed):
     of = printed(pairs([("poses", "8"), ("", "and the reference")]), width=60)
     lines = [line.rstrip() for line in of.split("\n")]
     assert lines[:2] == ["  poses  8", "         and the reference"]
@@ -56,7 +55,7 @@ def test_pairs_stand_in_two_columns_and_a_rule_parts_groups_of_rows(printed) -> 
 
 
 @given(rows=st.lists(ROW, min_size=1, max_size=4), width=st.integers(30, 120))
-def test_no_word_is_broken_and_no_line_is_too_long(printed, rows, width: int) -> None:
+def test_no_word_is_broken_and_no_line_is_too_long(printed, rows, width):
     heads = ("effect", "what it is", "poses\nfitted", "σ", "verdict")
     lines = printed(table(*heads, rows=rows, left=(0, 1, 4)), width=width).splitlines()
     assert max(map(len, lines)) <= width
@@ -69,7 +68,7 @@ def test_no_word_is_broken_and_no_line_is_too_long(printed, rows, width: int) ->
         assert all(any(row[2] in line for line in lines) for row in rows)
 
 
-def test_a_table_that_has_room_is_as_it_was_and_a_narrow_terminal_gets_lists(printed) -> None:
+def test_a_table_that_has_room_is_as_it_was_and_a_narrow_terminal_gets_lists(printed):
     wide = printed(table("effect", "share", rows=[("creep", "10 %")]), width=40).splitlines()
     assert wide == ["effect   share", "──────────────", "creep     10 %"]
     rows = [("1", "16.7 µm", "missing effect"), ("", "18.9 µm", "")]
@@ -89,7 +88,7 @@ def test_a_table_that_has_room_is_as_it_was_and_a_narrow_terminal_gets_lists(pri
     st.lists(st.tuples(st.integers(1, 20), st.integers(0, 20)), min_size=1, max_size=6),
     st.integers(0, 40),
 )
-def test_widths_share_the_room(columns: list[tuple[int, int]], more: int) -> None:
+def test_widths_share_the_room(columns, more):
     least, wanted = [a for a, _ in columns], [a + b for a, b in columns]
     widths = shared(least, wanted, sum(least) + more)
     assert sum(widths) == min(sum(least) + more, sum(wanted))

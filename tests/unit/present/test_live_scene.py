@@ -1,7 +1,6 @@
 """What a live viewer draws of a campaign while it is measured, and of revisions as they come."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,7 +18,7 @@ from tests.support.viewer_story import story
 pytestmark = pytest.mark.usefixtures("strict")
 
 
-def recorded(path: Path, told, end: bool = True) -> Path:
+def recorded(path, told, end=True):
     """Draw what is told into a file."""
     rec = rr.RecordingStream("hilcal", recording_id="test", send_properties=False)
     rec.set_sinks(rr.FileSink(str(path)))
@@ -38,22 +37,22 @@ def revisions():
         yield float(k), Revised(replace(told, revisions=(r,)))
 
 
-def stored(told, wrong: float = 6.0) -> list[ReadingStored]:
+def stored(told, wrong=6.0):
     return [e for _, e in events(told, wrong) if isinstance(e, ReadingStored)]
 
 
-def of_levels(path: Path) -> list[np.ndarray]:
+def of_levels(path):
     """The residuals in time, σ, of each level."""
     return [np.ravel(values(path, f"/live/1/{n}", "Scalars:scalars")) for n in style.LEVEL_NAMES]
 
 
 @pytest.fixture(scope="module")
-def measured(tmp_path_factory) -> Path:
+def measured(tmp_path_factory):
     return recorded(tmp_path_factory.mktemp("live") / "run.rrd", events(measuring()))
 
 
 @pytest.fixture(scope="module")
-def refined(tmp_path_factory) -> Path:
+def refined(tmp_path_factory):
     return recorded(tmp_path_factory.mktemp("live") / "refined.rrd", revisions())
 
 
@@ -141,7 +140,7 @@ def test_the_arm_moves_through_every_place_that_is_told(measured):
 
 
 def test_words_say_whether_the_model_fails_and_under_which_load():
-    def status(wrong: float) -> str:
+    def status(wrong):
         d = LiveTally.of(measuring())
         assert "no judgement yet" in style.markdown(d.words())
         for _, e in events(measuring(), wrong):

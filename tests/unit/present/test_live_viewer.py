@@ -6,9 +6,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import psutil
 import pytest
@@ -29,19 +27,19 @@ growing = pytest.mark.filterwarnings("ignore:RRD file has no footer")
 
 
 @pytest.fixture
-def home(tmp_path, monkeypatch) -> Path:
+def home(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
     return tmp_path
 
 
 @pytest.fixture
-def said() -> list[str]:
+def said():
     return []
 
 
 @pytest.fixture
-def live(home, said, free_port) -> Iterator[LiveViewer]:
+def live(home, said, free_port):
     """A started viewer on a free port."""
     made = LiveViewer(home / "run.live.rrd", said.append, free_port)
     made.start()
@@ -49,7 +47,7 @@ def live(home, said, free_port) -> Iterator[LiveViewer]:
     made.close()
 
 
-def tell(live: LiveViewer, poses: int = 24, paced: bool = False) -> float:
+def tell(live, poses=24, paced=False):
     """Tell a campaign as fast as it goes; returns how long the slowest call took, s.
 
     If `paced`, no faster than the process draws.
@@ -65,7 +63,7 @@ def tell(live: LiveViewer, poses: int = 24, paced: bool = False) -> float:
 
 
 @contextmanager
-def client(url: str, path: Path) -> Iterator["subprocess.Popen[bytes]"]:
+def client(url, path):
     """A viewer without a window, that saves what it gets."""
     command = [executable(), "--port", "auto", "--save", str(path), url]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -76,7 +74,7 @@ def client(url: str, path: Path) -> Iterator["subprocess.Popen[bytes]"]:
         process.wait()
 
 
-def readings(path: Path) -> int:
+def readings(path):
     """Compared readings that a recording has so far; it may still be growing."""
     if not path.exists() or path.stat().st_size == 0:
         return 0
@@ -88,14 +86,14 @@ def readings(path: Path) -> int:
         return 0
 
 
-def until(what, words: str, seconds: float = 30.0) -> None:
+def until(what, words, seconds=30.0):
     end = time.monotonic() + seconds
     while not what():
         assert time.monotonic() < end, words
         time.sleep(0.05)
 
 
-def alive(pid: int) -> bool:
+def alive(pid):
     return psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
 
 
@@ -205,7 +203,7 @@ KILLED = PROGRAM.format(
 )
 
 
-def run(code: str, path: Path, port: int) -> str:
+def run(code, path, port):
     """Let a program of its own tell a campaign; returns what it printed."""
     command, env = [sys.executable, "-c", code, str(path), str(port)], {"PYTHONPATH": str(ROOT)}
     done = subprocess.run(

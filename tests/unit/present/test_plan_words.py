@@ -1,7 +1,6 @@
 """What people read of a plan and of `next`: words that follow from numbers; a table."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -31,7 +30,7 @@ def shown(printed):
 
 
 @pytest.mark.parametrize("width", [80, 110])
-def test_everything_is_told_and_fits(shown, width: int) -> None:
+def test_everything_is_told_and_fits(shown, width):
     text = shown(width=width)
     assert max(map(len, text.splitlines())) <= width
     assert "…" not in text  # nothing is cut off
@@ -56,7 +55,7 @@ def test_everything_is_told_and_fits(shown, width: int) -> None:
     assert text.index("joint_tilt") < text.index("hysteresis  ")  # the best seen comes first
 
 
-def test_what_is_absent_is_not_told(shown) -> None:
+def test_what_is_absent_is_not_told(shown):
     text = shown(BARE)
     assert "made by hand" in text
     assert "0 load changes" in text
@@ -64,7 +63,7 @@ def test_what_is_absent_is_not_told(shown) -> None:
     assert [word for word in absent if word in text] == []
 
 
-def test_other_poses_than_asked_for_and_parameters_left_open_are_explained(shown) -> None:
+def test_other_poses_than_asked_for_and_parameters_left_open_are_explained(shown):
     words = " ".join(shown(replace(SUMMARY, asked_poses=24)).split())
     fewer = "3 and the reference: the cell leaves no more of 24, so that some are read again"
     assert fewer in words
@@ -85,11 +84,11 @@ def test_other_poses_than_asked_for_and_parameters_left_open_are_explained(shown
         (0, "not certified"),
     ],
 )
-def test_a_certificate_is_never_rounded_up(efficiency: float, words: str) -> None:
+def test_a_certificate_is_never_rounded_up(efficiency, words):
     assert words in certified(efficiency)
 
 
-def test_bars_are_as_long_as_what_they_show_and_the_plan_is_marked(shown) -> None:
+def test_bars_are_as_long_as_what_they_show_and_the_plan_is_marked(shown):
     lines = [line for line in shown().splitlines() if "█" in line]
     sizes = np.array([line.count("█") for line in lines])
     values = np.array([point.position_std_m for point in SUMMARY.curve])
@@ -100,7 +99,7 @@ def test_bars_are_as_long_as_what_they_show_and_the_plan_is_marked(shown) -> Non
     assert enough(SUMMARY.curve[:2]) == "More than 3 poses still improve the prediction."
 
 
-def test_the_order_is_stated_with_its_cost_and_what_it_saves() -> None:
+def test_the_order_is_stated_with_its_cost_and_what_it_saves():
     order = replace(SUMMARY.confounding, drift_std=17e-6 / 3600)
     words = order_remark(replace(SUMMARY, confounding=order))
     for told in (
@@ -135,7 +134,7 @@ NEVER = PairPower(B, A, 0.02, 0.05, True)
         ((NEVER, NEVER), "rule out none of the suspects"),
     ],
 )
-def test_the_sentence_follows_from_the_table(powers: tuple[PairPower, ...], words: str) -> None:
+def test_the_sentence_follows_from_the_table(powers, words):
     said = powers_summary(powers, 12, 40)
     assert said.startswith("40 readings at 12 poses")
     assert words in said
@@ -143,7 +142,7 @@ def test_the_sentence_follows_from_the_table(powers: tuple[PairPower, ...], word
     assert ("more poses raise it" in said) == (WEAK in powers)
 
 
-def test_no_chance_is_certain_and_none_is_given_where_nothing_would_do() -> None:
+def test_no_chance_is_certain_and_none_is_given_where_nothing_would_do():
     assert list(power_rows((SURE, WEAK, NEVER))) == [
         (A, B, "20 %", "> 99 %"),
         (B, A, "10 %", "45 %"),
@@ -168,7 +167,7 @@ PLAN = Plan((REFERENCE, "p, 1"), Q, STEPS)
 PULL = np.array([0.0, 0.0, -49.0, 0.0, 0.0, 1.5])
 
 
-def test_a_plan_as_a_table_has_every_step_in_order() -> None:
+def test_a_plan_as_a_table_has_every_step_in_order():
     lines = plan_csv(PLAN).splitlines()
     assert lines[0] == "x_order,pose,load,cycle,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad"
     assert lines[1] == f"1,reference,none,0,0.1,-1.2,1.4,-0.5,0.7,{1 / 3!r}"
@@ -176,7 +175,7 @@ def test_a_plan_as_a_table_has_every_step_in_order() -> None:
     assert len(lines) == 1 + len(PLAN.steps)
 
 
-def test_with_positions_it_is_an_exchange_table(tmp_path: Path) -> None:
+def test_with_positions_it_is_an_exchange_table(tmp_path):
     arm, q = load_arm("ur10e"), np.array([PLAN.joints(s.pose) for s in STEPS])
     head, *rows = plan_csv(PLAN, {"mass-5kg": PULL}).splitlines()
     cov = ",".join(f"cov_{a}" for a in ("x_x", "x_y", "x_z", "y_y", "y_z", "z_z"))

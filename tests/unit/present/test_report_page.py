@@ -5,20 +5,16 @@ import json
 import re
 import shutil
 import subprocess
-from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from playwright.sync_api import Browser
 
 from hilcal import numbers
 from hilcal.calibration.scatter import budget
 from hilcal.campaign.campaign import Campaign
 from hilcal.present.document import Chart, Table
 from hilcal.present.html.report import (
-    ReportContent,
     first_screen,
     left_out_errors,
     limit_words,
@@ -62,7 +58,7 @@ needs_poppler = pytest.mark.skipif(
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[ReportContent, Path]:
+def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("report")
     m, path = small_content(folder), folder / "report.html"
     path.write_text(page_of(m), encoding="utf-8")
@@ -70,22 +66,22 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[ReportContent, Path]
 
 
 @pytest.fixture(scope="module")
-def text(made) -> str:
+def text(made):
     return made[1].read_text(encoding="utf-8")
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
+def browser():
     with open_browser() as found:
         yield found
 
 
-def plain(m: ReportContent) -> ReportContent:
+def plain(m):
     """The same without its appendix."""
     return replace(m, appendix=False, scalings={})
 
 
-def large(m: ReportContent) -> ReportContent:
+def large(m):
     """The same with many revisions, poses of long names, and instruments, with no appendix."""
     told, count = m.story, len(m.story)
     change = ["", *["+ periodic_joint_compliance"] * 11]
@@ -99,7 +95,7 @@ def large(m: ReportContent) -> ReportContent:
     return replace(plain(m), story=story, overview=overview)
 
 
-def test_the_page_is_one_file_with_its_headings_tables_and_sentences(text) -> None:
+def test_the_page_is_one_file_with_its_headings_tables_and_sentences(text):
     outline = Outline(text)
     assert outline.tags.count("h1") == 1
     levels = [int(t[1]) for t in outline.tags if re.fullmatch(r"h[1-6]", t)]
@@ -118,7 +114,7 @@ def test_the_page_is_one_file_with_its_headings_tables_and_sentences(text) -> No
     assert outline.of("a", "href") == [f"#{i}" for i in ids]
 
 
-def test_names_are_text_and_what_is_in_scripts_is_json(text) -> None:
+def test_names_are_text_and_what_is_in_scripts_is_json(text):
     assert EVIL not in text
     assert "<img" not in text.split("<body>")[1].split("<script>/**")[0]
     assert "&lt;script&gt;" in text
@@ -127,7 +123,7 @@ def test_names_are_text_and_what_is_in_scripts_is_json(text) -> None:
     assert all("data" in json.loads(script) for script in found)
 
 
-def test_numbers_of_the_certificate_are_those_of_the_fit(made, text) -> None:
+def test_numbers_of_the_certificate_are_those_of_the_fit(made, text):
     m, error = made[0], left_out_errors(made[0].fit)
     assert error.max() == pytest.approx(m.fit.holdout.max_m)
     words, passed = limit_words(m)
@@ -144,7 +140,7 @@ def test_numbers_of_the_certificate_are_those_of_the_fit(made, text) -> None:
     assert f"{inside} of {len(error)} deflections of poses left out are within it" in text
 
 
-def test_what_is_said_to_be_wrong_is_of_poses_left_out(made) -> None:
+def test_what_is_said_to_be_wrong_is_of_poses_left_out(made):
     """The pose that fits worst is not the one that is predicted worst."""
     m, error = made[0], left_out_errors(made[0].fit)
     assert f"furthest off: {numbers.length(error.max())}" in first_screen(m).answers[1][1]
@@ -155,7 +151,7 @@ def test_what_is_said_to_be_wrong_is_of_poses_left_out(made) -> None:
 
 
 @pytest.mark.parametrize(("sigma", "within"), [(1.0, True), (1.57, False)])
-def test_poses_left_out_beyond_the_noise_are_not_said_to_be_within_it(made, sigma, within) -> None:
+def test_poses_left_out_beyond_the_noise_are_not_said_to_be_within_it(made, sigma, within):
     m, fit = made[0], replace(made[0].fit)
     calm = replace(m.diagnosis, reason="residual_is_noise")
     fit.__dict__["holdout"] = replace(m.fit.holdout, rms_sigma=sigma)
@@ -164,7 +160,7 @@ def test_poses_left_out_beyond_the_noise_are_not_said_to_be_within_it(made, sigm
     assert (f"by {sigma:.2f} times the noise" in said) != within
 
 
-def test_results_show_themselves_in_a_notebook(made) -> None:
+def test_results_show_themselves_in_a_notebook(made):
     m, path = made
     path_of = Refinement((RefinementStep(m.fit, m.diagnosis, None),))
     with Campaign.open(path.parent / "a&<b>.hilcal") as run:
@@ -181,7 +177,7 @@ def test_results_show_themselves_in_a_notebook(made) -> None:
             assert EVIL not in shown
 
 
-def test_without_an_appendix_the_page_has_the_parameters_and_nothing_else_of_it(made, text) -> None:
+def test_without_an_appendix_the_page_has_the_parameters_and_nothing_else_of_it(made, text):
     m, short = made[0], page_of(plain(made[0]))
     assert Outline(short).of("section", "id") == MAIN
     for words in ("Correlations", "SHA-256 of its readings", "Scaling none, gu", "Over joint 1",
@@ -200,7 +196,7 @@ def test_without_an_appendix_the_page_has_the_parameters_and_nothing_else_of_it(
         assert f">{value}</td>" in short
 
 
-def draw_all(page) -> None:
+def draw_all(page):
     page.evaluate("drawAll()")
     page.wait_for_function("charts.every((c) => c._fullLayout && c.querySelector('svg'))")
 
@@ -215,7 +211,7 @@ def draw_all(page) -> None:
         pytest.param(PHONE, "light", id="phone-light", marks=pytest.mark.slow),
     ],
 )
-def test_it_is_whole_in_a_browser(made, browser: Browser, size, scheme: str) -> None:
+def test_it_is_whole_in_a_browser(made, browser, size, scheme):
     m, path = made
     with opened(browser, path, viewport=size, color_scheme=scheme) as (page, bad):
         answers = page.locator(".answers").bounding_box()
@@ -243,7 +239,7 @@ def test_it_is_whole_in_a_browser(made, browser: Browser, size, scheme: str) -> 
 
 @needs_chromium
 @pytest.mark.parametrize("of", [plain, pytest.param(large, marks=pytest.mark.long)])
-def test_it_prints_on_six_pages_at_most(made, browser: Browser, tmp_path: Path, of) -> None:
+def test_it_prints_on_six_pages_at_most(made, browser, tmp_path, of):
     path = tmp_path / "short.html"
     path.write_text(page_of(of(made[0])), encoding="utf-8")
     with opened(browser, path, viewport=DESKTOP) as (page, bad):
@@ -254,9 +250,7 @@ def test_it_prints_on_six_pages_at_most(made, browser: Browser, tmp_path: Path, 
 
 
 @needs_chromium
-def test_long_names_of_many_poses_do_not_lie_over_each_other_on_a_phone(
-    made, browser: Browser, tmp_path: Path
-) -> None:
+def test_long_names_of_many_poses_do_not_lie_over_each_other_on_a_phone(made, browser, tmp_path):
     path = tmp_path / "page.html"
     path.write_text(page_of(large(made[0])), encoding="utf-8")
     with opened(browser, path, viewport=PHONE) as (page, _):
@@ -266,7 +260,7 @@ def test_long_names_of_many_poses_do_not_lie_over_each_other_on_a_phone(
 
 @needs_chromium
 @pytest.mark.slow
-def test_it_prints_on_a4_in_light_colours_with_all_charts(made, browser: Browser) -> None:
+def test_it_prints_on_a4_in_light_colours_with_all_charts(made, browser):
     with opened(browser, made[1], viewport=DESKTOP, color_scheme="dark") as (page, bad):
         page.evaluate(
             "window.addEventListener('beforeprint', () => { window.printed = charts.map("
@@ -291,9 +285,7 @@ def test_it_prints_on_a4_in_light_colours_with_all_charts(made, browser: Browser
 @needs_chromium
 @needs_poppler
 @pytest.mark.slow
-def test_printed_pages_are_numbered_light_and_end_with_no_heading(
-    made, browser: Browser, tmp_path: Path
-) -> None:
+def test_printed_pages_are_numbered_light_and_end_with_no_heading(made, browser, tmp_path):
     pdf = str(tmp_path / "page.pdf")
     with opened(browser, made[1], viewport=DESKTOP, color_scheme="dark") as (page, _):
         titles = set(page.locator("h2, h3, caption").all_text_contents())

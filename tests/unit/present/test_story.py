@@ -6,32 +6,25 @@ from functools import cache
 import numpy as np
 import pytest
 
-from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.residual_regression import Dependence
 from hilcal.diagnosis.verdict import diagnose
-from hilcal.errors import InputError
-from hilcal.identification.baseline import baseline
-from hilcal.identification.fit import Fit, fit
 from hilcal.identification.full_prediction import full_prediction
 from hilcal.identification.linearisation import HeldOut
 from hilcal.present.html.report import left_out_errors
-from hilcal.present.story import Chapter, Story, build_story, curve, of_left_out, pose_numbers
-from hilcal.readings.readings import Readings
+from hilcal.present.story import Chapter, build_story, curve, of_left_out, pose_numbers
 from hilcal.refinement import add
 from hilcal.robot.chain import evaluate
 from tests.support.cli_cases import rehearsal
+from tests.support.fit_cases import based
+from tests.support.refusals import refusal
 from tests.unit.diagnosis.test_residual_regression import hidden
 
 
-def fitted(cell, readings: Readings, mode: str) -> Fit:
-    return fit(baseline(cell, readings, mode), readings, mode)
-
-
 @cache
-def told(effect: str) -> Story:
+def told(effect):
     """A rehearsed campaign before and after its hidden effect is added."""
     r = rehearsal(effect)
-    first = fitted(r.cell, r.readings, r.mode)
+    first = based(r.cell, r.readings, r.mode)
     second = add(first, r.hidden)
     return build_story(
         [Chapter(4, None, first, diagnose(first)), Chapter(5, r.hidden, second, diagnose(second))]
@@ -39,7 +32,7 @@ def told(effect: str) -> Story:
 
 
 @pytest.mark.parametrize("effect", ["hysteresis", "encoder_offset"])
-def test_a_story_holds_together_and_the_right_suspect_lies_on_the_line_of_slope_one(effect) -> None:
+def test_a_story_holds_together_and_the_right_suspect_lies_on_the_line_of_slope_one(effect):
     story = told(effect)
     first, last = story.revisions
     assert [(r.revision, r.change) for r in (first, last)] == [(4, ""), (5, f"+ {effect}")]
@@ -60,9 +53,9 @@ def test_a_story_holds_together_and_the_right_suspect_lies_on_the_line_of_slope_
     assert g.x.min() < 0 < g.x.max()
 
 
-def test_vectors_are_in_base_axes() -> None:
+def test_vectors_are_in_base_axes():
     r, story = rehearsal("hysteresis"), told("hysteresis")
-    whitening = full_prediction(fitted(r.cell, r.readings, r.mode)).whitening
+    whitening = full_prediction(based(r.cell, r.readings, r.mode)).whitening
     expected = whitening.raw(r.readings.value) @ r.world.registration[:3, :3]
     # Deflections leave the base's turning open by what the closed form knows, some mrad.
     off = np.linalg.norm(story.measured - expected, axis=1)
@@ -71,7 +64,7 @@ def test_vectors_are_in_base_axes() -> None:
     assert (story.measured[weight, 2] < 0).all()  # it pulls down
 
 
-def test_arrows_start_at_the_nominal_target() -> None:
+def test_arrows_start_at_the_nominal_target():
     r, story = rehearsal("encoder_offset"), told("encoder_offset")
     nominal = evaluate(r.cell.arm, story.q).point(r.cell.target[:3, 3])
     np.testing.assert_allclose(story.anchor, nominal, atol=1e-12)
@@ -79,12 +72,12 @@ def test_arrows_start_at_the_nominal_target() -> None:
 
 
 @cache
-def unknown() -> Diagnosis:
+def unknown():
     c = hidden("dq2 = sin 3 q4", "absolute", 0, 1.5)
-    return diagnose(fitted(c.cell, c.readings, c.mode))
+    return diagnose(based(c.cell, c.readings, c.mode))
 
 
-def test_an_unknown_effect_has_a_curve_in_units_for_people() -> None:
+def test_an_unknown_effect_has_a_curve_in_units_for_people():
     d = unknown()
     r = build_story([Chapter(1, None, d.fit, d)]).revisions[0]
     lead, of = r.follows, d.dependences[0]
@@ -117,7 +110,7 @@ def test_a_suspect_that_explains_little_leaves_the_picture_to_the_variable(expla
         ("", 2.0, "time", 1.0),
     ],
 )
-def test_units_of_a_variable_are_those_of_people(unit, end, label, factor) -> None:
+def test_units_of_a_variable_are_those_of_people(unit, end, label, factor):
     x, y, up = np.array([0.0, end]), np.array([-2e-3, 2e-3]), np.array([0.0, 0.0, 1.0])
     found = curve(Dependence("time", unit, 0.5, "target", up, x, y, np.full(2, 1e-4), "m"))
     assert found.x_label == label
@@ -128,11 +121,11 @@ def test_units_of_a_variable_are_those_of_people(unit, end, label, factor) -> No
     assert "the target along (0.60, 0.00, 0.80) in base axes" in curve(aslant).y_label
 
 
-def test_gross_errors_are_shown_as_well() -> None:
+def test_gross_errors_are_shown_as_well():
     r = rehearsal("nothing")
     value = r.readings.value.copy()
     value[17] += 0.004
-    found = fitted(r.cell, replace(r.readings, value=value), "absolute")
+    found = based(r.cell, replace(r.readings, value=value), "absolute")
     assert found.outlier.any()
     story = build_story([Chapter(1, None, found, None)])
     assert len(story) == len(value)
@@ -148,14 +141,12 @@ def test_gross_errors_are_shown_as_well() -> None:
     assert np.sqrt(np.mean(kept**2)) == pytest.approx(found.holdout.rms_m, rel=1e-9)
 
 
-def test_other_readings_do_not_make_one_story() -> None:
+def test_other_readings_do_not_make_one_story():
     r = rehearsal("nothing")
     modes = ("absolute", "deflection")
-    chapters = [Chapter(1, None, fitted(r.cell, r.readings, mode), None) for mode in modes]
-    with pytest.raises(InputError, match="other readings"):
-        build_story(chapters)
-    with pytest.raises(InputError, match="identify"):
-        build_story([])
+    chapters = [Chapter(1, None, based(r.cell, r.readings, mode), None) for mode in modes]
+    refusal("other readings", build_story, chapters)
+    refusal("identify", build_story, [])
 
 
 @pytest.mark.parametrize(
@@ -169,5 +160,5 @@ def test_other_readings_do_not_make_one_story() -> None:
         (("p" + "9" * 30, "p1"), [1, 2]),
     ],
 )
-def test_poses_keep_the_numbers_of_their_names(names, numbers) -> None:
+def test_poses_keep_the_numbers_of_their_names(names, numbers):
     assert pose_numbers(names).tolist() == numbers

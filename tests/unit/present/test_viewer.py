@@ -7,7 +7,6 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -43,7 +42,7 @@ def told():
 
 
 @pytest.fixture(scope="module")
-def recording(told, tmp_path_factory) -> Path:
+def recording(told, tmp_path_factory):
     path = tmp_path_factory.mktemp("viewer") / "story.rrd"
     save(told, path)
     return path
@@ -55,7 +54,7 @@ def by_revision(recording):
     return lambda entity, name: rows(recording, entity, name, "revision")
 
 
-def bars(path: Path, entity: str, revision: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def bars(path, entity, revision):
     """Left and right edges and heights of the bars of a revision."""
     left, width, height = (
         np.array(rows(path, entity, f"BarChart:{name}", "revision")[revision])
@@ -118,7 +117,7 @@ def test_it_opens_at_the_first_revision_and_the_end_says_that_it_is_the_end(reco
     assert "86 %" not in read[3][0]
     reader = RrdReader(recording)
     (blueprint,) = reader.blueprints()
-    panel: dict[str, object] = {}
+    panel = {}
     for chunk in reader.stream(store=blueprint).filter(content="/time_panel").to_chunks():
         panel |= chunk.to_record_batch().to_pydict()
     assert panel["TimePanelBlueprint:timeline"] == [["revision"]]
@@ -252,12 +251,12 @@ def test_arm_of_another_shape_is_drawn(tmp_path):
 # pictures
 
 
-def share_of_red(png: np.ndarray) -> float:
+def share_of_red(png):
     """Share of pixels in the colour of a reading that the model fails."""
     return float((np.abs(png[..., :3].astype(int) - style.RED).max(axis=2) < 40).mean())
 
 
-def colors(png: np.ndarray) -> int:
+def colors(png):
     return len(np.unique(png.reshape(-1, png.shape[2]), axis=0))
 
 
@@ -332,7 +331,7 @@ def test_a_viewer_that_joins_late_gets_the_whole_story(told, tmp_path, monkeypat
             client.wait(10)
 
 
-def entities(path: Path) -> set[str]:
+def entities(path):
     """Entities that a file holds so far; it may still be growing."""
     if not path.exists() or path.stat().st_size == 0:
         return set()

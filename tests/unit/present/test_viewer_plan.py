@@ -16,6 +16,7 @@ from hilcal.robot.chain import evaluate
 from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step
 from tests.support.picture import Shot, pictures, vulkan_available
 from tests.support.recordings import entities, rows, same, texts
+from tests.support.refusals import refusal
 from tests.support.viewer_plan import (
     BARE,
     PLAN,
@@ -40,11 +41,11 @@ STEPS = list(enumerate(PLAN.steps, start=1))
 
 
 @pytest.fixture(scope="module")
-def d(shadowed) -> PlanView:
+def d(shadowed):
     return PlanView(*shadowed, PLAN, SUMMARY)
 
 
-def words(path, of: str = "plan") -> str:
+def words(path, of="plan"):
     return rows(path, f"/words/{of}", "TextDocument:text")[0][0].replace("\\", "")
 
 
@@ -283,15 +284,14 @@ def test_no_character_without_a_glyph_reaches_the_viewer(tmp_path):
 def test_what_does_not_fit_is_refused(shadowed, tmp_path):
     with pytest.raises(InputError, match="5 joint angles per pose; ur10e has 6"):
         record_plan(*shadowed, replace(PLAN, q=Q[:, :5]), SUMMARY, tmp_path / "x.rrd")
-    with pytest.raises(InputError, match="no folder"):
-        record_plan(*shadowed, PLAN, SUMMARY, tmp_path / "none" / "x.rrd")
+    refusal("no folder", record_plan, *shadowed, PLAN, SUMMARY, tmp_path / "none" / "x.rrd")
     assert list(tmp_path.iterdir()) == []
 
 
 # the eye
 
 
-def eye_place(path) -> np.ndarray:
+def eye_place(path):
     """Where the eye of the first view stands, as the recording says."""
     reader = RrdReader(path)
     (blueprint,) = reader.blueprints()

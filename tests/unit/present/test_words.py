@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hilcal import numbers
-from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.document import to_json as diagnosis_json
 from hilcal.diagnosis.effect_ranking import FALSE_ALARM
 from hilcal.diagnosis.misfit_breakdown import MisfitShare, misfit_breakdown
@@ -19,8 +18,6 @@ from hilcal.diagnosis.recorded import ROW_ORDER
 from hilcal.diagnosis.residual_regression import Dependence
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.options import typical_compliances
-from hilcal.identification.baseline import baseline
-from hilcal.identification.fit import Fit, fit
 from hilcal.identification.fit_document import to_json
 from hilcal.identification.full_prediction import error_before, full_prediction
 from hilcal.identification.linearisation import linearise
@@ -30,6 +27,7 @@ from hilcal.present.story import Chapter, build_story
 from hilcal.present.verdict import message
 from hilcal.present.viewer import campaign as viewer
 from tests.support.campaigns import campaign, cell_of, noiseless, plan, with_noise, world_of
+from tests.support.fit_cases import based
 
 # numbers
 
@@ -48,18 +46,18 @@ from tests.support.campaigns import campaign, cell_of, noiseless, plan, with_noi
         (1.04e-9, "0.00104 µm"),
     ],
 )
-def test_lengths(metres: float, words: str) -> None:
+def test_lengths(metres, words):
     assert numbers.length(metres) == words
 
 
 @given(st.floats(1e-3, 1e6), st.integers(1, 5))
-def test_digits_keep_the_value(value: float, count: int) -> None:
+def test_digits_keep_the_value(value, count):
     rel = 0.5 * 10.0 ** (1 - count)
     assert float(numbers.digits(value, count)) == pytest.approx(value, rel=rel)
 
 
 @given(st.floats(-1e4, 1e4), st.floats(1e-4, 1e2))
-def test_a_value_is_written_to_the_digits_of_its_uncertainty(value: float, std: float) -> None:
+def test_a_value_is_written_to_the_digits_of_its_uncertainty(value, std):
     written, spread = numbers.with_std(value, std)
     # from 9.95 on there are no decimals left to drop
     assert abs(float(written) - value) <= (0.5 if std >= 9.95 else 0.06 * std)
@@ -68,11 +66,11 @@ def test_a_value_is_written_to_the_digits_of_its_uncertainty(value: float, std: 
 
 
 @given(st.sampled_from(["m", "rad"]), st.floats(-1, 1), st.floats(0, 1))
-def test_no_length_nor_angle_has_an_exponent(unit: str, value: float, std: float) -> None:
+def test_no_length_nor_angle_has_an_exponent(unit, value, std):
     assert "e" not in "".join(numbers.measured(unit, value, std)[:2])
 
 
-def test_what_rounding_leaves_is_no_number() -> None:
+def test_what_rounding_leaves_is_no_number():
     assert numbers.measured("m", 3e-4, 4.59e-16) == ("300.0000", "< 0.001", "µm")
     assert numbers.measured("m", 2e-2, 4.59e-16) == ("20.0000000", "< 0.000001", "mm")
     assert numbers.measured("rad", 4.59e-16) == ("< 0.001", "", "µrad")
@@ -91,11 +89,11 @@ def test_what_rounding_leaves_is_no_number() -> None:
         ("m", [], ("µm", 1e6)),
     ],
 )
-def test_units_follow_the_largest_value(unit: str, values: list[float], expected: object) -> None:
+def test_units_follow_the_largest_value(unit, values, expected):
     assert numbers.unit_for(unit, values) == expected
 
 
-def test_lists_and_sentences() -> None:
+def test_lists_and_sentences():
     assert numbers.sentence("residuals are noise") == "Residuals are noise."
     assert numbers.names(["a"]) == "a"
     assert numbers.names(["a", "b", "c"]) == "a, b and c"
@@ -115,18 +113,18 @@ def test_a_small_p_value_is_written_in_one_way(p, written):
 
 
 @cache
-def fitted(mode: str, effect: str = "transmission_error") -> Fit:
+def fitted(mode, effect="transmission_error"):
     c = campaign(effect, mode, 1, poses=12, strength=3.0)
-    return fit(baseline(c.cell, c.readings, c.mode), c.readings, c.mode)
+    return based(c.cell, c.readings, c.mode)
 
 
 @pytest.fixture(scope="module")
-def absolute() -> Fit:
+def absolute():
     return fitted("absolute")
 
 
 @pytest.fixture(scope="module")
-def judged(absolute) -> Diagnosis:
+def judged(absolute):
     return diagnose(absolute)
 
 
@@ -198,7 +196,7 @@ PLACES = (
 )
 
 
-def test_variables_stand_in_groups_and_those_without_a_share_are_counted(shown) -> None:
+def test_variables_stand_in_groups_and_those_without_a_share_are_counted(shown):
     told = shown(*where_table(PLACES))
     order = ["joint 4 angle", "load", "time", "same in all readings of a pose", "points vertical"]
     places = [told.index(name) for name in order]
@@ -208,8 +206,8 @@ def test_variables_stand_in_groups_and_those_without_a_share_are_counted(shown) 
     assert "2 more are below 1 %" in told
 
 
-def test_a_curve_is_shown_only_where_it_is_determined_and_carries_something(shown) -> None:
-    def told(error: float, share: float = 0.3) -> str:
+def test_a_curve_is_shown_only_where_it_is_determined_and_carries_something(shown):
+    def told(error, share=0.3):
         x, y = np.arange(5.0), 1e-5 * np.arange(-2.0, 3.0)
         std = np.full(5, error)
         of = Dependence("time", "s", share, "joint 2", np.zeros(3), x, y, std, "rad")
@@ -221,7 +219,7 @@ def test_a_curve_is_shown_only_where_it_is_determined_and_carries_something(show
     assert told(2e-6, share=0.004) == ""
 
 
-def drifting(strength: float) -> Diagnosis:
+def drifting(strength):
     """Judge a drift of the tracker where nothing states the time."""
     cell, p = cell_of(registration_known=True), plan(16, 3)
     rng = np.random.default_rng(4)
@@ -229,10 +227,10 @@ def drifting(strength: float) -> Diagnosis:
     along = np.linspace(-1, 1, len(r))[:, None] * np.array([0.0, 0.0, strength])
     states = replace(r.states, time=None, load_time=None)
     r = replace(r, value=r.value + along, states=states)
-    return diagnose(fit(baseline(cell, r, "absolute"), r, "absolute"))
+    return diagnose(based(cell, r, "absolute"))
 
 
-def test_row_order_stands_for_the_time_where_there_is_none() -> None:
+def test_row_order_stands_for_the_time_where_there_is_none():
     by_name = {v.variable: v for v in drifting(1e-4).misfit_breakdown}
     assert "time" not in by_name
     order = by_name[ROW_ORDER]
@@ -240,19 +238,19 @@ def test_row_order_stands_for_the_time_where_there_is_none() -> None:
     assert order.share > 0.5
     assert order.group == "time and air"
     c = campaign(plan_seed=0)
-    timed = fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute")
+    timed = based(c.cell, c.readings, "absolute")
     assert ROW_ORDER not in {v.variable for v in misfit_breakdown(linearise(timed))}
 
 
 @pytest.mark.parametrize("strength", [2e-5, 4e-5, 1e-4])
-def test_an_unknown_effect_never_stands_beside_nothing_predicted(strength: float) -> None:
+def test_an_unknown_effect_never_stands_beside_nothing_predicted(strength):
     d = drifting(strength)
     if d.verdict == "unknown_effect":
         assert d.predictable_share >= 0.01
         assert " 0 % of the misfit" not in message(d)
 
 
-def test_what_the_pose_alone_predicts_is_said_so(shown) -> None:
+def test_what_the_pose_alone_predicts_is_said_so(shown):
     """Each pose is off by its own random amount; its repeats are off by the same."""
     cell, p = cell_of(registration_known=True), plan(16, 3, 2)
     rng = np.random.default_rng(4)
@@ -260,7 +258,7 @@ def test_what_the_pose_alone_predicts_is_said_so(shown) -> None:
     kind = r.pose * 10 + r.load  # so that only repeats have the error in common
     off = 1e-4 * rng.standard_normal((int(kind.max()) + 1, 3))[kind]
     r = replace(r, value=r.value + off)
-    d = diagnose(fit(baseline(cell, r, "absolute"), r, "absolute"))
+    d = diagnose(based(cell, r, "absolute"))
     assert d.verdict == "unknown_effect"
     assert d.repeated_share > 0.9
     same = f"{100 * d.repeated_share:.0f} % of the misfit is the same"

@@ -1,31 +1,29 @@
 """Cells as other laboratories have them: the same steps lead to the end, or say why not."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
-from hilcal.config import CellConfig, load_config
 from hilcal.config.cell import Target, Tool
 from hilcal.config.sections import Obstacle
-from hilcal.robot.catalogue import configs_dir
 from hilcal.store.campaign_file import CampaignFile
+from tests.support.campaigns import configuration
 from tests.support.procedure_cases import drawn, small
 
 
-def weights() -> CellConfig:
-    loads = load_config(configs_dir() / "cells" / "demo_ur10e.toml").loads
+def weights():
+    loads = configuration().loads
     hung = tuple(load for load in loads if load.mass_kg)
     return small().model_copy(update={"loads": hung, "force_sensor": None})
 
 
-def in_base_axes() -> CellConfig:
+def in_base_axes():
     config = small()
     tracker = config.tracker.model_copy(update={"frame": "base"})
     return config.model_copy(update={"tracker": tracker})
 
 
-def two_targets() -> CellConfig:
+def two_targets():
     targets = (
         Target(name="A", target_m=(0.06, 0.02, 0.12)),
         Target(name="B", target_m=(-0.06, 0.02, 0.12)),
@@ -46,7 +44,7 @@ def two_targets() -> CellConfig:
         pytest.param(two_targets(), 5, "deflection", id="two targets", marks=pytest.mark.slow),
     ],
 )
-def test_the_error_falls(config: CellConfig, poses: int, readings, tmp_path: Path) -> None:
+def test_the_error_falls(config, poses, readings, tmp_path):
     d = drawn(tmp_path / "run.hilcal", config=config, poses=poses, readings=readings)
     found = d.to_the_end()
     error = found.everything
@@ -57,7 +55,7 @@ def test_the_error_falls(config: CellConfig, poses: int, readings, tmp_path: Pat
     assert ({"none"} == set(found.loads)) == (config.loads == ())
 
 
-def test_points_in_the_way_of_something_are_left_out_by_name(tmp_path: Path) -> None:
+def test_points_in_the_way_of_something_are_left_out_by_name(tmp_path):
     d = drawn(tmp_path / "run.hilcal", config=in_base_axes(), poses=6, readings="absolute")
     while (step := d.procedure.next()).kind != "correct":
         d.do(step)
@@ -76,7 +74,7 @@ def test_points_in_the_way_of_something_are_left_out_by_name(tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-def test_tight_joint_limits_leave_few_poses(tmp_path: Path) -> None:
+def test_tight_joint_limits_leave_few_poses(tmp_path):
     config = small()
     limits = config.limits.model_copy(update={"joint_margin_rad": 1.6})
     planning = config.planning.model_copy(update={"singularity": 0.0, "candidates": 40})

@@ -14,20 +14,20 @@ from tests.support.procedure_cases import small
 
 
 @pytest.fixture(scope="module")
-def space() -> Space:
+def space():
     config = small()
     return Space(cell_from_config(config, configs_dir() / "cells"), config)
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_a_loaded_reading_keeps_its_unloaded_one(space: Space, seed: int) -> None:
+def test_a_loaded_reading_keeps_its_unloaded_one(space, seed):
     """Loads whose poses are reached along one to four loops, each with a return."""
     rng = np.random.default_rng(seed)
     names = [f"v{k}" for k in range(1, 13)]
     each = np.array_split(np.arange(1, 13), 2)
     loads = [load.name for load in space.config.loads]
 
-    def loops(poses: np.ndarray) -> tuple[tuple[PlannedStop, ...], ...]:
+    def loops(poses):
         parts = np.array_split(poses, rng.integers(1, 5))
         return tuple(tuple(PlannedStop(int(p), 0) for p in part) for part in parts)
 
@@ -43,7 +43,7 @@ def test_a_loaded_reading_keeps_its_unloaded_one(space: Space, seed: int) -> Non
     assert len(kept) < len(steps)
 
 
-def test_a_load_is_changed_at_the_reference_also_where_nothing_is_read(space: Space) -> None:
+def test_a_load_is_changed_at_the_reference_also_where_nothing_is_read(space):
     """What is drawn is drawn for the way that a session takes, and a correction expects."""
     load = space.config.loads[0].name
     q = np.array([[0.0, -1.2, 1.5, -1.5, -1.5, 0.0]] * 3)
@@ -51,6 +51,5 @@ def test_a_load_is_changed_at_the_reference_also_where_nothing_is_read(space: Sp
     steps = (Step("a", UNLOADED), Step("b", load), Step("a", load), Step("a", load, 1))
     plan = Plan((REFERENCE, "b", "a"), q, steps)
     side = planned_states(space.cell, space.config, plan).states.approach
-    assert side is not None
     assert side[:, 0].tolist() == [1.0, 1.0, 1.0, 1.0]
     assert (side[:, 1:] == 1.0).all()  # as the reference was reached

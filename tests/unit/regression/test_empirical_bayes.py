@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hilcal.identification.baseline import baseline
-from hilcal.identification.fit import Fit, fit
+from hilcal.identification.fit import fit
 from hilcal.identification.gauss_newton import effective_parameters
 from hilcal.identification.uncertainty import (
     HIDDEN,
@@ -13,7 +13,6 @@ from hilcal.identification.uncertainty import (
 )
 from hilcal.identification.validation import validate
 from hilcal.regression.empirical_bayes import (
-    EmpiricalPrior,
     FamilyProblem,
     maximise_evidence,
     solutions,
@@ -23,11 +22,10 @@ from hilcal.regression.projection import projection
 from hilcal.regression.schur import eliminate
 from tests.support.campaigns import campaign, measured, plan
 from tests.support.effect_cases import make
+from tests.support.fit_cases import based
 
 
-def linear(
-    strength, count, rows=1200, flat=3, noise=1.0, seed=0
-) -> tuple[EmpiricalPrior, np.ndarray]:
+def linear(strength, count, rows=1200, flat=3, noise=1.0, seed=0):
     """A random regression: flat columns, then groups of `count` of the given strengths."""
     rng = np.random.default_rng(seed)
     groups = np.repeat(np.arange(len(strength)), count)
@@ -69,7 +67,7 @@ def test_the_noise_factor_is_found_but_never_below_the_stated_one(noise):
     assert quiet.beta == 1.0
 
 
-def with_harmonics(effect: str, seed: int, hidden: int, **options) -> tuple[Fit, np.ndarray]:
+def with_harmonics(effect, seed, hidden, **options):
     """A fit with six harmonics per joint; (6, 6, 2) the true ones."""
     c = campaign(effect, "absolute", seed, plan_seed=0, poses=40, harmonics=hidden, **options)
     model = baseline(c.cell, c.readings, "absolute")
@@ -80,7 +78,7 @@ def with_harmonics(effect: str, seed: int, hidden: int, **options) -> tuple[Fit,
     return fit(model, c.readings, "absolute"), truth
 
 
-def amplitudes(found: Fit) -> np.ndarray:
+def amplitudes(found):
     return found.theta[found.model.slices()[-1]].reshape(6, 6, 2)
 
 
@@ -111,7 +109,7 @@ def test_nothing_there_leaves_almost_nothing_and_costs_less_than_two_percent():
     for seed in range(5):
         found, _ = with_harmonics("none", seed, 6)
         c = campaign("none", "absolute", seed, plan_seed=0, poses=40)
-        plain = fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute")
+        plain = based(c.cell, c.readings, "absolute")
         new = measured(c.world, plan(40, 77), np.random.default_rng(seed + 100))
         off = [validate(f.model, f.theta, f.readings, new, f.mode) for f in (found, plain)]
         worse.append(off[0].error.rms_sigma / off[1].error.rms_sigma)
@@ -170,7 +168,7 @@ def test_the_variance_is_right_where_the_data_choose_which_groups_to_keep():
     assert np.mean(naive) < 0.95
 
 
-def test_flat_columns_may_be_eliminated_before() -> None:
+def test_flat_columns_may_be_eliminated_before():
     rng = np.random.default_rng(8)
     a, flat = rng.normal(size=(80, 25)), 5
     y = a[:, :9] @ rng.normal(size=9) + rng.normal(size=80)
@@ -188,7 +186,7 @@ def test_flat_columns_may_be_eliminated_before() -> None:
 GROUPS, MEMBERS, ROWS, FLAT, FOLDS = 100, 2, 300, 4, 10
 
 
-def errors(seed: int) -> tuple[float, float, float]:
+def errors(seed):
     """RMS error: promised by folds, promised with the strengths of all rows, and real."""
     rng = np.random.default_rng(seed)
     group = np.repeat(np.arange(GROUPS), MEMBERS)
@@ -197,7 +195,7 @@ def errors(seed: int) -> tuple[float, float, float]:
     a = rng.normal(size=(ROWS, len(truth)))
     y = a @ truth + rng.normal(size=ROWS)
 
-    def fitted(rows: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    def fitted(rows, target):
         gram, rhs = rows.T @ rows, rows.T @ target
         found = maximise_evidence(
             gram, rhs, float(target @ target), len(rows), FLAT, group, np.full(len(group), 0.1)
@@ -209,7 +207,7 @@ def errors(seed: int) -> tuple[float, float, float]:
     fold = np.arange(ROWS) % FOLDS
     honest = solutions(problem, fold)
 
-    def at(strengths: np.ndarray, rows: np.ndarray, target: np.ndarray) -> np.ndarray:
+    def at(strengths, rows, target):
         live = np.append(np.arange(FLAT), FLAT + np.flatnonzero(strengths))
         ridge = np.append(np.zeros(FLAT), beta / strengths[strengths > 0] ** 2)
         x = rows[:, live]
@@ -217,7 +215,7 @@ def errors(seed: int) -> tuple[float, float, float]:
         u[live] = np.linalg.solve(x.T @ x + np.diag(ridge), x.T @ target)
         return u
 
-    def left(u_of: list[np.ndarray]) -> float:
+    def left(u_of):
         off = [y[fold == f] - a[fold == f] @ u for f, u in enumerate(u_of)]
         return float(np.sqrt(np.mean(np.concatenate(off) ** 2)))
 
@@ -226,7 +224,7 @@ def errors(seed: int) -> tuple[float, float, float]:
     return left(list(honest)), left(kept), real
 
 
-def test_folds_promise_the_error_on_rows_that_were_never_there() -> None:
+def test_folds_promise_the_error_on_rows_that_were_never_there():
     found = np.array([errors(seed) for seed in range(20)])
     honest, fixed = found[:, 2] / found[:, 0], found[:, 2] / found[:, 1]
     # A fold has nine tenths of the rows, so that it promises a little too much error.
@@ -234,7 +232,7 @@ def test_folds_promise_the_error_on_rows_that_were_never_there() -> None:
     assert np.mean(fixed) > 1.1
 
 
-def test_without_dropped_groups_and_shrinkage_a_fold_is_least_squares() -> None:
+def test_without_dropped_groups_and_shrinkage_a_fold_is_least_squares():
     rng = np.random.default_rng(0)
     a, truth = rng.normal(size=(200, 8)), rng.normal(size=8)
     y = a @ truth + 1e-3 * rng.normal(size=200)
@@ -250,7 +248,7 @@ def test_without_dropped_groups_and_shrinkage_a_fold_is_least_squares() -> None:
 LEARNT = 0.7
 
 
-def covered(truth: np.ndarray, campaigns: int = 4000) -> tuple[float, float]:
+def covered(truth, campaigns=4000):
     """Share of 95 % intervals that hold the truth, of pairs that were learnt: as chosen, widened.
 
     A pair is measured with unit noise; its prior variance is that of most evidence.

@@ -23,19 +23,18 @@ from hilcal.regression.forward_selection import (
     block_evidence,
     forward_selection,
 )
-from hilcal.types import Floats
 from tests.support.regression_cases import KINDS, Problem, problem
 
 DOF = 53.0
 
 
-def score(of: Problem, x: Floats | None = None):
+def score(of, x=None):
     x = of.x if x is None else x
     r = of.dense @ of.y
     return score_family(x.T @ of.dense @ x, x.T @ r, float(of.y @ r), DOF)
 
 
-def marginal(of: Problem, variance: Floats) -> float:
+def marginal(of, variance):
     """ln p(y) to a constant: covariance M⁻¹ + X diag(variance) Xᵀ, noise factor integrated out.
 
     The model's parameters without a prior would make M singular, so all have one.
@@ -45,12 +44,12 @@ def marginal(of: Problem, variance: Floats) -> float:
     return -0.5 * float(np.linalg.slogdet(c)[1]) - 0.5 * DOF * float(np.log(quadratic))
 
 
-def with_priors(family: int = 4, noise: float = 1.0) -> Problem:
+def with_priors(family=4, noise=1.0):
     of = problem("priors", family=family, noise=noise)
     return Problem(of.rows, np.full(len(of.ridge), 2.0), of.x, of.y)
 
 
-def test_it_is_the_ratio_of_marginal_likelihoods_where_that_is_largest() -> None:
+def test_it_is_the_ratio_of_marginal_likelihoods_where_that_is_largest():
     of = with_priors()
     found = score(of)
     rss = float(of.y @ of.dense @ of.y)
@@ -66,7 +65,7 @@ def test_it_is_the_ratio_of_marginal_likelihoods_where_that_is_largest() -> None
 
 
 @pytest.mark.parametrize("kind", ["flat", "priors", "no columns"])
-def test_posterior_mean_and_scale_are_those_of_ridge_regression(kind: str) -> None:
+def test_posterior_mean_and_scale_are_those_of_ridge_regression(kind):
     of = problem(kind)
     found = score(of)
     h = of.x.T @ of.dense @ of.x + found.ridge * np.eye(of.x.shape[1])
@@ -77,7 +76,7 @@ def test_posterior_mean_and_scale_are_those_of_ridge_regression(kind: str) -> No
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_common_factor_of_the_noise_changes_no_evidence(kind: str) -> None:
+def test_a_common_factor_of_the_noise_changes_no_evidence(kind):
     """Columns and data in units of another noise: only the prior's strength is moved."""
     of = problem(kind)
     louder = Problem(of.rows, of.ridge, of.x, 3 * of.y)
@@ -87,7 +86,7 @@ def test_a_common_factor_of_the_noise_changes_no_evidence(kind: str) -> None:
     assert other.log_evidence == pytest.approx(one.log_evidence, abs=0.02 * of.x.shape[1])
 
 
-def test_directions_that_cannot_be_seen_count_for_nothing() -> None:
+def test_directions_that_cannot_be_seen_count_for_nothing():
     of = problem("rank deficient")
     assert of.x.shape[1] == 6
     assert score(of).rank == 4
@@ -95,7 +94,7 @@ def test_directions_that_cannot_be_seen_count_for_nothing() -> None:
     assert list(visible(np.array([-1e-3, 1e-5, 1.0]))) == [False, False, True]
 
 
-def test_evidences_of_a_chain_add_up() -> None:
+def test_evidences_of_a_chain_add_up():
     """ln p(y | all) − ln p(y | none), each family with the strength that it was added with."""
     of = with_priors(family=6)
     columns = {"a": slice(0, 2), "b": slice(2, 3), "c": slice(3, 6)}
@@ -120,19 +119,19 @@ def test_evidences_of_a_chain_add_up() -> None:
 
 @pytest.mark.parametrize("rank", [1, 4, 20])
 @pytest.mark.parametrize("level", [1e-5, 0.01])
-def test_the_noncentrality_is_that_of_the_power(rank: int, level: float) -> None:
+def test_the_noncentrality_is_that_of_the_power(rank, level):
     value = noncentrality_of_power(rank, 60.0, level, 0.9)
     assert power_of_test(value, rank, 60.0, level) == pytest.approx(0.9, abs=1e-4)
 
 
-def test_without_a_family_the_power_is_the_level_and_known_noise_is_the_limit() -> None:
+def test_without_a_family_the_power_is_the_level_and_known_noise_is_the_limit():
     assert power_of_test(0.0, 3, 50.0, 0.01) == pytest.approx(0.01)
     few, many, known = (power_of_test(12.0, 3, rest, 0.01) for rest in (20.0, 1e6, np.inf))
     assert few < many == pytest.approx(known, rel=1e-4)
     assert family_power(np.zeros((2, 2)), np.ones(2), 0.01) == 0.01
 
 
-def test_the_power_is_the_share_of_rejections() -> None:
+def test_the_power_is_the_share_of_rejections():
     rng = np.random.default_rng(5)
     b, x = rng.standard_normal((30, 5)), rng.standard_normal((30, 3))
     beta = np.array([0.6, -0.4, 0.3])
@@ -146,7 +145,7 @@ def test_the_power_is_the_share_of_rejections() -> None:
     assert abs(rejected - promised) < 4 * np.sqrt(promised * (1 - promised) / 4000)
 
 
-def exact(k: int, dimension: int, level: float, c: float) -> float:
+def exact(k, dimension, level, c):
     """K equal eigenvalues: zᵀLz/zᵀz is `level` times a beta variable."""
     return float(beta.sf(c / level, k / 2, (dimension - k) / 2))
 
@@ -217,7 +216,7 @@ def test_nothing_to_test_is_no_evidence():
 
 
 @pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
-def test_no_more_dimensions_than_eigenvalues_and_any_scale(scale: float) -> None:
+def test_no_more_dimensions_than_eigenvalues_and_any_scale(scale):
     lam = scale * np.array([1e-9, 0.5, 1.0, 1.0, 2.0])
     drawn = np.random.default_rng(0).standard_normal((20000, 5)) ** 2
     ratio = (drawn @ lam) / drawn.sum(axis=1)
@@ -230,7 +229,7 @@ TRIED = np.logspace(-2, 3, 21)
 ROWS, MODEL, BLOCKS, WIDTH, FOLDS = 400, 12, 15, 4, 5
 
 
-def chosen_by_columns(own, ridge, x, y, most: int, least: float) -> list[int]:
+def chosen_by_columns(own, ridge, x, y, most, least):
     """Project all columns off the model, and what is left off each block that is chosen."""
     h = np.linalg.inv(own.T @ own + np.diag(ridge))
     m = np.eye(len(y)) - own @ h @ own.T
@@ -251,7 +250,7 @@ def chosen_by_columns(own, ridge, x, y, most: int, least: float) -> list[int]:
     return chosen
 
 
-def test_the_same_blocks_in_the_same_order() -> None:
+def test_the_same_blocks_in_the_same_order():
     lengths = []
     for seed in range(3):
         rng = np.random.default_rng(seed)
@@ -271,7 +270,7 @@ def test_the_same_blocks_in_the_same_order() -> None:
     assert min(lengths) >= 3
 
 
-def test_nothing_is_chosen_of_noise() -> None:
+def test_nothing_is_chosen_of_noise():
     rng = np.random.default_rng(1)
     own, x = rng.normal(size=(ROWS, MODEL)), rng.normal(size=(ROWS, BLOCKS, WIDTH))
     y, fold = rng.normal(size=ROWS), np.arange(ROWS) % FOLDS
@@ -279,7 +278,7 @@ def test_nothing_is_chosen_of_noise() -> None:
     assert [selection.without(f, 4, 8.0, TRIED) for f in range(FOLDS)] == [[]] * FOLDS
 
 
-def test_a_fold_that_the_sample_has_no_row_of_is_left_out_of_nothing() -> None:
+def test_a_fold_that_the_sample_has_no_row_of_is_left_out_of_nothing():
     """As one pose read 12,000 times beside others: a sample of the rows misses whole poses."""
     rng = np.random.default_rng(0)
     own, x = rng.normal(size=(60, 2)), rng.normal(size=(60, 3, 2))

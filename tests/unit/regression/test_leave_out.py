@@ -6,28 +6,26 @@ import pytest
 from hilcal.identification.linearisation import eliminate_columns
 from hilcal.regression.leave_out import (
     FamilyFolds,
-    Fold,
     family_products,
     folds,
     left_out_of_families,
     left_out_residual,
 )
 from hilcal.regression.normal_equations import find_basis, normal_equations
-from hilcal.regression.projection import Projection, projection
-from hilcal.types import Floats
+from hilcal.regression.projection import projection
 
 PRIOR = np.array([np.inf, np.inf, 0.5, 2.0, np.inf, 1.0])
 MAGNITUDE = np.array([1.0, 2.0, 1.0, 1.0, 0.5, 1.0])
 
 
-def refit(a: Floats, y: Floats, std: Floats, beta: float) -> Floats:
+def refit(a, y, std, beta):
     """Parameters of least squares with priors about zero, by rows that are appended."""
     known = np.isfinite(std)
     more = np.sqrt(beta) * np.eye(len(std))[known] / std[known][:, None]
     return np.linalg.lstsq(np.vstack([a, more]), np.append(y, np.zeros(len(more))), rcond=None)[0]
 
 
-def case(beta: float) -> tuple[Floats, Floats, Floats, Floats]:
+def case(beta):
     """Columns (R, 6), family (R, 2), data, and the parameters of the fit."""
     rng = np.random.default_rng(2)
     a, x = rng.standard_normal((60, 6)), rng.standard_normal((60, 2))
@@ -36,7 +34,7 @@ def case(beta: float) -> tuple[Floats, Floats, Floats, Floats]:
 
 
 @pytest.mark.parametrize("beta", [1.0, 2.5])
-def test_rows_left_out_are_predicted_as_by_a_refit_without_them(beta: float) -> None:
+def test_rows_left_out_are_predicted_as_by_a_refit_without_them(beta):
     a, x, y, theta = case(beta)
     basis = find_basis(a, np.ones(6), PRIOR)
     equations = normal_equations(a, y, basis, a.T @ a)
@@ -59,7 +57,7 @@ def test_rows_left_out_are_predicted_as_by_a_refit_without_them(beta: float) -> 
         np.testing.assert_allclose(theta + step, model, atol=1e-4)
 
 
-def model(beta: float) -> tuple[tuple[Fold, ...], Projection, Floats, Floats]:
+def model(beta):
     """Folds and columns of the fit of `case`, its residual, and a family."""
     a, x, y, theta = case(beta)
     basis = find_basis(a, np.ones(6), PRIOR)
@@ -70,7 +68,7 @@ def model(beta: float) -> tuple[tuple[Fold, ...], Projection, Floats, Floats]:
     return each, p, y - a @ theta, x
 
 
-def test_families_together_are_predicted_as_each_by_itself() -> None:
+def test_families_together_are_predicted_as_each_by_itself():
     each, p, white, x = model(1.0)
     other = np.random.default_rng(5).standard_normal((60, 4))
     families = [(x, 0.8), (other, 3.0), (other[:, :1], 0.1)]
@@ -86,7 +84,7 @@ def test_families_together_are_predicted_as_each_by_itself() -> None:
 
 
 @pytest.mark.parametrize("ridge", [0.0, 0.8, 40.0])
-def test_simulated_residuals_are_predicted_as_by_refits_without_their_fold(ridge: float) -> None:
+def test_simulated_residuals_are_predicted_as_by_refits_without_their_fold(ridge):
     each, p, _, x = model(1.0)
     y = np.random.default_rng(6).standard_normal((60, 3))
     found = FamilyFolds(each, p, x)
@@ -107,7 +105,7 @@ def test_simulated_residuals_are_predicted_as_by_refits_without_their_fold(ridge
 
 
 @pytest.mark.parametrize("out", [[0], [2, 3], [4, 5], [0, 1, 4]])
-def test_a_model_without_columns_is_as_a_refit_without_them(out: list[int]) -> None:
+def test_a_model_without_columns_is_as_a_refit_without_them(out):
     beta = 1.7
     a, _, y, theta = case(beta)
     mine = np.isin(np.arange(6), out)

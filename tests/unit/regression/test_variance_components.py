@@ -12,10 +12,9 @@ from hilcal.regression.variance_components import (
     hierarchy,
     variance_components,
 )
-from hilcal.types import Floats
 
 
-def one_way(groups: int, size: int, between: float, seed: int) -> BlockRows:
+def one_way(groups, size, between, seed):
     """Groups with a common normal shift of variance `between`, unit noise, and a mean."""
     rng = np.random.default_rng(seed)
     y = rng.standard_normal((groups, size)) + np.sqrt(between) * rng.standard_normal((groups, 1))
@@ -24,7 +23,7 @@ def one_way(groups: int, size: int, between: float, seed: int) -> BlockRows:
 
 
 @pytest.mark.parametrize("between", [0.0, 0.5, 40.0])
-def test_the_balanced_layout_has_a_closed_form(between: float) -> None:
+def test_the_balanced_layout_has_a_closed_form(between):
     """With known noise, 1 + n s is the variance of √n times the groups' means, mean free."""
     b = one_way(30, 4, between, 3)
     means = 2.0 * b.y.mean(axis=1)
@@ -36,7 +35,7 @@ def test_the_balanced_layout_has_a_closed_form(between: float) -> None:
         assert np.sqrt(found.covariance[0, 0]) == pytest.approx(std, rel=0.02)
 
 
-def dense(b: BlockRows, ridge: Floats, s: float) -> float:
+def dense(b, ridge, s):
     """The log of the marginal likelihood; columns without a prior integrated over all values."""
     size = b.y.size
     sigma = np.eye(size)
@@ -51,7 +50,7 @@ def dense(b: BlockRows, ridge: Floats, s: float) -> float:
     return -0.5 * float(np.linalg.slogdet(sigma)[1] + np.linalg.slogdet(h)[1] + y @ p @ y)
 
 
-def test_blocks_of_two_sizes_and_columns_with_priors_against_the_dense_likelihood() -> None:
+def test_blocks_of_two_sizes_and_columns_with_priors_against_the_dense_likelihood():
     rng, parts = np.random.default_rng(1), []
     ridge = np.array([0.0, 0.0, 2.0])
     for groups, size in ((12, 3), (5, 6)):
@@ -77,7 +76,7 @@ def test_blocks_of_two_sizes_and_columns_with_priors_against_the_dense_likelihoo
     assert found.log_likelihood == pytest.approx(gain, abs=2e-3)
 
 
-def test_two_components_are_told_apart_without_bias_and_their_uncertainty_is_right() -> None:
+def test_two_components_are_told_apart_without_bias_and_their_uncertainty_is_right():
     rng, truth, z = np.random.default_rng(0), np.array([2.0, 0.5]), []
     rows = rng.standard_normal((40, 3, 30))
     components = np.stack([v[:, :, None] * v[:, None, :] for v in rng.standard_normal((2, 40, 3))])
@@ -92,7 +91,7 @@ def test_two_components_are_told_apart_without_bias_and_their_uncertainty_is_rig
 
 
 @pytest.mark.parametrize("scale", [1e-8, 1e8])
-def test_the_scale_of_a_component_does_not_matter(scale: float) -> None:
+def test_the_scale_of_a_component_does_not_matter(scale):
     b = one_way(30, 4, 2.0, 5)
     whole = variance_components([b], np.zeros(1))
     scaled = BlockRows(b.y, b.rows, scale * b.components)
@@ -105,9 +104,7 @@ BETWEEN = np.linspace(0.2, 1.0, SIZE)
 WITHIN = 0.1
 
 
-def fleet(
-    seed: int, *, odd: tuple[int, int, float] | None = None, slope: float = 0.0
-) -> tuple[FleetEstimates, Floats]:
+def fleet(seed, *, odd=None, slope=0.0):
     """Campaigns of 30 arms, two months each; nobody determines parameter 0 of the first five."""
     rng = np.random.default_rng(seed)
     arm, time = np.repeat(np.arange(ARMS), TIMES), np.tile(np.arange(TIMES) / 1.0, ARMS)
@@ -126,7 +123,7 @@ def fleet(
     return FleetEstimates(mean, information, arm, time), mu
 
 
-def test_spreads_and_means_are_recovered_within_their_sampling_errors() -> None:
+def test_spreads_and_means_are_recovered_within_their_sampling_errors():
     means, spreads, within = [], [], []
     for seed in range(12):
         of, mu = fleet(seed)
@@ -141,7 +138,7 @@ def test_spreads_and_means_are_recovered_within_their_sampling_errors() -> None:
     assert np.mean(within) == pytest.approx(WITHIN, rel=0.15)
 
 
-def test_an_arm_that_is_unlike_the_others_is_named_and_leaves_the_spread_alone() -> None:
+def test_an_arm_that_is_unlike_the_others_is_named_and_leaves_the_spread_alone():
     of, _ = fleet(3, odd=(7, 4, 8.0))
     h, named = hierarchy(of)
     assert [(o.unit, o.parameter) for o in named] == [(7, 4)]
@@ -151,13 +148,13 @@ def test_an_arm_that_is_unlike_the_others_is_named_and_leaves_the_spread_alone()
 
 
 @pytest.mark.long
-def test_in_ordinary_fleets_no_arm_is_named() -> None:
+def test_in_ordinary_fleets_no_arm_is_named():
     fleets = 25
     alarms = sum(bool(hierarchy(fleet(100 + seed)[0])[1]) for seed in range(fleets))
     assert binom.sf(alarms - 1, fleets, FALSE_ALARM) > 1e-3
 
 
-def test_common_drift_is_found_beside_the_changes_of_single_arms() -> None:
+def test_common_drift_is_found_beside_the_changes_of_single_arms():
     of, _ = fleet(5, slope=0.3)
     h, _ = hierarchy(of)
     std = np.sqrt(np.diag(h.covariance)[SIZE:])
@@ -166,7 +163,7 @@ def test_common_drift_is_found_beside_the_changes_of_single_arms() -> None:
     assert np.abs(np.delete(h.slope / std, 2)).max() < 4
 
 
-def test_arms_measured_once_have_one_spread() -> None:
+def test_arms_measured_once_have_one_spread():
     of, _ = fleet(6)
     once = of.time == 0
     h, _ = hierarchy(

@@ -9,12 +9,10 @@ import pytest
 
 from hilcal.robot import chain as chains
 from hilcal.robot import se3
-from hilcal.robot.arm import Arm
 from hilcal.robot.body import body_poses
 from hilcal.robot.chain import Deviation, evaluate, joint_jacobian, twist_jacobian
 from hilcal.robot.scene import FLANGE, pinocchio_model
 from hilcal.robot.statics import Load, geometric_stiffness, slot_wrench_change, slot_wrenches
-from hilcal.types import Floats
 from tests.support.arm_cases import ARMS, ODD, arm_of, displacement, slope, twisted
 from tests.support.effect_cases import CELLS, situation
 
@@ -22,11 +20,11 @@ TOLERANCE = 1e-12
 COUNT = 12
 
 
-def angles(arm: Arm, count: int = COUNT) -> Floats:
+def angles(arm, count=COUNT):
     return np.random.default_rng(1).uniform(-np.pi, np.pi, (count, arm.n))
 
 
-def random_deviation(arm: Arm, size: float, count: int = COUNT) -> Deviation:
+def random_deviation(arm, size, count=COUNT):
     """Joint displacements and link twists of a size; the second slot has none."""
     rng = np.random.default_rng(2)
     twist = size * rng.normal(size=(count, arm.n + 1, 6))
@@ -34,7 +32,7 @@ def random_deviation(arm: Arm, size: float, count: int = COUNT) -> Deviation:
     return Deviation(dq=size * rng.normal(size=(count, arm.n)), twist=twist)
 
 
-def pinocchio_flange(arm: Arm, q: Floats) -> pin.SE3:
+def pinocchio_flange(arm, q):
     model = pinocchio_model(arm)
     data = model.createData()
     pin.framesForwardKinematics(model, data, q)
@@ -43,11 +41,9 @@ def pinocchio_flange(arm: Arm, q: Floats) -> pin.SE3:
 
 @pytest.mark.parametrize("name", ARMS)
 @pytest.mark.parametrize("size", [0.0, 1e-9, 1e-3, 0.5])
-def test_flange_is_where_pinocchio_has_it(name: str, size: float) -> None:
+def test_flange_is_where_pinocchio_has_it(name, size):
     arm = arm_of(name)
     q, d = angles(arm), random_deviation(arm, size)
-    assert d.dq is not None
-    assert d.twist is not None
     chain = evaluate(arm, q, d if size else None)
     for i in range(COUNT):
         flange = pinocchio_flange(twisted(arm, d.twist[i]), q[i] + d.dq[i])
@@ -58,11 +54,9 @@ def test_flange_is_where_pinocchio_has_it(name: str, size: float) -> None:
 
 
 @pytest.mark.parametrize("name", ["ur10e", ODD])
-def test_every_frame_is_its_matrix_product(name: str) -> None:
+def test_every_frame_is_its_matrix_product(name):
     arm = arm_of(name)
     q, d = angles(arm), random_deviation(arm, 0.02)
-    assert d.dq is not None
-    assert d.twist is not None
     chain = evaluate(arm, q, d)
     for i in range(COUNT):
         links = arm.links @ np.array([displacement(t) for t in d.twist[i]])
@@ -77,11 +71,11 @@ def test_every_frame_is_its_matrix_product(name: str) -> None:
                 pose = pose @ links[k + 1]
 
 
-def motion_by(arm: Arm, q: Floats, d: Deviation, change: Deviation, offset: Floats) -> Floats:
+def motion_by(arm, q, d, change, offset):
     """Motion (N, 6) of a flange-fixed point per change along a deviation, by differences."""
     r0 = evaluate(arm, q, d).rotation[-1]
 
-    def moved(t: float) -> Floats:
+    def moved(t):
         scaled = Deviation(
             dq=None if change.dq is None else t * change.dq,
             twist=None if change.twist is None else t * change.twist,
@@ -99,7 +93,7 @@ OFFSET = np.array([0.05, -0.1, 0.2])
 
 @pytest.mark.parametrize("name", ARMS)
 @pytest.mark.parametrize("size", [0.0, pytest.param(1e-3, marks=pytest.mark.slow), 0.3])
-def test_jacobians_are_slopes(name: str, size: float) -> None:
+def test_jacobians_are_slopes(name, size):
     arm = arm_of(name)
     count = 3
     q, d = angles(arm, count), random_deviation(arm, size, count)
@@ -121,12 +115,12 @@ def test_jacobians_are_slopes(name: str, size: float) -> None:
             assert_close_relative(by_slot[:, :, axis], expected)
 
 
-def assert_close_relative(found: Floats, expected: Floats) -> None:
+def assert_close_relative(found, expected):
     """Within 1e-7 of the longest motion."""
     assert np.abs(found - expected).max() <= 1e-7 * np.abs(expected).max()
 
 
-def test_no_states() -> None:
+def test_no_states():
     arm = arm_of("ur10e")
     chain = evaluate(arm, np.zeros((0, 6)), Deviation(twist=np.zeros((0, 7, 6))))
     assert chain.position.shape == (7, 0, 3)
@@ -134,7 +128,7 @@ def test_no_states() -> None:
 
 
 @pytest.mark.parametrize("name", ARMS)
-def test_bodies_and_flange_are_where_pinocchio_has_them(name: str) -> None:
+def test_bodies_and_flange_are_where_pinocchio_has_them(name):
     arm = arm_of(name)
     q = np.random.default_rng(3).uniform(-np.pi, np.pi, (4, arm.n))
     poses = body_poses(arm, q)
@@ -151,20 +145,20 @@ def test_bodies_and_flange_are_where_pinocchio_has_them(name: str) -> None:
 MAGNITUDES = (0.0, 1e-9, 1e-6, 1e-3, 0.1, 0.499, 0.501, 1.0, 3.0, 3.14)
 
 
-def vectors(seed: int, magnitude: float, count: int = 4) -> Floats:
+def vectors(seed, magnitude, count=4):
     """Random vectors (count, 3) of one length."""
     v = np.random.default_rng(seed).normal(size=(count, 3))
     return magnitude * v / np.linalg.norm(v, axis=1, keepdims=True)
 
 
-def twists(seed: int, magnitude: float, count: int = 4) -> Floats:
+def twists(seed, magnitude, count=4):
     """Twists (count, 6) that turn by `magnitude` and shift by about 1."""
     v = np.random.default_rng(seed + 1).normal(size=(count, 3))
     return np.hstack([v, vectors(seed, magnitude, count)])
 
 
 @pytest.mark.parametrize("magnitude", MAGNITUDES)
-def test_exp_is_the_matrix_exponential(magnitude: float) -> None:
+def test_exp_is_the_matrix_exponential(magnitude):
     xi = twists(0, magnitude)
     expected = np.array([displacement(x) for x in xi])
     np.testing.assert_allclose(se3.matrix(*se3.exp(xi)), expected, rtol=0, atol=1e-14)
@@ -172,7 +166,7 @@ def test_exp_is_the_matrix_exponential(magnitude: float) -> None:
 
 
 @pytest.mark.parametrize("short", [0.0, 1e-15, 1e-12, 1e-8, 1e-4, 0.1])
-def test_vectors_of_rotations_by_about_half_a_turn(short: float) -> None:
+def test_vectors_of_rotations_by_about_half_a_turn(short):
     w = np.random.default_rng(2).standard_normal((200, 3))
     w = np.vstack([w, np.eye(3), -np.eye(3), np.eye(3)[:2] + np.eye(3)[1:]])
     w *= (np.pi - short) / np.linalg.norm(w, axis=1, keepdims=True)
@@ -182,7 +176,7 @@ def test_vectors_of_rotations_by_about_half_a_turn(short: float) -> None:
     np.testing.assert_allclose(se3.rotation(found), r, rtol=0, atol=1e-14)
 
 
-def test_one_twist_and_none_at_all() -> None:
+def test_one_twist_and_none_at_all():
     r, p = se3.exp(np.zeros(6))
     np.testing.assert_array_equal(r, np.eye(3))
     np.testing.assert_array_equal(p, np.zeros(3))
@@ -195,7 +189,7 @@ STATES = 8
 GRAVITIES = {"floor": (0.0, 0.0, -9.80665), "odd": (3.0, -7.0, 4.0)}
 
 
-def case(arm: Arm, gravity: tuple[float, ...]) -> tuple[Floats, Deviation, Load]:
+def case(arm, gravity):
     """States, a deviation with large twists, and a load that pulls and turns."""
     rng = np.random.default_rng(5)
     q = rng.uniform(-np.pi, np.pi, (STATES, arm.n))
@@ -215,12 +209,10 @@ def case(arm: Arm, gravity: tuple[float, ...]) -> tuple[Floats, Deviation, Load]
 
 @pytest.mark.parametrize("name", ARMS)
 @pytest.mark.parametrize("gravity", GRAVITIES)
-def test_torques_are_those_that_pinocchio_holds_against(name: str, gravity: str) -> None:
+def test_torques_are_those_that_pinocchio_holds_against(name, gravity):
     # Pinocchio's generalized gravity holds the arm; weight and load pull the other way.
     arm = arm_of(name)
     q, d, load = case(arm, GRAVITIES[gravity])
-    assert d.dq is not None
-    assert d.twist is not None
     found = slot_wrenches(arm, evaluate(arm, q, d), load)
     for i in range(STATES):
         model = pinocchio_model(twisted(arm, d.twist[i]))
@@ -244,11 +236,9 @@ def test_torques_are_those_that_pinocchio_holds_against(name: str, gravity: str)
 
 
 @pytest.mark.parametrize("name", ["ur10e", ODD])
-def test_wrenches_are_sums_over_all_that_hangs_beyond(name: str) -> None:
+def test_wrenches_are_sums_over_all_that_hangs_beyond(name):
     arm = arm_of(name)
     q, d, load = case(arm, GRAVITIES["odd"])
-    assert d.dq is not None
-    assert d.twist is not None
     found = slot_wrenches(arm, evaluate(arm, q, d), load)
     for i in range(STATES):
         links = arm.links @ np.array([displacement(t) for t in d.twist[i]])
@@ -271,7 +261,7 @@ def test_wrenches_are_sums_over_all_that_hangs_beyond(name: str) -> None:
             np.testing.assert_allclose(found[i, k, 3:], turn @ moment, rtol=0, atol=1e-10)
 
 
-def test_change_of_the_wrenches_is_their_difference() -> None:
+def test_change_of_the_wrenches_is_their_difference():
     # Wrenches are linear in the load: the difference is exact. The load acts at the flange.
     arm = arm_of("ur10e")
     q, d, load = case(arm, GRAVITIES["floor"])
@@ -287,7 +277,7 @@ def test_change_of_the_wrenches_is_their_difference() -> None:
         np.testing.assert_allclose(found[:, p], expected, rtol=0, atol=1e-10)
 
 
-def test_load_point_may_differ_from_state_to_state() -> None:
+def test_load_point_may_differ_from_state_to_state():
     arm = arm_of("ur10e")
     q, d, load = case(arm, GRAVITIES["floor"])
     chain = evaluate(arm, q, d)

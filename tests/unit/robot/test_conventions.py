@@ -1,17 +1,16 @@
 """Signs, zeros and couplings of a controller; modified DH tables; URDFs that lack something."""
 
 import csv
+import json
 from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
-import pytest
 
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig
 from hilcal.config.sections import Conventions, Coupling
 from hilcal.design.feasible import Space, draw
-from hilcal.errors import InputError
 from hilcal.model.model import Model
 from hilcal.readings.covariance import TrackerNoise
 from hilcal.readings.readings import States
@@ -21,6 +20,7 @@ from hilcal.robot.conventions import as_counted
 from hilcal.robot.urdf import arm_from_urdf
 from hilcal.tables.table import read_table
 from tests.support.effect_cases import make
+from tests.support.refusals import refusal, refusals, refuses
 
 SIGN = [1, -1, 1, 1, -1, 1]
 OFFSET = [0.0, 90.0, -30.0, 0.0, 180.0, 5.0]
@@ -58,17 +58,9 @@ def test_jacobian_by_the_controllers_values_agrees_with_differences():
         np.testing.assert_allclose(found[:, :, j], (ahead - back) / (2 * step), atol=1e-8)
 
 
-@pytest.mark.parametrize(
-    ("keys", "words"),
-    [
-        ({"joint_sign": [1, 1, 1]}, "joint_sign has 3 values; ur10e has 6 joints"),
-        ({"joint_offset_deg": [0.0]}, "joint_offset_deg has 1 values"),
-        ({"joint_coupling": [{"joint": 7, "follows": 2}]}, "names joint 7; ur10e has joints 1"),
-    ],
-)
-def test_bad_conventions_are_refused(keys, words):
-    with pytest.raises(InputError, match=words):
-        described(**keys)
+@refusals("conventions")
+def test_bad_conventions_are_refused(case, given):
+    refuses(case, lambda: described(**json.loads(given)))
 
 
 ROW = """
@@ -140,8 +132,7 @@ def test_a_urdf_says_what_it_lacks(tmp_path):
 
 
 def test_a_rail_without_ends_is_refused_by_name(tmp_path):
-    with pytest.raises(InputError, match=r'prismatic joint "j1" has no <limit'):
-        arm_from_urdf(urdf(tmp_path, "prismatic"))
+    refusal(r'prismatic joint "j1" has no <limit', arm_from_urdf, urdf(tmp_path, "prismatic"))
 
 
 JOINT = """<joint name="j{k}" type="revolute"><parent link="l{k}"/><child link="l{next}"/>
@@ -232,20 +223,11 @@ def test_signs_and_zeros_of_the_controller_go_with_it(tmp_path):
     np.testing.assert_allclose(back[:, [2, 3]], drawn[:, [2, 3]], atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("follows", "words"),
-    [
-        ({3: '<mimic joint="j9"/>'}, 'mimics joint "j9", which is not there.*valid: .*j1, j2, j4'),
-        ({3: '<mimic joint="j2"/>', 4: '<mimic joint="j3"/>'}, '"j3", which follows another'),
-        ({3: '<mimic joint="j3"/>'}, '"j3" of the arm mimics joint "j3", which follows another'),
-        ({3: '<mimic joint="j2" multiplier="x"/>'}, "multiplier value .x. is not a valid float"),
-        ({3: '<mimic joint="j2" offset="inf"/>'}, "offset value .inf. is not"),
-    ],
-)
-def test_what_follows_nothing_is_refused(tmp_path, follows, words):
-    with pytest.raises(InputError, match=words) as caught:
-        arm_from_urdf(urdf_of_mimic(tmp_path, follows))
-    assert "\n" not in str(caught.value)
+@refusals("mimics")
+def test_what_follows_nothing_is_refused(case, given, tmp_path):
+    rows = (line.split(maxsplit=1) for line in given.splitlines())
+    path = urdf_of_mimic(tmp_path, {int(joint): follows for joint, follows in rows})
+    refuses(case, lambda: arm_from_urdf(path), path)
 
 
 def table(tmp_path, arm, columns, change=0.0):
@@ -267,11 +249,9 @@ def test_a_table_may_leave_its_column_out(tmp_path):
         found = read_table(path, arm, NOISE)
         np.testing.assert_allclose(found.states.q, q, atol=1e-6)
     path, _ = table(tmp_path, arm, (1, 2, 3, 4, 5), change=0.01)
-    with pytest.raises(InputError, match=r"q3_rad.*by the arm's description j3 follows to"):
-        read_table(path, arm, NOISE)
+    refusal(r"q3_rad.*by the arm's description j3 follows to", read_table, path, arm, NOISE)
     path, _ = table(tmp_path, arm, (1, 3, 4, 5))
-    with pytest.raises(InputError, match="column 'q2_rad' is missing"):
-        read_table(path, arm, NOISE)
+    refusal("column 'q2_rad' is missing", read_table, path, arm, NOISE)
 
 
 def test_planned_poses_are_poses_of_the_arm(tmp_path):

@@ -10,16 +10,15 @@ from hilcal.drivers.simulated.mechanics import rotation_vector
 from hilcal.drivers.simulated.truth import Truth
 from hilcal.drivers.simulated.ur_state import GRAVITY, Kinematics
 from hilcal.drivers.simulated.world import SimulatedNoise, World
-from hilcal.effects.protocol import Situation
 from hilcal.identification.full_covariance import joint_factors
 from hilcal.model.model import Model
-from hilcal.readings.readings import Readings
 from hilcal.robot.body import body_poses, capsules, is_known
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate
 from hilcal.robot.scene import Scene, pinocchio_model
 from tests.support.campaigns import true_parameters
 from tests.support.effect_cases import make, numeric_jacobian, some_states
+from tests.support.readings_cases import made
 
 SIGN = (1, -1, 1, 1, -1, 1)
 PAIRS = {(3, 2): 1.0, (6, 5): -0.5, (6, 4): 0.3}
@@ -164,16 +163,10 @@ def test_the_situation_says_whose_angles_they_are():
     for mechanical in (True, False):
         cell = coupled_cell(mechanical)
         states = some_states(cell, 3)
-        s: Situation = Model(cell, ()).predict(states, np.zeros(0)).situation
+        s = Model(cell, ()).predict(states, np.zeros(0)).situation
         expected = states.q if mechanical else drawn_angles(states.q) * SIGN
         np.testing.assert_allclose(s.angle, expected, atol=1e-12)
         np.testing.assert_array_equal(s.values, states.q)
-
-
-def measured_of(states):
-    each = np.arange(3)
-    nothing = np.zeros((3, 3)), np.tile(np.eye(3), (3, 1, 1))
-    return Readings(states, each, 0 * each, 0 * each, *nothing, ("none",), ("a", "b", "c"))
 
 
 @pytest.mark.parametrize("mechanical", [True, False])
@@ -183,7 +176,7 @@ def test_the_arms_scatter_is_that_of_its_drives(mechanical):
     world = World(cell, Truth.rigid(cell.arm), cell.registration, np.eye(4), SimulatedNoise(),
                   np.zeros(6))  # fmt: skip
     scatter = 1e-5 * np.arange(1.0, 7.0)
-    factors = joint_factors(cell, measured_of(states), scatter)
+    factors = joint_factors(cell, made(states.q, np.zeros((3, 3)), wrench=states.wrench), scatter)
     for j in range(6):
         one = np.tile(1e-6 * np.eye(6)[j], (3, 1))
         ahead, back = (world.sight(states, s).position for s in (one, -one))

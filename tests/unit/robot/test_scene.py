@@ -23,7 +23,7 @@ TABLE = Obstacle(name="table", center_m=(0.0, 0.0, -0.1), size_m=(3.0, 3.0, 0.1)
 
 
 @given(POINT, POINT, POINT, POINT)
-def test_distance_of_segments(a, b, c, d) -> None:
+def test_distance_of_segments(a, b, c, d):
     ends = [np.array(p) for p in (a, b, c, d)]
     share = np.linspace(0.0, 1.0, 81)[:, None]
     first = ends[0] + share * (ends[1] - ends[0])
@@ -35,7 +35,7 @@ def test_distance_of_segments(a, b, c, d) -> None:
 
 
 @pytest.mark.parametrize("name", [n for n in robot_names() if n.startswith("ur")])
-def test_usual_poses_are_free_and_folded_ones_are_not(name: str) -> None:
+def test_usual_poses_are_free_and_folded_ones_are_not(name):
     scene = Scene(load_arm(name), obstacles=(TABLE,))
     usual = np.array([UPRIGHT, [0.0, -1.5, 1.5, -1.5, -1.5, 0.0], *POSES.values()])
     assert is_known(load_arm(name)) == (name not in ("ur8long", "ur15", "ur18"))  # guessed
@@ -54,7 +54,7 @@ FOOT = {"ur3": 128, "ur3e": 128, "ur5": 149, "ur5e": 149, "ur20": 245, "ur30": 2
 
 
 @pytest.mark.parametrize("name", robot_names())
-def test_shapes_hold_the_crossings_of_axes_and_are_no_wider_than_the_foot(name: str) -> None:
+def test_shapes_hold_the_crossings_of_axes_and_are_no_wider_than_the_foot(name):
     """Feet: data sheets, mm; the tool's flange of a UR3e measures 63 mm."""
     arm = load_arm(name)
     assert all(0.03 <= part.radius <= FOOT.get(name, 190) / 2000 for part in capsules(arm))
@@ -66,7 +66,7 @@ def test_shapes_hold_the_crossings_of_axes_and_are_no_wider_than_the_foot(name: 
             assert {k - 1, k} & set(near)
 
 
-def test_known_distances_to_a_ball_a_box_and_a_cylinder() -> None:
+def test_known_distances_to_a_ball_a_box_and_a_cylinder():
     """Upright, the UR10e's upper arm stands 176.2 mm beside the base's axis, 60 mm thick."""
     arm = load_arm("ur10e")
     height = 0.1807 + 0.3
@@ -103,9 +103,7 @@ things = st.one_of(
 @pytest.mark.long
 @settings(max_examples=25, deadline=None)
 @given(st.sampled_from(["ur3e", "ur5", "ur10e", "ur20"]), things, st.integers(0, 999))
-def test_whatever_is_free_is_free_by_another_way_to_count(
-    name: str, thing: Obstacle, seed: int
-) -> None:
+def test_whatever_is_free_is_free_by_another_way_to_count(name, thing, seed):
     """Both ways: what is counted free keeps the margin, what is not comes closer than that."""
     arm = load_arm(name)
     scene = Scene(arm, obstacles=(thing,))
@@ -124,7 +122,7 @@ def test_whatever_is_free_is_free_by_another_way_to_count(
 
 @settings(max_examples=25, deadline=None)
 @given(st.sampled_from(["ur3e", "ur10e", ODD]), things, st.integers(0, 999))
-def test_no_gap_closes_faster_than_its_rate(name: str, thing: Obstacle, seed: int) -> None:
+def test_no_gap_closes_faster_than_its_rate(name, thing, seed):
     """What is nearest after turns of the joints was no farther before than the bound says."""
     arm, rng = arm_of(name), np.random.default_rng(seed)
     scene, point = Scene(arm, obstacles=(thing,)), rng.normal(0.0, 0.1, 3)
@@ -142,7 +140,7 @@ def test_no_gap_closes_faster_than_its_rate(name: str, thing: Obstacle, seed: in
         assert scene.free.touching(old, near, was).all()
 
 
-def test_an_arm_of_unknown_shape_gets_links_and_can_move() -> None:
+def test_an_arm_of_unknown_shape_gets_links_and_can_move():
     arm = arm_of(ODD)
     assert not is_known(arm)
     parts = capsules(arm)
@@ -156,6 +154,6 @@ def test_an_arm_of_unknown_shape_gets_links_and_can_move() -> None:
     assert 0.0 < share < 0.9
 
 
-def test_an_arm_of_a_known_name_and_another_build_is_unknown() -> None:
+def test_an_arm_of_a_known_name_and_another_build_is_unknown():
     assert not is_known(replace(arm_of(ODD), name="ur10e"))
     assert is_known(replace(load_arm("ur10e"), q_max=np.full(6, 1.0)))

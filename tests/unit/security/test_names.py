@@ -19,7 +19,6 @@ import tomllib
 from contextlib import redirect_stderr
 from dataclasses import replace
 from html.parser import HTMLParser
-from pathlib import Path
 from types import SimpleNamespace
 from xml.etree import ElementTree
 
@@ -70,6 +69,7 @@ from hilcal.tables.write import plan_csv, write_columns
 from hilcal.workbench.elements import plain
 from tests.support.paths import ROOT
 from tests.support.readings_cases import make_arm, simple
+from tests.support.refusals import refusal
 from tests.support.unguarded import unguarded
 from tests.unit.calibration.test_calibration import calibrated
 
@@ -91,13 +91,13 @@ FORMULA = tuple("=+-@\t\r\uff1d\uff0b\uff0d\uff20")
 few = settings(max_examples=40, deadline=None)
 
 
-def harmless(text: str) -> bool:
+def harmless(text):
     """Whether a text has no character that no name may hold, but for ends of lines."""
     return not set(text) & {*EVIL} - {"\n"}
 
 
 @pytest.mark.parametrize("sign", EVIL)
-def test_each_such_character_is_refused_in_one_line_and_escaped(sign: str) -> None:
+def test_each_such_character_is_refused_in_one_line_and_escaped(sign):
     with pytest.raises(InputError) as error:
         check_name(f"P1{sign}x", "t.csv: row 2, column 'pose'")
     said = str(error.value)
@@ -109,21 +109,18 @@ def test_each_such_character_is_refused_in_one_line_and_escaped(sign: str) -> No
     assert escaped(sign) == code
 
 
-def test_documents_are_checked_however_deep_they_are() -> None:
-    deep: object = "a\nb"
+def test_documents_are_checked_however_deep_they_are():
+    deep = "a\nb"
     for _ in range(5000):
         deep = [deep]
-    with pytest.raises(InputError, match="holds the character"):
-        check_names({"a": deep}, "f")
-    with pytest.raises(InputError, match=r"f: a: b 2: .* holds the character"):
-        check_names({"a": {"b": [1, "\x1b"]}}, "f")
-    with pytest.raises(InputError, match="holds the character"):
-        check_names({"a": {"b\u2028": 1}}, "f")
+    refusal("holds the character", check_names, {"a": deep}, "f")
+    refusal(r"f: a: b 2: .* holds the character", check_names, {"a": {"b": [1, "\x1b"]}}, "f")
+    refusal("holds the character", check_names, {"a": {"b\u2028": 1}}, "f")
 
 
 @few
 @given(names, names)
-def test_urscript(name: str, other: str) -> None:
+def test_urscript(name, other):
     text = movej_program([name, other], np.zeros((2, 6)))
     assert harmless(text)
     assert len(waypoints(text)) == 2
@@ -133,7 +130,7 @@ def test_urscript(name: str, other: str) -> None:
     assert text.split("\n")[1].endswith(f"  # {escaped(name)}")
 
 
-def the_same_cells(text: str, wanted: list[list[str]]) -> None:
+def the_same_cells(text, wanted):
     """Rows by their lines, with the names in place, and no cell that is a formula."""
     assert harmless(text)
     rows = list(csv.reader(io.StringIO(text, newline=""), strict=True))
@@ -149,7 +146,7 @@ def the_same_cells(text: str, wanted: list[list[str]]) -> None:
 
 @few
 @given(names)
-def test_csv(name: str) -> None:
+def test_csv(name):
     folder = FOLDER[0]
     write_columns(folder / "a.csv", {"pose": [name, "b"], name: [-1.5, None]}, {})
     text = (folder / "a.csv").read_bytes().decode()
@@ -175,7 +172,7 @@ def test_csv(name: str) -> None:
 
 @few
 @given(names)
-def test_xml_and_yaml(name: str) -> None:
+def test_xml_and_yaml(name):
     arm = replace(ARM, name=name, joint_names=tuple(f"{name}{k}" for k in "abcdef"))
     text = urdf(arm, f"{name}\n{name}-")
     assert harmless(text)
@@ -190,7 +187,7 @@ def test_xml_and_yaml(name: str) -> None:
 
 @few
 @given(names)
-def test_toml(name: str) -> None:
+def test_toml(name):
     arm = replace(ARM, source=name, joint_names=(name,) * 6)
     made = to_toml(dh_rows(ARM, "standard"), arm, name)
     content = tomllib.loads(made)
@@ -212,7 +209,7 @@ def test_toml(name: str) -> None:
 
 @few
 @given(names)
-def test_command_lines(name: str) -> None:
+def test_command_lines(name):
     line = f"hilcal refine {quoted(name)} --prior a"
     assert harmless(line)
     assert shlex.split(line) == ["hilcal", "refine", escaped(name), "--prior", "a"]
@@ -226,7 +223,7 @@ RUN_BY_PEOPLE = re.compile(
 )
 
 
-def unquoted(tree: ast.AST) -> list[int]:
+def unquoted(tree):
     """Lines in which a value stands as it is in a command line that people are told to run."""
     found = []
     for node in ast.walk(tree):
@@ -243,7 +240,7 @@ def unquoted(tree: ast.AST) -> list[int]:
     return found
 
 
-def test_values_in_command_lines_are_quoted() -> None:
+def test_values_in_command_lines_are_quoted():
     texts = {p: p.read_text(encoding="utf-8") for p in (ROOT / "hilcal").rglob("*.py")}
     found = {
         path.relative_to(ROOT).as_posix(): lines
@@ -257,7 +254,7 @@ def test_values_in_command_lines_are_quoted() -> None:
 
 @few
 @given(names)
-def test_json(name: str) -> None:
+def test_json(name):
     text = Plan((name,), np.zeros((1, 6)), (Step(name, name),), {"by": name}).to_json()
     assert text.isascii()
     assert harmless(text)
@@ -272,21 +269,21 @@ def test_json(name: str) -> None:
 class Tags(HTMLParser):
     """Tags with their attributes' names, and all text."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
-        self.tags: list[object] = []
-        self.words: list[str] = []
-        self.labels: list[str | None] = []
+        self.tags = []
+        self.words = []
+        self.labels = []
 
-    def handle_starttag(self, tag, attrs) -> None:
+    def handle_starttag(self, tag, attrs):
         self.tags.append((tag, [key for key, _ in attrs]))
         self.labels += [value for key, value in attrs if key == "aria-label"]
 
-    def handle_data(self, data) -> None:
+    def handle_data(self, data):
         self.words.append(data)
 
 
-def report(name: str) -> str:
+def report(name):
     figure = chart_style.figure(
         name, in_chart(name), traces=[go.Scatter(x=[in_chart(name)], y=[1])]
     )
@@ -301,8 +298,8 @@ def report(name: str) -> str:
 
 
 @settings(max_examples=12, deadline=None)
-@given(names)
-def test_html(name: str) -> None:
+@given(names.map(lambda name: name.replace("\n", "")))  # an end of line begins a paragraph
+def test_html(name):
     found, other = Tags(), Tags()
     text = report(f"x{name}")  # a cell without a short class has the same tag
     assert harmless(text)
@@ -325,7 +322,7 @@ def test_html(name: str) -> None:
 
 @few
 @given(names)
-def test_rerun(name: str) -> None:
+def test_rerun(name):
     assert harmless(viewer_style.safe(name))
     words = viewer_style.escaped(name)
     assert "\n" not in words
@@ -335,7 +332,7 @@ def test_rerun(name: str) -> None:
 
 @few
 @given(names)
-def test_python(name: str) -> None:
+def test_python(name):
     form = FORM[0]
     source = source_of_form(form, "my_law", evidence=f"{name}\n{name}", file=name)
     other = source_of_form(form, "my_law", evidence="a\nb", file="F.py")
@@ -346,14 +343,13 @@ def test_python(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["a\nimport os", "a-b", "A", ""])
-def test_an_effect_has_a_name_of_python(name: str) -> None:
-    with pytest.raises(InputError, match="valid: lower-case letters"):
-        source_of_form(FORM[0], name)
+def test_an_effect_has_a_name_of_python(name):
+    refusal("valid: lower-case letters", source_of_form, FORM[0], name)
 
 
 @few
 @given(names)
-def test_terminal(name: str) -> None:
+def test_terminal(name):
     for terminal_ in (False, True):
         file = io.StringIO()
         kept = SafeConsole(file=file, width=4000, force_terminal=terminal_, color_system=None)
@@ -374,7 +370,7 @@ def test_terminal(name: str) -> None:
     assert harmless(json.loads(out.getvalue())["error"]["message"])
 
 
-def test_progress_and_questions_are_no_markup() -> None:
+def test_progress_and_questions_are_no_markup():
     name = "[red]x[/]\x1b[31m\u202e"
     file = io.StringIO()
     console = SafeConsole(file=file, width=200, force_terminal=True, color_system=None)
@@ -392,7 +388,7 @@ def test_progress_and_questions_are_no_markup() -> None:
     assert asked.getvalue() == f"{escaped(name)}\n"
 
 
-def refused_or(read, name: str, what: str = "") -> None:
+def refused_or(read, name, what=""):
     """A reader refuses a name, naming its character, or keeps it."""
     kept, said = None, ""
     try:
@@ -408,7 +404,7 @@ def refused_or(read, name: str, what: str = "") -> None:
         assert "\n" not in kept, what
 
 
-def as_csv(header: list[str], *rows: list[object]) -> bytes:
+def as_csv(header, *rows):
     out = io.StringIO()
     csv.writer(out).writerows([header, *rows])
     return out.getvalue().encode("utf-8", "replace")
@@ -416,7 +412,7 @@ def as_csv(header: list[str], *rows: list[object]) -> bytes:
 
 @few
 @given(names)
-def test_tables_and_plans_refuse_a_name_or_keep_it(name: str) -> None:
+def test_tables_and_plans_refuse_a_name_or_keep_it(name):
     folder, q = FOLDER[0], [f"q{k}_rad" for k in range(1, 7)]
     if re.search("[\ud800-\udfff]", name):
         return  # no file of UTF-8 holds these
@@ -436,7 +432,7 @@ def test_tables_and_plans_refuse_a_name_or_keep_it(name: str) -> None:
 
 @few
 @given(names)
-def test_exchange_tables_are_read_back_or_refused(name: str) -> None:
+def test_exchange_tables_are_read_back_or_refused(name):
     readings = simple(4)
     whole = replace(readings, pose_names=(name, *readings.pose_names[1:]))
     for path in (FOLDER[0] / "t.csv", FOLDER[0] / "t.parquet"):
@@ -451,7 +447,7 @@ def test_exchange_tables_are_read_back_or_refused(name: str) -> None:
 
 @few
 @given(names)
-def test_cells_and_documents_refuse_a_name_or_keep_it(name: str) -> None:
+def test_cells_and_documents_refuse_a_name_or_keep_it(name):
     if re.search("[\ud800-\udfff]", name):
         return  # no TOML holds these
     cell = tomllib.loads((CELL).read_text())
@@ -464,12 +460,11 @@ def test_cells_and_documents_refuse_a_name_or_keep_it(name: str) -> None:
     refused_or(lambda: next(iter(storage.from_json(content).loads)).strip(), name, "calibration")
     if escaped(name) != name:
         prior = {"format": posterior_document.FORMAT, "version": 1, "arm": name}
-        with pytest.raises(InputError, match="holds the character"):
-            posterior_document.from_json(prior)
+        refusal("holds the character", posterior_document.from_json, prior)
 
 
 @pytest.mark.parametrize("table_", ["poses", "loads", "revisions"])
-def test_a_name_in_a_campaign_of_others_is_refused(table_: str, tmp_path: Path) -> None:
+def test_a_name_in_a_campaign_of_others_is_refused(table_, tmp_path):
     path = tmp_path / "run.hilcal"
     with CampaignFile.create(path, "{}", str(tmp_path), "made") as file:
         file.append_readings(simple(4))
@@ -495,22 +490,21 @@ def test_a_name_in_a_campaign_of_others_is_refused(table_: str, tmp_path: Path) 
     assert harmless(str(error.value))
 
 
-def test_a_name_is_refused_where_it_goes_into_a_campaign(tmp_path: Path) -> None:
+def test_a_name_is_refused_where_it_goes_into_a_campaign(tmp_path):
     readings = simple(4)
     named = replace(readings, pose_names=("a\nb", *readings.pose_names[1:]))
     with CampaignFile.create(tmp_path / "run.hilcal", "{}", "", "made") as file:
-        with pytest.raises(InputError, match=r"holds the character \\u000a"):
-            file.append_readings(named)
+        refusal(r"holds the character \\u000a", file.append_readings, named)
         assert file.n_readings == 0
 
 
-FOLDER: list[Path] = []
-FORM: list = []
-CALIBRATION: list = []
+FOLDER = []
+FORM = []
+CALIBRATION = []
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _made(tmp_path_factory: pytest.TempPathFactory):
+def _made(tmp_path_factory):
     from hilcal.discovery import shapes
     from hilcal.discovery.amplitudes import Factor
     from hilcal.discovery.law import Form, LawPart

@@ -6,19 +6,19 @@ import sqlite3
 import struct
 from contextlib import closing
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
 from hilcal.calibration.handover import urdf
-from hilcal.config import load_config
 from hilcal.errors import InputError
 from hilcal.readings.covariance import COVERS, WHOLE
 from hilcal.robot.catalogue import load_arm
 from hilcal.store import rows
 from hilcal.store.campaign_file import CampaignFile
-from tests.support.cli_cases import CELL, Capsys, ok, refused, rehearsal
+from tests.support.campaigns import configuration
+from tests.support.cli_cases import ok, refused, rehearsal
 from tests.support.cli_cases import run as run_of
+from tests.support.refusals import refusal
 from tests.unit.data.test_campaign import REVISION
 
 FOREVER = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT"
@@ -52,27 +52,27 @@ FOREIGN = {
 }
 
 
-def make(path: Path, config: str, base: str = "") -> Path:
+def make(path, config, base=""):
     with CampaignFile.create(path, config, base, "made", more={COVERS: WHOLE}) as file:
         file.append_readings(rehearsal("nothing", poses=8).readings)
     return path
 
 
 @pytest.fixture(scope="module")
-def plain(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+def plain(tmp_path_factory):
     path = tmp_path_factory.mktemp("plain") / "run.hilcal"
-    return make(path, load_config(CELL).to_json()).read_bytes()
+    return make(path, configuration().to_json()).read_bytes()
 
 
 @pytest.fixture
-def run(plain: bytes, tmp_path: Path) -> Path:
+def run(plain, tmp_path):
     path = tmp_path / "run.hilcal"
     path.write_bytes(plain)
     return path
 
 
 @pytest.mark.parametrize("what", FOREIGN)
-def test_what_no_hilcal_wrote_is_refused(what: str, run: Path, capsys: Capsys) -> None:
+def test_what_no_hilcal_wrote_is_refused(what, run, capsys):
     with closing(sqlite3.connect(run)) as db:
         db.executescript(FOREIGN[what])
     before = run.read_bytes()
@@ -84,7 +84,7 @@ def test_what_no_hilcal_wrote_is_refused(what: str, run: Path, capsys: Capsys) -
     assert list(run.parent.iterdir()) == [run]
 
 
-def test_what_the_tables_hold_is_not_part_of_their_names(run: Path) -> None:
+def test_what_the_tables_hold_is_not_part_of_their_names(run):
     """A name of an object that would write on a terminal is told as it is spelled, if short."""
     with closing(sqlite3.connect(run)) as db:
         db.execute(f'CREATE TABLE "x\x1b[2J\ny{"long" * 9999}" (a)')
@@ -94,7 +94,7 @@ def test_what_the_tables_hold_is_not_part_of_their_names(run: Path) -> None:
     assert len(str(told.value)) < 1000
 
 
-def journal_of_several_files(path: Path, other: Path) -> Path:
+def journal_of_several_files(path, other):
     """What a transaction over a campaign and other files leaves: SQLite deletes the other file."""
     page = path.read_bytes()[:4096]
     magic, nonce = bytes.fromhex("d9d505f920a163d7"), 1
@@ -110,7 +110,7 @@ def journal_of_several_files(path: Path, other: Path) -> Path:
     return journal
 
 
-def test_a_journal_beside_it_deletes_no_file(run: Path, capsys: Capsys) -> None:
+def test_a_journal_beside_it_deletes_no_file(run, capsys):
     mine = run.with_name("mine.txt")
     mine.write_text("kept")
     journal_of_several_files(run, mine)
@@ -122,7 +122,7 @@ def test_a_journal_beside_it_deletes_no_file(run: Path, capsys: Capsys) -> None:
     assert not mine.exists(), "this SQLite would not have obeyed it"
 
 
-def test_a_journal_that_is_a_link_leads_nowhere(run: Path, capsys: Capsys) -> None:
+def test_a_journal_that_is_a_link_leads_nowhere(run, capsys):
     mine = run.with_name("mine.txt")
     run.with_name(f"{run.name}-journal").symlink_to(mine)
     assert "-journal: a journal that no hilcal made" in refused(capsys, 2, "identify", run)
@@ -130,7 +130,7 @@ def test_a_journal_that_is_a_link_leads_nowhere(run: Path, capsys: Capsys) -> No
 
 
 @pytest.mark.parametrize("what", ["revisions", "meta", "readings", "poses", "events", "details"])
-def test_nothing_is_said_to_be_stored_that_is_not(what: str, run: Path) -> None:
+def test_nothing_is_said_to_be_stored_that_is_not(what, run):
     """Whatever swallows a row, also after the file was opened, is noticed."""
     with CampaignFile.open(run) as file:
         count, x, width = file.n_readings, file.readings(), {"events": 3, "details": 4}
@@ -139,7 +139,7 @@ def test_nothing_is_said_to_be_stored_that_is_not(what: str, run: Path) -> None:
             f"CREATE TEMP TRIGGER x BEFORE INSERT ON main.{what} BEGIN SELECT RAISE(IGNORE); END"
         )
 
-        def store() -> None:
+        def store():
             if what == "revisions":
                 file.append_revision(REVISION)
             elif what == "meta":
@@ -150,14 +150,11 @@ def test_nothing_is_said_to_be_stored_that_is_not(what: str, run: Path) -> None:
             else:
                 file.append_readings(x if what == "readings" else new)
 
-        with pytest.raises(InputError, match="not stored"):
-            store()
+        refusal("not stored", store)
         assert file.n_readings == count
 
 
-def test_a_pipe_in_the_place_of_a_campaign_is_not_waited_for(
-    tmp_path: Path, capsys: Capsys
-) -> None:
+def test_a_pipe_in_the_place_of_a_campaign_is_not_waited_for(tmp_path, capsys):
     os.mkfifo(tmp_path / "x.hilcal")
     assert "a pipe" in refused(capsys, 2, "info", tmp_path / "x.hilcal")
     assert run_of(capsys, "fleet", tmp_path, "-o", tmp_path / "p.json", "--workers", "1").code == 4
@@ -166,13 +163,13 @@ def test_a_pipe_in_the_place_of_a_campaign_is_not_waited_for(
 # the robot
 
 
-def own_robot(tmp_path: Path, model: str) -> Path:
-    config = json.loads(load_config(CELL).to_json())
+def own_robot(tmp_path, model):
+    config = json.loads(configuration().to_json())
     config["robot"]["model"] = model
     return make(tmp_path / "run.hilcal", json.dumps(config), str(tmp_path / "gone"))
 
 
-def test_no_robot_is_read_that_is_not_in_the_campaign(tmp_path: Path, capsys: Capsys) -> None:
+def test_no_robot_is_read_that_is_not_in_the_campaign(tmp_path, capsys):
     """A pipe at its place would never end; its content would be told."""
     pipe = tmp_path / "pipe.urdf"
     os.mkfifo(pipe)
@@ -185,7 +182,7 @@ def test_no_robot_is_read_that_is_not_in_the_campaign(tmp_path: Path, capsys: Ca
         path.unlink()
 
 
-def test_the_user_gives_the_robot_of_an_old_campaign(tmp_path: Path, capsys: Capsys) -> None:
+def test_the_user_gives_the_robot_of_an_old_campaign(tmp_path, capsys):
     path = own_robot(tmp_path, "own.urdf")
     mine, other = tmp_path / "mine.urdf", tmp_path / "other.urdf"
     mine.write_text(urdf(load_arm("ur10e")))

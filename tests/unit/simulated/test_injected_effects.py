@@ -17,11 +17,11 @@ from hilcal.drivers.simulated.injected_effects import (
     nothing_hidden,
 )
 from hilcal.drivers.simulated.truth import Truth
-from hilcal.drivers.simulated.world import World
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from studies.random_campaigns import dead_weights, rehearsal_states
 from tests.support.example_cell import ur10e_cell
+from tests.support.refusals import refusals, refuses
 
 CELL = ur10e_cell()
 WEIGHTS = dead_weights([4.0, 8.0, 12.0], CELL.gravity)
@@ -29,7 +29,7 @@ STATES, POSE, LOAD, CYCLE = rehearsal_states(CELL, 10, WEIGHTS, np.random.defaul
 VISIBLE = [(e, "absolute") for e in EFFECTS] + [(e, "deflection") for e in DEFLECTION_EFFECTS]
 
 
-def without(world: World, effect: str) -> World:
+def without(world, effect):
     """The same world where the effect is gone."""
     gone = np.zeros_like(getattr(world.physics, effect))
     return replace(world, physics=world.physics.with_effect(effect, gone))
@@ -165,21 +165,11 @@ def test_unknown_registration_and_target_are_the_worlds_own():
     assert np.hypot(*told.station[:2, 3]) == pytest.approx(3.0)
 
 
-@pytest.mark.parametrize(
-    ("effect", "strength", "mode", "message"),
-    [
-        ("gear_wear", 3.0, "absolute", "effect 'gear_wear' is unknown; valid: joint_compliance, "),
-        ("encoder_offset", 3.0, "deflection", "cancels in deflections; valid .*hysteresis"),
-        ("hysteresis", 3.0, "relative", "readings 'relative' is unknown; valid: absolute"),
-        ("hysteresis", -1.0, "absolute", "strength -1.0"),
-        ("hysteresis", float("nan"), "absolute", "strength nan"),
-        ("joint_stiffening", 300.0, "absolute", "cannot reach 300 sigma .*c \\+ 3 s tau"),
-    ],
-)
-def test_what_cannot_be_hidden_is_refused(effect, strength, mode, message):
-    with pytest.raises(InputError, match=message) as caught:
-        hide(effect, CELL, STATES, strength, mode, np.random.default_rng(0))
-    assert "\n" not in str(caught.value)
+@refusals("hidden")
+def test_what_cannot_be_hidden_is_refused(case, given):
+    effect, strength, mode = given.split()
+    rng = np.random.default_rng(0)
+    refuses(case, lambda: hide(effect, CELL, STATES, float(strength), mode, rng))
 
 
 @pytest.mark.parametrize(

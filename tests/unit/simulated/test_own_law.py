@@ -8,7 +8,7 @@ import pytest
 from hilcal.diagnosis.stepwise import add
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.drivers.simulated.injected_effects import ALL_EFFECTS, nothing_hidden
-from hilcal.drivers.simulated.own_law import OwnLaw, own_law, own_names
+from hilcal.drivers.simulated.own_law import own_law, own_names
 from hilcal.drivers.simulated.rehearsal import case_of_plan, check_choice, read_plan
 from hilcal.drivers.simulated.world_server import read_world, write_world
 from hilcal.effects.catalogue import installed
@@ -17,6 +17,7 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from tests.support.campaigns import cell_of, configuration, plan
 from tests.support.next_cases import SMALL, first_plan
+from tests.support.refusals import refusal
 from tests.support.user_effect_cases import CLASS, COLUMNS
 
 TURN = 3e-4
@@ -30,11 +31,11 @@ def file(tmp_path):
 
 
 @pytest.fixture
-def law(file) -> OwnLaw:
+def law(file):
     return own_law(installed().with_file(file), "mine", cell_of(), plan(6).states)
 
 
-def world_with(law: OwnLaw, theta: float):
+def world_with(law, theta):
     world = nothing_hidden(cell_of(), np.random.default_rng(1))
     return world, replace(world, own=replace(law, theta=np.array([theta])))
 
@@ -84,8 +85,7 @@ def test_a_law_that_has_changed_since_is_refused(law, file, tmp_path):
     _, world = world_with(law, TURN)
     write_world(tmp_path / "world.json", world, configuration())
     file.write_text(CLASS.replace(COLUMNS, "values = np.sin(s.angle[:, :1])"), encoding="utf-8")
-    with pytest.raises(InputError, match=r"mine\.py: changed since"):
-        read_world(tmp_path / "world.json")
+    refusal(r"mine\.py: changed since", read_world, tmp_path / "world.json")
 
 
 def test_what_the_simulated_cell_does_not_measure_is_named(file):
@@ -99,7 +99,5 @@ def test_only_effects_of_ones_own_are_added_to_the_choices(law):
     assert own_names(law.catalogue, ALL_EFFECTS) == ("mine",)
     assert own_names(installed(), ALL_EFFECTS) == ()  # all that ship have mechanics of their own
     check_choice("mine", law.catalogue)
-    with pytest.raises(InputError, match="hide 'mine'"):
-        check_choice("mine", installed())
-    with pytest.raises(InputError, match=r"hide 'mime' \(did you mean \"mine\"\?\)"):
-        check_choice("mime", law.catalogue)
+    refusal("hide 'mine'", check_choice, "mine", installed())
+    refusal(r"hide 'mime' \(did you mean \"mine\"\?\)", check_choice, "mime", law.catalogue)

@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 
 from hilcal.drivers.simulated.injected_effects import nothing_hidden
 from hilcal.drivers.simulated.truth import Truth
-from hilcal.drivers.simulated.world import World
 from studies.random_campaigns import dead_weights, rehearsal_states
 from tests.support.example_cell import ur10e_cell
 from tests.support.living_cell import frames, moment_beyond
@@ -27,7 +26,7 @@ SOFT = {
 }
 
 
-def world(cell=CELL, **effects) -> World:
+def world(cell=CELL, **effects):
     base = nothing_hidden(CELL, np.random.default_rng(2))
     return replace(base, cell=cell, physics=replace(Truth.rigid(cell.arm), **effects))
 
@@ -36,7 +35,7 @@ def cell_with(**changes):
     return replace(CELL, arm=replace(ARM, **changes))
 
 
-def close(a: World, b: World, states=STATES, atol=1e-13):
+def close(a, b, states=STATES, atol=1e-13):
     """Both rest alike and are seen alike."""
     one, two = a.sight(states), b.sight(states)
     np.testing.assert_allclose(one.position, two.position, rtol=0, atol=atol)
@@ -53,7 +52,7 @@ def rigid_torques(states):
     )
 
 
-def drive_angles(w: World, states):
+def drive_angles(w, states):
     return w.rest(states).deflection[:, w.drives]
 
 

@@ -7,7 +7,7 @@ from studies.all_effects_command import Case, refined
 
 
 @pytest.mark.long
-def test_few_positions_predict_nearly_as_well_as_can_be() -> None:
+def test_few_positions_predict_nearly_as_well_as_can_be():
     """Of 30 arms the mean is 1.08 times, and 92 % of others are in the band; single arms scatter.
 
     Without a background the error of these two arms is 1.5 times as large or more.
@@ -17,12 +17,10 @@ def test_few_positions_predict_nearly_as_well_as_can_be() -> None:
     assert len(ratios) == 2
     assert np.mean(ratios) < 1.2
     for f in found:
-        assert f is not None
         assert f.inside > 0.85
-        assert f.without_m is not None
         assert f.rms_m < 0.8 * f.without_m
         assert "link_geometry" in f.named
 
 
-def test_an_arm_that_is_not_as_described_is_refused() -> None:
+def test_an_arm_that_is_not_as_described_is_refused():
     assert refined(Case(30, 1, 10.0, False)) is None

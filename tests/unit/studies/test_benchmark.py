@@ -7,12 +7,10 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from hilcal.types import Floats
 from studies.benchmark.formula import Comparison, Formula, FormulaError
 from studies.benchmark.generate import PUBLIC, main, make, specs
 from studies.benchmark.score import main as score_main
@@ -24,7 +22,7 @@ HOME = ROOT / "studies" / "benchmark"
 TASKS = HOME / "tasks" / "public"
 
 
-def folder_of(track: str, kind: str) -> Path:
+def folder_of(track, kind):
     """Return the first public task of a kind with 30 poses."""
     for path in sorted(TASKS.glob(f"{track}-*")):
         task, truth = read_task(path), read_truth(path)
@@ -33,7 +31,7 @@ def folder_of(track: str, kind: str) -> Path:
     raise LookupError(kind)
 
 
-def answer(folder: Path, **changed: object) -> dict[str, Any]:
+def answer(folder, **changed):
     """Return the perfect answer to a task, with changes."""
     task, truth = read_task(folder), read_truth(folder)
     return {
@@ -46,7 +44,7 @@ def answer(folder: Path, **changed: object) -> dict[str, Any]:
     } | changed
 
 
-def scored(tmp_path: Path, folder: Path, **entrants: dict[str, Any]) -> dict[str, Any]:
+def scored(tmp_path, folder, **entrants):
     """Score the answers of entrants to one task: the rows and groups by entrant."""
     tasks, results = tmp_path / "tasks", tmp_path / "results"
     shutil.copytree(folder, tasks / folder.name, dirs_exist_ok=True)
@@ -58,7 +56,7 @@ def scored(tmp_path: Path, folder: Path, **entrants: dict[str, Any]) -> dict[str
     return {row["entrant"]: (row, whole[row["entrant"]]) for row in document["tasks"]}
 
 
-def test_a_perfect_a_constant_and_an_overconfident_entrant(tmp_path: Path) -> None:
+def test_a_perfect_a_constant_and_an_overconfident_entrant(tmp_path):
     folder = folder_of("elastic", "several")
     task, truth = read_task(folder), read_truth(folder)
     rng = np.random.default_rng(1)
@@ -103,14 +101,14 @@ def test_a_perfect_a_constant_and_an_overconfident_entrant(tmp_path: Path) -> No
     assert found["honest"][1]["relative"]["value"] == pytest.approx(honest["rms_m"] / 1e-9)
 
 
-def test_what_a_hidden_effect_contains_is_not_scored(tmp_path: Path) -> None:
+def test_what_a_hidden_effect_contains_is_not_scored(tmp_path):
     folder = next(path for path in sorted(TASKS.glob("*")) if read_truth(path).about["either"])
     effects = answer(folder)["effects"] | dict.fromkeys(read_truth(folder).about["either"], 0.7)
     row, _ = scored(tmp_path, folder, one=answer(folder, effects=effects))["one"]
     assert (row["log_score"], row["false_alarms"]) == (0.0, 0.0)
 
 
-def test_groups_are_geometric_means_and_failures_are_counted(tmp_path: Path) -> None:
+def test_groups_are_geometric_means_and_failures_are_counted(tmp_path):
     one, two = folder_of("elastic", "none"), folder_of("elastic", "one")
     for folder, factor in ((one, 1.0), (two, 4.0)):
         true = read_truth(folder).position
@@ -152,9 +150,7 @@ NAN = float("nan")
         ({"failed": "it hung"}, "failed: it hung"),
     ],
 )
-def test_an_answer_that_is_not_as_the_format_says_is_refused_in_a_line(
-    tmp_path: Path, changed: dict[str, Any], word: str
-) -> None:
+def test_an_answer_that_is_not_as_the_format_says_is_refused_in_a_line(tmp_path, changed, word):
     folder = folder_of("elastic", "one")
     path = tmp_path / "answer.json"
     path.write_text(json.dumps(answer(folder, **changed)), encoding="utf-8")
@@ -165,9 +161,7 @@ def test_an_answer_that_is_not_as_the_format_says_is_refused_in_a_line(
     assert "\n" not in str(refused.value)
 
 
-def test_a_damaged_task_is_refused_in_a_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_damaged_task_is_refused_in_a_line(tmp_path, capsys):
     folder = tmp_path / "tasks" / "elastic-001"
     shutil.copytree(TASKS / "elastic-001", folder)
     (tmp_path / "results" / "a").mkdir(parents=True)
@@ -199,7 +193,7 @@ def test_a_damaged_task_is_refused_in_a_line(
     assert "no task here" in capsys.readouterr().err
 
 
-def columns(n: int = 200) -> dict[str, Floats]:
+def columns(n=200):
     rng = np.random.default_rng(4)
     return {name: rng.uniform(-3.0, 3.0, n) for name in ("q1", "q2", "q4", "tau2", "time")}
 
@@ -216,7 +210,7 @@ def columns(n: int = 200) -> dict[str, Floats]:
         ("log(q4)", float("inf"), False),
     ],
 )
-def test_a_formula_beside_the_law(found: str, error: float | None, same: bool) -> None:
+def test_a_formula_beside_the_law(found, error, same):
     at = columns()
     beside = Comparison(Formula.parse(found, at), Formula.parse("0.0002*(sin(3*q4))", at), at, "q2")
     if error is not None:
@@ -224,7 +218,7 @@ def test_a_formula_beside_the_law(found: str, error: float | None, same: bool) -
     assert beside.equivalent() is same
 
 
-def test_a_formula_is_arithmetic_alone() -> None:
+def test_a_formula_is_arithmetic_alone():
     at = columns()
     value = Formula.parse("-2**2 + max(q1, min(q2, 0.5))/pi - abs(tau2)**1.5", at).value(at)
     by_hand = -4 + np.maximum(at["q1"], np.minimum(at["q2"], 0.5)) / np.pi
@@ -239,7 +233,7 @@ def test_a_formula_is_arithmetic_alone() -> None:
         assert "\n" not in str(refused.value)
 
 
-def test_a_law_that_cannot_be_read_is_a_failure_with_its_reason(tmp_path: Path) -> None:
+def test_a_law_that_cannot_be_read_is_a_failure_with_its_reason(tmp_path):
     folder = folder_of("law", "law")
     found = scored(
         tmp_path,
@@ -255,9 +249,7 @@ def test_a_law_that_cannot_be_read_is_a_failure_with_its_reason(tmp_path: Path) 
     assert found["silent"][0]["law_equivalent"] is None
 
 
-def test_who_writes_a_law_in_one_task_has_not_found_those_that_it_leaves_out(
-    tmp_path: Path,
-) -> None:
+def test_who_writes_a_law_in_one_task_has_not_found_those_that_it_leaves_out(tmp_path):
     first, second = sorted(TASKS.glob("law-*"))[:2]
     scored(tmp_path, first, some=answer(first), none=answer(first, law=None))
     scored(tmp_path, second, some=answer(second, law=None), none=answer(second, law=None))
@@ -270,7 +262,7 @@ def test_who_writes_a_law_in_one_task_has_not_found_those_that_it_leaves_out(
 
 
 @pytest.mark.parametrize("track", ["elastic", "law", "mujoco"])
-def test_a_key_makes_the_same_bytes_and_another_key_other_tasks(track: str) -> None:
+def test_a_key_makes_the_same_bytes_and_another_key_other_tasks(track):
     if track == "mujoco":
         pytest.importorskip("mujoco")
     public = [s for s in specs(PUBLIC, PUBLIC, (track,), 1) if s.poses == 30]
@@ -296,7 +288,7 @@ def test_a_key_makes_the_same_bytes_and_another_key_other_tasks(track: str) -> N
     assert "private" not in "".join(one[n] for n in ("task.json", "train.csv", "test.csv"))
 
 
-def test_the_public_part_has_every_cell_and_hides_every_effect() -> None:
+def test_the_public_part_has_every_cell_and_hides_every_effect():
     rows = []
     for folder in sorted(TASKS.glob("*")):
         task, truth = read_task(folder), read_truth(folder)
@@ -317,8 +309,8 @@ def test_the_public_part_has_every_cell_and_hides_every_effect() -> None:
 
 
 def test_the_command_makes_a_private_part_and_names_what_it_leaves_out(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+    tmp_path, monkeypatch, capsys
+):
     monkeypatch.delenv("HILCAL_DATA", raising=False)
     with pytest.raises(SystemExit) as ended:
         main(["-o", str(tmp_path), "--part", "private", "--key", "k", "--tracks", "ur5,ur10"])
@@ -334,9 +326,7 @@ def test_the_command_makes_a_private_part_and_names_what_it_leaves_out(
 
 
 @pytest.mark.parametrize("track", ["ur10", "ur5"])
-def test_real_tracks_are_made_of_the_public_readings(
-    track: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_real_tracks_are_made_of_the_public_readings(track, tmp_path, monkeypatch):
     data = Path(os.environ.get("HILCAL_DATA", ROOT.parent / "shared" / "data"))
     if not (data / {"ur10": "ipa_ur10", "ur5": "jacobi_ur5"}[track]).is_dir():
         pytest.skip(f"the readings of {track} are absent: set HILCAL_DATA to their folder")
@@ -356,7 +346,7 @@ def test_real_tracks_are_made_of_the_public_readings(
         assert len(np.unique(q, axis=0)) == len(q)  # nothing that is predicted was trained on
 
 
-def test_an_entrant_sees_no_truth(tmp_path: Path) -> None:
+def test_an_entrant_sees_no_truth(tmp_path):
     for_entrants(TASKS / "elastic-001", tmp_path / "task")
     assert sorted(path.name for path in (tmp_path / "task").iterdir()) == [
         "robot.urdf", "task.json", "test.csv", "train.csv",
@@ -376,7 +366,7 @@ runpy.run_module("benchmark.score", run_name="__main__")
 """
 
 
-def test_copied_out_it_reads_and_scores_with_numpy_alone(tmp_path: Path) -> None:
+def test_copied_out_it_reads_and_scores_with_numpy_alone(tmp_path):
     folder = folder_of("law", "law")
     scored(tmp_path, folder, perfect=answer(folder))
     out = tmp_path / "elsewhere"

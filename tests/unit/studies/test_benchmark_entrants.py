@@ -5,7 +5,6 @@ import json
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from hilcal.robot.chain import evaluate
 from hilcal.robot.urdf import arm_from_urdf
 from studies.benchmark.entrants.common import (
     COMPLIANCE,
-    ArmRows,
     Asked,
     Sought,
     chosen,
@@ -44,7 +42,7 @@ FAKES = {
 """What entrants do before they answer."""
 
 
-def first_task(track: str, poses: int = 30) -> Path:
+def first_task(track, poses=30):
     """Return the first public task of a track and a number of poses."""
     for path in sorted(TASKS.glob(f"{track}-*")):
         if json.loads((path / "task.json").read_text())["n_poses"] == poses:
@@ -53,14 +51,14 @@ def first_task(track: str, poses: int = 30) -> Path:
 
 
 @pytest.mark.parametrize("path", sorted(HERE.glob("*/entrant.py")), ids=lambda p: p.parent.name)
-def test_an_adapter_is_small_and_pinned(path: Path) -> None:
+def test_an_adapter_is_small_and_pinned(path):
     assert len(path.read_text().splitlines()) <= MOST_LINES
     needs = path.with_name("requirements.txt").read_text().split()
     assert path.parent.name == "hilcal" or all("==" in line for line in needs)
 
 
 @pytest.mark.parametrize("name", ["common.py", "run.py", "tables.py", "frames/entrant.py"])
-def test_what_others_need_imports_numpy_alone(name: str) -> None:
+def test_what_others_need_imports_numpy_alone(name):
     tree = ast.parse((HERE / name).read_text())
     plain = [a.name for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names]
     plain += [
@@ -71,12 +69,12 @@ def test_what_others_need_imports_numpy_alone(name: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def asked() -> Asked:
+def asked():
     """The smallest task of the elastic track."""
     return Asked.read(first_task("elastic"))
 
 
-def test_positions_are_those_of_hilcals_chain(asked: Asked) -> None:
+def test_positions_are_those_of_hilcals_chain(asked):
     theta = np.zeros(51)
     theta[:6] = [0.3, -1.0, 2.0, 1.0, 2.0, 3.0]
     arm = arm_from_urdf(asked.task.folder / "robot.urdf")
@@ -85,13 +83,13 @@ def test_positions_are_those_of_hilcals_chain(asked: Asked) -> None:
     np.testing.assert_allclose(asked.arm.predict(theta, asked.train), expected, atol=1e-12)
 
 
-def test_torques_are_those_of_another_dynamics() -> None:
+def test_torques_are_those_of_another_dynamics():
     law = Asked.read(first_task("law"))
     stated = np.stack([law.train.columns[f"x_tau{j}_Nm"] for j in range(1, 7)], axis=1)
     np.testing.assert_allclose(law.train.torque, stated, atol=6e-4)  # they are rounded to 1e-3
 
 
-def test_derivatives_are_exact(asked: Asked) -> None:
+def test_derivatives_are_exact(asked):
     rng = np.random.default_rng(1)
     theta = asked.arm.registered(asked.train)
     theta[COMPLIANCE] = 1e-5
@@ -107,7 +105,7 @@ def test_derivatives_are_exact(asked: Asked) -> None:
     np.testing.assert_allclose(moved, (ends[0] - ends[1]) / 2, atol=1e-10)
 
 
-def test_families_are_what_their_parameters_move(asked: Asked) -> None:
+def test_families_are_what_their_parameters_move(asked):
     theta = asked.arm.registered(asked.train)
     frames, z = families(asked, theta, asked.train, waves=3)
     assert list(z) == ["length", "angle", "give", "octave 0", "octave 1", "octave 2"]
@@ -124,10 +122,10 @@ def test_families_are_what_their_parameters_move(asked: Asked) -> None:
     np.testing.assert_allclose(moved, (ends[0] - ends[1]).ravel() / 2, atol=1e-8)
 
 
-def test_what_poses_left_out_ask_for_is_chosen(asked: Asked) -> None:
+def test_what_poses_left_out_ask_for_is_chosen(asked):
     truth = asked.train.y.mean(axis=0)
 
-    def predict(far: float, rows: ArmRows, other: ArmRows) -> Any:
+    def predict(far, rows, other):
         assert not {*rows.pose} & {*other.pose}
         return truth + far + 0.0 * other.y
 
@@ -136,7 +134,7 @@ def test_what_poses_left_out_ask_for_is_chosen(asked: Asked) -> None:
     np.testing.assert_allclose(off, asked.train.y - truth + 0.1)
 
 
-def test_a_sought_law_is_a_formula_of_its_terms(asked: Asked) -> None:
+def test_a_sought_law_is_a_formula_of_its_terms(asked):
     theta = asked.arm.registered(asked.train)
     sought = replace(Sought.of(asked, theta, asked.train), size=2.0)
     found = sought.law(np.array([0.5, 0.0, -0.25]), ["sin(2*q1)", "q2", "q3 (tau2/8.1)"])
@@ -144,15 +142,15 @@ def test_a_sought_law_is_a_formula_of_its_terms(asked: Asked) -> None:
     assert sought.law(np.zeros(1), ["q1"]) is None
 
 
-def test_poses_are_left_out_whole(asked: Asked) -> None:
-    def predict(rows: Any, other: Any) -> Any:
+def test_poses_are_left_out_whole(asked):
+    def predict(rows, other):
         assert not {*rows.pose} & {*other.pose}
         return other.y
 
     assert not left_out(asked.train, predict).any()
 
 
-def run(tmp_path: Path, *more: str, home: Path = HERE) -> int:
+def run(tmp_path, *more, home=HERE):
     """Run entrants with this interpreter; results go to tmp_path."""
     names = [p.parent.name for p in home.glob("*/entrant.py")]
     given = [f"--python={n}={sys.executable}" for n in names]
@@ -160,9 +158,7 @@ def run(tmp_path: Path, *more: str, home: Path = HERE) -> int:
     return main([*folders, *given, *more])
 
 
-def test_simple_entrants_run_and_geometry_is_better_than_frames(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_simple_entrants_run_and_geometry_is_better_than_frames(tmp_path, capsys):
     task = first_task("elastic")
     assert run(tmp_path, str(TASKS), "--entrants", "frames,ridge", "--tasks", task.name) == 0
     rows = {r["entrant"]: r for r in scores(TASKS, tmp_path / "out")}
@@ -175,7 +171,7 @@ def test_simple_entrants_run_and_geometry_is_better_than_frames(
 
 
 @pytest.mark.slow
-def test_hilcals_adapter_predicts_with_bands_and_names(tmp_path: Path) -> None:
+def test_hilcals_adapter_predicts_with_bands_and_names(tmp_path):
     task = next(
         path
         for path in sorted(TASKS.glob("elastic-*"))
@@ -192,7 +188,7 @@ def test_hilcals_adapter_predicts_with_bands_and_names(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def fakes(tmp_path: Path) -> Path:
+def fakes(tmp_path):
     """A folder of entrants that fail in all ways."""
     for name, act in FAKES.items():
         folder = tmp_path / "home" / name
@@ -209,7 +205,7 @@ def fakes(tmp_path: Path) -> Path:
     return tmp_path / "home"
 
 
-def test_the_runner_survives_whatever_entrants_do(tmp_path: Path, fakes: Path) -> None:
+def test_the_runner_survives_whatever_entrants_do(tmp_path, fakes):
     task = first_task("elastic").name
     assert (
         run(tmp_path, str(TASKS), "--tasks", task, "--limit", "3", "--jobs", "2", home=fakes) == 0
@@ -228,7 +224,7 @@ def test_the_runner_survives_whatever_entrants_do(tmp_path: Path, fakes: Path) -
     assert "| good | 1.00 |" in block(found)
 
 
-def test_what_was_run_is_not_run_again(tmp_path: Path, fakes: Path) -> None:
+def test_what_was_run_is_not_run_again(tmp_path, fakes):
     words = (str(TASKS), "--entrants", "good,cannot", "--tasks", first_task("elastic").name)
     assert run(tmp_path, *words, home=fakes) == 0
     (fakes / "good" / "entrant.py").write_text("raise SystemExit(1)")
@@ -243,9 +239,7 @@ def test_what_was_run_is_not_run_again(tmp_path: Path, fakes: Path) -> None:
     assert told.read_text() == page(date, rows, fakes)
 
 
-def test_a_row_that_is_reproduced_stands_beside_the_published_ones(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_row_that_is_reproduced_stands_beside_the_published_ones(tmp_path, capsys):
     words = (str(TASKS), "--entrants", "frames", "--tasks", "elastic-00[123]")
     assert run(tmp_path, *words, "--beside", str(KEPT)) == 0
     table = capsys.readouterr().out
@@ -259,7 +253,7 @@ def test_a_row_that_is_reproduced_stands_beside_the_published_ones(
 
 
 @pytest.mark.long
-def test_an_environment_that_cannot_be_made_is_a_reason(tmp_path: Path, fakes: Path) -> None:
+def test_an_environment_that_cannot_be_made_is_a_reason(tmp_path, fakes):
     (fakes / "good" / "requirements.txt").write_text("./no-such-folder\n")
     folders = ["-o", str(tmp_path / "out"), "--home", str(fakes), "--envs", str(tmp_path / "envs")]
     words = [str(TASKS), "--entrants", "good", "--tasks", first_task("elastic").name]
@@ -276,14 +270,12 @@ def test_an_environment_that_cannot_be_made_is_a_reason(tmp_path: Path, fakes: P
         (["--score", "--beside", "none.json"], "--beside none.json: cannot be read (["),
     ],
 )
-def test_wrong_words_are_refused(
-    words: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_wrong_words_are_refused(words, said, tmp_path, capsys):
     assert main([str(TASKS), "-o", str(tmp_path), *words]) == 2
     assert said in capsys.readouterr().err
 
 
-def test_the_page_is_made_of_what_was_kept() -> None:
+def test_the_page_is_made_of_what_was_kept():
     text = PAGE.read_text(encoding="utf-8")
     date, rows = kept(KEPT)
     assert text == page(date, rows, HERE)

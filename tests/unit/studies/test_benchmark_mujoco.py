@@ -1,13 +1,11 @@
 """The arm of springs in MuJoCo: against closed forms, its own dynamics and the other world."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 
 from hilcal.calibration.handover import urdf
-from hilcal.types import Floats
 from studies.benchmark.campaign import campaign
 from studies.benchmark.mujoco_tasks import SHOWN
 from studies.benchmark.world_elastic import bare
@@ -17,7 +15,7 @@ mujoco = pytest.importorskip("mujoco")
 G, MASS, LENGTH = 9.81, 4.0, 1.2
 
 
-def plain(link: int, **hidden: Floats) -> Springs:
+def plain(link, **hidden):
     """An arm whose joint 1 turns about -y and whose only extent, 1.2 m along x, leads to `link`.
 
     Behind it hangs a mass of 4 kg; a `link` of 6 is the flange.
@@ -44,12 +42,12 @@ def plain(link: int, **hidden: Floats) -> Springs:
     )
 
 
-def only(joint: int, value: float, joints: int = 6) -> Floats:
+def only(joint, value, joints=6):
     return value * np.eye(joints)[joint]
 
 
 @pytest.mark.parametrize("cubic", [0.0, -1e-9])
-def test_a_pendulum_gives_way_by_its_torque_over_its_stiffness(cubic: float) -> None:
+def test_a_pendulum_gives_way_by_its_torque_over_its_stiffness(cubic):
     compliance, n = 1e-5, 7
     q = np.zeros((n, 6))
     q[:, 0] = np.linspace(-2.0, 2.0, n)
@@ -64,7 +62,7 @@ def test_a_pendulum_gives_way_by_its_torque_over_its_stiffness(cubic: float) -> 
     np.testing.assert_allclose(place, by_hand, atol=1e-12)
 
 
-def test_a_beam_gives_way_as_a_cantilever() -> None:
+def test_a_beam_gives_way_as_a_cantilever():
     bend, force = 2e-6, 50.0  # 1/EI, N
     arm = plain(2, link_compliance=np.array([[bend, 0.0], [0.0, 0.0]]))
     place, turn = arm.flange(np.zeros((1, 6)), np.array([[0.0, 0.0, force, 0.0, 0.0, 0.0]]))
@@ -79,12 +77,12 @@ def test_a_beam_gives_way_as_a_cantilever() -> None:
     assert twist == pytest.approx(20.0 * LENGTH * 3e-6, rel=1e-6)
 
 
-def test_the_equilibrium_is_where_damped_motion_ends() -> None:
+def test_the_equilibrium_is_where_damped_motion_ends():
     q = np.zeros((1, 6))
     q[0, 0] = 0.4
     arm = plain(6, joint_compliance=only(0, 1e-4), joint_tilt_compliance=only(0, 1e-4))
     place, _ = arm.flange(q, np.zeros((1, 6)))
-    model: Any = arm._model
+    model = arm._model
     data = mujoco.MjData(model)
     command = [model.joint(f"command{k}").qposadr[0] for k in range(6)]
     model.dof_armature[command] = 1e13  # held by their inertia
@@ -98,7 +96,7 @@ def test_the_equilibrium_is_where_damped_motion_ends() -> None:
     np.testing.assert_allclose(data.body("body6").xpos, place[0], atol=1e-8)
 
 
-def drawn(softness: Floats, rng: np.random.Generator) -> dict[str, Floats]:
+def drawn(softness, rng):
     """Parameters of all effects that this world can hide, some tens of µm each."""
     return {
         "joint_stiffening": -0.1 * softness * rng.uniform(0.5, 1.0, 6),
@@ -119,7 +117,7 @@ def drawn(softness: Floats, rng: np.random.Generator) -> dict[str, Floats]:
 
 
 @pytest.mark.parametrize("robot", ["ur10e", "xarm6"])
-def test_two_mechanics_agree_to_a_micrometre(robot: str) -> None:
+def test_two_mechanics_agree_to_a_micrometre(robot):
     """Those of `hilcal.drivers.simulated` and these share no code; parameters are the same."""
     rng = np.random.default_rng(6)
     c = campaign(robot, 8, rng)
@@ -129,7 +127,7 @@ def test_two_mechanics_agree_to_a_micrometre(robot: str) -> None:
     assert hidden.keys() == {*SHOWN}
     always = {k: getattr(world.physics, k) for k in ("joint_compliance", "target_offset")}
 
-    def both(effects: dict[str, Floats]) -> tuple[Floats, Floats]:
+    def both(effects):
         physics = world.physics
         for name, value in effects.items():
             physics = physics.with_effect(name, value)

@@ -26,7 +26,7 @@ LEFT = Left(
 )
 
 
-def test_errors_are_counted_against_what_the_tracker_reads_elsewhere() -> None:
+def test_errors_are_counted_against_what_the_tracker_reads_elsewhere():
     c = calibrated("encoder_offset")
     world = campaign("encoder_offset", "absolute", 0, poses=POSES).world
     others = measured(world, plan(30, 7000), np.random.default_rng(5))
@@ -38,14 +38,14 @@ def test_errors_are_counted_against_what_the_tracker_reads_elsewhere() -> None:
     assert not judged(c, p, further)[1].any()
 
 
-def test_halves_are_halves() -> None:
+def test_halves_are_halves():
     found = dict(_parts(100, 2, 0.5))
     assert list(found) == ["random half 1", "random half 2", "first half"]
     assert all(rows.sum() == 50 for rows in found.values())
     assert found["first half"][:50].all()
 
 
-def test_the_worst_split_decides() -> None:
+def test_the_worst_split_decides():
     good = list(_figures("B", [LEFT, replace(LEFT, split="random half 2", mean_m=74e-6)]))
     assert [f.met for f in good] == [True, True, None]
     bad = list(_figures("B", [LEFT, replace(LEFT, mean_m=76e-6, inside=0.89)]))
@@ -55,7 +55,7 @@ def test_the_worst_split_decides() -> None:
     assert "30.0 % of poses; left there 300 µm" in list(_figures("B", [far]))[2].measured
 
 
-def test_four_fifths_are_four_fifths() -> None:
+def test_four_fifths_are_four_fifths():
     (name, rows), (other, different) = _parts(100, 2, 0.8)
     assert (name, other) == ("random 80 % 1", "random 80 % 2")
     assert rows.sum() == different.sum() == 80

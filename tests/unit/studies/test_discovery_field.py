@@ -17,7 +17,7 @@ BY_TEXT = {f.text: f for f in FORMULAS}
 
 
 @pytest.mark.long
-def test_a_product_is_found_without_its_dummies_and_a_quotient_only_with_reciprocals() -> None:
+def test_a_product_is_found_without_its_dummies_and_a_quotient_only_with_reciprocals():
     found = run_case(BY_TEXT["r F sin θ"], 0.01, 0, None)["hilcal"]
     assert found.equivalent
     assert "dummy" not in found.formula
@@ -27,7 +27,7 @@ def test_a_product_is_found_without_its_dummies_and_a_quotient_only_with_recipro
     assert "(1/C)" in quotient["hilcal, given 1/x"].formula
 
 
-def test_noise_alone_has_no_law() -> None:
+def test_noise_alone_has_no_law():
     rng = np.random.default_rng(2)
     x, _ = drawn(BY_TEXT["μ N"], 60, 1.0, rng)
     text, values = hilcal(x, rng.standard_normal(60), 1.0, reciprocals=False)
@@ -35,7 +35,7 @@ def test_noise_alone_has_no_law() -> None:
     assert np.ptp(values(x)) == 0.0
 
 
-def test_every_formula_has_values_over_its_range_doubled() -> None:
+def test_every_formula_has_values_over_its_range_doubled():
     for of in FORMULAS:
         for wider in (1.0, 2.0):
             x, y = drawn(of, 50, wider, np.random.default_rng(1))
@@ -44,8 +44,8 @@ def test_every_formula_has_values_over_its_range_doubled() -> None:
             assert sum(name.startswith("dummy") for name in x) in (1, 2, 3)
 
 
-def test_a_searcher_that_is_not_there_is_said_to_be_missing() -> None:
-    one: dict[str, object] = {
+def test_a_searcher_that_is_not_there_is_said_to_be_missing():
+    one = {
         "quantities": {"a": [1.0, 2.0]}, "angles": [], "target": [1.0, 2.0],
         "covariance": [[1.0, 0.0], [0.0, 1.0]], "fresh": {"a": [3.0]},
     }  # fmt: skip
@@ -56,10 +56,10 @@ def test_a_searcher_that_is_not_there_is_said_to_be_missing() -> None:
     assert figures["pysr, noise 1 %"] == "not run: needs Julia"
 
 
-def test_a_case_that_is_in_the_file_is_not_run_again(tmp_path: Path) -> None:
+def test_a_case_that_is_in_the_file_is_not_run_again(tmp_path):
     path, run = tmp_path / "cases.jsonl", []
 
-    def once(key: str) -> dict[str, object]:
+    def once(key):
         run.append(key)
         return {"size": len(key)}
 
@@ -69,7 +69,7 @@ def test_a_case_that_is_in_the_file_is_not_run_again(tmp_path: Path) -> None:
     assert len(path.read_text().splitlines()) == 3
 
 
-def test_frequencies_are_counted_by_what_was_said() -> None:
+def test_frequencies_are_counted_by_what_was_said():
     """Two laws, said with 0.9 and right; a third, with 0.6 and wrong: expected 2.4 ± 0.65."""
     both = [Drawn("a", "a", ((0.9, True), (0.1, False)), (2.0, 0.8), (1.0, 0.95))] * 2
     wrong = Drawn("a", "b", ((0.6, False), (0.3, True)), (1.0, 0.9), (1.0, 0.95))
@@ -88,7 +88,7 @@ def test_frequencies_are_counted_by_what_was_said() -> None:
     assert inside.measured == "95.0 %"
 
 
-def test_an_answer_is_equivalent_only_where_it_holds_beyond_the_range() -> None:
+def test_an_answer_is_equivalent_only_where_it_holds_beyond_the_range():
     assert mark(Answer("a", 1e-5, 1e-5)) == "="
     assert mark(Answer("a", 1e-5, 1.0)) == "≈"
     assert mark(Answer("a", 1e-2, 1e-9)) == "-"
@@ -96,6 +96,6 @@ def test_an_answer_is_equivalent_only_where_it_holds_beyond_the_range() -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("noise", [0.01])
-def test_answers_of_hilcal_repeat(noise: float) -> None:
+def test_answers_of_hilcal_repeat(noise):
     first, again = (run_case(BY_TEXT["μ N"], noise, 0, None)["hilcal"] for _ in range(2))
     assert (first.formula, first.left) == (again.formula, again.left)

@@ -1,7 +1,6 @@
 """The figures of the pages say what the pages say of them."""
 
 import json
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ from tests.support.paths import ROOT
 
 
 @pytest.fixture(scope="module")
-def drawn() -> dict[str, Any]:
+def drawn():
     """All figures by their name, as plotly draws them."""
     made = figures(ROOT / "docs" / "measured")
     assert tuple(made) == NAMES
@@ -21,11 +20,11 @@ def drawn() -> dict[str, Any]:
     }
 
 
-def traces(figure: dict[str, Any]) -> dict[str, dict[str, Any]]:
+def traces(figure):
     return {t["name"]: t for t in figure["data"] if "name" in t}
 
 
-def numbers(values: Any) -> np.ndarray:
+def numbers(values):
     """Numbers that plotly wrote as a list, or packed."""
     if isinstance(values, dict):
         import base64
@@ -35,7 +34,7 @@ def numbers(values: Any) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_figures_show_what_their_pages_say(drawn: dict[str, Any]) -> None:
+def test_figures_show_what_their_pages_say(drawn):
     scaling = {name: numbers(t["x"]) for name, t in traces(drawn["scaling"]).items()}
     assert scaling["gc"].max() < 1.1 < 1.2 < scaling["none"].min()
 

@@ -1,25 +1,20 @@
 """Figures that studies keep, and the page of results that is made of them."""
 
 import json
-from pathlib import Path
 
-import pytest
-
-from hilcal.errors import InputError
 from studies.records import Figure, keep, page
-from tests.support.cli_cases import Capsys, ok
+from tests.support.cli_cases import ok
 from tests.support.paths import ROOT
+from tests.support.refusals import refusal
 
 MEASURED = ROOT / "docs" / "measured"
 
 
-def test_the_page_of_results_is_made_of_what_was_measured() -> None:
+def test_the_page_of_results_is_made_of_what_was_measured():
     assert (ROOT / "docs" / "reference" / "results.md").read_text() == page(MEASURED)
 
 
-def test_a_record_has_its_command_and_comes_back_as_a_section(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_record_has_its_command_and_comes_back_as_a_section(tmp_path, monkeypatch):
     path = tmp_path / "a.json"
     arguments = ["studies", "plans", "--seed", "2", "--keep", str(path)]
     monkeypatch.setattr("sys.argv", arguments)
@@ -32,24 +27,20 @@ def test_a_record_has_its_command_and_comes_back_as_a_section(
     assert "| cost | 3 | 2 | **no** |" in text
 
 
-def test_a_study_keeps_its_figures(tmp_path: Path, capsys: Capsys) -> None:
+def test_a_study_keeps_its_figures(tmp_path, capsys):
     path = tmp_path / "s.json"
     ok(capsys, "studies", "scaling", "--runs", "20", "--keep", path)
     figures = json.loads(path.read_text())["figures"]
     assert [f["what"].split(":")[0] for f in figures] == ["none"] * 2 + ["gu"] * 2 + ["gc"] * 2
 
 
-def test_a_folder_without_records_and_a_wrong_file_are_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"no \*.json"):
-        page(tmp_path)
+def test_a_folder_without_records_and_a_wrong_file_are_named(tmp_path):
+    refusal(r"no \*.json", page, tmp_path)
     (tmp_path / "x.json").write_text("{}")
-    with pytest.raises(InputError, match=r"x\.json: not a record"):
-        page(tmp_path)
+    refusal(r"x\.json: not a record", page, tmp_path)
 
 
-def test_the_command_that_is_kept_is_the_one_without_the_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_command_that_is_kept_is_the_one_without_the_file(tmp_path, monkeypatch):
     """Also where another option names a file that is called alike."""
     earlier, path = tmp_path / "earlier" / "carry.json", tmp_path / "carry.json"
     earlier.parent.mkdir()

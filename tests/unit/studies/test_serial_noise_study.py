@@ -15,7 +15,7 @@ from studies.study_cases import study_case
 CONFIG = load_config(configs_dir() / "cells" / CELL)
 
 
-def test_the_noise_has_the_stated_covariance_and_the_correlation() -> None:
+def test_the_noise_has_the_stated_covariance_and_the_correlation():
     case = study_case(CONFIG, "ur10e", "absolute", (), 1.0, 0, n_poses=10)
     clean, drawn = case.readings.value - case.noise, []
     for seed in range(200):
@@ -27,7 +27,7 @@ def test_the_noise_has_the_stated_covariance_and_the_correlation() -> None:
 
 
 @pytest.mark.long
-def test_a_case_counts_what_is_within() -> None:
+def test_a_case_counts_what_is_within():
     c = serial_case((3, 0.9, ""), config=CONFIG, robot="ur10e", poses=6)
     for o in (c.before, c.after):
         assert 0 <= o.parameters[0] <= o.parameters[1] <= 6
@@ -36,7 +36,7 @@ def test_a_case_counts_what_is_within() -> None:
     assert c.found is not None
 
 
-def test_requirements_are_of_strong_noise_and_of_white() -> None:
+def test_requirements_are_of_strong_noise_and_of_white():
     good = Outcome("adequate", (), (95, 100), (95, 100))
     bad = Outcome("unknown_effect", ("creep",), (80, 100), (92, 100))
     strong = SerialCase(0, 0.9, "", bad, good, 0.91, proved=True)

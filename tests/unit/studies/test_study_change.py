@@ -5,16 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilcal.config import load_config
-from hilcal.robot.catalogue import configs_dir
 from studies.change import Case, case, studied_arm
 from studies.change_command import figures_of
+from tests.support.campaigns import configuration
 
-CONFIG = load_config(configs_dir() / "cells" / "demo_ur10e.toml")
+CONFIG = configuration()
 
 
 @pytest.mark.long
-def test_a_case_says_how_visible_its_change_was_and_what_was_named() -> None:
+def test_a_case_says_how_visible_its_change_was_and_what_was_named():
     arm = studied_arm(CONFIG, "ur10e", 0, poses=20)
     found = case(arm, "zero", 3, True, 7)
     assert found.found
@@ -30,7 +29,7 @@ def test_a_case_says_how_visible_its_change_was_and_what_was_named() -> None:
     assert again.z == found.z
 
 
-def test_figures_count_what_was_found_missed_and_claimed() -> None:
+def test_figures_count_what_was_found_missed_and_claimed():
     good = Case(
         "ur10e", "zero", 3, False, 1, 1e-3, strength=20.0, limit=5.0, parts="joint 3", z=(1.0,)
     )

@@ -2,7 +2,6 @@
 
 import io
 import json
-from typing import Any
 
 import pytest
 from rich.console import Console
@@ -16,7 +15,6 @@ from studies.diagnosis import (
     Judgement,
     Outcome,
     Refined,
-    Sample,
     run_case,
 )
 from studies.diagnosis_claims import claims
@@ -35,35 +33,24 @@ from studies.diagnosis_rates import (
 )
 from studies.diagnosis_table import report
 from studies.study_cases import effects_shown, laws_shown
-from tests.support.cli_cases import Capsys, ok, refused
+from tests.support.cli_cases import ok, refused
+from tests.support.refusals import check, refusals
 
 
-def asked(**given: Any) -> Asked:
+def asked(**given):
     """A question; two effects are a pair."""
-    usual: dict[str, Any] = {
+    usual = {
         "kind": "hidden", "robot": "ur10e", "mode": "absolute",
         "hidden": ("creep",), "strength": 2.0, "seed": 0,
     }  # fmt: skip
     return Asked(**{**usual, **given})
 
 
-def said(
-    lead: str = "creep",
-    *same_as: str,
-    verdict: str = "missing_effect",
-    variables: tuple[str, ...] = ("time", "load"),
-    carriers: tuple[str, ...] = (),
-) -> Judgement:
+def said(lead="creep", *same_as, verdict="missing_effect", variables=("time", "load"), carriers=()):
     return Judgement(verdict, lead, same_as, variables, carriers, "a sentence of times", 1.5)
 
 
-def refined(
-    *added: str,
-    same_as: tuple[str, ...] = (),
-    verdict: str = "adequate",
-    holdout: float = 1.0,
-    inside: tuple[Inside, ...] = (),
-) -> Refined:
+def refined(*added, same_as=(), verdict="adequate", holdout=1.0, inside=()):
     return Refined(
         judgement=said(verdict=verdict),
         added=tuple(Added(a, same_as) for a in added),
@@ -74,20 +61,20 @@ def refined(
     )
 
 
-def outcome(lead: str = "creep", *same_as: str, **given: Any) -> Outcome:
+def outcome(lead="creep", *same_as, **given):
     """The answer that `lead` is first, to a question about creep."""
     return Outcome(asked(**given), said(lead, *same_as))
 
 
-def quick(question: Asked) -> Outcome:
+def quick(question):
     """An answer without any work; by module and name, so that other processes find it."""
     if question.seed < 0:
         raise RuntimeError("a seed below 0")
     return Outcome(question, said(f"effect {question.seed}"))
 
 
-def extent(*kinds: str, **given: Any) -> Extent:
-    usual: dict[str, Any] = {
+def extent(*kinds, **given):
+    usual = {
         "kinds": kinds,
         "robots": ("ur3e", "ur10e"),
         "modes": MODES,
@@ -108,13 +95,11 @@ def extent(*kinds: str, **given: Any) -> Extent:
         ("a", (), False),
     ],
 )
-def test_found_is_first_or_in_a_set_of_at_most_three(
-    lead: str, same_as: tuple[str, ...], right: bool
-) -> None:
+def test_found_is_first_or_in_a_set_of_at_most_three(lead, same_as, right):
     assert found(outcome(lead, *same_as)) is right
 
 
-def test_what_came_first_instead_is_counted() -> None:
+def test_what_came_first_instead_is_counted():
     cases = [
         outcome(),
         outcome("backlash", "creep"),
@@ -131,7 +116,7 @@ def test_what_came_first_instead_is_counted() -> None:
     assert row.instead[0] == ("hysteresis", 2)
 
 
-def test_a_further_round_is_counted_by_itself() -> None:
+def test_a_further_round_is_counted_by_itself():
     again = asked(again=True)
     cases = [Outcome(again, said("a"), again=said()), Outcome(again, said("a"), again=said("b"))]
     (row,) = by_effect(cases)
@@ -141,7 +126,7 @@ def test_a_further_round_is_counted_by_itself() -> None:
     assert (claim.rate.share, claim.met) == (0.5, False)
 
 
-def test_refinements_count_where_the_effect_was_found_and_named() -> None:
+def test_refinements_count_where_the_effect_was_found_and_named():
     inside = (Inside("creep", 1, 1), Inside("joint_compliance", 4, 6))
     right = Outcome(asked(), said(), refined("creep", inside=inside))
     more = Outcome(asked(), said(), refined("creep", "backlash", holdout=1.06))
@@ -154,7 +139,7 @@ def test_refinements_count_where_the_effect_was_found_and_named() -> None:
     assert told["joint_compliance"].share == pytest.approx(4 / 6)
 
 
-def test_of_two_effects_a_set_that_was_added_stands_for_its_members() -> None:
+def test_of_two_effects_a_set_that_was_added_stands_for_its_members():
     pair = asked(kind="pairs", hidden=("creep", "backlash"))
     both = Outcome(pair, said(), refined("creep", "backlash"))
     stand_in = Outcome(pair, said(), refined("creep", "load_point", same_as=("backlash", "x")))
@@ -163,7 +148,7 @@ def test_of_two_effects_a_set_that_was_added_stands_for_its_members() -> None:
     assert [both_found(o) for o in (both, stand_in, one)] == [True, True, False]
 
 
-def test_outside_of_the_catalogue_the_verdict_and_the_variable_count() -> None:
+def test_outside_of_the_catalogue_the_verdict_and_the_variable_count():
     law = asked(kind="outside", hidden=("swaying bench",))
     late = Outcome(law, said(), refined("creep", verdict="unknown_effect"), variables=("time",))
     never = Outcome(law, said(), refined("creep"), variables=("joint 2 angle",))
@@ -174,7 +159,7 @@ def test_outside_of_the_catalogue_the_verdict_and_the_variable_count() -> None:
     assert not followed(Outcome(law, carried, variables=("time",)))
 
 
-def test_claims_are_met_or_not_by_what_is_asked() -> None:
+def test_claims_are_met_or_not_by_what_is_asked():
     quiet = [Outcome(asked(kind="nothing", hidden=()), said(verdict="adequate"))] * 99
     loud = Outcome(asked(kind="nothing", hidden=()), said())
     (claim,) = claims([*quiet, loud])
@@ -192,7 +177,7 @@ def test_claims_are_met_or_not_by_what_is_asked() -> None:
     assert always.met is False
 
 
-def test_everything_is_asked_of_every_arm() -> None:
+def test_everything_is_asked_of_every_arm():
     every = questions(extent("hidden", seeds=3))
     assert len(set(every)) == len(every)
     shown = sum(len(effects_shown(m)) for m in MODES)
@@ -204,8 +189,8 @@ def test_everything_is_asked_of_every_arm() -> None:
     assert {(q.mode, q.hidden) for q in first} == {(q.mode, q.hidden) for q in every}
 
 
-def test_a_case_that_fails_is_a_miss_that_says_why() -> None:
-    def broken(question: object) -> Sample:
+def test_a_case_that_fails_is_a_miss_that_says_why():
+    def broken(question):
         raise ValueError("no\n such thing")
 
     o = run_case(asked(), broken)
@@ -216,8 +201,8 @@ def test_a_case_that_fails_is_a_miss_that_says_why() -> None:
     assert "creep, ur10e, absolute, 2 σ, seed 0" in shown
 
 
-def test_a_campaign_that_cannot_be_does_not_count() -> None:
-    def beyond(question: object) -> Sample:
+def test_a_campaign_that_cannot_be_does_not_count():
+    def beyond(question):
         raise InputError("effect 'creep' cannot reach 2 sigma")
 
     o = run_case(asked(), beyond)
@@ -228,11 +213,11 @@ def test_a_campaign_that_cannot_be_does_not_count() -> None:
 
 
 @pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_ctrl_c_leaves_what_there_is(jobs: int) -> None:
+def test_ctrl_c_leaves_what_there_is(jobs):
     every = tuple(asked(seed=s) for s in range(200))
-    done: list[int] = []
+    done = []
 
-    def interrupted(step: int) -> None:
+    def interrupted(step):
         done.append(step)
         if len(done) == 5:
             raise KeyboardInterrupt
@@ -244,21 +229,20 @@ def test_ctrl_c_leaves_what_there_is(jobs: int) -> None:
 
 
 @pytest.mark.slow
-def test_an_error_of_a_case_ends_the_study_and_its_processes() -> None:
+def test_an_error_of_a_case_ends_the_study_and_its_processes():
     every = tuple(asked(seed=s) for s in (1, 2, -1, 3))
     with pytest.raises(RuntimeError, match="below 0"):
         run_all(every, quick, 2, lambda step: None)
 
 
-def written(outcomes: list[Outcome]) -> str:
+def written(outcomes):
     out = Console(file=io.StringIO(), width=100)
     for part in report(outcomes):
         out.print(part)
-    assert isinstance(out.file, io.StringIO)
     return out.file.getvalue()
 
 
-def test_the_document_is_json_and_holds_every_case() -> None:
+def test_the_document_is_json_and_holds_every_case():
     cases = [outcome(), Outcome(asked(), failure="InputError: no")]
     d = document(cases, complete=False)
     again = json.loads(json.dumps(d))
@@ -274,7 +258,7 @@ SMALL = (
 
 
 @pytest.mark.slow
-def test_the_command_gives_the_same_on_any_number_of_processes(capsys: Capsys) -> None:
+def test_the_command_gives_the_same_on_any_number_of_processes(capsys):
     one = ok(capsys, *SMALL, "--jobs", "1").document
     two = ok(capsys, *SMALL, "--jobs", "2").document
     assert one == two
@@ -286,21 +270,6 @@ def test_the_command_gives_the_same_on_any_number_of_processes(capsys: Capsys) -
     assert {c["kind"] for c in one["claims"]} == {"hidden", "nothing"}
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("everything",), "valid: hidden, nothing"),
-        (("--robot", "ur99"), "ur10e"),
-        (("--effect", "hysterisis"), "hysteresis"),
-        (("--readings", "deflection", "--effect", "encoder_offset"), "valid: "),
-        (("--readings", "both"), "deflection, absolute"),
-        (("--strength", "0"), "over 0"),
-        (("--seeds", "0"), "from 1"),
-        (("--jobs", "0"), "from 1"),
-        (("--first-seed", "-1"), "from 0"),
-    ],
-)
-def test_wrong_input_is_refused_in_one_line(
-    capsys: Capsys, arguments: tuple[str, ...], words: str
-) -> None:
-    assert words in refused(capsys, 2, "studies", "diagnosis", *arguments)
+@refusals("study_arguments")
+def test_wrong_input_of_a_study_is_refused_in_one_line(case, given, capsys):
+    check(case, refused(capsys, 2, "studies", *given.split()))

@@ -13,7 +13,7 @@ from tests.unit.studies.test_study_cases import case
 GOOD = Asked("ur5e", "absolute", law="wear")
 
 
-def test_every_law_displaces_the_target_as_it_is_drawn() -> None:
+def test_every_law_displaces_the_target_as_it_is_drawn():
     c = case("creep", mode="absolute", poses=8)
     s = scene(c.world, c.readings.states)
     assert len(KINDS) >= 10
@@ -28,7 +28,7 @@ def test_every_law_displaces_the_target_as_it_is_drawn() -> None:
         assert law.variables
 
 
-def test_claims_count_what_they_say() -> None:
+def test_claims_count_what_they_say():
     right = Outcome(GOOD, "law", "dq_2 = a", "wear", True, True, 0.99, 2.0, 1.1)
     wrong = Outcome(GOOD, "law", "dq_3 = a", "wear", False, True, 0.9, 2.0, 1.6)
     silent = Outcome(Asked("ur5e", "absolute"), "adequate")
@@ -43,7 +43,7 @@ def test_claims_count_what_they_say() -> None:
     assert "no law where an effect of the catalogue is hidden" not in found  # none was
 
 
-def test_more_is_claimed_of_laws_that_are_plain() -> None:
+def test_more_is_claimed_of_laws_that_are_plain():
     plain = replace(GOOD, strength=10.0, poses=100)
     nine = [Outcome(plain, "law", "dq_2 = a", "wear", True, True, 0.99, 2.0, 1.1)] * 9
     wrong = Outcome(plain, "law", "dq_3 = a", "wear", False, True, 0.99, 2.0, 1.1)

@@ -6,28 +6,25 @@ import numpy as np
 import pytest
 
 from hilcal.cell import cell_from_config
-from hilcal.config import CellConfig, load_config
 from hilcal.design.information import reading_covariance
 from hilcal.engine.engine import open_engine
-from hilcal.types import Floats
-from studies.plans import DOUBLE, GRID, PARAMETERS, RANDOM, TEST, PlansStudy, plans_study
+from studies.plans import DOUBLE, GRID, PARAMETERS, RANDOM, TEST, plans_study
 from studies.plans_command import arms, with_robot
 from studies.plans_errors import Errors, readings_asked
-from studies.plans_kinds import Scene, at_random, grid, matching, optimal, scene
+from studies.plans_kinds import at_random, grid, matching, optimal, scene
 from studies.plans_statistics import Measured, summary
 from studies.plans_table import as_predicted, halved
-from tests.support.cli_cases import CELL, Capsys, run
+from tests.support.campaigns import configuration
+from tests.support.cli_cases import run
 
 KNOWN = {"base_xyz_m": (-3.0, 0.5, -0.6), "base_rotvec_rad": (0.0, 0.0, 0.4)}
 
 
-def configured(
-    mode: str = "deflection", *, known: bool = False, robust: bool = False
-) -> CellConfig:
+def configured(mode="deflection", *, known=False, robust=False):
     """The demo's cell."""
-    config = load_config(CELL)
+    config = configuration()
     planning = {"readings": mode, **({} if robust else {"against": ()})}
-    update: dict[str, object] = {"planning": config.planning.model_copy(update=planning)}
+    update = {"planning": config.planning.model_copy(update=planning)}
     if known:
         update["tracker"] = config.tracker.model_copy(update=KNOWN)
     return config.model_copy(update=update)
@@ -36,33 +33,33 @@ def configured(
 SEED = 5
 
 
-def scene_of(config: CellConfig, candidates: int = 120) -> Scene:
+def scene_of(config, candidates=120):
     return scene(cell_from_config(config), config, candidates, np.random.default_rng(SEED))
 
 
 @pytest.fixture(scope="module")
-def deflection() -> Scene:
+def deflection():
     return scene_of(configured())
 
 
 @pytest.fixture(scope="module")
-def absolute() -> Scene:
+def absolute():
     return scene_of(configured("absolute"))
 
 
 @pytest.fixture(scope="module")
-def small() -> PlansStudy:
+def small():
     config = configured()
     return plans_study(
         cell_from_config(config), config, arms(0), readings=60, campaigns=3, candidates=80, seed=3
     )
 
 
-def errors_of(parameter: Floats, std: Floats, position: float = 1.0) -> Errors:
+def errors_of(parameter, std, position=1.0):
     return Errors(parameter, std, np.array([1.0, 10.0]), position, 2.0, 60, 12)
 
 
-def test_errors_are_summarised_over_campaigns() -> None:
+def test_errors_are_summarised_over_campaigns():
     std = np.array([1.0, 2.0])
     s = summary([errors_of(np.array([3.0, -8.0]), std, 1.0), errors_of(np.zeros(2), std, 7.0)])
     assert s.parameter == pytest.approx(np.sqrt(1.0 * 0.2))
@@ -73,7 +70,7 @@ def test_errors_are_summarised_over_campaigns() -> None:
     assert (s.campaigns, s.readings, s.poses) == (2, 60, 12)
 
 
-def test_the_stated_uncertainty_of_the_simulation_is_that_of_repeated_studies() -> None:
+def test_the_stated_uncertainty_of_the_simulation_is_that_of_repeated_studies():
     rng = np.random.default_rng(1)
     std = np.array([1.0, 2.0])
     many = [
@@ -96,15 +93,13 @@ def test_the_stated_uncertainty_of_the_simulation_is_that_of_repeated_studies() 
     ("value", "std", "verdict"),
     [(1.09, 0.01, "yes"), (0.91, 0.2, "yes"), (1.15, 0.03, "unclear"), (0.8, 0.04, "no")],
 )
-def test_a_verdict_tells_a_miss_from_noise(value: float, std: float, verdict: str) -> None:
+def test_a_verdict_tells_a_miss_from_noise(value, std, verdict):
     assert as_predicted(Measured(value, std)) == verdict
 
 
 @pytest.mark.parametrize("mode", ["deflection", "absolute"])
-def test_every_plan_keeps_its_readings_and_the_limits_of_the_cell(
-    mode: str, request: pytest.FixtureRequest
-) -> None:
-    of: Scene = request.getfixturevalue(mode)
+def test_every_plan_keeps_its_readings_and_the_limits_of_the_cell(mode, request):
+    of = request.getfixturevalue(mode)
     plans = [at_random(of, 60, np.random.default_rng(k)) for k in range(3)]
     plans += [grid(of, 60), optimal(of, TEST, 60, np.random.default_rng(0))]
     for plan in plans:
@@ -119,7 +114,7 @@ def test_every_plan_keeps_its_readings_and_the_limits_of_the_cell(
             )
 
 
-def test_deflections_have_their_own_unloaded_reading_each_time(deflection: Scene) -> None:
+def test_deflections_have_their_own_unloaded_reading_each_time(deflection):
     plan = optimal(deflection, PARAMETERS, 60, np.random.default_rng(0))
     assert plan.counts.max() > 1  # a unit is taken again
     asked = readings_asked(plan)
@@ -135,17 +130,14 @@ def test_deflections_have_their_own_unloaded_reading_each_time(deflection: Scene
 
 
 @pytest.mark.parametrize("mode", ["deflection", "absolute"])
-def test_a_planned_campaign_beats_the_others_where_it_is_asked_to(
-    mode: str, request: pytest.FixtureRequest
-) -> None:
-    of: Scene = request.getfixturevalue(mode)
+def test_a_planned_campaign_beats_the_others_where_it_is_asked_to(mode, request):
+    of = request.getfixturevalue(mode)
     plan = optimal(of, TEST, 60, np.random.default_rng(0)).predicted.position
     rest = [at_random(of, 60, np.random.default_rng(k)) for k in range(5)] + [grid(of, 60)]
-    assert plan is not None
     assert all(r.predicted.position > plan for r in rest if r.predicted.position is not None)
 
 
-def test_the_readings_of_random_plans_for_an_accuracy_are_found(deflection: Scene) -> None:
+def test_the_readings_of_random_plans_for_an_accuracy_are_found(deflection):
     at_120 = [at_random(deflection, 120, np.random.default_rng(k)) for k in range(20)]
     wanted = np.sqrt(np.mean([float(p.predicted.position or np.nan) ** 2 for p in at_120]))
     found = matching(deflection, float(wanted), 60, np.random.default_rng(77))
@@ -154,7 +146,7 @@ def test_the_readings_of_random_plans_for_an_accuracy_are_found(deflection: Scen
 
 
 @pytest.mark.parametrize("known", [False, True])
-def test_the_simulated_noise_is_the_planned_one(known: bool) -> None:
+def test_the_simulated_noise_is_the_planned_one(known):
     of = scene_of(configured(known=known))
     asked = readings_asked(at_random(of, 60, np.random.default_rng(0)))
     measured = arms(0)(of.cell, of.config, 4).measure(asked, np.random.default_rng(0))
@@ -166,7 +158,7 @@ def test_the_simulated_noise_is_the_planned_one(known: bool) -> None:
 
 
 @pytest.mark.slow
-def test_the_study_depends_on_its_seed_alone(small: PlansStudy) -> None:
+def test_the_study_depends_on_its_seed_alone(small):
     """Not on the number of workers either."""
     config = configured()
     cell = cell_from_config(config)
@@ -180,7 +172,7 @@ def test_the_study_depends_on_its_seed_alone(small: PlansStudy) -> None:
 
 
 @pytest.mark.long
-def test_the_study_compares_equal_numbers_of_readings(small: PlansStudy) -> None:
+def test_the_study_compares_equal_numbers_of_readings(small):
     assert [line.kind for line in small.lines] == [TEST, PARAMETERS, RANDOM, GRID, DOUBLE]
     for line in small.lines:
         wanted = 120 if line.kind == DOUBLE else 60
@@ -195,7 +187,7 @@ def test_the_study_compares_equal_numbers_of_readings(small: PlansStudy) -> None
 
 
 @pytest.mark.long
-def test_the_command_gives_one_document(capsys: Capsys) -> None:
+def test_the_command_gives_one_document(capsys):
     done = run(
         capsys, "studies", "plans", "--robot", "ur5e", "--campaigns", "2", "--readings", "50",
         "--candidates", "60", "--json",
@@ -215,28 +207,12 @@ def test_the_command_gives_one_document(capsys: Capsys) -> None:
         assert {s["as_predicted"], s["half"]} <= {"yes", "no", "unclear"}
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("--campaigns", "1"), "at least 2 campaigns"),
-        (("--candidates", "0"), "--candidates 0"),
-        (("--robot", "nobody"), "nobody"),
-        (("nowhere.toml",), "nowhere.toml"),
-    ],
-)
-def test_wrong_input_is_one_line(arguments: tuple[str, ...], words: str, capsys: Capsys) -> None:
-    done = run(capsys, "studies", "plans", *arguments)
-    assert done.code == 2
-    assert words in done.err
-    assert len(done.err.strip().splitlines()) == 1
-
-
-def studied(config: CellConfig, campaigns: int) -> PlansStudy:
+def studied(config, campaigns):
     cell = cell_from_config(config)
     return plans_study(cell, config, arms(0), campaigns=campaigns, candidates=400)
 
 
-def needs_at_most_half(study: PlansStudy, kind: str) -> bool:
+def needs_at_most_half(study, kind):
     """As predicted, and not truly worse than random plans of twice the readings."""
     (s,) = (s for s in study.shrinkage() if s.kind == kind)
     assert s.twice.std < 0.1
@@ -245,7 +221,7 @@ def needs_at_most_half(study: PlansStudy, kind: str) -> bool:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("robot", ["ur10e", "ur5e"])
-def test_errors_are_those_predicted_and_shrink_as_predicted(robot: str) -> None:
+def test_errors_are_those_predicted_and_shrink_as_predicted(robot):
     """Within 10 %, with a registered tracker: what is predicted then is all that there is."""
     study = studied(with_robot(configured(known=True), robot), 150)
     for line in study.lines:
@@ -262,7 +238,7 @@ def test_errors_are_those_predicted_and_shrink_as_predicted(robot: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("robot", ["ur10e", "ur5e"])
-def test_half_of_the_readings_of_random_plans_do(robot: str) -> None:
+def test_half_of_the_readings_of_random_plans_do(robot):
     """50 campaigns each, registration unknown; each plan in the measure that it was made for.
 
     With all effects as large as arms have them it is two thirds: what is known of arms serves both.

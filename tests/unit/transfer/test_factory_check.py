@@ -1,7 +1,6 @@
 """Whether an arm is still what its factory measured, on readings of a simulated world."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -11,7 +10,6 @@ from hilcal.config import CellConfig
 from hilcal.drivers.simulated.rehearsal import case_of_plan, read_plan
 from hilcal.effects.catalogue import installed
 from hilcal.errors import CannotAnswerError
-from hilcal.readings.readings import Readings
 from hilcal.robot.catalogue import load_arm
 from hilcal.transfer.factory import check_factory
 from tests.support.factory_cases import factory_of, write
@@ -25,7 +23,7 @@ CELL = {
 }
 
 
-def readings(folder: Path, hide: str, seed: int) -> tuple[CellConfig, Readings]:
+def readings(folder, hide, seed):
     """Readings of 20 poses of an arm that the factory had measured, with a later change."""
     write(folder / "arm.toml", "ur15")
     config = CellConfig.model_validate(CELL)
@@ -42,7 +40,7 @@ def readings(folder: Path, hide: str, seed: int) -> tuple[CellConfig, Readings]:
         pytest.param("link_geometry", marks=pytest.mark.long),
     ],
 )
-def test_a_change_since_the_factory_is_found_and_none_is_invented(tmp_path: Path, hide) -> None:
+def test_a_change_since_the_factory_is_found_and_none_is_invented(tmp_path, hide):
     config, measured = readings(tmp_path, hide, 3)
     cell, nominal = cell_from_config(config, tmp_path), load_arm("ur15")
     found = check_factory(cell, nominal, cell.factory, measured)
@@ -59,7 +57,7 @@ def test_a_change_since_the_factory_is_found_and_none_is_invented(tmp_path: Path
 
 
 @pytest.mark.long
-def test_too_few_readings_cannot_answer(tmp_path: Path) -> None:
+def test_too_few_readings_cannot_answer(tmp_path):
     config, measured = readings(tmp_path, "nothing", 3)
     cell = cell_from_config(config, tmp_path)
     few = measured[:7]

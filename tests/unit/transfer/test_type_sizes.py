@@ -1,21 +1,19 @@
 """The sizes of effects that a type of arm has, from arms whose true sizes are known."""
 
 import tomllib
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from hilcal.cell import Cell, cell_from_config
+from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig
 from hilcal.identification.baseline import baseline
 from hilcal.identification.mixed_fit import mixed_fit, with_all_effects
 from hilcal.mixed.families import families_of
 from hilcal.model.model import Model
 from hilcal.present.comparison import size_lines
-from hilcal.readings.readings import Readings
-from hilcal.transfer.members import TypeSize, evidence_of, type_sizes
+from hilcal.transfer.members import evidence_of, type_sizes
 from studies.random_descriptions import readings_of
 
 TRUTH = {"transmission_error": 0.1, "link_geometry": 0.3}
@@ -24,13 +22,13 @@ NOISE_M, ARM, FAMILY = 2e-5, 0.5, 0.5
 """Noise of a reading; how far arms and families scatter about them, in log s."""
 
 
-def cell_of(ordinary: Mapping[str, float]) -> Cell:
+def cell_of(ordinary):
     tool = {"target_m": [0.05, 0.02, 0.1], "mass_kg": 1.0, "com_m": [0.0, 0.0, 0.04]}
     section = {"robot": {"model": "ur10e"}, "tool": tool, "ordinary": ordinary}
     return cell_from_config(CellConfig.model_validate(section))
 
 
-def measured(cell: Cell, poses: int, rng: np.random.Generator) -> Readings:
+def measured(cell, poses, rng):
     """Readings of one arm of the type."""
     q = rng.uniform(-2.5, 2.5, (poses, 6))
     plain = readings_of(q, np.zeros((poses, 3)), np.full(3, NOISE_M))
@@ -47,13 +45,13 @@ def measured(cell: Cell, poses: int, rng: np.random.Generator) -> Readings:
     return replace(plain, value=value, scatter_stated=True)
 
 
-def at_nominal(cell: Cell, of: Readings) -> Readings:
+def at_nominal(cell, of):
     """Readings as the arm without any effect would give them."""
     return replace(of, value=Model(cell, ()).predict(of.states, np.zeros(0)).observation.position)
 
 
 @pytest.fixture(scope="module")
-def sizes() -> dict[str, TypeSize]:
+def sizes():
     cell, told = cell_of({}), []
     for arm in range(5):
         readings = measured(cell, 30, np.random.default_rng([arm, 7]))
@@ -62,7 +60,7 @@ def sizes() -> dict[str, TypeSize]:
     return {s.effect: s for s in type_sizes(told)}
 
 
-def test_the_sizes_of_a_type_are_in_their_intervals(sizes: dict[str, TypeSize]) -> None:
+def test_the_sizes_of_a_type_are_in_their_intervals(sizes):
     truth = np.array([TRUTH.get(name, 1.0) for name in sizes])
     low, high = (np.array([getattr(s, end) for s in sizes.values()]) for end in ("low", "high"))
     assert np.mean((low < truth) & (truth < high)) >= 0.9
@@ -71,7 +69,7 @@ def test_the_sizes_of_a_type_are_in_their_intervals(sizes: dict[str, TypeSize]) 
     assert high[truth == 1.0].max() > 2.0  # what no campaign tells stays open
 
 
-def test_what_a_cell_says_already_does_not_count_twice(sizes: dict[str, TypeSize]) -> None:
+def test_what_a_cell_says_already_does_not_count_twice(sizes):
     told = []
     cell = cell_of(TRUTH)
     for arm in range(5):
@@ -82,11 +80,11 @@ def test_what_a_cell_says_already_does_not_count_twice(sizes: dict[str, TypeSize
         assert s.factor == pytest.approx(sizes[s.effect].factor, rel=0.5)
 
 
-def test_no_campaign_tells_nothing() -> None:
+def test_no_campaign_tells_nothing():
     assert type_sizes([]) == ()
 
 
-def test_the_section_can_be_copied_into_a_cell(sizes: dict[str, TypeSize]) -> None:
+def test_the_section_can_be_copied_into_a_cell(sizes):
     heading, *section = size_lines(tuple(sizes.values()))
     assert "another arm of this type" in heading
     ordinary = tomllib.loads("\n".join(section))["ordinary"]

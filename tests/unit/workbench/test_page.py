@@ -1,7 +1,7 @@
 """The page in NiceGUI's own simulation: what it says, where, and that it stays."""
 
 import asyncio
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from typing import get_args
@@ -18,7 +18,7 @@ from tests.support.bench_cases import few_effects, stored
 
 
 @pytest.fixture(scope="module")
-def session(tmp_path_factory: pytest.TempPathFactory) -> WorkbenchSession:
+def session(tmp_path_factory):
     made = WorkbenchSession(stored(tmp_path_factory.mktemp("page") / "run.hilcal"), few_effects())
     made.load()
     return made
@@ -26,7 +26,7 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> WorkbenchSession:
 
 @asynccontextmanager
 async def opened(shared: TabsShared) -> AsyncIterator[User]:
-    def page() -> None:
+    def page():
         view = View(shared, "http://test/")
         view.build()
         view.begin(dark=False)
@@ -36,26 +36,22 @@ async def opened(shared: TabsShared) -> AsyncIterator[User]:
         yield user
 
 
-def seen(user: User, kind: type[ui.element], mark: str) -> list[str]:
+def seen(user, kind, mark):
     """Texts of elements that show, with a property."""
-    assert user.client is not None
     found = [e for e in user.client.elements.values() if isinstance(e, kind) and e.visible]
     return [str(e.props.get("innerHTML") or getattr(e, "text", "")) for e in found
             if mark in str(dict(e.props)) or mark in e.classes]  # fmt: skip
 
 
-def simulated(do: Callable[[], Awaitable[None]]) -> None:
-    asyncio.run(do())  # type: ignore[arg-type]
+def simulated(do):
+    asyncio.run(do())
 
 
 @pytest.mark.parametrize("reason", get_args(Reason))
-def test_nothing_but_the_verdict_says_whether_an_effect_is_missing(
-    session: WorkbenchSession, reason: Reason, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nothing_but_the_verdict_says_whether_an_effect_is_missing(session, reason, monkeypatch):
     """Where no effect is listed, whatever the verdict."""
     monkeypatch.setattr("hilcal.workbench.cards.message", lambda d: "the sentence")
     snapshot = session.snapshot
-    assert snapshot is not None
     judged = replace(snapshot.diagnosis, reason=reason, suspects=())
     last = replace(snapshot.chapters[-1], diagnosis=judged)
     shown = WorkbenchSession(session.path, few_effects())
@@ -74,7 +70,7 @@ def test_nothing_but_the_verdict_says_whether_an_effect_is_missing(
     simulated(look)
 
 
-def test_an_answer_appears_at_its_button_and_stays(session: WorkbenchSession) -> None:
+def test_an_answer_appears_at_its_button_and_stays(session):
     async def look() -> None:
         shared = TabsShared(session)
         before = session.path.read_bytes()

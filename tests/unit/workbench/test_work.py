@@ -10,10 +10,10 @@ from hilcal.workbench import viewer
 from hilcal.workbench.work import Work
 
 
-def test_only_one_thing_is_done_at_a_time() -> None:
+def test_only_one_thing_is_done_at_a_time():
     work, go, done = Work(), threading.Event(), []
 
-    def slow(say: object) -> None:
+    def slow(say):
         go.wait(10)
         done.append("slow")
 
@@ -25,9 +25,9 @@ def test_only_one_thing_is_done_at_a_time() -> None:
     assert (done, work.line, work.failure()) == (["slow"], "", "")
 
 
-def test_progress_and_failures_are_lines() -> None:
-    def fails(error: Exception) -> str:
-        def do(say: object) -> None:
+def test_progress_and_failures_are_lines():
+    def fails(error):
+        def do(say):
             raise error
 
         work = Work()
@@ -41,7 +41,7 @@ def test_progress_and_failures_are_lines() -> None:
 
     work, seen, go = Work(), threading.Event(), threading.Event()
 
-    def says(say) -> None:  # type: ignore[no-untyped-def]
+    def says(say):
         say("diagnosing")
         seen.set()
         go.wait(10)
@@ -53,11 +53,11 @@ def test_progress_and_failures_are_lines() -> None:
     assert work.wait(10)
 
 
-def test_the_viewers_files_come_by_the_loopback_address_alone() -> None:
-    heard: set[str] = set()
+def test_the_viewers_files_come_by_the_loopback_address_alone():
+    heard = set()
     done = threading.Event()
 
-    def watch() -> None:
+    def watch():
         while not done.wait(0.02):
             for process in psutil.Process().children(recursive=True):
                 with contextlib.suppress(psutil.Error):  # it has ended
