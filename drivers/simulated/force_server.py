@@ -20,6 +20,7 @@ import contextlib
 import select
 import socket
 import struct
+import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -504,45 +505,33 @@ def serve_page(sensor: NetFt, host: str, port: int) -> None:
     threading.Thread(target=server.serve_forever, daemon=True).start()
 
 
-def start_rdt(options: argparse.Namespace, board: Blackboard) -> NetFt:
-    """Return the sensor of a network, which answers on HTTP already."""
-    measuring, faults = np.random.default_rng(options.seed).spawn(2)
-    line = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    line.bind((options.host, options.port or 49152))
-    gauge = StrainGauge.draw(board, RDT_NOISE, measuring, options.on)
-    sensor = NetFt(gauge, faults, options.rate or 1000.0, line)
-    serve_page(sensor, options.host, options.web_port)
-    return sensor
-
-
-def start_serial(options: argparse.Namespace, board: Blackboard) -> Stream:
-    """Return the sensor of a serial line."""
-    measuring, faults = np.random.default_rng(options.seed).spawn(2)
-    sensor = KINDS[options.kind](options.rate)
-    gauge = StrainGauge.draw(board, sensor.noise, measuring, options.on)
-    port = PtyPort(options.directory / "force", sensor.baud, faults)
-    return Stream(sensor, gauge, port, due=time.monotonic())
-
-
-def main() -> None:
-    """Run until the parent ends."""
-    options = admin.begin(
-        __doc__,
-        {
-            "--kind": {"choices": [*sorted(KINDS), "netft"], "required": True},
-            "--host": {},
-            "--port": {"type": int},
-            "--web-port": {"type": int, "default": 8081},
-            "--rate": {"type": float, "help": "frames per second"},
-            "--on": {"type": float, "default": 1200.0, "help": "s that it has been on"},
-        },
-    )
+def start(options: argparse.Namespace) -> admin.Device:
+    """Return a sensor: of the network, which answers on HTTP already, or of a serial line."""
     board = Blackboard(options.directory / "world.bin")
-    sensor = (start_rdt if options.kind == "netft" else start_serial)(options, board)
-    admin.serve(options.directory / "force.sock", sensor.operations())
-    while True:
-        sensor.step()
+    measuring, faults = np.random.default_rng(options.seed).spawn(2)
+    sensor: NetFt | Stream
+    if options.kind == "netft":
+        line = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        line.bind((options.host, options.port or 49152))
+        gauge = StrainGauge.draw(board, RDT_NOISE, measuring, options.on)
+        sensor = NetFt(gauge, faults, options.rate or 1000.0, line)
+        serve_page(sensor, options.host, options.web_port)
+    else:
+        protocol = KINDS[options.kind](options.rate)
+        gauge = StrainGauge.draw(board, protocol.noise, measuring, options.on)
+        port = PtyPort(options.directory / "force", protocol.baud, faults)
+        sensor = Stream(protocol, gauge, port, due=time.monotonic())
+    return sensor.operations(), sensor.step
 
+
+OPTIONS: dict[str, dict[str, Any]] = {
+    "--kind": {"choices": [*sorted(KINDS), "netft"], "required": True},
+    "--host": {},
+    "--port": {"type": int},
+    "--web-port": {"type": int, "default": 8081},
+    "--rate": {"type": float, "help": "frames per second"},
+    "--on": {"type": float, "default": 1200.0, "help": "s that it has been on"},
+}
 
 if __name__ == "__main__":
-    main()
+    sys.exit(admin.run(__doc__, "force", start, OPTIONS))

@@ -394,21 +394,8 @@ def test_a_configuration_of_another_cell_is_refused(tmp_path):
 @pytest.mark.parametrize("text", ["", "[1]", '{"format": "hilcal-plan"}', "{"])
 def test_another_file_is_no_world(tmp_path, text):
     (tmp_path / "world.json").write_text(text)
-    with pytest.raises(InputError, match="not a world file"):
+    with pytest.raises(InputError, match="no world"):
         read_world(tmp_path / "world.json")
-
-
-def test_a_world_written_before_an_effect_was_known_has_none_of_it(tmp_path):
-    path = tmp_path / "world.json"
-    world = world_of(config(), **everything(np.random.default_rng(3)))
-    write_world(path, world, config())
-    content = json.loads(path.read_text())
-    del content["physics"]["joint_coupling"]
-    path.write_text(json.dumps(content))
-    back = read_world(path)[0]
-    assert back.truth == {
-        k: v for k, v in world.truth.items() if not k.startswith("joint_coupling")
-    }
 
 
 def test_a_damaged_world_says_so(tmp_path):
@@ -417,11 +404,7 @@ def test_a_damaged_world_says_so(tmp_path):
     content = json.loads(path.read_text())
     del content["physics"]["base_frame"]
     path.write_text(json.dumps(content))
-    with pytest.raises(InputError, match="damaged: KeyError 'base_frame'"):
-        read_world(path)
-    write_world(path, world_of(config()), config())
-    path.write_text(path.read_text().replace('"version": 2', '"version": 1'))
-    with pytest.raises(InputError, match="version 1; this hilcal reads 2"):
+    with pytest.raises(InputError, match=r"no world: TypeError .*'base_frame'"):
         read_world(path)
     with pytest.raises(InputError, match="cannot be read"):
         read_world(tmp_path / "none.json")
