@@ -336,6 +336,9 @@ class ArmState:
     scaling: float = 1.0  # further factor on the speed, as the controller applies it by itself
     slider: float = 1.0
     digital_outputs: int = 0  # RTDE `actual_digital_output_bits`
+    rtde_mute: bool = False  # whether RTDE answers nothing
+    rtde_stall: bool = False  # whether it sends no data
+    dashboard_mute: bool = False  # whether dashboard server or Robot API answer nothing
     refuses_motion: bool = False  # whether a motion that is commanded ends the program instead
     frozen_q: Floats | None = None  # (n,) told in spite of any motion, rad; None is the truth
     fault_ns: int = 0  # `time.monotonic_ns` of the last fault that was switched on
