@@ -22,11 +22,12 @@ import numpy as np
 from hilcal.config import CellConfig
 from hilcal.drivers.simulated import admin
 from hilcal.drivers.simulated.blackboard import Blackboard
-from hilcal.drivers.simulated.ur_state import Kinematics, Trajectory, WorldClock, pose
+from hilcal.drivers.simulated.ur_state import Kinematics, Trajectory, WorldClock
 from hilcal.drivers.simulated.world_server import read_world
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.devices import ArmSample, Report
 from hilcal.robot.arm import Arm
+from hilcal.robot.se3 import six
 from hilcal.types import Floats
 
 WATCHDOG_S = 0.5  # a motion that nobody has looked at for so long is stopped, real s
@@ -74,7 +75,7 @@ class ArmController:
                 "moving": motion.moving,
                 "torque": self._kinematics.weight_torque(q, self._payload, self._com).tolist(),
                 "joint_temperature": truth["joint_temperature"].tolist(),
-                "flange": pose(self._kinematics.flange(q)).tolist(),
+                "flange": six(self._kinematics.flange(q)),
                 "payload": self._payload,
                 "payload_com": self._com.tolist(),
                 "safety": self._safety,

@@ -15,7 +15,6 @@ client of others, is tested against it.
 """
 
 import argparse
-import binascii
 import contextlib
 import select
 import socket
@@ -30,9 +29,10 @@ from typing import Any
 
 import numpy as np
 
+from hilcal.drivers.checksums import crc_modbus, crc_x25
 from hilcal.drivers.simulated import admin
 from hilcal.drivers.simulated.blackboard import Blackboard
-from hilcal.drivers.simulated.pty_port import PtyPort, crc16
+from hilcal.drivers.simulated.pty_port import PtyPort
 from hilcal.types import Floats
 
 TICK_S = 0.004  # frames are handed over in batches at least so far apart, as a USB adapter does
@@ -129,15 +129,6 @@ class SensorProtocol:
         return {}
 
 
-_MIRRORED = bytes(int(f"{value:08b}"[::-1], 2) for value in range(256))
-
-
-def crc16_x25(data: bytes) -> int:
-    """Return the CRC-16/X25: the mirror image of CRC-16/CCITT, start FFFF, inverted."""
-    mirrored = binascii.crc_hqx(data.translate(_MIRRORED), 0xFFFF)
-    return (_MIRRORED[mirrored & 0xFF] << 8 | _MIRRORED[mirrored >> 8]) ^ 0xFFFF
-
-
 class Bota(SensorProtocol):
     """Bota Systems Rokubi and SensONE; the frame is described in `hilcal.drivers.bota`."""
 
@@ -158,7 +149,7 @@ class Bota(SensorProtocol):
         over = self.saturated or bool(np.any(inside != wrench))
         time_us = (self._start_us + round(number * 1e6 / self.rate)) & 0xFFFFFFFF
         body = self._body.pack(self.over_range if over else 0, *inside, time_us, temperature)
-        return b"\xaa" + body + struct.pack("<H", crc16_x25(body))
+        return b"\xaa" + body + crc_x25(body)
 
     def operations(self) -> dict[str, Callable[..., object]]:
         """`saturate {on}` sets the status; `clock {us}` sets the time of frame 0."""
@@ -288,7 +279,7 @@ def _words(text: str) -> list[int]:
 
 def _checked(data: bytes) -> bytes:
     """Return data with its CRC-16/MODBUS."""
-    return data + struct.pack("<H", crc16(data, 0xFFFF))
+    return data + crc_modbus(data)
 
 
 def _refusal(function: int, code: int) -> bytes:

@@ -27,10 +27,11 @@ from typing import Any
 
 import numpy as np
 
+from hilcal.drivers.checksums import crc16
 from hilcal.drivers.simulated import admin
 from hilcal.drivers.simulated.admin import setter
 from hilcal.drivers.simulated.blackboard import Blackboard, settled_truth
-from hilcal.drivers.simulated.pty_port import PtyPort, crc16
+from hilcal.drivers.simulated.pty_port import PtyPort
 from hilcal.types import Floats
 
 
@@ -293,7 +294,7 @@ def parse(line: str) -> GeocomRequest | None:
         return GeocomRequest(-1, 0, (), False, CANNOT_DECODE)
     rpc, transaction, crc, rest = match.groups()
     bare = f"%R1Q,{rpc},{transaction}:{rest}".encode("ascii", "replace")
-    error = OK if crc is None or int(crc) == crc16(bare, 0) else BAD_CHECKSUM
+    error = OK if crc is None or int(crc) == crc16(bare) else BAD_CHECKSUM
     parameters = tuple(rest.split(",")) if rest else ()
     return GeocomRequest(int(rpc), int(transaction or 0), parameters, crc is not None, error)
 
@@ -305,7 +306,7 @@ def reply(
     body = ",".join([str(code), *parameters])
     head = f"%R1P,{com},{transaction}"
     if checked:
-        head += f",{crc16(f'{head}:{body}'.encode(), 0)}"
+        head += f",{crc16(f'{head}:{body}'.encode())}"
     return f"{head}:{body}\r\n".encode()
 
 

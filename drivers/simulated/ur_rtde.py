@@ -15,6 +15,7 @@ import numpy as np
 
 from hilcal.drivers.simulated import ur_state as ur
 from hilcal.drivers.simulated.blackboard import Blackboard
+from hilcal.robot.se3 import of_six, six
 from hilcal.types import Floats
 
 VERSION = 2
@@ -265,8 +266,8 @@ class Sensors:
         held = _FRICTION[: len(self._torque())] * self._arm.trajectory.side - self._torque()
         return np.asarray(held + _TORQUE_PER_AMPERE * self._noise(_CURRENT_STD))
 
-    def _tool_pose(self, q: Floats) -> Floats:
-        return ur.pose(self._flange(q) @ ur.transform(self._arm.tcp))
+    def _tool_pose(self, q: Floats) -> Numbers:
+        return tuple(six(self._flange(q) @ of_six(self._arm.tcp.tolist())))
 
     def _tool_speed(self, qd: Floats) -> Floats:
         if not qd.any():

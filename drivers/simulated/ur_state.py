@@ -23,16 +23,6 @@ Goal = tuple[Floats, float, float]
 """Joint angles (n,), rad, speed and acceleration of the leading joint."""
 
 
-def transform(pose: Floats) -> Floats:
-    """Return the (4, 4) transform of position and rotation vector (6,)."""
-    return np.asarray(pin.SE3(pin.exp3(pose[3:]), pose[:3]).homogeneous)
-
-
-def pose(place: Floats) -> Floats:
-    """Return position and rotation vector (6,) of a transform (4, 4)."""
-    return np.concatenate([place[:3, 3], pin.log3(place[:3, :3])])
-
-
 class Kinematics:
     """Nominal kinematics and weight of the arm, as its controller knows them, by Pinocchio."""
 
