@@ -9,6 +9,7 @@ import numpy as np
 
 from hilcal.config import CellConfig
 from hilcal.drivers import force_stream as fs
+from hilcal.drivers.checksums import crc_x25
 from hilcal.measuring.devices import ForceSensorDevice
 from hilcal.types import Floats
 
@@ -30,7 +31,7 @@ def _overload(wrench: Floats, status: int) -> str:
 
 SENSOR = fs.SensorFormat(
     name="Bota sensor",
-    frame=fs.FrameFormat(b"\xaa", 37, lambda frame: fs.crc_x25(frame[1:]).to_bytes(2, "little")),
+    frame=fs.FrameFormat(b"\xaa", 37, lambda frame: crc_x25(frame[1:])),
     body=np.dtype(
         [("status", "<u2"), ("wrench", "<f4", 6), ("ticks", "<u4"), ("temperature", "<f4")]
     ),

@@ -9,11 +9,12 @@ angles about x, y and z; with the angles a and the rotation R(a),
 Source: Leica Geosystems, emScon TPI V3.6 (`emscon_packets`).
 """
 
+import contextlib
 import math
 import socket
 import struct
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, Literal, NoReturn
 
 import numpy as np
@@ -23,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from hilcal.config import CellConfig
 from hilcal.config.cell import Tracker as TrackerConfig
 from hilcal.drivers import emscon_packets as es
-from hilcal.drivers.links import network_failures, own_axes
+from hilcal.drivers.links import address, check_own_axes, network_failures
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.devices import Clock, Report, Row, TargetLostError, TrackerSample, report_of
 from hilcal.readings.covariance import tracker_covariance, tracker_noise
@@ -133,14 +134,20 @@ class EmsconConnection:
         number, status = struct.unpack_from("<II", body)
         return number, status
 
-    def _send(self, data: bytes) -> None:
+    @contextlib.contextmanager
+    def _failures(self) -> Iterator[None]:
+        """Turn what the socket raises into DeviceError; the connection is closed then."""
         try:
             with network_failures(DEVICE, self.where):
-                self._socket.settimeout(DEADLINE_S)
-                self._socket.sendall(data)
+                yield
         except DeviceError:
             self.close()
             raise
+
+    def _send(self, data: bytes) -> None:
+        with self._failures():
+            self._socket.settimeout(DEADLINE_S)
+            self._socket.sendall(data)
 
     def _packet(self, until: float) -> tuple[int, bytes]:
         """Type and content of the next packet; changes of state are kept aside.
@@ -162,21 +169,15 @@ class EmsconConnection:
             self._receive(until)
 
     def _receive(self, until: float) -> None:
-        try:
-            with network_failures(DEVICE, self.where):
-                left = until - time.monotonic()
-                if until and left <= 0.0:
-                    raise TimeoutError
-                self._socket.settimeout(left if until else 0.0)
-                try:
-                    data = self._socket.recv(es.LARGEST)
-                except BlockingIOError:
-                    if until:
-                        raise TimeoutError from None
-                    data = None
-        except DeviceError:
-            self.close()
-            raise
+        with self._failures():
+            left = until - time.monotonic()
+            if until and left <= 0.0:
+                raise TimeoutError
+            self._socket.settimeout(left if until else 0.0)
+            try:
+                data = self._socket.recv(es.LARGEST)
+            except BlockingIOError:  # of a socket that does not wait
+                data = None
         if data is None:
             raise BlockingIOError
         if not data:
@@ -472,7 +473,8 @@ def _positive(covariance: Floats) -> bool:
 def open_tracker(config: CellConfig) -> EmsconTracker:
     """Connect to the tracker that [tracker] names; nothing turns."""
     tracker = config.tracker
-    host, port = own_axes(tracker, "emscon", es.PORT)
+    host, port = address("[tracker]", "emscon", tracker.host, es.PORT)
+    check_own_axes(tracker)
     options = check_section(tracker.options, EmsconOptions, "[tracker] options")
     clock = Clock(config.simulation.clock)
     return EmsconTracker(lambda: EmsconConnection(host, port), tracker, options, clock)

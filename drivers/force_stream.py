@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -21,36 +21,6 @@ from hilcal.drivers.links import close_port, drain, line_failures, open_port
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.devices import Losses, Report, Row, WrenchSample, report_of
 from hilcal.types import Floats, Ints
-
-
-def crc_table(polynomial: int) -> tuple[int, ...]:
-    """Return the 256 remainders of a reflected 16-bit polynomial, for one byte at a time."""
-    table = []
-    for value in range(256):
-        for _ in range(8):
-            value = (value >> 1) ^ (polynomial if value & 1 else 0)
-        table.append(value)
-    return tuple(table)
-
-
-_MODBUS = crc_table(0xA001)
-_X25 = crc_table(0x8408)
-
-
-def crc_modbus(data: bytes) -> int:
-    """Return CRC-16/MODBUS: polynomial 0x8005 reflected, start 0xFFFF; 0x4B37 for b"123456789"."""
-    crc = 0xFFFF
-    for byte in data:
-        crc = (crc >> 8) ^ _MODBUS[(crc ^ byte) & 0xFF]
-    return crc
-
-
-def crc_x25(data: bytes) -> int:
-    """Return CRC-16/X-25: polynomial 0x1021 reflected, start and end 0xFFFF; 0x906E likewise."""
-    crc = 0xFFFF
-    for byte in data:
-        crc = (crc >> 8) ^ _X25[(crc ^ byte) & 0xFF]
-    return crc ^ 0xFFFF
 
 
 @dataclass(frozen=True, slots=True)
@@ -295,13 +265,18 @@ class ForceStream:
         self._thread = threading.Thread(target=self._read, name=DEVICE, daemon=True)
         self._thread.start()
 
-    def wait_for_first(self, seconds: float) -> None:
-        """Return when a frame has come; raises DeviceError where none came or the line failed."""
+    def started(self, seconds: float = FIRST_FRAME_S) -> Self:
+        """Return when a frame has come; closes where none came, or where the line failed."""
         end = time.monotonic() + seconds
-        while not self._kept and not self._failure and time.monotonic() < end:
-            time.sleep(POLL_S)
-        if not self._kept:
-            raise DeviceError(self._silence())
+        try:
+            while not self._kept and not self._failure and time.monotonic() < end:
+                time.sleep(POLL_S)
+            if not self._kept:
+                raise DeviceError(self._silence())
+        except BaseException:
+            self.close()
+            raise
+        return self
 
     def latest(self) -> WrenchSample:
         """Return the newest frame, at most `STALE_S` old."""
@@ -477,16 +452,6 @@ class ForceStream:
         )
 
 
-def streaming(stream: ForceStream, seconds: float = FIRST_FRAME_S) -> ForceStream:
-    """Return a stream whose first frame has come; it is closed where none does."""
-    try:
-        stream.wait_for_first(seconds)
-    except BaseException:
-        stream.close()
-        raise
-    return stream
-
-
 def open_streaming(section: Section, baud: int, sensor: SensorFormat) -> ForceStream:
     """Open the port of a sensor that streams from power-on, and wait for the first frame."""
     path = serial_port(section)
@@ -497,7 +462,7 @@ def open_streaming(section: Section, baud: int, sensor: SensorFormat) -> ForceSt
     except BaseException:
         close_port(port)
         raise
-    return streaming(ForceStream(port, sensor))
+    return ForceStream(port, sensor).started()
 
 
 def serial_port(section: Section) -> str:

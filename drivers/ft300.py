@@ -19,6 +19,7 @@ import serial
 
 from hilcal.config import CellConfig
 from hilcal.drivers import force_stream as fs
+from hilcal.drivers.checksums import crc_modbus
 from hilcal.drivers.force_stream import DEVICE
 from hilcal.drivers.links import close_port, drain, line_failures, open_port
 from hilcal.errors import DeviceError
@@ -90,7 +91,7 @@ def _overload(wrench: Floats, status: int) -> str:
 
 SENSOR = fs.SensorFormat(
     name="Robotiq FT 300",
-    frame=fs.FrameFormat(b"\x20\x4e", 16, lambda frame: fs.crc_modbus(frame).to_bytes(2, "little")),
+    frame=fs.FrameFormat(b"\x20\x4e", 16, crc_modbus),
     body=np.dtype([("wrench", "<i2", 6)]),
     unit=1.0 / np.repeat((100.0, 1000.0), 3),
     losses=lambda: fs.ByArrival(RATE_HZ),
@@ -113,7 +114,7 @@ def open_force_sensor(config: CellConfig) -> ForceSensorDevice:
     name = f"{SENSOR.name}, serial number {number}"
     facts = (("firmware", firmware),)
     stream = fs.ForceStream(port, SENSOR, name, facts, before_close=lambda: _end(port))
-    return fs.streaming(stream, FIRST_FRAME_S)
+    return stream.started(FIRST_FRAME_S)
 
 
 def _begin(port: serial.Serial) -> tuple[str, str]:

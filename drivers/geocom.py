@@ -27,7 +27,7 @@ from pydantic import Field
 
 from hilcal.config import CellConfig
 from hilcal.config.cell import Tracker as TrackerConfig
-from hilcal.drivers.links import close_port, drain, line_failures, open_port
+from hilcal.drivers.links import check_own_axes, close_port, drain, line_failures, open_port
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.devices import Clock, Report, Row, TargetLostError, TrackerSample, report_of
 from hilcal.readings.covariance import TrackerNoise, tracker_covariance
@@ -542,11 +542,7 @@ def open_tracker(config: CellConfig) -> GeoComTracker:
             '[tracker] driver = "geocom" lacks "port": the serial port, '
             'e.g. "/dev/serial/by-id/usb-FTDI_..."'
         )
-    if tracker.frame != "tracker":
-        raise InputError(
-            f'[tracker] frame = "{tracker.frame}": a GeoCOM instrument gives positions in its '
-            'own axes; it must be "tracker"'
-        )
+    check_own_axes(tracker)
     options = check_section(tracker.options, GeoComOptions, "[tracker] options")
     link = Link(tracker.port, tracker.baud or BAUD)
     return GeoComTracker(link, tracker, options, Clock(config.simulation.clock))

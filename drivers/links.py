@@ -140,12 +140,10 @@ def network_failures(device: str, where: str) -> Iterator[None]:
         raise DeviceError(f"{device} at {where}: the connection failed ({said})") from None
 
 
-def own_axes(tracker: Tracker, driver: str, port: int) -> tuple[str, int]:
-    """Return host and port of a tracker that measures in its own axes."""
-    found = address("[tracker]", driver, tracker.host, port)
+def check_own_axes(tracker: Tracker) -> None:
+    """Refuse another frame for a tracker that measures in its own axes."""
     if tracker.frame != "tracker":
         raise InputError(
             f'[tracker] frame = "{tracker.frame}": this instrument measures in its own axes; it '
             'must be "tracker"'
         )
-    return found

@@ -8,9 +8,12 @@ estimated from the campaign. Frames of 3.0 to 4.2; a server that knows later one
 Source: see `natnet_frames`.
 """
 
+import contextlib
 import socket
 import struct
 import time
+from collections.abc import Iterator
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -20,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from hilcal.config import CellConfig
 from hilcal.config.sections import Whole
 from hilcal.drivers import natnet_frames as nn
-from hilcal.drivers.links import network_failures, own_axes
+from hilcal.drivers.links import address, check_own_axes, network_failures
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.devices import Report, Row, TargetLostError, TrackerSample, report_of
 from hilcal.toml import Section, check_section
@@ -82,9 +85,9 @@ class NatNetTracker:
         position = np.array([b.position for b in bodies])
         turns = Rotation.from_quat(np.array([b.quaternion for b in bodies]))
         if len(bodies) > 1 and not np.any(np.ptp(position, axis=0)):
-            raise DeviceError(
-                f"{DEVICE} at {self.where}: all frames are the same to the last digit; is Motive "
-                "paused, or does it play a recording?"
+            raise self._error(
+                "all frames are the same to the last digit; is Motive paused, or does it play a "
+                "recording?"
             )
         turn = turns.mean()
         off = (turns * turn.inv()).as_rotvec()
@@ -104,11 +107,10 @@ class NatNetTracker:
     def report(self) -> Report:
         """Say who answered, and measure once."""
         s = self._server
-        version = f"{s.version[0]}.{s.version[1]}"
         sent = f"multicast {s.group}:{s.data_port}" if s.group else "to this computer"
         rows: list[Row] = [
             ("", "", "name", s.name),
-            ("NatNet", version, "natnet", version),
+            ("NatNet", self._version, "natnet", self._version),
             ("frames", sent, "", None),
             ("rigid body", self._name, "rigid_body", self._name),
         ]
@@ -143,9 +145,9 @@ class NatNetTracker:
             while len(found) < count:
                 now = time.monotonic()
                 if now - heard > DEADLINE_S or now > until:
-                    raise DeviceError(
-                        f"{DEVICE} at {self.where}: no frames come; is streaming switched on, and "
-                        "does a firewall let them through?"
+                    raise self._error(
+                        "no frames come; is streaming switched on, and does a firewall let them "
+                        "through?"
                     )
                 if now - max(heard, asked) > ANSWER_S:  # it may have forgotten this client
                     asked = now
@@ -171,13 +173,9 @@ class NatNetTracker:
         content = self._receive(line, nn.FRAME, 0.1)
         if content is None:
             return None
-        try:
+        wrong = f"frames are not of NatNet {self._version}; was the version changed in Motive?"
+        with self._parsing(wrong):
             number, bodies = nn.frame(content, self._server.version)
-        except struct.error:
-            raise DeviceError(
-                f"{DEVICE} at {self.where}: frames are not of NatNet "
-                f"{'.'.join(map(str, self._server.version))}; was the version changed in Motive?"
-            ) from None
         if number == self._newest:
             return None
         self._newest = number
@@ -187,31 +185,38 @@ class NatNetTracker:
 
     def _greet(self) -> nn.NatNetServer:
         content = self._ask(nn.connect(nn.NEWEST), nn.SERVER_INFO)
-        try:
+        with self._parsing("what answers is no NatNet server; is this its command port?"):
             server = nn.server(content)
-        except struct.error:
-            raise DeviceError(
-                f"{DEVICE} at {self.where}: what answers is no NatNet server; is this its command "
-                "port?"
-            ) from None
         if server.version > nn.NEWEST:
             words = f"Bitstream,{nn.NEWEST[0]}.{nn.NEWEST[1]}".encode() + b"\0"
             answer = self._ask(nn.message(nn.REQUEST, words), nn.RESPONSE)
             if server.group or answer[:4] not in (bytes(4), words[:4]):
                 self._refuse(server)
-            version = nn.NEWEST
-            server = nn.NatNetServer(
-                server.name, server.program, version, server.data_port, server.group
-            )
+            server = replace(server, version=nn.NEWEST)
         if server.version < nn.OLDEST:
             self._refuse(server)
         return server
 
     def _refuse(self, server: nn.NatNetServer) -> None:
-        raise DeviceError(
-            f"{DEVICE} at {self.where}: it sends frames of NatNet {server.version[0]}."
-            f"{server.version[1]}; valid: 3.0 to {nn.NEWEST[0]}.{nn.NEWEST[1]} (set it in Motive)"
+        raise self._error(
+            f"it sends frames of NatNet {server.version[0]}.{server.version[1]}; valid: 3.0 to "
+            f"{nn.NEWEST[0]}.{nn.NEWEST[1]} (set it in Motive)"
         )
+
+    @property
+    def _version(self) -> str:
+        return ".".join(map(str, self._server.version))
+
+    def _error(self, what: str) -> DeviceError:
+        return DeviceError(f"{DEVICE} at {self.where}: {what}")
+
+    @contextlib.contextmanager
+    def _parsing(self, wrong: str) -> Iterator[None]:
+        """Raise DeviceError where what is parsed inside is cut short."""
+        try:
+            yield
+        except struct.error:
+            raise self._error(wrong) from None
 
     def _joined(self, server: nn.NatNetServer) -> socket.socket:
         line = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -227,13 +232,8 @@ class NatNetTracker:
 
     def _found(self) -> tuple[int, str]:
         content = self._ask(nn.message(nn.REQUEST_DESCRIPTIONS), nn.DESCRIPTIONS)
-        try:
+        with self._parsing(f"its descriptions are not of NatNet {self._version}"):
             names = nn.names(content, self._server.version)
-        except struct.error:
-            raise DeviceError(
-                f"{DEVICE} at {self.where}: its descriptions are not of NatNet "
-                f"{'.'.join(map(str, self._server.version))}"
-            ) from None
         wanted = self._options.rigid_body
         if wanted is None and len(names) == 1:
             return next(iter(names.items()))
@@ -281,7 +281,8 @@ def _drain(line: socket.socket) -> None:
 def open_tracker(config: CellConfig) -> NatNetTracker:
     """Connect to the server that [tracker] names."""
     tracker = config.tracker
-    host, port = own_axes(tracker, "natnet", nn.PORT)
+    host, port = address("[tracker]", "natnet", tracker.host, nn.PORT)
+    check_own_axes(tracker)
     options = check_section(tracker.options, NatNetOptions, "[tracker] options")
     if options.frames < 2:
         raise InputError("[tracker] options: frames = 1; valid: 2 or more, which show the scatter")

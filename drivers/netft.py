@@ -227,6 +227,5 @@ def open_force_sensor(config: CellConfig) -> ForceSensorDevice:
         )
     line = Datagrams(host, port)
     known = tuple((what, told) for what, told in facts if told)
-    return fs.streaming(
-        fs.ForceStream(line, sensor, facts=known, deframer=line, failures=network_failures)
-    )
+    stream = fs.ForceStream(line, sensor, facts=known, deframer=line, failures=network_failures)
+    return stream.started()

@@ -31,13 +31,7 @@ from hilcal.drivers.ur_link.reading import (
     survey,
 )
 from hilcal.drivers.ur_link.states import CHECK_LINK, CONTROL, HOLD_ON, failure
-from hilcal.drivers.ur_link.supervision import (
-    PRIMARY_PORT,
-    Generation,
-    UrOptions,
-    generation,
-    why_silent,
-)
+from hilcal.drivers.ur_link.supervision import Generation, UrOptions, generation, why_silent
 from hilcal.drivers.ur_link.torque_reader import TORQUE, TorqueReader
 from hilcal.drivers.ur_link.worker import WorkerError
 from hilcal.errors import InputError
@@ -109,9 +103,8 @@ class UrArm:
             self._hz,
             self._controller,
             self._receiver,
-            self._generation.supervision,
+            self._generation,
             self._silent,
-            self._generation.script_port == PRIMARY_PORT,
         )
 
     def sample(self) -> ArmSample:

@@ -7,7 +7,6 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.drivers.simulated.mechanics import build, elasticity, equilibrium
 from hilcal.drivers.simulated.rehearsal import (
     CampaignStates,
     Rehearsal,
@@ -15,6 +14,8 @@ from hilcal.drivers.simulated.rehearsal import (
     simulate,
     simulation_case,
 )
+from hilcal.drivers.simulated.truth import Truth
+from hilcal.drivers.simulated.world import SimulatedNoise, World
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.types import Bools, Floats, Ints
@@ -178,13 +179,10 @@ def _rigid(cell: Cell, q: Floats, pull: Floats) -> tuple[Floats, Floats]:
 
     `pull`: (6,) or (N, 6) wrench.
     """
-    arm = cell.arm
-    tree = build(arm, arm.links, cell.tool_mass, cell.tool_com, cell.gravity, tilts=False)
-    none = np.zeros(arm.n)
-    law = elasticity(tree, none, none, none, np.zeros(3), np.zeros((0, 2)))
-    wrench = np.broadcast_to(pull, (len(q), 6))
-    rest = equilibrium(tree, law, q, wrench, cell.load_point)
-    return rest.flange, rest.torque[:, tree.drive]
+    here, none = np.eye(4), np.zeros(cell.arm.n)
+    rigid = World(cell, Truth.rigid(cell.arm), here, here, SimulatedNoise(), none)
+    rest = rigid.rest(States(q=q, wrench=np.broadcast_to(pull, (len(q), 6))))
+    return rest.flange, rest.torque[:, rigid.drives]
 
 
 def _sides(q: Floats, torque: Floats, moves: Bools, rng: np.random.Generator) -> Floats:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from hilcal.errors import DeviceError
+from hilcal.errors import DeviceError, HilcalError
 
 Handler = Callable[[str, dict[str, Any]], Any]
 
@@ -108,6 +108,31 @@ NOISE: dict[str, dict[str, Any]] = {
     f"--{name}-std": {"type": float, "nargs": 2, "required": True}
     for name in ("range", "transverse")
 }
+
+
+Device = tuple[Operations, Callable[[], None]]
+"""What can be asked of a device, and what it does over and over."""
+
+
+def run(
+    doc: str | None,
+    name: str,
+    start: Callable[[argparse.Namespace], Device],
+    more: Mapping[str, dict[str, Any]] | None = None,
+) -> int:
+    """Run the process of a device until its parent ends; its admin line is DIR/NAME.sock.
+
+    Returns the exit code where `start`, which is given the options, cannot make the device.
+    """
+    options = begin(doc, more or {})
+    try:
+        asked, step = start(options)
+    except HilcalError as error:
+        sys.stderr.write(f"{error}\n")
+        return error.exit_code
+    serve(options.directory / f"{name}.sock", asked)
+    while True:
+        step()
 
 
 def begin(doc: str | None, more: Mapping[str, dict[str, Any]]) -> argparse.Namespace:

@@ -9,6 +9,7 @@ asks it on its admin line, DIR/arm.sock. Operations: `sample`, `move {q, speed, 
 Universal Robots have a controller of their own, which speaks their protocols.
 """
 
+import argparse
 import contextlib
 import sys
 import threading
@@ -21,11 +22,12 @@ import numpy as np
 from hilcal.config import CellConfig
 from hilcal.drivers.simulated import admin
 from hilcal.drivers.simulated.blackboard import Blackboard
-from hilcal.drivers.simulated.ur_state import Kinematics, Trajectory, WorldClock, pose
+from hilcal.drivers.simulated.ur_state import Kinematics, Trajectory, WorldClock
 from hilcal.drivers.simulated.world_server import read_world
-from hilcal.errors import DeviceError, HilcalError, InputError
+from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.devices import ArmSample, Report
 from hilcal.robot.arm import Arm
+from hilcal.robot.se3 import six
 from hilcal.types import Floats
 
 WATCHDOG_S = 0.5  # a motion that nobody has looked at for so long is stopped, real s
@@ -73,7 +75,7 @@ class ArmController:
                 "moving": motion.moving,
                 "torque": self._kinematics.weight_torque(q, self._payload, self._com).tolist(),
                 "joint_temperature": truth["joint_temperature"].tolist(),
-                "flange": pose(self._kinematics.flange(q)).tolist(),
+                "flange": six(self._kinematics.flange(q)),
                 "payload": self._payload,
                 "payload_com": self._com.tolist(),
                 "safety": self._safety,
@@ -218,23 +220,20 @@ def open_arm(config: CellConfig) -> SimulatedArm:
     return arm
 
 
-def main() -> int:
-    """Run until the parent ends; returns the exit code."""
-    options = admin.begin(__doc__, {})
-    try:
-        world, _ = read_world(options.directory / "world.json")
-        board = Blackboard(options.directory / "world.bin")
-    except HilcalError as error:
-        sys.stderr.write(f"{error}\n")
-        return error.exit_code
+def start(options: argparse.Namespace) -> admin.Device:
+    """Return the controller of the arm in DIR/world.json."""
+    world, _ = read_world(options.directory / "world.json")
+    board = Blackboard(options.directory / "world.bin")
     controller = ArmController(world.cell.arm, board, np.random.default_rng(options.seed))
     controller.step()
     names = ("move", "stop", "payload", "jog", "protective_stop", "release", "sample")
     asked = {name: getattr(controller, name) for name in names}
-    admin.serve(options.directory / "arm.sock", admin.Operations(asked, controller.sample))
-    while True:
+
+    def step() -> None:
         time.sleep(_STEP_S if controller.step() else _REFRESH_S)
+
+    return admin.Operations(asked, controller.sample), step
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(admin.run(__doc__, "arm", start))

@@ -12,13 +12,16 @@ state, `transform {on}` sets an object's coordinate system, `drop` closes the co
 Source: as `hilcal.drivers.emscon_packets`. CESAPI, a client of others, is tested against it.
 """
 
+import argparse
 import contextlib
 import select
 import socket
 import struct
+import sys
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -273,39 +276,36 @@ def operations(t: SimulatedTracker) -> admin.Operations:
 
 
 def serve(t: SimulatedTracker, door: socket.socket) -> None:
-    """Answer for ever, one client after another."""
-    while True:
-        t.client, _ = door.accept()
-        with t.client:
-            came = bytearray()
-            while True:
-                t.station.tick()
-                if not select.select([t.client], [], [], _PULSE)[0]:
-                    continue
-                try:
-                    data = t.client.recv(es.LARGEST)
-                except OSError:
-                    data = b""
-                if not data:
+    """Answer the next client until it goes."""
+    t.client, _ = door.accept()
+    with t.client:
+        came = bytearray()
+        while True:
+            t.station.tick()
+            if not select.select([t.client], [], [], _PULSE)[0]:
+                continue
+            try:
+                data = t.client.recv(es.LARGEST)
+            except OSError:
+                data = b""
+            if not data:
+                break
+            came += data
+            while len(came) >= 12:
+                size, kind, command = struct.unpack_from("<iII", came)
+                if not 12 <= size <= es.LARGEST or kind != es.COMMAND:
+                    came.clear()
                     break
-                came += data
-                while len(came) >= 12:
-                    size, kind, command = struct.unpack_from("<iII", came)
-                    if not 12 <= size <= es.LARGEST or kind != es.COMMAND:
-                        came.clear()
-                        break
-                    if len(came) < size:
-                        break
-                    body = bytes(came[12:size])
-                    del came[:size]
-                    t.carry_out(command, body)
-        t.client = None
+                if len(came) < size:
+                    break
+                body = bytes(came[12:size])
+                del came[:size]
+                t.carry_out(command, body)
+    t.client = None
 
 
-def main() -> None:
-    """Run until the parent ends."""
-    orientation: dict[str, Any] = {"--orientation-std": {"type": float, "default": 8.7e-5}}
-    options = admin.begin(__doc__, {**admin.NETWORK, **admin.NOISE, **orientation})
+def start(options: argparse.Namespace) -> admin.Device:
+    """Return a tracker that listens."""
     measuring, turning = np.random.default_rng(options.seed).spawn(2)
     along, across = tuple(options.range_std), tuple(options.transverse_std)
     board = Blackboard(options.directory / "world.bin")
@@ -313,9 +313,11 @@ def main() -> None:
     noise = SimulatedNoise(along, across, options.orientation_std)
     tracker = SimulatedTracker(station, noise, turning)
     door = socket.create_server((options.host, options.port or 7000), backlog=1)
-    admin.serve(options.directory / "tracker.sock", operations(tracker))
-    serve(tracker, door)
+    return operations(tracker), partial(serve, tracker, door)
 
+
+ORIENTATION: dict[str, dict[str, Any]] = {"--orientation-std": {"type": float, "default": 8.7e-5}}
 
 if __name__ == "__main__":
-    main()
+    more = {**admin.NETWORK, **admin.NOISE, **ORIENTATION}
+    sys.exit(admin.run(__doc__, "tracker", start, more))

@@ -15,11 +15,11 @@ client of others, is tested against it.
 """
 
 import argparse
-import binascii
 import contextlib
 import select
 import socket
 import struct
+import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -29,9 +29,10 @@ from typing import Any
 
 import numpy as np
 
+from hilcal.drivers.checksums import crc_modbus, crc_x25
 from hilcal.drivers.simulated import admin
 from hilcal.drivers.simulated.blackboard import Blackboard
-from hilcal.drivers.simulated.pty_port import PtyPort, crc16
+from hilcal.drivers.simulated.pty_port import PtyPort
 from hilcal.types import Floats
 
 TICK_S = 0.004  # frames are handed over in batches at least so far apart, as a USB adapter does
@@ -128,15 +129,6 @@ class SensorProtocol:
         return {}
 
 
-_MIRRORED = bytes(int(f"{value:08b}"[::-1], 2) for value in range(256))
-
-
-def crc16_x25(data: bytes) -> int:
-    """Return the CRC-16/X25: the mirror image of CRC-16/CCITT, start FFFF, inverted."""
-    mirrored = binascii.crc_hqx(data.translate(_MIRRORED), 0xFFFF)
-    return (_MIRRORED[mirrored & 0xFF] << 8 | _MIRRORED[mirrored >> 8]) ^ 0xFFFF
-
-
 class Bota(SensorProtocol):
     """Bota Systems Rokubi and SensONE; the frame is described in `hilcal.drivers.bota`."""
 
@@ -157,7 +149,7 @@ class Bota(SensorProtocol):
         over = self.saturated or bool(np.any(inside != wrench))
         time_us = (self._start_us + round(number * 1e6 / self.rate)) & 0xFFFFFFFF
         body = self._body.pack(self.over_range if over else 0, *inside, time_us, temperature)
-        return b"\xaa" + body + struct.pack("<H", crc16_x25(body))
+        return b"\xaa" + body + crc_x25(body)
 
     def operations(self) -> dict[str, Callable[..., object]]:
         """`saturate {on}` sets the status; `clock {us}` sets the time of frame 0."""
@@ -287,7 +279,7 @@ def _words(text: str) -> list[int]:
 
 def _checked(data: bytes) -> bytes:
     """Return data with its CRC-16/MODBUS."""
-    return data + struct.pack("<H", crc16(data, 0xFFFF))
+    return data + crc_modbus(data)
 
 
 def _refusal(function: int, code: int) -> bytes:
@@ -504,45 +496,33 @@ def serve_page(sensor: NetFt, host: str, port: int) -> None:
     threading.Thread(target=server.serve_forever, daemon=True).start()
 
 
-def start_rdt(options: argparse.Namespace, board: Blackboard) -> NetFt:
-    """Return the sensor of a network, which answers on HTTP already."""
-    measuring, faults = np.random.default_rng(options.seed).spawn(2)
-    line = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    line.bind((options.host, options.port or 49152))
-    gauge = StrainGauge.draw(board, RDT_NOISE, measuring, options.on)
-    sensor = NetFt(gauge, faults, options.rate or 1000.0, line)
-    serve_page(sensor, options.host, options.web_port)
-    return sensor
-
-
-def start_serial(options: argparse.Namespace, board: Blackboard) -> Stream:
-    """Return the sensor of a serial line."""
-    measuring, faults = np.random.default_rng(options.seed).spawn(2)
-    sensor = KINDS[options.kind](options.rate)
-    gauge = StrainGauge.draw(board, sensor.noise, measuring, options.on)
-    port = PtyPort(options.directory / "force", sensor.baud, faults)
-    return Stream(sensor, gauge, port, due=time.monotonic())
-
-
-def main() -> None:
-    """Run until the parent ends."""
-    options = admin.begin(
-        __doc__,
-        {
-            "--kind": {"choices": [*sorted(KINDS), "netft"], "required": True},
-            "--host": {},
-            "--port": {"type": int},
-            "--web-port": {"type": int, "default": 8081},
-            "--rate": {"type": float, "help": "frames per second"},
-            "--on": {"type": float, "default": 1200.0, "help": "s that it has been on"},
-        },
-    )
+def start(options: argparse.Namespace) -> admin.Device:
+    """Return a sensor: of the network, which answers on HTTP already, or of a serial line."""
     board = Blackboard(options.directory / "world.bin")
-    sensor = (start_rdt if options.kind == "netft" else start_serial)(options, board)
-    admin.serve(options.directory / "force.sock", sensor.operations())
-    while True:
-        sensor.step()
+    measuring, faults = np.random.default_rng(options.seed).spawn(2)
+    sensor: NetFt | Stream
+    if options.kind == "netft":
+        line = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        line.bind((options.host, options.port or 49152))
+        gauge = StrainGauge.draw(board, RDT_NOISE, measuring, options.on)
+        sensor = NetFt(gauge, faults, options.rate or 1000.0, line)
+        serve_page(sensor, options.host, options.web_port)
+    else:
+        protocol = KINDS[options.kind](options.rate)
+        gauge = StrainGauge.draw(board, protocol.noise, measuring, options.on)
+        port = PtyPort(options.directory / "force", protocol.baud, faults)
+        sensor = Stream(protocol, gauge, port, due=time.monotonic())
+    return sensor.operations(), sensor.step
 
+
+OPTIONS: dict[str, dict[str, Any]] = {
+    "--kind": {"choices": [*sorted(KINDS), "netft"], "required": True},
+    "--host": {},
+    "--port": {"type": int},
+    "--web-port": {"type": int, "default": 8081},
+    "--rate": {"type": float, "help": "frames per second"},
+    "--on": {"type": float, "default": 1200.0, "help": "s that it has been on"},
+}
 
 if __name__ == "__main__":
-    main()
+    sys.exit(admin.run(__doc__, "force", start, OPTIONS))

@@ -14,20 +14,24 @@ lines `%R1Q,<rpc>,<trid>[,<crc>]:<p>` and `%R1P,<com>,<trid>[,<crc>]:<rc>,<p>`, 
 CRC-16/ARC over the line without the checksum and its comma.
 """
 
+import argparse
 import re
+import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from functools import partial
 from typing import Any
 
 import numpy as np
 
+from hilcal.drivers.checksums import crc16
 from hilcal.drivers.simulated import admin
 from hilcal.drivers.simulated.admin import setter
 from hilcal.drivers.simulated.blackboard import Blackboard, settled_truth
-from hilcal.drivers.simulated.pty_port import PtyPort, crc16
+from hilcal.drivers.simulated.pty_port import PtyPort
 from hilcal.types import Floats
 
 
@@ -290,7 +294,7 @@ def parse(line: str) -> GeocomRequest | None:
         return GeocomRequest(-1, 0, (), False, CANNOT_DECODE)
     rpc, transaction, crc, rest = match.groups()
     bare = f"%R1Q,{rpc},{transaction}:{rest}".encode("ascii", "replace")
-    error = OK if crc is None or int(crc) == crc16(bare, 0) else BAD_CHECKSUM
+    error = OK if crc is None or int(crc) == crc16(bare) else BAD_CHECKSUM
     parameters = tuple(rest.split(",")) if rest else ()
     return GeocomRequest(int(rpc), int(transaction or 0), parameters, crc is not None, error)
 
@@ -302,7 +306,7 @@ def reply(
     body = ",".join([str(code), *parameters])
     head = f"%R1P,{com},{transaction}"
     if checked:
-        head += f",{crc16(f'{head}:{body}'.encode(), 0)}"
+        head += f",{crc16(f'{head}:{body}'.encode())}"
     return f"{head}:{body}\r\n".encode()
 
 
@@ -570,35 +574,32 @@ def operations(station: Station, port: PtyPort) -> admin.Operations:
     return admin.Operations(own | port.faults(), state)
 
 
-def serve(station: Station, port: PtyPort) -> None:
-    """Answer for ever."""
-    buffer = bytearray()
-    while True:
-        buffer += port.read(0.02)
-        station.tick()
-        while (end := min((i for i in map(buffer.find, b"\r\n") if i >= 0), default=-1)) >= 0:
-            line = buffer[:end].decode("ascii", "replace").strip()
-            del buffer[: end + 1]
-            data = respond(station, line) if line else b""
-            if data:
-                port.send(data)
-                port.drain()
-        if len(buffer) > LONGEST_LINE:
-            buffer.clear()
-        port.pump()
+def serve(station: Station, port: PtyPort, buffer: bytearray) -> None:
+    """Take what has come, with what `buffer` holds of a line, and answer."""
+    buffer += port.read(0.02)
+    station.tick()
+    while (end := min((i for i in map(buffer.find, b"\r\n") if i >= 0), default=-1)) >= 0:
+        line = buffer[:end].decode("ascii", "replace").strip()
+        del buffer[: end + 1]
+        data = respond(station, line) if line else b""
+        if data:
+            port.send(data)
+            port.drain()
+    if len(buffer) > LONGEST_LINE:
+        buffer.clear()
+    port.pump()
 
 
-def main() -> None:
-    """Run until the parent ends."""
-    baud: dict[str, Any] = {"--baud": {"type": int, "default": 115200}}
-    options = admin.begin(__doc__, {**admin.NOISE, **baud})
+def start(options: argparse.Namespace) -> admin.Device:
+    """Return a station on its line."""
     measuring, faults = np.random.default_rng(options.seed).spawn(2)
     beam = Beam(tuple(options.range_std), tuple(options.transverse_std))
     station = Station(Blackboard(options.directory / "world.bin"), beam, measuring)
     port = PtyPort(options.directory / "tracker", options.baud, faults)
-    admin.serve(options.directory / "tracker.sock", operations(station, port))
-    serve(station, port)
+    return operations(station, port), partial(serve, station, port, bytearray())
 
+
+OPTIONS: dict[str, dict[str, Any]] = {**admin.NOISE, "--baud": {"type": int, "default": 115200}}
 
 if __name__ == "__main__":
-    main()
+    sys.exit(admin.run(__doc__, "tracker", start, OPTIONS))

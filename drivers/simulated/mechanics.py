@@ -6,7 +6,8 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from hilcal.drivers.simulated.truth import Misreading, long_links
+from hilcal.cell import Cell
+from hilcal.drivers.simulated.truth import Misreading, Truth, crossing_torque, long_links
 from hilcal.errors import InputError
 from hilcal.robot.arm import Arm
 from hilcal.types import Floats, Ints
@@ -77,32 +78,25 @@ class ElasticTree:
     drive: Ints  # (n,) indices of the joints themselves: command, errors and elasticity add
     beam: Ints  # (b, 5) indices of the tips: two displacements, twist, two rotations
     beam_length: Floats  # (b,) lengths, m
-    beam_link: Ints  # (b,) number k of each long link, the constant transform L_k
     tool: Ints  # (3,) indices of the flange's tilts about its x, y, z; (0,) where it has none
     last: int  # number of the last Pinocchio joint, which carries the flange
     flange: Floats  # (4, 4) flange in the last joint's frame
 
 
-def build(
-    arm: Arm,
-    links: Floats,
-    tool_mass: float,
-    tool_com: Floats,
-    gravity: Floats,
-    *,
-    tilts: bool = True,
-    beams: bool = False,
-    tool: bool = False,
-    moments: Floats | None = None,
-    guides: bool = False,
-) -> ElasticTree:
-    """Build the tree from the true links (n + 1, 4, 4), m; first moments (n, 3) add to the bodies'.
+def build(cell: Cell, hidden: Truth) -> ElasticTree:
+    """Build the tree of a cell's arm with its true links and first moments.
 
-    Only where the flange (`tool`) can tilt is no constant transform left behind the last degree of
-    freedom.
+    It has no degree of freedom more than the truth needs. Only where the flange can tilt is no
+    constant transform left behind the last one.
     """
+    arm = cell.arm
+    twists = zip(arm.links, hidden.link_geometry, strict=True)
+    links = np.array([link @ displacement(twist) for link, twist in twists])
+    tilts = np.any(hidden.joint_tilt_compliance) or np.any(hidden.base_compliance)
+    guides = np.any(hidden.guide_error)
+    bent = long_links(arm) if np.any(hidden.link_compliance) else np.zeros(0, dtype=np.int64)
     model = pin.Model()
-    model.gravity.linear = np.asarray(gravity, dtype=float)
+    model.gravity.linear = np.asarray(cell.gravity, dtype=float)
     here = pin.SE3.Identity()
     last = 0
 
@@ -117,7 +111,6 @@ def build(
     here = pin.SE3(links[0])
     tilt, tilt_joint, drive, beam = [], [], [], []
     guide: list[list[int]] = []
-    bent = long_links(arm) if beams else np.zeros(0, dtype=np.int64)
     for j in range(arm.n):
         slides = bool(arm.slides[j])
         if slides:
@@ -130,7 +123,7 @@ def build(
         tilt_joint += [j] * len(axes)
         if not slides:
             drive.append(add(pin.JointModelRZ(), f"drive{j + 1}"))
-        body = _body(float(arm.masses[j]), arm.coms[j], None if moments is None else moments[j])
+        body = _body(float(arm.masses[j]), arm.coms[j], hidden.link_mass[j])
         model.appendBodyToJoint(last, body, pin.SE3.Identity())
         here = pin.SE3(links[j + 1])
         if j + 1 in bent:
@@ -139,9 +132,9 @@ def build(
             moves = (pin.JointModelPY(), pin.JointModelPZ(), *(kind for kind, _ in turns))
             beam.append([add(kind, f"beam{j + 1}_{i}") for i, kind in enumerate(moves)])
             here = tip.inverse() * pin.SE3(links[j + 1])
+    tool = np.any(hidden.tool_compliance) or np.any(hidden.thermal_growth)
     hand = [add(kind, f"tool_{axis}") for kind, axis in turns] if tool else []
-    carried = pin.Inertia(float(tool_mass), np.asarray(tool_com, dtype=float), np.zeros((3, 3)))
-    model.appendBodyToJoint(last, carried, here)
+    model.appendBodyToJoint(last, _body(float(cell.tool_mass), cell.tool_com), here)
     return ElasticTree(
         model=model,
         base=np.array(base, dtype=np.int64),
@@ -151,14 +144,13 @@ def build(
         drive=np.array(drive),
         beam=np.array(beam, dtype=np.int64).reshape(-1, 5),
         beam_length=np.linalg.norm(links[bent, :3, 3], axis=1),
-        beam_link=bent,
         tool=np.array(hand, dtype=np.int64),
         last=last,
         flange=np.asarray(here.homogeneous),
     )
 
 
-def _body(mass: float, com: Floats, moment: Floats | None) -> pin.Inertia:
+def _body(mass: float, com: Floats, moment: Floats | None = None) -> pin.Inertia:
     """Return a body of the given mass whose first moment is mass com + moment, kg·m."""
     if moment is not None and np.any(moment):
         held = max(mass, _MASSLESS)
@@ -222,35 +214,22 @@ class Elasticity:
 
 
 def elasticity(
-    tree: ElasticTree,
-    joint: Floats,
-    stiffening: Floats,
-    tilt: Floats,
-    base: Floats,
-    beam: Floats,
-    *,
-    tool: Floats | None = None,
-    play: Floats | None = None,
-    crossing: Floats | None = None,
-    extra: Floats | None = None,
-    drive: Floats | None = None,
+    tree: ElasticTree, hidden: Truth, arm: Arm, extra: Floats | None = None
 ) -> Elasticity:
-    """Assemble the elastic law from physical constants, named as in `Truth`.
+    """Assemble the elastic law of an arm with this truth; `extra` (N, n) belongs to N states.
 
     A beam of length L that carries (F, M) at its tip gives way there by L³/3EI F + L²/2EI M,
     turns by L²/2EI F + L/EI M and twists by L/GJ M (Euler-Bernoulli; e.g. Gere and
-    Timoshenko, Mechanics of Materials, table of cantilever deflections). `play` (n,) is crossed at
-    the torque `crossing` (n,); `extra` (N, n) belongs to N states; `drive` (n, n) is how far each
-    drive turns each joint, its own where None.
+    Timoshenko, Mechanics of Materials, table of cantilever deflections).
     """
     size = tree.model.nv
     linear, cubic = np.zeros((size, size)), np.zeros(size)
-    linear[tree.base, tree.base] = base[: len(tree.base)]
-    linear[tree.drive, tree.drive] = joint
-    linear[tree.tilt, tree.tilt] = tilt[tree.tilt_joint]
-    cubic[tree.drive] = stiffening
+    linear[tree.base, tree.base] = hidden.base_compliance[: len(tree.base)]
+    linear[tree.drive, tree.drive] = hidden.joint_compliance
+    linear[tree.tilt, tree.tilt] = hidden.joint_tilt_compliance[tree.tilt_joint]
+    cubic[tree.drive] = hidden.joint_stiffening
     for (py, pz, rx, ry, rz), length, (bend, twist) in zip(
-        tree.beam, tree.beam_length, beam, strict=True
+        tree.beam, tree.beam_length, hidden.link_compliance[: len(tree.beam)], strict=True
     ):
         linear[[py, pz], [py, pz]] = length**3 / 3.0 * bend
         linear[[ry, rz], [ry, rz]] = length * bend
@@ -258,19 +237,18 @@ def elasticity(
         half = length**2 / 2.0 * bend
         linear[[py, rz], [rz, py]] = half  # a force along +y turns the tip about +z
         linear[[pz, ry], [ry, pz]] = -half  # a force along +z turns it about -y
-    if tool is not None and len(tree.tool):
-        linear[tree.tool, tree.tool] = tool[[1, 1, 0]]
+    if len(tree.tool):
+        linear[tree.tool, tree.tool] = hidden.tool_compliance[[1, 1, 0]]
     free, torque = np.zeros(size), np.ones(size)
-    if play is not None and crossing is not None:
-        free[tree.drive], torque[tree.drive] = play, crossing
+    free[tree.drive], torque[tree.drive] = hidden.backlash, crossing_torque(arm)
     own = None
     if extra is not None:
         own = np.zeros((len(extra), size))
         own[:, tree.drive] = extra
     turns = None
-    if drive is not None:
+    if arm.drive is not None:
         turns = np.eye(size)
-        turns[np.ix_(tree.drive, tree.drive)] = drive
+        turns[np.ix_(tree.drive, tree.drive)] = arm.drive
     return Elasticity(linear, cubic, free, torque, own, turns)
 
 
@@ -358,7 +336,7 @@ class _Loaded:
             if factor == 1.0:
                 return
             if not len(self.tree.tool):
-                raise ValueError("links can grow in a tree with tool=True only")
+                raise ValueError("links can grow only in a tree whose flange can tilt")
             self.model = self.tree.model.copy()
             placed = [(k, pin.SE3(place)) for k, place in enumerate(self.model.jointPlacements)]
             self.links = [(k, place) for k, place in placed if place.translation.any()]

@@ -14,10 +14,12 @@ same one again and again, `lose {share}` of the frames, `forget` all clients, `r
 Source: as `hilcal.drivers.natnet_frames`. natnet, a client of others, is tested against it.
 """
 
+import argparse
 import contextlib
 import select
 import socket
 import struct
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -190,18 +192,8 @@ def operations(cameras: Cameras) -> admin.Operations:
     return admin.Operations(own, state)
 
 
-def main() -> None:
-    """Run until the parent ends."""
-    options = admin.begin(
-        __doc__,
-        {
-            **admin.NETWORK,
-            "--version": {"default": "4.1"},
-            "--multicast": {"default": ""},
-            "--frame-std": {"type": float, "default": 5e-5},
-            "--distortion": {"type": float, "default": 1e-4},
-        },
-    )
+def start(options: argparse.Namespace) -> admin.Device:
+    """Return cameras that listen, and send at their rate."""
     seeing, drawn = np.random.default_rng(options.seed).spawn(2)
     board = Blackboard(options.directory / "world.bin")
     line = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -217,16 +209,27 @@ def main() -> None:
         *(board, seeing, line, (major, minor), options.frame_std, waves, options.distortion),
         options.multicast,
     )
-    admin.serve(options.directory / "tracker.sock", operations(cameras))
     period = 1.0 / min(RATE_HZ * board.scale, FASTEST_HZ)
     due = time.monotonic()
-    while True:
+
+    def step() -> None:
+        nonlocal due
         cameras.step(due - time.monotonic())
         now = time.monotonic()
         if now >= due:
             cameras.send()
             due = max(due + period, now)
 
+    return operations(cameras), step
+
+
+OPTIONS: dict[str, dict[str, Any]] = {
+    **admin.NETWORK,
+    "--version": {"default": "4.1"},
+    "--multicast": {"default": ""},
+    "--frame-std": {"type": float, "default": 5e-5},
+    "--distortion": {"type": float, "default": 1e-4},
+}
 
 if __name__ == "__main__":
-    main()
+    sys.exit(admin.run(__doc__, "tracker", start, OPTIONS))

@@ -30,16 +30,6 @@ _OUTPUT_SPEED = 5  # index in what tcgetattr returns
 _PULSE = 0.02  # longest wait in one call, s, so that an unplugged line closes soon
 
 
-def crc16(data: bytes, start: int) -> int:
-    """Return the CRC-16 with x¹⁶ + x¹⁵ + x² + 1, reflected: ARC from 0, MODBUS from FFFF."""
-    crc = start
-    for byte in data:
-        crc ^= byte
-        for _ in range(8):
-            crc = crc >> 1 ^ (0xA001 if crc & 1 else 0)
-    return crc
-
-
 class PtyPort:
     """One serial line under a stable name; safe to be used from several threads.
 

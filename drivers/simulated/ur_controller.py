@@ -29,7 +29,6 @@ import numpy as np
 
 from hilcal.drivers.simulated import ur_programs as programs
 from hilcal.drivers.simulated.blackboard import Blackboard
-from hilcal.drivers.simulated.ur_rtde import Faults
 from hilcal.drivers.simulated.ur_state import ArmState, Goal, RobotMode, Runtime, SafetyMode
 from hilcal.types import Floats
 
@@ -265,8 +264,8 @@ SERIAL_NUMBER = "20235500001"
 class ClientServer:
     """Serves the clients of a controller, each until it goes."""
 
-    def __init__(self, controller: Controller, faults: Faults, model: str) -> None:
-        self._controller, self._faults = controller, faults
+    def __init__(self, controller: Controller, model: str) -> None:
+        self._controller = controller
         self._model = model.upper().replace("E", "e")
         self._writers: set[asyncio.StreamWriter] = set()
 
@@ -302,11 +301,11 @@ class DashboardServer(ClientServer):
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Answer line by line; a connection made in local mode never gets more rights."""
         local = not self._controller.arm.remote
-        if not self._faults.dashboard_mute:
+        if not self._controller.arm.dashboard_mute:
             writer.write(f"{GREETING}\n".encode())
         while line := await reader.readline():
             words = line.decode("utf-8", "replace").strip()
-            if not self._faults.dashboard_mute:
+            if not self._controller.arm.dashboard_mute:
                 writer.write(f"{self.answer(words, local)}\n".encode())
                 if words.lower() == "quit":
                     return
@@ -377,7 +376,7 @@ class RobotApiServer(ClientServer):
                 key, _, value = name.partition(":")
                 head[key.lower()] = value.strip()
             body = await reader.readexactly(min(int(head.get("content-length", 0)), _BODY))
-            if self._faults.dashboard_mute:
+            if self._controller.arm.dashboard_mute:
                 continue
             status, content = self.answer(line[0], line[1], body)
             text = json.dumps(content).encode()

@@ -20,12 +20,13 @@ right, the way is not. Blends (r) are left out: every waypoint is reached. Sourc
 
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from enum import IntEnum
 
 import numpy as np
 
-from hilcal.drivers.simulated.ur_state import ArmState, Goal, pose, transform
+from hilcal.drivers.simulated.ur_state import ArmState, Goal
+from hilcal.robot.se3 import of_six, six
 from hilcal.types import Floats
 
 PROGRAM_STOP = 4.0  # deceleration when a program ends while the arm moves, rad/s²
@@ -160,10 +161,10 @@ class ControlScript:
             case ScriptCommand.TCP_OFFSET:
                 self._answer(arm.tcp)
             case ScriptCommand.FK:
-                self._answer(pose(arm.kinematics.flange(motion.q) @ transform(arm.tcp)))
+                self._answer(six(arm.kinematics.flange(motion.q) @ of_six(arm.tcp.tolist())))
             case ScriptCommand.FK_OF:
                 flange = arm.kinematics.flange(self._doubles(0, 6))
-                self._answer(pose(flange @ transform(self._doubles(6, 6))))
+                self._answer(six(flange @ of_six(self._doubles(6, 6).tolist())))
             case ScriptCommand.IS_STEADY:
                 steady = not motion.moving and now - motion.rest_time > _STEADY
                 arm.registers.out_int[self.register + 1] = int(steady)
@@ -184,7 +185,7 @@ class ControlScript:
             q = arm.trajectory.q
             self._answer(arm.kinematics.weight_torque(q, arm.payload, arm.payload_com))
         elif number == ScriptCommand.GET_STEPTIME:
-            self._answer(np.array([_STEP]))
+            self._answer([_STEP])
         else:
             raise ValueError(f"command {number} is not emulated")
 
@@ -204,9 +205,9 @@ class ControlScript:
     def _signal(self, value: int) -> None:
         self._arm.registers.out_int[self.register] = value
 
-    def _answer(self, values: Floats) -> None:
+    def _answer(self, values: Sequence[float] | Floats) -> None:
         part = slice(self.register, self.register + len(values))
-        self._arm.registers.out_double[part] = values.tolist()
+        self._arm.registers.out_double[part] = [float(value) for value in values]
 
     def _int(self, k: int) -> int:
         return self._arm.registers.in_int[self.register + k]

@@ -15,6 +15,7 @@ import numpy as np
 
 from hilcal.drivers.simulated import ur_state as ur
 from hilcal.drivers.simulated.blackboard import Blackboard
+from hilcal.robot.se3 import of_six, six
 from hilcal.types import Floats
 
 VERSION = 2
@@ -265,8 +266,8 @@ class Sensors:
         held = _FRICTION[: len(self._torque())] * self._arm.trajectory.side - self._torque()
         return np.asarray(held + _TORQUE_PER_AMPERE * self._noise(_CURRENT_STD))
 
-    def _tool_pose(self, q: Floats) -> Floats:
-        return ur.pose(self._flange(q) @ ur.transform(self._arm.tcp))
+    def _tool_pose(self, q: Floats) -> Numbers:
+        return tuple(six(self._flange(q) @ of_six(self._arm.tcp.tolist())))
 
     def _tool_speed(self, qd: Floats) -> Floats:
         if not qd.any():
@@ -315,21 +316,11 @@ _BACKLOG = 1 << 20  # bytes that a client may leave unread before it is cut off
 
 
 @dataclass(slots=True, eq=False)
-class Faults:
-    """Switches of what goes wrong with the links."""
-
-    rtde_mute: bool = False
-    rtde_stall: bool = False
-    dashboard_mute: bool = False
-
-
-@dataclass(slots=True, eq=False)
 class RtdeLinks:
     """All RTDE clients of one controller."""
 
     arm: ur.ArmState
     sensors: Sensors
-    faults: Faults
     taken: Callable[[], None]  # called after each input package
     links: set["RtdeLink"] = field(default_factory=set)
     owners: dict[str, "RtdeLink"] = field(default_factory=dict)
@@ -341,7 +332,7 @@ class RtdeLinks:
 
     def hears(self, register: int) -> bool:
         """Return whether a client that writes an integer register has an open link."""
-        return not self.faults.rtde_mute and f"{_INT}{register}" in self.owners
+        return not self.arm.rtde_mute and f"{_INT}{register}" in self.owners
 
     def send(self, now: float) -> None:
         """Send what is due."""
@@ -375,7 +366,7 @@ class RtdeLink:
             while True:
                 size, kind = HEADER.unpack(await self._reader.readexactly(HEADER.size))
                 body = await self._reader.readexactly(max(0, size - HEADER.size))
-                if not links.faults.rtde_mute:
+                if not links.arm.rtde_mute:
                     self._take(chr(kind), body)
         except (asyncio.IncompleteReadError, OSError):
             pass
@@ -392,7 +383,7 @@ class RtdeLink:
     def send(self, now: float) -> None:
         """Send one package and say when the next is due."""
         self.due = max(self.due + self._period, now - 4 * self._period)
-        if not self._links.faults.rtde_stall and not self._links.faults.rtde_mute:
+        if not self._links.arm.rtde_stall and not self._links.arm.rtde_mute:
             self._write(self._data())
 
     def half(self) -> None:

@@ -30,7 +30,7 @@ import numpy as np
 from hilcal.drivers.simulated import admin
 from hilcal.drivers.simulated import ur_controller as control
 from hilcal.drivers.simulated.blackboard import Blackboard
-from hilcal.drivers.simulated.ur_rtde import Faults, RtdeLink, RtdeLinks, Sensors
+from hilcal.drivers.simulated.ur_rtde import RtdeLink, RtdeLinks, Sensors
 from hilcal.drivers.simulated.ur_state import ArmState, Kinematics, Trajectory, WorldClock
 from hilcal.errors import DeviceError, HilcalError, InputError
 from hilcal.robot.arm import Arm
@@ -76,15 +76,15 @@ class UrServer:
         api_port: int = API,
         factory: FactoryKinematics | None = None,
     ) -> None:
-        self.arm, self.faults = state, Faults()
+        self.arm = state
         self.controller = control.Controller(state, board)
         sensors = Sensors(state, board, rng)
-        self.rtde = RtdeLinks(state, sensors, self.faults, self.controller.step)
+        self.rtde = RtdeLinks(state, sensors, self.controller.step)
         self.controller.hears = self.rtde.hears
         arm = state.kinematics.arm
         self.is_x = state.version[0] >= POLYSCOPE_X
         supervision = control.RobotApiServer if self.is_x else control.DashboardServer
-        self.dashboard = supervision(self.controller, self.faults, arm.name)
+        self.dashboard = supervision(self.controller, arm.name)
         status = control.NOT_INITIALISED if factory is None else factory.status
         rows = None if factory is None else factory.rows
         self.primary = control.PrimaryPort(
@@ -170,8 +170,8 @@ def operations(server: UrServer, loop: asyncio.AbstractEventLoop) -> admin.Handl
     """Return what may be asked and switched, from other threads than that of the loop."""
     arm, controller, links = server.arm, server.controller, server.rtde.links
 
-    def switch(name: str, of: object = server.faults) -> Callable[..., object]:
-        return lambda on=True: setattr(of, name, bool(on))
+    def switch(name: str) -> Callable[..., object]:
+        return lambda on=True: setattr(arm, name, bool(on))
 
     def each(do: Callable[[RtdeLink], None]) -> Callable[[], None]:
         def all_links() -> None:
@@ -201,7 +201,7 @@ def operations(server: UrServer, loop: asyncio.AbstractEventLoop) -> admin.Handl
             "dashboard_mute": switch("dashboard_mute"),
             "dashboard_drop": server.dashboard.drop,
             "refuse": lambda on=True: server.accept(not on),
-            "refuse_motion": switch("refuses_motion", arm),
+            "refuse_motion": switch("refuses_motion"),
             "freeze": freeze,
             "jog": lambda q: arm.trajectory.place(_joints(q)),
             "set": lambda **settings: _set(server, settings),

@@ -23,16 +23,6 @@ Goal = tuple[Floats, float, float]
 """Joint angles (n,), rad, speed and acceleration of the leading joint."""
 
 
-def transform(pose: Floats) -> Floats:
-    """Return the (4, 4) transform of position and rotation vector (6,)."""
-    return np.asarray(pin.SE3(pin.exp3(pose[3:]), pose[:3]).homogeneous)
-
-
-def pose(place: Floats) -> Floats:
-    """Return position and rotation vector (6,) of a transform (4, 4)."""
-    return np.concatenate([place[:3, 3], pin.log3(place[:3, :3])])
-
-
 class Kinematics:
     """Nominal kinematics and weight of the arm, as its controller knows them, by Pinocchio."""
 
@@ -336,6 +326,9 @@ class ArmState:
     scaling: float = 1.0  # further factor on the speed, as the controller applies it by itself
     slider: float = 1.0
     digital_outputs: int = 0  # RTDE `actual_digital_output_bits`
+    rtde_mute: bool = False  # whether RTDE answers nothing
+    rtde_stall: bool = False  # whether it sends no data
+    dashboard_mute: bool = False  # whether dashboard server or Robot API answer nothing
     refuses_motion: bool = False  # whether a motion that is commanded ends the program instead
     frozen_q: Floats | None = None  # (n,) told in spite of any motion, rad; None is the truth
     fault_ns: int = 0  # `time.monotonic_ns` of the last fault that was switched on

@@ -117,27 +117,7 @@ class World:
 
     def __post_init__(self) -> None:
         """Build the elastic arm once."""
-        links = np.array(
-            [
-                link @ mech.displacement(twist)
-                for link, twist in zip(self.cell.arm.links, self.physics.link_geometry, strict=True)
-            ]
-        )
-        tree = mech.build(
-            self.cell.arm,
-            links,
-            self.cell.tool_mass,
-            self.cell.tool_com,
-            self.cell.gravity,
-            tilts=bool(
-                np.any(self.physics.joint_tilt_compliance) or np.any(self.physics.base_compliance)
-            ),
-            beams=bool(np.any(self.physics.link_compliance)),
-            tool=bool(np.any(self.physics.tool_compliance) or np.any(self.physics.thermal_growth)),
-            moments=self.physics.link_mass,
-            guides=bool(np.any(self.physics.guide_error)),
-        )
-        object.__setattr__(self, "_tree", tree)
+        object.__setattr__(self, "_tree", mech.build(self.cell, self.physics))
 
     @property
     def truth(self) -> dict[str, float]:
@@ -178,33 +158,19 @@ class World:
 
     def rest(self, states: States, slip: Floats | None = None) -> mech.Equilibrium:
         """Return the equilibrium of N states; drives missed their command by `slip` (N, n), rad."""
-        q = self.cell.arm.chain_angles(states.q) + self.joint_errors(states)
-        guided = laws.guide_motion(self.physics, self.cell.arm, states)
+        arm, hidden = self.cell.arm, self.physics
+        q = arm.chain_angles(states.q) + self.joint_errors(states)
+        guided = laws.guide_motion(hidden, arm, states)
+        extra = laws.further_compliance(hidden, arm, states)
         return mech.equilibrium(
             self._tree,
-            self._elasticity(states),
-            q if slip is None else q + self.cell.arm.driven(slip),
+            mech.elasticity(self._tree, hidden, arm, extra),
+            q if slip is None else q + arm.driven(slip),
             states.wrench,
-            self.cell.load_point + self.physics.load_point,
-            growth=laws.link_growth(self.physics, states),
-            sensor=laws.Misreading.of(self.physics),
+            self.cell.load_point + hidden.load_point,
+            growth=laws.link_growth(hidden, states),
+            sensor=laws.Misreading.of(hidden),
             guide=None if guided is None else guided[:, :, [0, 1, 3, 4, 5]],
-        )
-
-    def _elasticity(self, states: States) -> mech.Elasticity:
-        hidden, tree = self.physics, self._tree
-        return mech.elasticity(
-            tree,
-            hidden.joint_compliance,
-            hidden.joint_stiffening,
-            hidden.joint_tilt_compliance,
-            hidden.base_compliance,
-            hidden.link_compliance[: len(tree.beam)],
-            tool=hidden.tool_compliance,
-            play=hidden.backlash,
-            crossing=laws.crossing_torque(self.cell.arm),
-            extra=laws.further_compliance(hidden, self.cell.arm, states),
-            drive=self.cell.arm.drive,
         )
 
     def drive_torque(self, states: States) -> Floats:

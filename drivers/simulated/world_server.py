@@ -14,6 +14,7 @@
 The world comes as a JSON file, exactly.
 """
 
+import argparse
 import contextlib
 import json
 import sys
@@ -34,7 +35,7 @@ from hilcal.drivers.simulated.mechanics import turned
 from hilcal.drivers.simulated.own_law import OwnLaw
 from hilcal.drivers.simulated.truth import AIR, Truth, warm_up
 from hilcal.drivers.simulated.world import SimulatedNoise, World
-from hilcal.errors import HilcalError, InputError
+from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.toml import suggest
 from hilcal.types import Floats
@@ -321,14 +322,6 @@ def _six(what: str, wrench: Sequence[float]) -> Floats:
     return given
 
 
-FORMAT = "hilcal-world"
-VERSION = 2
-_CELL = ("all_targets", "load_point", "tool_mass", "tool_com", "gravity")
-_ARM = ("links", "masses", "coms", "q_min", "q_max", "torque_max", "coupling", "slides")
-_LATER = ("joint_coupling", "guide_error")
-"""Parameters that world files may lack, since they were added later."""
-
-
 def write_world(path: Path, world: World, config: CellConfig, base_dir: Path | None = None) -> None:
     """Write the world and the configuration of its cell, whole or not at all, with every bit."""
     other = _differences(world.cell, cell_from_config(config, base_dir))
@@ -338,18 +331,13 @@ def write_world(path: Path, world: World, config: CellConfig, base_dir: Path | N
             "valid: the configuration that the world was made from"
         )
     content = {
-        "format": FORMAT,
-        "version": VERSION,
         "config": json.loads(config.to_json()),
         "base_dir": None if base_dir is None else str(base_dir.resolve()),
         "physics": {f.name: _listed(getattr(world.physics, f.name)) for f in fields(Truth)},
-        "registration": _listed(world.registration),
-        "station": _listed(world.station),
-        "joint_std": _listed(world.joint_std),
-        "joint_reference": world.joint_reference,
-        "offsets": None if world.offsets is None else _listed(world.offsets),
         "own": None if world.own is None else world.own.to_json(),
         "noise": asdict(world.noise),
+        "joint_reference": world.joint_reference,
+        **{name: _listed(getattr(world, name)) for name in _ARRAYS},
     }
     replace_file(path, json.dumps(content, indent=1))
 
@@ -358,64 +346,49 @@ def read_world(path: Path) -> tuple[World, CellConfig]:
     """Return the world of a file and the configuration of its cell."""
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    except ValueError as error:
-        raise InputError(f"{path}: not a world file ({error})") from None
-    if not isinstance(data, dict) or data.get("format") != FORMAT:
-        raise InputError(f'{path}: not a world file; it has "format": "{FORMAT}"')
-    if data.get("version") != VERSION:
-        raise InputError(f"{path}: version {data.get('version')!r}; this hilcal reads {VERSION}")
-    try:
         config = CellConfig.from_json(json.dumps(data["config"]))
         base_dir = None if data["base_dir"] is None else Path(data["base_dir"])
-        noise = data["noise"]
-        along, by, across, more = map(float, (*noise["range_std"], *noise["transverse_std"]))
-        cell = cell_from_config(config, base_dir)
+        cell, noise = cell_from_config(config, base_dir), data["noise"]
+        along, across = tuple(noise["range_std"]), tuple(noise["transverse_std"])
         world = World(
             cell=cell,
-            physics=_physics(cell, data["physics"]),
-            registration=_array(data["registration"]),
-            station=_array(data["station"]),
-            noise=SimulatedNoise((along, by), (across, more), float(noise["orientation_std"])),
-            joint_std=_array(data["joint_std"]),
-            joint_reference=float(data["joint_reference"]),
-            offsets=_array(data["offsets"]) if data.get("offsets") else None,
-            own=OwnLaw.from_json(cell, data["own"]) if data.get("own") else None,
+            physics=Truth(**{name: _array(value) for name, value in data["physics"].items()}),
+            noise=SimulatedNoise(along, across, noise["orientation_std"]),
+            joint_reference=data["joint_reference"],
+            own=None if data["own"] is None else OwnLaw.from_json(cell, data["own"]),
+            **{name: _array(data[name]) for name in _ARRAYS},
         )
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise InputError(f"{path}: damaged: {type(error).__name__} {error}") from None
+        raise InputError(f"{path}: no world: {type(error).__name__} {error}") from None
     return world, config
 
 
-def _physics(cell: Cell, data: dict[str, Any]) -> Truth:
-    """Return the hidden parameters; zero for what no world had when the file was written."""
-    rigid = Truth.rigid(cell.arm)
-    later = {name: getattr(rigid, name) for name in _LATER if name not in data}
-    given = {f.name: _array(data[f.name]) for f in fields(Truth) if f.name not in later}
-    return Truth(**given, **later)
+_ARRAYS = ("registration", "station", "joint_std", "offsets")
+_CELL = ("all_targets", "load_point", "tool_mass", "tool_com", "gravity")
+_ARM = ("links", "masses", "coms", "q_min", "q_max", "torque_max", "coupling", "slides")
 
 
-def _listed(array: Floats) -> dict[str, Any]:
+def _listed(array: Floats | None) -> dict[str, Any] | None:
     """Return an array as JSON; the shape apart, since one of its numbers may be 0."""
+    if array is None:
+        return None
     return {"shape": list(array.shape), "values": [float(x) for x in array.ravel()]}
 
 
-def _array(data: dict[str, Any]) -> Floats:
-    return np.array(data["values"], dtype=np.float64).reshape(data["shape"])
+def _array(data: dict[str, Any] | None) -> Any:
+    return None if data is None else np.array(data["values"], dtype=float).reshape(data["shape"])
 
 
 def _differences(a: Cell, b: Cell) -> list[str]:
     """Return the names of what is not the same in two cells; registrations do not count."""
-    out = [
-        name.removeprefix("all_")
-        for name in _CELL
-        if not np.array_equal(getattr(a, name), getattr(b, name))
-    ]
-    return out + [
-        f"arm.{name}"
-        for name in _ARM
-        if not np.array_equal(getattr(a.arm, name), getattr(b.arm, name))
+    parts: list[tuple[str, Any, Any, str]] = [(name, a, b, "") for name in _CELL]
+    parts += [(name, a.arm, b.arm, "arm.") for name in _ARM]
+    return [
+        prefix + name.removeprefix("all_")
+        for name, x, y, prefix in parts
+        if not np.array_equal(getattr(x, name), getattr(y, name))
     ]
 
 
@@ -433,24 +406,20 @@ def open_board(directory: Path, scale: float, begun: float = 0.0, joints: int = 
     return Blackboard(path)
 
 
-def main() -> int:
-    """Run until the parent ends; returns the exit code."""
-    options = admin.begin(__doc__, {})
-    try:
-        world, config = read_world(options.directory / "world.json")
-        board = open_board(options.directory, config.simulation.clock, joints=world.cell.arm.n)
-        living = WorldState(world, config, board, options.seed)
-    except HilcalError as error:
-        sys.stderr.write(f"{error}\n")
-        return error.exit_code
-    living.step(time.monotonic_ns())
-    names = ("hang", "mistake", "push", "swing", "state", "log")
-    asked = {name: getattr(living, name) for name in names}
-    admin.serve(options.directory / "world.sock", admin.Operations(asked))
-    while True:
+def start(options: argparse.Namespace) -> admin.Device:
+    """Return the world of DIR/world.json, as it goes on."""
+    world, config = read_world(options.directory / "world.json")
+    board = open_board(options.directory, config.simulation.clock, joints=world.cell.arm.n)
+    living = WorldState(world, config, board, options.seed)
+
+    def step() -> None:
         living.step(time.monotonic_ns())
         time.sleep(_POLL)
 
+    living.step(time.monotonic_ns())
+    names = ("hang", "mistake", "push", "swing", "state", "log")
+    return admin.Operations({name: getattr(living, name) for name in names}), step
+
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(admin.run(__doc__, "world", start))

@@ -111,56 +111,46 @@ class Pulse:
     late: float  # the longest pause between two signs of life that was too long, s; 0 for none
 
 
-class Control:
-    """Commands the arm; every call may raise WorkerError, and ends by its deadline."""
+class Control(Worker):
+    """Commands the arm; every call may raise WorkerError, and ends by its deadline.
 
-    def __init__(self, worker: Worker) -> None:
-        self._worker = worker
+    Where the process is killed, the robot's watchdog stops the arm.
+    """
 
-    @property
-    def pid(self) -> int:
-        """Number of the worker's process."""
-        return self._worker.pid
+    def __init__(self, host: str, generation: Generation, seconds: float) -> None:
+        """Take control of the arm within a deadline."""
+        flags = generation.script_port == PRIMARY_PORT, generation.upper
+        arguments = (host, repr(_HZ), repr(LEASE_S), *(str(int(flag)) for flag in flags))
+        super().__init__("hilcal.drivers.ur_link.control_worker", arguments, seconds)
 
     def alive(self, seconds: float = COMMAND_S) -> Pulse:
         """Watch the motion: renew its lease; the answer comes within a deadline, real s."""
-        answer = self._worker.call("alive", seconds)
+        answer = self.call("alive", seconds)
         return Pulse(bool(answer["expired"]), float(answer["late"]))
 
     def move(self, q: Floats, speed: float, acceleration: float, brake: float) -> bool:
         """Start a motion, rad; False where the controller does not take it."""
-        answer = self._worker.call(
-            "move",
-            COMMAND_S,
-            q=q.tolist(),
-            speed=speed,
-            acceleration=acceleration,
-            deceleration=brake,
-        )
-        return bool(answer["done"])
+        how = {"speed": speed, "acceleration": acceleration, "deceleration": brake}
+        return bool(self.call("move", COMMAND_S, q=q.tolist(), **how)["done"])
 
     def rest(self) -> None:
         """Say that the motion has ended: no lease any more."""
-        self._worker.call("rest", COMMAND_S)
+        self.call("rest", COMMAND_S)
 
     def stop(self, brake: float, seconds: float) -> None:
         """Brake, rad/s² of the leading joint."""
-        self._worker.call("stop", seconds, deceleration=brake)
+        self.call("stop", seconds, deceleration=brake)
 
     def set_payload(self, mass: float, com: Floats) -> bool:
         """Tell the payload, kg and m; whether the controller took it has to be read back."""
         told = com.tolist() if com.any() else [0.0, 0.0, _NO_COG]
-        return bool(self._worker.call("payload", COMMAND_S, mass=mass, com=told)["done"])
+        return bool(self.call("payload", COMMAND_S, mass=mass, com=told)["done"])
 
     def give_back(self) -> None:
         """End the robot's program and the process; never raises."""
         with contextlib.suppress(WorkerError):
-            self._worker.call("bye", COMMAND_S)
-        self._worker.kill()
-
-    def kill(self) -> None:
-        """End the process at once; the robot's watchdog then stops the arm."""
-        self._worker.kill()
+            self.call("bye", COMMAND_S)
+        self.kill()
 
 
 def take(host: str, receiver: Receiver, generation: Generation) -> Control:
@@ -176,7 +166,7 @@ def take(host: str, receiver: Receiver, generation: Generation) -> Control:
     except LinkError as error:
         raise failure(host, str(error), CHECK_LINK) from None
     try:
-        worker = _start(host, generation, end)
+        control = _start(host, generation, end)
     except WorkerError as error:
         text = str(error)
         if "already in use" in text:
@@ -187,23 +177,20 @@ def take(host: str, receiver: Receiver, generation: Generation) -> Control:
     try:
         _wait_for(receiver, (states.PLAYING,), 1.0)
     except LinkError as error:
-        worker.kill()
+        control.kill()
         raise failure(host, f"cannot take control: {error}") from None
-    return Control(worker)
+    return control
 
 
-def _start(host: str, generation: Generation, end: float) -> Worker:
+def _start(host: str, generation: Generation, end: float) -> Control:
     """Start the worker; the registers may be ours for a moment longer, from being asked for."""
-    relayed = str(int(generation.script_port == PRIMARY_PORT))
-    arguments = (host, repr(_HZ), repr(LEASE_S), relayed, str(int(generation.upper)))
-    module = "hilcal.drivers.ur_link.control_worker"
     try:
-        return Worker(module, arguments, end - time.monotonic())
+        return Control(host, generation, end - time.monotonic())
     except WorkerError as error:
         if "already in use" not in str(error):
             raise
     time.sleep(0.3)
-    return Worker(module, arguments, end - time.monotonic())
+    return Control(host, generation, end - time.monotonic())
 
 
 def _controlled(host: str) -> Exception:

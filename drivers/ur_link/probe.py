@@ -30,8 +30,7 @@ class ControllerFacts:
 
 def controller(host: str, outputs: tuple[str, ...], seconds: float) -> ControllerFacts:
     """Return the controller's version, and which of `outputs` it has."""
-    with Connection(host, PORT, "RTDE server", seconds) as line:
-        _hello(line)
+    with _greeted(host, seconds) as line:
         line.send(_frame("v"))
         version = struct.unpack(">4I", _reply(line, "v", 16))
         line.send(_frame("O", struct.pack(">d", _PROBE_HZ) + ",".join(outputs).encode()))
@@ -50,9 +49,8 @@ def check_stream(host: str, seconds: float) -> None:
 
 def stream(host: str, hz: float, outputs: tuple[str, ...], seconds: float) -> Connection:
     """Return a connection on which packets of outputs, which the controller has, come."""
-    line = Connection(host, PORT, "RTDE server", seconds)
+    line = _greeted(host, seconds)
     try:
-        _hello(line)
         line.send(_frame("O", struct.pack(">d", hz) + ",".join(outputs).encode()))
         _reply(line, "O", None)
         line.send(_frame("S"))
@@ -70,16 +68,22 @@ def packet(line: Connection) -> bytes:
 
 def in_use(host: str, inputs: tuple[str, ...], seconds: float) -> bool:
     """Whether somebody else holds one of the input registers that commands travel in."""
-    with Connection(host, PORT, "RTDE server", seconds) as line:
-        _hello(line)
+    with _greeted(host, seconds) as line:
         line.send(_frame("I", ",".join(inputs).encode()))
         return IN_USE in _reply(line, "I", None)[1:].decode(errors="replace").split(",")
 
 
-def _hello(line: Connection) -> None:
-    line.send(_frame("V", struct.pack(">H", 2)))
-    if _reply(line, "V", 1) != b"\x01":
-        raise LinkError("the RTDE server (port 30004) does not speak protocol 2")
+def _greeted(host: str, seconds: float) -> Connection:
+    """Return a connection that speaks protocol 2."""
+    line = Connection(host, PORT, "RTDE server", seconds)
+    try:
+        line.send(_frame("V", struct.pack(">H", 2)))
+        if _reply(line, "V", 1) != b"\x01":
+            raise LinkError("the RTDE server (port 30004) does not speak protocol 2")
+    except BaseException:
+        line.close()
+        raise
+    return line
 
 
 def _frame(kind: str, body: bytes = b"") -> bytes:

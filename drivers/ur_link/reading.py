@@ -22,14 +22,13 @@ from hilcal.drivers.ur_link import probe, states
 from hilcal.drivers.ur_link.lines import Connection, LinkError
 from hilcal.drivers.ur_link.probe import ControllerFacts
 from hilcal.drivers.ur_link.receive_worker import OUTPUTS as OUTPUTS
-from hilcal.drivers.ur_link.supervision import Supervision
+from hilcal.drivers.ur_link.supervision import PRIMARY_PORT, Generation
 from hilcal.drivers.ur_link.worker import Worker, WorkerError
 from hilcal.errors import InputError
 from hilcal.measuring.devices import ArmSample, Report, Row, report_of
 from hilcal.robot.factory import FactoryKinematics, of_rows
 from hilcal.types import Floats
 
-PRIMARY_PORT = 30001
 _PRIMARY = f"the primary port ({PRIMARY_PORT})"
 _HEAD = struct.Struct(">iB")
 _KINEMATICS = struct.Struct(">6I24dI")
@@ -47,8 +46,14 @@ def read_kinematics(host: str, seconds: float) -> FactoryKinematics:
                 raise LinkError(f"{_PRIMARY} does not answer as a controller does")
             body = line.read(size - _HEAD.size)
             part = _find(body) if kind == _STATE else None
-            if part is not None:
-                return _kinematics_of(part)
+            if part is None:
+                continue
+            told = _KINEMATICS.unpack_from(part)
+            rows = np.array(told[6:30]).reshape(4, 6)
+            try:
+                return of_rows(rows, "the controller", told[30], tuple(told[:6]))
+            except InputError as error:
+                raise LinkError(f"{_PRIMARY}: {error}") from None
     raise LinkError(f"{_PRIMARY} does not tell the arm's kinematics")
 
 
@@ -62,15 +67,6 @@ def _find(body: bytes) -> bytes | None:
             return body[at + _HEAD.size : at + size]
         at += size
     return None
-
-
-def _kinematics_of(part: bytes) -> FactoryKinematics:
-    told = _KINEMATICS.unpack_from(part)
-    rows = np.array(told[6:30]).reshape(4, 6)
-    try:
-        return of_rows(rows, "the controller", told[30], tuple(told[:6]))
-    except InputError as error:
-        raise LinkError(f"{_PRIMARY}: {error}") from None
 
 
 N = 6  # joints of every arm of this maker
@@ -205,12 +201,11 @@ def survey(
     hz: float,
     controller: ControllerFacts,
     receiver: Receiver,
-    supervision: Supervision,
+    generation: Generation,
     silent: str,
-    needs_primary: bool,
 ) -> Report:
     """Ask everything that can be asked without moving; `silent` is why nobody supervises."""
-    version = states.version_word(controller.version)
+    supervision, version = generation.supervision, states.version_word(controller.version)
     rows: list[Row] = [
         ("address", host, "address", host),
         ("controller version", version, "controller_version", version),
@@ -222,7 +217,7 @@ def survey(
         rows.append(("", "", "kinematics", kinematics.to_dict()))
     except LinkError as error:
         rows.append(("its kinematics", f"not told: {error}", "", None))
-        if needs_primary:
+        if generation.script_port == PRIMARY_PORT:
             problems.append(
                 f"{error}; programs go by it, so that the arm cannot be controlled without it: "
                 "enable the primary client interface in the controller's settings, under services"

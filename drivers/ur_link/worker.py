@@ -78,11 +78,6 @@ class Worker:
         """Its process number."""
         return self._process.pid
 
-    @property
-    def alive(self) -> bool:
-        """Whether the process runs."""
-        return self._process.poll() is None
-
     def call(self, op: str, seconds: float, **arguments: Any) -> dict[str, Any]:
         """Return the answer to a request; a worker that does not answer in time is ended."""
         end = time.monotonic() + seconds

@@ -1,10 +1,13 @@
 """The elastic arm against mechanics written out by hand: energy, torques, laws, cantilever."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from hilcal.drivers.simulated.mechanics import build, elasticity, equilibrium, long_links
+from hilcal.drivers.simulated.truth import Truth
 from hilcal.errors import InputError
 from hilcal.robot.arm import Arm
 from tests.support.example_cell import ur10e_cell
@@ -18,22 +21,28 @@ TILT = np.array([3.0, 4.0, 5.0, 15.0, 15.0, 20.0]) * 1e-6
 BASE = np.array([2.0, 3.0, 1.5]) * 1e-6
 BEAM = np.array([[8.0, 12.0], [9.0, 10.0]]) * 1e-6
 STIFF = -JOINT / 9.0 / np.array([300.0, 300.0, 150.0, 60.0, 50.0, 50.0]) ** 2
-NONE = np.zeros(6)
 Q = np.array([[0.3, -1.1, 1.4, 0.5, -0.7, 0.2], [-2.0, -0.6, 0.9, -1.8, 1.1, 2.5]])
 WRENCH = np.array([[20.0, -35.0, -110.0, 6.0, -4.0, 9.0], [-60.0, 10.0, -80.0, 2.0, 7.0, -5.0]])
 
 
-def solve(q, wrench, *, joint=NONE, stiff=NONE, tilt=NONE, base=NONE[:3], beam=None):
-    tree = build(
-        ARM, ARM.links, CELL.tool_mass, CELL.tool_com, CELL.gravity, beams=beam is not None
-    )
-    law = elasticity(tree, joint, stiff, tilt, base, np.zeros((0, 2)) if beam is None else beam)
-    rest = equilibrium(tree, law, np.atleast_2d(q), np.atleast_2d(wrench), CELL.load_point)
+def solve(q, wrench, cell=CELL, **hidden):
+    truth = replace(Truth.rigid(cell.arm), **hidden)
+    tree = build(cell, truth)
+    law = elasticity(tree, truth, cell.arm)
+    rest = equilibrium(tree, law, np.atleast_2d(q), np.atleast_2d(wrench), cell.load_point)
     return tree, law, rest
 
 
 def everything():
-    return solve(Q, WRENCH, joint=JOINT, stiff=STIFF, tilt=TILT, base=BASE, beam=BEAM)
+    return solve(
+        Q,
+        WRENCH,
+        joint_compliance=JOINT,
+        joint_stiffening=STIFF,
+        joint_tilt_compliance=TILT,
+        base_compliance=BASE,
+        link_compliance=BEAM,
+    )
 
 
 def test_energy_is_stationary_and_virtual_work_of_the_moment_balances():
@@ -43,7 +52,7 @@ def test_energy_is_stationary_and_virtual_work_of_the_moment_balances():
     for i in range(len(Q)):
 
         def work(delta, i=i):
-            give = {k: delta[dofs] for k, dofs in zip(tree.beam_link, tree.beam, strict=True)}
+            give = {k: delta[dofs] for k, dofs in zip(long_links(ARM), tree.beam, strict=True)}
             bodies, _, flange = frames(
                 ARM,
                 Q[i] + delta[tree.drive],
@@ -81,7 +90,7 @@ def test_energy_is_stationary_and_virtual_work_of_the_moment_balances():
 def test_the_linear_law_is_the_limit():
     errors = []
     for small in (1.0, 0.1, 0.01):
-        tree, _, rest = solve(Q[0], WRENCH[0], joint=small * JOINT)
+        tree, _, rest = solve(Q[0], WRENCH[0], joint_compliance=small * JOINT)
         linear = [
             small * JOINT[j] * np.dot(*moment_beyond(CELL, Q[0], WRENCH[0], j)[:2])
             for j in range(6)
@@ -106,12 +115,12 @@ def cantilever():
 def test_a_long_link_bends_as_a_cantilever(force):
     arm, length, bend, twist = cantilever(), 0.8, 2e-7, 5e-7
     moment = np.array([0.4, -0.3, 0.6])
-    tree = build(arm, arm.links, 0.0, np.zeros(3), CELL.gravity, beams=True)
     assert list(long_links(arm)) == [1]
-    none = np.zeros(2)
-    law = elasticity(tree, none, none, none, np.zeros(3), np.array([[bend, twist]]))
+    none = np.zeros(3)
+    cell = replace(CELL, arm=arm, tool_mass=0.0, tool_com=none, load_point=none)
     wrench = np.concatenate([force, moment])[None]
-    rest = equilibrium(tree, law, np.zeros((1, 2)), wrench, np.zeros(3))
+    given = np.array([[bend, twist]])
+    _, _, rest = solve(np.zeros((1, 2)), wrench, cell, link_compliance=given)
     # handbook: deflection L³/3EI F ± L²/2EI M, slope L²/2EI F ± L/EI M, twist L/GJ M
     y = length**3 / 3 * bend * force[1] + length**2 / 2 * bend * moment[2]
     z = length**3 / 3 * bend * force[2] - length**2 / 2 * bend * moment[1]
@@ -141,8 +150,8 @@ def test_jacobian_is_the_derivative_of_the_flange():
 
 def test_a_gear_that_would_spring_back_is_refused():
     with pytest.raises(InputError, match=r"state 0: joint_stiffening is too strong"):
-        solve(Q, WRENCH, joint=JOINT, stiff=-JOINT / 50.0**2)
+        solve(Q, WRENCH, joint_compliance=JOINT, joint_stiffening=-JOINT / 50.0**2)
 
 
 def test_an_arm_that_collapses_is_refused():
-    refusal(r"state \d: .*equilibrium", solve, Q, WRENCH, joint=np.full(6, 0.3))
+    refusal(r"state \d: .*equilibrium", solve, Q, WRENCH, joint_compliance=np.full(6, 0.3))
