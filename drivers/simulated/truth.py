@@ -4,6 +4,7 @@ What a state brings about beside its load (sides, temperatures, time, the joint 
 force sensor misreads what acts.
 """
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
@@ -19,20 +20,6 @@ _AXES = ("x", "y", "z")
 _TURNS = ("rx", "ry", "rz")
 _TWIST = (*_AXES, *_TURNS)
 _WRENCH = ("fx", "fy", "fz", "mx", "my", "mz")
-_LABELS: dict[str, tuple[str, ...]] = {
-    "base_frame": _TWIST,
-    "tracker_drift": _TWIST,
-    "base_compliance": _AXES,
-    "load_point": _AXES,
-    "target_offset": _AXES,
-    "tool_compliance": ("along", "across"),
-    "creep": ("k",),
-    "thermal_growth": ("alpha",),
-    "wrench_bias": _WRENCH,
-    "wrench_gain": _WRENCH,
-    "sensor_misalignment": _TURNS,
-    "tracker_scale": ("scale",),
-}
 _GUIDE = {"x": (2, 3, 4), "y": (2, 3, 4), "z": (1,)} | dict.fromkeys(_TURNS, (1, 2, 3, 4))
 """Orders of the motion errors of a guide, by direction."""
 
@@ -85,17 +72,12 @@ class Truth:
     @staticmethod
     def rigid(arm: Arm, harmonics: int = 0) -> "Truth":
         """Return the truth of an arm that is perfect and rigid."""
-        n = arm.n
-        shapes = {name: (len(labels),) for name, labels in _LABELS.items()} | {
-            "link_compliance": (len(long_links(arm)), 2),
-            "joint_coupling": (n, n),
-            "transmission_error": (n, harmonics, 2),
-            "link_geometry": (n + 1, 6),
-            "periodic_joint_compliance": (n, 2),
-            "link_mass": (n, 3),
-            "guide_error": (int(arm.slides.sum()), sum(map(len, _GUIDE.values()))),
-        }  # all others have one parameter per joint
-        return Truth(**{f.name: np.zeros(shapes.get(f.name, (n,))) for f in fields(Truth)})
+
+        def zeros(effect: str) -> Floats:
+            out = np.zeros([len(axis) for axis in _labels(effect, arm, harmonics)])
+            return out.reshape(arm.n, harmonics, 2) if effect == "transmission_error" else out
+
+        return Truth(**{f.name: zeros(f.name) for f in fields(Truth)})
 
     def with_effect(self, effect: str, value: Floats) -> "Truth":
         """Return the same truth with one effect's parameters replaced."""
@@ -105,35 +87,41 @@ class Truth:
         """Return every parameter that is not zero, as "effect.part": value in SI."""
         out: dict[str, float] = {}
         for f in fields(self):
-            values = getattr(self, f.name)
-            labels = _labels(f.name, values.shape, arm)
-            for label, value in zip(labels, values.ravel(), strict=True):
+            axes = _labels(f.name, arm, self.transmission_error.shape[1])
+            values = getattr(self, f.name).ravel()
+            for parts, value in zip(itertools.product(*axes), values, strict=True):
                 if value != 0.0:
-                    out[f"{f.name}.{label}"] = float(value)
+                    out[".".join((f.name, *parts))] = float(value)
         return out
 
 
-def _labels(effect: str, shape: tuple[int, ...], arm: Arm) -> list[str]:
-    """Return the labels of one effect's parameters in the order of their array."""
-    if effect in _LABELS:
-        return list(_LABELS[effect])
-    joints, slots = [f"j{j + 1}" for j in range(arm.n)], [f"link{k}" for k in range(arm.n + 1)]
-    harmonics = range(1, shape[1] + 1 if effect == "transmission_error" else 1)
-    parts: dict[str, tuple[list[str], Sequence[str]]] = {
-        "transmission_error": (joints, [f"{x}{k}" for k in harmonics for x in ("cos", "sin")]),
+def _labels(effect: str, arm: Arm, harmonics: int) -> tuple[Sequence[str], ...]:
+    """Return the labels of one effect's parameters along each axis of their array."""
+    joints, links = [f"j{j + 1}" for j in range(arm.n)], [f"link{k}" for k in range(arm.n + 1)]
+    waves = [f"{part}{k + 1}" for k in range(harmonics) for part in ("cos", "sin")]
+    errors = [f"{kind}{k}" for kind, orders in _GUIDE.items() for k in orders]
+    axes: dict[str, tuple[Sequence[str], ...]] = {
+        "base_frame": (_TWIST,),
+        "tracker_drift": (_TWIST,),
+        "base_compliance": (_AXES,),
+        "load_point": (_AXES,),
+        "target_offset": (_AXES,),
+        "tool_compliance": (("along", "across"),),
+        "creep": (("k",),),
+        "thermal_growth": (("alpha",),),
+        "wrench_bias": (_WRENCH,),
+        "wrench_gain": (_WRENCH,),
+        "sensor_misalignment": (_TURNS,),
+        "tracker_scale": (("scale",),),
+        "transmission_error": (joints, waves),
         "joint_coupling": (joints, [f"q{i + 1}" for i in range(arm.n)]),
-        "link_geometry": (slots, _TWIST),
-        "link_compliance": ([slots[k] for k in long_links(arm)], ("bend", "twist")),
-        "link_mass": (slots[1:], _AXES),
-        "guide_error": (
-            [joints[j] for j in np.flatnonzero(arm.slides)],
-            [f"{kind}{k}" for kind, orders in _GUIDE.items() for k in orders],
-        ),
+        "link_geometry": (links, _TWIST),
+        "link_compliance": ([links[k] for k in long_links(arm)], ("bend", "twist")),
+        "link_mass": (links[1:], _AXES),
+        "guide_error": ([joints[j] for j in np.flatnonzero(arm.slides)], errors),
         "periodic_joint_compliance": (joints, ("cos2", "sin2")),
     }
-    if effect not in parts:
-        return joints
-    return [f"{name}.{part}" for name in parts[effect][0] for part in parts[effect][1]]
+    return axes.get(effect, (joints,))
 
 
 LINK_REFERENCE = 20.0  # temperature at which links have their nominal length, °C (ISO 1)

@@ -133,14 +133,8 @@ class World:
     @property
     def ages(self) -> bool:
         """Whether the target moves while arm and load rest: with time or temperature."""
-        hidden = self.physics
-        causes = (
-            hidden.tracker_drift,
-            hidden.creep,
-            hidden.thermal_growth,
-            hidden.thermal_joint_drift,
-        )
-        return self.own is not None or any(bool(np.any(cause)) for cause in causes)
+        causes = ("tracker_drift", "creep", "thermal_growth", "thermal_joint_drift")
+        return self.own is not None or any(np.any(getattr(self.physics, c)) for c in causes)
 
     def joint_errors(self, states: States) -> Floats:
         """Return the joint displacements (N, n) that do not depend on the load, rad.

@@ -20,7 +20,7 @@ import json
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -40,41 +40,6 @@ from hilcal.readings.readings import States
 from hilcal.toml import suggest
 from hilcal.types import Floats
 from hilcal.whole_file import replace_file
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SimulatedMount:
-    """Where the force sensor sits: everything beyond it weighs on it."""
-
-    origin: Floats  # (3,) of the sensor, flange axes, m
-    axes: Floats  # (3, 3) the sensor's axes in flange axes: maps sensor into flange components
-
-    @classmethod
-    def of(cls, config: CellConfig) -> "SimulatedMount":
-        """Return the mount of a configuration; at the flange where it has no sensor."""
-        sensor = config.force_sensor
-        if sensor is None:
-            return cls(np.zeros(3), np.eye(3))
-        rotation = turned(np.array([sensor.rotvec_rad]))[0]
-        return cls(np.array(sensor.origin_m), rotation)
-
-    def feels(self, world: World, turn: Floats, wrench: Floats) -> Floats:
-        """Return the (6,) wrench of tool and load on the sensor, its axes, N and N·m.
-
-        f = Rᵀ (m g + f_load),  tau = Rᵀ ((c - o) × m g + (p - o) × f_load + tau_load)
-        """
-        cell = world.cell
-        weight = cell.tool_mass * cell.gravity
-        point = cell.load_point + world.physics.load_point
-        force = weight + wrench[:3]
-        moment = (
-            np.cross(turn @ (cell.tool_com - self.origin), weight)
-            + np.cross(turn @ (point - self.origin), wrench[:3])
-            + wrench[3:]
-        )
-        back = (turn @ self.axes).T
-        return np.concatenate([back @ force, back @ moment])
-
 
 ENCODER_STD = 2e-6  # noise of a motor-side encoder at the joint, rad
 
@@ -121,7 +86,9 @@ class WorldState:
             )
         self._world, self._board, self._seed = world, board, seed
         self._loads = config.loads
-        self._mount = SimulatedMount.of(config)
+        sensor = config.force_sensor  # at the flange where there is none
+        self._sensor_at = np.array(sensor.origin_m) if sensor else np.zeros(3)
+        self._sensor_turn = turned(np.array([sensor.rotvec_rad]))[0] if sensor else np.eye(3)
         self._ages = world.ages
         self._rng = np.random.default_rng([seed, 0])
         self._lock = threading.RLock()
@@ -166,16 +133,22 @@ class WorldState:
         with self._lock:
             wanted = self._number(name)
             load = self._mistakes.pop(0) if self._mistakes else wanted
-            before = self._load, self._since
-            self._load, self._since = load, self._board.time
-            try:
-                self._publish(self._look())
-            except InputError:
-                self._load, self._since = before
-                raise
+            with self._tried():
+                self._load, self._since = load, self._board.time
             self._known = None  # a load that swings may be at rest by the next look
             self._note(f"asked for {self._name(wanted)}, hung {self._name(load)}")
             return None if load == 0 else self._name(load)
+
+    @contextlib.contextmanager
+    def _tried(self) -> Iterator[None]:
+        """Publish what is changed inside; what the arm does not bear changes nothing."""
+        before = self._load, self._since, self._push
+        try:
+            yield
+            self._publish(self._look())
+        except InputError:
+            self._load, self._since, self._push = before
+            raise
 
     def mistake(self, name: str | None) -> None:
         """Let the next `hang` hang this load instead, whatever it is asked for."""
@@ -186,12 +159,8 @@ class WorldState:
         """Apply a further wrench at the load point, base axes, N and N·m, until it is changed."""
         pushed = _six("push", wrench)
         with self._lock:
-            before, self._push = self._push, pushed
-            try:
-                self._publish(self._look())
-            except InputError:
-                self._push = before
-                raise
+            with self._tried():
+                self._push = pushed
             self._note(f"push {pushed.tolist()}")
 
     def swing(self, wrench: Sequence[float], period: float, decay: float) -> None:
@@ -265,11 +234,27 @@ class WorldState:
             target_rotation=sight.rotation[0],
             targets=targets,
             flange=flange,
-            sensor_wrench=self._mount.feels(world, flange[:3, :3], wrench),
+            sensor_wrench=self._felt(flange[:3, :3], wrench),
             drive_torque=world.cell.arm.drive_torques(rest.torque[0, world.drives]),
             arrivals=int(arm["arrivals"]),
             **self._passing(arm, now),
         )
+
+    def _felt(self, turn: Floats, wrench: Floats) -> Floats:
+        """Return the (6,) wrench of tool and load on the sensor, its axes, N and N·m.
+
+        f = Rᵀ (m g + f_load),  tau = Rᵀ ((c - o) × m g + (p - o) × f_load + tau_load)
+        """
+        cell, at = self._world.cell, self._sensor_at
+        weight = cell.tool_mass * cell.gravity
+        point = cell.load_point + self._world.physics.load_point
+        moment = (
+            np.cross(turn @ (cell.tool_com - at), weight)
+            + np.cross(turn @ (point - at), wrench[:3])
+            + wrench[3:]
+        )
+        back = (turn @ self._sensor_turn).T
+        return np.concatenate([back @ (weight + wrench[:3]), back @ moment])
 
     def _look(self) -> Any:
         """Return the arm's section, or what it was before its writer died while writing."""
