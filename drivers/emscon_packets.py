@@ -111,7 +111,6 @@ class Measurement:
     quaternion: Floats | None  # (4,) scalar first, of a 6-D target; None of a reflector
     angles: Floats  # (3,) the same as rotations about x, y, z, rad
     angle_covariance: Floats  # (3, 3) of these, rad²; zero: it states none
-    environment: tuple[float, float, float]  # temperature °C, pressure mbar, relative humidity %
 
 
 _SINGLE, _SINGLE2 = struct.Struct("<Ii17d"), struct.Struct("<Ii23d")
@@ -124,30 +123,28 @@ def measurement(kind: int, body: bytes) -> Measurement:
     if kind == PROBE:
         d = np.array(_PROBE.unpack(body)[9:])
         turned = _covariance(d[31:34], d[35:38])
-        environment, position = d[38:], _covariance(d[10:13], d[14:17])
-        return Measurement(d[:3], position, d[17:21], d[21:24], turned, _three(environment))
+        return Measurement(d[:3], _covariance(d[10:13], d[14:17]), d[17:21], d[21:24], turned)
     if kind == SINGLE2:
         d = np.array(_SINGLE2.unpack(body)[2:])
-        stated = _covariance(d[13:16], d[17:20])
-        return Measurement(d[:3], stated, None, np.zeros(3), none, _three(d[20:]))
+        return Measurement(d[:3], _covariance(d[13:16], d[17:20]), None, np.zeros(3), none)
     d = np.array(_SINGLE.unpack(body)[2:])
-    stated = _covariance(d[10:13], np.zeros(3))
-    return Measurement(d[:3], stated, None, np.zeros(3), none, _three(d[14:]))
+    return Measurement(d[:3], _covariance(d[10:13], np.zeros(3)), None, np.zeros(3), none)
 
 
-def pack_measurement(m: Measurement, mode: int) -> tuple[int, bytes]:
-    """Return type and content of the result that tells a measurement; the inverse of the above."""
+def pack_measurement(
+    m: Measurement, mode: int, environment: tuple[float, float, float]
+) -> tuple[int, bytes]:
+    """Return type and content of the result that tells a measurement; the inverse of the above.
+
+    `environment` is temperature °C, pressure mbar, relative humidity %.
+    """
     stated = _stated(m.covariance)
     if m.quaternion is None:
-        values = (*m.position, *stated, 0.0, 0.0, 0.0, *stated, *m.environment)
+        values = (*m.position, *stated, 0.0, 0.0, 0.0, *stated, *environment)
         return SINGLE2, _SINGLE2.pack(mode, 0, *values)
     turned = _stated(m.angle_covariance)
     values = (*m.position, *stated, *stated, *m.quaternion, *m.angles, *turned, *turned)
-    return PROBE, _PROBE.pack(mode, 0, 0, 0, 1, 0, 0, 0, 0, *values, *m.environment)
-
-
-def _three(values: Floats) -> tuple[float, float, float]:
-    return float(values[0]), float(values[1]), float(values[2])
+    return PROBE, _PROBE.pack(mode, 0, 0, 0, 1, 0, 0, 0, 0, *values, *environment)
 
 
 def _covariance(std: Floats, mixed: Floats) -> Floats:

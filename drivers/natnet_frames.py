@@ -81,7 +81,6 @@ class Body:
     number: int
     position: Floats  # (3,) of its pivot, m
     quaternion: Floats  # (4,) scalar last
-    error: float  # mean distance of its markers from where they should be, m
     tracked: bool
 
 
@@ -143,7 +142,7 @@ def frame(content: bytes, version: Version) -> tuple[int, list[Body]]:
     for _ in range(r.listed()[0]):
         known, *v = r.take(_BODY)
         tracked = bool(int(v[8]) & 1)
-        bodies.append(Body(int(known), np.array(v[:3]), np.array(v[3:7]), v[7], tracked))
+        bodies.append(Body(int(known), np.array(v[:3]), np.array(v[3:7]), tracked))
     return number, bodies
 
 

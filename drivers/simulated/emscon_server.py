@@ -177,8 +177,8 @@ class SimulatedTracker:
             J = _rates(angles)
             turned = np.asarray((b * noise.orientation_std) ** 2 * np.linalg.inv(J.T @ J))
         at = a * (position + moved)
-        m = es.Measurement(at, covariance, turn, b * angles, turned, self.environment())
-        kind, packed = es.pack_measurement(m, mode)
+        m = es.Measurement(at, covariance, turn, b * angles, turned)
+        kind, packed = es.pack_measurement(m, mode, self.environment())
         self.send(kind, struct.pack("<I", es.OK) + packed)
 
 

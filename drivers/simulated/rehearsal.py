@@ -241,24 +241,21 @@ def planned_states(
     lasts = np.abs(moved).max(axis=1) / speed + speed / acceleration + resting
     time = begun + np.cumsum(lasts + _LOADING * changed)
     hung = np.maximum.accumulate(np.where(changed, time - resting, begun))
+    count = len(cell.all_targets)
+    each = np.repeat(np.arange(len(q)), count)
+    target = np.tile(np.arange(count), len(q))
+    passed = _MEASURING * target
     states = States(
-        q=q,
-        wrench=wrench,
-        time=time,
-        load_time=np.maximum(time - hung, 1.0),
-        joint_temperature=warm_up(time, cell.arm.n),
-        approach=approach_sides(stops),
+        q=q[each],
+        wrench=wrench[each],
+        time=time[each] + passed,
+        load_time=np.maximum(time - hung, 1.0)[each] + passed,
+        joint_temperature=warm_up(time, cell.arm.n)[each],
+        approach=approach_sides(stops)[each],
+        target=None if cell.targets is None else target,
     )
     pose = np.array([plan.pose_names.index(step.pose) for step in plan.steps])
     cycle = np.array([step.cycle for step in plan.steps])
-    if cell.targets is None:
-        return CampaignStates(states, pose, load, cycle)
-    each = np.repeat(np.arange(len(pose)), len(cell.targets))
-    target = np.tile(np.arange(len(cell.targets)), len(pose))
-    states = states[each]
-    passed = _MEASURING * target
-    loaded = np.maximum(time - hung, 1.0)[each] + passed
-    states = replace(states, target=target, time=time[each] + passed, load_time=loaded)
     return CampaignStates(states, pose[each], load[each], cycle[each])
 
 

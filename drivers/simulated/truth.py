@@ -147,6 +147,13 @@ def warm_up(time: Floats, n: int = 6) -> Floats:
     return np.asarray(AIR + rise + (_WARM_START - rise) * left)
 
 
+def needed(effect: str, name: str, values: Floats | None, what: str) -> Floats:
+    """Return a field of the states that a hidden effect needs; `what` tells that it is missing."""
+    if values is None:
+        raise InputError(f"{name}: {effect} is hidden but the states {what}")
+    return values
+
+
 def drive_errors(hidden: Truth, arm: Arm, states: States, reference: float) -> Floats:
     """Return the displacements (N, n) of the drives that do not depend on the load, rad.
 
@@ -157,12 +164,8 @@ def drive_errors(hidden: Truth, arm: Arm, states: States, reference: float) -> F
     """
     error = np.broadcast_to(hidden.encoder_offset, states.q.shape).copy()
     if np.any(hidden.hysteresis):
-        if states.approach is None:
-            raise InputError(
-                "approach: hysteresis is hidden but the states name no side from which "
-                "the joints arrived; valid: -1 or +1 per state and joint"
-            )
-        error += hidden.hysteresis * states.approach
+        what = "name no side from which the joints arrived; valid: -1 or +1 per state and joint"
+        error += hidden.hysteresis * needed("hysteresis", "approach", states.approach, what)
     if np.any(hidden.thermal_joint_drift):
         error += hidden.thermal_joint_drift * (joint_temperature(states) - reference)
     order = np.arange(1, hidden.transmission_error.shape[1] + 1)
@@ -189,12 +192,8 @@ def guide_motion(hidden: Truth, arm: Arm, states: States) -> Floats | None:
 
 def joint_temperature(states: States) -> Floats:
     """Return the (N, n) temperatures of the joints, °C."""
-    if states.joint_temperature is None:
-        raise InputError(
-            "joint_temperature: thermal_joint_drift is hidden but the states carry no "
-            "temperatures of the joints; valid: °C per state and joint"
-        )
-    return states.joint_temperature
+    what = "carry no temperatures of the joints; valid: °C per state and joint"
+    return needed("thermal_joint_drift", "joint_temperature", states.joint_temperature, what)
 
 
 def further_compliance(hidden: Truth, arm: Arm, states: States) -> Floats | None:
@@ -208,12 +207,9 @@ def further_compliance(hidden: Truth, arm: Arm, states: States) -> Floats | None
         angle = arm.phases(states.q)
         extra = cos * np.cos(2.0 * angle) + sin * np.sin(2.0 * angle)
     if np.any(hidden.creep):
-        if states.load_time is None:
-            raise InputError(
-                "load_time: creep is hidden but the states do not tell how long the load "
-                "has hung; valid: seconds since its last change"
-            )
-        crept = hidden.creep * np.log10(1.0 + states.load_time)
+        what = "do not tell how long the load has hung; valid: seconds since its last change"
+        time = needed("creep", "load_time", states.load_time, what)
+        crept = hidden.creep * np.log10(1.0 + time)
         more = crept[:, None] * hidden.joint_compliance
         extra = more if extra is None else extra + more
     return extra
@@ -234,11 +230,8 @@ def link_growth(hidden: Truth, states: States) -> Floats | None:
     temperature = states.air_temperature
     if temperature is None and states.joint_temperature is not None:
         temperature = states.joint_temperature.mean(axis=1)
-    if temperature is None:
-        raise InputError(
-            "air_temperature: thermal_growth is hidden but the states carry no temperature; "
-            "valid: °C of the air, or of the joints"
-        )
+    what = "carry no temperature; valid: °C of the air, or of the joints"
+    temperature = needed("thermal_growth", "air_temperature", temperature, what)
     return np.asarray(1.0 + hidden.thermal_growth * (temperature - LINK_REFERENCE))
 
 

@@ -8,7 +8,6 @@ from hilcal.cell import Cell
 from hilcal.drivers.simulated import mechanics as mech
 from hilcal.drivers.simulated import truth as laws
 from hilcal.drivers.simulated.own_law import OwnLaw
-from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.types import Floats, Ints
 
@@ -199,12 +198,9 @@ class World:
             shift, turn = self.own.moved(self.cell, frame, hidden.joint_compliance, states)
             position, rotation = position + shift, turn @ rotation
         if np.any(hidden.tracker_drift):
-            if states.time is None:
-                raise InputError(
-                    "time: tracker_drift is hidden but the states carry no time stamps; "
-                    "valid: seconds since the campaign's start"
-                )
-            moved = np.array([mech.displacement(hidden.tracker_drift * t) for t in states.time])
+            what = "carry no time stamps; valid: seconds since the campaign's start"
+            time = laws.needed("tracker_drift", "time", states.time, what)
+            moved = np.array([mech.displacement(hidden.tracker_drift * t) for t in time])
             position = (moved[:, :3, :3] @ position[:, :, None])[:, :, 0] + moved[:, :3, 3]
             rotation = moved[:, :3, :3] @ rotation
         if np.any(hidden.tracker_scale):

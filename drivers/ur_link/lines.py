@@ -3,15 +3,12 @@
 import contextlib
 import socket
 import time
+from collections.abc import Iterator
 from typing import Self
 
 
 class LinkError(Exception):
-    """A connection failed; the text names it and the reason; `refused`: nobody listens there."""
-
-    def __init__(self, text: str, *, refused: bool = False) -> None:
-        super().__init__(text)
-        self.refused = refused
+    """A connection failed; the text names it and the reason."""
 
 
 class Connection:
@@ -23,14 +20,21 @@ class Connection:
         self._seconds = seconds
         self._end = time.monotonic() + seconds
         self._buffer = b""
-        try:
+        with self._failures(host):
             self._socket = socket.create_connection((host, port), timeout=seconds)
+
+    @contextlib.contextmanager
+    def _failures(self, host: str = "") -> Iterator[None]:
+        """Turn what the socket raises into LinkError."""
+        try:
+            yield
         except ConnectionRefusedError:
-            raise LinkError(f"the {self._where} refuses the connection", refused=True) from None
+            raise LinkError(f"the {self._where} refuses the connection") from None
         except socket.gaierror:
             raise LinkError(f'the address "{host}" is unknown') from None
         except TimeoutError:
-            raise LinkError(f"the {self._where} does not answer within {seconds:g} s") from None
+            late = f"does not answer within {self._seconds:g} s"
+            raise LinkError(f"the {self._where} {late}") from None
         except OSError as error:
             raise LinkError(f"the {self._where}: {error.strerror or error}") from None
 
@@ -40,13 +44,9 @@ class Connection:
 
     def send(self, data: bytes) -> None:
         """Send everything."""
-        try:
+        with self._failures():
             self._socket.settimeout(self._left())
             self._socket.sendall(data)
-        except TimeoutError:
-            raise self._late() from None
-        except OSError as error:
-            raise LinkError(f"the {self._where}: {error.strerror or error}") from None
 
     def read(self, count: int) -> bytes:
         """Return exactly so many bytes."""
@@ -81,13 +81,9 @@ class Connection:
         self.close()
 
     def _more(self) -> None:
-        try:
+        with self._failures():
             self._socket.settimeout(self._left())
             data = self._socket.recv(65536)
-        except TimeoutError:
-            raise self._late() from None
-        except OSError as error:
-            raise LinkError(f"the {self._where}: {error.strerror or error}") from None
         if not data:
             raise LinkError(f"the {self._where} closed the connection")
         self._buffer += data
@@ -97,6 +93,3 @@ class Connection:
         if left <= 0:
             raise TimeoutError
         return left
-
-    def _late(self) -> LinkError:
-        return LinkError(f"the {self._where} does not answer within {self._seconds:g} s")

@@ -192,7 +192,7 @@ class RobotApi:
         except TimeoutError:
             raise LinkError(f"the {self.name} does not answer in time") from None
         except ConnectionRefusedError:
-            raise LinkError(f"the {self.name} refuses the connection", refused=True) from None
+            raise LinkError(f"the {self.name} refuses the connection") from None
         except (OSError, http.client.HTTPException, ValueError) as error:
             words = getattr(error, "strerror", None) or type(error).__name__
             raise LinkError(f"the {self.name}: {words}") from None

@@ -256,10 +256,9 @@ def _emscon() -> Parser:
     sound = []
     for turn in (None, np.array([0.5, 0.5, 0.5, 0.5])):
         cov = 1e-10 * np.eye(3)
-        m = es.Measurement(
-            TARGET, cov, turn, np.array([0.0, 1.57, 1.57]), cov, (20.0, 1013.0, 40.0)
-        )
-        kind, packed = es.pack_measurement(m, es.STATIONARY if turn is None else es.STATIONARY_6D)
+        m = es.Measurement(TARGET, cov, turn, np.array([0.0, 1.57, 1.57]), cov)
+        mode = es.STATIONARY if turn is None else es.STATIONARY_6D
+        kind, packed = es.pack_measurement(m, mode, (20.0, 1013.0, 40.0))
         body = es.OK.to_bytes(4, "little") + packed
         change = es.HEADER.pack(12, es.CHANGE) + (7).to_bytes(4, "little")
         sound.append(change + es.HEADER.pack(8 + len(body), kind) + body)
