@@ -110,7 +110,7 @@ NOISE: dict[str, dict[str, Any]] = {
 }
 
 
-Device = tuple[Operations, Callable[[], None]]
+Device = tuple[Handler, Callable[[], None]]
 """What can be asked of a device, and what it does over and over."""
 
 
@@ -120,33 +120,19 @@ def run(
     start: Callable[[argparse.Namespace], Device],
     more: Mapping[str, dict[str, Any]] | None = None,
 ) -> int:
-    """Run the process of a device until its parent ends; its admin line is DIR/NAME.sock.
+    """Run the process of a device; its admin line is DIR/NAME.sock.
 
-    Returns the exit code where `start`, which is given the options, cannot make the device.
-    """
-    options = begin(doc, more or {})
-    try:
-        asked, step = start(options)
-    except HilcalError as error:
-        sys.stderr.write(f"{error}\n")
-        return error.exit_code
-    serve(options.directory / f"{name}.sock", asked)
-    while True:
-        step()
-
-
-def begin(doc: str | None, more: Mapping[str, dict[str, Any]]) -> argparse.Namespace:
-    """Return the options of a device's process, which ends at once when standard input closes.
-
-    The parent holds its other end; `more` options are arguments of `add_argument` by name.
+    It ends at once when standard input closes, whose other end the parent holds. `more` options are
+    arguments of `add_argument` by name. Returns the exit code where `start`, which is given the
+    options, cannot make the device.
     """
     parser = argparse.ArgumentParser(
         description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--directory", type=Path, required=True, help="where the devices meet")
     parser.add_argument("--seed", type=int, default=0, help="of everything random")
-    for name, how in more.items():
-        parser.add_argument(name, **how)
+    for option, how in (more or {}).items():
+        parser.add_argument(option, **how)
     options = parser.parse_args()
 
     def wait() -> None:
@@ -156,4 +142,11 @@ def begin(doc: str | None, more: Mapping[str, dict[str, Any]]) -> argparse.Names
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the one who started it
     threading.Thread(target=wait, daemon=True).start()
-    return options
+    try:
+        asked, step = start(options)
+    except HilcalError as error:
+        sys.stderr.write(f"{error}\n")
+        return error.exit_code
+    serve(options.directory / f"{name}.sock", asked)
+    while True:
+        step()

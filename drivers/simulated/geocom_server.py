@@ -274,31 +274,6 @@ _REQUEST = re.compile(r"%R1Q,(\d{1,5})(?:,(\d{1,5}))?(?:,(\d{1,5}))?:(.*)")
 NAME, SERIAL = "SIM LASER STATION", 123456
 
 
-@dataclass(frozen=True, slots=True)
-class GeocomRequest:
-    """One request, taken apart."""
-
-    rpc: int
-    transaction: int  # number that the answer repeats
-    parameters: tuple[str, ...]
-    checked: bool  # whether it came with a checksum, so the answer carries one too
-    error: int = OK  # code of the communication, `OK` where the request is sound
-
-
-def parse(line: str) -> GeocomRequest | None:
-    """Take a line apart; None where it is no request at all."""
-    if not line.startswith("%R1Q,"):
-        return None
-    match = _REQUEST.fullmatch(line)
-    if match is None:
-        return GeocomRequest(-1, 0, (), False, CANNOT_DECODE)
-    rpc, transaction, crc, rest = match.groups()
-    bare = f"%R1Q,{rpc},{transaction}:{rest}".encode("ascii", "replace")
-    error = OK if crc is None or int(crc) == crc16(bare) else BAD_CHECKSUM
-    parameters = tuple(rest.split(",")) if rest else ()
-    return GeocomRequest(int(rpc), int(transaction or 0), parameters, crc is not None, error)
-
-
 def reply(
     com: int, transaction: int, code: int, parameters: Sequence[str], *, checked: bool
 ) -> bytes:
@@ -528,22 +503,27 @@ def respond(station: Station, line: str) -> bytes:
     """Return the answer to one line, empty where it is none of the protocol's."""
     if line == "c":  # abort: there is never anything left to abort
         return b"?\r\n"
-    request = parse(line)
-    if request is None:
+    if not line.startswith("%R1Q,"):
         return b""
-    station.requests.append((request.rpc, request.parameters))
-    transaction = request.transaction
+    match = _REQUEST.fullmatch(line)
+    rpc, told, crc, rest = match.groups() if match else ("-1", "0", None, "")
+    number, parameters = int(rpc), tuple(rest.split(",")) if rest else ()
+    station.requests.append((number, parameters))
+    transaction = int(told or 0)
     if station.wrong_transactions > 0:
         station.wrong_transactions -= 1
         transaction = (transaction + 1) % 2**15
-    if request.error != OK:
-        return reply(request.error, transaction, 0, [], checked=request.checked)
-    code, values = answer(station, request.rpc, request.parameters)
-    pause, count = station.delays.pop(request.rpc, (0.0, 0))
+    if match is None:
+        return reply(CANNOT_DECODE, transaction, 0, [], checked=False)
+    bare = f"%R1Q,{rpc},{told}:{rest}".encode("ascii", "replace")
+    if crc is not None and int(crc) != crc16(bare):
+        return reply(BAD_CHECKSUM, transaction, 0, [], checked=True)
+    code, values = answer(station, number, parameters)
+    pause, count = station.delays.pop(number, (0.0, 0))
     if count > 1:
-        station.delays[request.rpc] = pause, count - 1
+        station.delays[number] = pause, count - 1
     time.sleep(pause)
-    return reply(OK, transaction, code, values, checked=request.checked)
+    return reply(OK, transaction, code, values, checked=crc is not None)
 
 
 def operations(station: Station, port: PtyPort) -> admin.Operations:

@@ -32,7 +32,7 @@ from hilcal.drivers.simulated import ur_controller as control
 from hilcal.drivers.simulated.blackboard import Blackboard
 from hilcal.drivers.simulated.ur_rtde import RtdeLink, RtdeLinks, Sensors
 from hilcal.drivers.simulated.ur_state import ArmState, Kinematics, Trajectory, WorldClock
-from hilcal.errors import DeviceError, HilcalError, InputError
+from hilcal.errors import DeviceError, InputError
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.factory import FactoryKinematics, read_factory, with_factory
@@ -281,8 +281,8 @@ def _share(key: str, value: Any) -> float:
     return float(value)
 
 
-async def serve(options: argparse.Namespace) -> None:
-    """Open everything, and run until the process ends."""
+def start(options: argparse.Namespace) -> admin.Device:
+    """Return a controller that listens."""
     arm, factory = load_arm(options.robot), None
     if arm.n != len(HOME):
         raise InputError(f"--robot {options.robot}: {arm.n} joints; an arm of UR has {len(HOME)}")
@@ -297,31 +297,18 @@ async def serve(options: argparse.Namespace) -> None:
     rng = np.random.default_rng(options.seed)
     state = switched_on(arm, board, read_version(options.version), rng)
     server = UrServer(state, board, options.host, rng, options.api_port, factory)
-    await server.open()
-    loop = asyncio.get_running_loop()
-    admin.serve(options.directory / "arm.sock", operations(server, loop))
-    await server.run()
+    loop = asyncio.new_event_loop()
+    loop.run_until_complete(server.open())
+    return operations(server, loop), lambda: loop.run_until_complete(server.run())
 
 
-def main() -> int:
-    """Read the command line and serve; one line and an exit code where that is impossible."""
-    options = admin.begin(
-        __doc__,
-        {
-            "--host": {"required": True},
-            "--robot": {"required": True},
-            "--version": {"default": "5.11.6.1010327"},
-            "--api-port": {"type": int, "default": API},
-            "--calibration": {"type": Path},
-        },
-    )
-    try:
-        asyncio.run(serve(options))
-    except HilcalError as error:
-        sys.stderr.write(f"{error}\n")
-        return error.exit_code
-    return 0
-
+OPTIONS: dict[str, dict[str, Any]] = {
+    "--host": {"required": True},
+    "--robot": {"required": True},
+    "--version": {"default": "5.11.6.1010327"},
+    "--api-port": {"type": int, "default": API},
+    "--calibration": {"type": Path},
+}
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(admin.run(__doc__, "arm", start, OPTIONS))
