@@ -57,8 +57,8 @@ class NatNetServer:
     name: str
     program: str
     version: Version  # of NatNet in which it sends frames
-    data_port: int = 0  # where it sends frames to; 0 where it does not tell
-    group: str = ""  # multicast address; empty where it sends to each client
+    data_port: int  # where it sends frames to; 0 where it does not tell
+    group: str  # multicast address; empty where it sends to each client
 
 
 def server(content: bytes) -> NatNetServer:
@@ -66,12 +66,11 @@ def server(content: bytes) -> NatNetServer:
     name, *numbers = _SERVER.unpack_from(content)
     version = numbers[4], numbers[5]
     called = name.split(b"\0")[0].decode("utf-8", "replace")
-    known = NatNetServer(called, ".".join(map(str, numbers[:4])), version)
-    if len(content) < _SERVER.size + _CONNECTION.size:
-        return known
-    _, port, multicast, *group = _CONNECTION.unpack_from(content, _SERVER.size)
-    where = ".".join(map(str, group)) if multicast else ""
-    return NatNetServer(known.name, known.program, version, port, where)
+    port, where = 0, ""
+    if len(content) >= _SERVER.size + _CONNECTION.size:
+        _, port, multicast, *group = _CONNECTION.unpack_from(content, _SERVER.size)
+        where = ".".join(map(str, group)) if multicast else ""
+    return NatNetServer(called, ".".join(map(str, numbers[:4])), version, port, where)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

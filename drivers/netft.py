@@ -146,16 +146,12 @@ def page(host: str, port: int) -> str:
             line.request("GET", "/netftapi2.xml")
             answer = line.getresponse()
             words = answer.read(_LARGEST).decode("utf-8", "replace")
+            wrong = f"it has no page netftapi2.xml (HTTP status {answer.status})"
+            there = answer.status == http.client.OK
         except http.client.HTTPException as error:
-            raise DeviceError(
-                f"{DEVICE} at {where}: what comes is no web page ({type(error).__name__}); is this "
-                "a Net F/T?"
-            ) from None
-    if answer.status != http.client.OK:
-        raise DeviceError(
-            f"{DEVICE} at {where}: it has no page netftapi2.xml (HTTP status {answer.status}); is "
-            "this a Net F/T?"
-        )
+            wrong, there = f"what comes is no web page ({type(error).__name__})", False
+    if not there:
+        raise DeviceError(f"{DEVICE} at {where}: {wrong}; is this a Net F/T?")
     return words
 
 

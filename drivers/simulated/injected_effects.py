@@ -211,22 +211,13 @@ def hide(
         sqrt(mean |W (r - r_0)|²) = strength_sigma
 
     r are the noise-free readings with the effect, r_0 without, W whitens by the covariance
-    of a reading; in deflection mode r is the loaded minus the unloaded reading of one pose
-    and W belongs to that difference. The direction is drawn; the length is found by secants.
-    Joints that drift with temperature do so from the states' first temperature on.
+    of a reading of m elements, 3 or 6; in deflection mode r is the loaded minus the unloaded
+    reading of one pose and W belongs to that difference. The direction is drawn; the length is
+    found by secants. Joints that drift with temperature do so from the states' first one on.
 
-    Args:
-        effect: one of `ALL_EFFECTS`, an effect of a user's own, or "none".
-        cell: the cell as configured.
-        states: N states at which the strength holds.
-        strength_sigma: RMS over all whitened elements, >= 0.
-        readings_mode: "absolute" or "deflection".
-        rng: generator.
-        world: the world that the effect is added to; a fresh one when None.
-        m: elements per reading, 3 or 6.
-        pose: (N,) index of the pose, for deflections; equal joints are one pose when None.
-        cycle: (N,) index of the cycle, for deflections; one cycle when None.
-        harmonics: number of harmonics of a hidden transmission error.
+    `effect` is one of `ALL_EFFECTS`, one of a user's own, or "none"; it is added to `world`, a
+    fresh one when None. `pose` and `cycle` (N,) pair the readings of deflections; equal joints are
+    one pose, and all states one cycle, when None.
     """
     _check(effect, strength_sigma, readings_mode, m)
     if world is None:

@@ -256,7 +256,7 @@ def _state(server: UrServer) -> dict[str, Any]:
         **{name: getattr(motion, name) for name in ("moving", "arrivals")},
         **{name: getattr(arm, name) for name in ("remote", "payload", "fault_ns", "input_ns")},
         "runtime": int(arm.runtime),
-        "safety": int(arm.safety_bits),
+        "safety": arm.safety_bits,
         "robot_mode": int(arm.robot_mode),
         "scripts": controller.scripts,
         "script_running": controller.program_runs,

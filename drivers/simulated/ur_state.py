@@ -6,7 +6,7 @@ All times of a trajectory are world time in s; the caller says what time it is.
 import time
 from collections import deque
 from dataclasses import dataclass, field
-from enum import IntEnum, IntFlag
+from enum import IntEnum
 
 import numpy as np
 import pinocchio as pin
@@ -248,16 +248,6 @@ class Runtime(IntEnum):
     RESUMING = 5
 
 
-class Safety(IntFlag):
-    """RTDE `safety_status_bits`."""
-
-    NORMAL = 1 << 0
-    PROTECTIVE_STOP = 1 << 2
-    ROBOT_EMERGENCY_STOP = 1 << 6
-    EMERGENCY_STOP = 1 << 7
-    STOPPED = 1 << 10
-
-
 class SafetyMode(IntEnum):
     """RTDE `safety_mode` and `safety_status`, and the dashboard's words for them."""
 
@@ -267,12 +257,11 @@ class SafetyMode(IntEnum):
 
 
 _BITS = {
-    SafetyMode.NORMAL: Safety.NORMAL,
-    SafetyMode.PROTECTIVE_STOP: Safety.PROTECTIVE_STOP | Safety.STOPPED,
-    SafetyMode.ROBOT_EMERGENCY_STOP: (
-        Safety.ROBOT_EMERGENCY_STOP | Safety.EMERGENCY_STOP | Safety.STOPPED
-    ),
+    SafetyMode.NORMAL: 1 << 0,
+    SafetyMode.PROTECTIVE_STOP: 1 << 2 | 1 << 10,  # of the cause, and "stopped due to safety"
+    SafetyMode.ROBOT_EMERGENCY_STOP: 1 << 6 | 1 << 7 | 1 << 10,
 }
+"""RTDE `safety_status_bits`."""
 
 
 class WorldClock:
@@ -337,7 +326,7 @@ class ArmState:
     """(monotonic_ns, what happened)."""
 
     @property
-    def safety_bits(self) -> Safety:
+    def safety_bits(self) -> int:
         """RTDE `safety_status_bits`."""
         return _BITS[self.safety_mode]
 

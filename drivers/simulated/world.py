@@ -60,10 +60,6 @@ class SimulatedNoise:
         seen = mech.turned(azimuth + elevation) @ sight[:, :, None]
         return np.asarray(seen[:, :, 0] * (distance + draw[2] * along)[:, None])
 
-    def observe_turn(self, count: int, rng: np.random.Generator) -> Floats:
-        """Return (count, 3) small rotations about the tracker's axes, rad."""
-        return self.orientation_std * rng.standard_normal((count, 3))
-
     def _spread(self, position: Floats) -> tuple[Floats, Floats, Floats]:
         """Return sigma_range (N,), sigma_transverse (N,) and the line of sight (N, 3)."""
         distance = np.linalg.norm(position, axis=1)
@@ -233,7 +229,7 @@ class World:
         position = seen @ back[:3, :3].T + back[:3, 3]
         if m == 3:
             return position
-        turn = mech.turned(self.noise.observe_turn(len(states), rng))
+        turn = mech.turned(self.noise.orientation_std * rng.standard_normal((len(states), 3)))
         return np.hstack([position, mech.rotation_vector(turn @ sight.rotation)])
 
     def _from_station(self, position: Floats) -> Floats:

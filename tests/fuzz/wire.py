@@ -305,7 +305,7 @@ def _natnet() -> Parser:
         tracker = NatNetTracker.__new__(NatNetTracker)
         tracker.where, tracker._newest = "fuzz", -1
         version = versions[data[0] % 4]
-        tracker._server = nn.NatNetServer("fuzz", "1", version)
+        tracker._server = nn.NatNetServer("fuzz", "1", version, 0, "")
         if data[0] < 4:
             bodies = tracker._next(Socket(data[1:]))  # type: ignore[arg-type]
             for body in bodies or ():
