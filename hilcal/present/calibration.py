@@ -202,7 +202,6 @@ def improvement_report(gain: Improvement, limit_m: float | None) -> Iterator[Blo
 
 
 def _rows(part: Improved) -> Iterator[tuple[str, ...]]:
-    """Yield before, after and noise of some points."""
     before, after = (map(length, (s.mean_m, s.rms_m, s.max_m)) for s in (part.before, part.after))
     band, inside = length(part.band_m), f"{part.inside} of {part.count}"
     yield (load_name(part.name), "before", *before, "", "")

@@ -29,6 +29,7 @@ from hilcal.measuring.progress import (
     Question,
     ReadingStored,
     Remark,
+    Watcher,
 )
 from hilcal.names import escaped
 
@@ -158,10 +159,11 @@ class _Watcher:
     """Keeps two lines up to date on a terminal, notes scroll by above them; else a line for each.
 
     While somebody is asked a question the two are gone, for their refresh would wipe it away.
+    `also` is told everything as well.
     """
 
-    def __init__(self, console: Console, total: int) -> None:
-        self.console, self.begun = console, time.monotonic()
+    def __init__(self, console: Console, total: int, also: Watcher | None) -> None:
+        self.console, self.begun, self._also = console, time.monotonic(), also
         self._now: dict[str, Any] = {"left": "", "last": "", "phase": "", "done": 0, "total": total}
         self._shown: _TwoLines | None = None
 
@@ -187,6 +189,8 @@ class _Watcher:
 
     def notify(self, event: object) -> None:
         """Take note."""
+        if self._also is not None:
+            self._also.notify(event)
         if isinstance(event, Question):
             self.end()
             if self.console.is_terminal and self._now["done"]:
@@ -219,9 +223,9 @@ class _Watcher:
 
 
 @contextmanager
-def watching(console: Console, total: int) -> Iterator[_Watcher]:
-    """Yield a watcher that shows a campaign of so many readings."""
-    watcher = _Watcher(console, total)
+def watching(console: Console, total: int, also: Watcher | None = None) -> Iterator[_Watcher]:
+    """Yield a watcher that shows a campaign of so many readings, and tells another one."""
+    watcher = _Watcher(console, total, also)
     watcher.begin()
     try:
         yield watcher

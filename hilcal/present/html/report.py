@@ -242,7 +242,6 @@ def left_out_errors(fit: Fit) -> Floats:
 
 
 def _certificate(m: ReportContent) -> PageSection:
-    """Return the certificate for a quality manager."""
     parts: list[Block] = [replace(errors(m.fit), caption="Error before and after")]
     if m.corrected is not None:
         parts.append(_corrected(m.corrected))
@@ -258,7 +257,6 @@ def _certificate(m: ReportContent) -> PageSection:
 
 
 def _corrected(found: Mapping[str, Any]) -> Table:
-    """Errors where the arm was moved to corrected joint targets and measured again."""
     heads = ("load", "n", "before, rms", "largest", "corrected, rms", "largest", "in 95 % band")
     out = table(*heads, caption="Measured at uncorrected and at corrected joint targets")
     for part in (*found["loads"], found["error"]):
@@ -348,7 +346,6 @@ def _conditions(m: ReportContent) -> Iterator[Block]:
 
 
 def _by_load(m: ReportContent) -> Table:
-    """Errors of poses left out by load."""
     fit, error = m.fit, left_out_errors(m.fit)
     kept = fit.readings[~fit.outlier][fit.whitening.reading]
     limit = () if m.limit_m is None else ("limit",)
@@ -501,14 +498,12 @@ def _evidence(m: ReportContent) -> PageSection:
 
 
 def _added_variables(d: Diagnosis, of: Sequence[Suspect]) -> Iterator[Chart]:
-    """Yield the added-variable plot of each suspect that has one."""
     for s in of:
         if (found := regressor(d.fit, s)) is not None:
             yield Chart(f"Added variable: {s.effect}", charts.added_variable(found, s.effect))
 
 
 def _suspects_table(rows: Sequence[Suspect], caption: str) -> Table:
-    """Return a table of suspects."""
     heads = ("effect", "explains", "on poses left out", "log evidence", "p-value", "passes")
     out = table(*heads, "not separable from", caption=caption)
     for s in rows:
@@ -560,7 +555,6 @@ def _halves(t: Table) -> Iterator[Table]:
 
 
 def _appendix(m: ReportContent) -> Iterator[PageSection]:
-    """Yield the sections of the appendix."""
     for name, title, parts in (
         ("joints", "Over each joint", _joints(m)),
         ("rejected", "Rejected suspects", _rejected(m)),

@@ -140,7 +140,6 @@ class PlanView:
         self.colors = np.array(each).round().astype(np.uint8)
 
     def __len__(self) -> int:
-        """Return the number of steps."""
         return len(self.plan.steps)
 
     def _sight(self) -> Ints:
