@@ -97,10 +97,8 @@ def serve(story: Story, ip: str = "127.0.0.1", port: int = PORT) -> Iterator[str
     """
     at = f"viewer server {ip}:{port}"
     recording.disable_analytics()
-    try:
-        recording.bind(ip, port)
-    except (OSError, OverflowError) as error:
-        raise InputError(f"{at}: {error}; choose a free port of this machine") from error
+    if (why := recording.refused(ip, port)) is not None:
+        raise InputError(f"{at}: {why}; choose a free port of this machine")
     try:
         rec = _opened(story)
         rec.set_sinks(rr.GrpcServerSink(bind_ip=ip, port=port))

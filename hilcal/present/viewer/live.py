@@ -5,11 +5,11 @@ import math
 import pickle
 import threading
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from datetime import timedelta
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 import rerun as rr
@@ -355,15 +355,13 @@ class LiveScene:
             dot = rr.Points3D(dots, colors=[style.MEASURED], radii=[0.01])
             rec.log(f"{self._world}/dots", dot)
         if arrows:
-            rec.log(f"{self._world}/arrows", _arrows(arrows))
+            rec.log(f"{self._world}/arrows", style.residual_arrows(*zip(*arrows, strict=True)))
         if balls:
             rec.log(f"{self._world}/balls", style.noise_balls(balls, [[BALL] * 3] * len(balls)))
         if now and d.group > 1:  # the last reading, drawn until the next one comes
-            rec.log(f"{self._world}/now/arrow", _arrows(now))
-            rec.log(
-                f"{self._world}/now/ball",
-                style.noise_balls([at for at, *_ in now], [[BALL] * 3] * len(now)),
-            )
+            ball = style.noise_balls([at for at, *_ in now], [[BALL] * 3] * len(now))
+            rec.log(f"{self._world}/now/arrow", style.residual_arrows(*zip(*now, strict=True)))
+            rec.log(f"{self._world}/now/ball", ball)
         if d.judged > before and not (self._batches and before):
             rec.log(f"{self._series}/limit", rr.Scalars(LIMIT))
         target, _, worst = max(read, key=lambda r: -1.0 if r[2] is None else r[2].norm2)
@@ -398,20 +396,16 @@ class LiveScene:
             self._titles = titles
 
 
-def _arrows(of: Sequence[tuple[Floats, Floats, int]]) -> rr.Arrows3D:
-    """Return arrows that begin at places, m, with their levels."""
-    return style.residual_arrows(*zip(*of, strict=True))
-
-
 def follow(messages: BinaryIO, reply: Callable[..., None], record: Path, port: int) -> None:
     """Show what pickled (time of day, s; event) tell, in a file and at a free port from `port`."""
     identifier = str(uuid.uuid4())
     outlets = [_Outlet(identifier, reply, f"recording {record}", file=record)]
     with contextlib.suppress(OSError):
         recording.disable_analytics()
-    free = next((p for p in range(port, port + PORTS) if recording.free("127.0.0.1", p)), None)
+    ports = range(port, port + PORTS)
+    free = next((p for p in ports if recording.refused("127.0.0.1", p) is None), None)
     if free is None:
-        reply(problem=f"no free port from {port} to {port + PORTS - 1}: no live viewer is served")
+        reply(problem=f"no free port from {port} to {ports[-1]}: no live viewer is served")
         reply(url=None)
     else:
         outlets.append(_Outlet(identifier, reply, f"live viewer at port {free}", port=free))
@@ -444,13 +438,12 @@ class _Outlet:
         config = rr.ChunkBatcherConfig(flush_tick=timedelta(days=1)) if file else None
         self._rec = recording.stream(identifier, config)
         try:
-            served: dict[str, Any] = {
-                "bind_ip": "127.0.0.1",
-                "port": port,
-                "server_memory_limit": MEMORY,
-            }
-            self._rec.set_sinks(rr.FileSink(str(file)) if file else rr.GrpcServerSink(**served))
-            self._scene = LiveScene(self._rec, batches=self._file is not None)
+            self._rec.set_sinks(
+                rr.FileSink(str(file))
+                if file
+                else rr.GrpcServerSink("127.0.0.1", port, server_memory_limit=MEMORY)
+            )
+            self._scene = LiveScene(self._rec, batches=file is not None)
         except (OSError, RuntimeError, ValueError) as error:
             self._fail(error)
 
