@@ -218,7 +218,7 @@ def limit_words(m: ReportContent) -> tuple[str, bool | None]:
     """Say whether the limit is kept, and by what that was judged."""
     if m.limit_m is None:
         return "", None
-    if m.tested is not None:
+    if m.tested is not None and m.tested.found.judged.unseen:
         a = m.tested.found.shares
         count, over, passed, most = a.everything.count, a.over, bool(a.passed), a.everything.max_m
         end = f" (campaign {m.tested.name}, never fitted; largest {length(most)})."
@@ -228,9 +228,12 @@ def limit_words(m: ReportContent) -> tuple[str, bool | None]:
         error = left_out_errors(m.fit)
         count, over = len(error), int(np.sum(error > m.limit_m))
         passed, most = over == 0, float(error.max())
+        none = "No validation campaign was given"
+        if m.tested is not None:
+            none = f"{m.tested.name} was fitted itself"
         end = (
-            f", each pose predicted without itself (largest {length(most)}). No validation "
-            "campaign was given: an independent test is missing."
+            f", each pose predicted without itself (largest {length(most)}). {none}: an "
+            "independent test is missing."
         )
     head = f"{'PASSED' if passed else 'FAILED'}: {count - over} of {count} errors are within"
     return f"{head} {length(m.limit_m)}{end}", passed
