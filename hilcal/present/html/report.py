@@ -47,7 +47,7 @@ from hilcal.present.fit import (
     scalings_table,
     where_table,
 )
-from hilcal.present.html import Card, FirstScreen, render
+from hilcal.present.html import FirstScreen, render
 from hilcal.present.registration import base_line, covariance_words
 from hilcal.present.story import Chapter, Story, StoryRevision, curve, laws, regressor
 from hilcal.present.verdict import headline, message, repeatability_source
@@ -191,9 +191,9 @@ def _missing(d: Diagnosis | None) -> str:
     return f"{words} {name} is: {d.fit.model.catalogue[name].summary}."
 
 
-def _cards(m: ReportContent) -> Iterator[Card]:
-    def card(label: str, rms_m: float, max_m: float, more: str = "") -> Card:
-        return Card(label, length(rms_m), f"rms; largest {length(max_m)}{more}")
+def _cards(m: ReportContent) -> Iterator[tuple[str, str, str]]:
+    def card(label: str, rms_m: float, max_m: float, more: str = "") -> tuple[str, str, str]:
+        return label, length(rms_m), f"rms; largest {length(max_m)}{more}"
 
     before, held = error_before(m.fit), m.fit.holdout
     what = "nominal arm, only its frames fitted"
@@ -208,10 +208,10 @@ def _cards(m: ReportContent) -> Iterator[Card]:
         of = m.corrected["error"]
         was, now = (length(float(of[k]["rms_m"])) for k in ("before", "after"))
         words = f"rms; {was} without correction; {of['count']} points"
-        yield Card("Measured at corrected targets", now, words)
+        yield "Measured at corrected targets", now, words
     yield card("After, poses left out", held.rms_m, held.max_m)
     noise = "rms that the stated noise would leave"
-    yield Card("Noise alone", length(m.story.noise_floor_m), noise)
+    yield "Noise alone", length(m.story.noise_floor_m), noise
 
 
 def limit_words(m: ReportContent) -> tuple[str, bool | None]:
