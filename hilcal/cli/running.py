@@ -60,7 +60,6 @@ from hilcal.measuring.connect import (
     with_kinematics,
 )
 from hilcal.measuring.devices import Clock
-from hilcal.measuring.progress import Watcher
 from hilcal.measuring.route import dry_run
 from hilcal.measuring.run import HOW_ON
 from hilcal.measuring.run import run as run_plan
@@ -68,7 +67,7 @@ from hilcal.names import quoted
 from hilcal.numbers import sentence
 from hilcal.present.campaign import factory_words
 from hilcal.present.diagnosis import NEWCOMER
-from hilcal.present.live_viewer import LiveViewer, Several
+from hilcal.present.live_viewer import LiveViewer
 from hilcal.present.plan import plan_facts
 from hilcal.present.progress import Say, counting, full_words, missed_words, watching, working
 from hilcal.present.registration import covariance_words
@@ -241,10 +240,9 @@ def measure(
         answers = with_kinematics(answers, cell)
         refuse_unready(answers)
         assert rig is not None  # noqa: S101  (refuse_unready has raised otherwise)
-        watcher: Watcher = stack.enter_context(watching(t.progress, len(log.plan.steps)))
         if viewer is not None:
             viewer.measuring(campaign.path.name, cell, log)
-            watcher = Several((watcher, viewer))
+        watcher = stack.enter_context(watching(t.progress, len(log.plan.steps), viewer))
         log.event("devices", {"answers": [answer_json(answer) for answer in answers]})
         clock = Clock(config.simulation.clock)
         live = LiveModel(cell, config)

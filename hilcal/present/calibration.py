@@ -190,19 +190,15 @@ def improvement_report(gain: Improvement, limit_m: float | None) -> Iterator[Blo
     if left > MOST_LEFT:
         yield f"left out: {left - MOST_LEFT} more"
     if limit_m is not None:
-        over, size, largest = gain.over(limit_m), length(limit_m), length(e.after.max_m)
-        of = " for deflections" if gain.mode == "deflection" else ""
-        at = f"{'FAILED' if over else 'PASSED'}{of}: {over or 'no'}"
-        yield (
-            f"{at} of {e.count} errors at the corrected targets are over {size}; the largest is "
-            f"{largest}."
-            if over
-            else f"{at} error at the corrected targets is over {size}, the largest is {largest}."
-        )
+        over, of = gain.over(limit_m), " for deflections" if gain.mode == "deflection" else ""
+        what = f"PASSED{of}: no error at the corrected targets is"
+        if over:
+            what = f"FAILED{of}: {over} of {e.count} errors at the corrected targets are"
+        largest = f"the largest is {length(e.after.max_m)}"
+        yield f"{what} over {length(limit_m)}{';' if over else ','} {largest}."
 
 
 def _rows(part: Improved) -> Iterator[tuple[str, ...]]:
-    """Yield before, after and noise of some points."""
     before, after = (map(length, (s.mean_m, s.rms_m, s.max_m)) for s in (part.before, part.after))
     band, inside = length(part.band_m), f"{part.inside} of {part.count}"
     yield (load_name(part.name), "before", *before, "", "")

@@ -159,18 +159,16 @@ def check_report(answers: "tuple[ConnectionResult, ...]", dry: "DryRun | None") 
 def factory_words(found: "FactoryCheck") -> Iterator[Block]:
     """Yield whether an arm is still what its factory measured, and how well that is known."""
     moved, std = numbers.length(found.moved_m), numbers.length(found.moved_std_m)
-    yield ""
+    words = (
+        "The arm is what its factory measured, as far as these readings tell "
+        f"(p = {found.p_value:.2g}): what they leave of its geometry"
+    )
     if found.changed:
-        yield (
+        words = (
             "The arm is no longer what its factory measured: its geometry has changed "
-            f"(p = {found.p_value:.1g}), which moves the target by {moved} (rms, ± {std})."
+            f"(p = {found.p_value:.1g}), which"
         )
-    else:
-        yield (
-            "The arm is what its factory measured, as far as these readings tell "
-            f"(p = {found.p_value:.2g}): what they leave of its geometry moves the target by "
-            f"{moved} (rms, ± {std})."
-        )
+    yield from ("", f"{words} moves the target by {moved} (rms, ± {std}).")
     yield (
         f"From the factory's kinematics {found.readings} readings are "
         f"{numbers.length(found.factory_m)} off (rms, the arm's own weight in it), from the "
@@ -305,23 +303,19 @@ def event_words(e: Mapping[str, Any]) -> str:
 def _revisions_tables(o: Overview) -> Iterator[Block]:
     """Yield a table of each kind of readings, whose errors do not compare; → is the one in use."""
     kinds = dict.fromkeys(str(r.options["readings"]) for r in o.revisions)
-    branched = any(r.made_from not in (None, r.number - 1) for r in o.revisions)
-    first = ("rev.", "from", "model") if branched else ("rev.", "model")
-    heads, left = (
-        (*first, "fit", "left out", "σ", "v.f.", "verdict"),
-        (len(first) - 1, len(first) + 4),
-    )
+    branched = int(any(r.made_from not in (None, r.number - 1) for r in o.revisions))
+    heads = ("rev.", *["from"] * branched, "model", "fit", "left out", "σ", "v.f.", "verdict")
     for kind in kinds:
         if len(kinds) > 1:
             yield f"Of {'deflections' if kind == 'deflection' else 'absolute readings'}:"
-        out = table(*heads, left=left)
+        out = table(*heads, left=(1 + branched, 6 + branched))
         for r in (r for r in o.revisions if r.options["readings"] == kind):
             fit = r.result_json["identify"]
             held = fit["error"]["holdout"]
             verdict = str(r.result_json.get("diagnose", {}).get("verdict", ""))
             out.add(
                 f"→ {r.number}" if r.number == o.in_use else str(r.number),
-                *(("" if r.made_from is None else str(r.made_from),) if branched else ()),
+                *["" if r.made_from is None else str(r.made_from)] * branched,
                 model_words(r),
                 numbers.length(float(fit["error"]["fit"]["rms_m"])),
                 numbers.length(float(held["rms_m"])),

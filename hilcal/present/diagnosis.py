@@ -216,7 +216,6 @@ def redundant_line(d: Diagnosis) -> Iterator[str]:
 
 
 def _repeats(e: PureError) -> Iterator[str]:
-    """Yield the scatter of repeated readings, and where it differs most from what is stated."""
     yield (
         f"Repeated readings scatter {e.factor**0.5:.2f} times as much as stated "
         f"({e.dof:.0f} degrees of freedom)."
@@ -416,7 +415,6 @@ def _law(law: Law, d: Discovery, first: bool) -> Iterator[Block]:
 
 
 def _structures(of: Sequence[Structure]) -> Table:
-    """Return the likely laws: probability, complexity, share on poses left out."""
     best = pareto(of)
     rows = table("law", "probability", "complexity", "on poses left out", "")
     for x in of:

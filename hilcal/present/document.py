@@ -44,11 +44,9 @@ class Words:
     indent: int = 0  # blanks in front of each of its lines
 
     def __str__(self) -> str:
-        """Return the text."""
         return self.text
 
     def __rich__(self) -> RenderableType:
-        """Return it as rich prints it."""
         text, start = Text(self.text), self.text.find(self.stressed)
         text.stylize(STYLES[self.tone], start, start + len(self.stressed or self.text))
         return Padding(text, (0, 0, 0, self.indent)) if self.indent else text
@@ -61,7 +59,6 @@ class Items:
     rows: tuple[str, ...]
 
     def __rich__(self) -> RenderableType:
-        """Return it as rich prints it."""
         return "\n".join(f"- {row}" for row in self.rows)
 
 
@@ -87,16 +84,57 @@ class Table:
         """Draw a rule below the rows so far."""
         self.ruled.add(len(self.rows))
 
-    def __rich__(self) -> RenderableType:
-        """Return it as rich prints it."""
-        if any(self.heads):
-            return WordTable(self)
-        out = RichTable.grid(padding=(0, 2), pad_edge=False)
-        out.add_column(no_wrap=True)
-        out.add_column(overflow="fold")
-        for what, said in self.rows:
-            out.add_row(Text(f"  {what}"), Text(said))
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Columns as wide as they want to be; where there is less room, lines break between words.
+
+        Columns of words (to the left) are narrowed down to their longest word, columns of numbers
+        down to their longest cell. Where even that does not fit, each row becomes a short list of
+        its cells, headed by the first one.
+        """
+        if not any(self.heads):
+            named = RichTable.grid(padding=(0, 2), pad_edge=False)
+            named.add_column(no_wrap=True)
+            named.add_column(overflow="fold")
+            for what, said in self.rows:
+                named.add_row(Text(f"  {what}"), Text(said))
+            yield named
+            return
+        least, wanted = [], []
+        for k, (head, *cells) in enumerate(zip(self.heads, *self.rows, strict=True)):
+            words = [word for cell in cells for word in cell.split()]
+            whole = words if k in self.left else cells  # what must not be broken
+            least.append(_longest(*head.split(), *whole))
+            wanted.append(max(least[-1], _longest(head, *cells)))
+        for gap in GAPS:
+            room = options.max_width - gap * (len(wanted) - 1)
+            if sum(wanted) <= room or (gap == GAPS[-1] and sum(least) <= room):
+                yield self._columns(gap, shared(least, wanted, room))
+                return
+        yield from self._lists()
+
+    def _columns(self, gap: int, widths: Sequence[int]) -> RichTable:
+        # one more blank than the padding is the column's edge
+        out = RichTable(
+            box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False, padding=(0, 1, 0, gap - 2)
+        )
+        for k, (name, width) in enumerate(zip(self.heads, widths, strict=True)):
+            side: Literal["left", "right"] = "left" if k in self.left else "right"
+            out.add_column(name, justify=side, overflow="fold", width=width)
+        for k, row in enumerate(self.rows):
+            if k in self.ruled and k:
+                out.add_section()
+            out.add_row(*row, style=STYLES[self.tones.get(k, "text")])
         return out
+
+    def _lists(self) -> RenderResult:
+        heads = [" ".join(head.split()) for head in self.heads]
+        for row in self.rows:
+            cells = [" ".join(cell.split()) for cell in row]
+            first = next((k for k, cell in enumerate(cells) if cell), 0)
+            yield Text(f"{heads[first]} {cells[first]}".strip(), style="bold")
+            for head, cell in list(zip(heads, cells, strict=True))[first + 1 :]:
+                if cell:
+                    yield Padding(Text(f"{head}: {cell}" if head else cell), (0, 0, 0, 2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,7 +147,6 @@ class Chart:
     height: int = 230
 
     def __rich__(self) -> RenderableType:
-        """Return the sentence that it shows."""
         return says(self.figure)
 
 
@@ -184,54 +221,6 @@ def captioned(blocks: Iterable[Block], caption: str = "") -> tuple[Block, ...]:
             block = replace(block, caption=title, heads=heads)
         out.append(block)
     return tuple(out)
-
-
-class WordTable(RichTable):
-    """Columns as wide as they want to be; where there is less room, lines break between words.
-
-    Columns of words (to the left) are narrowed down to their longest word, columns of numbers down
-    to their longest cell. Where even that does not fit, each row becomes a short list of its cells,
-    headed by the first one.
-    """
-
-    def __init__(self, of: Table) -> None:
-        """Take a table over."""
-        super().__init__(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
-        self._of = of
-        for k, name in enumerate(of.heads):
-            self.add_column(name, justify="left" if k in of.left else "right", overflow="fold")
-        for k, row in enumerate(of.rows):
-            if k in of.ruled and k:
-                self.add_section()
-            self.add_row(*row, style=STYLES[of.tones.get(k, "text")])
-
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Choose the widths for the room that there is."""
-        least, wanted = [], []
-        for k, (head, *cells) in enumerate(zip(self._of.heads, *self._of.rows, strict=True)):
-            words = [word for cell in cells for word in cell.split()]
-            whole = words if k in self._of.left else cells  # what must not be broken
-            least.append(_longest(*head.split(), *whole))
-            wanted.append(max(least[-1], _longest(head, *cells)))
-        for gap in GAPS:
-            room = options.max_width - gap * (len(wanted) - 1)
-            if sum(wanted) <= room or (gap == GAPS[-1] and sum(least) <= room):
-                self.padding = (0, 1, 0, gap - 2)  # one more blank is the column's edge
-                for column, width in zip(self.columns, shared(least, wanted, room), strict=True):
-                    column.width = width
-                yield from super().__rich_console__(console, options)
-                return
-        yield from self._lists()
-
-    def _lists(self) -> RenderResult:
-        heads = [" ".join(head.split()) for head in self._of.heads]
-        for row in self._of.rows:
-            cells = [" ".join(cell.split()) for cell in row]
-            first = next((k for k, cell in enumerate(cells) if cell), 0)
-            yield Text(f"{heads[first]} {cells[first]}".strip(), style="bold")
-            for head, cell in list(zip(heads, cells, strict=True))[first + 1 :]:
-                if cell:
-                    yield Padding(Text(f"{head}: {cell}" if head else cell), (0, 0, 0, 2))
 
 
 def shared(least: Sequence[int], wanted: Sequence[int], room: int) -> list[int]:

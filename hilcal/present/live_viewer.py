@@ -19,7 +19,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -27,7 +26,7 @@ from typing import IO, Any
 from hilcal.cell import Cell
 from hilcal.measuring.progress import ArmAt
 from hilcal.present.progress import Say
-from hilcal.present.story import Chapter, Story, build_story
+from hilcal.present.story import Chapter, build_story
 from hilcal.robot.arm import Arm
 from hilcal.store.plan import Plan, Step
 from hilcal.store.run_log import RunLog
@@ -44,13 +43,6 @@ class Measuring:
     plan: Plan
     earlier: tuple[tuple[float, Step], ...] = ()  # stored by earlier sessions, at times of day, s
     names: tuple[str, ...] = ()  # of the targets, where there are several
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Revised:
-    """A revision has been fitted and judged: the story has the readings, and it alone."""
-
-    story: Story
 
 
 PORT = 9877  # not 9876: there a viewer listens itself, and one that finds it taken opens no window
@@ -129,7 +121,7 @@ class LiveViewer:
     def revised(self, chapter: Chapter) -> None:
         """Tell a revision; what cannot be drawn is said, and nothing is raised."""
         try:
-            self._tell(time.time(), Revised(build_story([chapter])))
+            self._tell(time.time(), build_story([chapter]))
         except Exception as error:  # a picture must not cost the revision
             self._say(f"revision {chapter.number} is not in the live viewer: {error}")
 
@@ -181,19 +173,6 @@ class LiveViewer:
         if not self._closing:
             self._say("the live viewer has ended; everything else goes on")
         self._ready.set()
-
-
-class Several:
-    """A watcher that passes each event on to several."""
-
-    def __init__(self, watchers: Sequence[Any]) -> None:
-        """Pass on to these."""
-        self._watchers = watchers
-
-    def notify(self, event: object) -> None:
-        """Pass on."""
-        for watcher in self._watchers:
-            watcher.notify(event)
 
 
 def main() -> None:

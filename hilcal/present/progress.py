@@ -29,6 +29,7 @@ from hilcal.measuring.progress import (
     Question,
     ReadingStored,
     Remark,
+    Watcher,
 )
 from hilcal.names import escaped
 
@@ -144,30 +145,6 @@ def missed_words(status: GoalStatus, count: int) -> str:
     return f"{words}, {status.ratio:.2g} times what is asked for"
 
 
-class _Watcher:
-    """Tells a campaign line by line, with the seconds since the start; see `_Bar`."""
-
-    def __init__(self, console: Console) -> None:
-        self.console, self.begun = console, time.monotonic()
-
-    def notify(self, event: object) -> None:
-        """Take note."""
-        if isinstance(event, Phase):
-            self.tell(phase=event.text)
-        elif isinstance(event, Remark | GoalMet):
-            self.tell(note=f"note: {event.text if isinstance(event, Remark) else met_words(event)}")
-        elif isinstance(event, ReadingStored):
-            left = f"{spoken(event.left_real)} left" if event.left_real > 0 else ""
-            reading = f"{event.step}{figures(event)}"
-            self.tell(left=left, last=reading, done=event.done, total=event.total)
-
-    def tell(self, **what: Any) -> None:
-        """Print what goes on, what is to be noted, or the last reading."""
-        words = what.get("phase") or what.get("note") or "{done}/{total} {last}".format(**what)
-        left = f", {what['left']}" if what.get("left") else ""
-        _line(self.console, self.begun, f"{words}{left}", width=6)
-
-
 class _TwoLines(Progress):
     """The bar with what goes on, and below it the last reading: both fit 80 columns."""
 
@@ -178,19 +155,22 @@ class _TwoLines(Progress):
             yield Text(task.fields["last"], no_wrap=True, overflow="ellipsis")
 
 
-class _Bar(_Watcher):
-    """Keeps two lines up to date on a terminal; notes scroll by above them.
+class _Watcher:
+    """Keeps two lines up to date on a terminal, notes scroll by above them; else a line for each.
 
-    While somebody is asked a question they are gone, for their refresh would wipe it away.
+    While somebody is asked a question the two are gone, for their refresh would wipe it away.
+    `also` is told everything as well.
     """
 
-    def __init__(self, console: Console, total: int) -> None:
-        super().__init__(console)
+    def __init__(self, console: Console, total: int, also: Watcher | None) -> None:
+        self.console, self.begun, self._also = console, time.monotonic(), also
         self._now: dict[str, Any] = {"left": "", "last": "", "phase": "", "done": 0, "total": total}
         self._shown: _TwoLines | None = None
 
     def begin(self) -> None:
-        """Show the lines."""
+        """Show the lines, on a terminal."""
+        if not self.console.is_terminal:
+            return
         columns = (
             BarColumn(bar_width=20),
             MofNCompleteColumn(),
@@ -209,40 +189,48 @@ class _Bar(_Watcher):
 
     def notify(self, event: object) -> None:
         """Take note."""
+        if self._also is not None:
+            self._also.notify(event)
         if isinstance(event, Question):
             self.end()
-            if self._now["done"]:
+            if self.console.is_terminal and self._now["done"]:
                 left = f", {self._now['left']}" if self._now["left"] else ""
                 words = f"\n{self._now['done']} of {self._now['total']} readings are stored{left}."
                 self.console.print(words, style="dim", markup=False)
         elif isinstance(event, Answered):
             self.begin()
-        else:
-            super().notify(event)
+        elif isinstance(event, Remark | GoalMet):
+            text = f"note: {event.text if isinstance(event, Remark) else met_words(event)}"
+            if self.console.is_terminal:
+                self.console.print(text, markup=False, highlight=False)
+            else:
+                _line(self.console, self.begun, text, width=6)
+        elif isinstance(event, Phase):
+            self._tell(event.text, phase=event.text)
+        elif isinstance(event, ReadingStored):
+            left = f"{spoken(event.left_real)} left" if event.left_real > 0 else ""
+            last = f"{event.step}{figures(event)}"
+            words = f"{event.done}/{event.total} {last}{', ' * bool(left)}{left}"
+            self._tell(words, left=left, last=last, done=event.done, total=event.total)
 
-    def tell(self, **what: Any) -> None:
-        """Show what goes on and the last reading; print what is to be noted."""
-        if "note" in what:
-            self.console.print(what["note"], markup=False, highlight=False)
-            return
+    def _tell(self, words: str, **what: Any) -> None:
         self._now |= what
         if self._shown is not None:
             task = self._shown.task_ids[0]
             self._shown.update(task, completed=self._now["done"], **self._now)
+        elif not self.console.is_terminal:
+            _line(self.console, self.begun, words, width=6)
 
 
 @contextmanager
-def watching(console: Console, total: int) -> Iterator[_Watcher]:
-    """Yield a watcher that shows a campaign of so many readings."""
-    if not console.is_terminal:
-        yield _Watcher(console)
-        return
-    bar = _Bar(console, total)
-    bar.begin()
+def watching(console: Console, total: int, also: Watcher | None = None) -> Iterator[_Watcher]:
+    """Yield a watcher that shows a campaign of so many readings, and tells another one."""
+    watcher = _Watcher(console, total, also)
+    watcher.begin()
     try:
-        yield bar
+        yield watcher
     finally:
-        bar.end()
+        watcher.end()
 
 
 def figures(event: ReadingStored) -> str:

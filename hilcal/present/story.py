@@ -184,7 +184,6 @@ class Story:
         return self.pose_names[i] if self.pose_names else str(self.pose[i])
 
     def __len__(self) -> int:
-        """Return the number of readings N."""
         return len(self.pose)
 
 

@@ -200,8 +200,7 @@ def _alternative(a: Alternative) -> str:
 
 def _insufficient(d: Diagnosis) -> list[str]:
     lead, i = d.suspects[0], d.insufficiency
-    if i is None:
-        raise ValueError("a diagnosis of an insufficient catalogue without what it leaves")
+    assert i is not None  # noqa: S101  (by the reason)
     follows = f", and follow {' and '.join(d.follows)}" if d.follows else ""
     return [
         f"{lead.effect} explains {percent(lead.share)} of the misfit, but all effects of the "
@@ -249,8 +248,7 @@ def _no_suspect(d: Diagnosis) -> list[str]:
 
 def _pose_alone(d: Diagnosis) -> list[str]:
     a = d.pose_alone
-    if a is None:
-        raise ValueError("a diagnosis of a misfit by pose without its share")
+    assert a is not None  # noqa: S101  (by the reason)
     first, *rest = a.effects
     chance = "" if a.chance is None else f" with a chance of {percent(a.chance)}"
     others = f", or {' or '.join(rest[:2])}," if rest else ""
@@ -265,8 +263,7 @@ def _pose_alone(d: Diagnosis) -> list[str]:
 
 
 def _misjudged(d: Diagnosis) -> list[str]:
-    if d.noise is None:
-        raise ValueError("a diagnosis of misjudged noise without a judgement of the noise")
+    assert d.noise is not None  # noqa: S101  (by the reason)
     repeats = d.pure_error
     if d.scatter is not None and d.fit.readings.arm_scatter is None:
         return [
@@ -322,8 +319,7 @@ def _noise_place(repeats: PureError | None) -> list[str]:
 def _left_to_the_arm(d: Diagnosis) -> list[str]:
     """Say that what is left is the arm's repeatability, and that no effect is missing."""
     s = d.scatter
-    if s is None:
-        raise ValueError("a diagnosis of the arm's scatter without an estimate of it")
+    assert s is not None  # noqa: S101  (by the reason)
     predicted = "Nothing recorded predicts it (0 % on poses left out)."
     if s.predicted_share >= 0.005:
         by = " and ".join(s.predicted_by) or "what was recorded"

@@ -23,22 +23,13 @@ HERE = Path(__file__).parent
 
 
 @dataclass(frozen=True, slots=True)
-class Card:
-    """One number of the first screen: `label`, `value` with unit, and a note."""
-
-    label: str
-    value: str
-    note: str
-
-
-@dataclass(frozen=True, slots=True)
 class FirstScreen:
     """What the first screen says."""
 
     headline: str  # the verdict in a few words
     tone: str  # "good", "doubt" or "bad", for the colour; the headline says it in words
     answers: tuple[tuple[str, str], ...]  # question and answer
-    cards: tuple[Card, ...]  # before and after
+    cards: tuple[tuple[str, str, str], ...]  # numbers: label, value with unit, note
     limit: str = ""  # "PASSED" or "FAILED" and why; empty without a limit
     passed: bool | None = None  # whether the limit is kept; None without one
     verdict: str | None = None  # of the diagnosis; None where nothing was diagnosed

@@ -32,7 +32,7 @@ from hilcal.present.document import (
     load_name,
     table,
 )
-from hilcal.present.html import Card, FirstScreen, render
+from hilcal.present.html import FirstScreen, render
 from hilcal.present.html.report import identity
 
 if TYPE_CHECKING:
@@ -157,11 +157,11 @@ def comparison_screen(c: Comparison, earlier: str) -> FirstScreen:
     )
     largest = f"rms; largest {numbers.length(error.max_m)}"
     cards = [
-        Card("Error today", numbers.length(error.rms_m), largest),
-        Card("Expected", numbers.length(t.stated_m), "rms that the calibration states"),
+        ("Error today", numbers.length(error.rms_m), largest),
+        ("Expected", numbers.length(t.stated_m), "rms that the calibration states"),
     ]
     if t.drawing_m is not None:
-        cards.append(Card("Uncalibrated", numbers.length(t.drawing_m), "rms of the arm as drawn"))
+        cards.append(("Uncalibrated", numbers.length(t.drawing_m), "rms of the arm as drawn"))
     answers = (
         ("Is the calibration still good?", good),
         ("What has changed?", " ".join(map(sentence, found.found)) or f"{headline(c)}."),
@@ -195,8 +195,8 @@ def _fleet_screen(fleet: "Fleet") -> FirstScreen:
         headline = f"Unlike their type: {numbers.names(arms)}"
         todo = "Measure these arms again, and look at these joints."
     cards = (
-        Card("Arms", str(sum(len(t.arms) for t in fleet.types)), "that were pooled"),
-        Card("Campaigns", str(len(fleet.members)), f"used; not used: {len(fleet.failures)}"),
+        ("Arms", str(sum(len(t.arms) for t in fleet.types)), "that were pooled"),
+        ("Campaigns", str(len(fleet.members)), f"used; not used: {len(fleet.failures)}"),
     )
     answers = (
         ("Which arms are unlike, and by how much?", "; ".join(map(unlike_words, odd)) or "None."),

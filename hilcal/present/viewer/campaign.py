@@ -28,7 +28,7 @@ from hilcal.present.viewer.recording import along, fixed
 from hilcal.robot.body import capsules
 from hilcal.types import Floats, Ints
 
-FOLLOWS = "What the residual follows (axes: Details)"
+FOLLOWS = "What the residual follows"
 LAW = "Law beyond the catalogue: blue readings, green law"
 ERRORS = "Error of each revision [µm]: blue fitted, pink left out, red largest, green noise"
 SERIES = {
@@ -69,7 +69,7 @@ is the worst reading; the order in µm can be another, where some readings are n
 in µm, against the noise. Left-out error far above the fitted one = too many parameters.
 
 **What the residual follows**: its mean over the leading suspect, or, where that explains little of
-it, over the recorded variable that carries most of it; *Details* names both axes.
+it, over the recorded variable that carries most of it; the line above names both axes.
 """
 
 
@@ -97,10 +97,8 @@ def serve(story: Story, ip: str = "127.0.0.1", port: int = PORT) -> Iterator[str
     """
     at = f"viewer server {ip}:{port}"
     recording.disable_analytics()
-    try:
-        recording.bind(ip, port)
-    except (OSError, OverflowError) as error:
-        raise InputError(f"{at}: {error}; choose a free port of this machine") from error
+    if (why := recording.refused(ip, port)) is not None:
+        raise InputError(f"{at}: {why}; choose a free port of this machine")
     try:
         rec = _opened(story)
         rec.set_sinks(rr.GrpcServerSink(bind_ip=ip, port=port))
@@ -190,12 +188,12 @@ def blueprint(story: Story) -> rrb.Blueprint:
         rrb.Tabs(_bars("errors", ERRORS), _bars("bars", bars)),
         row_shares=[11, 4],
     )
-    laws = [_bars("law", LAW)] if any(r.laws for r in story.revisions) else []
+    laws = [_curve_view("law", LAW)] if any(r.laws for r in story.revisions) else []
     words = (("verdict", "Verdict"), ("details", "Details"), ("guide", "How to read this"))
     right = rrb.Vertical(
         rrb.Tabs(*(style.text(of, name) for of, name in words)),
         rrb.Tabs(
-            _bars("follows", FOLLOWS),
+            _curve_view("follows", FOLLOWS),
             *laws,
             style.text("parameters", "Parameters ± σ"),
             style.text("revisions", "Table"),
@@ -234,8 +232,15 @@ def _view3d(story: Story, name: str, without: str) -> rrb.Spatial3DView:
     return style.view3d("world", name, place, middle, contents)
 
 
-def _bars(origin: str, name: str) -> rrb.BarChartView:
-    return rrb.BarChartView(origin=origin, name=name, plot_legend=rrb.PlotLegend(visible=False))
+def _bars(origin: str, name: str, titlebar: bool = True) -> rrb.BarChartView:
+    quiet = rrb.PlotLegend(visible=False)
+    return rrb.BarChartView(origin=origin, name=name, plot_legend=quiet, titlebar=titlebar)
+
+
+def _curve_view(entity: str, name: str) -> rrb.Vertical:
+    """Return the bars of a curve below its axes in words, for which a bar chart has no place."""
+    axes = rrb.TextDocumentView(origin=f"words/{entity}", name=f"{name}: axes", titlebar=False)
+    return rrb.Vertical(axes, _bars(entity, name, titlebar=False), row_shares=[1, 6], name=name)
 
 
 def _error_bars(rec: rr.RecordingStream, story: Story) -> None:
@@ -252,9 +257,9 @@ def _error_bars(rec: rr.RecordingStream, story: Story) -> None:
 def _curve_bars(rec: rr.RecordingStream, entity: str, c: DependenceCurve | None) -> None:
     """Log a curve, readings by their mean in bins, as bars, and beside each that of the law."""
     bars: dict[str, Floats] = {}
-    edges = np.zeros(0)
+    edges, axes = np.zeros(0), "Nothing is drawn of this revision."
     if c is not None and len(c.x):
-        x, y = c.x, c.y
+        x, y, axes = c.x, c.y, f"Vertical: {c.y_label}; horizontal: {c.x_label}."
         if c.error is None:
             order = np.argsort(x, kind="stable")
             bins = np.array_split(order, min(_BINS, max(1, len(order) // 4)))
@@ -267,6 +272,7 @@ def _curve_bars(rec: rr.RecordingStream, entity: str, c: DependenceCurve | None)
         gaps = np.diff(at) if len(at) > 1 else np.ones(1)
         wide = np.concatenate([at[:1] - gaps[:1], at, at[-1:] + gaps[-1:]])
         edges = 0.5 * (wide[1:] + wide[:-1])
+    rec.log(f"words/{entity}", style.document(style.markdown([axes])))
     for k, (part, color) in enumerate((("mean", style.MEASURED), ("law", style.NOISE))):
         if part not in bars:
             rec.log(f"{entity}/{part}", rr.Clear(recursive=False))

@@ -2,7 +2,6 @@
 
 import math
 import re
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -41,55 +40,39 @@ GUIDE = """### How to read this
 """
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class DrawnType:
-    """One type of a fleet; A arms, K pooled parameters, C campaigns."""
+    """What the views of a type need; A arms, K pooled parameters, C campaigns of `members`."""
 
-    pooled: "Pooled"
-    arm: Arm  # its links, for drawing
-    odd: Bools  # (A, K) what is unlike the type
-    owner: tuple[int, ...]  # (C,) arm of each campaign
-    seconds: Floats  # (C,) when it was measured, since 1970
-    campaigns: Floats
-    """(C, K) distance of each campaign from the mean of the type, in σ: the root of the spread from
-    arm to arm and its own uncertainty; NaN where it tells nothing."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """(K,) names of the parameters."""
-        return tuple(p.parameter for p in self.pooled.parameters)
-
-    @property
-    def joints(self) -> tuple[int, ...]:
-        """(K,) joint that a parameter is of, from 1; 0 for none."""
-        return tuple(int(found[1]) if (found := _JOINT.search(n)) else 0 for n in self.names)
-
-    @property
-    def reach(self) -> float:
-        """The arms' reach, m: sizes are drawn by it."""
-        return max(self.arm.reach, 0.1)
-
-
-def drawn_type(t: "Pooled", members: "tuple[Member, ...]") -> DrawnType:
-    """Derive what the views of a type need."""
-    names, arms = [p.parameter for p in t.parameters], list(t.arms)
-    of_type = [m for m in members if m.type == t.type and m.name in t.campaigns]
-    of_type.sort(key=lambda m: (arms.index(m.arm), seconds_of(m.date)))
-    campaigns = np.full((len(of_type), len(names)), np.nan)
-    for row, m in zip(campaigns, of_type, strict=True):
-        p = m.posterior
-        for name, value, std in zip(p.names, p.mean, p.std, strict=True):
-            if name in names and np.isfinite(std):
-                of = t.parameters[k := names.index(name)]
-                row[k] = (value - of.mean) / np.hypot(of.between, std)
-    odd = np.zeros((len(arms), len(names)), dtype=np.bool_)
-    for o in t.odd:
-        odd[arms.index(o.arm), names.index(o.parameter)] = True
-    n = len(t.prior.links) - 1  # an arm that has the links of the type, and nothing else
-    none, wide, joints = np.zeros(n), np.full(n, np.inf), tuple(f"j{k + 1}" for k in range(n))
-    arm = Arm(t.type, t.prior.links, none, np.zeros((n, 3)), -wide, wide, wide, 0.0, joints, "")
-    owner = tuple(arms.index(m.arm) for m in of_type)
-    return DrawnType(t, arm, odd, owner, np.array([seconds_of(m.date) for m in of_type]), campaigns)
+    def __init__(self, pooled: "Pooled", members: "tuple[Member, ...]") -> None:
+        arms, links = list(pooled.arms), pooled.prior.links
+        self.pooled, self.names = pooled, tuple(p.parameter for p in pooled.parameters)  # (K,)
+        # (K,) joint that a parameter is of, from 1; 0 for none
+        found = [_JOINT.search(name) for name in self.names]
+        self.joints = tuple(0 if of is None else int(of[1]) for of in found)
+        n = len(links) - 1  # an arm that has the links of the type, and nothing else
+        none, wide, joints = np.zeros(n), np.full(n, np.inf), tuple(f"j{k + 1}" for k in range(n))
+        self.arm = Arm(
+            pooled.type, links, none, np.zeros((n, 3)), -wide, wide, wide, 0.0, joints, ""
+        )
+        self.reach = max(self.arm.reach, 0.1)  # m: sizes are drawn by it
+        # (A, K) what is unlike the type
+        self.odd: Bools = np.zeros((len(arms), len(self.names)), dtype=np.bool_)
+        for o in pooled.odd:
+            self.odd[arms.index(o.arm), self.names.index(o.parameter)] = True
+        of_type = [m for m in members if m.type == pooled.type and m.name in pooled.campaigns]
+        of_type.sort(key=lambda m: (arms.index(m.arm), seconds_of(m.date)))
+        # (C,) arm of each campaign, and when it was measured, s since 1970
+        self.owner = np.array([arms.index(m.arm) for m in of_type], dtype=np.int64)
+        self.seconds = np.array([seconds_of(m.date) for m in of_type])
+        # (C, K) distance of each campaign from the mean of the type, in σ: the root of the spread
+        # from arm to arm and its own uncertainty; NaN where it tells nothing
+        self.campaigns = np.full((len(of_type), len(self.names)), np.nan)
+        for row, m in zip(self.campaigns, of_type, strict=True):
+            p = m.posterior
+            for name, value, std in zip(p.names, p.mean, p.std, strict=True):
+                if name in self.names and np.isfinite(std):
+                    mean = pooled.parameters[k := self.names.index(name)]
+                    row[k] = (value - mean.mean) / np.hypot(mean.between, std)
 
 
 def places(d: DrawnType) -> Floats:
@@ -157,10 +140,9 @@ def _rows(d: DrawnType) -> list[int]:
 
 def _drift(rec: rr.RecordingStream, path: str, d: DrawnType) -> None:
     """Send each arm's campaigns along `date`, a view per parameter."""
-    owner = np.array(d.owner)
     for k in _rows(d):
         for a, arm in enumerate(d.pooled.arms):
-            known = (owner == a) & np.isfinite(d.campaigns[:, k])
+            known = (d.owner == a) & np.isfinite(d.campaigns[:, k])
             if not known.any():
                 continue
             odd = bool(d.odd[a, k])
@@ -178,7 +160,7 @@ def record_fleet(fleet: "Fleet", path: Path) -> None:
         InputError: the folder is missing.
         HilcalError: the file cannot be written.
     """
-    types = [drawn_type(t, fleet.members) for t in fleet.types]
+    types = [DrawnType(t, fleet.members) for t in fleet.types]
     names = [(d.pooled.type, d.pooled.arms, d.pooled.odd, d.names) for d in types]
     content = (a for d in types for a in (d.pooled.distance, d.seconds, d.campaigns))
     rec = recording.opened(names, *content)

@@ -5,11 +5,11 @@ import math
 import pickle
 import threading
 import uuid
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from datetime import timedelta
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 import rerun as rr
@@ -21,7 +21,7 @@ from hilcal import numbers
 from hilcal.errors import HilcalError, InputError
 from hilcal.measuring.progress import ArmAt, GoalMet, LiveResidual, Phase, ReadingStored, Remark
 from hilcal.present.document import Block, Items, heading, table
-from hilcal.present.live_viewer import Measuring, Revised
+from hilcal.present.live_viewer import Measuring
 from hilcal.present.progress import figures, met_words, spoken, status_words
 from hilcal.present.story import LIMITS, Story, levels
 from hilcal.present.viewer import campaign, recording, style
@@ -97,10 +97,6 @@ class LiveJudgement:
         """0 inside the noise, 1 beyond 99 %, 2 beyond 99.99 %."""
         return int(levels(np.array([self.norm2]))[0])
 
-    def __str__(self) -> str:
-        """Return the residual for people, with its size in σ."""
-        return f"{numbers.length(self.length)} ({self.sigma:.1f} σ)"
-
 
 def judged(step: Step, live: LiveResidual, target: str = "") -> LiveJudgement | None:
     """Return a reading as `LiveJudgement`; None where it was not compared."""
@@ -110,52 +106,34 @@ def judged(step: Step, live: LiveResidual, target: str = "") -> LiveJudgement | 
     return LiveJudgement(step, target, float(np.linalg.norm(r)), float(r @ np.linalg.solve(v, r)))
 
 
-@dataclass(slots=True, eq=False)
 class LiveTally:
-    """A campaign that is being measured."""
+    """A campaign that is being measured: it begins, or goes on."""
 
-    measured: Measuring
-    bodies: Floats  # (P, n + 2, 4, 4) poses of the arm's bodies at each pose of the plan
-    anchor: dict[str, Floats]  # (T, 3) nominal positions of the targets by pose, base axes, m
-    done: int = 0  # readings that are stored
-    left: float = 0.0  # real seconds that the rest takes
-    phase: str = ""
-    last: ReadingStored | None = None
-    judged: int = 0  # how many readings were compared with a model
-    outside: int = 0  # of these how many are outside their ball
-    loads: dict[str, list[int]] = field(default_factory=dict)  # both by load
-    worst: list[LiveJudgement] = field(default_factory=list)  # farthest from the model
-    remarks: list[str] = field(default_factory=list)  # newest last
-    group_worst: float = 0.0  # largest `LiveJudgement.norm2` of the group that is being measured
-
-    @classmethod
-    def of(cls, measured: Measuring) -> "LiveTally":
-        """Return that of a campaign that begins, or goes on."""
-        bodies = body_poses(measured.arm, measured.plan.q)
-        flange = bodies[:, -1]
+    def __init__(self, measured: Measuring) -> None:
+        plan, self.measured = measured.plan, measured
+        # (P, n + 2, 4, 4) poses of the arm's bodies at each pose of the plan
+        self.bodies = body_poses(measured.arm, plan.q)
+        flange = self.bodies[:, -1]
         at = flange[:, None, :3, 3] + np.einsum("pij,tj->pti", flange[:, :3, :3], measured.targets)
-        anchor = dict(zip(measured.plan.pose_names, at, strict=True))
-        return cls(measured, bodies, anchor, len({step for _, step in measured.earlier}))
-
-    @property
-    def total(self) -> int:
-        """Readings that are planned."""
-        return len(self.measured.plan.steps)
-
-    @property
-    def group(self) -> int:
-        """Residuals, one after the other, of which a viewer keeps those that stand out; 1: all."""
-        planned = self.total * len(self.measured.targets)
-        return 1 if planned <= FLUENT else math.ceil(planned / GROUPS)
-
-    @property
-    def targets(self) -> Floats:
-        """(K, 3) nominal positions of the targets in all poses, m."""
-        return np.concatenate(list(self.anchor.values()))
+        # nominal positions of the targets, base axes, m: (K, 3) in all poses, (T, 3) by pose
+        self.targets, self._anchor = at.reshape(-1, 3), dict(zip(plan.pose_names, at, strict=True))
+        # readings that are planned, and stored; real seconds that the rest takes
+        self.total, self.done = len(plan.steps), len({step for _, step in measured.earlier})
+        self.left, self.phase = 0.0, ""
+        self.last: ReadingStored | None = None
+        # readings that were compared with a model, and how many of them are outside their ball
+        self.judged, self.outside = 0, 0
+        self.loads: dict[str, list[int]] = {}  # both by load
+        self.worst: list[LiveJudgement] = []  # farthest from the model
+        self.remarks: list[str] = []  # newest last
+        # residuals, one after the other, of which a viewer keeps those that stand out; 1: all
+        planned = self.total * len(measured.targets)
+        self.group = 1 if planned <= FLUENT else math.ceil(planned / GROUPS)
+        self._group_worst = 0.0  # largest `LiveJudgement.norm2` of the present group
 
     def place(self, step: Step, target: int = 0) -> Floats:
         """(3,) where the nominal arm holds a target, m."""
-        return np.asarray(self.anchor[step.pose][target])
+        return np.asarray(self._anchor[step.pose][target])
 
     def add(self, event: ReadingStored) -> list[tuple[int, LiveResidual, LiveJudgement | None]]:
         """Take note of a reading; returns each target's residual, judged where there is a model."""
@@ -172,8 +150,8 @@ class LiveTally:
         compared, beyond = self.loads.get(step.load, (0, 0))
         self.loads[step.load] = [compared + 1, beyond + outside]
         self.worst = sorted([*self.worst, j], key=lambda other: -other.norm2)[:WORST]
-        j = replace(j, stands_out=begins or j.norm2 > self.group_worst)
-        self.group_worst = max(j.norm2, 0.0 if begins else self.group_worst)
+        j = replace(j, stands_out=begins or j.norm2 > self._group_worst)
+        self._group_worst = max(j.norm2, 0.0 if begins else self._group_worst)
         return j
 
     @property
@@ -256,7 +234,7 @@ class LiveScene:
         self._passed: list[tuple[float, tuple[float, ...]]] = []
         self._since = 0  # those of them that came before the last reading
         self._now: LiveTally | None = None
-        self._acts = 0
+        self._acts, self._world, self._series = 0, "", ""  # campaigns so far; entities of the last
         self._story: Story | None = None
         self._titles: tuple[str, ...] = ()
 
@@ -270,8 +248,8 @@ class LiveScene:
         if isinstance(what, Measuring):
             self.settle()
             self._measuring(wall, what)
-        elif isinstance(what, Revised):
-            self._revised(what.story)
+        elif isinstance(what, Story):
+            self._revised(what)
         elif self._now is not None:
             self._event(self._now, what)
 
@@ -297,17 +275,11 @@ class LiveScene:
     def _show(self, views: rrb.Blueprint) -> None:
         self._rec.send_blueprint(views, make_active=True, make_default=True)
 
-    @property
-    def _world(self) -> str:
-        return f"world/live/{self._acts}"
-
-    @property
-    def _series(self) -> str:
-        return f"live/{self._acts}"
-
     def _measuring(self, wall: float, what: Measuring) -> None:
-        rec, d = self._rec, LiveTally.of(what)
+        rec, d = self._rec, LiveTally(what)
         self._acts, self._now = self._acts + 1, d
+        self._series = f"live/{self._acts}"
+        self._world = f"world/{self._series}"
         rec.send_recording_name(f"hilcal: {style.safe(what.name)}")
         fixed(rec, "world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
         self._arm = style.MovingArm(rec, f"{self._world}/arm", what.arm, what.targets)
@@ -383,21 +355,20 @@ class LiveScene:
             dot = rr.Points3D(dots, colors=[style.MEASURED], radii=[0.01])
             rec.log(f"{self._world}/dots", dot)
         if arrows:
-            rec.log(f"{self._world}/arrows", _arrows(arrows))
+            rec.log(f"{self._world}/arrows", style.residual_arrows(*zip(*arrows, strict=True)))
         if balls:
             rec.log(f"{self._world}/balls", style.noise_balls(balls, [[BALL] * 3] * len(balls)))
         if now and d.group > 1:  # the last reading, drawn until the next one comes
-            rec.log(f"{self._world}/now/arrow", _arrows(now))
-            rec.log(
-                f"{self._world}/now/ball",
-                style.noise_balls([at for at, *_ in now], [[BALL] * 3] * len(now)),
-            )
+            ball = style.noise_balls([at for at, *_ in now], [[BALL] * 3] * len(now))
+            rec.log(f"{self._world}/now/arrow", style.residual_arrows(*zip(*now, strict=True)))
+            rec.log(f"{self._world}/now/ball", ball)
         if d.judged > before and not (self._batches and before):
             rec.log(f"{self._series}/limit", rr.Scalars(LIMIT))
         target, _, worst = max(read, key=lambda r: -1.0 if r[2] is None else r[2].norm2)
         words = f"{event.step.pose}, {event.step.load}"
         if worst is not None:
-            words += f"{', ' * bool(worst.target)}{worst.target}: {worst}"
+            size = f"{numbers.length(worst.length)} ({worst.sigma:.1f} σ)"
+            words += f"{', ' * bool(worst.target)}{worst.target}: {size}"
         at = d.place(event.step, target) + _ABOVE
         rec.log(f"{self._world}/last", style.labels([at], [words]))
 
@@ -425,20 +396,16 @@ class LiveScene:
             self._titles = titles
 
 
-def _arrows(of: Sequence[tuple[Floats, Floats, int]]) -> rr.Arrows3D:
-    """Return arrows that begin at places, m, with their levels."""
-    return style.residual_arrows(*zip(*of, strict=True))
-
-
 def follow(messages: BinaryIO, reply: Callable[..., None], record: Path, port: int) -> None:
     """Show what pickled (time of day, s; event) tell, in a file and at a free port from `port`."""
     identifier = str(uuid.uuid4())
     outlets = [_Outlet(identifier, reply, f"recording {record}", file=record)]
     with contextlib.suppress(OSError):
         recording.disable_analytics()
-    free = next((p for p in range(port, port + PORTS) if recording.free("127.0.0.1", p)), None)
+    ports = range(port, port + PORTS)
+    free = next((p for p in ports if recording.refused("127.0.0.1", p) is None), None)
     if free is None:
-        reply(problem=f"no free port from {port} to {port + PORTS - 1}: no live viewer is served")
+        reply(problem=f"no free port from {port} to {ports[-1]}: no live viewer is served")
         reply(url=None)
     else:
         outlets.append(_Outlet(identifier, reply, f"live viewer at port {free}", port=free))
@@ -471,20 +438,19 @@ class _Outlet:
         config = rr.ChunkBatcherConfig(flush_tick=timedelta(days=1)) if file else None
         self._rec = recording.stream(identifier, config)
         try:
-            served: dict[str, Any] = {
-                "bind_ip": "127.0.0.1",
-                "port": port,
-                "server_memory_limit": MEMORY,
-            }
-            self._rec.set_sinks(rr.FileSink(str(file)) if file else rr.GrpcServerSink(**served))
-            self._scene = LiveScene(self._rec, batches=self._file is not None)
+            self._rec.set_sinks(
+                rr.FileSink(str(file))
+                if file
+                else rr.GrpcServerSink("127.0.0.1", port, server_memory_limit=MEMORY)
+            )
+            self._scene = LiveScene(self._rec, batches=file is not None)
         except (OSError, RuntimeError, ValueError) as error:
             self._fail(error)
 
     def tell(self, wall: float, what: object) -> None:
         """Draw what happened, and hand it on: now, or with what comes next."""
         whole = not isinstance(what, ArmAt)  # places of the arm go on in batches
-        now = isinstance(what, Measuring | Revised)
+        now = isinstance(what, Measuring | Story)
         self._draw(lambda scene: scene.tell(wall, what), whole, now)
 
     def _draw(self, draw: Callable[[LiveScene], None], whole: bool, now: bool) -> None:

@@ -1,6 +1,5 @@
 """A plan in rerun, before anything is measured: the cell at each step, and the plan in words."""
 
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -17,7 +16,7 @@ from hilcal.design.run_order import pace, timeline
 from hilcal.design.summary import PlanSummary
 from hilcal.errors import InputError
 from hilcal.measuring.clearance import TRACKER_UNKNOWN as NO_TRACKER
-from hilcal.measuring.clearance import Clearance, LineOfSight
+from hilcal.measuring.clearance import Clearance
 from hilcal.measuring.route import route
 from hilcal.present import plan as plan_blocks
 from hilcal.present.document import Block, Words, heading, load_name, pairs, table
@@ -28,7 +27,7 @@ from hilcal.robot import body
 from hilcal.robot import chain as chains
 from hilcal.robot.body import body_poses
 from hilcal.store.plan import UNLOADED, Plan
-from hilcal.types import Bools, Floats, Ints
+from hilcal.types import Floats, Ints
 
 SEEN, TURNED, HIDDEN, UNKNOWN = range(4)
 """Does the tracker see the target: yes; it is turned too far away; something is between; not
@@ -81,114 +80,89 @@ load changes by hand.
 """
 
 
-@dataclass(frozen=True, eq=False)
 class PlanView:
     """A plan in its cell: where everything is at each of its S steps, base axes, SI.
+
+    `powers` are those of the suspects that the plan separates, pair by pair.
 
     Raises:
         InputError: the plan's poses do not have as many joints as the arm.
     """
 
-    cell: Cell
-    config: CellConfig  # its loads, obstacles, limits and sight
-    plan: Plan
-    summary: PlanSummary
-    powers: tuple[PairPower, ...] = ()  # of the suspects that the plan separates, pair by pair
-
-    def __post_init__(self) -> None:
-        """Refuse a plan of another arm."""
-        joints, arm = self.plan.q.shape[1], self.cell.arm
-        if joints != arm.n:
+    def __init__(
+        self,
+        cell: Cell,
+        config: CellConfig,
+        plan: Plan,
+        summary: PlanSummary,
+        powers: tuple[PairPower, ...] = (),
+    ) -> None:
+        arm, loads, steps = cell.arm, plan.loads, plan.steps
+        if plan.q.shape[1] != arm.n:
             raise InputError(
-                f"the plan has {joints} joint angles per pose; {arm.name} has {arm.n} joints"
+                f"the plan has {plan.q.shape[1]} joint angles per pose; {arm.name} has {arm.n} "
+                "joints"
             )
-
-    def __len__(self) -> int:
-        """Return the number of steps."""
-        return len(self.plan.steps)
-
-    @cached_property
-    def shapes(self) -> Clearance:
-        """Shapes of arm, tool, obstacles and loads, as collisions are checked."""
-        return Clearance(self.cell, self.config)
-
-    @cached_property
-    def _view(self) -> LineOfSight | None:
-        return self.shapes.sight
-
-    @property
-    def tracker(self) -> Floats | None:
-        """(3,) where the tracker stands; None where that is not known."""
-        return None if self._view is None else self._view.tracker
-
-    @cached_property
-    def load(self) -> Ints:
-        """(S,) index into the loads of the plan."""
-        names = self.plan.loads
-        return np.array([names.index(s.load) for s in self.plan.steps], dtype=np.int64)
-
-    @cached_property
-    def pose(self) -> Ints:
-        """(S,) index of the step's pose."""
-        row = {name: k for k, name in enumerate(self.plan.pose_names)}
-        return np.array([row[s.pose] for s in self.plan.steps], dtype=np.int64)
-
-    @property
-    def q(self) -> Floats:
-        """(S, n) joint angles, rad."""
-        return self.plan.q[self.pose]
-
-    @cached_property
-    def bodies(self) -> Floats:
-        """(S, n + 2, 4, 4) poses of base, bodies and flange."""
-        return body_poses(self.cell.arm, self.q)
-
-    @cached_property
-    def target(self) -> Floats:
-        """(S, 3) the target, or the flange where its place is not known."""
-        return chains.evaluate(self.cell.arm, self.q).point(self.cell.target[:3, 3])
-
-    @cached_property
-    def incidence(self) -> Floats | None:
-        """(S,) angle between the target's normal and the beam; None where not given."""
-        return None if self._view is None else self._view.incidence(self.q)
-
-    @cached_property
-    def sight(self) -> Ints:
-        """(S,) `SEEN` and so on."""
-        if self._view is None:
-            return np.full(len(self), UNKNOWN)
-        free = np.zeros(len(self), dtype=np.bool_)
-        for k, name in enumerate(self.plan.loads):
-            free[self.load == k] = self._view.free(self.q[self.load == k], name)
-        angle, most = self.incidence, self.config.sight.incidence_max_rad
-        turned = np.zeros(len(self), dtype=np.bool_) if angle is None else angle > most
-        return np.where(~free, HIDDEN, np.where(turned, TURNED, SEEN)).astype(np.int64)
-
-    @property
-    def unseen(self) -> Bools:
-        """(S,) steps whose target the tracker does not see."""
-        return np.asarray((self.sight == TURNED) | (self.sight == HIDDEN))
-
-    def why(self, step: int) -> str:
-        """Return why the target is not seen at a step; empty where it is."""
-        if self._view is None or self.sight[step] == SEEN:
-            return ""
-        q, load = self.q[step : step + 1], self.plan.loads[self.load[step]]
-        problems = self._view.problems(q, load, "")
-        if words := "; ".join(line.removeprefix(": ") for line in problems):
-            return words
-        hidden = self._view.hidden(q, load)  # some of several targets
-        return f"hidden: {', '.join(self.cell.target_names[k] for k in hidden)}"
-
-    @cached_property
-    def rank(self) -> Ints:
-        """(S,) how many other loads are measured before in the same pose: its bead's place."""
+        self.cell, self.config, self.plan = cell, config, plan
+        self.summary, self.powers = summary, powers
+        self.reach = max(arm.reach, 0.1)  # m: sizes are drawn by it
+        self.shapes = Clearance(cell, config)  # as collisions are checked
+        self.view = self.shapes.sight
+        # (3,) where the tracker stands; None where that is not known
+        self.tracker = None if self.view is None else self.view.tracker
+        # (S,) index of the load and of the pose, joint angles (S, n), rad, and number, from 1
+        self.load: Ints = np.array([loads.index(s.load) for s in steps], dtype=np.int64)
+        row = {name: k for k, name in enumerate(plan.pose_names)}
+        self.pose: Ints = np.array([row[s.pose] for s in steps], dtype=np.int64)
+        self.q = plan.q[self.pose]
+        self.steps = rr.TimeColumn("step", sequence=np.arange(1, len(self) + 1))
+        # (S, n + 2, 4, 4) base, bodies and flange; (S, 3) the target, or the flange where its
+        # place is not known
+        self.bodies = body_poses(arm, self.q)
+        self.target = chains.evaluate(arm, self.q).point(cell.target[:3, 3])
+        # (S,) angle between the target's normal and the beam; None where not given
+        self.incidence = None if self.view is None else self.view.incidence(self.q)
+        self.sight = self._sight()
+        self.unseen = np.isin(self.sight, (TURNED, HIDDEN))  # (S,)
+        # (S,) how many other loads are measured before in the same pose: its bead's place
         order: dict[int, list[int]] = {}
         pairs = list(zip(self.pose.tolist(), self.load.tolist(), strict=True))
         for p, k in dict.fromkeys(pairs):
             order.setdefault(p, []).append(k)
-        return np.array([order[p].index(k) for p, k in pairs], dtype=np.int64)
+        self.rank: Ints = np.array([order[p].index(k) for p, k in pairs], dtype=np.int64)
+        # (S,) middle of each reading since the start, s
+        margin = config.limits.joint_margin_rad
+        self.time = timeline(plan, arm, margin, pace(config))[1]
+        # (L, 3) a colour of each load; beyond seven, the same again and darker
+        hung = [name for name in loads if name != UNLOADED]
+        rgb = {n: _LOADS[k % 7] * _FADED ** (k // 7) for k, n in enumerate(hung)}
+        each = [rgb.get(n, np.array(_UNLOADED)) for n in loads]
+        self.colors = np.array(each).round().astype(np.uint8)
+
+    def __len__(self) -> int:
+        return len(self.plan.steps)
+
+    def _sight(self) -> Ints:
+        """(S,) `SEEN` and so on."""
+        if self.view is None:
+            return np.full(len(self), UNKNOWN)
+        free = np.zeros(len(self), dtype=np.bool_)
+        for k, name in enumerate(self.plan.loads):
+            free[self.load == k] = self.view.free(self.q[self.load == k], name)
+        angle, most = self.incidence, self.config.sight.incidence_max_rad
+        turned = np.zeros(len(self), dtype=np.bool_) if angle is None else angle > most
+        return np.where(~free, HIDDEN, np.where(turned, TURNED, SEEN)).astype(np.int64)
+
+    def why(self, step: int) -> str:
+        """Return why the target is not seen at a step; empty where it is."""
+        if self.view is None or self.sight[step] == SEEN:
+            return ""
+        q, load = self.q[step : step + 1], self.plan.loads[self.load[step]]
+        problems = self.view.problems(q, load, "")
+        if words := "; ".join(line.removeprefix(": ") for line in problems):
+            return words
+        hidden = self.view.hidden(q, load)  # some of several targets
+        return f"hidden: {', '.join(self.cell.target_names[k] for k in hidden)}"
 
     @cached_property
     def ways(self) -> tuple[Floats, ...]:
@@ -205,30 +179,6 @@ class PlanView:
         chain = chains.evaluate(self.cell.arm, np.vstack(joined))
         ends = np.cumsum([len(leg) for leg in joined])[:-1]
         return tuple(np.split(chain.point(self.cell.target[:3, 3]), ends))
-
-    @cached_property
-    def time(self) -> Floats:
-        """(S,) middle of each reading since the start, s."""
-        margin = self.config.limits.joint_margin_rad
-        return timeline(self.plan, self.cell.arm, margin, pace(self.config))[1]
-
-    @property
-    def reach(self) -> float:
-        """The arm's reach, m: sizes are drawn by it."""
-        return max(self.cell.arm.reach, 0.1)
-
-    @property
-    def steps(self) -> rr.TimeColumn:
-        """(S,) numbers of the steps on the timeline, from 1."""
-        return rr.TimeColumn("step", sequence=np.arange(1, len(self) + 1))
-
-    @cached_property
-    def colors(self) -> "np.ndarray[tuple[int, ...], np.dtype[np.uint8]]":
-        """(L, 3) a colour of each load; beyond seven, the same again and darker."""
-        hung = [name for name in self.plan.loads if name != UNLOADED]
-        rgb = {n: _LOADS[k % 7] * _FADED ** (k // 7) for k, n in enumerate(hung)}
-        each = [rgb.get(n, np.array(_UNLOADED)) for n in self.plan.loads]
-        return np.array(each).round().astype(np.uint8)
 
 
 def _static_scene(rec: rr.RecordingStream, d: PlanView) -> None:

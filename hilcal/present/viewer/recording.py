@@ -22,20 +22,15 @@ _FLUSH_TIMEOUT = 10.0
 _LOG = logging.getLogger(__name__)
 
 
-def bind(ip: str, port: int) -> None:
-    """Bind a port and let it go, or raise OSError: the server itself would only log it."""
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        probe.bind((ip, port))
-
-
-def free(ip: str, port: int) -> bool:
-    """Return whether a port can be bound."""
+def refused(ip: str, port: int) -> Exception | None:
+    """Return why a port cannot be bound; None where it can. A server itself would only log it."""
     try:
-        bind(ip, port)
-    except (OSError, OverflowError):
-        return False
-    return True
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind((ip, port))
+    except (OSError, OverflowError) as error:
+        return error
+    return None
 
 
 def opened(*content: object) -> rr.RecordingStream:

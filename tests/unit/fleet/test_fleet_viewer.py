@@ -5,7 +5,7 @@ import pytest
 import rerun as rr
 
 from hilcal.present.viewer import style
-from hilcal.present.viewer.fleet import drawn_type, places, record_fleet
+from hilcal.present.viewer.fleet import DrawnType, places, record_fleet
 from hilcal.robot.body import capsules
 from hilcal.transfer.fleet import Fleet
 from hilcal.transfer.pooled import pooled
@@ -38,7 +38,7 @@ def recorded(one, path, odd):
 
 def test_campaigns_are_as_far_from_the_type_as_their_arm(one):
     whole, of = fleet(one, 1.5)
-    d = drawn_type(of, whole.members)
+    d = DrawnType(of, whole.members)
     assert np.argwhere(d.odd).tolist() == [[ODD, d.names.index("joint_compliance.j3")]]
     assert d.joints == tuple(int(name[-1]) for name in d.names)
     assert (d.pooled.distance.shape, d.campaigns.shape) == (
@@ -47,7 +47,7 @@ def test_campaigns_are_as_far_from_the_type_as_their_arm(one):
     )
     assert [d.owner[k] for k in (0, 1, 2)] == [0, 0, 1]
     assert d.seconds[1] - d.seconds[0] == 59 * 86400
-    odd = d.campaigns[np.array(d.owner) == ODD][:, d.names.index("joint_compliance.j3")]
+    odd = d.campaigns[d.owner == ODD][:, d.names.index("joint_compliance.j3")]
     assert (odd > 5).all()
     apart = np.linalg.norm(places(d)[:, None] - places(d), axis=2) + 10 * np.eye(ARMS)
     assert apart.min() > 0.5
@@ -56,7 +56,7 @@ def test_campaigns_are_as_far_from_the_type_as_their_arm(one):
 @pytest.mark.long
 def test_the_odd_joint_alone_is_red_and_its_arm_framed(one, tmp_path):
     path = recorded(one, tmp_path / "fleet.rrd", 1.5)
-    d = drawn_type(fleet(one, 1.5)[1], fleet(one, 1.5)[0].members)
+    d = DrawnType(fleet(one, 1.5)[1], fleet(one, 1.5)[0].members)
     shapes = capsules(d.arm)
     colors = [rgb(c) for c in rows(path, "/arms0/arms", "Capsules3D:colors")[0]]
     red = [k for k, c in enumerate(colors) if c == style.RED]

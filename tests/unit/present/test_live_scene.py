@@ -7,7 +7,6 @@ import pytest
 import rerun as rr
 
 from hilcal.measuring.progress import ArmAt, LiveResidual, ReadingStored, Remark
-from hilcal.present.live_viewer import Revised
 from hilcal.present.viewer import live, style
 from hilcal.present.viewer.live import BALL, FLUENT, GROUPS, LIMIT, MANY, LiveTally, judged
 from tests.support.live_story import BLIND, events, measuring, plan, residual
@@ -34,7 +33,7 @@ def recorded(path, told, end=True):
 def revisions():
     told = story()
     for k, r in enumerate(told.revisions):
-        yield float(k), Revised(replace(told, revisions=(r,)))
+        yield float(k), replace(told, revisions=(r,))
 
 
 def stored(told, wrong=6.0):
@@ -87,7 +86,7 @@ def test_of_a_thousand_readings_and_more_the_worst_of_each_group_stay(tmp_path):
     sigma = np.array([judged(e.step, e.live).sigma for e in stored(told, 2.0)[BLIND:]])
     group = -(-len(told.plan.steps) // GROUPS)
     shown = np.sort(np.concatenate(of_levels(path)))
-    assert LiveTally.of(told).group == group == 8
+    assert LiveTally(told).group == group == 8
     assert len(shown) < 0.45 * len(sigma)
     worst = [sigma[k : k + group].max() for k in range(0, len(sigma), group)]
     assert all(np.abs(shown - w).min() < 1e-9 for w in worst)
@@ -103,7 +102,7 @@ def test_every_target_of_an_arrival_is_drawn_where_it_is(tmp_path):
     one = measuring()
     targets = np.vstack([one.targets, [[-0.1, 0.05, 0.02]]])
     told = replace(one, targets=targets, names=("left", "right"))
-    shown, rng, d = [], np.random.default_rng(2), LiveTally.of(told)
+    shown, rng, d = [], np.random.default_rng(2), LiveTally(told)
     for wall, e in events(told, wrong=0.0):
         if isinstance(e, ReadingStored):
             right = residual(rng, 9.0) if e.done > BLIND else LiveResidual()
@@ -141,7 +140,7 @@ def test_the_arm_moves_through_every_place_that_is_told(measured):
 
 def test_words_say_whether_the_model_fails_and_under_which_load():
     def status(wrong):
-        d = LiveTally.of(measuring())
+        d = LiveTally(measuring())
         assert "no judgement yet" in style.markdown(d.words())
         for _, e in events(measuring(), wrong):
             if isinstance(e, ReadingStored):
@@ -187,7 +186,7 @@ def test_the_errors_of_revisions_grow_one_by_one_and_end_as_the_whole_story(refi
 
 def test_other_readings_begin_another_story(tmp_path):
     other = story(poses=12)
-    told = [*revisions(), (9.0, Revised(replace(other, revisions=(other.revisions[-1],))))]
+    told = [*revisions(), (9.0, replace(other, revisions=(other.revisions[-1],)))]
     path = recorded(tmp_path / "two.rrd", told, end=False)
     assert len(values(path, "/errors/fit", "BarChart:values")) == 5
     tables = [row[0] for row in values(path, "/words/revisions", "TextDocument:text")]

@@ -25,10 +25,11 @@ from hilcal.present.html.report import page as page_of
 from hilcal.present.story import Chapter
 from hilcal.refinement import Refinement, RefinementStep
 from hilcal.store.overview import MeasuringDevice
+from hilcal.write_report import Asked, content_of
 from tests.support.browser import DESKTOP, PHONE, needs_chromium, open_browser
 from tests.support.outline import Outline
 from tests.support.picture import pixels
-from tests.support.report_pages import EVIL, opened, small_content
+from tests.support.report_pages import EVIL, opened, small_content, write_campaign
 
 PAPER = 681
 """Width of A4 without its margins, 180 mm, in CSS pixels."""
@@ -138,6 +139,18 @@ def test_numbers_of_the_certificate_are_those_of_the_fit(made, text):
     assert b.combined >= m.fit.holdout.rms_m
     inside = np.sum(error <= b.expanded)
     assert f"{inside} of {len(error)} deflections of poses left out are within it" in text
+
+
+def test_a_limit_of_the_cell_is_not_judged_by_a_campaign_that_was_fitted(tmp_path):
+    path, same = tmp_path / "a.hilcal", tmp_path / "b.hilcal"
+    write_campaign(path)
+    shutil.copy(path, same)
+    with Campaign.open(path) as run, Campaign.open(same) as other:
+        m = content_of(run, Asked(validation=other))
+    words, passed = limit_words(replace(m, limit_m=1e-3))
+    assert passed
+    assert words.startswith("PASSED")
+    assert f"{same.name} was fitted itself: an independent test is missing" in words
 
 
 def test_what_is_said_to_be_wrong_is_of_poses_left_out(made):

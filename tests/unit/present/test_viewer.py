@@ -96,6 +96,10 @@ def test_a_curve_is_drawn_by_bars_about_its_values(tmp_path, curve, width):
     if width is not None:
         np.testing.assert_allclose(right - left, width)
     assert 3 not in rows(path, "/follows/mean", "BarChart:values", "revision")  # nothing follows
+    axes = rows(path, "/words/follows", "TextDocument:text", "revision")
+    named = f"Vertical: {curve.y_label}; horizontal: {curve.x_label}."
+    assert axes[2][0].replace("\\", "") == named
+    assert "Nothing" in axes[3][0]
 
 
 def test_readings_over_a_suspect_are_drawn_by_their_mean(told, recording):
