@@ -91,8 +91,13 @@ def of_dict(content: Any, source: str) -> FactoryKinematics:
         checksum = tuple(map(int, content["joint_checksum"]))
         return of_rows(rows, source, int(content["calibration_status"]), checksum)
     except (ValueError, KeyError, TypeError) as error:
-        words = " ".join(str(error).split())
-        raise InputError(f"{source}: not the kinematics of an arm ({words})") from None
+        raise InputError(f"{source}: not the kinematics of an arm ({_why(error)})") from None
+
+
+def _why(error: Exception) -> str:
+    if isinstance(error, KeyError):
+        return f"it lacks {error.args[0]}"
+    return " ".join(str(error).split())
 
 
 def read_factory(path: Path, nominal: Arm, text: str | None = None) -> FactoryKinematics:
@@ -109,9 +114,8 @@ def read_factory(path: Path, nominal: Arm, text: str | None = None) -> FactoryKi
     try:
         found = reader(text, nominal, str(path))
     except (ValueError, KeyError, TypeError, configparser.Error) as error:
-        words = " ".join(str(error).split())
         raise InputError(
-            f"{path}: not the kinematics of an arm ({words}); valid: {KINDS}"
+            f"{path}: not the kinematics of an arm ({_why(error)}); valid: {KINDS}"
         ) from None
     check_of(found, nominal)
     return found

@@ -123,8 +123,8 @@ def _poses(data: object, where: str) -> tuple[tuple[str, ...], Floats]:
         )
         if not numbers or not q or (count and len(q) != count):
             raise InputError(
-                f"{where}: pose {name!r}: q_rad must be a list of {count or ''} finite numbers, "
-                f"rad, below {LARGEST:g}"
+                f"{where}: pose {name!r}: q_rad must be a list of {f'{count} ' if count else ''}"
+                f"finite numbers, rad, below {LARGEST:g}"
             )
         rows[name] = [float(x) for x in q]
     return tuple(rows), np.array(list(rows.values()))
