@@ -240,7 +240,9 @@ def pose_constants(p: Linearisation) -> PoseConstants | None:
         return None
     gain = _square(np.asarray(columns.T @ p.project_out(p.residual[:, None])), shared, t)
     within = (p.rss - gain) / (fit.dof - rank)
-    p_value = float(f_distribution.sf(gain / rank / within, rank, fit.dof - rank))
+    nothing_else = np.inf if gain > 0 else 0.0  # what poses that repeat exactly leave
+    ratio = gain / rank / within if within > 0 else nothing_else
+    p_value = float(f_distribution.sf(ratio, rank, fit.dof - rank))
     return PoseConstants(p.projection, columns, shared, t, rank, gain, p_value)
 
 

@@ -391,6 +391,8 @@ def every_direction(fit: Fit, c: Contrasts) -> list[NoiseWhere]:
         for k, (_, _, d) in enumerate(directions):
             along = np.einsum("kir,kis->krs", d[rows[k]], slopes[rows[k]])
             size[k, some] = np.sum(along**2, axis=(0, 1))
+    if not square.all():  # repeats that are equal to the last digit tell no direction from another
+        return []
     out = []
     for (kind, name, _), t in zip(directions, size, strict=True):
         mean, spread = float(t[1:].mean()), float(t[1:].std())

@@ -300,7 +300,7 @@ def hypotheses(d: Described) -> Iterator[Hypothesis]:
     simple += ["travel_millimetres"] * bool(slides.any())
     yield from map(Hypothesis, simple if d.turn is None else [*simple, *OF_ATTITUDES])
     yield from (Hypothesis("arm", arm=arm.name) for arm in other_arms(d.arm))
-    yield from (Hypothesis("shift", shift=k) for k in SHIFTS)
+    yield from (Hypothesis("shift", shift=k) for k in shifts(len(d.q)))
     # Columns: two exchanged, or all in a turn.
     straight, orders = tuple(range(1, n + 1)), []
     for i, j in combinations(range(n), 2):
@@ -310,6 +310,11 @@ def hypotheses(d: Described) -> Iterator[Hypothesis]:
     orders += [(*straight[k:], *straight[:k]) for k in range(1, n)]
     orders.append(straight[::-1])
     yield from (Hypothesis("columns", order=order) for order in dict.fromkeys(orders))
+
+
+def shifts(count: int) -> Iterator[int]:
+    """Yield the shifts of rows that leave at least half of so many readings to judge by."""
+    yield from (k for k in SHIFTS if 2 * abs(k) <= count)
 
 
 def pairs(n: int) -> Iterator[Way]:
@@ -554,9 +559,10 @@ class _DescriptionSearch:
 
         Where a pose has many readings, only its last one is wrong, and looks like a gross error.
         """
-        ways: list[Way] = [(Hypothesis("shift", shift=k),) for k in SHIFTS]
+        count = len(self._readings)
+        ways: list[Way] = [(Hypothesis("shift", shift=k),) for k in shifts(count)]
         tried = {way: self.score(way) for way in ways}
-        return _explained(tried, min(self.enough, self.score(()) / FACTOR))
+        return _explained(tried, min(self.enough, self.score(()) / FACTOR)) if tried else ()
 
     def _enough(self, tried: dict[Way, float], base: float) -> tuple[Explanation, ...]:
         """Those that explain the readings: the simplest of each kind, best first."""
