@@ -50,6 +50,7 @@ class DetectableEffect:
     """Minimum detectable strength of an effect outside of the model.
 
     Attributes:
+        effect: its name.
         least_m: rms displacement of the target, m, whose whitened residual after fitting the
             model is one sigma; None where the model absorbs the effect.
     """
@@ -83,6 +84,7 @@ class CriterionResult:
     the parameters in ordinary magnitudes with the singular values σ.
 
     Attributes:
+        criterion: its name.
         position_std_m: standard uncertainty of the position at the prediction poses, m.
         position_open_m: the same with all potential terms estimated as well.
         joint_share: largest relative standard uncertainty of a joint compliance; None without.
