@@ -225,7 +225,7 @@ def fit(
             common with it (`baseline` adds the others); or (P,) standard deviations of zero-mean
             priors, infinite for flat ones, zero for parameters held at zero; where None, those of
             the effects.
-        mode: the same as `readings`, by its name in what is returned.
+        mode: another name of `readings`; results call it `mode`.
 
     Raises:
         InputError: another kind of readings or of scaling, or a deflection without its unloaded
@@ -326,7 +326,7 @@ def refine(
             `hilcal refine --discover`, and the files of laws that stay are written there.
         background: whether all effects of the catalogue predict together where the named ones
             leave more than noise.
-        mode: the same as `readings`.
+        mode: another name of `readings`.
 
     Raises:
         InputError: another kind of readings, a prior that is not one of them, or no such folder.

@@ -201,9 +201,8 @@ class Compensation(Brief):
 
     def _brief(self) -> dict[str, str]:
         return {
-            "points": f"{len(self.q)}, of which {np.count_nonzero(self.usable)} can be used",
+            "points": f"{len(self.q)}, of which {np.count_nonzero(self.inverse.solved)} are solved",
             "q": f"array {self.q.shape}, rad, of joints that slide m",
-            "error before": f"{1e3 * ErrorSize.of(self.before.error_m).rms_m:.3g} mm rms",
             "more": "q, before, after, usable, inside, limits, singular",
         }
 

@@ -110,13 +110,17 @@ class Campaign(Brief):
         return cls(path, catalogue, read_only=read_only)
 
     def _brief(self) -> dict[str, str]:
-        used = self.in_use()
         poses = len(np.unique(self.readings.pose))
+        try:
+            used = self.in_use()
+            revision = "no revision yet" if used is None else f"revision {used.number}"
+        except InputError:  # a value can be printed when its file is closed, or gone
+            revision = "not known, the file is closed"
         return {
             "file": str(self.path),
             "arm": self.cell.arm.name,
-            "readings": f"{len(self.readings)} at {poses} poses ({self.mode()} readings)",
-            "in use": "no revision yet" if used is None else f"revision {used.number}",
+            "readings": f"{len(self.readings)} at {poses} poses",
+            "in use": revision,
             "more": "readings.to_frame(), fit(), calibration(), append()",
         }
 

@@ -199,7 +199,7 @@ PAIRS_UP_TO = 4  # pairs of loads are units of their own up to so many loads; a 
 MOST_BYTES = 600_000_000  # Memory that the rows of all units may take. A choice.
 MOST_PARAMETERS = 200
 SAMPLE = 300  # Candidate poses by which strengths are judged. A choice.
-MOST_TIMES = 5.0  # its expected size with which a family has to reach one σ; a choice
+MOST_TIMES = 5.0  # times its expected size at which a family must move readings by 1 σ; a choice
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -204,9 +204,16 @@ def test_what_a_console_prints_of_a_value_is_at_most_fifteen_lines(site):
             text = repr(value)
             assert text.count("\n") < 15, text
             assert len(text) < 2500, text
+        assert "revision" in repr(run)
         assert judged.verdict in repr(judged)
         assert judged.suspects[0].effect in repr(judged)
         assert all(step.diagnosis.verdict in repr(found) for step in found.steps)
+
+
+def test_a_campaign_is_printed_when_it_is_closed(site):
+    with hc.Campaign(site.run, read_only=True) as run:
+        pass
+    assert "the file is closed" in repr(run)
 
 
 def test_results_are_data_frames(site, tmp_path):
