@@ -49,12 +49,18 @@ class RepeatabilityEstimate:
     def words(self, configured: Floats) -> str:
         """Return it for people, beside the configured standard deviations (n,), rad."""
         stated = float(np.sqrt(np.mean(configured**2)))
-        joints = f"is about {self.joint_std:.1g}" if self.shown else "does not show beside it"
+        joints = f"is about {self.joint_std:.1g}" if self.shown else "is too small to be seen"
         return (
-            f"{self.dof} returns to {self.poses} poses scatter by {1e6 * self.scatter:.0f} µm, "
+            f"{self.returns} scatter{'s' * (self.dof == 1)} by {1e6 * self.scatter:.0f} µm, "
             f"the instrument alone by {1e6 * self.instrument:.0f} µm: joint_std_rad {joints}, "
             f"configured {stated:.1g}"
         )
+
+    @property
+    def returns(self) -> str:
+        """How many returns to how many poses, in words."""
+        dof, poses = self.dof, self.poses
+        return f"{dof} return{'s' * (dof != 1)} to {poses} pose{'s' * (poses != 1)}"
 
 
 def repeatability(visits: Sequence[UnloadedVisit]) -> RepeatabilityEstimate | None:

@@ -245,11 +245,11 @@ def _checks(o: Overview) -> Iterator[tuple[str, str]]:
         yield "tool", f"{o.tool['mass_kg']:.3f} kg, its centre at {com} mm in flange axes"
     if o.repeatability is not None:
         r = RepeatabilityEstimate(**o.repeatability)
-        joints = "the joints do not show beside it"
+        joints = "that of the joints is too small to be seen"
         if r.shown:
             joints = f"joints {numbers.digits(1e6 * r.joint_std, 2)} µrad"
         scatter, alone = numbers.length(r.scatter), numbers.length(r.instrument)
-        returns = f"{r.dof} returns to {r.poses} poses scatter by {scatter}"
+        returns = f"{r.returns} scatter{'s' * (r.dof == 1)} by {scatter}"
         yield "repeatability", f"{returns}, the instrument alone by {alone}; {joints}"
 
 

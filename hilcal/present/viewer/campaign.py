@@ -259,7 +259,7 @@ def _curve_bars(rec: rr.RecordingStream, entity: str, c: DependenceCurve | None)
     bars: dict[str, Floats] = {}
     edges, axes = np.zeros(0), "Nothing is drawn of this revision."
     if c is not None and len(c.x):
-        x, y, axes = c.x, c.y, f"Vertical: {c.y_label}; horizontal: {c.x_label}."
+        x, y, axes = c.x, c.y, f"Horizontal: {c.x_label}; vertical: {c.y_label}."
         if c.error is None:
             order = np.argsort(x, kind="stable")
             bins = np.array_split(order, min(_BINS, max(1, len(order) // 4)))

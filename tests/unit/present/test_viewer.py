@@ -97,7 +97,7 @@ def test_a_curve_is_drawn_by_bars_about_its_values(tmp_path, curve, width):
         np.testing.assert_allclose(right - left, width)
     assert 3 not in rows(path, "/follows/mean", "BarChart:values", "revision")  # nothing follows
     axes = rows(path, "/words/follows", "TextDocument:text", "revision")
-    named = f"Vertical: {curve.y_label}; horizontal: {curve.x_label}."
+    named = f"Horizontal: {curve.x_label}; vertical: {curve.y_label}."
     assert axes[2][0].replace("\\", "") == named
     assert "Nothing" in axes[3][0]
 
