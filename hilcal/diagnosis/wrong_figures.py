@@ -9,6 +9,7 @@ would round it.
 """
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -162,7 +163,11 @@ def wrong_figures(of: Fit, suspects: Sequence[Suspect]) -> tuple[WrongFigure, ..
     if of.model.background:
         return ()
     best = min((s.score.delta_bic for s in suspects if s.score.rank), default=0.0)
-    tried = [(figure, *figure.first_step(of)) for figure in _figures(of)]
+    tried: list[tuple[_Figure, Floats, float]] = []
+    for figure in _figures(of):
+        # A fit may be so close to the largest load that more of it has no equilibrium.
+        with suppress(CannotAnswerError):
+            tried.append((figure, *figure.first_step(of)))
     most = max((share for _, _, share in tried), default=0.0)
     found: list[tuple[float, WrongFigure]] = []
     for figure, step, share in tried:
