@@ -297,20 +297,20 @@ def check_sources(record: RevisionRecord, run: Path, catalogue: Catalogue) -> No
     """Refuse a revision whose effects are missing or have changed since it was fitted."""
     stored = record.options.get(SOURCES, {})
     for name in _predicting(record):
-        stored_source, file = stored.get(name), catalogue.file_of(name)
+        source, file = stored.get(name), catalogue.file_of(name)
         if name not in catalogue.names:
             hint, note = "FILE.py", ""
-            if isinstance(stored_source, dict) and {"file", "sha256"} <= set(stored_source):
-                hint = str(stored_source["file"])
+            if isinstance(source, dict) and {"file", "sha256"} <= set(source):
+                hint = str(source["file"])
                 note = (
-                    f" (SHA-256 {str(stored_source['sha256'])[:16]}…; it is a program, and is run: read it "
-                    "first where somebody sent it)"
+                    f" (SHA-256 {str(source['sha256'])[:16]}…; it is a program, and is run: read "
+                    "it first where somebody sent it)"
                 )
             raise InputError(
                 f"{run}: revision {record.number} has the effect {name}, which is not in the "
                 f"catalogue{note}; give the file that defines it: --effects-from {quoted(hint)}"
             )
-        if stored_source and file and stored_source["sha256"] != file.sha256:
+        if source and file and source["sha256"] != file.sha256:
             raise InputError(
                 f"{run}: revision {record.number} was fitted with another {name}: {file.path} has "
                 "changed since then; fit again: hilcal identify or refine"
