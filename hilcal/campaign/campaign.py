@@ -399,7 +399,7 @@ class Campaign(Brief):
             () if record is None else revisions.chain(self.file.revisions(), record.number)
         )
 
-    def append(self, result: Fit | Diagnosis | Refinement) -> int:
+    def append(self, found: Fit | Diagnosis | Refinement) -> int:
         """Append a fit, a diagnosed fit, or all steps of a refinement as revisions.
 
         Nothing is stored where the latest revisions are these already.
@@ -410,12 +410,12 @@ class Campaign(Brief):
         Raises:
             InputError: it was fitted to other readings than those of this campaign.
         """
-        if isinstance(result, Refinement):
-            records = [self.record(s.fit, s.diagnosis, s.added, s.removed) for s in result.steps]
-        elif isinstance(result, Diagnosis):
-            records = [self.record(result.fit, result)]
+        if isinstance(found, Refinement):
+            records = [self.record(s.fit, s.diagnosis, s.added, s.removed) for s in found.steps]
+        elif isinstance(found, Diagnosis):
+            records = [self.record(found.fit, found)]
         else:
-            records = [self.record(result)]
+            records = [self.record(found)]
         return self.append_records(records)[-1]
 
     def append_records(
@@ -441,7 +441,7 @@ class Campaign(Brief):
 
     def store(
         self,
-        fitted: Fit,
+        found: Fit,
         diagnosis: Diagnosis | None = None,
         added: str | None = None,
         removed: str | None = None,
@@ -459,11 +459,11 @@ class Campaign(Brief):
             InputError: it was fitted to other readings than those of this campaign, or these are
                 of a validation campaign (`store.procedure_log`).
         """
-        return self.file.append_revision(self.record(fitted, diagnosis, added, removed, parent))
+        return self.file.append_revision(self.record(found, diagnosis, added, removed, parent))
 
     def record(
         self,
-        fitted: Fit,
+        found: Fit,
         diagnosis: Diagnosis | None = None,
         added: str | None = None,
         removed: str | None = None,
@@ -471,11 +471,11 @@ class Campaign(Brief):
     ) -> RevisionRecord:
         """Return the record that `store` stores; raises as `store` does."""
         refuse_fitting(self.file)
-        hashed = content_hash(fitted.readings)
+        hashed = content_hash(found.readings)
         if hashed != content_hash(self.readings):
             raise InputError(f"{self.path}: the fit is of other readings than this campaign's")
         document = None if diagnosis is None else to_json(diagnosis)
-        record = revisions.to_record(fitted, document, added, hashed, removed, parent)
+        record = revisions.to_record(found, document, added, hashed, removed, parent)
         options: dict[str, Any] = {STORED: self.data_hash, **typed_now()}
         if self.changes:
             options[CELL] = self.changes

@@ -237,11 +237,11 @@ class Procedure:
             self.keep(o, refinement)
         return refinement
 
-    def keep(self, o: Campaign, refinement: Refinement) -> tuple[int, ...]:
+    def keep(self, o: Campaign, found: Refinement) -> tuple[int, ...]:
         """Store the revisions of a refinement; return their numbers."""
-        records = [o.record(s.fit, s.diagnosis, s.added, s.removed) for s in refinement.steps]
-        content = {"readings_sha256": o.data_hash, "verdict": refinement.verdict}
-        self._refinements[:] = [refinement]
+        records = [o.record(s.fit, s.diagnosis, s.added, s.removed) for s in found.steps]
+        content = {"readings_sha256": o.data_hash, "verdict": found.verdict}
+        self._refinements[:] = [found]
         return ProcedureLog(o.file).append(REFINED, content, revisions=records)
 
     def decide(self, say: Say = lambda words: None) -> Decision:
