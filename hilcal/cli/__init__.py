@@ -217,9 +217,9 @@ def _top(
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a command of `hilcal` and exit; see `execute`."""
-    options = sys.argv[1:] if arguments is None else list(arguments)
-    named = _words_to_complete() if os.environ.get(_COMPLETE) else options
-    execute(lambda: _hilcal(named), "hilcal", options)
+    argv = sys.argv[1:] if arguments is None else list(arguments)
+    named = _words_to_complete() if os.environ.get(_COMPLETE) else argv
+    execute(lambda: _hilcal(named), "hilcal", argv)
 
 
 def _words_to_complete() -> list[str]:
@@ -242,13 +242,13 @@ def execute(make: Callable[[], typer.Typer], name: str, arguments: Sequence[str]
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")
     debug = os.environ.get(DEBUG, "") not in ("", "0")
-    options = list(arguments)
+    argv = list(arguments)
     out = Watched(sys.stdout)
     with warnings.catch_warnings(), redirect_stdout(out):
         if not debug:
             warnings.simplefilter("ignore")
-        failed = Failures("--json" in options, out, debug)
-        sys.exit(_run(make, name, options, failed))
+        failed = Failures("--json" in argv, out, debug)
+        sys.exit(_run(make, name, argv, failed))
 
 
 @contextmanager

@@ -123,17 +123,14 @@ def calibrate(
     go_on = _Continuation(t, shlex.join([*line, "--resume", *flags]), shlex.join([*line, *flags]))
     p = _procedure(cell, output, resume, rehearse, config, numbers, catalogue, settings, go_on)
     prior = p.settings.prior
-    if (
-        prior is not None
-        and options.prior is None
-        and Path(prior).parent != output.absolute().parent
-    ):
-        raise InputError(
-            f"{output}: its prior is {prior!r}, and no file elsewhere is read because a campaign "
-            f"names it; give it yourself: --prior {quoted(prior)}"
-        )
-    if prior is not None and p.next().kind in FITTED_LATER:
-        p = replace(p, known=PriorOptions(Path(prior)).load(catalogue))
+    if prior is not None:
+        if options.prior is None and Path(prior).parent != output.absolute().parent:
+            raise InputError(
+                f"{output}: its prior is {prior!r}, and no file elsewhere is read because a "
+                f"campaign names it; give it yourself: --prior {quoted(prior)}"
+            )
+        if p.next().kind in FITTED_LATER:
+            p = replace(p, known=PriorOptions(Path(prior)).load(catalogue))
     if not (yes or rehearse or somebody_there(t)) and p.next().kind != "done":
         raise InputError(
             "nobody can be asked before the arm moves; give --yes, or run it at a terminal"

@@ -67,28 +67,20 @@ def import_(
         raise InputError(f"{missing} is missing; without it only --preview is possible")
     with working(t.progress) as say:
         imported = import_campaign(table, config, output, kind, second, overwrite=force, say=say)
-    readings, settings, cell, noise = (
-        imported.readings,
-        imported.config,
-        imported.cell,
-        imported.noise,
-    )
+    readings, cell, noise = imported.readings, imported.cell, imported.noise
+    model = imported.config.robot.model
     notes = (*imported.notes, covariance_words(imported.parts, noise), *cell.arm.notes)
     loads = [readings.load_names[k] for k in np.unique(readings.load)]
     poses = len(np.unique(readings.pose))
     kind = f"each reading is a position{'' if readings.m == 3 else ' and an orientation'}"
     kind = observed_words(readings) if readings.observers else kind
     t.show(heading(f"{len(readings)} readings of {poses} poses"))
-    t.show(f"  robot {settings.robot.model}; {kind}\n  loads: {', '.join(loads)}")
+    t.show(f"  robot {model}; {kind}\n  loads: {', '.join(loads)}")
     targets = _targets(cell, readings)
     if targets:
         t.show("  targets: " + "; ".join(target_words(**x) for x in targets))
-    torques, registered, misdescription, likely_arm = (
-        check_torques(cell, readings),
-        None,
-        None,
-        None,
-    )
+    torques = check_torques(cell, readings)
+    registered = misdescription = likely_arm = None
     lines = [*notes, *torque_lines(torques)]
     with suppress(CannotAnswerError):  # the readings do not determine the registration
         registered = register(cell, readings)
@@ -105,7 +97,7 @@ def import_(
     t.show(Words(line, indent=2) for line in lines)
     t.document(
         campaign=str(output),
-        robot=settings.robot.model,
+        robot=model,
         n_readings=len(readings),
         n_poses=poses,
         elements=readings.m,
@@ -127,9 +119,8 @@ def _targets(cell: Cell, readings: Readings) -> list[dict[str, Any]]:
     if readings.states.target is None:
         return []
     count = np.bincount(readings.target, minlength=len(readings.target_names))
-    stated = cell.known_targets
     return [
-        {"name": name, "n_readings": int(count[k]), "known": stated[k]}
+        {"name": name, "n_readings": int(count[k]), "known": cell.known_targets[k]}
         for k, name in enumerate(readings.target_names)
     ]
 
@@ -151,12 +142,8 @@ def show_preview(
         t.show(Words(line, indent=2) for line in outcome)
     if output is not None:
         if second is not None:  # its path is relative to the mapping file
-            second_path, folder = second.absolute(), output.absolute().parent
-            path = (
-                second_path.relative_to(folder)
-                if second_path.is_relative_to(folder)
-                else second_path
-            )
+            path, folder = second.absolute(), output.absolute().parent
+            path = path.relative_to(folder) if path.is_relative_to(folder) else path
             proposal.sections["second_file"]["path"] = str(path)
         replace_file(output, proposal.to_toml(table.name))
         t.notice(f"{output}: the mapping; import with --format {output}")

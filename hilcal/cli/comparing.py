@@ -122,15 +122,10 @@ def validate(
         record = record_of(t, o, say, revision)
         result = validate_campaign(o, unseen, record, limit_m, register=register, say=say)
         name = model_name(titles(result.model, o.fitted_readings(record)))
-    judged, prediction, beyond, shares = (
-        result.judged,
-        result.prediction,
-        result.beyond,
-        result.shares,
-    )
+    judged, prediction, shares = result.judged, result.prediction, result.shares
     t.show(heading(f"{called(judged.number)}: {name}"))
     t.show(opening(judged, prediction))
-    t.show(validation_report(judged, prediction, beyond))
+    t.show(validation_report(judged, prediction, result.beyond))
     t.show(shares_report(shares))
     if prediction.error.rms_sigma > OVER and not register:
         t.show(
@@ -154,6 +149,6 @@ def validate(
         error=prediction.error.to_json(),
         variance_factor=prediction.variance_factor,
         noise_floor_m=prediction.noise_floor,
-        **beyond.to_dict(),
+        **result.beyond.to_dict(),
         **shares.to_dict(),
     )

@@ -205,20 +205,16 @@ def _task(
         return _Task(read_points(path, arm, calibration.loads, mapping), tool)
     if arm.n != JOINTS:
         raise InputError(f"{path}: a UR program, and {arm.name} has {arm.n} joints")
-    program, waypoints, points, program_tool = program_points(path, options.leave)
-    if program_tool is None and tool is None and points.wanted is not None:
+    program, waypoints, points, tcp = program_points(path, options.leave)
+    if tcp is None and tool is None and points.wanted is not None:
         for k in np.flatnonzero(np.isfinite(points.wanted[:, 0, 0]))[:1].tolist():
             raise InputError(
                 f"{path}: {points.names[k]} is a pose of a tool centre point that the program does "
                 'not set; give --tool "X Y Z RX RY RZ" as the installation has it'
             )
-    if (
-        program_tool is not None
-        and tool is not None
-        and not np.allclose(program_tool, tool, atol=1e-9)
-    ):
+    if tcp is not None and tool is not None and not np.allclose(tcp, tool, atol=1e-9):
         raise InputError(f"{path}: set_tcp is another tool than --tool; leave out one of them")
-    return _Task(points, tool if program_tool is None else program_tool, program, waypoints)
+    return _Task(points, tool if tcp is None else tcp, program, waypoints)
 
 
 def _only(task: _Task, retained: list[int], refused: list[str]) -> _Task:

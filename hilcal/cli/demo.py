@@ -153,10 +153,8 @@ def _resembled(r: Rehearsal, case: RehearsalSettings) -> bool:
     hidden = suspects.pop(r.hidden, None)
     if hidden is None or not (hidden.passes or any(s.passes for s in suspects.values())):
         return False
-    near = (
-        abs(s.score.log_evidence - hidden.score.log_evidence) < CLOSE for s in suspects.values()
-    )
-    return any(near)
+    evidence = hidden.score.log_evidence
+    return any(abs(s.score.log_evidence - evidence) < CLOSE for s in suspects.values())
 
 
 def _left_open(r: Rehearsal, case: RehearsalSettings) -> bool:
@@ -407,8 +405,8 @@ def _judge_law(r: Rehearsal, refinement: Refinement, laws: LawSearch) -> tuple[b
         d = next((d for d in laws.found if d.laws and d.laws[0].name == step.added), None)
         if d is not None:
             law, same = d.laws[0], agreement(previous.fit, step.fit, moved)
-            agreed = f"Found was {law.formula}, which agrees with it over these readings by a"
-            return same >= SAME, f"{hidden}. {agreed} correlation of {same:.3f}."
+            statement = f"Found was {law.formula}, which agrees with it over these readings by a"
+            return same >= SAME, f"{hidden}. {statement} correlation of {same:.3f}."
     return False, f"{hidden}. It was not found."
 
 
@@ -417,10 +415,8 @@ def _judge(r: Rehearsal, refinement: Refinement) -> tuple[bool, str]:
     if r.hidden == NOTHING:
         if not added and refinement.verdict == "adequate":
             return True, "Nothing was hidden, and nothing was found."
-        return (
-            False,
-            f"Nothing was hidden, but the verdict is {refinement.verdict.replace('_', ' ')}.",
-        )
+        verdict = refinement.verdict.replace("_", " ")
+        return False, f"Nothing was hidden, but the verdict is {verdict}."
     hidden = f"Hidden was {r.hidden}, at {r.strength_sigma:g} times the noise"
     suspects = refinement.steps[0].diagnosis.suspects
     same = suspects[0].same_as if suspects else ()

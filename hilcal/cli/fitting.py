@@ -110,7 +110,7 @@ def called(number: int | None) -> str:
 
 
 def mode_of_option(run: Campaign, kind: str | None) -> Mode:
-    """Return the kind of readings: the option, else the latest revision's, else by the readings."""
+    """Return the kind of readings: the option, else that of `Campaign.mode`."""
     if kind is None:
         return run.mode()
     if kind not in MODES:
