@@ -57,42 +57,42 @@ T = TypeVar("T")
 STREAM = "a longer series is fitted as a stream (docs/how-to/fit-a-stream.md)"
 
 
-def check_size(what: str, size: int, most: int) -> None:
+def check_size(name: str, size: int, most: int) -> None:
     """Refuse more than `most` bytes.
 
     Raises:
         InputError: over the limit, which the message states.
     """
     if size > most:
-        raise InputError(f"{what}: {size / 1e6:.1f} MB; valid: at most {most / 1e6:.1f} MB")
+        raise InputError(f"{name}: {size / 1e6:.1f} MB; valid: at most {most / 1e6:.1f} MB")
 
 
-def check_rows(what: str, rows: int) -> None:
+def check_rows(name: str, rows: int) -> None:
     """Refuse too many rows; raises as `check_size` does."""
     if rows > ROWS:
-        raise InputError(f"{what}: more than {ROWS} rows; {STREAM}")
+        raise InputError(f"{name}: more than {ROWS} rows; {STREAM}")
 
 
-def check_cells(what: str, rows: int, columns: int = 1) -> None:
+def check_cells(name: str, rows: int, columns: int = 1) -> None:
     """Refuse too many columns or cells; raises as `check_size` does."""
     if columns > COLUMNS:
-        raise InputError(f"{what}: {columns} columns; valid: at most {COLUMNS}")
+        raise InputError(f"{name}: {columns} columns; valid: at most {COLUMNS}")
     if rows * columns > CELLS:
-        raise InputError(f"{what}: more than {CELLS / 1e6:.0f} million cells; {STREAM}")
+        raise InputError(f"{name}: more than {CELLS / 1e6:.0f} million cells; {STREAM}")
 
 
-def check_planned(what: str, items: str, count: int) -> None:
+def check_planned(name: str, items: str, count: int) -> None:
     """Refuse a plan of too many poses or steps; raises as `check_size` does."""
     if count > PLANNED:
-        raise InputError(f"{what}: {count} {items}; valid: at most {PLANNED} in a plan")
+        raise InputError(f"{name}: {count} {items}; valid: at most {PLANNED} in a plan")
 
 
 class Lines:
     """The lines of a table's text; refuses rows longer than `LINE`."""
 
-    def __init__(self, what: str, stream: TextIO) -> None:
-        """Read from a stream; `what` names it in messages."""
-        self._what, self._stream, self._row_length, self._rows = what, stream, 0, 0
+    def __init__(self, name: str, stream: TextIO) -> None:
+        """Read from a stream; `name` is for messages."""
+        self._name, self._stream, self._row_length, self._rows = name, stream, 0, 0
 
     def __iter__(self) -> Self:
         """Return the lines."""
@@ -104,7 +104,7 @@ class Lines:
         self._row_length += len(line)
         if self._row_length > LINE:
             raise InputError(
-                f"{self._what}: row {self._rows + 1} is longer than {LINE} characters; valid: "
+                f"{self._name}: row {self._rows + 1} is longer than {LINE} characters; valid: "
                 "a line for each reading"
             )
         if not line:
@@ -115,8 +115,8 @@ class Lines:
         """Count a complete row; raises as `check_rows` and `check_cells` do."""
         self._row_length = 0
         self._rows += 1
-        check_rows(self._what, self._rows)
-        check_cells(self._what, self._rows, columns)
+        check_rows(self._name, self._rows)
+        check_cells(self._name, self._rows, columns)
 
 
 def check_parameters(count: int) -> None:
@@ -125,10 +125,10 @@ def check_parameters(count: int) -> None:
         raise InputError(f"{count} parameters; valid: at most {PARAMETERS}")
 
 
-def check_numbers(what: str, count: int) -> None:
+def check_numbers(name: str, count: int) -> None:
     """Refuse an array of too many numbers; raises as `check_size` does."""
     if count > NUMBERS:
-        raise InputError(f"{what}: {count:.2g} numbers; valid: at most {NUMBERS:.2g}")
+        raise InputError(f"{name}: {count:.2g} numbers; valid: at most {NUMBERS:.2g}")
 
 
 def check_fitted(readings: int, elements: int, where: str = "") -> None:
@@ -172,8 +172,8 @@ class _Memory:
     new block when memory has run out.
     """
 
-    def __init__(self, what: str) -> None:
-        self._what = what
+    def __init__(self, name: str) -> None:
+        self._name = name
         self._previous: tuple[int, int] | None = None
         self._reserve: mmap.mmap | None = None
 
@@ -202,18 +202,18 @@ class _Memory:
         _LOCK.release()
         if kind is not None and issubclass(kind, MemoryError):
             raise InputError(
-                f"{self._what}: reading it takes more than {MEMORY / 1e6:.0f} MB of memory; valid: "
+                f"{self._name}: reading it takes more than {MEMORY / 1e6:.0f} MB of memory; valid: "
                 "a smaller file"
             ) from None
 
 
-def memory(what: str) -> _Memory:
+def memory(name: str) -> _Memory:
     """Limit the memory that the block of a `with` statement may take to `MEMORY`.
 
     Raises:
         InputError: the block needs more.
     """
-    return _Memory(what)
+    return _Memory(name)
 
 
 def bounded(read: Callable[Concatenate[Q, P], T]) -> Callable[Concatenate[Q, P], T]:

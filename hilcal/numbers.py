@@ -121,11 +121,11 @@ def p_equals(p: float) -> str:
     return f"p {text}" if text.startswith("<") else f"p = {text}"
 
 
-def many_tests(count: int, level: float, what: str = "effects") -> str:
+def many_tests(count: int, level: float, tested: str = "effects") -> str:
     """Write the number of tests, and the level p at which one counts (Bonferroni)."""
     level_each = digits(level / max(count, 1), 1)
     return (
-        f"{count} {what} were tested: one counts from p < {level_each}, which is {level:g} / "
+        f"{count} {tested} were tested: one counts from p < {level_each}, which is {level:g} / "
         f"{count}, so that chance alone names any of them once in {1 / level:.0f} diagnoses."
     )
 

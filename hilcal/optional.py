@@ -33,12 +33,12 @@ REQUIRED = {
 
 
 @contextmanager
-def needed_by(what: str) -> Iterator[None]:
-    """Raise a MissingPackageError where an import in the block fails; `what` needs the package."""
+def needed_by(user: str) -> Iterator[None]:
+    """Raise a MissingPackageError where an import in the block fails; `user` needs the package."""
     try:
         yield
     except ImportError as error:
-        raise MissingPackageError(f"{what}: {lacking(error) or error}") from error
+        raise MissingPackageError(f"{user}: {lacking(error) or error}") from error
 
 
 def lacking(error: BaseException) -> str:

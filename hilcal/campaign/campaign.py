@@ -323,11 +323,11 @@ class Campaign(Brief):
                 f"{record.number}"
             )
 
-    def require_gc(self, number: int | None, scaling: str, what: str) -> None:
+    def require_gc(self, number: int | None, scaling: str, task: str) -> None:
         """Refuse a fit, of revision `number`, whose residual is not whitened."""
         if scaling != "gc":
             raise InputError(
-                f"revision {number} has scaling {scaling}; {what} needs gc: run hilcal identify "
+                f"revision {number} has scaling {scaling}; {task} needs gc: run hilcal identify "
                 f"again{self._until_used(number)}"
             )
 

@@ -147,13 +147,9 @@ def change_cell(
     Returns:
         The campaign in the changed cell, number and diagnosis of the new revision.
     """
-    in_changed_cell = o.with_cell(changes)
+    changed = o.with_cell(changes)
     record = o.record(before) if number is None else o.file.revision(number)
-    diagnosis = refit(in_changed_cell, record, say, o.history(number))
+    diagnosis = refit(changed, record, say, o.history(number))
     if number is None:
         number = o.store(before, judged)
-    return (
-        in_changed_cell,
-        in_changed_cell.store(diagnosis.fit, diagnosis, parent=number),
-        diagnosis,
-    )
+    return changed, changed.store(diagnosis.fit, diagnosis, parent=number), diagnosis

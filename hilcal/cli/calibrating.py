@@ -182,9 +182,10 @@ class _Continuation:
         except (InputError, LimitError):
             raise
         except HilcalError as error:
-            words = str(error).removesuffix(HOW_ON).rstrip(". ")
-            how = f"then go on with: {self.resume}" if isinstance(error, MovedFileError) else safe()
-            raise type(error)(f"{words}; {how}") from error
+            message = str(error).removesuffix(HOW_ON).rstrip(". ")
+            moved = isinstance(error, MovedFileError)
+            advice = f"then go on with: {self.resume}" if moved else safe()
+            raise type(error)(f"{message}; {advice}") from error
 
 
 def _procedure(

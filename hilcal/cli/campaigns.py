@@ -219,22 +219,23 @@ def accept(
 def repair(run: Path, robot: Path | None = None, as_json: bool = False) -> None:
     """Open a campaign again that a bad revision closes: it is set aside, no reading is."""
     t = terminal(as_json)
-    done = repaired(run)
+    result = repaired(run)
     if robot is not None:
         put_robot(run, robot)
         t.show(f"{run} holds its robot now: {robot}")
-    if done is None and robot is None:
+    if result is None and robot is None:
         t.show(f"{run}: no revision is bad; nothing was changed.")
-    if done is not None:
-        numbers = ", ".join(map(str, done.revisions))
+    if result is not None:
+        numbers = ", ".join(map(str, result.revisions))
         t.show(
-            f"{run}: {done.why}. Set aside: revision{'s' * (len(done.revisions) > 1)} {numbers}. "
-            f"All readings are there; the file as it was is {done.original}. Fit again with:"
+            f"{run}: {result.why}. Set aside: revision{'s' * (len(result.revisions) > 1)} "
+            f"{numbers}. All readings are there; the file as it was is {result.original}. Fit "
+            "again with:"
         )
         t.command(f"hilcal identify {quoted(run)}")
     t.document(
-        set_aside=[] if done is None else list(done.revisions),
-        original=None if done is None else str(done.original),
+        set_aside=[] if result is None else list(result.revisions),
+        original=None if result is None else str(result.original),
         robot=None if robot is None else str(robot),
     )
 

@@ -111,8 +111,8 @@ def compensate(
         task = _task(points, calibration, options, start, kind)
         targets, foreign = task.points, task.foreign
         arm = calibration.controller if task.program else arm
-        for words in filter(None, (targets.taken, *(foreign.said if foreign else ()))):
-            t.notice(f"{points}: {words}")
+        for remark in filter(None, (targets.taken, *(foreign.said if foreign else ()))):
+            t.notice(f"{points}: {remark}")
         wrench = _wrench(targets, calibration, options)
         say(f"compensating {len(targets.names)} points")
         on_flange = calibration.tool_pose(task.tool)
@@ -128,8 +128,8 @@ def compensate(
         t.notice(
             f"note: {', '.join(slow)} has no compiled form: a point takes 25 to 60 ms, not 0.1 ms"
         )
-    both = zip(unclear, refusals(compensation, options.outside), strict=True)
-    refused = ["; ".join(filter(None, pair)) for pair in both]
+    pairs = zip(unclear, refusals(compensation, options.outside), strict=True)
+    refused = ["; ".join(filter(None, pair)) for pair in pairs]
     outcomes = fates(foreign.program.points if foreign else task.waypoints, refused)
     retained = [k for k, why in enumerate(refused) if not why]
     if not options.leave or not retained:
@@ -228,14 +228,16 @@ def _only(task: _Task, retained: list[int], refused: list[str]) -> _Task:
         task.points.q[retained],
         None if poses is None else poses[retained],
     )
-    why = iter(refused)
-    waypoints = tuple(w if w.left else replace(w, left=next(why)) for w in task.waypoints)
+    reasons = iter(refused)
+    waypoints = tuple(w if w.left else replace(w, left=next(reasons)) for w in task.waypoints)
     return replace(task, points=points, waypoints=waypoints)
 
 
-def _wrench(points: Points, calibration: Calibration, asked: CompensationOptions) -> Floats | None:
+def _wrench(
+    points: Points, calibration: Calibration, options: CompensationOptions
+) -> Floats | None:
     """Return the wrench at the points, (6,) or (N, 6)."""
-    load, wrench = asked.load, asked.wrench
+    load, wrench = options.load, options.wrench
     if sum(x is not None for x in (load, wrench, points.wrench, points.sensed)) > 1:
         raise InputError("the load is given twice; valid: one of --load, --wrench, columns")
     if wrench is not None:

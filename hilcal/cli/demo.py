@@ -131,7 +131,7 @@ def doubtful_case(
         choice = hide or str(rng.choice(HARD_TO_SEPARATE))
         case = replace(settings, config=strong, choice=choice, seed=int(rng.integers(2**31)))
         if k % ARMS == 0:
-            plan = first_plan(case, few, FIRST, lambda words: None)
+            plan = first_plan(case, few, FIRST, lambda text: None)
         secret = case_of_plan(strong, plan, choice, case.seed, case.world)
         drawn = [read_plan(secret, plan, [case.seed, 1 + j]) for j in range(DRAWS)]
         if choice == NOTHING or (
@@ -263,8 +263,8 @@ def demo(
             t.show(heading("What was found against what is true"))
             t.show([*truth_table(truth)])
         improved = _put_to_use(t, p, m.measure, without_devices)
-    ok, words = _judge(r, refinement) if laws is None else _judge_law(r, refinement, laws)
-    t.show([verdict_line(refinement.diagnosis), "", heading(words)])
+    ok, outcome = _judge(r, refinement) if laws is None else _judge_law(r, refinement, laws)
+    t.show([verdict_line(refinement.diagnosis), "", heading(outcome)])
     if r.world.own is not None and laws is not None:
         t.show(
             f"The simulated arm moved by {r.world.own.effect.summary} with the model's own "
@@ -377,7 +377,7 @@ def _introduce(t: Terminal, r: Rehearsal, choice: str, seed: int) -> None:
     used = np.unique(r.readings.load)
     loads = [name for k, name in enumerate(r.readings.load_names) if k in used and name != "none"]
     poses = len(np.unique(r.readings.pose))
-    what = {
+    secret = {
         NOTHING: "Nothing is hidden in it; the program does not know that.",
         RANDOM: "An effect, drawn at random, is hidden in it.",
         INVENTED: "A law is hidden in it that no effect of the catalogue describes; the program "
@@ -386,7 +386,7 @@ def _introduce(t: Terminal, r: Rehearsal, choice: str, seed: int) -> None:
     t.show(heading(f"A simulated {r.cell.arm.name} and a laser tracker, seed {seed}"))
     t.show(
         f"{poses} poses, unloaded and under {len(loads)} loads ({', '.join(loads)}): "
-        f"{len(r.readings)} readings.\n{what}"
+        f"{len(r.readings)} readings.\n{secret}"
     )
     kind = "deflections: loaded minus unloaded" if r.mode == "deflection" else "absolute positions"
     t.show(f"The model is fitted to {kind}.\n")
@@ -422,8 +422,8 @@ def _judge(r: Rehearsal, refinement: Refinement) -> tuple[bool, str]:
     same = suspects[0].same_as if suspects else ()
     if r.hidden in added:
         others_added = [a for a in added if a != r.hidden]
-        more = f" Added as well: {numbers.names(others_added)}." if others_added else ""
-        return True, f"{hidden}. It was found and added.{more}"
+        ending = f" Added as well: {numbers.names(others_added)}." if others_added else ""
+        return True, f"{hidden}. It was found and added.{ending}"
     if added and r.hidden in same:
         return True, f"{hidden}. It was named among those that these readings do not separate."
     return False, f"{hidden}. It was not found."

@@ -257,8 +257,8 @@ def _write_geometry(calibration: Calibration, options: ExportOptions) -> Iterato
     messages: list[str] = []
     files: dict[Path, str | bytes] = {}
     if options.ur_kinematics is not None:
-        words = _ur_note(note, base, arm, options.ur_hash)
-        text, beyond = handover.ur_kinematics(nominal, arm.arm, words, options.ur_hash)
+        comment = _ur_note(note, base, arm, options.ur_hash)
+        text, beyond = handover.ur_kinematics(nominal, arm.arm, comment, options.ur_hash)
         files[options.ur_kinematics] = text
         shift, tilt = np.linalg.norm(beyond[:3, 3]), np.linalg.norm(beyond[:3, :3] - np.eye(3))
         messages.append(

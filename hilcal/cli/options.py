@@ -25,9 +25,9 @@ def _declared(text: str) -> dict[str, Any]:
     declared = {}
     for entry in re.split(r"\n(?=\S)", inspect.cleandoc(text)) if text else ():
         name, spec, meaning = " ".join(entry.split()).split(" | ", 2)
-        words = spec.split()
-        names = [word for word in words if word.startswith("-")]
-        value = " ".join(word for word in words if word not in names) or None
+        parts = spec.split()
+        names = [word for word in parts if word.startswith("-")]
+        value = " ".join(word for word in parts if word not in names) or None
         make = typer.Option if names else typer.Argument
         declared[name] = make(*names, metavar=value, help=meaning)
     return declared
@@ -92,12 +92,10 @@ def command(text: str = "") -> Callable[[F], F]:
     declarations, annotated = SHARED | _declared(text), cast(Any, Annotated)
 
     def declare(function: F) -> F:
-        parameters = inspect.signature(function).parameters.values()
-        joint: dict[str, Any] = {
-            p.name: p.annotation for p in parameters if is_dataclass(p.annotation)
-        }
+        params = inspect.signature(function).parameters.values()
+        joint: dict[str, Any] = {p.name: p.annotation for p in params if is_dataclass(p.annotation)}
         flattened = []
-        for p in parameters:
+        for p in params:
             parts = (
                 inspect.signature(joint[p.name]).parameters.values() if p.name in joint else (p,)
             )
@@ -155,7 +153,7 @@ def check_new(path: Path, force: bool) -> None:
         raise InputError(f"{path}: the file exists; choose another name or give --force")
 
 
-def check_folder(path: Path, what: str) -> None:
+def check_folder(path: Path, option: str) -> None:
     """Refuse a file in a folder that does not exist, before any work is done."""
     if not path.absolute().parent.is_dir():
-        raise InputError(f"{what}: no folder {path.absolute().parent}; make it first")
+        raise InputError(f"{option}: no folder {path.absolute().parent}; make it first")

@@ -203,7 +203,7 @@ def make_plan(
     poses: int,
     seed: int,
     catalogue: Catalogue,
-    say: Say = lambda words: None,
+    say: Say = lambda text: None,
 ) -> Plan:
     """Return a plan whose poses are each read unloaded and under every load that they bear."""
     rng = np.random.default_rng(check_seed(seed))
@@ -267,12 +267,7 @@ def next_(
         f"--plan {quoted(output)}"
     )
     t.document(
-        {
-            **checked_plan.to_dict(),
-            "plan": str(output),
-            "suspects": list(effects),
-            **separates(chosen),
-        }
+        checked_plan.to_dict(), plan=str(output), suspects=list(effects), **separates(chosen)
     )
 
 

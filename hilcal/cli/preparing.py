@@ -165,11 +165,11 @@ def ports() -> list[str]:
     """Return the serial ports of this computer, by persistent names where they have one."""
     from serial.tools import list_ports  # takes a while
 
-    devices = [p.device for p in list_ports.comports()]
+    port_names = [p.device for p in list_ports.comports()]
     folder = Path("/dev/serial/by-id")
     links = sorted(folder.iterdir()) if folder.is_dir() else []
     named = {str(p.resolve()): str(p) for p in links}
-    return [named.get(device, device) for device in devices]
+    return [named.get(device, device) for device in port_names]
 
 
 @dataclass(frozen=True, slots=True)
@@ -253,20 +253,18 @@ def init(
     """Write a commented CELL.toml: asks at a terminal, else takes the options."""
     t = terminal(as_json)
     options = {f"--{name.replace('_', '-')}": value for name, value in locals().items()}
-    interactive = somebody_there(t) and not as_json
+    asks = somebody_there(t) and not as_json
     check_folder(cell, str(cell))
-    check_new(
-        cell, force or (interactive and cell.exists() and agreed(t, f"{cell} exists. Replace it?"))
-    )
+    check_new(cell, force or (asks and cell.exists() and agreed(t, f"{cell} exists. Replace it?")))
     draft = Draft(cell.absolute().parent)
-    if interactive:
+    if asks:
         t.notice(f"Enter alone leaves a thing open; Ctrl-C ends, and {cell} is not written.\n")
     for question in questions():
         stated = options[question.option]
         if stated is not None:
             for text in stated if isinstance(stated, list) else [stated]:
                 _from_option(draft, question, text)
-        elif interactive:
+        elif asks:
             _ask(t, draft, question)
         elif question.parameter == "robot":
             raise InputError(

@@ -171,13 +171,10 @@ def _change(
             new = Chapter(c.number, c.added, c.fit, c.diagnosis, c.removed)
             if live is not None:
                 live.revised(new)
-        previous_record, d = o.file.revision(number), c.diagnosis
-        verdict = str(previous_record.result_json.get("diagnose", {}).get("verdict", ""))
-        both = [
-            Chapter(number, previous_record.added, previous, None, previous_record.removed),
-            new,
-        ]
-        t.show(errors_by_revision(both, verdict))
+        old, d = o.file.revision(number), c.diagnosis
+        verdict = str(old.result_json.get("diagnose", {}).get("verdict", ""))
+        pair = [Chapter(number, old.added, previous, None, old.removed), new]
+        t.show(errors_by_revision(pair, verdict))
         named = write_effect(effect, options or {})
         t.show(fell(previous, c.fit, named) if adds else rose(previous, c.fit, effect))
         t.show([] if c.expected is None else addition_lines(c.expected))
@@ -187,7 +184,7 @@ def _change(
                 chapters = o.chapters(say, c.number)
             record_story(t, chapters, record)
     t.document(
-        revisions=revisions_json(both, verdict),
+        revisions=revisions_json(pair, verdict),
         verdict=d.verdict,
         message=message(d),
         **{} if c.expected is None else {"addition": suspect_json(c.expected)},
@@ -236,10 +233,8 @@ def refine(
                 say("registering")
                 model, fitted = starting_model(o, mode, named, carried), o.readings
             history = NOTHING if latest is None else o.history(latest.number)
-            start_numbers = () if latest is None else (latest.number,)
-            numbers_to_be = itertools.chain(
-                start_numbers, itertools.count(len(o.file.revisions()) + 1)
-            )
+            origin = () if latest is None else (latest.number,)
+            numbers_to_be = itertools.chain(origin, itertools.count(len(o.file.revisions()) + 1))
 
             def judged(step: RefinementStep) -> None:
                 if live is not None:
@@ -252,10 +247,10 @@ def refine(
                 finish(step.fit, say)
             records = [
                 o.record(s.fit, s.diagnosis, s.added, s.removed)
-                for s in refinement.steps[len(start_numbers) :]
+                for s in refinement.steps[len(origin) :]
             ]
             n_revisions = len(o.file.revisions())
-            numbered = (*start_numbers, *o.append_records(records, *start_numbers))
+            numbered = (*origin, *o.append_records(records, *origin))
             chapters = chapters_of(numbered, refinement.steps)
         t.show(errors_by_revision(chapters))
         t.show(options_line(refinement.fit))

@@ -439,19 +439,19 @@ def last_time(readings: Readings) -> float:
     return 0.0 if time is None else float(time.max())
 
 
-def to_the_end(t: Terminal, work: Callable[[], object], done: Callable[[], int]) -> None:
+def to_the_end(t: Terminal, work: Callable[[], object], count: Callable[[], int]) -> None:
     """Measure the missing readings by `work`; try again after a device failure.
 
     On a busy computer a simulated device may stall, which a driver takes for a failure. At most
-    `TRIES` - 1 failures in a row without a new reading are accepted; `done` counts the readings.
+    `TRIES` - 1 failures in a row without a new reading are accepted; `count` returns the number of readings.
     """
-    tries, stored = TRIES, done()
+    tries, stored = TRIES, count()
     while True:
         try:
             work()
         except DeviceError as error:
-            count = done()
-            tries, stored = (TRIES if count > stored else tries) - 1, count
+            current = count()
+            tries, stored = (TRIES if current > stored else tries) - 1, current
             if tries <= 0:
                 raise
             t.notice(f"note: {error}")

@@ -43,7 +43,7 @@ class Doubt:
     """The misfit that depends on the pose alone, where further unloaded poses settle the doubt."""
 
 
-def doubt_of(d: Diagnosis, say: Say = lambda words: None) -> Doubt | None:
+def doubt_of(d: Diagnosis, say: Say = lambda text: None) -> Doubt | None:
     """Return the doubt that a diagnosis leaves; None without one, or where an option settles it."""
     suspects = in_doubt(d)
     if not suspects or any(s.coarse for s in d.suspects if s.effect in suspects):
@@ -53,7 +53,7 @@ def doubt_of(d: Diagnosis, say: Say = lambda words: None) -> Doubt | None:
     return Doubt(without(d.fit, suspects, say), suspects, alone)
 
 
-def without(fitted: Fit, suspects: tuple[str, ...], say: Say = lambda words: None) -> Fit:
+def without(fitted: Fit, suspects: tuple[str, ...], say: Say = lambda text: None) -> Fit:
     """Return the fit of a model without some effects."""
     for name in suspects:
         if name in fitted.model.names:
@@ -68,7 +68,7 @@ def separating(
     doubt: Doubt,
     poses: int | None,
     rng: np.random.Generator,
-    say: Say = lambda words: None,
+    say: Say = lambda text: None,
     reference: Floats | None = None,
     usual: int = 20,
 ) -> Next:

@@ -157,7 +157,7 @@ class Procedure:
 
     # the first plan
 
-    def plan(self, say: Say = lambda words: None) -> CheckedPlan:
+    def plan(self, say: Say = lambda text: None) -> CheckedPlan:
         """Choose the first plan, without storing it; fewer poses where the cell allows no more."""
         rng, config = self._rng(_FIRST), self._planned()
         return checked_plan(self.cell, config, self.settings.poses, rng, self.catalogue, say)
@@ -213,7 +213,7 @@ class Procedure:
 
     def refine(
         self,
-        say: Say = lambda words: None,
+        say: Say = lambda text: None,
         seen: Callable[[int, RefinementStep], None] = lambda number, step: None,
     ) -> Refinement:
         """Fit, diagnose, and change the model until it is adequate; all revisions are stored.
@@ -244,7 +244,7 @@ class Procedure:
         self._refinements[:] = [found]
         return ProcedureLog(o.file).append(REFINED, content, revisions=records)
 
-    def decide(self, say: Say = lambda words: None) -> Decision:
+    def decide(self, say: Say = lambda text: None) -> Decision:
         """Decide whether to measure more; a further plan is appended to the campaign."""
         with Campaign.open(self.run, self.catalogue) as o:
             log, run = ProcedureLog(o.file), RunLog(o.file)
@@ -270,7 +270,7 @@ class Procedure:
         with CampaignFile.open(self.run) as campaign:
             ProcedureLog(campaign).append(DECIDED, {"action": STOP, "reason": "asked"})
 
-    def compute(self, step: ProcedureStep, say: Say = lambda words: None) -> object:
+    def compute(self, step: ProcedureStep, say: Say = lambda text: None) -> object:
         """Do a step in which nothing moves, other than "plan"; return its result."""
         steps: dict[str, Callable[[Say], object]] = {
             "refine": self.refine,
@@ -290,7 +290,7 @@ class Procedure:
 
     # testing what is never fitted
 
-    def plan_validation(self, say: Say = lambda words: None) -> Plan:
+    def plan_validation(self, say: Say = lambda text: None) -> Plan:
         """Choose poses and loads of the validation campaign, and make its file."""
         with Campaign.open(self.run, self.catalogue, read_only=True) as o:
             say("restoring the model")
@@ -309,7 +309,7 @@ class Procedure:
             self._create(self.files.validation, VALIDATION, plan, o)
         return plan
 
-    def validate(self, say: Say = lambda words: None) -> Acceptance:
+    def validate(self, say: Say = lambda text: None) -> Acceptance:
         """Freeze the validation campaign, and predict its readings."""
         with (
             Campaign.open(self.run, self.catalogue) as o,
@@ -354,7 +354,7 @@ class Procedure:
                 f"(SHA-256 {frozen['readings_sha256'][:12]}…, now {hashed[:12]}…)"
             )
 
-    def correct(self, say: Say = lambda words: None) -> Plan:
+    def correct(self, say: Say = lambda text: None) -> Plan:
         """Correct the joint targets of the validation poses, and make the campaign for them."""
         with (
             Campaign.open(self.run, self.catalogue) as o,
@@ -380,7 +380,7 @@ class Procedure:
             self._create(self.files.corrected, CORRECTED, plan, o)
         return plan
 
-    def compare(self, say: Say = lambda words: None) -> Improvement:
+    def compare(self, say: Say = lambda text: None) -> Improvement:
         """Compare the measured errors at uncorrected and corrected joint targets."""
         with (
             Campaign.open(self.run, self.catalogue) as o,

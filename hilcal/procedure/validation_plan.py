@@ -52,7 +52,7 @@ def validation_plan(
     reference: Floats | None,
     count: int,
     rng: np.random.Generator,
-    say: Say = lambda words: None,
+    say: Say = lambda text: None,
     *,
     under_load: bool = False,
 ) -> Plan:
@@ -217,7 +217,7 @@ def corrected_plan(
     reference: Floats,
     start: float,
     rng: np.random.Generator,
-    say: Say = lambda words: None,
+    say: Say = lambda text: None,
 ) -> Plan:
     """Return the plan of the corrected joint targets of a validation campaign.
 
@@ -248,16 +248,20 @@ def corrected_plan(
         states = expected_states(plan, cell.arm, config, wrench, last, start)
         at_points = states[np.array([s.pose != REFERENCE for s in plan.steps])]
         compensation = _compensated(calibration, at_points, validation, points, order)
-        bad = {k: why for k, why in enumerate(refusals(compensation, allowed_outside=True)) if why}
-        bad = _blocked(space, compensation.q, reference, [points.loads[k] for k in order]) | bad
-        if not bad:
+        refused = {
+            k: why for k, why in enumerate(refusals(compensation, allowed_outside=True)) if why
+        }
+        refused = (
+            _blocked(space, compensation.q, reference, [points.loads[k] for k in order]) | refused
+        )
+        if not refused:
             say("checking every motion in a dry run")
             corrected = _with_targets(plan, points, order, compensation, left_out)
             refuse(dry_run(cell, config, corrected), "the run at corrected targets")
             return corrected
-        left_out |= {points.names[order[k]]: why for k, why in bad.items()}
-    words = "; ".join(f"{name}: {why}" for name, why in list(left_out.items())[:3])
-    raise CannotAnswerError(f"no validation pose can be corrected: {words}")
+        left_out |= {points.names[order[k]]: why for k, why in refused.items()}
+    reasons = "; ".join(f"{name}: {why}" for name, why in list(left_out.items())[:3])
+    raise CannotAnswerError(f"no validation pose can be corrected: {reasons}")
 
 
 def _compensated(

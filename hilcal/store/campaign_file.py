@@ -319,8 +319,8 @@ class CampaignFile:
             raise self._damaged(f"no {missing[0]}")
         return meta
 
-    def _damaged(self, what: object) -> InputError:
-        return InputError(f"{self.path}: the campaign file is damaged ({what})")
+    def _damaged(self, detail: object) -> InputError:
+        return InputError(f"{self.path}: the campaign file is damaged ({detail})")
 
     def _layout(self) -> Layout | None:
         with schema.sqlite_errors(self.path):

@@ -82,25 +82,25 @@ def _required(f: Field[Any]) -> bool:
 
 
 def numbers(
-    what: str, values: object, shape: Sequence[int] = (), *, least: float = -LARGEST
+    name: str, values: object, shape: Sequence[int] = (), *, least: float = -LARGEST
 ) -> Floats:
     """Return numbers as an array; a ValueError for another shape, or a number out of range."""
     array = np.asarray(values, dtype=float)
     if array.shape != tuple(shape):
-        raise ValueError(f"{what} has shape {array.shape}; expected {tuple(shape)}")
+        raise ValueError(f"{name} has shape {array.shape}; expected {tuple(shape)}")
     if not np.all((array >= least) & (array <= LARGEST)):
-        raise ValueError(f"{what} has a number that cannot be")
+        raise ValueError(f"{name} has a number that cannot be")
     return array
 
 
-def frames(what: str, values: object, *, several: bool = False) -> Floats:
+def frames(name: str, values: object, *, several: bool = False) -> Floats:
     """Return a frame (4, 4), or K frames; a ValueError where the matrix is none."""
     array = np.asarray(values, dtype=float)
-    numbers(what, array, (*array.shape[:several], 4, 4))
+    numbers(name, array, (*array.shape[:several], 4, 4))
     turn = array[..., :3, :3]
     orthonormal = np.allclose(turn @ np.swapaxes(turn, -1, -2), np.eye(3), atol=1e-6)
     if not orthonormal or np.any(array[..., 3, :] != [0.0, 0.0, 0.0, 1.0]):
-        raise ValueError(f"{what} is no frame: a rotation and a translation")
+        raise ValueError(f"{name} is no frame: a rotation and a translation")
     return array
 
 
@@ -120,7 +120,7 @@ def write_document(path: Path, content: Mapping[str, object], indent: int | None
 
 
 def read_document(
-    content: object, what: str, form: str, versions: tuple[int, ...], read: Callable[[Any], T]
+    content: object, name: str, form: str, versions: tuple[int, ...], read: Callable[[Any], T]
 ) -> T:
     """Return the value that `read` makes of a document of one of the `versions`.
 
@@ -128,27 +128,27 @@ def read_document(
         InputError: another format or version, or a damaged document.
     """
     if not isinstance(content, dict) or content.get("format") != form:
-        raise InputError(f'no {what}; valid: a JSON document with "format": "{form}"')
+        raise InputError(f'no {name}; valid: a JSON document with "format": "{form}"')
     if content.get("version") not in versions:
         readable = "version" + "s" * (len(versions) > 1) + " " + " and ".join(map(str, versions))
         raise InputError(
-            f"a {what} of version {content.get('version')}, written by hilcal "
+            f"a {name} of version {content.get('version')}, written by hilcal "
             f"{content.get('hilcal')}; this program reads {readable}"
         )
-    check_names({k: v for k, v in content.items() if k != "source"}, what)
+    check_names({k: v for k, v in content.items() if k != "source"}, name)
     try:
         return read(content)
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
-        raise InputError(f"a damaged {what}: {error!r}") from None
+        raise InputError(f"a damaged {name}: {error!r}") from None
 
 
 @limits.bounded
-def read_file(path: Path, what: str, read: Callable[[Any], T]) -> T:
+def read_file(path: Path, name: str, read: Callable[[Any], T]) -> T:
     """Return the value that `read` makes of a JSON file's content."""
     try:
         content = parse_json(limits.read_text(path, limits.DOCUMENT))
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: no {what}: {error}") from None
+        raise InputError(f"{path}: no {name}: {error}") from None
     try:
         return read(content)
     except InputError as error:

@@ -98,11 +98,11 @@ def read_plan(text: str, where: str) -> Plan:
     return Plan(names, q, steps, {key: x for key, x in data.items() if key not in keys})
 
 
-def _entries(data: object, what: str, where: str) -> list[Any]:
+def _entries(data: object, kind: str, where: str) -> list[Any]:
     """Return a list of poses or steps; refuse an empty or a long one."""
     if not isinstance(data, list) or not data:
-        raise InputError(f'{where}: "{what}s" must be a list of at least one {what}')
-    limits.check_planned(where, f"{what}s", len(data))
+        raise InputError(f'{where}: "{kind}s" must be a list of at least one {kind}')
+    limits.check_planned(where, f"{kind}s", len(data))
     return data
 
 

@@ -243,8 +243,8 @@ def fetch_readings(
     """Return all readings, in order; refuse missing or damaged ones, and invalid names."""
     (count,) = connection.execute("SELECT count(*) FROM readings").fetchone()
 
-    def damaged(what: str) -> InputError:
-        return InputError(f"{path}: the campaign file is damaged{what}")
+    def damaged(place: str) -> InputError:
+        return InputError(f"{path}: the campaign file is damaged{place}")
 
     if not count:
         raise damaged(" (its readings are gone)")
@@ -277,10 +277,10 @@ def fetch_readings(
         if bad := np.flatnonzero(~is_covariance(readings.covariance))[:1].tolist():
             why = "its covariance is not positive semi-definite"
             raise damaged(f" at reading {bad[0] + 1}: {why}")
-    for what, listed in (("target", target_names), ("observer", observers)):
-        numbers = getattr(readings.states, what)
+    for kind, listed in (("target", target_names), ("observer", observers)):
+        numbers = getattr(readings.states, kind)
         if numbers is not None and not 0 <= numbers.min() <= numbers.max() < len(listed):
-            raise damaged(f" ({what}s are missing)")
+            raise damaged(f" ({kind}s are missing)")
     return readings
 
 

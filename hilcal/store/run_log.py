@@ -96,7 +96,7 @@ class RunLog:
     def plan(self) -> Plan:
         """The joined plans; of all but the last one only the measured steps."""
         done = self.done() if len(self.plans) > 1 else frozenset()
-        return reduce(lambda whole, further: joined(whole, done, further), self.plans)
+        return reduce(lambda a, b: joined(a, done, b), self.plans)
 
     def with_new_names(self, plan: Plan) -> Plan:
         """Return a further plan with names and cycles that are new in the campaign."""
