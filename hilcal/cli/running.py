@@ -443,7 +443,8 @@ def to_the_end(t: Terminal, work: Callable[[], object], count: Callable[[], int]
     """Measure the missing readings by `work`; try again after a device failure.
 
     On a busy computer a simulated device may stall, which a driver takes for a failure. At most
-    `TRIES` - 1 failures in a row without a new reading are accepted; `count` returns the number of readings.
+    `TRIES` - 1 failures in a row without a new reading are accepted. `count` returns the number of
+    readings.
     """
     tries, stored = TRIES, count()
     while True:
