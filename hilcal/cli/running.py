@@ -1,4 +1,4 @@
-"""`run` and `simulate`: campaigns on devices, in a simulated cell, or drawn at random."""
+"""`run` and `simulate`: campaigns on devices, in a simulated cell, or drawn without devices."""
 
 import shlex
 import signal
@@ -146,7 +146,7 @@ def run(
         options += [word for path in effects_from or () for word in ("--effects-from", str(path))]
         line = shlex.join(("hilcal", "run", str(cell), "-o", str(output), "--resume", *options))
         live = stack.enter_context(followed(t, view, output))
-        with _says_how_to_resume(campaign, planned, line):
+        with _resumable(campaign, planned, line):
             measured = measure(t, config, numbers, campaign, goal, viewer=live)
     document: dict[str, object] = {"campaign": str(output), "readings": measured}
     document["planned"] = planned
@@ -174,36 +174,27 @@ def _default_plan(
         rng = np.random.default_rng(seed)
         planned = checked_plan(cell, config, POSES, rng, catalogue, say)
     t.show(plan_facts(planned.summary))
-    plan_command = (
-        "hilcal",
-        "plan",
-        str(path),
-        "-o",
-        "plan.json",
-        *(("--seed", str(seed)) * bool(seed)),
-    )
+    options = ("--seed", str(seed)) if seed else ()
+    line = shlex.join(("hilcal", "plan", str(path), "-o", "plan.json", *options))
     if notes := len(planned.summary.remarks):
         t.show(f"What it assumes and leaves out ({notes} note{'s' * (notes > 1)}):")
-        t.command(shlex.join(plan_command))
+        t.command(line)
     if yes or not somebody_there(t):
         return planned.plan
     t.notice("")
     if not agreed(t, "Measure this plan now? The arm will move."):
         raise StoppedError(
-            "not measured, nothing has moved. To see, keep or change the whole plan: "
-            + shlex.join(plan_command)
+            f"not measured, nothing has moved. To see, keep or change the whole plan: {line}"
         )
     return planned.plan
 
 
 @contextmanager
-def _says_how_to_resume(
-    campaign: CampaignFile, planned: int, resume_command: str
-) -> Iterator[None]:
+def _resumable(campaign: CampaignFile, planned: int, line: str) -> Iterator[None]:
     """Add the number of stored readings and the command that resumes to errors of a run."""
 
     def safe() -> str:
-        return f"{campaign.n_readings} of {planned} readings are safe; go on with: {resume_command}"
+        return f"{campaign.n_readings} of {planned} readings are safe; go on with: {line}"
 
     try:
         try:
@@ -212,7 +203,7 @@ def _says_how_to_resume(
             campaign.check_place()
     except MovedFileError as error:
         message = str(error).removesuffix(HOW_ON).rstrip(". ")
-        raise MovedFileError(f"{message}; then go on with: {resume_command}") from error
+        raise MovedFileError(f"{message}; then go on with: {line}") from error
     except KeyboardInterrupt:
         raise StoppedError(f"interrupted: the arm stands, {safe()}") from None
     except HilcalError as error:
@@ -531,11 +522,9 @@ def simulate(
         say("preparing the simulated cell")
         secret = case_of_plan(config, campaign_plan, choice, number, catalogue, base_dir)
     if secret.hidden != NOTHING and (config.fitted, secret.mode) == ("deflection", "absolute"):
-        reason = (
-            f"{choice} hides what they may not show" if choice == RANDOM else f"{choice} cancels"
-        )
+        why = f"{choice} hides what they may not show" if choice == RANDOM else f"{choice} cancels"
         t.notice(
-            f"warning: deflections are planned and fitted, and {reason} in them; set readings = "
+            f"warning: deflections are planned and fitted, and {why} in them; set readings = "
             f'"absolute" in [planning] of {cell} for a campaign that shows it'
         )
     with told_to_end(signal.SIGTERM, signal.SIGINT, signal.SIGHUP) as wait, ExitStack() as stack:

@@ -158,7 +158,11 @@ class Procedure:
     # the first plan
 
     def plan(self, say: Say = lambda text: None) -> CheckedPlan:
-        """Choose the first plan, without storing it; fewer poses where the cell allows no more."""
+        """Choose the first plan, without storing it.
+
+        Raises:
+            CannotAnswerError: the cell leaves too few poses.
+        """
         rng, config = self._rng(_FIRST), self._planned()
         return checked_plan(self.cell, config, self.settings.poses, rng, self.catalogue, say)
 

@@ -180,9 +180,9 @@ class CorrectedPoints:
 
 
 def points_of(readings: Readings, mode: str) -> CorrectedPoints:
-    """Return the points to correct: the readings of the first target but at the reference pose.
+    """Return the points to correct: readings of the first target, except at the reference pose.
 
-    For deflections these are the loaded readings that have an unloaded one of pose and cycle.
+    For deflections, only loaded readings with an unloaded one of the same pose and cycle.
     """
     first = readings.target == 0
     unloaded_rows = {
