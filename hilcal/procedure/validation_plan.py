@@ -191,11 +191,8 @@ def points_of(readings: Readings, mode: str) -> CorrectedPoints:
     }
     rows, unloaded = [], []
     for k in np.flatnonzero(first).tolist():
-        base = (
-            -1
-            if mode == "absolute"
-            else unloaded_rows.get((int(readings.pose[k]), int(readings.cycle[k])))
-        )
+        arrival = int(readings.pose[k]), int(readings.cycle[k])
+        base = -1 if mode == "absolute" else unloaded_rows.get(arrival)
         to_correct = mode == "absolute" or not readings.unloaded[k]
         if to_correct and base is not None and readings.pose_names[readings.pose[k]] != REFERENCE:
             rows.append(k)
@@ -248,20 +245,17 @@ def corrected_plan(
         states = expected_states(plan, cell.arm, config, wrench, last, start)
         at_points = states[np.array([s.pose != REFERENCE for s in plan.steps])]
         compensation = _compensated(calibration, at_points, validation, points, order)
-        refused = {
-            k: why for k, why in enumerate(refusals(compensation, allowed_outside=True)) if why
-        }
-        refused = (
-            _blocked(space, compensation.q, reference, [points.loads[k] for k in order]) | refused
-        )
+        reasons = refusals(compensation, allowed_outside=True)
+        refused = _blocked(space, compensation.q, reference, [points.loads[k] for k in order])
+        refused |= {k: why for k, why in enumerate(reasons) if why}
         if not refused:
             say("checking every motion in a dry run")
             corrected = _with_targets(plan, points, order, compensation, left_out)
             refuse(dry_run(cell, config, corrected), "the run at corrected targets")
             return corrected
         left_out |= {points.names[order[k]]: why for k, why in refused.items()}
-    reasons = "; ".join(f"{name}: {why}" for name, why in list(left_out.items())[:3])
-    raise CannotAnswerError(f"no validation pose can be corrected: {reasons}")
+    causes = "; ".join(f"{name}: {why}" for name, why in list(left_out.items())[:3])
+    raise CannotAnswerError(f"no validation pose can be corrected: {causes}")
 
 
 def _compensated(

@@ -275,9 +275,9 @@ class CampaignFile:
                 except InputError as error:
                     return tuple(records), (expected, str(error))
                 except (ValueError, TypeError, AttributeError) as error:
-                    place = f"the campaign is damaged at revision {expected}"
+                    defect = f"the campaign is damaged at revision {expected}"
                     why = f" ({error})" if str(error) else ""
-                    return tuple(records), (expected, place + why)
+                    return tuple(records), (expected, defect + why)
         return tuple(records), None
 
     def revision(self, number: int) -> RevisionRecord:
@@ -295,9 +295,7 @@ class CampaignFile:
         files of older programs, of those and the next ones, which were appended during the fit.
         """
         records, damaged = self._sound_revisions()
-        fitted = [
-            (r.number, *reference) for r in records if (reference := fitted_to(r)) is not None
-        ]
+        fitted = [(r.number, *basis) for r in records if (basis := fitted_to(r)) is not None]
         if not fitted:
             return damaged
         readings, hashes = self.readings(), dict[int, str]()

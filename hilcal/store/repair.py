@@ -72,11 +72,7 @@ def _naming(file: CampaignFile, first: int) -> tuple[str, ...]:
     entries = [[e.get("revision"), *e.get("revisions", ())] for e in ProcedureLog(file).entries()]
     keys: list[str] = []
     for key, groups in ((ACCEPTED, accepted), (ENTRY, entries)):
-        bad = (
-            k
-            for k, numbers in enumerate(groups)
-            if any(n is not None and n >= first for n in numbers)
-        )
+        bad = (k for k, g in enumerate(groups) if any(n is not None and n >= first for n in g))
         keys += [key.format(k + 1) for k in range(next(bad, len(groups)), len(groups))]
     return tuple(keys)
 
