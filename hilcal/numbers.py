@@ -50,10 +50,10 @@ def joint_value(value: float, unit: str, places: int = 1) -> str:
     return f"{factor * value:.{places}f}{name if name == '°' else ' ' + name}"
 
 
-def sizes(pairs: Iterable[tuple[str, float]]) -> str:
+def sizes(items: Iterable[tuple[str, float]]) -> str:
     """Write (unit, value) pairs, SI, in units for people."""
     return ", ".join(
-        f"{text} {name}" for text, _, name in (measured(u, v, count=2) for u, v in pairs)
+        f"{text} {name}" for text, _, name in (measured(u, v, count=2) for u, v in items)
     )
 
 

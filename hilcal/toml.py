@@ -137,11 +137,7 @@ def read_json(text: str, where: str) -> Any:
 
 
 def parse_json(text: str) -> Any:
-    """Return the content of a JSON document.
-
-    Raises:
-        ValueError: not JSON, nested too deeply, or too large.
-    """
+    """Return the content of a JSON text; a ValueError for an invalid, too deep or too large one."""
     if sum(map(text.count, ",:[{")) > limits.VALUES:
         raise ValueError(f"more than {limits.VALUES / 1e6:.0f} million values")
     try:

@@ -87,6 +87,5 @@ def validate(
     prediction = validation.validate(model, theta, fitted, chosen, mode, registered=register)
     say("comparing with what was measured")
     beyond = extrapolation(run.predictive(record, model, theta), fitted, prediction)
-    return CampaignValidation(
-        model, judged, prediction, beyond, acceptance(prediction, beyond, limit_m)
-    )
+    shares = acceptance(prediction, beyond, limit_m)
+    return CampaignValidation(model, judged, prediction, beyond, shares)

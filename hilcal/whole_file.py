@@ -51,9 +51,7 @@ def replacing(path: str | Path, *, must_be_new: bool = False) -> Iterator[Path]:
             new.unlink(missing_ok=True)
             raise
     except OSError as error:
-        reason = (
-            os.strerror(error.errno) if error.errno else error
-        )  # of libraries: without a number
+        reason = os.strerror(error.errno) if error.errno else error  # libraries set no number
         raise InputError(f"{path}: cannot be written ({reason})") from error
     except UnicodeEncodeError as error:
         raise InputError(f"{path}: a text is not valid Unicode ({error.object!r:.80})") from error

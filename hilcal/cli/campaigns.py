@@ -175,10 +175,8 @@ def info(run: Path, as_json: bool = False) -> None:
     torques = None if content.readings is None else check_torques(cell, content.readings)
     t.show(info_report(content, run.name, covariance_words(parts, noise)))
     t.show(torque_lines(torques))
-    document = to_json(content, str(run), parts)
-    if torques is not None:
-        document["torques"] = torques.to_json()
-    t.document(document)
+    extra = {} if torques is None else {"torques": torques.to_json()}
+    t.document(to_json(content, str(run), parts), **extra)
 
 
 @command("""

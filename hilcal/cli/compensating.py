@@ -121,34 +121,30 @@ def compensate(
         unclear = doubts(arm, on_flange, task.corrected, q, start) or [""] * len(q)
         acting = wrench if targets.sensed is None else calibration.load_wrench(q, targets.sensed)
         poses = _program_poses(task, calibration, q, arm)
-        compensation = calibration.compensate(
+        result = calibration.compensate(
             q, acting, tool=task.tool, wanted=poses, recorded=targets.recorded
         )
     if slow := calibration.without_kernel(task.tool):
         t.notice(
             f"note: {', '.join(slow)} has no compiled form: a point takes 25 to 60 ms, not 0.1 ms"
         )
-    pairs = zip(unclear, refusals(compensation, options.outside), strict=True)
+    pairs = zip(unclear, refusals(result, options.outside), strict=True)
     refused = ["; ".join(filter(None, pair)) for pair in pairs]
     outcomes = fates(foreign.program.points if foreign else task.waypoints, refused)
     retained = [k for k, why in enumerate(refused) if not why]
     if not options.leave or not retained:
-        wrong = (
-            ~compensation.inverse.solved | compensation.singular | compensation.limits.any(axis=1)
-        )
+        wrong = ~result.inverse.solved | result.singular | result.limits.any(axis=1)
         _refuse(points, targets.names, refused, wrong | np.array(unclear, bool))
     elif any(refused):
         q, task = q[retained], _only(task, retained, refused)
         poses = None if poses is None else poses[retained]
-        compensation = calibration.compensate(q, acting, tool=task.tool, wanted=poses)
-    document = compensation.to_dict(task.points.names)
+        result = calibration.compensate(q, acting, tool=task.tool, wanted=poses)
+    document = result.to_dict(task.points.names)
     if outcomes:
         document["waypoints"] = [asdict(fate) for fate in outcomes]
-    files = [
-        f for path in output or () for f in _write(path, task, compensation, document, arm.units)
-    ]
+    files = [f for path in output or () for f in _write(path, task, result, document, arm.units)]
     written = [str(path) for path in files]
-    t.show(compensation_report(calibration, task.points.names, q, compensation))
+    t.show(compensation_report(calibration, task.points.names, q, result))
     t.show(waypoints_table(outcomes))
     hint = "Nothing is written; -o F.csv, F.json or F.script keeps the joint values."
     t.show(f"\nWritten: {', '.join(written)}." if written else f"\n{hint}")
@@ -286,16 +282,12 @@ def _check_output(path: Path, points: Path, force: bool) -> None:
 
 
 def _write(
-    path: Path,
-    task: _Task,
-    compensation: Compensation,
-    document: dict[str, object],
-    units: Sequence[str],
+    path: Path, task: _Task, result: Compensation, document: dict[str, object], units: Sequence[str]
 ) -> list[Path]:
     """Write the joint values in the format of the file's name; return the files."""
-    names, n = task.points.names, compensation.q.shape[1]
+    names, n = task.points.names, result.q.shape[1]
     if task.foreign is not None and path.suffix.lower() in READERS:
-        files = {path.with_suffix(k): v for k, v in task.foreign.corrected(compensation.q).items()}
+        files = {path.with_suffix(k): v for k, v in task.foreign.corrected(result.q).items()}
         for file_path, text in files.items():
             replace_file(file_path, text)
         return list(files)
@@ -303,27 +295,23 @@ def _write(
     if path.suffix == ".json":
         content = json.dumps(plain(document), allow_nan=False, indent=2) + "\n"
     elif path.suffix == ".csv":
-        content = _csv(names, compensation, units)
+        content = _csv(names, result, units)
     elif n != JOINTS:
         raise InputError(f"{path}: a UR program has {JOINTS} joints, this arm has {n}")
     elif task.program is None:
-        content = movej_program(names, compensation.q)
+        content = movej_program(names, result.q)
     else:
-        content = with_joints(task.program, task.corrected, compensation.q)
+        content = with_joints(task.program, task.corrected, result.q)
     replace_file(path, content)
     return [path]
 
 
-def _csv(names: tuple[str, ...], compensation: Compensation, units: Sequence[str]) -> str:
+def _csv(names: tuple[str, ...], result: Compensation, units: Sequence[str]) -> str:
     out = io.StringIO()
     rows = csv.writer(out, lineterminator="\n")
     rows.writerow(["pose", *joint_columns(units), "before_m", "std_m", "band_m"])
     for k, name in enumerate(names):
-        numbers = (
-            compensation.before.error_m[k],
-            compensation.after.std_m[k],
-            compensation.after.band_m[k],
-        )
-        values = [f"{v:.9f}" for v in compensation.q[k]]
+        numbers = (result.before.error_m[k], result.after.std_m[k], result.after.band_m[k])
+        values = [f"{v:.9f}" for v in result.q[k]]
         rows.writerow([csv_text(name), *values, *(f"{x:.4g}" for x in numbers)])
     return out.getvalue()

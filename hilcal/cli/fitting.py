@@ -49,7 +49,7 @@ def fit_of(t: Terminal, run: Campaign, say: Say, revision: int | None) -> tuple[
     number, fitted = run.fit_in_use(say, revision)
     if number is None:
         t.notice(
-            f"no revision yet: taking the baseline {_described(fitted)}; hilcal identify keeps it"
+            f"no revision yet: taking the baseline {_summary(fitted)}; hilcal identify keeps it"
         )
     return number, fitted
 
@@ -69,11 +69,11 @@ def stored_fit(t: Terminal, run: Campaign, say: Say, revision: int | None) -> tu
     number, fitted = run.fit_in_use(say, revision)
     if number is None:
         number = run.store(fitted)
-        t.notice(f"no revision yet: made the baseline, revision {number} {_described(fitted)}")
+        t.notice(f"no revision yet: made the baseline, revision {number} {_summary(fitted)}")
     return number, fitted
 
 
-def _described(fitted: Fit) -> str:
+def _summary(fitted: Fit) -> str:
     return f"({model_name(fitted.model.named)}; {fitted.mode} readings)"
 
 

@@ -18,10 +18,7 @@ POSES = 20
 
 
 def _declared(text: str) -> dict[str, Any]:
-    """Return options and arguments by parameter.
-
-    The entries of the text are "parameter | names and value | meaning".
-    """
+    """Return options by parameter, from entries "parameter | names and value | meaning"."""
     declared = {}
     for entry in re.split(r"\n(?=\S)", inspect.cleandoc(text)) if text else ():
         name, spec, meaning = " ".join(entry.split()).split(" | ", 2)

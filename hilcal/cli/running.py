@@ -154,10 +154,8 @@ def run(
         document["goal"] = goal.status.to_dict()
         if goal.status.met:
             t.show(f'The goal "{goal.goal.text}" is met: {full_words(goal.status)}.')
-    total = "" if measured == planned else f" of {planned}"
-    t.show(
-        f"{measured}{total} readings are in {output}. Go on with: hilcal refine {quoted(output)}"
-    )
+    count = f"{measured}" if measured == planned else f"{measured} of {planned}"
+    t.show(f"{count} readings are in {output}. Go on with: hilcal refine {quoted(output)}")
     missed: CannotAnswerError | None = None
     if goal is not None and not goal.status.met:
         line = f"hilcal plan {quoted(cell)} -o more.json --after {quoted(output)}"
@@ -356,26 +354,24 @@ def on_devices(t: Terminal, settings: RehearsalSettings, plan: Plan) -> Iterator
         with working(t.progress) as say:
             secret = settings.case(plan)
             say("starting the simulated devices")
-            simulated = stack.enter_context(
-                simulated_cell(secret, settings.seed, settings.base_dir)
-            )
+            world = stack.enter_context(simulated_cell(secret, settings.seed, settings.base_dir))
         t.notice(NEWCOMER)
         campaign = stack.enter_context(
-            create_run(settings.output, simulated.config, settings.base_dir, plan, True)
+            create_run(settings.output, world.config, settings.base_dir, plan, True)
         )
 
         def missing(file: CampaignFile, epoch: float | None = None) -> None:
             to_the_end(
                 t,
-                lambda: measure(t, simulated.config, secret.cell, file, epoch=epoch),
+                lambda: measure(t, world.config, secret.cell, file, epoch=epoch),
                 lambda: file.n_readings,
             )
 
         def measured() -> Rehearsal:
             missing(campaign)
             stored = campaign.readings(), campaign.about(COVERS)
-            readings = full_readings(*stored, secret.cell, simulated.config)
-            return secret.measured(readings, simulated.config)
+            readings = full_readings(*stored, secret.cell, world.config)
+            return secret.measured(readings, world.config)
 
         def further(next_plan: Plan) -> Rehearsal:
             log = RunLog(campaign)
@@ -394,14 +390,9 @@ def in_process(t: Terminal, settings: RehearsalSettings, plan: Plan) -> Iterator
     with working(t.progress):
         secret = settings.case(plan)
     source = "rehearsal in a simulated cell, without devices"
-    config = secret.config.to_json()
+    text = secret.config.to_json()
     with CampaignFile.create(
-        settings.output,
-        config,
-        str(settings.base_dir),
-        source,
-        overwrite=True,
-        more={COVERS: WHOLE},
+        settings.output, text, str(settings.base_dir), source, overwrite=True, more={COVERS: WHOLE}
     ) as campaign:
 
         def measured(part: Plan, number: int, start: float) -> Rehearsal:

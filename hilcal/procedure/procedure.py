@@ -136,9 +136,9 @@ class Procedure:
             stored = continued(path, cell, config, effects)
             return replace(stored, settings=replace(stored.settings, **options))
         readings = config.planning.readings if config.loads else "absolute"
-        defaults = Settings(seed=config.simulation.seed, readings=readings)
+        default = Settings(seed=config.simulation.seed, readings=readings)
         return cls(
-            path, cell, config, cell.base_dir.absolute(), effects, replace(defaults, **options)
+            path, cell, config, cell.base_dir.absolute(), effects, replace(default, **options)
         )
 
     @property
@@ -158,11 +158,7 @@ class Procedure:
     # the first plan
 
     def plan(self, say: Say = lambda text: None) -> CheckedPlan:
-        """Choose the first plan, without storing it.
-
-        Raises:
-            CannotAnswerError: the cell leaves too few poses.
-        """
+        """Choose the first plan, unstored; a CannotAnswerError for a cell with too few poses."""
         rng, config = self._rng(_FIRST), self._planned()
         return checked_plan(self.cell, config, self.settings.poses, rng, self.catalogue, say)
 
@@ -335,14 +331,10 @@ class Procedure:
             prediction = validation.validate(model, theta, fitted, readings, mode)
             beyond = extrapolation(o.predictive(record, model, theta), fitted, prediction)
             shares = acceptance(prediction, beyond)
-            content = {
-                "revision": record.number,
-                "error": prediction.error.to_json(),
-                "noise_floor_m": prediction.noise_floor,
-                "stated_m": shares.everything.stated_m,
-                "within": shares.everything.within,
-            }
-            log.append(VALIDATED, content)
+            total = shares.everything
+            content = {"revision": record.number, "error": prediction.error.to_json()}
+            content |= {"noise_floor_m": prediction.noise_floor, "stated_m": total.stated_m}
+            log.append(VALIDATED, {**content, "within": total.within})
         return shares
 
     def _freeze(self, log: ProcedureLog, unseen: CampaignFile) -> None:

@@ -110,11 +110,9 @@ def _ordered(
     rng: np.random.Generator,
 ) -> Plan:
     """Order the chosen poses with joint values (P, n), from the reference pose (n,)."""
-    names, ordering = [c.pose for c in chosen], Ordering(repeats=0, draws=DRAWS)
-    ordered = order_plan(
-        space.cell, config, names, q, reference, chosen, space.passable, rng, ordering
-    )
-    return fewer_returns(ordered.plan, space, config)
+    names, order = [c.pose for c in chosen], Ordering(repeats=0, draws=DRAWS)
+    best = order_plan(space.cell, config, names, q, reference, chosen, space.passable, rng, order)
+    return fewer_returns(best.plan, space, config)
 
 
 def fewer_returns(plan: Plan, space: Space, config: CellConfig) -> Plan:
@@ -227,33 +225,30 @@ def corrected_plan(
     say("correcting joint values")
     points = points_of(validation, calibration.mode)
     space, last = Space(cell, config), validation.states[slice(len(validation) - 1, None)]
-    q = validation.states.q[points.rows]
-    left_out = {
-        points.names[k]: why for k, why in _blocked(space, q, reference, points.loads).items()
-    }
+    names, q = points.names, validation.states.q[points.rows]
+    blocked = _blocked(space, q, reference, points.loads)
+    left_out = {names[k]: why for k, why in blocked.items()}
     while True:
-        keep = np.array(
-            [k for k, name in enumerate(points.names) if name not in left_out], dtype=int
-        )
+        keep = np.array([k for k, name in enumerate(names) if name not in left_out], dtype=int)
         if not len(keep):
             break
-        chosen = [Chosen(points.names[k], (points.loads[k],)) for k in keep]
+        chosen = [Chosen(names[k], (points.loads[k],)) for k in keep]
         plan = _ordered(space, config, chosen, q[keep], reference, rng)
-        order = np.array([points.names.index(s.pose) for s in plan.steps if s.pose != REFERENCE])
-        wrenches = {points.names[k]: validation.states.wrench[points.rows[k]] for k in keep}
+        order = np.array([names.index(s.pose) for s in plan.steps if s.pose != REFERENCE])
+        wrenches = {names[k]: validation.states.wrench[points.rows[k]] for k in keep}
         wrench = np.array([wrenches.get(s.pose, np.zeros(6)) for s in plan.steps])
         states = expected_states(plan, cell.arm, config, wrench, last, start)
         at_points = states[np.array([s.pose != REFERENCE for s in plan.steps])]
-        compensation = _compensated(calibration, at_points, validation, points, order)
-        reasons = refusals(compensation, allowed_outside=True)
-        refused = _blocked(space, compensation.q, reference, [points.loads[k] for k in order])
+        result = _compensated(calibration, at_points, validation, points, order)
+        reasons = refusals(result, allowed_outside=True)
+        refused = _blocked(space, result.q, reference, [points.loads[k] for k in order])
         refused |= {k: why for k, why in enumerate(reasons) if why}
         if not refused:
             say("checking every motion in a dry run")
-            corrected = _with_targets(plan, points, order, compensation, left_out)
+            corrected = _with_targets(plan, points, order, result, left_out)
             refuse(dry_run(cell, config, corrected), "the run at corrected targets")
             return corrected
-        left_out |= {points.names[order[k]]: why for k, why in refused.items()}
+        left_out |= {names[order[k]]: why for k, why in refused.items()}
     causes = "; ".join(f"{name}: {why}" for name, why in list(left_out.items())[:3])
     raise CannotAnswerError(f"no validation pose can be corrected: {causes}")
 
@@ -296,25 +291,20 @@ def _with_targets(
     plan: Plan,
     points: CorrectedPoints,
     order: Ints,
-    compensation: Compensation,
+    result: Compensation,
     left_out: Mapping[str, str],
 ) -> Plan:
     """Return the plan with corrected joint values in place of the nominal ones."""
-    corrected = {points.names[k]: row for k, row in zip(order, compensation.q, strict=True)}
+    names, loads = points.names, points.loads
+    corrected = {names[k]: row for k, row in zip(order, result.q, strict=True)}
     rows = [corrected.get(n, old) for n, old in zip(plan.pose_names, plan.q, strict=True)]
-    expected = zip(
-        order, compensation.before.error_m.tolist(), compensation.after.band_m.tolist(), strict=True
-    )
+    errors, bands = result.before.error_m.tolist(), result.after.band_m.tolist()
+    expected = zip(order, errors, bands, strict=True)
     about = {
         **plan.about,
         "purpose": "corrected",
         "points": [
-            {
-                "pose": points.names[k],
-                "load": points.loads[k],
-                "expected_before_m": error,
-                "band_m": band,
-            }
+            {"pose": names[k], "load": loads[k], "expected_before_m": error, "band_m": band}
             for k, error, band in expected
         ],
         LEFT_OUT: [{"point": name, "why": why} for name, why in left_out.items()],
@@ -336,11 +326,9 @@ def paired(validation: Readings, corrected: Readings, mode: str) -> tuple[Readin
     corrected_rows = {corrected.pose_names[corrected.pose[k]]: int(k) for k in first}
     common = [k for k, name in enumerate(points.names) if name in corrected_rows]
     rows, bases = points.rows[common], points.unloaded[common]
-    measured = corrected[np.array([corrected_rows[points.names[k]] for k in common], dtype=int)]
+    c = corrected[np.array([corrected_rows[points.names[k]] for k in common], dtype=int)]
     uncorrected = validation[rows]
-    moved = replace(
-        uncorrected, states=measured.states, value=measured.value, covariance=measured.covariance
-    )
+    moved = replace(uncorrected, states=c.states, value=c.value, covariance=c.covariance)
     if mode == "absolute":
         return uncorrected, moved
     free = validation[np.unique(bases)]

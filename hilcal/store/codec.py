@@ -42,11 +42,7 @@ def encode(value: Any) -> Any:
 
 
 def decode(kind: Any, content: Any) -> Any:
-    """Return the value of a type from the JSON of `encode`.
-
-    Raises:
-        TypeError, ValueError, KeyError: other content, as Python's conversions raise.
-    """
+    """Return a value of a type from the JSON of `encode`; raises as Python's conversions do."""
     origin, arguments = get_origin(kind), get_args(kind)
     if origin in (Union, types.UnionType):  # of a type and None
         return None if content is None else decode(arguments[0], content)
@@ -122,11 +118,7 @@ def write_document(path: Path, content: Mapping[str, object], indent: int | None
 def read_document(
     content: object, name: str, form: str, versions: tuple[int, ...], read: Callable[[Any], T]
 ) -> T:
-    """Return the value that `read` makes of a document of one of the `versions`.
-
-    Raises:
-        InputError: another format or version, or a damaged document.
-    """
+    """Return what `read` makes of a document; an InputError for another format or version."""
     if not isinstance(content, dict) or content.get("format") != form:
         raise InputError(f'no {name}; valid: a JSON document with "format": "{form}"')
     if content.get("version") not in versions:

@@ -191,16 +191,14 @@ def with_new_names(plan: Plan, campaign: Plan, number: int) -> Plan:
     return replace(plan, pose_names=tuple(names), q=np.array(q), steps=steps)
 
 
-def joined(previous: Plan, done: frozenset[Step], further: Plan) -> Plan:
+def joined(first: Plan, done: frozenset[Step], further: Plan) -> Plan:
     """Join the measured steps (`done`) of a previous plan and a further plan."""
-    measured = tuple(s for s in previous.steps if s in done)
+    measured = tuple(s for s in first.steps if s in done)
     used = {s.pose for s in measured} | {REFERENCE}
-    added = [
-        k for k, p in enumerate(previous.pose_names) if p in used and p not in further.pose_names
-    ]
+    added = [k for k, p in enumerate(first.pose_names) if p in used and p not in further.pose_names]
     return Plan(
-        (*further.pose_names, *(previous.pose_names[k] for k in added)),
-        np.vstack([further.q, previous.q[added]]),
+        (*further.pose_names, *(first.pose_names[k] for k in added)),
+        np.vstack([further.q, first.q[added]]),
         (*measured, *further.steps),
         further.about,
     )

@@ -98,10 +98,7 @@ def _unpacked(
     names: Sequence[Sequence[str]],
     observers: Sequence[ObserverName],
 ) -> Readings:
-    """Return readings from records (N, K), `index` (N, 3) of pose, load and cycle, and `names`.
-
-    `names` are those of poses, loads and targets.
-    """
+    """Return readings of records (N, K) and `index` (N, 3); `names` are of poses, loads, targets."""
     fields: dict[str, Any] = {}
     column, single_widths = 0, _widths(0, 0)
     for name, width in layout:
@@ -170,11 +167,9 @@ def insert(connection: sqlite3.Connection, table: str, rows: Sequence[Sequence[o
     if not rows:
         return
     marks = ", ".join("?" * len(rows[0]))
-    cursor = connection.executemany(f"INSERT INTO {table} VALUES ({marks})", rows)  # noqa: S608
-    if cursor.rowcount != len(rows):
-        raise sqlite3.DatabaseError(
-            f"{len(rows) - cursor.rowcount} rows of {table} were not stored"
-        )
+    done = connection.executemany(f"INSERT INTO {table} VALUES ({marks})", rows)  # noqa: S608
+    if done.rowcount != len(rows):
+        raise sqlite3.DatabaseError(f"{len(rows) - done.rowcount} rows of {table} were not stored")
 
 
 def last_id(connection: sqlite3.Connection, table: str) -> int:

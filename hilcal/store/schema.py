@@ -7,6 +7,7 @@ and "PRAGMA synchronous".
 """
 
 import os
+import re
 import sqlite3
 import stat
 import sys
@@ -74,7 +75,7 @@ _MESSAGES: dict[str, tuple[type[HilcalError], str]] = {
         "that can be written",
     ),
 }
-"""Error and message by the words in SQLite's message."""
+"""Error and message by a pattern in SQLite's message."""
 _LONGEST_S = 60.0
 """Longest time to check a file when it is opened; a choice."""
 
@@ -115,9 +116,7 @@ def sqlite_errors(path: Path) -> Iterator[None]:
         raise InputError(f"{path}: the campaign file is damaged") from e
     except sqlite3.DatabaseError as e:
         text = str(e)
-        kinds = (
-            kind for words, kind in _MESSAGES.items() if any(w in text for w in words.split("|"))
-        )
+        kinds = (kind for words, kind in _MESSAGES.items() if re.search(words, text))
         error, message = next(kinds, (InputError, "the campaign file cannot be used ({})"))
         raise error(f"{path}: {message.format(text)}") from e
 
