@@ -98,7 +98,7 @@ def _unpacked(
     names: Sequence[Sequence[str]],
     observers: Sequence[ObserverName],
 ) -> Readings:
-    """Return readings of records (N, K) and `index` (N, 3); `names` are of poses, loads, targets."""
+    """Return readings of records (N, K), `index` (N, 3); `names` are of poses, loads, targets."""
     fields: dict[str, Any] = {}
     column, single_widths = 0, _widths(0, 0)
     for name, width in layout:
