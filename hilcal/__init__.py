@@ -3,9 +3,9 @@
     import hilcal as hc
 
     with hc.Campaign("run.hilcal") as run:
-        found = hc.fit(hc.baseline(run), run)
-        print(found.summary())
-        print(hc.diagnose(found).verdict)
+        fit = hc.fit(hc.baseline(run), run)
+        print(fit.summary())
+        print(hc.diagnose(fit).verdict)
 
 Every name is imported when it is first used, so that `import hilcal` costs nothing.
 """
@@ -103,13 +103,13 @@ def __getattr__(name: str) -> object:
     """Import a name of the library when it is first used."""
     if name not in _PLACES:
         raise AttributeError(f"module 'hilcal' has no attribute {name!r}")
-    found = getattr(import_module(_PLACES[name]), name)
-    globals()[name] = found
-    return found
+    value = getattr(import_module(_PLACES[name]), name)
+    globals()[name] = value
+    return value
 
 
 def presenter() -> Presenter:
-    """Return who writes what values say."""
+    """Return the presenter of values, see `shown.Presenter`."""
     return cast(Presenter, import_module("hilcal.present"))
 
 

@@ -1,4 +1,4 @@
-"""The cell as numbers: arm, target, load point, tool, registration."""
+"""The cell in numbers: arm, target, load point, tool, registration."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -21,14 +21,14 @@ from hilcal.types import Floats, Ints
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observer:
-    """One of several that observe the target: what is read is of its position p in their axes.
+    """An observer of the target, with the target's position p in the observer's axes.
 
     Attributes:
         name: kind and name. A station reads p, a point |p| + offset, a gauge p_x.
         frame: (4, 4) T_observer_sensor.
-        free: what is estimated: elements of the twist of the frame, observer's axes; of a point,
-            which no turn concerns, 3 is the offset (see `Deviation.observer`).
-        offset: of a distance, m.
+        free: estimated elements of the twist of the frame, observer's axes; of a point, whose
+            rotation has no meaning, 3 is the offset (see `Deviation.observer`).
+        offset: offset of a distance, m.
     """
 
     name: ObserverName
@@ -38,14 +38,14 @@ class Observer:
 
     @property
     def tied(self) -> bool:
-        """Whether its place is described, so that it has axes in common with others."""
+        """Whether its place is described, in axes that other observers share."""
         return (
             not self.free or self.free == (3,) or (self.name.kind == "gauge" and self.free == (0,))
         )
 
 
 def plane_frame(direction: Floats, origin: Floats) -> Floats:
-    """(4, 4) frame whose x axis is the direction (3,), which need not be of unit length."""
+    """Return the frame (4, 4) with origin (3,) and x axis along `direction` (3,), of any length."""
     x = direction / np.linalg.norm(direction)
     y = np.cross(np.eye(3)[int(np.argmin(np.abs(x)))], x)
     y /= np.linalg.norm(y)
@@ -57,14 +57,14 @@ def plane_frame(direction: Floats, origin: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cell(Brief):
-    """What a prediction needs beside states and effects; SI units.
+    """The data that a prediction needs besides states and effects; SI units.
 
     Attributes:
         arm: the arm.
         target: (4, 4) T_flange_target, the tracked target in flange axes.
         load_point: (3,) where the wrench acts, flange axes, m.
         tool_mass: mass of what the flange carries permanently, kg.
-        tool_com: (3,) its centre of mass, flange axes, m.
+        tool_com: (3,) centre of that mass, flange axes, m.
         gravity: (3,) acceleration of gravity, base axes, m/s².
         registration: (4, 4) T_sensor_base: maps base into sensor (tracker) coordinates.
         registration_known: False where it has to be estimated.
@@ -72,16 +72,17 @@ class Cell(Brief):
         config: the configuration that the cell was made from: instruments, loads, limits; None
             for a cell that was made from numbers alone.
         base_dir: directory that relative paths in `config` refer to.
-        measured_torques: whether effects take the joint torques that were measured, where readings
-            have them, in place of those of the described masses and loads.
-        factory: kinematics of this one arm by its factory, where a file of them is given; `arm` has
-            them where the configuration says so.
+        measured_torques: whether effects take measured joint torques, where readings have them,
+            instead of those computed from the described masses and loads.
+        factory: the factory's kinematics of this arm, from a file; `arm` has them where the
+            configuration says so.
         targets: (T, 4, 4) T_flange_target of several targets, in the order of `target_names`;
             `target` is the first of them. None where the tool carries one.
-        target_names: their names.
-        observers: what observes the target, in the order of `Readings.observers`; empty where one
-            tracker reads all.
-        targets_known: which of their offsets are known; `target_known` where all are.
+        target_names: names of the targets.
+        observers: the observers of the target, in the order of `Readings.observers`; empty where
+            one tracker reads all.
+        targets_known: whether the offset of each target is known; `target_known` is True where all
+            are.
     """
 
     arm: Arm
@@ -113,41 +114,41 @@ class Cell(Brief):
         return (self.target_known,) if self.targets is None else self.targets_known
 
     def target_of(self, number: Ints | None) -> Floats:
-        """Targets (N, 4, 4) by their number (N,), see `States.target`; (4, 4) for None."""
+        """Return targets (N, 4, 4) by number (N,), see `States.target`; (4, 4) for None."""
         return self.target if number is None else self.all_targets[number]
 
     def with_targets(self, poses: Floats, known: Sequence[bool] | None = None) -> "Cell":
-        """Return the cell with other T_flange_target (T, 4, 4), and which of them are known."""
-        found = tuple(self.known_targets if known is None else known)
+        """Return the cell with other T_flange_target (T, 4, 4), and whether each is known."""
+        flags = tuple(self.known_targets if known is None else known)
         several = self.targets is not None
         return replace(
             self,
             target=poses[0],
-            target_known=all(found),
+            target_known=all(flags),
             targets=poses if several else None,
-            targets_known=found if several else (),
+            targets_known=flags if several else (),
         )
 
     def observed_by(self, names: Sequence[ObserverName]) -> "Cell":
-        """Return the cell with the observers of readings, as far as it describes them.
+        """Return the cell with the observers of readings, by its configuration.
 
-        The first station's axes are those of the positions; where the cell states the place of no
-        point and of no gauge, and nothing reads positions, these are the axes of the base.
+        The first station's axes are those of the positions. Without a station and without a stated
+        place of any point or gauge, the axes of the positions are those of the base.
         """
         if not names or tuple(o.name for o in self.observers) == tuple(names):
             return self
         stations = [name for name in names if name.kind == "station"]
         observers = tuple(self._observer(name, name in stations[:1]) for name in names)
-        seen = replace(self, observers=observers)
-        return replace(seen, registration_known=self.registration_known or not seen.tied)
+        observed = replace(self, observers=observers)
+        return replace(observed, registration_known=self.registration_known or not observed.tied)
 
     @property
     def tied(self) -> bool:
-        """Whether what observes fixes the axes of the positions, apart from the base's."""
+        """Whether the observers define axes of the positions other than those of the base."""
         return not self.observers or any(o.tied for o in self.observers)
 
     def _observer(self, name: ObserverName, first: bool) -> Observer:
-        """Return an observer as it is described."""
+        """Return an observer by its description; `first` is the first station."""
         frame = np.eye(4)
         if name.kind == "station":
             return Observer(name, frame, () if first else tuple(range(6)))
@@ -198,15 +199,14 @@ def cell_from_config(
 ) -> Cell:
     """Return the cell that a configuration describes.
 
-    Unknown is what the configuration leaves out: the target where `target_m` is absent, the
-    registration where `frame = "tracker"` comes without a pose of the base; both start as
-    identities.
+    The target is unknown without `target_m`, the registration where `frame = "tracker"` comes
+    without a pose of the base. Both are the identity then.
 
     Args:
         config: the checked configuration.
         base_dir: directory that a robot's file path is relative to.
-        robot_file: what that file holds, as a campaign keeps it; then none is read.
-        calibration_file: the same of the file of its kinematics by the factory.
+        robot_file: text of the robot's file, as a campaign stores it; then no file is read.
+        calibration_file: the same for the file of the factory's kinematics.
 
     Raises:
         InputError: unknown robot, unusable robot file, or a number of joint values that does
@@ -252,19 +252,19 @@ def cell_from_config(
 
 
 def tracker_place(cell: Cell, config: CellConfig) -> Floats | None:
-    """Return (3,) where the tracker stands, base axes, m; None where it is not known.
+    """Return the tracker's position (3,), base axes, m; None where it is unknown.
 
-    From a known registration T_sensor_base it is −Rᵀ p; else `[tracker] station_m` (positions in
-    base axes), else `[sight] tracker_m`.
+    It is −Rᵀ p of a known registration T_sensor_base; else `[tracker] station_m` (positions in base
+    axes), else `[sight] tracker_m`.
     """
     if config.tracker.frame == "tracker" and cell.registration_known:
         return np.asarray(-cell.registration[:3, :3].T @ cell.registration[:3, 3])
-    told = config.tracker.station_m or config.sight.tracker_m
-    return None if told is None else np.array(told)
+    position = config.tracker.station_m or config.sight.tracker_m
+    return None if position is None else np.array(position)
 
 
 def _pose(xyz: tuple[float, ...] | None, rotvec: tuple[float, ...] | None) -> Floats:
-    """(4, 4) pose; identity for what is not given."""
+    """Return a pose (4, 4); None is no translation, or no rotation."""
     pose = np.eye(4)
     if rotvec is not None:
         pose[:3, :3] = rotation(np.array(rotvec))

@@ -8,15 +8,15 @@ class HilcalError(Exception):
 
 
 class InputError(HilcalError):
-    """Wrong input: says what is wrong, where, and what would be valid."""
+    """Wrong input; the message states what is wrong, where, and what is valid."""
 
     exit_code = 2
 
 
 class MissingPackageError(InputError, NotImplementedError):
-    """A package is not installed: says how to install it.
+    """A package is not installed; the message states how to install it.
 
-    A notebook that shows a value shows its `repr` then, since this is a `NotImplementedError`, too.
+    It is a `NotImplementedError` so that notebooks show the `repr` of a value instead.
     """
 
 
@@ -27,22 +27,22 @@ class DeviceError(HilcalError):
 
 
 class MovedFileError(DeviceError):
-    """A campaign was deleted, replaced or moved while it was open; says where its readings are."""
+    """An open campaign was deleted, replaced or moved; the message states where readings are."""
 
 
 class CannotAnswerError(HilcalError):
-    """The data cannot answer the question; says what to measure."""
+    """The data cannot answer the question; the message states what to measure."""
 
     exit_code = 4
 
 
 class LimitError(HilcalError):
-    """A limit that was given is not kept."""
+    """A stated limit is exceeded."""
 
     exit_code = 5
 
 
 class StoppedError(HilcalError):
-    """A person stopped it; says what is safe and how to go on."""
+    """A person stopped the program; the message states what is stored and how to resume."""
 
     exit_code = 130

@@ -1,4 +1,4 @@
-"""A campaign file of a table of readings."""
+"""Import of a table of readings into a campaign file."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,13 +18,13 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Imported:
-    """What was imported."""
+    """The result of an import."""
 
-    config: CellConfig  # of the cell
-    cell: Cell  # the cell
-    readings: Readings  # as they are stored
-    noise: NoiseEstimate | None  # its estimate; None where it is stated, or cannot be estimated
-    parts: CovarianceParts  # what the covariances consist of
+    config: CellConfig
+    cell: Cell
+    readings: Readings  # as stored
+    noise: NoiseEstimate | None  # None where the noise is stated, or cannot be estimated
+    parts: CovarianceParts  # components of the covariances
     notes: tuple[str, ...]  # one sentence for each decision
 
 
@@ -48,13 +48,13 @@ def import_campaign(
     base_dir = config.absolute().parent
     cell = cell_from_config(settings, base_dir)
     say(f"reading {table}")
-    found = import_readings(table, kind, settings, cell.arm, second)
-    if not found.noise_stated:
+    imported = import_readings(table, kind, settings, cell.arm, second)
+    if not imported.noise_stated:
         say("estimating the noise, which nothing states")
-    found, noise = with_estimated_noise(found, cell, settings)
-    more = {COVERS: found.covers}
-    more |= {FROM: TRACKER} if found.from_tracker else {}
-    more |= {} if noise is None else {NOISE: noise.to_json()}
+    imported, noise = with_estimated_noise(imported, cell, settings)
+    texts = {COVERS: imported.covers}
+    texts |= {FROM: TRACKER} if imported.from_tracker else {}
+    texts |= {} if noise is None else {NOISE: noise.to_json()}
     say(f"writing {output}")
     source = f"{table.name} ({Path(kind).name})"
     CampaignFile.create(
@@ -63,8 +63,8 @@ def import_campaign(
         str(base_dir),
         source,
         overwrite=overwrite,
-        more=more,
-        readings=found.readings,
+        more=texts,
+        readings=imported.readings,
     ).close()
-    parts = covariance_parts(found.covers, settings)
-    return Imported(settings, cell, found.readings, noise, parts, found.notes)
+    parts = covariance_parts(imported.covers, settings)
+    return Imported(settings, cell, imported.readings, noise, parts, imported.notes)

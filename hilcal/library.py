@@ -60,19 +60,19 @@ def read_table(path: str | Path, cell: Cell, mapping: str | Path | None = None) 
 
     Args:
         path: the table; without a mapping the exchange table, docs/reference/exchange-table.md.
-        cell: the cell that it was measured in; its tracker gives the covariances where the table
-            has none, the readings themselves where it states no noise, and its [repeatability] is
-            added where the table's do not include it.
-        mapping: what `hilcal import --format` takes: the path of a mapping file
+        cell: the cell that the table was measured in. Where the table has no covariances, they are
+            those of the cell's [tracker], or estimated from the readings where it states no noise.
+            The cell's [repeatability] is added to covariances that do not include it.
+        mapping: as in `hilcal import --format`: the path of a mapping file
             (docs/how-to/import-a-table.md), or the name of a format.
 
     Raises:
-        InputError: anything that cannot be right, with row and column.
+        InputError: an invalid value, with row and column.
     """
     form, config = "table" if mapping is None else mapping, cell.configured()
     imported = import_readings(Path(path), form, config, cell.arm)
-    found, noise = with_estimated_noise(imported, cell, config)
-    readings = full_readings(found.readings, found.covers, cell, config)
+    estimated, noise = with_estimated_noise(imported, cell, config)
+    readings = full_readings(estimated.readings, estimated.covers, cell, config)
     return replace(readings, noise_stated=noise is None)
 
 
@@ -85,23 +85,23 @@ def fit_stream(
     workers: int | None = None,
     scheduler: str | None = None,
 ) -> StreamFit:
-    """Fit a model to readings that need not fit into memory: a Parquet file, in passes.
+    """Fit a model to a Parquet file of readings, in passes, without loading it into memory.
 
     >>> cell = hc.Cell.load(CELL)
-    >>> found = hc.fit_stream(STREAM, cell, ["joint_compliance"], workers=1)
-    >>> found.model.names, found.converged
+    >>> fit = hc.fit_stream(STREAM, cell, ["joint_compliance"], workers=1)
+    >>> fit.model.names, fit.converged
     (('base_frame', 'joint_compliance'), True)
 
     Args:
         path: a Parquet file with the columns of the exchange table; `pose` and `load` are not
-            needed, each row stands alone.
-        effects: names of effects, besides unknown frames; the baseline's where None.
-        prior: what another campaign taught of the arm.
+            needed, rows are independent.
+        effects: names of effects, besides unknown frames; None: those of the baseline.
+        prior: the prior from another campaign of the arm.
         workers: processes of this machine, one per processor by default.
-        scheduler: address of a Dask cluster in their place, whose workers read the same path.
+        scheduler: address of a Dask cluster to use instead, whose workers read the same path.
 
     Raises:
-        InputError: a damaged file, or a row that cannot be right, by its number.
+        InputError: a damaged file, or an invalid row, by its number.
         CannotAnswerError: readings that do not determine an unknown frame.
     """
     tracker = cell.configured().tracker
@@ -119,20 +119,20 @@ def bootstrap(
     workers: int | None = 1,
     scheduler: str | None = None,
 ) -> bootstraps.Bootstrap:
-    """Draw the poses of a fit again and again, and fit its model to each draw.
+    """Resample the poses of a fit repeatedly, and fit its model to each draw.
 
     >>> cell = hc.Cell.load(CELL)
     >>> readings = hc.read_table(TABLE, cell)
-    >>> found = hc.bootstrap(hc.fit(hc.baseline(cell, readings), readings), draws=20)
-    >>> found.theta.shape, found.interval(0.9).shape
+    >>> result = hc.bootstrap(hc.fit(hc.baseline(cell, readings), readings), draws=20)
+    >>> result.theta.shape, result.interval(0.9).shape
     ((20, 12), (2, 12))
 
     Args:
-        found: the fit whose standard uncertainties are in question; `ratio` compares them.
-        seed: of the draws; the result does not depend on the workers.
-        workers: processes of this machine; None is one per processor, for scripts that begin with
+        found: the fit; `ratio` of the result compares its standard uncertainties.
+        seed: seed of the draws; the result does not depend on the workers.
+        workers: processes of this machine; None: one per processor, for scripts that begin with
             `if __name__ == "__main__"`.
-        scheduler: address of a Dask cluster in their place.
+        scheduler: address of a Dask cluster to use instead.
     """
     with open_engine(None if scheduler is not None else workers, scheduler) as engine:
         return bootstraps.bootstrap(found, engine, draws, seed)
@@ -147,8 +147,7 @@ def baseline(
 ) -> Model:
     """Return the model that every campaign starts from.
 
-    Unknown frames are registered and become part of the model; joint compliance joins where any
-    reading was taken under a load.
+    The model has the unknown frames, and joint compliance where any reading was taken under a load.
 
     >>> cell = hc.Cell.load(CELL)
     >>> model = hc.baseline(cell, hc.read_table(TABLE, cell))
@@ -158,15 +157,15 @@ def baseline(
     ('base_frame', 'joint_compliance')
 
     Args:
-        cell: the cell; or a campaign, which has its cell, its readings and its catalogue.
+        cell: the cell; or a campaign, for its cell, readings and catalogue.
         data: the readings, where `cell` is no campaign.
-        readings: "deflection" or "absolute"; as the cell plans and the data allow where None.
-        catalogue: the effects that a model can have; the installed ones where None.
-        prior: what another campaign taught of this arm, from `load_posterior`; its effects are in
-            the model, and fits start from what it knows. `carried_prior` says more of the two.
+        readings: "deflection" or "absolute"; None: as the cell plans and the data allow.
+        catalogue: the effects that a model can have; None: the installed ones.
+        prior: the posterior of another campaign of this arm, from `load_posterior`, or a prior made
+            from one by `carried_prior`. The model has its effects, and fits start from it.
 
     Raises:
-        InputError: another kind of readings, or a prior that is not one of these readings.
+        InputError: another kind of readings, or a prior that does not fit these readings.
         CannotAnswerError: the readings do not determine an unknown frame.
     """
     if isinstance(cell, Campaign):
@@ -174,8 +173,8 @@ def baseline(
         cell = cell.cell
     if data is None:
         raise InputError("a cell without readings; valid: baseline(cell, readings), baseline(run)")
-    data, known = _readings(data), _carried(prior, catalogue)
-    return starting_models.baseline(cell, data, _mode(readings, data, cell), catalogue, known)
+    data, carried = _readings(data), _carried(prior, catalogue)
+    return starting_models.baseline(cell, data, _mode(readings, data, cell), catalogue, carried)
 
 
 def _readings(data: Readings | Campaign) -> Readings:
@@ -183,7 +182,7 @@ def _readings(data: Readings | Campaign) -> Readings:
 
 
 def _with_prior(model: Model, data: Readings, prior: Posterior | CarriedPrior) -> Model:
-    """Return a model with what another campaign taught of those effects that it has."""
+    """Return a model with a prior on those of its effects that the prior has."""
     carried = _carried(prior, model.catalogue)
     if carried is not None:
         check_prior(carried, model.cell.arm, data)
@@ -193,7 +192,7 @@ def _with_prior(model: Model, data: Readings, prior: Posterior | CarriedPrior) -
 def _carried(
     prior: Posterior | CarriedPrior | None, catalogue: Catalogue | None
 ) -> CarriedPrior | None:
-    """Return a posterior as prior, of the same arm."""
+    """Return a posterior as a prior of the same arm."""
     return carried_prior(prior, catalogue=catalogue) if isinstance(prior, Posterior) else prior
 
 
@@ -209,22 +208,21 @@ def fit(
     """Fit a model to readings by whitened Gauss-Newton.
 
     >>> with hc.Campaign.open(RUN) as run:
-    ...     found = hc.fit(hc.baseline(run.cell, run.readings), run.readings)
-    >>> found.model.names
+    ...     fit = hc.fit(hc.baseline(run.cell, run.readings), run.readings)
+    >>> fit.model.names
     ('base_frame', 'joint_compliance')
-    >>> found.parameters["joint_compliance.j2"].unit
+    >>> fit.parameters["joint_compliance.j2"].unit
     'rad/(N·m)'
-    >>> found.error.rms_sigma < found.holdout.rms_sigma
+    >>> fit.error.rms_sigma < fit.holdout.rms_sigma
     True
 
     Args:
         data: the readings, or their campaign.
-        readings: "deflection" or "absolute"; as the cell plans and the data allow where None.
+        readings: "deflection" or "absolute"; None: as the cell plans and the data allow.
         scaling: "none", "gu" or "gc" (whitened by the full covariance).
-        prior: what another campaign taught of this arm, for those effects that the model has in
-            common with it (`baseline` adds the others); or (P,) standard deviations of zero-mean
-            priors, infinite for flat ones, zero for parameters held at zero; where None, those of
-            the effects.
+        prior: the posterior of another campaign of this arm, for the effects that the model shares
+            with it (`baseline` adds the others); or (P,) standard deviations of zero-mean priors,
+            infinite for flat ones, zero for parameters fixed at zero; None: those of the effects.
         mode: another name of `readings`; results call it `mode`.
 
     Raises:
@@ -241,28 +239,29 @@ def fit(
     data = with_prior_scatter(model, data)
     if scaling not in SCALINGS:
         raise InputError(f"scaling {scaling!r} is unknown; valid: {', '.join(SCALINGS)}")
-    found = fits.fit(model, data, _mode(readings, data, model.cell), scaling, prior=std)
-    return with_serial_noise(found, std)
+    fitted = fits.fit(model, data, _mode(readings, data, model.cell), scaling, prior=std)
+    return with_serial_noise(fitted, std)
 
 
 def diagnose(
     fit: Fit | Campaign, history: History = NOTHING, say: Callable[[str], None] = lambda text: None
 ) -> Diagnosis:
-    """Judge a fit.
+    """Diagnose a fit: what is missing in its model, with a verdict.
 
     >>> with hc.Campaign.open(RUN) as run:
-    ...     found = hc.fit(hc.baseline(run), run)
-    >>> d = hc.diagnose(found)
+    ...     fit = hc.fit(hc.baseline(run), run)
+    >>> d = hc.diagnose(fit)
     >>> d.verdict, d.suspects[0].effect
     ('missing_effect', 'joint_tilt_compliance')
 
     Args:
-        fit: the fit; or a campaign, of which the revision in use is judged.
-        history: how its model was reached; of a campaign, as it tells.
+        fit: the fit; or a campaign, for its revision in use.
+        history: effects added to and removed from the model so far; that of the revision where
+            `fit` is a campaign.
         say: takes progress, one line each.
 
     Raises:
-        InputError: for a fit whose residual is not whitened, or of too many readings; a campaign
+        InputError: a fit whose residual is not whitened, or of too many readings; a campaign
             without a revision.
     """
     if isinstance(fit, Campaign):
@@ -271,7 +270,7 @@ def diagnose(
 
 
 def load_posterior(path: str | Path, catalogue: Catalogue | None = None) -> Posterior:
-    """Return what an earlier campaign taught of its arm, as prior of another one.
+    """Return the posterior of a campaign, which can be the prior of another one.
 
     >>> with hc.Campaign.open(RUN) as run:
     ...     number = run.append(hc.fit(hc.baseline(run.cell, run.readings), run.readings))
@@ -280,12 +279,12 @@ def load_posterior(path: str | Path, catalogue: Catalogue | None = None) -> Post
     ('ur10e', 'joint_compliance')
 
     Args:
-        path: a campaign file, of which the revision in use is taken, or a JSON file of a posterior.
-        catalogue: has its effects; the installed ones where None.
+        path: a campaign file, for its revision in use, or a JSON file of a posterior.
+        catalogue: the effects; None: the installed ones.
 
     Raises:
-        InputError: no such file, neither of both, or a campaign without a revision.
-        CannotAnswerError: its model has no effect of the arm.
+        InputError: no such file, a file of another kind, or a campaign without a revision.
+        CannotAnswerError: the model has no effect of the arm.
     """
     path = Path(path)
     try:
@@ -318,38 +317,38 @@ def refine(
     [None, 'joint_tilt_compliance']
 
     Args:
-        model: the starting model; or a campaign alone, from its baseline on.
+        model: the starting model; or a campaign alone, for its baseline.
         data: the readings, or their campaign.
-        readings: "deflection" or "absolute"; as the cell plans and the data allow where None.
+        readings: "deflection" or "absolute"; None: as the cell plans and the data allow.
         prior: as for `fit`.
-        discover: a folder; a law is then searched where no effect explains the misfit, as by
-            `hilcal refine --discover`, and the files of laws that stay are written there.
-        background: whether all effects of the catalogue predict together where the named ones
-            leave more than noise.
+        discover: a folder. Where no effect explains the misfit, a law is searched, as by
+            `hilcal refine --discover`; the files of laws in the final model are written there.
+        background: whether all effects of the catalogue are fitted together, as a background, where
+            the named ones leave more than noise.
         mode: another name of `readings`.
 
     Raises:
-        InputError: another kind of readings, a prior that is not one of them, or no such folder.
+        InputError: another kind of readings, a prior that does not fit them, or no such folder.
         CannotAnswerError: fewer measured elements than identifiable parameters.
     """
-    asked = _either(readings, mode)
+    readings = _either(readings, mode)
     if isinstance(model, Campaign):
         data = model.readings if data is None else data
-        model = baseline(model, data, asked, prior=prior)
+        model = baseline(model, data, readings, prior=prior)
     elif data is None:
         raise InputError("a model without readings; valid: refine(model, readings), refine(run)")
     data = _readings(data)
     if prior is not None:
         model = _with_prior(model, data, prior)
-    kind = _mode(asked, data, model.cell)
+    kind = _mode(readings, data, model.cell)
     if discover is None:
         return refine_model(model, data, kind, background=background)
     if not Path(discover).is_dir():
         raise InputError(f"discover={str(discover)!r}: no such folder; valid: one for laws' files")
     laws = LawSearch(Path(discover))
-    found = refine_model(model, data, kind, laws=laws, background=background)
-    laws.write(found.names)
-    return found
+    refinement = refine_model(model, data, kind, laws=laws, background=background)
+    laws.write(refinement.names)
+    return refinement
 
 
 def plan(
@@ -368,15 +367,15 @@ def plan(
 
     Args:
         cell: the cell with its limits, loads and `[planning]`, from `Cell.load`.
-        poses: how many, each read unloaded and under every load that it bears.
-        criterion: "D", "A", "E", "K", "I" or "separate"; as `[planning]` has it where None.
-        given: a fit of what has been measured already.
-        seed: of the random candidates.
-        prior: what another campaign taught of this arm; the model is planned for with what it
-            knows. Not beside `given`, which has its own.
+        poses: number of poses, each read unloaded and under every load that it bears.
+        criterion: "D", "A", "E", "K", "I" or "separate"; None: that of `[planning]`.
+        given: a fit of the previous readings.
+        seed: seed of the random candidates.
+        prior: the prior from another campaign of this arm, unless `given` is stated, which has its
+            prior.
 
     Raises:
-        InputError: numbers or names that cannot be, or a cell without configuration.
+        InputError: invalid numbers or names, or a cell without configuration.
         CannotAnswerError: the cell leaves too few poses, or the readings are too few.
     """
     with needed_by("a plan"):
@@ -401,8 +400,8 @@ def simulate(
 ) -> "Rehearsal":
     """Measure a plan in a simulated cell in which an effect is hidden.
 
-    The arm, its tracker and what is hidden are drawn from the seed. No device is simulated; the
-    readings are drawn at once, each the mean of `[acquire] samples` measurements.
+    The arm, its tracker and the hidden effect are drawn by the seed. No device is simulated; each
+    reading is drawn as the mean of `[acquire] samples` measurements.
 
     >>> cell = hc.Cell.load(CELL)
     >>> plan = hc.plan(cell, poses=6)
@@ -412,12 +411,12 @@ def simulate(
     ('creep', True)
 
     Args:
-        cell: the cell, whose `[simulation]` has the strength of what is hidden; or what an earlier
-            call returned, for a further campaign of the same arm.
-        hide: of the first campaign: an effect of `hilcal effects`, "random", "nothing", or
+        cell: the cell, whose `[simulation]` has the strength of the hidden effect; or the result of
+            a previous call, for a further campaign of the same arm.
+        hide: for a first campaign: an effect of `hilcal effects`, "random", "nothing", or
             "invented", a law that the catalogue lacks.
-        seed: of everything random; of a further campaign of its noise.
-        catalogue: has effects of your own, which can be hidden, too.
+        seed: seed of all random numbers; for a further campaign, of its noise.
+        catalogue: the effects that can be hidden; None: the installed ones.
 
     Returns:
         The campaign: `readings`, `hidden`, `mode`, and the truth in `world`; `save` writes a
@@ -427,16 +426,16 @@ def simulate(
         InputError: an effect that cannot be hidden; lists the valid ones.
     """
     with needed_by("a simulated cell"):
-        from hilcal.drivers.simulated import rehearsal  # the simulated world is of no use but here
+        from hilcal.drivers.simulated import rehearsal  # needed here alone
 
-    what = plan if isinstance(plan, Plan) else plan.plan
+    bare_plan = plan if isinstance(plan, Plan) else plan.plan
     if not isinstance(cell, Cell):
-        return rehearsal.read_plan(cell, what, [seed])
+        return rehearsal.read_plan(cell, bare_plan, [seed])
     if hide == rehearsal.INVENTED:
         catalogue = rehearsal.invented_law(catalogue or installed())
     config = cell.configured()
-    case = rehearsal.case_of_plan(config, what, hide, seed, catalogue, cell.base_dir)
-    return rehearsal.read_plan(case, what, [seed, 1])
+    case = rehearsal.case_of_plan(config, bare_plan, hide, seed, catalogue, cell.base_dir)
+    return rehearsal.read_plan(case, bare_plan, [seed, 1])
 
 
 @contextmanager
@@ -454,17 +453,17 @@ def view(run: Campaign | str | Path, port: int = 9877) -> Iterator[str]:
 
 
 def _either(readings: str | None, mode: str | None) -> str | None:
-    """Return the kind of readings, by either of its names."""
+    """Return the kind of readings from either argument; refuse two that differ."""
     if readings is not None and mode is not None and readings != mode:
         raise InputError(f"readings = {readings!r} and mode = {mode!r}; valid: one of both")
     return mode if readings is None else readings
 
 
-def _mode(asked: str | None, data: Readings, cell: Cell) -> Mode:
-    """Check the kind of readings; as the cell plans and the data allow where none is asked for."""
-    if asked is None:
+def _mode(kind: str | None, data: Readings, cell: Cell) -> Mode:
+    """Return the checked kind of readings; None: as the cell plans and the data allow."""
+    if kind is None:
         config = cell.config
         return usual_mode(data) if config is None else usual_mode(data, config.planning.readings)
-    if asked not in MODES:
-        raise InputError(f"readings {asked!r} is unknown; valid: {', '.join(MODES)}")
-    return asked
+    if kind not in MODES:
+        raise InputError(f"readings {kind!r} is unknown; valid: {', '.join(MODES)}")
+    return kind

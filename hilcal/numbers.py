@@ -1,4 +1,4 @@
-"""Numbers for people: sensible digits, and units in which they are easy to read."""
+"""Numbers for people: rounded, in units that are easy to read."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -22,11 +22,11 @@ _UNITS: dict[str, tuple[tuple[str, float, float], ...]] = {
 }
 
 LEAST = {"m": 1e-9, "rad": 1e-9}
-"""SI; what is less is the rounding of a computation, and nothing that anything measures."""
+"""SI; smaller values are rounding errors, below any measurement."""
 
 
 def unit_for(unit: str, values: Sequence[float]) -> tuple[str, float]:
-    """Unit for people, and its factor, for values that stand in one column."""
+    """Return the unit for people, and its factor, for the values of a column."""
     largest = max((abs(v) for v in values), default=0.0)
     for name, factor, limit in _UNITS.get(unit, ()):
         if largest < limit:
@@ -35,40 +35,42 @@ def unit_for(unit: str, values: Sequence[float]) -> tuple[str, float]:
 
 
 def angle_or(unit: str) -> tuple[str, float]:
-    """Unit for people, and its factor, of a recorded variable: angles in degrees, others in SI."""
+    """Return unit and factor of a recorded variable: angles in degrees, others in SI."""
     return ("°", 180.0 / math.pi) if unit == "rad" else (unit, 1.0)
 
 
 def of_joint(unit: str) -> tuple[str, float]:
-    """Unit for people, and its factor, of the value of a joint in rad, or in m where it slides."""
+    """Return the unit for people, and its factor, of a joint value in rad, or m of a slide."""
     return ("mm", 1e3) if unit == "m" else angle_or(unit)
 
 
 def joint_value(value: float, unit: str, places: int = 1) -> str:
-    """Write the value of a joint in rad, or in m where it slides, for people."""
+    """Write a joint value in rad, or m of a slide, for people."""
     name, factor = of_joint(unit)
     return f"{factor * value:.{places}f}{name if name == '°' else ' ' + name}"
 
 
-def sizes(of: Iterable[tuple[str, float]]) -> str:
+def sizes(items: Iterable[tuple[str, float]]) -> str:
     """Write (unit, value) pairs, SI, in units for people."""
-    return ", ".join(f"{text} {name}" for text, _, name in (measured(u, v, count=2) for u, v in of))
+    return ", ".join(
+        f"{text} {name}" for text, _, name in (measured(u, v, count=2) for u, v in items)
+    )
 
 
 def measured(
     unit: str, value: float, std: float = math.nan, alike: Sequence[float] = (), count: int = 3
 ) -> tuple[str, str, str]:
-    """Write a value, its standard uncertainty and their unit for people; all given in SI.
+    """Return a value, its standard uncertainty ("" without one) and their unit for people, from SI.
 
-    What is below `LEAST` is said to be less than that; "" is no uncertainty. `alike` are values
-    whose column has one unit; `count` are the digits of a value without an uncertainty.
+    A number below `LEAST` is written as "< " with that limit. `alike` are the values of a column
+    with one unit; `count` is the number of digits of a value without an uncertainty.
     """
     name, factor = unit_for(unit, alike or [value])
     least = LEAST.get(unit, 0.0)
     less = "< " + f"{factor * least:.9f}".rstrip("0")
     if math.isfinite(std) and std > 0:
-        written, spread = with_std(factor * value, factor * max(std, least))
-        return written, less if std < least else spread, name
+        text, spread = with_std(factor * value, factor * max(std, least))
+        return text, less if std < least else spread, name
     return less if 0 < abs(value) < least else digits(factor * value, count), "", name
 
 
@@ -81,7 +83,7 @@ def length(metres: float) -> str:
 
 
 def digits(value: float, count: int = 3) -> str:
-    """Write a number with so many significant digits, without an exponent where that is short."""
+    """Write a number with `count` significant digits, without an exponent where that is short."""
     if value == 0 or not math.isfinite(value):
         return f"{value:g}"
     power = math.floor(math.log10(abs(value)))
@@ -91,7 +93,7 @@ def digits(value: float, count: int = 3) -> str:
 
 
 def with_std(value: float, std: float) -> tuple[str, str]:
-    """Write a value to the last of two significant digits of its standard uncertainty."""
+    """Write a value and its standard uncertainty with two significant digits of the latter."""
     if not (math.isfinite(std) and std > 0):
         return digits(value), ""
     places = 1 - math.floor(math.log10(std))
@@ -107,7 +109,7 @@ def percent(share: float) -> str:
 
 
 def chance(p: float) -> str:
-    """Write a p-value, so that small ones stay short."""
+    """Write a p-value; small ones with an exponent."""
     if p < 1e-16:
         return "< 1e-16"
     return f"{p:.0e}" if p < 1e-3 else f"{p:.2g}"
@@ -115,16 +117,16 @@ def chance(p: float) -> str:
 
 def p_equals(p: float) -> str:
     """Write "p = " or "p < " with a p-value, in the digits of the tables."""
-    told = chance(p)
-    return f"p {told}" if told.startswith("<") else f"p = {told}"
+    text = chance(p)
+    return f"p {text}" if text.startswith("<") else f"p = {text}"
 
 
-def many_tests(count: int, level: float, what: str = "effects") -> str:
-    """Say how many were tested, and at which level one counts so that chance names none."""
-    each = digits(level / max(count, 1), 1)
+def many_tests(count: int, level: float, tested: str = "effects") -> str:
+    """Write the number of tests, and the level p at which one counts (Bonferroni)."""
+    level_each = digits(level / max(count, 1), 1)
     return (
-        f"{count} {what} were tested: one counts from p < {each}, which is {level:g} / {count}, so "
-        f"that chance alone names any of them once in {1 / level:.0f} diagnoses."
+        f"{count} {tested} were tested: one counts from p < {level_each}, which is {level:g} / "
+        f"{count}, so that chance alone names any of them once in {1 / level:.0f} diagnoses."
     )
 
 
@@ -140,9 +142,9 @@ def sentence(message: str) -> str:
 
 
 def few(items: Sequence[str], most: int = 2) -> str:
-    """Write the first names of a list, and how many more there are."""
-    rest = len(items) - most
-    return ", ".join(items[:most]) + (f" and {rest} more" if rest > 0 else "")
+    """Write the first names of a list, and the number of the others."""
+    remaining = len(items) - most
+    return ", ".join(items[:most]) + (f" and {remaining} more" if remaining > 0 else "")
 
 
 def names(items: Sequence[str], word: str = "and") -> str:

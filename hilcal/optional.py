@@ -1,4 +1,4 @@
-"""Packages that may be missing: the line that installs each."""
+"""Packages that may be missing, and the line that installs each."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,7 +16,7 @@ EXTRAS = {
     "openpyxl": "tables",
     "pyarrow": "tables",
 }
-"""Extra of pyproject.toml that brings a package, by the name by which the package is imported."""
+"""Extra of pyproject.toml that installs a package, by the package's import name."""
 
 REQUIRED = {
     "coal": "pin",
@@ -29,20 +29,20 @@ REQUIRED = {
     "serial": "pyserial",
     "sklearn": "scikit-learn",
 }
-"""Distribution by the name of its package: required, but not by every command."""
+"""Distribution by the import name of its package: required, but not by every command."""
 
 
 @contextmanager
-def needed_by(what: str) -> Iterator[None]:
-    """Import packages that may be missing: MissingPackageError, which `what` needs them begins."""
+def needed_by(user: str) -> Iterator[None]:
+    """Raise a MissingPackageError where an import in the block fails; `user` needs the package."""
     try:
         yield
     except ImportError as error:
-        raise MissingPackageError(f"{what}: {lacking(error) or error}") from error
+        raise MissingPackageError(f"{user}: {lacking(error) or error}") from error
 
 
 def lacking(error: BaseException) -> str:
-    """Say which package an import lacks, and the line that installs it; "" for other errors."""
+    """Return which package an import lacks, and how to install it; "" for other errors."""
     name = (error.name or "") if isinstance(error, ModuleNotFoundError) else ""
     package = name.split(".")[0]
     if package not in EXTRAS and package not in REQUIRED:
@@ -51,7 +51,7 @@ def lacking(error: BaseException) -> str:
 
 
 def install(package: str) -> str:
-    """Return the line that installs a package, given the name by which it is imported."""
+    """Return the line that installs a package, by its import name."""
     if package in EXTRAS:
         return f'pip install "hilcal[{EXTRAS[package]}]"'
     return f"pip install {REQUIRED[package]}"

@@ -1,7 +1,6 @@
-"""How values show themselves: a few lines at a console, words and tables in a notebook.
+"""Display of values: a few lines at a console, text and tables in a notebook.
 
-What a value says to people is written above it (`hilcal.present`): the library names who writes it,
-when asked.
+`hilcal.present`, a higher layer, writes the texts; `hilcal.presenter` imports it when needed.
 """
 
 from collections.abc import Mapping
@@ -12,12 +11,12 @@ if TYPE_CHECKING:
     import pandas as pd
 
 MOST_LINES = 15  # lines of a `repr`
-WIDTH = 70  # characters of a value in it; longer ones are named by type and size
+WIDTH = 70  # characters of a value in a `repr`; longer values are named by type and size
 FEW = 7  # numbers of an array that are written out
 
 
 class Presenter(Protocol):
-    """Writes what values say; `hilcal.presenter` returns it."""
+    """Writes values for people; `hilcal.presenter` returns it."""
 
     def html_of(self, value: object) -> str:
         """Return a value as a notebook shows it."""
@@ -33,21 +32,21 @@ class Presenter(Protocol):
 
 
 def brief(value: Any) -> str:
-    """Return a dataclass in at most `MOST_LINES` lines: what its `_brief` says, else its fields."""
-    if (of := getattr(value, "_brief", None)) is not None:
-        texts = of()
+    """Return a dataclass in at most `MOST_LINES` lines: by its `_brief`, else by its fields."""
+    if (describe := getattr(value, "_brief", None)) is not None:
+        texts = describe()
     else:
         texts = {f.name: shortened(getattr(value, f.name)) for f in fields(value) if f.repr}
     lines = [f"  {name}: {text}" for name, text in texts.items()]
     if len(lines) > MOST_LINES - 2:
-        left = len(lines) - (MOST_LINES - 3)
-        lines = [*lines[: MOST_LINES - 3], f"  ... and {left} more"]
+        hidden = len(lines) - (MOST_LINES - 3)
+        lines = [*lines[: MOST_LINES - 3], f"  ... and {hidden} more"]
     return "\n".join([f"{type(value).__name__}(", *lines, ")"])
 
 
 def shortened(value: object) -> str:
     """Return a value in one short line: itself, or its type, name and size."""
-    import numpy as np  # not where `hilcal` is only imported
+    import numpy as np  # not at `import hilcal`
 
     kind = type(value).__name__
     if isinstance(value, np.ndarray):
@@ -56,10 +55,10 @@ def shortened(value: object) -> str:
     if isinstance(value, Mapping):
         return f"{kind} of {len(value)}: {_cut(', '.join(map(str, value)))}" if value else "{}"
     if isinstance(value, tuple | list):
-        whole = repr(value) if all(isinstance(v, str | int | float) for v in value) else ""
-        if value and (not whole or len(whole) > WIDTH):
+        text = repr(value) if all(isinstance(v, str | int | float) for v in value) else ""
+        if value and (not text or len(text) > WIDTH):
             return f"{len(value)} of {type(value[0]).__name__}"
-        return whole or "()"
+        return text or "()"
     if is_dataclass(value) or len(repr(value)) > WIDTH:
         names = getattr(value, "names", None) or getattr(value, "name", None)
         if isinstance(names, str | tuple) and names:
@@ -79,14 +78,14 @@ class Brief:
     __slots__ = ()
 
     def __init_subclass__(cls, **options: Any) -> None:
-        """Put `brief` where the decorator `dataclass` would put a complete `repr`."""
+        """Set `brief` as `repr`, so that the decorator `dataclass` makes none."""
         super().__init_subclass__(**options)
         if "__repr__" not in cls.__dict__:
             type.__setattr__(cls, "__repr__", brief)
 
 
 class Shown(Brief):
-    """A value that notebooks show in words and tables."""
+    """A value that notebooks show as text and tables."""
 
     __slots__ = ()
 
@@ -100,11 +99,11 @@ class Tabular(Brief):
     __slots__ = ()
 
     def to_frame(self) -> "pd.DataFrame":
-        """Return a pandas data frame, SI, units at the ends of the columns' names.
+        """Return a pandas data frame in SI units, with the unit at the end of a column's name.
 
-        Of readings: the columns of the exchange table. Of a fit: a row per reading with its pose,
-        load, residual, and residual without its pose. Of a diagnosis: a row per suspect, best
-        first. Of a plan: a row per reading in the order of measuring.
+        Readings have the columns of the exchange table. A fit has a row per reading with pose,
+        load, residual, and residual of the fit without the pose. A diagnosis has a row per suspect,
+        best first. A plan has a row per reading in the order of measuring.
 
         Raises:
             InputError: pandas is not installed.
@@ -113,7 +112,7 @@ class Tabular(Brief):
 
 
 def presenter() -> Presenter:
-    """Return who writes what values say; the library is loaded wherever one of its values is."""
+    """Return the presenter of values."""
     import hilcal
 
     return hilcal.presenter()

@@ -1,4 +1,4 @@
-"""Reading TOML into checked sections, with one clear line for whatever is wrong."""
+"""Reading TOML into checked sections; every error is one clear line."""
 
 import difflib
 import inspect
@@ -29,8 +29,8 @@ Vector3 = tuple[Number, Number, Number]
 class Section(BaseModel):
     """One section of a file: immutable, finite numbers only, unknown keys refused.
 
-    The description of a field says what is valid; it completes "it must be ...". It is in the
-    class's docstring, as "key: description | example in TOML", with the `WORDS` of the class.
+    The description of a field states what is valid and completes "it must be ...". The class's
+    docstring has it, as "key: description | example in TOML"; `WORDS` are abbreviations in it.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -38,11 +38,11 @@ class Section(BaseModel):
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
-        """Take what the docstring says of the keys."""
+        """Set descriptions and examples of the fields from the docstring."""
         for entry in re.split(r"\n(?=\w+: )", inspect.cleandoc(cls.__doc__ or "")):
-            key, _, words = " ".join(entry.split()).partition(": ")
+            key, _, text = " ".join(entry.split()).partition(": ")
             if key in cls.__annotations__ and key in cls.model_fields:
-                description, _, example = words.partition(" | ")
+                description, _, example = text.partition(" | ")
                 for name, phrase in cls.WORDS.items():
                     description = description.replace(name, phrase)
                 field = cls.model_fields[key]
@@ -79,21 +79,21 @@ def read_toml(path: Path) -> dict[str, Any]:
                 "sections"
             )
     try:
-        found = tomllib.loads(text)
+        data = tomllib.loads(text)
     except RecursionError:
         raise InputError(f"{path.name}: nested too deeply; valid: TOML with sections") from None
     except tomllib.TOMLDecodeError as error:
         where = f"(at line {max(1, len(text.splitlines()))}, end of document)"
         message = str(error).replace("(at end of document)", where)
         raise InputError(f"{path.name}: TOML syntax error: {message}") from None
-    except ValueError as error:  # a whole number of thousands of digits
+    except ValueError as error:  # an integer of thousands of digits
         raise InputError(f"{path.name}: not TOML: {error}") from None
-    _check_whole(found, path.name)
-    return found
+    _check_whole(data, path.name)
+    return data
 
 
 def _check_whole(data: dict[str, Any], where: str) -> None:
-    """Refuse whole numbers that TOML does not have; Python reads them from hexadecimal ones."""
+    """Refuse integers of more than 64 bits, which Python reads from hexadecimal digits."""
     pending: list[Any] = [data]
     while pending:
         inner = pending.pop()
@@ -123,10 +123,10 @@ def check_json(text: str, section: type[S], where: str) -> S:
 
 
 def read_json(text: str, where: str) -> Any:
-    """Return what a JSON document holds; `where` names it in messages.
+    """Return the content of a JSON document; `where` names it in messages.
 
     Raises:
-        InputError: not JSON, or nested too deeply.
+        InputError: not JSON, nested too deeply, or too large.
     """
     try:
         return parse_json(text)
@@ -137,7 +137,7 @@ def read_json(text: str, where: str) -> Any:
 
 
 def parse_json(text: str) -> Any:
-    """Return what a JSON document holds; ValueError where it is none, too deep, or too large."""
+    """Return the content of a JSON text; a ValueError for an invalid, too deep or too large one."""
     if sum(map(text.count, ",:[{")) > limits.VALUES:
         raise ValueError(f"more than {limits.VALUES / 1e6:.0f} million values")
     try:
@@ -155,8 +155,8 @@ def _whole(digits: str) -> int:
 def suggest(name: str, valid: Sequence[str]) -> str:
     """Return ' (did you mean "x"?)' for a name close to one of the valid ones, else nothing.
 
-    Long names and those beyond the first thousand are not compared, which takes the square of
-    their length.
+    Long names and those beyond the first thousand are not compared: the time grows with the square
+    of a name's length.
     """
     near = [v for v in islice(valid, 1000) if len(v) <= _SHORT]
     close = difflib.get_close_matches(name, near, n=1) if len(name) <= _SHORT else ()
@@ -165,9 +165,9 @@ def suggest(name: str, valid: Sequence[str]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _Place:
-    """Where an error is: `[tool]` or nothing, its class, the field and the vector's element."""
+    """Place of an error: header as `[tool]` or empty, section, key, and element of a vector."""
 
-    words: str
+    header: str
     section: type[Section]
     key: str = ""
     field: FieldInfo | None = None
@@ -175,35 +175,35 @@ class _Place:
 
 
 def _message(error: ValidationError, root: type[Section]) -> str:
-    """One line for the gravest error: unknown keys first, since they explain missing ones."""
+    """Return one line for the first error; unknown keys first, since they explain missing ones."""
     first = min(error.errors(include_url=False), key=lambda e: e["type"] != "extra_forbidden")
     kind = first["type"]
     place = _locate(root, first["loc"], inside=kind in ("value_error", "extra_forbidden"))
     if kind == "extra_forbidden":
         unknown, valid = str(first["loc"][-1]), list(place.section.model_fields)
-        thing = "key" if place.words else "section or key"
+        thing = "key" if place.header else "section or key"
         return (
-            f'{place.words or "the file"} has no {thing} "{unknown}"{suggest(unknown, valid)}; '
+            f'{place.header or "the file"} has no {thing} "{unknown}"{suggest(unknown, valid)}; '
             f"valid here: {', '.join(valid)}"
         )
     must = place.field.description if place.field is not None else None
     must = f"it must be {must}" if must else first["msg"]
     if kind == "value_error":
-        return f"{place.words} {first['ctx']['error']}".strip()
+        return f"{place.header} {first['ctx']['error']}".strip()
     if kind == "missing" and place.element is None:
-        return f'{place.words or "the file"} lacks "{place.key}": {must}'
-    whole = place.element is None or kind == "missing"
-    element = "" if whole else f", element {place.element}"
+        return f'{place.header or "the file"} lacks "{place.key}": {must}'
+    complete = place.element is None or kind == "missing"
+    element = "" if complete else f", element {place.element}"
     value = _show(first["input"])
-    return f"{place.words} {place.key}{element} = {value} is not valid: {must}".strip()
+    return f"{place.header} {place.key}{element} = {value} is not valid: {must}".strip()
 
 
 def _locate(root: type[Section], loc: tuple[int | str, ...], *, inside: bool) -> _Place:
-    """Follow an error's location through the sections to the key."""
+    """Return the place of an error from its location, through the sections to the key."""
     place = _Place("", root)
     for i, part in enumerate(loc):
         if isinstance(part, int):  # of an array of sections
-            place = replace(place, words=f"[{place.words}] number {part + 1}")
+            place = replace(place, header=f"[{place.header}] number {part + 1}")
             continue
         field = place.section.model_fields.get(part)
         inner = section_of(field)
@@ -228,6 +228,6 @@ def section_of(field: FieldInfo | None) -> type[Section] | None:
 
 
 def _show(value: object) -> str:
-    """Show a value shortly, on one line."""
+    """Return a value as one short line."""
     text = json.dumps(value, default=str)
     return text if len(text) <= 60 else f"{text[:57]}..."

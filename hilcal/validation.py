@@ -1,4 +1,4 @@
-"""Prediction of another campaign's readings: what was fitted is left out, the rest is judged."""
+"""Validation: prediction of another campaign's readings, without those that were fitted."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -25,34 +25,34 @@ def validate(
 ) -> CampaignValidation:
     """Predict readings of another campaign with a revision of this one.
 
-    Readings that the revision was fitted to are recognised, whatever file they come in (see
-    `hilcal.readings.same_readings`), and left out; where all were fitted, all are predicted, and
+    Readings that the revision was fitted to are recognised in any file (see
+    `hilcal.readings.same_readings`) and left out. Where all were fitted, all are predicted, and
     `judged.unseen` is False.
 
     >>> with hc.Campaign.open(RUN) as run:
-    ...     found = hc.validate(run, run)
-    >>> found.judged.fitted, found.judged.unseen
+    ...     result = hc.validate(run, run)
+    >>> result.judged.fitted, result.judged.unseen
     (50, False)
 
     Args:
-        run: has the revision; without any, the baseline is fitted and not kept. A campaign, or its
-            path.
-        other: has the readings; the same.
-        revision: its number, or a record; the one in use where None.
-        limit_m: the largest 3-D position error that is allowed, m; that of the configuration of
-            `run`, [limits] accuracy_m, where None.
-        register: the tracker was set up anew: estimate its place first.
+        run: the campaign of the revision, or its path; without a revision the baseline is fitted,
+            but not stored.
+        other: the campaign of the readings, or its path.
+        revision: number or record of the revision; None: the one in use.
+        limit_m: the largest 3-D position error allowed, m; None: [limits] accuracy_m of the
+            configuration of `run`.
+        register: the tracker was moved: estimate its registration first.
         say: takes progress, one line each.
 
     Raises:
         InputError: another robot, no such revision, or an effect that needs a column that the
             other readings lack.
         CannotAnswerError: a limit, and all readings were fitted; or the registration does not
-            settle.
+            converge.
     """
     if not isinstance(run, Campaign) or not isinstance(other, Campaign):
-        with opened(run) as one, opened(other) as two:
-            return validate(one, two, revision, limit_m, register=register, say=say)
+        with opened(run) as first, opened(other) as second:
+            return validate(first, second, revision, limit_m, register=register, say=say)
     if run.cell.arm.name != other.cell.arm.name:
         raise InputError(
             f"{other.path}: robot {other.cell.arm.name}; the model of {run.path} is of "
@@ -61,30 +61,31 @@ def validate(
     record = revision if isinstance(revision, RevisionRecord) else run.in_use(revision)
     if record is None:
         record = run.record(run.fit_in_use(say)[1])
-    mode, fitted, there = mode_of(record), run.fitted_readings(record), other.readings
+    mode, fitted, readings = mode_of(record), run.fitted_readings(record), other.readings
     model, theta = run.restore_model(record)
-    known, fresh = never_fitted(there, fitted, mode == "deflection")
-    mixed = bool(known.any() and fresh.any())
+    refitted, fresh = never_fitted(readings, fitted, mode == "deflection")
+    mixed = bool(refitted.any() and fresh.any())
     judged = Judged(
         number=record.number or None,
         mode=mode,
-        readings=len(there),
-        fitted=int(known.sum()),
-        spoilt=int(np.sum(~known & ~fresh)) if mixed else 0,
-        unseen=mixed or not known.any(),
-        scalar=bool(there.scalar.any()),
+        readings=len(readings),
+        fitted=int(refitted.sum()),
+        spoilt=int(np.sum(~refitted & ~fresh)) if mixed else 0,
+        unseen=mixed or not refitted.any(),
+        scalar=bool(readings.scalar.any()),
     )
     if limit_m is None and judged.unseen:
         limit_m = run.config.limits.accuracy_m
     if limit_m is not None and not judged.unseen:
-        count = "all" if known.all() else f"{judged.fitted} of"
+        count = "all" if refitted.all() else f"{judged.fitted} of"
         raise CannotAnswerError(
-            f"{other.path}: {count} its {len(there)} readings were fitted by {judged.model} of "
+            f"{other.path}: {count} its {len(readings)} readings were fitted by {judged.model} of "
             f"{run.path}; a limit is tested with readings that were not"
         )
-    chosen = there[fresh] if mixed else there
+    chosen = readings[fresh] if mixed else readings
     say(f"predicting {len(chosen)} readings")
-    found = validation.validate(model, theta, fitted, chosen, mode, registered=register)
+    prediction = validation.validate(model, theta, fitted, chosen, mode, registered=register)
     say("comparing with what was measured")
-    beyond = extrapolation(run.predictive(record, model, theta), fitted, found)
-    return CampaignValidation(model, judged, found, beyond, acceptance(found, beyond, limit_m))
+    beyond = extrapolation(run.predictive(record, model, theta), fitted, prediction)
+    shares = acceptance(prediction, beyond, limit_m)
+    return CampaignValidation(model, judged, prediction, beyond, shares)

@@ -1,4 +1,4 @@
-"""Every file is written beside its place, and put there when it is complete and on the disk."""
+"""Atomic writing: a file takes its place when it is complete and on the disk."""
 
 import errno
 import os
@@ -19,24 +19,23 @@ def replace_file(path: str | Path, content: str | bytes, *, must_be_new: bool = 
 
 @contextmanager
 def replacing(path: str | Path, *, must_be_new: bool = False) -> Iterator[Path]:
-    """Give an empty file to be written in the block, which then takes the place of `path`.
+    """Yield the path of an empty file, which replaces `path` at the end of the block.
 
-    Whatever ends the block or the process before, the file that was there is as it was. It is the
-    file that a link points to; the new one has the permissions of the old one. A device, a pipe,
-    and the file that this program prints to have no place to be put at: they are given themselves.
+    If the block or the process ends early, an existing file is unchanged. Of a link, the file that
+    it points to is replaced. The new file has the permissions of the old one. A device, a pipe and
+    the file that this program prints to cannot be replaced: their own path is yielded.
 
     Args:
-        path: the file.
-        must_be_new: refuse to replace one.
+        must_be_new: refuse to replace a file.
 
     Raises:
-        InputError: it cannot be written, or there is one already.
+        InputError: the file cannot be written, or exists and `must_be_new`.
     """
     try:
         old = _status(Path(path))
         if old is not None and must_be_new:
             raise InputError(f"{path}: the file exists; choose another name")
-        if old is not None and _written_straight(old):
+        if old is not None and _written_in_place(old):
             yield Path(path)
             return
         place = Path(os.path.realpath(path))
@@ -52,22 +51,22 @@ def replacing(path: str | Path, *, must_be_new: bool = False) -> Iterator[Path]:
             new.unlink(missing_ok=True)
             raise
     except OSError as error:
-        words = os.strerror(error.errno) if error.errno else error  # libraries add their own
-        raise InputError(f"{path}: cannot be written ({words})") from error
+        reason = os.strerror(error.errno) if error.errno else error  # libraries set no number
+        raise InputError(f"{path}: cannot be written ({reason})") from error
     except UnicodeEncodeError as error:
         raise InputError(f"{path}: a text is not valid Unicode ({error.object!r:.80})") from error
 
 
 def _status(path: Path) -> os.stat_result | None:
-    """Return what is there, or where a link leads; None for nothing."""
+    """Return the status of a file, or of a link's file; None without a file."""
     try:
         return path.stat()
     except FileNotFoundError:
         return None
 
 
-def _written_straight(old: os.stat_result) -> bool:
-    """Whether a file is no place for another one: a device, a pipe, or our own output."""
+def _written_in_place(old: os.stat_result) -> bool:
+    """Whether a file cannot be replaced: a device, a pipe, or the output of this program."""
     if stat.S_ISDIR(old.st_mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
     if not stat.S_ISREG(old.st_mode):
@@ -80,9 +79,9 @@ def _written_straight(old: os.stat_result) -> bool:
 
 
 def _finish(new: Path, old: os.stat_result | None) -> None:
-    """Bring a written file to the disk, with owner and permissions of the one it replaces."""
+    """Flush a new file to the disk, with owner and permissions of the file that it replaces."""
     if old is not None:
-        with suppress(PermissionError):  # only root gives files away
+        with suppress(PermissionError):  # only root may change the owner
             os.chown(new, old.st_uid, old.st_gid)
         new.chmod(stat.S_IMODE(old.st_mode))
     handle = os.open(new, os.O_RDONLY)

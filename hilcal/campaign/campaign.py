@@ -1,4 +1,4 @@
-"""A campaign: its readings with their full covariance, and the fits that were stored in it."""
+"""A campaign: its readings with their full covariance, and its stored fits."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -57,7 +57,7 @@ Say = Callable[[str], None]
 class Campaign(Brief):
     """An open campaign file; close it, or use it in a `with` statement.
 
-    Where a method takes the number of a `revision`, it is the one in use (see `in_use`) where None.
+    A method's parameter `revision` is a number; None is the revision in use, see `in_use`.
 
     >>> with hc.Campaign.open(RUN) as run:
     ...     len(run.readings), run.cell.arm.name, run.mode()
@@ -66,11 +66,10 @@ class Campaign(Brief):
     Attributes:
         file: the SQLite file, open for appending revisions.
         readings: all readings, with the covariance of instrument, averaging and repeatability.
-        catalogue: the effects that a model of it can have.
-        changes: what is different in the cell from what it was told to be when the readings were
-            taken, see `with_cell`.
-        noise: as it was estimated from the readings; None where the table or the cell states it, or
-            the samples of measured readings show it.
+        catalogue: the effects that a model can have.
+        changes: changes of the cell since the readings were taken, see `with_cell`.
+        noise: the noise as estimated from the readings; None where the table, the cell or the
+            samples of the readings state it.
     """
 
     file: CampaignFile
@@ -88,16 +87,16 @@ class Campaign(Brief):
 
         Args:
             catalogue: the effects that a model can have; the installed ones unless given.
-            read_only: write nothing to the file, nor beside it.
+            read_only: write neither the file nor files next to it.
 
         Raises:
-            InputError: not a sound campaign, or without readings.
+            InputError: not a valid campaign, or without readings.
         """
         file = CampaignFile.open(path, read_only=read_only)
         try:
             number, records = file.accepted(), file.revisions()
-            used = records[-1:] if number is None else records[number - 1 : number]
-            self._set(file, catalogue or installed(), used[0].cell if used else {})
+            in_use = records[-1:] if number is None else records[number - 1 : number]
+            self._set(file, catalogue or installed(), in_use[0].cell if in_use else {})
         except BaseException:
             file.close()
             raise
@@ -112,9 +111,9 @@ class Campaign(Brief):
     def _brief(self) -> dict[str, str]:
         poses = len(np.unique(self.readings.pose))
         try:
-            used = self.in_use()
-            revision = "no revision yet" if used is None else f"revision {used.number}"
-        except InputError:  # a value can be printed when its file is closed, or gone
+            record = self.in_use()
+            revision = "no revision yet" if record is None else f"revision {record.number}"
+        except InputError:  # the file is closed or deleted
             revision = "not known, the file is closed"
         return {
             "file": str(self.path),
@@ -125,7 +124,7 @@ class Campaign(Brief):
         }
 
     def _repr_html_(self) -> str:
-        from hilcal.present.campaign import info_report  # notebooks alone need them
+        from hilcal.present.campaign import info_report  # for notebooks only
         from hilcal.present.html import fragment
         from hilcal.present.registration import covariance_words
 
@@ -133,15 +132,15 @@ class Campaign(Brief):
         return fragment(info_report(overview(self.file), self.path.name, covariance))
 
     def _set(self, file: CampaignFile, catalogue: Catalogue, changes: Changes) -> None:
-        """Set the attributes from an open file, and what is changed in its cell."""
+        """Set the attributes from an open file and the changes of its cell."""
         config = CellConfig.from_json(file.config_json)
         try:
             config = changed(config, changes)
         except InputError as error:
             raise InputError(f"{file.path}: a revision is damaged ({error})") from None
-        kept = file.about(ROBOT_FILE), file.about(CALIBRATION_FILE)
-        check_robot(file.path, file.config_json, *kept)
-        cell, restated = cell_from_config(config, None, *kept), _restates(file, changes)
+        robot_texts = file.about(ROBOT_FILE), file.about(CALIBRATION_FILE)
+        check_robot(file.path, file.config_json, *robot_texts)
+        cell, restated = cell_from_config(config, None, *robot_texts), _restates(file, changes)
         noise = None if restated else estimated_noise(file)
         readings = _with_instrument(file.readings(), config, restated, noise)
         covers = INSTRUMENT if restated else file.about(COVERS)
@@ -153,25 +152,25 @@ class Campaign(Brief):
             object.__setattr__(self, field.name, value)
 
     def at(self, changes: Changes) -> Self:
-        """Return the campaign with what a revision changed in the cell, on the same open file."""
+        """Return the campaign, on the same open file, with these changes of the original cell."""
         if changes == self.changes:
             return self
-        other = object.__new__(type(self))
-        other._set(self.file, self.catalogue, changes)
-        return other
+        campaign = object.__new__(type(self))
+        campaign._set(self.file, self.catalogue, changes)
+        return campaign
 
     def with_cell(self, changes: Changes) -> Self:
-        """Return the campaign with a cell that is changed further; the file keeps what it has.
+        """Return the campaign with further changes of the cell; the file is not changed.
 
-        The noise of the tracker makes the covariances of readings whose table states none, as
-        importing it again would; no other number of a reading changes.
+        The tracker's noise determines the covariances of readings whose table states none, as in
+        an import; no other number of a reading changes.
 
         Args:
-            changes: values by key, by section, of the keys of `config.changes.CHANGEABLE`; None
-                leaves a key out.
+            changes: values by section and key, for the keys of `config.changes.CHANGEABLE`; the
+                value None removes a key.
 
         Raises:
-            InputError: a key or a value that is not valid, or one that these readings do not use.
+            InputError: a key or a value is not valid, or these readings do not use the key.
         """
         merged = {
             section: {**self.changes.get(section, {}), **changes.get(section, {})}
@@ -184,24 +183,24 @@ class Campaign(Brief):
         return self.at(merged)
 
     def unchangeable(self, changes: Changes | None = None) -> dict[tuple[str, str], str]:
-        """Return sections and keys of the cell that these readings do not let change, and why.
+        """Return the keys of the cell that cannot be changed, by (section, key), with the reason.
 
-        With all of `changes` in it; with those of now where None.
+        `changes` are all changes of the cell; those of the campaign where None.
         """
-        found: dict[tuple[str, str], str] = {}
+        reasons: dict[tuple[str, str], str] = {}
         noise, changes = self.file.about(NOISE), self.changes if changes is None else changes
         if noise is None and self.file.about(FROM) != TRACKER:
             why = "the covariances of these readings are those that were measured, or of the table"
-            found |= {("tracker", key): why for key in INSTRUMENT_NOISE}
+            reasons |= {("tracker", key): why for key in INSTRUMENT_NOISE}
         covers = INSTRUMENT if _restates(self.file, changes) else self.file.about(COVERS)
         if covers != INSTRUMENT:
-            more = "; state the noise in [tracker], too" if noise is not None else ""
-            why = f"the covariances of these readings include the arm's scatter already{more}"
+            hint = "; state the noise in [tracker], too" if noise is not None else ""
+            why = f"the covariances of these readings include the arm's scatter already{hint}"
             old = "an older version of hilcal imported these readings; import the table again"
-            found["repeatability", "joint_std_rad"] = why if covers == WHOLE else old
+            reasons["repeatability", "joint_std_rad"] = why if covers == WHOLE else old
         if self.file.about(PLAN) is not None and self.config.force_sensor is not None:
-            found["tool", "load_point_m"] = "the force sensor's moments are stored about it"
-        return found
+            reasons["tool", "load_point_m"] = "the force sensor's moments are stored about it"
+        return reasons
 
     @property
     def path(self) -> Path:
@@ -210,7 +209,7 @@ class Campaign(Brief):
 
     @property
     def covariance_parts(self) -> CovarianceParts:
-        """What the covariance of its readings consists of."""
+        """The components of the readings' covariance."""
         return covariance_parts(self._stated_covers, self.config)
 
     @property
@@ -219,30 +218,30 @@ class Campaign(Brief):
 
     @property
     def covers(self) -> str:
-        """What the covariance of `readings` covers, as an exchange table states it."""
+        """What the covariance of `readings` covers, in the words of an exchange table."""
         return INSTRUMENT if self.covariance_parts in ("instrument", "as imported") else WHOLE
 
     @property
     def stored_covers(self) -> str:
-        """What the covariance of the file's readings covers, as an exchange table states it.
+        """What the covariance of the file's readings covers, in the words of an exchange table.
 
-        A file that does not say is read as it is: where importing would add the arm's scatter, its
-        table says that it is in it.
+        Covariances of a file that does not state this are taken as complete where the cell states
+        a scatter of the arm.
         """
         added = covariance_parts(INSTRUMENT, self.config) != "instrument"
         return self._stated_covers or (WHOLE if added else INSTRUMENT)
 
     @property
     def data_hash(self) -> str:
-        """SHA-256 of its readings as the file stores them, without those appended since."""
+        """SHA-256 of `readings` as the file stores them, without readings appended since."""
         return self.file.data_hash(len(self.readings))
 
     def save_table(self, path: Path, *, as_stored: bool = False) -> None:
         """Write the readings as an exchange table, CSV or Parquet by the file's name.
 
         Args:
-            path: the file; one that is there is replaced.
-            as_stored: without the arm's scatter where it was added to their covariance.
+            path: the file; an existing one is replaced.
+            as_stored: leave out the arm's scatter where it was added to the covariance.
 
         Raises:
             InputError: the file cannot be written.
@@ -271,38 +270,37 @@ class Campaign(Brief):
         self.close()
 
     def latest(self) -> RevisionRecord | None:
-        """Return the latest revision, if there is any."""
+        """Return the latest revision; None without revisions."""
         return next(reversed(self.file.revisions()), None)
 
     def in_use(self, revision: int | None = None) -> RevisionRecord | None:
-        """Return the revision that is used: as asked, else the accepted, else the latest one."""
+        """Return the revision of a number; None: the accepted one, else the latest."""
         number = self.file.accepted() if revision is None else revision
         return self.latest() if number is None else self.file.revision(number)
 
     def _fitted(self, revision: int | None) -> RevisionRecord:
-        """Return the revision that is used; refuses a campaign without any."""
+        """Return the same; refuse a campaign without revisions."""
         record = self.in_use(revision)
         if record is None:
             raise InputError(f"{self.path}: no revision yet; run hilcal identify or refine first")
         return record
 
     def accept(self, revision: int | None) -> None:
-        """Make a revision the one that is used unless another is asked for; None: the latest."""
+        """Make a revision the one in use; None: always the latest."""
         self.file.accept(revision)
 
     def mode(self) -> Mode:
-        """Kind of readings: that of the revision in use, else as planned and the readings allow."""
+        """Return the kind of readings of the revision in use, else of plan and readings."""
         record = self.in_use()
         if record is not None:
             return revisions.mode_of(record)
         return usual_mode(self.readings, self.config.planning.readings)
 
     def fit(self, revision: int | None = None) -> Fit:
-        """Return a stored fit, found again from its stored parameters.
+        """Return a stored fit.
 
         Raises:
-            InputError: no such revision, or its readings or effects are not at hand as they were
-                when it was stored.
+            InputError: no such revision, or its readings or effects have changed since.
         """
         return self.restore(self._fitted(revision))
 
@@ -325,16 +323,16 @@ class Campaign(Brief):
                 f"{record.number}"
             )
 
-    def require_gc(self, number: int | None, scaling: str, what: str) -> None:
+    def require_gc(self, number: int | None, scaling: str, task: str) -> None:
         """Refuse a fit, of revision `number`, whose residual is not whitened."""
         if scaling != "gc":
             raise InputError(
-                f"revision {number} has scaling {scaling}; {what} needs gc: run hilcal identify "
+                f"revision {number} has scaling {scaling}; {task} needs gc: run hilcal identify "
                 f"again{self._until_used(number)}"
             )
 
     def _until_used(self, number: int | None) -> str:
-        """Words after "run hilcal identify again": what the new fit lacks until it is used."""
+        """Return how to put a new fit into use, after "run hilcal identify again"."""
         if number is None or number != self.file.accepted():
             return ""
         return (
@@ -343,7 +341,7 @@ class Campaign(Brief):
         )
 
     def fitted_readings(self, record: RevisionRecord) -> Readings:
-        """Return the readings that a revision was fitted to; later ones come after them."""
+        """Return the readings that a revision was fitted to, which are the first ones."""
         self._require_its_cell(record)
         with revisions.sound(record):
             return self.readings[: int(record.result_json["identify"]["n_readings"])]
@@ -356,11 +354,11 @@ class Campaign(Brief):
         )
 
     def predictive(self, record: RevisionRecord, model: Model, theta: Floats) -> Predictive:
-        """Return what a stored revision knows of readings that it has not seen."""
+        """Return the predictive distribution of a stored revision."""
         return revisions.restore_predictive(record, model, theta, self.fitted_readings(record))
 
     def calibration(self, revision: int | None = None) -> Calibration:
-        """Return a stored fit ready for use, see `Calibration`; raises as `fit` does."""
+        """Return the calibration of a stored fit; raises as `fit` does."""
         record = self._fitted(revision)
         judged: Mapping[str, Any] = record.result_json.get("diagnose", {})
         source = {
@@ -374,7 +372,7 @@ class Campaign(Brief):
         return Calibration.of(self.restore(record), source)
 
     def _kinematics(self) -> dict[str, object]:
-        """Return the controller's kinematics as a calibration keeps them, where they were told."""
+        """Return the controller's kinematics for a calibration; empty where unknown."""
         if self.file.about(PLAN) is not None:
             event = RunLog(self.file).last("devices") or {}
             for answer in event.get("answers", ()):
@@ -384,27 +382,27 @@ class Campaign(Brief):
         return {} if factory is None or factory.rows is None else {"kinematics": factory.to_dict()}
 
     def posterior(self, revision: int | None = None) -> Posterior:
-        """Return what a stored fit taught of the arm, which is the prior of another campaign.
+        """Return the posterior of a stored fit, which can be the prior of another campaign.
 
         Raises:
-            InputError: see `fit`, or one that is not fitted with scaling gc.
-            CannotAnswerError: its model has no effect of the arm.
+            InputError: see `fit`, or the fit's scaling is not gc.
+            CannotAnswerError: the model has no effect of the arm.
         """
         record = self._fitted(revision)
         source = Source(self.path.name, record.number, record.created)
         return Posterior.of(self.restore(record), source)
 
     def history(self, revision: int | None = None) -> History:
-        """Return how the model of a revision was reached, which `diagnose` takes."""
+        """Return the history of a revision's model, which `diagnose` takes."""
         record = self.in_use(revision)
         return revisions.history(
             () if record is None else revisions.chain(self.file.revisions(), record.number)
         )
 
     def append(self, found: Fit | Diagnosis | Refinement) -> int:
-        """Store a fit, a diagnosed fit, or all steps of a refinement; revisions only append.
+        """Append a fit, a diagnosed fit, or all steps of a refinement as revisions.
 
-        What the latest revision, or those that led to it, are already is not stored again.
+        Nothing is stored where the latest revisions are these already.
 
         Returns:
             The number of the (last) revision.
@@ -423,23 +421,22 @@ class Campaign(Brief):
     def append_records(
         self, records: Sequence[RevisionRecord], parent: int | None = None
     ) -> tuple[int, ...]:
-        """Store revisions of which each is made from the one before; returns their numbers.
+        """Store a chain of revisions, each made from the previous one; return their numbers.
 
         Args:
-            records: from `record`; none of them is stored where the latest revision, and those
-                that led to it, are these already.
+            records: from `record`; none is stored where the latest chain ends with them already.
             parent: number of the revision that the first one is made from; None for a first model.
         """
         if not records:
             return ()
         last = revisions.chain(self.file.revisions())[-len(records) :]
-        there = last and last[0].made_from == parent and len(last) == len(records)
-        if there and all(map(revisions.is_again, records, last)):
+        comparable = last and last[0].made_from == parent and len(last) == len(records)
+        if comparable and all(map(revisions.is_again, records, last)):
             return tuple(r.number for r in last)
         numbers: list[int] = []
         for record in records:
-            before = numbers[-1] if numbers else parent
-            numbers.append(self.file.append_revision(replace(record, parent=before)))
+            previous = numbers[-1] if numbers else parent
+            numbers.append(self.file.append_revision(replace(record, parent=previous)))
         return tuple(numbers)
 
     def store(
@@ -450,11 +447,10 @@ class Campaign(Brief):
         removed: str | None = None,
         parent: int | None = None,
     ) -> int:
-        """Store a fit, with what was changed in the model since the revision before.
+        """Store a fit, with the effect that was added to or removed from the model.
 
         Args:
-            removed: the effect that was taken out.
-            parent: number of the revision that was changed; the one before where None.
+            parent: number of the revision that was changed; the previous one where None.
 
         Returns:
             The number of the revision.
@@ -473,24 +469,24 @@ class Campaign(Brief):
         removed: str | None = None,
         parent: int | None = None,
     ) -> RevisionRecord:
-        """Return what `store` stores, without storing it; raises as `store` does."""
+        """Return the record that `store` stores; raises as `store` does."""
         refuse_fitting(self.file)
         hashed = content_hash(found.readings)
         if hashed != content_hash(self.readings):
             raise InputError(f"{self.path}: the fit is of other readings than this campaign's")
         document = None if diagnosis is None else to_json(diagnosis)
         record = revisions.to_record(found, document, added, hashed, removed, parent)
-        more: dict[str, Any] = {STORED: self.data_hash, **typed_now()}
+        options: dict[str, Any] = {STORED: self.data_hash, **typed_now()}
         if self.changes:
-            more[CELL] = self.changes
-        return replace(record, options={**record.options, **more})
+            options[CELL] = self.changes
+        return replace(record, options={**record.options, **options})
 
     def fit_in_use(
         self, say: Say = lambda text: None, revision: int | None = None
     ) -> tuple[int | None, Fit]:
-        """Return number and fit of the revision in use; without any, fit the baseline.
+        """Return number and fit of the revision in use; without one, None and the baseline's fit.
 
-        Nothing is stored; the number is None where the baseline was fitted.
+        Nothing is stored.
         """
         record = self.in_use(revision)
         if record is not None:
@@ -502,15 +498,15 @@ class Campaign(Brief):
         return None, with_serial_noise(fit(model, self.readings, self.mode()))
 
     def chapters(self, say: Say = lambda text: None, revision: int | None = None) -> list[Chapter]:
-        """Return the revision in use and those that it was made from, diagnosed; see `view`.
+        """Return the revision in use and its ancestors, diagnosed; see `view`.
 
-        Without any revision it is the baseline, which is not stored. Raises as `fit` does.
+        Without revisions, return the baseline, which is not stored. Raises as `fit` does.
         """
         last = self.in_use(revision)
         if last is None:
-            _, found = self.fit_in_use(say)
+            _, fitted = self.fit_in_use(say)
             say("diagnosing it")
-            return [Chapter(1, None, found, diagnose(found, say=say))]
+            return [Chapter(1, None, fitted, diagnose(fitted, say=say))]
         records = revisions.chain_in_cell(self.file.revisions(), last.number)
         fits = []
         for record in records:
@@ -519,9 +515,9 @@ class Campaign(Brief):
         numbers = {id(f): r.number for f, r in zip(fits, records, strict=True)}
         judged: list[Diagnosis | None] = []
         while len(judged) < len(fits):
-            same = _named_from(fits[len(judged) :])
-            say(f"diagnosing revision {numbers[id(same[-1])]}")
-            judged += _judged(same, lambda f: self.history(numbers[id(f)]), say)
+            group = _named_from(fits[len(judged) :])
+            say(f"diagnosing revision {numbers[id(group[-1])]}")
+            judged += _judged(group, lambda f: self.history(numbers[id(f)]), say)
         return [
             Chapter(r.number, r.added, f, d, r.removed)
             for r, f, d in zip(records, fits, judged, strict=True)
@@ -531,30 +527,30 @@ class Campaign(Brief):
 def _judged(
     fits: Sequence[Fit], history: Callable[[Fit], History], say: Say
 ) -> Sequence[Diagnosis | None]:
-    """Judge one fit, or one with a background of which more and more is named."""
+    """Diagnose a fit, or fits that name more and more effects of one background."""
     if fits[0].scaling != "gc":
         return [None]
     if len(fits) == 1:
         return [diagnose(fits[0], history(fits[0]), say)]
     tested = background_evidence(fits[0])
     return judge_naming(
-        fits, tested, history, lambda left: Evidence(fits[-1], say=say, background=left)
+        fits, tested, history, lambda remaining: Evidence(fits[-1], say=say, background=remaining)
     )[0]
 
 
 def _named_from(fits: Sequence[Fit]) -> Sequence[Fit]:
-    """Return the first of some fits, and those after it that only name more of its background."""
+    """Return the first fit, and the next ones that only name further effects of its background."""
     first, count = fits[0], 1
     for f in fits[1:]:
-        before = fits[count - 1].model.background
-        if not f.model.background < before or not np.array_equal(f.theta, first.theta):
+        previous = fits[count - 1].model.background
+        if not f.model.background < previous or not np.array_equal(f.theta, first.theta):
             break
         count += 1
     return fits[:count]
 
 
 def estimated_noise(file: CampaignFile) -> NoiseEstimate | None:
-    """Return the noise as estimated at import, or after measuring; None where it is stated."""
+    """Return the noise estimated at import or after measuring; None where it is stated."""
     if file.about(PLAN) is None:
         return NoiseEstimate.from_json(file.about(NOISE))
     event = RunLog(file).last(NOISE)
@@ -564,7 +560,7 @@ def estimated_noise(file: CampaignFile) -> NoiseEstimate | None:
 def _with_instrument(
     readings: Readings, config: CellConfig, restated: bool, noise: NoiseEstimate | None
 ) -> Readings:
-    """Return stored readings with the instrument's covariance as it is stated or estimated now."""
+    """Return stored readings with the instrument's covariance as stated or estimated."""
     if restated:
         return with_noise_of(config.tracker, readings)
     if noise is not None and noise.factors is not None:
@@ -573,7 +569,7 @@ def _with_instrument(
 
 
 def _restates(file: CampaignFile, changes: Changes) -> bool:
-    """Whether the covariances of readings are made anew of what changed in [tracker]."""
+    """Whether changes in [tracker] replace the covariances of the readings."""
     keys = changes.get("tracker", {}).keys()
     if file.about(NOISE) is not None:
         return not keys.isdisjoint(INSTRUMENT_NOISE)
@@ -582,7 +578,7 @@ def _restates(file: CampaignFile, changes: Changes) -> bool:
 
 @contextmanager
 def opened(run: Campaign | str | Path) -> Iterator[Campaign]:
-    """Yield a campaign, or that of a path, which is closed again."""
+    """Yield a campaign, or open that of a path for the block."""
     if isinstance(run, Campaign):
         yield run
         return

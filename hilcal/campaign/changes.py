@@ -1,4 +1,4 @@
-"""A revision with one effect more or less than another, or in a changed cell: judged, stored."""
+"""Changes of a revision: an effect added or removed, or a changed cell; refitted and stored."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -26,17 +26,17 @@ Say = Callable[[str], None]
 class Changed:
     """A revision and the one that it was made from."""
 
-    before_number: int  # number of the revision before
+    before_number: int  # number of the previous revision
     before: Fit
-    number: int  # of the new revision
+    number: int  # number of the new revision
     fit: Fit
     diagnosis: Diagnosis
     added: str | None
-    """The effect that was added, with its options where a finer form took its place."""
-    removed: str | None  # the effect that was taken out
+    """The added effect; with its options where it replaced a coarser form of itself."""
+    removed: str | None
     expected: Suspect | None
-    """What the fit before promised of an effect that was added, and what was kept of it; None where
-    it has no whitened residual."""
+    """What the previous fit predicted of the added effect, and what the new fit has of it; None
+    without an added effect or a whitened residual."""
 
 
 def add_effect(
@@ -48,11 +48,14 @@ def add_effect(
     say: Say,
     judged: Diagnosis | None = None,
 ) -> Changed:
-    """Add an effect to a revision's model, and store the fit as a revision that comes from it.
+    """Add an effect to a revision's model, and store the fit as a revision made from it.
 
-    Where there is no revision yet, `number` is None, and `before` becomes one, too, when the effect
-    could be added. Raises an InputError where the model has the effect already, or the readings do
-    not allow it, and a CannotAnswerError where they are too few.
+    `number` is None where no revision exists; then `before`, of diagnosis `judged`, is stored, too,
+    once the effect is fitted.
+
+    Raises:
+        InputError: the model has the effect already, or the readings do not allow it.
+        CannotAnswerError: too few readings.
     """
     named = write_effect(effect, options)
     say(f"adding {named}")
@@ -69,7 +72,7 @@ def remove_effect(
     say: Say,
     judged: Diagnosis | None = None,
 ) -> Changed:
-    """Take an effect out of a revision's model; else as `add_effect`."""
+    """Remove an effect from a revision's model; else as `add_effect`."""
     say(f"removing {effect}")
     return _stored(o, number, before, remove(before, effect), None, effect, say, judged)
 
@@ -85,48 +88,47 @@ def _stored(
     judged: Diagnosis | None,
 ) -> Changed:
     say("diagnosing")
-    known = o.history(number)
-    how = History(
-        added=tuple(n for n in after.model.names if n in (added, *known.added)),
-        removed=(*known.removed, *([] if removed is None else [removed])),
+    previous = o.history(number)
+    history = History(
+        added=tuple(n for n in after.model.names if n in (added, *previous.added)),
+        removed=(*previous.removed, *([] if removed is None else [removed])),
     )
-    d = diagnose(after, how, say)
-    for found in (before, after):
+    d = diagnose(after, history, say)
+    for f in (before, after):
         say("predicting the poses left out")
-        _ = found.holdout
+        _ = f.holdout
         say("computing standard uncertainties")
-        _ = found.uncertainty
+        _ = f.uncertainty
     if number is None:
         number = o.store(before, judged)
-    made = o.store(after, d, added, removed, number)
+    new_number = o.store(after, d, added, removed, number)
     promised = added is not None and before.scaling == "gc"
     expected = addition(before, after) if promised else None
-    return Changed(number, before, made, after, d, added, removed, expected)
+    return Changed(number, before, new_number, after, d, added, removed, expected)
 
 
 def refit(o: Campaign, record: RevisionRecord, say: Say, history: History = NOTHING) -> Diagnosis:
-    """Fit the model of a revision to all readings of a campaign, in its cell, and judge the fit.
+    """Fit the model of a revision to all readings of a campaign, in its cell, and diagnose the fit.
 
-    Frames that were unknown are in it where the cell does not know them now. What the revision has
-    beside its effects it has again, estimated anew: another campaign's prior, a background, the
-    arm's scatter. Nothing is stored. `history` is how its model was reached. Raises as `add_effect`
-    does.
+    Frames that the cell does not know are estimated. The prior of another campaign, a background
+    and the arm's scatter are used where the revision has them; the latter two are estimated again.
+    Nothing is stored. `history` is that of the model. Raises as `add_effect` does.
     """
     mode = mode_of(record)
     frames = o.catalogue.unknown_frames(o.at(record.cell).cell)
     names = [name for name in record.effects if name not in frames]
-    options = {n: of for n, of in record.options["effects"].items() if n not in frames}
+    options = {n: values for n, values in record.options["effects"].items() if n not in frames}
     say(f"fitting {' + '.join(names) or 'the nominal arm'} to {len(o.readings)} readings")
     model = with_effects(o.cell, o.readings, mode, names, options, o.catalogue, carried_of(record))
-    found = with_serial_noise(fit(model, with_prior_scatter(model, o.readings), mode))
+    fitted = with_serial_noise(fit(model, with_prior_scatter(model, o.readings), mode))
     if has_background(record):
         say("fitting all effects of the catalogue together")
-        found = with_background(found, found.model.names) or found
-    judged = diagnose(found, history, say)
+        fitted = with_background(fitted, fitted.model.names) or fitted
+    judged = diagnose(fitted, history, say)
     if record.scatter_alone and judged.reason == "arm_scatter" and judged.scatter is not None:
         say("the arm's scatter enters the covariance; diagnosing")
-        readings = with_arm_scatter(found.model.cell, found.readings, judged.scatter)
-        judged = diagnose(fit(found.model, readings, mode, start=found.theta), history, say)
+        readings = with_arm_scatter(fitted.model.cell, fitted.readings, judged.scatter)
+        judged = diagnose(fit(fitted.model, readings, mode, start=fitted.theta), history, say)
     return judged
 
 
@@ -138,14 +140,16 @@ def change_cell(
     say: Say,
     judged: Diagnosis | None = None,
 ) -> tuple[Campaign, int, Diagnosis]:
-    """Fit a revision's model in a changed cell, and store the fit as a revision that says so.
+    """Fit a revision's model in a changed cell, and store the fit with the changes as a revision.
 
-    Returns the campaign in that cell, number and diagnosis of the new revision. Where there is none
-    yet, `number` is None, and `before` becomes one, too. Raises as `add_effect` does.
+    `number`, `before` and `judged` are as in `add_effect`, which raises the same errors.
+
+    Returns:
+        The campaign in the changed cell, number and diagnosis of the new revision.
     """
-    there = o.with_cell(changes)
+    changed = o.with_cell(changes)
     record = o.record(before) if number is None else o.file.revision(number)
-    found = refit(there, record, say, o.history(number))
+    diagnosis = refit(changed, record, say, o.history(number))
     if number is None:
         number = o.store(before, judged)
-    return there, there.store(found.fit, found, parent=number), found
+    return changed, changed.store(diagnosis.fit, diagnosis, parent=number), diagnosis

@@ -1,4 +1,4 @@
-"""Fits as revisions of a campaign file: what is stored, and how the fit comes back."""
+"""Fits as revisions of a campaign file: storing and restoring."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -30,30 +30,30 @@ from hilcal.store.rows import content_hash
 from hilcal.types import Floats
 
 _WIDEST = 1e100
-"""No prior is as wide: its square, times those of whitened rows, is within double precision."""
+"""Largest standard deviation of a prior: its square times whitened rows does not overflow."""
 SERIAL = "serial_noise"
-"""Key among the parameters of a revision: how its noise is correlated along the order."""
+"""Key in the parameters of a revision: serial correlation of its noise."""
 RANDOM = "random"
-"""Key among the parameters of a revision: its random effects; those that are not among the effects
-of the revision are its background."""
+"""Key in the parameters of a revision: its random effects; those that are not among the effects of
+the revision are its background."""
 SOURCES = "effects_from"
-"""Key among the options of a revision: the files that its effects are from."""
+"""Key in the options of a revision: the files that define its effects."""
 
 
 def to_record(
-    found: Fit,
+    fitted: Fit,
     diagnosis: Mapping[str, object] | None,
     added: str | None,
     data_hash: str,
     removed: str | None = None,
     parent: int | None = None,
 ) -> RevisionRecord:
-    """Return what is stored of a fit: enough to find it again, and what was reported of it.
+    """Return the record of a fit: what restores it, and its reported results.
 
-    Without an effect `added` or `removed` a new chain starts; `parent` is the number of the
-    revision that it was made from, where that is not the one before.
+    Without an effect `added` or `removed` a new chain starts. `parent` is the number of the
+    revision that it was made from, where that is not the previous one.
     """
-    model, cell, readings = found.model, found.model.cell, found.readings
+    model, cell, readings = fitted.model, fitted.model.cell, fitted.readings
     files = {name: model.catalogue.file_of(name) for name in model.names}
     sources = {n: {"file": f.path, "sha256": f.sha256} for n, f in files.items() if f is not None}
     std = {name: values.tolist() for name, values in model.random.items()}
@@ -65,7 +65,7 @@ def to_record(
         CARRIED: model.prior and model.prior.to_json(),
         RANDOM: {"effects": list(model.names), "std": std} if std else None,
     }
-    result: dict[str, object] = {"identify": fit_document.to_json(found)}
+    result: dict[str, object] = {"identify": fit_document.to_json(fitted)}
     if diagnosis is not None:
         result["diagnose"] = fit_document.plain(diagnosis)
     return RevisionRecord(
@@ -74,8 +74,8 @@ def to_record(
         removed=removed,
         parent=parent,
         options={
-            "readings": found.mode,
-            "scaling": found.scaling,
+            "readings": fitted.mode,
+            "scaling": fitted.scaling,
             "effects": {e.name: dict(e.options) for e in model.effects},
             **({SOURCES: sources} if sources else {}),
         },
@@ -83,12 +83,12 @@ def to_record(
         program_version=__version__,
         parameters_json={
             "names": _names(model),
-            "theta": found.theta.tolist(),
-            "std": [fit_document.finite(s) for s in found.uncertainty.std],
-            "prior": [fit_document.finite(s) for s in found.solution.prior],
+            "theta": fitted.theta.tolist(),
+            "std": [fit_document.finite(s) for s in fitted.uncertainty.std],
+            "prior": [fit_document.finite(s) for s in fitted.solution.prior],
             "registration": cell.registration.tolist(),
             "target": cell.target.tolist(),
-            "outliers": np.flatnonzero(found.outlier).tolist(),
+            "outliers": np.flatnonzero(fitted.outlier).tolist(),
             **{key: value for key, value in optional.items() if value},
         },
         result_json=result,
@@ -100,7 +100,7 @@ def _names(model: Model) -> list[str]:
 
 
 def is_again(new: RevisionRecord, stored: RevisionRecord) -> bool:
-    """Whether a stored revision holds all of a new one but the time and the command."""
+    """Whether a stored revision equals a new one but for time, command and parent."""
 
     def plain(r: RevisionRecord) -> Any:
         result = {key: r.result_json.get(key) for key in new.result_json}
@@ -118,7 +118,7 @@ def restore(
     catalogue: Catalogue | None = None,
     stored: str | None = None,
 ) -> Fit:
-    """Find a stored fit again: the same model from the stored parameters, quickly.
+    """Restore a fit: fit its model again, from the stored parameters as start.
 
     `stored` is the hash of the readings as the file stores them, where there is a file.
     """
@@ -143,9 +143,9 @@ def restore(
 def _fitted_to(record: RevisionRecord, readings: Readings, stored: str | None) -> bool:
     """Whether a revision was fitted to these readings.
 
-    Revisions of programs before `STORED` have the hash of computed covariances alone, whose last
-    bits are those of the machine that fitted; elsewhere their number of readings has to do. Stored
-    readings cannot be changed, only appended, and each has a checksum.
+    Records older than the key `STORED` only have the hash of computed covariances, whose last bits
+    depend on the machine; on other machines the number of readings must suffice. Stored readings
+    are never changed, only appended, and each has a checksum.
     """
     reported = record.result_json.get("identify")
     count = reported.get("n_readings") if isinstance(reported, Mapping) else None
@@ -153,22 +153,22 @@ def _fitted_to(record: RevisionRecord, readings: Readings, stored: str | None) -
         return False
     if stored is not None and stored == record.options.get(STORED):
         return True
-    known = record.data_hash == content_hash(readings)
-    return known or (STORED not in record.options and count is not None)
+    matches = record.data_hash == content_hash(readings)
+    return matches or (STORED not in record.options and count is not None)
 
 
 @contextmanager
 def sound(record: RevisionRecord) -> Iterator[None]:
-    """Say that a revision is damaged where its entries are not what this program stores."""
+    """Raise an InputError where the block fails since the entries of a revision are damaged."""
     try:
         yield
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        words = " ".join(str(error).split())[:80]
-        raise InputError(f"revision {record.number} is damaged ({words})") from error
+        text = " ".join(str(error).split())[:80]
+        raise InputError(f"revision {record.number} is damaged ({text})") from error
 
 
 def _prior(record: RevisionRecord) -> Floats:
-    """Standard deviations (P,) of the priors of a stored fit; infinite for none."""
+    """Return the standard deviations (P,) of the priors of a stored fit; infinite without prior."""
     stored = record.parameters_json["prior"]
     prior = np.array([np.inf if s is None else float(s) for s in stored], dtype=float)
     possible = (prior >= 0.0) & ((prior <= _WIDEST) | np.isinf(prior))
@@ -180,7 +180,7 @@ def _prior(record: RevisionRecord) -> Floats:
 def restore_model(
     record: RevisionRecord, cell: Cell, readings: Readings, catalogue: Catalogue | None = None
 ) -> tuple[Model, Floats]:
-    """Model and parameters (P,) of a revision, in the cell as it was registered then."""
+    """Return model and parameters (P,) of a revision, in the cell as registered by its fit."""
     with sound(record):
         return _restored(record, cell, readings, catalogue or installed())
 
@@ -188,7 +188,7 @@ def restore_model(
 def _restored(
     record: RevisionRecord, cell: Cell, readings: Readings, catalogue: Catalogue
 ) -> tuple[Model, Floats]:
-    """Do the same of a record that may be damaged: then any exception can be raised."""
+    """Do the same; a damaged record may raise any exception."""
     stored: Mapping[str, Any] = record.parameters_json
     targets = frames("targets", stored.get("targets", [stored["target"]]), several=True)
     registration = frames("registration", stored["registration"])
@@ -205,11 +205,11 @@ def _restored(
         trios = zip(cell.observers, places, observed, strict=True)
         placed = (replace(o, frame=f, offset=float(s["offset_m"])) for o, f, s in trios)
         cell = replace(cell, observers=tuple(placed))
-    options, of_random = record.options["effects"], stored.get(RANDOM)
-    names = tuple(of_random["effects"] if of_random else record.effects)
+    options, random_effects = record.options["effects"], stored.get(RANDOM)
+    names = tuple(random_effects["effects"] if random_effects else record.effects)
     effects = tuple(catalogue.make(e, cell, readings.states, options.get(e)) for e in names)
     size = {e.name: len(e.magnitudes) for e in effects}
-    std = of_random["std"] if of_random else {}
+    std = random_effects["std"] if random_effects else {}
     random = {name: np.array(values, dtype=float) for name, values in std.items()}
     for name, values in random.items():
         if values.shape != (size.get(name),) or not np.all((values > 0) & (values < LARGEST)):
@@ -227,7 +227,7 @@ def _restored(
 
 
 def carried_of(record: RevisionRecord) -> CarriedPrior | None:
-    """Return the prior of another campaign that a revision was fitted with; None without."""
+    """Return the prior of another campaign in a revision's fit; None without one."""
     carried = record.parameters_json.get(CARRIED)
     return None if carried is None else CarriedPrior.from_json(carried)
 
@@ -235,7 +235,7 @@ def carried_of(record: RevisionRecord) -> CarriedPrior | None:
 def restore_predictive(
     record: RevisionRecord, model: Model, theta: Floats, readings: Readings
 ) -> Predictive:
-    """Return what a stored fit with parameters (P,) knows of readings that it has not seen."""
+    """Return the predictive distribution of a stored fit with parameters (P,)."""
     stored: Mapping[str, Any] = record.parameters_json
     with sound(record):
         prior, mode = _prior(record), mode_of(record)
@@ -245,42 +245,42 @@ def restore_predictive(
 
 
 def has_background(record: RevisionRecord) -> bool:
-    """Whether effects that are not named predict with the model of a revision."""
+    """Whether the model of a revision has a background of effects that are not named."""
     return not set(_predicting(record)) <= set(record.effects)
 
 
 def _predicting(record: RevisionRecord) -> Sequence[str]:
-    """Names of all effects of a revision, those of its background too."""
-    every: Sequence[str] = record.parameters_json.get(RANDOM, {}).get("effects", record.effects)
-    return every
+    """Return the names of all effects of a revision, with those of its background."""
+    names: Sequence[str] = record.parameters_json.get(RANDOM, {}).get("effects", record.effects)
+    return names
 
 
 def mode_of(record: RevisionRecord) -> Mode:
-    """Kind of readings of a revision."""
+    """Return the kind of readings of a revision."""
     return MODES[MODES.index(record.options["readings"])]
 
 
 def chain(
     records: tuple[RevisionRecord, ...], last: int | None = None
 ) -> tuple[RevisionRecord, ...]:
-    """Return a revision, the latest where None, and those that it was made from, oldest first."""
+    """Return a revision (None: the latest) and its ancestors, oldest first."""
     by_number = {r.number: r for r in records}
-    found: list[RevisionRecord] = []
+    linked: list[RevisionRecord] = []
     number = max(by_number, default=None) if last is None else last
     while number in by_number:
-        found.append(by_number[number])
+        linked.append(by_number[number])
         number = by_number[number].made_from
-    return tuple(reversed(found))
+    return tuple(reversed(linked))
 
 
 def chain_in_cell(records: tuple[RevisionRecord, ...], last: int) -> tuple[RevisionRecord, ...]:
-    """Return those revisions of a chain that were fitted in the cell of the last one."""
-    found = chain(records, last)
-    return tuple(r for r in found if r.cell == found[-1].cell)
+    """Return the revisions of a chain that were fitted in the cell of its last one."""
+    linked = chain(records, last)
+    return tuple(r for r in linked if r.cell == linked[-1].cell)
 
 
 def history(records: tuple[RevisionRecord, ...]) -> History:
-    """Return how the model of the last of the revisions of a `chain` was reached."""
+    """Return the history of the model of the last revision of a `chain`."""
     if not records:
         return History()
     last = records[-1]
@@ -294,24 +294,24 @@ def history(records: tuple[RevisionRecord, ...]) -> History:
 
 
 def check_sources(record: RevisionRecord, run: Path, catalogue: Catalogue) -> None:
-    """Refuse a revision whose effects are not at hand as they were when it was fitted."""
+    """Refuse a revision whose effects are missing or have changed since it was fitted."""
     stored = record.options.get(SOURCES, {})
     for name in _predicting(record):
-        then, now = stored.get(name), catalogue.file_of(name)
+        source, file = stored.get(name), catalogue.file_of(name)
         if name not in catalogue.names:
-            where, known = "FILE.py", ""
-            if isinstance(then, dict) and {"file", "sha256"} <= set(then):
-                where = str(then["file"])
-                known = (
-                    f" (SHA-256 {str(then['sha256'])[:16]}…; it is a program, and is run: read it "
-                    "first where somebody sent it)"
+            hint, note = "FILE.py", ""
+            if isinstance(source, dict) and {"file", "sha256"} <= set(source):
+                hint = str(source["file"])
+                note = (
+                    f" (SHA-256 {str(source['sha256'])[:16]}…; it is a program, and is run: read "
+                    "it first where somebody sent it)"
                 )
             raise InputError(
                 f"{run}: revision {record.number} has the effect {name}, which is not in the "
-                f"catalogue{known}; give the file that defines it: --effects-from {quoted(where)}"
+                f"catalogue{note}; give the file that defines it: --effects-from {quoted(hint)}"
             )
-        if then and now and then["sha256"] != now.sha256:
+        if source and file and source["sha256"] != file.sha256:
             raise InputError(
-                f"{run}: revision {record.number} was fitted with another {name}: {now.path} has "
+                f"{run}: revision {record.number} was fitted with another {name}: {file.path} has "
                 "changed since then; fit again: hilcal identify or refine"
             )

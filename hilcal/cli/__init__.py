@@ -1,4 +1,4 @@
-"""The command line: one file per group of commands, imported where it is used."""
+"""The command line: one file per group of commands, imported when a command of it is called."""
 
 import errno
 import itertools
@@ -66,7 +66,7 @@ def one_line(message: object) -> str:
 
 
 def error_document(message: object, code: int) -> dict[str, object]:
-    """Return an error as a command's document holds it."""
+    """Return the "error" part of a command's JSON document."""
     kind = _KINDS.get(code, "unexpected")
     return {"error": {"message": one_line(message), "kind": kind, "exit_code": code}}
 
@@ -75,17 +75,17 @@ class Watched:
     """A stream that knows whether anything was written to it."""
 
     def __init__(self, stream: TextIO) -> None:
-        """Stand before a stream; everything but `write` is the stream's own."""
+        """Wrap a stream; all attributes but `write` are those of the stream."""
         self.written = False
         self._stream = stream
 
     def write(self, text: str) -> int:
-        """Write, and take note."""
+        """Write a text; an empty one does not count."""
         self.written = self.written or bool(text)
         return self._stream.write(text)
 
     def __getattr__(self, name: str) -> Any:
-        """Return what the stream has."""
+        """Return an attribute of the stream."""
         return getattr(self._stream, name)
 
 
@@ -95,10 +95,10 @@ class Failures:
 
     as_json: bool
     out: Watched  # where the document goes
-    debug: bool  # whether people want to know more
+    debug: bool  # whether tracebacks are shown
 
     def tell(self, error: BaseException | None, message: str, code: int) -> int:
-        """Say what failed in one line, and in one document; returns the exit code."""
+        """Print the failure as one line, with --json as a document, too; return the exit code."""
         if self.debug and error is not None:
             traceback.print_exception(error)
         print(_laid_out(f"error: {one_line(message)}"), file=sys.stderr)
@@ -109,19 +109,19 @@ class Failures:
 
 
 def _laid_out(line: str) -> str:
-    """Return a line as people read it: on a terminal broken between words.
+    """Return a line, on a terminal wrapped between words.
 
-    A command at its end has a line of its own there, to be copied as it stands.
+    There, a command at the end of the line is put on a separate line, which can be copied.
     """
     if not sys.stderr.isatty():
         return line
-    found = _COMMAND.match(line)
-    words, command = found.groups() if found else (line, "")
+    match = _COMMAND.match(line)
+    message, command = match.groups() if match else (line, "")
     width = shutil.get_terminal_size().columns
     wrap = textwrap.TextWrapper(
         width, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False
     )
-    return "\n".join((*wrap.wrap(words), *([f"  {command}"] if command else ())))
+    return "\n".join((*wrap.wrap(message), *([f"  {command}"] if command else ())))
 
 
 def application(
@@ -131,7 +131,7 @@ def application(
     group: type[CommandGroup] = CommandGroup,
     completion: bool = False,
 ) -> typer.Typer:
-    """Return an empty application; with `alone` it does something without a command."""
+    """Return an empty application; with `alone` it can be called without a command."""
     return typer.Typer(
         cls=group,
         add_completion=completion,
@@ -146,11 +146,11 @@ def application(
 
 
 def _hilcal(arguments: Sequence[str]) -> typer.Typer:
-    """Return the application; of its commands only the one that the arguments name is imported."""
+    """Return the application; only the command that the arguments name is imported."""
     app = application(str(_top.__doc__), group=InOrderOfWork, completion=True)
-    words = [word for word in arguments if not word.startswith("-")]
+    names = [word for word in arguments if not word.startswith("-")]
     for name, command in COMMANDS.items():
-        if words[:1] != [name]:
+        if names[:1] != [name]:
             app.command(name, help=command.summary)(_placeholder)
         elif command.subcommands:
             with _loading(name):
@@ -167,7 +167,7 @@ def _hilcal(arguments: Sequence[str]) -> typer.Typer:
 
 @contextmanager
 def _loading(name: str) -> Iterator[None]:
-    """Show on a terminal that the program is there while a command's libraries are loaded."""
+    """Animate a line on a terminal while the libraries of a command are loaded."""
     if not sys.stderr.isatty() or os.environ.get(_COMPLETE):
         yield
         return
@@ -198,11 +198,11 @@ def _group(command: Command) -> typer.Typer:
 
 
 def _placeholder() -> None:
-    """Hold the place of a command that is listed and not used."""
+    """Stand for a command that is listed but not called."""
 
 
-def _version(asked: bool) -> None:
-    if asked:
+def _version(requested: bool) -> None:
+    if requested:
         print(f"hilcal {__version__}")
         raise typer.Exit
 
@@ -217,13 +217,13 @@ def _top(
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a command of `hilcal` and exit; see `execute`."""
-    given = sys.argv[1:] if arguments is None else list(arguments)
-    words = _words_to_complete() if os.environ.get(_COMPLETE) else given
-    execute(lambda: _hilcal(words), "hilcal", given)
+    argv = sys.argv[1:] if arguments is None else list(arguments)
+    named = _words_to_complete() if os.environ.get(_COMPLETE) else argv
+    execute(lambda: _hilcal(named), "hilcal", argv)
 
 
 def _words_to_complete() -> list[str]:
-    """Return the words of the line that a shell asks to complete, without the program's name."""
+    """Return the words of the line to complete, without the program's name."""
     line = os.environ.get("COMP_WORDS") or os.environ.get("_TYPER_COMPLETE_ARGS", "")
     try:
         return shlex.split(line)[1:]
@@ -234,26 +234,26 @@ def _words_to_complete() -> list[str]:
 def execute(make: Callable[[], typer.Typer], name: str, arguments: Sequence[str]) -> None:
     """Run a command and exit; see `EXIT_CODES`.
 
-    Wrong input and failures are one line on stderr; HILCAL_DEBUG=1 shows where they came from.
+    Wrong input and failures are one line on stderr; HILCAL_DEBUG=1 shows tracebacks.
     With --json the error is a JSON document on stdout, too, unless the command has printed one.
-    What `make` raises is reported like what a command raises.
+    Errors that `make` raises are reported in the same way.
     """
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")
     debug = os.environ.get(DEBUG, "") not in ("", "0")
-    given = list(arguments)
+    argv = list(arguments)
     out = Watched(sys.stdout)
     with warnings.catch_warnings(), redirect_stdout(out):
         if not debug:
             warnings.simplefilter("ignore")
-        failed = Failures("--json" in given, out, debug)
-        sys.exit(_run(make, name, given, failed))
+        failed = Failures("--json" in argv, out, debug)
+        sys.exit(_run(make, name, argv, failed))
 
 
 @contextmanager
 def _computing() -> Iterator[None]:
-    """Limit BLAS to one thread: more gain nothing on small matrices, and cost on a busy machine."""
+    """Limit BLAS to one thread: several gain nothing on small matrices and load the machine."""
     if "numpy" not in sys.modules:  # --help, --version: nothing is computed
         yield
         return
@@ -275,7 +275,7 @@ def _run(
     except HilcalError as error:
         return failures.tell(error, str(error), error.exit_code)
     except BrokenPipeError:
-        # Nobody reads any more; what is still in the buffer must not raise again at exit.
+        # The reader is gone; flushing the buffer at exit must not raise again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), out.fileno())
         return _BROKEN_PIPE
     except KeyboardInterrupt:
@@ -291,30 +291,28 @@ def _run(
 
 
 def _explained(error: Exception, name: str) -> tuple[str, int]:
-    """Return what a person should know of an error that is not the program's own, and its code."""
-    # Usage errors are of the command-line library, which one depends on its version.
-    if (message := getattr(error, "format_message", None)) is not None:
+    """Return message and exit code of an error that is no `HilcalError`."""
+    # The class of usage errors depends on the version of the command-line library.
+    if (format_message := getattr(error, "format_message", None)) is not None:
         where = getattr(getattr(error, "ctx", None), "command_path", name)
-        what = str(message()).rstrip(".")
-        return what + (f" See {where} -h" if what.endswith("?") else f"; see {where} -h"), _USAGE
+        usage = str(format_message()).rstrip(".")
+        return usage + (f" See {where} -h" if usage.endswith("?") else f"; see {where} -h"), _USAGE
     if type(error).__name__ == "Abort":
         return "interrupted", _INTERRUPTED
     if isinstance(error, OSError) and error.errno in _FULL:  # output, or a library's cache
-        words = f"{error.filename or 'a file'} cannot be written ({os.strerror(error.errno)})"
+        file = error.filename or "a file"
         hint = "make room on the disks of output, program and temporary files"
-        return f"{words}: {hint}", DeviceError.exit_code
-    if isinstance(error, ImportError) and (lacks := _LIBRARY.match(str(error))):
-        package = " (libgomp1 on Debian)" if lacks[1] == "libgomp.so.1" else ""
-        words = f"the system library {lacks[1]} is missing: install its package{package}"
-        return words, _USAGE
-    if words := lacking(error):
-        return words, _USAGE
+        message = f"{file} cannot be written ({os.strerror(error.errno)}): {hint}"
+        return message, DeviceError.exit_code
+    if isinstance(error, ImportError) and (library := _LIBRARY.match(str(error))):
+        package = " (libgomp1 on Debian)" if library[1] == "libgomp.so.1" else ""
+        return f"the system library {library[1]} is missing: install its package{package}", _USAGE
+    if message := lacking(error):
+        return message, _USAGE
     from hilcal.effects.from_file import failure_of
 
     if failed := failure_of(error):
         return str(failed), failed.exit_code
-    words = " ".join(str(error).split())
-    return (
-        f"unexpected {type(error).__name__}: {words}; please report it ({DEBUG}=1 shows more)",
-        1,
-    )
+    text = " ".join(str(error).split())
+    message = f"unexpected {type(error).__name__}: {text}; please report it ({DEBUG}=1 shows more)"
+    return message, 1

@@ -1,4 +1,4 @@
-"""`calibrate`: the operator's one command, from the plan to the measured improvement."""
+"""`calibrate`: one command from the plan to the measured improvement."""
 
 import shlex
 from collections.abc import Iterator
@@ -52,14 +52,14 @@ from hilcal.store.run_log import RunLog
 from hilcal.tables.units import parse_duration, parse_length
 
 VALIDATION = 20
-"""Poses of a validation campaign; a choice: their mean error is known to a tenth of itself."""
+"""Poses of a validation campaign; a choice: they determine the mean error to 10 %."""
 FITTED_LATER = ("plan", "measure", "refine", "decide")  # Steps that a fit may follow
-LONGEST = "2 h"  # How long measuring may last; a choice
+LONGEST = "2 h"  # Longest time for measuring; a choice
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationOptions:
-    """What is wanted of a calibration."""
+    """Goals and sizes of a calibration."""
 
     goal: str | None = None
     limit: str | None = None
@@ -69,11 +69,11 @@ class CalibrationOptions:
     prior: Path | None = None
 
     def settings(self) -> dict[str, Any]:
-        """Return the settings of the procedure that are given."""
+        """Return the stated options as settings of the procedure."""
         for name, count in (("--poses", self.poses), ("--validation", self.validation)):
             if count is not None and count < 1:
                 raise InputError(f"{name} {count}; valid: a whole number from 1")
-        asked = {
+        stated = {
             "goal_m": None if self.goal is None else parse_length(self.goal, "--goal"),
             "limit_m": None if self.limit is None else parse_length(self.limit, "--limit"),
             "max_time_s": None
@@ -83,7 +83,7 @@ class CalibrationOptions:
             "validation": self.validation,
             "prior": self.prior and str(self.prior.absolute()),
         }
-        return {key: value for key, value in asked.items() if value is not None}
+        return {key: value for key, value in stated.items() if value is not None}
 
 
 AS_USUAL = CalibrationOptions()
@@ -106,42 +106,43 @@ AS_USUAL = CalibrationOptions()
     yes | --yes -y | Do not ask before the arm moves; for scripts.
     """)
 def calibrate(
-    cell: Path, output: Path, resume: bool = False, asked: CalibrationOptions = AS_USUAL,
+    cell: Path, output: Path, resume: bool = False, options: CalibrationOptions = AS_USUAL,
     rehearse: bool = False, yes: bool = False, view: bool = False,
     effects_from: list[Path] | None = None, as_json: bool = False,
 ) -> None:  # fmt: skip
     """Plan, measure, fit, measure what is in doubt, validate, correct, and measure the gain."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     config, numbers = read_cell(cell)
-    settings = asked.settings()
+    settings = options.settings()
     if config.limits.accuracy_m is not None and not resume:
         settings.setdefault("limit_m", config.limits.accuracy_m)
-    on = ["hilcal", "calibrate", str(cell), "-o", str(output)]
-    more = ["--rehearse"] * rehearse + ["--yes"] * yes + ["--view"] * view
-    more += [] if asked.prior is None else ["--prior", str(asked.prior)]
-    more += [word for path in effects_from or () for word in ("--effects-from", str(path))]
-    go_on = _Continuation(t, shlex.join([*on, "--resume", *more]), shlex.join([*on, *more]))
+    line = ["hilcal", "calibrate", str(cell), "-o", str(output)]
+    flags = ["--rehearse"] * rehearse + ["--yes"] * yes + ["--view"] * view
+    flags += [] if options.prior is None else ["--prior", str(options.prior)]
+    flags += [word for path in effects_from or () for word in ("--effects-from", str(path))]
+    go_on = _Continuation(t, shlex.join([*line, "--resume", *flags]), shlex.join([*line, *flags]))
     p = _procedure(cell, output, resume, rehearse, config, numbers, catalogue, settings, go_on)
-    kept = p.settings.prior
-    if kept is not None and asked.prior is None and Path(kept).parent != output.absolute().parent:
-        raise InputError(
-            f"{output}: its prior is {kept!r}, and no file elsewhere is read because a campaign "
-            f"names it; give it yourself: --prior {quoted(kept)}"
-        )
-    if kept is not None and p.next().kind in FITTED_LATER:
-        p = replace(p, known=PriorOptions(Path(kept)).load(catalogue))
+    prior = p.settings.prior
+    if prior is not None:
+        if options.prior is None and Path(prior).parent != output.absolute().parent:
+            raise InputError(
+                f"{output}: its prior is {prior!r}, and no file elsewhere is read because a "
+                f"campaign names it; give it yourself: --prior {quoted(prior)}"
+            )
+        if p.next().kind in FITTED_LATER:
+            p = replace(p, known=PriorOptions(Path(prior)).load(catalogue))
     if not (yes or rehearse or somebody_there(t)) and p.next().kind != "done":
         raise InputError(
             "nobody can be asked before the arm moves; give --yes, or run it at a terminal"
         )
-    with go_on.told(p), ExitStack() as stack:
+    with go_on.explained(p), ExitStack() as stack:
         live = stack.enter_context(followed(t, view, output))
         CalibrationOperator(t, p, stack, rehearse, yes, live).to_the_end()
         with working(t.progress) as say:
-            found = p.compare(say)
+            improvement = p.compare(say)
     limit_m, files = p.settings.limit_m, p.files
     t.show(step_heading(ProcedureStep("compare", output)))
-    t.show(improvement_report(found, limit_m))
+    t.show(improvement_report(improvement, limit_m))
     t.show(
         f"\nThe calibration is in {output}, its test in {files.validation.name} and "
         f"{files.corrected.name}. Correct your points and programs with:"
@@ -150,29 +151,29 @@ def calibrate(
     t.show("Write it up as one HTML page, with a certificate first:")
     t.command(shlex.join(["hilcal", "report", str(output), "--operator", "NAME"]))
     failed: HilcalError | None = None
-    if limit_m is not None and found.over(limit_m):
-        words = limit_failure(found, limit_m)
-        undecided = limit_m < found.everything.noise_m
-        failed = CannotAnswerError(words) if undecided else LimitError(words)
-    t.document({**_document(p), "improvement": found.to_dict(), "limit_m": limit_m}, failed)
+    if limit_m is not None and improvement.over(limit_m):
+        failure = limit_failure(improvement, limit_m)
+        undecided = limit_m < improvement.everything.noise_m
+        failed = CannotAnswerError(failure) if undecided else LimitError(failure)
+    t.document({**_document(p), "improvement": improvement.to_dict(), "limit_m": limit_m}, failed)
 
 
 @dataclass(frozen=True, slots=True)
 class _Continuation:
-    """How an interrupted calibration is continued, for people."""
+    """The commands that start and resume a calibration."""
 
     t: Terminal
-    on: str  # the command that goes on
-    again: str  # the command that begins
+    resume: str
+    start: str
 
     @contextmanager
-    def told(self, p: Procedure) -> Iterator[None]:
-        """Let whatever ends the command early say what is safe, and the line that goes on."""
+    def explained(self, p: Procedure) -> Iterator[None]:
+        """Add to errors what is stored, and the command that resumes."""
 
         def safe() -> str:
             if not p.run.exists():
-                return f"{p.run} is not there; begin again with: {self.again}"
-            return f"everything measured so far is safe; go on with: {self.on}"
+                return f"{p.run} is not there; begin again with: {self.start}"
+            return f"everything measured so far is safe; go on with: {self.resume}"
 
         try:
             yield
@@ -181,9 +182,10 @@ class _Continuation:
         except (InputError, LimitError):
             raise
         except HilcalError as error:
-            words = str(error).removesuffix(HOW_ON).rstrip(". ")
-            how = f"then go on with: {self.on}" if isinstance(error, MovedFileError) else safe()
-            raise type(error)(f"{words}; {how}") from error
+            message = str(error).removesuffix(HOW_ON).rstrip(". ")
+            moved = isinstance(error, MovedFileError)
+            advice = f"then go on with: {self.resume}" if moved else safe()
+            raise type(error)(f"{message}; {advice}") from error
 
 
 def _procedure(
@@ -194,10 +196,10 @@ def _procedure(
     config: CellConfig,
     cell: Cell,
     catalogue: Catalogue,
-    asked: dict[str, Any],
+    stated: dict[str, Any],
     go_on: _Continuation,
 ) -> Procedure:
-    """Begin a calibration, or take it up from its file."""
+    """Begin a calibration, or resume it from its file."""
     hide = (config.simulation.hide or NOTHING) if rehearse else None
     base_dir = path.absolute().parent
     if rehearse:
@@ -208,31 +210,31 @@ def _procedure(
         check_effects(cell, config, catalogue)
         if resume:
             go_on.t.notice(f"{output} is not there yet: the calibration begins")
-        _refuse_goal(config.fitted, asked, path)
-        seed = config.simulation.seed
-        usual = Settings(POSES, VALIDATION, parse_duration(LONGEST, "--max-time"), seed=seed)
-        settings = replace(usual, readings=config.fitted, hide=hide, **asked)
+        _refuse_goal(config.fitted, stated, path)
+        max_time_s, seed = parse_duration(LONGEST, "--max-time"), config.simulation.seed
+        defaults = Settings(POSES, VALIDATION, max_time_s, seed=seed)
+        settings = replace(defaults, readings=config.fitted, hide=hide, **stated)
         p = Procedure(output, cell, config, base_dir, catalogue, settings)
         p.check_files()
         return p
     p = continued(output, cell, config, catalogue)
     if (p.settings.hide is not None) != rehearse:
-        what = "no rehearsal; leave --rehearse out" if rehearse else "a rehearsal; give --rehearse"
-        raise InputError(f"{output}: its calibration is {what}")
+        kind = "no rehearsal; leave --rehearse out" if rehearse else "a rehearsal; give --rehearse"
+        raise InputError(f"{output}: its calibration is {kind}")
     if not resume:
-        there = f"{output}: a calibration is there already, {standing(p.next())}"
-        raise InputError(f"{there}; go on with: {go_on.on}")
-    _refuse_goal(p.settings.readings, asked, path)
-    p = replace(p, settings=replace(p.settings, **asked))
+        message = f"{output}: a calibration is there already, {standing(p.next())}"
+        raise InputError(f"{message}; go on with: {go_on.resume}")
+    _refuse_goal(p.settings.readings, stated, path)
+    p = replace(p, settings=replace(p.settings, **stated))
     with CampaignFile.open(output) as campaign:
         p.resume(campaign)
     go_on.t.notice(f"{output}: a calibration, {standing(p.next())}")
     return p
 
 
-def _refuse_goal(kind: Mode, asked: dict[str, Any], cell: Path) -> None:
-    """Refuse a goal that the readings do not show."""
-    if kind == "deflection" and "goal_m" in asked:
+def _refuse_goal(kind: Mode, stated: dict[str, Any], cell: Path) -> None:
+    """Refuse a position error as the goal of deflections, which do not show it."""
+    if kind == "deflection" and "goal_m" in stated:
         raise InputError(
             "--goal is an error of the position, which deflections do not show: a calibration with "
             f'[planning] readings = "absolute" in {cell} reaches it; or leave out --goal'
@@ -261,7 +263,7 @@ def _document(p: Procedure) -> dict[str, object]:
 
 @dataclass(slots=True)
 class CalibrationOperator:
-    """Does one step after the other, and asks before the arm moves."""
+    """Does the steps of a calibration, and asks before the arm moves."""
 
     t: Terminal
     p: Procedure
@@ -269,16 +271,16 @@ class CalibrationOperator:
     rehearse: bool
     yes: bool
     viewer: LiveViewer | None = None
-    simulated: CellConfig | None = None  # of simulated devices, once they are there
-    ready: bool = False  # whether every device has said so
+    simulated: CellConfig | None = None  # of simulated devices, once they run
+    ready: bool = False  # whether every device has reported that it is ready
 
     @property
     def clock(self) -> float:
-        """How much faster than real time the cell goes."""
+        """Clock rate of the cell relative to real time."""
         return self.p.config.simulation.clock if self.rehearse else 1.0
 
     def to_the_end(self) -> None:
-        """Do all steps that are left but the comparison."""
+        """Do all remaining steps before the comparison."""
         while (step := self.p.next()).kind not in ("done", "compare"):
             self.t.show(step_heading(step, self.clock))
             if step.moves:
@@ -295,8 +297,8 @@ class CalibrationOperator:
             refuse_unready(answers)
             self.ready = True
         if not self.yes and somebody_there(self.t):
-            what = "The simulated arm will move." if self.rehearse else "The arm will move."
-            if not agreed(self.t, f"Measure now? {what}"):
+            warning = "The simulated arm will move." if self.rehearse else "The arm will move."
+            if not agreed(self.t, f"Measure now? {warning}"):
                 raise StoppedError("not measured, nothing has moved")
         config = self._config()
 
@@ -309,7 +311,7 @@ class CalibrationOperator:
             self.p.measure(step, work)
 
     def _config(self) -> CellConfig:
-        """Return the configuration that leads to the devices; starts simulated ones."""
+        """Return the configuration of the devices; in a rehearsal, start simulated ones."""
         if not self.rehearse:
             return self.p.config
         if self.simulated is None:
@@ -319,31 +321,31 @@ class CalibrationOperator:
         return self.simulated
 
     def _computing(self, step: ProcedureStep) -> None:
-        """Do a step in which nothing moves, and say what came of it."""
+        """Do a step in which nothing moves, and report its result."""
         p, t, viewer = self.p, self.t, self.viewer
         if step.kind == "plan":
             with working(t.progress) as say:
-                made = p.plan(say)
-            t.show(plan_facts(made.summary))
-            p.begin(made.plan, p.config)
+                checked_plan = p.plan(say)
+            t.show(plan_facts(checked_plan.summary))
+            p.begin(checked_plan.plan, p.config)
             return
-        found: Any
+        result: Any
         with working(t.progress) as say:
             if step.kind == "refine" and viewer is not None:
-                found = p.refine(say, lambda n, s: viewer.revised(*chapters_of([n], [s])))
+                result = p.refine(say, lambda n, s: viewer.revised(*chapters_of([n], [s])))
             else:
-                found = p.compute(step, say)
+                result = p.compute(step, say)
         if step.kind == "refine":
             with CampaignFile.open(p.run, read_only=True) as campaign:
                 refined = ProcedureLog(campaign).last(REFINED) or {"revisions": []}
-            t.show(errors_by_revision(chapters_of(refined["revisions"], found.steps)))
-            t.show([verdict_line(found.diagnosis), ""])
-            t.show(prior_lines(found.fit))
+            t.show(errors_by_revision(chapters_of(refined["revisions"], result.steps)))
+            t.show([verdict_line(result.diagnosis), ""])
+            t.show(prior_lines(result.fit))
         elif step.kind == "decide":
-            of = p.settings
-            t.show(decision_report(found, of.goal_m, of.readings, self.clock))
+            settings = p.settings
+            t.show(decision_report(result, settings.goal_m, settings.readings, self.clock))
         elif step.kind == "validate":
-            t.show(validation_lines(found))
+            t.show(validation_lines(result))
 
 
 def _count(path: Path) -> int:

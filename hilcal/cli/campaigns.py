@@ -63,50 +63,52 @@ def import_(
         show_preview(t, table, second, config, output, force)
         return
     if config is None or output is None:
-        what = "--config CELL.toml" if config is None else "-o RUN.hilcal"
-        raise InputError(f"{what} is missing; without it only --preview is possible")
+        missing = "--config CELL.toml" if config is None else "-o RUN.hilcal"
+        raise InputError(f"{missing} is missing; without it only --preview is possible")
     with working(t.progress) as say:
-        found = import_campaign(table, config, output, kind, second, overwrite=force, say=say)
-    readings, settings, cell, noise = found.readings, found.config, found.cell, found.noise
-    notes = (*found.notes, covariance_words(found.parts, noise), *cell.arm.notes)
+        imported = import_campaign(table, config, output, kind, second, overwrite=force, say=say)
+    readings, cell, noise = imported.readings, imported.cell, imported.noise
+    model = imported.config.robot.model
+    notes = (*imported.notes, covariance_words(imported.parts, noise), *cell.arm.notes)
     loads = [readings.load_names[k] for k in np.unique(readings.load)]
     poses = len(np.unique(readings.pose))
     kind = f"each reading is a position{'' if readings.m == 3 else ' and an orientation'}"
     kind = observed_words(readings) if readings.observers else kind
     t.show(heading(f"{len(readings)} readings of {poses} poses"))
-    t.show(f"  robot {settings.robot.model}; {kind}\n  loads: {', '.join(loads)}")
+    t.show(f"  robot {model}; {kind}\n  loads: {', '.join(loads)}")
     targets = _targets(cell, readings)
     if targets:
         t.show("  targets: " + "; ".join(target_words(**x) for x in targets))
-    torques, registered, wrong, other = check_torques(cell, readings), None, None, None
+    torques = check_torques(cell, readings)
+    registered = misdescription = likely_arm = None
     lines = [*notes, *torque_lines(torques)]
     with suppress(CannotAnswerError):  # the readings do not determine the registration
         registered = register(cell, readings)
     if registered is not None:
-        wrong = examine(registered, readings)
-        if wrong is None or not wrong.refused:
+        misdescription = examine(registered, readings)
+        if misdescription is None or not misdescription.refused:
             lines += registration_lines(registered)
-            other = other_arm(registered, readings)
-    if other is not None:
-        lines.append(f"Note: {other_arm_line(other)}")
-    if wrong is not None:
-        begin = "Nothing can be fitted yet" if wrong.refused else "Note"
-        lines.append(f"{begin}: {wrong.words(cell, readings)}.")
+            likely_arm = other_arm(registered, readings)
+    if likely_arm is not None:
+        lines.append(f"Note: {other_arm_line(likely_arm)}")
+    if misdescription is not None:
+        begin = "Nothing can be fitted yet" if misdescription.refused else "Note"
+        lines.append(f"{begin}: {misdescription.words(cell, readings)}.")
     t.show(Words(line, indent=2) for line in lines)
     t.document(
         campaign=str(output),
-        robot=settings.robot.model,
+        robot=model,
         n_readings=len(readings),
         n_poses=poses,
         elements=readings.m,
         loads=loads,
         targets=targets,
         observers=[str(name) for name in readings.observers],
-        covariance=found.parts,
+        covariance=imported.parts,
         noise=None if noise is None else asdict(noise),
         notes=list(notes),
-        description=None if wrong is None else wrong.to_json(cell, readings),
-        other_arm=None if other is None else other.to_json(),
+        description=None if misdescription is None else misdescription.to_json(cell, readings),
+        other_arm=None if likely_arm is None else likely_arm.to_json(),
         torques=None if torques is None else torques.to_json(),
         frames=None if registered is None else registered.to_json(),
     )
@@ -117,9 +119,8 @@ def _targets(cell: Cell, readings: Readings) -> list[dict[str, Any]]:
     if readings.states.target is None:
         return []
     count = np.bincount(readings.target, minlength=len(readings.target_names))
-    known = cell.known_targets
     return [
-        {"name": name, "n_readings": int(count[k]), "known": known[k]}
+        {"name": name, "n_readings": int(count[k]), "known": cell.known_targets[k]}
         for k, name in enumerate(readings.target_names)
     ]
 
@@ -128,21 +129,21 @@ def show_preview(
     t: Terminal, table: Path, second: Path | None, config: Path | None, output: Path | None,
     force: bool,
 ) -> None:  # fmt: skip
-    """Print what a table seems to hold; write the mapping file where one is asked for."""
+    """Print the proposed mapping of a table; write it to the mapping file `output`."""
     if output is not None and output.suffix != ".toml":
         raise InputError(f"-o {output}: --preview writes a mapping file; name it like mapping.toml")
     if output is not None:
         check_new(output, force)
-    found = preview_table(table, None if config is None else Cell.load(config), second)
-    proposal, outcome = found.proposal, found.outcome
-    t.show(import_preview(proposal, found.rows, table.name))
+    preview = preview_table(table, None if config is None else Cell.load(config), second)
+    proposal, outcome = preview.proposal, preview.outcome
+    t.show(import_preview(proposal, preview.rows, table.name))
     if outcome:
         t.show(heading("with this mapping:"))
-        t.show(Words(words, indent=2) for words in outcome)
+        t.show(Words(line, indent=2) for line in outcome)
     if output is not None:
         if second is not None:  # its path is relative to the mapping file
-            whole, here = second.absolute(), output.absolute().parent
-            path = whole.relative_to(here) if whole.is_relative_to(here) else whole
+            path, folder = second.absolute(), output.absolute().parent
+            path = path.relative_to(folder) if path.is_relative_to(folder) else path
             proposal.sections["second_file"]["path"] = str(path)
         replace_file(output, proposal.to_toml(table.name))
         t.notice(f"{output}: the mapping; import with --format {output}")
@@ -154,7 +155,7 @@ def show_preview(
             {"section": u.what, "columns": u.columns, "meaning": u.meaning, "first": u.example}
             for u in proposal.understood
         ],
-        unsure=[{"section": what, "what": words} for what, words in proposal.unsure],
+        unsure=[{"section": what, "what": line} for what, line in proposal.unsure],
         unused=[{"column": name, "why": why} for name, why in proposal.unused],
         missing=proposal.lacking,
         outcome=outcome,
@@ -167,15 +168,15 @@ def info(run: Path, as_json: bool = False) -> None:
     """Say what a campaign holds: readings, instruments, drift, events, revisions."""
     t = terminal(as_json)
     with CampaignFile.open(run, read_only=True) as file:
-        found = overview(file)
-        parts = covariance_parts(file.about(COVERS), found.config)
+        content = overview(file)
+        parts = covariance_parts(file.about(COVERS), content.config)
         noise = estimated_noise(file)
-        cell = cell_from_config(found.config, None, file.about(ROBOT_FILE))
-    torques = None if found.readings is None else check_torques(cell, found.readings)
-    t.show(info_report(found, run.name, covariance_words(parts, noise)))
+        cell = cell_from_config(content.config, None, file.about(ROBOT_FILE))
+    torques = None if content.readings is None else check_torques(cell, content.readings)
+    t.show(info_report(content, run.name, covariance_words(parts, noise)))
     t.show(torque_lines(torques))
-    more = {} if torques is None else {"torques": torques.to_json()}
-    t.document({**to_json(found, str(run), parts), **more})
+    extra = {} if torques is None else {"torques": torques.to_json()}
+    t.document(to_json(content, str(run), parts), **extra)
 
 
 @command("""
@@ -216,22 +217,23 @@ def accept(
 def repair(run: Path, robot: Path | None = None, as_json: bool = False) -> None:
     """Open a campaign again that a bad revision closes: it is set aside, no reading is."""
     t = terminal(as_json)
-    done = repaired(run)
+    result = repaired(run)
     if robot is not None:
         put_robot(run, robot)
         t.show(f"{run} holds its robot now: {robot}")
-    if done is None and robot is None:
+    if result is None and robot is None:
         t.show(f"{run}: no revision is bad; nothing was changed.")
-    if done is not None:
-        numbers = ", ".join(map(str, done.revisions))
+    if result is not None:
+        numbers = ", ".join(map(str, result.revisions))
         t.show(
-            f"{run}: {done.why}. Set aside: revision{'s' * (len(done.revisions) > 1)} {numbers}. "
-            f"All readings are there; the file as it was is {done.original}. Fit again with:"
+            f"{run}: {result.why}. Set aside: revision{'s' * (len(result.revisions) > 1)} "
+            f"{numbers}. All readings are there; the file as it was is {result.original}. Fit "
+            "again with:"
         )
         t.command(f"hilcal identify {quoted(run)}")
     t.document(
-        set_aside=[] if done is None else list(done.revisions),
-        original=None if done is None else str(done.original),
+        set_aside=[] if result is None else list(result.revisions),
+        original=None if result is None else str(result.original),
         robot=None if robot is None else str(robot),
     )
 
@@ -250,7 +252,7 @@ def fleet(
     workers: int | None = None, scheduler: str | None = None, as_json: bool = False,
 ) -> None:  # fmt: skip
     """Pool many campaigns: a prior for other arms, arms unlike their type, drift."""
-    # loads all that is fitted and shown
+    # these import the modules for fitting and reports
     from hilcal.cli.fitting import check_record
     from hilcal.cli.showing import opening
     from hilcal.engine.engine import open_engine
@@ -263,25 +265,25 @@ def fleet(
 
     t = terminal(as_json)
     check_record(record)
-    entries(directory)  # refused before workers are started
+    entries(directory)  # refuses a directory before workers are started
     with open_engine(workers, scheduler) as engine:
-        found = pool_fleet(directory, engine, partial(counting, t.progress))
-    t.show(fleet_report(found))
+        pooled = pool_fleet(directory, engine, partial(counting, t.progress))
+    t.show(fleet_report(pooled))
     written = {}
-    for of in found.types:
-        path = out if len(found.types) == 1 else out.with_stem(f"{out.stem}-{of.type}")
-        write(of.prior, path)
-        written[of.type] = str(path)
-        t.show(f"\n{path}: what to expect of another {of.type}, for --prior {quoted(path)}")
-    document = to_json(found, written)
+    for arm_type in pooled.types:
+        path = out if len(pooled.types) == 1 else out.with_stem(f"{out.stem}-{arm_type.type}")
+        write(arm_type.prior, path)
+        written[arm_type.type] = str(path)
+        t.show(f"\n{path}: what to expect of another {arm_type.type}, for --prior {quoted(path)}")
+    document = to_json(pooled, written)
     if report is not None:
-        write_fleet_report(found, directory, report)
+        write_fleet_report(pooled, directory, report)
         t.show(f"{report}: the report")
         document["report"] = str(report)
     if record is not None:
         from hilcal.present.viewer.fleet import record_fleet  # loads the viewer's library
 
-        record_fleet(found, record)
+        record_fleet(pooled, record)
         t.notice(f"recorded {record}; open it with: {opening(record)}")
         document["recording"] = str(record)
     t.document(document)

@@ -1,4 +1,4 @@
-"""The list of commands: where each stands and what it is for, without importing any of them."""
+"""The list of commands: module and summary of each; none of them is imported."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -66,19 +66,19 @@ doctor | preparing
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A command by the place of its function, which is imported when the command is used."""
+    """A command; its function is imported when the command is called."""
 
-    place: str  # "module:function" in `hilcal.cli`; empty for a group that does nothing by itself
+    place: str  # "module:function" in `hilcal.cli`; empty for a group without a function
     summary: str  # first line of the function's docstring, for the list of commands
     subcommands: tuple[tuple[str, str], ...] = ()
-    """"module:function" by name; with any, the command is a group."""
+    """Name and "module:function"; a command that has any is a group."""
 
 
 def load(place: str) -> Callable[..., Any]:
     """Import a function by "module:function"."""
-    module, function = place.split(":")
-    found: Callable[..., Any] = getattr(import_module(f"hilcal.cli.{module}"), function)
-    return found
+    module, name = place.split(":")
+    function: Callable[..., Any] = getattr(import_module(f"hilcal.cli.{module}"), name)
+    return function
 
 
 _SUBCOMMANDS = {
@@ -109,7 +109,7 @@ EXIT_CODES = (
     "Exit codes: 0 done; 2 wrong input; 3 a device failed; 4 the data cannot answer the question; "
     "5 a limit is not kept; 130 interrupted with Ctrl-C."
 )
-"""Of every command."""
+"""Exit codes of every command but `run`."""
 
 EXIT_CODES_OF_RUN = (
     "Exit codes: 0 done; 2 wrong input; 3 a device failed; 4 a goal is not met; 130 interrupted "
@@ -119,24 +119,24 @@ EXIT_CODES_OF_RUN = (
 
 
 class CommandGroup(TyperGroup):
-    """A group whose help gives the whole summary of each command, wrapped between words."""
+    """A group whose help has the full summary of each command, wrapped between words."""
 
     sections: dict[str, tuple[str, ...]] = {}  # noqa: RUF012  (replaced, never changed)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write the commands, under headings where there are any."""
         names = self.list_commands(ctx)
-        rest = tuple(set(names).difference(*self.sections.values()))
+        unlisted = tuple(set(names).difference(*self.sections.values()))
         widest = max(map(len, names))
-        for title, section in {**self.sections, "Commands": sorted(rest)}.items():
-            known = [(name, self.get_command(ctx, name)) for name in section if name in names]
-            summaries = [str(getattr(c, "help", None) or "").strip() for _, c in known]
-            if known:
+        for title, section in {**self.sections, "Commands": sorted(unlisted)}.items():
+            commands = [(name, self.get_command(ctx, name)) for name in section if name in names]
+            summaries = [str(getattr(c, "help", None) or "").strip() for _, c in commands]
+            if commands:
                 with formatter.section(title):
                     formatter.write_dl(
                         [
-                            (name.ljust(widest), words.split("\n\n")[0])
-                            for (name, _), words in zip(known, summaries, strict=True)
+                            (name.ljust(widest), summary.split("\n\n")[0])
+                            for (name, _), summary in zip(commands, summaries, strict=True)
                         ]
                     )
 

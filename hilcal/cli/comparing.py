@@ -1,4 +1,4 @@
-"""`compare` and `validate`: the model against what was measured, fitted and never fitted."""
+"""`compare` and `validate`: the model against fitted and against unseen readings."""
 
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -46,51 +46,51 @@ def compare(
     if later is None:
         if same_setup:
             raise InputError("--same-setup goes with a later campaign: compare A.hilcal B.hilcal")
-        _one(t, run, revision, catalogue)
+        _show_misfit(t, run, revision, catalogue)
         return
     with (
         Campaign.open(run, catalogue, read_only=True) as o,
-        Campaign.open(later, catalogue, read_only=True) as there,
+        Campaign.open(later, catalogue, read_only=True) as later_run,
         working(t.progress) as say,
     ):
         if o.in_use(revision) is None:
             t.notice(f"{run}: no revision yet, taking the baseline; hilcal refine makes a model")
-        found = compare_campaigns(
-            o, there, revision, same_setup=True if same_setup else None, say=say
+        comparison = compare_campaigns(
+            o, later_run, revision, same_setup=True if same_setup else None, say=say
         )
-    name = model_name(titles(found.fit.model, found.fit.readings))
-    t.show(heading(f"{run.name}: {called(found.number)} ({name})"))
-    t.show(comparison_report(found, run.name, later.name))
-    command = next_command(found, str(run), str(later))
+    name = model_name(titles(comparison.fit.model, comparison.fit.readings))
+    t.show(heading(f"{run.name}: {called(comparison.number)} ({name})"))
+    t.show(comparison_report(comparison, run.name, later.name))
+    command = next_command(comparison, str(run), str(later))
     if command is not None:
         t.command(command)
-    t.document(comparison_json(found, str(run), str(later)))
+    t.document(comparison_json(comparison, str(run), str(later)))
 
 
-def _one(t: Terminal, run: Path, revision: int | None, catalogue: Catalogue) -> None:
+def _show_misfit(t: Terminal, run: Path, revision: int | None, catalogue: Catalogue) -> None:
     with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
-        number, found = fit_of(t, o, say, revision)
-        o.require_gc(number, found.scaling, "comparing")
+        number, fitted = fit_of(t, o, say, revision)
+        o.require_gc(number, fitted.scaling, "comparing")
         say("looking where it fails")
-        places = misfit_breakdown(linearise(found))
-        finish(found, say)
-        e, left_out = full_prediction(found), bool(found.model.background)
+        places = misfit_breakdown(linearise(fitted))
+        finish(fitted, say)
+        e, left_out = full_prediction(fitted), bool(fitted.model.background)
         if left_out:  # a background follows the fitted poses more closely than others
-            raw, w = all_left_out(found)
+            raw, w = all_left_out(fitted)
             e = replace(e, raw=raw, whitening=w)
         worst = worst_poses(e)
-    name = model_name(titles(found.model, found.readings))
+    name = model_name(titles(fitted.model, fitted.readings))
     t.show(heading(f"{called(number)}: {name}"))
-    t.show([misses(found), follows(places), "", errors(found), ""])
+    t.show([misses(fitted), follows(places), "", errors(fitted), ""])
     t.show([*where_table(places), ""])
     t.show(worst_table(worst, left_out))
     t.document(
         revision=number,
-        model=list(found.model.named),
-        readings=found.mode,
-        error={"fit": found.error.to_json(), "holdout": found.holdout.to_json()},
-        variance_factor=found.variance_factor,
-        variance_factor_interval=list(found.variance_factor_interval),
+        model=list(fitted.model.named),
+        readings=fitted.mode,
+        error={"fit": fitted.error.to_json(), "holdout": fitted.holdout.to_json()},
+        variance_factor=fitted.variance_factor,
+        variance_factor_interval=list(fitted.variance_factor_interval),
         noise_floor_m=e.noise_floor,
         where=[{"variable": p.variable, "share": p.share, "p_value": p.p_value} for p in places],
         worst=[asdict(w) for w in worst],
@@ -98,7 +98,7 @@ def _one(t: Terminal, run: Path, revision: int | None, catalogue: Catalogue) -> 
 
 
 OVER = 5.0
-"""Errors in units of the noise from which another place of the tracker is suspected; a guess."""
+"""RMS error, in units of the noise, above which a moved tracker is suspected; a guess."""
 
 
 @command("""
@@ -120,35 +120,35 @@ def validate(
         working(t.progress) as say,
     ):
         record = record_of(t, o, say, revision)
-        done = validate_campaign(o, unseen, record, limit_m, register=register, say=say)
-        name = model_name(titles(done.model, o.fitted_readings(record)))
-    judged, found, beyond, shares = done.judged, done.prediction, done.beyond, done.shares
+        result = validate_campaign(o, unseen, record, limit_m, register=register, say=say)
+        name = model_name(titles(result.model, o.fitted_readings(record)))
+    judged, prediction, shares = result.judged, result.prediction, result.shares
     t.show(heading(f"{called(judged.number)}: {name}"))
-    t.show(opening(judged, found))
-    t.show(validation_report(judged, found, beyond))
+    t.show(opening(judged, prediction))
+    t.show(validation_report(judged, prediction, result.beyond))
     t.show(shares_report(shares))
-    if found.error.rms_sigma > OVER and not register:
+    if prediction.error.rms_sigma > OVER and not register:
         t.show(
             "Was the tracker set up anew for these readings? Then --register fits its place first."
         )
     failed: HilcalError | None = None
     if shares.passed is False:
-        words = validation_failure(shares, judged)
-        failed = CannotAnswerError(words) if shares.undecided else LimitError(words)
+        failure = validation_failure(shares, judged)
+        failed = CannotAnswerError(failure) if shares.undecided else LimitError(failure)
     t.document(
         None,
         failed,
         revision=judged.number,
-        model=list(done.model.named),
+        model=list(result.model.named),
         readings=judged.mode,
         registered=register,
         n_readings=judged.readings,
         n_fitted=judged.fitted,
         never_fitted=judged.unseen,
-        n_measurements=len(found.raw),
-        error=found.error.to_json(),
-        variance_factor=found.variance_factor,
-        noise_floor_m=found.noise_floor,
-        **beyond.to_dict(),
+        n_measurements=len(prediction.raw),
+        error=prediction.error.to_json(),
+        variance_factor=prediction.variance_factor,
+        noise_floor_m=prediction.noise_floor,
+        **result.beyond.to_dict(),
         **shares.to_dict(),
     )

@@ -39,28 +39,28 @@ from hilcal.whole_file import replace_file
 
 PROGRAMS = (".script", ".urscript")
 WRITTEN = (".csv", ".json", *PROGRAMS)
-NAMED = 5  # Refused points that an error names
+NAMED = 5  # Most refused points that an error names
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Task:
-    """What is to be compensated."""
+    """The points to compensate, and the program that they come from."""
 
-    points: Points  # the points
+    points: Points
     tool: Floats | None  # (4, 4) T_flange_tool; the tracked target where None
-    program: str | None = None  # text of the program that the points are of
-    waypoints: tuple[Waypoint, ...] = ()  # of that program, those that are left too
-    other: UnderstoodProgram | None = None  # of another maker than UR, in place of the two
+    program: str | None = None  # text of a UR program
+    waypoints: tuple[Waypoint, ...] = ()  # all waypoints of a UR program
+    foreign: UnderstoodProgram | None = None  # a program of another maker than UR
 
     @property
     def corrected(self) -> list[Waypoint]:
-        """The waypoints that are not left as they are."""
+        """The waypoints that are corrected."""
         return [w for w in self.waypoints if not w.left]
 
 
 @dataclass(frozen=True, slots=True)
 class CompensationOptions:
-    """Options of what acts at the points, and how they are reached."""
+    """Options of the load at the points, and of how the points are reached."""
 
     load: str | None = None
     wrench: str | None = None
@@ -94,7 +94,7 @@ AS_USUAL = CompensationOptions()
     """)
 def compensate(
     model: Path, points: Path, output: list[Path] | None = None,
-    asked: CompensationOptions = AS_USUAL, revision: int | None = None,
+    options: CompensationOptions = AS_USUAL, revision: int | None = None,
     effects_from: list[Path] | None = None, kind: str = "table", force: bool = False,
     as_json: bool = False,
 ) -> None:  # fmt: skip
@@ -106,65 +106,65 @@ def compensate(
         say(f"reading {model}")
         calibration = _calibration(model, catalogue, revision)
         arm = calibration.model.cell.arm
-        start = None if asked.near is None else _numbers(asked.near, arm.n, "--near")
+        start = None if options.near is None else _numbers(options.near, arm.n, "--near")
         start = None if start is None else np.where(arm.slides, start, np.radians(start))
-        task = _task(points, calibration, asked, start, kind)
-        of, other = task.points, task.other
+        task = _task(points, calibration, options, start, kind)
+        targets, foreign = task.points, task.foreign
         arm = calibration.controller if task.program else arm
-        for words in filter(None, (of.taken, *(other.said if other else ()))):
-            t.notice(f"{points}: {words}")
-        given = _wrench(of, calibration, asked)
-        say(f"compensating {len(of.names)} points")
+        for remark in filter(None, (targets.taken, *(foreign.said if foreign else ()))):
+            t.notice(f"{points}: {remark}")
+        wrench = _wrench(targets, calibration, options)
+        say(f"compensating {len(targets.names)} points")
         on_flange = calibration.tool_pose(task.tool)
         begin = calibration.measured.middle(arm.n) if start is None and not task.program else start
-        q = on_branch(of, arm, on_flange, begin)
+        q = on_branch(targets, arm, on_flange, begin)
         unclear = doubts(arm, on_flange, task.corrected, q, start) or [""] * len(q)
-        acting = given if of.sensed is None else calibration.load_wrench(q, of.sensed)
-        wanted = _wanted(task, calibration, q, arm)
-        found = calibration.compensate(
-            q, acting, tool=task.tool, wanted=wanted, recorded=of.recorded
+        acting = wrench if targets.sensed is None else calibration.load_wrench(q, targets.sensed)
+        poses = _program_poses(task, calibration, q, arm)
+        result = calibration.compensate(
+            q, acting, tool=task.tool, wanted=poses, recorded=targets.recorded
         )
     if slow := calibration.without_kernel(task.tool):
         t.notice(
             f"note: {', '.join(slow)} has no compiled form: a point takes 25 to 60 ms, not 0.1 ms"
         )
-    both = zip(unclear, refusals(found, asked.outside), strict=True)
-    refused = ["; ".join(filter(None, pair)) for pair in both]
-    become = fates(other.program.points if other else task.waypoints, refused)
-    kept = [k for k, why in enumerate(refused) if not why]
-    if not asked.leave or not kept:
-        wrong = ~found.inverse.solved | found.singular | found.limits.any(axis=1)
-        _refuse(points, of.names, refused, wrong | np.array(unclear, bool))
+    pairs = zip(unclear, refusals(result, options.outside), strict=True)
+    refused = ["; ".join(filter(None, pair)) for pair in pairs]
+    outcomes = fates(foreign.program.points if foreign else task.waypoints, refused)
+    retained = [k for k, why in enumerate(refused) if not why]
+    if not options.leave or not retained:
+        wrong = ~result.inverse.solved | result.singular | result.limits.any(axis=1)
+        _refuse(points, targets.names, refused, wrong | np.array(unclear, bool))
     elif any(refused):
-        q, task = q[kept], _only(task, kept, refused)
-        wanted = None if wanted is None else wanted[kept]
-        found = calibration.compensate(q, acting, tool=task.tool, wanted=wanted)
-    document = found.to_dict(task.points.names)
-    if become:
-        document["waypoints"] = [asdict(fate) for fate in become]
-    files = [f for path in output or () for f in _write(path, task, found, document, arm.units)]
+        q, task = q[retained], _only(task, retained, refused)
+        poses = None if poses is None else poses[retained]
+        result = calibration.compensate(q, acting, tool=task.tool, wanted=poses)
+    document = result.to_dict(task.points.names)
+    if outcomes:
+        document["waypoints"] = [asdict(fate) for fate in outcomes]
+    files = [f for path in output or () for f in _write(path, task, result, document, arm.units)]
     written = [str(path) for path in files]
-    t.show(compensation_report(calibration, task.points.names, q, found))
-    t.show(waypoints_table(become))
-    nothing = "Nothing is written; -o F.csv, F.json or F.script keeps the joint values."
-    t.show(f"\nWritten: {', '.join(written)}." if written else f"\n{nothing}")
+    t.show(compensation_report(calibration, task.points.names, q, result))
+    t.show(waypoints_table(outcomes))
+    hint = "Nothing is written; -o F.csv, F.json or F.script keeps the joint values."
+    t.show(f"\nWritten: {', '.join(written)}." if written else f"\n{hint}")
     t.document({**document, "written": written})
 
 
-def _wanted(task: _Task, calibration: Calibration, q: Floats, arm: Arm) -> Floats | None:
-    """Return where a program asks for the tool (N, 4, 4), None where the nominal arm has it there.
+def _program_poses(task: _Task, calibration: Calibration, q: Floats, arm: Arm) -> Floats | None:
+    """Return the tool poses that a program states (N, 4, 4); None where they are the nominal ones.
 
-    The controller takes a pose by its own kinematics, so that the nominal arm is elsewhere at the
-    joint values `q` that it goes to; joint values are those of the nominal arm. A calibration of
-    deflections knows no geometry: its unloaded arm is where the controller has it.
+    The controller reaches a stated pose by its own kinematics, so the nominal arm has another pose
+    at the same joint values `q`. Points stated as joint values have the pose of the nominal arm.
+    A calibration of deflections has no geometry: its unloaded arm is that of the controller.
     """
-    poses = task.points.wanted
-    if poses is None or arm is calibration.model.cell.arm or calibration.mode == "deflection":
+    targets = task.points.wanted
+    if targets is None or arm is calibration.model.cell.arm or calibration.mode == "deflection":
         return None
-    there = calibration.predict(q, tool=task.tool, std=False)
-    nominal = se3.matrix(there.nominal_rotation, there.nominal_position)
-    told = np.isfinite(poses).all(axis=(1, 2), keepdims=True)
-    return np.where(told, poses, nominal)
+    prediction = calibration.predict(q, tool=task.tool, std=False)
+    nominal = se3.matrix(prediction.nominal_rotation, prediction.nominal_position)
+    stated = np.isfinite(targets).all(axis=(1, 2), keepdims=True)
+    return np.where(stated, targets, nominal)
 
 
 def _calibration(path: Path, catalogue: Catalogue, revision: int | None) -> Calibration:
@@ -177,55 +177,63 @@ def _calibration(path: Path, catalogue: Catalogue, revision: int | None) -> Cali
 
 
 def _task(
-    path: Path, calibration: Calibration, asked: CompensationOptions, near: Floats | None, kind: str
+    path: Path,
+    calibration: Calibration,
+    options: CompensationOptions,
+    near: Floats | None,
+    kind: str,
 ) -> _Task:
-    arm, given = calibration.model.cell.arm, None
-    if asked.tool is not None:
-        six = _numbers(asked.tool, 6, "--tool")
-        given = se3.matrix(se3.rotation(six[3:]), six[:3])
+    arm, tool = calibration.model.cell.arm, None
+    if options.tool is not None:
+        six = _numbers(options.tool, 6, "--tool")
+        tool = se3.matrix(se3.rotation(six[3:]), six[:3])
     if path.suffix.lower() in READERS:
-        other = understood(path, arm, frames=asked.frames, tool=given, near=near, leave=asked.leave)
-        return _Task(other.points, other.tool, other=other)
-    if asked.frames is not None:
+        foreign = understood(
+            path, arm, frames=options.frames, tool=tool, near=near, leave=options.leave
+        )
+        return _Task(foreign.points, foreign.tool, foreign=foreign)
+    if options.frames is not None:
         raise InputError(f"{path}: --frames is for programs: {', '.join(READERS)}")
     if path.suffix not in PROGRAMS:
-        if asked.leave:
+        if options.leave:
             raise InputError(f"{path}: --leave is for waypoints of a program; valid: without it")
         mapping = None if kind == "table" else find_mapping(kind, PointMapping)
-        return _Task(read_points(path, arm, calibration.loads, mapping), given)
+        return _Task(read_points(path, arm, calibration.loads, mapping), tool)
     if arm.n != JOINTS:
         raise InputError(f"{path}: a UR program, and {arm.name} has {arm.n} joints")
-    program, every, points, own = program_points(path, asked.leave)
-    if own is None and given is None and points.wanted is not None:
+    program, waypoints, points, tcp = program_points(path, options.leave)
+    if tcp is None and tool is None and points.wanted is not None:
         for k in np.flatnonzero(np.isfinite(points.wanted[:, 0, 0]))[:1].tolist():
             raise InputError(
                 f"{path}: {points.names[k]} is a pose of a tool centre point that the program does "
                 'not set; give --tool "X Y Z RX RY RZ" as the installation has it'
             )
-    if own is not None and given is not None and not np.allclose(own, given, atol=1e-9):
+    if tcp is not None and tool is not None and not np.allclose(tcp, tool, atol=1e-9):
         raise InputError(f"{path}: set_tcp is another tool than --tool; leave out one of them")
-    return _Task(points, given if own is None else own, program, every)
+    return _Task(points, tool if tcp is None else tcp, program, waypoints)
 
 
-def _only(task: _Task, kept: list[int], refused: list[str]) -> _Task:
-    """Return the task of a program without the waypoints that are refused."""
-    if task.other is not None:
-        other = task.other.without(refused)
-        return replace(task, points=other.points, other=other)
-    wanted = task.points.wanted
+def _only(task: _Task, retained: list[int], refused: list[str]) -> _Task:
+    """Return the task of a program without its refused waypoints."""
+    if task.foreign is not None:
+        foreign = task.foreign.without(refused)
+        return replace(task, points=foreign.points, foreign=foreign)
+    poses = task.points.wanted
     points = Points(
-        tuple(task.points.names[k] for k in kept),
-        task.points.q[kept],
-        None if wanted is None else wanted[kept],
+        tuple(task.points.names[k] for k in retained),
+        task.points.q[retained],
+        None if poses is None else poses[retained],
     )
-    why = iter(refused)
-    waypoints = tuple(w if w.left else replace(w, left=next(why)) for w in task.waypoints)
+    reasons = iter(refused)
+    waypoints = tuple(w if w.left else replace(w, left=next(reasons)) for w in task.waypoints)
     return replace(task, points=points, waypoints=waypoints)
 
 
-def _wrench(points: Points, calibration: Calibration, asked: CompensationOptions) -> Floats | None:
-    """(6,) or (N, 6) wrench at the points."""
-    load, wrench = asked.load, asked.wrench
+def _wrench(
+    points: Points, calibration: Calibration, options: CompensationOptions
+) -> Floats | None:
+    """Return the wrench at the points, (6,) or (N, 6)."""
+    load, wrench = options.load, options.wrench
     if sum(x is not None for x in (load, wrench, points.wrench, points.sensed)) > 1:
         raise InputError("the load is given twice; valid: one of --load, --wrench, columns")
     if wrench is not None:
@@ -238,27 +246,27 @@ def _wrench(points: Points, calibration: Calibration, asked: CompensationOptions
     return calibration.loads[load]
 
 
-def _numbers(written: str, count: int, option: str) -> Floats:
+def _numbers(text: str, count: int, option: str) -> Floats:
     try:
-        values = np.array([float(word) for word in written.replace(",", " ").split()])
+        values = np.array([float(word) for word in text.replace(",", " ").split()])
     except ValueError:
         values = np.empty(0)
     if len(values) != count or not np.isfinite(values).all():
-        raise InputError(f"{option} {written!r}; valid: {count} numbers")
+        raise InputError(f"{option} {text!r}; valid: {count} numbers")
     return values
 
 
 def _refuse(path: Path, names: tuple[str, ...], refused: list[str], wrong: Bools) -> None:
-    """Refuse the whole table where points are refused."""
+    """Refuse all points where any is refused; `wrong` are those that no option allows."""
     bad = [k for k, why in enumerate(refused) if why]
     if not bad:
         return
     named = "; ".join(f"{names[k]}: {refused[k]}" for k in bad[:NAMED])
-    more = f"; and {len(bad) - NAMED} more" if len(bad) > NAMED else ""
-    words = f"{path}: {len(bad)} of {len(names)} points are refused: {named}{more}"
+    ending = f"; and {len(bad) - NAMED} more" if len(bad) > NAMED else ""
+    message = f"{path}: {len(bad)} of {len(names)} points are refused: {named}{ending}"
     if wrong[bad].any():
-        raise InputError(words)
-    raise CannotAnswerError(f"{words}; measure there, or give --allow-outside")
+        raise InputError(message)
+    raise CannotAnswerError(f"{message}; measure there, or give --allow-outside")
 
 
 def _check_output(path: Path, points: Path, force: bool) -> None:
@@ -268,42 +276,42 @@ def _check_output(path: Path, points: Path, force: bool) -> None:
         raise InputError(f"{path}: unknown kind of file; valid: {', '.join(valid)}")
     check_new(path, force)
     if kind == ".src" and path.suffix == points.suffix:
-        for beside in path.parent.glob(f"{path.stem}.*"):
-            if beside.suffix.lower() == ".dat":
-                check_new(beside, force)
+        for companion in path.parent.glob(f"{path.stem}.*"):
+            if companion.suffix.lower() == ".dat":
+                check_new(companion, force)
 
 
 def _write(
-    path: Path, task: _Task, found: Compensation, document: dict[str, object], units: Sequence[str]
+    path: Path, task: _Task, result: Compensation, document: dict[str, object], units: Sequence[str]
 ) -> list[Path]:
-    """Write the joint values as the file's name asks; returns the files."""
-    names, n = task.points.names, found.q.shape[1]
-    if task.other is not None and path.suffix.lower() in READERS:
-        files = {path.with_suffix(k): v for k, v in task.other.corrected(found.q).items()}
-        for each, file in files.items():
-            replace_file(each, file)
+    """Write the joint values in the format of the file's name; return the files."""
+    names, n = task.points.names, result.q.shape[1]
+    if task.foreign is not None and path.suffix.lower() in READERS:
+        files = {path.with_suffix(k): v for k, v in task.foreign.corrected(result.q).items()}
+        for file_path, text in files.items():
+            replace_file(file_path, text)
         return list(files)
     content: str
     if path.suffix == ".json":
         content = json.dumps(plain(document), allow_nan=False, indent=2) + "\n"
     elif path.suffix == ".csv":
-        content = _csv(names, found, units)
+        content = _csv(names, result, units)
     elif n != JOINTS:
         raise InputError(f"{path}: a UR program has {JOINTS} joints, this arm has {n}")
     elif task.program is None:
-        content = movej_program(names, found.q)
+        content = movej_program(names, result.q)
     else:
-        content = with_joints(task.program, task.corrected, found.q)
+        content = with_joints(task.program, task.corrected, result.q)
     replace_file(path, content)
     return [path]
 
 
-def _csv(names: tuple[str, ...], found: Compensation, units: Sequence[str]) -> str:
+def _csv(names: tuple[str, ...], result: Compensation, units: Sequence[str]) -> str:
     out = io.StringIO()
     rows = csv.writer(out, lineterminator="\n")
     rows.writerow(["pose", *joint_columns(units), "before_m", "std_m", "band_m"])
     for k, name in enumerate(names):
-        numbers = (found.before.error_m[k], found.after.std_m[k], found.after.band_m[k])
-        values = [f"{v:.9f}" for v in found.q[k]]
+        numbers = (result.before.error_m[k], result.after.std_m[k], result.after.band_m[k])
+        values = [f"{v:.9f}" for v in result.q[k]]
         rows.writerow([csv_text(name), *values, *(f"{x:.4g}" for x in numbers)])
     return out.getvalue()

@@ -79,20 +79,21 @@ from hilcal.store.plan import REFERENCE, Plan
 from hilcal.store.revision import RevisionRecord
 from hilcal.store.rows import content_hash
 
-STRENGTH = 4.0  # Of what is hidden, in units of the noise: clearly there in so few readings
+STRENGTH = 4.0  # Size of the hidden effect, in units of the noise: significant in so few readings
 FIRST = 6  # Poses of the first campaign
-CANDIDATES = 60  # Poses that it is chosen from. A choice: planning takes a second
-ARMS = 4  # Arms that are drawn for one plan. A choice
-TRIES = 200  # Arms that are drawn at most. Of 10 seeds it took 1 to 32 and once 105, and 2 to 34 s
+CANDIDATES = 60  # Candidate poses of the first campaign. A choice: planning takes a second
+ARMS = 4  # Arms drawn per plan. A choice
+TRIES = 200  # Most arms drawn. 10 seeds took 1 to 32 arms and once 105, in 2 to 34 s
 DRAWS = 5  # Draws of the noise for which a rival has to be as good. A choice
 CAMPAIGNS = 3
-"""First campaigns that are measured at most until one leaves a doubt. Without devices the first
-always does; of other draws of the noise four in five do (38 of 48)."""
+"""Most first campaigns measured until one leaves a doubt. Without devices the first one always
+does; with other draws of the noise four in five do (38 of 48)."""
 CLOSE = 2.0
-"""Most difference in log evidence between the hidden effect and its rival in each of these draws.
-A choice: it scatters by about 1.3, and `SAME_EVIDENCE` is 3."""
+"""Largest difference in log evidence between the hidden effect and its rival in each draw.
+A choice: the difference scatters by about 1.3, and `SAME_EVIDENCE` is 3."""
 SHARE = 0.8
-"""Of `--poses`, what the second campaign takes: both together last about as long as one else."""
+"""Poses of the second campaign, as a share of `--poses`: both campaigns together last about as long
+as a single one otherwise."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,34 +102,36 @@ class Doubted:
 
     readings: int
     record: RevisionRecord | None  # of the diagnosis; None where nothing is in doubt
-    plan: Plan | None  # the measurements that separate the suspects; None as the record
+    plan: Plan | None  # measurements that separate the suspects; None where nothing is in doubt
     document: dict[str, object]
 
 
 def doubtful_case(
-    told: RehearsalSettings, hide: str | None, say: Say, number: int = 0
+    settings: RehearsalSettings, hide: str | None, say: Say, number: int = 0
 ) -> tuple[RehearsalSettings, Plan, bool]:
     """Draw an effect to hide and a small campaign that leaves it in doubt.
 
-    Both come from the seed; another `number` is another case. A case counts when for each of
-    `DRAWS` draws of the noise a rival explains the readings about as well as the hidden effect, and
-    when the diagnosis of the first draw names both, and says that more readings would separate
-    them. Returned are its settings, the plan of its first campaign, and whether that leaves a
-    doubt; it is the last case where none of `TRIES` does.
+    Both follow from the seed and `number`. A case is doubtful when a rival explains the readings
+    about as well as the hidden effect in each of `DRAWS` draws of the noise, and when the diagnosis
+    of the first draw names both effects and says that further readings would separate them.
+
+    Returns:
+        The settings of the first doubtful case, or of the last one where none of `TRIES` is; the
+        plan of its first campaign; whether the case is doubtful.
     """
-    loads = told.config.loads[1::2] or told.config.loads
-    quick = {"candidates": min(told.config.planning.candidates, CANDIDATES), "against": ()}
-    planning = told.config.planning.model_copy(update=quick)
-    few = told.config.model_copy(update={"loads": loads, "planning": planning})
-    simulation = told.config.simulation.model_copy(update={"strength_sigma": STRENGTH})
-    strong = told.config.model_copy(update={"simulation": simulation})
+    loads = settings.config.loads[1::2] or settings.config.loads
+    quick = {"candidates": min(settings.config.planning.candidates, CANDIDATES), "against": ()}
+    planning = settings.config.planning.model_copy(update=quick)
+    few = settings.config.model_copy(update={"loads": loads, "planning": planning})
+    simulation = settings.config.simulation.model_copy(update={"strength_sigma": STRENGTH})
+    strong = settings.config.model_copy(update={"simulation": simulation})
     say("drawing an arm and a small campaign that leaves its effect in doubt")
     for k in range(TRIES):
-        rng = np.random.default_rng([told.seed, number, k])
+        rng = np.random.default_rng([settings.seed, number, k])
         choice = hide or str(rng.choice(HARD_TO_SEPARATE))
-        case = replace(told, config=strong, choice=choice, seed=int(rng.integers(2**31)))
+        case = replace(settings, config=strong, choice=choice, seed=int(rng.integers(2**31)))
         if k % ARMS == 0:
-            plan = first_plan(case, few, FIRST, lambda words: None)
+            plan = first_plan(case, few, FIRST, lambda text: None)
         secret = case_of_plan(strong, plan, choice, case.seed, case.world)
         drawn = [read_plan(secret, plan, [case.seed, 1 + j]) for j in range(DRAWS)]
         if choice == NOTHING or (
@@ -143,19 +146,19 @@ def _fit(r: Rehearsal, catalogue: Catalogue) -> Fit:
 
 
 def _resembled(r: Rehearsal, case: RehearsalSettings) -> bool:
-    """Whether the hidden effect is clearly there, and a rival explains the readings as well."""
+    """Whether the hidden effect or a rival is significant, and a rival fits as well."""
     p = linearise(_fit(r, case.catalogue))
     effects = [e for e in candidates(p.fit) if e.name in (r.hidden, *RESEMBLING)]
-    found = {s.effect: s for s in rank_suspects(p, effects)}
-    own = found.pop(r.hidden, None)
-    if own is None or not (own.passes or any(s.passes for s in found.values())):
+    suspects = {s.effect: s for s in rank_suspects(p, effects)}
+    hidden = suspects.pop(r.hidden, None)
+    if hidden is None or not (hidden.passes or any(s.passes for s in suspects.values())):
         return False
-    near = (abs(s.score.log_evidence - own.score.log_evidence) < CLOSE for s in found.values())
-    return any(near)
+    evidence = hidden.score.log_evidence
+    return any(abs(s.score.log_evidence - evidence) < CLOSE for s in suspects.values())
 
 
 def _left_open(r: Rehearsal, case: RehearsalSettings) -> bool:
-    """Whether the diagnosis leaves the hidden effect and others that could be separated from it."""
+    """Whether the diagnosis leaves the hidden effect in doubt, and all rivals are separable."""
     d = judge(Evidence(_fit(r, case.catalogue)), History())
     return r.hidden in left_open(d) and all(rival.possible for rival in d.separability)
 
@@ -163,37 +166,37 @@ def _left_open(r: Rehearsal, case: RehearsalSettings) -> bool:
 def doubted(
     t: Terminal, r: Rehearsal, seed: int, first: Plan, poses: int, catalogue: Catalogue
 ) -> Doubted:
-    """Diagnose a first campaign, and plan what separates the suspects where that is in doubt.
+    """Diagnose a first campaign; where suspects are left in doubt, plan what separates them.
 
-    `poses` is as asked for, see `SHARE`.
+    `poses` is the value of `--poses`, see `SHARE`.
     """
     with working(t.progress) as say:
         say("fitting and diagnosing the first readings")
-        found = _fit(r, catalogue)
-        d = diagnose(found, say=say)
+        fitted = _fit(r, catalogue)
+        d = diagnose(fitted, say=say)
     document: dict[str, object] = {"verdict": d.verdict, "message": message(d), "suspects": []}
     suspects = left_open(d)
     if not suspects:
         return Doubted(len(r.readings), None, None, document)
-    t.show(step_report(1, model_name(found.model.named), d))
+    t.show(step_report(1, model_name(fitted.model.named), d))
     t.show(heading(f"Ambiguous between {numbers.names(suspects)}: what would settle it?"))
     with working(t.progress) as say:
         place = first.joints(REFERENCE) if REFERENCE in first.pose_names else None
         rng = np.random.default_rng(seed)
-        asked = Request(max(round(SHARE * poses), 1))
-        chosen = measure_next(r.cell, r.config, found, suspects, asked, rng, say, place)
+        request = Request(max(round(SHARE * poses), 1))
+        chosen = measure_next(r.cell, r.config, fitted, suspects, request, rng, say, place)
         plan = plan_of(chosen, suspects)
         refuse(dry_run(r.cell, r.config, plan), "the plan")
     visited = len({s.pose for s in plan.steps} - {REFERENCE})
     t.show(next_report(chosen, visited, len(plan.steps)))
     document |= {"suspects": list(suspects), **separates(chosen)}
-    record = to_record(found, to_json(d), None, content_hash(r.readings))
+    record = to_record(fitted, to_json(d), None, content_hash(r.readings))
     return Doubted(len(r.readings), record, plan, document)
 
 
 CELL = "demo_ur10e.toml"
 POSES = 20
-"""Of the plan; a choice: with validation and corrected run it takes three and a half minutes."""
+"""Poses of the plan; a choice: with validation and corrected run it takes 3.5 minutes."""
 VALIDATION = 10  # Poses of the validation campaign; a choice for the same reason
 
 
@@ -218,50 +221,50 @@ def demo(
     check_record(record)
     config = load_config(configs_dir() / "cells" / CELL)
     number = check_seed(config.simulation.seed if seed is None else seed)
-    wanted = hide or config.simulation.hide
-    world = invented_law(catalogue) if wanted == INVENTED else catalogue
-    check_choice(wanted or RANDOM, world)
+    hidden = hide or config.simulation.hide
+    world = invented_law(catalogue) if hidden == INVENTED else catalogue
+    check_choice(hidden or RANDOM, world)
     files = Files(output)
     for path in (output, files.validation, files.corrected):
         may_write(path, True)  # before the planning, which takes a while
-    told = RehearsalSettings(
-        config, wanted or RANDOM, number, output, configs_dir() / "cells", catalogue, world
+    case = RehearsalSettings(
+        config, hidden or RANDOM, number, output, configs_dir() / "cells", catalogue, world
     )
     laws = None
-    if wanted == INVENTED:  # named after the campaign, which it replaces, too
+    if hidden == INVENTED:  # the law is named after the campaign; its file is replaced
         word = re.sub(r"[^a-z0-9]+", "_", output.stem.lower()).strip("_")
         name = f"law_of_{word}" if word else "law"
         laws = LawSearch(output.absolute().parent, name, replacing=True)
-    with _campaign(t, told, poses, without_devices, ambiguous) as (m, r, doubt):
+    with _campaign(t, case, poses, without_devices, ambiguous) as (m, r, doubt):
         with working(t.progress) as say:
             model = baseline(r.cell, r.readings, r.mode, catalogue)
-            found = refine_model(model, r.readings, r.mode, say, laws=laws)
+            refinement = refine_model(model, r.readings, r.mode, say, laws=laws)
             if laws is not None:
-                laws.write(found.names)
-                catalogue = found.fit.model.catalogue
-            for step in found.steps:
+                laws.write(refinement.names)
+                catalogue = refinement.fit.model.catalogue
+            for step in refinement.steps:
                 finish(step.fit, say)
-        settings = Settings(poses, validation, seed=number, readings=r.mode, hide=told.choice)
-        p = Procedure(output, r.cell, r.config, told.base_dir, catalogue, settings)
+        settings = Settings(poses, validation, seed=number, readings=r.mode, hide=case.choice)
+        p = Procedure(output, r.cell, r.config, case.base_dir, catalogue, settings)
         with Campaign.open(output, catalogue) as o:
             if doubt is not None and doubt.record is not None:
                 o.file.append_revision(doubt.record)
             p.resume(o.file)
-            numbered = p.keep(o, found)
-        chapters = chapters_of(numbered, found.steps)
-        for c, s in zip(chapters, found.steps, strict=True):
+            numbered = p.keep(o, refinement)
+        chapters = chapters_of(numbered, refinement.steps)
+        for c, s in zip(chapters, refinement.steps, strict=True):
             t.show(step_report(c.number, changed(c), s.diagnosis))
         if laws is not None:
             t.show(refined_laws(laws))
         t.show(heading("The error, revision by revision"))
         t.show(errors_by_revision(chapters))
-        truth = compared(found.steps[-1].fit, r.world.truth)
+        truth = compared(refinement.steps[-1].fit, r.world.truth)
         if truth:
             t.show(heading("What was found against what is true"))
             t.show([*truth_table(truth)])
         improved = _put_to_use(t, p, m.measure, without_devices)
-    ok, words = _judge(r, found) if laws is None else _judge_law(r, found, laws)
-    t.show([verdict_line(found.diagnosis), "", heading(words)])
+    ok, outcome = _judge(r, refinement) if laws is None else _judge_law(r, refinement, laws)
+    t.show([verdict_line(refinement.diagnosis), "", heading(outcome)])
     if r.world.own is not None and laws is not None:
         t.show(
             f"The simulated arm moved by {r.world.own.effect.summary} with the model's own "
@@ -274,10 +277,10 @@ def demo(
         )
     record_story(t, chapters, record)
     files_given = [*(effects_from or ()), *(() if laws is None else laws.files.values())]
-    more = "".join(f" --effects-from {quoted(path)}" for path in files_given)
-    t.show(f"\nThe campaign is in {output}. Go on with: hilcal view {quoted(output)}{more}")
+    options = "".join(f" --effects-from {quoted(path)}" for path in files_given)
+    t.show(f"\nThe campaign is in {output}. Go on with: hilcal view {quoted(output)}{options}")
     t.show("As one HTML page, with a certificate first:")
-    t.command(f"hilcal report {quoted(output)}{more}")
+    t.command(f"hilcal report {quoted(output)}{options}")
     t.document(
         campaign=str(output),
         hidden=r.hidden,
@@ -287,9 +290,9 @@ def demo(
         found=ok,
         **{} if laws is None else laws_json(laws),
         **{} if doubt is None else {"doubt": doubt.document},
-        verdict=found.verdict,
-        message=message(found.diagnosis),
-        rejected=list(found.rejected),
+        verdict=refinement.verdict,
+        message=message(refinement.diagnosis),
+        rejected=list(refinement.rejected),
         revisions=revisions_json(chapters),
         parameters=[asdict(p) for p in truth],
         truth=r.world.truth,
@@ -303,39 +306,39 @@ def demo(
             "inside": improved.everything.inside,
             "measured": improved.to_dict(),
         },
-        diagnoses=[to_json(s.diagnosis) for s in found.steps],
+        diagnoses=[to_json(s.diagnosis) for s in refinement.steps],
     )
 
 
 @contextmanager
 def _campaign(
-    t: Terminal, told: RehearsalSettings, poses: int, without_devices: bool, ambiguous: bool
+    t: Terminal, case: RehearsalSettings, poses: int, without_devices: bool, ambiguous: bool
 ) -> Iterator[tuple[RehearsedCampaign, Rehearsal, Doubted | None]]:
-    """Measure a campaign; the cell is there as long as the block lasts.
+    """Measure a campaign; its simulated devices run until the block ends.
 
-    With `ambiguous`, arms are measured until one leaves a doubt, and then what settles it.
+    With `ambiguous`, measure arms until one leaves a doubt, then the readings that settle it.
     """
     measured = in_process if without_devices else on_devices
-    there, first = told.output.exists(), told
+    existed, first = case.output.exists(), case
     for tries in range(1, CAMPAIGNS + 1):
         another = False
         with working(t.progress) as say:
             if ambiguous:
                 hidden = None if first.choice == RANDOM else first.choice
-                told, plan, another = doubtful_case(first, hidden, say, tries - 1)
+                case, plan, another = doubtful_case(first, hidden, say, tries - 1)
             else:
-                plan = first_plan(told, told.config, poses, say)
-        for path in (Files(told.output).validation, Files(told.output).corrected):
+                plan = first_plan(case, case.config, poses, say)
+        for path in (Files(case.output).validation, Files(case.output).corrected):
             path.unlink(missing_ok=True)
-        with measured(t, told, plan) as m:
-            if there and tries == 1:
-                t.notice(f"{told.output} existed and is replaced")
+        with measured(t, case, plan) as m:
+            if existed and tries == 1:
+                t.notice(f"{case.output} existed and is replaced")
             r = m.rehearsal
             _introduce(t, r, first.choice, first.seed)
             if not ambiguous:
                 yield m, r, None
                 return
-            doubt = doubted(t, r, first.seed, plan, poses, told.catalogue)
+            doubt = doubted(t, r, first.seed, plan, poses, case.catalogue)
             if doubt.plan is not None:
                 r = m.further(doubt.plan)
                 new = len(r.readings) - doubt.readings
@@ -350,7 +353,7 @@ def _campaign(
 
 
 def _put_to_use(t: Terminal, p: Procedure, measure: Measure, drawn: bool) -> Improvement | None:
-    """Move the simulated arm to corrected targets, and say what its tracker measures there."""
+    """Move the simulated arm to corrected targets, and report the errors measured there."""
     t.show(heading("Put to use"))
     try:
         p.stop()
@@ -374,7 +377,7 @@ def _introduce(t: Terminal, r: Rehearsal, choice: str, seed: int) -> None:
     used = np.unique(r.readings.load)
     loads = [name for k, name in enumerate(r.readings.load_names) if k in used and name != "none"]
     poses = len(np.unique(r.readings.pose))
-    what = {
+    secret = {
         NOTHING: "Nothing is hidden in it; the program does not know that.",
         RANDOM: "An effect, drawn at random, is hidden in it.",
         INVENTED: "A law is hidden in it that no effect of the catalogue describes; the program "
@@ -383,43 +386,44 @@ def _introduce(t: Terminal, r: Rehearsal, choice: str, seed: int) -> None:
     t.show(heading(f"A simulated {r.cell.arm.name} and a laser tracker, seed {seed}"))
     t.show(
         f"{poses} poses, unloaded and under {len(loads)} loads ({', '.join(loads)}): "
-        f"{len(r.readings)} readings.\n{what}"
+        f"{len(r.readings)} readings.\n{secret}"
     )
     kind = "deflections: loaded minus unloaded" if r.mode == "deflection" else "absolute positions"
     t.show(f"The model is fitted to {kind}.\n")
 
 
-def _judge_law(r: Rehearsal, found: Refinement, laws: LawSearch) -> tuple[bool, str]:
-    own = r.world.own
-    if own is None:
+def _judge_law(r: Rehearsal, refinement: Refinement, laws: LawSearch) -> tuple[bool, str]:
+    hidden_law = r.world.own
+    if hidden_law is None:
         return False, "Nothing was hidden."
-    ((_, true),) = own.truth.items()
-    unit, factor = numbers.unit_for(own.effect.parameters[0].unit, [true])
-    hidden = f"Hidden was a law: {own.effect.summary}, a = {factor * true:.3g} {unit}"
+    ((_, true),) = hidden_law.truth.items()
+    unit, factor = numbers.unit_for(hidden_law.effect.parameters[0].unit, [true])
+    hidden = f"Hidden was a law: {hidden_law.effect.summary}, a = {factor * true:.3g} {unit}"
     soft = r.world.physics.joint_compliance
-    moved, _ = own.moved(r.cell, r.world.registration, soft, r.readings.states)
-    for before, after in pairwise(found.steps):
-        d = next((d for d in laws.found if d.laws and d.laws[0].name == after.added), None)
+    moved, _ = hidden_law.moved(r.cell, r.world.registration, soft, r.readings.states)
+    for previous, step in pairwise(refinement.steps):
+        d = next((d for d in laws.found if d.laws and d.laws[0].name == step.added), None)
         if d is not None:
-            law, same = d.laws[0], agreement(before.fit, after.fit, moved)
-            told = f"Found was {law.formula}, which agrees with it over these readings by a"
-            return same >= SAME, f"{hidden}. {told} correlation of {same:.3f}."
+            law, same = d.laws[0], agreement(previous.fit, step.fit, moved)
+            statement = f"Found was {law.formula}, which agrees with it over these readings by a"
+            return same >= SAME, f"{hidden}. {statement} correlation of {same:.3f}."
     return False, f"{hidden}. It was not found."
 
 
-def _judge(r: Rehearsal, found: Refinement) -> tuple[bool, str]:
-    added = [s.added for s in found.steps if s.added]
+def _judge(r: Rehearsal, refinement: Refinement) -> tuple[bool, str]:
+    added = [s.added for s in refinement.steps if s.added]
     if r.hidden == NOTHING:
-        if not added and found.verdict == "adequate":
+        if not added and refinement.verdict == "adequate":
             return True, "Nothing was hidden, and nothing was found."
-        return False, f"Nothing was hidden, but the verdict is {found.verdict.replace('_', ' ')}."
+        verdict = refinement.verdict.replace("_", " ")
+        return False, f"Nothing was hidden, but the verdict is {verdict}."
     hidden = f"Hidden was {r.hidden}, at {r.strength_sigma:g} times the noise"
-    suspects = found.steps[0].diagnosis.suspects
+    suspects = refinement.steps[0].diagnosis.suspects
     same = suspects[0].same_as if suspects else ()
     if r.hidden in added:
-        others = [a for a in added if a != r.hidden]
-        more = f" Added as well: {numbers.names(others)}." if others else ""
-        return True, f"{hidden}. It was found and added.{more}"
+        others_added = [a for a in added if a != r.hidden]
+        ending = f" Added as well: {numbers.names(others_added)}." if others_added else ""
+        return True, f"{hidden}. It was found and added.{ending}"
     if added and r.hidden in same:
         return True, f"{hidden}. It was named among those that these readings do not separate."
     return False, f"{hidden}. It was not found."

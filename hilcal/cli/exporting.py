@@ -1,4 +1,4 @@
-"""`export`: a campaign and what was identified, for other programs, controllers and people."""
+"""`export`: a campaign and its identified model, for other programs and controllers."""
 
 import json
 import re
@@ -30,12 +30,12 @@ from hilcal.tables.write import check_suffix, revision_table, write_columns
 from hilcal.whole_file import replace_file
 
 MANY = 10.0
-"""m; a distance along a joint's axis beyond which it is said that it cancels with others."""
+"""Distance along a joint's axis beyond which a note about cancellation is printed, m."""
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
-    """What is to be written, and how."""
+class ExportOptions:
+    """The files to write, and how."""
 
     readings: Path | None = None
     table: Path | None = None
@@ -63,9 +63,9 @@ class Wanted:
 
     @property
     def of_model(self) -> list[Path]:
-        """Files of what was identified."""
-        found = (self.residuals, self.parameters, self.calibration, *self.geometry)
-        return [path for path in found if path is not None]
+        """Files of the identified model."""
+        fitted = (self.residuals, self.parameters, self.calibration, *self.geometry)
+        return [path for path in fitted if path is not None]
 
     @property
     def paths(self) -> list[Path]:
@@ -74,7 +74,7 @@ class Wanted:
         return [*(path for path in data if path is not None), *self.of_model]
 
     def check(self, force: bool) -> None:
-        """Refuse what cannot be written, before anything is computed."""
+        """Refuse a file that cannot be written, before anything is computed."""
         if not self.paths:
             raise InputError(
                 "nothing to export; give --readings, --table, --residuals or --revisions F.csv or "
@@ -85,22 +85,22 @@ class Wanted:
         for path in (self.readings, self.table, self.residuals, self.revisions):
             if path is not None:
                 check_suffix(path)
-        for given, name, valid in (
+        for file, name, valid in (
             (self.parameters, "--parameters", (".json", ".csv")),
             (self.dh, "--dh", (".toml", ".csv")),
             (self.matlab, "--matlab", (".m",)),
         ):
-            if given is not None and given.suffix.lower() not in valid:
+            if file is not None and file.suffix.lower() not in valid:
                 raise InputError(
-                    f"{name} {given}: unknown kind of file; valid: {' or '.join(valid)}"
+                    f"{name} {file}: unknown kind of file; valid: {' or '.join(valid)}"
                 )
-        for what, name, other, needs in (
+        for value, name, target, needs in (
             (self.modified, "--dh-modified", self.dh, "--dh"),
             (self.ur_hash, "--ur-hash", self.ur_kinematics, "--ur-kinematics"),
             (self.base_link is not None, "--base-link", self.into, "--into"),
             (self.tip_link is not None, "--tip-link", self.into, "--into"),
         ):
-            if what and not other:
+            if value and not target:
                 raise InputError(f"{name} is about {needs}; give it, too")
         if twice := [path for path in self.paths if self.paths.count(path) > 1]:
             raise InputError(f"{twice[0]}: two things cannot be written to one file")
@@ -139,50 +139,50 @@ class Wanted:
     force | --force | Replace existing files.
     """)
 def export(
-    run: Path, wanted: Wanted, revision: int | None = None, force: bool = False,
+    run: Path, options: ExportOptions, revision: int | None = None, force: bool = False,
     effects_from: list[Path] | None = None, as_json: bool = False,
 ) -> None:  # fmt: skip
     """Hand over: readings, parameters, calibration, URDF, DH, frames."""
     t = terminal(as_json)
-    wanted.check(force)
-    if revision is not None and not wanted.of_model:
+    options.check(force)
+    if revision is not None and not options.of_model:
         raise InputError("--revision is about the model; give --parameters or --calibration, too")
-    with Campaign.open(run, catalogue_with(effects_from), read_only=True) as opened:
-        record = opened.in_use(revision)
-        if record is None and (wanted.of_model or wanted.revisions is not None):
+    with Campaign.open(run, catalogue_with(effects_from), read_only=True) as campaign:
+        record = campaign.in_use(revision)
+        if record is None and (options.of_model or options.revisions is not None):
             raise InputError(f"{run}: no revision yet, so nothing of it; run hilcal identify first")
-        t.show(_write_data(opened, wanted, force))
-        if wanted.revisions is not None and record is not None:
-            records = opened.file.revisions()
+        t.show(_write_data(campaign, options, force))
+        if options.revisions is not None and record is not None:
+            records = campaign.file.revisions()
             about = {"table": "revisions", "campaign": run.name}
-            write_columns(wanted.revisions, revision_table(records, record.number), about)
-            t.show(f"{wanted.revisions}: revisions 1 to {len(records)}; {record.number} is in use")
-        if record is not None and wanted.of_model:
+            write_columns(options.revisions, revision_table(records, record.number), about)
+            t.show(f"{options.revisions}: revisions 1 to {len(records)}; {record.number} is in use")
+        if record is not None and options.of_model:
             with working(t.progress) as say:
-                t.show(_write_model(say, opened, revision, record, wanted))
-    t.document({"written": [str(path) for path in wanted.paths]})
+                t.show(_write_model(say, campaign, revision, record, options))
+    t.document({"written": [str(path) for path in options.paths]})
 
 
-def _write_data(run: Campaign, wanted: Wanted, force: bool) -> Iterator[str]:
-    """Write readings and cell; yields what was written."""
+def _write_data(run: Campaign, options: ExportOptions, force: bool) -> Iterator[str]:
+    """Write readings and cell; yield a line on each file."""
     count = len(run.readings)
-    if wanted.readings is not None:
-        run.save_table(wanted.readings, as_stored=True)
-        scatter = ", the arm's scatter in their covariance"
-        more = "" if run.stored_covers == INSTRUMENT else scatter
-        yield f"{wanted.readings}: {count} readings as stored{more}"
-    if wanted.table is not None:
-        run.save_table(wanted.table)
-        yield f"{wanted.table}: {count} readings, covariance: {run.covariance_parts}"
-    if (cell := wanted.cell) is not None:
-        kept = run.file.about(ROBOT_FILE)
-        if kept is not None:
+    if options.readings is not None:
+        run.save_table(options.readings, as_stored=True)
+        scatter = run.stored_covers != INSTRUMENT
+        note = ", the arm's scatter in their covariance" if scatter else ""
+        yield f"{options.readings}: {count} readings as stored{note}"
+    if options.table is not None:
+        run.save_table(options.table)
+        yield f"{options.table}: {count} readings, covariance: {run.covariance_parts}"
+    if (cell := options.cell) is not None:
+        robot_text = run.file.about(ROBOT_FILE)
+        if robot_text is not None:
             robot = cell.parent / Path(run.config.robot.model).name
-            if robot.exists() and not force and robot.read_bytes() != kept.encode():
+            if robot.exists() and not force and robot.read_bytes() != robot_text.encode():
                 raise InputError(
                     f"{robot}: another file is there; choose another folder or give --force"
                 )
-            replace_file(robot, kept)
+            replace_file(robot, robot_text)
             yield f"{robot}: the robot, as the campaign keeps it"
         replace_file(cell, cell_toml(run))
         yield f"{cell}: the cell's configuration"
@@ -191,22 +191,22 @@ def _write_data(run: Campaign, wanted: Wanted, force: bool) -> Iterator[str]:
 def cell_toml(run: Campaign) -> str:
     """Return the configuration that a campaign was measured with, as CELL.toml.
 
-    The file of a robot that is not of the catalogue stands beside it; that of a campaign which does
-    not keep it is named by its whole path.
+    The file of a robot that is not of the catalogue is named by its name alone where the campaign
+    stores it, else by its path.
     """
     content = run.config.model_dump(mode="json", exclude_none=True)
     robot = Path(run.file.base_dir) / run.config.robot.model
     if robot.suffix:
-        kept = run.file.about(ROBOT_FILE) is not None
-        content["robot"]["model"] = robot.name if kept else str(robot)
+        stored = run.file.about(ROBOT_FILE) is not None
+        content["robot"]["model"] = robot.name if stored else str(robot)
     return f"# The cell of {run.path.name}, every key written out.\n{tomli_w.dumps(content)}"
 
 
 def _write_model(
-    say: Say, run: Campaign, revision: int | None, record: RevisionRecord, wanted: Wanted
+    say: Say, run: Campaign, revision: int | None, record: RevisionRecord, options: ExportOptions
 ) -> Iterator[str]:
-    """Write what was identified; yields what was written."""
-    number, parameters = record.number, wanted.parameters
+    """Write the files of the model; yield a line on each."""
+    number, parameters = record.number, options.parameters
     source: dict[str, object] = {"campaign": run.path.name, "revision": number}
     source["readings_sha256"] = record.data_hash
     if parameters is not None and parameters.suffix.lower() == ".csv":
@@ -215,91 +215,95 @@ def _write_model(
         write_columns(parameters, {name: [row[name] for row in rows] for name in names}, {})
         yield f"{parameters}: {len(rows)} parameters of revision {number}"
         parameters = None
-    if wanted.residuals is not None or parameters is not None:
+    if options.residuals is not None or parameters is not None:
         say("restoring the fit")
         fitted = run.fit(revision)
         if parameters is not None:
             say("computing uncertainties")
-            found: dict[str, Any] = parameters_document.to_json(fitted, source)
-            replace_file(parameters, json.dumps(found, indent=1, allow_nan=False) + "\n")
+            document: dict[str, Any] = parameters_document.to_json(fitted, source)
+            replace_file(parameters, json.dumps(document, indent=1, allow_nan=False) + "\n")
             yield (
-                f"{parameters}: {len(found['parameters'])} parameters of revision {number}, "
-                f"covariance of the {len(found['covariance_of'])} that the readings determine"
+                f"{parameters}: {len(document['parameters'])} parameters of revision {number}, "
+                f"covariance of the {len(document['covariance_of'])} that the readings determine"
             )
-        if wanted.residuals is not None:
+        if options.residuals is not None:
             say("predicting poses left out")
             about = {"table": "residuals", **source}
-            write_columns(wanted.residuals, residual_table(fitted), about)
+            write_columns(options.residuals, residual_table(fitted), about)
             kind = "deflections" if fitted.mode == "deflection" else "readings"
             yield (
-                f"{wanted.residuals}: measured − predicted of {len(fitted.raw)} fitted {kind}, "
+                f"{options.residuals}: measured − predicted of {len(fitted.raw)} fitted {kind}, "
                 f"revision {number}"
             )
-    if wanted.calibration is None and not wanted.geometry:
+    if options.calibration is None and not options.geometry:
         return
     say("restoring the fit, and what it knows of other readings")
     identified = run.calibration(revision)
-    if wanted.calibration is not None:
-        identified.save(wanted.calibration)
-        yield f"{wanted.calibration}: the calibration of revision {number}"
-    if wanted.geometry:
-        yield from _write_geometry(identified, wanted)
+    if options.calibration is not None:
+        identified.save(options.calibration)
+        yield f"{options.calibration}: the calibration of revision {number}"
+    if options.geometry:
+        yield from _write_geometry(identified, options)
 
 
-def _write_geometry(found: Calibration, wanted: Wanted) -> Iterator[str]:
-    """Write the corrected geometry in the forms that are wanted; yields what was written."""
-    arm = corrected(found)
-    cell, beyond = found.model.cell, None
+def _write_geometry(calibration: Calibration, options: ExportOptions) -> Iterator[str]:
+    """Write the files of the corrected geometry; yield a line on each."""
+    arm = corrected(calibration)
+    cell, beyond = calibration.model.cell, None
     nominal = cell.arm
-    note = f"{nominal.name} as calibrated with hilcal, {found.source['campaign']}"
-    base = base_line(cell, found.frames, found.mode)
+    note = f"{nominal.name} as calibrated with hilcal, {calibration.source['campaign']}"
+    base = base_line(cell, calibration.frames, calibration.mode)
     holds = ", ".join(arm.within) or "the nominal geometry"
-    said: list[str] = []
+    messages: list[str] = []
     files: dict[Path, str | bytes] = {}
-    if wanted.ur_kinematics is not None:
-        words = _ur_note(note, base, arm, wanted.ur_hash)
-        text, beyond = handover.ur_kinematics(nominal, arm.arm, words, wanted.ur_hash)
-        files[wanted.ur_kinematics] = text
+    if options.ur_kinematics is not None:
+        comment = _ur_note(note, base, arm, options.ur_hash)
+        text, beyond = handover.ur_kinematics(nominal, arm.arm, comment, options.ur_hash)
+        files[options.ur_kinematics] = text
         shift, tilt = np.linalg.norm(beyond[:3, 3]), np.linalg.norm(beyond[:3, :3] - np.eye(3))
-        said.append(
-            f"{wanted.ur_kinematics}: kinematics_params_file of UR's ROS driver with {holds}; it "
+        messages.append(
+            f"{options.ur_kinematics}: kinematics_params_file of UR's ROS driver with {holds}; it "
             f"has no place for the flange's own shift ({length(float(shift))}) and tilt "
             f"({1e3 * float(tilt) / np.sqrt(2):.2g} mrad): tcp_for_ur_kinematics of --frames does"
         )
-    if wanted.urdf is not None:
-        files[wanted.urdf] = handover.urdf(arm.arm, f"{note}. {base}")
-        said.append(f"{wanted.urdf}: URDF, base_link to tool0, with {holds}")
-    if wanted.dh is not None:
-        rows = dh_table.dh_rows(arm.arm, "modified" if wanted.modified else "standard")
-        alone = wanted.dh.suffix.lower() == ".csv"
-        about = f"{note}, revision {found.source['revision']}"
-        files[wanted.dh] = (
+    if options.urdf is not None:
+        files[options.urdf] = handover.urdf(arm.arm, f"{note}. {base}")
+        messages.append(f"{options.urdf}: URDF, base_link to tool0, with {holds}")
+    if options.dh is not None:
+        rows = dh_table.dh_rows(arm.arm, "modified" if options.modified else "standard")
+        alone = options.dh.suffix.lower() == ".csv"
+        about = f"{note}, revision {calibration.source['revision']}"
+        files[options.dh] = (
             dh_table.to_csv(rows, arm.arm) if alone else dh_table.to_toml(rows, arm.arm, about)
         )
-        said += _dh_words(wanted.dh, rows, holds, alone)
-    if wanted.frames is not None:
-        files[wanted.frames] = handover.frames(found, arm, beyond)
-        said.append(f"{wanted.frames}: tool and base, as fitted and as a controller takes them")
-    if wanted.matlab is not None:
-        files[wanted.matlab] = handover.matlab(arm.arm, wanted.matlab.stem, f"{note}. {base}")
-        said.append(f"{wanted.matlab}: a rigidBodyTree, base to tool0, with {holds}")
-    for path in wanted.into or ():
-        made = correct_file(path, nominal, arm, *_ends(found, wanted, path))
-        files[path] = made.content
-        said.append(made.said)
+        messages += _dh_words(options.dh, rows, holds, alone)
+    if options.frames is not None:
+        files[options.frames] = handover.frames(calibration, arm, beyond)
+        messages.append(
+            f"{options.frames}: tool and base, as fitted and as a controller takes them"
+        )
+    if options.matlab is not None:
+        files[options.matlab] = handover.matlab(arm.arm, options.matlab.stem, f"{note}. {base}")
+        messages.append(f"{options.matlab}: a rigidBodyTree, base to tool0, with {holds}")
+    for path in options.into or ():
+        description = correct_file(path, nominal, arm, *_ends(calibration, options, path))
+        files[path] = description.content
+        messages.append(description.said)
     for path, content in files.items():
         replace_file(path, content)
-    yield from (*said, base)
+    yield from (*messages, base)
     if arm.beyond:
         yield f"Not in it, since not constant: {', '.join(arm.beyond)}; hilcal compensate has it"
 
 
-def _ends(found: Calibration, wanted: Wanted, path: Path) -> tuple[str | None, str | None]:
-    """Base and tip in a file: as given, else as the cell has them for its own file."""
-    config = found.model.cell.config
-    given = wanted.base_link, wanted.tip_link
-    if any(given) or config is None or Path(config.robot.model).name != path.name:
-        return given
+def _ends(
+    calibration: Calibration, options: ExportOptions, path: Path
+) -> tuple[str | None, str | None]:
+    """Return base and tip in a file: the options, or those of the cell in the cell's own file."""
+    config = calibration.model.cell.config
+    stated = options.base_link, options.tip_link
+    if any(stated) or config is None or Path(config.robot.model).name != path.name:
+        return stated
     return config.robot.base_link, config.robot.tip_link
 
 
@@ -316,15 +320,15 @@ def _ur_note(note: str, base: str, arm: Corrected, digest: str | None) -> str:
 
 
 def _dh_words(path: Path, rows: dh_table.DhRows, holds: str, alone: bool) -> Iterator[str]:
-    """Yield what a table holds, and what it does not."""
+    """Yield lines on what a DH table holds, and what it does not."""
     yield f"{path}: {rows.convention} DH rows with {holds}"
     if max(rows.base_moves, rows.flange_moves) > dh_table.EXACT:
         parts = (
             f"where joint 1's axis lies in the base (up to {length(rows.base_moves)} at the flange)"
             f" and how the flange sits on the last axis (up to {length(rows.flange_moves)})"
         )
-        where = "they are left out" if alone else "base_m_rad and flange_m_rad of the file hold it"
-        yield f"A DH table has no place for {parts}; {where}."
+        place = "they are left out" if alone else "base_m_rad and flange_m_rad of the file hold it"
+        yield f"A DH table has no place for {parts}; {place}."
     elif rows.disagreement <= dh_table.EXACT:
         yield "Forward kinematics of the rows is that of the corrected arm, to 1 nm."
     far = abs(rows.d).max()

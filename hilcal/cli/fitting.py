@@ -1,4 +1,4 @@
-"""`identify` and `bootstrap`; the fit in use, effects and their options, a prior, recordings."""
+"""`identify` and `bootstrap`; shared: fit in use, effects and options, priors, recordings."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -44,16 +44,18 @@ from hilcal.tables.parquet_stream import open_stream
 
 
 def fit_of(t: Terminal, run: Campaign, say: Say, revision: int | None) -> tuple[int | None, Fit]:
-    """Return number and fit of the revision in use; without any the baseline, which is not kept."""
+    """Return number and fit of the revision in use; without one, a baseline that is not stored."""
     _tell_accepted(t, run, revision)
-    number, found = run.fit_in_use(say, revision)
+    number, fitted = run.fit_in_use(say, revision)
     if number is None:
-        t.notice(f"no revision yet: taking the baseline {_what(found)}; hilcal identify keeps it")
-    return number, found
+        t.notice(
+            f"no revision yet: taking the baseline {_summary(fitted)}; hilcal identify keeps it"
+        )
+    return number, fitted
 
 
 def record_of(t: Terminal, run: Campaign, say: Say, revision: int | None) -> RevisionRecord:
-    """Return the revision in use as stored; without any that of the baseline, number 0."""
+    """Return the record of the revision in use; without one, that of the baseline, number 0."""
     record = run.in_use(revision)
     if record is None:
         return run.record(fit_of(t, run, say, revision)[1])
@@ -62,21 +64,21 @@ def record_of(t: Terminal, run: Campaign, say: Say, revision: int | None) -> Rev
 
 
 def stored_fit(t: Terminal, run: Campaign, say: Say, revision: int | None) -> tuple[int, Fit]:
-    """Do the same for a command that makes a revision; the baseline becomes revision 1."""
+    """Return number and fit of the revision in use; without one, store the baseline as one."""
     _tell_accepted(t, run, revision)
-    number, found = run.fit_in_use(say, revision)
+    number, fitted = run.fit_in_use(say, revision)
     if number is None:
-        number = run.store(found)
-        t.notice(f"no revision yet: made the baseline, revision {number} {_what(found)}")
-    return number, found
+        number = run.store(fitted)
+        t.notice(f"no revision yet: made the baseline, revision {number} {_summary(fitted)}")
+    return number, fitted
 
 
-def _what(found: Fit) -> str:
-    return f"({model_name(found.model.named)}; {found.mode} readings)"
+def _summary(fitted: Fit) -> str:
+    return f"({model_name(fitted.model.named)}; {fitted.mode} readings)"
 
 
 def _tell_accepted(t: Terminal, run: Campaign, revision: int | None) -> None:
-    """Say that an accepted revision is used where there are later ones."""
+    """Print a notice where the accepted revision is not the latest."""
     accepted, latest = run.file.accepted(), run.latest()
     if revision is None and latest is not None and accepted not in (None, latest.number):
         t.notice(f"using revision {accepted}, which is accepted; the latest is {latest.number}")
@@ -88,81 +90,81 @@ def starting_model(
     effects: Mapping[str, Options] | None,
     prior: CarriedPrior | None = None,
 ) -> Model:
-    """Return a model of unknown frames and these effects; the baseline without any named."""
+    """Return a model of unknown frames and the effects; the baseline where `effects` is None."""
     if effects is None:
         return baseline(o.cell, o.readings, mode, o.catalogue, prior)
     return with_effects(o.cell, o.readings, mode, effects, effects, o.catalogue, prior)
 
 
-def finish(found: Fit, say: Say) -> None:
-    """Compute what a fit's report and its document hold, while it is said what is done."""
+def finish(fitted: Fit, say: Say) -> None:
+    """Compute, with progress, the properties of a fit that its report and its JSON need."""
     say("predicting the poses left out")
-    _ = found.holdout
+    _ = fitted.holdout
     say("computing standard uncertainties")
-    _ = found.uncertainty
+    _ = fitted.uncertainty
 
 
 def called(number: int | None) -> str:
-    """Return how a revision is called in a heading; None is the baseline that is not kept."""
+    """Return a revision's name in a heading; None is the baseline that is not stored."""
     return "Baseline, not kept" if number is None else f"Revision {number}"
 
 
-def mode_of_option(run: Campaign, asked: str | None) -> Mode:
-    """Kind of readings: as asked, else as in the latest revision, else what they allow."""
-    if asked is None:
+def mode_of_option(run: Campaign, kind: str | None) -> Mode:
+    """Return the kind of readings: the option, else that of `Campaign.mode`."""
+    if kind is None:
         return run.mode()
-    if asked not in MODES:
-        raise InputError(f"--readings {asked!r} is unknown; valid: {', '.join(MODES)}")
-    return asked
+    if kind not in MODES:
+        raise InputError(f"--readings {kind!r} is unknown; valid: {', '.join(MODES)}")
+    return kind
 
 
 def scalings(name: str) -> tuple[Scaling, ...]:
-    """Return the scalings that `--scaling` asks for; the one that is kept comes last."""
-    found = tuple(s for s in SCALINGS if name in (s, "all"))
-    if not found:
+    """Return the scalings of `--scaling`; the last one is stored."""
+    matching = tuple(s for s in SCALINGS if name in (s, "all"))
+    if not matching:
         raise InputError(f"--scaling {name!r} is unknown; valid: {', '.join(SCALINGS)}, all")
-    return found
+    return matching
 
 
 def wanted_effects(
-    given: str | None, catalogue: Catalogue, option: str = "--effects"
+    text: str | None, catalogue: Catalogue, option: str = "--effects"
 ) -> dict[str, dict[str, object]] | None:
-    """Read `--effects "a, b(option=value)"`: options by name, see `read_effects_text`."""
-    if given is None:
+    """Read `--effects "a, b(option=value)"`: options by effect, see `read_effects_text`."""
+    if text is None:
         return None
-    wanted = read_effects_text(given, option, catalogue)
-    if not wanted:
+    effects = read_effects_text(text, option, catalogue)
+    if not effects:
         raise InputError(f"{option} is empty; give one name or several, separated by commas")
-    return wanted
+    return effects
 
 
-def check_options(o: Campaign, wanted: Mapping[str, Options]) -> None:
+def check_options(o: Campaign, effects: Mapping[str, Options]) -> None:
     """Refuse options of effects before any work is done."""
-    for name, options in wanted.items():
+    for name, options in effects.items():
         o.catalogue.make(name, o.cell, o.readings.states, options).prior_std()
 
 
 def chosen(model: Model, readings: Readings) -> dict[str, dict[str, object]]:
-    """Options of the effects of a model that are not the usual ones for its readings, by name."""
+    """Return the options that differ from the defaults for the readings, by effect."""
     named = (e for e in model.effects if e.name not in model.background)
     options = {e.name: chosen_options(e, readings.states, readings.m) for e in named}
-    return {name: given for name, given in options.items() if given}
+    return {name: values for name, values in options.items() if values}
 
 
 def titles(model: Model, readings: Readings) -> tuple[str, ...]:
-    """Names of a model's effects, with the options that are not the usual ones."""
-    given = chosen(model, readings)
-    return tuple(write_effect(name, given.get(name, {})) for name in model.named)
+    """Return the names of a model's effects, with the options that differ from the defaults."""
+    options = chosen(model, readings)
+    return tuple(write_effect(name, options.get(name, {})) for name in model.named)
 
 
 def check_record(path: Path | None) -> None:
-    """Refuse a recording that cannot be written before any work is done."""
+    """Refuse a recording that cannot be written, before any work is done."""
     if path is not None:
         check_folder(path, f"--record {path}")
 
 
 def record_story(t: Terminal, chapters: list[Chapter], path: Path | None) -> None:
-    """Write a recording, where it is asked for."""
+    """Write a recording, unless `path` is None."""
     if path is None:
         return
     from hilcal.present.viewer import save  # loads the viewer's library, which takes a while
@@ -175,19 +177,19 @@ def record_story(t: Terminal, chapters: list[Chapter], path: Path | None) -> Non
 
 @dataclass(frozen=True, slots=True)
 class PriorOptions:
-    """The options of a prior as they were given."""
+    """The options of a prior."""
 
     prior: Path | None = None
     prior_of: str = "arm"
     drift: str | None = None
 
     def load(self, catalogue: Catalogue) -> CarriedPrior | None:
-        """Return the prior; None where none is asked for."""
+        """Return the prior; None without `--prior`."""
         if self.prior is None:
             if self.drift is not None:
                 raise InputError("--drift is of a prior; give --prior OTHER.hilcal as well")
             return None
-        from hilcal.library import load_posterior  # imports all that a script can do
+        from hilcal.library import load_posterior  # imports the whole library
 
         posterior = load_posterior(self.prior, catalogue)
         try:
@@ -199,31 +201,31 @@ class PriorOptions:
 NO_PRIOR = PriorOptions()
 
 
-def fitted_with(prior: CarriedPrior, o: Campaign, found: Fit) -> Fit:
-    """Return a fit of the same effects and those of a prior, with it; nothing is stored."""
-    if found.model.prior is not None:
-        known = found.model.prior.posterior.source.campaign or "a posterior"
-        raise InputError(f"the revision has a prior already, {known}; leave out --prior")
-    learnt = [e.name for e in prior.posterior.effects]
-    more = [n for n in learnt if o.catalogue[n].computable(o.readings.states)]
-    names = dict.fromkeys((*found.model.names, *more))
-    given = chosen(found.model, found.readings)
-    model = with_effects(o.cell, o.readings, found.mode, names, given, o.catalogue, prior)
-    return with_serial_noise(fit(model, with_prior_scatter(model, found.readings), found.mode))
+def fitted_with(prior: CarriedPrior, o: Campaign, fitted: Fit) -> Fit:
+    """Refit with a prior and the effects that it has in addition; nothing is stored."""
+    if fitted.model.prior is not None:
+        source = fitted.model.prior.posterior.source.campaign or "a posterior"
+        raise InputError(f"the revision has a prior already, {source}; leave out --prior")
+    prior_effects = [e.name for e in prior.posterior.effects]
+    computable = [n for n in prior_effects if o.catalogue[n].computable(o.readings.states)]
+    names = dict.fromkeys((*fitted.model.names, *computable))
+    options = chosen(fitted.model, fitted.readings)
+    model = with_effects(o.cell, o.readings, fitted.mode, names, options, o.catalogue, prior)
+    return with_serial_noise(fit(model, with_prior_scatter(model, fitted.readings), fitted.mode))
 
 
 def _drifts(text: str | None) -> dict[str, float]:
-    """Read "a=0.1,b=0.2"."""
-    found = {}
+    """Read "a=0.1,b=0.2"; an entry without "=" becomes NaN."""
+    drifts = {}
     for part in (text or "").split(","):
         name, equals, value = (w.strip() for w in part.partition("="))
         if not part.strip():
             continue
         try:
-            found[name] = float(value) if equals else float("nan")
+            drifts[name] = float(value) if equals else float("nan")
         except ValueError:
             raise InputError(f"--drift {part.strip()!r}; valid: EFFECT=NUMBER") from None
-    return found
+    return drifts
 
 
 @command("""
@@ -247,8 +249,8 @@ def identify(
     A Parquet table in place of the campaign is read as a stream, in passes that need little memory.
     """
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
-    wanted, named = scalings(scaling), wanted_effects(effects, catalogue)
-    known = prior.load(catalogue)
+    requested, named = scalings(scaling), wanted_effects(effects, catalogue)
+    carried = prior.load(catalogue)
     if run.suffix == ".parquet" or is_parquet(run):
         if scaling != "gc" or readings not in (None, "absolute") or fit_validation:
             raise InputError(
@@ -256,7 +258,7 @@ def identify(
                 "--scaling, --readings and --fit-validation"
             )
         count = check_workers(workers, scheduler, effects_from)
-        identify_stream(t, run, cell, named, catalogue, known, out, count, scheduler)
+        identify_stream(t, run, cell, named, catalogue, carried, out, count, scheduler)
         return
     if any(option is not None for option in (cell, out, workers, scheduler)):
         raise InputError("--cell, -o, --workers and --scheduler are of a stream, READINGS.parquet")
@@ -273,51 +275,51 @@ def identify(
         fits: dict[Scaling, Fit] = {}
         with working(t.progress) as say:
             say("registering")
-            model = starting_model(o, mode, named, known)
+            model = starting_model(o, mode, named, carried)
             fitted = with_prior_scatter(model, o.readings)
-            for s in wanted:
+            for s in requested:
                 say(f"fitting {model_name(titles(model, o.readings))}, scaling {s}")
                 fits[s] = with_serial_noise(fit(model, fitted, mode, s))
                 finish(fits[s], say)
-            kept = fits[wanted[-1]]
-            before = len(o.file.revisions())
-            number = o.append(kept)
-    t.show(fit_report(kept, details))
-    t.show(prior_lines(kept))
+            stored = fits[requested[-1]]
+            n_revisions = len(o.file.revisions())
+            number = o.append(stored)
+    t.show(fit_report(stored, details))
+    t.show(prior_lines(stored))
     if details or o.noise:
         t.show(numbers.sentence(covariance_words(o.covariance_parts, o.noise)))
-    t.show(options_line(kept))
-    torques = check_torques(kept.model.cell, kept.readings)
+    t.show(options_line(stored))
+    torques = check_torques(stored.model.cell, stored.readings)
     t.show(torque_lines(torques))
-    other = other_arm_of(o.cell, o.readings)
-    if other is not None:
-        t.show(other_arm_line(other))
+    other_arm = other_arm_of(o.cell, o.readings)
+    if other_arm is not None:
+        t.show(other_arm_line(other_arm))
     document = {
         "revision": number,
-        **to_json(kept),
-        "options": options_json(kept),
+        **to_json(stored),
+        "options": options_json(stored),
         "covariance": o.covariance_parts,
         **({} if torques is None else {"torques": torques.to_json()}),
-        "other_arm": None if other is None else other.to_json(),
+        "other_arm": None if other_arm is None else other_arm.to_json(),
     }
     if len(fits) > 1:
         t.show(["", *scalings_table(fits)])
-        document["scalings"] = {s: to_json(found) for s, found in fits.items()}
+        document["scalings"] = {s: to_json(f) for s, f in fits.items()}
     already = f"Revision {number} of {run} is this fit already; nothing was stored."
-    t.show(f"\n{already if number <= before else f'Stored as revision {number} of {run}.'}")
+    t.show(f"\n{already if number <= n_revisions else f'Stored as revision {number} of {run}.'}")
     t.document(document)
 
 
-def options_line(found: Fit) -> list[str]:
-    """Return a line with the options that are not the usual ones; none where all are usual."""
-    options = chosen(found.model, found.readings)
-    given = [write_effect(name, of) for name, of in options.items()]
-    return [f"Options: {', '.join(given)}."] if given else []
+def options_line(fitted: Fit) -> list[str]:
+    """Return a line with the options that differ from the defaults; none where no option does."""
+    options = chosen(fitted.model, fitted.readings)
+    written = [write_effect(name, values) for name, values in options.items()]
+    return [f"Options: {', '.join(written)}."] if written else []
 
 
-def options_json(found: Fit) -> dict[str, dict[str, object]]:
+def options_json(fitted: Fit) -> dict[str, dict[str, object]]:
     """Return all options of the effects, by name."""
-    return {e.name: dict(e.options) for e in found.model.effects}
+    return {e.name: dict(e.options) for e in fitted.model.effects}
 
 
 def identify_stream(
@@ -338,13 +340,13 @@ def identify_stream(
     config = cell.configured()
     stream = open_stream(path, cell.arm, tracker_noise(config.tracker), config.tracker.station_m)
     with open_engine(workers, scheduler) as engine:
-        shown = partial(counting, t.progress)
-        found = fit_stream(stream, cell, engine, effects, catalogue, prior, shown)
-    t.show(stream_report(found))
-    document = stream_json(found)
+        progress = partial(counting, t.progress)
+        stream_fit = fit_stream(stream, cell, engine, effects, catalogue, prior, progress)
+    t.show(stream_report(stream_fit))
+    document = stream_json(stream_fit)
     if out is not None:
-        source = {"stream": path.name, "readings": found.readings}
-        calibration_of_stream(found, source).save(out)
+        source = {"stream": path.name, "readings": stream_fit.readings}
+        calibration_of_stream(stream_fit, source).save(out)
         t.show(f"\n{out}: the calibration, for compensate and hc.Calibration")
         document["calibration"] = str(out)
     t.document(document)
@@ -372,6 +374,6 @@ def bootstrap(
             say("computing standard uncertainties")
             _ = fit.uncertainty
         with counting(t.progress, "draws", draws) as advance:
-            found = draw_again(fit, engine, draws, seed, advance)
-    t.show(bootstrap_report(found))
-    t.document(revision=number, seed=seed, **found.to_dict(), remarks=[*bootstrap_remarks(found)])
+            result = draw_again(fit, engine, draws, seed, advance)
+    t.show(bootstrap_report(result))
+    t.document(revision=number, seed=seed, **result.to_dict(), remarks=[*bootstrap_remarks(result)])

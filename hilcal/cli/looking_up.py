@@ -1,4 +1,4 @@
-"""`effects`, `config`, `study`: the catalogue, every key of a cell, the program's mathematics."""
+"""`effects`, `config`, `study`: the catalogue, the keys of a cell, studies of scaling."""
 
 import keyword
 import re
@@ -47,10 +47,10 @@ def effects(
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     cell, rail = example_cell(), example_cell(slides=True)
     states = example_states(cell)
-    made = [kind(cell if kind.applies(cell) else rail, states) for kind in catalogue.effects]
-    defaults = {e.name: option_defaults(type(e), e.cell, states) for e in made}
+    instances = [kind(cell if kind.applies(cell) else rail, states) for kind in catalogue.effects]
+    defaults = {e.name: option_defaults(type(e), e.cell, states) for e in instances}
     out = table("effect", "law", left=(0, 1))
-    for e in made:
+    for e in instances:
         units = ", ".join(dict.fromkeys(p.unit for p in e.parameters))
         needs = f"; needs {', '.join(e.needs)}" if e.needs else ""
         count = len(e.parameters)
@@ -67,13 +67,13 @@ def effects(
         ),
     ]
     t.show(note("\n".join(notes)))
-    t.show(["", _options_table(made, defaults)])
+    t.show(["", _options_table(instances, defaults)])
     t.show(note(OPTIONS_NOTE))
-    t.document({"effects": [_document(e, defaults[e.name], catalogue) for e in made]})
+    t.document({"effects": [_document(e, defaults[e.name], catalogue) for e in instances]})
 
 
 def _expected(e: Effect) -> str:
-    """Say how large the families of an effect are expected to be; the largest of each unit."""
+    """Return the expected standard deviation of an effect's parameters, the largest per unit."""
     largest: dict[str, float] = {}
     for _, std, unit in expected_sizes(e):
         largest[unit] = max(largest.get(unit, 0.0), std)
@@ -81,21 +81,21 @@ def _expected(e: Effect) -> str:
     return f"; expected {sizes}" if sizes else ""
 
 
-def _options_table(made: list[Effect], defaults: dict[str, dict[str, object]]) -> Table:
-    """Return the options of effects; an option that others have too is explained once."""
+def _options_table(instances: list[Effect], defaults: dict[str, dict[str, object]]) -> Table:
+    """Return the options of effects; an option that several effects have is explained once."""
     out = table("effect", "option", "what it chooses", left=(0, 1, 2))
     explained: dict[tuple[str, str], str] = {}
-    for e in made:
+    for e in instances:
         for name, meaning in e.option_help.items():
             first = explained.setdefault((name, meaning), e.name)
-            words = meaning if first == e.name else f"as for {first}"
+            text = meaning if first == e.name else f"as for {first}"
             default = written(defaults[e.name][name])
-            out.add(e.name, name, f"{words}\ndefault: {default}" if default else words)
+            out.add(e.name, name, f"{text}\ndefault: {default}" if default else text)
     return out
 
 
 def _document(e: Effect, defaults: dict[str, object], catalogue: Catalogue) -> dict[str, object]:
-    shown = [{"name": p.name, "unit": p.unit, "meaning": p.meaning} for p in e.parameters]
+    parameters = [{"name": p.name, "unit": p.unit, "meaning": p.meaning} for p in e.parameters]
     return {
         "name": e.name,
         "law": e.summary,
@@ -104,7 +104,7 @@ def _document(e: Effect, defaults: dict[str, object], catalogue: Catalogue) -> d
         "options": list(e.option_help),
         "defaults": plain(defaults),
         "option_help": dict(e.option_help),
-        "parameters": shown,
+        "parameters": parameters,
         "plausible": None
         if not np.isfinite(e.most())
         else {q.unit: e.most() * q.scale for q in e.parameters},
@@ -116,7 +116,7 @@ def _document(e: Effect, defaults: dict[str, object], catalogue: Catalogue) -> d
 
 
 def _source(kind: type[Effect], catalogue: Catalogue) -> str:
-    """Return where an effect is from: "built in", "installed", or a file."""
+    """Return the source of an effect: "built in", "installed", or a file."""
     if file := catalogue.file_of(kind.name):
         return file.path
     return "built in" if kind in BUILT_IN else "installed"
@@ -149,13 +149,13 @@ def new(name: str, output: Path | None = None, as_json: bool = False) -> None:
 
 
 def template_of(name: str) -> str:
-    """Return the text of the template with the effect's name, and its class called after it."""
+    """Return the text of the template with the effect's name, from which its class is named."""
     class_name = "".join(part.capitalize() for part in name.split("_"))
-    while class_name in vars(template):  # a name that the file uses for something else
+    while class_name in vars(template):  # the file uses the name already
         class_name += "Effect"
     content = Path(str(template.__file__)).read_text(encoding="utf-8")
     names = {"template": name, "Template": class_name}
-    return re.sub(r"\b[Tt]emplate\b", lambda found: names[found[0]], content)
+    return re.sub(r"\b[Tt]emplate\b", lambda match: names[match[0]], content)
 
 
 DRIVERS_OWN: dict[str, type[Section]] = {
@@ -173,10 +173,10 @@ DRIVERS_OWN: dict[str, type[Section]] = {
     """)
 def config(section: str | None = None, as_json: bool = False) -> None:
     """Explain the sections and keys of CELL.toml: unit, default, example."""
-    t, known = terminal(as_json), reference.tables(DRIVERS_OWN)
-    found = known if section is None else (reference.table(section, known),)
-    t.show(sections_overview(found) if section is None else section_report(found[0]))
-    t.document(sections=[asdict(s) for s in found])
+    t, tables = terminal(as_json), reference.tables(DRIVERS_OWN)
+    sections = tables if section is None else (reference.table(section, tables),)
+    t.show(sections_overview(sections) if section is None else section_report(sections[0]))
+    t.document(sections=[asdict(s) for s in sections])
 
 
 def write_page(path: str = "docs/reference/cell-configuration.md") -> None:
@@ -199,10 +199,10 @@ def scaling(
 
     t = terminal(as_json)
     check(runs)
-    what = f"experiments of {runs} campaigns, each with every scaling"
+    task = f"experiments of {runs} campaigns, each with every scaling"
     with (
         open_engine(*one_by_default(workers, scheduler)) as engine,
-        counting(t.progress, what, experiments()) as advance,
+        counting(t.progress, task, experiments()) as advance,
     ):
         rng = np.random.default_rng(check_seed(seed))
         study = scaling_study(rng, runs, engine=engine, advance=advance)

@@ -1,4 +1,4 @@
-"""How the options of commands are declared, and those that several commands have."""
+"""Declaration of the options of commands, and the options that several commands share."""
 
 import inspect
 import re
@@ -18,16 +18,16 @@ POSES = 20
 
 
 def _declared(text: str) -> dict[str, Any]:
-    """Options and arguments by parameter, of entries "parameter | names and value | meaning"."""
-    found = {}
+    """Return options by parameter, from entries "parameter | names and value | meaning"."""
+    declared = {}
     for entry in re.split(r"\n(?=\S)", inspect.cleandoc(text)) if text else ():
         name, spec, meaning = " ".join(entry.split()).split(" | ", 2)
-        words = spec.split()
-        names = [word for word in words if word.startswith("-")]
-        value = " ".join(word for word in words if word not in names) or None
+        parts = spec.split()
+        names = [word for word in parts if word.startswith("-")]
+        value = " ".join(word for word in parts if word not in names) or None
         make = typer.Option if names else typer.Argument
-        found[name] = make(*names, metavar=value, help=meaning)
-    return found
+        declared[name] = make(*names, metavar=value, help=meaning)
+    return declared
 
 
 SHARED = _declared("""
@@ -62,10 +62,10 @@ force | --force | Replace an existing file.
 
 
 def _open_to_others(context: typer.Context, address: str | None) -> str | None:
-    """Say what an address without TLS means."""
+    """Warn of an address without TLS."""
     if address and not address.startswith(("tls://", "wss://")) and not context.resilient_parsing:
-        words = f"--scheduler {address}: without TLS, whoever reaches it runs code there and here"
-        typer.echo(f"{words}, as you; tls://host:8786 keeps others out", err=True)
+        warning = f"--scheduler {address}: without TLS, whoever reaches it runs code there and here"
+        typer.echo(f"{warning}, as you; tls://host:8786 keeps others out", err=True)
     return address
 
 
@@ -82,63 +82,63 @@ Scheduler = Annotated[str | None, SHARED["scheduler"]]
 
 
 def command(text: str = "") -> Callable[[F], F]:
-    """Declare the parameters of a command by entries of a text, else as `SHARED` has them.
+    """Declare the parameters of a command by entries of a text; those not in it by `SHARED`.
 
-    A parameter that is a dataclass stands for its fields: they are options of the command.
+    The fields of a parameter that is a dataclass become options of the command.
     """
-    known, annotated = SHARED | _declared(text), cast(Any, Annotated)
+    declarations, annotated = SHARED | _declared(text), cast(Any, Annotated)
 
     def declare(function: F) -> F:
-        given = inspect.signature(function).parameters.values()
-        joint: dict[str, Any] = {p.name: p.annotation for p in given if is_dataclass(p.annotation)}
-        shown = []
-        for p in given:
+        params = inspect.signature(function).parameters.values()
+        joint: dict[str, Any] = {p.name: p.annotation for p in params if is_dataclass(p.annotation)}
+        flattened = []
+        for p in params:
             parts = (
                 inspect.signature(joint[p.name]).parameters.values() if p.name in joint else (p,)
             )
             for part in parts:
-                info = known.get(part.name)
+                info = declarations.get(part.name)
                 kind = annotated[part.annotation, info] if info else part.annotation
-                shown.append(part.replace(annotation=kind))
+                flattened.append(part.replace(annotation=kind))
 
         @wraps(function)
-        def whole(**options: Any) -> None:
+        def wrapper(**options: Any) -> None:
             for name, kind in joint.items():
                 options[name] = kind(**{f.name: options.pop(f.name) for f in fields(kind)})
             function(**options)
 
-        declared: Any = whole
-        declared.__signature__ = inspect.Signature(shown)
-        declared.__annotations__ = {p.name: p.annotation for p in shown}
-        return cast(F, whole)
+        declared: Any = wrapper
+        declared.__signature__ = inspect.Signature(flattened)
+        declared.__annotations__ = {p.name: p.annotation for p in flattened}
+        return cast(F, wrapper)
 
     return declare
 
 
 def catalogue_with(paths: list[Path] | None) -> Catalogue:
     """Return the installed effects and those of files."""
-    found = installed()
+    catalogue = installed()
     for path in paths or ():
-        found = found.with_file(path)
-    return found
+        catalogue = catalogue.with_file(path)
+    return catalogue
 
 
 def one_by_default(workers: int | None, scheduler: str | None) -> tuple[int | None, str | None]:
-    """Return what `open_engine` takes: this process where neither of both was given."""
+    """Return the arguments of `open_engine`; one process where neither is stated."""
     return (1 if workers is None and scheduler is None else workers), scheduler
 
 
 def check_workers(
     workers: int | None, scheduler: str | None, effects_from: list[Path] | None
 ) -> int | None:
-    """Return the number of processes: this one alone with effects of a file."""
+    """Return the number of processes: 1 with effects of a file."""
     if effects_from and (scheduler is not None or workers not in (None, 1)):
         raise InputError("--effects-from: other processes do not have its effects; --workers 1")
     return 1 if effects_from else workers
 
 
 def check_seed(seed: int) -> int:
-    """Return a seed; a negative one is refused."""
+    """Return a seed; refuse a negative one."""
     if seed < 0:
         raise InputError(f"--seed {seed}; valid: a whole number, 0 or more")
     return seed
@@ -150,7 +150,7 @@ def check_new(path: Path, force: bool) -> None:
         raise InputError(f"{path}: the file exists; choose another name or give --force")
 
 
-def check_folder(path: Path, what: str) -> None:
-    """Refuse a file in a folder that is not there, before any work is done."""
+def check_folder(path: Path, option: str) -> None:
+    """Refuse a file in a folder that does not exist, before any work is done."""
     if not path.absolute().parent.is_dir():
-        raise InputError(f"{what}: no folder {path.absolute().parent}; make it first")
+        raise InputError(f"{option}: no folder {path.absolute().parent}; make it first")

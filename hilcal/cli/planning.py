@@ -1,4 +1,4 @@
-"""`plan`, `next`: choose poses, loads and order; `check`: who answers, and may a plan be run."""
+"""`plan`, `next`: choose poses, loads and their order; `check`: examine devices and a plan."""
 
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -49,23 +49,23 @@ def write(
     t: Terminal,
     cell: Cell,
     config: CellConfig,
-    made: CheckedPlan,
+    checked_plan: CheckedPlan,
     output: Path,
     csv: Path | None,
     record: Path | None,
     powers: tuple[PairPower, ...] = (),
 ) -> None:
-    """Write a plan: as a file, and where asked as a table and as a recording."""
-    made.save(output)
+    """Write a plan: as a file, and optionally as a table and as a recording."""
+    checked_plan.save(output)
     if csv is not None:
         pulls = {load.name: load.wrench(cell.gravity) for load in config.loads}
-        replace_file(csv, plan_csv(made.plan, pulls, cell.arm.units))
+        replace_file(csv, plan_csv(checked_plan.plan, pulls, cell.arm.units))
     if record is not None:
         from hilcal.present.viewer.plan import record_plan
 
         with working(t.progress) as say:
             say(f"recording {record}")
-            record_plan(cell, config, made.plan, made.summary, record, powers)
+            record_plan(cell, config, checked_plan.plan, checked_plan.summary, record, powers)
 
 
 @command(f"""
@@ -95,24 +95,24 @@ def plan(
     unloaded: Literal["around", "first"] = "first" if unloaded_first else "around"
     if criterion is not None and canonical(criterion) not in CRITERIA:
         raise InputError(f"--criterion {criterion!r} is unknown; valid: {', '.join(CRITERIA)}")
-    wanted = Request(poses, readings, criterion, unloaded=unloaded)
+    request = Request(poses, readings, criterion, unloaded=unloaded)
     with working(t.progress) as say:
-        known, reference = None, None
+        fitted, reference = None, None
         if after is not None:
             with Campaign.open(after, catalogue, read_only=True) as run:
-                known, reference = fit_of(t, run, say, revision)[1], reference_in(run.file)
+                fitted, reference = fit_of(t, run, say, revision)[1], reference_in(run.file)
         rng = np.random.default_rng(check_seed(seed))
         chosen = make(
-            numbers, config, wanted, rng, known, say, catalogue, carried, reference=reference
+            numbers, config, request, rng, fitted, say, catalogue, carried, reference=reference
         )
         plan_ = replace(chosen.ordered.plan, about=about(chosen))
         summary = summarise(chosen, config, rng, say, compare=not quick, curve=not quick)
         say("checking every motion in a dry run")
-        made = checked(numbers, config, plan_, summary)
-    write(t, numbers, config, made, output, csv, record)
-    t.show(plan_report(made.summary) if details else plan_screen(made.summary))
+        checked_plan = checked(numbers, config, plan_, summary)
+    write(t, numbers, config, checked_plan, output, csv, record)
+    t.show(plan_report(checked_plan.summary) if details else plan_screen(checked_plan.summary))
     t.show(f"The plan is in {output}: a file that you may edit. Every limit was checked.")
-    t.document({**made.to_dict(), "plan": str(output)})
+    t.document({**checked_plan.to_dict(), "plan": str(output)})
 
 
 @command("""
@@ -143,23 +143,23 @@ def check(
         dry = dry_checked(t, numbers, config, load_plan(plan))
     try:
         answers = with_kinematics(answers_of(t, config), numbers)
-    except InputError:  # the cell names no device: the plan is checked all the same
+    except InputError:  # the cell names no device: report the plan alone
         if dry is None or not dry.problems:
             raise
         answers = ()
     t.show(check_report(answers, dry))
     if save_calibration is not None:
-        told = told_by(answers)
-        if told is None:
+        kinematics = told_by(answers)
+        if kinematics is None:
             raise DeviceError("arm: it does not tell its kinematics; nothing is written")
-        replace_file(save_calibration, told.to_toml(), must_be_new=True)
+        replace_file(save_calibration, kinematics.to_toml(), must_be_new=True)
         t.show(f"The kinematics of the arm's controller are in {save_calibration}.")
     failed: HilcalError | None = None
-    judged = None
+    factory_result = None
     if factory is not None and (factory.exists() or not any(a.problems for a in answers)):
-        from hilcal.cli.running import factory_check  # which needs this file
+        from hilcal.cli.running import factory_check  # imports this module
 
-        judged = factory_check(t, config, numbers, catalogue, answers, factory, yes)
+        factory_result = factory_check(t, config, numbers, catalogue, answers, factory, yes)
     if names := ", ".join(a.device for a in answers if a.problems):
         failed = DeviceError(f"not ready: {names}; see above")
     elif dry is not None:
@@ -170,12 +170,12 @@ def check(
         ok=not any(a.problems for a in answers) and not (dry and dry.problems),
         devices=[answer_json(a) for a in answers],
         plan=None if dry is None else asdict(dry),
-        **{} if judged is None else {"factory": judged},
+        **{} if factory_result is None else {"factory": factory_result},
     )
 
 
 def answers_of(t: Terminal, config: CellConfig) -> tuple[ConnectionResult, ...]:
-    """Return what every device says of itself; nothing moves."""
+    """Return the report of every device; nothing moves."""
     with working(t.progress) as say:
         say("connecting to every device")
         rig, answers = connect(config)
@@ -185,14 +185,14 @@ def answers_of(t: Terminal, config: CellConfig) -> tuple[ConnectionResult, ...]:
 
 
 def dry_checked(t: Terminal, cell: Cell, config: CellConfig, plan: Plan) -> DryRun:
-    """Return the dry run of a plan, which takes seconds where it is long."""
+    """Return the dry run of a plan; shows progress, since a long plan takes seconds."""
     with working(t.progress) as say:
         say("checking every motion in a dry run")
         return dry_run(cell, config, plan)
 
 
 def read_cell(path: Path) -> tuple[CellConfig, Cell]:
-    """Return the configuration in a file, and the cell as numbers."""
+    """Return the configuration in a file, and its cell."""
     config = load_config(path)
     return config, cell_from_config(config, path.absolute().parent)
 
@@ -203,9 +203,9 @@ def make_plan(
     poses: int,
     seed: int,
     catalogue: Catalogue,
-    say: Say = lambda words: None,
+    say: Say = lambda text: None,
 ) -> Plan:
-    """Return a plan of so many poses, each read unloaded and under every load that it bears."""
+    """Return a plan whose poses are each read unloaded and under every load that they bear."""
     rng = np.random.default_rng(check_seed(seed))
     return with_origin(make(cell, config, Request(poses), rng, None, say, catalogue))
 
@@ -250,35 +250,35 @@ def next_(
     if poses is not None and poses < 1:
         raise InputError(f"--poses {poses}; valid: a whole number from 1")
     with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
-        given = None if cell is None else read_cell(cell)
+        changed = None if cell is None else read_cell(cell)
         doubt = _without_suspects(t, o, revision, _named(suspects, catalogue), say, carried)
         compare = (details or as_json) and not quick
-        n = next_plan(o, doubt, poses, rng, say, cell=given, compare=compare)
-        config, numbers = (o.config, o.cell) if given is None else given
-    found, made, effects = n.found, n.made, doubt.suspects
-    write(t, numbers, config, made, output, csv, record, found.powers)
+        planned = next_plan(o, doubt, poses, rng, say, cell=changed, compare=compare)
+        config, numbers = (o.config, o.cell) if changed is None else changed
+    chosen, checked_plan, effects = planned.found, planned.made, doubt.suspects
+    write(t, numbers, config, checked_plan, output, csv, record, chosen.powers)
     t.show(f"In doubt: {words_of.names(effects, 'or')}.\n")
     report = next_report if doubt.alone is None else poses_report
-    t.show(report(found, made.summary.poses, made.summary.readings, details))
-    t.show(plan_report(made.summary) if details else brief_plan(made.summary))
+    t.show(report(chosen, checked_plan.summary.poses, checked_plan.summary.readings, details))
+    t.show(plan_report(checked_plan.summary) if details else brief_plan(checked_plan.summary))
     t.show(f"The plan is in {output}. Measure it into the same campaign with:")
     t.show(
         f"  hilcal run {quoted(cell or 'CELL.toml')} -o {quoted(run)} --append "
         f"--plan {quoted(output)}"
     )
     t.document(
-        {**made.to_dict(), "plan": str(output), "suspects": list(effects), **separates(found)}
+        checked_plan.to_dict(), plan=str(output), suspects=list(effects), **separates(chosen)
     )
 
 
-def separates(found: Next) -> dict[str, object]:
-    """Return what a JSON document says of pairs; powers are those with the planned readings."""
+def separates(chosen: Next) -> dict[str, object]:
+    """Return the pairs of effects for JSON; "separates" is with the planned readings."""
     return {
-        "separates": [[t.effect, t.rival, t.then] for t in found.powers],
-        "separates_now": [[t.effect, t.rival, t.now] for t in found.powers],
-        "inseparable": [[t.effect, t.rival] for t in found.powers if t.not_separable],
-        "difference": found.shares,
-        "notes": list(found.notes),
+        "separates": [[t.effect, t.rival, t.then] for t in chosen.powers],
+        "separates_now": [[t.effect, t.rival, t.now] for t in chosen.powers],
+        "inseparable": [[t.effect, t.rival] for t in chosen.powers if t.not_separable],
+        "difference": chosen.shares,
+        "notes": list(chosen.notes),
     }
 
 
@@ -290,7 +290,7 @@ def _without_suspects(
     say: Say,
     prior: CarriedPrior | None,
 ) -> Doubt:
-    """Return the effects to separate, and a fit whose model does not hold them."""
+    """Return the effects to separate, and a fit whose model is without them."""
     number, newest = fit_of(t, o, say, revision)
     o.require_gc(number, newest.scaling, "next")
     if prior is not None:
@@ -303,12 +303,12 @@ def _without_suspects(
 
 
 def _named(text: str | None, catalogue: Catalogue) -> tuple[str, ...] | None:
-    """Read `--suspects`: names of effects, which have no options here."""
-    wanted = wanted_effects(text, catalogue, "--suspects")
-    if wanted is None:
+    """Read `--suspects`: names of effects without options."""
+    effects = wanted_effects(text, catalogue, "--suspects")
+    if effects is None:
         return None
-    for name in (name for name, options in wanted.items() if options):
+    for name in (name for name, options in effects.items() if options):
         raise InputError(f"--suspects: {name} takes no options here; valid: {name}")
-    if not 2 <= len(wanted) <= MOST:
-        raise InputError(f"--suspects has {len(wanted)} names; valid: 2 to {MOST}")
-    return tuple(wanted)
+    if not 2 <= len(effects) <= MOST:
+        raise InputError(f"--suspects has {len(effects)} names; valid: 2 to {MOST}")
+    return tuple(effects)

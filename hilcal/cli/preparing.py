@@ -1,4 +1,4 @@
-"""`init`: a CELL.toml to begin with; `doctor`: what an operator needs to know of this computer."""
+"""`init`: write a CELL.toml; `doctor`: examine this computer."""
 
 import re
 import sys
@@ -33,14 +33,14 @@ from hilcal.toml import check_section
 from hilcal.whole_file import replace_file
 
 SIMULATED = "simulated"  # Port of a device that exists in a rehearsal only
-CLOCK = 20.0  # How much faster than real time a rehearsal goes, as in the demo's cell
+CLOCK = 20.0  # Clock rate of a rehearsal relative to real time, as in the demo's cell
 UNITS: dict[str, dict[str, float]] = {
     "m": {**METRIC, "cm": 1e-2},
     "m/m": {"m/m": 1.0, "mm/m": 1e-3, "um/m": 1e-6, "µm/m": 1e-6, "μm/m": 1e-6},
     "kg": {"kg": 1.0, "g": 1e-3},
     "N": {"N": 1.0, "kN": 1e3},
 }
-"""Units that a quantity may be given in; it is in the first of them, SI, where none is given."""
+"""Units of each kind of quantity; the first one, SI, is the default."""
 _QUANTITY = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\W\d]+(?:/m)?)?")
 _LOAD = re.compile(r"(?:(?P<name>[^=]+)=)?(?P<values>[^=]*?\d[^=]*?(?P<unit>kg|g|N|kN))\s*")
 LOADS = 'e.g. "5 kg", or a pull in base axes: "pull x = 80, 0, 0 N"'
@@ -48,13 +48,13 @@ LOADS = 'e.g. "5 kg", or a pull in base axes: "pull x = 80, 0, 0 N"'
 
 @dataclass(slots=True)
 class Draft:
-    """A cell in the making; every answer is checked as it comes."""
+    """The draft of a cell; every answer is checked at once."""
 
-    base_dir: Path  # to which paths in it refer
-    data: dict[str, Any] = field(default_factory=dict)  # the sections so far, as TOML has them
+    base_dir: Path  # directory that paths are relative to
+    data: dict[str, Any] = field(default_factory=dict)  # the sections, as in TOML
 
     def set(self, section: str, **values: object) -> None:
-        """Set keys of a section; nothing is set where a value is not valid."""
+        """Set keys of a section; none is set if a value is not valid."""
         data = deepcopy(self.data)
         data.setdefault(section, {}).update(values)
         self._take(data)
@@ -63,139 +63,139 @@ class Draft:
         check_section(data, CellConfig, "the answer")
         self.data = data
 
-    def answer(self, asked: str, words: str) -> None:
-        """Put the answer to a question, by the parameter of its option, into the cell."""
-        match asked:
+    def answer(self, parameter: str, text: str) -> None:
+        """Enter the answer to the question of an option's parameter."""
+        match parameter:
             case "robot":
-                load_arm(words, self.base_dir)
-                self.set("robot", model=words)
+                load_arm(text, self.base_dir)
+                self.set("robot", model=text)
             case "host":
-                if not re.fullmatch(r"[\w.:-]+", words):
-                    raise InputError(f'{words!r} is no address; valid: e.g. "192.168.56.101"')
+                if not re.fullmatch(r"[\w.:-]+", text):
+                    raise InputError(f'{text!r} is no address; valid: e.g. "192.168.56.101"')
                 names = drivers(devices.ARMS)
-                self.set("robot", driver="ur" if "ur" in names else names[0], host=words)
+                self.set("robot", driver="ur" if "ur" in names else names[0], host=text)
             case "repeatability":
-                self.set("robot", repeatability_m=number(words, "m"))
+                self.set("robot", repeatability_m=number(text, "m"))
             case "tracker":
-                driver(devices.TRACKERS, words, "[tracker] driver")
-                self.set("tracker", driver=words)
+                driver(devices.TRACKERS, text, "[tracker] driver")
+                self.set("tracker", driver=text)
             case "force_sensor":
-                driver(devices.FORCE_SENSORS, words, "[force_sensor] driver")
-                self.set("force_sensor", driver=words, port=SIMULATED)
+                driver(devices.FORCE_SENSORS, text, "[force_sensor] driver")
+                self.set("force_sensor", driver=text, port=SIMULATED)
             case "tracker_port" | "force_port":  # a serial port, which is a path, or an address
-                section = {"tracker_port": "tracker", "force_port": "force_sensor"}[asked]
+                section = {"tracker_port": "tracker", "force_port": "force_sensor"}[parameter]
                 self.data[section].pop("port", None)
-                self.set(section, **{"port" if "/" in words else "host": words})
+                self.set(section, **{"port" if "/" in text else "host": text})
             case "tracker_accuracy":
-                fixed, _, growing = words.partition("+")
+                fixed, _, growing = text.partition("+")
                 std, per_m = number(fixed, "m"), number(growing, "m/m") if growing else 0.0
                 keys = ("range_std", "transverse_std")
                 values = {f"{k}_m": std for k in keys} | {f"{k}_per_m": per_m for k in keys}
                 self.set("tracker", **values)
             case "target" | "load_point" | "tool_com":
                 key = {"target": "target_m", "load_point": "load_point_m", "tool_com": "com_m"}
-                self.set("tool", **{key[asked]: vector(words, "m")})
+                self.set("tool", **{key[parameter]: vector(text, "m")})
             case "tool_mass":
-                self.set("tool", mass_kg=number(words, "kg"))
+                self.set("tool", mass_kg=number(text, "kg"))
             case "load":
-                self._add_load(words)
+                self._add_load(text)
             case "readings":
-                if words == "deflection" and not self.data.get("loads"):
+                if text == "deflection" and not self.data.get("loads"):
                     raise InputError('"deflection" needs a load; valid without one: absolute')
-                self.set("planning", readings=words)
+                self.set("planning", readings=text)
             case "floor":
                 reach = load_arm(self.data["robot"]["model"], self.base_dir).reach
                 side = round(2.0 * reach, 1)
-                self.set("limits", workspace_min_m=[-side, -side, number(words, "m")])
+                self.set("limits", workspace_min_m=[-side, -side, number(text, "m")])
             case "tracker_place":
-                self.set("sight", tracker_m=vector(words, "m"))
+                self.set("sight", tracker_m=vector(text, "m"))
 
-    def _add_load(self, words: str) -> None:
-        match = _LOAD.fullmatch(words)
+    def _add_load(self, text: str) -> None:
+        match = _LOAD.fullmatch(text)
         if match is None:
-            raise InputError(f"{words!r} is no load; valid: {LOADS}")
-        one: dict[str, object] = {"name": (match["name"] or words.replace(" ", "")).strip()}
+            raise InputError(f"{text!r} is no load; valid: {LOADS}")
+        load: dict[str, object] = {"name": (match["name"] or text.replace(" ", "")).strip()}
         if match["unit"] in UNITS["kg"]:
-            one["mass_kg"] = number(match["values"], "kg")
+            load["mass_kg"] = number(match["values"], "kg")
         else:
-            one["force_N"] = vector(match["values"], "N")
-        self._take({**self.data, "loads": [*self.data.get("loads", ()), one]})
+            load["force_N"] = vector(match["values"], "N")
+        self._take({**self.data, "loads": [*self.data.get("loads", ()), load]})
 
 
-def number(words: str, unit: str) -> float:
-    """Read a number, in `unit` or in the one that is behind it."""
-    found = _quantities(words, unit)
-    if len(found) != 1:
-        raise InputError(f"{words.strip()!r} is no number; valid: one in {unit}")
-    return found[0]
+def number(text: str, unit: str) -> float:
+    """Read a number; its unit may follow, else it is `unit`."""
+    values = _quantities(text, unit)
+    if len(values) != 1:
+        raise InputError(f"{text.strip()!r} is no number; valid: one in {unit}")
+    return values[0]
 
 
-def vector(words: str, unit: str) -> list[float]:
-    """Read three numbers, in `unit`, or each or all with the one behind it or them."""
-    found = _quantities(words, unit)
-    if len(found) != 3:
-        many = f"{len(found)} number{'s' * (len(found) != 1)}"
-        raise InputError(f"{words.strip()!r} is {many}; valid: three in {unit}")
-    return found
+def vector(text: str, unit: str) -> list[float]:
+    """Read three numbers; one unit may follow each or all, else it is `unit`."""
+    values = _quantities(text, unit)
+    if len(values) != 3:
+        count = f"{len(values)} number{'s' * (len(values) != 1)}"
+        raise InputError(f"{text.strip()!r} is {count}; valid: three in {unit}")
+    return values
 
 
-def _quantities(words: str, unit: str) -> list[float]:
-    """Read numbers with their units; empty where anything else is among them."""
-    known, found = UNITS[unit], _QUANTITY.findall(words)
-    if _QUANTITY.sub("", words).strip("[](),; \t").replace(",", "").replace(";", "").strip():
+def _quantities(text: str, unit: str) -> list[float]:
+    """Read numbers with their units; empty where the text has anything else."""
+    factor_of, matches = UNITS[unit], _QUANTITY.findall(text)
+    if _QUANTITY.sub("", text).strip("[](),; \t").replace(",", "").replace(";", "").strip():
         return []
-    given = [u for _, u in found if u]
-    for u in given:
-        if u not in known:
-            raise InputError(f"{words.strip()!r} has the unit {u}; valid: {', '.join(known)}")
-    if len(given) == 1 and found[-1][1]:
-        given *= len(found)
-    if given and len(given) != len(found):
-        raise InputError(f"{words.strip()!r} has units behind some numbers only; valid: all or one")
-    factors = [known[u] for u in given] or [1.0] * len(found)
-    return [round(float(x) * f, 12) for (x, _), f in zip(found, factors, strict=True)]
+    stated = [u for _, u in matches if u]
+    for u in stated:
+        if u not in factor_of:
+            raise InputError(f"{text.strip()!r} has the unit {u}; valid: {', '.join(factor_of)}")
+    if len(stated) == 1 and matches[-1][1]:
+        stated *= len(matches)
+    if stated and len(stated) != len(matches):
+        raise InputError(f"{text.strip()!r} has units behind some numbers only; valid: all or one")
+    factors = [factor_of[u] for u in stated] or [1.0] * len(matches)
+    return [round(float(x) * f, 12) for (x, _), f in zip(matches, factors, strict=True)]
 
 
 def drivers(group: str) -> list[str]:
-    """Names of the drivers that are installed for one kind of device."""
+    """Return the names of the installed drivers for a kind of device."""
     return sorted({point.name for point in entry_points(group=group)})
 
 
 def ports() -> list[str]:
-    """Serial ports of this computer, by names that stay the same where there are such."""
+    """Return the serial ports of this computer, by persistent names where they have one."""
     from serial.tools import list_ports  # takes a while
 
-    there = [p.device for p in list_ports.comports()]
+    port_names = [p.device for p in list_ports.comports()]
     folder = Path("/dev/serial/by-id")
-    steady = sorted(folder.iterdir()) if folder.is_dir() else []
-    named = {str(p.resolve()): str(p) for p in steady}
-    return [named.get(device, device) for device in there]
+    links = sorted(folder.iterdir()) if folder.is_dir() else []
+    named = {str(p.resolve()): str(p) for p in links}
+    return [named.get(device, device) for device in port_names]
 
 
 @dataclass(frozen=True, slots=True)
 class CellQuestion:
-    """One thing that is asked for."""
+    """A question about the cell."""
 
-    asked: str  # parameter of the option that gives it without a question
-    words: str
-    without: str = ""  # what an empty answer means; empty where there has to be one
+    parameter: str  # parameter of the option that answers the question
+    text: str
+    default: str = ""  # meaning of an empty answer; empty where an answer is needed
 
     @property
     def option(self) -> str:
-        """The option that gives it without a question."""
-        return "--" + self.asked.replace("_", "-")
+        """The option that answers the question."""
+        return "--" + self.parameter.replace("_", "-")
 
     @property
     def needs(self) -> str:
-        """The section that must be there for it to be asked."""
+        """The section without which the question does not arise; may be empty."""
         needed = {"tracker_port": "tracker", "force_port": "force_sensor", "tool_com": "tool"}
-        return needed.get(self.asked, "")
+        return needed.get(self.parameter, "")
 
 
 def questions() -> list[CellQuestion]:
-    """Return all that is asked for, in order."""
+    """Return all questions, in order."""
     trackers, sensors = drivers(devices.TRACKERS), drivers(devices.FORCE_SENSORS)
-    written = f"""
+    text = f"""
 robot | Which arm? One of {", ".join(robot_names())}, or {OTHER_ARMS} |
 host | Address of its controller | not connected yet
 repeatability | What pose repeatability does its maker state (ISO 9283)? E.g. 0.05 mm |
@@ -217,7 +217,7 @@ floor | What height must arm and load stay above? In m, base axes | no limit
 tracker_place | Where does the tracker stand, roughly? x, y, z in m, base axes |
     not known: sight is not checked
 """
-    lines = written.replace("\n    ", " ").strip().splitlines()
+    lines = text.replace("\n    ", " ").strip().splitlines()
     return [CellQuestion(*(part.strip() for part in line.split(" |"))) for line in lines]
 
 
@@ -253,20 +253,20 @@ def init(
     """Write a commented CELL.toml: asks at a terminal, else takes the options."""
     t = terminal(as_json)
     options = {f"--{name.replace('_', '-')}": value for name, value in locals().items()}
-    there = somebody_there(t) and not as_json
+    asks = somebody_there(t) and not as_json
     check_folder(cell, str(cell))
-    check_new(cell, force or (there and cell.exists() and agreed(t, f"{cell} exists. Replace it?")))
+    check_new(cell, force or (asks and cell.exists() and agreed(t, f"{cell} exists. Replace it?")))
     draft = Draft(cell.absolute().parent)
-    if there:
+    if asks:
         t.notice(f"Enter alone leaves a thing open; Ctrl-C ends, and {cell} is not written.\n")
     for question in questions():
-        given = options[question.option]
-        if given is not None:
-            for words in given if isinstance(given, list) else [given]:
-                _from_option(draft, question, words)
-        elif there:
+        stated = options[question.option]
+        if stated is not None:
+            for text in stated if isinstance(stated, list) else [stated]:
+                _from_option(draft, question, text)
+        elif asks:
             _ask(t, draft, question)
-        elif question.asked == "robot":
+        elif question.parameter == "robot":
             raise InputError(
                 f"--robot is missing, and nobody can be asked; valid: {', '.join(robot_names())}, "
                 f"or {OTHER_ARMS}"
@@ -285,48 +285,48 @@ def init(
 
 
 def _lacking(draft: Draft) -> str:
-    """Say which keys the cell still needs before it can be measured."""
+    """Return a clause with the keys that the cell lacks for measuring."""
     connection = "host" if "host" in draft.data.get("tracker", {}) else "port"
     keys = (("robot", "driver"), ("robot", "host"), ("tracker", "driver"), ("tracker", connection))
-    wanted = [f"[{s}] {key}" for s, key in keys if key not in draft.data.get(s, {})]
-    return f", once it has {' and '.join(wanted)}" if wanted else ""
+    missing = [f"[{s}] {key}" for s, key in keys if key not in draft.data.get(s, {})]
+    return f", once it has {' and '.join(missing)}" if missing else ""
 
 
-def _from_option(draft: Draft, question: CellQuestion, words: str) -> None:
+def _from_option(draft: Draft, question: CellQuestion, text: str) -> None:
     if question.needs and question.needs not in draft.data:
         raise InputError(
             f"{question.option} without --{question.needs.replace('_', '-')}; give both"
         )
     try:
-        draft.answer(question.asked, words.strip())
+        draft.answer(question.parameter, text.strip())
     except InputError as error:
-        raise InputError(f'{question.option} "{words}": {_shortly(error)}') from None
+        raise InputError(f'{question.option} "{text}": {_shortly(error)}') from None
 
 
 def _ask(t: Terminal, draft: Draft, question: CellQuestion) -> None:
-    """Ask until the answer is valid, or empty where that means something."""
+    """Ask until the answer is valid, or empty where the question has a default."""
     if question.needs and question.needs not in draft.data:
         return
-    if question.asked.endswith("_port"):
+    if question.parameter.endswith("_port"):
         t.notice(f"Serial ports here: {', '.join(ports()) or 'none'}.")
-    words = question.words + (f" (Enter: {question.without}):" if question.without else ":")
+    prompt = question.text + (f" (Enter: {question.default}):" if question.default else ":")
     while True:
-        t.progress.print(words, markup=False, highlight=False, style="bold")
+        t.progress.print(prompt, markup=False, highlight=False, style="bold")
         t.progress.print("> ", end="", markup=False, highlight=False)
         answer = sys.stdin.readline()
         if not answer:
             raise StoppedError("nothing is written: the input ended")
         answer = answer.strip()
-        if not answer and question.without:
+        if not answer and question.default:
             return
         try:
-            draft.answer(question.asked, answer)
+            draft.answer(question.parameter, answer)
         except InputError as error:
             t.notice(f"  Not so: {_shortly(error)}")
             continue
-        if question.asked != "load":
+        if question.parameter != "load":
             return
-        words = "Another one (Enter: no more):"
+        prompt = "Another one (Enter: no more):"
 
 
 def _shortly(error: InputError) -> str:
@@ -334,7 +334,7 @@ def _shortly(error: InputError) -> str:
 
 
 def _complete(draft: Draft) -> None:
-    """Add what a plan and a rehearsal need, and check the whole."""
+    """Add the keys that a plan and a rehearsal need, and check the cell."""
     if draft.data.setdefault("planning", {}).setdefault("readings", "absolute") == "absolute":
         loaded = () if not draft.data.get("loads") else LOADED
         draft.set("planning", model=[*GEOMETRY, *loaded])
@@ -389,4 +389,4 @@ def _ports(config: CellConfig | None) -> dict[str, str]:
     ports = {"tracker": config.tracker.port}
     if config.force_sensor is not None:
         ports["force sensor"] = config.force_sensor.port
-    return {what: port for what, port in ports.items() if port and port != SIMULATED}
+    return {device: port for device, port in ports.items() if port and port != SIMULATED}

@@ -72,7 +72,7 @@ from hilcal.whole_file import replace_file
 
 
 def chapters_of(numbers: Iterable[int], steps: Iterable[RefinementStep]) -> list[Chapter]:
-    """Return the steps of a refinement by the numbers of their revisions."""
+    """Return the steps of a refinement as chapters with the numbers of their revisions."""
     return [
         Chapter(number, s.added, s.fit, s.diagnosis, s.removed)
         for number, s in zip(numbers, steps, strict=True)
@@ -80,16 +80,16 @@ def chapters_of(numbers: Iterable[int], steps: Iterable[RefinementStep]) -> list
 
 
 def errors_by_revision(chapters: Sequence[Chapter], stored: str = "") -> list[Block]:
-    """Return the table in which the error falls, and what its columns are.
+    """Return the table of errors by revision, and the key of its columns.
 
-    `stored` is the verdict on a chapter that has no diagnosis.
+    `stored` is the verdict of a chapter without a diagnosis.
     """
     rows = [(c.number, changed(c), c.fit, _verdict(c, stored)) for c in chapters]
     return [revisions_table(rows), key(chapters[-1].fit.readings)]
 
 
 def changed(c: Chapter) -> str:
-    """Return what a revision changed; empty for a first model."""
+    """Return the change that a revision makes; empty for a first model."""
     return change(c.added, c.removed, c.fit.readings.arm_scatter is not None)
 
 
@@ -105,13 +105,13 @@ def diagnose(
     """Say which effect the model lacks."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
-        number, found = fit_of(t, o, say, revision)
-        o.require_gc(number, found.scaling, "diagnosing")
+        number, fitted = fit_of(t, o, say, revision)
+        o.require_gc(number, fitted.scaling, "diagnosing")
         say("diagnosing" if number is None else f"diagnosing revision {number}")
-        d = judge(found, o.history(number), say)
-        finish(found, say)
+        d = judge(fitted, o.history(number), say)
+        finish(fitted, say)
     t.show(diagnosis_report(d))
-    t.show(torque_lines(check_torques(found.model.cell, found.readings)))
+    t.show(torque_lines(check_torques(fitted.model.cell, fitted.readings)))
     t.document({"revision": number, **to_json(d)})
 
 
@@ -124,10 +124,10 @@ def add(
 ) -> None:  # fmt: skip
     """Add an effect to the model: error before and after."""
     catalogue = catalogue_with(effects_from)
-    wanted = read_effects_text(effect, "EFFECT", catalogue)
-    if len(wanted) != 1:
-        raise InputError(f"EFFECT {effect!r} has {len(wanted)} effects; valid: one")
-    ((name, options),) = wanted.items()
+    effects = read_effects_text(effect, "EFFECT", catalogue)
+    if len(effects) != 1:
+        raise InputError(f"EFFECT {effect!r} has {len(effects)} effects; valid: one")
+    ((name, options),) = effects.items()
     _change(run, revision, name, record, view, as_json, catalogue, options)
 
 
@@ -154,29 +154,29 @@ def _change(
     catalogue: Catalogue,
     options: Options | None = None,
 ) -> None:
-    """Make a revision with one effect more, which has `options`, or one less."""
+    """Make a revision with an additional effect; without `options`, with the effect removed."""
     t, adds = terminal(as_json), options is not None
     check_record(record)
     with Campaign.open(run, catalogue) as o, followed(t, view, run) as live:
         check_options(o, {effect: options or {}} if adds else {})
         with working(t.progress) as say:
-            number, before = stored_fit(t, o, say, revision)
+            number, previous = stored_fit(t, o, say, revision)
             if live is not None:
                 for chapter in o.chapters(say, number):
                     live.revised(chapter)
             if options is None:
-                c = remove_effect(o, number, before, effect, say)
+                c = remove_effect(o, number, previous, effect, say)
             else:
-                c = add_effect(o, number, before, effect, options, say)
-            made = Chapter(c.number, c.added, c.fit, c.diagnosis, c.removed)
+                c = add_effect(o, number, previous, effect, options, say)
+            new = Chapter(c.number, c.added, c.fit, c.diagnosis, c.removed)
             if live is not None:
-                live.revised(made)
-        first, d = o.file.revision(number), c.diagnosis
-        verdict = str(first.result_json.get("diagnose", {}).get("verdict", ""))
-        both = [Chapter(number, first.added, before, None, first.removed), made]
-        t.show(errors_by_revision(both, verdict))
+                live.revised(new)
+        old, d = o.file.revision(number), c.diagnosis
+        verdict = str(old.result_json.get("diagnose", {}).get("verdict", ""))
+        pair = [Chapter(number, old.added, previous, None, old.removed), new]
+        t.show(errors_by_revision(pair, verdict))
         named = write_effect(effect, options or {})
-        t.show(fell(before, c.fit, named) if adds else rose(before, c.fit, effect))
+        t.show(fell(previous, c.fit, named) if adds else rose(previous, c.fit, effect))
         t.show([] if c.expected is None else addition_lines(c.expected))
         t.show(["", verdict_line(d)])
         if record is not None:
@@ -184,7 +184,7 @@ def _change(
                 chapters = o.chapters(say, c.number)
             record_story(t, chapters, record)
     t.document(
-        revisions=revisions_json(both, verdict),
+        revisions=revisions_json(pair, verdict),
         verdict=d.verdict,
         message=message(d),
         **{} if c.expected is None else {"addition": suspect_json(c.expected)},
@@ -212,10 +212,10 @@ def refine(
     named = wanted_effects(effects, catalogue)
     check_record(record)
     start = "--revision" if revision is not None else "--from-latest" if from_latest else ""
-    given = named is not None or readings is not None or prior.prior is not None
-    if start and (given or (from_latest and revision)):
+    stated = named is not None or readings is not None or prior.prior is not None
+    if start and (stated or (from_latest and revision)):
         raise InputError(f"{start} keeps effects and readings; leave out the other options")
-    known = prior.load(catalogue)
+    carried = prior.load(catalogue)
     laws = LawSearch(run.absolute().parent) if discover else None
     with Campaign.open(run, catalogue) as o, followed(t, view, run) as live:
         refuse_fitting(o.file)
@@ -231,71 +231,72 @@ def refine(
                 model, fitted = restored.model, restored.readings
             else:
                 say("registering")
-                model, fitted = starting_model(o, mode, named, known), o.readings
-            how = NOTHING if latest is None else o.history(latest.number)
-            begun = () if latest is None else (latest.number,)
-            numbers_to_be = itertools.chain(begun, itertools.count(len(o.file.revisions()) + 1))
+                model, fitted = starting_model(o, mode, named, carried), o.readings
+            history = NOTHING if latest is None else o.history(latest.number)
+            origin = () if latest is None else (latest.number,)
+            numbers_to_be = itertools.chain(origin, itertools.count(len(o.file.revisions()) + 1))
 
             def judged(step: RefinementStep) -> None:
                 if live is not None:
                     live.revised(*chapters_of([next(numbers_to_be)], [step]))
 
-            found = refine_model(model, fitted, mode, say, how, laws, judged, background)
+            refinement = refine_model(model, fitted, mode, say, history, laws, judged, background)
             if laws is not None:
-                laws.write(found.names)
-            for step in found.steps:
+                laws.write(refinement.names)
+            for step in refinement.steps:
                 finish(step.fit, say)
             records = [
-                o.record(s.fit, s.diagnosis, s.added, s.removed) for s in found.steps[len(begun) :]
+                o.record(s.fit, s.diagnosis, s.added, s.removed)
+                for s in refinement.steps[len(origin) :]
             ]
-            before = len(o.file.revisions())
-            numbered = (*begun, *o.append_records(records, *begun))
-            chapters = chapters_of(numbered, found.steps)
+            n_revisions = len(o.file.revisions())
+            numbered = (*origin, *o.append_records(records, *origin))
+            chapters = chapters_of(numbered, refinement.steps)
         t.show(errors_by_revision(chapters))
-        t.show(options_line(found.fit))
+        t.show(options_line(refinement.fit))
         if o.noise is not None:
             t.show(numbers.sentence(covariance_words(o.covariance_parts, o.noise)))
-        t.show(set_aside(found.fit, details))
-        t.show(verdict_line(found.diagnosis))
-        if numbered[-1] <= before:
+        t.show(set_aside(refinement.fit, details))
+        t.show(verdict_line(refinement.diagnosis))
+        if numbered[-1] <= n_revisions:
             t.show(f"Revision {numbered[-1]} is this model already; nothing was stored.")
-        t.show([*fitted_lines(found.fit)][: None if details else 1])
-        t.show(prior_lines(found.fit))
-        other = other_arm_of(o.cell, o.readings) if latest is None else None
-        if other is not None:
-            t.show(other_arm_line(other))
-        if weight := masses_note(found.fit):
-            t.show(numbers.sentence(weight))
-        if found.rejected:
+        t.show([*fitted_lines(refinement.fit)][: None if details else 1])
+        t.show(prior_lines(refinement.fit))
+        other_arm = other_arm_of(o.cell, o.readings) if latest is None else None
+        if other_arm is not None:
+            t.show(other_arm_line(other_arm))
+        if note := masses_note(refinement.fit):
+            t.show(numbers.sentence(note))
+        if refinement.rejected:
             t.show(
                 f"Tried and left out, since the error on poses left out did not fall: "
-                f"{', '.join(found.rejected)}."
+                f"{', '.join(refinement.rejected)}."
             )
         if laws is not None:
             t.show(refined_laws(laws))
-        last = found.diagnosis
-        if last.verdict != "adequate" and not last.dependences:
-            t.show(follows(last.misfit_breakdown))
-        t.show([*curves(last.dependences, len(last.dependences) if details else 1)])
-        if live is not None:  # its verdict may have changed when others were tried
+        diagnosis = refinement.diagnosis
+        if diagnosis.verdict != "adequate" and not diagnosis.dependences:
+            t.show(follows(diagnosis.misfit_breakdown))
+        t.show([*curves(diagnosis.dependences, len(diagnosis.dependences) if details else 1)])
+        if live is not None:  # its verdict may have changed when further effects were tried
             live.revised(chapters[-1])
         record_story(t, chapters, record)
     t.document(
         revisions=revisions_json(chapters),
-        verdict=last.verdict,
-        message=message(last),
-        rejected=list(found.rejected),
-        background=background_of(found.fit).to_json(),
+        verdict=diagnosis.verdict,
+        message=message(diagnosis),
+        rejected=list(refinement.rejected),
+        background=background_of(refinement.fit).to_json(),
         **{} if laws is None else laws_json(laws),
-        frames=frames_to_json(found.fit),
-        **prior_to_json(found.fit),
-        other_arm=None if other is None else other.to_json(),
-        diagnosis=to_json(last),
+        frames=frames_to_json(refinement.fit),
+        **prior_to_json(refinement.fit),
+        other_arm=None if other_arm is None else other_arm.to_json(),
+        diagnosis=to_json(diagnosis),
     )
 
 
 def revisions_json(chapters: Iterable[Chapter], stored: str = "") -> list[dict[str, object]]:
-    """Return what the contract says of each revision; `stored` is as in `errors_by_revision`."""
+    """Return the revisions for JSON; `stored` is as in `errors_by_revision`."""
     return [
         {
             "revision": r.number,
@@ -326,35 +327,35 @@ def discover(
 ) -> None:  # fmt: skip
     """Search a law for what no effect explains, and write it as an effect."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
-    wanted = _effects_against(against, catalogue)
+    effects = _effects_against(against, catalogue)
     name = output.stem
     if output.suffix != ".py" or not NAME.fullmatch(name) or name in catalogue.names:
         raise InputError(
             f"-o {output}: the effect is called after its file; valid: lower-case letters, digits "
             "and _, a letter first, .py at the end, and no name of the catalogue"
         )
-    if wanted is not None and revision is not None:
+    if effects is not None and revision is not None:
         raise InputError("--against and --revision: give one of them")
     check_folder(output, f"-o {output}")
     with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
         number: int | None = None
-        if wanted is None:
-            number, found = fit_of(t, o, say, revision)
+        if effects is None:
+            number, fitted = fit_of(t, o, say, revision)
         else:
-            check_options(o, wanted)
-            model = starting_model(o, o.mode(), wanted or None)
+            check_options(o, effects)
+            model = starting_model(o, o.mode(), effects or None)
             say(f"fitting {model_name(model.named)}")
-            found = with_serial_noise(fit(model, o.readings, o.mode()))
-        d = search(found, say, name)
+            fitted = with_serial_noise(fit(model, o.readings, o.mode()))
+        d = search(fitted, say, name)
     document = {"revision": number, **discovery_json(d), "written": None}
     t.show(discovery_report(d))
     if not d.laws:
         t.document(document, CannotAnswerError(silence(d)))
     rivals = rival_sources(d) if alternatives else {}
     written = {name: d.source, **rivals}
-    places = {own: output.with_name(f"{own}.py") for own in written}
-    for own, source in written.items():
-        replace_file(places[own], source)
+    places = {effect: output.with_name(f"{effect}.py") for effect in written}
+    for effect, source in written.items():
+        replace_file(places[effect], source)
     t.show(
         f"\n{output} has the first law as the effect {name}. Add it, and judge the model with it:"
     )
@@ -364,16 +365,16 @@ def discover(
         t.show("No other law explains these readings as well.")
     if rivals:
         t.show("Plan the measurements that separate it from what explains these readings as well:")
-        files = " ".join(f"--effects-from {quoted(places[own])}" for own in written)
+        files = " ".join(f"--effects-from {quoted(places[effect])}" for effect in written)
         t.command(f"hilcal next {quoted(run)} -o PLAN.json --suspects {','.join(written)} {files}")
-    others = [{"name": own, "written": str(places[own])} for own in rivals]
-    t.document({**document, "written": str(output), "alternatives": others})
+    rival_files = [{"name": effect, "written": str(places[effect])} for effect in rivals]
+    t.document({**document, "written": str(output), "alternatives": rival_files})
 
 
 def _effects_against(
     model: str | None, catalogue: Catalogue
 ) -> dict[str, dict[str, object]] | None:
-    """Read `--against`: options of effects by name; none of them for the baseline."""
+    """Read `--against`: options of effects by name; empty for the baseline."""
     if model == "baseline":
         return {}
     if model is None or not model.endswith(".json"):

@@ -1,4 +1,4 @@
-"""`run` and `simulate`: campaigns on devices, in a simulated cell, or drawn at once."""
+"""`run` and `simulate`: campaigns on devices, in a simulated cell, or drawn without devices."""
 
 import shlex
 import signal
@@ -103,7 +103,7 @@ def run(
     config, numbers = read_cell(cell)
     goal = None if until is None else GoalRule(until, numbers, config, catalogue)
     base_dir = cell.absolute().parent
-    if rehearse:  # what cannot be hidden is refused before anything is planned
+    if rehearse:  # refuses an effect that cannot be hidden before anything is planned
         as_told(config, config.simulation.hide or NOTHING, catalogue)
     with ExitStack() as stack:
         further: Plan | None = None
@@ -116,7 +116,7 @@ def run(
                 raise InputError("--append needs the further plan: give it with --plan PLAN")
             campaign = stack.enter_context(CampaignFile.open(output, check_revisions=False))
             check_same_cell(campaign, config, base_dir)
-            made = RunLog(campaign).plans[0]
+            campaign_plan = RunLog(campaign).plans[0]
             if plan is not None:
                 further = RunLog(campaign).with_new_names(load_plan(plan))
                 refuse(dry_checked(t, numbers, config, further), str(plan))
@@ -126,25 +126,27 @@ def run(
                     f"{output}: the file exists; go on with it by --resume, add a plan by "
                     "--append, or choose another name"
                 )
-            made = load_plan(plan) if plan else _own_plan(t, cell, config, numbers, catalogue, yes)
-            refuse(dry_checked(t, numbers, config, made), str(plan or "the plan"))
+            campaign_plan = (
+                load_plan(plan) if plan else _default_plan(t, cell, config, numbers, catalogue, yes)
+            )
+            refuse(dry_checked(t, numbers, config, campaign_plan), str(plan or "the plan"))
         if rehearse:
             with working(t.progress) as say:
                 say("starting the simulated devices")
                 choice, seed = config.simulation.hide or NOTHING, config.simulation.seed
-                secret = case_of_plan(config, made, choice, seed, catalogue, base_dir)
+                secret = case_of_plan(config, campaign_plan, choice, seed, catalogue, base_dir)
                 config = stack.enter_context(simulated_cell(secret, seed, base_dir)).config
         if further is not None:
             RunLog(campaign).append(further)
         elif not resume:
-            campaign = stack.enter_context(create_run(output, config, base_dir, made))
+            campaign = stack.enter_context(create_run(output, config, base_dir, campaign_plan))
         planned = len(RunLog(campaign).plan.steps) * len(numbers.all_targets)
-        more = ["--rehearse"] * rehearse + ["--view"] * view
-        more += [] if until is None else ["--until", until]
-        more += [word for path in effects_from or () for word in ("--effects-from", str(path))]
-        on = shlex.join(("hilcal", "run", str(cell), "-o", str(output), "--resume", *more))
+        options = ["--rehearse"] * rehearse + ["--view"] * view
+        options += [] if until is None else ["--until", until]
+        options += [word for path in effects_from or () for word in ("--effects-from", str(path))]
+        line = shlex.join(("hilcal", "run", str(cell), "-o", str(output), "--resume", *options))
         live = stack.enter_context(followed(t, view, output))
-        with _says_how_to_resume(campaign, planned, on):
+        with _resumable(campaign, planned, line):
             measured = measure(t, config, numbers, campaign, goal, viewer=live)
     document: dict[str, object] = {"campaign": str(output), "readings": measured}
     document["planned"] = planned
@@ -152,46 +154,45 @@ def run(
         document["goal"] = goal.status.to_dict()
         if goal.status.met:
             t.show(f'The goal "{goal.goal.text}" is met: {full_words(goal.status)}.')
-    of = "" if measured == planned else f" of {planned}"
-    t.show(f"{measured}{of} readings are in {output}. Go on with: hilcal refine {quoted(output)}")
+    count = f"{measured}" if measured == planned else f"{measured} of {planned}"
+    t.show(f"{count} readings are in {output}. Go on with: hilcal refine {quoted(output)}")
     missed: CannotAnswerError | None = None
     if goal is not None and not goal.status.met:
-        on = f"hilcal plan {quoted(cell)} -o more.json --after {quoted(output)}"
-        words = f"{missed_words(goal.status, measured)}; plan on with: {on}"
-        missed = CannotAnswerError(words)
+        line = f"hilcal plan {quoted(cell)} -o more.json --after {quoted(output)}"
+        missed = CannotAnswerError(f"{missed_words(goal.status, measured)}; plan on with: {line}")
     t.document(document, missed)
 
 
-def _own_plan(
+def _default_plan(
     t: Terminal, path: Path, config: CellConfig, cell: Cell, catalogue: Catalogue, yes: bool
 ) -> Plan:
-    """Make a plan, show it, and ask whether to measure it, where somebody can be asked."""
+    """Make a plan and show it; ask whether to measure it, unless `yes` or nobody can answer."""
     with working(t.progress) as say:
         seed = check_seed(config.simulation.seed)
         rng = np.random.default_rng(seed)
-        made = checked_plan(cell, config, POSES, rng, catalogue, say)
-    t.show(plan_facts(made.summary))
-    whole = ("hilcal", "plan", str(path), "-o", "plan.json", *(("--seed", str(seed)) * bool(seed)))
-    if notes := len(made.summary.remarks):
+        planned = checked_plan(cell, config, POSES, rng, catalogue, say)
+    t.show(plan_facts(planned.summary))
+    options = ("--seed", str(seed)) if seed else ()
+    line = shlex.join(("hilcal", "plan", str(path), "-o", "plan.json", *options))
+    if notes := len(planned.summary.remarks):
         t.show(f"What it assumes and leaves out ({notes} note{'s' * (notes > 1)}):")
-        t.command(shlex.join(whole))
+        t.command(line)
     if yes or not somebody_there(t):
-        return made.plan
+        return planned.plan
     t.notice("")
     if not agreed(t, "Measure this plan now? The arm will move."):
         raise StoppedError(
-            "not measured, nothing has moved. To see, keep or change the whole plan: "
-            + shlex.join(whole)
+            f"not measured, nothing has moved. To see, keep or change the whole plan: {line}"
         )
-    return made.plan
+    return planned.plan
 
 
 @contextmanager
-def _says_how_to_resume(campaign: CampaignFile, planned: int, on: str) -> Iterator[None]:
-    """Let whatever ends a run early say what is safe, and the line that goes on."""
+def _resumable(campaign: CampaignFile, planned: int, line: str) -> Iterator[None]:
+    """Add the number of stored readings and the command that resumes to errors of a run."""
 
     def safe() -> str:
-        return f"{campaign.n_readings} of {planned} readings are safe; go on with: {on}"
+        return f"{campaign.n_readings} of {planned} readings are safe; go on with: {line}"
 
     try:
         try:
@@ -199,15 +200,15 @@ def _says_how_to_resume(campaign: CampaignFile, planned: int, on: str) -> Iterat
         finally:
             campaign.check_place()
     except MovedFileError as error:
-        words = str(error).removesuffix(HOW_ON).rstrip(". ")
-        raise MovedFileError(f"{words}; then go on with: {on}") from error
+        message = str(error).removesuffix(HOW_ON).rstrip(". ")
+        raise MovedFileError(f"{message}; then go on with: {line}") from error
     except KeyboardInterrupt:
         raise StoppedError(f"interrupted: the arm stands, {safe()}") from None
     except HilcalError as error:
-        words = str(error)
-        if not words.endswith(HOW_ON):
+        message = str(error)
+        if not message.endswith(HOW_ON):
             raise
-        raise type(error)(words.removesuffix(HOW_ON) + safe()) from error
+        raise type(error)(message.removesuffix(HOW_ON) + safe()) from error
 
 
 def measure(
@@ -219,16 +220,15 @@ def measure(
     epoch: float | None = None,
     viewer: LiveViewer | None = None,
 ) -> int:
-    """Measure what is missing in a campaign; returns how many readings it then holds.
+    """Measure the missing readings of a campaign; return the number that it then holds.
 
-    With a goal it is only as much as that needs; nothing where it is met already. The campaign's
-    time counts from `epoch`, a time of day in s, where that is given. A live viewer is told all.
+    Measuring ends when `goal` is met. `epoch` is the wall time at zero of the campaign's time, s.
     """
     log = RunLog(campaign)
     stored = log.readings()
     if goal is not None and stored is not None and goal(stored, last=True).met:
         kinds = [e["kind"] for e in log.events() if e["kind"] != "noise"]
-        if kinds[-1:] == ["finished"]:  # the last session came to its end: nothing hangs
+        if kinds[-1:] == ["finished"]:  # the last session is complete: no load hangs on the arm
             return campaign.n_readings
     with _ends_as_interrupt(t), ExitStack() as stack:
         with working(t.progress) as say:
@@ -252,22 +252,22 @@ def measure(
 
 
 def estimate_noise(t: Terminal, config: CellConfig, cell: Cell, campaign: CampaignFile) -> None:
-    """Estimate, store and say the noise of measured readings that nothing states."""
+    """Estimate, store and print the noise of the readings, where no source states it."""
     log = RunLog(campaign)
-    found = measured_noise(campaign.readings(), cell, config)
-    if found is not None:
-        log.event(NOISE, asdict(found))
-        t.notice(sentence(covariance_words("instrument", found)))
-    elif log.last(NOISE) is not None:  # of fewer readings, which these do not bear out
+    noise = measured_noise(campaign.readings(), cell, config)
+    if noise is not None:
+        log.event(NOISE, asdict(noise))
+        t.notice(sentence(covariance_words("instrument", noise)))
+    elif log.last(NOISE) is not None:  # withdraws an estimate from fewer readings
         log.event(NOISE, {"factors": None})
 
 
 def _sighted(rig: Rig, answer: ConnectionResult, say: Say) -> ConnectionResult:
-    """Let a tracker that has lost its target search for it; only its telescope turns."""
+    """Let a tracker that has lost its target search for it; the arm does not move."""
     if answer.device != "tracker" or not answer.problems:
         return answer
     say(f"tracker: {answer.problems[0]}; searching")
-    with suppress(DeviceError):  # what it then says of itself is what counts
+    with suppress(DeviceError):  # the tracker's report decides
         rig.tracker.find_target()
         return replace(answer, report=rig.tracker.report())
     return answer
@@ -275,19 +275,19 @@ def _sighted(rig: Rig, answer: ConnectionResult, say: Say) -> ConnectionResult:
 
 @contextmanager
 def _ends_as_interrupt(t: Terminal) -> Iterator[None]:
-    """Let Ctrl-C, a plea to end, or a closed terminal stop the arm; once is enough.
+    """Raise KeyboardInterrupt at the first SIGINT, SIGTERM or SIGHUP, so that the arm stops.
 
-    Stopping has deadlines of its own, so whoever asks again meanwhile is told to wait. Signals are
-    for a process's main thread; in another one, as of a worker of many, the process's end stops it.
+    Stopping has its own deadlines: further signals only print a notice. Threads other than the main
+    one cannot handle signals; there, only the end of the process stops the measurement.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    asked: list[int] = []
+    received: list[int] = []
 
     def stop(number: int, frame: FrameType | None) -> None:
-        asked.append(number)
-        if len(asked) == 1:
+        received.append(number)
+        if len(received) == 1:
             raise KeyboardInterrupt
         t.notice("stopping the arm; wait a moment")
 
@@ -296,21 +296,21 @@ def _ends_as_interrupt(t: Terminal) -> Iterator[None]:
 
 
 TRIES = 4
-BREAK = 600.0  # Between two plans of a campaign that is drawn by lots, s
+BREAK = 600.0  # Time between two plans of a campaign that is drawn at random, s
 
 
 @dataclass(frozen=True, slots=True)
 class RehearsalSettings:
-    """What a rehearsal is of."""
+    """Cell, hidden effect and files of a rehearsal."""
 
     config: CellConfig
-    choice: str  # an effect that is hidden, "random" or "nothing"
+    choice: str  # the hidden effect, "random" or "nothing"
     seed: int
     output: Path
     base_dir: Path  # directory that paths in the configuration are relative to
     catalogue: Catalogue
     lacking: Catalogue | None = None
-    """The same with what is hidden, where the models cannot have that."""
+    """The catalogue with the hidden law, where the models do not have it."""
 
     @property
     def world(self) -> Catalogue:
@@ -318,97 +318,97 @@ class RehearsalSettings:
         return self.catalogue if self.lacking is None else self.lacking
 
     def case(self, plan: Plan) -> SimulationCase:
-        """Hide what is chosen in the simulated cell; see `case_of_plan`."""
+        """Hide the choice in the simulated cell; see `case_of_plan`."""
         return case_of_plan(self.config, plan, self.choice, self.seed, self.world, self.base_dir)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RehearsedCampaign:
-    """A first campaign, in a simulated cell that is still there."""
+    """A first campaign, in a simulated cell that can measure again."""
 
     rehearsal: Rehearsal  # the cell, and all readings
     further: Callable[[Plan], Rehearsal]
-    """Measures one further plan, into the same campaign; returns all readings."""
-    measure: Measure  # measures what is missing of another campaign, in the same cell
+    """Measures one further plan into the same campaign; returns all readings."""
+    measure: Measure  # measures the missing readings of another campaign in the same cell
 
 
-def first_plan(told: RehearsalSettings, config: CellConfig, poses: int, say: Say) -> Plan:
-    """Plan a campaign, as the program that is not told what is hidden would.
+def first_plan(settings: RehearsalSettings, config: CellConfig, poses: int, say: Say) -> Plan:
+    """Plan a campaign without knowledge of the hidden effect.
 
-    `config` may have some of the loads only.
+    `config` may have only some of the loads of the settings.
     """
-    config = as_told(config, told.choice, told.world)
-    cell = cell_from_config(config, told.base_dir)
-    plan = make_plan(cell, config, poses, told.seed, told.catalogue, say)
+    config = as_told(config, settings.choice, settings.world)
+    cell = cell_from_config(config, settings.base_dir)
+    plan = make_plan(cell, config, poses, settings.seed, settings.catalogue, say)
     refuse(dry_run(cell, config, plan), "the plan")
     return plan
 
 
 @contextmanager
-def on_devices(t: Terminal, told: RehearsalSettings, plan: Plan) -> Iterator[RehearsedCampaign]:
-    """Run a plan on simulated devices; they stay for further plans as long as the block lasts.
+def on_devices(t: Terminal, settings: RehearsalSettings, plan: Plan) -> Iterator[RehearsedCampaign]:
+    """Run a plan on simulated devices, which run until the block ends.
 
-    The drivers are the real ones; what they talk to are the simulated devices of one world, each
-    a process of its own.
+    The real drivers talk to simulated devices of one world; each device is a process.
     """
     with ExitStack() as stack:
         with working(t.progress) as say:
-            secret = told.case(plan)
+            secret = settings.case(plan)
             say("starting the simulated devices")
-            there = stack.enter_context(simulated_cell(secret, told.seed, told.base_dir))
+            world = stack.enter_context(simulated_cell(secret, settings.seed, settings.base_dir))
         t.notice(NEWCOMER)
-        made = create_run(told.output, there.config, told.base_dir, plan, True)
-        campaign = stack.enter_context(made)
+        campaign = stack.enter_context(
+            create_run(settings.output, world.config, settings.base_dir, plan, True)
+        )
 
-        def missing(of: CampaignFile, epoch: float | None = None) -> None:
+        def missing(file: CampaignFile, epoch: float | None = None) -> None:
             to_the_end(
                 t,
-                lambda: measure(t, there.config, secret.cell, of, epoch=epoch),
-                lambda: of.n_readings,
+                lambda: measure(t, world.config, secret.cell, file, epoch=epoch),
+                lambda: file.n_readings,
             )
 
         def measured() -> Rehearsal:
             missing(campaign)
             stored = campaign.readings(), campaign.about(COVERS)
-            readings = full_readings(*stored, secret.cell, there.config)
-            return secret.measured(readings, there.config)
+            readings = full_readings(*stored, secret.cell, world.config)
+            return secret.measured(readings, world.config)
 
-        def further(more: Plan) -> Rehearsal:
+        def further(next_plan: Plan) -> Rehearsal:
             log = RunLog(campaign)
-            log.append(log.with_new_names(more))
+            log.append(log.with_new_names(next_plan))
             return measured()
 
         yield RehearsedCampaign(measured(), further, missing)
 
 
 @contextmanager
-def in_process(t: Terminal, told: RehearsalSettings, plan: Plan) -> Iterator[RehearsedCampaign]:
-    """Draw the readings of a plan from the simulated world without any device.
+def in_process(t: Terminal, settings: RehearsalSettings, plan: Plan) -> Iterator[RehearsedCampaign]:
+    """Draw the readings of a plan from the simulated world, without devices.
 
-    They are written bit by bit, as a real campaign grows.
+    The readings are stored pose by pose, like those of a real campaign.
     """
     with working(t.progress):
-        secret = told.case(plan)
+        secret = settings.case(plan)
     source = "rehearsal in a simulated cell, without devices"
-    made = secret.config.to_json()
+    text = secret.config.to_json()
     with CampaignFile.create(
-        told.output, made, str(told.base_dir), source, overwrite=True, more={COVERS: WHOLE}
+        settings.output, text, str(settings.base_dir), source, overwrite=True, more={COVERS: WHOLE}
     ) as campaign:
 
-        def measured(part: Plan, number: int, begun: float) -> Rehearsal:
-            r = read_plan(secret, part, [told.seed, number], begun)
+        def measured(part: Plan, number: int, start: float) -> Rehearsal:
+            r = read_plan(secret, part, [settings.seed, number], start)
             _write(t, campaign, r.readings)
             return secret.measured(campaign.readings())
 
-        def further(more: Plan) -> Rehearsal:
+        def further(next_plan: Plan) -> Rehearsal:
             last = last_time(campaign.readings())
-            return measured(with_new_names(more, plan, 2), 2, last + BREAK)
+            return measured(with_new_names(next_plan, plan, 2), 2, last + BREAK)
 
-        def missing(of: CampaignFile, epoch: float | None = None) -> None:
-            # Campaigns beside the first one are told by what their names have beyond its own.
-            log, number = RunLog(of), 3 + len(of.path.stem) - len(told.output.stem)
-            begun = last_time(campaign.readings()) + number * BREAK
-            drawn = read_plan(secret, log.plan, [told.seed, number], begun).readings
+        def missing(file: CampaignFile, epoch: float | None = None) -> None:
+            # Campaigns are told apart by the number of letters appended to the first one's name.
+            log, number = RunLog(file), 3 + len(file.path.stem) - len(settings.output.stem)
+            start = last_time(campaign.readings()) + number * BREAK
+            drawn = read_plan(secret, log.plan, [settings.seed, number], start).readings
             for k, step in enumerate(log.plan.steps):
                 log.record(drawn[slice(k, k + 1)], step, {"drawn": True})
 
@@ -416,25 +416,26 @@ def in_process(t: Terminal, told: RehearsalSettings, plan: Plan) -> Iterator[Reh
 
 
 def last_time(readings: Readings) -> float:
-    """Return when the last reading was taken, s; 0 where that is not known."""
+    """Return the time of the last reading, s; 0 where times are unknown."""
     time = readings.states.time
     return 0.0 if time is None else float(time.max())
 
 
-def to_the_end(t: Terminal, work: Callable[[], object], done: Callable[[], int]) -> None:
-    """Do the work of measuring what is missing, and go on after a failure as `run --resume` does.
+def to_the_end(t: Terminal, work: Callable[[], object], count: Callable[[], int]) -> None:
+    """Measure the missing readings by `work`; try again after a device failure.
 
-    A busy computer gives a simulated device no turn for a while, which is the same to the driver
-    as a device that fails. `done` tells how many readings there are.
+    On a busy computer a simulated device may stall, which a driver takes for a failure. At most
+    `TRIES` - 1 failures in a row without a new reading are accepted. `count` returns the number of
+    readings.
     """
-    left, before = TRIES, done()
+    tries, stored = TRIES, count()
     while True:
         try:
             work()
         except DeviceError as error:
-            now = done()
-            left, before = (TRIES if now > before else left) - 1, now
-            if left <= 0:
+            current = count()
+            tries, stored = (TRIES if current > stored else tries) - 1, current
+            if tries <= 0:
                 raise
             t.notice(f"note: {error}")
             t.notice("going on with what is missing")
@@ -443,7 +444,7 @@ def to_the_end(t: Terminal, work: Callable[[], object], done: Callable[[], int])
 
 
 def _write(t: Terminal, campaign: CampaignFile, readings: Readings) -> None:
-    """Append readings in their order, pose after pose."""
+    """Append readings in their order, pose by pose."""
     starts = [0, *(np.flatnonzero(np.diff(readings.pose)) + 1).tolist(), len(readings)]
     with counting(t.progress, "measuring poses", len(starts) - 1) as advance:
         for begin, end in pairwise(starts):
@@ -452,31 +453,31 @@ def _write(t: Terminal, campaign: CampaignFile, readings: Readings) -> None:
 
 
 NEXT_SEED = 1000
-"""Between the seeds of two starts: each device takes the seed and a few that follow."""
+"""Distance between the seeds of two starts: devices use the seed and the next few numbers."""
 
 
 @contextmanager
 def lasting_cell(p: Procedure) -> Iterator[CellConfig]:
-    """Run the simulated devices of a calibration, whose campaign file is there.
+    """Run the simulated devices of a calibration that has a campaign file.
 
-    What is true follows from the cell, its first plan and the seed, which do not change. The
-    world's time has gone on since its first start; the devices' noise is another each time.
+    The true parameters follow from the cell, its first plan and the seed, which do not change. The
+    world's time continues from its first start; the noise differs between starts.
     """
     with CampaignFile.open(p.run) as campaign:
         plan, log = RunLog(campaign).plans[0], ProcedureLog(campaign)
         starts = [entry for entry in log.entries() if entry["kind"] == WORLD]
-        now = time.time()
-        log.append(WORLD, {"wall_s": now})
+        wall_s = time.time()
+        log.append(WORLD, {"wall_s": wall_s})
     choice, seed = p.settings.hide or NOTHING, p.settings.seed
     secret = case_of_plan(p.config, plan, choice, seed, p.catalogue, p.base_dir)
-    passed = now - starts[0]["wall_s"] if starts else 0.0
-    begun = max(passed, 0.0) * p.config.simulation.clock
-    own = seed + NEXT_SEED * len(starts)
-    with simulated_cell(secret, own, p.base_dir, begun=begun) as there:
-        yield there.config
+    passed = wall_s - starts[0]["wall_s"] if starts else 0.0
+    start = max(passed, 0.0) * p.config.simulation.clock
+    device_seed = seed + NEXT_SEED * len(starts)
+    with simulated_cell(secret, device_seed, p.base_dir, begun=start) as simulated:
+        yield simulated.config
 
 
-FASTEST = 200.0  # Clock of a simulated world, as `[simulation] clock` allows
+FASTEST = 200.0  # Largest clock rate of a simulated world, as in `[simulation] clock`
 
 
 @command("""
@@ -502,54 +503,54 @@ def simulate(
         config = config.model_copy(update={"simulation": simulation})
     base_dir = cell.absolute().parent
     choice = hide or config.simulation.hide or NOTHING
-    as_told(config, choice, catalogue)  # refuses what cannot be hidden before anything is planned
+    as_told(config, choice, catalogue)  # refuses an effect that cannot be hidden, before planning
     with working(t.progress) as say:
         if plan is None:
             say("planning a campaign, to know how strong an effect has to be")
-            made = make_plan(numbers, config, POSES, number, catalogue, say)
+            campaign_plan = make_plan(numbers, config, POSES, number, catalogue, say)
         else:
-            made = load_plan(plan)
+            campaign_plan = load_plan(plan)
         say("preparing the simulated cell")
-        secret = case_of_plan(config, made, choice, number, catalogue, base_dir)
+        secret = case_of_plan(config, campaign_plan, choice, number, catalogue, base_dir)
     if secret.hidden != NOTHING and (config.fitted, secret.mode) == ("deflection", "absolute"):
-        what = f"{choice} hides what they may not show" if choice == RANDOM else f"{choice} cancels"
+        why = f"{choice} hides what they may not show" if choice == RANDOM else f"{choice} cancels"
         t.notice(
-            f"warning: deflections are planned and fitted, and {what} in them; set readings = "
+            f"warning: deflections are planned and fitted, and {why} in them; set readings = "
             f'"absolute" in [planning] of {cell} for a campaign that shows it'
         )
     with told_to_end(signal.SIGTERM, signal.SIGINT, signal.SIGHUP) as wait, ExitStack() as stack:
         with working(t.progress) as say:
             say("starting the devices")
-            there = stack.enter_context(simulated_cell(secret, number, base_dir, output))
+            simulated = stack.enter_context(simulated_cell(secret, number, base_dir, output))
         target = output / "cell.toml"
-        told = with_person(there.config) if person else there.config
-        replace_file(target, to_toml(_placed(told, base_dir)))
+        written = with_person(simulated.config) if person else simulated.config
+        replace_file(target, to_toml(_placed(written, base_dir)))
         t.show(f"The devices run. Their cell is {target}; go on in another terminal with:")
         t.command(shlex.join(("hilcal", "check", str(target))))
-        which = () if plan is None else ("--plan", str(plan))
-        t.command(shlex.join(("hilcal", "run", str(target), *which, "-o", "run.hilcal")))
+        plan_option = () if plan is None else ("--plan", str(plan))
+        t.command(shlex.join(("hilcal", "run", str(target), *plan_option, "-o", "run.hilcal")))
         t.show("Ctrl-C ends them.")
         wait()
     t.show("The devices have ended.")
 
 
 def with_person(config: CellConfig) -> CellConfig:
-    """Return the configuration of a simulated cell whose loads are left to a person."""
+    """Return the configuration of a simulated cell whose loads a person changes."""
     options = {**config.operator.options, "person": True}
     operator = config.operator.model_copy(update={"options": options})
     return config.model_copy(update={"operator": operator})
 
 
 def _placed(config: CellConfig, base_dir: Path) -> CellConfig:
-    """Return the configuration with a robot's files named by their whole paths."""
-    told = {"model": config.robot.model, "calibration": config.robot.calibration or ""}
-    files = {k: str((base_dir / v).absolute()) for k, v in told.items() if Path(v).suffix}
+    """Return the configuration with absolute paths of the robot's files."""
+    paths = {"model": config.robot.model, "calibration": config.robot.calibration or ""}
+    files = {k: str((base_dir / v).absolute()) for k, v in paths.items() if Path(v).suffix}
     robot = config.robot.model_copy(update=files)
     return config.model_copy(update={"robot": robot})
 
 
 FACTORY_POSES = 20
-"""Poses without a load; a choice: of 12 an offset of one encoder by 1 mrad may stay in doubt."""
+"""Poses without a load; a choice: with 12, an encoder offset of 1 mrad may stay in doubt."""
 
 
 def factory_check(
@@ -561,22 +562,22 @@ def factory_check(
     output: Path,
     yes: bool,
 ) -> dict[str, object]:
-    """Measure into a campaign, or take one that is there, and say what it tells of the arm."""
+    """Compare the arm with its factory kinematics on a campaign; measure it unless it exists."""
     factory = told_by(answers) or cell.factory
     if factory is None:
         raise InputError(
             "--factory: the arm's controller does not tell its kinematics; give [robot] calibration"
         )
     if not output.exists():
-        _measured(t, config, cell, catalogue, output, yes)
+        _measure_without_loads(t, config, cell, catalogue, output, yes)
     with Campaign.open(output, catalogue, read_only=True) as run, working(t.progress) as say:
         say("fitting all effects from the factory's kinematics")
-        found = check_factory(run.cell, nominal_arm(run.cell), factory, run.readings, catalogue)
-    t.show(factory_words(found))
-    return {**asdict(found), "campaign": str(output)}
+        checked = check_factory(run.cell, nominal_arm(run.cell), factory, run.readings, catalogue)
+    t.show(factory_words(checked))
+    return {**asdict(checked), "campaign": str(output)}
 
 
-def _measured(
+def _measure_without_loads(
     t: Terminal, config: CellConfig, cell: Cell, catalogue: Catalogue, output: Path, yes: bool
 ) -> None:
     planning = config.planning.model_copy(update={"readings": "absolute"})

@@ -1,4 +1,4 @@
-"""`report`, `view` and `workbench`: the story of a campaign as a page, in rerun, to work at."""
+"""`report`, `view` and `workbench`: a campaign as a page, in rerun, or to work on."""
 
 import os
 import shlex
@@ -55,22 +55,22 @@ def report(
             return stack.enter_context(Campaign.open(path, catalogue, read_only=True))
 
         first = stack.enter_context(Campaign.open(run, catalogue, read_only=True))
-        asked = Asked(opened(later), opened(validation), limit_m, operator, revision, appendix)
-        done = write_report(first, output, asked, say)
-    t.show(f"{done.headline}.")
-    if done.limit:
-        t.show(done.limit)
+        options = Asked(opened(later), opened(validation), limit_m, operator, revision, appendix)
+        result = write_report(first, output, options, say)
+    t.show(f"{result.headline}.")
+    if result.limit:
+        t.show(result.limit)
     t.show(f"Report: {output} ({output.stat().st_size / 1e6:.1f} MB); print it for a PDF.")
     t.document(
         report=str(output),
         bytes=output.stat().st_size,
-        headline=done.headline,
-        passed=done.passed,
-        verdict=done.verdict,
+        headline=result.headline,
+        passed=result.passed,
+        verdict=result.verdict,
     )
 
 
-ENDING = 5.0  # How long a server of a page or a story may delay the end, s
+ENDING = 5.0  # Longest delay of the end of the process by a server of a page or viewer, s
 
 
 @command("""
@@ -94,7 +94,7 @@ def view(
         from hilcal.present.viewer import serve  # loads the viewer's library, which takes a while
 
         story = build_story(chapters)
-    guard = _end_of_process()  # a viewer that does not answer may delay it; the campaign is closed
+    guard = _end_of_process()  # an unresponsive viewer may delay the end; the campaign is closed
     try:
         with told_to_end(signal.SIGINT, signal.SIGTERM) as wait, serve(story, port=port) as url:
             t.show("Open the viewer with:")
@@ -109,19 +109,19 @@ def view(
 
 
 def _end_of_process() -> threading.Timer:
-    """Return what ends the process, once started, where its threads do not end by themselves."""
+    """Return a timer that ends the process, if its threads do not end by themselves."""
     guard = threading.Timer(ENDING, os._exit, (0,))
     guard.daemon = True
     return guard
 
 
 @contextmanager
-def followed(t: Terminal, asked: bool, run: Path) -> Iterator[LiveViewer | None]:
-    """Let a live viewer follow what the block does, where it is asked for.
+def followed(t: Terminal, requested: bool, run: Path) -> Iterator[LiveViewer | None]:
+    """Start a live viewer for the block if requested; yields None otherwise.
 
-    The recording goes beside the campaign.
+    Its recording is written next to the campaign.
     """
-    if not asked:
+    if not requested:
         yield None
         return
     live = LiveViewer(run.with_name(f"{run.stem}.live.rrd"), t.notice)
@@ -145,10 +145,10 @@ def opening(recording: Path) -> str:
 
 
 def viewer_command() -> str:
-    """Return how to start the viewer that came with the program."""
-    beside = Path(sys.executable).with_name("rerun")
-    if shutil.which("rerun") is None and beside.is_file():
-        return str(beside)
+    """Return the command that starts the viewer."""
+    installed = Path(sys.executable).with_name("rerun")
+    if shutil.which("rerun") is None and installed.is_file():
+        return str(installed)
     return "rerun"
 
 
@@ -181,24 +181,24 @@ def workbench(
     elif run.is_file() and not is_campaign(run):
         raise InputError(f"{run}: no campaign; to begin with a table, give --config CELL.toml, too")
     with CampaignFile.open(run, read_only=True) as file:
-        file.readings()  # a file without any is refused before a page is opened
+        file.readings()  # refuses a file without readings before a page is opened
 
-    def told(url: str) -> None:
+    def announce(url: str) -> None:
         t.show("Open the workbench with:")
         t.command(url)
         t.document({"url": url, "run": str(run)})
         sys.stdout.flush()
         t.notice(f"It lets one browser in, within {UNUSED_S / 60:g} minutes. Serving until Ctrl-C.")
 
-    if not serve(WorkbenchSession(run, catalogue), port, told, browser=not no_browser):
+    if not serve(WorkbenchSession(run, catalogue), port, announce, browser=not no_browser):
         t.notice("Nobody opened it: its address is no longer valid. Start it again.")
-    _end_of_process().start()  # a fit in a thread may delay it; what is stored is durable
+    _end_of_process().start()  # a fit in a thread may delay the end; stored revisions are durable
 
 
 def _import(
     t: Terminal, table: Path, config: Path, run: Path, kind: str, second: Path | None
 ) -> None:
-    """Make the campaign file of a table; one that is there stays."""
+    """Make the campaign file of a table; refuse to replace a file."""
     if run.exists():
         raise InputError(
             f"{run}: the file exists, and is left as it is; open it with hilcal workbench "
@@ -207,9 +207,9 @@ def _import(
     from hilcal.import_campaign import import_campaign
 
     with working(t.progress) as say:
-        found = import_campaign(table, config, run, kind, second, say=say)
+        imported = import_campaign(table, config, run, kind, second, say=say)
     t.notice(
-        f"{len(found.readings)} readings of {table} are in {run} now; the table is not changed."
+        f"{len(imported.readings)} readings of {table} are in {run} now; the table is not changed."
     )
-    for note in (*found.notes, covariance_words(found.parts, found.noise)):
+    for note in (*imported.notes, covariance_words(imported.parts, imported.noise)):
         t.notice(note)

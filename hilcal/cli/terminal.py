@@ -1,4 +1,4 @@
-"""The terminal: tables or one JSON document on stdout, all else on stderr; questions, signals."""
+"""The terminal: tables or one JSON document on stdout, the rest on stderr; questions, signals."""
 
 import contextlib
 import json
@@ -27,9 +27,9 @@ class Terminal:
     """The two streams."""
 
     json: bool  # whether stdout is for one JSON document
-    people: Console  # where tables and words for people go
-    progress: Console  # where progress and notices go
-    out: TextIO  # where the document goes
+    people: Console  # for tables and sentences
+    progress: Console  # for progress and notices
+    out: TextIO  # for the document
 
     def show(self, parts: Iterable[RenderableType] | RenderableType) -> None:
         """Print for people."""
@@ -38,13 +38,14 @@ class Terminal:
         for part in parts:
             self.people.print(part, markup=False, highlight=False)
 
-    def notice(self, words: str) -> None:
-        """Say what people should know but did not ask for; broken between words on a terminal."""
-        whole = not self.progress.is_terminal
-        self.progress.print(words, markup=False, highlight=False, soft_wrap=whole)
+    def notice(self, message: str) -> None:
+        """Print a remark besides the result; a terminal wraps it between words."""
+        self.progress.print(
+            message, markup=False, highlight=False, soft_wrap=not self.progress.is_terminal
+        )
 
     def command(self, line: str) -> None:
-        """Print a command on a line of its own, which no line's end divides, to be copied."""
+        """Print a command on one unwrapped line, to be copied."""
         self.people.print(f"  {line}", markup=False, highlight=False, soft_wrap=True)
 
     def document(
@@ -54,16 +55,16 @@ class Terminal:
         /,
         **keys: object,
     ) -> None:
-        """Print the JSON document, where it is asked for.
+        """Print the JSON document, with --json.
 
-        With `failed`, why the command fails nevertheless, which is in the document as "error" and
-        raised after printing.
+        The error `failed` becomes the part "error" of the document, and is raised after printing.
         """
-        whole = {**(content or {}), **keys}
+        document = {**(content or {}), **keys}
         if failed is not None:
-            whole |= error_document(failed, failed.exit_code)
+            document |= error_document(failed, failed.exit_code)
         if self.json:
-            print(json.dumps(plain(whole), allow_nan=False, indent=2), file=self.out, flush=True)
+            text = json.dumps(plain(document), allow_nan=False, indent=2)
+            print(text, file=self.out, flush=True)
         if failed is not None:
             raise failed
 
@@ -71,13 +72,13 @@ class Terminal:
 def terminal(as_json: bool) -> Terminal:
     """Return the streams of a command.
 
-    With `as_json`, `sys.stdout` becomes stderr until the command ends, see `hilcal.cli.execute`:
-    what a user's effect prints must not be in the document. Where both are a terminal they are one
-    console, which prints above what is in progress, not into its line.
+    With `as_json`, `sys.stdout` becomes stderr until the command ends (see `hilcal.cli.execute`),
+    so that output of a user's effect does not get into the document. Where both streams are a
+    terminal they share a console, which prints above the line of progress.
     """
     progress, out = _console(sys.stderr), sys.stdout
-    one = as_json or (progress.is_terminal and out.isatty())
-    people = progress if one else _console(out)
+    shared = as_json or (progress.is_terminal and out.isatty())
+    people = progress if shared else _console(out)
     if as_json:
         sys.stdout = sys.stderr
     return Terminal(as_json, people, progress, out)
@@ -102,7 +103,7 @@ def somebody_there(t: Terminal) -> bool:
 def agreed(t: Terminal, question: str) -> bool:
     """Ask until the answer is yes or no; the end of the input is no.
 
-    What was typed before the question is dropped.
+    Input that was typed before the question is dropped.
     """
     with contextlib.suppress(termios.error, OSError, ValueError):
         termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)
@@ -122,23 +123,23 @@ def agreed(t: Terminal, question: str) -> bool:
         t.notice(f"{answer!r} is no answer. Type y or n, and press Enter.")
 
 
-POLL = 0.2  # How long a plea to end may stay unheard where a signal does not wake the sleeper, s
+POLL = 0.2  # Longest delay of the reaction to a signal that does not interrupt the sleep, s
 
 
 @contextmanager
 def told_to_end(*kinds: signal.Signals) -> Iterator[Callable[[], None]]:
-    """Catch signals; what is yielded waits for the first of them.
+    """Catch signals; yields a function that waits for the first of them.
 
-    A handler runs between two instructions of the very thread that waits, so it must take no lock:
-    `threading.Event.set` would wait for ever where the thread is just inside `Event.wait`.
+    The handler runs in the waiting thread, so it must take no lock: `threading.Event.set` would
+    deadlock inside `Event.wait`.
     """
-    asked: list[int] = []
+    received: list[int] = []
 
     def wait() -> None:
-        while not asked:
+        while not received:
             time.sleep(POLL)
 
-    with handled(kinds, lambda number, _: asked.append(number)):
+    with handled(kinds, lambda number, _: received.append(number)):
         yield wait
 
 
@@ -147,9 +148,9 @@ def handled(
     kinds: Iterable[signal.Signals], handler: Callable[[int, FrameType | None], object]
 ) -> Iterator[None]:
     """Handle signals as long as the block lasts."""
-    before = {kind: signal.signal(kind, handler) for kind in kinds}
+    previous = {kind: signal.signal(kind, handler) for kind in kinds}
     try:
         yield
     finally:
-        for kind, earlier in before.items():
-            signal.signal(kind, earlier)
+        for kind, former in previous.items():
+            signal.signal(kind, former)

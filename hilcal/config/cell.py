@@ -1,4 +1,4 @@
-"""CELL.toml as a whole, and the sections that say what the cell is."""
+"""CELL.toml as a whole, and the sections that describe the cell."""
 
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -205,15 +205,15 @@ class Tracker(CellSection):
 
     @model_validator(mode="after")
     def _registration(self) -> "Tracker":
-        given = [k for k in ("base_xyz_m", "base_rotvec_rad") if getattr(self, k) is not None]
-        if self.frame == "base" and given:
+        stated = [k for k in ("base_xyz_m", "base_rotvec_rad") if getattr(self, k) is not None]
+        if self.frame == "base" and stated:
             raise ValueError(
-                f'{given[0]} together with frame = "base"; a registration is given only with '
+                f'{stated[0]} together with frame = "base"; a registration is given only with '
                 'frame = "tracker"'
             )
-        if len(given) == 1:
+        if len(stated) == 1:
             raise ValueError(
-                f"{given[0]} alone; a known registration needs base_xyz_m and base_rotvec_rad "
+                f"{stated[0]} alone; a known registration needs base_xyz_m and base_rotvec_rad "
                 "(leave both out to have it estimated)"
             )
         if self.frame == "tracker" and self.station_m is not None:
@@ -348,7 +348,7 @@ class CellConfig(CellSection):
 
     @property
     def fitted(self) -> Literal["deflection", "absolute"]:
-        """What will be fitted: `[planning] readings`; without loads, absolute readings."""
+        """Kind of readings that will be fitted: `[planning] readings`; "absolute" without loads."""
         return self.planning.readings if self.loads else "absolute"
 
     def to_json(self) -> str:

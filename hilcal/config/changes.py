@@ -1,8 +1,8 @@
-"""Changes of a cell after its readings were taken: of what does not enter what is stored.
+"""Changes of a cell after its readings were taken.
 
-A change says of a section and a key of CELL.toml what its value is from now on, and is checked as
-CELL.toml is. What makes readings or wrenches of what devices say (the robot, the loads, the frame
-of the positions, ...) cannot be changed afterwards: that needs an import, or a measurement.
+A change is a new value of a key of CELL.toml, and is checked like CELL.toml. Keys that determine
+the stored readings and wrenches (the robot, the loads, the frame of the positions, ...) cannot be
+changed: they need a new import or measurement.
 """
 
 import tomllib
@@ -36,7 +36,7 @@ def changed(config: CellConfig, changes: Changes) -> CellConfig:
     """Return a configuration with changes.
 
     Args:
-        changes: of some keys of `CHANGEABLE`; None leaves a key out.
+        changes: values of keys of `CHANGEABLE`; None removes a key.
     """
     if not changes:
         return config
@@ -45,52 +45,52 @@ def changed(config: CellConfig, changes: Changes) -> CellConfig:
         valid = CHANGEABLE.get(section, ())
         for key, value in keys.items():
             if key not in valid:
-                every = [f"[{s}] {k}" for s, names in CHANGEABLE.items() for k in names]
+                valid_keys = [f"[{s}] {k}" for s, names in CHANGEABLE.items() for k in names]
                 raise InputError(
-                    f"{_WHERE}: [{section}] {key} cannot be changed once there are "
-                    f"readings{suggest(f'[{section}] {key}', every)}; valid: {', '.join(every)}"
+                    f"{_WHERE}: [{section}] {key} cannot be changed once there are readings"
+                    f"{suggest(f'[{section}] {key}', valid_keys)}; valid: {', '.join(valid_keys)}"
                 )
             content[section][key] = value
-    found = check_section(content, CellConfig, _WHERE)
-    names = [[t.name for t in c.tool.targets] for c in (config, found)]
+    merged = check_section(content, CellConfig, _WHERE)
+    names = [[t.name for t in c.tool.targets] for c in (config, merged)]
     if names[0] != names[1]:
         raise InputError(
             f"{_WHERE}: [tool] targets has other names than the readings; valid: "
             f"{', '.join(names[0]) or 'no targets'}"
         )
-    return found
+    return merged
 
 
 def read_value(section: str, key: str, text: str) -> Any:
-    """Return a value that was written as in CELL.toml; nothing is None."""
+    """Return a value from its text in CELL.toml; an empty text is None."""
     if not text.strip():
         return None
     try:
-        found = tomllib.loads(f"{key} = {text}")
+        parsed = tomllib.loads(f"{key} = {text}")
     except (tomllib.TOMLDecodeError, RecursionError, ValueError):
-        found = {}
-    if list(found) != [key]:
+        parsed = {}
+    if list(parsed) != [key]:
         must = described(section, key)
         raise InputError(
             f"{_WHERE}: [{section}] {key} = {' '.join(text.split())[:60]} is not valid: it must be "
             f"{must}"
         )
-    return found[key]
+    return parsed[key]
 
 
 def described(section: str, key: str) -> str:
-    """Return what is valid for a key."""
+    """Return the description of a key's valid values."""
     fields = getattr(section_of(CellConfig.model_fields[section]), "model_fields", {})
     return str(fields[key].description)
 
 
 def write_value(value: Any) -> str:
-    """Return a value as CELL.toml has it; one that is left out is "not given"."""
+    """Return a value as text in CELL.toml; None is "not given"."""
     if value is None:
         return "not given"
     if isinstance(value, Mapping):
-        given = {k: v for k, v in value.items() if v is not None}
-        return "{" + ", ".join(f"{k} = {write_value(v)}" for k, v in given.items()) + "}"
+        stated = {k: v for k, v in value.items() if v is not None}
+        return "{" + ", ".join(f"{k} = {write_value(v)}" for k, v in stated.items()) + "}"
     if isinstance(value, list | tuple):
         return f"[{', '.join(write_value(v) for v in value)}]"
     if isinstance(value, bool):

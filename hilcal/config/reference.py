@@ -1,4 +1,4 @@
-"""Every key of CELL.toml with unit, default and example; a commented CELL.toml to begin with."""
+"""The reference of CELL.toml: unit, default and example of every key; a commented CELL.toml."""
 
 import re
 import textwrap
@@ -23,29 +23,29 @@ _UNITS = dict(
         "singularity=1; factor=1; direction=1",
     )
 )
-"""Units by the end of a key's name; the first that fits."""
+"""Units by the end of a key's name; the first match counts."""
 REQUIRED = "required"
 NOT_SET = "not set"
 
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """One key."""
+    """A key of CELL.toml."""
 
     name: str
-    unit: str  # of its value; "" for texts, choices and tables
-    default: str  # as it is written in TOML, `REQUIRED` or `NOT_SET`
-    valid: str  # what its value must be
+    unit: str  # unit of the value; "" for texts, choices and tables
+    default: str  # in TOML, `REQUIRED` or `NOT_SET`
+    valid: str  # description of valid values
     example: str  # a line of TOML
 
 
 @dataclass(frozen=True, slots=True)
 class KeyTable:
-    """One section of CELL.toml."""
+    """A section of CELL.toml."""
 
     name: str  # e.g. "tracker"
-    header: str  # as it is written, e.g. "[tracker]" or "[[loads]]"
-    about: str  # what it is for, one line
+    header: str  # e.g. "[tracker]" or "[[loads]]"
+    about: str  # purpose, one line
     keys: tuple[Key, ...]
 
 
@@ -53,27 +53,27 @@ def tables(options: Mapping[str, type[Section]] | None = None) -> tuple[KeyTable
     """Return all sections, in the order of the configuration.
 
     Args:
-        options: sections of drivers' own keys, by name, e.g. "tracker.options (emscon)".
+        options: sections of keys of drivers, by name, e.g. "tracker.options (emscon)".
     """
-    found: list[KeyTable] = []
+    sections: list[KeyTable] = []
     for name, field in CellConfig.model_fields.items():
         inner = section_of(field)
         if inner is None:
-            found.append(_by_name(name, field))
+            sections.append(_by_name(name, field))
             continue
-        found += _tables(name, inner, _is_list(field))
+        sections += _tables(name, inner, _is_list(field))
         if getattr(field.annotation, "__origin__", None) is dict:
-            found[-1] = replace(found[-1], header=f"[{name}.NAME]")
+            sections[-1] = replace(sections[-1], header=f"[{name}.NAME]")
         for place, section in (options or {}).items():
             if place.split(".")[0] == name:
-                found.append(_table(place, section, False))
-    return tuple(found)
+                sections.append(_table(place, section, False))
+    return tuple(sections)
 
 
-def table(name: str, known: tuple[KeyTable, ...]) -> KeyTable:
+def table(name: str, sections: tuple[KeyTable, ...]) -> KeyTable:
     """Return a section by name, with or without its brackets."""
-    plain, names = name.strip().strip("[]").strip(), [t.name for t in known]
-    for t in known:
+    plain, names = name.strip().strip("[]").strip(), [t.name for t in sections]
+    for t in sections:
         if t.name == plain:
             return t
     raise InputError(
@@ -82,7 +82,7 @@ def table(name: str, known: tuple[KeyTable, ...]) -> KeyTable:
 
 
 def _tables(name: str, section: type[Section], several: bool) -> Iterator[KeyTable]:
-    """Yield a section and those inside of it."""
+    """Yield a section and its subsections."""
     yield _table(name, section, several)
     for key, field in section.model_fields.items():
         inner = section_of(field)
@@ -98,12 +98,12 @@ def _table(name: str, section: type[Section], several: bool) -> KeyTable:
 
 
 def _by_name(name: str, field: FieldInfo) -> KeyTable:
-    """Return a section whose keys are names of the user's."""
+    """Return a section whose keys are names."""
     ((key, value),) = example(field).items()
     valid = f"a number over 0; the key is a name, as {key}"
-    one = Key("NAME", "1", "1.0", valid, f"{key} = {inline(value)}")
+    column = Key("NAME", "1", "1.0", valid, f"{key} = {inline(value)}")
     about = (field.description or "").split(": ", 1)[-1]
-    return KeyTable(name, f"[{name}]", f"{about[:1].upper()}{about[1:]}.", (one,))
+    return KeyTable(name, f"[{name}]", f"{about[:1].upper()}{about[1:]}.", (column,))
 
 
 def _key(name: str, field: FieldInfo) -> Key:
@@ -113,7 +113,7 @@ def _key(name: str, field: FieldInfo) -> Key:
 
 
 def example(field: FieldInfo) -> Any:
-    """Return the example of a field: the one that is given, else its default."""
+    """Return the example of a field: the stated one, else the default."""
     return field.examples[0] if field.examples else _default_value(field)
 
 
@@ -157,7 +157,7 @@ SHOWN = {
     "planning": ("model", "readings", "criterion", "work_min_m", "work_max_m", "candidates"),
     "simulation": ("hide", "clock"),
 }
-"""Keys that are in the file, as values or as examples; `hilcal config` explains all."""
+"""Keys in a new CELL.toml, as values or as examples; `hilcal config` explains all keys."""
 _HEAD = """\
 # {title}
 # Written by hilcal init; SI units. A line that begins with # and a key is an example: take the #
@@ -166,24 +166,24 @@ _HEAD = """\
 
 
 def cell_text(data: Mapping[str, Any], title: str) -> str:
-    """Return a CELL.toml with the sections and keys that have values, as TOML has them."""
-    lines, known = [_HEAD.format(title=escaped(title))], tables()
+    """Return a commented CELL.toml with the sections and keys of `data`, and with examples."""
+    lines, sections = [_HEAD.format(title=escaped(title))], tables()
     for name, keys in SHOWN.items():
-        lines += [*_section(table(name, known), keys, data.get(name)), ""]
+        lines += [*_section(table(name, sections), keys, data.get(name)), ""]
     return "\n".join(lines)
 
 
-def _section(t: KeyTable, keys: Sequence[str], given: Any) -> Iterator[str]:
+def _section(t: KeyTable, keys: Sequence[str], content: Any) -> Iterator[str]:
     yield from _comment(t.about)
-    if t.header.startswith("[[") or (not given and REQUIRED in [k.default for k in t.keys]):
-        if not given:
+    if t.header.startswith("[[") or (not content and REQUIRED in [k.default for k in t.keys]):
+        if not content:
             yield f"#{t.header}"
             yield from (f"#{k.example}" for k in t.keys if k.name in keys)
-        for one in given or ():
+        for entry in content or ():
             yield t.header
-            yield from (f"{key} = {inline(value)}" for key, value in one.items())
+            yield from (f"{key} = {inline(value)}" for key, value in entry.items())
         return
-    values, by_name = dict(given or {}), {k.name: k for k in t.keys}
+    values, by_name = dict(content or {}), {k.name: k for k in t.keys}
     yield t.header
     for name in dict.fromkeys((*keys, *values)):
         key = by_name[name]
@@ -192,10 +192,10 @@ def _section(t: KeyTable, keys: Sequence[str], given: Any) -> Iterator[str]:
         yield f"{name} = {inline(values[name])}" if name in values else f"#{key.example}"
 
 
-def _comment(words: str) -> list[str]:
-    return [f"# {line}" for line in textwrap.wrap(words, 98)]
+def _comment(text: str) -> list[str]:
+    return [f"# {line}" for line in textwrap.wrap(text, 98)]
 
 
 def to_toml(config: CellConfig) -> str:
-    """Return CELL.toml's text; `load_config` reads back the same configuration."""
+    """Return the text of CELL.toml; `load_config` reads back the same configuration."""
     return tomli_w.dumps(config.model_dump(exclude_none=True, exclude_defaults=True, mode="json"))

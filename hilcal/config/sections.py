@@ -11,7 +11,7 @@ from hilcal.types import Floats
 
 Whole = Annotated[int, Strict(), Field(ge=1)]
 HOST = 'the address in the network, e.g. "192.168.0.1"; another port as "192.168.0.1:7000"'
-"""Of an instrument that is connected by Ethernet."""
+"""Description of the key `host` of an instrument that is connected by Ethernet."""
 PORT = 'the serial port, e.g. "/dev/serial/by-id/usb-FTDI_..."'
 
 
@@ -28,7 +28,7 @@ class CellSection(Section):
 
 
 def check_distinct(section: str, things: Sequence[Any]) -> None:
-    """Refuse two entries of a list of sections that have one name."""
+    """Refuse two sections of the same name."""
     names = [thing.name for thing in things]
     for name in names:
         if names.count(name) > 1:
@@ -36,7 +36,7 @@ def check_distinct(section: str, things: Sequence[Any]) -> None:
 
 
 def _check_box(section: Section, low: str, high: str) -> None:
-    """Refuse a corner that is not below the other one in x, y and z."""
+    """Refuse a box whose low corner is not below the high one in x, y and z."""
     a, b = getattr(section, low), getattr(section, high)
     if a is not None and b is not None and not np.all(np.less(a, b)):
         raise ValueError(f"{low} = {list(a)} is not below {high} = {list(b)}")
@@ -175,7 +175,7 @@ class Conventions(CellSection):
         return self
 
 
-HANG_M = 0.3  # Length of what hangs from the load point where a load with a mass does not say, m
+HANG_M = 0.3  # Default of hang_m of a load with a mass, m
 
 
 class CellLoad(CellSection):
@@ -217,7 +217,7 @@ class CellLoad(CellSection):
 
     @property
     def hanging_m(self) -> float:
-        """Length of what hangs below the load point, m: `hang_m`, or its default."""
+        """Length of the load below the load point, m: `hang_m`, or its default."""
         if self.hang_m is not None:
             return self.hang_m
         return HANG_M if self.mass_kg > 0.0 else 0.0
@@ -307,9 +307,9 @@ _Joints = Annotated[tuple[Number, ...], Field(min_length=1)]
 _BOX = ("center_m", "size_m")
 _CYLINDER = ("bottom_m", "radius_m", "height_m")
 LOADED = ("joint_compliance",)
-"""What loads show, and what is planned for unless the cell says otherwise."""
+"""Effects under load; the default of `[planning] model`."""
 GEOMETRY = ("encoder_offset",)
-"""What a first plan of absolute readings is for, beside what loads do."""
+"""Effects of the geometry that a first plan of absolute readings is for, in addition."""
 
 
 class Planning(CellSection):
@@ -354,8 +354,8 @@ class Planning(CellSection):
     def _work(self) -> "Planning":
         low, high = self.work_min_m, self.work_max_m
         if (low is None) != (high is None):
-            alone, other = ("work_min_m", "work_max_m")[:: 1 if high is None else -1]
-            raise ValueError(f"{alone} alone; a box needs {other} too")
+            stated, missing = ("work_min_m", "work_max_m")[:: 1 if high is None else -1]
+            raise ValueError(f"{stated} alone; a box needs {missing} too")
         if low is not None and self.work_q_rad:
             raise ValueError("work_q_rad together with work_min_m; give one of them")
         _check_box(self, "work_min_m", "work_max_m")
@@ -386,11 +386,11 @@ class Obstacle(CellSection):
     def _one_shape(self) -> "Obstacle":
         box = [key for key in _BOX if getattr(self, key) is not None]
         cylinder = [key for key in _CYLINDER if getattr(self, key) is not None]
-        whole = (len(box), len(cylinder)) in ((len(_BOX), 0), (0, len(_CYLINDER)))
-        if not whole:
-            given = ", ".join((*box, *cylinder)) or "no shape"
+        complete = (len(box), len(cylinder)) in ((len(_BOX), 0), (0, len(_CYLINDER)))
+        if not complete:
+            shapes = ", ".join((*box, *cylinder)) or "no shape"
             raise ValueError(
-                f'obstacle "{self.name}" has {given}; give {" and ".join(_BOX)} for a box, or '
+                f'obstacle "{self.name}" has {shapes}; give {" and ".join(_BOX)} for a box, or '
                 f"{', '.join(_CYLINDER[:-1])} and {_CYLINDER[-1]} for an upright cylinder"
             )
         lengths = (*(self.size_m or ()), self.radius_m or 0.0, self.height_m or 0.0)

@@ -1,1 +1,1 @@
-"""A whole calibration, step by step: each step is chosen from what the campaign's files hold."""
+"""The calibration procedure: each step follows from the contents of the campaign files."""

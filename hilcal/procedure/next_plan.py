@@ -1,4 +1,4 @@
-"""Whether more is to be measured: what is in doubt, and what a further plan would tell."""
+"""Decision on further measurements: effects in doubt, and the gain of a further plan."""
 
 from dataclasses import dataclass, replace
 
@@ -30,21 +30,21 @@ from hilcal.store.plan import Plan
 from hilcal.types import Floats
 
 POSES = 20
-"""Poses where the doubt does not say how many it needs; a choice."""
+"""Poses of a plan, where the doubt does not determine their number; a choice."""
 
 
 @dataclass(frozen=True, slots=True)
 class Doubt:
-    """What is to be separated."""
+    """Effects to separate."""
 
     fit: Fit  # of a model without the suspects
-    suspects: tuple[str, ...]  # the effects
+    suspects: tuple[str, ...]
     alone: PoseAlone | None = None
-    """The misfit where more poses, unloaded, are what tells of it; None else."""
+    """The misfit that depends on the pose alone, where further unloaded poses settle the doubt."""
 
 
-def doubt_of(d: Diagnosis, say: Say = lambda words: None) -> Doubt | None:
-    """Return what a diagnosis leaves open; None where nothing is, or an option settles it."""
+def doubt_of(d: Diagnosis, say: Say = lambda text: None) -> Doubt | None:
+    """Return the doubt that a diagnosis leaves; None without one, or where an option settles it."""
     suspects = in_doubt(d)
     if not suspects or any(s.coarse for s in d.suspects if s.effect in suspects):
         return None
@@ -53,13 +53,13 @@ def doubt_of(d: Diagnosis, say: Say = lambda words: None) -> Doubt | None:
     return Doubt(without(d.fit, suspects, say), suspects, alone)
 
 
-def without(found: Fit, suspects: tuple[str, ...], say: Say = lambda words: None) -> Fit:
+def without(fitted: Fit, suspects: tuple[str, ...], say: Say = lambda text: None) -> Fit:
     """Return the fit of a model without some effects."""
     for name in suspects:
-        if name in found.model.names:
+        if name in fitted.model.names:
             say(f"fitting without {name}")
-            found = remove(found, name)
-    return found
+            fitted = remove(fitted, name)
+    return fitted
 
 
 def separating(
@@ -68,40 +68,40 @@ def separating(
     doubt: Doubt,
     poses: int | None,
     rng: np.random.Generator,
-    say: Say = lambda words: None,
+    say: Say = lambda text: None,
     reference: Floats | None = None,
     usual: int = 20,
 ) -> Next:
     """Plan the measurements that separate the suspects of a doubt, or raise a CannotAnswerError.
 
-    As many readings as so many poses take, as many as the doubt needs, or `usual` where neither is
-    known. `reference` (n,) are the joints of the campaign's reference pose, rad.
+    The plan has the readings of `poses` poses; None: of as many as the doubt needs, else of
+    `usual`. `reference` (n,) are the joints of the campaign's reference pose, rad.
     """
-    before, effects = doubt.fit, doubt.suspects
+    fitted, effects = doubt.fit, doubt.suspects
     if doubt.alone is None:
-        asked = Request(usual if poses is None else poses)
-        return measure_next(cell, config, before, effects, asked, rng, say, reference)
+        request = Request(usual if poses is None else poses)
+        return measure_next(cell, config, fitted, effects, request, rng, say, reference)
     count = doubt.alone.more if poses is None else poses
-    planned = measure_poses(cell, config, before, count, rng, say, reference)
+    planned = measure_poses(cell, config, fitted, count, rng, say, reference)
     say("predicting the powers")
-    powers = tuple(PairPower(*row, False) for row in pose_powers(before, effects, count))
+    powers = tuple(PairPower(*row, False) for row in pose_powers(fitted, effects, count))
     return Next(planned, powers, {}, 1.0, ())
 
 
-def plan_of(found: Next, suspects: tuple[str, ...]) -> Plan:
-    """Return the plan with what its file says of it."""
-    told = [[t.effect, t.rival, round(t.then, 4)] for t in found.powers]
-    more = {**about(found.planned), "suspects": list(suspects), "separates": told}
-    return replace(found.planned.ordered.plan, about=more)
+def plan_of(chosen: Next, suspects: tuple[str, ...]) -> Plan:
+    """Return the plan with its origin, the suspects and the powers of separating them."""
+    powers = [[t.effect, t.rival, round(t.then, 4)] for t in chosen.powers]
+    content = {**about(chosen.planned), "suspects": list(suspects), "separates": powers}
+    return replace(chosen.planned.ordered.plan, about=content)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NextPlan:
     """The next measurements."""
 
-    doubt: Doubt  # what they separate
-    found: Next  # how well, pair by pair
-    made: CheckedPlan  # the plan, which may be run
+    doubt: Doubt  # the effects to separate
+    found: Next  # the powers, pair by pair
+    made: CheckedPlan  # the plan, all motions checked
 
 
 def next_plan(
@@ -116,27 +116,27 @@ def next_plan(
 ) -> NextPlan:
     """Plan the measurements that settle a doubt, and check every motion in a dry run.
 
-    As many readings as so many poses take; what the doubt needs where None. `cell` is given where
-    it is not the campaign's any more. To `compare` criteria and numbers of poses takes longer.
-    Raises as `separating` does.
+    `poses` is as in `separating`. `cell` replaces the campaign's where it has changed. To `compare`
+    criteria and numbers of poses takes longer. Raises as `separating` does.
     """
     config, numbers = (o.config, o.cell) if cell is None else cell
-    found = separating(numbers, config, doubt, poses, rng, say, reference_in(o.file), POSES)
+    chosen = separating(numbers, config, doubt, poses, rng, say, reference_in(o.file), POSES)
     compare = compare and not doubt.alone
-    summary = summarise(found.planned, config, rng, say, compare=compare, curve=compare)
+    summary = summarise(chosen.planned, config, rng, say, compare=compare, curve=compare)
     say("checking every motion in a dry run")
-    made = checked(numbers, config, plan_of(found, doubt.suspects), summary)
-    return NextPlan(doubt, found, made)
+    checked_plan = checked(numbers, config, plan_of(chosen, doubt.suspects), summary)
+    return NextPlan(doubt, chosen, checked_plan)
 
 
 def doubt_to_settle(o: Campaign, d: Diagnosis, say: Say) -> Doubt:
-    """Return what a diagnosis leaves open, and a fit whose model does not hold the suspects.
+    """Return the doubt that a diagnosis leaves.
 
-    Raises a CannotAnswerError where nothing is in doubt; it says what else to do.
+    Raises:
+        CannotAnswerError: nothing is in doubt; the message has the next step instead.
     """
-    found = doubt_of(d, say)
-    if found is not None:
-        return found
+    doubt = doubt_of(d, say)
+    if doubt is not None:
+        return doubt
     finer = [s for s in d.suspects if s.coarse and s.effect in in_doubt(d)]
     if finer:
         raise CannotAnswerError(f"not two effects, but one in doubt: {_differ(o, finer[0])}")
@@ -144,7 +144,7 @@ def doubt_to_settle(o: Campaign, d: Diagnosis, say: Say) -> Doubt:
 
 
 def _settled(o: Campaign, d: Diagnosis) -> str:
-    """Say that no suspects are to be separated, and what else to do."""
+    """Return the message that there are no suspects to separate, with the next step."""
     head = "no suspects to separate:"
     if d.verdict == "adequate":
         return (
@@ -187,7 +187,7 @@ def _settled(o: Campaign, d: Diagnosis) -> str:
 
 
 def _differ(o: Campaign, s: Suspect) -> str:
-    """Say how to let joints differ, where the readings ask for it."""
+    """Return the message on how to give joints different parameters."""
     return (
         f"the model has one {s.coarse} for several joints; let them differ, and diagnose again: "
         f"hilcal add {quoted(o.path)} {quoted(s.effect)}"
@@ -195,23 +195,23 @@ def _differ(o: Campaign, s: Suspect) -> str:
 
 
 WORTH = 0.05
-"""Share by which a further plan must lower the predicted error to be worth its time; a choice."""
-TOLD = 0.1
-"""Power that a further plan must add for a pair of suspects to be worth its time; a choice."""
+"""Least share by which a further plan must lower the predicted error; a choice."""
+LEAST_GAIN = 0.1
+"""Least power that a further plan must add for a pair of suspects; a choice."""
 MOST_PLANS = 6
-"""Plans of a campaign at most; a choice: what five further plans have not settled, a sixth of the
-same size will not."""
+"""Most plans of a campaign; a choice: a doubt left by five further plans survives a sixth of the
+same size."""
 MOST = 200
-"""Points at which the error is predicted at most; a choice."""
+"""Most points at which the error is predicted; a choice."""
 
 
 @dataclass(frozen=True, slots=True)
 class PredictedError:
-    """Distances within which 95 % of points are after compensation, as the fit states them."""
+    """Predicted 95 % quantiles of the position error after compensation."""
 
-    now_m: float  # all of it
+    now_m: float  # with all contributions
     floor_m: float
-    """What no further reading lowers: the arm's repeatability, and what the model leaves."""
+    """Without that of the parameters: the arm's repeatability and the model's misfit."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -220,16 +220,16 @@ class Decision:
 
     reason: str
     """"adequate", "goal_met"; "doubt" or "goal" where a further plan is to be measured; "floor",
-    "no_gain", "inseparable", "time" or "plans" where more cannot be told or costs too much; the
-    verdict where no measurement would help."""
+    "no_gain", "inseparable", "time" or "plans" where a further plan gains nothing or costs too
+    much; the verdict where no measurement would help."""
     verdict: str
     error: PredictedError
-    then_m: float | None = None  # the same after the further plan; None where it is about a doubt
+    then_m: float | None = None  # `error.now_m` after a further plan; None where it is for a doubt
     suspects: tuple[str, ...] = ()  # effects in doubt
-    power: float | None = None  # least chance of separating two of them after the further plan
+    power: float | None = None  # least power of separating two of them after the further plan
     plan: Plan | None = None
-    """The further plan, that is measured unless the reason is "time"; None without one."""
-    seconds: float = 0.0  # how long it takes, cell s
+    """The further plan; see `measures`."""
+    seconds: float = 0.0  # duration of the further plan, cell s
 
     @property
     def measures(self) -> bool:
@@ -237,7 +237,7 @@ class Decision:
         return self.reason in ("doubt", "goal")
 
     def to_json(self) -> dict[str, object]:
-        """Return it as an entry of the log holds it."""
+        """Return the decision as an entry of the log."""
         return {
             "reason": self.reason,
             "verdict": self.verdict,
@@ -253,22 +253,22 @@ class Decision:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FurtherMeasuring:
-    """Whether to measure more, after a refinement."""
+    """The decision whether to measure more, after a refinement."""
 
     cell: Cell
     config: CellConfig
     settings: Settings
     d: Diagnosis  # of the last fit
-    plans: tuple[Plan, ...]  # those so far
+    plans: tuple[Plan, ...]  # all plans so far
     reference: Floats | None  # (n,) joints of their reference pose, rad
     rng: np.random.Generator
     say: Say
 
     def decide(self) -> Decision:
-        """Decide whether to measure more, and what.
+        """Decide whether to measure a further plan, and which.
 
-        A doubt between effects comes first; then a predicted error above the goal. A further plan
-        is measured where it would tell more and the time allows it.
+        A doubt between effects comes first, then a predicted error above the goal. A further plan
+        must bring a gain within the time allowed.
         """
         d, settings = self.d, self.settings
         error = predicted_error(Calibration.of(d.fit), d.fit.readings.states, self.config)
@@ -287,25 +287,25 @@ class FurtherMeasuring:
         return replace(further, reason="plans") if len(self.plans) >= MOST_PLANS else further
 
     def _separating(self, error: PredictedError) -> Decision | None:
-        """Return what would settle a doubt; None where there is none."""
+        """Return the decision on the diagnosis' doubt; None without a doubt."""
         doubt = doubt_of(self.d, self.say)
         if doubt is None:
             return None
         nothing = Decision("inseparable", self.d.verdict, error, suspects=doubt.suspects)
         poses, site = self.settings.poses, (self.cell, self.config)
         try:
-            found = separating(*site, doubt, None, self.rng, self.say, self.reference, poses)
+            chosen = separating(*site, doubt, None, self.rng, self.say, self.reference, poses)
         except (CannotAnswerError, InputError):
             return nothing
-        separable = [p for p in found.powers if not p.not_separable]
-        if max((p.then - p.now for p in separable), default=0.0) < TOLD:
+        separable = [p for p in chosen.powers if not p.not_separable]
+        if max((p.then - p.now for p in separable), default=0.0) < LEAST_GAIN:
             return nothing
-        plan, power = plan_of(found, doubt.suspects), min(p.then for p in separable)
+        plan, power = plan_of(chosen, doubt.suspects), min(p.then for p in separable)
         seconds = duration_of(plan)
         return replace(nothing, reason="doubt", power=power, plan=plan, seconds=seconds)
 
     def _sharpening(self, error: PredictedError) -> Decision | None:
-        """Return what would lower the predicted error; None where it is as wanted."""
+        """Return the decision on the predicted error; None where it meets the goal."""
         goal = self.settings.goal_m
         if goal is None or error.now_m <= goal:
             return None
@@ -314,20 +314,20 @@ class FurtherMeasuring:
             return replace(decision, reason="floor")
         self.say("planning what would lower the predicted error")
         planning = self.config.planning.model_copy(update={"readings": self.d.fit.mode})
-        config, asked = self.config.model_copy(update={"planning": planning}), self.settings.poses
+        config, poses = self.config.model_copy(update={"planning": planning}), self.settings.poses
         try:
             planned = make(
-                *(self.cell, config, Request(asked), self.rng, self.d.fit, self.say),
+                *(self.cell, config, Request(poses), self.rng, self.d.fit, self.say),
                 reference=self.reference,
             )
         except (CannotAnswerError, InputError):
             return decision
-        before = predicted(planned.problem, work=planned.work).position
-        after, share = planned.predicted.position, 1.0
-        if before is not None and after is not None and np.isfinite(after):
-            share = (after / before) ** 2 if np.isfinite(before) and before > 0 else 0.0
-        of_parameters = max(error.now_m**2 - error.floor_m**2, 0.0)
-        then = float(np.sqrt(error.floor_m**2 + share * of_parameters))
+        std = predicted(planned.problem, work=planned.work).position
+        std_then, share = planned.predicted.position, 1.0
+        if std is not None and std_then is not None and np.isfinite(std_then):
+            share = (std_then / std) ** 2 if np.isfinite(std) and std > 0 else 0.0
+        parameter_variance = max(error.now_m**2 - error.floor_m**2, 0.0)
+        then = float(np.sqrt(error.floor_m**2 + share * parameter_variance))
         if then > (1.0 - WORTH) * error.now_m:
             return replace(decision, then_m=then)
         plan = replace(planned.ordered.plan, about=about(planned))
@@ -336,21 +336,21 @@ class FurtherMeasuring:
 
 
 def predicted_error(calibration: Calibration, fitted: States, config: CellConfig) -> PredictedError:
-    """Predict the error after compensation where the robot will work.
+    """Predict the position error after compensation where the robot will work, as 95 % quantile.
 
-    At `[planning] work_q_rad` where it is given, else half-way between measured poses, under the
-    loads of the readings: the distance that 95 % of all these points are within.
+    The points are at `[planning] work_q_rad`, or half-way between measured poses, under the loads
+    of the readings.
     """
     states = _work(fitted, config)
-    told = calibration.predict(states.q, states.wrench, recorded=recorded(states))
-    assert told.covariance is not None  # noqa: S101  (asked for by default)
-    of = tool_of(calibration.model, calibration.theta, None)
+    prediction = calibration.predict(states.q, states.wrench, recorded=recorded(states))
+    assert prediction.covariance is not None  # noqa: S101  (asked for by default)
+    tool = tool_of(calibration.model, calibration.theta, None)
     chain = evaluate(calibration.model.cell.arm, states.q)
-    floor = calibration.scatter.covariance(of.model.cell, chain, told.position)
+    floor = calibration.scatter.covariance(tool.model.cell, chain, prediction.position)
     floor = floor + calibration.misfit * np.eye(3)
-    pooled = np.stack([told.covariance.mean(axis=0), floor.mean(axis=0)])
-    now, least = band(pooled)
-    return PredictedError(float(now), float(least))
+    pooled = np.stack([prediction.covariance.mean(axis=0), floor.mean(axis=0)])
+    total, least_error = band(pooled)
+    return PredictedError(float(total), float(least_error))
 
 
 def _work(fitted: States, config: CellConfig) -> States:

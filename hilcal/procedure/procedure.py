@@ -1,15 +1,15 @@
-"""The steps of a calibration: each reads what the files hold, does one thing, and appends it.
+"""The steps of a calibration: each reads the files, does one thing, and appends the result.
 
     plan ─► measure ─► refine ─► decide ─► plan_validation ─► measure_validation ─► validate
                ▲                    │                                                  │
                └── a further plan ──┘          compare ◄─ measure_corrected ◄─ correct ◄─┘
 
-A step that was cut short has either appended all of its result or nothing; readings are stored one
-by one. So the next step follows from the files (`state.next_step`), whatever has stopped the one
-before, and nothing is measured twice.
+An interrupted step has appended either all of its result or nothing; readings are stored one by
+one. So the next step follows from the files (`state.next_step`) after any stop, and nothing is
+measured twice.
 
-The validation campaign is a file of its own. Before anything is predicted of it, its hash enters
-the calibration's log; from then on it has to be just this.
+The validation campaign is a separate file. Its hash enters the calibration's log before any of its
+readings is predicted; from then on the file must not change.
 """
 
 import itertools
@@ -85,8 +85,8 @@ from hilcal.store.rows import content_hash
 from hilcal.store.run_log import PLAN, RunLog, check_same_cell, create_run
 
 Measure = Callable[[CampaignFile, float | None], None]
-"""Measures what is missing of a campaign's plan and stores it there; the time of day, s, that its
-time counts from is given where it is not its own."""
+"""Measures and stores the missing readings of a campaign's plan. The second argument is the wall
+time at zero of the campaign's time, s; None: the campaign's own start."""
 
 _FIRST, _FURTHER, _VALIDATING, _CORRECTING = range(4)
 """Streams of random numbers."""
@@ -101,13 +101,13 @@ class Procedure:
     'plan'
 
     Attributes:
-        run: the campaign file that is fitted; the others stand beside it.
+        run: the campaign file that is fitted; the others are in the same directory.
         cell: the cell as configured.
         config: its configuration.
         base_dir: directory that paths in the configuration are relative to.
         catalogue: the effects that a model can have.
-        settings: what is asked for.
-        known: the prior of every fit, of `settings.prior`; None without one.
+        settings: goals, sizes and seed.
+        known: the prior of every fit, from `settings.prior`; None without one.
     """
 
     run: Path
@@ -117,31 +117,33 @@ class Procedure:
     catalogue: Catalogue
     settings: Settings
     known: CarriedPrior | None = None
-    _found: list[Refinement] = field(default_factory=list, repr=False)
+    _refinements: list[Refinement] = field(default_factory=list, repr=False)  # the latest, if any
 
     @classmethod
     def at(
-        cls, run: str | Path, cell: Cell, catalogue: Catalogue | None = None, **asked: Any
+        cls, run: str | Path, cell: Cell, catalogue: Catalogue | None = None, **options: Any
     ) -> "Procedure":
-        """Begin a calibration, or take up the one that a campaign file holds.
+        """Begin a calibration, or resume that of an existing campaign file.
 
         Args:
-            run: the campaign file; the others go beside it.
+            run: the campaign file; the others go into the same directory.
             cell: from `Cell.load`.
             catalogue: the effects that a model can have; the installed ones unless given.
-            **asked: what is asked for, see `Settings`; of a calibration that is there, what it was.
+            **options: fields of `Settings`; by default those of the existing calibration.
         """
-        path, config, known = Path(run), cell.configured(), catalogue or installed()
+        path, config, effects = Path(run), cell.configured(), catalogue or installed()
         if path.exists():
-            there = continued(path, cell, config, known)
-            return replace(there, settings=replace(there.settings, **asked))
+            stored = continued(path, cell, config, effects)
+            return replace(stored, settings=replace(stored.settings, **options))
         readings = config.planning.readings if config.loads else "absolute"
-        usual = Settings(seed=config.simulation.seed, readings=readings)
-        return cls(path, cell, config, cell.base_dir.absolute(), known, replace(usual, **asked))
+        default = Settings(seed=config.simulation.seed, readings=readings)
+        return cls(
+            path, cell, config, cell.base_dir.absolute(), effects, replace(default, **options)
+        )
 
     @property
     def files(self) -> Files:
-        """Its files."""
+        """All files of the calibration."""
         return Files(self.run)
 
     def record(self) -> RevisionRecord:
@@ -155,24 +157,24 @@ class Procedure:
 
     # the first plan
 
-    def plan(self, say: Say = lambda words: None) -> CheckedPlan:
-        """Choose the first plan; nothing is stored yet. A cell may leave too few poses."""
+    def plan(self, say: Say = lambda text: None) -> CheckedPlan:
+        """Choose the first plan, unstored; a CannotAnswerError for a cell with too few poses."""
         rng, config = self._rng(_FIRST), self._planned()
         return checked_plan(self.cell, config, self.settings.poses, rng, self.catalogue, say)
 
     def begin(self, plan: Plan, config: CellConfig, *, covers: str = INSTRUMENT) -> None:
         """Make the campaign file with its first plan.
 
-        `config` is what the file holds, with the devices that are used; `covers` what the
-        covariance of the readings will cover.
+        `config` is stored in it, with the devices that are used; `covers` is what the covariance of
+        the readings will cover.
         """
         self.check_files()
         first = entry(BEGUN, {"settings": self.settings.to_json()})
-        more = {COVERS: covers, ENTRY.format(1): first}
-        create_run(self.run, config, self.base_dir, plan, source=self._source(), more=more).close()
+        texts = {COVERS: covers, ENTRY.format(1): first}
+        create_run(self.run, config, self.base_dir, plan, source=self._source(), more=texts).close()
 
     def check_files(self) -> None:
-        """Refuse files of another calibration where those of this one will be."""
+        """Refuse existing files under the names of this calibration's test campaigns."""
         for path in (self.files.validation, self.files.corrected):
             if path.exists():
                 raise InputError(
@@ -180,21 +182,21 @@ class Procedure:
                 )
 
     def resume(self, campaign: CampaignFile) -> None:
-        """Keep what is asked for in the log of the campaign."""
+        """Store the settings in the campaign's log, where they have changed."""
         check_same_cell(campaign, self.config, self.base_dir)
         log, settings = ProcedureLog(campaign), self.settings.to_json()
-        before = log.last(BEGUN)
-        if before is None or before["settings"] != settings:
+        stored = log.last(BEGUN)
+        if stored is None or stored["settings"] != settings:
             log.append(BEGUN, {"settings": settings})
 
     # measuring
 
     def measure(self, step: ProcedureStep, measure: Measure) -> int:
-        """Measure what is missing of a plan; returns how many readings its campaign then holds.
+        """Measure the missing readings of a plan; return the number that its campaign then holds.
 
         Raises:
-            DeviceError: a device failed; what was measured is stored.
-            KeyboardInterrupt: somebody stopped it; the same holds.
+            DeviceError: a device failed; the readings so far are stored.
+            KeyboardInterrupt: interrupted; the readings so far are stored.
         """
         epoch = None if step.path == self.run else self._epoch()
         with CampaignFile.open(step.path) as campaign:
@@ -202,7 +204,7 @@ class Procedure:
             return campaign.n_readings
 
     def _epoch(self) -> float | None:
-        """Return the time of day that the campaign's time counts from, s; None where not known."""
+        """Return the wall time at zero of the campaign's time, s; None where unknown."""
         with CampaignFile.open(self.run, read_only=True) as campaign:
             details = RunLog(campaign).details() if campaign.about(PLAN) is not None else []
         return float(details[0]["epoch_wall_s"]) if details else None
@@ -211,14 +213,14 @@ class Procedure:
 
     def refine(
         self,
-        say: Say = lambda words: None,
+        say: Say = lambda text: None,
         seen: Callable[[int, RefinementStep], None] = lambda number, step: None,
     ) -> Refinement:
         """Fit, diagnose, and change the model until it is adequate; all revisions are stored.
 
         Args:
             say: takes progress.
-            seen: takes each step as soon as it is judged, with the number of its revision.
+            seen: takes each step as soon as it is diagnosed, after the number of its revision.
 
         Raises:
             CannotAnswerError: the readings do not determine the baseline.
@@ -228,48 +230,48 @@ class Procedure:
             say("registering")
             model = baseline(o.cell, o.readings, mode, o.catalogue, self.known)
             numbers = itertools.count(len(o.file.revisions()) + 1)
-            found = refine(
+            refinement = refine(
                 model, o.readings, mode, say, seen=lambda step: seen(next(numbers), step)
             )
             say("computing standard uncertainties")
-            self.keep(o, found)
-        return found
+            self.keep(o, refinement)
+        return refinement
 
     def keep(self, o: Campaign, found: Refinement) -> tuple[int, ...]:
-        """Store the revisions of a refinement; returns their numbers."""
+        """Store the revisions of a refinement; return their numbers."""
         records = [o.record(s.fit, s.diagnosis, s.added, s.removed) for s in found.steps]
         content = {"readings_sha256": o.data_hash, "verdict": found.verdict}
-        self._found[:] = [found]
+        self._refinements[:] = [found]
         return ProcedureLog(o.file).append(REFINED, content, revisions=records)
 
-    def decide(self, say: Say = lambda words: None) -> Decision:
-        """Decide whether to measure more; a further plan is in the campaign then."""
+    def decide(self, say: Say = lambda text: None) -> Decision:
+        """Decide whether to measure more; a further plan is appended to the campaign."""
         with Campaign.open(self.run, self.catalogue) as o:
             log, run = ProcedureLog(o.file), RunLog(o.file)
-            if self._found:
-                d = self._found[0].diagnosis
+            if self._refinements:
+                d = self._refinements[0].diagnosis
             else:
                 record = self._record(o)
                 say(f"diagnosing revision {record.number}")
                 d = diagnose(o.restore(record), o.history(record.number), say)
             rng = self._rng(_FURTHER, len(run.plans))
             reference = reference_of(run.plans[0])
-            asked = (self.cell, self._planned(), self.settings)
-            found = FurtherMeasuring(*asked, d, run.plans, reference, rng, say).decide()
-            plan = found.plan if found.measures else None
+            site = (self.cell, self._planned(), self.settings)
+            decision = FurtherMeasuring(*site, d, run.plans, reference, rng, say).decide()
+            plan = decision.plan if decision.measures else None
             if plan is not None:
                 plan = run.with_new_names(plan)  # `run` checks every motion of it
             action = STOP if plan is None else MEASURE
-            log.append(DECIDED, {"action": action, **found.to_json()}, plan=plan)
-        return found
+            log.append(DECIDED, {"action": action, **decision.to_json()}, plan=plan)
+        return decision
 
     def stop(self) -> None:
-        """Measure no further plan: the last refinement is what will be tested."""
+        """Stop measuring: the last refinement will be tested."""
         with CampaignFile.open(self.run) as campaign:
             ProcedureLog(campaign).append(DECIDED, {"action": STOP, "reason": "asked"})
 
-    def compute(self, step: ProcedureStep, say: Say = lambda words: None) -> object:
-        """Do a step after the first in which nothing moves; returns what came of it."""
+    def compute(self, step: ProcedureStep, say: Say = lambda text: None) -> object:
+        """Do a step in which nothing moves, other than "plan"; return its result."""
         steps: dict[str, Callable[[Say], object]] = {
             "refine": self.refine,
             "decide": self.decide,
@@ -281,14 +283,14 @@ class Procedure:
         return steps[step.kind](say)
 
     def predicted(self) -> PredictedError:
-        """Predict the error after compensation with the model as it is."""
+        """Predict the error after compensation with the last model."""
         with Campaign.open(self.run, self.catalogue, read_only=True) as o:
             calibration, record = self._calibration(o)
             return predicted_error(calibration, o.fitted_readings(record).states, self.config)
 
     # testing what is never fitted
 
-    def plan_validation(self, say: Say = lambda words: None) -> Plan:
+    def plan_validation(self, say: Say = lambda text: None) -> Plan:
         """Choose poses and loads of the validation campaign, and make its file."""
         with Campaign.open(self.run, self.catalogue, read_only=True) as o:
             say("restoring the model")
@@ -307,7 +309,7 @@ class Procedure:
             self._create(self.files.validation, VALIDATION, plan, o)
         return plan
 
-    def validate(self, say: Say = lambda words: None) -> Acceptance:
+    def validate(self, say: Say = lambda text: None) -> Acceptance:
         """Freeze the validation campaign, and predict its readings."""
         with (
             Campaign.open(self.run, self.catalogue) as o,
@@ -326,17 +328,17 @@ class Procedure:
             say(f"predicting {len(readings)} readings")
             model, theta = o.restore_model(record)
             mode = self._mode(fitted)
-            found = validation.validate(model, theta, fitted, readings, mode)
-            beyond = extrapolation(o.predictive(record, model, theta), fitted, found)
-            shares = acceptance(found, beyond)
-            every = shares.everything
-            content = {"revision": record.number, "error": found.error.to_json()}
-            content |= {"noise_floor_m": found.noise_floor, "stated_m": every.stated_m}
-            log.append(VALIDATED, {**content, "within": every.within})
+            prediction = validation.validate(model, theta, fitted, readings, mode)
+            beyond = extrapolation(o.predictive(record, model, theta), fitted, prediction)
+            shares = acceptance(prediction, beyond)
+            total = shares.everything
+            content = {"revision": record.number, "error": prediction.error.to_json()}
+            content |= {"noise_floor_m": prediction.noise_floor, "stated_m": total.stated_m}
+            log.append(VALIDATED, {**content, "within": total.within})
         return shares
 
     def _freeze(self, log: ProcedureLog, unseen: CampaignFile) -> None:
-        """Record the hash of the validation campaign; later it has to be the same."""
+        """Record the hash of the validation campaign; refuse one that differs from its record."""
         frozen, readings = log.last(FROZEN), unseen.readings()
         hashed = content_hash(readings)
         if frozen is None:
@@ -348,8 +350,8 @@ class Procedure:
                 f"(SHA-256 {frozen['readings_sha256'][:12]}…, now {hashed[:12]}…)"
             )
 
-    def correct(self, say: Say = lambda words: None) -> Plan:
-        """Correct the joint targets of the validation poses, and make the file of their run."""
+    def correct(self, say: Say = lambda text: None) -> Plan:
+        """Correct the joint targets of the validation poses, and make the campaign for them."""
         with (
             Campaign.open(self.run, self.catalogue) as o,
             opened(self.files.validation, VALIDATION, self.run) as unseen,
@@ -358,8 +360,8 @@ class Procedure:
             say("restoring the model")
             calibration, record = self._calibration(o)
             readings = self._readings(o, record, unseen)
-            made = read_plan(unseen.about(PLAN) or "", f"{unseen.path}, its plan")
-            reference = reference_of(made)
+            measured_plan = read_plan(unseen.about(PLAN) or "", f"{unseen.path}, its plan")
+            reference = reference_of(measured_plan)
             time = readings.states.time
             plan = corrected_plan(
                 self.cell,
@@ -374,8 +376,8 @@ class Procedure:
             self._create(self.files.corrected, CORRECTED, plan, o)
         return plan
 
-    def compare(self, say: Say = lambda words: None) -> Improvement:
-        """Compare the errors at uncorrected and at corrected joint targets, as measured."""
+    def compare(self, say: Say = lambda text: None) -> Improvement:
+        """Compare the measured errors at uncorrected and corrected joint targets."""
         with (
             Campaign.open(self.run, self.catalogue) as o,
             opened(self.files.validation, VALIDATION, self.run) as unseen,
@@ -386,14 +388,14 @@ class Procedure:
             say("comparing errors before and after")
             calibration, record = self._calibration(o)
             first, last = (self._readings(o, record, file) for file in (unseen, moved))
-            before, after = paired(first, last, calibration.mode)
+            uncorrected, corrected = paired(first, last, calibration.mode)
             left_out = left_out_of(read_plan(moved.about(PLAN) or "", f"{moved.path}, its plan"))
             p = o.predictive(record, *o.restore_model(record))
-            found = improvement(calibration, p, before, after, before.states, left_out)
+            gain = improvement(calibration, p, uncorrected, corrected, uncorrected.states, left_out)
             if log.last(IMPROVED) is None:
                 content = {"revision": record.number, "readings_sha256": moved.data_hash()}
-                log.append(IMPROVED, {**content, **found.to_dict()})
-        return found
+                log.append(IMPROVED, {**content, **gain.to_dict()})
+        return gain
 
     # what the steps share
 
@@ -401,12 +403,12 @@ class Procedure:
         return np.random.default_rng([self.settings.seed, *stream])
 
     def _planned(self) -> CellConfig:
-        """Return the configuration for planning: of the kind of readings that is fitted."""
+        """Return the configuration for planning, with the kind of readings that is fitted."""
         planning = self.config.planning.model_copy(update={"readings": self.settings.readings})
         return self.config.model_copy(update={"planning": planning})
 
     def _mode(self, readings: Readings) -> Mode:
-        """Return the kind of readings that is fitted; deflections where the readings allow."""
+        """Return the kind of readings to fit; deflections only where the readings allow."""
         return usual_mode(readings, self.settings.readings)
 
     def _record(self, o: Campaign) -> RevisionRecord:
@@ -420,34 +422,34 @@ class Procedure:
         return o.calibration(record.number), record
 
     def _readings(self, o: Campaign, record: RevisionRecord, file: CampaignFile) -> Readings:
-        """Return the readings of another file with the covariance that the fit takes them for."""
+        """Return the readings of another file, with their covariance by the fit of a revision."""
         model, _ = o.restore_model(record)
-        known = (True,) * len(model.cell.known_targets)
+        all_known = (True,) * len(model.cell.known_targets)
         cell = replace(model.cell, registration_known=True)
-        cell = cell.with_targets(cell.all_targets, known)
-        found = full_readings(file.readings(), file.about(COVERS), cell, o.config)
+        cell = cell.with_targets(cell.all_targets, all_known)
+        readings = full_readings(file.readings(), file.about(COVERS), cell, o.config)
         scatter = record.parameters_json.get("arm_scatter")
         if scatter is None:
-            return found
-        return with_arm_scatter(cell, found, ArmScatter.from_json(scatter))
+            return readings
+        return with_arm_scatter(cell, readings, ArmScatter.from_json(scatter))
 
     def _create(self, path: Path, purpose: str, plan: Plan, o: Campaign) -> None:
-        more = {
+        texts = {
             PURPOSE: purpose,
             CALIBRATION: identity(self.run),
             COVERS: o.file.about(COVERS) or INSTRUMENT,
         }
         config = CellConfig.from_json(o.file.config_json)
         source = self._source(f"{purpose} campaign of {self.run.name}, ")
-        create_run(path, config, self.base_dir, plan, source=source, more=more).close()
+        create_run(path, config, self.base_dir, plan, source=source, more=texts).close()
 
-    def _source(self, what: str = "") -> str:
-        how = "measured" if self.settings.hide is None else "rehearsed in a simulated cell"
-        return f"{what}{how} by hilcal calibrate"
+    def _source(self, prefix: str = "") -> str:
+        origin = "measured" if self.settings.hide is None else "rehearsed in a simulated cell"
+        return f"{prefix}{origin} by hilcal calibrate"
 
 
 def with_origin(chosen: Planned) -> Plan:
-    """Return a plan that says where it is from."""
+    """Return a plan with its origin and remarks."""
     return replace(chosen.ordered.plan, about={**about(chosen), "remarks": list(remarks(chosen))})
 
 
@@ -459,7 +461,7 @@ def checked_plan(
     catalogue: Catalogue,
     say: Say,
 ) -> CheckedPlan:
-    """Choose a plan of so many poses, each under every load that it bears; check all motions."""
+    """Choose a plan, each pose under every load that it bears; check all motions."""
     chosen = make(cell, config, Request(poses), rng, None, say, catalogue)
     summary = summarise(chosen, config, rng, say, compare=False)
     say("checking every motion in a dry run")
@@ -467,7 +469,7 @@ def checked_plan(
 
 
 def continued(run: Path, cell: Cell, config: CellConfig, catalogue: Catalogue) -> Procedure:
-    """Return a calibration as its campaign file has it."""
+    """Return the calibration of a campaign file, with the file's settings."""
     with CampaignFile.open(run, read_only=True) as campaign:
         settings, base_dir = settings_of(campaign), cell.base_dir.absolute()
         check_same_cell(campaign, config, base_dir)

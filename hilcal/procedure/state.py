@@ -1,4 +1,4 @@
-"""Where a calibration stands: the next step, by what its files hold and nothing else."""
+"""State of a calibration: its next step, determined by the contents of its files alone."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,32 +35,31 @@ BEGUN, REFINED, DECIDED, FROZEN = "begun", "refined", "decided", "frozen"
 VALIDATED, IMPROVED, WORLD = "validated", "improved", "world"
 """Kinds of entries in the log."""
 MEASURE, STOP = "measure", "stop"
-"""What was decided: to measure a further plan, or that the model is as good as it gets."""
+"""Decisions: measure a further plan, or stop measuring."""
 SUFFIX = ".hilcal"
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What a calibration was asked for; kept in its campaign."""
+    """Settings of a calibration; stored in its campaign."""
 
     poses: int = 20  # size of the first plan, and of further ones
     validation: int = 20  # poses of the validation campaign
     max_time_s: float = 7200.0
-    """How long measuring may last in all plans together, as they state it, cell s."""
+    """Longest time for measuring, all plans together, by their stated durations, cell s."""
     goal_m: float | None = None
-    """The error that is wanted after compensation: 95 % of the points within it; None for no goal
-    beside an adequate model."""
+    """Error after compensation that 95 % of the points shall keep; None: an adequate model."""
     limit_m: float | None = None
-    """The largest error that is allowed at corrected targets; None for none."""
-    seed: int = 0  # of everything random
+    """Largest error allowed at corrected targets; None without a limit."""
+    seed: int = 0  # of all random numbers
     readings: Mode = "deflection"  # kind of readings that is fitted
-    hide: str | None = None  # what a rehearsal hides in its simulated cell; None on real devices
-    under_load: bool = False  # whether the model is tested under loads alone, where there are any
+    hide: str | None = None  # effect hidden in a rehearsal's simulated cell; None on real devices
+    under_load: bool = False  # whether the model is tested under loads only, where there are any
     prior: str | None = None
-    """File of the campaign or the posterior that is the prior of every fit; None without."""
+    """File of the campaign or posterior that is the prior of every fit; None without a prior."""
 
     def to_json(self) -> dict[str, object]:
-        """Return it as JSON; `settings_of` reads it."""
+        """Return the settings as JSON, which `settings_of` reads."""
         return dict(encode(self))
 
 
@@ -73,27 +72,27 @@ class Files:
     @property
     def validation(self) -> Path:
         """The validation campaign."""
-        return self._beside(VALIDATION)
+        return self._sibling(VALIDATION)
 
     @property
     def corrected(self) -> Path:
         """The run at corrected targets."""
-        return self._beside(CORRECTED)
+        return self._sibling(CORRECTED)
 
-    def _beside(self, what: str) -> Path:
-        return self.run.with_name(f"{self.run.name.removesuffix(SUFFIX)}.{what}{SUFFIX}")
+    def _sibling(self, purpose: str) -> Path:
+        return self.run.with_name(f"{self.run.name.removesuffix(SUFFIX)}.{purpose}{SUFFIX}")
 
 
 @dataclass(frozen=True, slots=True)
 class ProcedureStep:
-    """What a calibration does next."""
+    """A step of a calibration; the counts are 0 where the arm does not move."""
 
-    kind: Kind  # what
-    path: Path  # the campaign that it is about
-    missing: int = 0  # readings that are missing, where the arm moves
-    planned: int = 0  # readings of the plan, where the arm moves
-    load_changes: int = 0  # how often a person has to change the load, where the arm moves
-    seconds: float = 0.0  # how long the arm takes for what is missing, roughly, cell s
+    kind: Kind
+    path: Path  # the campaign of the step
+    missing: int = 0  # missing readings
+    planned: int = 0  # readings of the plan
+    load_changes: int = 0  # load changes by a person
+    seconds: float = 0.0  # approximate duration of the missing readings, cell s
 
     @property
     def moves(self) -> bool:
@@ -109,9 +108,9 @@ def next_step(run: Path) -> ProcedureStep:
     with CampaignFile.open(run, read_only=True) as campaign:
         log = ProcedureLog(campaign)
         if log.last(BEGUN) is None:
-            raise _another(run)
+            raise _not_of_calibrate(run)
         decided = log.last(DECIDED)
-        if decided is not None and not files.validation.exists() and _asked_anew(log):
+        if decided is not None and not files.validation.exists() and _settings_changed(log):
             return ProcedureStep("decide", run)
         if decided is None or decided["action"] == MEASURE:
             missing = _missing("measure", campaign)
@@ -121,30 +120,30 @@ def next_step(run: Path) -> ProcedureStep:
             if refined is None or refined["readings_sha256"] != campaign.data_hash():
                 return ProcedureStep("refine", run)
             return ProcedureStep("decide", run)
-        looked, improved = log.last(VALIDATED) is not None, log.last(IMPROVED) is not None
+        validated, improved = log.last(VALIDATED) is not None, log.last(IMPROVED) is not None
     tests: list[tuple[Path, str, Kind, Kind, Kind, bool, Path]] = [
-        (files.validation, VALIDATION, *_VALIDATING, looked, files.validation),
+        (files.validation, VALIDATION, *_VALIDATING, validated, files.validation),
         (files.corrected, CORRECTED, *_CORRECTING, improved, run),
     ]
-    for path, purpose, plan, measure, judge, judged, of in tests:
+    for path, purpose, plan, measure, judge, judged, target in tests:
         if not path.exists():
             return ProcedureStep(plan, path)
         with opened(path, purpose, run) as campaign:
             missing = _missing(measure, campaign)
         if missing is not None or not judged:
-            return missing or ProcedureStep(judge, of)
+            return missing or ProcedureStep(judge, target)
     return ProcedureStep("done", run)
 
 
-def _asked_anew(log: ProcedureLog) -> bool:
-    """Whether other settings were asked for since measuring was ended."""
+def _settings_changed(log: ProcedureLog) -> bool:
+    """Whether settings were entered after the decision to stop measuring."""
     kinds = [entry["kind"] for entry in log.entries() if entry["kind"] in (BEGUN, DECIDED)]
     last = log.last(DECIDED)
     return kinds[-1] == BEGUN and last is not None and last["action"] == STOP
 
 
 def opened(path: Path, purpose: str, run: Path, *, read_only: bool = True) -> CampaignFile:
-    """Open a file of a calibration."""
+    """Open a test campaign of the calibration `run`; refuse a file of another purpose or run."""
     campaign = CampaignFile.open(path, read_only=read_only)
     if campaign.about(PURPOSE) != purpose or campaign.about(CALIBRATION) != identity(run):
         campaign.close()
@@ -153,22 +152,22 @@ def opened(path: Path, purpose: str, run: Path, *, read_only: bool = True) -> Ca
 
 
 def identity(run: Path) -> str:
-    """Return what the other files of a calibration know their campaign by: name and beginning."""
+    """Return name and creation time of a campaign, stored in the other files of a calibration."""
     with CampaignFile.open(run, read_only=True) as campaign:
         return f"{run.name} of {campaign.created}"
 
 
 def settings_of(campaign: CampaignFile) -> Settings:
-    """Return what a calibration was asked for, as it was last."""
-    begun = ProcedureLog(campaign).last(BEGUN)
-    if begun is None:
-        raise _another(campaign.path)
-    settings: Settings = decode(Settings, begun["settings"])
+    """Return the latest settings of a calibration."""
+    entry = ProcedureLog(campaign).last(BEGUN)
+    if entry is None:
+        raise _not_of_calibrate(campaign.path)
+    settings: Settings = decode(Settings, entry["settings"])
     return settings
 
 
-def _another(run: Path) -> InputError:
-    """Return the error of a campaign that was not made by `calibrate`."""
+def _not_of_calibrate(run: Path) -> InputError:
+    """Return the error for a campaign that `calibrate` did not make."""
     return InputError(
         f"{run}: not a campaign of hilcal calibrate; choose another name, or go on with its own "
         f"commands: hilcal info {quoted(run)}"
@@ -176,23 +175,23 @@ def _another(run: Path) -> InputError:
 
 
 def duration_of(plan: Plan) -> float:
-    """Return how long a plan takes as it states it, cell s."""
-    told = plan.about.get("duration_s", {})
-    return float(told.get("total", 0.0)) if isinstance(told, dict) else 0.0
+    """Return the duration that a plan states, cell s; 0 without one."""
+    durations = plan.about.get("duration_s", {})
+    return float(durations.get("total", 0.0)) if isinstance(durations, dict) else 0.0
 
 
 def _missing(kind: Kind, campaign: CampaignFile) -> ProcedureStep | None:
-    """Return the step that measures what is missing of the last plan; None where nothing is."""
+    """Return the step that measures the missing readings of the last plan; None without any."""
     log = RunLog(campaign)
-    last, done = log.plans[-1], log.done()
-    left = last.without(done).steps
-    if not left:
+    plan, done = log.plans[-1], log.done()
+    steps = plan.without(done).steps
+    if not steps:
         return None
-    loads = [s.load for s in left]
+    loads = [s.load for s in steps]
     changes = sum(a != b for a, b in zip(["none", *loads], [*loads, "none"], strict=True))
-    share = len(left) / len(last.steps)
-    seconds = share * duration_of(last)
-    return ProcedureStep(kind, campaign.path, len(left), len(last.steps), changes, seconds)
+    share = len(steps) / len(plan.steps)
+    seconds = share * duration_of(plan)
+    return ProcedureStep(kind, campaign.path, len(steps), len(plan.steps), changes, seconds)
 
 
 def reference_in(file: CampaignFile) -> Floats | None:

@@ -1,7 +1,7 @@
-"""Plans of the campaigns that test a calibration, and their readings side by side.
+"""Plans of the two campaigns that test a calibration, and the pairs of their readings.
 
-The validation campaign: poses and loads within what was measured, and none of its poses. The run at
-corrected joint targets: the same points at the joint values that the calibration gives.
+The validation campaign has new poses within the range of the fitted readings. The corrected
+campaign has the same points at the joint values that the calibration gives.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,16 +30,16 @@ from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step
 from hilcal.types import Bools, Floats, Ints
 
 DRAWN = 4
-"""Poses that are drawn for each one that is wanted; a choice: few of them cannot be reached or lie
-far from all that was measured."""
+"""Poses drawn per requested pose; a choice: few cannot be reached or are far from all fitted ones.
+"""
 LEAST_RANGE = 1e-4
-"""Range that a joint which stood still in the campaign has here, rad; a choice."""
+"""Least range of a joint, rad, for joints that did not move in the campaign; a choice."""
 DRAWS = 4
-"""Orders that are drawn; a choice: drift is no matter here, only time."""
+"""Orders drawn; a choice: only the duration matters, not the drift."""
 
 
 def recorded(states: States) -> dict[str, Floats]:
-    """Return the columns that a model may need beside joint angles and wrench, by name."""
+    """Return the columns that a model may need besides joint angles and wrench, by name."""
     names = ("time", "load_time", "air_temperature", "joint_temperature", "approach")
     return {name: v for name in names if (v := getattr(states, name)) is not None}
 
@@ -52,51 +52,51 @@ def validation_plan(
     reference: Floats | None,
     count: int,
     rng: np.random.Generator,
-    say: Say = lambda words: None,
+    say: Say = lambda text: None,
     *,
     under_load: bool = False,
 ) -> Plan:
-    """Choose poses at random, the loads in turn, and put them in order.
+    """Choose random poses, assign the loads in turn, and order the readings.
 
-    The poses are drawn evenly over the joint angles that were measured; those that the cell does
-    not allow, that are not reached, or that lie far from all measured ones (see
-    `identification.validation`) are left out, so that they may be fewer than `count`. Each is
-    measured under one load, for deflections unloaded as well; of a fit to positions the unloaded
-    arm is one of the loads, unless `under_load` leaves it out. `reference` (n,) are the joints of
-    the pose where loads are changed, rad; that of the first reading where None.
+    The poses are uniform in the measured range of joint angles. Poses that the cell does not allow,
+    that cannot be reached, or that are far from all fitted ones (see `identification.validation`)
+    are left out, so there may be fewer than `count`. Each pose is measured under one load, for
+    deflections also unloaded; for positions "unloaded" is one of the loads, unless `under_load`
+    excludes it. Loads are changed at the joints `reference` (n,), rad; None: those of the first
+    reading.
     """
     say("drawing poses within what was measured")
     loads = _loads(calibration, fitted, under_load)
     hung = [load for load in config.loads if load.name in loads]
-    own = config.model_copy(update={"loads": tuple(hung)})
-    space = Space(_within(cell, config, fitted.states.q), own)
+    tested_config = config.model_copy(update={"loads": tuple(hung)})
+    space = Space(_within(cell, config, fitted.states.q), tested_config)
     base = fitted.states.q[0] if reference is None else reference
-    found = draw(space, DRAWN * count, rng)
-    good = {
-        name: found.allowed[:, found.loads.index(name)] & space.passable(base, found.q, name)
+    drawn = draw(space, DRAWN * count, rng)
+    usable = {
+        name: drawn.allowed[:, drawn.loads.index(name)] & space.passable(base, drawn.q, name)
         for name in (UNLOADED, *loads)
     }
-    last = fitted.states[np.full(len(found.q), len(fitted) - 1)]
-    usual = replace(last, q=found.q, q_actual=None, target=None)
+    last = fitted.states[np.full(len(drawn.q), len(fitted) - 1)]
+    states = replace(last, q=drawn.q, q_actual=None, target=None)
     for name in loads:
         wrench = calibration.loads.get(name, np.zeros(6))
-        good[name] &= good[UNLOADED] & ~_far(calibration, usual, wrench)
-    wanted: list[tuple[int, str]] = []
-    for k in range(len(found.q)):
-        # The loads in turn; where a pose does not bear one, the next.
-        order = [loads[(len(wanted) + j) % len(loads)] for j in range(len(loads))]
-        borne = [name for name in order if good[name][k]]
-        if borne and len(wanted) < count:
-            wanted.append((k, borne[0]))
-    if not wanted:
+        usable[name] &= usable[UNLOADED] & ~_far(calibration, states, wrench)
+    selected: list[tuple[int, str]] = []
+    for k in range(len(drawn.q)):
+        # The loads in turn; the next load where the pose does not bear this one.
+        order = [loads[(len(selected) + j) % len(loads)] for j in range(len(loads))]
+        borne = [name for name in order if usable[name][k]]
+        if borne and len(selected) < count:
+            selected.append((k, borne[0]))
+    if not selected:
         raise CannotAnswerError(
             "no pose within the joint angles that were measured is left for a validation campaign: "
             "all are beyond the cell's limits, out of sight, or not reached from the reference pose"
         )
     say("ordering the readings")
-    also = (UNLOADED,) if calibration.mode == "deflection" else ()
-    chosen = [Chosen(f"v{i}", (*also, name)) for i, (_, name) in enumerate(wanted, start=1)]
-    plan = _ordered(space, own, chosen, found.q[[k for k, _ in wanted]], base, rng)
+    unloaded = (UNLOADED,) if calibration.mode == "deflection" else ()
+    chosen = [Chosen(f"v{i}", (*unloaded, name)) for i, (_, name) in enumerate(selected, start=1)]
+    plan = _ordered(space, tested_config, chosen, drawn.q[[k for k, _ in selected]], base, rng)
     refuse(dry_run(cell, config, plan), "the validation plan")
     return replace(plan, about={**plan.about, "purpose": "validation"})
 
@@ -109,18 +109,17 @@ def _ordered(
     reference: Floats,
     rng: np.random.Generator,
 ) -> Plan:
-    """Put the chosen poses in order, at joint values (P, n), from the reference pose (n,)."""
-    names, how = [c.pose for c in chosen], Ordering(repeats=0, draws=DRAWS)
-    found = order_plan(space.cell, config, names, q, reference, chosen, space.passable, rng, how)
-    return fewer_returns(found.plan, space, config)
+    """Order the chosen poses with joint values (P, n), from the reference pose (n,)."""
+    names, order = [c.pose for c in chosen], Ordering(repeats=0, draws=DRAWS)
+    best = order_plan(space.cell, config, names, q, reference, chosen, space.passable, rng, order)
+    return fewer_returns(best.plan, space, config)
 
 
 def fewer_returns(plan: Plan, space: Space, config: CellConfig) -> Plan:
     """Return the plan without readings at the reference pose where a load is changed.
 
-    The arm goes there all the same. The first and the last one stay, which measure the drift of a
-    campaign that takes minutes, and the unloaded ones of loaded ones that stay: a deflection needs
-    both.
+    The arm still moves there. The first and last reference readings stay, which measure the drift;
+    so does the unloaded reading of every loaded one that stays, for the deflection.
     """
     steps = plan.steps
     stays = [
@@ -130,15 +129,15 @@ def fewer_returns(plan: Plan, space: Space, config: CellConfig) -> Plan:
         for k, s in enumerate(steps)
     ]
     needed = {Step(s.pose, UNLOADED, s.cycle) for s in compress(steps, stays)}
-    kept = [s for s, stay in zip(steps, stays, strict=True) if stay or s in needed]
-    made = replace(plan, steps=tuple(kept))
+    retained = [s for s, stay in zip(steps, stays, strict=True) if stay or s in needed]
+    shorter = replace(plan, steps=tuple(retained))
     margin = config.limits.joint_margin_rad
-    lasts = timeline(made, space.cell.arm, margin, pace(config))[0]
-    return replace(made, about={**plan.about, "duration_s": lasts.about()})
+    durations = timeline(shorter, space.cell.arm, margin, pace(config))[0]
+    return replace(shorter, about={**plan.about, "duration_s": durations.about()})
 
 
 def _loads(calibration: Calibration, fitted: Readings, under_load: bool) -> tuple[str, ...]:
-    """Names of the loads under which the model is tested: those that it was fitted under."""
+    """Return the names of the loads to test, which are those of the fitted readings."""
     used = [fitted.load_names[k] for k in dict.fromkeys(fitted.load.tolist())]
     hung = tuple(name for name in used if name != UNLOADED and name in calibration.loads)
     if calibration.mode == "deflection" or (hung and under_load):
@@ -147,7 +146,7 @@ def _loads(calibration: Calibration, fitted: Readings, under_load: bool) -> tupl
 
 
 def _within(cell: Cell, config: CellConfig, q: Floats) -> Cell:
-    """Return the cell with an arm that leaves no measured range of joint angles (N, n)."""
+    """Return the cell with joint limits at the range of the measured joint angles (N, n)."""
     margin, arm = config.limits.joint_margin_rad + 2e-6, cell.arm
     low, high = q.min(axis=0), q.max(axis=0)
     wider = 0.5 * np.maximum(LEAST_RANGE - (high - low), 0.0)
@@ -157,42 +156,43 @@ def _within(cell: Cell, config: CellConfig, q: Floats) -> Cell:
 
 
 def _far(calibration: Calibration, states: States, wrench: Floats) -> Bools:
-    """(N,) which states lie far from all that was measured, whatever the temperature."""
-    told = calibration.predict(states.q, wrench, recorded=recorded(states))
+    """Return whether each state is outside the measured range (N,); temperature is ignored."""
+    prediction = calibration.predict(states.q, wrench, recorded=recorded(states))
     far = np.zeros(len(states), dtype=np.bool_)
-    for o in told.outside:
+    for o in prediction.outside:
         far |= o.points & ("temperature" not in o.of.variable)
     return far
 
 
-LEFT_OUT = "left_out"  # Key of a plan's file: which points are missing, and why
+LEFT_OUT = "left_out"  # Key in a plan's file: the omitted points, with reasons
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CorrectedPoints:
     """K readings of a validation campaign whose poses are to be corrected."""
 
-    rows: Ints  # (K,) of the readings
-    unloaded: Ints  # (K,) rows of their unloaded readings, for a fit to deflections; -1 otherwise
-    names: tuple[str, ...]
-    loads: tuple[str, ...]  # name of each one's load
+    rows: Ints  # (K,) rows of the readings
+    unloaded: Ints  # (K,) rows of their unloaded readings, for a fit to deflections; else -1
+    names: tuple[str, ...]  # K names
+    loads: tuple[str, ...]  # name of each point's load
 
 
 def points_of(readings: Readings, mode: str) -> CorrectedPoints:
-    """Return what is corrected: of the first target each pose under its load.
+    """Return the points to correct: readings of the first target, except at the reference pose.
 
-    For deflections it is each loaded reading that has an unloaded one in its pose and cycle.
+    For deflections, only loaded readings with an unloaded one of the same pose and cycle.
     """
     first = readings.target == 0
-    at = {
+    unloaded_rows = {
         (int(readings.pose[k]), int(readings.cycle[k])): int(k)
         for k in np.flatnonzero(first & readings.unloaded)
     }
     rows, unloaded = [], []
     for k in np.flatnonzero(first).tolist():
-        base = -1 if mode == "absolute" else at.get((int(readings.pose[k]), int(readings.cycle[k])))
-        taken = mode == "absolute" or not readings.unloaded[k]
-        if taken and base is not None and readings.pose_names[readings.pose[k]] != REFERENCE:
+        arrival = int(readings.pose[k]), int(readings.cycle[k])
+        base = -1 if mode == "absolute" else unloaded_rows.get(arrival)
+        to_correct = mode == "absolute" or not readings.unloaded[k]
+        if to_correct and base is not None and readings.pose_names[readings.pose[k]] != REFERENCE:
             rows.append(k)
             unloaded.append(base)
     loads = tuple(readings.load_names[readings.load[k]] for k in rows)
@@ -210,93 +210,104 @@ def corrected_plan(
     calibration: Calibration,
     validation: Readings,
     reference: Floats,
-    begun: float,
+    start: float,
     rng: np.random.Generator,
-    say: Say = lambda words: None,
+    say: Say = lambda text: None,
 ) -> Plan:
     """Return the plan of the corrected joint targets of a validation campaign.
 
-    A point's joint values are found for the state in which its reading will be taken: the wrench
-    that was measured in the validation, sides of approach and times as the route gives them,
-    temperatures as they were last. Points that cannot be corrected, or that the cell does not allow
-    at their corrected values, are left out; the plan says which. `reference` (n,) are the joints of
-    the validation's reference pose, rad; the plan begins at `begun`, in the time of the campaign,
-    s.
+    A point is corrected for the expected state of its reading: the wrench measured in the
+    validation, approach sides and times from the route, the last measured temperatures. Points that
+    cannot be corrected, or whose corrected joint values the cell does not allow, are left out and
+    listed in the plan. `reference` (n,) are the joints of the validation's reference pose, rad;
+    `start` is the time of the campaign at which the plan begins, s.
     """
     say("correcting joint values")
-    of = points_of(validation, calibration.mode)
+    points = points_of(validation, calibration.mode)
     space, last = Space(cell, config), validation.states[slice(len(validation) - 1, None)]
-    q = validation.states.q[of.rows]
-    left = {of.names[k]: why for k, why in _blocked(space, q, reference, of.loads).items()}
+    names, q = points.names, validation.states.q[points.rows]
+    blocked = _blocked(space, q, reference, points.loads)
+    left_out = {names[k]: why for k, why in blocked.items()}
     while True:
-        keep = np.array([k for k, name in enumerate(of.names) if name not in left], dtype=int)
+        keep = np.array([k for k, name in enumerate(names) if name not in left_out], dtype=int)
         if not len(keep):
             break
-        chosen = [Chosen(of.names[k], (of.loads[k],)) for k in keep]
+        chosen = [Chosen(names[k], (points.loads[k],)) for k in keep]
         plan = _ordered(space, config, chosen, q[keep], reference, rng)
-        order = np.array([of.names.index(s.pose) for s in plan.steps if s.pose != REFERENCE])
-        wrenches = {of.names[k]: validation.states.wrench[of.rows[k]] for k in keep}
+        order = np.array([names.index(s.pose) for s in plan.steps if s.pose != REFERENCE])
+        wrenches = {names[k]: validation.states.wrench[points.rows[k]] for k in keep}
         wrench = np.array([wrenches.get(s.pose, np.zeros(6)) for s in plan.steps])
-        states = expected_states(plan, cell.arm, config, wrench, last, begun)
-        mine = states[np.array([s.pose != REFERENCE for s in plan.steps])]
-        found = _compensated(calibration, mine, validation, of, order)
-        bad = {k: why for k, why in enumerate(refusals(found, allowed_outside=True)) if why}
-        bad = _blocked(space, found.q, reference, [of.loads[k] for k in order]) | bad
-        if not bad:
+        states = expected_states(plan, cell.arm, config, wrench, last, start)
+        at_points = states[np.array([s.pose != REFERENCE for s in plan.steps])]
+        result = _compensated(calibration, at_points, validation, points, order)
+        reasons = refusals(result, allowed_outside=True)
+        refused = _blocked(space, result.q, reference, [points.loads[k] for k in order])
+        refused |= {k: why for k, why in enumerate(reasons) if why}
+        if not refused:
             say("checking every motion in a dry run")
-            made = _with_targets(plan, of, order, found, left)
-            refuse(dry_run(cell, config, made), "the run at corrected targets")
-            return made
-        left |= {of.names[order[k]]: why for k, why in bad.items()}
-    words = "; ".join(f"{name}: {why}" for name, why in list(left.items())[:3])
-    raise CannotAnswerError(f"no validation pose can be corrected: {words}")
+            corrected = _with_targets(plan, points, order, result, left_out)
+            refuse(dry_run(cell, config, corrected), "the run at corrected targets")
+            return corrected
+        left_out |= {names[order[k]]: why for k, why in refused.items()}
+    causes = "; ".join(f"{name}: {why}" for name, why in list(left_out.items())[:3])
+    raise CannotAnswerError(f"no validation pose can be corrected: {causes}")
 
 
 def _compensated(
-    calibration: Calibration, states: States, validation: Readings, of: CorrectedPoints, order: Ints
+    calibration: Calibration,
+    states: States,
+    validation: Readings,
+    points: CorrectedPoints,
+    order: Ints,
 ) -> Compensation:
-    """Correct the points for the states that are expected, in the order of the plan."""
-    nominal = validation.states[of.rows[order]].q
-    wanted = None
+    """Correct the points for their expected states, in the order of the plan."""
+    nominal = validation.states[points.rows[order]].q
+    poses = None
     if calibration.mode == "deflection":
-        # Where the unloaded arm was, in the state in which it was read.
+        # The goal is the pose of the unloaded arm, in the state of its reading.
         tool = tool_of(calibration.model, calibration.theta, None)
-        free = replace(validation.states[of.unloaded[order]], target=None)
+        free = replace(validation.states[points.unloaded[order]], target=None)
         rotation, position = tool_poses(tool, tool.model.predict(free, tool.theta))
-        wanted = se3.matrix(rotation, position)
-    return calibration.compensate(nominal, states.wrench, wanted=wanted, recorded=recorded(states))
+        poses = se3.matrix(rotation, position)
+    return calibration.compensate(nominal, states.wrench, wanted=poses, recorded=recorded(states))
 
 
 def _blocked(space: Space, q: Floats, reference: Floats, loads: Sequence[str]) -> dict[int, str]:
-    """Say which joint values (K, n) the cell does not allow under their loads, and why."""
+    """Return why the cell does not allow joint values (K, n) under their loads, by row."""
     out: dict[int, str] = {}
     names = np.array(loads)
     for load in dict.fromkeys(loads):
-        mine = np.flatnonzero(names == load)
-        for reason, kept in space.reasons(q[mine], load).items():
-            for k in mine[~kept]:
+        under_load = np.flatnonzero(names == load)
+        for reason, allowed in space.reasons(q[under_load], load).items():
+            for k in under_load[~allowed]:
                 out.setdefault(int(k), f"not allowed: {REASONS[reason][1]}")
-        clear: Bools = space.passable(reference, q[mine], load)
-        for k in mine[~clear]:
+        clear: Bools = space.passable(reference, q[under_load], load)
+        for k in under_load[~clear]:
             out.setdefault(int(k), "no clear motion to it from the reference pose")
     return out
 
 
 def _with_targets(
-    plan: Plan, of: CorrectedPoints, order: Ints, found: Compensation, left: Mapping[str, str]
+    plan: Plan,
+    points: CorrectedPoints,
+    order: Ints,
+    result: Compensation,
+    left_out: Mapping[str, str],
 ) -> Plan:
-    """Return the plan with the corrected joint values in the place of the nominal ones."""
-    corrected = {of.names[k]: row for k, row in zip(order, found.q, strict=True)}
+    """Return the plan with corrected joint values in place of the nominal ones."""
+    names, loads = points.names, points.loads
+    corrected = {names[k]: row for k, row in zip(order, result.q, strict=True)}
     rows = [corrected.get(n, old) for n, old in zip(plan.pose_names, plan.q, strict=True)]
-    expected = zip(order, found.before.error_m.tolist(), found.after.band_m.tolist(), strict=True)
+    errors, bands = result.before.error_m.tolist(), result.after.band_m.tolist()
+    expected = zip(order, errors, bands, strict=True)
     about = {
         **plan.about,
         "purpose": "corrected",
         "points": [
-            {"pose": of.names[k], "load": of.loads[k], "expected_before_m": off, "band_m": band}
-            for k, off, band in expected
+            {"pose": names[k], "load": loads[k], "expected_before_m": error, "band_m": band}
+            for k, error, band in expected
         ],
-        LEFT_OUT: [{"point": name, "why": why} for name, why in left.items()],
+        LEFT_OUT: [{"point": name, "why": why} for name, why in left_out.items()],
     }
     return Plan(plan.pose_names, np.array(rows), plan.steps, about)
 
@@ -304,60 +315,60 @@ def _with_targets(
 def paired(validation: Readings, corrected: Readings, mode: str) -> tuple[Readings, Readings]:
     """Return the readings of the same points at uncorrected and at corrected joint values.
 
-    For deflections both come with the unloaded readings of the points, from the validation: the
-    corrected readings take the pose and the cycle of the uncorrected ones. They share no error: of
-    several targets only the first one is compared.
+    For deflections both include the unloaded readings of the points from the validation; the
+    corrected readings take pose and cycle of the uncorrected ones. Common errors are dropped, since
+    only the first of several targets is compared.
     """
     alone: dict[str, Any] = {"common": None, "stated": None, "arm_scatter": None, "serial": None}
     validation, corrected = (replace(x, **alone) for x in (validation, corrected))
-    of = points_of(validation, mode)
+    points = points_of(validation, mode)
     first = np.flatnonzero(corrected.target == 0)
-    there = {corrected.pose_names[corrected.pose[k]]: int(k) for k in first}
-    known = [k for k, name in enumerate(of.names) if name in there]
-    rows, bases = of.rows[known], of.unloaded[known]
-    after = corrected[np.array([there[of.names[k]] for k in known], dtype=int)]
-    before = validation[rows]
-    moved = replace(before, states=after.states, value=after.value, covariance=after.covariance)
+    corrected_rows = {corrected.pose_names[corrected.pose[k]]: int(k) for k in first}
+    common = [k for k, name in enumerate(points.names) if name in corrected_rows]
+    rows, bases = points.rows[common], points.unloaded[common]
+    c = corrected[np.array([corrected_rows[points.names[k]] for k in common], dtype=int)]
+    uncorrected = validation[rows]
+    moved = replace(uncorrected, states=c.states, value=c.value, covariance=c.covariance)
     if mode == "absolute":
-        return before, moved
+        return uncorrected, moved
     free = validation[np.unique(bases)]
-    return Readings.joined([free, before]), Readings.joined([free, moved])
+    return Readings.joined([free, uncorrected]), Readings.joined([free, moved])
 
 
 def left_out_of(plan: Plan) -> list[tuple[str, str]]:
-    """Return the points that a plan leaves out, as its file says, each with the reason."""
+    """Return the points that a plan leaves out, each with the reason."""
     return [(str(x["point"]), str(x["why"])) for x in plan.about.get(LEFT_OUT, [])]
 
 
 def expected_states(
-    plan: Plan, arm: Arm, config: CellConfig, wrench: Floats, last: States, begun: float
+    plan: Plan, arm: Arm, config: CellConfig, wrench: Floats, last: States, start: float
 ) -> States:
-    """Return the state of each of the S steps of a plan.
+    """Return the expected state at each of the S steps of a plan.
 
-    Sides of approach and times under load follow from the route, as a session takes it. Joints and
-    air are as warm as in the last reading, the one state `last`, whose columns are returned.
-    `wrench` (S, 6) is that of each step's load at the load point, base axes, N and N·m; the plan
-    begins at `begun`, in the time of the campaign, s.
+    Approach sides and times under load follow from the route. Temperatures are those of `last`, the
+    single state of the last reading; the result has the columns of `last`. `wrench` (S, 6) is that
+    of each step's load at the load point, base axes, N and N·m. `start` is the time of the campaign
+    at which the plan begins, s.
     """
-    at = pace(config)
+    pacing = pace(config)
     stops = route(plan, arm, config.limits.joint_margin_rad)
-    now, since = begun, begun
-    times, hung = [], []
-    for before, stop in pairwise(stops):
-        now += duration(before.q, stop.q, at.speed, at.acceleration)
+    time, loaded_since = start, start
+    times, load_times = [], []
+    for previous, stop in pairwise(stops):
+        time += duration(previous.q, stop.q, pacing.speed, pacing.acceleration)
         if stop.change_to is not None:
-            now += at.change_s
-            since = now
+            time += pacing.change_s
+            loaded_since = time
         if stop.step is not None:
-            times.append(now + at.reading_s / 2)
-            hung.append(times[-1] - since)
-            now += at.reading_s
-    every = last[np.zeros(len(plan.steps), dtype=np.int64)]
-    known = {
+            times.append(time + pacing.reading_s / 2)
+            load_times.append(times[-1] - loaded_since)
+            time += pacing.reading_s
+    repeated = last[np.zeros(len(plan.steps), dtype=np.int64)]
+    columns = {
         "time": np.array(times),
-        "load_time": np.array(hung),
+        "load_time": np.array(load_times),
         "approach": approach_sides(stops),
     }
-    given = {name: v for name, v in known.items() if getattr(last, name) is not None}
+    recorded_columns = {name: v for name, v in columns.items() if getattr(last, name) is not None}
     q = np.array([plan.joints(step.pose) for step in plan.steps])
-    return replace(every, q=q, wrench=wrench, q_actual=None, target=None, **given)
+    return replace(repeated, q=q, wrench=wrench, q_actual=None, target=None, **recorded_columns)

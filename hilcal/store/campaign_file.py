@@ -1,6 +1,6 @@
 """RUN.hilcal: one SQLite file with immutable readings and appended model revisions.
 
-A file that is not the one of its name any more while it is open is found again, or rescued.
+If an open file is moved, deleted or replaced, its new place is found, or a copy is written.
 """
 
 import itertools
@@ -37,11 +37,11 @@ from hilcal.whole_file import replacing
 
 _TARGETS, _OBSERVERS = "targets", "observers"
 ACCEPTED = "accepted {}"
-"""Keys of the acceptances, numbered from 1; the last one holds."""
+"""Keys of the acceptances, numbered from 1; the last one is valid."""
 _MEANWHILE = 1000
-"""Readings that were appended during a fit, at most; a choice: each takes a second."""
+"""Most readings appended during a fit; a choice: each takes a second."""
 _HASHED = 1_000_000
-"""Readings that are hashed, at most, to find how many they were; a choice: it takes seconds."""
+"""Most readings that are hashed to find the number of fitted ones; a choice: it takes seconds."""
 _OTHER_READINGS = (
     "the readings were changed after revision {} had been fitted to them (their SHA-256 is another)"
 )
@@ -53,15 +53,15 @@ _OPEN = Path("/proc/self/fd")
 class CampaignFile:
     """An open campaign file; use it in a `with` statement.
 
-    What `append_readings` and `append_revision` have returned from survives a kill of the
-    process and a loss of power. Readings and revisions cannot be changed or deleted.
+    Readings and revisions cannot be changed or deleted. They survive a kill of the process and a
+    loss of power once `append_readings` or `append_revision` has returned.
     """
 
     def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
-        """Take over an open connection; use `create` or `open`."""
+        """Take an open connection; use `create` or `open` instead."""
         self.path, self.connection = path, connection
         self._identity = identity(path)
-        self._now: Path | None = None
+        self._new_place: Path | None = None
         self._written = False
         self._meta = self._read_meta()
         self.config_json, self.base_dir = self._meta["config"], self._meta["base_dir"]
@@ -96,9 +96,9 @@ class CampaignFile:
     def open(
         cls, path: str | Path, *, read_only: bool = False, check_revisions: bool = True
     ) -> Self:
-        """Open a campaign and check that it is whole.
+        """Open a campaign and check that it is complete and undamaged.
 
-        Bad revisions (`bad_revision`) are refused, unless the readings alone are needed.
+        Bad revisions (`bad_revision`) are refused with `check_revisions`.
         """
         path = Path(path)
         if path.exists() and not (path.is_file() or path.is_dir()):
@@ -111,8 +111,8 @@ class CampaignFile:
         except OSError as e:
             raise InputError(f"{path}: cannot be read ({e.strerror})") from e
         if head != schema.HEADER:
-            what = "is empty" if not head else "is not a hilcal campaign (not an SQLite file)"
-            raise InputError(f"{path}: the file {what}")
+            state = "is empty" if not head else "is not a hilcal campaign (not an SQLite file)"
+            raise InputError(f"{path}: the file {state}")
         with schema.sqlite_errors(path):
             connection = schema.connect(path, read_only)
             try:
@@ -134,9 +134,9 @@ class CampaignFile:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close the file; what was written is not left in one that is not in its place."""
+        """Close the file; raise as `check_place` does where it was written."""
         try:
-            if self._written and self._now is None:
+            if self._written and self._new_place is None:
                 self.check_place()
         finally:
             self.close()
@@ -154,37 +154,34 @@ class CampaignFile:
 
     @contextmanager
     def transaction(self) -> Iterator[sqlite3.Connection]:
-        """Store everything of a block, or nothing; raises as `check_place` does, too."""
+        """Store all changes of the block, or none; raises as `check_place` does, too."""
         self._written = True
         try:
             with schema.sqlite_errors(self.path), schema.transaction(self.connection) as open_file:
                 yield open_file
         except HilcalError:
-            self.check_place()  # which is why
+            self.check_place()  # the cause
             raise
         self.check_place()
 
     def check_place(self) -> None:
-        """Raise a MovedFileError where the open file is not the one of its name any more."""
+        """Raise a MovedFileError where the path does not lead to the open file."""
         if identity(self.path) == self._identity:
             return
-        if self._now is None:
-            self._now = moved_to(self._identity) or rescued(self.connection, self.path)
+        if self._new_place is None:
+            self._new_place = moved_to(self._identity) or rescued(self.connection, self.path)
         raise MovedFileError(
             f"{self.path}: deleted, replaced or moved while it was open; all {self.n_readings} "
-            f"readings stored so far are in {self._now}: move that back to {self.path} first"
+            f"readings stored so far are in {self._new_place}: move that back to {self.path} first"
         )
 
     def append_readings(self, readings: Readings) -> int:
-        """Append readings in one transaction; names already known keep their numbers."""
+        """Append readings in one transaction; return the number of all readings."""
         with self.transaction():
             return self.insert(readings)
 
     def insert(self, readings: Readings) -> int:
-        """Do the same inside a transaction that the caller has begun.
-
-        Covariances are stored exactly symmetric, as tables hold them, whatever rounding made them.
-        """
+        """Append readings within the caller's transaction; covariances are made symmetric."""
         cov = readings.covariance
         readings = replace(readings, covariance=0.5 * (cov + np.swapaxes(cov, -1, -2)))
         if len(readings):
@@ -196,25 +193,25 @@ class CampaignFile:
         return rows.insert_readings(self.connection, readings)
 
     def readings(self) -> Readings:
-        """All readings in the order in which they were appended."""
+        """Return all readings in the order in which they were appended."""
         layout = self._layout()
         if layout is None:
             raise InputError(f"{self.path}: the campaign holds no readings yet")
         with schema.sqlite_errors(self.path):
-            names, by = self._stored(_TARGETS, tuple[str, ...]), self._observers()
-            return rows.fetch_readings(self.connection, self.path, layout, names, by)
+            names, observers = self._stored(_TARGETS, tuple[str, ...]), self._observers()
+            return rows.fetch_readings(self.connection, self.path, layout, names, observers)
 
     def data_hash(self, count: int | None = None) -> str:
-        """SHA-256 of the readings, or of the first ones; see `content_hash`."""
+        """Return the SHA-256 of the first `count` readings, or of all; see `content_hash`."""
         return content_hash(self.readings()[:count])
 
     def append_revision(self, record: RevisionRecord) -> int:
-        """Append a model revision; returns its number, 1, 2, ..., whatever the record has."""
+        """Append a model revision; return its new number, 1, 2, ...."""
         with self.transaction():
             return self.insert_revision(record)
 
     def insert_revision(self, record: RevisionRecord) -> int:
-        """Do the same inside a transaction that the caller has begun."""
+        """Append a model revision within the caller's transaction."""
         number = rows.last_id(self.connection, "revisions") + 1
         if record.parent == number - 1 and replace(record, parent=None).follows:
             record = replace(record, parent=None)
@@ -233,11 +230,11 @@ class CampaignFile:
         return number
 
     def accepted(self) -> int | None:
-        """Number of the accepted revision; None where the latest one is used."""
+        """Return the number of the accepted revision; None where the latest one is used."""
         return next(reversed(self.acceptances()), None)
 
     def accept(self, number: int | None) -> None:
-        """Make a revision the one that is used; None lets the latest one be used again."""
+        """Make a revision the one that is used; None: always the latest."""
         if number is not None:
             self.revision(number)
         with self.transaction():
@@ -246,26 +243,26 @@ class CampaignFile:
             schema.require(self.connection, schema.CHOSEN_REVISION)
 
     def acceptances(self) -> list[int | None]:
-        """All that was accepted, in order."""
+        """Return all acceptances, in order."""
         with schema.sqlite_errors(self.path):
             meta = self._read_meta()
-        found: list[int | None] = []
-        while (text := meta.get(ACCEPTED.format(len(found) + 1))) is not None:
+        numbers: list[int | None] = []
+        while (text := meta.get(ACCEPTED.format(len(numbers) + 1))) is not None:
             number = rows.stored_json(self.path, text)
             if number is not None and not isinstance(number, int):
                 raise self._damaged("an acceptance")
-            found.append(number)
-        return found
+            numbers.append(number)
+        return numbers
 
     def revisions(self) -> tuple[RevisionRecord, ...]:
-        """All revisions, oldest first."""
+        """Return all revisions, oldest first; refuse damaged ones."""
         records, damaged = self._sound_revisions()
         if damaged is not None:
             raise InputError(f"{self.path}: {damaged[1]}; {_mend(self.path)}")
         return records
 
     def _sound_revisions(self) -> tuple[tuple[RevisionRecord, ...], tuple[int, str] | None]:
-        """Return the revisions before the first damaged one; and its number, and what it is."""
+        """Return the revisions before the first damaged one, and number and defect of that."""
         records: list[RevisionRecord] = []
         with schema.sqlite_errors(self.path), limits.memory(str(self.path)):
             stored = self.connection.execute("SELECT id, content, crc FROM revisions ORDER BY id")
@@ -278,13 +275,13 @@ class CampaignFile:
                 except InputError as error:
                     return tuple(records), (expected, str(error))
                 except (ValueError, TypeError, AttributeError) as error:
-                    what = f"the campaign is damaged at revision {expected}"
+                    defect = f"the campaign is damaged at revision {expected}"
                     why = f" ({error})" if str(error) else ""
-                    return tuple(records), (expected, what + why)
+                    return tuple(records), (expected, defect + why)
         return tuple(records), None
 
     def revision(self, number: int) -> RevisionRecord:
-        """One revision."""
+        """Return a revision by its number."""
         records = self.revisions()
         if not 1 <= number <= len(records):
             valid = f"there are 1 to {len(records)}" if records else "there are none yet"
@@ -292,14 +289,13 @@ class CampaignFile:
         return records[number - 1]
 
     def bad_revision(self) -> tuple[int, str] | None:
-        """Return the first revision that is damaged, or was fitted to other readings, and why.
+        """Return number and defect of the first revision that is damaged or of other readings.
 
-        Its hash is that of the first readings: of those that it was fitted to, or, as programs
-        before stored it, of some more, which were appended while it was fitted. Either proves that
-        they are as they were.
+        A revision's hash must be that of the first readings: of those that were fitted, or, in
+        files of older programs, of those and the next ones, which were appended during the fit.
         """
         records, damaged = self._sound_revisions()
-        fitted = [(r.number, *of) for r in records if (of := fitted_to(r)) is not None]
+        fitted = [(r.number, *basis) for r in records if (basis := fitted_to(r)) is not None]
         if not fitted:
             return damaged
         readings, hashes = self.readings(), dict[int, str]()
@@ -321,8 +317,8 @@ class CampaignFile:
             raise self._damaged(f"no {missing[0]}")
         return meta
 
-    def _damaged(self, what: object) -> InputError:
-        return InputError(f"{self.path}: the campaign file is damaged ({what})")
+    def _damaged(self, detail: object) -> InputError:
+        return InputError(f"{self.path}: the campaign file is damaged ({detail})")
 
     def _layout(self) -> Layout | None:
         with schema.sqlite_errors(self.path):
@@ -333,7 +329,7 @@ class CampaignFile:
             raise self._damaged(e) from e
 
     def _stored(self, key: str, kind: Any) -> Any:
-        """A list about the campaign, of some type; empty where there is none."""
+        """Return the list, of type `kind`, in a text about the campaign; empty without the text."""
         content = rows.stored_json(self.path, self._read_meta().get(key, "[]"))
         try:
             return decode(kind, content)
@@ -341,12 +337,12 @@ class CampaignFile:
             raise self._damaged(f"its {key}") from None
 
     def _claim_layout(self, layout: Layout) -> None:
-        """Fix the quantities of a reading with the first ones; refuse others later."""
-        known = self._layout()
-        if known is None:
+        """Fix the layout by the first readings; refuse other layouts later."""
+        stored = self._layout()
+        if stored is None:
             rows.insert_meta(self.connection, "layout", json.dumps(layout))
-        elif known != layout:
-            differ = sorted({name for name, _ in set(known) ^ set(layout)})
+        elif stored != layout:
+            differ = sorted({name for name, _ in set(stored) ^ set(layout)})
             raise InputError(
                 f"{self.path}: the readings differ from those before in {', '.join(differ)}; "
                 f"a campaign holds one kind of reading, start another for these"
@@ -359,7 +355,7 @@ class CampaignFile:
         return tuple(ObserverName(kind, name) for kind, name in stored)
 
     def _claim_observers(self, readings: Readings) -> None:
-        """Name the observers with the first readings; refuse others later."""
+        """Fix the observers by the first readings; refuse other observers later."""
         if readings.states.torque is not None or readings.states.observer is not None:
             schema.require(self.connection, schema.MORE_COLUMNS)
         if readings.states.observer is None:
@@ -371,7 +367,7 @@ class CampaignFile:
             raise InputError(f"{self.path}: the readings are by other observers than those before")
 
     def _numbered_targets(self, readings: Readings) -> Readings:
-        """Return the readings with targets numbered as in the file; the first ones name them."""
+        """Return the readings with targets numbered as in the file, by the first readings."""
         if readings.states.target is None:
             return readings
         if self._read_meta().get(_TARGETS) is None:
@@ -393,27 +389,27 @@ def _mend(path: Path) -> str:
 
 
 def identity(path: Path | str) -> Identity | None:
-    """Device and number of a file, by which it is the same under every name; None for none."""
+    """Return device and inode of a file, which identify it under any name; None without a file."""
     with suppress(OSError):
-        found = os.stat(path)
-        return found.st_dev, found.st_ino
+        status = os.stat(path)
+        return status.st_dev, status.st_ino
     return None
 
 
-def moved_to(known: Identity | None) -> Path | None:
-    """Return where a file that this process has open is now; None for a deleted one."""
+def moved_to(target: Identity | None) -> Path | None:
+    """Return the present path of a file that this process has open; None for a deleted one."""
     with suppress(OSError):
         for descriptor in _OPEN.iterdir():
-            if identity(descriptor) == known:
+            if identity(descriptor) == target:
                 with suppress(OSError):
-                    now = descriptor.readlink()
-                    if identity(now) == known:
-                        return now
+                    place = descriptor.readlink()
+                    if identity(place) == target:
+                        return place
     return None
 
 
 def rescued(connection: sqlite3.Connection, path: Path) -> Path:
-    """Write a copy of an open file that has no name any more, beside where it was."""
+    """Write a copy of an open file that was deleted, in the same directory; return its path."""
     home = path.absolute().parent
     folder = home if home.is_dir() else Path(tempfile.gettempdir())
     place = free_place(folder, f"{path.stem}.rescued", path.suffix)
@@ -423,7 +419,7 @@ def rescued(connection: sqlite3.Connection, path: Path) -> Path:
 
 
 def free_place(folder: Path, name: str, end: str = "") -> Path:
-    """Return a path that no file has: name and end, with -2, -3, ... between them where needed."""
+    """Return a path without a file: name and end, with -2, -3, ... between them where needed."""
     places = (folder / f"{name}{f'-{k}' * (k > 1)}{end}" for k in itertools.count(1))
     return next(place for place in places if not place.exists())
 
@@ -432,7 +428,7 @@ def free_place(folder: Path, name: str, end: str = "") -> Path:
 def new_campaign(
     path: Path, about: Mapping[str, str], overwrite: bool
 ) -> Iterator[sqlite3.Connection]:
-    """Give an empty campaign to the block; the file appears when the block has filled it."""
+    """Yield an empty campaign to be filled; the file appears at the end of the block."""
     may_write(path, overwrite)
     with replacing(path) as new:
         try:
@@ -465,6 +461,6 @@ def may_write(path: Path, overwrite: bool) -> None:
 
 
 def _without_sidecars(path: Path) -> None:
-    """Remove what would be rolled back into a new file of this name."""
+    """Remove journals that SQLite would replay into a new file of this name."""
     for end in ("-journal", "-wal", "-shm"):
         path.with_name(path.name + end).unlink(missing_ok=True)

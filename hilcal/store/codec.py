@@ -1,8 +1,8 @@
-"""The one codec of what is stored: values as JSON by their fields, and back by their types.
+"""The codec of all stored values: to JSON by their fields, and back by their types.
 
-A dataclass becomes an object of its fields, arrays and tuples lists, infinite numbers, which JSON
-lacks, the texts "inf" and "-inf". Back, a field that is missing has its default, and further ones
-are passed over: so what earlier programs wrote is read.
+A dataclass becomes an object of its fields; arrays and tuples become lists; infinite numbers, which
+JSON lacks, become the texts "inf" and "-inf". When decoding, a missing field has its default, and
+unknown fields are ignored, so that files of older programs can be read.
 """
 
 import base64
@@ -25,7 +25,7 @@ from hilcal.whole_file import replace_file
 
 T = TypeVar("T")
 LARGEST = 1e9
-"""No length, angle, mass, force or parameter is as large, in SI units."""
+"""Upper bound of all lengths, angles, masses, forces and parameters, in SI units."""
 
 
 def encode(value: Any) -> Any:
@@ -42,25 +42,25 @@ def encode(value: Any) -> Any:
 
 
 def decode(kind: Any, content: Any) -> Any:
-    """Return the value of a type that `encode` made JSON of; others raise as conversions do."""
-    origin, of = get_origin(kind), get_args(kind)
+    """Return a value of a type from the JSON of `encode`; raises as Python's conversions do."""
+    origin, arguments = get_origin(kind), get_args(kind)
     if origin in (Union, types.UnionType):  # of a type and None
-        return None if content is None else decode(of[0], content)
+        return None if content is None else decode(arguments[0], content)
     if origin is Literal:
-        if content not in of:
-            raise ValueError(f"{content!r} is none of {of}")
+        if content not in arguments:
+            raise ValueError(f"{content!r} is none of {arguments}")
         return content
     if origin is np.ndarray:
-        return np.array(content, dtype=get_args(of[1])[0])
+        return np.array(content, dtype=get_args(arguments[1])[0])
     if origin is tuple:
-        kinds = of[:1] * len(content) if of[1:] == (...,) else of
+        kinds = arguments[:1] * len(content) if arguments[1:] == (...,) else arguments
         return tuple(decode(k, v) for k, v in zip(kinds, content, strict=True))
     if origin is not None and issubclass(origin, Mapping):
-        return {str(k): decode(of[1], v) for k, v in content.items()}
+        return {str(k): decode(arguments[1], v) for k, v in content.items()}
     if isinstance(kind, type) and is_dataclass(kind):
         hints = _hints(kind)
-        given = [f for f in fields(kind) if f.init and (f.name in content or _required(f))]
-        return kind(**{f.name: decode(hints[f.name], content[f.name]) for f in given})
+        present = [f for f in fields(kind) if f.init and (f.name in content or _required(f))]
+        return kind(**{f.name: decode(hints[f.name], content[f.name]) for f in present})
     if kind is float:
         return float(content)
     if kind in (str, int, bool) and type(content) is not kind:
@@ -78,30 +78,30 @@ def _required(f: Field[Any]) -> bool:
 
 
 def numbers(
-    what: str, values: object, shape: Sequence[int] = (), *, least: float = -LARGEST
+    name: str, values: object, shape: Sequence[int] = (), *, least: float = -LARGEST
 ) -> Floats:
-    """Return numbers as an array; a ValueError for another shape, or what nothing in a cell has."""
+    """Return numbers as an array; a ValueError for another shape, or a number out of range."""
     array = np.asarray(values, dtype=float)
     if array.shape != tuple(shape):
-        raise ValueError(f"{what} has shape {array.shape}; expected {tuple(shape)}")
+        raise ValueError(f"{name} has shape {array.shape}; expected {tuple(shape)}")
     if not np.all((array >= least) & (array <= LARGEST)):
-        raise ValueError(f"{what} has a number that cannot be")
+        raise ValueError(f"{name} has a number that cannot be")
     return array
 
 
-def frames(what: str, values: object, *, several: bool = False) -> Floats:
-    """Return a rotation and translation (4, 4), or K of them; a ValueError for what is none."""
+def frames(name: str, values: object, *, several: bool = False) -> Floats:
+    """Return a frame (4, 4), or K frames; a ValueError where the matrix is none."""
     array = np.asarray(values, dtype=float)
-    numbers(what, array, (*array.shape[:several], 4, 4))
+    numbers(name, array, (*array.shape[:several], 4, 4))
     turn = array[..., :3, :3]
     orthonormal = np.allclose(turn @ np.swapaxes(turn, -1, -2), np.eye(3), atol=1e-6)
     if not orthonormal or np.any(array[..., 3, :] != [0.0, 0.0, 0.0, 1.0]):
-        raise ValueError(f"{what} is no frame: a rotation and a translation")
+        raise ValueError(f"{name} is no frame: a rotation and a translation")
     return array
 
 
 def pack(values: Floats) -> str:
-    """Return numbers as base64 of their little-endian doubles, so that none is rounded."""
+    """Return numbers as base64 of their little-endian doubles, without rounding."""
     return base64.b64encode(np.ascontiguousarray(values, dtype="<f8").tobytes()).decode("ascii")
 
 
@@ -116,31 +116,31 @@ def write_document(path: Path, content: Mapping[str, object], indent: int | None
 
 
 def read_document(
-    content: object, what: str, form: str, versions: tuple[int, ...], read: Callable[[Any], T]
+    content: object, name: str, form: str, versions: tuple[int, ...], read: Callable[[Any], T]
 ) -> T:
-    """Return what a document holds; refuses another kind of it, a newer version, a damaged one."""
+    """Return what `read` makes of a document; an InputError for another format or version."""
     if not isinstance(content, dict) or content.get("format") != form:
-        raise InputError(f'no {what}; valid: a JSON document with "format": "{form}"')
+        raise InputError(f'no {name}; valid: a JSON document with "format": "{form}"')
     if content.get("version") not in versions:
-        known = "version" + "s" * (len(versions) > 1) + " " + " and ".join(map(str, versions))
+        readable = "version" + "s" * (len(versions) > 1) + " " + " and ".join(map(str, versions))
         raise InputError(
-            f"a {what} of version {content.get('version')}, written by hilcal "
-            f"{content.get('hilcal')}; this program reads {known}"
+            f"a {name} of version {content.get('version')}, written by hilcal "
+            f"{content.get('hilcal')}; this program reads {readable}"
         )
-    check_names({k: v for k, v in content.items() if k != "source"}, what)
+    check_names({k: v for k, v in content.items() if k != "source"}, name)
     try:
         return read(content)
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
-        raise InputError(f"a damaged {what}: {error!r}") from None
+        raise InputError(f"a damaged {name}: {error!r}") from None
 
 
 @limits.bounded
-def read_file(path: Path, what: str, read: Callable[[Any], T]) -> T:
-    """Return what a JSON file holds; `read` makes the value of its content."""
+def read_file(path: Path, name: str, read: Callable[[Any], T]) -> T:
+    """Return the value that `read` makes of a JSON file's content."""
     try:
         content = parse_json(limits.read_text(path, limits.DOCUMENT))
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: no {what}: {error}") from None
+        raise InputError(f"{path}: no {name}: {error}") from None
     try:
         return read(content)
     except InputError as error:

@@ -1,7 +1,7 @@
-"""What a campaign keeps beside its readings: files of its robot, the command that made it.
+"""Texts that a campaign stores: the files of its robot, and the command that made it.
 
-A campaign that was sent is read by that, on any machine, and reads no file outside of itself. The
-command line sets the command as it was typed for as long as it works.
+With these texts a campaign can be read on any machine, without a file outside of it. The command
+line sets the command as typed while it runs.
 """
 
 import json
@@ -16,7 +16,7 @@ from hilcal.errors import InputError
 from hilcal.names import quoted
 
 ROBOT_FILE = "robot_file"
-"""Key of the file of a robot which is not of the catalogue."""
+"""Key of the file of a robot that is not in the catalogue."""
 CALIBRATION_FILE = "calibration_file"
 """Key of the file of [robot] calibration."""
 KEYS = {ROBOT_FILE: "model", CALIBRATION_FILE: "calibration"}
@@ -24,7 +24,7 @@ _KINDS = (".urdf", ".toml")
 
 
 def robot_file_of(config_json: str, base_dir: str) -> dict[str, str]:
-    """Return what to keep of the robot of a configuration; no model for one of the catalogue."""
+    """Return the robot's files to store, by key; a robot of the catalogue has no model file."""
     out: dict[str, str] = {}
     for key, name in KEYS.items():
         path = Path(base_dir) / _robot_value(config_json, name)
@@ -33,16 +33,16 @@ def robot_file_of(config_json: str, base_dir: str) -> dict[str, str]:
 
 
 def check_robot(
-    path: Path, config_json: str, kept: str | None, calibration: str | None = None
+    path: Path, config_json: str, robot_text: str | None, calibration: str | None = None
 ) -> None:
-    """Refuse a campaign whose robot is in a file outside of it: whoever made it chose the path."""
+    """Refuse a campaign whose robot is in a file outside of it, whose path is not trusted."""
     if calibration is None and (file := _robot_value(config_json, "calibration")):
         raise InputError(
             f"{path}: its robot's kinematics are in a file that it does not hold, {file!r}, and "
             "which is not read; valid: a campaign that was made where that file was"
         )
     model = _robot_value(config_json, "model")
-    if kept is None and Path(model).suffix.lower() in _KINDS:
+    if robot_text is None and Path(model).suffix.lower() in _KINDS:
         raise InputError(
             f"{path}: its robot is in a file that it does not hold, {model!r}, and which is not "
             f"read; give that file yourself: hilcal repair {quoted(path)} "
@@ -51,7 +51,7 @@ def check_robot(
 
 
 def text_of(path: Path, key: str = ROBOT_FILE) -> dict[str, str]:
-    """Return a robot's file as a campaign keeps it; nothing where it cannot be read."""
+    """Return the text of a robot's file by its key; empty where it cannot be read."""
     try:
         if not path.is_file():
             return {}
@@ -67,14 +67,14 @@ def _robot_value(config_json: str, key: str) -> str:
 
 
 COMMAND = "command"
-"""Key of the command, among what a file says of itself and among the options of a revision."""
+"""Key of the command, in the texts of a file and in the options of a revision."""
 _typed: ContextVar[str | None] = ContextVar("typed", default=None)
 
 
 @contextmanager
-def typed(words: Sequence[str]) -> Iterator[None]:
-    """Let what the block makes be said to be made by a command."""
-    token = _typed.set(shlex.join(words))
+def typed(arguments: Sequence[str]) -> Iterator[None]:
+    """Record a command as the origin of all that the block makes."""
+    token = _typed.set(shlex.join(arguments))
     try:
         yield
     finally:
@@ -82,6 +82,6 @@ def typed(words: Sequence[str]) -> Iterator[None]:
 
 
 def typed_now() -> dict[str, str]:
-    """Return the command that works, by its key; empty where there is none."""
-    words = _typed.get()
-    return {} if words is None else {COMMAND: words}
+    """Return the running command, by its key; empty without one."""
+    command = _typed.get()
+    return {} if command is None else {COMMAND: command}

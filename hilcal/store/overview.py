@@ -1,4 +1,4 @@
-"""What a campaign file holds, read from it alone: nothing is fitted, no effect is needed."""
+"""Overview of a campaign file, from the file alone: without fits or effects."""
 
 import re
 from collections import Counter
@@ -22,59 +22,60 @@ _SERIAL = re.compile(r"serial(?: number)?:? (\S+)", re.IGNORECASE)
 
 @dataclass(frozen=True, slots=True)
 class MeasuringDevice:
-    """A device that measured, as it answered when a session began."""
+    """A device that measured, as it answered at the beginning of a session."""
 
     device: str  # part of the cell, e.g. "tracker"
     driver: str
     name: str  # as it answered
     serial_number: str | None  # None where it gave none
-    facts: Mapping[str, str]  # what else it answered, by name
-    utc: str  # when it answered first, ISO 8601
+    facts: Mapping[str, str]  # further answers, by name
+    utc: str  # time of the first answer, ISO 8601
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tare:
     """A zero of the force sensor."""
 
-    utc: str  # when, ISO 8601
-    wrench: Floats  # (6,) what it read with nothing on the hook, sensor axes, N and N·m
+    utc: str  # time, ISO 8601
+    wrench: Floats  # (6,) wrench read with an empty hook, sensor axes, N and N·m
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Return:
     """A return to the reference pose."""
 
-    utc: str  # when, ISO 8601
-    shift_m: Floats  # (3,) shift since the first reading there, sensor axes, m
+    utc: str  # time, ISO 8601
+    shift_m: Floats  # (3,) shift since the first reading at the pose, sensor axes, m
     sigma: float  # its size in standard deviations
     over: bool  # whether it was over the limit of [acquire] drift_limit_sigma
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Overview:
-    """A campaign at a glance."""
+    """The contents of a campaign file."""
 
-    created: str  # when the file was made, ISO 8601, UTC
-    program_version: str  # of the program that made it
-    source: str  # where the readings come from
-    command: str  # that made the file, as it was typed; empty where it is not kept
+    created: str  # time when the file was made, ISO 8601, UTC
+    program_version: str  # version of the program that made the file
+    source: str  # origin of the readings
+    command: str  # command that made the file, as typed; empty where unknown
     config: CellConfig
-    readings: Readings | None  # all of them, with the covariances as stored; None before the first
+    readings: Readings | None  # all readings, with covariances as stored; None without readings
     loads: Mapping[str, int]  # number of readings by load
     targets: Mapping[str, int]  # number of readings by target, where there are several
     planned: int | None  # number of planned steps; None for an imported campaign
-    measured: int  # of them those that were measured
-    plans: int
-    instruments: tuple[MeasuringDevice, ...]  # that were connected, each once
-    tares: tuple[Tare, ...]  # of the force sensor, in order
-    returns: tuple[Return, ...]  # to the reference pose, in order
+    measured: int  # number of measured steps
+    plans: int  # number of plans
+    instruments: tuple[MeasuringDevice, ...]  # connected devices, each once
+    tares: tuple[Tare, ...]  # in order
+    returns: tuple[Return, ...]  # in order
     tool: Mapping[str, Any] | None
-    """As the force sensor found it last: mass_kg, com_m, ...; None where it did not."""
-    repeatability: Mapping[str, Any] | None  # as the last session found it; None where it did not
-    events: tuple[Mapping[str, Any], ...]  # all that happened, in order: "kind", "utc" and more
+    """The tool as last identified by the force sensor: mass_kg, com_m, ...; None where it was not.
+    """
+    repeatability: Mapping[str, Any] | None  # as estimated by the last session; None without one
+    events: tuple[Mapping[str, Any], ...]  # all events, in order: "kind", "utc" and their content
     revisions: tuple[RevisionRecord, ...]
     accepted: int | None  # number of the accepted revision, if any
-    in_use: int | None  # number of the revision that commands use, if there is any
+    in_use: int | None  # number of the revision that commands use, if any
 
     @property
     def poses(self) -> int:
@@ -83,7 +84,7 @@ class Overview:
 
 
 def overview(file: CampaignFile) -> Overview:
-    """Return what a campaign file holds."""
+    """Return the overview of a campaign file."""
     log = None if file.about(PLAN) is None else RunLog(file)
     events = () if log is None else tuple(log.events())
     r = file.readings() if file.n_readings else None
@@ -126,19 +127,19 @@ def _count(index: Sequence[int], names: Sequence[str]) -> dict[str, int]:
 
 
 def _instruments(events: Sequence[Mapping[str, Any]]) -> tuple[MeasuringDevice, ...]:
-    found: dict[tuple[str, str], MeasuringDevice] = {}
+    devices: dict[tuple[str, str], MeasuringDevice] = {}
     for event in events:
         for a in event["answers"] if event["kind"] == "devices" else ():
             facts, name = dict(a["facts"]), str(a["name"])
             m = _SERIAL.search(name)
             serial = facts.get("serial number") or (m and m[1].rstrip(",;"))
             device = MeasuringDevice(a["device"], a["driver"], name, serial, facts, event["utc"])
-            found.setdefault((device.device, name), device)
-    return tuple(found.values())
+            devices.setdefault((device.device, name), device)
+    return tuple(devices.values())
 
 
 def _last(events: Sequence[Mapping[str, Any]], kind: str) -> Mapping[str, Any] | None:
-    """Return what the last event of a kind says, without when."""
+    """Return the content of the last event of a kind, without its times."""
     for event in reversed(events):
         if event["kind"] == kind:
             return {k: v for k, v in event.items() if k not in ("kind", "utc", "wall_s")}

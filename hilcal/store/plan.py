@@ -1,4 +1,4 @@
-"""A plan: which states to measure, in which order. Data that a person can edit."""
+"""A plan: the states to measure, in order. Its file can be edited by a person."""
 
 import itertools
 import json
@@ -17,17 +17,17 @@ from hilcal.toml import read_json, suggest
 from hilcal.types import Floats
 
 LARGEST = 1e3
-"""rad; a choice: no joint turns so far, and finite numbers beyond it are damage."""
+"""Upper bound of joint angles, rad; a choice: larger numbers are damage."""
 FORMAT = "hilcal-plan"
 VERSION = 1
 UNLOADED = "none"
 REFERENCE = "reference"
-"""The pose that drift checks return to, and where loads are changed."""
+"""The pose of drift checks and load changes."""
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One reading to take; (pose, load, cycle) names it in the whole campaign."""
+    """A reading to take; (pose, load, cycle) is unique in a campaign."""
 
     pose: str
     load: str  # name of the load, "none" for unloaded
@@ -40,13 +40,13 @@ class Step:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plan(Brief):
-    """Poses, and steps in the order in which they are taken."""
+    """Poses, and steps in the order of measurement."""
 
     pose_names: tuple[str, ...]  # P distinct names
     q: Floats  # (P, n) commanded joint angles, rad
     steps: tuple[Step, ...]  # distinct steps
     about: dict[str, Any] = field(default_factory=dict)
-    """Further keys of the file: how the plan was made, what it promises."""
+    """Further keys of the file: origin and predictions of the plan."""
 
     def joints(self, pose: str) -> Floats:
         """Return the (n,) joint angles of a pose by name, rad."""
@@ -58,7 +58,7 @@ class Plan(Brief):
         return tuple(dict.fromkeys(step.load for step in self.steps))
 
     def without(self, done: frozenset[Step]) -> "Plan":
-        """Return the same plan with only the steps that are not in `done`."""
+        """Return the plan without the steps in `done`."""
         return replace(self, steps=tuple(step for step in self.steps if step not in done))
 
     def to_json(self) -> str:
@@ -94,20 +94,20 @@ def read_plan(text: str, where: str) -> Plan:
     check_names(data, where)
     names, q = _poses(data.get("poses"), where)
     steps = _steps(data.get("steps"), names, where)
-    known = ("format", "version", "poses", "steps")
-    return Plan(names, q, steps, {key: x for key, x in data.items() if key not in known})
+    keys = ("format", "version", "poses", "steps")
+    return Plan(names, q, steps, {key: x for key, x in data.items() if key not in keys})
 
 
-def _entries(data: object, what: str, where: str) -> list[Any]:
-    """A list of poses or steps that is not empty."""
+def _entries(data: object, kind: str, where: str) -> list[Any]:
+    """Return a list of poses or steps; refuse an empty or a long one."""
     if not isinstance(data, list) or not data:
-        raise InputError(f'{where}: "{what}s" must be a list of at least one {what}')
-    limits.check_planned(where, f"{what}s", len(data))
+        raise InputError(f'{where}: "{kind}s" must be a list of at least one {kind}')
+    limits.check_planned(where, f"{kind}s", len(data))
     return data
 
 
 def _poses(data: object, where: str) -> tuple[tuple[str, ...], Floats]:
-    """Names and joint angles of the poses."""
+    """Return names (P) and joint angles (P, n) of the poses."""
     rows: dict[str, list[float]] = {}
     for k, pose in enumerate(_entries(data, "pose", where), start=1):
         if not isinstance(pose, dict) or set(pose) != {"name", "q_rad"}:
@@ -131,7 +131,7 @@ def _poses(data: object, where: str) -> tuple[tuple[str, ...], Floats]:
 
 
 def _steps(data: object, names: tuple[str, ...], where: str) -> tuple[Step, ...]:
-    """Steps in order."""
+    """Return the steps in order."""
     steps: dict[Step, int] = {}
     for k, step in enumerate(_entries(data, "step", where), start=1):
         keys = set(step) if isinstance(step, dict) else set()
@@ -145,45 +145,45 @@ def _steps(data: object, names: tuple[str, ...], where: str) -> tuple[Step, ...]
             raise InputError(f'{where}: step {k}: load {load!r} must be a name, "none" is unloaded')
         if not isinstance(cycle, int) or isinstance(cycle, bool) or cycle < 0:
             raise InputError(f"{where}: step {k}: cycle {cycle!r} must be a whole number from 0")
-        made = Step(pose, load, cycle)
-        if made in steps:
-            raise InputError(f"{where}: steps {steps[made]} and {k} are the same ({made})")
-        steps[made] = k
+        parsed = Step(pose, load, cycle)
+        if parsed in steps:
+            raise InputError(f"{where}: steps {steps[parsed]} and {k} are the same ({parsed})")
+        steps[parsed] = k
     return tuple(steps)
 
 
-def with_new_names(plan: Plan, before: Plan, number: int) -> Plan:
-    """Return a further plan with names and cycles that a campaign does not have yet.
+def with_new_names(plan: Plan, campaign: Plan, number: int) -> Plan:
+    """Return plan number `number` of a campaign with names and cycles that are new in it.
 
-    The reference pose becomes that of the campaign, so that the drift is measured over all of it. A
-    pose of a known name at other joints gets another name; one at the same joints is the same
-    pose, and its readings get new cycles, with unloaded readings of their own.
+    The reference pose becomes that of the campaign, so that the drift refers to it. A pose with a
+    name of the campaign at other joints gets a new name. At the same joints it is the same pose,
+    and its readings get new cycles, with separate unloaded readings.
     """
-    if plan.q.shape[1] != before.q.shape[1]:
+    if plan.q.shape[1] != campaign.q.shape[1]:
         raise InputError(
             f"the plan has {plan.q.shape[1]} joint angles per pose; the campaign has "
-            f"{before.q.shape[1]}"
+            f"{campaign.q.shape[1]}"
         )
-    if (REFERENCE in plan.pose_names) != (REFERENCE in before.pose_names):
-        has = "the plan" if REFERENCE in plan.pose_names else "the campaign"
-        raise InputError(f'only {has} has a pose "{REFERENCE}"; valid: both or none')
-    known = dict(zip(before.pose_names, before.q, strict=True))
-    used = {*known, *plan.pose_names}
+    if (REFERENCE in plan.pose_names) != (REFERENCE in campaign.pose_names):
+        side = "the plan" if REFERENCE in plan.pose_names else "the campaign"
+        raise InputError(f'only {side} has a pose "{REFERENCE}"; valid: both or none')
+    campaign_joints = dict(zip(campaign.pose_names, campaign.q, strict=True))
+    used = {*campaign_joints, *plan.pose_names}
     names, q = [], []
     for name, joints in zip(plan.pose_names, plan.q, strict=True):
         if name == REFERENCE:
-            joints = known[name]
-        elif name in known and np.abs(joints - known[name]).max() > SAME_POSE:
+            joints = campaign_joints[name]
+        elif name in campaign_joints and np.abs(joints - campaign_joints[name]).max() > SAME_POSE:
             free = (f"{name}-{number}{f'-{k}' * (k > 1)}" for k in itertools.count(1))
             name = next(new for new in free if new not in used)
             used.add(name)
-        elif name in known:
-            joints = known[name]
+        elif name in campaign_joints:
+            joints = campaign_joints[name]
         names.append(name)
         q.append(joints)
     new = dict(zip(plan.pose_names, names, strict=True))
     last: dict[str, int] = {}
-    for step in before.steps:
+    for step in campaign.steps:
         last[step.pose] = max(last.get(step.pose, -1), step.cycle)
     steps = tuple(
         Step(new[s.pose], s.load, s.cycle + last.get(new[s.pose], -1) + 1) for s in plan.steps
@@ -191,17 +191,14 @@ def with_new_names(plan: Plan, before: Plan, number: int) -> Plan:
     return replace(plan, pose_names=tuple(names), q=np.array(q), steps=steps)
 
 
-def joined(before: Plan, done: frozenset[Step], further: Plan) -> Plan:
-    """Return all in one: what was measured before a further plan came, and that plan.
-
-    What was planned before and not measured is given up.
-    """
-    kept = tuple(s for s in before.steps if s in done)
-    used = {s.pose for s in kept} | {REFERENCE}
-    more = [k for k, p in enumerate(before.pose_names) if p in used and p not in further.pose_names]
+def joined(first: Plan, done: frozenset[Step], further: Plan) -> Plan:
+    """Join the measured steps (`done`) of a previous plan and a further plan."""
+    measured = tuple(s for s in first.steps if s in done)
+    used = {s.pose for s in measured} | {REFERENCE}
+    added = [k for k, p in enumerate(first.pose_names) if p in used and p not in further.pose_names]
     return Plan(
-        (*further.pose_names, *(before.pose_names[k] for k in more)),
-        np.vstack([further.q, before.q[more]]),
-        (*kept, *further.steps),
+        (*further.pose_names, *(first.pose_names[k] for k in added)),
+        np.vstack([further.q, first.q[added]]),
+        (*measured, *further.steps),
         further.about,
     )

@@ -1,10 +1,10 @@
-"""What a calibration has done so far, and what its campaigns were measured for.
+"""The log of a calibration, and the purpose of a campaign.
 
-Entries are only appended to its campaign file. With the readings, plans and revisions of the same
-file they are the whole state of the procedure (`hilcal.procedure`).
+Entries are only appended to the campaign file. With the readings, plans and revisions of the file
+they are the complete state of the procedure (`hilcal.procedure`).
 
-Readings of a validation campaign are worth something because nothing was fitted to them. Its file
-says so, and what fits refuses it, until somebody releases it; that is recorded in it for good.
+The readings of a validation campaign must never have been fitted. Its file states the purpose, and
+fits refuse it until it is released; the release is recorded in the file for good.
 """
 
 import json
@@ -25,20 +25,20 @@ ENTRY = "calibrate {}"
 
 
 class ProcedureLog:
-    """The entries of a campaign; what a method has appended survives a kill of the process."""
+    """The entries of a campaign; an appended entry survives a kill of the process."""
 
     def __init__(self, campaign: CampaignFile) -> None:
-        """Read and write entries of an open campaign."""
+        """Use the log of an open campaign."""
         self._campaign = campaign
 
     def entries(self) -> tuple[dict[str, Any], ...]:
-        """Return all entries in order: "kind", "utc" and more."""
+        """Return all entries in order: "kind", "utc" and the content."""
         with schema.sqlite_errors(self._campaign.path):
             meta = rows.fetch_meta(self._campaign.connection, self._campaign.path)
-        found: list[dict[str, Any]] = []
-        while (text := meta.get(ENTRY.format(len(found) + 1))) is not None:
-            found.append(rows.stored_json(self._campaign.path, text, check_entry))
-        return tuple(found)
+        entries: list[dict[str, Any]] = []
+        while (text := meta.get(ENTRY.format(len(entries) + 1))) is not None:
+            entries.append(rows.stored_json(self._campaign.path, text, check_entry))
+        return tuple(entries)
 
     def last(self, kind: str) -> dict[str, Any] | None:
         """Return the last entry of a kind; None without any."""
@@ -52,10 +52,10 @@ class ProcedureLog:
         plan: Plan | None = None,
         revisions: Sequence[RevisionRecord] = (),
     ) -> tuple[int, ...]:
-        """Append an entry, with a further plan and revisions that it is about, or none of it.
+        """Append an entry with its further plan and revisions, or nothing.
 
-        The plan has names that the campaign does not have yet. Returns the numbers of the
-        revisions, which are in the entry as "revisions".
+        The plan has names that are new in the campaign. Returns the numbers of the revisions, which
+        the entry has as "revisions".
         """
         log = None if plan is None else RunLog(self._campaign)
         with self._campaign.transaction() as connection:
@@ -64,55 +64,55 @@ class ProcedureLog:
             if log is not None and plan is not None:
                 key = f"{PLAN} {len(log.plans) + 1}"
                 rows.insert_meta(connection, key, plan.to_json())
-            whole = {**content, "revisions": list(stored)} if stored else content
-            rows.insert_meta(connection, ENTRY.format(number), entry(kind, whole))
+            document = {**content, "revisions": list(stored)} if stored else content
+            rows.insert_meta(connection, ENTRY.format(number), entry(kind, document))
         return stored
 
 
 def entry(kind: str, content: dict[str, Any]) -> str:
-    """Return the text of an entry that is made now."""
+    """Return the text of an entry with the present time."""
     return json.dumps({"kind": kind, "utc": utc_now(), **content}, allow_nan=False)
 
 
 PURPOSE = "purpose"
-"""Key of the purpose among the texts about a campaign; a campaign without it may be fitted."""
+"""Key of the purpose in the texts of a campaign; a campaign without it may be fitted."""
 VALIDATION = "validation"
-"""Measured to test a model."""
+"""Purpose: to test a model."""
 CORRECTED = "corrected"
-"""Measured at the corrected joint targets of a validation campaign."""
+"""Purpose: to test the corrected joint targets of a validation campaign."""
 CALIBRATION = "calibration"
-"""Key of the name of the campaign file whose model is tested."""
+"""Key of the identity of the campaign whose model is tested."""
 RELEASED = "released for fitting"
 
 
 def purpose_of(campaign: CampaignFile) -> str | None:
-    """Return `VALIDATION` or `CORRECTED`; None for a campaign that was measured to be fitted."""
+    """Return `VALIDATION` or `CORRECTED`; None for a campaign that is measured to be fitted."""
     return campaign.about(PURPOSE)
 
 
 def _only_tests(campaign: CampaignFile) -> bool:
-    """Whether readings were measured to test a model, and have not been released for fitting."""
+    """Whether a campaign was measured to test a model, and has not been released for fitting."""
     with schema.sqlite_errors(campaign.path):
         released = RELEASED in rows.fetch_meta(campaign.connection, campaign.path)
     return purpose_of(campaign) is not None and not released
 
 
 def release(campaign: CampaignFile, why: str) -> None:
-    """Release such readings; the file says so from now on."""
+    """Release a test campaign for fitting; its file records it."""
     if _only_tests(campaign):
         with campaign.transaction() as connection:
             rows.insert_meta(connection, RELEASED, json.dumps({"utc": utc_now(), "by": why}))
 
 
 def refuse_fitting(campaign: CampaignFile) -> None:
-    """Refuse to fit readings that were measured to test a model."""
+    """Refuse a test campaign that has not been released for fitting."""
     if not _only_tests(campaign):
         return
     tests = purpose_of(campaign) == VALIDATION
-    what = "a validation campaign" if tests else "the run at corrected targets"
-    of = campaign.about(CALIBRATION)
+    kind = "a validation campaign" if tests else "the run at corrected targets"
+    tested = campaign.about(CALIBRATION)
     raise InputError(
-        f"{campaign.path}: {what}{f' of {of}' if of else ''}, never to be fitted: it tests the "
-        "model; to fit it all the same, which its file then says for good: hilcal identify "
+        f"{campaign.path}: {kind}{f' of {tested}' if tested else ''}, never to be fitted: it tests "
+        "the model; to fit it all the same, which its file then says for good: hilcal identify "
         f"{quoted(campaign.path)} --fit-validation"
     )

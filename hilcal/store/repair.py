@@ -1,4 +1,4 @@
-"""What opens a campaign again: a bad revision is set aside, a robot's file is put in."""
+"""Repair of a campaign: set a bad revision aside, or add the robot's file."""
 
 import sqlite3
 from dataclasses import dataclass
@@ -17,17 +17,17 @@ from hilcal.whole_file import replace_file
 
 @dataclass(frozen=True, slots=True)
 class Repaired:
-    """What was set aside."""
+    """The revisions that a repair has set aside."""
 
-    why: str  # what is wrong with the first of them
+    why: str  # the defect of the first one
     revisions: tuple[int, ...]
-    original: Path  # the file as it was
+    original: Path  # copy of the file before the repair
 
 
 def repair(path: Path) -> Repaired | None:
-    """Set aside the first bad revision, all after it, and what names one of them.
+    """Set aside the first bad revision, all later ones, and all entries that name one of them.
 
-    Later revisions may have been made from it. The readings have to be sound.
+    Later revisions may depend on the bad one. The readings must be undamaged.
     """
     with CampaignFile.open(path, check_revisions=False) as file:
         if file.n_readings:
@@ -39,25 +39,25 @@ def repair(path: Path) -> Repaired | None:
         with file.transaction() as connection:
             original = free_place(path.parent, f"{path.name}.original")
             replace_file(original, connection.serialize(), must_be_new=True)
-            found = connection.execute(
+            cursor = connection.execute(
                 "SELECT id FROM revisions WHERE id >= ? OR id < 1 ORDER BY id", (first,)
             )
-            numbers = tuple(int(number) for (number,) in found.fetchall())
+            numbers = tuple(int(number) for (number,) in cursor.fetchall())
             _delete(connection, "revisions", "id", numbers)
             _delete(connection, "meta", "key", _naming(file, first))
     return Repaired(why, numbers, original)
 
 
 def put_robot(path: Path, file: Path) -> None:
-    """Put the file of its robot into a campaign that does not hold it."""
+    """Store the robot's file in a campaign that lacks it."""
     with CampaignFile.open(path) as campaign:
         robot = CellConfig.from_json(campaign.config_json).robot
         if campaign.about(ROBOT_FILE) is not None or not Path(robot.model).suffix:
             raise InputError(f"{path}: its robot is in it already; leave out --robot")
-        kept = text_of(file)
-        if not kept:
+        texts = text_of(file)
+        if not texts:
             raise InputError(f"--robot {file}: cannot be read as text")
-        text, base, tip = kept[ROBOT_FILE], robot.base_link, robot.tip_link
+        text, base, tip = texts[ROBOT_FILE], robot.base_link, robot.tip_link
         arm = load_arm(robot.model, base_link=base, tip_link=tip, text=text)
         n = campaign.readings().states.q.shape[1] if campaign.n_readings else arm.n
         if arm.n != n:
@@ -67,13 +67,13 @@ def put_robot(path: Path, file: Path) -> None:
 
 
 def _naming(file: CampaignFile, first: int) -> tuple[str, ...]:
-    """Keys of the acceptances and of the entries of a calibration from the first that names one."""
+    """Return the keys of acceptances and log entries, from the first with revision >= `first`."""
     accepted = [[number] for number in file.acceptances()]
     entries = [[e.get("revision"), *e.get("revisions", ())] for e in ProcedureLog(file).entries()]
     keys: list[str] = []
-    for key, named in ((ACCEPTED, accepted), (ENTRY, entries)):
-        bad = (k for k, of in enumerate(named) if any(n is not None and n >= first for n in of))
-        keys += [key.format(k + 1) for k in range(next(bad, len(named)), len(named))]
+    for key, groups in ((ACCEPTED, accepted), (ENTRY, entries)):
+        bad = (k for k, g in enumerate(groups) if any(n is not None and n >= first for n in g))
+        keys += [key.format(k + 1) for k in range(next(bad, len(groups)), len(groups))]
     return tuple(keys)
 
 
@@ -82,8 +82,8 @@ def _delete(
 ) -> None:
     """Delete rows of an immutable table."""
     guard = f"{table}_no_delete"
-    (made,) = (s for s in schema.statements() if s.startswith(f"CREATE TRIGGER {guard} "))
+    (trigger,) = (s for s in schema.statements() if s.startswith(f"CREATE TRIGGER {guard} "))
     connection.execute(f"DROP TRIGGER {guard}")
     delete = f"DELETE FROM {table} WHERE {key} = ?"  # noqa: S608
     connection.executemany(delete, [(value,) for value in values])
-    connection.execute(made)
+    connection.execute(trigger)

@@ -1,4 +1,4 @@
-"""A model revision: what was fitted, to which data, by which program, with what result."""
+"""The record of a model revision: model, data, program and result of a fit."""
 
 import hashlib
 import json
@@ -14,53 +14,52 @@ from hilcal.store.stored_schema import REVISION, check
 from hilcal.toml import parse_json
 
 STORED = "stored_sha256"
-"""Key among the options of a revision: hash of the readings as the file stores them.
+"""Key in the options of a revision: hash of the readings as the file stores them.
 
-`data_hash` is that of the readings with the arm's scatter in their covariance, which is computed:
-its last bits depend on the machine."""
+`data_hash` includes the arm's scatter in the covariance, which is computed, so that its last bits
+depend on the machine."""
 
 CELL = "cell"
-"""Key among the options of a revision: what was changed in the cell, see `config.changes`."""
+"""Key in the options of a revision: the changes of the cell, see `config.changes`."""
 
 
 def utc_now() -> str:
-    """Present time, ISO 8601, UTC, to the second."""
+    """Return the present time, ISO 8601, UTC, to the second."""
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
 def seconds_of(date: str, where: str = "date") -> float:
-    """Return seconds since 1970 of a date in ISO 8601, UTC unless it says otherwise."""
+    """Return the seconds since 1970 of a date in ISO 8601; UTC unless it states a zone."""
     try:
-        found = datetime.fromisoformat(date)
+        parsed = datetime.fromisoformat(date)
     except ValueError:
         raise InputError(f"{where}: {date!r}; valid: a date as 2026-03-31") from None
-    return (found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp()
+    return (parsed if parsed.tzinfo else parsed.replace(tzinfo=UTC)).timestamp()
 
 
 @dataclass(frozen=True, slots=True)
 class RevisionRecord:
-    """One fit, as a campaign file keeps it; all mappings are JSON."""
+    """A fit as a campaign file stores it; all mappings are JSON."""
 
     effects: tuple[str, ...]  # canonical names of the model's effects, in order
     added: str | None
-    """The effect that this revision added to the one before; None for a first model."""
-    options: Mapping[str, Any]  # what was chosen: scaling, kind of readings, options of the effects
-    data_hash: str  # `content_hash` of the readings that were fitted
+    """The effect added to the parent's model; None for a first model."""
+    options: Mapping[str, Any]  # scaling, kind of readings, options of the effects
+    data_hash: str  # `content_hash` of the fitted readings
     program_version: str  # version of the program that fitted
-    parameters_json: Mapping[str, Any]  # the parameters, enough to predict with the model again
-    result_json: Mapping[str, Any]  # what `identify --json` or `diagnose --json` reported
+    parameters_json: Mapping[str, Any]  # the parameters, sufficient for predictions
+    result_json: Mapping[str, Any]  # results as in `identify --json` and `diagnose --json`
     created: str = field(default_factory=utc_now)  # ISO 8601, UTC
-    number: int = 0  # 1, 2, ... in one campaign; the campaign gives it
-    removed: str | None = None  # the effect that this revision took out of the one before
+    number: int = 0  # 1, 2, ... in one campaign, given by it
+    removed: str | None = None  # the effect removed from the parent's model
     parent: int | None = None
-    """Number of the revision that it was made from; None where that is the one before, or where it
-    was made from none."""
+    """Number of the revision that it was made from; None for the previous one, or a first model."""
 
     @property
     def cell(self) -> Changes:
-        """What was changed in the campaign's cell before this was fitted; nothing as a rule."""
-        found: Changes = self.options.get(CELL, {})
-        return found
+        """Changes of the campaign's cell for this fit; empty without any."""
+        changes: Changes = self.options.get(CELL, {})
+        return changes
 
     @property
     def made_from(self) -> int | None:
@@ -77,13 +76,13 @@ class RevisionRecord:
 
     @property
     def scatter_alone(self) -> bool:
-        """Whether it changed the covariance alone, by the arm's scatter as estimated."""
+        """Whether it only adds the estimated scatter of the arm to the covariance."""
         scatter = self.parameters_json.get("arm_scatter") is not None
         return scatter and self.added is None and self.removed is None
 
 
 def change(added: str | None, removed: str | None, scatter: bool = False) -> str:
-    """Return what a revision changed, as "+ a", "− b" or "+ a − b"; empty for a first model."""
+    """Return the change of a revision as "+ a", "− b" or "+ a − b"; empty for a first model."""
     if scatter and added is None and removed is None:
         return "arm's scatter"
     parts = [f"+ {added}"] if added else []
@@ -91,7 +90,7 @@ def change(added: str | None, removed: str | None, scatter: bool = False) -> str
 
 
 def to_text(record: RevisionRecord) -> str:
-    """JSON text of a record without its number; floats keep their exact value, and are finite."""
+    """Return the JSON text of a record without its number; floats are exact, and finite."""
     content = {f.name: getattr(record, f.name) for f in fields(record) if f.name != "number"}
     if record.parent is None:
         del content["parent"]
@@ -99,7 +98,7 @@ def to_text(record: RevisionRecord) -> str:
 
 
 def from_text(text: str, number: int) -> RevisionRecord:
-    """Record from its JSON text."""
+    """Return the record of a JSON text; a ValueError or InputError for a damaged one."""
     try:
         content = parse_json(text)
         r = RevisionRecord(**{**content, "effects": tuple(content["effects"])}, number=number)
@@ -112,7 +111,7 @@ def from_text(text: str, number: int) -> RevisionRecord:
 
 
 def fitted_to(record: RevisionRecord) -> tuple[int, str] | None:
-    """Return how many readings a revision was fitted to, the first ones, and their stored hash."""
+    """Return number and stored hash of the readings that were fitted; None without the hash."""
     identified = record.result_json.get("identify")
     count = identified.get("n_readings") if isinstance(identified, dict) else None
     stored = record.options.get(STORED)
@@ -122,14 +121,14 @@ def fitted_to(record: RevisionRecord) -> tuple[int, str] | None:
 
 
 CARRIED = "carried_prior"
-"""Key among the parameters of a revision: the prior that it was fitted with, as JSON."""
+"""Key in the parameters of a revision: the prior of another campaign in the fit, as JSON."""
 _POSTERIOR, _HASH = "posterior", "posterior_sha256"
 _KEY = "posterior {}"
-"""Key of a posterior in the file, by its hash."""
+"""Key of a posterior in the file, with its hash."""
 
 
 def split(record: RevisionRecord) -> tuple[RevisionRecord, str | None, str]:
-    """Return a record that names its posterior, the key of that in the file, and its text."""
+    """Move the posterior out of a record; return the record, and the posterior's key and text."""
     carried = record.parameters_json.get(CARRIED)
     if carried is None:
         return record, None, ""
@@ -141,7 +140,7 @@ def split(record: RevisionRecord) -> tuple[RevisionRecord, str | None, str]:
 
 
 def join(record: RevisionRecord, stored: Mapping[str, str]) -> RevisionRecord:
-    """Return a record with the posterior that it names; a ValueError where that is not there."""
+    """Put the posterior into a record that names one; a ValueError where it is missing."""
     carried: Any = record.parameters_json.get(CARRIED)
     if carried is None:
         return record
@@ -150,5 +149,5 @@ def join(record: RevisionRecord, stored: Mapping[str, str]) -> RevisionRecord:
     text = stored.get(_KEY.format(carried.get(_HASH)))
     if text is None:
         raise ValueError("a prior is missing")
-    whole = {k: v for k, v in carried.items() if k != _HASH} | {_POSTERIOR: parse_json(text)}
-    return replace(record, parameters_json={**record.parameters_json, CARRIED: whole})
+    restored = {k: v for k, v in carried.items() if k != _HASH} | {_POSTERIOR: parse_json(text)}
+    return replace(record, parameters_json={**record.parameters_json, CARRIED: restored})

@@ -20,11 +20,11 @@ from hilcal.toml import parse_json
 from hilcal.types import Bools, Floats, Ints
 
 Layout = tuple[tuple[str, int], ...]
-"""Fields of a record in order, and how many doubles each takes; absent quantities take none."""
+"""Fields of a record in order, with their number of doubles; absent quantities are left out."""
 LARGEST = 1e12
-"""No quantity of a reading is as large, in SI units: times in s are below 1e11."""
+"""Upper bound of all quantities of a reading, in SI units: times in s are below 1e11."""
 MAY_LACK = "torque"
-"""Quantity of a state that single readings may lack, all of its numbers NaN then."""
+"""Quantity of a state that single readings may lack; all of its numbers are NaN then."""
 _PER_JOINT = ("q", "joint_temperature", "approach", "q_actual", "torque")
 _STATE = (
     *("q", "wrench", "time", "load_time", "air_temperature", "joint_temperature", "approach"),
@@ -33,36 +33,36 @@ _STATE = (
 
 
 def _widths(n: int, m: int) -> dict[str, int]:
-    """Doubles of each field, in order, of n joints and m measured elements."""
+    """Return the number of doubles of each field, in order, for n joints and m elements."""
     state = {name: n if name in _PER_JOINT else 1 for name in _STATE} | {"wrench": 6}
     return state | {"value": m, "covariance": m * m}
 
 
 def layout_of(readings: Readings) -> Layout:
-    """Layout of the records of some readings."""
+    """Return the layout of the records of readings."""
     absent = {name for name in _STATE if getattr(readings.states, name) is None}
     widths = _widths(readings.states.q.shape[1], readings.m)
     return tuple((name, width) for name, width in widths.items() if name not in absent)
 
 
 def read_layout(text: str) -> Layout:
-    """Return a layout from its JSON text; raises a ValueError where no reading has it."""
+    """Return a layout from its JSON text; a ValueError for a layout that no reading has."""
     try:
-        found = tuple((str(name), int(width)) for name, width in parse_json(text))
+        layout = tuple((str(name), int(width)) for name, width in parse_json(text))
     except (TypeError, OverflowError) as error:
         raise ValueError(str(error)) from error
-    given = dict(found)
-    n, m = given.get("q", 0), given.get("value", 0)
-    wanted = tuple((k, w) for k, w in _widths(n, m).items() if k in given)
-    if not {"q", "wrench", "value", "covariance"} <= set(given) or m not in (3, 6):
+    widths = dict(layout)
+    n, m = widths.get("q", 0), widths.get("value", 0)
+    expected = tuple((k, w) for k, w in _widths(n, m).items() if k in widths)
+    if not {"q", "wrench", "value", "covariance"} <= set(widths) or m not in (3, 6):
         raise ValueError("fields that no reading has")
-    if n < 1 or found != wanted:
+    if n < 1 or layout != expected:
         raise ValueError("fields of a wrong order or width")
-    return found
+    return layout
 
 
 def pack(readings: Readings) -> Floats:
-    """(N, K) records; refuses arrays of a wrong shape, and numbers that are not finite."""
+    """Return records (N, K); refuse arrays of a wrong shape, and numbers that are not finite."""
     count, parts = len(readings), []
     for name, width in layout_of(readings):
         owner = readings.states if name in _STATE else readings
@@ -70,24 +70,24 @@ def pack(readings: Readings) -> Floats:
         if part.size != count * width or len(part) != count:
             raise InputError(f"readings: {name} has shape {part.shape} for {count} readings")
         part = part.reshape(count, width)
-        known = np.isfinite(part).all(axis=1)
+        valid = np.isfinite(part).all(axis=1)
         if name == MAY_LACK:
-            known |= np.isnan(part).all(axis=1)
-        if not known.all():
-            i = int(np.argmin(known))
+            valid |= np.isnan(part).all(axis=1)
+        if not valid.all():
+            i = int(np.argmin(valid))
             raise InputError(f"readings: {name} of reading {i + 1} is not finite")
         parts.append(part)
     return np.ascontiguousarray(np.hstack(parts), dtype="<f8")
 
 
 def _lacking(records: Floats, layout: Layout) -> Bools:
-    """(N, K) numbers that are NaN since a reading lacks the whole quantity, and may."""
-    out, at = np.zeros(records.shape, dtype=np.bool_), 0
+    """Return which numbers (N, K) are NaN because the reading lacks the quantity `MAY_LACK`."""
+    out, column = np.zeros(records.shape, dtype=np.bool_), 0
     for name, width in layout:
         if name == MAY_LACK:
-            none = np.isnan(records[:, at : at + width])
-            out[:, at : at + width] = none.all(axis=1, keepdims=True)
-        at += width
+            missing = np.isnan(records[:, column : column + width])
+            out[:, column : column + width] = missing.all(axis=1, keepdims=True)
+        column += width
     return out
 
 
@@ -98,13 +98,13 @@ def _unpacked(
     names: Sequence[Sequence[str]],
     observers: Sequence[ObserverName],
 ) -> Readings:
-    """Readings of (N, K) records, (N, 3) pose, load and cycle, names of poses, loads, targets."""
+    """Return readings of records (N, K), `index` (N, 3); `names` are of poses, loads, targets."""
     fields: dict[str, Any] = {}
-    at, one = 0, _widths(0, 0)
+    column, single_widths = 0, _widths(0, 0)
     for name, width in layout:
-        block = np.array(records[:, at : at + width], dtype=np.float64)
-        fields[name] = block[:, 0] if one[name] == 1 else block
-        at += width
+        block = np.array(records[:, column : column + width], dtype=np.float64)
+        fields[name] = block[:, 0] if single_widths[name] == 1 else block
+        column += width
     for name in ("target", "observer"):
         if name in fields:
             fields[name] = fields[name].astype(np.int64)
@@ -126,11 +126,11 @@ def _unpacked(
 
 
 def content_hash(readings: Readings) -> str:
-    """SHA-256 (hex) of what was measured, in order.
+    """Return the SHA-256 (hex) of readings in order.
 
-    Depends on every number and on the names of poses, loads and targets, but not on how names are
-    numbered, on names without readings, or on how the readings were appended; nor on a scatter of
-    the arm that was estimated from them.
+    The hash depends on every number and on the names of poses, loads and targets. It does not
+    depend on the numbering of names, on names without readings, on how the readings were appended,
+    or on a scatter of the arm that was estimated from them.
     """
     readings = readings.as_stated()
     sha = hashlib.sha256()
@@ -154,7 +154,7 @@ def content_hash(readings: Readings) -> str:
 
 
 def text_crc(key: str, text: str) -> int:
-    """Checksum of a text under a key."""
+    """Return the checksum of a text under a key."""
     return zlib.crc32(text.encode(), zlib.crc32(key.encode()))
 
 
@@ -163,7 +163,7 @@ def _reading_crc(number: int, where: Sequence[int], record: bytes) -> int:
 
 
 def insert(connection: sqlite3.Connection, table: str, rows: Sequence[Sequence[object]]) -> None:
-    """Append rows to a table; raises a DatabaseError where not all of them are in it."""
+    """Append rows to a table; a DatabaseError where not all of them were stored."""
     if not rows:
         return
     marks = ", ".join("?" * len(rows[0]))
@@ -173,7 +173,7 @@ def insert(connection: sqlite3.Connection, table: str, rows: Sequence[Sequence[o
 
 
 def last_id(connection: sqlite3.Connection, table: str) -> int:
-    """Number of the last row of a table; 0 where it is empty."""
+    """Return the number of the last row of a table; 0 where it is empty."""
     (last,) = connection.execute(f"SELECT ifnull(max(id), 0) FROM {table}").fetchone()  # noqa: S608
     return int(last)
 
@@ -184,7 +184,7 @@ def insert_meta(connection: sqlite3.Connection, key: str, value: str) -> None:
 
 
 def fetch_meta(connection: sqlite3.Connection, path: Path) -> dict[str, str]:
-    """All texts about the campaign; refuses damaged ones."""
+    """Return all texts about the campaign by key; refuse damaged ones."""
     with limits.memory(str(path)):
         rows = connection.execute("SELECT key, value, crc FROM meta").fetchall()
     meta = {str(key): str(value) for key, value, _ in rows}
@@ -194,26 +194,26 @@ def fetch_meta(connection: sqlite3.Connection, path: Path) -> dict[str, str]:
 
 
 def _fetch_names(connection: sqlite3.Connection, table: str) -> tuple[str, ...]:
-    """Names of the poses or loads by number."""
-    found = connection.execute(f"SELECT name FROM {table} ORDER BY id")  # noqa: S608
-    return tuple(str(name) for (name,) in found)
+    """Return the names of the poses or loads by number."""
+    rows = connection.execute(f"SELECT name FROM {table} ORDER BY id")  # noqa: S608
+    return tuple(str(name) for (name,) in rows)
 
 
 def _insert_names(connection: sqlite3.Connection, table: str, names: Sequence[str]) -> Ints:
-    """Numbers of names, of which new ones are appended in order."""
+    """Return the numbers of names; new names are appended in order."""
     if len(set(names)) != len(names):
         raise InputError(f"readings: two {table} have the same name")
-    known = {name: k for k, name in enumerate(_fetch_names(connection, table))}
+    numbers = {name: k for k, name in enumerate(_fetch_names(connection, table))}
     for name in names:
-        if name not in known:
+        if name not in numbers:
             check_name(name, table)
-            insert(connection, table, [(len(known), name)])
-            known[name] = len(known)
-    return np.array([known[name] for name in names], dtype=np.int64)
+            insert(connection, table, [(len(numbers), name)])
+            numbers[name] = len(numbers)
+    return np.array([numbers[name] for name in names], dtype=np.int64)
 
 
 def insert_readings(connection: sqlite3.Connection, readings: Readings) -> int:
-    """Append readings after those that are there; returns how many there are then."""
+    """Append readings; return the number of all readings."""
     records = pack(readings)
     pose = _insert_names(connection, "poses", readings.pose_names)[readings.pose]
     load = _insert_names(connection, "loads", readings.load_names)[readings.load]
@@ -235,11 +235,11 @@ def fetch_readings(
     target_names: Sequence[str] = (),
     observers: Sequence[ObserverName] = (),
 ) -> Readings:
-    """All readings, in order; refuses missing or damaged ones, and names that are none."""
+    """Return all readings, in order; refuse missing or damaged ones, and invalid names."""
     (count,) = connection.execute("SELECT count(*) FROM readings").fetchone()
 
-    def damaged(what: str) -> InputError:
-        return InputError(f"{path}: the campaign file is damaged{what}")
+    def damaged(place: str) -> InputError:
+        return InputError(f"{path}: the campaign file is damaged{place}")
 
     if not count:
         raise damaged(" (its readings are gone)")
@@ -254,16 +254,16 @@ def fetch_readings(
         records, index = np.empty((count, width)), np.empty((count, 3), dtype=np.int64)
         for number, (key, *where, record, crc) in enumerate(rows, start=1):
             try:
-                whole = key == number and len(record) == 8 * width
-                whole = whole and _reading_crc(key, where, record) == crc
+                intact = key == number and len(record) == 8 * width
+                intact = intact and _reading_crc(key, where, record) == crc
             except (TypeError, ValueError, OverflowError):
-                whole = False
-            if not whole:
+                intact = False
+            if not intact:
                 raise damaged(f" at reading {number}")
             records[number - 1] = np.frombuffer(record, "<f8")
             index[number - 1] = where
-        sound = (np.abs(records) < LARGEST) | _lacking(records, layout)
-        if bad := np.flatnonzero(~sound.all(axis=1))[:1].tolist():
+        plausible = (np.abs(records) < LARGEST) | _lacking(records, layout)
+        if bad := np.flatnonzero(~plausible.all(axis=1))[:1].tolist():
             raise damaged(f" at reading {bad[0] + 1}")
         counts = [len(names[0]), len(names[1])]
         if index[:, :2].min() < 0 or np.any(index[:, :2].max(axis=0) >= counts):
@@ -272,15 +272,15 @@ def fetch_readings(
         if bad := np.flatnonzero(~is_covariance(readings.covariance))[:1].tolist():
             why = "its covariance is not positive semi-definite"
             raise damaged(f" at reading {bad[0] + 1}: {why}")
-    for what, known in (("target", target_names), ("observer", observers)):
-        of = getattr(readings.states, what)
-        if of is not None and not 0 <= of.min() <= of.max() < len(known):
-            raise damaged(f" ({what}s are missing)")
+    for kind, listed in (("target", target_names), ("observer", observers)):
+        numbers = getattr(readings.states, kind)
+        if numbers is not None and not 0 <= numbers.min() <= numbers.max() < len(listed):
+            raise damaged(f" ({kind}s are missing)")
     return readings
 
 
 def stored_json(path: Path, text: str, check: Callable[[object], None] | None = None) -> Any:
-    """Return what a stored JSON text holds, which `check` may refuse by a ValueError."""
+    """Return the content of a stored JSON text; `check` may refuse it by a ValueError."""
     try:
         with limits.memory(str(path)):
             content = parse_json(text)
@@ -292,11 +292,11 @@ def stored_json(path: Path, text: str, check: Callable[[object], None] | None = 
 
 
 def check_poses(connection: sqlite3.Connection, path: Path, readings: Readings) -> None:
-    """Refuse a pose that is commanded to other joints than in earlier readings."""
+    """Refuse a pose whose commanded joints differ from those of its previous readings."""
     if len(readings) == 0:
         return
     q = readings.states.q
-    pose, first, group = np.unique(readings.pose, return_index=True, return_inverse=True)
+    pose, first, pose_index = np.unique(readings.pose, return_index=True, return_inverse=True)
     reference = q[first]
     for k, number in enumerate(pose.tolist()):
         stored = connection.execute(
@@ -306,7 +306,7 @@ def check_poses(connection: sqlite3.Connection, path: Path, readings: Readings) 
         ).fetchone()
         if stored is not None:  # q comes first in a record
             reference[k] = np.frombuffer(stored[0], "<f8", q.shape[1])
-    bad = np.abs(q - reference[group]).max(axis=1) > SAME_POSE
+    bad = np.abs(q - reference[pose_index]).max(axis=1) > SAME_POSE
     if bad.any():
         name = readings.pose_names[readings.pose[np.argmax(bad)]]
         raise InputError(

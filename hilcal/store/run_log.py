@@ -1,4 +1,4 @@
-"""A measured campaign's plan, raw details of every reading, and what happened on the way."""
+"""The log of a measured campaign: its plans, the raw details of every reading, events."""
 
 import json
 import sqlite3
@@ -22,13 +22,13 @@ from hilcal.store.revision import utc_now
 from hilcal.store.stored_schema import DETAIL, check, check_event
 
 PLAN = "plan"
-"""Key of the plan among the texts about a campaign; further ones are "plan 2" and so on."""
+"""Key of the first plan among the texts of a campaign; further ones have "plan 2" and so on."""
 
 
 SAME = ("robot", "tool", "loads")
-"""Sections of the configuration that stay as they are for a whole campaign ..."""
+"""Sections of the configuration that must not change during a campaign ..."""
 ADDRESSES = {"driver", "host", "port", "baud", "options"}
-"""... but for these keys of them."""
+"""... except these keys."""
 
 
 def create_run(
@@ -41,7 +41,7 @@ def create_run(
     source: str = "measured by hilcal run",
     more: Mapping[str, str] | None = None,
 ) -> CampaignFile:
-    """Make the empty campaign of a run, its plan inside; `more` are further texts about it."""
+    """Make the campaign file of a run, with its plan and further texts `more`, without readings."""
     texts = {PLAN: plan.to_json(), COVERS: INSTRUMENT, **(more or {})}
     return CampaignFile.create(
         path, config.to_json(), str(base_dir), source, overwrite=overwrite, more=texts
@@ -50,19 +50,19 @@ def create_run(
 
 def check_same_cell(campaign: CampaignFile, config: CellConfig, base_dir: Path) -> None:
     """Refuse to continue a campaign in another cell."""
-    for key, now in robot_file_of(config.to_json(), str(base_dir)).items():
-        kept = campaign.about(key)
-        if kept is not None and kept != now:
+    for key, text in robot_file_of(config.to_json(), str(base_dir)).items():
+        stored_text = campaign.about(key)
+        if stored_text is not None and stored_text != text:
             raise InputError(
                 f"{base_dir / getattr(config.robot, KEYS[key])} is not what it was when "
                 f"{campaign.path} was begun; a campaign is of one robot: start another one for this"
             )
     for section in SAME:
-        stored, given = (
+        stored, current = (
             c.model_dump(mode="json", include={section: True}, exclude={section: ADDRESSES})
             for c in (CellConfig.from_json(campaign.config_json), config)
         )
-        if stored != given:
+        if stored != current:
             raise InputError(
                 f"[{section}] differs from what {campaign.path} was begun with; a campaign is "
                 "measured in one cell: start another one for this"
@@ -70,13 +70,14 @@ def check_same_cell(campaign: CampaignFile, config: CellConfig, base_dir: Path) 
 
 
 class RunLog:
-    """What a run writes into its campaign file; all of it durable before a method returns.
+    """Plans, readings and events that a run writes into its campaign file.
 
-    A reading, its step and its raw details enter together or not at all, and no step twice.
+    All writing is durable before a method returns. A reading, its step and its raw details are
+    stored together or not at all, and no step twice.
     """
 
     def __init__(self, campaign: CampaignFile) -> None:
-        """Write to an open campaign."""
+        """Read the plans of an open campaign; refuse one without."""
         text = campaign.about(PLAN)
         if text is None:
             raise InputError(
@@ -93,31 +94,31 @@ class RunLog:
 
     @property
     def plan(self) -> Plan:
-        """All plans in one; of those before the last one only what was measured."""
+        """The joined plans; of all but the last one only the measured steps."""
         done = self.done() if len(self.plans) > 1 else frozenset()
-        return reduce(lambda whole, further: joined(whole, done, further), self.plans)
+        return reduce(lambda a, b: joined(a, done, b), self.plans)
 
     def with_new_names(self, plan: Plan) -> Plan:
-        """Return a further plan with names and cycles that the campaign does not have yet."""
-        last, whole = self.plans[-1], self.plan
+        """Return a further plan with names and cycles that are new in the campaign."""
+        last, planned = self.plans[-1], self.plan
         missing = len(last.without(self.done()).steps)
-        made = with_new_names(plan, whole, len(self.plans) + 1)
-        again = with_new_names(plan, self._before_last(), len(self.plans))
-        if missing and again.steps == last.steps and np.array_equal(again.q, last.q):
+        renamed = with_new_names(plan, planned, len(self.plans) + 1)
+        resumed = with_new_names(plan, self._before_last(), len(self.plans))
+        if missing and resumed.steps == last.steps and np.array_equal(resumed.q, last.q):
             raise InputError(
                 f"{self._campaign.path}: this plan is in the campaign already, and {missing} of "
                 f"its {len(last.steps)} readings are missing; go on with --resume"
             )
-        return made
+        return renamed
 
     def _before_last(self) -> Plan:
-        """Return what was planned before the last plan, as far as that matters for names."""
+        """Return the measured steps and all poses of the plans before the last one."""
         done = self.done() if len(self.plans) > 1 else frozenset()
-        whole = reduce(lambda a, b: joined(a, done, b), self.plans[1:-1], self.plans[0])
-        return Plan(whole.pose_names, whole.q, tuple(s for s in whole.steps if s in done))
+        planned = reduce(lambda a, b: joined(a, done, b), self.plans[1:-1], self.plans[0])
+        return Plan(planned.pose_names, planned.q, tuple(s for s in planned.steps if s in done))
 
     def append(self, plan: Plan) -> None:
-        """Append a further plan, see `with_new_names`; what is missing of others is given up."""
+        """Append a further plan, see `with_new_names`; missing steps of other plans are dropped."""
         with self._campaign.transaction() as connection:
             rows.insert_meta(connection, f"{PLAN} {len(self.plans) + 1}", plan.to_json())
         self.plans = (*self.plans, plan)
@@ -125,10 +126,10 @@ class RunLog:
     def record(
         self, reading: Readings, step: Step, detail: dict[str, Any], *more: dict[str, Any]
     ) -> None:
-        """Append the reading of a step, with everything raw that belongs to it.
+        """Append the reading of a step, with its raw details.
 
-        Of several targets all readings of the arrival, one detail for each, or none of them: a step
-        that is measured again is another arrival. Where the disk fails, the file is as before.
+        With several targets, the readings of all targets at one arrival are stored together, with
+        one detail each. The file is unchanged where the disk fails.
         """
         details = (detail, *more)
         if len(reading) != len(details):
@@ -147,7 +148,7 @@ class RunLog:
                     ) from None
 
     def event(self, kind: str, content: dict[str, Any]) -> None:
-        """Append what happened, with the time (UTC)."""
+        """Append an event, with the time (UTC)."""
         text = json.dumps({"kind": kind, "utc": utc_now(), **content}, allow_nan=False)
         with self._campaign.transaction() as connection:
             number = rows.last_id(connection, "events") + 1
@@ -169,19 +170,19 @@ class RunLog:
                     f"reading {number}"
                 )
             pose, load, cycle = self._step(key)
-            found = rows.stored_json(self._campaign.path, text, partial(check, DETAIL))
-            out.append({**found, "step": {"pose": pose, "load": load, "cycle": cycle}})
+            content = rows.stored_json(self._campaign.path, text, partial(check, DETAIL))
+            out.append({**content, "step": {"pose": pose, "load": load, "cycle": cycle}})
         return out
 
     def events(self) -> list[dict[str, Any]]:
-        """Return what happened, in order: "kind", "utc" and more."""
+        """Return the events in order: "kind", "utc" and the content."""
         return self._events("SELECT * FROM events ORDER BY id")
 
     def last(self, kind: str) -> dict[str, Any] | None:
-        """Return the last event of a kind, see `events`; None where there is none."""
+        """Return the last event of a kind, see `events`; None without one."""
         of_kind = f'{{"kind": "{kind}", %'
-        last = "SELECT * FROM events WHERE content LIKE ? ORDER BY id DESC LIMIT 1"
-        return next(iter(self._events(last, of_kind)), None)
+        statement = "SELECT * FROM events WHERE content LIKE ? ORDER BY id DESC LIMIT 1"
+        return next(iter(self._events(statement, of_kind)), None)
 
     def _events(self, statement: str, *values: str) -> list[dict[str, Any]]:
         out = []
@@ -194,14 +195,14 @@ class RunLog:
         return out
 
     def readings(self) -> Readings | None:
-        """Return all readings, None before the first."""
+        """Return all readings; None without any."""
         return self._campaign.readings() if self._campaign.n_readings else None
 
     def _step(self, key: str) -> tuple[str, str, int]:
-        found = rows.stored_json(self._campaign.path, key)
-        if not isinstance(found, list) or [type(x) for x in found[:3]] != [str, str, int]:
+        entry = rows.stored_json(self._campaign.path, key)
+        if not isinstance(entry, list) or [type(x) for x in entry[:3]] != [str, str, int]:
             raise InputError(f"{self._campaign.path}: the campaign is damaged (step {key})")
-        return found[0], found[1], found[2]
+        return entry[0], entry[1], entry[2]
 
     def _select(self, statement: str, *values: str) -> list[Any]:
         path = self._campaign.path
@@ -210,7 +211,7 @@ class RunLog:
 
 
 def _key(step: Step, reading: Readings, row: int) -> str:
-    """Key of a stored detail: the step, and the name of the target where there are several."""
+    """Return the key of a stored detail: the step, and the target's name if there are several."""
     several = reading.states.target is not None
     target = [reading.target_names[reading.target[row]]] if several else []
     return json.dumps([step.pose, step.load, step.cycle, *target])

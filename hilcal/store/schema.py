@@ -1,12 +1,13 @@
 """Schema of a campaign file: tables that only grow.
 
-The journal is SQLite's rollback journal, not a write-ahead log: what is committed is in the
-one file and nowhere else, whatever kills the process; a `-journal` beside it holds only the
-undoing of an unfinished transaction and is gone after the next opening. Source: SQLite
-documentation, "Atomic Commit In SQLite" and "PRAGMA synchronous".
+The journal is SQLite's rollback journal, not a write-ahead log: committed data are in the one file
+alone, whatever ends the process. A `-journal` next to the file only undoes an unfinished
+transaction; the next opening removes it. Source: SQLite documentation, "Atomic Commit In SQLite"
+and "PRAGMA synchronous".
 """
 
 import os
+import re
 import sqlite3
 import stat
 import sys
@@ -22,13 +23,14 @@ from hilcal.errors import DeviceError, HilcalError, InputError
 APPLICATION_ID = 0x68696C63  # "hilc"
 ONE_TARGET, SEVERAL_TARGETS, CHOSEN_REVISION = 2, 3, 4
 CARRIED_PRIOR, CHANGED_CELL, MORE_COLUMNS = 5, 6, 7
-"""Versions of a file: readings of one target, or of several; an accepted revision, or one made from
-another than the one before; a revision fitted with a prior of another campaign, or in a cell that
-was changed since its readings were taken; readings with joint torques, or of several observers.
-Programs that do not know one would take the file for damaged, or for another."""
+"""Versions of a file: readings of one target, or of several; an accepted revision, or one not made
+from the previous one; a revision with a prior of another campaign, or in a changed cell; readings
+with joint torques, or of several observers. Older programs would misread a file of a newer one."""
 VERSION = MORE_COLUMNS
 HEADER = b"SQLite format 3\x00"
-_JOURNAL = bytes.fromhex("d9d505f920a163d7")  # begins a journal, and ends one that ends in a name
+_JOURNAL = bytes.fromhex(
+    "d9d505f920a163d7"
+)  # magic number; also ends a journal that ends in a name
 
 _TABLES = """
 CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL, crc INTEGER NOT NULL) WITHOUT ROWID;
@@ -56,7 +58,7 @@ _KEYS = {"meta": "key"} | dict.fromkeys(
     ("poses", "loads", "readings", "revisions", "details", "events"), "id"
 )
 _SINCE = {"details": 2, "events": 2}
-_SAID: dict[str, tuple[type[HilcalError], str]] = {
+_MESSAGES: dict[str, tuple[type[HilcalError], str]] = {
     "malformed|not a database": (InputError, "the campaign file is damaged or truncated ({})"),
     "full|I/O error": (
         DeviceError,
@@ -73,31 +75,31 @@ _SAID: dict[str, tuple[type[HilcalError], str]] = {
         "that can be written",
     ),
 }
-"""What is said of an error of SQLite, by the words that its message has."""
+"""Error and message by a pattern in SQLite's message."""
 _LONGEST_S = 60.0
-"""No check of a file that is opened takes as long; a choice."""
+"""Longest time to check a file when it is opened; a choice."""
 
 
 def statements() -> list[str]:
-    """All statements that make an empty campaign, triggers against change included."""
-    made = [s for s in _TABLES.split(";") if s.strip()]
+    """Return the statements that make an empty campaign, with triggers against changes."""
+    created = [s for s in _TABLES.split(";") if s.strip()]
     for table, key in _KEYS.items():
         refuse = f"BEGIN SELECT RAISE(ABORT, '{table} are immutable: append only'); END"
-        there = f"WHEN EXISTS (SELECT 1 FROM {table} WHERE {key} = NEW.{key}) "  # noqa: S608
-        made += [
-            f"CREATE TRIGGER {table}_no_{what} BEFORE {event} ON {table} {when}{refuse}"
-            for what, event, when in (
+        exists = f"WHEN EXISTS (SELECT 1 FROM {table} WHERE {key} = NEW.{key}) "  # noqa: S608
+        created += [
+            f"CREATE TRIGGER {table}_no_{suffix} BEFORE {event} ON {table} {condition}{refuse}"
+            for suffix, event, condition in (
                 ("update", "UPDATE", ""),
                 ("delete", "DELETE", ""),
-                ("replace", "INSERT", there),
+                ("replace", "INSERT", exists),
             )
         ]
     versions = f"PRAGMA application_id = {APPLICATION_ID}", f"PRAGMA user_version = {ONE_TARGET}"
-    return [*made, *versions]
+    return [*created, *versions]
 
 
 def is_campaign(path: Path) -> bool:
-    """Whether a file's header is that of a campaign (whatever the state of the rest)."""
+    """Whether a file's header is that of a campaign; its content is not checked."""
     with path.open("rb") as stream:
         head = stream.read(72)
     return head.startswith(HEADER) and head[68:72] == APPLICATION_ID.to_bytes(4, "big")
@@ -105,7 +107,7 @@ def is_campaign(path: Path) -> bool:
 
 @contextmanager
 def sqlite_errors(path: Path) -> Iterator[None]:
-    """Turn SQLite's errors into one line."""
+    """Raise SQLite's errors as errors of one line."""
     try:
         yield
     except UnicodeEncodeError as e:
@@ -114,20 +116,20 @@ def sqlite_errors(path: Path) -> Iterator[None]:
         raise InputError(f"{path}: the campaign file is damaged") from e
     except sqlite3.DatabaseError as e:
         text = str(e)
-        kinds = (kind for words, kind in _SAID.items() if any(w in text for w in words.split("|")))
-        error, what = next(kinds, (InputError, "the campaign file cannot be used ({})"))
-        raise error(f"{path}: {what.format(text)}") from e
+        kinds = (kind for words, kind in _MESSAGES.items() if re.search(words, text))
+        error, message = next(kinds, (InputError, "the campaign file cannot be used ({})"))
+        raise error(f"{path}: {message.format(text)}") from e
 
 
 def connect(path: Path, read_only: bool = False) -> sqlite3.Connection:
-    """Open an existing file, every commit durable before it returns.
+    """Open an existing file; every commit is durable before it returns.
 
     Args:
-        read_only: write nothing, neither to the file nor beside it. A journal beside the file is
-            what a killed program left unfinished; SQLite has to undo that before anybody can read,
-            and then the file is opened for writing all the same.
+        read_only: write neither the file nor files next to it. A file with the journal of a killed
+            program is opened for writing, since SQLite has to undo the unfinished transaction
+            before the file can be read.
     """
-    _refuse_log(path)
+    _refuse_write_ahead_log(path)
     unfinished = _journal(path)
     mode = "ro" if read_only and not unfinished else "rw"
     connection = sqlite3.connect(
@@ -148,22 +150,23 @@ def connect(path: Path, read_only: bool = False) -> sqlite3.Connection:
 
 
 def _journal(path: Path) -> bool:
-    """Whether a journal lies beside a file; SQLite obeys it, whoever wrote it.
+    """Whether a file has a journal; refuse one by which SQLite would change other files.
 
-    One that ends in a name belongs to a transaction over several files, and SQLite deletes the file
-    of that name: any file. Through a link it would write elsewhere. Source: SQLite documentation,
-    "Database File Format", section 3, "The Rollback Journal", and pager.c, `pager_delsuper`.
+    SQLite replays any journal. A journal that ends in a name belongs to a transaction over several
+    files, and SQLite deletes the file of that name. Through a link it would write elsewhere.
+    Source: SQLite documentation, "Database File Format", section 3, "The Rollback Journal", and
+    pager.c, `pager_delsuper`.
     """
-    journal = Path(f"{os.path.realpath(path)}-journal")  # beside a link's file
+    journal = Path(f"{os.path.realpath(path)}-journal")  # next to the file that a link points to
     try:
-        ours = stat.S_ISREG(journal.lstat().st_mode)
-        if ours:
+        safe = stat.S_ISREG(journal.lstat().st_mode)
+        if safe:
             with journal.open("rb") as stream:
                 stream.seek(-min(len(_JOURNAL), journal.stat().st_size), os.SEEK_END)
-                ours = stream.read() != _JOURNAL
+                safe = stream.read() != _JOURNAL
     except FileNotFoundError:
         return False
-    if not ours:
+    if not safe:
         raise InputError(
             f"{journal}: a journal that no hilcal made, by which opening {path} would change other "
             "files; delete it, or take the campaign without it"
@@ -171,8 +174,8 @@ def _journal(path: Path) -> bool:
     return True
 
 
-def _refuse_log(path: Path) -> None:
-    """Refuse a file with a write-ahead log, before SQLite writes anything beside it."""
+def _refuse_write_ahead_log(path: Path) -> None:
+    """Refuse a file with a write-ahead log, before SQLite writes any file."""
     with path.open("rb") as stream:
         if 2 in stream.read(20)[18:]:  # versions of the format, to write and to read
             raise InputError(
@@ -183,10 +186,10 @@ def _refuse_log(path: Path) -> None:
 
 @contextmanager
 def transaction(connection: sqlite3.Connection) -> Iterator[sqlite3.Connection]:
-    """Commit everything or nothing.
+    """Commit all changes of the block, or none.
 
-    An interrupt between the statement `with` and its block leaves a transaction open: the next one
-    rolls it back, or the end of the connection.
+    An interrupt between the statement `with` and its block leaves the transaction open; the next
+    transaction or the end of the connection rolls it back.
     """
     if connection.in_transaction:
         connection.execute("ROLLBACK")
@@ -195,21 +198,21 @@ def transaction(connection: sqlite3.Connection) -> Iterator[sqlite3.Connection]:
         yield connection
         connection.execute("COMMIT")
     except BaseException:
-        with suppress(sqlite3.ProgrammingError):  # it is closed, and has rolled back
+        with suppress(sqlite3.ProgrammingError):  # closed, which has rolled back
             if connection.in_transaction:
                 connection.execute("ROLLBACK")
         raise
 
 
 def require(connection: sqlite3.Connection, *versions: int) -> None:
-    """Raise the version of the schema where it is lower; older programs refuse the file then."""
-    (now,) = connection.execute("PRAGMA user_version").fetchone()
-    if now < max(versions):
+    """Raise the version of the schema where it is lower, so that older programs refuse the file."""
+    (version,) = connection.execute("PRAGMA user_version").fetchone()
+    if version < max(versions):
         connection.execute(f"PRAGMA user_version = {max(versions)}")
 
 
 def check_file(connection: sqlite3.Connection, path: Path) -> None:
-    """Refuse what is not a sound campaign of a known version, and of exactly its schema."""
+    """Refuse a file that is damaged, of another version, or not exactly of its schema."""
     end = time.monotonic() + _LONGEST_S
     connection.set_progress_handler(lambda: time.monotonic() > end, 100_000)
     (application,) = connection.execute("PRAGMA application_id").fetchone()
@@ -220,38 +223,38 @@ def check_file(connection: sqlite3.Connection, path: Path) -> None:
         raise InputError(
             f"{path}: made by a newer hilcal (schema {version}, this one reads up to {VERSION})"
         )
-    _refuse_log(path)  # an unfinished journal may have brought it
+    _refuse_write_ahead_log(path)  # an unfinished journal may have brought it
     _check_schema(connection, path, version)
     (pages,) = connection.execute("PRAGMA page_count").fetchone()
     (page_size,) = connection.execute("PRAGMA page_size").fetchone()
     if path.stat().st_size < pages * page_size:  # SQLite fills a cut page with zeros
         raise InputError(f"{path}: the campaign file is truncated")
-    (sound,) = connection.execute("PRAGMA quick_check(1)").fetchone()
-    if sound != "ok":
-        raise InputError(f"{path}: the campaign file is damaged ({' '.join(sound.split())})")
+    (report,) = connection.execute("PRAGMA quick_check(1)").fetchone()
+    if report != "ok":
+        raise InputError(f"{path}: the campaign file is damaged ({' '.join(report.split())})")
     connection.set_progress_handler(None, 0)
 
 
 def _check_schema(connection: sqlite3.Connection, path: Path, version: int) -> None:
     """Refuse tables, views, triggers and indexes that are not exactly those of a campaign.
 
-    A received file could act by them: swallow what is stored, show other readings, never end.
+    In a received file they could drop what is stored, show other readings, or never end.
     """
-    found, wanted = _schema(connection), _wanted()
-    wanted = {entry for entry in wanted if version >= _SINCE.get(entry[2], 1)}
-    if extra := sorted(found - wanted):
+    actual, expected = _schema(connection), _own_schema()
+    expected = {entry for entry in expected if version >= _SINCE.get(entry[2], 1)}
+    if extra := sorted(actual - expected):
         kind, name, *_ = extra[0]
         raise InputError(
             f"{path}: has the {kind} {name[:60]!r}, which no hilcal made; a campaign that another "
             "program has changed is not opened; valid: the file as hilcal wrote it"
         )
-    if missing := sorted(wanted - found):
+    if missing := sorted(expected - actual):
         kind, name, *_ = missing[0]
         raise InputError(f"{path}: the campaign file is damaged (no {kind} '{name}')")
 
 
 def _schema(connection: sqlite3.Connection) -> set[tuple[str, str, str, str]]:
-    """Type, name, table and statement of everything in a file."""
+    """Return type, name, table and statement of every entry of a file's schema."""
     rows = connection.execute(
         "SELECT type, name, tbl_name, ifnull(sql, '') FROM sqlite_master LIMIT 1000"
     )
@@ -259,8 +262,8 @@ def _schema(connection: sqlite3.Connection) -> set[tuple[str, str, str, str]]:
 
 
 @cache
-def _wanted() -> set[tuple[str, str, str, str]]:
-    """Do so for a campaign as this program makes it; no version made a table differently."""
+def _own_schema() -> set[tuple[str, str, str, str]]:
+    """Return the same for a campaign of this program; tables are the same in all versions."""
     with closing(sqlite3.connect(":memory:")) as empty:
         for statement in statements():
             empty.execute(statement)

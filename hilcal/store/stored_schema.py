@@ -1,6 +1,6 @@
-"""What the documents in a campaign file hold, as far as the program reads it.
+"""Schemas of the documents in a campaign file, as far as the program reads them.
 
-Each is checked where it comes out of the file. Keys beside those named here are kept.
+A document is checked when it is read. Keys that no schema names are kept.
 """
 
 from collections.abc import Mapping
@@ -31,15 +31,15 @@ class _Strict(_Document):
 
 
 def _of(base: Schema = _Document, /, **keys: Any) -> Any:
-    """Return a document with keys of types, or of pairs of a type and a default."""
-    given: dict[str, Any] = {
-        k: of if isinstance(of, tuple) else (of, ...) for k, of in keys.items()
+    """Return a schema with keys of types, or of pairs of a type and a default."""
+    fields: dict[str, Any] = {
+        k: kind if isinstance(kind, tuple) else (kind, ...) for k, kind in keys.items()
     }
-    return create_model("document", __base__=base, **given)
+    return create_model("document", __base__=base, **fields)
 
 
-def _list(of: Any) -> Any:
-    return list.__class_getitem__(of)
+def _list(kind: Any) -> Any:
+    return list.__class_getitem__(kind)
 
 
 _ERRORS = _of(mean_m=Number, rms_m=Number, max_m=Number, rms_sigma=Number)
@@ -76,9 +76,9 @@ DETAIL: Schema = _of(
     q_actual=(tuple[Number, ...] | None, None),
     tracker_covariance=(Matrix | None, None),
 )
-"""What is kept with a reading."""
+"""The details of a reading."""
 _DOUBTFUL = _of(DETAIL, pose=Text, load=Text, target=(Text | None, None))
-"""A reading that was measured and cannot be of its target under its load."""
+"""A reading that cannot be of its target under its load."""
 _HAPPENED: Schema = _of(kind=Text, utc=Text)
 _happened = partial(_of, _HAPPENED)
 EVENTS: Mapping[str, Schema] = {
@@ -91,8 +91,8 @@ EVENTS: Mapping[str, Schema] = {
     "repeatability": _happened(
         dof=Count, poses=Count, scatter=Number, instrument=Number, joint_std=Number
     ),
-    "load": _happened(hanging=Text | None, why=(Text, "")),  # None while that is being put right
-    # stored: among the readings, since it was seen too late to be doubtful
+    "load": _happened(hanging=Text | None, why=(Text, "")),  # None while a wrong load is corrected
+    # stored: it is among the readings, since it was recognised too late
     "doubted": _happened(why=Text, reading=_DOUBTFUL, stored=(bool, False)),
     "start": _happened(missing=Count),
     "finished": _happened(readings=Count),
@@ -105,7 +105,7 @@ EVENTS: Mapping[str, Schema] = {
         joint_std_rad=(Number | None, None),
     ),
 }
-"""Of a session, by kind."""
+"""Events of a session, by kind."""
 _SETTINGS = _of(
     _Strict,
     poses=Count,
@@ -127,11 +127,11 @@ ENTRIES: Mapping[str, Schema] = {
     "decided": _happened(action=Text),
     "frozen": _happened(readings_sha256=Text),
 }
-"""Of a calibration's log, by kind."""
+"""Entries of a calibration's log, by kind."""
 
 
 def check(schema: Schema, content: object) -> None:
-    """Refuse, by a ValueError of a line, a document that is not as it should be."""
+    """Raise a ValueError of one line for a document that does not fit its schema."""
     try:
         schema.model_validate(content)
     except ValidationError as error:
@@ -141,7 +141,7 @@ def check(schema: Schema, content: object) -> None:
 
 
 def check_event(content: object, known: Mapping[str, Schema] = EVENTS) -> None:
-    """Refuse what is no event of a session, or no entry of a log; raises as `check` does."""
+    """Refuse an invalid event of a session, or entry of a log; raises as `check` does."""
     kind = content.get("kind") if isinstance(content, dict) else None
     check(known.get(kind, _HAPPENED) if isinstance(kind, str) else _HAPPENED, content)
 

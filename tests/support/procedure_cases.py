@@ -111,4 +111,4 @@ def drawn(
 def again(d: Drawn) -> Drawn:
     """The same calibration as another process finds it: nothing but its files."""
     p = d.procedure
-    return replace(d, procedure=replace(p, _found=[]), dies_after=None)
+    return replace(d, procedure=replace(p, _refinements=[]), dies_after=None)
