@@ -317,12 +317,12 @@ def measured_predicted(story: Story, revision: StoryRevision) -> go.Figure:
     x, y = (1e6 * story.deviation(v) for v in (revision.predicted, story.measured))
     ends = np.array([min(x.min(), y.min()), max(x.max(), y.max())])
     traces: list[object] = [line(ends, ends, "exact", dash="dash")]
-    colors = (MEASURED, HOLDOUT, AMBER)
+    colors, text = (MEASURED, HOLDOUT, AMBER), d.named()
     for k, (axis, color) in enumerate(zip("xyz", colors, strict=True)):
         values = "measured %{y:.1f} µm, predicted %{x:.1f} µm<extra></extra>"
-        hover = {"text": d.named(), "hovertemplate": f"%{{text}}<br>{axis}: {values}"}
+        hover = f"%{{text}}<br>{axis}: {values}"
         points = (x[d.index, k], y[d.index, k], color, SYMBOLS[k])
-        traces.append(marks(*points, name=f"base {axis}", **hover))
+        traces.append(marks(*points, name=f"base {axis}", text=text, hovertemplate=hover))
     measure = "deflection" if story.mode == "deflection" else "deviation from the nominal arm"
     total = np.sum((y - y.mean(axis=0)) ** 2)
     share = 100 * (1 - np.sum((y - x) ** 2) / total) if total > 0 else 0.0

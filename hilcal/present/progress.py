@@ -72,17 +72,17 @@ def working(console: Console) -> Iterator[Say]:
 
 
 @contextmanager
-def counting(console: Console, name: str, total: int) -> Iterator[Advance]:
+def counting(console: Console, task_name: str, total: int) -> Iterator[Advance]:
     """Yield a function that advances a bar on a terminal; elsewhere print one line at the start."""
     if not console.is_terminal:
-        console.print(f"{name}: {total}", markup=False, highlight=False)
+        console.print(f"{task_name}: {total}", markup=False, highlight=False)
         yield lambda step: None
         return
     name = TextColumn("{task.description}", markup=False)
     times = (TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
     columns = (name, BarColumn(), MofNCompleteColumn(), *times)
     with Progress(*columns, console=console, transient=True) as bar:
-        task = bar.add_task(name, total=total)
+        task = bar.add_task(task_name, total=total)
         yield lambda step: bar.advance(task, step)
 
 
