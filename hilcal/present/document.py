@@ -69,7 +69,7 @@ class Table:
     heads: tuple[str, ...]  # all empty for pairs of a name and a description
     rows: list[tuple[str, ...]] = field(default_factory=list)
     left: tuple[int, ...] = (0,)  # left-aligned columns of text; the others are right-aligned
-    caption: str = ""  # replaces the heading above the table
+    caption: str = ""  # empty: the heading above the table
     narrow: bool = False  # whether a wide page shows it side by side with another table
     tones: dict[int, Tone] = field(default_factory=dict)  # by row, other than "text"
     ruled: set[int] = field(default_factory=set)  # rows with a rule above
@@ -167,7 +167,7 @@ def says(figure: "go.Figure") -> str:
 
 
 def load_name(name: str, under: str = "") -> str:
-    """Return the display name of a load, after a preposition such as "under "."""
+    """Return the display name of a load, with the prefix `under` unless it is unloaded."""
     return "unloaded" if name == UNLOADED else under + name
 
 
@@ -233,5 +233,5 @@ def shared(least: Sequence[int], full: Sequence[int], room: int) -> list[int]:
 
 
 def _longest(*cells: str) -> int:
-    """Return the width of the longest line, at least 1."""
+    """Return the width of the longest line; 1 without cells."""
     return max((cell_len(line) for cell in cells for line in cell.split("\n")), default=1)

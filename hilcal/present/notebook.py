@@ -78,7 +78,7 @@ def _(path: Refinement) -> Iterator[Block]:
 
 
 def frame_of(value: object) -> "pd.DataFrame":
-    """Return a result as a data frame; MissingPackageError where pandas is not installed."""
+    """Return a result as a data frame; MissingPackageError without pandas."""
     with needed_by("to_frame"):
         import pandas as pd
 

@@ -232,7 +232,7 @@ class ScalingStudy:
     poses: int  # number of poses
     loads: int  # wrenches per pose
     typical_correlation: float
-    """The ρ with the rms correlation of a reading by the specified tracker and arm."""
+    """The ρ whose rms correlation is that of a reading by the specified tracker and arm."""
     cells: tuple[StudyCell, ...]
     """One for each scaling, correlation, unit, and shared or separate unloaded readings."""
 

@@ -74,7 +74,7 @@ it, over the recorded variable that carries most of it; the line above names bot
 
 
 def save(story: Story, path: Path) -> None:
-    """Write a story as a recording file, whole or not at all; an existing file is replaced.
+    """Write a story as a recording file, atomically; an existing file is replaced.
 
     Raises:
         InputError: the folder is missing.
@@ -91,7 +91,7 @@ def serve(story: Story, ip: str = "127.0.0.1", port: int = PORT) -> Iterator[str
     Viewers (`rerun ADDRESS`) may join late and rejoin; their analytics are disabled for this user.
 
     Raises:
-        InputError: the port is taken.
+        InputError: the port is occupied.
         HilcalError: the port cannot be served.
     """
     server = f"viewer server {ip}:{port}"

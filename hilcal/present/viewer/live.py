@@ -161,7 +161,7 @@ class LiveTally:
     def wrong(self) -> bool:
         """Whether more readings are outside of their balls than noise explains, see `ALARM`."""
         chance = stats.binom.sf(self.outside - 1, self.judged, 1.0 - LIMITS[0])
-        return self.outside > 0 and bool(chance < ALARM)
+        return bool(chance < ALARM)
 
     def words(self) -> Iterator[Block]:
         """Yield the progress of the campaign and the verdict so far."""
