@@ -70,11 +70,7 @@ def open_engine(workers: int | None = None, scheduler: str | None = None) -> Ite
     """Yield an engine of processes of this machine or of a cluster; processes end with the block.
 
     Anybody who reaches a scheduler at a tcp:// address can run code there, and here; tls:// admits
-    only holders of a certificate.
-
-    Raises:
-        InputError: an invalid address or number of workers.
-        ClusterError: no scheduler or no worker answers.
+    only holders of a certificate. An invalid address is an InputError, a silent one a ClusterError.
     """
     if scheduler is not None:
         if workers is not None:

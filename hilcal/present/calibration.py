@@ -430,10 +430,8 @@ def worst_table(test: Acceptance) -> Table:
     return _shares_table("worst poses", "load", test.poses[:WORST], test.limit_m)
 
 
-def _shares_table(
-    head: str, worst_head: str, shares: Iterable[Share], limit: float | None
-) -> Table:
-    heads = (head, "n", "rms", "largest", worst_head, "stated", "z", "in 95 %")
+def _shares_table(head: str, worst: str, shares: Iterable[Share], limit: float | None) -> Table:
+    heads = (head, "n", "rms", "largest", worst, "stated", "z", "in 95 %")
     out = table(*heads, *(() if limit is None else ("limit",)), left=(0, 4))
     for s in shares:
         rms, largest, stated = map(length, (s.rms_m, s.max_m, s.stated_m))

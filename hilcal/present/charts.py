@@ -255,7 +255,8 @@ def residual_over(
     high = x > np.median(x)
     says = f"{name} is the same for all readings."
     if high.any():
-        low, beyond = (_rms(revision.sigma[members] / 3**0.5) for members in (~high, high))
+        sigma = revision.sigma / 3**0.5
+        low, beyond = (np.sqrt(np.mean(sigma[members] ** 2)) for members in (~high, high))
         median = f"{np.median(x):.0f}{unit if unit == '°' else f' {unit}'}".strip()
         says = (
             f"Residual over {name}: {low:.2g} times the noise rms up to {median}, "
@@ -278,10 +279,6 @@ def residual_by_time(story: Story, revision: StoryRevision) -> go.Figure:
         return residual_over(story, revision, rows, "row, in the order of the file", "")
     minutes = (story.time_s - story.time_s.min()) / 60
     return residual_over(story, revision, minutes, "time since the first reading", "min")
-
-
-def _rms(x: Floats) -> float:
-    return float(np.sqrt(np.mean(x**2)))
 
 
 def _by(story: Story, revision: StoryRevision, group: str) -> str:
@@ -365,10 +362,7 @@ def workspace(
 
 
 def added_variable(r: DependenceCurve, effect: str) -> go.Figure:
-    """Draw the added-variable plot of an effect: the slope is 1 if the effect is the right one.
-
-    The regressor is the part of the effect that the fitted model cannot represent.
-    """
+    """Draw the added-variable plot of an effect; its slope is 1 if the effect is the right one."""
     rows = worst_and_even(np.abs(r.y), MOST)
     ends = np.array([r.x.min(), r.x.max()])
     slope = float(r.x @ r.y / max(float(r.x @ r.x), 1e-300))
@@ -501,24 +495,21 @@ def error_per_revision(story: Story) -> go.Figure:
         text = [numbers.digits(v) for v in rms]
         traces.append(bar(rms, names, color, text, name=name, hovertemplate=hover))
     floor, noise = 1e6 * story.noise_floor_m, numbers.length(story.noise_floor_m)
+    first, last = steps[0], steps[-1]
     holdout, fitted = (
         [numbers.length(e.rms_m) for e in errors]
-        for errors in (
-            (steps[0].holdout, steps[-1].holdout),
-            (steps[0].error, steps[-1].error),
-        )
+        for errors in ((first.holdout, last.holdout), (first.error, last.error))
     )
     says = (
-        f"One revision: {holdout[0]} rms error on poses left out; noise alone would leave {noise}."
+        f"One revision: {holdout[0]} rms error on poses left out; noise alone would leave {noise}"
     )
     if len(steps) > 1:
-        went = "fell" if steps[-1].holdout.rms_m < steps[0].holdout.rms_m else "went"
         says = (
-            f"The rms error {went} from {holdout[0]} to {holdout[1]} on poses left out, and from "
-            f"{' to '.join(fitted)} on the fitted ones, over {len(steps)} revisions; noise alone "
-            f"would leave {noise}."
+            f"The rms error {'fell' if last.holdout.rms_m < first.holdout.rms_m else 'went'} from "
+            f"{' to '.join(holdout)} on poses left out, and from {' to '.join(fitted)} on the "
+            f"fitted ones, over {len(steps)} revisions; noise alone would leave {noise}"
         )
-    out = figure(says, x="error, rms [µm]", traces=traces, height=130 + 26 * len(names))
+    out = figure(f"{says}.", x="error, rms [µm]", traces=traces, height=130 + 26 * len(names))
     dashed = {"color": NOISE, "dash": "dash", "width": 2}
     out.add_vline(floor, line=dashed, layer="below")
     # for the legend alone: a shape has no entry there

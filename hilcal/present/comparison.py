@@ -129,9 +129,8 @@ def _changes(c: Comparison) -> Iterator[Block]:
     if setup := dict.fromkeys(words_of(x) for x in candidates if not x.of_arm):
         yield f"Not of the arm: {numbers.names(list(setup))}."
     yield _left(c)
-    yield numbers.many_tests(changes.tested, LEVEL, "candidates").replace(
-        "diagnoses", "comparisons"
-    )
+    tests = numbers.many_tests(changes.tested, LEVEL, "candidates")
+    yield tests.replace("diagnoses", "comparisons")
 
 
 def sentence(change: Change) -> str:
@@ -189,10 +188,8 @@ def _limits(c: Comparison) -> Iterator[Block]:
     for limit in changes.limits:
         if limit.change.listed:
             by_joint.setdefault(limit.part, {})[limit.change.words] = limit
-    shown = list(dict.fromkeys(name for by_name in by_joint.values() for name in by_name))
-    rows = (
-        (part, *(_least(by_name.get(name)) for name in shown)) for part, by_name in by_joint.items()
-    )
+    shown = list(dict.fromkeys(name for row in by_joint.values() for name in row))
+    rows = ((part, *(_least(row.get(name)) for name in shown)) for part, row in by_joint.items())
     yield table("would have been seen", *shown, rows=rows)
     yield (
         f"The smallest change that these readings would have shown in {POWER * 10:.0f} cases of "

@@ -101,10 +101,7 @@ def _listed(lines: Sequence[str], most: int) -> Iterator[str]:
 
 
 def parameters(fit: Fit, most: int = ALL_ROWS, where: str = "--details") -> Iterator[Block]:
-    """Yield a table of at most `most` parameters and a summary of each family.
-
-    Parameters of frames are the first to be omitted; `where` says how to list all.
-    """
+    """Yield a table of `most` parameters, omitting frames first, and families; `where`: of all."""
     rows: list[tuple[str, ...]] = []
     frames: list[tuple[str, ...]] = []
     families, undetermined = [], []
@@ -126,10 +123,9 @@ def parameters(fit: Fit, most: int = ALL_ROWS, where: str = "--details") -> Iter
                 section.append((f"{effect.name}.{p.name}", *shown, p.meaning))
         missing = [p.name for k, p in zip(identifiable, effect.parameters, strict=True) if not k]
         if missing:
-            which = " ".join(missing)
-            if len(missing) > 6:
-                share = f"{len(missing)} of {len(index)}" if identifiable.any() else "none of it"
-                which = f"({share})"
+            which = " ".join(missing) if len(missing) <= 6 else f"({len(missing)} of {len(index)})"
+            if len(missing) > 6 and not identifiable.any():
+                which = "(none of it)"
             undetermined.append(f"{effect.name} {which}")
     omitted = len(frames) + len(rows) - most
     if frames or rows:
@@ -322,8 +318,7 @@ class Worst:
 
 def target_words(name: str, n_readings: int, known: bool) -> str:
     """Return the description of one of several targets."""
-    offset = "known" if known else "estimated"
-    return f"{name} ({n_readings} readings, its offset {offset})"
+    return f"{name} ({n_readings} readings, its offset {'known' if known else 'estimated'})"
 
 
 def worst_poses(e: FullPrediction, most: int = MOST_LISTED) -> list[Worst]:
@@ -356,8 +351,7 @@ def scalings_table(fits: Mapping[Scaling, Fit]) -> Iterator[Block]:
         for k, p in zip(range(s.start, s.stop), effect.parameters, strict=True):
             if values := [float(f.theta[k]) for f in columns if f.uncertainty.identifiable[k]]:
                 unit, factor = numbers.unit_for(p.unit, values)
-                entries = (_entry(f, k, factor) for f in columns)
-                out.add(f"{effect.name}.{p.name}", *entries, unit)
+                out.add(f"{effect.name}.{p.name}", *(_entry(f, k, factor) for f in columns), unit)
     out.rule()
     bases = [f.solution.equations.basis for f in columns]
     for name, cells in (

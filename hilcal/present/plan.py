@@ -252,10 +252,7 @@ def brief_plan(s: PlanSummary) -> str:
 
 
 def next_report(plan: Next, poses: int, readings: int, details: bool = True) -> Iterator[Block]:
-    """Yield the powers to separate pairs of suspects, with the readings so far and with the plan.
-
-    Without `details` only the weakest pair of each suspect is listed.
-    """
+    """Yield the powers of pairs of suspects; without `details` of each suspect's weakest pair."""
     yield heading("Telling the suspects apart")
     yield power_table(plan.powers if details else _weakest(plan.powers))
     yield note(
@@ -267,10 +264,7 @@ def next_report(plan: Next, poses: int, readings: int, details: bool = True) -> 
 
 
 def poses_report(plan: Next, poses: int, readings: int, details: bool = True) -> Iterator[Block]:
-    """Yield the plan of further poses for a misfit that depends on the pose alone.
-
-    The arguments are those of `next_report`.
-    """
+    """Yield the plan of poses for a misfit that depends on the pose alone; see `next_report`."""
     yield heading("Poses where nothing was read yet")
     yield (
         f"The misfit is the same under every load of a pose, so that loads tell nothing of it: "

@@ -85,10 +85,7 @@ class Reduced:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Errors:
-    """The contribution of a row group to the errors of fitted and of left-out readings.
-
-    Index 0 of `sums` and `most` is of the fit, 1 of predictions without the reading's fold.
-    """
+    """The contribution of a row group to the errors of the fit (0) and without its fold (1)."""
 
     sums: Floats  # (2, 3) sums of the distance, of its square, of the whitened squares
     most: Floats  # (2,) largest distance, m

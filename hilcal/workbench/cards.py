@@ -123,8 +123,8 @@ def _verdict(view: View, d: Snapshot) -> None:
             number("error on poses left out", numbers.length(fit.holdout.rms_m))
             number("error on fitted poses", numbers.length(fit.error.rms_m))
             number("noise alone would leave", numbers.length(d.story.noise_floor_m))
-            factor = f"{fit.variance_factor:.2f}"
-            number(f"variance factor, 95 %: {low:.2f} to {high:.2f}", factor)
+            interval = f"95 %: {low:.2f} to {high:.2f}"
+            number(f"variance factor, {interval}", f"{fit.variance_factor:.2f}")
         name = "Baseline, not kept yet" if d.number is None else f"Revision {d.number}"
         with ui.row().classes("items-center").style("gap: 6px 10px"):
             soft(f"{name}: {model_name(fit.model.named)}")
@@ -342,8 +342,7 @@ def _laws(view: View, d: Snapshot) -> None:
         return
     with _part("Laws beyond the catalogue"):
         for law in curves:
-            facts = "; ".join(f"{name}: {text}" for name, text in law.facts)
-            soft(f"{law.title}: {facts}")
+            soft(f"{law.title}: " + "; ".join(f"{name}: {text}" for name, text in law.facts))
             chart(view, charts.curve_chart(law)).props("data-part=law")
 
 
@@ -412,8 +411,8 @@ def planned(view: View, d: Snapshot) -> None:
         return
     next_, path = view.session.planned
     summary, powers = next_.made.summary, next_.found.powers
-    text = powers_summary(powers, summary.poses, summary.readings)
-    ui.label(text).props("data-part=planned")
+    sentence = powers_summary(powers, summary.poses, summary.readings)
+    ui.label(sentence).props("data-part=planned")
     for effect, rival, power_now, power_then in power_rows(powers):
         soft(f"If {effect} is there, {rival} is ruled out: {power_now} now, {power_then} then.")
     ui.label(f"The plan is in {path.name}. Measure it into the same campaign with:")

@@ -116,8 +116,7 @@ class Snapshot:
 def _figures(o: Campaign) -> tuple[Figure, ...]:
     """Return the values of the cell of a campaign that can be changed."""
     # with the instrument's noise, so that keys that need a stated noise are shown, too
-    together = {"tracker": dict.fromkeys(INSTRUMENT_NOISE)}
-    fixed, out = o.unchangeable(together), []
+    fixed, out = o.unchangeable({"tracker": dict.fromkeys(INSTRUMENT_NOISE)}), []
     for section, keys in CHANGEABLE.items():
         section_config = getattr(o.config, section)
         for key in keys:

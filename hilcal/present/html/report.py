@@ -274,8 +274,7 @@ def _uncertainty(fit: Fit) -> Iterator[Block]:
         yield "No uncertainty is stated: the fit is not weighted by the full covariance."
         return
     b = budget(fit)
-    spatial = ~fit.readings[~fit.outlier].scalar[fit.whitening.reading]
-    error = left_out_errors(fit)[spatial]
+    error = left_out_errors(fit)[~fit.readings[~fit.outlier].scalar[fit.whitening.reading]]
     inside = int(np.sum(error <= b.expanded))
     quantity = "deflection" if fit.mode == "deflection" else "position"
     within = f"; {inside} of {len(error)} {quantity}s of poses left out are within it"
@@ -313,8 +312,7 @@ def _limit(m: ReportContent) -> Iterator[Block]:
         t = m.tested.validation
         yield f"Validation campaign {m.tested.name}"
         yield from opening(t.judged, t.prediction)
-        report = validation_report(t.judged, t.prediction, t.beyond)
-        yield from captioned(report, "Validation")
+        yield from captioned(validation_report(t.judged, t.prediction, t.beyond), "Validation")
         yield from captioned(loads_report(t.shares), "Errors of the validation campaign")
 
 
@@ -351,8 +349,7 @@ def _conditions(m: ReportContent) -> Iterator[Block]:
 def _by_load(m: ReportContent) -> Table:
     fit, error = m.fit, left_out_errors(m.fit)
     fitted = fit.readings[~fit.outlier][fit.whitening.reading]
-    limit = () if m.limit_m is None else ("limit",)
-    heads = ("load", "n", "rms", "largest", "at pose", *limit)
+    heads = ("load", "n", "rms", "largest", "at pose", *["limit"] * (m.limit_m is not None))
     out = table(*heads, caption="Error of poses left out, by load")
     for k in np.unique(fitted.load):
         of_load = np.flatnonzero(fitted.load == k)

@@ -200,8 +200,8 @@ def blueprint(story: Story) -> rrb.Blueprint:
         row_shares=[5, 4],
     )
     play: Literal["following", "paused"] = "following" if story.growing else "paused"
-    both = rrb.Horizontal(left, right, column_shares=[3, 2])
-    return style.whole(both, "revision", play, fps=1.0)
+    views = rrb.Horizontal(left, right, column_shares=[3, 2])
+    return style.whole(views, "revision", play, fps=1.0)
 
 
 def titles(story: Story) -> tuple[str, str, str]:

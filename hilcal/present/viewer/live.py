@@ -43,8 +43,7 @@ BALL = SIGMA_LENGTH * style.BALL_SIGMAS
 """Radius of the ball that holds 99 % of the readings if the model is right, m."""
 LIMIT = style.BALL_SIGMAS / 3**0.5  # the same in the σ of a reading
 ALARM = 0.001
-"""The model is called wrong if noise alone leaves as many readings outside their balls with less
-than this probability."""
+"""Probability of so many readings outside their balls below which the model is called wrong."""
 WORST, REMARKS = 3, 3  # listed readings and remarks
 BALLS, MANY = 60, 300
 """Number of readings above which balls, and above which arrows, are drawn only for arrows that
@@ -356,8 +355,8 @@ class LiveScene:
                 balls.append(place)
             rec.log(f"{self._series}/{style.LEVEL_NAMES[j.level]}", rr.Scalars(j.sigma))
         if dots:
-            dot = rr.Points3D(dots, colors=[style.MEASURED], radii=[0.01])
-            rec.log(f"{self._world}/dots", dot)
+            points = rr.Points3D(dots, colors=[style.MEASURED], radii=[0.01])
+            rec.log(f"{self._world}/dots", points)
         if arrows:
             rec.log(f"{self._world}/arrows", style.residual_arrows(*zip(*arrows, strict=True)))
         if balls:
@@ -481,8 +480,7 @@ class _Outlet:
 
     def end(self) -> None:
         """Draw the complete story and close the outlet."""
-        to_open = self._file is not None
-        self._draw(lambda scene: scene.end(to_open), complete=True, at_once=True)
+        self._draw(lambda scene: scene.end(self._file is not None), complete=True, at_once=True)
         if self._scene is not None:  # after a failure `disconnect` would wait forever
             self._rec.disconnect()
 

@@ -130,8 +130,7 @@ class PlanView:
             order.setdefault(p, []).append(k)
         self.rank: Ints = np.array([order[p].index(k) for p, k in pairs], dtype=np.int64)
         # (S,) time of the middle of each reading, s
-        margin = config.limits.joint_margin_rad
-        self.time = timeline(plan, arm, margin, pace(config))[1]
+        self.time = timeline(plan, arm, config.limits.joint_margin_rad, pace(config))[1]
         # (L, 3) a colour of each load; after seven they repeat, darker
         hung = [name for name in loads if name != UNLOADED]
         rgb = {n: _LOADS[k % 7] * _FADED ** (k // 7) for k, n in enumerate(hung)}
@@ -192,8 +191,8 @@ def _static_scene(rec: rr.RecordingStream, d: PlanView) -> None:
         low, high = ((d.tracker + k * _HEAD * _UP)[None] for k in (-1.2, 0.2))
         head = style.drawn_capsules(low, high, np.array([_HEAD]), [_TRACKER])
         fixed(rec, "world/tracker", head)
-        name = style.labels([d.tracker + 2.2 * _HEAD * _UP], ["tracker"])
-        fixed(rec, "world/tracker/name", name)
+        above = d.tracker + 2.2 * _HEAD * _UP
+        fixed(rec, "world/tracker/name", style.labels([above], ["tracker"]))
 
 
 def _obstacles(rec: rr.RecordingStream, things: tuple[Obstacle, ...]) -> None:
@@ -465,8 +464,7 @@ def blueprint(d: PlanView) -> rrb.Blueprint:
         hidden = [f"- $origin/{x}/**" for x in ("tracker", "beam", "workspace", "way")]
         mean = d.target.mean(axis=0)
         name = f"{TRACKER}, {numbers.length(float(np.linalg.norm(d.tracker - mean)))} away"
-        view = style.view3d("world", name, d.tracker, mean, ["+ $origin/**", *hidden])
-        scenes.append(view)
+        scenes.append(style.view3d("world", name, d.tracker, mean, ["+ $origin/**", *hidden]))
     legend = rrb.PlotLegend(rrb.Corner2D.RightBottom)
     times = rrb.TimeSeriesView(origin="schedule", name=SCHEDULE, plot_legend=legend)
     texts = (("plan", "Plan"), ("step", "This step"), ("guide", "How to read this"))
