@@ -20,11 +20,11 @@ def frame_of(value: object) -> "pd.DataFrame":
     return notebook.frame_of(value)
 
 
-def message(of: object) -> str:
+def message(diagnosis: object) -> str:
     """Return the verdict of a diagnosis in a sentence."""
     from hilcal.diagnosis.diagnosis import Diagnosis
     from hilcal.present import verdict
 
-    if not isinstance(of, Diagnosis):
-        raise TypeError(f"no sentence for a {type(of).__name__}")
-    return verdict.message(of)
+    if not isinstance(diagnosis, Diagnosis):
+        raise TypeError(f"no sentence for a {type(diagnosis).__name__}")
+    return verdict.message(diagnosis)

@@ -267,7 +267,7 @@ def compensation_report(
         f"  error after    {100 * BAND:.0f} % of the points within "
         f"{length(float(bands.max()))}; expected {expected} rms"
     )
-    yield f"  the latter includes {', '.join(_parts(calibration, c.untold))}"
+    yield f"  the latter includes {', '.join(_contributions(calibration, c.untold))}"
     yield f"  {base_line(calibration.model.cell, calibration.frames, calibration.mode)}"
     rows = table("point", "before", "after, 95 %", "largest correction")
     for k in sorted(np.argsort(-errors, kind="stable")[:LISTED]):
@@ -286,7 +286,7 @@ def compensation_report(
         yield f"The {LISTED} of {len(names)} points with the largest error before are listed."
 
 
-def _parts(calibration: Calibration, untold: Sequence[str]) -> Iterator[str]:
+def _contributions(calibration: Calibration, untold: Sequence[str]) -> Iterator[str]:
     """Yield the contributions to the stated error after compensation."""
     yield "the parameters"
     for name in untold:

@@ -227,7 +227,7 @@ def drawn(story: Story, revision: StoryRevision, most: int = MOST) -> ChartReadi
 def residual_by_pose(story: Story, revision: StoryRevision) -> go.Figure:
     """Draw the residual of each reading in σ over its pose, poses by number."""
     d, full = drawn(story, revision), [story.pose_name(int(i)) for i in story.first]
-    out = _residuals(d, story.row[d.index].astype(float), "", _by(story, revision, "pose"))
+    out = _residuals(d, story.row[d.index].astype(float), "", _extremes(story, revision, "pose"))
     short = [n if len(n) <= LONGEST_NAME else f"…{n[1 - LONGEST_NAME :]}" for n in full]
     names, step = [label(n) for n in short], -(-len(full) // MOST_POSES)
     return out.update_xaxes(tickvals=list(range(0, len(names), step)), ticktext=names[::step])
@@ -240,7 +240,7 @@ def residual_by_load(story: Story, revision: StoryRevision) -> go.Figure:
     position = np.array([loads.index(name) for name in story.load_names], dtype=float)
     # scattered within a load, so that points do not hide each other
     jitter = np.random.default_rng(0).uniform(-0.3, 0.3, len(position))
-    out = _residuals(d, (position + jitter)[d.index], "load", _by(story, revision, "load"))
+    out = _residuals(d, (position + jitter)[d.index], "load", _extremes(story, revision, "load"))
     names = [label(load_name(name)) for name in loads]
     return out.update_xaxes(tickvals=list(range(len(names))), ticktext=names)
 
@@ -281,7 +281,7 @@ def residual_by_time(story: Story, revision: StoryRevision) -> go.Figure:
     return residual_over(story, revision, minutes, "time since the first reading", "min")
 
 
-def _by(story: Story, revision: StoryRevision, group: str) -> str:
+def _extremes(story: Story, revision: StoryRevision, group: str) -> str:
     """Return a sentence on the worst and the best pose, or load."""
     names: Sequence[str] = story.load_names
     if group == "pose":

@@ -117,7 +117,7 @@ def _changes(c: Comparison) -> Iterator[Block]:
         )
         return
     if not changes.found:
-        yield _left(c)
+        yield _remainder(c)
         return
     for change in changes.found:
         yield sentence(change)
@@ -128,7 +128,7 @@ def _changes(c: Comparison) -> Iterator[Block]:
     candidates = (x.candidate for x in changes.found)
     if setup := dict.fromkeys(words_of(x) for x in candidates if not x.of_arm):
         yield f"Not of the arm: {numbers.names(list(setup))}."
-    yield _left(c)
+    yield _remainder(c)
     tests = numbers.many_tests(changes.tested, LEVEL, "candidates")
     yield tests.replace("diagnoses", "comparisons")
 
@@ -169,7 +169,7 @@ def _table(changes: Sequence[Change]) -> Table:
     return out
 
 
-def _left(c: Comparison) -> str:
+def _remainder(c: Comparison) -> str:
     changes, scatter = c.changes, numbers.digits(c.changes.scatter, 2)
     if changes.explained:
         return f"What is left after that is scatter as stated ({scatter} times)."

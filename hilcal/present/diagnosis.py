@@ -339,7 +339,7 @@ def discovery_report(d: Discovery) -> Iterator[Block]:
         yield ""
         yield from _law(law, d, first=k == 0)
         for c in d.curves if k == 0 else ():
-            yield from _drawn(c)
+            yield from _law_table(c)
     yield from ("", _structures(d.structures))
     moved, std = map(length, d.average_m())
     yield (
@@ -424,7 +424,7 @@ def _structures(structures: Sequence[Structure]) -> Table:
     return rows
 
 
-def _drawn(c: Curve) -> Iterator[Block]:
+def _law_table(c: Curve) -> Iterator[Block]:
     """Yield a table of a law and the binned means of the readings, over a quantity."""
     x, y, std, _ = c.binned
     if len(x) >= LEAST_BINS:

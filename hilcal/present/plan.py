@@ -104,10 +104,10 @@ def certified(efficiency: float) -> str:
     """Return a sentence on a certified efficiency, rounded down because it is a lower bound."""
     if efficiency < UNCERTAIN:
         return "of the plan: not certified, since the bound of the best plan did not close"
-    return f"of the plan: at least {_floor(efficiency)} (certified lower bound); not accuracy"
+    return f"of the plan: at least {_percent(efficiency)} (certified lower bound); not accuracy"
 
 
-def _floor(efficiency: float) -> str:
+def _percent(efficiency: float) -> str:
     return f"{int(min(max(efficiency, 0.0), 1.0) * 1000 + 1e-6) / 10:.1f} %"
 
 
@@ -144,9 +144,9 @@ def order_remark(s: PlanSummary) -> str:
             "The order is randomised, so that drift is little correlated with joints and loads, "
             f"and takes {100 * s.longer:.1f} % longer than the shortest one. "
         )
-    out += f"Estimating a drift as well costs up to about {_lost(c)} of a parameter's information"
+    out += f"Estimating a drift as well costs up to about {_loss(c)} of a parameter's information"
     if randomised and s.shortest is not None:
-        out += f" ({_lost(s.shortest)} in the shortest order)"
+        out += f" ({_loss(s.shortest)} in the shortest order)"
     mean = length(abs(c.bias_m)) if abs(c.bias_m) >= 1e-7 else "less than 0.1 µm"
     out += (
         f". Without it in the fit, a drift of {digits(3.6e9 * c.drift, 2)} µm/h shifts "
@@ -158,7 +158,7 @@ def order_remark(s: PlanSummary) -> str:
     return f"{out}."
 
 
-def _lost(c: Confounding) -> str:
+def _loss(c: Confounding) -> str:
     """Return the share of information that a drift costs, rounded up to whole percent."""
     return f"{max(1, math.ceil(100 * c.correlation**2 - 1e-6))} %"
 
@@ -192,7 +192,7 @@ def _criteria_table(s: PlanSummary) -> Iterator[Block]:
             *("-" if x is None else length(x) for x in (c.position_std_m, c.position_open_m)),
             "-" if c.joint_share is None else f"{digits(100 * c.joint_share, 2)} %",
             *(digits(c.o1), digits(c.o2, 2), digits(c.o3)),
-            "-" if c.efficiency is None else _floor(c.efficiency),
+            "-" if c.efficiency is None else _percent(c.efficiency),
             tone="strong" if this else "text",
         )
     yield out

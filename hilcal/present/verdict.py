@@ -52,7 +52,7 @@ def message(d: Diagnosis) -> str:
 
 def _verdict(d: Diagnosis) -> list[str]:
     if d.wrong_figures:
-        return _figures(d.wrong_figures)
+        return _wrong_figures(d.wrong_figures)
     if d.reason == "readings_disagree":
         return [numbers.sentence(disagreement_words(d.fit))]
     of_reason = {
@@ -62,26 +62,26 @@ def _verdict(d: Diagnosis) -> list[str]:
         "no_suspect": _no_suspect,
         "misjudged_noise": _misjudged,
         "background": _background,
-        "arm_scatter": _left_to_the_arm,
+        "arm_scatter": _arm_scatter,
         "pose_alone": _pose_alone,
     }
     if d.reason in of_reason:
         return of_reason[d.reason](d)
     if d.scatter is not None:
-        adequate = _left_to_the_arm(d)
+        adequate = _arm_scatter(d)
     else:
         factor = f"variance factor {d.fit.variance_factor:.2f}"
         adequate = [f"Residuals are what the noise explains: {factor}.", *_nothing_missing(d)]
-        adequate += _noise_place(d.pure_error)
+        adequate += _misstated_noise(d.pure_error)
     doubts = [_alternative(a) for a in d.alternatives if a.inseparable]
     if d.reason != "inseparable_addition":
         return adequate
     return [*adequate, f"But {'; '.join(doubts)}. Measure what separates them."]
 
 
-def _figures(figures: tuple[WrongFigure, ...]) -> list[str]:
+def _wrong_figures(figures: tuple[WrongFigure, ...]) -> list[str]:
     """Return sentences on figures of the cell that may be wrong; each alone explains the misfit."""
-    first, *alternatives = map(_figure, figures)
+    first, *alternatives = map(_wrong_figure, figures)
     return [
         numbers.sentence(first),
         *(f"Or else {figure}." for figure in alternatives),
@@ -89,7 +89,7 @@ def _figures(figures: tuple[WrongFigure, ...]) -> list[str]:
     ]
 
 
-def _figure(f: WrongFigure) -> str:
+def _wrong_figure(f: WrongFigure) -> str:
     change = f"({length(f.rms_m)} → {length(f.rms_with_m)} rms with it)"
     if f.kind == "tool_com":
         estimated, stated = (", ".join(f"{1e3 * x:.0f}" for x in v) for v in (f.found, f.stated))
@@ -277,12 +277,12 @@ def _misjudged(d: Diagnosis) -> list[str]:
             f"the residuals no {compared} than the repeats: scale the covariance by "
             f"{repeats.factor:.2g}.",
             "No effect is missing.",
-            *_noise_place(repeats),
+            *_misstated_noise(repeats),
         ]
     if d.noise.reason == "too_large":
         return [
             f"Residuals are only {_spread(d)}: the stated covariance is too large.",
-            *_noise_place(repeats),
+            *_misstated_noise(repeats),
         ]
     few = "Without repeated readings" if repeats is None else "With so few repeated readings"
     return [
@@ -303,7 +303,7 @@ def _repeats_scatter_less(noise: NoiseVerdict | None, repeats: PureError | None)
     return [f"Repeated readings scatter only {repeats.factor**0.5:.2g} times what is stated."]
 
 
-def _noise_place(repeats: PureError | None) -> list[str]:
+def _misstated_noise(repeats: PureError | None) -> list[str]:
     """Return a sentence on where the noise differs most from the stated one."""
     if repeats is None or repeats.where is None:
         return []
@@ -316,7 +316,7 @@ def _noise_place(repeats: PureError | None) -> list[str]:
     ]
 
 
-def _left_to_the_arm(d: Diagnosis) -> list[str]:
+def _arm_scatter(d: Diagnosis) -> list[str]:
     """Return sentences that the rest is the arm's repeatability, and that no effect is missing."""
     s = d.scatter
     assert s is not None  # noqa: S101  (by the reason)
@@ -345,7 +345,7 @@ def _left_to_the_arm(d: Diagnosis) -> list[str]:
         ]
     return [
         f"What is left, {length(s.size_m)} rms, is of the size of the arm's "
-        f"repeatability{_maker(s, d.fit.model.cell.arm)}.",
+        f"repeatability{_rp_comparison(s, d.fit.model.cell.arm)}.",
         numbers.sentence(sigmas(s)),
         predicted,
         *_nothing_missing(d),
@@ -362,7 +362,7 @@ def _no_repeatability(s: ArmScatter, arm: Arm) -> list[str]:
             "readings to be sure."
         ]
     return [
-        f"The arm would have to scatter by {length(s.size_m)} rms{_maker(s, arm)}, more "
+        f"The arm would have to scatter by {length(s.size_m)} rms{_rp_comparison(s, arm)}, more "
         "than an arm's repeatability: the instrument is noisier than stated, or the arm or the "
         "target was loose."
     ]
@@ -383,7 +383,7 @@ def sigmas(s: ArmScatter) -> str:
     return f"the joints scatter by σ_q [µrad] = {clear}, the others by less than can be told"
 
 
-def _maker(s: ArmScatter, arm: Arm) -> str:
+def _rp_comparison(s: ArmScatter, arm: Arm) -> str:
     """Return the comparison with the repeatability RP of ISO 9283."""
     states = "arms of industry have 0.02 to 0.1 mm"
     if arm.repeatability is not None:

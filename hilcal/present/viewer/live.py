@@ -260,7 +260,7 @@ class LiveScene:
         """Draw what waits for the end of a batch: motion of the arm, texts, the limit."""
         self._move()
         if self._batches and self._tally is not None and self._tally.last is not None:
-            self._words(self._tally)
+            self._send_summary(self._tally)
             self._rec.log(f"{self._series}/limit", rr.Scalars(LIMIT))
 
     def end(self, to_open: bool) -> None:
@@ -304,7 +304,7 @@ class LiveScene:
             along(rec, f"{self._world}/dots", time, dots)
         self._passed.append((wall, tuple(start.plan.q[0].tolist())))
         self._move()
-        self._words(d)
+        self._send_summary(d)
         self._show(live_blueprint(d, self._world, self._series))
 
     def _move(self) -> None:
@@ -331,7 +331,7 @@ class LiveScene:
         else:
             return
         if not self._batches:
-            self._words(d)
+            self._send_summary(d)
 
     def _reading(self, d: LiveTally, event: ReadingStored) -> None:
         """Draw a reading: each target's arrow, ball and point in time, and a label."""
@@ -375,7 +375,7 @@ class LiveScene:
         above = d.place(event.step, target) + _ABOVE
         rec.log(f"{self._world}/last", style.labels([above], [label]))
 
-    def _words(self, d: LiveTally) -> None:
+    def _send_summary(self, d: LiveTally) -> None:
         self._rec.log("words/measuring", style.document(style.markdown(d.words())))
 
     def _log(self, text: str, level: str = "INFO") -> None:

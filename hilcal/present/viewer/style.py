@@ -165,16 +165,16 @@ def _arrays(parts: Shapes) -> tuple[Floats, Floats, Floats, "np.ndarray[Any, np.
     return start, end, radius, np.array(colors, dtype=np.uint8)
 
 
-def residual_arrows(at: Any, vectors: Any, level: Any) -> rr.Arrows3D:
+def residual_arrows(origins: Any, vectors: Any, level: Any) -> rr.Arrows3D:
     """Return residuals at points (K, 3) in the colours of their levels (K,); level 0 is thin."""
     index = np.asarray(level)
     colors, radii = LEVEL_COLORS[index], np.where(index > 0, 0.0055, 0.0035)
-    return rr.Arrows3D(origins=at, vectors=vectors, colors=colors, radii=radii)
+    return rr.Arrows3D(origins=origins, vectors=vectors, colors=colors, radii=radii)
 
 
-def noise_balls(at: Any, half: Any, turn: Floats | None = None) -> rr.Ellipsoids3D:
+def noise_balls(centers: Any, half: Any, turn: Floats | None = None) -> rr.Ellipsoids3D:
     """Return ellipsoids at points (K, 3) with half axes (K, 3), m, and quaternions (K, 4)."""
-    shape = {"centers": at, "half_sizes": half, "quaternions": turn}
+    shape = {"centers": centers, "half_sizes": half, "quaternions": turn}
     return rr.Ellipsoids3D(**shape, colors=[(*NOISE, 46)], fill_mode="solid")
 
 
