@@ -42,7 +42,7 @@ class Measuring:
     targets: Floats  # (T, 3) tracked targets, flange axes, m
     plan: Plan
     earlier: tuple[tuple[float, Step], ...] = ()  # (wall time in s, step) of earlier sessions
-    names: tuple[str, ...] = ()  # of the targets, where there are several
+    names: tuple[str, ...] = ()  # of the targets, if there are several
 
 
 PORT = 9877  # not 9876, on which a viewer itself listens; it opens no window if that is occupied

@@ -77,8 +77,7 @@ def save(story: Story, path: Path) -> None:
     """Write a story as a recording file, atomically; an existing file is replaced.
 
     Raises:
-        InputError: the folder is missing.
-        HilcalError: the file cannot be written.
+        InputError: the folder is missing, or the file cannot be written.
     """
     rec = _opened(story)
     recording.write(rec, blueprint(story), lambda: tell(rec, story), Path(path))

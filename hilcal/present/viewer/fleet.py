@@ -157,8 +157,7 @@ def record_fleet(fleet: "Fleet", path: Path) -> None:
     """Write a fleet as a recording file; equal fleets give equal recordings.
 
     Raises:
-        InputError: the folder is missing.
-        HilcalError: the file cannot be written.
+        InputError: the folder is missing, or the file cannot be written.
     """
     types = [DrawnType(t, fleet.members) for t in fleet.types]
     names = [(d.pooled.type, d.pooled.arms, d.pooled.odd, d.names) for d in types]

@@ -353,8 +353,8 @@ def record_plan(
     recordings. `powers` of the pairs of suspects that the plan separates are shown first.
 
     Raises:
-        InputError: the folder is missing, or the plan's poses do not fit the arm.
-        HilcalError: the file cannot be written.
+        InputError: the folder is missing, the file cannot be written, or the plan's poses do not
+            fit the arm.
     """
     d = PlanView(cell, config, plan, summary, powers)
     rec = recording.opened(d.config.to_json(), d.plan.to_json(), d.summary, d.powers)
