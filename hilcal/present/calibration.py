@@ -356,7 +356,7 @@ def opening(judged: Judged, test: Validation) -> Iterator[str]:
 
 
 def validation_report(judged: Judged, test: Validation, beyond: Extrapolation) -> Iterator[Block]:
-    """Yield the errors inside and outside of the measured range, and the variables that leave it."""
+    """Yield the errors inside and outside of the measured range, and variables that leave it."""
     out = table(error_words(test.readings), "rms", "mean", "largest", "rms in σ", "stated", "z")
     inside, outside = beyond.inside_error, beyond.outside_error
     every = np.ones(len(beyond.z), dtype=np.bool_)
