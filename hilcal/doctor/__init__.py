@@ -1,1 +1,1 @@
-"""What stands between an operator and a campaign on this computer: found without any device."""
+"""Checks of this computer before a campaign, without any device."""

@@ -25,31 +25,31 @@ State = Literal["ok", "warning", "problem"]
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that was looked at."""
+    """The result of one check."""
 
     topic: str  # "program", "computer", "serial ports", "network" or "cell"
-    name: str  # of the thing, e.g. "clock"
+    name: str  # of the checked item, e.g. "clock"
     state: State
-    """"ok"; "warning" where a campaign runs but may suffer; "problem" where it does not."""
-    said: str  # how it is, in words
-    mend: str = ""  # what to do about it; empty where nothing is to be done
+    """"ok"; "warning": a campaign runs but may suffer; "problem": a campaign does not run."""
+    said: str  # description of the state
+    mend: str = ""  # remedy; empty if none is needed
 
 
 COMPUTER = partial(Finding, "computer")
 PROGRAM = partial(Finding, "program")
 LEAST_FREE = 1e9
-"""Free space below which a campaign may fill the disk, bytes: its recordings take up to 0.1 GB."""
-SLOW_WRITE = 0.1  # durable write that makes a campaign slow, s: a reading takes about a second
+"""Least free space, bytes; the recordings of a campaign take up to 0.1 GB."""
+SLOW_WRITE = 0.1  # duration of a durable write that slows a campaign, s; a reading takes 1 s
 LEAST_MEMORY = 2e9
-"""Memory below which large campaigns do not fit, bytes (12,000 readings took 1.84 GB)."""
-FIRST_DAY = datetime(2026, 1, 1).astimezone()  # A clock before this day has never been set
+"""Least memory for large campaigns, bytes (12,000 readings took 1.84 GB)."""
+FIRST_DAY = datetime(2026, 1, 1).astimezone()  # a clock before this day has never been set
 ON_NETWORK = ("nfs", "nfs4", "cifs", "smb3", "9p", "fuse.sshfs")
-"""File systems on which SQLite's locks are not to be relied on (SQLite FAQ, question 5)."""
+"""File systems on which SQLite's locks are unreliable (SQLite FAQ, question 5)."""
 _TIME_ERROR, _WRITES = 5, 9
 LOWEST = (3, 11)
 DISTRIBUTION = "hilcal"
 NATIVE = {"pin": "pinocchio", "ur-rtde": "rtde_control", "rerun-sdk": "rerun", "numba": "numba"}
-"""Packages with compiled parts, by the module that loads them: these fail on other processors."""
+"""Modules of packages with compiled parts, which fail on other processors."""
 GROUPS = {
     "hilcal.arms": "arms",
     "hilcal.trackers": "trackers",
@@ -64,7 +64,7 @@ _EXTRA = re.compile(r"""extra\s*==\s*["']([^"']+)["']""")
 
 
 def computer(folder: Path) -> tuple[Finding, ...]:
-    """Return the findings on this computer, and on the folder where campaigns are stored."""
+    """Return the findings on this computer and on the folder of campaigns."""
     return (clock(), *disk(folder), _memory(), load())
 
 
@@ -72,32 +72,32 @@ def clock(
     now: Callable[[], datetime] = lambda: datetime.now().astimezone(),
     state: Callable[[], int | None] = lambda: _kernel_clock(),
 ) -> Finding:
-    """Return whether the clock is set and kept right: readings and revisions bear its time."""
-    is_now, status = now(), state()
-    said = is_now.strftime("%Y-%m-%d %H:%M:%S %Z")
+    """Return whether the clock is set and synchronised; readings and revisions have its time."""
+    time_now, status = now(), state()
+    text = time_now.strftime("%Y-%m-%d %H:%M:%S %Z")
     mend = "switch time synchronisation on: timedatectl set-ntp true"
-    if is_now < FIRST_DAY:
-        return COMPUTER("clock", "problem", f"{said}: it was never set", mend)
+    if time_now < FIRST_DAY:
+        return COMPUTER("clock", "problem", f"{text}: it was never set", mend)
     if status is None:
-        return COMPUTER("clock", "ok", f"{said}; whether it is synchronised is not known")
+        return COMPUTER("clock", "ok", f"{text}; whether it is synchronised is not known")
     if status == _TIME_ERROR:
-        return COMPUTER("clock", "warning", f"{said}, not synchronised", mend)
-    return COMPUTER("clock", "ok", f"{said}, synchronised")
+        return COMPUTER("clock", "warning", f"{text}, not synchronised", mend)
+    return COMPUTER("clock", "ok", f"{text}, synchronised")
 
 
 def _kernel_clock() -> int | None:
-    """Return the kernel's clock state by adjtimex(2); None where it has none."""
+    """Return the kernel's clock state by adjtimex(2); None if it is not available."""
     try:
         ask = ctypes.CDLL(None).adjtimex
     except (OSError, AttributeError):
         return None
-    buffer = ctypes.create_string_buffer(struct.calcsize("64q"))  # all zero: it only asks
+    buffer = ctypes.create_string_buffer(struct.calcsize("64q"))  # all zero: changes nothing
     status = int(ask(buffer))
     return None if status < 0 else status
 
 
 def disk(folder: Path) -> tuple[Finding, ...]:
-    """Return whether campaigns can be stored in a folder, durably and fast."""
+    """Return the findings on durable and fast storage of campaigns in a folder."""
     return tuple(_disk(folder))
 
 
@@ -113,34 +113,34 @@ def _disk(folder: Path) -> Iterator[Finding]:
     yield COMPUTER(name, "warning" if little else "ok", f"{free / 1e9:.1f} GB free", mend)
     kind = _file_system(folder)
     if kind in ON_NETWORK:
-        said = f"a file system on the network ({kind}): its locks are not to be relied on"
+        text = f"a file system on the network ({kind}): its locks are not to be relied on"
         mend = "measure into a folder of a local disk, and copy the file afterwards"
-        yield COMPUTER("file system", "warning", said, mend)
+        yield COMPUTER("file system", "warning", text, mend)
     try:
         seconds = _durable_write(folder)
     except (OSError, sqlite3.Error) as error:
         mend = f"make {folder} writable, or name another with --folder"
         yield COMPUTER("writing", "problem", f"fails: {error}", mend)
     else:
-        said, slow = f"a reading is stored durably in {1e3 * seconds:.1f} ms", seconds > SLOW_WRITE
+        text, slow = f"a reading is stored durably in {1e3 * seconds:.1f} ms", seconds > SLOW_WRITE
         mend = "measure into a folder of a local disk" if slow else ""
-        yield COMPUTER("writing", "warning" if slow else "ok", said, mend)
+        yield COMPUTER("writing", "warning" if slow else "ok", text, mend)
 
 
 def _file_system(folder: Path, mounts: Path = Path("/proc/mounts")) -> str:
-    """Return the kind of file system of a folder; empty where it is not known."""
+    """Return the type of the file system of a folder; empty if unknown."""
     try:
         lines = [line.split() for line in mounts.read_text(encoding="utf-8").splitlines()]
     except OSError:
         return ""
-    at = folder.resolve()
-    parents = {str(at), *map(str, at.parents)}
-    found = [fields for fields in lines if len(fields) > 2 and fields[1] in parents]
-    return max(found, key=lambda fields: len(fields[1]))[2] if found else ""
+    path = folder.resolve()
+    parents = {str(path), *map(str, path.parents)}
+    matches = [fields for fields in lines if len(fields) > 2 and fields[1] in parents]
+    return max(matches, key=lambda fields: len(fields[1]))[2] if matches else ""
 
 
 def _durable_write(folder: Path) -> float:
-    """Return the median time of a small transaction as a campaign file makes it, s."""
+    """Return the median time of a small transaction, with the settings of a campaign file, s."""
     times = []
     with tempfile.TemporaryDirectory(prefix=".hilcal-doctor-", dir=folder) as inside:
         connection = sqlite3.connect(Path(inside) / "try.sqlite", isolation_level=None)
@@ -148,58 +148,56 @@ def _durable_write(folder: Path) -> float:
             connection.execute("PRAGMA synchronous = EXTRA")
             connection.execute("CREATE TABLE reading (bytes BLOB)")
             for _ in range(_WRITES):
-                begun = time.perf_counter()
+                start = time.perf_counter()
                 connection.execute("INSERT INTO reading VALUES (zeroblob(1000))")
-                times.append(time.perf_counter() - begun)
+                times.append(time.perf_counter() - start)
         finally:
             connection.close()
     return statistics.median(times)
 
 
 def _memory() -> Finding:
-    """Return whether there is memory for large campaigns."""
+    """Return whether the memory suffices for large campaigns."""
     try:
         pages = (os.sysconf(name) for name in ("SC_AVPHYS_PAGES", "SC_PHYS_PAGES"))
-        free, whole = (n * os.sysconf("SC_PAGE_SIZE") for n in pages)
+        free, total = (n * os.sysconf("SC_PAGE_SIZE") for n in pages)
     except (ValueError, OSError):
         return COMPUTER("memory", "ok", "not known")
-    said, little = (
-        f"{whole / 1e9:.1f} GB, of which {free / 1e9:.1f} GB unused",
-        whole < LEAST_MEMORY,
-    )
+    text = f"{total / 1e9:.1f} GB, of which {free / 1e9:.1f} GB unused"
+    little = total < LEAST_MEMORY
     mend = "campaigns of thousands of readings need another computer" if little else ""
-    return COMPUTER("memory", "warning" if little else "ok", said, mend)
+    return COMPUTER("memory", "warning" if little else "ok", text, mend)
 
 
 def load(measured: Callable[[], tuple[float, float, float]] = os.getloadavg) -> Finding:
-    """Return whether other programs keep the processors busy: an arm must hear from us in time."""
+    """Return whether other programs occupy the processors; an arm needs commands in time."""
     cores, busy = os.cpu_count() or 1, measured()[0]
-    said, mend = f"{cores}; in the last minute {busy:.1f} programs wanted one at a time", ""
+    text, mend = f"{cores}; in the last minute {busy:.1f} programs wanted one at a time", ""
     if busy > cores:
         mend = "end other programs: the arm stops by itself where this program is 0.1 s late"
-    return COMPUTER("processors", "warning" if mend else "ok", said, mend)
+    return COMPUTER("processors", "warning" if mend else "ok", text, mend)
 
 
 def program(version: str) -> tuple[Finding, ...]:
-    """Return the findings on what is installed, of hilcal in this version."""
+    """Return the findings on the installed hilcal of this version, Python, packages and drivers."""
     old = sys.version_info < LOWEST
-    said = f"{platform.python_version()} at {sys.executable}, {platform.platform()}"
+    python = f"{platform.python_version()} at {sys.executable}, {platform.platform()}"
     mend = "install Python 3.11 or later" if old else ""
     return (
         PROGRAM("hilcal", "ok", f"version {version}"),
-        PROGRAM("Python", "problem" if old else "ok", said, mend),
+        PROGRAM("Python", "problem" if old else "ok", python, mend),
         *packages(metadata.requires(DISTRIBUTION) or ()),
         *_drivers(),
     )
 
 
 def packages(requirements: Iterable[str]) -> tuple[Finding, ...]:
-    """Return whether the packages of a distribution are there and load.
+    """Return whether the packages of a distribution are installed and load.
 
-    Requirements are as its metadata list them, e.g. 'pyarrow>=17; extra == "tables"'. One for
-    earlier Pythons alone has no wheel for this one.
+    Requirements are those of its metadata, e.g. 'pyarrow>=17; extra == "tables"'. A requirement
+    for earlier Pythons only has no wheel for this one.
     """
-    there, out = [], []
+    installed, out = [], []
     lacking: dict[str, list[str]] = {}
     for requirement in requirements:
         match, extra = _NAME.match(requirement), _EXTRA.search(requirement)
@@ -214,9 +212,9 @@ def packages(requirements: Iterable[str]) -> tuple[Finding, ...]:
                 lacking.setdefault(extra[1], []).append(name)
             elif below is not None and sys.version_info[:2] >= tuple(map(int, below.groups())):
                 python = ".".join(map(str, sys.version_info[:2]))
-                said = f"has no wheel for Python {python}; the driver that needs it says so"
+                text = f"has no wheel for Python {python}; the driver that needs it says so"
                 mend = "use Python 3.11 or 3.12 for the computer of a cell with such a device"
-                out.append(PROGRAM(name, "warning", said, mend))
+                out.append(PROGRAM(name, "warning", text, mend))
             else:
                 mend = f"install it: pip install '{requirement}'"
                 out.append(PROGRAM(name, "problem", "is not installed", mend))
@@ -229,24 +227,24 @@ def packages(requirements: Iterable[str]) -> tuple[Finding, ...]:
             mend = f"install it anew: pip install --force-reinstall {name}=={version}"
             out.append(PROGRAM(name, "problem", f"{version} does not load: {why}", mend))
         else:
-            there.append(f"{name} {version}")
-    for of, names in lacking.items():
-        said = f"{', '.join(names)}: not installed; what needs them says so"
-        mend = f'where it is wanted: pip install "hilcal[{of}]"'
-        out.append(PROGRAM(f"optional: {of}", "ok", said, mend))
-    return (PROGRAM("packages", "ok", ", ".join(there)), *out)
+            installed.append(f"{name} {version}")
+    for extra_name, names in lacking.items():
+        text = f"{', '.join(names)}: not installed; what needs them says so"
+        mend = f'where it is wanted: pip install "hilcal[{extra_name}]"'
+        out.append(PROGRAM(f"optional: {extra_name}", "ok", text, mend))
+    return (PROGRAM("packages", "ok", ", ".join(installed)), *out)
 
 
 def _drivers() -> Iterator[Finding]:
-    for group, what in GROUPS.items():
+    for group, devices in GROUPS.items():
         names = []
         for point in metadata.entry_points(group=group):
             try:
                 point.load()
             except Exception as error:
-                said = f"{point.value} does not load ({type(error).__name__}: {error})"
+                text = f"{point.value} does not load ({type(error).__name__}: {error})"
                 mend = f"repair or remove the package that brings {point.name}"
-                yield PROGRAM(f"driver {point.name}", "warning", said, mend)
+                yield PROGRAM(f"driver {point.name}", "warning", text, mend)
             else:
                 names.append(point.name)
-        yield PROGRAM(f"drivers of {what}", "ok", ", ".join(sorted(names)) or "none")
+        yield PROGRAM(f"drivers of {devices}", "ok", ", ".join(sorted(names)) or "none")

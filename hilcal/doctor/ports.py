@@ -1,4 +1,4 @@
-"""What was found: serial adapters and the network, who may use them, how late they answer."""
+"""Checks of serial adapters and of the network: presence, permissions and delays."""
 
 import grp
 import os
@@ -19,21 +19,21 @@ from hilcal.doctor.computer import Finding, State
 PORT = partial(Finding, "serial ports")
 NETWORK = partial(Finding, "network")
 LATE_MS = 1
-"""Latency timer that answers within a few milliseconds need, ms. The driver's default is 16: it
-holds bytes back for so long (FTDI, AN232B-04)."""
+"""Largest latency timer for answers within a few milliseconds, ms. The timer is the time for which
+the driver holds bytes back; its default is 16 (FTDI, AN232B-04)."""
 MEDDLERS = {
     "ModemManager": "it talks to serial adapters that are plugged in",
     "brltty": "it takes adapters for Braille displays",
 }
-"""Services that open adapters of others."""
+"""Services that open adapters of other programs."""
 SECONDS = 1.0
-"""How long an answer may take, s. A choice: on a cell's own network it takes a millisecond."""
-SLOW = 0.02  # time of connecting that a controller in the same room never needs, s. A choice
+"""Most time for an answer, s. A choice: on a cell's own network it takes a millisecond."""
+SLOW = 0.02  # longer than any connection to a controller in the same room takes, s. A choice
 
 
 @dataclass(frozen=True, slots=True)
 class System:
-    """Where the kernel shows its devices and processes."""
+    """Folders in which the kernel shows its devices and processes."""
 
     dev: Path = Path("/dev")
     sys: Path = Path("/sys")
@@ -41,34 +41,35 @@ class System:
 
 
 def adapters() -> dict[str, str]:
-    """Return what is plugged in, by the path of its port."""
+    """Return the descriptions of connected adapters, by path of the port."""
     return {port.device: port.description for port in sorted(list_ports.comports())}
 
 
 def serial_ports(
-    wanted: Mapping[str, str], found: Mapping[str, str], system: System | None = None
+    needed: Mapping[str, str], connected: Mapping[str, str], system: System | None = None
 ) -> tuple[Finding, ...]:
     """Return the findings on serial ports.
 
-    `wanted` is the path of the port by device of the cell, `found` what is plugged in, by port.
+    `needed` has the path of the port of each device of the cell, `connected` is that of `adapters`.
     """
-    at = system or System()
-    names, used = _by_id(at.dev), {str(Path(p).resolve()): what for what, p in wanted.items()}
+    system = system or System()
+    names = _by_id(system.dev)
+    used = {str(Path(path).resolve()): device for device, path in needed.items()}
     out = []
-    for what, path in wanted.items():
+    for device, path in needed.items():
         if not Path(path).exists():
-            there = ", ".join(names.get(p, p) for p in found) or "none"
-            mend = f"plug its adapter in, or name another port in the cell; ports now: {there}"
-            out.append(PORT(what, "problem", f"there is no {path}", mend))
-    every = {str(Path(p).resolve()): about for p, about in found.items()}
+            ports = ", ".join(names.get(p, p) for p in connected) or "none"
+            mend = f"plug its adapter in, or name another port in the cell; ports now: {ports}"
+            out.append(PORT(device, "problem", f"there is no {path}", mend))
+    every = {str(Path(p).resolve()): about for p, about in connected.items()}
     every.update({p: every.get(p, "") for p in used if Path(p).exists()})
     for path, description in sorted(every.items()):
         name = ": ".join(filter(None, (used.get(path), names.get(path, path))))
-        out.extend(_port(name, path, description, path in used, at))
-    if not wanted and not found:
+        out.extend(_port(name, path, description, path in used, system))
+    if not needed and not connected:
         out.append(PORT("adapters", "ok", "none is plugged in"))
-    if found:
-        running = {_program(at.proc, number) for number in _numbers(at.proc)}
+    if connected:
+        running = {_program(system.proc, number) for number in _numbers(system.proc)}
         for name, why in MEDDLERS.items():
             if name in running:
                 mend = f"sudo systemctl stop {name}"
@@ -76,36 +77,36 @@ def serial_ports(
     return tuple(out)
 
 
-def _port(name: str, path: str, about: str, wanted: bool, at: System) -> Iterator[Finding]:
-    worse: State = "problem" if wanted else "warning"
-    said = " ".join(filter(None, (path if path not in name else "", about))) or "there"
-    of = os.stat(path)
-    if not stat.S_ISCHR(of.st_mode):
+def _port(name: str, path: str, about: str, needed: bool, system: System) -> Iterator[Finding]:
+    worse: State = "problem" if needed else "warning"
+    text = " ".join(filter(None, (path if path not in name else "", about))) or "there"
+    status = os.stat(path)
+    if not stat.S_ISCHR(status.st_mode):
         yield PORT(name, worse, f"{path} is no serial port", "name another in the cell")
         return
     if not os.access(path, os.R_OK | os.W_OK):
-        group = str(of.st_gid)
+        group = str(status.st_gid)
         with suppress(KeyError):
-            group = grp.getgrgid(of.st_gid).gr_name
+            group = grp.getgrgid(status.st_gid).gr_name
         mend = f"sudo usermod -aG {group} $USER, then log in again"
-        yield PORT(name, worse, f"{said}; you have no right to use it", mend)
+        yield PORT(name, worse, f"{text}; you have no right to use it", mend)
         return
-    holder = _holder(of.st_rdev, at.proc)
+    holder = _holder(status.st_rdev, system.proc)
     if holder:
         mend = "end that program before a campaign"
-        yield PORT(name, "warning", f"{said}; {holder} has it open", mend)
-    timer, late = at.sys / "bus/usb-serial/devices" / Path(path).name / "latency_timer", 0
+        yield PORT(name, "warning", f"{text}; {holder} has it open", mend)
+    timer, late = system.sys / "bus/usb-serial/devices" / Path(path).name / "latency_timer", 0
     with suppress(OSError, ValueError):
         late = int(timer.read_text(encoding="ascii"))
     if late > LATE_MS:
-        slow = f"{said}; holds answers back for up to {late} ms (latency timer)"
+        slow = f"{text}; holds answers back for up to {late} ms (latency timer)"
         yield PORT(name, "warning", slow, f"echo {LATE_MS} | sudo tee {timer}")
     elif not holder:
-        yield PORT(name, "ok", f"{said}; free, and you may use it")
+        yield PORT(name, "ok", f"{text}; free, and you may use it")
 
 
 def _by_id(dev: Path) -> dict[str, str]:
-    """Return the names that do not change when an adapter is replugged, by path of the port."""
+    """Return the permanent names of adapters, by path of the port."""
     try:
         links = sorted((dev / "serial" / "by-id").iterdir())
         return {str(link.resolve()): str(link) for link in links}
@@ -113,16 +114,16 @@ def _by_id(dev: Path) -> dict[str, str]:
         return {}
 
 
-def _holder(wanted: int, proc: Path) -> str:
-    """Return which other process has a device open, as far as this user may see; else empty."""
+def _holder(device: int, proc: Path) -> str:
+    """Return the other process that has a device open, if this user may see it; else empty."""
     for number in _numbers(proc):
         if number == os.getpid():
             continue
         with suppress(OSError):
             for file in list((proc / str(number) / "fd").iterdir()):
                 with suppress(OSError):
-                    device = str(file.readlink()).startswith("/dev/")
-                    if device and file.stat().st_rdev == wanted:
+                    in_dev = str(file.readlink()).startswith("/dev/")
+                    if in_dev and file.stat().st_rdev == device:
                         return f"{_program(proc, number)} (process {number})"
     return ""
 
@@ -147,14 +148,14 @@ def reachable(host: str, services: Mapping[int, str], seconds: float = SECONDS) 
         address = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0][4][0]
     except (OSError, UnicodeError) as error:
         mend = "check the address in the cell, or name the host in /etc/hosts"
-        said = f"its name is not known ({getattr(error, 'strerror', None) or error})"
-        return [NETWORK(host, "problem", said, mend)]
+        text = f"its name is not known ({getattr(error, 'strerror', None) or error})"
+        return [NETWORK(host, "problem", text, mend)]
     out = []
-    for port, what in services.items():
-        name, begun = f"{what}, {host} port {port}", time.monotonic()
+    for port, service in services.items():
+        name, start = f"{service}, {host} port {port}", time.monotonic()
         try:
             with socket.create_connection((str(address), port), seconds):
-                took = time.monotonic() - begun
+                took = time.monotonic() - start
         except TimeoutError:
             mend = "check cable, address and network of the cell; is the controller switched on?"
             out.append(NETWORK(name, "problem", f"no answer in {seconds:g} s", mend))

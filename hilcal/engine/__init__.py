@@ -1,1 +1,1 @@
-"""Many independent computations: on this machine, or on a cluster of others (Dask)."""
+"""Many independent computations, on this machine or on a cluster (Dask)."""

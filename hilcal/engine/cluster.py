@@ -1,7 +1,7 @@
-"""A cluster that somebody has started: `dask scheduler`, `dask worker`.
+"""A running cluster of `dask scheduler` and `dask worker`.
 
-Whoever reaches a scheduler or a worker at a tcp:// address can run code there. With tls:// both
-sides show a certificate of one authority; files are named by Dask's own configuration
+Anybody who reaches a scheduler or a worker at a tcp:// address can run code there. With tls:// both
+sides need certificates of the same authority; Dask's configuration names their files
 (`distributed.comm.tls`, https://distributed.dask.org/en/stable/tls.html).
 """
 
@@ -20,8 +20,8 @@ from hilcal.optional import needed_by
 if TYPE_CHECKING:  # takes half a second to import
     from distributed import Client
 
-ANSWER_S = 10.0  # How long a cluster's scheduler may take to answer; a choice
-WORKERS_S = 10.0  # How long a cluster may have no worker at the start; a choice
+ANSWER_S = 10.0  # most time for the scheduler's answer, s; a choice
+WORKERS_S = 10.0  # most time until a cluster has a worker, s; a choice
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,7 +34,7 @@ class Cluster:
     def results(
         self, task: Task, items: Sequence[Any], seeds: Sequence[np.random.SeedSequence | None]
     ) -> Iterator[tuple[int, Any]]:
-        """Yield (number of the item, result) as they are done."""
+        """Yield (number of the item, result) in the order of completion."""
         from distributed import KilledWorker, as_completed
         from distributed.client import FutureCancelledError
 
@@ -43,7 +43,7 @@ class Cluster:
         futures = self.client.map(task, list(items), list(seeds), pure=False)
         number = {future.key: k for k, future in enumerate(futures)}
         waiting = as_completed(futures, loop=self.client.loop, with_results=True)
-        del futures  # so that a worker can forget what has been fetched
+        del futures  # so that workers can release fetched results
         try:
             for future, result in waiting:
                 yield number[future.key], result
@@ -89,7 +89,7 @@ def cluster(address: str) -> Iterator[Cluster]:
 
 
 def _check_certificates(address: str) -> None:
-    """Refuse certificates that are not named, or cannot be read."""
+    """Raise InputError if certificates are not configured or cannot be read."""
     from distributed.security import Security
 
     why: object = "none are named"
@@ -106,10 +106,10 @@ def _check_certificates(address: str) -> None:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep Dask's own words about workers that come and go from the operator's screen."""
+    """Suppress Dask's log messages on workers that come and go."""
     with needed_by("a cluster"):
         import dask
-        import distributed  # its settings are complete before they are changed
+        import distributed  # loads its default settings, before they are changed
 
     loggers = [logging.getLogger(name) for name in (distributed.__name__, "tornado")]
     levels = [logger.level for logger in loggers]

@@ -1,14 +1,14 @@
-"""`Engine.map`: a function of each item, in order, the same bits on any number of workers.
+"""`Engine.map`: a function of each item, in order, bit-identical for any number of workers.
 
-One worker computes in this process. Several are processes of this machine (`processes`), or those
-of a cluster that somebody has started (`cluster`). What does not depend on how many there are or
-which computes what:
+A single worker computes in this process. Several are processes of this machine (`processes`) or of
+a running cluster (`cluster`). The following do not depend on the number of workers nor on the
+distribution of the items:
 
-- the random numbers of an item: item k has the k-th child of `SeedSequence(seed)`;
+- the random numbers: item k has the k-th child of `SeedSequence(seed)`;
 - BLAS: one thread;
 - the order of the results, and so of a sum over them.
 
-A worker that dies costs no result: what it held is computed again. Ctrl-C leaves no process.
+The item of a worker that dies is computed again. Ctrl-C leaves no process.
 """
 
 import os
@@ -30,9 +30,9 @@ Advance = Callable[[int], None]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Engine:
-    """Computes many items; made by `open_engine`."""
+    """Computes many items; created by `open_engine`."""
 
-    workers: Processes | Cluster | None  # what computes; None where this process does
+    workers: Processes | Cluster | None  # None: this process computes
 
     def map(
         self,
@@ -41,18 +41,18 @@ class Engine:
         seed: int | None = None,
         advance: Advance | None = None,
     ) -> tuple[Result, ...]:
-        """Return function(item) of every item, in order of the items."""
-        found: dict[int, Result] = {}
+        """Return function(item) of every item, in the order of the items."""
+        results: dict[int, Result] = {}
         for k, result in self.results(function, items, seed):
-            found[k] = result
+            results[k] = result
             if advance is not None:
                 advance(1)
-        return tuple(found[k] for k in range(len(items)))
+        return tuple(results[k] for k in range(len(items)))
 
     def results(
         self, function: Callable[..., Result], items: Sequence[Item], seed: int | None = None
     ) -> Iterator[tuple[int, Result]]:
-        """Yield (number of the item, result) as they are done, in no order; see `map`."""
+        """Yield (number of the item, result) in the order of completion; see `map`."""
         count = len(items)
         seeds = [None] * count if seed is None else np.random.SeedSequence(seed).spawn(count)
         if self.workers is None:
@@ -62,23 +62,23 @@ class Engine:
         yield from self.workers.results(Task(function, versions()), items, seeds)
 
 
-ALONE = Engine(None)  # Computes in this process; BLAS has as many threads as it had
+ALONE = Engine(None)  # computes in this process, with the present number of BLAS threads
 
 
 @contextmanager
 def open_engine(workers: int | None = None, scheduler: str | None = None) -> Iterator[Engine]:
-    """Yield an engine of processes of this machine, or a cluster; workers end with the block.
+    """Yield an engine of processes of this machine or of a cluster; processes end with the block.
 
-    Whoever reaches a scheduler at a tcp:// address can run code there, and here; tls:// keeps
-    others out. An address that is none is an InputError, one where nothing answers a ClusterError.
+    Anybody who reaches a scheduler at a tcp:// address can run code there, and here; tls:// admits
+    only holders of a certificate. An invalid address is an InputError, a silent one a ClusterError.
     """
     if scheduler is not None:
         if workers is not None:
             raise InputError(
                 "a cluster has its own workers; valid: --workers N or --scheduler ADDRESS"
             )
-        with cluster(scheduler) as there:
-            yield Engine(there)
+        with cluster(scheduler) as remote:
+            yield Engine(remote)
         return
     count = len(os.sched_getaffinity(0)) if workers is None else workers
     if count < 1:
@@ -89,5 +89,5 @@ def open_engine(workers: int | None = None, scheduler: str | None = None) -> Ite
         with threadpool_limits(limits=1, user_api="blas"):
             yield ALONE
         return
-    with processes(count) as here:
-        yield Engine(here)
+    with processes(count) as local:
+        yield Engine(local)

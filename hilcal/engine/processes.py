@@ -1,7 +1,7 @@
-"""Workers that are processes of this machine, reached by pipes alone; what one computes.
+"""Workers that are processes of this machine, connected by pipes only.
 
-A socket on the loopback address would let every user of the machine in, and what a worker is given
-to run is code. A pipe has two ends, and no name by which another process could find it.
+Workers run code that they receive. A socket on the loopback address would admit every user of the
+machine; a pipe has no name by which another process could open it.
 """
 
 import multiprocessing
@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 import scipy
-import scipy.linalg  # its BLAS is another library than numpy's, and must be loaded to be limited
+import scipy.linalg  # loads scipy's BLAS, which is not numpy's, so that its threads can be limited
 from threadpoolctl import threadpool_limits
 
 from hilcal import __version__
@@ -33,17 +33,17 @@ from hilcal.errors import HilcalError, InputError
 
 Versions = tuple[tuple[str, str], ...]
 
-DEATHS = 3  # Workers that one item may take with it before it is given up; Dask's own, a choice
+DEATHS = 3  # most workers that may die with one item before it is given up; Dask's own, a choice
 
 
 class ClusterError(HilcalError):
-    """A cluster does not answer, or an item kills its workers; exit code as of a device."""
+    """A cluster does not answer, or an item kills its workers; exit code as for a device."""
 
     exit_code = 3
 
 
 def deadly(where: str) -> ClusterError:
-    """Return the error of an item that ended every worker that computed it."""
+    """Return the error for an item whose workers all died."""
     return ClusterError(
         f"{where}: one computation ended {DEATHS + 1} workers, each time without a message (out of "
         "memory?); start fewer workers, or larger ones"
@@ -51,7 +51,7 @@ def deadly(where: str) -> ClusterError:
 
 
 def versions() -> Versions:
-    """Return the versions that decide the last bits of a result."""
+    """Return the versions of the packages that determine the last bits of a result."""
     return (
         ("hilcal", __version__),
         ("Python", ".".join(platform.python_version_tuple()[:2])),
@@ -62,27 +62,27 @@ def versions() -> Versions:
 
 @cache
 def one_blas_thread() -> None:
-    """Limit BLAS to one thread in this process, for good.
+    """Limit BLAS to one thread in this process, permanently.
 
-    The order of a sum over several threads depends on how many there are, and so do its last bits.
+    The last bits of a sum depend on the number of threads.
     """
     threadpool_limits(limits=1, user_api="blas")
 
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """A function as it runs on a worker."""
+    """A function for workers."""
 
-    function: Callable[..., Any]  # of an item, or of an item and a generator where there are seeds
-    versions: Versions  # of the program that asked
+    function: Callable[..., Any]  # of an item or, with seeds, of an item and a generator
+    versions: Versions  # of the calling program
 
     def __call__(self, item: Any, seed: np.random.SeedSequence | None = None) -> Any:
         """Compute one item."""
-        for (name, there), (_, here) in zip(self.versions, versions(), strict=True):
-            if there != here:
+        for (name, caller), (_, worker) in zip(self.versions, versions(), strict=True):
+            if caller != worker:
                 raise InputError(
-                    f"a worker of the cluster has {name} {here}, this program {there}; start the "
-                    "workers from an environment of the same lock"
+                    f"a worker of the cluster has {name} {worker}, this program {caller}; start "
+                    "the workers from an environment of the same lock"
                 )
         one_blas_thread()
         return compute(self.function, item, seed)
@@ -91,25 +91,25 @@ class Task:
 def compute(
     function: Callable[..., Any], item: Any, seed: np.random.SeedSequence | None = None
 ) -> Any:
-    """Compute one item in this process; warnings are not for the reader of a result."""
+    """Compute one item in this process, without warnings."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return function(item) if seed is None else function(item, np.random.default_rng(seed))
 
 
 SIGNALLED = 128
-"""Exit code of a program that a signal ended, less the signal's number, as shells have it."""
+"""Exit code of a program that a signal ended, minus the number of the signal, as in shells."""
 _SPAWN = multiprocessing.get_context("spawn")  # a fork would copy locks that threads of BLAS hold
 
 
 @contextmanager
 def processes(count: int) -> Iterator["Processes"]:
-    """Yield workers of this machine; they end with the block, whatever they are at."""
-    # What a worker that is killed leaves among temporary files goes with the folder.
+    """Yield workers of this machine, which are killed at the end of the block."""
+    # Temporary files of killed workers are deleted with the folder.
     folder: tempfile.TemporaryDirectory[str] = tempfile.TemporaryDirectory(
         prefix="hilcal-workers-", ignore_cleanup_errors=True
     )
-    with _ended_in_order(), folder as scratch:
+    with _signals_as_exit(), folder as scratch:
         workers = Processes(count, scratch)
         try:
             yield workers
@@ -118,10 +118,10 @@ def processes(count: int) -> Iterator["Processes"]:
 
 
 class Processes:
-    """Workers, begun when there is something for them."""
+    """Workers, started on demand."""
 
     def __init__(self, count: int, scratch: str) -> None:
-        """Begin none yet; `scratch` is the folder of their temporary files."""
+        """Start no worker yet; `scratch` is the folder of their temporary files."""
         self._count, self._scratch = count, scratch
         self._all: set[_Worker] = set()
         self._idle: list[_Worker] = []
@@ -129,13 +129,13 @@ class Processes:
     def results(
         self, task: Task, items: Sequence[Any], seeds: Sequence[np.random.SeedSequence | None]
     ) -> Iterator[tuple[int, Any]]:
-        """Yield (number of the item, result) as they are done."""
+        """Yield (number of the item, result) in the order of completion."""
         todo, deaths = deque(range(len(items))), Counter[int]()
         busy: dict[Any, tuple[_Worker, int]] = {}
         try:
             while todo or busy:
                 while len(self._idle) < min(self._count - len(busy), len(todo)):
-                    self._begin()
+                    self._start()
                 while todo and len(busy) < self._count:
                     worker, k = self._idle.pop(), todo.popleft()
                     busy[worker.line] = worker, k
@@ -156,22 +156,22 @@ class Processes:
                         raise result
                     yield k, result
         finally:
-            self._end([worker for worker, _ in busy.values()])  # nobody waits for them any more
+            self._end([worker for worker, _ in busy.values()])  # their results are not needed
 
     def end(self) -> None:
-        """End all of them."""
+        """Kill all workers."""
         self._end(list(self._all))
 
-    def _begin(self) -> None:
-        # Ctrl-C is for this process: a worker is born with it blocked. Python 3.11 unblocks it
-        # where the first worker starts the tracker of resources, so that is started before.
+    def _start(self) -> None:
+        # Only this process handles Ctrl-C: a worker starts with SIGINT blocked. Python 3.11
+        # unblocks the signal when it starts the resource tracker, which therefore runs before.
         resource_tracker.ensure_running()
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             worker = _Worker(self._scratch)
             self._all.add(worker)
         finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         self._idle.append(worker)
 
     def _end(self, workers: list["_Worker"]) -> None:
@@ -180,37 +180,37 @@ class Processes:
         for worker in workers:
             worker.process.join()
             worker.line.close()
-            self._all.discard(worker)  # results that are given up later end theirs again
+            self._all.discard(worker)  # an abandoned `results` may end its workers again
 
 
 class _Worker:
-    """A process and the line to it."""
+    """A process and the pipe to it."""
 
     def __init__(self, scratch: str) -> None:
-        self.line, there = _SPAWN.Pipe()
-        self.process = _SPAWN.Process(target=_serve, args=(there, scratch))
+        self.line, remote = _SPAWN.Pipe()
+        self.process = _SPAWN.Process(target=_serve, args=(remote, scratch))
         self.process.start()
-        there.close()
+        remote.close()
         self._task: Task | None = None
 
     def give(self, task: Task, item: Any, seed: np.random.SeedSequence | None) -> None:
-        """Let it compute an item; a task that it has is not sent again."""
-        with suppress(ConnectionError):  # it is dead, as the end of its line will tell
+        """Send an item to compute; the last task is not sent again."""
+        with suppress(ConnectionError):  # a dead worker; `results` notices the end of its pipe
             self.line.send_bytes(_packed((None if task is self._task else task, item, seed)))
         self._task = task
 
 
 def _serve(line: "Connection[Any, Any]", scratch: str) -> None:
-    """Compute what comes over the line until it is closed, in the process of a worker."""
+    """Run a worker: compute the items from the pipe until it is closed."""
     os.environ["TMPDIR"] = tempfile.tempdir = scratch
     threading.Thread(target=_end_with_parent, daemon=True).start()
     task: Any = None
     while True:
         try:
-            given, item, seed = line.recv()
+            new_task, item, seed = line.recv()
         except EOFError:
             return
-        task = given or task
+        task = new_task or task
         try:
             answer = _packed((True, task(item, seed)))
         except Exception as error:
@@ -220,9 +220,10 @@ def _serve(line: "Connection[Any, Any]", scratch: str) -> None:
 
 
 def _packed(message: tuple[Any, ...]) -> bytes:
-    """Pickle by protocol 5, which keeps the order of an array's axes in memory.
+    """Pickle by protocol 5, which preserves any order of an array's axes in memory.
 
-    The order of sums depends on it, and so do the last bits; protocol 4 keeps only C and Fortran's.
+    The order of sums, and so their last bits, depend on that order; protocol 4 preserves only C and
+    Fortran order.
     """
     return pickle.dumps(message, protocol=5)
 
@@ -235,10 +236,10 @@ def _end_with_parent() -> None:
 
 
 @contextmanager
-def _ended_in_order() -> Iterator[None]:
-    """Let a plea to end, or a closed terminal, leave the block as Ctrl-C does.
+def _signals_as_exit() -> Iterator[None]:
+    """Raise SystemExit in the block on SIGTERM and SIGHUP.
 
-    Their default ends the process at once, and leaves the workers' folder behind.
+    By default these end the process at once and leave the workers' folder behind.
     """
 
     def end(number: int, frame: FrameType | None) -> None:
@@ -246,8 +247,8 @@ def _ended_in_order() -> Iterator[None]:
 
     kinds = []
     if threading.current_thread() is threading.main_thread():
-        both = (signal.SIGTERM, signal.SIGHUP)
-        kinds = [kind for kind in both if signal.getsignal(kind) is signal.SIG_DFL]
+        endings = (signal.SIGTERM, signal.SIGHUP)
+        kinds = [kind for kind in endings if signal.getsignal(kind) is signal.SIG_DFL]
     for kind in kinds:
         signal.signal(kind, end)
     try:

@@ -1,4 +1,4 @@
-"""What results say: a document of words, tables and charts, made once, and what renders it."""
+"""Reports of results: documents of text, tables and charts, and their renderers."""
 
 from typing import TYPE_CHECKING
 
@@ -7,7 +7,7 @@ if TYPE_CHECKING:
 
 
 def html_of(value: object) -> str:
-    """Return a result as a notebook shows it."""
+    """Return the HTML of a result for a notebook."""
     from hilcal.present import notebook  # loads all kinds of results
 
     return notebook.html_of(value)
@@ -20,11 +20,11 @@ def frame_of(value: object) -> "pd.DataFrame":
     return notebook.frame_of(value)
 
 
-def message(of: object) -> str:
-    """Return a diagnosis in a sentence."""
+def message(diagnosis: object) -> str:
+    """Return the verdict of a diagnosis in a sentence."""
     from hilcal.diagnosis.diagnosis import Diagnosis
     from hilcal.present import verdict
 
-    if not isinstance(of, Diagnosis):
-        raise TypeError(f"no sentence for a {type(of).__name__}")
-    return verdict.message(of)
+    if not isinstance(diagnosis, Diagnosis):
+        raise TypeError(f"no sentence for a {type(diagnosis).__name__}")
+    return verdict.message(diagnosis)

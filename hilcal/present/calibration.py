@@ -1,4 +1,4 @@
-"""A calibration made, tested and put to use: `calibrate`, `validate`, `bootstrap`, `compensate`."""
+"""Reports of `calibrate`, `validate`, `bootstrap` and `compensate`."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -63,66 +63,66 @@ DOES: Mapping[str, str] = {
     "compare": "Each point as measured at its uncorrected and at its corrected joint values: "
     "seconds",
 }
-"""Steps that compute, and how long they take for a campaign of some hundred readings."""
-MOST_LEFT, LISTED = 6, 12  # points without a correction, and points, that are listed
-MOST, WORST = 4, 6  # variables, and poses, that are listed
+"""Steps that compute, with their duration for a campaign of some hundred readings."""
+MOST_LEFT, LISTED = 6, 12  # listed points without a correction; listed compensated points
+MOST, WORST = 4, 6  # listed variables; listed poses
 DOUBTED = 1.5
-"""Error over the stated standard deviation from which the statement is called too small."""
+"""Least rms ratio of error to stated standard deviation that is reported."""
 WIDER = 1.5
-"""Ratio from which on the stated standard uncertainty is called too small; a choice. The standard
-deviation of 200 draws is known to 5 %, but that of few poses to much less."""
+"""Ratio of drawn to stated standard uncertainty above which the stated one is called too small; a
+choice. 200 draws determine a standard deviation to 5 %, few poses much less well."""
 CROWDED = 0.5
-"""Degrees of freedom that a fit spends, per pose, from which on draws are too wide; a choice."""
+"""Effective parameters per pose above which the draws scatter too widely; a choice."""
 
 
 def step_heading(step: "ProcedureStep", clock: float = 1.0) -> Iterator[Block]:
-    """Yield what comes next, and how long it takes, of `clock` cell seconds per real second."""
+    """Yield the next step and its duration; `clock` is in cell seconds per real second."""
     yield from ("", heading(TITLES[step.kind]))
     if not step.moves:
         yield f"{DOES[step.kind]}.\n"
         return
-    of = "" if step.missing == step.planned else f" of {step.planned}"
+    of_planned = "" if step.missing == step.planned else f" of {step.planned}"
     changes = step.load_changes
-    hung = f", {changes} load change{'s' * (changes != 1)}" if changes else ""
-    yield f"{step.missing}{of} readings{hung}: {lasting(step.seconds, clock)}.\n"
+    load_changes = f", {changes} load change{'s' * (changes != 1)}" if changes else ""
+    yield f"{step.missing}{of_planned} readings{load_changes}: {lasting(step.seconds, clock)}.\n"
 
 
 def lasting(seconds: float, clock: float = 1.0) -> str:
-    """Say how long the arm takes, in cell s; a simulated cell goes `clock` times faster."""
+    """Return a duration, in cell seconds; a simulated cell runs `clock` times faster."""
     faster = "" if clock == 1.0 else f" ({clock:g} times faster in this simulated cell)"
     return f"about {spoken(seconds)}{faster}"
 
 
 def standing(step: "ProcedureStep") -> str:
-    """Say in a line where a calibration stands."""
+    """Return the state of a calibration in a clause."""
     if step.kind == "done":
         return "it is complete"
-    left = f" ({step.missing} of {step.planned} readings are missing)" if step.moves else ""
-    return f'its next step is "{TITLES[step.kind]}"{left}'
+    missing = f" ({step.missing} of {step.planned} readings are missing)" if step.moves else ""
+    return f'its next step is "{TITLES[step.kind]}"{missing}'
 
 
 def decision_report(
     d: "Decision", goal_m: float | None, mode: Mode, clock: float = 1.0
 ) -> Iterator[str]:
-    """Yield what was decided after a refinement of deflections or absolute readings, and why.
+    """Yield the decision after a refinement, with its reason.
 
-    `goal_m` is in m, None without one; `clock` in cell seconds per real second.
+    `goal_m` is None without a goal; `clock` is in cell seconds per real second.
     """
-    now = length(d.error.now_m)
-    yield f"Predicted after compensation: {100 * BAND:.0f} % of the points within {now}."
+    band = length(d.error.now_m)
+    yield f"Predicted after compensation: {100 * BAND:.0f} % of the points within {band}."
     goal, then = ("" if x is None else length(x) for x in (goal_m, d.then_m))
     cost = f"further readings ({lasting(d.seconds, clock)})"
     cost = "" if d.plan is None else f"{len(d.plan.steps)} {cost}"
     names = numbers.names(d.suspects)
     would = f"separate {names}" if d.suspects else f"lower the predicted error to {then}"
     power = "" if d.power is None else f"with a power of {d.power:.2f} at least"
-    of, rest = "", ""
+    scope, also = "", ""
     if mode == "deflection":
-        of, rest = " for deflections", f" {numbers.sentence(UNCALIBRATED)}"
+        scope, also = " for deflections", f" {numbers.sentence(UNCALIBRATED)}"
     reasons = {
-        "adequate": f"The model is adequate{of}; nothing more is measured to fit it.{rest}",
-        "goal_met": f"The model is adequate, and the goal of {goal} is met{of}: nothing more is "
-        f"measured to fit it.{rest}",
+        "adequate": f"The model is adequate{scope}; nothing more is measured to fit it.{also}",
+        "goal_met": f"The model is adequate, and the goal of {goal} is met{scope}: nothing more is "
+        f"measured to fit it.{also}",
         "doubt": f"{names} are in doubt: {cost} will separate them, {power}.",
         "goal": f"The goal is {goal}: {cost} are predicted to lower this to {then}.",
         "floor": f"The goal of {goal} is out of reach: the arm's repeatability and what the model "
@@ -157,7 +157,7 @@ def validation_lines(test: Acceptance) -> Iterator[str]:
 
 
 def improvement_report(gain: Improvement, limit_m: float | None) -> Iterator[Block]:
-    """Yield the error before and after the correction, as measured, and whether a limit is kept."""
+    """Yield the measured errors before and after the correction, and the verdict on a limit."""
     heads = ("load", "error", "mean", "rms", "max", "95 % within", "inside")
     parts = (*gain.by_load, *([gain.everything] if len(gain.by_load) > 1 else []))
     yield table(*heads, rows=(row for part in parts for row in _rows(part)), left=(0, 1))
@@ -178,8 +178,8 @@ def improvement_report(gain: Improvement, limit_m: float | None) -> Iterator[Blo
     e, removed = gain.everything, ""
     if e.removed is not None:
         removed = f"; of what exceeded the noise {100 * e.removed:.1f} % is gone"
-    left = len(gain.left_out)
-    without = f" {left} points could not be corrected." if left else ""
+    uncorrected = len(gain.left_out)
+    without = f" {uncorrected} points could not be corrected." if uncorrected else ""
     yield (
         f"At the corrected joint targets the arm is off by {length(e.after.mean_m)} (mean) "
         f"instead of {length(e.before.mean_m)}, measured by the tracker at {e.count} points"
@@ -187,15 +187,15 @@ def improvement_report(gain: Improvement, limit_m: float | None) -> Iterator[Blo
     )
     for name, why in gain.left_out[:MOST_LEFT]:
         yield f"left out: {name}: {why}"
-    if left > MOST_LEFT:
-        yield f"left out: {left - MOST_LEFT} more"
+    if uncorrected > MOST_LEFT:
+        yield f"left out: {uncorrected - MOST_LEFT} more"
     if limit_m is not None:
-        over, of = gain.over(limit_m), " for deflections" if gain.mode == "deflection" else ""
-        what = f"PASSED{of}: no error at the corrected targets is"
+        over, scope = gain.over(limit_m), " for deflections" if gain.mode == "deflection" else ""
+        verdict = f"PASSED{scope}: no error at the corrected targets is"
         if over:
-            what = f"FAILED{of}: {over} of {e.count} errors at the corrected targets are"
+            verdict = f"FAILED{scope}: {over} of {e.count} errors at the corrected targets are"
         largest = f"the largest is {length(e.after.max_m)}"
-        yield f"{what} over {length(limit_m)}{';' if over else ','} {largest}."
+        yield f"{verdict} over {length(limit_m)}{';' if over else ','} {largest}."
 
 
 def _rows(part: Improved) -> Iterator[tuple[str, ...]]:
@@ -207,7 +207,7 @@ def _rows(part: Improved) -> Iterator[tuple[str, ...]]:
 
 
 def limit_failure(gain: Improvement, limit_m: float) -> str:
-    """Return the one line on a limit that is not kept."""
+    """Return the error message for a limit that is exceeded."""
     e = gain.everything
     line = (
         f"{gain.over(limit_m)} of {e.count} errors at the corrected targets are over the limit of "
@@ -220,18 +220,18 @@ def limit_failure(gain: Improvement, limit_m: float) -> str:
 
 
 def refusals(c: Compensation, allowed_outside: bool) -> list[str]:
-    """Return why each point is refused, of N points; empty where it is not."""
+    """Return the reasons to refuse each of N points; an empty string accepts a point."""
     out = []
     for k in range(len(c.q)):
         why = []
         if not c.inverse.solved[k]:
-            left = length(float(c.inverse.residual_m[k]))
-            why.append(f"cannot be reached on its branch, {left} are left")
+            residual = length(float(c.inverse.residual_m[k]))
+            why.append(f"cannot be reached on its branch, {residual} are left")
         if c.singular[k]:
             why.append("the pose is singular")
         for j in np.flatnonzero(c.limits[k]):
-            at = numbers.joint_value(c.q[k, j], c.units[j])
-            why.append(f"joint {j + 1} would be beyond its limit ({at})")
+            value = numbers.joint_value(c.q[k, j], c.units[j])
+            why.append(f"joint {j + 1} would be beyond its limit ({value})")
         if not allowed_outside:
             why += [_outside(o, k) for o in c.after.outside if o.points[k]]
         out.append("; ".join(why))
@@ -239,43 +239,43 @@ def refusals(c: Compensation, allowed_outside: bool) -> list[str]:
 
 
 def _outside(o: Outside, k: int) -> str:
-    """Say what a point leaves of that which was measured."""
+    """Return how point k lies outside of the measured range."""
     value, r = float(o.values[k]), o.of
     if r.unit == "rad" or (r.unit == "m" and r.variable.endswith(" travel")):
-        at, low, high = (numbers.joint_value(x, r.unit) for x in (value, r.low, r.high))
-        return f"{r.variable} {at}, measured {low} to {high}"
+        at_point, low, high = (numbers.joint_value(x, r.unit) for x in (value, r.low, r.high))
+        return f"{r.variable} {at_point}, measured {low} to {high}"
     if r.unit == "m":
         return (
             f"far from all that was measured (± {length(value)} by the parameters alone, "
             f"{length(r.high)} there)"
         )
-    at, low, high = (numbers.digits(x) for x in (value, r.low, r.high))
-    return f"{r.variable} {at} {r.unit}, measured {low} to {high}"
+    at_point, low, high = (numbers.digits(x) for x in (value, r.low, r.high))
+    return f"{r.variable} {at_point} {r.unit}, measured {low} to {high}"
 
 
 def compensation_report(
     calibration: Calibration, names: Sequence[str], before: Floats, c: Compensation
 ) -> Iterator[Block]:
-    """Yield the summary and the points with the largest corrections, of given values (N, n)."""
-    now, later = c.before.error_m, c.after.band_m
+    """Yield a summary and the points with the largest errors; `before` (N, n): nominal joints."""
+    errors, bands = c.before.error_m, c.after.band_m
     expected = length(float(np.sqrt(np.mean(c.after.std_m**2))))
-    asked = "the unloaded arm" if calibration.mode == "deflection" else "the nominal arm"
+    uncorrected = "the unloaded arm" if calibration.mode == "deflection" else "the nominal arm"
     yield heading(f"{len(names)} points compensated")
     yield (
-        f"  error before   {length(float(now.mean()))} mean, "
-        f"{length(float(now.max()))} largest, from where {asked} has the tool\n"
+        f"  error before   {length(float(errors.mean()))} mean, "
+        f"{length(float(errors.max()))} largest, from where {uncorrected} has the tool\n"
         f"  error after    {100 * BAND:.0f} % of the points within "
-        f"{length(float(later.max()))}; expected {expected} rms"
+        f"{length(float(bands.max()))}; expected {expected} rms"
     )
-    yield f"  the latter includes {', '.join(_parts(calibration, c.untold))}"
+    yield f"  the latter includes {', '.join(_contributions(calibration, c.untold))}"
     yield f"  {base_line(calibration.model.cell, calibration.frames, calibration.mode)}"
-    out = table("point", "before", "after, 95 %", "largest correction")
-    for k in sorted(np.argsort(-now, kind="stable")[:LISTED]):
+    rows = table("point", "before", "after, 95 %", "largest correction")
+    for k in sorted(np.argsort(-errors, kind="stable")[:LISTED]):
         turn = np.abs(c.q[k] - before[k])
         joint = int(np.argmax(turn))
         largest = f"joint {joint + 1}: {numbers.joint_value(turn[joint], c.units[joint], 3)}"
-        out.add(names[k], length(float(now[k])), f"± {length(float(later[k]))}", largest)
-    yield from ("", out)
+        rows.add(names[k], length(float(errors[k])), f"± {length(float(bands[k]))}", largest)
+    yield from ("", rows)
     for o in c.turned_on:
         yield (
             f"{o.of.variable}: in {int(o.points.sum())} of {len(names)} points whole turns from "
@@ -286,8 +286,8 @@ def compensation_report(
         yield f"The {LISTED} of {len(names)} points with the largest error before are listed."
 
 
-def _parts(calibration: Calibration, untold: Sequence[str]) -> Iterator[str]:
-    """Yield what the stated error after compensation consists of."""
+def _contributions(calibration: Calibration, untold: Sequence[str]) -> Iterator[str]:
+    """Yield the contributions to the stated error after compensation."""
     yield "the parameters"
     for name in untold:
         moved = length(float(np.sqrt(3 * calibration.conditions[name].variance_m2)))
@@ -303,39 +303,39 @@ def _parts(calibration: Calibration, untold: Sequence[str]) -> Iterator[str]:
 
 @dataclass(frozen=True, slots=True)
 class Fate:
-    """What became of a waypoint of a program."""
+    """Outcome of the correction of one waypoint of a program."""
 
     line: int  # of the program
-    done: str  # "corrected", "left" (not understood) or "refused"; these two are as they were
-    why: str | None  # it is left or refused
-    blend_m: float  # radius within which the arm passes it without a stop
+    done: str  # "corrected"; unchanged: "left" (not understood) or "refused"
+    why: str | None  # reason for "left" or "refused"
+    blend_m: float  # radius within which the arm passes the waypoint without a stop
 
 
 def fates(waypoints: Sequence[Waypoint | ProgramPoint], refused: Sequence[str]) -> list[Fate]:
-    """Return what becomes of each waypoint; `refused` says why, of those that are not left."""
-    rest, out = iter(refused), []
+    """Return the outcome of each waypoint; `refused`: a reason or "" per understood waypoint."""
+    reasons, out = iter(refused), []
     for w in waypoints:
-        why = w.left or next(rest)
+        why = w.left or next(reasons)
         done = "left" if w.left else "refused" if why else "corrected"
         out.append(Fate(w.line, done, why or None, w.blend_m))
     return out
 
 
-def waypoints_table(found: Sequence[Fate]) -> Iterator[Block]:
-    """Yield a table of all waypoints of a program; nothing where there are none."""
-    if not found:
+def waypoints_table(outcomes: Sequence[Fate]) -> Iterator[Block]:
+    """Yield a table of all waypoints of a program; nothing without waypoints."""
+    if not outcomes:
         return
     out = table("line", "waypoint", "why")
-    for f in found:
+    for f in outcomes:
         passed = f"the arm passes its place within {length(f.blend_m)} and does not stop"
         out.add(str(f.line), f.done, f.why or (passed if f.blend_m > 0 else ""))
     yield from ("", out)
-    if any(f.blend_m > 0 and f.done == "corrected" for f in found):
+    if any(f.blend_m > 0 and f.done == "corrected" for f in outcomes):
         yield "Of a blended waypoint the corner of the path is corrected; the radius stays."
 
 
 def opening(judged: Judged, test: Validation) -> Iterator[str]:
-    """Yield how many of the readings were fitted, and how far the others are off."""
+    """Yield the number of readings that were fitted, and the error of the tested ones."""
     error = f"{length(test.error.rms_m)} rms"
     noise = f"noise alone would leave {length(test.noise_floor)}.\n"
     count = f"{len(test.raw)} {judged.what}"
@@ -347,16 +347,16 @@ def opening(judged: Judged, test: Validation) -> Iterator[str]:
         )
         return
     if judged.fitted:
-        more = f", and {judged.spoilt} more share an unloaded reading" if judged.spoilt else ""
+        sharing = f", and {judged.spoilt} more share an unloaded reading" if judged.spoilt else ""
         yield (
             f"{judged.fitted} of the {judged.readings} readings were fitted by {judged.model}"
-            f"{more}; they are left out."
+            f"{sharing}; they are left out."
         )
     yield f"{count} that were never fitted are predicted to {error}; {noise}"
 
 
 def validation_report(judged: Judged, test: Validation, beyond: Extrapolation) -> Iterator[Block]:
-    """Yield the errors, inside and outside of what was measured, and where outside is."""
+    """Yield the errors inside and outside of the measured range, and variables that leave it."""
     out = table(error_words(test.readings), "rms", "mean", "largest", "rms in σ", "stated", "z")
     inside, outside = beyond.inside_error, beyond.outside_error
     every = np.ones(len(beyond.z), dtype=np.bool_)
@@ -380,8 +380,8 @@ def validation_report(judged: Judged, test: Validation, beyond: Extrapolation) -
     else:
         yield f"Extrapolation: {count} of {total} lie outside of what was measured:"
         yield from (f"  {_beyond(v)}" for v in beyond.variables[:MOST])
-        more = len(beyond.variables) - MOST
-        yield f"  and {more} more variables\n" if more > 0 else ""
+        unlisted = len(beyond.variables) - MOST
+        yield f"  and {unlisted} more variables\n" if unlisted > 0 else ""
     if (z_all := _rms(beyond.z)) > DOUBTED:
         yield f"These readings are {z_all:.2g} times as far off as the fit states.\n"
 
@@ -399,7 +399,7 @@ def _beyond(v: Beyond) -> str:
 
 
 def shares_report(test: Acceptance) -> Iterator[Block]:
-    """Yield errors by load, the worst poses, and whether a limit is kept."""
+    """Yield the errors by load, the worst poses, and the verdict on a limit."""
     yield from loads_report(test)
     yield from (worst_table(test), "")
     if test.limit_m is None:
@@ -417,7 +417,7 @@ def shares_report(test: Acceptance) -> Iterator[Block]:
 
 
 def loads_report(test: Acceptance) -> Iterator[Block]:
-    """Yield errors by load."""
+    """Yield the errors by load."""
     every = () if len(test.loads) == 1 else (test.everything,)
     yield _shares_table("load", "at", (*test.loads, *every), test.limit_m)
     yield note(
@@ -430,14 +430,14 @@ def worst_table(test: Acceptance) -> Table:
     return _shares_table("worst poses", "load", test.poses[:WORST], test.limit_m)
 
 
-def _shares_table(of: str, at: str, shares: Iterable[Share], limit: float | None) -> Table:
-    heads = (of, "n", "rms", "largest", at, "stated", "z", "in 95 %")
+def _shares_table(head: str, worst: str, shares: Iterable[Share], limit: float | None) -> Table:
+    heads = (head, "n", "rms", "largest", worst, "stated", "z", "in 95 %")
     out = table(*heads, *(() if limit is None else ("limit",)), left=(0, 4))
     for s in shares:
         rms, largest, stated = map(length, (s.rms_m, s.max_m, s.stated_m))
-        kept = () if limit is None else ("kept" if s.passes(limit) else "over",)
+        verdict = () if limit is None else ("kept" if s.passes(limit) else "over",)
         within = f"{100 * s.within:.0f} %"
-        out.add(s.name, str(s.count), rms, largest, s.worst, stated, f"{s.z:.2f}", within, *kept)
+        out.add(s.name, str(s.count), rms, largest, s.worst, stated, f"{s.z:.2f}", within, *verdict)
     return out
 
 
@@ -447,7 +447,7 @@ def _place(worst: Share) -> str:
 
 
 def validation_failure(test: Acceptance, judged: Judged) -> str:
-    """Return the one line on a limit that is not kept."""
+    """Return the error message for a limit that is exceeded."""
     worst = test.poses[0]
     head = (
         f"the limit of {length(test.limit_m or 0.0)} is not kept: {test.over} of "
@@ -467,7 +467,7 @@ def _rms(x: Floats) -> float:
 
 
 def bootstrap_report(draws: Bootstrap) -> Iterator[Block]:
-    """Yield all that people want to know of a bootstrap."""
+    """Yield the report of a bootstrap: stated and drawn standard uncertainty of each parameter."""
     fit, ends = draws.fit, draws.interval()
     yield heading(f"Model: {model_name(fit.model.named)}")
     yield (
@@ -497,17 +497,17 @@ def bootstrap_report(draws: Bootstrap) -> Iterator[Block]:
 
 
 def bootstrap_remarks(draws: Bootstrap) -> Iterator[str]:
-    """Yield what the draws say of the stated standard uncertainties."""
-    known, solution = draws.ratio[draws.compared], draws.fit.solution
-    if len(known):
+    """Yield the conclusions on the stated standard uncertainties."""
+    ratios, solution = draws.ratio[draws.compared], draws.fit.solution
+    if len(ratios):
         yield (
-            f"Over the draws the parameters scatter {known.min():.2f} to {known.max():.2f} times "
-            f"as far as is stated (median {np.median(known):.2f})."
+            f"Over the draws the parameters scatter {ratios.min():.2f} to {ratios.max():.2f} times "
+            f"as far as is stated (median {np.median(ratios):.2f})."
         )
     wide = sorted(np.flatnonzero(draws.ratio > WIDER), key=lambda k: -draws.ratio[k])
     if wide:
-        of = names_of(draws.fit.model)
-        listed = numbers.few([f"{of[k]} ({draws.ratio[k]:.1f} times)" for k in wide], 5)
+        names = names_of(draws.fit.model)
+        listed = numbers.few([f"{names[k]} ({draws.ratio[k]:.1f} times)" for k in wide], 5)
         if solution.effective > CROWDED * draws.poses:
             yield (
                 f"Wider than stated: {listed}. This does not show that the stated ones are too "
@@ -526,11 +526,11 @@ def bootstrap_remarks(draws: Bootstrap) -> Iterator[str]:
             "is chance for draws of single poses; the stated ones, found by leaving out regions of "
             "joint space, are the ones to use."
         )
-    elif len(known):
+    elif len(ratios):
         yield f"None scatters more than {WIDER:g} times as far: the stated ones can be used."
-    if other := int((solution.estimated & ~draws.compared).sum()):
+    if excluded := int((solution.estimated & ~draws.compared).sum()):
         yield (
-            f"{other} parameters are not compared: the readings do not determine them, or they "
+            f"{excluded} parameters are not compared: the readings do not determine them, or they "
             "are of a family that shrinks its parameters towards zero."
         )
     if draws.failed:

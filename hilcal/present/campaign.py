@@ -1,4 +1,4 @@
-"""What prepares a campaign, what it holds, and two of its revisions side by side."""
+"""Reports on the preparation of a campaign, on its contents, and on two of its revisions."""
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
@@ -34,9 +34,9 @@ begin with.
 """
 MARKS = {"ok": "✓", "warning": "!", "problem": "✗"}
 WIDEST, LISTED = 34, 12
-"""Characters of a cell before it is shortened; unused columns that are listed, not counted."""
+"""Largest width of a table cell, in characters; most unused columns that are listed."""
 SHOWN = ("start", "load", "doubted", "goal", "interrupted", "failed", "finished")
-"""Kinds of events that are listed; drift is where it is over its limit."""
+"""Kinds of events that are always listed; drift is listed only above its limit."""
 MOST_EVENTS = 30
 NONE, UNSEEN = "–", "not determined"
 
@@ -60,7 +60,7 @@ def section_report(t: KeyTable) -> Iterator[Block]:
 
 
 def reference_page(tables: Sequence[KeyTable]) -> str:
-    """Return the page of the reference, in Markdown."""
+    """Return the reference page of all keys, in Markdown."""
     lines = [_HEAD]
     for t in tables:
         lines += [f"## `{t.header}`", "", t.about, ""]
@@ -74,10 +74,10 @@ def reference_page(tables: Sequence[KeyTable]) -> str:
 
 
 def doctor_report(findings: Sequence[Finding]) -> Iterator[Block]:
-    """Yield everything that was looked at, by topic, and how it is mended."""
-    for topic, of in itertools.groupby(findings, lambda f: f.topic):
+    """Yield all findings by topic, with their remedies."""
+    for topic, of_topic in itertools.groupby(findings, lambda f: f.topic):
         rows = pairs(())
-        for f in of:
+        for f in of_topic:
             rows.add(MARKS[f.state], f"{f.name}: {f.said}")
             if f.mend:
                 rows.add("", f"→ {f.mend}")
@@ -96,7 +96,7 @@ def doctor_summary(findings: Sequence[Finding]) -> str:
 
 
 def import_preview(proposal: Proposal, rows: int, source: str) -> Iterator[Block]:
-    """Yield what was understood, unsure and not used of a table of so many rows, from a file."""
+    """Yield the parts of a table that were understood, missing, unsure and not used."""
     yield heading(f"{source}: {rows} rows")
     if file := proposal.sections.get("file", {}):
         yield "  " + ", ".join(f"{key} = {value!r}" for key, value in file.items())
@@ -110,7 +110,7 @@ def import_preview(proposal: Proposal, rows: int, source: str) -> Iterator[Block
         unused = [*unused[:LISTED], f"and {len(unused) - LISTED} more"]
     for title, sentences in (
         ("missing:", proposal.lacking),
-        ("unsure:", [f"{what}: {words}" for what, words in proposal.unsure]),
+        ("unsure:", [f"{column}: {doubt}" for column, doubt in proposal.unsure]),
         ("not used:", [", ".join(unused)] if unused else []),
     ):
         if sentences:
@@ -119,19 +119,19 @@ def import_preview(proposal: Proposal, rows: int, source: str) -> Iterator[Block
 
 
 def _short(cells: Sequence[str]) -> str:
-    """First and last of several names or values, cut to a width."""
-    words = ", ".join(cells) if len(cells) <= 3 else f"{cells[0]}, {cells[1]} … {cells[-1]}"
-    return words if len(words) <= WIDEST else words[: WIDEST - 1] + "…"
+    """Join names or values, of many the first two and the last, cut to WIDEST characters."""
+    line = ", ".join(cells) if len(cells) <= 3 else f"{cells[0]}, {cells[1]} … {cells[-1]}"
+    return line if len(line) <= WIDEST else line[: WIDEST - 1] + "…"
 
 
 def check_report(answers: "tuple[ConnectionResult, ...]", dry: "DryRun | None") -> Iterator[Block]:
-    """Yield who answered, in which state, and every problem."""
+    """Yield the answer and state of each device, every problem, and the result of a dry run."""
     out = table("device", "driver", "", "who answers, and what it says", left=(0, 1, 2, 3))
     for a in answers:
         name, facts = ("no answer", ()) if a.report is None else (a.report.name, a.report.facts)
         out.add(a.device, a.driver, "✗" if a.problems else "✓", name)
-        for what, value in facts:
-            out.add("", "", "", f"{what}: {value}")
+        for fact, value in facts:
+            out.add("", "", "", f"{fact}: {value}")
         for problem in a.problems:
             out.add("", "", "!", problem)
     if answers:
@@ -156,29 +156,29 @@ def check_report(answers: "tuple[ConnectionResult, ...]", dry: "DryRun | None") 
     yield from (f"note: {remark}" for remark in dry.remarks)
 
 
-def factory_words(found: "FactoryCheck") -> Iterator[Block]:
-    """Yield whether an arm is still what its factory measured, and how well that is known."""
-    moved, std = numbers.length(found.moved_m), numbers.length(found.moved_std_m)
-    words = (
+def factory_words(check: "FactoryCheck") -> Iterator[Block]:
+    """Yield whether the geometry of an arm differs from its factory calibration."""
+    moved, std = numbers.length(check.moved_m), numbers.length(check.moved_std_m)
+    conclusion = (
         "The arm is what its factory measured, as far as these readings tell "
-        f"(p = {found.p_value:.2g}): what they leave of its geometry"
+        f"(p = {check.p_value:.2g}): what they leave of its geometry"
     )
-    if found.changed:
-        words = (
+    if check.changed:
+        conclusion = (
             "The arm is no longer what its factory measured: its geometry has changed "
-            f"(p = {found.p_value:.1g}), which"
+            f"(p = {check.p_value:.1g}), which"
         )
-    yield from ("", f"{words} moves the target by {moved} (rms, ± {std}).")
+    yield from ("", f"{conclusion} moves the target by {moved} (rms, ± {std}).")
     yield (
-        f"From the factory's kinematics {found.readings} readings are "
-        f"{numbers.length(found.factory_m)} off (rms, the arm's own weight in it), from the "
-        f"maker's nominal ones {numbers.length(found.nominal_m)}; "
-        f"their noise is {numbers.length(found.noise_m)}."
+        f"From the factory's kinematics {check.readings} readings are "
+        f"{numbers.length(check.factory_m)} off (rms, the arm's own weight in it), from the "
+        f"maker's nominal ones {numbers.length(check.nominal_m)}; "
+        f"their noise is {numbers.length(check.noise_m)}."
     )
 
 
 def info_report(o: Overview, name: str, covariance: str) -> Iterator[Block]:
-    """Yield what the campaign of a file name holds; `covariance` says what its covariances are."""
+    """Yield the contents of a campaign; `covariance` describes the covariances of its readings."""
     count = 0 if o.readings is None else len(o.readings)
     yield heading(f"{name}: {count} readings of {o.poses} poses, {o.config.robot.model}")
     yield from (pairs(_head(o, covariance)), "")
@@ -196,9 +196,9 @@ def info_report(o: Overview, name: str, covariance: str) -> Iterator[Block]:
         yield "None yet: hilcal identify or refine makes one."
         return
     yield from _revisions_tables(o)
-    what = "error" if o.readings is None else error_words(o.readings)
+    error_name = "error" if o.readings is None else error_words(o.readings)
     yield note(
-        f"fit, left out: rms of the {what}, of the fitted poses and of poses left out, "
+        f"fit, left out: rms of the {error_name}, of the fitted poses and of poses left out, "
         "there in σ of the noise as well; v.f.: variance factor."
     )
     yield (
@@ -209,16 +209,16 @@ def info_report(o: Overview, name: str, covariance: str) -> Iterator[Block]:
 
 
 def _head(o: Overview, covariance: str) -> Iterator[tuple[str, str]]:
-    by = f" by hilcal {o.program_version}" if o.program_version else ""
-    yield "made", f"{utc(o.created)} UTC{by}; {o.source}"
+    program = f" by hilcal {o.program_version}" if o.program_version else ""
+    yield "made", f"{utc(o.created)} UTC{program}; {o.source}"
     if o.planned is not None:
         sessions = sum(e["kind"] == "start" for e in o.events)
-        words = f"{sessions} session{'s' * (sessions != 1)}"
-        words += f", {o.plans} plans" if o.plans > 1 else ""
+        extent = f"{sessions} session{'s' * (sessions != 1)}"
+        extent += f", {o.plans} plans" if o.plans > 1 else ""
         time = None if o.readings is None else o.readings.states.time
         if time is not None:
-            words += f", {np.ptp(time) / 60:.0f} min from first to last reading"
-        yield "measured", f"{o.measured} of {o.planned} planned steps in {words}"
+            extent += f", {np.ptp(time) / 60:.0f} min from first to last reading"
+        yield "measured", f"{o.measured} of {o.planned} planned steps in {extent}"
     if o.readings is None:
         yield "readings", "none yet"
         return
@@ -277,7 +277,7 @@ def _events(o: Overview) -> Iterator[Block]:
 
 
 def event_words(e: Mapping[str, Any]) -> str:
-    """Return an event in words."""
+    """Return the description of an event."""
     kind = str(e["kind"])
     if kind == "start":
         return f"began, {e['missing']} readings missing"
@@ -287,9 +287,9 @@ def event_words(e: Mapping[str, Any]) -> str:
         return "nothing hangs" if e["hanging"] == "none" else f"load {e['hanging']}"
     if kind == "doubted":
         r = e["reading"]
-        of = f", {r['target']}" if r.get("target") else ""
-        how = "stored, doubted later" if e.get("stored") else "kept as doubted"
-        return f"reading of {r['pose']}, {r['load']}{of} {how}: {e['why']}"
+        target = f", {r['target']}" if r.get("target") else ""
+        fate = "stored, doubted later" if e.get("stored") else "kept as doubted"
+        return f"reading of {r['pose']}, {r['load']}{target} {fate}: {e['why']}"
     if kind == "finished":
         return f"finished, {e['readings']} readings"
     if kind == "goal":
@@ -301,7 +301,10 @@ def event_words(e: Mapping[str, Any]) -> str:
 
 
 def _revisions_tables(o: Overview) -> Iterator[Block]:
-    """Yield a table of each kind of readings, whose errors do not compare; → is the one in use."""
+    """Yield a table of revisions per kind of readings, as their errors do not compare.
+
+    → marks the revision in use.
+    """
     kinds = dict.fromkeys(str(r.options["readings"]) for r in o.revisions)
     branched = int(any(r.made_from not in (None, r.number - 1) for r in o.revisions))
     heads = ("rev.", *["from"] * branched, "model", "fit", "left out", "σ", "v.f.", "verdict")
@@ -327,24 +330,24 @@ def _revisions_tables(o: Overview) -> Iterator[Block]:
 
 
 def model_words(r: RevisionRecord) -> str:
-    """Return what a revision changed, or its whole model where it is a first one; and its cell."""
+    """Return the changes of a revision, or its whole model if it is the first; and its cell."""
     scatter = r.parameters_json.get("arm_scatter") is not None and not r.cell
     model = change(r.added, r.removed, scatter) or model_name(r.effects)
     return f"{model}; {cell_words(r.cell)}" if r.cell else model
 
 
 def utc(time: str) -> str:
-    """Return a time (ISO 8601, UTC) to the second, without what every time here has."""
+    """Return a time (ISO 8601, UTC) to the second, without T and time zone."""
     return time[:19].replace("T", " ")
 
 
 def two_revisions(a: RevisionRecord, b: RevisionRecord) -> Table:
-    """Return two revisions as they were stored, and the difference, second minus first, if any."""
+    """Return a table of two stored revisions with their difference, second minus first."""
     heads = ("", f"revision {a.number}", f"revision {b.number}", "difference")
     out = table(*heads, left=(0, 1, 2, 3))
 
-    def add(what: str, first: str, second: str, difference: str = "differs") -> None:
-        out.add(what, first, second, difference if first != second else "")
+    def add(quantity: str, first: str, second: str, difference: str = "differs") -> None:
+        out.add(quantity, first, second, difference if first != second else "")
 
     names = [f"+ {name}" for name in b.effects if name not in a.effects]
     names += [f"− {name}" for name in a.effects if name not in b.effects]
@@ -353,33 +356,33 @@ def two_revisions(a: RevisionRecord, b: RevisionRecord) -> Table:
         add("cell", *(cell_words(r.cell) or "as told at first" for r in (a, b)))
     add("verdict", verdict_of(a), verdict_of(b))
     fits = [r.result_json["identify"] for r in (a, b)]
-    for what, of in (("error on poses left out", "holdout"), ("error on fitted poses", "fit")):
-        before, after = (float(f["error"][of]["rms_m"]) for f in fits)
-        share = f" ({100 * (after - before) / before:+.0f} %)" if before else ""
-        by = f"{'+' * (after > before)}{numbers.length(after - before)}{share}".replace("-", "−")
-        add(what, numbers.length(before), numbers.length(after), by)
+    for name, key in (("error on poses left out", "holdout"), ("error on fitted poses", "fit")):
+        rms_a, rms_b = (float(f["error"][key]["rms_m"]) for f in fits)
+        share = f" ({100 * (rms_b - rms_a) / rms_a:+.0f} %)" if rms_a else ""
+        gain = f"{'+' * (rms_b > rms_a)}{numbers.length(rms_b - rms_a)}{share}".replace("-", "−")
+        add(name, numbers.length(rms_a), numbers.length(rms_b), gain)
     add("variance factor", *(numbers.digits(float(f["variance_factor"])) for f in fits))
     add("readings", *(str(f["n_readings"]) for f in fits))
-    known: list[dict[str, Mapping[str, Any]]] = [
+    parameters: list[dict[str, Mapping[str, Any]]] = [
         {p["name"]: p for p in f["parameters"]} for f in fits
     ]
-    for name in dict.fromkeys([*known[0], *known[1]]):
-        both = [of.get(name) for of in known]
+    for name in dict.fromkeys([*parameters[0], *parameters[1]]):
+        both = [p.get(name) for p in parameters]
         values = [0.0 if p is None or p["value"] is None else float(p["value"]) for p in both]
-        given = next(p for p in both if p is not None)
-        unit, factor = numbers.unit_for(str(given["unit"]), values)
+        unit_si = next(str(p["unit"]) for p in both if p is not None)
+        unit, factor = numbers.unit_for(unit_si, values)
         first, second = (_value(p, factor) for p in both)
         if {first, second} <= {NONE, UNSEEN}:
             continue
         moved = factor * (values[1] - values[0])
-        by = ("+" * (moved > 0) + numbers.digits(moved, 2)).replace("-", "−")
-        by *= not {first, second} & {NONE, UNSEEN}
-        add(f"{name} [{unit}]" if unit else name, first, second, by)
+        difference = ("+" * (moved > 0) + numbers.digits(moved, 2)).replace("-", "−")
+        difference *= not {first, second} & {NONE, UNSEEN}
+        add(f"{name} [{unit}]" if unit else name, first, second, difference)
     return out
 
 
 def verdict_of(record: RevisionRecord) -> str:
-    """Return the verdict as words; a line for none."""
+    """Return the verdict, or a dash without one."""
     verdict = record.result_json.get("diagnose", {}).get("verdict")
     return NONE if verdict is None else str(verdict).replace("_", " ")
 
@@ -390,7 +393,7 @@ def left_out_m(record: RevisionRecord) -> float:
 
 
 def cell_words(changes: Changes) -> str:
-    """Return changes of a cell in a line, as CELL.toml would have them."""
+    """Return changes of a cell in a line, in the syntax of CELL.toml."""
     return "; ".join(
         f"[{section}] " + ", ".join(f"{key} = {write_value(value)}" for key, value in keys.items())
         for section, keys in changes.items()
@@ -398,7 +401,7 @@ def cell_words(changes: Changes) -> str:
 
 
 def refitted(before: Fit, after: Fit) -> str:
-    """Return what a fit in a changed cell did to error and variance factor."""
+    """Return the change of error and variance factor by a fit in a changed cell."""
     errors = (numbers.length(f.holdout.rms_m) for f in (before, after))
     factors = (f"{f.variance_factor:.2f}" for f in (before, after))
     return (

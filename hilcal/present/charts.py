@@ -1,8 +1,8 @@
-"""Charts of fits, diagnoses and stories, pure functions of such values; what all charts share.
+"""Charts of fits, diagnoses and stories, as pure functions of these values.
 
-The colours are those of the viewer (Okabe and Ito's, which colour-blind people tell apart), darker
-or lighter where that is needed for a contrast of 3 : 1 on both papers (WCAG 2.2, 1.4.11). No chart
-tells anything by colour alone.
+The colours are those of the viewer (Okabe and Ito's, safe for colour-blind readers), darkened or
+lightened to a contrast of 3 : 1 on both backgrounds (WCAG 2.2, 1.4.11). No chart conveys anything
+by colour alone.
 """
 
 import html
@@ -42,28 +42,28 @@ GREY = "#888b94"
 AMBER = "#c07f00"
 RED = "#e0325c"
 LIGHT, DARK = "#ffffff", "#15171c"
-"""The papers that charts are drawn on."""
+"""Background colours of charts."""
 LEVELS = (GREY, AMBER, RED)
 SYMBOLS = ("circle", "diamond", "x")
-"""Marks of the levels, so that they are told apart without colours."""
+"""Marks of the levels, distinct without colours."""
 CONFIG: dict[str, object] = {"displayModeBar": False, "responsive": True, "scrollZoom": False}
 """Options for plotly.js: no toolbar, and the wheel scrolls the page."""
 SIGMA_LIMITS = np.sqrt(chi2.ppf(LIMITS, 3)).tolist()
-"""Mahalanobis distances from which a reading is doubtful, and outside."""
+"""Mahalanobis distances above which a reading is doubtful, and outside."""
 _INK = {False: ("#24272e", "#d9dbe0"), True: ("#e4e5e9", "#3b3f48")}
-MOST = 1500  # points that a chart draws; a choice by the size of the page, 8 MB
+MOST = 1500  # points of a chart; a choice that limits a page to 8 MB
 MOST_POSES, LONGEST_NAME = 16, 12
-"""Poses up to which all their names stand at the axis, and characters of such a name; choices."""
+"""Most poses that are all named at the axis; most characters of such a name; choices."""
 LONGEST, MOST_ARROWS = 0.25, 300
-"""Length of the largest residual as drawn, m, and arrows of a level at most; choices."""
+"""Drawn length of the largest residual, m; most arrows of a level; choices."""
 MOST_VARIABLES, MOST_CORRELATED, MOST_FAMILIES = 12, 30, 16
 RANGE, WIDEST, BINS = 5.0, 50.0, 40
-"""Least and largest range of the histogram, σ; what lies beyond is counted in its last bins."""
+"""Least and largest range of the histogram, σ; its outermost bins include all values beyond."""
 _NICE = (1.0, 2.0, 5.0)
 
 
 def template(dark: bool) -> go.layout.Template:
-    """Return the look of charts on a light or dark page: transparent paper, quiet grid."""
+    """Return the style of charts on a light or dark page, with a transparent background."""
     ink, grid = _INK[dark]
     axis = {
         **dict.fromkeys(("gridcolor", "linecolor", "zerolinecolor"), grid),
@@ -96,7 +96,7 @@ def figure(
 ) -> go.Figure:
     """Return a figure in the light scheme, `height` CSS pixels high and as wide as the page.
 
-    `says` is the sentence that it shows; `x` and `y` are the titles of the axes, with their units.
+    `says` is the sentence below the chart; `x` and `y` are the titles of the axes, with units.
     """
     out = go.Figure(data=list(traces))
     out.update_layout(template=template(False), height=height, meta={"says": escaped(says)})
@@ -108,16 +108,16 @@ def figure(
 def line(
     x: Floats, y: Floats, name: str = "", color: str = NOISE, dash: str = "solid"
 ) -> go.Scatter:
-    """Return a line that tells nothing when it is pointed at."""
+    """Return a line without hover text."""
     look = {"color": color, "width": 2, "dash": dash}
-    more = {"name": name, "showlegend": bool(name), "hoverinfo": "skip"}
-    return go.Scatter(x=single(x), y=single(y), mode="lines", line=look, **more)
+    options = {"name": name, "showlegend": bool(name), "hoverinfo": "skip"}
+    return go.Scatter(x=single(x), y=single(y), mode="lines", line=look, **options)
 
 
 def marks(
     x: object, y: object, color: str = MEASURED, symbol: str = "circle", size: int = 6, **more: Any
 ) -> go.Scatter:
-    """Return points, at numbers or names; `more` is their name and what they tell."""
+    """Return points at numbers or names; `more` has further options of plotly, e.g. hover text."""
     x, y = (single(v) if isinstance(v, np.ndarray) else v for v in (x, y))
     marker = {"color": color, "symbol": symbol, "size": size}
     return go.Scatter(**{"x": x, "y": y, "mode": "markers", "marker": marker, **more})
@@ -126,7 +126,7 @@ def marks(
 def bar(
     values: Sequence[float], names: Sequence[str], color: object, text: Sequence[str], **more: Any
 ) -> go.Bar:
-    """Return horizontal bars with a text each."""
+    """Return horizontal bars, each with a text."""
     look = {"orientation": "h", "textposition": "auto", "marker": {"color": color}}
     return go.Bar(x=list(values), y=list(names), text=list(text), **look, **more)
 
@@ -140,18 +140,18 @@ def bars(
     colors: Sequence[str] | str = MEASURED,
 ) -> go.Figure:
     """Draw horizontal bars, the first on top, each with its value in two digits."""
-    more = {"hovertext": [label(h) for h in hover], "hoverinfo": "text", "showlegend": False}
+    options = {"hovertext": [label(h) for h in hover], "hoverinfo": "text", "showlegend": False}
     formats = ((v, ".0f" if abs(v) >= 10 else ".2g") for v in values)
-    text = ["0" if abs(v) < 0.005 else format(v, how) for v, how in formats]
-    trace = bar(values, [label(n) for n in names], colors, text, **more)
+    text = ["0" if abs(v) < 0.005 else format(v, spec) for v, spec in formats]
+    trace = bar(values, [label(n) for n in names], colors, text, **options)
     out = figure(says, x=x, traces=[trace], height=90 + 28 * len(names))
     out.update_yaxes(autorange="reversed")
     return out
 
 
-def label(words: str) -> str:
-    """Return words without a meaning in the HTML that plotly takes for labels."""
-    return html.escape(escaped(words), quote=False)
+def label(text: str) -> str:
+    """Return a text escaped for plotly, which reads labels as HTML."""
+    return html.escape(escaped(text), quote=False)
 
 
 def in_scheme(chart: go.Figure, dark: bool) -> go.Figure:
@@ -159,21 +159,21 @@ def in_scheme(chart: go.Figure, dark: bool) -> go.Figure:
     return go.Figure(chart).update_layout(template=template(dark))
 
 
-def empty(words: str) -> go.Figure:
-    """Return a chart of nothing that says why."""
-    note = {"text": words, "showarrow": False, "xref": "paper", "yref": "paper", "x": 0.5, "y": 0.5}
+def empty(why: str) -> go.Figure:
+    """Return an empty chart with a sentence that gives the reason."""
+    note = {"text": why, "showarrow": False, "xref": "paper", "yref": "paper", "x": 0.5, "y": 0.5}
     hidden = {"visible": False}
-    return figure(words, height=160, annotations=[note], xaxis=hidden, yaxis=hidden)
+    return figure(why, height=160, annotations=[note], xaxis=hidden, yaxis=hidden)
 
 
 def single(values: Floats) -> Floats:
-    """Return numbers as they are drawn: single precision makes pages half as large."""
+    """Return numbers in single precision, which halves the size of pages."""
     return np.asarray(values, dtype=np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChartReadings:
-    """The readings that a chart draws of a revision of a story: `index` (K,), growing."""
+    """The readings of a revision that a chart draws; `index` (K,) in ascending order."""
 
     story: Story
     revision: StoryRevision
@@ -186,7 +186,7 @@ class ChartReadings:
 
     @property
     def note(self) -> str:
-        """What is said where not all readings are drawn; else empty."""
+        """A sentence on the choice of readings; empty if all are drawn."""
         if len(self.index) == len(self.story):
             return ""
         worst = max(1, len(self.index) // 5)
@@ -196,38 +196,38 @@ class ChartReadings:
         )
 
     def by_level(self) -> Iterator[tuple[int, Bools]]:
-        """Yield each level that occurs with its members (K,)."""
+        """Yield each occurring level with the mask of its readings (K,)."""
         level = self.revision.level[self.index]
         yield from ((int(k), level == k) for k in np.unique(level))
 
     def named(self, members: Bools | slice = slice(None)) -> list[str]:
-        """Return some, or all, in words: pose, load, target where there are several, distance."""
+        """Return the hover text of readings: pose, load, target if there are several, distance."""
         story, size, sigma = self.story, self.revision.size_m, self.revision.sigma
         out = []
         for i in self.index[members].tolist():
-            words = f"{story.pose_name(i)}, {load_name(story.load_names[i])}"
+            name = f"{story.pose_name(i)}, {load_name(story.load_names[i])}"
             if story.target is not None and len(story.target_names) > 1:
-                words += f", {story.target_names[int(story.target[i])]}"
+                name += f", {story.target_names[int(story.target[i])]}"
             distance = f"{numbers.length(float(size[i]))}, {sigma[i]:.1f} σ"
-            out.append(f"{label(words)}: {distance}")
+            out.append(f"{label(name)}: {distance}")
         return out
 
     def marks(self, x: Floats, y: Floats, level: int, members: Bools, **more: Any) -> go.Scatter:
-        """Return some (K,) as points of a level at x, y (K,)."""
-        at = x[members], y[members], LEVELS[level], SYMBOLS[level]
+        """Return the members (K,) of a level as points at x, y (K,)."""
+        points = x[members], y[members], LEVELS[level], SYMBOLS[level]
         more |= {"name": LEVEL_NAMES[level], "text": self.named(members)}
-        return marks(*at, **more, hovertemplate="%{text}<extra></extra>")
+        return marks(*points, **more, hovertemplate="%{text}<extra></extra>")
 
 
 def drawn(story: Story, revision: StoryRevision, most: int = MOST) -> ChartReadings:
-    """Choose at most `most` readings."""
+    """Choose at most `most` readings to draw."""
     return ChartReadings(story, revision, worst_and_even(revision.whitened_norm2, most))
 
 
 def residual_by_pose(story: Story, revision: StoryRevision) -> go.Figure:
-    """Draw the residual of each reading in σ over its pose, poses in the order of their numbers."""
+    """Draw the residual of each reading in σ over its pose, poses by number."""
     d, full = drawn(story, revision), [story.pose_name(int(i)) for i in story.first]
-    out = _residuals(d, story.row[d.index].astype(float), "", _by(story, revision, "pose"))
+    out = _residuals(d, story.row[d.index].astype(float), "", _extremes(story, revision, "pose"))
     short = [n if len(n) <= LONGEST_NAME else f"…{n[1 - LONGEST_NAME :]}" for n in full]
     names, step = [label(n) for n in short], -(-len(full) // MOST_POSES)
     return out.update_xaxes(tickvals=list(range(0, len(names), step)), ticktext=names[::step])
@@ -237,10 +237,10 @@ def residual_by_load(story: Story, revision: StoryRevision) -> go.Figure:
     """Draw the residual of each reading in σ over its load."""
     d = drawn(story, revision)
     loads = list(dict.fromkeys(story.load_names))
-    of = np.array([loads.index(name) for name in story.load_names], dtype=float)
+    position = np.array([loads.index(name) for name in story.load_names], dtype=float)
     # scattered within a load, so that points do not hide each other
-    jitter = np.random.default_rng(0).uniform(-0.3, 0.3, len(of))
-    out = _residuals(d, (of + jitter)[d.index], "load", _by(story, revision, "load"))
+    jitter = np.random.default_rng(0).uniform(-0.3, 0.3, len(position))
+    out = _residuals(d, (position + jitter)[d.index], "load", _extremes(story, revision, "load"))
     names = [label(load_name(name)) for name in loads]
     return out.update_xaxes(tickvals=list(range(len(names))), ticktext=names)
 
@@ -248,17 +248,18 @@ def residual_by_load(story: Story, revision: StoryRevision) -> go.Figure:
 def residual_over(
     story: Story, revision: StoryRevision, values: Floats, name: str, unit: str
 ) -> go.Figure:
-    """Draw residuals in σ over values (N,) in a unit for people, NaN where not known."""
+    """Draw residuals in σ over values (N,) in a display unit; NaN: unknown."""
     d = drawn(story, revision)
-    known = np.isfinite(values)
-    x = np.where(known, values, np.median(values[known]) if known.any() else 0.0)
+    finite = np.isfinite(values)
+    x = np.where(finite, values, np.median(values[finite]) if finite.any() else 0.0)
     high = x > np.median(x)
     says = f"{name} is the same for all readings."
     if high.any():
-        low, beyond = (_rms(revision.sigma[members] / 3**0.5) for members in (~high, high))
-        at = f"{np.median(x):.0f}{unit if unit == '°' else f' {unit}'}".strip()
+        sigma = revision.sigma / 3**0.5
+        low, beyond = (np.sqrt(np.mean(sigma[members] ** 2)) for members in (~high, high))
+        median = f"{np.median(x):.0f}{unit if unit == '°' else f' {unit}'}".strip()
         says = (
-            f"Residual over {name}: {low:.2g} times the noise rms up to {at}, "
+            f"Residual over {name}: {low:.2g} times the noise rms up to {median}, "
             f"{beyond:.2g} times beyond."
         )
     return _residuals(d, values[d.index], f"{name} [{unit}]" if unit else name, says)
@@ -272,7 +273,7 @@ def residual_by_joint(story: Story, revision: StoryRevision, joint: int) -> go.F
 
 
 def residual_by_time(story: Story, revision: StoryRevision) -> go.Figure:
-    """Draw the residual of each reading in σ over the time; over its row where none is known."""
+    """Draw the residual of each reading in σ over time; over its row if no times are known."""
     if story.time_s is None:
         rows = np.arange(len(story), dtype=float)
         return residual_over(story, revision, rows, "row, in the order of the file", "")
@@ -280,80 +281,73 @@ def residual_by_time(story: Story, revision: StoryRevision) -> go.Figure:
     return residual_over(story, revision, minutes, "time since the first reading", "min")
 
 
-def _rms(x: Floats) -> float:
-    return float(np.sqrt(np.mean(x**2)))
-
-
-def _by(story: Story, revision: StoryRevision, what: str) -> str:
-    """Say which pose or load is worst, and how good the best one is."""
+def _extremes(story: Story, revision: StoryRevision, group: str) -> str:
+    """Return a sentence on the worst and the best pose, or load."""
     names: Sequence[str] = story.load_names
-    if what == "pose":
+    if group == "pose":
         names = [story.pose_name(i) for i in range(len(story))]
-    each, which = np.unique(names, return_inverse=True)
-    rms = np.sqrt(np.bincount(which, revision.sigma**2 / 3) / np.bincount(which))
+    labels, label_index = np.unique(names, return_inverse=True)
+    rms = np.sqrt(np.bincount(label_index, revision.sigma**2 / 3) / np.bincount(label_index))
     worst = int(np.argmax(rms))
-    name = "the unloaded readings" if each[worst] == UNLOADED else f"{what} {each[worst]}"
-    if len(each) == 1:
+    name = "the unloaded readings" if labels[worst] == UNLOADED else f"{group} {labels[worst]}"
+    if len(labels) == 1:
         return f"All readings are of {name}: {rms[0]:.2g} times the noise rms."
     return (
         f"Worst is {name} with {rms[worst]:.2g} times the noise rms; best, {rms.min():.2g} times."
     )
 
 
-def _residuals(d: ChartReadings, x: Floats, title: str, words: str) -> go.Figure:
-    """Draw residuals over x (K,); each point carries the number of its reading."""
+def _residuals(d: ChartReadings, x: Floats, title: str, sentence: str) -> go.Figure:
+    """Draw residuals over x (K,); `customdata` of each point is the number of its reading."""
     traces = [
         d.marks(x, d.sigma, k, members, customdata=d.index[members]) for k, members in d.by_level()
     ]
-    out = figure(words + d.note, x=title, y="residual [σ]", traces=traces, height=320)
+    out = figure(sentence + d.note, x=title, y="residual [σ]", traces=traces, height=320)
     for limit, color in zip(SIGMA_LIMITS, (AMBER, RED), strict=True):
         out.add_hline(limit, line={"color": color, "dash": "dot", "width": 1})
     return out.update_yaxes(rangemode="tozero")
 
 
 def measured_predicted(story: Story, revision: StoryRevision) -> go.Figure:
-    """Draw what was measured over what is predicted, less the nominal arm, along the base axes."""
+    """Draw measured over predicted deviations from the nominal arm, along the base axes."""
     d = drawn(story, revision, most=500)  # three points each
     x, y = (1e6 * story.deviation(v) for v in (revision.predicted, story.measured))
     ends = np.array([min(x.min(), y.min()), max(x.max(), y.max())])
     traces: list[object] = [line(ends, ends, "exact", dash="dash")]
-    colors = (MEASURED, HOLDOUT, AMBER)
+    colors, text = (MEASURED, HOLDOUT, AMBER), d.named()
     for k, (axis, color) in enumerate(zip("xyz", colors, strict=True)):
         values = "measured %{y:.1f} µm, predicted %{x:.1f} µm<extra></extra>"
-        more: dict[str, Any] = {
-            "text": d.named(),
-            "hovertemplate": f"%{{text}}<br>{axis}: {values}",
-        }
-        at = (x[d.index, k], y[d.index, k], color, SYMBOLS[k])
-        traces.append(marks(*at, name=f"base {axis}", **more))
-    what = "deflection" if story.mode == "deflection" else "deviation from the nominal arm"
+        hover = f"%{{text}}<br>{axis}: {values}"
+        points = (x[d.index, k], y[d.index, k], color, SYMBOLS[k])
+        traces.append(marks(*points, name=f"base {axis}", text=text, hovertemplate=hover))
+    measure = "deflection" if story.mode == "deflection" else "deviation from the nominal arm"
     total = np.sum((y - y.mean(axis=0)) ** 2)
     share = 100 * (1 - np.sum((y - x) ** 2) / total) if total > 0 else 0.0
     says = (
-        f"Measured against predicted {what}: the model accounts for {share:.1f} % of what was "
+        f"Measured against predicted {measure}: the model accounts for {share:.1f} % of what was "
         f"measured.{d.note}"
     )
-    titles = {k: f"{v} {what.split()[0]} [µm]" for k, v in (("x", "predicted"), ("y", "measured"))}
-    return figure(says, **titles, traces=traces, height=420)
+    x_title, y_title = (f"{v} {measure.split()[0]} [µm]" for v in ("predicted", "measured"))
+    return figure(says, x=x_title, y=y_title, traces=traces, height=420)
 
 
 def workspace(
     story: Story, revision: StoryRevision, plane: Literal["xy", "xz"] = "xy"
 ) -> go.Figure:
-    """Draw the target of each reading, by its level, with its residual; "xy" is seen from above."""
+    """Draw target and residual of each reading, by level; "xy" is the view from above."""
     d = drawn(story, revision, most=1000)
     axes = ["xyz".index(a) for a in plane]
-    at, residual = story.anchor[d.index][:, axes], revision.residual[d.index][:, axes]
+    target, residual = story.anchor[d.index][:, axes], revision.residual[d.index][:, axes]
     largest = float(revision.size_m.max(initial=0.0))
     times = round_factor(LONGEST / largest, _NICE) if largest > 0 else 1.0
     traces: list[object] = []
     for k, members in d.by_level():
         worst = np.flatnonzero(members)[np.argsort(-d.sigma[members])][:MOST_ARROWS]
-        start, end = at[worst], at[worst] + times * residual[worst]
+        start, end = target[worst], target[worst] + times * residual[worst]
         gap = np.full_like(start, np.nan)  # between one line and the next
         lines = np.stack([start, end, gap], axis=1).reshape(-1, 2)
         traces.append(line(lines[:, 0], lines[:, 1], color=LEVELS[k]))
-        traces.append(d.marks(at[:, 0], at[:, 1], k, members, size=5, showlegend=False))
+        traces.append(d.marks(target[:, 0], target[:, 1], k, members, size=5, showlegend=False))
     outside = int((revision.level == len(LEVELS) - 1).sum())
     says = (
         f"Targets with their errors, {times:g} times enlarged: {outside} of {len(story)} readings "
@@ -368,17 +362,17 @@ def workspace(
 
 
 def added_variable(r: DependenceCurve, effect: str) -> go.Figure:
-    """Draw residual over regressor, both freed of what the model can do: slope 1 if it is right."""
-    at = worst_and_even(np.abs(r.y), MOST)
+    """Draw the added-variable plot of an effect; its slope is 1 if the effect is the right one."""
+    rows = worst_and_even(np.abs(r.y), MOST)
     ends = np.array([r.x.min(), r.x.max()])
     slope = float(r.x @ r.y / max(float(r.x @ r.x), 1e-300))
     hover = "would explain %{x:.1f}, residual %{y:.1f}<extra></extra>"
     traces = [
-        marks(r.x[at], r.y[at], name="readings", size=5, hovertemplate=hover),
+        marks(r.x[rows], r.y[rows], name="readings", size=5, hovertemplate=hover),
         line(ends, ends, "if it is right: slope 1", dash="dash"),
         line(ends, slope * ends, f"found: slope {slope:.2f}", RED),
     ]
-    note = "" if len(at) == len(r.x) else f" Of {len(r.x)} points {len(at)} are drawn."
+    note = "" if len(rows) == len(r.x) else f" Of {len(r.x)} points {len(rows)} are drawn."
     says = (
         f"Residual against what {effect} would explain: slope {slope:.2f}, where 1 means that it "
         f"is right and 0 that it explains nothing.{note}"
@@ -387,7 +381,7 @@ def added_variable(r: DependenceCurve, effect: str) -> go.Figure:
 
 
 def misfit_shares(d: Diagnosis) -> go.Figure:
-    """Draw the share of the misfit that follows each recorded variable, the largest on top."""
+    """Draw the share of the misfit that each recorded variable explains, the largest on top."""
     rows = [v for v in d.misfit_breakdown if v.share >= LEAST_SHARE][:MOST_VARIABLES]
     if not rows:
         return empty("The misfit follows no recorded variable.")
@@ -399,7 +393,7 @@ def misfit_shares(d: Diagnosis) -> go.Figure:
 
 
 def curve_chart(c: DependenceCurve) -> go.Figure:
-    """Draw means over a variable with standard uncertainties, and the law, where there is one."""
+    """Draw means over a variable with their standard uncertainties, and the law if there is one."""
     points = marks(
         [label(n) for n in c.names] if c.names else c.x,
         c.y,
@@ -424,27 +418,27 @@ def parameter_correlations(fit: Fit) -> tuple[list[str], Floats]:
     names = names_of(fit.model)
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     keep = np.flatnonzero(fit.uncertainty.identifiable & s.estimated & (std > 0))
-    of = covariance[np.ix_(keep, keep)] / np.outer(std[keep], std[keep])
-    return [names[k] for k in keep], np.clip(of, -1.0, 1.0)
+    correlation = covariance[np.ix_(keep, keep)] / np.outer(std[keep], std[keep])
+    return [names[k] for k in keep], np.clip(correlation, -1.0, 1.0)
 
 
 def correlations(fit: Fit) -> go.Figure:
-    """Draw the correlations of the identifiable parameters; of many, those of the strongest."""
-    names, of = parameter_correlations(fit)
+    """Draw the correlations of the identifiable parameters; of many, the most correlated ones."""
+    names, rho = parameter_correlations(fit)
     if len(names) < 2:
         return empty("Fewer than two parameters are identifiable: nothing is correlated.")
-    away = np.abs(of - np.diag(np.diag(of)))
-    i, j = np.unravel_index(int(np.argmax(away)), away.shape)
+    off_diagonal = np.abs(rho - np.diag(np.diag(rho)))
+    i, j = np.unravel_index(int(np.argmax(off_diagonal)), off_diagonal.shape)
     says = (
-        f"The strongest correlation is {of[i, j]:+.2f}, of {names[i]} and {names[j]}; columns are "
+        f"The strongest correlation is {rho[i, j]:+.2f}, of {names[i]} and {names[j]}; columns are "
         "in the order of the rows."
     )
-    some: Ints = np.sort(np.argsort(-away.max(axis=1), kind="stable")[:MOST_CORRELATED])
+    some: Ints = np.sort(np.argsort(-off_diagonal.max(axis=1), kind="stable")[:MOST_CORRELATED])
     if len(some) < len(names):
         says += f" The {len(some)} most correlated of {len(names)} parameters are drawn."
     shown = [label(names[k]) for k in some]
     trace = go.Heatmap(
-        z=single(of[np.ix_(some, some)]),
+        z=single(rho[np.ix_(some, some)]),
         y=shown,
         hovertext=[[f"{a}<br>{b}" for a in shown] for b in shown],
         zmin=-1,
@@ -459,7 +453,7 @@ def correlations(fit: Fit) -> go.Figure:
 
 
 def noise_check(fit: Fit) -> go.Figure:
-    """Draw the histogram of the whitened residual, and what noise leaves of it: N(0, 1 − p/n)."""
+    """Draw the histogram of the whitened residual and its expected density, N(0, 1 − p/n)."""
     white = fit.white[np.isfinite(fit.white)]
     reach = float(np.clip(np.ceil(np.quantile(np.abs(white), 0.995)), RANGE, WIDEST))
     edges, width = np.linspace(-reach, reach, BINS + 1, retstep=True)
@@ -487,33 +481,35 @@ def noise_check(fit: Fit) -> go.Figure:
 
 
 def error_per_revision(story: Story) -> go.Figure:
-    """Draw the rms error of each revision, the first on top, and what noise alone would leave."""
-    of = story.revisions
-    changes = [(r.change if k else "") or "start" for k, r in enumerate(of)]
-    names = [label(f"{r.revision}: {c}") for r, c in zip(of, changes, strict=True)]
+    """Draw the rms error of each revision, the first on top, and the error by noise alone."""
+    steps = story.revisions
+    changes = [(r.change if k else "") or "start" for k, r in enumerate(steps)]
+    names = [label(f"{r.revision}: {c}") for r, c in zip(steps, changes, strict=True)]
     traces: list[object] = []
     for errors, name, color in (
-        ([r.error for r in of], "fitted poses", MEASURED),
-        ([r.holdout for r in of], "poses left out", HOLDOUT),
+        ([r.error for r in steps], "fitted poses", MEASURED),
+        ([r.holdout for r in steps], "poses left out", HOLDOUT),
     ):
         rms = [1e6 * e.rms_m for e in errors]
         hover = "%{y}: %{text} µm, " + name + "<extra></extra>"
         text = [numbers.digits(v) for v in rms]
         traces.append(bar(rms, names, color, text, name=name, hovertemplate=hover))
     floor, noise = 1e6 * story.noise_floor_m, numbers.length(story.noise_floor_m)
-    left, fitted = (
+    first, last = steps[0], steps[-1]
+    holdout, fitted = (
         [numbers.length(e.rms_m) for e in errors]
-        for errors in ((of[0].holdout, of[-1].holdout), (of[0].error, of[-1].error))
+        for errors in ((first.holdout, last.holdout), (first.error, last.error))
     )
-    says = f"One revision: {left[0]} rms error on poses left out; noise alone would leave {noise}."
-    if len(of) > 1:
-        went = "fell" if of[-1].holdout.rms_m < of[0].holdout.rms_m else "went"
+    says = (
+        f"One revision: {holdout[0]} rms error on poses left out; noise alone would leave {noise}"
+    )
+    if len(steps) > 1:
         says = (
-            f"The rms error {went} from {left[0]} to {left[1]} on poses left out, and from "
-            f"{' to '.join(fitted)} on the fitted ones, over {len(of)} revisions; noise alone "
-            f"would leave {noise}."
+            f"The rms error {'fell' if last.holdout.rms_m < first.holdout.rms_m else 'went'} from "
+            f"{' to '.join(holdout)} on poses left out, and from {' to '.join(fitted)} on the "
+            f"fitted ones, over {len(steps)} revisions; noise alone would leave {noise}"
         )
-    out = figure(says, x="error, rms [µm]", traces=traces, height=130 + 26 * len(names))
+    out = figure(f"{says}.", x="error, rms [µm]", traces=traces, height=130 + 26 * len(names))
     dashed = {"color": NOISE, "dash": "dash", "width": 2}
     out.add_vline(floor, line=dashed, layer="below")
     # for the legend alone: a shape has no entry there
@@ -524,20 +520,21 @@ def error_per_revision(story: Story) -> go.Figure:
 
 
 def made_of(sizes: Sequence[FamilySize]) -> go.Figure:
-    """Draw the size of each family by that of an ordinary arm, over its 95 % interval."""
+    """Draw the size of each family, relative to an ordinary arm, with its 95 % interval."""
     shown, first = sizes[:MOST_FAMILIES], sizes[0]
     traces = []
-    for named, words, color, symbol in (
+    for named, group, color, symbol in (
         (True, "named", MEASURED, "circle"),
         (False, "predicted with, not named", GREY, "diamond"),
     ):
-        if not (of := [s for s in shown if s.named == named]):
+        if not (members := [s for s in shown if s.named == named]):
             continue
-        low, at, high = np.array([(s.low, s.std, s.high) for s in of]).T / [s.ordinary for s in of]
-        error = {"type": "data", "symmetric": False, "array": high - at, "arrayminus": at - low}
-        hover = {"hovertext": [label(_size(s)) for s in of], "hoverinfo": "text"}
-        names, error_x = [label(s.name) for s in of], {**error, "color": color}
-        traces.append(marks(at, names, color, symbol, 9, name=words, error_x=error_x, **hover))
+        low, std, high = np.array([(s.low, s.std, s.high) for s in members]).T
+        low, std, high = (v / [s.ordinary for s in members] for v in (low, std, high))
+        error = {"type": "data", "symmetric": False, "array": high - std, "arrayminus": std - low}
+        hover = {"hovertext": [label(_size(s)) for s in members], "hoverinfo": "text"}
+        names, error_x = [label(s.name) for s in members], {**error, "color": color}
+        traces.append(marks(std, names, color, symbol, 9, name=group, error_x=error_x, **hover))
     says = (
         f"{first.name} moves the target most, by {numbers.length(first.moves_m)} rms. Sizes are "
         "standard deviations of the parameters, with 95 % intervals; 1 is an ordinary arm, and "

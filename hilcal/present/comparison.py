@@ -1,4 +1,4 @@
-"""What `compare A B` and `fleet` say: what has changed on an arm, arms unlike their type."""
+"""Reports of `compare A B` (changes of an arm) and `fleet` (arms that differ from their type)."""
 
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from hilcal.transfer.members import TypeSize
     from hilcal.transfer.pooled import Odd, Pooled
 
-MOST_PARAMETERS, MOST_ROWS = 6, 12  # parameters of a change, and of both fits, that are listed
-CLEAR = 2.0  # standard deviations from which one of several parameters of a change is listed
+MOST_PARAMETERS, MOST_ROWS = 6, 12  # listed parameters of a change; of both fits
+CLEAR = 2.0  # least σ of a listed parameter of a change that has several
 FAR = 3.0  # standard deviations between which most arms lie; a choice
 KNOWN = {
     "list": "arms.csv",
@@ -29,15 +29,15 @@ KINDS = {"trait": ", a trait of the type", "defect": ", of single arms: a defect
 
 
 def words_of(c: Candidate) -> str:
-    """Return what may have changed, in words."""
-    words = c.change.words or c.effect
+    """Return a name of the part that may have changed."""
+    name = c.change.words or c.effect
     if c.joint:
-        return f"joint {c.joint}'s {words}"
-    return f"the {words} of {c.part}" if c.kind == "link" else words
+        return f"joint {c.joint}'s {name}"
+    return f"the {name} of {c.part}" if c.kind == "link" else name
 
 
 def comparison_report(c: Comparison, earlier: str, later: str) -> Iterator[Block]:
-    """Yield everything that is said, with the names of the two files."""
+    """Yield the report of a comparison; `earlier` and `later` are the names of the two files."""
     yield from (*_setup(c, earlier, later), "")
     yield from (*_today(c, earlier), "")
     yield from _changes(c)
@@ -46,8 +46,8 @@ def comparison_report(c: Comparison, earlier: str, later: str) -> Iterator[Block
 
 
 def _setup(c: Comparison, earlier: str, later: str) -> Iterator[str]:
-    what = measurements(c.mode, c.today.prediction.readings)
-    yield f"{len(c.today.prediction.raw)} {what} of {later}, measured later."
+    quantity = measurements(c.mode, c.today.prediction.readings)
+    yield f"{len(c.today.prediction.raw)} {quantity} of {later}, measured later."
     if c.shared:
         model = "the baseline" if c.number is None else f"revision {c.number}"
         yield f"{c.shared} of its {c.readings} readings were fitted by {model}; they are left out."
@@ -82,7 +82,7 @@ def _today(c: Comparison, earlier: str) -> Iterator[Block]:
         f"The error is {numbers.digits(t.z, 2)} times what it states, all correlations counted "
         f"({numbers.p_equals(t.p_value)}): {'no ' * (t.p_value >= LEVEL)}more than its uncertainty."
     )
-    # How far the poses are from the measured ones, the expected error counts.
+    # The expected error includes the distance of the poses from the measured ones (leverage).
     variables = (v for v in t.beyond.variables if v.variable != "leverage")
     if ranges := [f"{v.variable} ({v.count})" for v in variables]:
         yield (
@@ -92,22 +92,22 @@ def _today(c: Comparison, earlier: str) -> Iterator[Block]:
 
 
 def headline(c: Comparison) -> str:
-    """Say in a few words whether something has changed."""
-    found = c.changes
-    if not found.found and found.explained:
+    """Return in a clause whether something has changed."""
+    changes = c.changes
+    if not changes.found and changes.explained:
         return "Nothing has changed beyond the uncertainty"
     if c.another_arm:
         return "This looks like another arm of the same type"
-    if found.found:
-        parts = numbers.names(list(dict.fromkeys(x.candidate.part for x in found.found)))
+    if changes.found:
+        parts = numbers.names(list(dict.fromkeys(x.candidate.part for x in changes.found)))
         return f"Something has changed: {parts}"
     return "Something has changed, and no single candidate explains it"
 
 
 def _changes(c: Comparison) -> Iterator[Block]:
-    found = c.changes
-    yield heading("What has changed" if found.found and not c.another_arm else f"{headline(c)}.")
-    if not found.found and found.explained:
+    changes = c.changes
+    yield heading("What has changed" if changes.found and not c.another_arm else f"{headline(c)}.")
+    if not changes.found and changes.explained:
         yield from _limits(c)
         return
     if c.another_arm:
@@ -116,26 +116,28 @@ def _changes(c: Comparison) -> Iterator[Block]:
             "changes explain them."
         )
         return
-    if not found.found:
-        yield _left(c)
+    if not changes.found:
+        yield _remainder(c)
         return
-    for change in found.found:
+    for change in changes.found:
         yield sentence(change)
         if change.same_as:
-            others = numbers.names([words_of(o) for o in change.same_as], "or")
-            yield f"  These readings do not distinguish it from {others}."
-    yield from ("", _table(found.found))
-    if named := dict.fromkeys(words_of(x.candidate) for x in found.found if not x.candidate.of_arm):
-        yield f"Not of the arm: {numbers.names(list(named))}."
-    yield _left(c)
-    yield numbers.many_tests(found.tested, LEVEL, "candidates").replace("diagnoses", "comparisons")
+            alternatives = numbers.names([words_of(o) for o in change.same_as], "or")
+            yield f"  These readings do not distinguish it from {alternatives}."
+    yield from ("", _table(changes.found))
+    candidates = (x.candidate for x in changes.found)
+    if setup := dict.fromkeys(words_of(x) for x in candidates if not x.of_arm):
+        yield f"Not of the arm: {numbers.names(list(setup))}."
+    yield _remainder(c)
+    tests = numbers.many_tests(changes.tested, LEVEL, "candidates")
+    yield tests.replace("diagnoses", "comparisons")
 
 
 def sentence(change: Change) -> str:
     """Return a change in one sentence."""
     c, s = change.candidate, change.sizes[0]
-    what, why = words_of(c), c.change.cause
-    head = what[:1].upper() + what[1:]
+    name, why = words_of(c), c.change.cause
+    head = name[:1].upper() + name[1:]
     if len(change.sizes) > 1:
         return (
             f"{head} has changed: it moves the target by {numbers.length(change.moved_m)} rms "
@@ -146,54 +148,54 @@ def sentence(change: Change) -> str:
     if c.moving.effect.elastic and s.before is not None and s.before[0] > 0:
         share = f", to {numbers.digits((s.before[0] + s.value) / s.before[0], 2)} times what it was"
     signed = value if value.startswith("-") else f"+{value}"
-    words = f"{head} has moved by {signed} ± {std} {unit}{share} ({abs(s.z):.0f} σ)"
-    return f"{words}: {why}" if why else f"{words}."
+    statement = f"{head} has moved by {signed} ± {std} {unit}{share} ({abs(s.z):.0f} σ)"
+    return f"{statement}: {why}" if why else f"{statement}."
 
 
-def _table(found: Sequence[Change]) -> Table:
+def _table(changes: Sequence[Change]) -> Table:
     out = table("change", "by", "±", "unit", "σ", "p", "at target", left=(0, 3))
-    for change in found:
-        more = (numbers.chance(change.p_value), numbers.length(change.moved_m))
+    for change in changes:
+        common = (numbers.chance(change.p_value), numbers.length(change.moved_m))
         alone = len(change.sizes) == 1
         shown = [s for s in change.sizes if alone or abs(s.z) >= CLEAR]
         if not shown:
-            out.add(change.candidate.name, *[""] * 4, *more)
+            out.add(change.candidate.name, *[""] * 4, *common)
         for k, s in enumerate(shown[:MOST_PARAMETERS]):
             measured = numbers.measured(s.unit, s.value, s.std, [s.value, s.std])
             name = change.candidate.name if alone else f"{change.candidate.effect}.{s.parameter}"
-            out.add(name, *measured, f"{abs(s.z):.1f}", *(("", "") if k else more))
+            out.add(name, *measured, f"{abs(s.z):.1f}", *(("", "") if k else common))
         if len(shown) > MOST_PARAMETERS:
             out.add(f"  … {len(shown) - MOST_PARAMETERS} more", *[""] * 6)
     return out
 
 
-def _left(c: Comparison) -> str:
-    found, scatter = c.changes, numbers.digits(c.changes.scatter, 2)
-    if found.explained:
+def _remainder(c: Comparison) -> str:
+    changes, scatter = c.changes, numbers.digits(c.changes.scatter, 2)
+    if changes.explained:
         return f"What is left after that is scatter as stated ({scatter} times)."
     outside = any(v.variable != "leverage" for v in c.today.beyond.variables)
-    more = ", or the earlier model is wrong where it was not measured" if outside else ""
+    extrapolated = ", or the earlier model is wrong where it was not measured" if outside else ""
     return (
         f"What is left is {scatter} times the stated scatter "
-        f"({numbers.p_equals(found.unexplained)}): more has changed than the candidates explain, "
-        f"or these readings are noisier than stated{more}."
+        f"({numbers.p_equals(changes.unexplained)}): more has changed than the candidates explain, "
+        f"or these readings are noisier than stated{extrapolated}."
     )
 
 
 def _limits(c: Comparison) -> Iterator[Block]:
-    found = c.changes
+    changes = c.changes
     by_joint: dict[str, dict[str, Limit]] = {}
-    for limit in found.limits:
+    for limit in changes.limits:
         if limit.change.listed:
             by_joint.setdefault(limit.part, {})[limit.change.words] = limit
-    shown = list(dict.fromkeys(words for of in by_joint.values() for words in of))
-    rows = ((part, *(_least(of.get(words)) for words in shown)) for part, of in by_joint.items())
+    shown = list(dict.fromkeys(name for row in by_joint.values() for name in row))
+    rows = ((part, *(_least(row.get(name)) for name in shown)) for part, row in by_joint.items())
     yield table("would have been seen", *shown, rows=rows)
     yield (
         f"The smallest change that these readings would have shown in {POWER * 10:.0f} cases of "
         f"10; where nothing has changed, a change is claimed once in {1 / LEVEL:.0f}."
     )
-    zeros = [x.part for x in found.limits if x.change.by_frame and _least(x) == "-"]
+    zeros = [x.part for x in changes.limits if x.change.by_frame and _least(x) == "-"]
     if c.mode == "deflection":
         yield "Deflections do not show zeros and geometry: these cancel in them."
     elif zeros:
@@ -208,28 +210,28 @@ def _least(limit: Limit | None) -> str:
 
 
 def _parameters(d: Differences | None) -> Iterator[Block]:
-    """Yield the parameters of both fits, those that differ most first."""
+    """Yield the parameters of both fits, the largest differences first."""
     if d is None:
         return
     yield from ("", heading("Both campaigns' own fits, as far as they can be compared"))
-    known = sorted(((r.z, r) for r in d.rows if r.z is not None), key=lambda zr: -abs(zr[0]))
-    if known:
+    comparable = sorted(((r.z, r) for r in d.rows if r.z is not None), key=lambda zr: -abs(zr[0]))
+    if comparable:
         out = table("parameter", "before", "after", "by", "±", "unit", "σ", left=(0, 5))
-        for z, r in known[:MOST_ROWS]:
+        for z, r in comparable[:MOST_ROWS]:
             unit, factor = numbers.unit_for(r.unit, [r.before, r.after, r.difference])
-            by, error = numbers.with_std(factor * r.difference, factor * (r.std or 0.0))
+            difference, error = numbers.with_std(factor * r.difference, factor * (r.std or 0.0))
             places = len(error.partition(".")[2])
             sizes = (f"{factor * v:.{places}f}" for v in (r.before, r.after))
-            out.add(r.name, *sizes, by, error, unit, f"{abs(z):.1f}")
+            out.add(r.name, *sizes, difference, error, unit, f"{abs(z):.1f}")
         yield out
-        if len(known) > MOST_ROWS:
-            yield f"{len(known) - MOST_ROWS} more differ less."
+        if len(comparable) > MOST_ROWS:
+            yield f"{len(comparable) - MOST_ROWS} more differ less."
     for e in d.effects:
         chance = numbers.p_equals(e.p_value)
         yield f"{e.effect}, as a whole: χ² {e.chi2:.0f} of {e.rank} ({chance})."
-    if rest := len(d.rows) - len(known):
+    if excluded := len(d.rows) - len(comparable):
         yield (
-            f"{rest} cannot be compared one by one: frames absorb them, or a campaign tells "
+            f"{excluded} cannot be compared one by one: frames absorb them, or a campaign tells "
             "nothing of them."
         )
     if d.apart:
@@ -237,21 +239,21 @@ def _parameters(d: Differences | None) -> Iterator[Block]:
 
 
 def next_step(c: Comparison, earlier: str) -> str:
-    """Return in one sentence what to do next; `next_command` is the line for it."""
-    found = c.changes
+    """Return the recommended next step as a clause."""
+    changes = c.changes
     if c.another_arm:
         return "calibrate it by itself."
-    if not found.found and found.explained:
+    if not changes.found and changes.explained:
         return f"nothing; the calibration of {earlier} holds."
-    arm = [x for x in found.found if x.candidate.of_arm]
-    if found.explained and found.found and not arm:
+    arm = [x for x in changes.found if x.candidate.of_arm]
+    if changes.explained and changes.found and not arm:
         return f"put the setup right, and compare again; the calibration of {earlier} holds."
     parts = numbers.names(list(dict.fromkeys(x.candidate.part for x in arm))) or "the arm"
     return f"recalibrate {parts}, with what {earlier} knows as prior; more readings make it surer."
 
 
 def next_command(c: Comparison, earlier: str, later: str) -> str | None:
-    """Return the command line for the next step; None where there is none."""
+    """Return the command line for the next step; None without one."""
     if c.another_arm:
         return f"hilcal refine {quoted(later)}"
     arm = any(x.candidate.of_arm for x in c.changes.found)
@@ -262,32 +264,32 @@ def next_command(c: Comparison, earlier: str, later: str) -> str | None:
 def comparison_json(c: Comparison, earlier: str, later: str) -> dict[str, object]:
     """Return the comparison as JSON, SI, with its sentences."""
     changes = [{**x.to_dict(), "words": sentence(x)} for x in c.changes.found]
-    after = {"next": next_step(c, earlier), "next_command": next_command(c, earlier, later)}
-    return {**c.to_dict(), "changes": changes, **after}
+    step = {"next": next_step(c, earlier), "next_command": next_command(c, earlier, later)}
+    return {**c.to_dict(), "changes": changes, **step}
 
 
 def fleet_report(fleet: "Fleet") -> Iterator[Block]:
-    """Yield all that people want to know of a fleet."""
+    """Yield the report of a fleet."""
     for t in fleet.types:
         yield from type_report(t)
     yield from closing(fleet)
 
 
 def closing(fleet: "Fleet") -> Iterator[Block]:
-    """Yield how arms are known, and what was not used."""
-    known = {m.known for m in fleet.members}
-    yield f"Which arm a campaign is of: by {'; '.join(KNOWN[k] for k in KNOWN if k in known)}."
+    """Yield how arms were identified, and the files that were not used."""
+    sources = {m.known for m in fleet.members}
+    yield f"Which arm a campaign is of: by {'; '.join(KNOWN[k] for k in KNOWN if k in sources)}."
     if fleet.failures:
         yield from ("", heading(f"Not used: {len(fleet.failures)}"))
         yield from (f"  {f.name}: {f.reason}" for f in fleet.failures)
 
 
 def type_report(t: "Pooled") -> Iterator[Block]:
-    """Yield what is known of one type."""
+    """Yield the pooled parameters, unusual arms and drifts of one type."""
     yield heading(f"{t.type}: {len(t.arms)} arms, {len(t.campaigns)} campaigns")
     repeated = any(p.within is not None for p in t.parameters)
-    more = ["between campaigns"] * repeated
-    heads = ("parameter", "mean", "±", "between arms", "±", *more, "unit")
+    within_head = ["between campaigns"] * repeated
+    heads = ("parameter", "mean", "±", "between arms", "±", *within_head, "unit")
     out = table(*heads, left=(0, len(heads) - 1))
     for p in t.parameters:
         unit, factor = numbers.unit_for(p.unit, [p.mean, p.between])
@@ -319,17 +321,17 @@ def type_report(t: "Pooled") -> Iterator[Block]:
 
 
 def size_lines(sizes: Sequence["TypeSize"]) -> Iterator[str]:
-    """Yield the section of a cell for effects whose size differs from that on other arms."""
-    if other := [s for s in sizes if s.differs]:
+    """Yield the [ordinary] section of CELL.toml for effects of unusual size on this type."""
+    if differing := [s for s in sizes if s.differs]:
         yield "Effects whose size differs from that on other arms, for another arm of this type:"
         yield "  [ordinary]"
-        for s in other:
+        for s in differing:
             factor, low, high = map(numbers.digits, (s.factor, s.low, s.high))
             yield f"  {s.effect} = {factor} # 95 %: {low} to {high}"
 
 
 def unlike_words(o: "Odd") -> str:
-    """Say what is unlike, and by how much."""
+    """Return the parameter of an unusual arm and its deviation."""
     unit, factor = numbers.unit_for(o.unit, [o.off])
     off = f"{'+' if o.off > 0 else '−'}{numbers.digits(factor * abs(o.off))} {unit}"
     who = f"{o.arm} has changed by {o.campaign}" if o.campaign else o.arm

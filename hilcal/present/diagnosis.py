@@ -1,4 +1,4 @@
-"""Diagnoses, revisions and laws in words and tables: suspects, what was not found, curves."""
+"""Reports of diagnoses, revisions and laws: suspects, detectable effects, curves."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -31,14 +31,14 @@ REVISION_HEADS = (
     *("rev.", "model", "poses\nfitted", "\nσ", "poses\nleft out", "\nσ"),
     *("variance\nfactor", "verdict"),
 )
-"""Of a table of revisions."""
-NEAR = 0.99  # component from which a direction is called an axis; a choice
+"""Heads of a table of revisions."""
+NEAR = 0.99  # least component of a direction that is named after its axis; a choice
 BARS = "▁▂▃▄▅▆▇█"
 CURVES = 2
-COMPARED = 24  # parameters that are compared with the true ones
+COMPARED = 24  # most parameters that are compared with the true ones
 FEW, LEAST_BINS = 3, 3
-"""Effects that a law is said to resemble, and bins that make a curve; choices."""
-RARE = 0.01  # probability below which no figure is written
+"""Most effects that a law is said to resemble; least bins of a curve; choices."""
+RARE = 0.01  # probability below which only "< 1 %" is written
 NOT_TRIED = "could not be tried in the exact model"
 NEWCOMER = f"""\
 The lines that follow are those of a real run: what the arm does, and each reading with its pose,
@@ -48,14 +48,13 @@ how far it misses. While it is fitted to few poses, and lacks what is hidden, th
 
 
 def verdict_line(d: Diagnosis) -> Words:
-    """Return the verdict with its message; names of the catalogue keep their spelling."""
-    words = message(d)
+    """Return the verdict with its message."""
     tone: Tone = "good" if d.verdict == "adequate" else "doubt"
-    return Words(f"Verdict: {headline(d)}.\n{words}", tone, headline(d))
+    return Words(f"Verdict: {headline(d)}.\n{message(d)}", tone, headline(d))
 
 
 def suspects_table(d: Diagnosis, most: int = SUSPECTS) -> Table:
-    """Return the ranked suspects that chance alone does not explain."""
+    """Return the table of the most significant suspects."""
     heads = ("missing effect?", "explains", "on poses left out", "p-value", "inseparable from")
     out = table(*heads, left=(0, 4))
     for s in shown_suspects(d)[:most]:
@@ -66,24 +65,24 @@ def suspects_table(d: Diagnosis, most: int = SUSPECTS) -> Table:
 
 
 def shown_suspects(d: Diagnosis) -> list[Suspect]:
-    """Return the suspects that pass the test, then those that nearly do, each best first."""
+    """Return the suspects that pass the test or have a p-value below `CERTAIN`."""
     return [s for s in d.suspects if s.passes or s.score.p_value < CERTAIN]
 
 
 def addition_lines(s: Suspect) -> Iterator[str]:
-    """Yield what is wrong with an effect that was added: its size, or a promise that broke."""
+    """Yield warnings on an added effect: implausible size, or less gain than predicted."""
     if not s.plausible:
         yield f"{s.effect} is implausible: it {implausible(s)}."
     if not s.keeps:
-        kept = percent(max(s.kept, 0.0))
         yield (
             f"The linearisation promised that {s.effect} explains {percent(s.share)} of "
-            f"the misfit; the refit kept {kept} of that: remove it, hilcal remove RUN {s.effect}."
+            f"the misfit; the refit kept {percent(max(s.kept, 0.0))} of that: remove it, hilcal "
+            f"remove RUN {s.effect}."
         )
 
 
 def diagnosis_report(d: Diagnosis) -> Iterator[Block]:
-    """Yield the verdict, where the model fails and the suspects."""
+    """Yield verdict, suspects and the variables that the misfit follows."""
     yield from (heading(f"Model: {model_name(d.fit.model.named)}"), misses(d.fit))
     if d.verdict != "adequate" and not d.dependences:
         yield follows(d.misfit_breakdown)
@@ -119,7 +118,7 @@ def diagnosis_report(d: Diagnosis) -> Iterator[Block]:
 
 
 def finer(d: Diagnosis) -> Iterator[str]:
-    """Yield how to let joints differ, where the readings ask for it."""
+    """Yield the command that gives each joint its parameters, where a suspect asks for it."""
     for s in d.suspects:
         if s.passes and s.coarse:
             yield (
@@ -129,7 +128,7 @@ def finer(d: Diagnosis) -> Iterator[str]:
 
 
 def revisions_table(rows: Sequence[tuple[int, str, Fit, str]]) -> Table:
-    """Return the table in which the error falls, from (number, change, fit, verdict)."""
+    """Return the table of revisions (number, change, fit, verdict) with their errors."""
     out = table(*REVISION_HEADS, rows=(revision_cells(*row) for row in rows), left=(0, 1, 7))
     floor = length(full_prediction(rows[-1][2]).noise_floor)
     out.add("", "noise alone", floor, "1.00", floor, "1.00", "1", "", tone="note")
@@ -145,7 +144,7 @@ def revision_cells(number: int, change: str, fit: Fit, verdict: str) -> tuple[st
 
 
 def key(readings: Readings) -> Words:
-    """Return what the columns of `revisions_table` are."""
+    """Return the explanation of the columns of `revisions_table`."""
     return note(
         f"Errors: rms of the {error_words(readings)}, and of all elements in σ, one standard "
         "deviation of the noise.\n"
@@ -153,7 +152,7 @@ def key(readings: Readings) -> Words:
 
 
 def fell(before: Fit, after: Fit, effect: str) -> str:
-    """Say what adding an effect did to the error on poses left out."""
+    """Return a sentence on the change of the error on poses left out by an added effect."""
     change = _from_to(before, after)
     if after.holdout.rms_sigma < before.holdout.rms_sigma:
         return f"With {effect} the error on poses left out falls {change}."
@@ -164,7 +163,7 @@ def fell(before: Fit, after: Fit, effect: str) -> str:
 
 
 def rose(before: Fit, after: Fit, effect: str) -> str:
-    """Say what taking an effect out did to the error on poses left out."""
+    """Return a sentence on the change of the error on poses left out by a removed effect."""
     needed = predicts_better(after, before)
     verb, end = ("rises", "it belongs there") if needed else ("goes", "it is not needed")
     change = _from_to(before, after)
@@ -176,9 +175,9 @@ def _from_to(before: Fit, after: Fit) -> str:
 
 
 def could_have_been_seen(d: Diagnosis) -> Iterator[Block]:
-    """Yield the table of effects that were not found, the best visible first."""
-    rest = [s for s in d.suspects if not s.passes]
-    visible = sorted((s for s in rest if s.shown), key=lambda s: s.least.displacement_m)
+    """Yield the minimum detectable sizes of the effects that were not found, smallest first."""
+    not_named = [s for s in d.suspects if not s.passes]
+    visible = sorted((s for s in not_named if s.shown), key=lambda s: s.least.displacement_m)
     if visible:
         least = [(s.effect, s.least) for s in visible]
         rows = [(e, length(x.displacement_m), numbers.sizes(x.parameters)) for e, x in least]
@@ -188,7 +187,7 @@ def could_have_been_seen(d: Diagnosis) -> Iterator[Block]:
             "would be seen from: rms displacement of the target at which nine campaigns like this "
             "one in ten would name the effect; rms of the parameters that make it.\n"
         )
-    for s in rest:
+    for s in not_named:
         if (finest := s.least.finest_m) is not None:
             when = f"from {length(finest)}" if np.isfinite(finest) else "at no size"
             yield f"A {s.effect} finer than these poses resolve would be seen {when}.\n"
@@ -197,7 +196,7 @@ def could_have_been_seen(d: Diagnosis) -> Iterator[Block]:
 
 
 def doubtful(d: Diagnosis) -> Iterator[str]:
-    """Yield suspects that would need an implausible size, or do not keep what they promise."""
+    """Yield suspects with an implausible size, or with less gain than predicted."""
     for s in d.suspects:
         if not s.plausible and s.score.p_value < CERTAIN:
             yield f"{s.effect} is implausible: it {implausible(s)}."
@@ -206,7 +205,7 @@ def doubtful(d: Diagnosis) -> Iterator[str]:
 
 
 def redundant_line(d: Diagnosis) -> Iterator[str]:
-    """Yield a sentence on effects of the model without which the readings are explained as well."""
+    """Yield a sentence on redundant effects of the model."""
     if d.redundant:
         it = "it" if len(d.redundant) == 1 else "them"
         yield (
@@ -229,7 +228,7 @@ def _repeats(e: PureError) -> Iterator[str]:
 
 
 def curves(dependences: Sequence[Dependence], most: int = CURVES) -> Iterator[Block]:
-    """Yield the curve of each variable that carries `LEAST_SHARE`, where it is determined."""
+    """Yield the curve of each variable that explains at least `LEAST_SHARE` of the misfit."""
     carrying = [d for d in dependences if d.share >= LEAST_SHARE][:most]
     for d in carrying:
         carries = f"{d.variable} carries {percent(d.share)}"
@@ -244,7 +243,7 @@ def curves(dependences: Sequence[Dependence], most: int = CURVES) -> Iterator[Bl
 
 
 def moves(d: Dependence) -> str:
-    """Say what errs with a variable."""
+    """Return the name of the quantity whose error depends on the variable."""
     if d.y_unit == "rad":
         return d.moves
     main = int(np.argmax(np.abs(d.direction)))
@@ -261,7 +260,7 @@ def _binned(
     names: Sequence[str] = (),
     law: Floats | None = None,
 ) -> Table:
-    """Return K bins (variable, mean in SI, standard uncertainty), drawn as bars in the heading."""
+    """Return a table of K bins (variable, mean in SI, standard uncertainty) with bars as head."""
     x, y, error = bins
     unit, factor = numbers.unit_for(unit_of, list(y))
     height = (y - y.min()) / ((y.max() - y.min()) or 1.0) * (len(BARS) - 1)
@@ -270,13 +269,13 @@ def _binned(
     for k in range(len(x)):
         value, spread = numbers.with_std(factor * float(y[k]), factor * float(error[k]))
         places = len(value.partition(".")[2])
-        more = () if law is None else (f"{factor * law[k]:.{places}f}",)
-        out.add(names[k] if names else numbers.digits(float(x[k])), value, spread, *more)
+        law_cell = () if law is None else (f"{factor * law[k]:.{places}f}",)
+        out.add(names[k] if names else numbers.digits(float(x[k])), value, spread, *law_cell)
     return out
 
 
 def step_report(number: int, change: str, d: Diagnosis) -> Iterator[Block]:
-    """Yield what one revision shows: how far off, where, and which effect would explain it."""
+    """Yield the error of one revision, the variables that it follows, and the suspects."""
     yield heading(f"Revision {number}: {change or model_name(d.fit.model.named)}")
     yield misses(d.fit)
     if d.verdict != "adequate":
@@ -288,7 +287,7 @@ def step_report(number: int, change: str, d: Diagnosis) -> Iterator[Block]:
 
 @dataclass(frozen=True, slots=True)
 class Compared:
-    """A parameter that was found, beside the true one; SI."""
+    """An estimated parameter and its true value; SI."""
 
     name: str
     true: float
@@ -298,20 +297,20 @@ class Compared:
 
 
 def compared(fit: Fit, truth: Mapping[str, float]) -> list[Compared]:
-    """Identifiable parameters that have a true value, but for those that are shrunk on purpose."""
+    """Return the identifiable parameters with a true value, without families that are shrunk."""
     rows = []
     for effect, s in zip(fit.model.effects, fit.model.slices(), strict=True):
         for k, p in zip(range(s.start, s.stop), effect.parameters, strict=True):
             name = f"{effect.name}.{p.name}"
-            known = name in truth and effect.groups() is None
-            if known and fit.uncertainty.identifiable[k]:
+            comparable = name in truth and effect.groups() is None
+            if comparable and fit.uncertainty.identifiable[k]:
                 value, std = float(fit.theta[k]), float(fit.uncertainty.std[k])
                 rows.append(Compared(name, truth[name], value, std, p.unit))
     return rows
 
 
 def truth_table(rows: Sequence[Compared]) -> Iterator[Block]:
-    """Yield the table of found against true parameters."""
+    """Yield the table of estimated and true parameters."""
     out = table("parameter", "true", "found", "±", "unit", "off by", left=(0, 4))
     for r in rows[:COMPARED]:
         unit, factor = numbers.unit_for(r.unit, [r.true, r.value])
@@ -326,7 +325,7 @@ def truth_table(rows: Sequence[Compared]) -> Iterator[Block]:
 
 
 def discovery_report(d: Discovery) -> Iterator[Block]:
-    """Yield what was found, or why nothing is proposed."""
+    """Yield the discovered laws, or the reason for none."""
     yield heading(f"Laws for what {model_name(d.fit.model.named)} leaves unexplained")
     if not d.laws:
         yield numbers.sentence(silence(d))
@@ -340,19 +339,19 @@ def discovery_report(d: Discovery) -> Iterator[Block]:
         yield ""
         yield from _law(law, d, first=k == 0)
         for c in d.curves if k == 0 else ():
-            yield from _drawn(c)
+            yield from _law_table(c)
     yield from ("", _structures(d.structures))
     moved, std = map(length, d.average_m())
     yield (
         f"Averaged over them by their probability, laws move the readings by {moved} rms; what is "
         f"then predicted has a standard uncertainty of {std}, the choice of the law included."
     )
-    for what, why in (*d.refused, *d.unfitted):
-        yield f"{what} {NOT_TRIED} ({why})."
+    for law_name, why in (*d.refused, *d.unfitted):
+        yield f"{law_name} {NOT_TRIED} ({why})."
 
 
 def silence(d: Discovery) -> str:
-    """Say why no law is proposed, and what could not be tried."""
+    """Return the reason why no law is proposed, and the effects that could not be tried."""
     return _silence(d) + "".join(f"; {e} {NOT_TRIED} ({why})" for e, why in d.unfitted)
 
 
@@ -414,10 +413,10 @@ def _law(law: Law, d: Discovery, first: bool) -> Iterator[Block]:
         yield f"  seen for     {', '.join(ranges)}; nothing is known outside"
 
 
-def _structures(of: Sequence[Structure]) -> Table:
-    best = pareto(of)
+def _structures(structures: Sequence[Structure]) -> Table:
+    best = pareto(structures)
     rows = table("law", "probability", "complexity", "on poses left out", "")
-    for x in of:
+    for x in structures:
         remarks = [x.law or "", "best of its size" if x in best else ""]
         chance = percent(x.probability) if x.probability >= RARE else f"< {100 * RARE:g} %"
         sizes = chance, str(x.form.complexity), percent(x.holdout_share)
@@ -425,8 +424,8 @@ def _structures(of: Sequence[Structure]) -> Table:
     return rows
 
 
-def _drawn(c: Curve) -> Iterator[Block]:
-    """Yield the law over a quantity beside the mean of the readings there."""
+def _law_table(c: Curve) -> Iterator[Block]:
+    """Yield a table of a law and the binned means of the readings, over a quantity."""
     x, y, std, _ = c.binned
     if len(x) >= LEAST_BINS:
         head = c.quantity if c.quantity_unit == "1" else f"{c.quantity} [{c.quantity_unit}]"
@@ -434,13 +433,13 @@ def _drawn(c: Curve) -> Iterator[Block]:
 
 
 def coefficient(c: Coefficient) -> str:
-    """Write a coefficient with its standard uncertainty, in a unit for people."""
+    """Return a coefficient with its standard uncertainty, in a display unit."""
     value, std, unit = numbers.measured(c.unit, c.value, c.std)
     return f"{value} ± {std} {'' if unit == '1' else unit}".rstrip()
 
 
 def refined_laws(s: LawSearch) -> Iterator[Block]:
-    """Yield what the searches of a refinement came to: laws that stayed, or why there is none."""
+    """Yield the laws that a refinement retained, or the reason for none, of each search."""
     for d in s.found:
         if not d.laws:
             yield numbers.sentence(silence(d))

@@ -1,8 +1,8 @@
-"""What a result says: words, tables and charts, made once; terminal, page and viewer render them.
+"""Blocks of a report: paragraphs, lists, tables and charts, for terminal, page and viewer.
 
-A builder yields blocks from the values of the library (`fit_report(fit)`); rich prints them,
-`html.fragment` and `viewer.style.markdown` write them down. A plain string is a paragraph, and its
-ends of lines are for the terminal.
+A builder yields blocks from values of the library (`fit_report(fit)`); rich prints them,
+`html.fragment` and `viewer.style.markdown` convert them. A plain string is a paragraph; only the
+terminal keeps its line breaks.
 """
 
 from collections.abc import Iterable, Sequence
@@ -31,17 +31,17 @@ STYLES: dict[Tone, str] = {
     "good": "bold green",
     "doubt": "bold yellow",
 }
-GAPS = (3, 2)  # blanks between two columns on a terminal: the wider where there is room
+GAPS = (3, 2)  # blanks between two columns on a terminal: wide, or narrow if there is no room
 
 
 @dataclass(frozen=True, slots=True)
 class Words:
-    """A paragraph; `stressed` is the part of the text that has the tone, all of it where empty."""
+    """A paragraph; its tone applies to the part `stressed`, or to the whole text without one."""
 
     text: str
     tone: Tone = "text"
     stressed: str = ""
-    indent: int = 0  # blanks in front of each of its lines
+    indent: int = 0  # blanks in front of each line
 
     def __str__(self) -> str:
         return self.text
@@ -66,12 +66,12 @@ class Items:
 class Table:
     """A table that is filled row by row; the first cell of each row is its header."""
 
-    heads: tuple[str, ...]  # all empty for pairs of a name and what is said of it
+    heads: tuple[str, ...]  # all empty for pairs of a name and a description
     rows: list[tuple[str, ...]] = field(default_factory=list)
-    left: tuple[int, ...] = (0,)  # columns of words, which stand to the left, numbers to the right
-    caption: str = ""  # what it shows, where no heading above says it
-    narrow: bool = False  # whether it stands beside another one where the page is wide
-    tones: dict[int, Tone] = field(default_factory=dict)  # of rows that are not plain
+    left: tuple[int, ...] = (0,)  # left-aligned columns of text; the others are right-aligned
+    caption: str = ""  # empty: the heading above the table
+    narrow: bool = False  # whether a wide page shows it side by side with another table
+    tones: dict[int, Tone] = field(default_factory=dict)  # by row, other than "text"
     ruled: set[int] = field(default_factory=set)  # rows with a rule above
 
     def add(self, *cells: str, tone: Tone = "text") -> None:
@@ -85,30 +85,29 @@ class Table:
         self.ruled.add(len(self.rows))
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Columns as wide as they want to be; where there is less room, lines break between words.
+        """Render columns at their full width, or narrower with lines broken between words.
 
-        Columns of words (to the left) are narrowed down to their longest word, columns of numbers
-        down to their longest cell. Where even that does not fit, each row becomes a short list of
-        its cells, headed by the first one.
+        The least width is the longest word of a column of text, the longest cell of a column of
+        numbers. If the least widths do not fit, each row becomes a list headed by its first cell.
         """
         if not any(self.heads):
             named = RichTable.grid(padding=(0, 2), pad_edge=False)
             named.add_column(no_wrap=True)
             named.add_column(overflow="fold")
-            for what, said in self.rows:
-                named.add_row(Text(f"  {what}"), Text(said))
+            for name, description in self.rows:
+                named.add_row(Text(f"  {name}"), Text(description))
             yield named
             return
-        least, wanted = [], []
+        least, natural = [], []
         for k, (head, *cells) in enumerate(zip(self.heads, *self.rows, strict=True)):
             words = [word for cell in cells for word in cell.split()]
-            whole = words if k in self.left else cells  # what must not be broken
-            least.append(_longest(*head.split(), *whole))
-            wanted.append(max(least[-1], _longest(head, *cells)))
+            unbroken = words if k in self.left else cells
+            least.append(_longest(*head.split(), *unbroken))
+            natural.append(max(least[-1], _longest(head, *cells)))
         for gap in GAPS:
-            room = options.max_width - gap * (len(wanted) - 1)
-            if sum(wanted) <= room or (gap == GAPS[-1] and sum(least) <= room):
-                yield self._columns(gap, shared(least, wanted, room))
+            room = options.max_width - gap * (len(natural) - 1)
+            if sum(natural) <= room or (gap == GAPS[-1] and sum(least) <= room):
+                yield self._columns(gap, shared(least, natural, room))
                 return
         yield from self._lists()
 
@@ -139,7 +138,7 @@ class Table:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chart:
-    """A figure of plotly; `wide` as the page, `height` in CSS pixels, 0 for the figure's own."""
+    """A figure of plotly; `wide`: as wide as the page; `height` in CSS pixels, 0: the figure's."""
 
     title: str
     figure: "go.Figure"
@@ -155,7 +154,7 @@ Block = str | Words | Items | Table | Chart
 
 @dataclass(frozen=True, slots=True)
 class PageSection:
-    """A section of a page; `id` is what links lead to."""
+    """A section of a page; `id` is the target of links."""
 
     id: str
     title: str
@@ -163,12 +162,12 @@ class PageSection:
 
 
 def says(figure: "go.Figure") -> str:
-    """Return the sentence that a chart shows, for those who do not see it."""
+    """Return the sentence of a chart, for readers who do not see it."""
     return str((figure.layout.meta or {}).get("says", ""))
 
 
 def load_name(name: str, under: str = "") -> str:
-    """Return a load's name for people, e.g. after "under "."""
+    """Return the display name of a load, with the prefix `under` unless it is unloaded."""
     return "unloaded" if name == UNLOADED else under + name
 
 
@@ -190,23 +189,23 @@ def table(
 
 
 def pairs(rows: Iterable[Sequence[str]]) -> Table:
-    """Return a table of names and what is said of each."""
+    """Return a table of names and descriptions."""
     return table("", "", rows=rows, left=(0, 1))
 
 
 def captioned(blocks: Iterable[Block], caption: str = "") -> tuple[Block, ...]:
     """Return blocks for a page: a paragraph for each line, and a caption for every table.
 
-    It is the table's own, else the heading right above, unless that is a sentence, else `caption`;
-    where two tables would have the same, the second says what its rows are.
+    The caption is the table's, else the heading right above unless it is a sentence, else
+    `caption`. Of two tables with the same caption the second one adds its first head.
     """
     out: list[Block] = []
     used: set[str] = set()
     for block in blocks:
         if isinstance(block, str | Words):
-            words = block if isinstance(block, Words) else Words(block)
-            lines = (line.strip() for line in words.text.split("\n"))
-            out += [replace(words, text=line) for line in lines if line]
+            paragraph = block if isinstance(block, Words) else Words(block)
+            lines = (line.strip() for line in paragraph.text.split("\n"))
+            out += [replace(paragraph, text=line) for line in lines if line]
             continue
         if isinstance(block, Table):
             above, title = out[-1] if out else None, block.caption
@@ -223,16 +222,16 @@ def captioned(blocks: Iterable[Block], caption: str = "") -> tuple[Block, ...]:
     return tuple(out)
 
 
-def shared(least: Sequence[int], wanted: Sequence[int], room: int) -> list[int]:
-    """Share a width, at least that of `least`: each column what it wants, or as much above that."""
-    level = max(t for t in range(room + 1) if sum(map(min, wanted, (x + t for x in least))) <= room)
-    out = [max(x, min(w, x + level)) for x, w in zip(least, wanted, strict=True)]
-    for k, most in enumerate(wanted):
+def shared(least: Sequence[int], full: Sequence[int], room: int) -> list[int]:
+    """Share a width `room` ≥ Σ least: a column gets `full`, or `least` and an equal addition."""
+    level = max(t for t in range(room + 1) if sum(map(min, full, (x + t for x in least))) <= room)
+    out = [max(x, min(w, x + level)) for x, w in zip(least, full, strict=True)]
+    for k, most in enumerate(full):
         if out[k] < most and sum(out) < room:
             out[k] += 1
     return out
 
 
 def _longest(*cells: str) -> int:
-    """Return the width of the longest line, at least 1."""
+    """Return the width of the longest line; 1 without cells."""
     return max((cell_len(line) for cell in cells for line in cell.split("\n")), default=1)

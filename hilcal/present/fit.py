@@ -1,4 +1,4 @@
-"""A fit in words and tables: parameters, errors, what cannot be seen; scalings, streams, priors."""
+"""Reports of fits: parameters, errors, undetermined directions; scalings, streams, priors."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -43,27 +43,27 @@ GROUPS: dict[Group, str] = {
     "pose": "same in all readings of a pose",
     "direction": "points {}",
 }
-"""Groups of the table of variables in their order, and how a row of each is called."""
+"""Groups of the table of variables in their order, with the format of a row's name."""
 CERTAIN = 0.005
 TELL_P = 1e-3
-"""p-value, times the number of groups that are looked at, below which a disagreement is told."""
+"""Bonferroni-corrected p-value below which a disagreement with the prior is reported."""
 MOST_TOLD = 5
 
 
 def model_name(names: Sequence[str]) -> str:
-    """Write a model as the sum of its effects."""
+    """Return the name of a model: the sum of its effects."""
     return " + ".join(names) or "the rigid nominal arm"
 
 
 def kind(fit: Fit) -> str:
-    """Return what was fitted, in words."""
+    """Return number and kind of the fitted measurements."""
     if fit.mode == "absolute":
         return f"{len(fit.raw)} absolute readings"
     return f"{len(fit.raw)} deflections (loaded minus unloaded) of {len(fit.readings)} readings"
 
 
 def fit_report(fit: Fit, details: bool = True) -> Iterator[Block]:
-    """Yield all that people want to know of a fit, or one screen of it."""
+    """Yield the report of a fit; without `details` one screen."""
     yield heading(f"Model: {model_name(fit.model.named)}")
     yield f"Fitted to {kind(fit)}; scaling {fit.scaling}."
     yield f"{before_and_after(fit)}\n"
@@ -83,28 +83,28 @@ def fit_report(fit: Fit, details: bool = True) -> Iterator[Block]:
 
 
 def set_aside(fit: Fit, details: bool) -> Iterator[str]:
-    """Yield how many readings were set aside, which are in no error of a fit, or which."""
+    """Yield the number of gross errors, which no error of a fit includes; in detail a list."""
     if not (gross := gross_errors(fit)):
         return
     were = f"{len(gross)} readings are" if len(gross) > 1 else "1 reading is"
-    words = f"{were} set aside as gross error{'s' * (len(gross) > 1)}, and in none of these figures"
-    yield f"{words} (pose/load):" if details else f"{words}; --details lists them."
+    total = f"{were} set aside as gross error{'s' * (len(gross) > 1)}, and in none of these figures"
+    yield f"{total} (pose/load):" if details else f"{total}; --details lists them."
     if details:
         yield from _listed([f"  {g.pose}/{g.load}: {g.reason}" for g in gross], GROSS)
 
 
 def _listed(lines: Sequence[str], most: int) -> Iterator[str]:
-    """Yield the first lines, and how many more there are."""
+    """Yield the first lines and the number of the others."""
     yield from lines[:most]
     if len(lines) > most:
         yield f"  ... and {len(lines) - most} more; --json lists all"
 
 
 def parameters(fit: Fit, most: int = ALL_ROWS, where: str = "--details") -> Iterator[Block]:
-    """Yield a table of some parameters, frames last, and each family; `where` is the rest."""
+    """Yield a table of `most` parameters, omitting frames first, and families; `where`: of all."""
     rows: list[tuple[str, ...]] = []
     frames: list[tuple[str, ...]] = []
-    families, unseen = [], []
+    families, undetermined = [], []
     for effect, s in zip(fit.model.effects, fit.model.slices(), strict=True):
         if effect.name in fit.model.background:
             continue
@@ -112,34 +112,34 @@ def parameters(fit: Fit, most: int = ALL_ROWS, where: str = "--details") -> Iter
         if effect.groups() is not None or len(index) > ALL_ROWS:
             families.append(_family(fit, effect, index))
             continue
-        of = frames if effect.role in FRAME_ROLES else rows
-        known, theta = fit.uncertainty.identifiable[index], fit.theta[index]
+        section = frames if effect.role in FRAME_ROLES else rows
+        identifiable, theta = fit.uncertainty.identifiable[index], fit.theta[index]
         std = fit.uncertainty.std[index].tolist()
         units = np.array([p.unit for p in effect.parameters])
         for k, p in enumerate(effect.parameters):
-            if known[k]:
-                alike = theta[known & (units == p.unit)].tolist()
+            if identifiable[k]:
+                alike = theta[identifiable & (units == p.unit)].tolist()
                 shown = numbers.measured(p.unit, float(theta[k]), std[k], alike)
-                of.append((f"{effect.name}.{p.name}", *shown, p.meaning))
-        left = [p.name for k, p in zip(known, effect.parameters, strict=True) if not k]
-        if left:
-            which = " ".join(left)
-            if len(left) > 6:
-                which = f"({f'{len(left)} of {len(index)}' if known.any() else 'none of it'})"
-            unseen.append(f"{effect.name} {which}")
-    rest = len(frames) + len(rows) - most
+                section.append((f"{effect.name}.{p.name}", *shown, p.meaning))
+        missing = [p.name for k, p in zip(identifiable, effect.parameters, strict=True) if not k]
+        if missing:
+            which = " ".join(missing) if len(missing) <= 6 else f"({len(missing)} of {len(index)})"
+            if len(missing) > 6 and not identifiable.any():
+                which = "(none of it)"
+            undetermined.append(f"{effect.name} {which}")
+    omitted = len(frames) + len(rows) - most
     if frames or rows:
-        shown_rows = [*frames, *rows] if rest <= 0 else [*rows, *frames][:most]
+        shown_rows = [*frames, *rows] if omitted <= 0 else [*rows, *frames][:most]
         yield table(*PARAMETER_COLUMNS, rows=shown_rows, left=(0, 3, 4))
-        more = f"{rest} more parameters: {where}. " if rest > 0 else ""
-        yield note(f"{more}±: standard uncertainty.\n")
+        pointer = f"{omitted} more parameters: {where}. " if omitted > 0 else ""
+        yield note(f"{pointer}±: standard uncertainty.\n")
     yield from families
-    if unseen:
-        yield f"Not determined by these readings: {'; '.join(unseen)}.\n"
+    if undetermined:
+        yield f"Not determined by these readings: {'; '.join(undetermined)}.\n"
 
 
 def _family(fit: Fit, effect: Effect, index: Ints) -> str:
-    """Summarise a family of hundreds of parameters."""
+    """Return a summary of a family of many parameters."""
     theta, live = fit.theta[index], fit.solution.estimated[index]
     units = {p.unit for p in effect.parameters}
     unit, factor = numbers.unit_for(units.pop(), list(theta)) if len(units) == 1 else ("", 1.0)
@@ -160,7 +160,7 @@ def _family(fit: Fit, effect: Effect, index: Ints) -> str:
 
 
 def errors(fit: Fit) -> Table:
-    """Return the table of errors: before, fitted, left out, and what noise alone leaves."""
+    """Return the table of errors: nominal arm, fitted poses, poses left out, noise alone."""
     rows = {
         "before: rigid nominal arm": error_before(fit),
         "poses fitted": fit.error,
@@ -170,34 +170,34 @@ def errors(fit: Fit) -> Table:
 
 
 def error_words(readings: Readings) -> str:
-    """Return what the error of a reading is: of a distance or a height it is one number."""
+    """Return the name of the error of a reading: 3-D, unless some readings are scalar."""
     return "error of the readings" if readings.scalar.any() else "3-D position error"
 
 
 def _errors(
-    of: Mapping[str, ErrorBlock], floor_m: float, what: str = "3-D position error"
+    blocks: Mapping[str, ErrorBlock], floor_m: float, head: str = "3-D position error"
 ) -> Table:
-    out = table(what, "rms", "mean", "largest", "rms in σ")
-    for name, e in of.items():
+    out = table(head, "rms", "mean", "largest", "rms in σ")
+    for name, e in blocks.items():
         out.add(name, *map(length, (e.rms_m, e.mean_m, e.max_m)), f"{e.rms_sigma:.2f}")
     out.add("noise alone", length(floor_m), "", "", "1.00")
     return out
 
 
 def before_and_after(fit: Fit) -> str:
-    """Say in a sentence what was there before, and what the model leaves."""
-    before, floor = length(error_before(fit).rms_m), length(full_prediction(fit).noise_floor)
-    was = f"The rigid nominal arm, its frames fitted alone, is off by {before} rms"
+    """Return a sentence on the errors without and with the fitted model."""
+    nominal, floor = length(error_before(fit).rms_m), length(full_prediction(fit).noise_floor)
+    without = f"The rigid nominal arm, its frames fitted alone, is off by {nominal} rms"
     if fit.mode == "deflection":
-        was = f"Deflections of {before} rms were measured"
-    left = f"the model leaves {length(fit.error.rms_m)}"
-    if fit.model.background:  # which follows the fitted poses more closely than others
-        left = f"at poses left out the model leaves {length(fit.holdout.rms_m)}"
-    return f"{was}; {left} (noise alone: {floor})."
+        without = f"Deflections of {nominal} rms were measured"
+    with_model = f"the model leaves {length(fit.error.rms_m)}"
+    if fit.model.background:  # it fits the fitted poses too closely for their error to tell
+        with_model = f"at poses left out the model leaves {length(fit.holdout.rms_m)}"
+    return f"{without}; {with_model} (noise alone: {floor})."
 
 
 def remarks(fit: Fit) -> Iterator[Block]:
-    """Yield a sentence for each thing that the numbers alone do not say."""
+    """Yield remarks on variance factor, noise, scaling, undetermined directions, gross errors."""
     yield _variance_factor(fit)
     yield from background_line(fit)
     if (scatter := fit.readings.arm_scatter) is not None:
@@ -206,8 +206,8 @@ def remarks(fit: Fit) -> Iterator[Block]:
         yield correlated(serial)
     yield _scaling_remark(fit)
     if null := fit.uncertainty.null:
-        what = "directions, parameters that move together," if len(null) > 1 else "direction"
-        yield f"{len(null)} {what} cannot be seen in these readings:"
+        noun = "directions, parameters that move together," if len(null) > 1 else "direction"
+        yield f"{len(null)} {noun} cannot be seen in these readings:"
         yield from _listed([f"  {d}" for d in null], DIRECTIONS)
     yield from fitted_lines(fit)
     yield from (f"{remark[0].upper()}{remark[1:]}." for remark in notes(fit))
@@ -215,12 +215,12 @@ def remarks(fit: Fit) -> Iterator[Block]:
 
 
 def background_line(fit: Fit) -> Iterator[str]:
-    """Yield a sentence on the effects that a model predicts with and does not name."""
-    behind = background_of(fit)
-    if behind.effects:
+    """Yield a sentence on the background: effects in the predictions that are not named."""
+    background = background_of(fit)
+    if background.effects:
         yield (
-            f"Background: {len(behind.effects)} effects that are not named, together "
-            f"{length(behind.rms_m)} rms; all are predicted with."
+            f"Background: {len(background.effects)} effects that are not named, together "
+            f"{length(background.rms_m)} rms; all are predicted with."
         )
 
 
@@ -233,21 +233,21 @@ def _variance_factor(fit: Fit | StreamFit) -> str:
 
 
 def _scaling_remark(fit: Fit) -> str:
-    """Say whether parameter scaling was needed."""
+    """Return a sentence on whether parameter scaling was needed."""
     basis = fit.solution.equations.basis
-    before, after = basis.condition_unscaled, basis.condition_scaled
-    if not (np.isfinite(before) and np.isfinite(after)):
+    unscaled, scaled = basis.condition_unscaled, basis.condition_scaled
+    if not (np.isfinite(unscaled) and np.isfinite(scaled)):
         return "Condition numbers: none, the model has no free parameter."
-    needed = before > 1e3 and before > 10 * after
+    needed = unscaled > 1e3 and unscaled > 10 * scaled
     return (
-        f"Condition number {numbers.condition(before)} in physical units, "
-        f"{numbers.condition(after)} after parameter scaling: parameter scaling "
+        f"Condition number {numbers.condition(unscaled)} in physical units, "
+        f"{numbers.condition(scaled)} after parameter scaling: parameter scaling "
         f"{'was needed' if needed else 'made no difference that matters'}."
     )
 
 
 def misses(fit: Fit) -> str:
-    """Say in a sentence how far the model is from the measurements."""
+    """Return a sentence on the error on poses left out."""
     return (
         f"On poses left out, predicted {measurements(fit.mode, fit.readings)} are off by "
         f"{length(fit.holdout.rms_m)} rms; noise alone would leave "
@@ -256,14 +256,14 @@ def misses(fit: Fit) -> str:
 
 
 def measurements(mode: str, readings: Readings) -> str:
-    """Return what is predicted, in a word."""
+    """Return the name of the predicted measurements."""
     if mode == "deflection":
         return "deflections"
     return "readings" if readings.scalar.any() else "positions"
 
 
 def follows(places: Sequence[MisfitShare]) -> str:
-    """Say in a sentence what the misfit follows."""
+    """Return a sentence on the variables that the misfit follows."""
     clear = [p for p in places if p.p_value < CERTAIN and p.share > 0.05]
     sides = [p for p in clear if p.variable.startswith("direction") and p.share > 0.5]
     same = [p for p in clear if p.variable == POSE and p.share > 0.5]
@@ -273,41 +273,42 @@ def follows(places: Sequence[MisfitShare]) -> str:
             "The misfit follows none of the variables: neither joints nor load, time or direction."
         )
     named = numbers.names([f"{p.variable} ({percent(p.share)})" for p in causes])
-    said = f"The misfit follows {named or 'none of the variables'}"
+    statement = f"The misfit follows {named or 'none of the variables'}"
     if sides:
         side = sides[0].variable.removeprefix("direction ")
-        said += f"; {percent(sides[0].share)} of it is {side}"
+        statement += f"; {percent(sides[0].share)} of it is {side}"
     if same:
-        said += f"; {percent(same[0].share)} of it is the same under every load of a pose"
-    return f"{said}."
+        statement += f"; {percent(same[0].share)} of it is the same under every load of a pose"
+    return f"{statement}."
 
 
 def where_table(places: Sequence[MisfitShare]) -> Iterator[Block]:
-    """Yield the table of variables that the misfit follows, by groups, and what a share is."""
+    """Yield the table of variables that the misfit follows, by groups, and its explanation."""
     out = table("where the model fails", "share", "p-value")
     shown = [p for p in places if p.share >= LEAST_SHARE]
-    for group, words in GROUPS.items():
+    for group, row_name in GROUPS.items():
         out.rule()
         for p in shown:
             if p.group == group:
-                name = words.format(p.variable.removeprefix("direction "))
+                name = row_name.format(p.variable.removeprefix("direction "))
                 out.add(name, percent(p.share), numbers.chance(p.p_value))
     if shown:
         yield out
     tested = [p for p in places if p.group not in ("pose", "direction")]
     tests = numbers.many_tests(len(tested), FALSE_ALARM, "variables")
-    rest, least = len(places) - len(shown), percent(LEAST_SHARE)
-    more = f"; {rest} more {'is' if rest == 1 else 'are'} below {least}" if rest else ""
+    remainder = ""
+    if small := len(places) - len(shown):
+        remainder = f"; {small} more {'is' if small == 1 else 'are'} below {percent(LEAST_SHARE)}"
     yield note(
         "share of the misfit: what a smooth law of the variable predicts on poses left out (these "
         "overlap); what is the same in all readings of a pose; what points along a direction"
-        f"{more}. p-value: chance of that share in noise; {tests}"
+        f"{remainder}. p-value: chance of that share in noise; {tests}"
     )
 
 
 @dataclass(frozen=True, slots=True)
 class Worst:
-    """The measurement of a pose that errs most: 3-D error in m, and all of it in σ."""
+    """The worst measurement of a pose: its 3-D error in m, and all its elements together in σ."""
 
     pose: str
     load: str
@@ -316,31 +317,31 @@ class Worst:
 
 
 def target_words(name: str, n_readings: int, known: bool) -> str:
-    """Return one of several targets in words."""
-    offset = "known" if known else "estimated"
-    return f"{name} ({n_readings} readings, its offset {offset})"
+    """Return the description of one of several targets."""
+    return f"{name} ({n_readings} readings, its offset {'known' if known else 'estimated'})"
 
 
 def worst_poses(e: FullPrediction, most: int = MOST_LISTED) -> list[Worst]:
-    """Measurements of the poses that err most in units of the noise, worst first."""
+    """Return the worst measurement of each of the worst poses, in units of the noise."""
     distance, out = np.sqrt(e.mahalanobis2), dict[str, Worst]()
     for k in np.argsort(-distance, kind="stable").tolist():
-        (pose, load), of = e.name(k), e.target_name(k)
+        (pose, load), target = e.name(k), e.target_name(k)
         if pose not in out and len(out) < most:
             error = float(np.linalg.norm(e.raw[k, :3]))
-            out[pose] = Worst(f"{pose} {of}" if of else pose, load, error, float(distance[k]))
+            name = f"{pose} {target}" if target else pose
+            out[pose] = Worst(name, load, error, float(distance[k]))
     return list(out.values())
 
 
 def worst_table(worst: Sequence[Worst], left_out: bool = False) -> Table:
-    """Return the table of the worst poses, as fitted or as predicted without themselves."""
+    """Return the table of the worst poses, as fitted or as predicted when left out."""
     title = "worst poses, each left out" if left_out else "worst poses"
     rows = ((w.pose, w.load, length(w.error_m), f"{w.sigma:.1f}") for w in worst)
     return table(title, "load", "error", "in σ", rows=rows, left=(0, 1))
 
 
 def scalings_table(fits: Mapping[Scaling, Fit]) -> Iterator[Block]:
-    """Yield a table: parameters with standard uncertainties, errors, condition numbers."""
+    """Yield a table of parameters, errors and condition numbers, with a column per scaling."""
     yield heading("The same readings with every scaling")
     columns, model = list(fits.values()), next(iter(fits.values())).model
     out = table("", *fits, "unit", left=(0, len(fits) + 1))
@@ -350,18 +351,17 @@ def scalings_table(fits: Mapping[Scaling, Fit]) -> Iterator[Block]:
         for k, p in zip(range(s.start, s.stop), effect.parameters, strict=True):
             if values := [float(f.theta[k]) for f in columns if f.uncertainty.identifiable[k]]:
                 unit, factor = numbers.unit_for(p.unit, values)
-                entries = (_entry(f, k, factor) for f in columns)
-                out.add(f"{effect.name}.{p.name}", *entries, unit)
+                out.add(f"{effect.name}.{p.name}", *(_entry(f, k, factor) for f in columns), unit)
     out.rule()
     bases = [f.solution.equations.basis for f in columns]
-    for name, of in (
+    for name, cells in (
         ("rms error, poses fitted", [length(f.error.rms_m) for f in columns]),
         ("rms error, poses left out", [length(f.holdout.rms_m) for f in columns]),
         ("variance factor (of gc)", [numbers.digits(f.variance_factor) for f in columns]),
         ("condition, physical units", [numbers.condition(b.condition_unscaled) for b in bases]),
         ("condition, parameters scaled", [numbers.condition(b.condition_scaled) for b in bases]),
     ):
-        out.add(name, *of, "")
+        out.add(name, *cells, "")
     yield out
     yield note(
         "none: least squares as is; gu: weighted by standard deviations; gc: whitened by the full "
@@ -377,19 +377,19 @@ def _entry(fit: Fit, k: int, factor: float) -> str:
 
 
 def stream_report(fit: StreamFit) -> Iterator[Block]:
-    """Yield all that people want to know of a fit to a stream."""
+    """Yield the report of a fit to a stream."""
     yield heading(f"Model: {model_name(fit.model.names)}")
     yield f"Fitted to {fit.readings} absolute readings of a stream, in {fit.passes} passes.\n"
     meaning = {f"{e.name}.{p.name}": p.meaning for e in fit.model.effects for p in e.parameters}
-    out, unseen = table(*PARAMETER_COLUMNS, left=(0, 3, 4)), []
+    out, undetermined = table(*PARAMETER_COLUMNS, left=(0, 3, 4)), []
     for p in fit.parameters:
         if p.value is None or p.std is None:
-            unseen.append(p.name)
+            undetermined.append(p.name)
         else:
             out.add(p.name, *numbers.measured(p.unit, p.value, p.std), meaning[p.name])
     yield from (out, note("±: standard uncertainty.\n"))
-    if unseen:
-        yield f"Not determined by these readings: {', '.join(unseen)}.\n"
+    if undetermined:
+        yield f"Not determined by these readings: {', '.join(undetermined)}.\n"
     named = {"readings fitted": fit.error, "tenths of the stream left out": fit.holdout}
     yield from (_errors(named, fit.noise_floor), "", _variance_factor(fit))
     if fit.inflated:
@@ -406,28 +406,28 @@ def stream_report(fit: StreamFit) -> Iterator[Block]:
 
 
 def prior_lines(fit: Fit) -> list[str]:
-    """Return what people are told of the prior that a fit used; nothing without one."""
+    """Return the report on the prior of a fit; nothing without one."""
     prior = fit.model.prior
     if prior is None:
         return []
     source = prior.posterior.source
-    of = {"arm": " of this arm", "type": " of another arm of the type"}[prior.relation]
-    if source.campaign and not source.revision:  # a fleet, which says itself of which arms
-        of = ""
+    arm = {"arm": " of this arm", "type": " of another arm of the type"}[prior.relation]
+    if source.campaign and not source.revision:  # a fleet; its name states the arms
+        arm = ""
     name = source.campaign or "a posterior"
     name += f", revision {source.revision}" if source.revision else ""
-    lines = [f"Prior: {name} ({source.n_readings} readings{of})."]
-    # the groups about which prior and readings disagree beyond chance, worst first
+    lines = [f"Prior: {name} ({source.n_readings} readings{arm})."]
+    # groups of parameters in which prior and readings disagree beyond chance, worst first
     moved = [c for c in fit.conflicts if c.p_value * len(fit.conflicts) < TELL_P]
     lines += [
-        f"  {_of(c.group)} has moved by {min(c.moved_sigma, 37):.1f} σ of what the prior allows: "
-        "wear, a crash or a repair?"
+        f"  {_group_name(c.group)} has moved by {min(c.moved_sigma, 37):.1f} σ of what the prior "
+        "allows: wear, a crash or a repair?"
         for c in moved[:MOST_TOLD]
     ]
     if len(moved) > MOST_TOLD:
         lines.append(f"  … and {len(moved) - MOST_TOLD} more (--json lists them)")
-    known = {e.name for e in prior.posterior.effects}
-    new = [e.name for e in fit.model.effects if of_arm(e) and e.name not in known]
+    in_prior = {e.name for e in prior.posterior.effects}
+    new = [e.name for e in fit.model.effects if of_arm(e) and e.name not in in_prior]
     ask = "hilcal compare EARLIER LATER says what has changed"
     if new:
         lines.append(f"  Its model did not have {numbers.names(new)}; {ask}.")
@@ -438,8 +438,8 @@ def prior_lines(fit: Fit) -> list[str]:
     return lines
 
 
-def _of(group: DriftGroup) -> str:
-    words = group.effect.replace("_", " ")
+def _group_name(group: DriftGroup) -> str:
+    effect = group.effect.replace("_", " ")
     if group.joint is not None:
-        return f"joint {group.joint}'s {words}"
-    return f"the {words} of {group.part}" if group.part else f"the {words}"
+        return f"joint {group.joint}'s {effect}"
+    return f"the {effect} of {group.part}" if group.part else f"the {effect}"

@@ -1,12 +1,12 @@
-"""A live viewer beside a command: a process of its own, which the command never waits for.
+"""A live viewer of a running command, in a separate process that the command never waits for.
 
     command ─► bounded queue ─► thread ─► pipe ─► process: serves viewers, writes the recording
 
-Whatever becomes of viewer, recording or process, the command goes on: a full queue drops messages,
-a dead process is reported once. The process ends when its pipe does, so that the recording is
-complete however the command ends. It is `python -m hilcal.present.live_viewer RECORD.rrd PORT`: it
-reads pickled messages from standard input and writes a JSON object per line to standard output,
-"url" once it serves, "problem" for people.
+A failure of viewer, recording or process does not stop the command: a full queue drops messages,
+a dead process is reported once. The process ends when its pipe is closed, so that the recording is
+complete however the command ends. `python -m hilcal.present.live_viewer RECORD.rrd PORT` starts
+the process. It reads pickled messages from standard input and writes a JSON object per line to
+standard output: "url" when it serves, "problem" with a message for people.
 """
 
 import contextlib
@@ -35,50 +35,50 @@ from hilcal.types import Floats
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measuring:
-    """A campaign begins, or goes on, to be measured."""
+    """Message: the measurement of a campaign begins or resumes."""
 
     name: str
     arm: Arm
     targets: Floats  # (T, 3) tracked targets, flange axes, m
     plan: Plan
-    earlier: tuple[tuple[float, Step], ...] = ()  # stored by earlier sessions, at times of day, s
-    names: tuple[str, ...] = ()  # of the targets, where there are several
+    earlier: tuple[tuple[float, Step], ...] = ()  # (wall time in s, step) of earlier sessions
+    names: tuple[str, ...] = ()  # of the targets, if there are several
 
 
-PORT = 9877  # not 9876: there a viewer listens itself, and one that finds it taken opens no window
-MOST = 2000  # messages that wait for the process at most, some 500 bytes each; a choice
+PORT = 9877  # not 9876, on which a viewer itself listens; it opens no window if that is occupied
+MOST = 2000  # most messages in the queue, some 500 bytes each; a choice
 ARM_S = 0.2
-"""Between two places of the arm that are told, s; a choice: motion is seen, files stay small."""
+"""Interval between two recorded arm positions, s; a choice: smooth motion, small files."""
 START_S, END_S = 20.0, 10.0
-"""How long the process may take to start, for it loads the viewer's library, and to finish the
+"""Most time for the process to start, which loads the viewer's library, and to finish the
 recording, s; choices."""
-NICE = 15  # behind everything else, so that the arm's watchdog never waits for a picture; a choice
+NICE = 15  # low priority, so that the arm's watchdog never waits for a picture; a choice
 _ROOT = Path(__file__).resolve().parents[2]
 
 
 class LiveViewer:
-    """Tells the viewer's process what happens; no method waits for it but `start` and `close`."""
+    """Sends events to the viewer's process; only `start` and `close` wait for the process."""
 
     def __init__(self, record: Path, say: Say, port: int = PORT) -> None:
-        """Start nothing; `say` is told of problems from another thread, `port` is tried first."""
+        """Start nothing yet; another thread calls `say` with problems; `port` is tried first."""
         self.record = record
-        self.dropped = 0  # messages that were not passed on because the process did not keep up
-        self.url: str | None = None  # what a viewer opens; None where nothing is served
+        self.dropped = 0  # messages that were not sent because the process did not keep up
+        self.url: str | None = None  # for a viewer to open; None if nothing is served
         self._say, self._port = say, port
         self._queue: queue.Queue[tuple[float, object] | None] = queue.Queue(MOST)
         self._process: subprocess.Popen[bytes] | None = None
         self._threads: list[threading.Thread] = []
-        self._ready, self._closing, self._arm_told = threading.Event(), False, 0.0
+        self._ready, self._closing, self._arm_sent = threading.Event(), False, 0.0
 
     @property
     def pid(self) -> int | None:
-        """Number of the process, None before it is started."""
+        """Number of the process; None before `start`."""
         return None if self._process is None else self._process.pid
 
     def start(self) -> None:
-        """Start the process and wait until it serves; where it does not, problems are told."""
+        """Start the process and wait until it serves; problems go to `say`."""
         path = filter(None, (str(_ROOT), os.environ.get("PYTHONPATH")))
-        more = {"PYTHONPATH": os.pathsep.join(path), "OMP_NUM_THREADS": "1", "RUST_LOG": "off"}
+        variables = {"PYTHONPATH": os.pathsep.join(path), "OMP_NUM_THREADS": "1", "RUST_LOG": "off"}
         command = (sys.executable, "-P", "-m", "hilcal.present.live_viewer")
         try:
             self._process = process = subprocess.Popen(  # noqa: S603 - our interpreter and module
@@ -87,7 +87,7 @@ class LiveViewer:
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
                 bufsize=0,
-                env=os.environ | more,
+                env=os.environ | variables,
                 start_new_session=True,  # Ctrl-C is for the command
             )
         except OSError as error:
@@ -102,31 +102,32 @@ class LiveViewer:
             self._say(f"the live viewer has not started in {START_S:.0f} s; it goes on without")
 
     def notify(self, event: object) -> None:
-        """Pass on an event of `measuring.progress`; returns at once."""
-        now = time.time()
+        """Send an event of `measuring.progress`; returns at once."""
+        wall = time.time()
         if isinstance(event, ArmAt):
-            # Readings are worth more than places of the arm, which are told five times a second.
-            if now - self._arm_told < ARM_S or self._queue.qsize() > MOST // 2:
+            # Half of the queue is reserved for readings, which matter more than arm positions.
+            if wall - self._arm_sent < ARM_S or self._queue.qsize() > MOST // 2:
                 return
-            self._arm_told = now
-        self._tell(now, event)
+            self._arm_sent = wall
+        self._send(wall, event)
 
     def measuring(self, name: str, cell: Cell, log: RunLog) -> None:
-        """Tell that a campaign is measured, and what it holds already."""
-        known = (d for d in log.details() if "wall_s" in d)
-        earlier = tuple((float(d["wall_s"]), Step(**d["step"])) for d in known)
-        of = cell.arm, cell.all_targets[:, :3, 3], log.plan
-        self._tell(time.time(), Measuring(name, *of, earlier, cell.target_names))
+        """Send the start of a measurement, with the steps of earlier sessions."""
+        stored = (d for d in log.details() if "wall_s" in d)
+        steps = tuple((float(d["wall_s"]), Step(**d["step"])) for d in stored)
+        targets = cell.all_targets[:, :3, 3]
+        start = Measuring(name, cell.arm, targets, log.plan, steps, cell.target_names)
+        self._send(time.time(), start)
 
     def revised(self, chapter: Chapter) -> None:
-        """Tell a revision; what cannot be drawn is said, and nothing is raised."""
+        """Send a revision; a failure to draw it goes to `say` and is not raised."""
         try:
-            self._tell(time.time(), build_story([chapter]))
+            self._send(time.time(), build_story([chapter]))
         except Exception as error:  # a picture must not cost the revision
             self._say(f"revision {chapter.number} is not in the live viewer: {error}")
 
     def close(self) -> None:
-        """Let the process finish the recording, and end it."""
+        """Let the process finish the recording, and stop it."""
         process = self._process
         if process is None or self._closing:
             return
@@ -144,16 +145,16 @@ class LiveViewer:
         if self.dropped:
             self._say(f"the live viewer did not keep up: {self.dropped} messages are not recorded")
 
-    def _tell(self, wall: float, what: object) -> None:
+    def _send(self, wall: float, content: object) -> None:
         if self._closing or self._process is None or self._process.poll() is not None:
             return
         try:
-            self._queue.put_nowait((wall, what))
+            self._queue.put_nowait((wall, content))
         except queue.Full:
             self.dropped += 1
 
     def _write(self, pipe: IO[bytes]) -> None:
-        """Thread: write messages to the process; ends with it, or at `close`."""
+        """Thread: write messages to the process until it ends, or until `close`."""
         with contextlib.suppress(OSError), pipe:
             while (message := self._queue.get()) is not None:
                 content = memoryview(pickle.dumps(message))
@@ -161,7 +162,7 @@ class LiveViewer:
                     content = content[pipe.write(content) :]
 
     def _listen(self, pipe: IO[bytes]) -> None:
-        """Thread: pass on what the process says; its end is the last word."""
+        """Thread: handle the replies of the process until it ends."""
         with pipe:
             for line in pipe:
                 reply: dict[str, Any] = json.loads(line)
@@ -176,22 +177,22 @@ class LiveViewer:
 
 
 def main() -> None:
-    """Be the process: serve and record until standard input ends."""
+    """Run the process: serve and record until standard input ends."""
     if hasattr(os, "nice"):
-        os.nice(NICE)  # before the viewer's library starts its threads, which inherit it
+        os.nice(NICE)  # before the viewer's library starts threads, which inherit the priority
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if hasattr(signal, "SIGXFSZ"):
-        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # a file that may not grow is an error
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # OSError at the limit of file size instead
     replies = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)  # what a library prints is no reply
+    os.dup2(2, 1)  # a library's prints go to standard error
 
-    def reply(**what: object) -> None:
-        print(json.dumps(what), file=replies, flush=True)
+    def reply(**fields: object) -> None:
+        print(json.dumps(fields), file=replies, flush=True)
 
     from hilcal.present.viewer.live import follow  # loads the viewer's library
 
     follow(sys.stdin.buffer, reply, Path(sys.argv[1]), int(sys.argv[2]))
-    os._exit(0)  # a viewer that does not answer could hold the end up
+    os._exit(0)  # a viewer that does not answer could block a regular exit
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Results for the library: in a notebook what the terminal says, as HTML; as pandas data frames."""
+"""Results of the library as HTML for notebooks and as pandas data frames."""
 
 import io
 from collections.abc import Iterable, Iterator
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 
 def html_of(value: object) -> str:
-    """Return a result as a piece of HTML."""
+    """Return the report of a result as a fragment of HTML."""
     from hilcal.present.html import fragment  # needs an extra
 
     return fragment(_blocks(value))
@@ -46,7 +46,7 @@ def html_of(value: object) -> str:
 
 @singledispatch
 def _blocks(value: object) -> Iterable[Block]:
-    """Return what is said of a result."""
+    """Return the report of a result."""
     raise TypeError(f"nothing is said of a {type(value).__name__}")
 
 
@@ -78,7 +78,7 @@ def _(path: Refinement) -> Iterator[Block]:
 
 
 def frame_of(value: object) -> "pd.DataFrame":
-    """Return a result as a data frame; MissingPackageError where pandas is not installed."""
+    """Return a result as a data frame; MissingPackageError without pandas."""
     with needed_by("to_frame"):
         import pandas as pd
 

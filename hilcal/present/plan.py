@@ -1,4 +1,4 @@
-"""A plan, and the one that `next` makes, in words and tables."""
+"""Reports of plans: of a campaign, and of the measurements of `next`."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -23,52 +23,52 @@ CRITERIA = {
 BAR = 30
 SCREEN = 4  # remarks on the first screen; the most important come first
 UNCERTAIN = 1e-3
-"""Least certified efficiency that tells anything. A choice: the last digit that is printed."""
+"""Least certified efficiency that is reported. A choice: the last printed digit."""
 LIKE = 1.1
-"""A number of poses is enough where the end of the curve is not better by more than this factor.
-A choice."""
+"""A number of poses is enough if its predicted uncertainty is at most this multiple of that at the
+end of the curve. A choice."""
 _STRETCHED, _MOST_LOADS, _LEAST_SHARE = 1.15, 2, 0.1
 
 
 def plan_facts(s: PlanSummary) -> Iterator[Block]:
-    """Yield what a plan costs and reaches, and what more poses would give."""
+    """Yield costs and predicted uncertainty of a plan, and of plans with more poses."""
     yield from (heading("Plan"), pairs(cost_rows(s)), "")
     if larger := [c for c in s.curve if c.poses > s.poses]:
-        more = [f"{c.poses} poses ± {length(c.position_std_m)}" for c in larger[::2]]
-        yield f"More would give, predicted for the {s.quantity}: {', '.join(more)}."
+        larger_plans = [f"{c.poses} poses ± {length(c.position_std_m)}" for c in larger[::2]]
+        yield f"More would give, predicted for the {s.quantity}: {', '.join(larger_plans)}."
 
 
 def plan_screen(s: PlanSummary) -> Iterator[Block]:
-    """Yield what a plan costs and reaches, on one screen; `plan_report` yields the rest as well."""
+    """Yield the summary of a plan on one screen; `plan_report` is the full report."""
     yield from plan_facts(s)
     heads = ("predicted for", "parameters", "±", "unit", "± in %, worst")
     if s.parameters:
         yield from (table(*heads, rows=_effect_rows(s.parameters), left=(0, 3)), "")
-    if visible := _detectable(s):
-        (first, least), (last, most) = visible[0], visible[-1]
+    if detectable := _detectable(s):
+        (first, least), (last, most) = detectable[0], detectable[-1]
         yield f"Outside of the model: {first} is seen from {least}, ..., {last} from {most}."
     yield from _undetectable(s)
     yield from (f"note: {remark}" for remark in s.remarks[:SCREEN])
-    rest = len(s.remarks) - SCREEN
-    more = f"{rest} more notes, every parameter" if rest > 0 else "every parameter"
-    yield f"--details: {more}, criteria, numbers of poses, effects outside of the model."
+    unlisted = len(s.remarks) - SCREEN
+    details = f"{unlisted} more notes, every parameter" if unlisted > 0 else "every parameter"
+    yield f"--details: {details}, criteria, numbers of poses, effects outside of the model."
 
 
 def _effect_rows(parameters: Sequence[PredictedParameter]) -> Iterator[tuple[str, ...]]:
-    """Yield a row for the parameters of an effect that have one unit."""
+    """Yield a row for all parameters of an effect with the same unit."""
     groups: dict[tuple[str, str], list[PredictedParameter]] = {}
     for p in parameters:
         groups.setdefault((_effect(p), p.unit), []).append(p)
-    for (effect, si), every in groups.items():
-        known = [p for p in every if math.isfinite(p.std)]
-        count = f"{f'{len(known)} of ' * (len(known) < len(every))}{len(every)}"
-        if not known:
+    for (effect, si), members in groups.items():
+        determined = [p for p in members if math.isfinite(p.std)]
+        count = f"{f'{len(determined)} of ' * (len(determined) < len(members))}{len(members)}"
+        if not determined:
             yield effect, count, "not determined", "", ""
             continue
-        stds = [p.std for p in known]
+        stds = [p.std for p in determined]
         unit, factor = numbers.unit_for(si, stds)
         least, most = (digits(factor * x, 2) for x in (min(stds), max(stds)))
-        shares = [p.std / abs(p.value) for p in known if p.value]
+        shares = [p.std / abs(p.value) for p in determined if p.value]
         worst = f"{digits(100 * max(shares), 2)} %" if shares else ""
         yield effect, count, least if least == most else f"{least} to {most}", unit, worst
 
@@ -91,28 +91,28 @@ def plan_report(s: PlanSummary) -> Iterator[Block]:
         yield from (_curve(s), f"{enough(s.curve)}\n")
     if s.detectable:
         yield heading("Minimum detectable effects outside of the model")
-        if visible := _detectable(s):
-            yield table("effect", "from", rows=visible)
+        if detectable := _detectable(s):
+            yield table("effect", "from", rows=detectable)
             yield note(
                 "from: rms displacement of the target that is one sigma of these readings.\n"
             )
-        yield from (f"{words}\n" for words in _undetectable(s))
+        yield from (f"{sentence}\n" for sentence in _undetectable(s))
     yield from (f"note: {remark}" for remark in s.remarks)
 
 
 def certified(efficiency: float) -> str:
-    """Return a certified efficiency in words; rounded down, it is a bound."""
+    """Return a sentence on a certified efficiency, rounded down because it is a lower bound."""
     if efficiency < UNCERTAIN:
         return "of the plan: not certified, since the bound of the best plan did not close"
-    return f"of the plan: at least {_floor(efficiency)} (certified lower bound); not accuracy"
+    return f"of the plan: at least {_percent(efficiency)} (certified lower bound); not accuracy"
 
 
-def _floor(efficiency: float) -> str:
+def _percent(efficiency: float) -> str:
     return f"{int(min(max(efficiency, 0.0), 1.0) * 1000 + 1e-6) / 10:.1f} %"
 
 
 def cost_rows(s: PlanSummary) -> Iterator[tuple[str, str]]:
-    """Yield names and values of what a plan costs and reaches."""
+    """Yield names and values of the costs and predicted results of a plan."""
     fewer = ""
     if s.asked_poses not in (None, s.poses):
         fewer = f": the cell leaves no more of {s.asked_poses}, so that some are read again"
@@ -134,7 +134,7 @@ def cost_rows(s: PlanSummary) -> Iterator[tuple[str, str]]:
 
 
 def order_remark(s: PlanSummary) -> str:
-    """Return in sentences what the order costs and how a linear drift acts."""
+    """Return sentences on the cost of the order and on the effect of a linear drift."""
     c, randomised = s.confounding, s.longer >= 5e-4
     if c is None:
         return ""
@@ -144,9 +144,9 @@ def order_remark(s: PlanSummary) -> str:
             "The order is randomised, so that drift is little correlated with joints and loads, "
             f"and takes {100 * s.longer:.1f} % longer than the shortest one. "
         )
-    out += f"Estimating a drift as well costs up to about {_lost(c)} of a parameter's information"
+    out += f"Estimating a drift as well costs up to about {_loss(c)} of a parameter's information"
     if randomised and s.shortest is not None:
-        out += f" ({_lost(s.shortest)} in the shortest order)"
+        out += f" ({_loss(s.shortest)} in the shortest order)"
     mean = length(abs(c.bias_m)) if abs(c.bias_m) >= 1e-7 else "less than 0.1 µm"
     out += (
         f". Without it in the fit, a drift of {digits(3.6e9 * c.drift, 2)} µm/h shifts "
@@ -158,13 +158,13 @@ def order_remark(s: PlanSummary) -> str:
     return f"{out}."
 
 
-def _lost(c: Confounding) -> str:
+def _loss(c: Confounding) -> str:
     """Return the share of information that a drift costs, rounded up to whole percent."""
     return f"{max(1, math.ceil(100 * c.correlation**2 - 1e-6))} %"
 
 
 def _parameter_rows(parameters: Sequence[PredictedParameter]) -> Iterator[tuple[str, ...]]:
-    """Yield rows; parameters of one effect and unit share a prefix."""
+    """Yield a row per parameter; parameters of one effect and unit share a prefix of the unit."""
     for p in parameters:
         alike = [o for o in parameters if (o.unit, _effect(o)) == (p.unit, _effect(p))]
         sizes = [o.std if o.value is None else o.value for o in alike]
@@ -182,7 +182,7 @@ def _effect(p: PredictedParameter) -> str:
 
 
 def _criteria_table(s: PlanSummary) -> Iterator[Block]:
-    """Yield what plans by other criteria would reach with as many readings."""
+    """Yield the predicted results of plans by other criteria with as many readings."""
     heads = ("criterion", "predicted ±", "open ±", "joint ±", "O1 (D)", "O2 (K)", "O3 (E)")
     out = table(*heads, "certified")
     for c in s.criteria:
@@ -192,7 +192,7 @@ def _criteria_table(s: PlanSummary) -> Iterator[Block]:
             *("-" if x is None else length(x) for x in (c.position_std_m, c.position_open_m)),
             "-" if c.joint_share is None else f"{digits(100 * c.joint_share, 2)} %",
             *(digits(c.o1), digits(c.o2, 2), digits(c.o3)),
-            "-" if c.efficiency is None else _floor(c.efficiency),
+            "-" if c.efficiency is None else _percent(c.efficiency),
             tone="strong" if this else "text",
         )
     yield out
@@ -217,7 +217,7 @@ def _curve(s: PlanSummary) -> Table:
 
 
 def enough(curve: Sequence[CurvePoint]) -> str:
-    """Return in words from which number of poses on more of them change little."""
+    """Return a sentence on the number of poses from which more of them change little."""
     last = curve[-1]
     first = next(p for p in curve if p.position_std_m <= LIKE * last.position_std_m)
     if first is last:
@@ -236,13 +236,13 @@ def _detectable(s: PlanSummary) -> list[tuple[str, str]]:
 
 
 def _undetectable(s: PlanSummary) -> Iterator[str]:
-    """Yield which effects the readings cannot detect, where there are some."""
+    """Yield a sentence on the effects that the readings cannot detect, if any."""
     if names := [d.effect for d in s.detectable if d.least_m is None]:
         yield f"These readings cannot detect {numbers.names(names, 'or')}."
 
 
 def brief_plan(s: PlanSummary) -> str:
-    """Say in two sentences what a plan costs and how good it is."""
+    """Return two sentences on the cost and the efficiency of a plan."""
     loads = numbers.names([load_name(name) for name in s.loads])
     certain = "" if s.efficiency is None else f" Efficiency {certified(s.efficiency)}."
     return (
@@ -252,7 +252,7 @@ def brief_plan(s: PlanSummary) -> str:
 
 
 def next_report(plan: Next, poses: int, readings: int, details: bool = True) -> Iterator[Block]:
-    """Yield the powers of the pairs, now and then; without `details` each suspect's weakest."""
+    """Yield the powers of pairs of suspects; without `details` of each suspect's weakest pair."""
     yield heading("Telling the suspects apart")
     yield power_table(plan.powers if details else _weakest(plan.powers))
     yield note(
@@ -264,7 +264,7 @@ def next_report(plan: Next, poses: int, readings: int, details: bool = True) -> 
 
 
 def poses_report(plan: Next, poses: int, readings: int, details: bool = True) -> Iterator[Block]:
-    """Yield what further poses tell of a misfit of the pose alone; arguments of `next_report`."""
+    """Yield the plan of poses for a misfit that depends on the pose alone; see `next_report`."""
     yield heading("Poses where nothing was read yet")
     yield (
         f"The misfit is the same under every load of a pose, so that loads tell nothing of it: "
@@ -280,7 +280,7 @@ def poses_report(plan: Next, poses: int, readings: int, details: bool = True) ->
 
 
 def _weakest(powers: Sequence[PairPower]) -> tuple[PairPower, ...]:
-    """Return of each effect that may be there the pair that is separated least."""
+    """Return for each possible effect the pair with the lowest power."""
     least: dict[str, PairPower] = {}
     for t in powers:
         if t.effect not in least or t.then < least[t.effect].then:
@@ -289,24 +289,24 @@ def _weakest(powers: Sequence[PairPower]) -> tuple[PairPower, ...]:
 
 
 def power_table(powers: Sequence[PairPower], rival: str = "this is ruled out") -> Table:
-    """Return the table of powers of pairs, now and with the plan."""
+    """Return the table of powers of pairs, with the readings so far and with the plan."""
     return table("if this is there", rival, "now", "then", rows=power_rows(powers), left=(0, 1))
 
 
 def power_rows(powers: Sequence[PairPower]) -> Iterator[tuple[str, str, str, str]]:
-    """Yield effect, rival, and the powers now and with the plan."""
+    """Yield effect, rival, and the powers with the readings so far and with the plan."""
     for t in powers:
         then = "not in this cell" if t.not_separable else _chance(t.then)
         yield t.effect, t.rival, _chance(t.now), then
 
 
 def _chance(power: float) -> str:
-    """Write a chance; no test is certain."""
+    """Return a power as text; none is 100 %."""
     return "> 99 %" if power > 0.995 else numbers.percent(power)
 
 
 def powers_summary(powers: Sequence[PairPower], poses: int, readings: int) -> str:
-    """Say in a sentence what the plan will settle."""
+    """Return a sentence on the power of the plan."""
     able = [t for t in powers if not t.not_separable]
     head = f"{readings} readings at {poses} poses"
     if not able:
@@ -331,16 +331,16 @@ def powers_summary(powers: Sequence[PairPower], poses: int, readings: int) -> st
 
 
 def _difference(plan: Next) -> str:
-    """Say which loads and poses make the difference."""
-    by = sorted(plan.shares.items(), key=lambda pair: -pair[1])
+    """Return a sentence on the loads and poses that separate the weakest pair."""
+    shares = sorted(plan.shares.items(), key=lambda item: -item[1])
     named = [
         f"{'the unloaded readings' if load == UNLOADED else load} ({numbers.percent(share)})"
-        for load, share in by[:_MOST_LOADS]
+        for load, share in shares[:_MOST_LOADS]
         if share >= _LEAST_SHARE
     ]
-    words = f"What separates the weakest pair comes from {numbers.names(named)}"
+    sentence = f"What separates the weakest pair comes from {numbers.names(named)}"
     if plan.reach_ratio > _STRETCHED:
-        words += ", most of it with the arm stretched out"
+        sentence += ", most of it with the arm stretched out"
     elif plan.reach_ratio < 1 / _STRETCHED:
-        words += ", most of it with the arm drawn in"
-    return f"{words}."
+        sentence += ", most of it with the arm drawn in"
+    return f"{sentence}."

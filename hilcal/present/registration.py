@@ -1,4 +1,4 @@
-"""Where base and target are, what the poses and torques tell of a cell, what covariances hold."""
+"""Reports on registration, frames, joint torques and the contents of covariances."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -21,7 +21,7 @@ from hilcal.types import Floats
 
 PLACES = 5, 4  # decimals of a position in m and of an angle in degrees. A choice
 ALONG = 0.98
-"""Share of its length that one element must have for a direction to be named after that axis."""
+"""Least component of a unit vector that is named after its axis."""
 WORDS: dict[CovarianceParts, str] = {
     "instrument": (
         "the instrument alone; the arm's own scatter is not in it ([repeatability] "
@@ -41,7 +41,7 @@ WORDS: dict[CovarianceParts, str] = {
 
 
 def registration_lines(registration: Registration) -> Iterator[str]:
-    """Yield where the nominal arm's base and target are, and how well the readings fit."""
+    """Yield the estimated poses of base and target, and the residual of the nominal arm."""
     if registration.estimated:
         rad = registration.turn_rms
         turn = "" if rad is None else f" and {np.degrees(rad):.3g}°"
@@ -58,11 +58,11 @@ def registration_lines(registration: Registration) -> Iterator[str]:
 
 
 def observed_words(readings: Readings) -> str:
-    """Return how many readings each observer made of what."""
-    what = {"station": "positions by", "point": "distances from", "gauge": "heights of"}
+    """Return the number and kind of readings of each observer."""
+    kinds = {"station": "positions by", "point": "distances from", "gauge": "heights of"}
     count = np.bincount(readings.observer, minlength=len(readings.observers)).tolist()
     pairs = zip(readings.observers, count, strict=True)
-    return ", ".join(f"{n} {what[o.kind]} {o.name}" for o, n in pairs)
+    return ", ".join(f"{n} {kinds[o.kind]} {o.name}" for o, n in pairs)
 
 
 def _observer(o: Observer) -> str:
@@ -76,17 +76,17 @@ def _observer(o: Observer) -> str:
     return f"{o.name} stands at {_place(inverse)}"
 
 
-def other_arm_line(other: OtherArm) -> str:
-    """Return what to write where the readings are those of another arm of the catalogue."""
+def other_arm_line(arm: OtherArm) -> str:
+    """Return a sentence on another arm of the catalogue that fits the readings better."""
     return (
-        f"These data fit the {other.name} better: {numbers.length(other.rms)} → "
-        f"{numbers.length(other.rms_with)} rms after registration; in CELL.toml: "
-        f'[robot] model = "{other.name}".'
+        f"These data fit the {arm.name} better: {numbers.length(arm.rms)} → "
+        f"{numbers.length(arm.rms_with)} rms after registration; in CELL.toml: "
+        f'[robot] model = "{arm.name}".'
     )
 
 
 def fitted_lines(fit: Fit) -> Iterator[str]:
-    """Yield where the robot's base is, and the targets that were unknown."""
+    """Yield the pose of the robot's base, the fitted targets and their undetermined directions."""
     roles = [e.role for e in fit.model.effects]
     yield base_line(fit.model.cell, fit.frames, fit.mode)
     if "target" in roles:
@@ -96,7 +96,7 @@ def fitted_lines(fit: Fit) -> Iterator[str]:
 
 
 def base_line(cell: Cell, frames: RobotFrames, mode: Mode = "absolute") -> str:
-    """Return where the robot's base is; of deflections the nominal arm's, to 1 mm."""
+    """Return the pose of the robot's base; deflections determine it to 1 mm only."""
     if np.array_equal(frames.base, np.eye(4)) and frames.base_stated:
         return "The robot's base: the axes that the positions are given in."
     why, places = "as the cell states it", PLACES
@@ -108,7 +108,7 @@ def base_line(cell: Cell, frames: RobotFrames, mode: Mode = "absolute") -> str:
 
 
 def undetermined_lines(registration: Registration) -> Iterator[str]:
-    """Yield a sentence for each direction of the frames that the poses do not determine."""
+    """Yield a sentence for each undetermined direction of the frames."""
     names = registration.cell.target_names if registration.cell.targets is not None else ()
     still = [int(k) + 1 for k in np.flatnonzero(registration.still)]
     why = "the tool hardly changed its orientation, or turned about one axis only"
@@ -119,9 +119,9 @@ def undetermined_lines(registration: Registration) -> Iterator[str]:
     elif still:
         why = f"joints {numbers.names(list(map(str, still)))} never turned"
     for u in registration.undetermined:
-        what = _undetermined(u, names)
-        verb = "separate" if " from " in what else "determine"
-        yield f"The poses cannot {verb} {what}: {why}; it stays near the start."
+        direction = _undetermined(u, names)
+        verb = "separate" if " from " in direction else "determine"
+        yield f"The poses cannot {verb} {direction}: {why}; it stays near the start."
 
 
 def _undetermined(u: Undetermined, names: tuple[str, ...]) -> str:
@@ -170,12 +170,12 @@ def _place(t: Floats, places: tuple[int, int] = PLACES) -> str:
     turn = np.degrees(se3.rotation_vector(t[:3, :3]))
     if not np.any(np.abs(turn) > 1e-9):
         return f"({place}) m"
-    words = ", ".join(f"{x:.{places[1]}f}" for x in turn)
-    return f"({place}) m, turned by the rotation vector ({words})°"
+    rotation = ", ".join(f"{x:.{places[1]}f}" for x in turn)
+    return f"({place}) m, turned by the rotation vector ({rotation})°"
 
 
 def covariance_words(parts: CovarianceParts, noise: NoiseEstimate | None = None) -> str:
-    """Return a sentence without its full stop; `noise` is the estimate, where nothing states it."""
+    """Return the contents of the covariances as a clause; `noise`: its estimate if not stated."""
     if noise is None:
         return f"each covariance is that of {WORDS[parts]}"
     turn = arm = ""
@@ -197,7 +197,7 @@ def covariance_words(parts: CovarianceParts, noise: NoiseEstimate | None = None)
 
 
 def torque_lines(check: TorqueCheck | None) -> Iterator[str]:
-    """Yield a sentence for each described mass that the torques contradict, else one for all."""
+    """Yield a sentence for each mass that the torques contradict, and one for all others."""
     if check is None:
         return
     if not check.factors:
@@ -207,20 +207,20 @@ def torque_lines(check: TorqueCheck | None) -> Iterator[str]:
             yield f"Measured joint torques: {_differs(f)}."
     if right := [_size(f) for f in check.factors if not f.differs]:
         yield f"Measured joint torques agree with the description: {'; '.join(right)}."
-    left = ", ".join(numbers.digits(x, 2) for x in check.std_Nm)
-    yield f"Measured joint torques scatter about that by {left} N·m, joint by joint (friction)."
+    scatter = ", ".join(numbers.digits(x, 2) for x in check.std_Nm)
+    yield f"Measured joint torques scatter about that by {scatter} N·m, joint by joint (friction)."
 
 
 def _differs(f: TorqueFactor) -> str:
-    what = f.of if f.of in (ARM, TOOL) else f"load {f.of}"
+    mass = f.of if f.of in (ARM, TOOL) else f"load {f.of}"
     if f.factor < 0:
         return (
-            f"{what} acts with the other sign ({numbers.digits(f.factor)} times the described "
+            f"{mass} acts with the other sign ({numbers.digits(f.factor)} times the described "
             "torques); tau1_Nm, ... are the torques that the drives exert, against the load's"
         )
     if f.stated_kg is None:
-        return f"{what} acts {numbers.digits(f.factor)} times as strongly as described{_band(f)}"
-    return f"{what} is {numbers.digits(f.factor * f.stated_kg)} kg, not {f.stated_kg:.4g}{_band(f)}"
+        return f"{mass} acts {numbers.digits(f.factor)} times as strongly as described{_band(f)}"
+    return f"{mass} is {numbers.digits(f.factor * f.stated_kg)} kg, not {f.stated_kg:.4g}{_band(f)}"
 
 
 def _size(f: TorqueFactor) -> str:

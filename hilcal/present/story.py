@@ -1,4 +1,4 @@
-"""A campaign as charts and viewer draw it: readings and the revisions of its model, base axes."""
+"""The values that charts and viewer draw: readings and revisions of a model, in base axes."""
 
 import itertools
 import math
@@ -41,65 +41,65 @@ from hilcal.types import Floats, Ints
 Mode = Literal["deflection", "absolute"]
 LEVEL_NAMES = ("inside the noise", "doubtful", "outside the noise")
 LIMITS = (0.99, 0.9999)
-"""Quantiles of χ²(3) from which a reading is doubtful, and outside: noise does that once in 100,
-and in 10,000 readings."""
+"""Quantiles of χ²(3) above which a reading is doubtful, and outside. Noise alone exceeds them once
+in 100, and once in 10,000 readings."""
 MOST_NUMBER = 10**9
 UNDIAGNOSED = "not diagnosed"
 LITTLE = 0.2
-"""Share of the predictable misfit that the first suspect must explain for its own chart to be
-shown, not those of the variables; a guess."""
+"""Least share of the predictable misfit that the first suspect explains for its chart to be shown
+instead of that of the strongest variable; a guess."""
 LEAST_CARRIED = 0.02  # share of the misfit below which a variable is not shown; a guess
 MOST_SUSPECTS, MOST_PARAMETERS = 3, 40
 
 
 def levels(norm2: Floats) -> Ints:
-    """Level (N,) of squared Mahalanobis distances (N,), 3 dof, into `LEVEL_NAMES`."""
+    """Return the index (N,) into `LEVEL_NAMES` of squared Mahalanobis distances (N,), 3 dof."""
     return np.digitize(norm2, stats.chi2.ppf(LIMITS, 3)).astype(np.int64)
 
 
 def worst_and_even(badness: Floats, most: int) -> Ints:
-    """Return at most `most` indices, growing: the worst fifth, the others chosen evenly."""
+    """Return at most `most` ascending indices: the worst fifth, and evenly chosen others."""
     if len(badness) <= most:
         return np.arange(len(badness))
     worst = np.argsort(-badness, kind="stable")[: max(1, most // 5)]
-    rest = np.setdiff1d(np.arange(len(badness)), worst)
-    even = rest[np.linspace(0, len(rest) - 1, most - len(worst)).round().astype(np.int64)]
+    others = np.setdiff1d(np.arange(len(badness)), worst)
+    even = others[np.linspace(0, len(others) - 1, most - len(worst)).round().astype(np.int64)]
     return np.sort(np.concatenate([worst, np.unique(even)]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DependenceCurve:
-    """Something over a variable that it may follow; units as the labels name them."""
+    """A quantity over a variable that it may depend on; its labels state the units."""
 
-    title: str  # the variable, the suspect or the law
+    title: str  # name of the variable, the suspect or the law
     says: str
-    x: Floats  # (K,) the variable: of single readings, or centres of bins
+    x: Floats  # (K,) the variable, of single readings or at centres of bins
     y: Floats  # (K,) residual, or its mean in the bin
     x_label: str  # the variable with its unit
-    y_label: str  # what errs or moves, with its unit
-    error: Floats | None = None  # (K,) standard uncertainty of the means; None of single readings
-    names: tuple[str, ...] = ()  # (K,) of the bins, where x only counts them; else empty
+    y_label: str  # the quantity with its unit
+    error: Floats | None = None  # (K,) standard uncertainty of the means; None: single readings
+    names: tuple[str, ...] = ()  # (K,) of the bins if x only counts them; else empty
     line: Floats | None = None  # (2, L) the variable, and the law
-    facts: tuple[tuple[str, str], ...] = ()  # what a law is, in names and words
+    facts: tuple[tuple[str, str], ...] = ()  # properties of a law: name and text
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StoryRevision:
     """One fitted model revision of N readings."""
 
-    revision: int  # its number, growing along the story
-    change: str  # what it changed, e.g. "+ hysteresis"; empty for the first
-    verdict: str  # one of the verdicts of `diagnose`, or `UNDIAGNOSED`
+    revision: int  # its number, ascending along the story
+    change: str  # e.g. "+ hysteresis"; empty for the first
+    verdict: str  # a verdict of `diagnose`, or `UNDIAGNOSED`
     residual: Floats  # (N, 3) measured - predicted, base axes, m
     predicted: Floats  # (N, 3) position, or deflection vector in deflection mode, m
     whitened_norm2: Floats  # (N,) squared Mahalanobis distances, 3 degrees of freedom
     error: ErrorBlock  # of the fitted readings
     holdout: ErrorBlock  # of whole poses left out
-    cells: tuple[str, ...] = ()  # of its row in a table of revisions
+    cells: tuple[str, ...] = ()  # row of a table of revisions
     panels: Mapping[str, tuple[Block, ...]] = field(default_factory=dict)
-    """"verdict", "details" and "parameters" in words and tables."""
-    follows: DependenceCurve | None = None  # what the residual follows
-    laws: tuple[DependenceCurve, ...] = ()  # that the catalogue does not have, one per curve
+    """Blocks of the panels "verdict", "details" and "parameters"."""
+    follows: DependenceCurve | None = None  # the residual over its strongest cause
+    laws: tuple[DependenceCurve, ...] = ()  # curves of laws that the catalogue lacks
 
     @property
     def size_m(self) -> Floats:
@@ -118,38 +118,38 @@ class StoryRevision:
 
     @property
     def name(self) -> str:
-        """What it changed, or its model where it is the first."""
+        """The change of the revision, or its model if it is the first."""
         return self.change or (self.cells[1] if self.cells else "first model")
 
 
 @dataclass(frozen=True, eq=False)
 class Story:
-    """N readings and the revisions of the model that was fitted to them; SI, base axes."""
+    """N readings and the revisions of the model fitted to them; SI, base axes."""
 
     arm: Arm
     mode: Mode
     q: Floats  # (N, n) joint angles, rad
     pose: Ints  # (N,) number of the commanded pose
-    load_names: tuple[str, ...]  # (N,) of each reading
-    anchor: Floats  # (N, 3) nominal position of the target, where arrows start, m
+    load_names: tuple[str, ...]  # (N,)
+    anchor: Floats  # (N, 3) nominal position of the target, start of the arrows, m
     measured: Floats  # (N, 3) deflection vector, or position in absolute mode, m
     covariance: Floats  # (N, 3, 3) of the residual, m²
     noise_floor_m: float  # rms 3-D error that noise alone would leave
     revisions: tuple[StoryRevision, ...]
-    target: Ints | None = None  # (N,) of the target that was read, into `target_names`
+    target: Ints | None = None  # (N,) index of the target into `target_names`
     target_names: tuple[str, ...] = ()
-    pose_names: tuple[str, ...] = ()  # (N,) of each reading; empty where the number is the name
-    time_s: Floats | None = None  # (N,) None where the readings do not state it
+    pose_names: tuple[str, ...] = ()  # (N,); empty if the numbers are the names
+    time_s: Floats | None = None  # (N,); None: unknown
     growing: bool = False  # whether further revisions may follow
 
     @cached_property
     def poses(self) -> Ints:
-        """(P,) the numbers of its poses, growing."""
+        """(P,) ascending numbers of the poses."""
         return np.unique(self.pose)
 
     @cached_property
     def first(self) -> Ints:
-        """(P,) the first reading of each pose."""
+        """(P,) index of the first reading of each pose."""
         return np.unique(self.pose, return_index=True)[1]
 
     @cached_property
@@ -159,28 +159,28 @@ class Story:
 
     @cached_property
     def bodies(self) -> Floats:
-        """(P, n + 2, 4, 4) poses of the arm's bodies at each pose."""
+        """(P, n + 2, 4, 4) poses of the arm's bodies."""
         return body_poses(self.arm, self.q[self.first])
 
     @cached_property
     def targets(self) -> Floats:
-        """(T, 3) places of the targets that were read, flange axes, m."""
+        """(T, 3) positions of the measured targets, flange axes, m."""
         flange = self.bodies[self.row, -1]
         offset = np.einsum("nij,ni->nj", flange[:, :3, :3], self.anchor - flange[:, :3, 3])
         number = np.zeros(len(self), dtype=np.int64) if self.target is None else self.target
         return np.array([np.median(offset[number == k], axis=0) for k in np.unique(number)])
 
     def deviation(self, value: Floats) -> Floats:
-        """Deflection (N, 3) of measured or predicted values: absolute ones less the nominal."""
+        """Return deflections (N, 3), or the deviations of positions from the nominal arm's."""
         return value if self.mode == "deflection" else value - self.anchor
 
     def last_of_poses(self, badness: Floats) -> Ints:
-        """(P,) the reading of each pose that has the largest of (N,)."""
+        """Return the reading (P,) of each pose with the largest badness (N,)."""
         order = np.lexsort((badness, self.row))
         return np.asarray(order[np.flatnonzero(np.diff(self.row[order], append=-1))])
 
     def pose_name(self, i: int) -> str:
-        """Return the name of reading i's pose, as everywhere else."""
+        """Return the name of reading i's pose."""
         return self.pose_names[i] if self.pose_names else str(self.pose[i])
 
     def __len__(self) -> int:
@@ -189,7 +189,7 @@ class Story:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chapter:
-    """One revision: its number, the effect that it added, the fit, and its diagnosis, if any."""
+    """One revision: its number, the added or removed effect, the fit, and its diagnosis, if any."""
 
     number: int
     added: str | None
@@ -201,8 +201,8 @@ class Chapter:
 def build_story(chapters: Sequence[Chapter]) -> Story:
     """Build the story of successive revisions of one campaign, in axes of the last one's base.
 
-    All readings are shown, also those that were set aside as gross errors. An arrow starts where
-    the rigid nominal arm would hold the target.
+    The story includes readings that were set aside as gross errors. `anchor` is the position of
+    the target on the rigid nominal arm.
 
     Raises:
         InputError: no revision, or revisions of different readings.
@@ -218,7 +218,7 @@ def build_story(chapters: Sequence[Chapter]) -> Story:
                 f"revision {c.number} was fitted to other readings; nothing to compare"
             )
     readings, rows, frames = last.readings, last.whitening.reading, fit.frames
-    to_base, states = frames.base[:3, :3], readings.states  # a vector v is v @ to_base there
+    to_base, states = frames.base[:3, :3], readings.states  # v @ to_base is a vector v in base axes
     rigid = Model(fit.model.cell.with_targets(frames.declared), ()).predict(states, np.zeros(0))
     if fit.mode == "absolute":
         chain, predicted = frames.chain, last.prediction.observation.base_position
@@ -246,7 +246,7 @@ def build_story(chapters: Sequence[Chapter]) -> Story:
 
 
 def of_left_out(revision: StoryRevision, fit: Fit) -> StoryRevision:
-    """Return a revision with the errors of poses left out in place of those of its fit."""
+    """Return a revision with the residuals of each pose when left out instead of fitted."""
     raw, w = all_left_out(fit)
     residual = raw[:, :3] @ fit.frames.base[:3, :3]
     predicted = revision.predicted + revision.residual - residual
@@ -254,28 +254,28 @@ def of_left_out(revision: StoryRevision, fit: Fit) -> StoryRevision:
     return replace(revision, residual=residual, predicted=predicted, whitened_norm2=norm2)
 
 
-def round_factor(wanted: float, steps: Sequence[float]) -> float:
-    """Return the largest of `steps` (1 to 10) times a power of ten that is at most `wanted`.
+def round_factor(limit: float, steps: Sequence[float]) -> float:
+    """Return the largest of `steps` (1 to 10) times a power of ten that is at most `limit`.
 
-    It is 1 where nothing, or something infinite, is wanted.
+    The result is 1 if `limit` is not positive or not finite.
     """
-    if not (math.isfinite(wanted) and wanted > 0):
+    if not (math.isfinite(limit) and limit > 0):
         return 1.0
-    power = 10.0 ** math.floor(math.log10(wanted))
-    return float(max(f for f in steps if f * power <= wanted * (1 + 1e-9)) * power)
+    power = 10.0 ** math.floor(math.log10(limit))
+    return float(max(f for f in steps if f * power <= limit * (1 + 1e-9)) * power)
 
 
 def pose_numbers(names: Sequence[str]) -> Ints:
-    """Number of each pose, by which the viewer orders them.
+    """Return a number for each pose, by which the viewer orders them.
 
-    It is that which its name ends in, 13 of "p13". A pose without, as the reference, has the
-    smallest number from 0 that is free. Where two names end in the same number: 1, 2, ...
+    The number ends the name, 13 in "p13". A name without one, such as the reference, gets the
+    smallest free number from 0. If two names end in the same number, the poses count from 1.
     """
     ends = [re.search(r"[0-9]+$", name) for name in names]
-    given = [int(end.group()) for end in ends if end is not None]
-    if not given or len(set(given)) < len(given) or max(given) >= MOST_NUMBER:
+    stated = [int(end.group()) for end in ends if end is not None]
+    if not stated or len(set(stated)) < len(stated) or max(stated) >= MOST_NUMBER:
         return np.arange(1, len(names) + 1)
-    free = (k for k in itertools.count() if k not in set(given))
+    free = (k for k in itertools.count() if k not in set(stated))
     numbers = [next(free) if end is None else int(end.group()) for end in ends]
     return np.array(numbers, dtype=np.int64)
 
@@ -314,9 +314,9 @@ def _revision(c: Chapter, e: FullPrediction, residual: Floats, measured: Floats)
 
 
 def follows(d: Diagnosis) -> DependenceCurve | None:
-    """Return what the residual follows: the first suspect, or the variable that carries most."""
-    known = 0.0 if d.lead is None else d.lead.holdout_share
-    explained = d.insufficiency is None and known >= LITTLE * d.predictable_share
+    """Return the residual over the first suspect, or over the strongest variable."""
+    by_lead = 0.0 if d.lead is None else d.lead.holdout_share
+    explained = d.insufficiency is None and by_lead >= LITTLE * d.predictable_share
     carried = [v for v in d.dependences if v.share >= LEAST_CARRIED and v.determined]
     if carried and d.verdict != "adequate" and not explained:
         return curve(carried[0])
@@ -325,7 +325,7 @@ def follows(d: Diagnosis) -> DependenceCurve | None:
 
 
 def laws(fit: Fit) -> tuple[DependenceCurve, ...]:
-    """Return the curves of laws from files, in units for people; see `drawn_laws`."""
+    """Return the curves of laws from files, in display units; see `drawn_laws`."""
     out = []
     for law in drawn_laws(fit):
         values = ", ".join(
@@ -342,30 +342,30 @@ def laws(fit: Fit) -> tuple[DependenceCurve, ...]:
             x_unit, x_factor = numbers.angle_or(c.quantity_unit)
             y_unit, factor = numbers.unit_for(c.unit, list(c.line[1]))
             over = c.quantity if x_unit in ("", "1") else f"{c.quantity} [{x_unit}]"
-            of, line = f"{c.of} of {c.site} [{y_unit}]", c.line * [[x_factor], [factor]]
-            drawn = (x_factor * x, factor * y, over, of, factor * error)
+            moved, line = f"{c.of} of {c.site} [{y_unit}]", c.line * [[x_factor], [factor]]
+            drawn = (x_factor * x, factor * y, over, moved, factor * error)
             out.append(DependenceCurve(law.name, says, *drawn, line=line, facts=facts))
     return tuple(out)
 
 
 def curve(d: Dependence) -> DependenceCurve:
-    """Return a dependence in units for people."""
+    """Return a dependence in display units."""
     x_unit, x_factor = numbers.of_joint(d.unit) if d.unit in ("rad", "m") else (d.unit, 1.0)
     if d.unit == "s" and (span := float(np.ptp(d.x))) > 120:
         x_unit, x_factor = ("h", 1 / 3600) if span > 7200 else ("min", 1 / 60)
     y_unit, y_factor = numbers.unit_for(d.y_unit, list(d.y))
     says = f"{numbers.percent(d.share)} of the misfit on poses left out follows {d.variable}."
     over = f"{d.variable} [{x_unit}]" if x_unit else d.variable
-    of, x, y = f"error of {moves(d)} [{y_unit}]", x_factor * d.x, y_factor * d.y
-    return DependenceCurve(d.variable, says, x, y, over, of, y_factor * d.error, d.labels)
+    error, x, y = f"error of {moves(d)} [{y_unit}]", x_factor * d.x, y_factor * d.y
+    return DependenceCurve(d.variable, says, x, y, over, error, y_factor * d.error, d.labels)
 
 
 def regressor(fit: Fit, suspect: Suspect) -> DependenceCurve | None:
-    """Return the added variable of a suspect, see `added_variable`; None where it has none."""
-    found = added_variable(fit, suspect)
-    if found is None:
+    """Return the added-variable curve of a suspect; None where `added_variable` is."""
+    added = added_variable(fit, suspect)
+    if added is None:
         return None
     says = f"Where {suspect.effect} is right, the readings lie on the line of slope 1."
-    x, y = (1e6 * v for v in found)
-    what = f"what {suspect.effect} would explain [µm]"
-    return DependenceCurve(suspect.effect, says, x, y, what, "residual along it [µm]")
+    x, y = (1e6 * v for v in added)
+    label = f"what {suspect.effect} would explain [µm]"
+    return DependenceCurve(suspect.effect, says, x, y, label, "residual along it [µm]")

@@ -1,4 +1,4 @@
-"""A diagnosis in a few short sentences; the `message` of JSON documents and files."""
+"""The verdict of a diagnosis in a few sentences; the `message` of JSON documents and files."""
 
 from collections.abc import Mapping
 
@@ -23,7 +23,7 @@ from hilcal.readings.readings import ArmScatter, SerialNoise
 from hilcal.robot.arm import Arm
 
 MOST_LIKELY, MOST_HIDDEN = 4, 4
-"""Effects of a background, and effects that the readings cannot show, that the message names."""
+"""Most effects of a background, and most undetectable effects, that the message names."""
 HEADLINES: Mapping[Verdict, str] = {
     "adequate": "adequate: the residual is noise",
     "missing_effect": "an effect is missing",
@@ -32,7 +32,7 @@ HEADLINES: Mapping[Verdict, str] = {
     "noise_misjudged": "the noise is not what was stated",
 }
 UNCALIBRATED = "geometry is not calibrated"
-"""What deflections leave: errors that are the same under every load cancel in them."""
+"""Limit of deflections: errors that are the same under every load cancel in them."""
 
 
 def headline(d: Diagnosis) -> str:
@@ -45,14 +45,14 @@ def headline(d: Diagnosis) -> str:
 
 
 def message(d: Diagnosis) -> str:
-    """Return the verdict in a few sentences; the effect that it names is the first suspect."""
+    """Return the verdict in a few sentences; an effect named as missing is the first suspect."""
     serial = d.fit.readings.serial
     return " ".join([*_verdict(d), *([] if serial is None else [correlated(serial)])])
 
 
 def _verdict(d: Diagnosis) -> list[str]:
     if d.wrong_figures:
-        return _figures(d.wrong_figures)
+        return _wrong_figures(d.wrong_figures)
     if d.reason == "readings_disagree":
         return [numbers.sentence(disagreement_words(d.fit))]
     of_reason = {
@@ -62,57 +62,57 @@ def _verdict(d: Diagnosis) -> list[str]:
         "no_suspect": _no_suspect,
         "misjudged_noise": _misjudged,
         "background": _background,
-        "arm_scatter": _left_to_the_arm,
+        "arm_scatter": _arm_scatter,
         "pose_alone": _pose_alone,
     }
     if d.reason in of_reason:
         return of_reason[d.reason](d)
     if d.scatter is not None:
-        adequate = _left_to_the_arm(d)
+        adequate = _arm_scatter(d)
     else:
         factor = f"variance factor {d.fit.variance_factor:.2f}"
         adequate = [f"Residuals are what the noise explains: {factor}.", *_nothing_missing(d)]
-        adequate += _noise_place(d.pure_error)
+        adequate += _misstated_noise(d.pure_error)
     doubts = [_alternative(a) for a in d.alternatives if a.inseparable]
     if d.reason != "inseparable_addition":
         return adequate
     return [*adequate, f"But {'; '.join(doubts)}. Measure what separates them."]
 
 
-def _figures(found: tuple[WrongFigure, ...]) -> list[str]:
-    """Say which figures of the cell may be wrong: any one of several explains the misfit."""
-    first, *rest = (_figure(f) for f in found)
+def _wrong_figures(figures: tuple[WrongFigure, ...]) -> list[str]:
+    """Return sentences on figures of the cell that may be wrong; each alone explains the misfit."""
+    first, *alternatives = map(_wrong_figure, figures)
     return [
         numbers.sentence(first),
-        *(f"Or else {other}." for other in rest),
+        *(f"Or else {figure}." for figure in alternatives),
         "Until that is settled no effect is looked for.",
     ]
 
 
-def _figure(f: WrongFigure) -> str:
+def _wrong_figure(f: WrongFigure) -> str:
     change = f"({length(f.rms_m)} → {length(f.rms_with_m)} rms with it)"
     if f.kind == "tool_com":
-        there, here = (", ".join(f"{1e3 * x:.0f}" for x in at) for at in (f.found, f.stated))
+        estimated, stated = (", ".join(f"{1e3 * x:.0f}" for x in v) for v in (f.found, f.stated))
         return (
-            f"the tool's centre of mass seems to be at ({there}) mm, not ({here}) mm {change}: "
-            "measure it, correct [tool] com_m, and import or measure again"
+            f"the tool's centre of mass seems to be at ({estimated}) mm, not ({stated}) mm "
+            f"{change}: measure it, correct [tool] com_m, and import or measure again"
         )
-    found, stated = (f"{x[0]:.3g} {f.unit}" for x in (f.found, f.stated))
+    estimated, stated = (f"{x[0]:.3g} {f.unit}" for x in (f.found, f.stated))
     if f.kind == "tool_mass":
         return (
-            f"the tool seems to weigh {found}, not {stated} {change}: weigh it, correct [tool] "
+            f"the tool seems to weigh {estimated}, not {stated} {change}: weigh it, correct [tool] "
             "mass_kg, and import or measure again"
         )
     does, check = ("weigh", "weigh it") if f.unit == "kg" else ("pull with", "measure its force")
     return (
-        f"load '{f.load}' seems to {does} {found}, not {stated} {change}: {check}, correct it "
+        f"load '{f.load}' seems to {does} {estimated}, not {stated} {change}: {check}, correct it "
         "where it was entered ([[loads]] of CELL.toml, or the table's wrench), and import or "
         "measure again"
     )
 
 
 def _nothing_missing(d: Diagnosis) -> list[str]:
-    """Say that no effect is missing, of those that such readings show at a plausible size."""
+    """Return sentences that no effect is missing, of those detectable at a plausible size."""
     if d.fit.mode == "deflection":
         return [
             "No effect that deflections show is missing.",
@@ -125,7 +125,7 @@ def _nothing_missing(d: Diagnosis) -> list[str]:
 
 
 def _background(d: Diagnosis) -> list[str]:
-    """Say which effects of the background are likely, and what to measure."""
+    """Return sentences on the likely effects of the background, and on what to measure."""
     likely = [b for b in d.background if b.p_value < LIKELY][:MOST_LIKELY]
     names = ", ".join(f"{b.effect} ({p_equals(b.p_value)})" for b in likely)
     noise = []
@@ -160,14 +160,14 @@ def _explains(s: Suspect) -> str:
 
 
 def implausible(s: Suspect) -> str:
-    """Say which size a suspect needs, and which is plausible."""
+    """Return a clause on the size that a suspect needs and on the plausible size."""
     needed = sizes([(unit, rms) for unit, rms, _ in s.needs])
     most = sizes([(unit, most) for unit, _, most in s.needs])
     return f"would need parameters of {needed} rms, where up to {most} is plausible"
 
 
 def broken(s: Suspect) -> str:
-    """Say how much the exact model keeps of what the linearisation promised."""
+    """Return a clause on the share of the linear prediction that the exact model confirms."""
     return f"the exact model keeps {percent(max(s.kept, 0.0))} of what its linearisation promises"
 
 
@@ -184,7 +184,7 @@ def _inseparable(d: Diagnosis) -> list[str]:
 
 
 def _separable(r: Separability) -> str:
-    """Name a rival, with the readings that would separate it."""
+    """Return the name of a rival, with the number of readings that would separate it."""
     if not r.possible:
         return f"{r.effect} (no readings of this kind can)"
     if r.times <= 1.0:
@@ -193,7 +193,7 @@ def _separable(r: Separability) -> str:
 
 
 def _alternative(a: Alternative) -> str:
-    """Name the effects that could replace one of the model."""
+    """Return a clause on the effects that could replace one of the model."""
     several = [f"{numbers.names(a.others)} together"] if len(a.others) > 1 and a.as_good else []
     return f"{a.effect} could as well be {', or '.join((*a.same_as, *several))}"
 
@@ -249,14 +249,14 @@ def _no_suspect(d: Diagnosis) -> list[str]:
 def _pose_alone(d: Diagnosis) -> list[str]:
     a = d.pose_alone
     assert a is not None  # noqa: S101  (by the reason)
-    first, *rest = a.effects
+    first, *effects = a.effects
     chance = "" if a.chance is None else f" with a chance of {percent(a.chance)}"
-    others = f", or {' or '.join(rest[:2])}," if rest else ""
+    alternatives = f", or {' or '.join(effects[:2])}," if effects else ""
     return [
         f"Residuals are {_spread(d)}.",
         f"{percent(a.share)} of the misfit is the same under every load of a pose: it depends on "
         "the pose alone.",
-        f"{first} finer than {a.poses} poses can resolve{others} would do that.",
+        f"{first} finer than {a.poses} poses can resolve{alternatives} would do that.",
         "So would an arm that repeats worse than stated, where each pose was arrived at once.",
         f"{a.more} more poses would decide{chance}.",
     ]
@@ -277,12 +277,12 @@ def _misjudged(d: Diagnosis) -> list[str]:
             f"the residuals no {compared} than the repeats: scale the covariance by "
             f"{repeats.factor:.2g}.",
             "No effect is missing.",
-            *_noise_place(repeats),
+            *_misstated_noise(repeats),
         ]
     if d.noise.reason == "too_large":
         return [
             f"Residuals are only {_spread(d)}: the stated covariance is too large.",
-            *_noise_place(repeats),
+            *_misstated_noise(repeats),
         ]
     few = "Without repeated readings" if repeats is None else "With so few repeated readings"
     return [
@@ -297,35 +297,35 @@ def _spread(d: Diagnosis) -> str:
 
 
 def _repeats_scatter_less(noise: NoiseVerdict | None, repeats: PureError | None) -> list[str]:
-    """Return a sentence where repeats scatter less than the residuals."""
+    """Return a sentence if the repeats scatter less than the residuals."""
     if noise is None or noise.reason != "lack_of_fit" or repeats is None:
         return []
     return [f"Repeated readings scatter only {repeats.factor**0.5:.2g} times what is stated."]
 
 
-def _noise_place(repeats: PureError | None) -> list[str]:
-    """Return a sentence on where the noise differs most from what is stated."""
+def _misstated_noise(repeats: PureError | None) -> list[str]:
+    """Return a sentence on where the noise differs most from the stated one."""
     if repeats is None or repeats.where is None:
         return []
     w = repeats.where
-    of = "of unloaded readings" if w.name == "unloaded" else f"under {w.name}"
-    place = {"axis": w.name, "joint": f"along the motion of {w.name}"}.get(w.kind, of)
+    under = "of unloaded readings" if w.name == "unloaded" else f"under {w.name}"
+    place = {"axis": w.name, "joint": f"along the motion of {w.name}"}.get(w.kind, under)
     return [
         f"The noise differs most {place}: the repeats scatter {w.factor**0.5:.2g} times as much "
         "there as stated."
     ]
 
 
-def _left_to_the_arm(d: Diagnosis) -> list[str]:
-    """Say that what is left is the arm's repeatability, and that no effect is missing."""
+def _arm_scatter(d: Diagnosis) -> list[str]:
+    """Return sentences that the rest is the arm's repeatability, and that no effect is missing."""
     s = d.scatter
     assert s is not None  # noqa: S101  (by the reason)
     predicted = "Nothing recorded predicts it (0 % on poses left out)."
     if s.predicted_share >= 0.005:
-        by = " and ".join(s.predicted_by) or "what was recorded"
+        causes = " and ".join(s.predicted_by) or "what was recorded"
         size = length(s.predicted_share**0.5 * s.size_m)
         predicted = (
-            f"{percent(s.predicted_share)} of it, {size} rms, follows {by} on poses left out, "
+            f"{percent(s.predicted_share)} of it, {size} rms, follows {causes} on poses left out, "
             "which is negligible beside the rest."
         )
     doubt = []
@@ -345,7 +345,7 @@ def _left_to_the_arm(d: Diagnosis) -> list[str]:
         ]
     return [
         f"What is left, {length(s.size_m)} rms, is of the size of the arm's "
-        f"repeatability{_maker(s, d.fit.model.cell.arm)}.",
+        f"repeatability{_rp_comparison(s, d.fit.model.cell.arm)}.",
         numbers.sentence(sigmas(s)),
         predicted,
         *_nothing_missing(d),
@@ -354,7 +354,7 @@ def _left_to_the_arm(d: Diagnosis) -> list[str]:
 
 
 def _no_repeatability(s: ArmScatter, arm: Arm) -> list[str]:
-    """Say why what is left is not the arm's repeatability; the start of it is said already."""
+    """Return a sentence on why the scatter is not the arm's repeatability."""
     if instrument_instead(s):
         return [
             f"They are as if the instrument were {s.instrument_factor:.2g} times as noisy as "
@@ -362,14 +362,14 @@ def _no_repeatability(s: ArmScatter, arm: Arm) -> list[str]:
             "readings to be sure."
         ]
     return [
-        f"The arm would have to scatter by {length(s.size_m)} rms{_maker(s, arm)}, more "
+        f"The arm would have to scatter by {length(s.size_m)} rms{_rp_comparison(s, arm)}, more "
         "than an arm's repeatability: the instrument is noisier than stated, or the arm or the "
         "target was loose."
     ]
 
 
 def sigmas(s: ArmScatter) -> str:
-    """Write the standard deviations with their uncertainties."""
+    """Return the standard deviations of the arm's scatter with their uncertainties."""
     pairs = [numbers.with_std(1e6 * v, 1e6 * e) for v, e in zip(s.std, s.std_error, strict=True)]
     if s.kind == "isotropic":
         return f"the target scatters by σ = {' ± '.join(pairs[0])} µm along each axis"
@@ -383,8 +383,8 @@ def sigmas(s: ArmScatter) -> str:
     return f"the joints scatter by σ_q [µrad] = {clear}, the others by less than can be told"
 
 
-def _maker(s: ArmScatter, arm: Arm) -> str:
-    """Compare with ISO 9283's figure."""
+def _rp_comparison(s: ArmScatter, arm: Arm) -> str:
+    """Return the comparison with the repeatability RP of ISO 9283."""
     states = "arms of industry have 0.02 to 0.1 mm"
     if arm.repeatability is not None:
         states = f"the maker states {numbers.digits(1e3 * arm.repeatability, 2)} mm"
@@ -392,7 +392,7 @@ def _maker(s: ArmScatter, arm: Arm) -> str:
 
 
 def repeatability_source(source: ScatterSource, arm: Arm) -> str:
-    """Say what an arm's repeatability is from, as an uncertainty budget does."""
+    """Return the source of an arm's repeatability, in the terms of an uncertainty budget."""
     if source == "maker" and arm.repeatability is not None:
         return f"type B: the maker states RP {length(arm.repeatability)} (ISO 9283)"
     return {
@@ -404,13 +404,13 @@ def repeatability_source(source: ScatterSource, arm: Arm) -> str:
 
 
 def correlated(n: SerialNoise) -> str:
-    """Say that the readings are correlated along their order, and what it does."""
+    """Return sentences on the serial correlation of the readings and on its consequences."""
     unit = "s" if n.clock == "time" else "readings"
     share = "" if n.share > 0.95 else f" in {percent(n.share)} of their variance"
     doubt = ""
     if not n.proved:
-        others = " and ".join(n.instead) or "effects of the catalogue"
-        doubt = f" This is in doubt: {others} would explain the readings as well. Repeat them."
+        rivals = " and ".join(n.instead) or "effects of the catalogue"
+        doubt = f" This is in doubt: {rivals} would explain the readings as well. Repeat them."
     low, high = n.wider
     return (
         f"Readings are correlated along their order{share}: "

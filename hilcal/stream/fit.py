@@ -1,13 +1,15 @@
 """A model fitted to a stream: Gauss-Newton in which each step is one pass.
 
 A pass reads each chunk once, predicts it, whitens residual and Jacobian, and reduces them to one
-triangle per fold, whose products are those of the rows. Replaced is what needs all readings:
+triangle R per fold, RᵀR = AᵀA for the rows A. The following steps differ from those of a fit in
+memory, as they would need all readings at once:
 
-- registration, starting model and starting values are those of a sample of at most `SAMPLE`
-  readings, spread evenly;
-- tenths of the stream, in its order, are left out in place of poses: the errors of readings that
-  follow each other are not independent;
-- readings beyond the limit of a gross error are set aside once, after a first fit.
+- Registration, starting model and starting values are those of a sample of at most `SAMPLE`
+  readings, spread evenly.
+- Tenths of the stream, in its order, are left out instead of poses, since the errors of
+  consecutive readings are not independent.
+- Readings beyond the limit of a gross error are set aside after a fit, in at most
+  `OUTLIER_ROUNDS` rounds.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -63,10 +65,10 @@ from hilcal.types import Bools, Floats, Ints
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PassTask:
-    """What a worker needs to know."""
+    """The input of a worker for a pass."""
 
     stream: ReadingStream
-    model: Model  # that is fitted; its cell is registered
+    model: Model  # in the registered cell
     joint_std: Floats  # (n,) scatter that is added to the covariances, rad; zero for none
     outliers: Mapping[int, Ints]
     """Rows that are set aside, counted from 0 in the stream, ascending, by row group."""
@@ -74,7 +76,7 @@ class PassTask:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reduced:
-    """What a row group gives to a step."""
+    """The contribution of a row group to a step."""
 
     triangles: dict[int, Floats]
     """(P + 1, P + 1) of the columns of all parameters and of the residual, by fold."""
@@ -83,7 +85,7 @@ class Reduced:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Errors:
-    """What a row group gives to the errors; of the fit, and predicted without its fold."""
+    """The contribution of a row group to the errors of the fit (0) and without its fold (1)."""
 
     sums: Floats  # (2, 3) sums of the distance, of its square, of the whitened squares
     most: Floats  # (2,) largest distance, m
@@ -101,25 +103,24 @@ class _Chunk:
     w: Whitening
     prediction: Prediction
     raw: Floats
-    kept: Bools
+    inlier: Bools
 
 
 def reduce_group(group: int, work: PassTask, theta: Floats) -> Reduced:
     """Reduce the whitened rows of a row group at parameters (P,)."""
     every, size = np.arange(work.model.size), work.model.size + 1
-    found: dict[int, Triangle] = {}
+    triangles: dict[int, Triangle] = {}
     rank = 0
     for c in _chunks(group, work, theta):
         rows = whitened_jacobian(work.model, c.prediction, theta, c.w, every)
         right = c.w.whiten(c.raw).reshape(-1)
-        kept = np.repeat(c.kept, c.w.m)
         for fold in np.unique(c.fold):
-            mine = kept & np.repeat(c.fold == fold, c.w.m)
-            some = slice(None) if mine.all() else mine
-            found.setdefault(int(fold), Triangle(size)).add(rows[some], right[some])
+            in_fold = np.repeat(c.inlier & (c.fold == fold), c.w.m)
+            some = slice(None) if in_fold.all() else in_fold
+            triangles.setdefault(int(fold), Triangle(size)).add(rows[some], right[some])
         full = np.count_nonzero(np.any(c.w.buckets[0].factor != 0, axis=-1), axis=-1)
-        rank += int(full[c.kept].sum())
-    return Reduced({fold: t.r for fold, t in found.items()}, rank)
+        rank += int(full[c.inlier].sum())
+    return Reduced({fold: t.r for fold, t in triangles.items()}, rank)
 
 
 def errors_of_group(
@@ -127,8 +128,8 @@ def errors_of_group(
 ) -> Errors:
     """Return the errors of a row group at parameters (P,).
 
-    `change` (F, P) is what leaving out each fold does to them; readings beyond the squared
-    Mahalanobis distance `far` are named.
+    `change` (F, P) is the change of the parameters by leaving out each fold; `far` is the squared
+    Mahalanobis distance beyond which rows are listed.
     """
     moved = np.flatnonzero(np.any(change != 0, axis=0))
     sums, most, floor, rank = np.zeros((2, 3)), np.zeros(2), 0.0, 0
@@ -151,19 +152,19 @@ def errors_of_group(
 
 
 def sample_group(group: int, work: PassTask, step: int) -> Readings | None:
-    """Return every `step`-th reading of the stream that lies in a row group, None for none.
+    """Return every `step`-th reading of the stream in a row group; None without one.
 
-    All its rows are read, and what cannot be right is refused before anything is computed.
+    The function reads all rows, so that invalid ones are refused before any computation.
     """
-    found = []
+    sampled = []
     row = work.stream.first_row(group)
     for readings in work.stream.chunks(group):
         rows = np.arange(row, row + len(readings))
         chosen = rows % step == 0
         if chosen.any():
-            found.append(replace(readings[chosen], pose=rows[chosen]))
+            sampled.append(replace(readings[chosen], pose=rows[chosen]))
         row += len(readings)
-    return Readings.joined(found) if found else None
+    return Readings.joined(sampled) if sampled else None
 
 
 def _chunks(group: int, work: PassTask, theta: Floats) -> Iterator[_Chunk]:
@@ -184,22 +185,22 @@ def _chunks(group: int, work: PassTask, theta: Floats) -> Iterator[_Chunk]:
 
 Result = TypeVar("Result")
 SAMPLE = 2000
-"""Readings that registration, starting model and starting values are taken from; a choice: enough
-for every effect of the catalogue, and a fit of a second."""
-NAMED = 10  # Gross errors that are named; a choice
-OUTLIER_ROUNDS = 2  # Searches for gross errors, each followed by a new fit; a choice
-MAX_OUTLIER_SHARE = 0.05  # Most readings that are set aside, as a share; a choice: more is a misfit
+"""Most readings for registration, starting model and starting values; a choice: enough for every
+effect of the catalogue, and a fit of a second."""
+NAMED = 10  # most gross errors that are named; a choice
+OUTLIER_ROUNDS = 2  # most searches for gross errors that are followed by a new fit; a choice
+MAX_OUTLIER_SHARE = 0.05  # largest share of gross errors; a choice: more are a misfit of the model
 
 Counting = Callable[[str, int], AbstractContextManager[Advance]]
 
 
-def _unseen(what: str, total: int) -> AbstractContextManager[Advance]:
+def _silent(name: str, total: int) -> AbstractContextManager[Advance]:
     return nullcontext(lambda step: None)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _StreamPoint(NewtonPoint):
-    """A point with the triangle of all parameters' columns and the residual, by fold."""
+    """A point with the triangles of columns and residual, of all readings and by fold."""
 
     folds: Mapping[int, Floats]
     triangle: Floats
@@ -207,13 +208,13 @@ class _StreamPoint(NewtonPoint):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Stream(NewtonProblem[_StreamPoint]):
-    """Readings of a stream; a point takes one pass."""
+    """The least-squares problem of a stream; each point takes one pass."""
 
     same_rows: ClassVar[bool] = False
 
     work: PassTask
     engine: Engine
-    counting: Counting = _unseen
+    counting: Counting = _silent
     passed: list[int] = field(default_factory=list)
 
     def at(self, y: Floats) -> _StreamPoint:
@@ -229,7 +230,7 @@ class _Stream(NewtonProblem[_StreamPoint]):
         return _StreamPoint(y, theta, rss, sum(part.rank for part in parts), folds, triangle)
 
     def over(self, run: Callable[[int], Result]) -> tuple[Result, ...]:
-        """Return a function of each row group: one pass."""
+        """Return the values of a function of each row group, in one pass."""
         self.passed.append(1)
         return _over(self.work.stream, run, self.engine, self.counting, 1 + len(self.passed))
 
@@ -253,12 +254,12 @@ class StreamFit(WithVarianceFactor):
     """A model fitted to a stream."""
 
     model: Model  # robot and effects
-    sample: Fit  # the fit of the sample that it started from
+    sample: Fit  # fit of the sample, the starting point
     theta: Floats  # (P,) parameters
-    covariance: Floats  # (P, P) of the parameters, widened where the residual is larger than noise
-    std: Floats  # (P,) standard uncertainties; infinite where not identifiable
-    identifiable: Bools  # (P,) which parameters the data determine
-    estimated: Bools  # (P,) which were not held at zero
+    covariance: Floats  # (P, P) of the parameters, widened if the residual is larger than noise
+    std: Floats  # (P,) standard uncertainties; infinite if not identifiable
+    identifiable: Bools  # (P,) whether the data determine a parameter
+    estimated: Bools  # (P,) whether a parameter was not held at zero
     null: tuple[str, ...]  # names of the unidentifiable directions
     inflated: bool  # whether the residual is larger than noise
     readings: int  # number of readings of the stream
@@ -266,19 +267,19 @@ class StreamFit(WithVarianceFactor):
     dof: float  # degrees of freedom
     rank: int  # number of directions that the data determine
     condition: tuple[float, float]
-    """condition number of the whitened columns, in physical units and scaled."""
-    error: ErrorBlock  # error block of the fit
-    holdout: ErrorBlock  # the same, each tenth of the stream predicted without it
+    """Condition number of the whitened columns, in physical units and scaled."""
+    error: ErrorBlock  # of the fit
+    holdout: ErrorBlock  # of each tenth of the stream, predicted without it
     noise_floor: float  # rms position error by the stated noise alone, m
     outliers: int  # number of readings set aside as gross errors
     named: tuple[tuple[int, float], ...]
-    """(row in the file, from 1; Mahalanobis distance) of the worst of them."""
-    passes: int  # passes over the stream
+    """(row in the file, from 1; Mahalanobis distance) of the worst gross errors."""
+    passes: int  # over the stream
     converged: bool  # whether the last step was negligible
 
     @property
     def parameters(self) -> Estimates:
-        """The parameters with their standard uncertainties, those of dropped groups left out."""
+        """The parameters with their standard uncertainties, without those of dropped groups."""
         return Estimates.of(self.model, self.theta, self.std, self.identifiable, self.estimated)
 
 
@@ -289,13 +290,13 @@ def fit_stream(
     effects: Mapping[str, Options] | None = None,
     catalogue: Catalogue | None = None,
     prior: CarriedPrior | None = None,
-    counting: Counting = _unseen,
+    counting: Counting = _silent,
 ) -> StreamFit:
     """Fit a model to a stream of absolute readings.
 
     Args:
-        effects: options by effect, besides unknown frames; the baseline where None.
-        counting: shows how far a pass is, as `present.progress.counting` does.
+        effects: options by effect, in addition to unknown frames; None: the baseline.
+        counting: shows the progress of a pass, as `present.progress.counting` does.
 
     Raises:
         CannotAnswerError: too few readings, or an unknown frame that they do not determine.
@@ -312,67 +313,66 @@ def fit_stream(
     theta = first.theta
     far = limit(readings.m, len(stream), bulk(first.mahalanobis2, readings.m))
     for search in range(OUTLIER_ROUNDS + 1):
-        found = _solved(problem, theta)
-        theta = found.point.theta
-        errors = found.errors(far)
+        solved = _solved(problem, theta)
+        theta = solved.point.theta
+        errors = solved.errors(far)
         aside = {k: e.far for k, e in enumerate(errors) if len(e.far)}
-        count, known = _count(aside), _count(problem.work.outliers)
-        if count in (0, known) or count > MAX_OUTLIER_SHARE * len(stream):
+        count, previous = _count(aside), _count(problem.work.outliers)
+        if count in (0, previous) or count > MAX_OUTLIER_SHARE * len(stream):
             break
         if search < OUTLIER_ROUNDS:
             problem = replace(problem, work=replace(problem.work, outliers=aside))
-    return found.result(first, errors)
+    return solved.result(first, errors)
 
 
 def _scatter(stream: ReadingStream, cell: Cell) -> Floats:
-    """(n,) scatter of the arm that is added to the covariances, rad; zero where they have it."""
+    """Return the arm's scatter (n,) to add to the covariances, rad; zero if they include it."""
     config = cell.configured()
     stated = columns.covariance_columns(3)[0] in stream.columns
-    whole = stream.covers == WHOLE or (stated and config.repeatability.in_tables)
-    return np.zeros(cell.arm.n) if whole else config.repeatability.per_joint(cell.arm.n)
+    included = stream.covers == WHOLE or (stated and config.repeatability.in_tables)
+    return np.zeros(cell.arm.n) if included else config.repeatability.per_joint(cell.arm.n)
 
 
 def _sample(work: PassTask, engine: Engine, counting: Counting) -> Readings:
     step = -(-len(work.stream) // SAMPLE)
     run = partial(sample_group, work=work, step=step)
     parts = _over(work.stream, run, engine, counting, 1)
-    found = Readings.joined([part for part in parts if part is not None])
-    names = tuple(f"row {k + 1}" for k in found.pose)
-    return replace(found, pose=np.arange(len(found)), pose_names=names)
+    sample = Readings.joined([part for part in parts if part is not None])
+    names = tuple(f"row {k + 1}" for k in sample.pose)
+    return replace(sample, pose=np.arange(len(sample)), pose_names=names)
 
 
 def _count(rows: Mapping[int, Ints]) -> int:
-    return sum(len(found) for found in rows.values())
+    return sum(map(len, rows.values()))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _StreamMinimum:
-    """The minimum, and the normal equations there: of all, and without each fold."""
+    """The minimum of a problem, with its normal equations."""
 
     problem: _Stream
     point: _StreamPoint
-    by: Regularisation
+    regularisation: Regularisation
     converged: bool
     equations: NormalEquations
-    change: Floats
+    change: Floats  # (F, P) of the parameters by leaving out each fold
 
     def errors(self, far: float) -> tuple[Errors, ...]:
-        """Return the errors of each row group, and the readings beyond a squared distance."""
-        of = self.problem
-        run = partial(
-            errors_of_group, work=of.work, theta=self.point.theta, change=self.change, far=far
-        )
-        return of.over(run)
+        """Return the errors of each row group; see `errors_of_group`."""
+        work, theta = self.problem.work, self.point.theta
+        run = partial(errors_of_group, work=work, theta=theta, change=self.change, far=far)
+        return self.problem.over(run)
 
     def result(self, first: Fit, errors: tuple[Errors, ...]) -> StreamFit:
-        """Return what is known of the fit."""
-        of, model, by, point = self.problem, self.problem.model, self.by, self.point
-        basis, space, groups = self.equations.basis, of.coordinates, prior_of(of.model)[1]
+        """Return the fit: parameters with uncertainties, errors and gross errors."""
+        problem, model, point = self.problem, self.problem.model, self.point
+        beta, prior = self.regularisation.beta, self.regularisation.prior
+        basis, space, groups = self.equations.basis, problem.coordinates, prior_of(model)[1]
         transform, scale = space.transform(basis.transform), scales_of(model)
-        covariance = transform @ self.equations.inverse(by.beta) @ transform.T
-        covariance[space.index, space.index] += space.rest / by.beta
+        covariance = transform @ self.equations.inverse(beta) @ transform.T
+        covariance[space.index, space.index] += space.rest / beta
         formal = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-        spent = spent_parameters(self.equations, by.beta, groups)
+        spent = spent_parameters(self.equations, beta, groups)
         dof = max(point.elements - spent, 1.0)
         inflated = bool(chi2.sf(point.rss, dof) < MISFIT_CHANCE)
         std = formal
@@ -383,9 +383,9 @@ class _StreamMinimum:
             std = np.maximum(formal * np.sqrt(point.rss / dof), jackknife)
         null = in_ordinary_magnitudes(space, basis.null, scale)
         carried = space.carried(len(scale))
-        seen = identifiable_parameters(basis, by.prior, carried, scale, std, null)
+        identifiable = identifiable_parameters(basis, prior, carried, scale, std, null)
         wider = std / np.where(formal > 0, formal, 1.0)
-        sums, count = sum(e.sums for e in errors), len(of.work.stream)
+        sums, count = sum(e.sums for e in errors), len(problem.work.stream)
         rank, most = sum(e.rank for e in errors), np.max([e.most for e in errors], axis=0)
         blocks = [
             ErrorBlock(
@@ -396,7 +396,7 @@ class _StreamMinimum:
             )
             for s, m in zip(np.asarray(sums), most, strict=True)
         ]
-        aside = of.work.outliers
+        aside = problem.work.outliers
         worst = [
             (int(row) + 1, float(np.sqrt(d2)))
             for k, e in enumerate(errors)
@@ -408,9 +408,9 @@ class _StreamMinimum:
             sample=first,
             theta=point.theta,
             covariance=wider[:, None] * covariance * wider,
-            std=np.where(seen, std, np.inf),
-            identifiable=seen,
-            estimated=(by.prior != 0) | carried,
+            std=np.where(identifiable, std, np.inf),
+            identifiable=identifiable,
+            estimated=(prior != 0) | carried,
             null=name_directions(model, null),
             inflated=inflated,
             readings=count,
@@ -422,41 +422,42 @@ class _StreamMinimum:
             holdout=blocks[1],
             noise_floor=float(np.sqrt(sum(e.floor for e in errors) / count)),
             outliers=_count(aside),
-            named=tuple(sorted(worst, key=lambda one: -one[1])[:NAMED]),
-            passes=1 + len(of.passed),
+            named=tuple(sorted(worst, key=lambda row: -row[1])[:NAMED]),
+            passes=1 + len(problem.passed),
             converged=self.converged,
         )
 
 
 def _solved(problem: _Stream, theta: Floats) -> _StreamMinimum:
-    """Return the minimum from parameters (P,) on."""
+    """Return the minimum, starting from parameters (P,)."""
     space = problem.coordinates
-    found = minimum(problem, space.of_theta(theta), None)
-    point, by, converged = found.point, found.by, found.converged
-    if point.elements <= by.basis.structural:
+    solution = minimum(problem, space.of_theta(theta), None)
+    point, regularisation = solution.point, solution.by
+    live_basis, beta, prior = regularisation.basis, regularisation.beta, regularisation.prior
+    if point.elements <= live_basis.structural:
         raise CannotAnswerError(
-            f"{point.elements} measured elements for {by.basis.structural} parameters: nothing is "
-            "left to judge the model by"
+            f"{point.elements} measured elements for {live_basis.structural} parameters: nothing "
+            "is left to judge the model by"
         )
-    live = np.flatnonzero(by.prior > 0)
-    basis = over_all_parameters(by.basis, live, len(theta))
-    z = prior_coordinates(basis, point.y, by.prior)
+    live = np.flatnonzero(prior > 0)
+    basis = over_all_parameters(live_basis, live, len(theta))
+    z = prior_coordinates(basis, point.y, prior)
 
     def equations_of(triangle: Floats) -> NormalEquations:
-        rows = by.basis.rows(space.columns(triangle[:, :-1])[:, live])
+        rows = live_basis.rows(space.columns(triangle[:, :-1])[:, live])
         return NormalEquations(basis, rows.T @ rows, rows.T @ (triangle[:, -1] + rows @ z))
 
     equations, size = equations_of(point.triangle), len(theta) + 1
     change = np.zeros((FOLDS, len(theta)))
-    transform, now = space.transform(basis.transform), equations.solve(by.beta)
+    transform, scaled = space.transform(basis.transform), equations.solve(beta)
     for fold in point.folds:
-        rest = combined((r for k, r in point.folds.items() if k != fold), size)
-        change[fold] = transform @ (equations_of(rest).solve(by.beta) - now)
-    return _StreamMinimum(problem, point, by, converged, equations, change)
+        others = combined((r for k, r in point.folds.items() if k != fold), size)
+        change[fold] = transform @ (equations_of(others).solve(beta) - scaled)
+    return _StreamMinimum(problem, point, regularisation, solution.converged, equations, change)
 
 
 def to_json(fit: StreamFit) -> dict[str, object]:
-    """Keys of the contract, and what a stream has beside them.
+    """Return the JSON document of a fit.
 
     `error.holdout`: each tenth of the stream, predicted without it.
     """

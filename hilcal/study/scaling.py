@@ -1,13 +1,13 @@
-"""What `none`, `gu` and `gc` do to the same data, by Monte-Carlo.
+"""Monte-Carlo comparison of the scalings `none`, `gu` and `gc` on the same data.
 
-The whitening of `hilcal.readings.whitening` is applied to simulated readings of an arm under known
-loads, poses and wrenches drawn within its limits:
+The whitening of `hilcal.readings.whitening` is applied to simulated readings of an arm at random
+poses within its limits, under known wrenches:
 
     A_M c = ΔX_M,   column j of a block: J_j (J_jᵀ w)
 
 with the geometric Jacobian J of the target and the wrench w at the target. The noise is drawn per
-reading; deflections are formed as in a campaign, loaded minus unloaded; errors of the estimates are
-set against the Cramér–Rao bound, and the stated 95 % intervals are counted.
+reading; deflections are loaded minus unloaded readings, as in a campaign. The study compares errors
+of the estimates with the Cramér–Rao bound, and determines the coverage of stated 95 % intervals.
 """
 
 from collections.abc import Sequence
@@ -35,10 +35,10 @@ from hilcal.types import Bools, Floats
 
 TARGET = np.array([0.05, 0.0, 0.12])  # flange axes, m
 STATION = np.array([2.5, -1.5, 1.0])  # of the tracker, base axes, m
-# A laser tracker with a 6-D probe: 15 µm + 6 µm/m, and 0.005° about any axis.
+# A laser tracker with a 6-D probe: 15 µm + 6 µm/m, and 0.005° about each axis.
 TRACKER = TrackerNoise(5e-6, 0.5e-6, 15e-6, 6e-6, orientation_std=9e-5)
-JOINT_STD = 2e-5  # rad; the arm then repeats to 0.02-0.04 mm
-# Forces and moments on the target, base axes, N and N·m: a weight, and pulls by a rope at a lever.
+JOINT_STD = 2e-5  # rad; gives a repeatability of 0.02-0.04 mm
+# Forces and moments on the target, base axes, N and N·m: a weight, and pulls by a rope on a lever.
 WRENCHES = np.array(
     [
         [0.0, 0.0, -100.0, 0.0, 0.0, 0.0],
@@ -47,7 +47,7 @@ WRENCHES = np.array(
         [-50.0, 50.0, -50.0, -8.0, 8.0, -8.0],
     ]
 )
-_CLEARANCE = 0.15  # m; links stay above the floor, the target off the base axis by twice this
+_CLEARANCE = 0.15  # m, of links from the floor; the target has twice this from the base axis
 _SINGULAR = 0.05  # smallest singular value of J, lengths in units of 1 m
 _CANDIDATES = 4000
 
@@ -62,14 +62,14 @@ class StudyDesign:
     observation: Floats  # (P, L, 6, n) blocks of A_M, m and rad per rad/(N·m)
     std: Floats
     """(P, 6) standard deviations of the elements of one reading: tracker and arm, m, rad."""
-    specified: Floats  # (P, 6, 6) correlations of one reading, as tracker and arm give them
-    common: Floats  # (P, 6, 6) correlations of the arm's own repeatability J Σ_q Jᵀ
+    specified: Floats  # (P, 6, 6) correlations of one reading by tracker and arm
+    common: Floats  # (P, 6, 6) correlations of the arm's repeatability J Σ_q Jᵀ
 
     def covariance(self, correlation: float) -> Floats:
-        """Covariance (P, 6, 6) of one reading: V = D ((1 - ρ) I + ρ C) D.
+        """Return the covariance (P, 6, 6) of one reading, V = D ((1 - ρ) I + ρ C) D.
 
-        D holds the standard deviations, which do not change with ρ; C is the correlation matrix
-        of the arm's repeatability. ρ is the share of each element's variance that is common.
+        D: diagonal of the standard deviations, independent of ρ; C: correlation matrix of the
+        arm's repeatability; ρ: share of each element's variance that is common to the elements.
         """
         mixed = (1 - correlation) * np.eye(6) + correlation * self.common
         return self.std[:, :, None] * mixed * self.std[:, None, :]
@@ -108,7 +108,7 @@ def make_design(rng: np.random.Generator, arm: Arm, poses: int) -> StudyDesign:
 
 
 def make_readings(design: StudyDesign, covariance: Floats, shared: bool) -> Readings:
-    """Readings (values left at zero) of the design: unloaded and loaded, pose by pose.
+    """Return the readings of the design, unloaded and loaded, pose by pose, with values of zero.
 
     Args:
         covariance: (P, 6, 6) of one reading at each pose.
@@ -132,7 +132,7 @@ def make_readings(design: StudyDesign, covariance: Floats, shared: bool) -> Read
 
 
 def bound(design: StudyDesign, covariance: Floats, shared: bool) -> Floats:
-    """Cramér–Rao bound (n, n) on the covariance of any unbiased estimate of c.
+    """Return the Cramér–Rao bound (n, n) on the covariance of any unbiased estimate of c.
 
         F⁻¹,  F = Σ_p Σ_kl (C⁻¹)_kl A_pkᵀ V_p⁻¹ A_pl,   C = I + 1 1ᵀ (shared) or 2 I
 
@@ -148,7 +148,7 @@ def bound(design: StudyDesign, covariance: Floats, shared: bool) -> Floats:
 
 
 def _feasible(arm: Arm, q: Floats) -> Bools:
-    """(N,) which candidates the arm can hold under every wrench."""
+    """Return whether the arm can hold each of N candidates under every wrench."""
     chain = evaluate(arm, q)
     target = chain.point(TARGET)
     heights = np.concatenate([chain.position[1:, :, 2], target[None, :, 2]])
@@ -161,25 +161,25 @@ def _feasible(arm: Arm, q: Floats) -> Bools:
 
 
 def _torques(arm: Arm, chain: Chain, wrench: Floats) -> Floats:
-    """(N, n) static joint torques under weight and a wrench at the target, N·m."""
+    """Return the static joint torques (N, n) under weight and a wrench at the target, N·m."""
     wrenches = np.broadcast_to(wrench, (chain.position.shape[1], 6))
     load = Load(wrenches, TARGET, 0.0, np.zeros(3), np.array([0.0, 0.0, -9.80665]))
     return arm.drive_torques(arm.along(slot_wrenches(arm, chain, load)))
 
 
 def _correlation(covariance: Floats) -> Floats:
-    """Correlation matrices (..., k, k), with ones on the diagonal."""
+    """Return correlation matrices (..., k, k), with exact ones on the diagonal."""
     std = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
     out = covariance / (std[..., :, None] * std[..., None, :])
     np.einsum("...ii->...i", out)[...] = 1.0
     return np.asarray(out)
 
 
-# Correlation ρ, whether unloaded readings are shared, and the generator of the noise.
+# Correlation ρ, whether unloaded readings are shared, generator of the noise.
 _Experiment = tuple[float, bool, np.random.Generator]
 LEVEL = 0.95
 CORRELATIONS = (0.0, 0.3, 0.6, 0.9, 0.99)
-# Name, and what a length in m and an angle in rad are multiplied by.
+# Name, factor of lengths in m, factor of angles in rad.
 UNITS: tuple[tuple[str, float, float], ...] = (
     ("m, rad", 1.0, 1.0),
     ("mm, rad", 1e3, 1.0),
@@ -194,19 +194,19 @@ class StudyCell:
     Attributes:
         scaling: "none", "gu" or "gc".
         correlation: share ρ of each element's variance that is common to the elements.
-        unit: units that the deflections were written in.
+        unit: units of the deflections.
         shared_unloaded: whether the loads of a pose share one unloaded reading.
         error_over_bound: root mean square over runs and parameters of the error of a parameter
-            in units of its bound, sqrt(F⁻¹_jj); 1 where the bound is attained.
-        error_over_bound_mc: of it.
-        coverage: share of the stated 95 % intervals that hold the true parameter.
-        coverage_mc: of it.
-        variance_factor: mean χ²/dof of the whitened residual; None for `none`, where it has
-            no meaning.
-        parameter_error_over_bound: (n,) the same per parameter.
-        parameter_coverage: (n,) the same per parameter.
-        unit_shift: largest change of any estimate in any run against the first unit, in
-            units of the bound.
+            in units of its bound, sqrt(F⁻¹_jj); 1 if the bound is attained.
+        error_over_bound_mc: standard uncertainty of `error_over_bound`.
+        coverage: share of the stated 95 % intervals that contain the true parameter.
+        coverage_mc: standard uncertainty of `coverage`.
+        variance_factor: mean χ²/dof of the whitened residual; None for `none`, where it is not
+            defined.
+        parameter_error_over_bound: (n,) `error_over_bound` per parameter.
+        parameter_coverage: (n,) `coverage` per parameter.
+        unit_shift: largest change of any estimate in any run between a unit and the first unit,
+            in units of the bound.
     """
 
     scaling: Scaling
@@ -225,22 +225,22 @@ class StudyCell:
 
 @dataclass(frozen=True, slots=True)
 class ScalingStudy:
-    """The study's cells and what they were made of."""
+    """The cells of a study, with its settings."""
 
     arm: str  # name of the arm
     runs: int  # Monte-Carlo runs per cell
     poses: int  # number of poses
     loads: int  # wrenches per pose
     typical_correlation: float
-    """the ρ whose mean square correlation is that of the arm and the tracker as specified."""
+    """The ρ whose rms correlation is that of a reading by the specified tracker and arm."""
     cells: tuple[StudyCell, ...]
-    """every scaling, correlation, unit and way of sharing the unloaded reading."""
+    """One for each scaling, correlation, unit, and shared or separate unloaded readings."""
 
     def of(self, scaling: Scaling, unit: str, shared_unloaded: bool) -> tuple[StudyCell, ...]:
-        """Cells of one curve, by growing correlation."""
+        """Return the cells of one curve, by ascending correlation."""
         key = (scaling, unit, shared_unloaded)
-        found = [c for c in self.cells if (c.scaling, c.unit, c.shared_unloaded) == key]
-        return tuple(sorted(found, key=lambda c: c.correlation))
+        curve = [c for c in self.cells if (c.scaling, c.unit, c.shared_unloaded) == key]
+        return tuple(sorted(curve, key=lambda c: c.correlation))
 
     def to_json(self) -> dict[str, object]:
         """Return the study as plain values, with a summary per scaling."""
@@ -269,26 +269,26 @@ def scaling_study(
 ) -> ScalingStudy:
     """Simulate the identification of joint compliances with every scaling.
 
-    Each correlation, a share ρ of variance that the six elements have in common, is an experiment
-    of its own, with unloaded readings shared or not: that is what the engine computes side by side,
-    `experiments` of them. All scalings and units see the same noise. The arm is the UR10e for None.
+    Each correlation, the share ρ of variance that is common to the six elements, is one experiment
+    with shared and one with separate unloaded readings. The engine computes the experiments, see
+    `experiments`, in parallel. All scalings and units have the same noise. `arm` None: the UR10e.
     """
     check(runs, correlations, poses)
     design = make_design(rng, arm or load_arm("ur10e"), poses)
-    asked = _experiments(rng, design, correlations, runs)
-    done = engine.map(partial(_cells, design=design, runs=runs), asked, advance=advance)
+    tasks = _experiments(rng, design, correlations, runs)
+    results = engine.map(partial(_cells, design=design, runs=runs), tasks, advance=advance)
     return ScalingStudy(
         arm=design.arm.name,
         runs=runs,
         poses=poses,
         loads=len(design.wrenches),
         typical_correlation=_off_diagonal(design.specified) / _off_diagonal(design.common),
-        cells=tuple(cell for cells in done for cell in cells),
+        cells=tuple(cell for cells in results for cell in cells),
     )
 
 
 def check(runs: int, correlations: Sequence[float] = CORRELATIONS, poses: int = 30) -> None:
-    """Refuse a study that cannot be, before workers are started for it; see `scaling_study`."""
+    """Raise InputError for invalid arguments of `scaling_study`, before workers are started."""
     if runs < 2:
         raise InputError(f"runs = {runs}: a Monte-Carlo study needs 2 or more")
     if poses < 2:
@@ -301,16 +301,16 @@ def check(runs: int, correlations: Sequence[float] = CORRELATIONS, poses: int = 
 
 
 def experiments(correlations: Sequence[float] = CORRELATIONS) -> int:
-    """Return how many experiments a study of these correlations has."""
+    """Return the number of experiments of a study."""
     return 2 * len(correlations)
 
 
 def _experiments(
     rng: np.random.Generator, design: StudyDesign, correlations: Sequence[float], runs: int
 ) -> list[_Experiment]:
-    """Give each experiment the generator as it is when those before have drawn their noise.
+    """Return the experiments, each with the state of the generator after the previous ones.
 
-    So each can be computed by itself, and the random numbers are those of all in one sequence.
+    Each experiment can thus be computed alone, with the random numbers of a serial computation.
     """
     out = []
     for shared in (False, True):
@@ -321,17 +321,17 @@ def _experiments(
 
 
 def _noise(rng: np.random.Generator, readings: Readings, runs: int) -> Floats:
-    """(N, 6, R) standard normal numbers: for every element of N readings in R runs."""
+    """Return standard normal numbers (N, 6, R) for the elements of N readings in R runs."""
     return rng.standard_normal((len(readings), 6, runs))
 
 
-def _cells(of: _Experiment, design: StudyDesign, runs: int) -> list[StudyCell]:
-    """All scalings and units on the same noise; `_mc` are from the spread of the runs."""
-    rho, shared, rng = of
+def _cells(experiment: _Experiment, design: StudyDesign, runs: int) -> list[StudyCell]:
+    """Return all scalings and units with the same noise; `_mc` are from the spread of the runs."""
+    rho, shared, rng = experiment
     covariance = design.covariance(rho)
     limit = np.sqrt(np.diagonal(bound(design, covariance, shared)))[:, None]
     readings = make_readings(design, covariance, shared)
-    # A copy, so that the same experiment can be computed again, as after a worker's death.
+    # A copy, so that the experiment can be repeated after a worker's death.
     noise = np.linalg.cholesky(covariance)[readings.pose] @ _noise(deepcopy(rng), readings, runs)
     cells = []
     for scaling in SCALINGS:
@@ -369,7 +369,7 @@ def _cells(of: _Experiment, design: StudyDesign, runs: int) -> list[StudyCell]:
 def _fit(w: Whitening, blocks: Floats, noise: Floats) -> tuple[Floats, Floats, float | None]:
     """Return errors of all runs (n, R), half widths of their intervals (n, R), and mean χ²/dof.
 
-    `noise` (D, 6, R) are the errors of the deflections.
+    `noise` (D, 6, R): errors of the deflections.
     """
     a = w.whiten(blocks).reshape(-1, blocks.shape[-1])
     e = w.whiten(noise).reshape(-1, noise.shape[-1])
@@ -379,14 +379,14 @@ def _fit(w: Whitening, blocks: Floats, noise: Floats) -> tuple[Floats, Floats, f
     spread = np.linalg.norm(solve_triangular(r, np.eye(len(r))), axis=1)[:, None]
     dof = w.rank - len(r)
     factor = (np.sum(e * e, axis=0) - np.sum(projected * projected, axis=0)) / dof
-    if w.scaling == "none":  # no noise is stated: the residual's own variance
+    if w.scaling == "none":  # unknown noise: use the variance of the residual
         return error, stats.t.ppf((1 + LEVEL) / 2, dof) * spread * np.sqrt(factor), None
     half = np.broadcast_to(stats.norm.ppf((1 + LEVEL) / 2) * spread, error.shape)
     return error, half, float(factor.mean())
 
 
 def _off_diagonal(correlation: Floats) -> float:
-    """Root mean square of the correlations between different elements."""
+    """Return the root mean square of the correlations between different elements."""
     k = correlation.shape[-1]
     off = correlation[..., ~np.eye(k, dtype=bool)]
     return float(np.sqrt(np.mean(off**2)))
@@ -394,7 +394,7 @@ def _off_diagonal(correlation: Floats) -> float:
 
 BOUND_TOLERANCE = 0.03
 COVERAGE_BAND = (0.94, 0.96)
-# What is shown: the units matter to `none` alone.
+# The displayed curves; only the results of `none` depend on the units.
 CURVES: tuple[tuple[Scaling, str], ...] = (
     *(("none", unit) for unit, _, _ in UNITS),
     ("gu", UNITS[0][0]),
@@ -404,7 +404,7 @@ UNLOADED = {False: "own", True: "shared"}
 
 
 def title(study: ScalingStudy) -> str:
-    """One line that says what was simulated."""
+    """Return a line on the simulated campaign."""
     return (
         f"Joint compliances of a {study.arm}: {study.poses} poses x {study.loads} loads, "
         f"{study.runs} Monte-Carlo runs"
@@ -412,12 +412,12 @@ def title(study: ScalingStudy) -> str:
 
 
 def largest_shift(study: ScalingStudy, *scalings: Scaling) -> float:
-    """Largest change of an estimate with the units, in units of the bound."""
+    """Return the largest change of an estimate with the units, in units of the bound."""
     return max(c.unit_shift for c in study.cells if c.scaling in scalings)
 
 
 def table(study: ScalingStudy) -> Table:
-    """Error over bound and coverage per scaling: one row per correlation."""
+    """Return error over bound and coverage per scaling, with a row per correlation."""
     out = Table(
         title=title(study), caption=_caption(study), box=box.SIMPLE_HEAD, caption_justify="left"
     )
@@ -438,7 +438,7 @@ def table(study: ScalingStudy) -> Table:
 
 
 def _entry(cell: StudyCell) -> Text:
-    """Error and coverage, green where they are as they should be."""
+    """Return error and coverage, green if they agree with their ideal values, else red."""
     low, high = COVERAGE_BAND
     fits = abs(cell.error_over_bound - 1) <= BOUND_TOLERANCE
     covers = low <= cell.coverage <= high
@@ -450,7 +450,7 @@ def _entry(cell: StudyCell) -> Text:
 
 
 def _caption(study: ScalingStudy) -> str:
-    """How to read the table."""
+    """Return the explanation of the table."""
     error = max(c.error_over_bound_mc / c.error_over_bound for c in study.cells)
     coverage = max(c.coverage_mc for c in study.cells)
     return (

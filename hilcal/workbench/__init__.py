@@ -1,4 +1,4 @@
-"""The workbench: a page on this machine where an operator compares, adds, removes, measures next.
+"""The workbench: a local page on which an operator compares, adds and removes effects, and plans.
 
-`guard` lets in nobody but the operator's own browser.
+`guard` admits only the operator's browser.
 """

@@ -1,4 +1,4 @@
-"""The cards of the page: the verdict, where it fails, what is missing, revisions, the next plan."""
+"""The cards of the page: verdict, misfit, suspects, revisions, cell, next plan."""
 
 from __future__ import annotations
 
@@ -43,15 +43,15 @@ if TYPE_CHECKING:
 
 FURTHEST = 8
 FURTHEST_SHARE = 0.05
-"""Share of the readings that are compared with the others as those furthest off; a choice."""
+"""Share of the readings that counts as furthest off; a choice."""
 DIFFERENCES = 4
 DOWNLOADS = {"report": "Report", "calibration": "Calibration", "table": "Table of readings"}
 NONE_PASSES = "No effect passes the tests by itself; what that means, the verdict says."
-"""Whether one is missing is the verdict's alone to say."""
+"""This text does not say whether an effect is missing; only the verdict does."""
 
 
 def waiting(view: View) -> None:
-    """Say that nothing is there yet."""
+    """Draw the page before the first snapshot."""
     with ui.column().classes("part").style("margin-top: 16px"):
         title(view.session.path.name)
         if view.work.failure():
@@ -63,7 +63,7 @@ def waiting(view: View) -> None:
 
 @contextmanager
 def _part(name: str = "") -> Iterator[ui.column]:
-    """Open a card, with a title."""
+    """Open a card with a title, if any."""
     with ui.column().classes("part") as column:
         if name:
             title(name)
@@ -71,7 +71,7 @@ def _part(name: str = "") -> Iterator[ui.column]:
 
 
 def snapshot(view: View, d: Snapshot) -> None:
-    """Draw everything."""
+    """Draw all cards."""
     kind = "deflections" if d.fit.mode == "deflection" else "absolute readings"
     with ui.row().classes("items-baseline").style("gap: 4px 16px; padding-top: 16px"):
         ui.html(f"<h1 class='verdict'>{plain(d.name)}</h1>", sanitize=False)
@@ -110,31 +110,31 @@ def snapshot(view: View, d: Snapshot) -> None:
 
 
 def _verdict(view: View, d: Snapshot) -> None:
-    """Draw whether the model is good, and its effects, each with a button that takes it out."""
+    """Draw the verdict, the errors, and the effects of the model with buttons to remove them."""
     judged, fit = d.diagnosis, d.fit
     kind, mark = ("good", "✓") if judged.verdict == "adequate" else ("bad", "!")
     with _part() as part:
         part.props("data-part=verdict")
-        words = plain(numbers.sentence(headline(judged)))
-        ui.html(f"<h2 class='verdict {kind}'>{mark} {words}</h2>", sanitize=False)
+        text = plain(numbers.sentence(headline(judged)))
+        ui.html(f"<h2 class='verdict {kind}'>{mark} {text}</h2>", sanitize=False)
         ui.label(message(judged))
         low, high = fit.variance_factor_interval
         with ui.element("div").classes("numbers"):
             number("error on poses left out", numbers.length(fit.holdout.rms_m))
             number("error on fitted poses", numbers.length(fit.error.rms_m))
             number("noise alone would leave", numbers.length(d.story.noise_floor_m))
-            factor = f"{fit.variance_factor:.2f}"
-            number(f"variance factor, 95 %: {low:.2f} to {high:.2f}", factor)
-        called = "Baseline, not kept yet" if d.number is None else f"Revision {d.number}"
+            interval = f"95 %: {low:.2f} to {high:.2f}"
+            number(f"variance factor, {interval}", f"{fit.variance_factor:.2f}")
+        name = "Baseline, not kept yet" if d.number is None else f"Revision {d.number}"
         with ui.row().classes("items-center").style("gap: 6px 10px"):
-            soft(f"{called}: {model_name(fit.model.named)}")
-            for name in d.removable:
-                button(view, f"Remove {name}", partial(view.remove, name), "outline dense")
+            soft(f"{name}: {model_name(fit.model.named)}")
+            for effect in d.removable:
+                button(view, f"Remove {effect}", partial(view.remove, effect), "outline dense")
         answer(view, "model")
 
 
 def _fails(view: View, d: Snapshot) -> None:
-    """Draw where the model fails."""
+    """Draw the variables that the misfit follows."""
     with _part("Where it fails"):
         if d.diagnosis.residual_is_noise:
             soft("Nowhere beyond the noise: what is left is what it explains.")
@@ -165,16 +165,16 @@ def _missing(view: View, d: Snapshot) -> None:
             )
         else:
             soft(NONE_PASSES)
-        others, view.adder = [s.effect for s in d.diagnosis.suspects], None
-        if others:
+        effects, view.adder = [s.effect for s in d.diagnosis.suspects], None
+        if effects:
             kind = "unelevated" if rows else "outline"
-            words = f"Add {view.tab.suspect}"
-            view.adder = button(view, words, view.add, f"{kind} data-part=add")
+            text = f"Add {view.tab.suspect}"
+            view.adder = button(view, text, view.add, f"{kind} data-part=add")
             view.adder.set_visibility(view.tab.suspect is not None)
         answer(view, "missing")
-        if others:
+        if effects:
             ui.select(
-                others,
+                effects,
                 label="Another effect",
                 value=view.tab.suspect,
                 on_change=lambda e: view.choose(e.value),
@@ -182,10 +182,10 @@ def _missing(view: View, d: Snapshot) -> None:
 
 
 def _suspects(view: View, d: Snapshot) -> None:
-    """Draw the table of suspects, of which one is chosen by a click."""
-    found = suspects_table(d.diagnosis)  # what it is inseparable from is said below
-    found = replace(found, heads=found.heads[:4], rows=[row[:4] for row in found.rows])
-    table = drawn(found, selection="single")
+    """Draw the table of suspects; a click chooses one."""
+    suspects = suspects_table(d.diagnosis)  # without the last column: a sentence below has it
+    suspects = replace(suspects, heads=suspects.heads[:4], rows=[row[:4] for row in suspects.rows])
+    table = drawn(suspects, selection="single")
     table.props("hide-selected-banner data-part=missing").classes("choice")
     table.selected = [row for row in table.rows if row["0"] == view.tab.suspect]
 
@@ -212,28 +212,27 @@ def evidence(view: View, d: Snapshot) -> None:
         soft("…")
 
     async def draw() -> None:
-        found = await run.io_bound(view.session.evidence, d, effect)
-        if place.is_deleted:  # something else was chosen meanwhile
+        curve = await run.io_bound(view.session.evidence, d, effect)
+        if place.is_deleted:  # another effect was chosen meanwhile
             return
         place.clear()
         with place:
-            if found is None:
+            if curve is None:
                 soft("These readings say nothing of it.")
             else:
-                chart(view, charts.added_variable(found, effect)).props("data-part=evidence")
+                chart(view, charts.added_variable(curve, effect)).props("data-part=evidence")
 
     background_tasks.create(draw(), name="evidence")
 
 
 def readings(view: View, d: Snapshot) -> None:
-    """Draw the residuals over a variable, the readings that were picked and what they share."""
+    """Draw the residuals over a variable, the selected readings and their differences."""
     variable = view.tab.variable
     title("The readings" if variable is None else f"The readings over {variable}")
     recorded = view.session.recorded(d) if variable not in (None, "load") else {}
-    if (found := recorded.get(variable or "")) is not None:
-        name, factor = numbers.angle_or(found.unit)
-        values = factor * found.values
-        figure = charts.residual_over(d.story, d.revision, values, found.name, name)
+    if (r := recorded.get(variable or "")) is not None:
+        unit, factor = numbers.angle_or(r.unit)
+        figure = charts.residual_over(d.story, d.revision, factor * r.values, r.name, unit)
     else:
         kind = charts.residual_by_load if variable == "load" else charts.residual_by_pose
         figure = kind(d.story, d.revision)
@@ -245,10 +244,10 @@ def readings(view: View, d: Snapshot) -> None:
         return
     ui.label(f"{view.tab.picked_title}:").style("font-weight: 500")
     clear = [difference(x) for x in view.session.differences(d, np.array(picked)) if x.clear]
-    said = "Nothing recorded sets them apart from the others."
+    text = "Nothing recorded sets them apart from the others."
     if clear:
-        said = f"What sets them apart: {'; '.join(clear[:DIFFERENCES])}."
-    ui.label(said).props("data-part=differences")
+        text = f"What sets them apart: {'; '.join(clear[:DIFFERENCES])}."
+    ui.label(text).props("data-part=differences")
     sigma, size = d.revision.sigma, d.revision.size_m
     rows = block("pose", "load", "error", "in noise", left=(0, 1, 2, 3))
     for k in sorted(picked, key=lambda k: -sigma[k])[:FURTHEST]:
@@ -260,11 +259,11 @@ def readings(view: View, d: Snapshot) -> None:
 
 
 def difference(x: Difference) -> str:
-    """Write how picked readings differ from the others."""
+    """Return the difference of the selected readings from the others as text."""
     if x.variable.startswith("load "):
         name = "unloaded" if x.variable == f"load {UNLOADED}" else x.variable
-        picked, others = numbers.percent(x.picked), numbers.percent(x.others)
-        return f"{name}: {picked} of them, {others} of the others"
+        a, b = numbers.percent(x.picked), numbers.percent(x.others)
+        return f"{name}: {a} of them, {b} of the others"
     unit, factor = numbers.angle_or(x.unit)
     a, b = (numbers.digits(factor * value) for value in (x.picked, x.others))
     return f"{x.variable} {a} {unit}, the others {b} {unit}".replace(" ,", ",").rstrip()
@@ -278,7 +277,7 @@ def furthest(d: Snapshot) -> list[int]:
 
 
 def _revisions(view: View, d: Snapshot) -> None:
-    """Draw all revisions, each with the way back to it."""
+    """Draw all revisions, with buttons to look at them and to go back to them."""
     with _part("Revisions"):
         if not d.records:
             soft("None yet: the baseline is kept when something is added to it.")
@@ -300,8 +299,8 @@ def _one_revision(view: View, d: Snapshot, r: RevisionRecord) -> None:
         if r.number != d.number:
             button(view, "Look", partial(view.show, r.number), "flat dense")
         if r.number not in (d.number, d.in_use) or d.number != d.in_use:
-            words = "Go back to it" if r.number != d.number else "Use it"
-            button(view, words, partial(view.go_back, r.number), "outline dense")
+            text = "Go back to it" if r.number != d.number else "Use it"
+            button(view, text, partial(view.go_back, r.number), "outline dense")
 
 
 def _side_by_side(view: View, d: Snapshot) -> None:
@@ -324,8 +323,8 @@ def _side_by_side(view: View, d: Snapshot) -> None:
         def draw() -> None:
             place.clear()
             with place:
-                of = two_revisions(by_number[chosen[0].value], by_number[chosen[1].value])
-                drawn(of).props("wrap-cells")
+                table = two_revisions(by_number[chosen[0].value], by_number[chosen[1].value])
+                drawn(table).props("wrap-cells")
 
         def changed() -> None:
             view.tab.pair = chosen[0].value, chosen[1].value
@@ -338,18 +337,17 @@ def _side_by_side(view: View, d: Snapshot) -> None:
 
 
 def _laws(view: View, d: Snapshot) -> None:
-    """Draw the laws of the model that the catalogue does not have."""
-    if not (found := curves_of_laws(d.fit)):
+    """Draw the laws of the model that the catalogue lacks."""
+    if not (curves := curves_of_laws(d.fit)):
         return
     with _part("Laws beyond the catalogue"):
-        for law in found:
-            facts = "; ".join(f"{what}: {said}" for what, said in law.facts)
-            soft(f"{law.title}: {facts}")
+        for law in curves:
+            soft(f"{law.title}: " + "; ".join(f"{name}: {text}" for name, text in law.facts))
             chart(view, charts.curve_chart(law)).props("data-part=law")
 
 
 def viewer(view: View, d: Snapshot) -> None:
-    """Draw the 3-D view, or what opens it."""
+    """Draw the 3-D view, or the button that opens it."""
     with ui.column().classes("part").style("margin: 16px 0 32px"):
         title("The arm and its readings in space")
         if view.tab.viewer:
@@ -361,10 +359,10 @@ def viewer(view: View, d: Snapshot) -> None:
 
 
 def _cell(view: View, d: Snapshot) -> None:
-    """Draw what can be changed in the cell; what is typed stays until it is used."""
+    """Draw the values of the cell that can be changed; typed values stay until they are used."""
 
-    def keep(at: tuple[str, str], field: ui.input) -> Callable[[], None]:
-        return lambda: view.tab.texts.update({at: field.value or ""})
+    def keep(key: tuple[str, str], field: ui.input) -> Callable[[], None]:
+        return lambda: view.tab.texts.update({key: field.value or ""})
 
     with _part("Noise and cell"):
         soft(
@@ -378,18 +376,17 @@ def _cell(view: View, d: Snapshot) -> None:
         with ui.element("div").classes("figures").props("data-part=cell"):
             for f in d.figures:
                 if not f.fixed:
-                    at = f.section, f.key
-                    value = view.tab.texts.get(at, f.text)
+                    key = f.section, f.key
+                    value = view.tab.texts.get(key, f.text)
                     field = ui.input(f"[{f.section}] {f.key}", value=value).props("dense outlined")
                     field.props["hint"] = f.valid
-                    field.on_value_change(keep(at, field))
-        words = "Fit with these values"
-        button(view, words, view.change_cell, "unelevated data-part=change")
+                    field.on_value_change(keep(key, field))
+        button(view, "Fit with these values", view.change_cell, "unelevated data-part=change")
         answer(view, "cell")
 
 
 def _next_measurement(view: View, d: Snapshot) -> None:
-    """Draw what asks for the next measurement."""
+    """Draw the form that plans the next measurement."""
     with _part("Measure next"):
         soft("Plan the poses and loads that tell apart what these readings leave open.")
         with ui.row().classes("items-center").style("gap: 12px; width: 100%"):
@@ -409,15 +406,15 @@ def _next_measurement(view: View, d: Snapshot) -> None:
 
 
 def planned(view: View, d: Snapshot) -> None:
-    """Draw the next measurements, where they are planned."""
+    """Draw the planned next measurements, if any."""
     if view.session.planned is None:
         return
     next_, path = view.session.planned
     summary, powers = next_.made.summary, next_.found.powers
-    words = powers_summary(powers, summary.poses, summary.readings)
-    ui.label(words).props("data-part=planned")
-    for effect, rival, now, then in power_rows(powers):
-        soft(f"If {effect} is there, {rival} is ruled out: {now} now, {then} then.")
+    sentence = powers_summary(powers, summary.poses, summary.readings)
+    ui.label(sentence).props("data-part=planned")
+    for effect, rival, power_now, power_then in power_rows(powers):
+        soft(f"If {effect} is there, {rival} is ruled out: {power_now} now, {power_then} then.")
     ui.label(f"The plan is in {path.name}. Measure it into the same campaign with:")
     ui.label(view.session.run_line()).classes("code")
     soft("Then read the file again here.")

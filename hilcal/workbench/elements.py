@@ -1,4 +1,4 @@
-"""The small parts that the page is made of: the strip of the status, titles, buttons, charts."""
+"""Elements of the page: the status strip, titles, numbers, tables, buttons, charts."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 
 
 class Status:
-    """The strip that says what is being done, and what became of the file."""
+    """The strip that shows the current task and the state of the file."""
 
     def __init__(self, view: View) -> None:
-        """Make it, empty."""
+        """Make an empty strip."""
         with ui.column().classes("strip").style("gap: 0"):
             rows = [ui.row().classes("bench items-center").style("gap: 12px") for _ in range(3)]
         self.busy, self.answered, self.stale = rows
@@ -31,7 +31,7 @@ class Status:
             ui.spinner(size="1.3em")
             self.doing = ui.label().classes("soft").props("aria-live=polite")
         with self.answered:
-            self.told = ui.label().classes("answer").props("role=alert data-answer=file")
+            self.message = ui.label().classes("answer").props("role=alert data-answer=file")
             self.refit = button(view, "Fit anew to all readings", view.fit_anew, "outline dense")
         with self.stale:
             ui.label("Another command has changed the file.").classes("bad")
@@ -40,7 +40,7 @@ class Status:
             row.set_visibility(False)
 
     def show(self, work: Work) -> None:
-        """Show how the work stands."""
+        """Show the current task, or the answer of the last one."""
         line = work.line
         self.busy.set_visibility(bool(line))
         self.doing.set_text(f"{line} …")
@@ -49,63 +49,63 @@ class Status:
 
 
 def answer(view: View, place: str) -> None:
-    """Draw where it is said what is being done for the buttons above, and what came of it."""
+    """Draw the label for progress and answer of the buttons above."""
     view.answers[place] = ui.label().classes("answer").props(f"role=status data-answer={place}")
 
 
-def number(what: str, value: str) -> None:
-    """Draw a number with what it is."""
-    ui.html(f"<b>{plain(value)}</b><span>{plain(what)}</span>", sanitize=False).classes("number")
+def number(name: str, value: str) -> None:
+    """Draw a number with its name."""
+    ui.html(f"<b>{plain(value)}</b><span>{plain(name)}</span>", sanitize=False).classes("number")
 
 
-def title(words: str) -> None:
+def title(text: str) -> None:
     """Draw the title of a part."""
-    ui.html(f"<h2>{plain(words)}</h2>", sanitize=False)
+    ui.html(f"<h2>{plain(text)}</h2>", sanitize=False)
 
 
-def soft(words: str) -> ui.label:
-    """Draw words that explain."""
-    return ui.label(words).classes("soft")
+def soft(text: str) -> ui.label:
+    """Draw an explanation."""
+    return ui.label(text).classes("soft")
 
 
-def drawn(of: Table, selection: Literal["single"] | None = None) -> ui.table:
-    """Draw a table of a document; a row has its cells by the number of the column."""
+def drawn(table: Table, selection: Literal["single"] | None = None) -> ui.table:
+    """Draw a table of a document; the keys of a row are the numbers of the columns."""
     columns = [
         {
             "name": str(k),
             "label": head,
             "field": str(k),
-            "align": "left" if k in of.left else "right",
+            "align": "left" if k in table.left else "right",
         }
-        for k, head in enumerate(of.heads)
+        for k, head in enumerate(table.heads)
     ]
     rows = [
-        {"at": i} | {str(k): cell for k, cell in enumerate(row)} for i, row in enumerate(of.rows)
+        {"at": i} | {str(k): cell for k, cell in enumerate(row)} for i, row in enumerate(table.rows)
     ]
-    made = ui.table(columns=columns, rows=rows, row_key="at", selection=selection)
-    return made.props("flat dense").style("width: 100%")
+    element = ui.table(columns=columns, rows=rows, row_key="at", selection=selection)
+    return element.props("flat dense").style("width: 100%")
 
 
-def button(view: View, words: str, act: Callable[[], object], props: str) -> ui.button:
-    """Draw a button that cannot be pressed while something is being done."""
+def button(view: View, text: str, act: Callable[[], object], props: str) -> ui.button:
+    """Draw a button that is disabled during a task."""
     color = None if "outline" in props or "flat" in props else "primary"
-    made = ui.button(words, on_click=act, color=color).props(f"no-caps {props}")
-    return made.bind_enabled_from(view.work, "what", backward=lambda what: what is None)
+    element = ui.button(text, on_click=act, color=color).props(f"no-caps {props}")
+    return element.bind_enabled_from(view.work, "task", backward=lambda task: task is None)
 
 
 def chart(view: View, figure: go.Figure) -> ui.plotly:
-    """Draw a chart in the page's scheme, with its sentence for those who do not see it."""
-    dressed = style.in_scheme(figure, view.tab.dark).to_plotly_json()
-    shown = ui.plotly({**dressed, "config": style.CONFIG}).classes("chart")
-    shown.props["role"], shown.props["aria-label"] = "img", says(figure)
-    return shown
+    """Draw a chart in the page's scheme, with its sentence for screen readers."""
+    content = style.in_scheme(figure, view.tab.dark).to_plotly_json()
+    element = ui.plotly({**content, "config": style.CONFIG}).classes("chart")
+    element.props["role"], element.props["aria-label"] = "img", says(figure)
+    return element
 
 
 def point(e: GenericEventArguments) -> dict[str, Any]:
-    """Return the point of a chart that was clicked, as plotly.js describes it."""
+    """Return the clicked point of a chart, as plotly.js describes it."""
     return dict((e.args.get("points") or [{}])[0])
 
 
-def plain(words: str) -> str:
-    """Return words without a meaning in HTML."""
-    return html.escape(escaped(words))
+def plain(text: str) -> str:
+    """Return a text escaped for HTML."""
+    return html.escape(escaped(text))

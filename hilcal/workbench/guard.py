@@ -1,19 +1,19 @@
-"""Who may talk to the workbench: the browser to which its address was given, on this machine.
+"""Access control of the workbench: only a browser on this machine that opened the printed address.
 
-The server is bound to the loopback address. That alone does not keep out the pages of other sites,
-which the operator's own browser opens:
+The server is bound to the loopback address. This alone does not exclude pages of other sites in the
+operator's browser:
 
-- a page whose name is made to resolve to 127.0.0.1 (DNS rebinding) sends its own name as Host: any
-  Host but this server's own is refused;
-- a page of another site, or of another port of this machine, sends its Origin with a WebSocket
-  handshake and with every request that changes something, and Sec-Fetch-Site with all: they are
-  refused unless they are of this server; a WebSocket must say its Origin;
-- another user or program of this machine has not the cookie, a random secret that scripts cannot
-  read and other sites do not send. It is given once, for the random token of the address that the
-  command prints; every other request needs it. A token that nobody uses dies after a while.
+- A page whose name resolves to 127.0.0.1 (DNS rebinding) sends its own name as Host. Any Host but
+  this server's is refused.
+- A page of another site, or of another port of this machine, sends its Origin with a WebSocket
+  handshake and with every request that changes something, and Sec-Fetch-Site with all requests.
+  Origins and sites other than this server are refused; a WebSocket must state its Origin.
+- Another user or program of this machine does not have the cookie, a random secret that scripts
+  cannot read and other sites do not send. The cookie is given once, for the random token of the
+  address that the command prints; every other request needs it. An unused token expires.
 
-A policy in every answer forbids the browser to load anything from elsewhere, or to show the page in
-a frame of another site.
+A policy in every answer forbids the browser to load anything from other hosts, and other sites to
+show the page in a frame.
 """
 
 import secrets
@@ -30,21 +30,21 @@ Send = Callable[[Message], Awaitable[None]]
 App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 PATHS = ("/_nicegui/", "/_nicegui_ws/", "/viewer/")
-"""What is served beside the page; the rest does not exist."""
+"""Paths that are served in addition to the page."""
 LOOPBACK = ("127.0.0.1", "::1")
 TOKEN = "token"  # noqa: S105 (its name)
-UNUSED_S = 600.0  # how long a token waits for its use, s; a choice
+UNUSED_S = 600.0  # time until an unused token expires, s; a choice
 _ENTERED = b"""<!doctype html><title>hilcal</title><link rel="icon" href="data:,">
 <meta http-equiv="refresh" content="0; url=/">"""
-"""The page itself leads on: a browser that another page or a file sent here would not send a strict
-cookie along with a redirection."""
+"""A page that forwards to the workbench. After an HTTP redirection a browser that came from another
+page or a file would not send a strict cookie."""
 
 
 class AccessGuard:
-    """An ASGI application that passes on only what the operator's browser asks for."""
+    """An ASGI application that passes on only requests of the operator's browser."""
 
     def __init__(self, app: App, port: int, token: str) -> None:
-        """Guard an application at a port; `token` is the secret of its address."""
+        """Guard an application at a port; `token` is the secret in its address."""
         self.app, self._token = app, token
         self._secret = secrets.token_urlsafe(32)
         self._until = time.monotonic() + UNUSED_S
@@ -53,7 +53,7 @@ class AccessGuard:
         self.origins = tuple(f"http://{host}" for host in self._hosts)
         self._cookie = f"hilcal_workbench_{port}"
         sockets = " ".join(f"ws://{host}" for host in self._hosts)
-        # Vue compiles templates and wasm is code, so both kinds of `eval` are needed.
+        # Vue compiles templates and the viewer is wasm: both kinds of `eval` are needed.
         self._headers = [
             (
                 b"content-security-policy",
@@ -76,7 +76,7 @@ class AccessGuard:
         if scope["type"] not in ("http", "websocket"):
             await self.app(scope, receive, send)
             return
-        why = self._stranger(scope)
+        why = self._foreign(scope)
         if why is not None:
             await self._refuse(scope, send, 403, why)
         elif self._has_cookie(scope):
@@ -85,8 +85,8 @@ class AccessGuard:
             elif scope["path"] == "/" and scope["query_string"]:
                 await self._answer(send, 303, (b"location", b"/"))
             else:
-                await self.app(scope, receive, self._marked(send))
-        elif not self._knows(scope):
+                await self.app(scope, receive, self._with_policy(send))
+        elif not self._has_token(scope):
             await self._refuse(scope, send, 403, "open the address that hilcal workbench printed")
         elif self.entered or self.abandoned:
             why = "has been opened" if self.entered else "was left unused for too long"
@@ -101,11 +101,11 @@ class AccessGuard:
 
     @property
     def abandoned(self) -> bool:
-        """Whether nobody has used the token in its time, and so nobody ever will."""
+        """Whether the token expired unused, so that nobody can open the page any more."""
         return not self.entered and time.monotonic() > self._until
 
-    def _stranger(self, scope: Scope) -> str | None:
-        """Say why a request is not of this server's own page on this machine; None where it is."""
+    def _foreign(self, scope: Scope) -> str | None:
+        """Return why a request is not from this server's page on this machine; None if it is."""
         if (scope.get("client") or LOOPBACK)[0] not in LOOPBACK:
             return "only this machine may ask"
         if _heads(scope, b"host") not in [[host] for host in self._hosts]:
@@ -127,15 +127,15 @@ class AccessGuard:
             jar.load("; ".join(_heads(scope, b"cookie")))
         except CookieError:
             return False
-        found = jar.get(self._cookie)
-        return found is not None and _same(found.value, self._secret)
+        cookie = jar.get(self._cookie)
+        return cookie is not None and _same(cookie.value, self._secret)
 
-    def _knows(self, scope: Scope) -> bool:
-        """Whether a visit of the page brings the token."""
+    def _has_token(self, scope: Scope) -> bool:
+        """Return whether a request for the page has the token."""
         if scope["type"] != "http" or (scope["method"], scope["path"]) != ("GET", "/"):
             return False
-        given = parse_qs(scope["query_string"].decode("latin-1")).get(TOKEN, [""])
-        return _same(given[0], self._token)
+        tokens = parse_qs(scope["query_string"].decode("latin-1")).get(TOKEN, [""])
+        return _same(tokens[0], self._token)
 
     async def _answer(
         self, send: Send, status: int, *heads: tuple[bytes, bytes], body: bytes = b""
@@ -151,17 +151,17 @@ class AccessGuard:
         kind = (b"content-type", b"text/plain; charset=utf-8")
         await self._answer(send, status, kind, body=f"{why}\n".encode())
 
-    def _marked(self, send: Send) -> Send:
-        async def marked(message: Message) -> None:
+    def _with_policy(self, send: Send) -> Send:
+        async def send_with_policy(message: Message) -> None:
             if message["type"] == "http.response.start":
                 message = {**message, "headers": [*message.get("headers", ()), *self._headers]}
             await send(message)
 
-        return marked
+        return send_with_policy
 
 
 def _heads(scope: Scope, name: bytes) -> list[str]:
-    """Return the headers of a name, of which there may be several."""
+    """Return all headers of a name."""
     return [value.decode("latin-1") for key, value in scope["headers"] if key.lower() == name]
 
 

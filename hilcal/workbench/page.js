@@ -1,4 +1,4 @@
-/* The answer to a click stays where it is seen while the page around it is drawn anew. */
+/* Keeps the answer to a click at its place on the screen while the page is redrawn. */
 (() => {
   let place = null, want = null, last = null, moved = 0;
   for (const kind of ["wheel", "touchmove", "keydown", "pointerdown"])

@@ -1,4 +1,4 @@
-"""The page: what happens when something is clicked, and when it is drawn anew."""
+"""The page: actions of its buttons, and updates of its parts."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -19,7 +19,7 @@ from hilcal.workbench.session import Snapshot, WorkbenchSession
 from hilcal.workbench.viewer import WebViewer
 from hilcal.workbench.work import Answer, Say, Work
 
-TICK, LOOK = 0.2, 2.0  # how often a tab looks whether something has changed, and at the file, s
+TICK, LOOK = 0.2, 2.0  # intervals at which a tab checks the session and the file for changes, s
 CSS = Path(__file__).with_name("page.css")
 SCRIPT = Path(__file__).with_name("page.js")
 DARK = "matchMedia('(prefers-color-scheme: dark)').matches"
@@ -27,24 +27,24 @@ DARK = "matchMedia('(prefers-color-scheme: dark)').matches"
 
 @dataclass
 class Tab:
-    """What one tab looks at; nothing of it is stored."""
+    """State of one browser tab; it is not stored."""
 
-    snapshot: Snapshot | None = None  # that the rest belongs to
+    snapshot: Snapshot | None = None  # that the other fields refer to
     suspect: str | None = None  # the missing effect whose evidence is shown
     variable: str | None = None  # over which residuals are drawn; None for the pose
-    picked: list[int] | None = None  # measurements of the story that were clicked
-    picked_title: str = ""  # what they are, in words
-    dark: bool = False  # whether the browser asks for a dark page
+    picked: list[int] | None = None  # selected measurements of the story
+    picked_title: str = ""  # their description
+    dark: bool = False  # whether the browser prefers a dark page
     texts: dict[tuple[str, str], str] = field(default_factory=dict)
-    """Values of the cell by section and key, as they were typed and not used yet."""
+    """Values of the cell by section and key that were typed and not used yet."""
     pair: tuple[int, int] | None = None  # the two revisions that are shown side by side
-    looks: bool = False  # whether the 3-D view was asked for
+    viewer_requested: bool = False
     viewer: str = ""  # address of the 3-D view; empty before it was opened
 
 
 @dataclass
 class TabsShared:
-    """What all tabs share."""
+    """State that all tabs share."""
 
     session: WorkbenchSession
     work: Work = field(default_factory=Work)
@@ -53,7 +53,7 @@ class TabsShared:
 
 
 def install(app: FastAPI, session: WorkbenchSession) -> None:
-    """Add the page, and the files of the 3-D viewer, to an application; begin to read."""
+    """Add page and 3-D viewer to an application, and start to read the file."""
     shared = TabsShared(session)
 
     @app.get("/viewer/{name:path}")
@@ -75,7 +75,7 @@ def install(app: FastAPI, session: WorkbenchSession) -> None:
 
 
 def read_file(shared: TabsShared) -> None:
-    """Begin to read the file."""
+    """Start to read the file."""
 
     def read(say: Say) -> str:
         again = shared.session.snapshot is not None
@@ -89,10 +89,10 @@ class View:
     """One tab of the page."""
 
     def __init__(self, shared: TabsShared, address: str) -> None:
-        """Begin with what is there; `address` is this server's, as the browser calls it."""
+        """Create an empty tab; `address` is this server's, as the browser calls it."""
         self.shared, self.session, self.work = shared, shared.session, shared.work
         self.address, self.tab = address, Tab()
-        self.places: dict[str, ui.column] = {}  # of the parts that are drawn alone, see `REDRAWN`
+        self.places: dict[str, ui.column] = {}  # of the parts in `REDRAWN`
         self.adder: ui.button | None = None
         self.answers: dict[str, ui.label] = {}
         self._drawn = -1, False
@@ -101,7 +101,7 @@ class View:
         self._planned: object = None
 
     def build(self) -> None:
-        """Make the parts that stay, and look for changes from time to time."""
+        """Create the permanent parts and the timers that check for changes."""
         ui.colors(primary="#1f6f9f", positive="#00785a", negative="#c0274b", warning="#8a5a00")
         ui.add_css(CSS)
         ui.add_body_html(f"<script>{SCRIPT.read_text(encoding='utf-8')}</script>")
@@ -111,12 +111,12 @@ class View:
         ui.timer(LOOK, self.look)
 
     def begin(self, *, dark: bool) -> None:
-        """Draw, now that it is known whether the browser asks for a dark page."""
+        """Draw the page in the browser's colour scheme."""
         self.tab.dark, self._ready = dark, True
         self.draw()
 
     def tick(self) -> None:
-        """Show what is being done, and draw anew what has changed."""
+        """Show the current task, and redraw the parts that have changed."""
         self.status.show(self.work)
         self.show_answers()
         if self._file is not None:
@@ -125,43 +125,42 @@ class View:
             ui.download.content(content, name)
         if not self._ready:
             return
-        state = self.session.count, self.work.what is not None
+        state = self.session.count, self.work.task is not None
         if state != self._drawn and (state[0] != self._drawn[0] or self.session.snapshot is None):
             self.draw()
         self._drawn = state
         if self.session.planned is not self._planned:
             self.redraw("planned")
         drawing = self.shared.drawing
-        asked = self.tab.looks and not self.tab.viewer
-        if asked and drawing is not None and drawing[0] is self.tab.snapshot:
-            at = f"{self.address}viewer/"
-            files = "".join(f"&url={at}{name}" for name in drawing[1])
-            self.tab.viewer = f"{at}?persist=0&notebook=0&theme=dark{files}"
+        pending = self.tab.viewer_requested and not self.tab.viewer
+        if pending and drawing is not None and drawing[0] is self.tab.snapshot:
+            folder = f"{self.address}viewer/"
+            files = "".join(f"&url={folder}{name}" for name in drawing[1])
+            self.tab.viewer = f"{folder}?persist=0&notebook=0&theme=dark{files}"
             self.redraw("viewer")
 
     def show_answers(self) -> None:
-        """Show at each place what is being done there, or what came of it."""
+        """Show at each place the progress of its task, or its last answer."""
         for place, label in self.answers.items():
             busy = self.work.line if self.work.place == place else ""
-            came = self.work.answers.get(place)
-            label.set_text(f"{busy} …" if busy else numbers.sentence(came.words if came else ""))
-            label.set_visibility(bool(busy or came))
-            done = came is not None and came.done
+            answer = self.work.answers.get(place)
+            label.set_text(f"{busy} …" if busy else numbers.sentence(answer.text if answer else ""))
+            label.set_visibility(bool(busy or answer))
+            done = answer is not None and answer.done
             label.props(f"data-came={'busy' if busy else 'done' if done else 'failed'}")
 
     def look(self) -> None:
-        """Say when another command has changed the file."""
-        self.status.stale.set_visibility(self.work.what is None and self.session.stale)
+        """Show whether another command has changed the file."""
+        self.status.stale.set_visibility(self.work.task is None and self.session.stale)
 
     def draw(self) -> None:
-        """Draw everything for what the session shows now."""
-        self._drawn = self.session.count, self.work.what is not None
-        snapshot, before = self.session.snapshot, self.tab
-        if snapshot is not before.snapshot:
+        """Draw the complete page for the current snapshot."""
+        self._drawn = self.session.count, self.work.task is not None
+        snapshot, tab = self.session.snapshot, self.tab
+        if snapshot is not tab.snapshot:
             suspect = next(iter(snapshot.diagnosis.significant), None) if snapshot else None
-            kept = {"dark": before.dark, "texts": before.texts, "pair": before.pair}
-            self.tab = Tab(snapshot, suspect, **kept)  # type: ignore[arg-type]
-        self.answers = {"file": self.status.told}
+            self.tab = Tab(snapshot, suspect, dark=tab.dark, texts=tab.texts, pair=tab.pair)
+        self.answers = {"file": self.status.message}
         self.body.clear()
         with self.body:
             if snapshot is None:
@@ -172,7 +171,7 @@ class View:
         self.show_answers()
 
     def redraw(self, name: str) -> None:
-        """Draw one of the parts `REDRAWN` alone, where it is there."""
+        """Draw one of the parts in `REDRAWN`, if the page has it."""
         if name == "planned":
             self._planned = self.session.planned
         if (place := self.places.get(name)) is not None:
@@ -181,40 +180,40 @@ class View:
                 if self.tab.snapshot is not None:
                     REDRAWN[name](self, self.tab.snapshot)
 
-    def _do(self, place: str, what: str, act: Callable[[Snapshot, Say], object]) -> None:
-        """Begin something on this tab's snapshot; the text that `act` returns stays there."""
+    def _do(self, place: str, task: str, act: Callable[[Snapshot, Say], object]) -> None:
+        """Start a task on this tab's snapshot; the text that `act` returns is its answer."""
         snapshot = self.tab.snapshot
         if snapshot is not None and not self.work.start(
-            what, lambda say: act(snapshot, say), place
+            task, lambda say: act(snapshot, say), place
         ):
             self.work.answers[place] = Answer("Something else was being done; nothing was begun.")
 
     def _change(
-        self, place: str, what: str, effect: str, act: Callable[[Snapshot, str, Say], Snapshot]
+        self, place: str, verb: str, effect: str, act: Callable[[Snapshot, str, Say], Snapshot]
     ) -> None:
-        """Begin to add or remove an effect, and say what that did."""
+        """Start to add or remove an effect; the answer states the change of the error."""
 
         def do(snapshot: Snapshot, say: Say) -> str:
             act(snapshot, effect, say)
             if (c := self.session.changed) is None:
                 return ""
-            did = fell if c.added else rose
-            lines = [did(c.before, c.fit, c.added or c.removed or "")]
+            sentence = fell if c.added else rose
+            lines = [sentence(c.before, c.fit, c.added or c.removed or "")]
             lines.append(f"It is revision {c.number}.")
             return " ".join(lines + ([] if c.expected is None else [*addition_lines(c.expected)]))
 
-        self._do(place, f"{what} {effect}", do)
+        self._do(place, f"{verb} {effect}", do)
 
     def add(self) -> None:
         """Add the chosen effect."""
         self._change("missing", "Adding", self.tab.suspect or "", self.session.add)
 
     def remove(self, effect: str) -> None:
-        """Take an effect out."""
+        """Remove an effect."""
         self._change("model", "Removing", effect, self.session.remove)
 
     def go_back(self, number: int) -> None:
-        """Show a revision and let every command use it."""
+        """Show a revision, and accept it for every command."""
 
         def act(snapshot: Snapshot, say: Say) -> str:
             self.session.go_back(snapshot, number, say)
@@ -223,7 +222,7 @@ class View:
         self._do("revisions", f"Going to revision {number}", act)
 
     def show(self, number: int) -> None:
-        """Show a revision; nothing is written."""
+        """Show a revision without writing to the file."""
 
         def act(snapshot: Snapshot, say: Say) -> str:
             self.session.load(say, number)
@@ -240,25 +239,25 @@ class View:
         snapshot = self.session.snapshot
 
         def act(say: Say) -> str:
-            anew = self.session.fit_anew(snapshot, say)
-            return f"Fitted to all {anew.n_readings} readings: revision {anew.number}."
+            refit = self.session.fit_anew(snapshot, say)
+            return f"Fitted to all {refit.n_readings} readings: revision {refit.number}."
 
         self.work.start("Fitting anew", act)
 
     def change_cell(self) -> None:
-        """Fit in the cell as it was typed; what was typed stays until it is used."""
+        """Fit in the cell with the typed values, which stay in their fields if that fails."""
         texts = dict(self.tab.texts)
 
         def act(snapshot: Snapshot, say: Say) -> str:
-            anew = self.session.change_cell(snapshot, texts, say)
+            refit = self.session.change_cell(snapshot, texts, say)
             for key in texts:
                 self.tab.texts.pop(key, None)
-            return f"{refitted(snapshot.fit, anew.fit)} It is revision {anew.number}."
+            return f"{refitted(snapshot.fit, refit.fit)} It is revision {refit.number}."
 
         self._do("cell", "Fitting in the changed cell", act)
 
     def download(self, kind: str) -> None:
-        """Make a file about the shown revision, and give it to the browser."""
+        """Write a file on the shown revision for the browser to download."""
 
         def act(snapshot: Snapshot, say: Say) -> str:
             name, content = self._file = self.session.document(snapshot, kind, say)
@@ -278,8 +277,8 @@ class View:
         )
 
     def open_viewer(self) -> None:
-        """Prepare the 3-D view, unless another tab has."""
-        self.tab.looks = True
+        """Prepare the 3-D view, unless another tab has done so."""
+        self.tab.viewer_requested = True
         if self.shared.drawing is not None and self.shared.drawing[0] is self.tab.snapshot:
             return
 
@@ -299,13 +298,13 @@ class View:
             self.redraw("evidence")
 
     def pick_variable(self, name: str) -> None:
-        """Show the residuals over a variable, and its readings that are furthest off."""
+        """Show the residuals over a variable, and the readings that are furthest off."""
         self.tab.variable = name
         worst = cards.furthest(self.tab.snapshot) if self.tab.snapshot else []
         self._pick(worst, "The readings that are furthest off")
 
     def pick_pose(self, measurement: int) -> None:
-        """Show the readings of the pose of one."""
+        """Show the readings of the pose of a measurement."""
         snapshot = self.tab.snapshot
         if snapshot is not None and 0 <= measurement < len(snapshot.story):
             story = snapshot.story
@@ -313,7 +312,7 @@ class View:
             self._pick(readings, f"The readings of pose {story.pose_name(measurement)}")
 
     def _pick(self, measurements: list[int], title: str) -> None:
-        """Show some readings, and what distinguishes them."""
+        """Show some readings and the differences from the others."""
         self.tab.picked, self.tab.picked_title = measurements, title
         self.redraw("readings")
 
@@ -324,4 +323,4 @@ REDRAWN: dict[str, Callable[[View, Snapshot], None]] = {
     "planned": cards.planned,
     "viewer": cards.viewer,
 }
-"""The parts of the page that change without the rest."""
+"""Parts of the page that are redrawn separately."""

@@ -17,35 +17,34 @@ from hilcal.optional import needed_by
 from hilcal.workbench.session import WorkbenchSession
 
 HOST = "127.0.0.1"
-PORT = 8787  # the port that is tried where none is asked for; a choice
-GRACE = 2  # how long an open page may delay the end, s
+PORT = 8787  # default port; a choice
+GRACE = 2  # most time that an open page may delay the end, s
 
 
 def require_nicegui() -> None:
-    """Refuse to begin where the user-interface library is not installed."""
+    """Raise MissingPackageError if NiceGUI is not installed."""
     with needed_by("the workbench"):
         import nicegui  # noqa: F401
 
 
 def _listening(port: int | None) -> socket.socket:
-    """Listen at a loopback port; where None, at the usual one or, where that is taken, any."""
-    wanted = (PORT, 0) if port is None else (port,)
-    for one in wanted:
-        made = socket.socket()
-        made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    """Listen at a loopback port; None: at the default port or, if it is occupied, at any port."""
+    for candidate in (PORT, 0) if port is None else (port,):
+        sock = socket.socket()
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            made.bind((HOST, one))
+            sock.bind((HOST, candidate))
         except (OSError, OverflowError) as error:
-            made.close()
+            sock.close()
             why = str(error)
             continue
-        made.listen(128)
-        return made
+        sock.listen(128)
+        return sock
     raise InputError(f"--port {port}: {why}; choose a free port of this machine")
 
 
 def _quiet_environment() -> None:
-    """Let NiceGUI neither read nor write storage of its own, nor speak to another machine."""
+    """Keep NiceGUI from its own storage and from other machines."""
     folder = Path(tempfile.gettempdir()) / f"hilcal-no-storage-{secrets.token_hex(8)}"
     os.environ["NICEGUI_STORAGE_PATH"] = str(folder)
     for name in ("NICEGUI_REDIS_URL", "NICEGUI_HOST", "NICEGUI_PORT", "NICEGUI_PROTOCOL"):
@@ -54,10 +53,10 @@ def _quiet_environment() -> None:
 
 @contextlib.contextmanager
 def _leading_to(url: str) -> Iterator[Path]:
-    """Yield a file that leads a browser to an address, and that its user alone can read.
+    """Yield a file, readable by its user only, that leads a browser to an address.
 
-    Every user of the machine reads the arguments of every process: a browser that is started with
-    the address itself would tell its token to all.
+    Every user of the machine can read the arguments of all processes: a browser that is started
+    with the address itself would reveal its token.
     """
     runtime = Path(os.environ.get("XDG_RUNTIME_DIR", ""))
     place = runtime if runtime.is_absolute() and os.access(runtime, os.W_OK) else None
@@ -70,15 +69,15 @@ def _leading_to(url: str) -> Iterator[Path]:
 
 
 def serve(
-    session: WorkbenchSession, port: int | None, told: Callable[[str], None], *, browser: bool
+    session: WorkbenchSession, port: int | None, announce: Callable[[str], None], *, browser: bool
 ) -> bool:
-    """Serve the workbench of a campaign until Ctrl-C; whether somebody opened it.
+    """Serve the workbench of a campaign until Ctrl-C; return whether somebody opened it.
 
-    It ends by itself where nobody has in the time of its token: nobody could any more. `told` is
-    called with the address once it is served; `browser` opens it in the default browser.
+    The server also ends when its token expires unused. It calls `announce` with its address once it
+    serves; `browser` opens the address in the default browser.
 
     Raises:
-        InputError: NiceGUI is not installed, or the port cannot be had.
+        InputError: NiceGUI is not installed, or the port is not available.
     """
     require_nicegui()
     _quiet_environment()
@@ -91,7 +90,7 @@ def serve(
     from hilcal.workbench.guard import TOKEN, AccessGuard
     from hilcal.workbench.page import install
 
-    # What a click fails by is told on the page; the library's own remarks are for its developers.
+    # The page shows errors of clicks; the library's log is for its developers.
     logging.getLogger("nicegui").setLevel(logging.CRITICAL)
     with _listening(port) as sock:
         number, token = int(sock.getsockname()[1]), secrets.token_urlsafe(32)
@@ -116,16 +115,16 @@ def serve(
                     self.should_exit = True
 
                 kinds = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-                before = [signal.signal(kind, end) for kind in kinds]
+                handlers = [signal.signal(kind, end) for kind in kinds]
                 try:
                     yield
                 finally:
-                    for kind, handler in zip(kinds, before, strict=True):
+                    for kind, handler in zip(kinds, handlers, strict=True):
                         signal.signal(kind, handler)
 
             async def startup(self, sockets: list[socket.socket] | None = None) -> None:
                 await super().startup(sockets)
-                told(url)
+                announce(url)
                 if browser:
                     lead = opening.enter_context(_leading_to(url)).as_uri()
                     threading.Thread(target=webbrowser.open, args=(lead,), daemon=True).start()

@@ -1,8 +1,8 @@
-"""The state of a workbench, and what can be done at it; every number is one of the library.
+"""State and actions of a workbench; all computations are those of the library.
 
-One session serves all tabs. Its methods take seconds and are run one at a time (`work`). Each
-change names the snapshot on which it was asked for: where the session has gone on since, by another
-tab or a second click, it is refused and nothing is appended.
+One session serves all tabs. Its methods take seconds, and `work` runs one at a time. Each change
+names the snapshot that it is based on. If the session has a newer snapshot, by another tab or a
+second click, the change is refused and nothing is appended.
 """
 
 import tempfile
@@ -50,7 +50,7 @@ from hilcal.workbench.work import Say
 from hilcal.write_report import Asked, write_report
 
 Stamp = tuple[int, int, int]
-"""Size (bytes), time of the last change (ns) and inode of a file, by which a change is noticed."""
+"""Size (bytes), time of the last change (ns) and inode of a file, to detect changes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,37 +59,37 @@ class Figure:
 
     section: str  # of CELL.toml
     key: str
-    text: str  # as CELL.toml has it; empty where it is not given, or was estimated
-    valid: str  # what is valid, in words
-    fixed: str  # why these readings do not let it change; empty where they do
+    text: str  # in the syntax of CELL.toml; empty if not stated, or if estimated
+    valid: str  # description of the valid values
+    fixed: str  # why these readings forbid a change; empty if they allow it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Snapshot:
-    """A campaign with one of its revisions, and the way to it; made anew after every change."""
+    """A campaign with the shown revision and its predecessors; created after every change."""
 
     name: str  # of the file
     arm: str
-    n_readings: int  # all of them
+    n_readings: int  # including those set aside
     records: tuple[RevisionRecord, ...]  # all revisions, oldest first
-    accepted: int | None  # the revision that every command uses; None where it is the latest
-    number: int | None  # the revision that is shown; None for the baseline, which is not kept
-    chapters: tuple[Chapter, ...]  # the shown revision and those before it, oldest first
-    story: Story  # the same as it is drawn
-    stamp: Stamp  # of the file as it was read
-    source: str  # where the readings come from
-    covariance: str  # what their covariance consists of, in words
-    changes: Changes  # of the cell since they were taken
-    figures: tuple[Figure, ...]  # of the cell as it is for the shown revision
+    accepted: int | None  # the revision that every command uses; None: the latest
+    number: int | None  # the shown revision; None for the baseline, which is not stored
+    chapters: tuple[Chapter, ...]  # the shown revision and its predecessors, oldest first
+    story: Story  # of the same revisions
+    stamp: Stamp  # of the file when it was read
+    source: str  # of the readings
+    covariance: str  # description of the contents of their covariance
+    changes: Changes  # of the cell since the measurement
+    figures: tuple[Figure, ...]  # of the cell of the shown revision
 
     @property
     def fit(self) -> Fit:
-        """The fit that is shown."""
+        """The fit of the shown revision."""
         return self.chapters[-1].fit
 
     @property
     def diagnosis(self) -> Diagnosis:
-        """The judgement of it."""
+        """The diagnosis of the shown revision."""
         judged = self.chapters[-1].diagnosis
         if judged is None:
             raise ValueError("a snapshot without a diagnosis")
@@ -97,34 +97,34 @@ class Snapshot:
 
     @property
     def revision(self) -> StoryRevision:
-        """The shown revision as it is drawn."""
+        """The shown revision of the story."""
         return self.story.revisions[-1]
 
     @property
     def in_use(self) -> int | None:
-        """The revision that every command uses; None where there is none yet."""
+        """The revision that every command uses; None without revisions."""
         latest = self.records[-1].number if self.records else None
         return latest if self.accepted is None else self.accepted
 
     @property
     def removable(self) -> tuple[str, ...]:
-        """Effects of the shown model that may be taken out: all but frames that are unknown."""
+        """Effects of the shown model that can be removed: all except unknown frames."""
         frames = self.fit.model.catalogue.unknown_frames(self.fit.model.cell)
         return tuple(name for name in self.fit.model.named if name not in frames)
 
 
 def _figures(o: Campaign) -> tuple[Figure, ...]:
-    """Return what can be changed in the cell of a campaign."""
-    together = {"tracker": dict.fromkeys(INSTRUMENT_NOISE)}  # what needs a stated noise is shown
-    fixed, out = o.unchangeable(together), []
+    """Return the values of the cell of a campaign that can be changed."""
+    # with the instrument's noise, so that keys that need a stated noise are shown, too
+    fixed, out = o.unchangeable({"tracker": dict.fromkeys(INSTRUMENT_NOISE)}), []
     for section, keys in CHANGEABLE.items():
-        of = getattr(o.config, section)
+        section_config = getattr(o.config, section)
         for key in keys:
-            value = getattr(of, key)
+            value = getattr(section_config, key)
             if isinstance(value, tuple) and value and isinstance(value[0], Target):
                 value = [target.model_dump(exclude_none=True) for target in value]
             elif key == "targets" or (o.config.tool.targets and key.startswith("target_")):
-                continue  # the tool has one target, or several
+                continue  # keys of the other way to state targets
             estimated = o.noise is not None and key in INSTRUMENT_NOISE
             text = "" if value is None or estimated else write_value(value)
             why = fixed.get((section, key), "")
@@ -132,89 +132,89 @@ def _figures(o: Campaign) -> tuple[Figure, ...]:
     return tuple(out)
 
 
-def silent(words: str) -> None:
-    """Say nothing."""
+def silent(text: str) -> None:
+    """Ignore progress."""
 
 
 class WorkbenchSession:
     """A campaign file at the workbench.
 
-    Every method that takes a snapshot raises InputError where that is outdated; `say` takes
-    progress, one line each.
+    Every method with a snapshot raises InputError if the snapshot is outdated; `say` gets lines of
+    progress.
     """
 
     def __init__(self, path: str | Path, catalogue: Catalogue | None = None) -> None:
-        """Take a file; nothing is read yet."""
+        """Store the path of a file, without reading the file."""
         self.path, self._catalogue = Path(path), catalogue
-        self.snapshot: Snapshot | None = None  # what is shown; None before `load`
-        self.changed: Changed | None = None  # by the last change; None where another was chosen
+        self.snapshot: Snapshot | None = None  # current one; None before `load`
+        self.changed: Changed | None = None  # the change that led to it; None for other actions
         self.planned: tuple[NextPlan, Path] | None = None  # the last plan, and its file
-        self.count = 0  # of the snapshots that were shown
-        self._known: dict[int, Chapter] = {}
-        self._hash = ""
+        self.count = 0  # number of snapshots so far
+        self._cache: dict[int, Chapter] = {}  # by number of the revision; 0: baseline
+        self._hash = ""  # of the readings of the cache
 
     def load(self, say: Say = silent, revision: int | None = None) -> Snapshot:
-        """Read the file, judge a revision and those that it was made from, and show it.
+        """Read the file, diagnose a revision and its predecessors, and show it.
 
-        Nothing is written to the file, nor beside it. `revision` is the one in use where None.
+        Nothing is written. `revision` None is the one in use.
 
         Raises:
-            InputError: no sound campaign, no such revision, or one that cannot be restored.
+            InputError: no valid campaign, no such revision, or one that cannot be restored.
             CannotAnswerError: the readings do not determine the baseline.
         """
         stamp = self._stamp()
         with self._open(read_only=True) as o:
-            self._forget_others(o)
+            self._check_cache(o)
             chapters, record = self._chapters(o, revision, say), o.in_use(revision)
             if record is None:
                 return self._show(o.at({}), None, chapters, stamp=stamp)
             return self._show(o.at(record.cell), record.number, chapters, stamp=stamp)
 
     def add(self, snapshot: Snapshot, effect: str, say: Say = silent) -> Snapshot:
-        """Add an effect, written as for `hilcal add`, to the shown model; see `changes`."""
+        """Add an effect, in the syntax of `hilcal add`, to the shown model; see `changes`."""
         with self._writing(snapshot) as o:
-            wanted = read_effects_text(effect, "effect", o.catalogue)
-            if len(wanted) != 1:
-                raise InputError(f"effect {effect!r} has {len(wanted)} effects; valid: one")
-            ((name, options),) = wanted.items()
+            effects = read_effects_text(effect, "effect", o.catalogue)
+            if len(effects) != 1:
+                raise InputError(f"effect {effect!r} has {len(effects)} effects; valid: one")
+            ((name, options),) = effects.items()
             o.catalogue.make(name, o.cell, o.readings.states, options).prior_std()
-            of = snapshot.number, snapshot.fit
-            return self._changed(o, add_effect(o, *of, name, options, say, snapshot.diagnosis))
+            base = snapshot.number, snapshot.fit
+            return self._changed(o, add_effect(o, *base, name, options, say, snapshot.diagnosis))
 
     def remove(self, snapshot: Snapshot, effect: str, say: Say = silent) -> Snapshot:
-        """Take an effect out of the shown model; raises as `add`."""
+        """Remove an effect from the shown model; raises as `add`."""
         with self._writing(snapshot) as o:
-            of = snapshot.number, snapshot.fit
-            return self._changed(o, remove_effect(o, *of, effect, say, snapshot.diagnosis))
+            base = snapshot.number, snapshot.fit
+            return self._changed(o, remove_effect(o, *base, effect, say, snapshot.diagnosis))
 
     def go_back(self, snapshot: Snapshot, number: int, say: Say = silent) -> Snapshot:
-        """Show a revision, and let every command use it; nothing is taken away."""
+        """Show a revision, and accept it for every command; no revision is deleted."""
         with self._writing(snapshot) as o:
             chapters = self._chapters(o, number, say)
             o.accept(None if number == len(o.file.revisions()) else number)
             return self._show(o.at(o.file.revision(number).cell), number, chapters)
 
     def fit_anew(self, snapshot: Snapshot | None, say: Say = silent) -> Snapshot:
-        """Fit the model and prior of the revision in use to all readings, also later ones."""
+        """Fit the model and prior of the revision in use to all readings, including new ones."""
         with self._writing(snapshot, changed=True) as o:
             record = o.in_use()
             if record is None:
                 raise InputError(f"{o.path}: no revision yet")
             number = self._store(o, refit(o, record, say))
             if o.file.accepted() is not None:
-                o.accept(None)  # it cannot be used any more
-            return self._show(o, number, (self._known[number],))
+                o.accept(None)  # it is invalid for the new readings
+            return self._show(o, number, (self._cache[number],))
 
     def change_cell(
         self, snapshot: Snapshot, texts: Mapping[tuple[str, str], str], say: Say = silent
     ) -> Snapshot:
         """Fit the shown model in a changed cell, and show that revision; see `changes`.
 
-        `texts` are values by section and key, written as in CELL.toml; those that are shown change
-        nothing, and an empty one leaves the key out.
+        `texts` are values by section and key, in the syntax of CELL.toml; unchanged texts have no
+        effect, an empty text omits the key.
 
         Raises:
-            InputError: nothing is changed, or a value that is not valid.
+            InputError: no value is changed, or a value is invalid.
             CannotAnswerError: the readings do not determine the model.
         """
         changes: dict[str, dict[str, Any]] = {}
@@ -225,23 +225,23 @@ class WorkbenchSession:
         if not changes:
             raise InputError("no value differs from what is used already; nothing was fitted")
         with self._writing(snapshot) as o:
-            of = snapshot.number, snapshot.fit
-            there, number, found = change_cell(o, *of, changes, say, snapshot.diagnosis)
-            self._known[number] = Chapter(number, None, found.fit, found)
-            return self._show(there, number, self._chapters(there, number, silent))
+            base = snapshot.number, snapshot.fit
+            in_cell, number, diagnosis = change_cell(o, *base, changes, say, snapshot.diagnosis)
+            self._cache[number] = Chapter(number, None, diagnosis.fit, diagnosis)
+            return self._show(in_cell, number, self._chapters(in_cell, number, silent))
 
     def document(self, snapshot: Snapshot, kind: str, say: Say = silent) -> tuple[str, bytes]:
-        """Return name and content of a file about the shown revision.
+        """Return name and content of a file on the shown revision.
 
-        `kind` is "report" (HTML), "calibration" (JSON), which keeps a baseline that is not kept,
-        or "table" (the exchange table).
+        `kind` is "report" (HTML), "calibration" (JSON; stores the baseline if it is shown) or
+        "table" (the exchange table).
         """
         self._require(snapshot)
         number = snapshot.number
         if kind == "calibration" and number is None:
             with self._writing(snapshot) as o:
                 number = self._store(o, snapshot.diagnosis)
-                self._show(o, number, (self._known[number],))
+                self._show(o, number, (self._cache[number],))
         ends = {"report": ".html", "calibration": "-calibration.json", "table": "-readings.csv"}
         with tempfile.TemporaryDirectory() as folder, self._open(read_only=True) as opened:
             o, path = opened.at(snapshot.changes), Path(folder) / f"{self.path.stem}{ends[kind]}"
@@ -262,14 +262,14 @@ class WorkbenchSession:
         *,
         quick: bool = True,
     ) -> NextPlan:
-        """Plan the measurements that settle what the shown diagnosis leaves open, and save them.
+        """Plan the measurements that resolve the doubt of the shown diagnosis, and save the plan.
 
-        `poses` is what the doubt needs where None; `quick` compares no criteria, nor numbers of
-        poses, as `hilcal next` does.
+        `poses` None is the number that the doubt needs; `quick` omits the comparison of criteria
+        and numbers of poses.
 
         Raises:
-            InputError: a file that exists or cannot be written, or a plan that may not be run.
-            CannotAnswerError: nothing is in doubt, or no measurement would settle it.
+            InputError: the file exists or cannot be written, or the plan must not be run.
+            CannotAnswerError: nothing is in doubt, or no measurement would resolve the doubt.
         """
         if output.exists():
             raise InputError(f"{output}: the file exists; choose another name")
@@ -277,10 +277,10 @@ class WorkbenchSession:
         with self._open(read_only=True) as opened:
             o = opened.at(snapshot.changes)
             doubt, rng = doubt_to_settle(o, snapshot.diagnosis, say), np.random.default_rng(0)
-            found = next_plan(o, doubt, poses, rng, say, compare=not quick)
-        found.made.save(output)
-        self.planned = found, output
-        return found
+            plan = next_plan(o, doubt, poses, rng, say, compare=not quick)
+        plan.made.save(output)
+        self.planned = plan, output
+        return plan
 
     def run_line(self) -> str:
         """Return the command that measures the plan into the same campaign."""
@@ -300,16 +300,16 @@ class WorkbenchSession:
 
     def evidence(self, snapshot: Snapshot, effect: str) -> DependenceCurve | None:
         """Return residual and regressor of a suspect, for its added-variable plot."""
-        found = next((s for s in snapshot.diagnosis.suspects if s.effect == effect), None)
-        return None if found is None else regressor(snapshot.fit, found)
+        suspect = next((s for s in snapshot.diagnosis.suspects if s.effect == effect), None)
+        return None if suspect is None else regressor(snapshot.fit, suspect)
 
     def recorded(self, snapshot: Snapshot) -> dict[str, Recorded]:
-        """Return what was recorded of each measurement of the story (D,), by name."""
+        """Return the recorded variables of the measurements of the story (D,), by name."""
         rows = full_prediction(snapshot.fit).whitening.reading
         return {v.name: replace(v, values=v.values[rows]) for v in recorded_values(snapshot.fit)}
 
     def differences(self, snapshot: Snapshot, measurements: Ints) -> tuple[Difference, ...]:
-        """Return what sets some measurements of the story apart, the clearest first."""
+        """Return how some measurements of the story differ from the others, clearest first."""
         picked = np.zeros(len(snapshot.fit.readings), dtype=bool)
         picked[full_prediction(snapshot.fit).whitening.reading[measurements]] = True
         return distinguish(snapshot.fit, picked)
@@ -318,12 +318,12 @@ class WorkbenchSession:
         return Campaign.open(self.path, self._catalogue, read_only=read_only)
 
     def _writing(self, snapshot: Snapshot | None, *, changed: bool = False) -> Campaign:
-        """Open the file for a change; `changed`: another command may have changed it since."""
+        """Open the file for a change; `changed`: also after a change by another command."""
         self._require(snapshot, changed=changed)
         o = self._open(read_only=False)
         try:
             refuse_fitting(o.file)
-            self._forget_others(o)
+            self._check_cache(o)
             return o if changed or snapshot is None else o.at(snapshot.changes)
         except BaseException:
             o.close()
@@ -338,34 +338,34 @@ class WorkbenchSession:
             )
 
     def _chapters(self, o: Campaign, revision: int | None, say: Say) -> tuple[Chapter, ...]:
-        """Return a revision and those that it was made from; they are judged where not known."""
+        """Return a revision and its predecessors, diagnosed unless they are in the cache."""
         record, numbers = o.in_use(revision), [0]
         if record is None:
             refuse_fitting(o.file)
         else:
             o = o.at(record.cell)
             numbers = [r.number for r in chain_in_cell(o.file.revisions(), record.number)]
-        if not self._known.keys() >= set(numbers):
-            self._known |= zip(numbers, o.chapters(say, revision), strict=True)
-        out = tuple(self._known[number] for number in numbers)
+        if not self._cache.keys() >= set(numbers):
+            self._cache |= zip(numbers, o.chapters(say, revision), strict=True)
+        out = tuple(self._cache[number] for number in numbers)
         if out[-1].diagnosis is None:
             o.require_gc(out[-1].number, out[-1].fit.scaling, "judging")
         return out
 
-    def _forget_others(self, o: Campaign) -> None:
-        """Forget what was fitted to other readings than the file has now."""
+    def _check_cache(self, o: Campaign) -> None:
+        """Clear the cache if it belongs to other readings."""
         if (stored := o.data_hash) != self._hash:
-            self._known, self._hash = {}, stored
+            self._cache, self._hash = {}, stored
 
-    def _store(self, o: Campaign, found: Diagnosis) -> int:
-        number = o.append(found)
-        self._known[number] = Chapter(number, None, found.fit, found)
+    def _store(self, o: Campaign, diagnosis: Diagnosis) -> int:
+        number = o.append(diagnosis)
+        self._cache[number] = Chapter(number, None, diagnosis.fit, diagnosis)
         return number
 
     def _changed(self, o: Campaign, c: Changed) -> Snapshot:
-        if c.before_number not in self._known:  # the baseline, kept now
-            self._known[c.before_number] = self._known[0]
-        self._known[c.number] = Chapter(c.number, c.added, c.fit, c.diagnosis, c.removed)
+        if c.before_number not in self._cache:  # the baseline, which the change has stored
+            self._cache[c.before_number] = self._cache[0]
+        self._cache[c.number] = Chapter(c.number, c.added, c.fit, c.diagnosis, c.removed)
         return self._show(o, c.number, self._chapters(o, c.number, silent), changed=c)
 
     def _show(
@@ -377,7 +377,7 @@ class WorkbenchSession:
         stamp: Stamp | None = None,
         changed: Changed | None = None,
     ) -> Snapshot:
-        """Show a revision of a file that is as it is now, or as it was at a stamp."""
+        """Show a revision; `stamp` is that of the file when it was read, None: its current one."""
         self.snapshot = Snapshot(
             name=self.path.name,
             arm=o.cell.arm.name,
@@ -398,9 +398,9 @@ class WorkbenchSession:
         return self.snapshot
 
     def _stamp(self) -> Stamp:
-        """Return what tells whether the file was changed; InputError where it is not there."""
+        """Return the stamp of the file; InputError if the file cannot be read."""
         try:
-            found = self.path.stat()
+            status = self.path.stat()
         except OSError as error:
             raise InputError(f"{self.path}: cannot be read ({error.strerror})") from None
-        return found.st_size, found.st_mtime_ns, found.st_ino
+        return status.st_size, status.st_mtime_ns, status.st_ino

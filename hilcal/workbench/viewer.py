@@ -1,8 +1,8 @@
-"""The rerun web viewer as a part of the page, served behind the same guard as the rest.
+"""The rerun web viewer as a part of the page, served behind the same guard.
 
-rerun's own server lets in every program of this machine, and its page asks other hosts for fonts.
-So a short-lived process of it, on the loopback address, is asked for the viewer's files once; they
-and the recording are then served by the workbench, to the operator's browser alone.
+rerun's own server admits every program of this machine, and its page loads fonts from other hosts.
+The workbench therefore runs that server briefly, on the loopback address, to get the viewer's
+files once. It then serves these files and the recording to the operator's browser only.
 """
 
 import re
@@ -27,8 +27,8 @@ RECORDING = "application/octet-stream"
 _PATIENCE = 30.0
 _ELSEWHERE = re.compile(r"<link\b[^>]*>", re.DOTALL)
 _HEAD = "<head>"
-# rerun asks for newer versions and sends usage statistics: both get an empty answer, and what is
-# of this server is asked for with the operator's cookie. (The policy of the page forbids the rest.)
+# rerun asks for newer versions and sends usage statistics: both get an empty answer. Requests to
+# this server get the operator's cookie. (The policy of the page forbids all other requests.)
 _HERE = (
     "<script>const asked = fetch; window.fetch = (to, how) => "
     "new URL(to.url || to, location).origin === location.origin "
@@ -43,29 +43,28 @@ def end():
 threading.Thread(target=end, daemon=True).start()
 sys.exit(subprocess.call(sys.argv[1:], stdin=subprocess.DEVNULL))
 """
-"""Runs a command until standard input ends, however the program that holds it has ended."""
+"""Runs a command until standard input ends, which also a killed parent process causes."""
 _NOBODY = "rerun+http://127.0.0.1:9/proxy"
-"""What the viewer would show: given something, rerun opens no port for recordings."""
+"""A dummy recording to show: with one, rerun opens no port for recordings."""
 
 
 class WebViewer:
-    """The viewer's files and the recordings that it shows, in memory."""
+    """The viewer's files and its recordings, in memory."""
 
     def __init__(self) -> None:
-        """Begin with nothing."""
         self._files: dict[str, bytes] = {}
         self._recorded: dict[str, bytes] = {}
 
     def prepare(self, story: Story, count: int, say: Say) -> tuple[str, ...]:
-        """Record a story, and return the names of the files by which the viewer shows it.
+        """Record a story, and return the names of its files for the viewer.
 
-        The layout is a file of its own: a web viewer takes the one in a recording for a proposal.
-        `count` makes the names differ from those before.
+        The layout is a separate file, since a web viewer treats one in a recording as a proposal
+        only. `count` distinguishes the names from earlier ones.
 
         Raises:
-            HilcalError: the viewer cannot be had, or the story not be recorded.
+            HilcalError: the viewer is not available, or the story cannot be recorded.
         """
-        # loads the viewer's library, which takes a while
+        # slow imports of the viewer's library
         from hilcal.present.viewer.campaign import blueprint, save
         from hilcal.present.viewer.recording import APPLICATION
 
@@ -83,7 +82,7 @@ class WebViewer:
         return names
 
     def file(self, name: str) -> tuple[bytes, str] | None:
-        """Return content and kind of a file; None where there is none of this name."""
+        """Return content and media type of a file; None for an unknown name."""
         name = name or "index.html"
         if name in self._recorded:
             return self._recorded[name], RECORDING
@@ -91,7 +90,7 @@ class WebViewer:
 
 
 def _fetched() -> dict[str, bytes]:
-    """Return the files of the web viewer that came with rerun-sdk."""
+    """Return the files of the web viewer in rerun-sdk."""
     from hilcal.present.viewer.recording import executable  # loads the viewer's library
 
     with socket.socket() as probe:
@@ -106,14 +105,14 @@ def _fetched() -> dict[str, bytes]:
         start_new_session=True,
     )
     try:
-        found = {name: _get(port, name, process) for name in FILES}
+        files = {name: _get(port, name, process) for name in FILES}
     finally:
         if process.stdin is not None:
             process.stdin.close()
         process.wait()
-    page = _ELSEWHERE.sub("", found["index.html"].decode("utf-8"))
+    page = _ELSEWHERE.sub("", files["index.html"].decode("utf-8"))
     page = page.replace(_HEAD, _HEAD + _HERE, 1)
-    return {**found, "index.html": page.encode("utf-8")}
+    return {**files, "index.html": page.encode("utf-8")}
 
 
 def _get(port: int, name: str, process: "subprocess.Popen[bytes]") -> bytes:

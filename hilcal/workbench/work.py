@@ -1,4 +1,4 @@
-"""One piece of work at a time, beside the page, with what it says of its progress."""
+"""One task at a time, in a thread of its own, with its progress and its answer."""
 
 import threading
 import time
@@ -13,63 +13,63 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What came of a piece of work, in words, and whether it was done."""
+    """The outcome of a task: a text, and whether the task succeeded."""
 
-    words: str
+    text: str
     done: bool = True
 
 
 @dataclass(slots=True)
 class Work:
-    """What is being done."""
+    """The current task and the last answers."""
 
-    what: str | None = None  # in words; None where nothing is
-    place: str = ""  # the part of the page where it was asked for
-    said: str = ""  # the last line of its progress
-    answers: dict[str, Answer] = field(default_factory=dict)  # the last at each place
+    task: str | None = None  # its description; None without a task
+    place: str = ""  # the part of the page that started it
+    progress: str = ""  # the last line of its progress
+    answers: dict[str, Answer] = field(default_factory=dict)  # the last answer at each place
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
-    def start(self, what: str, do: Callable[[Say], object], place: str = "file") -> bool:
-        """Begin work in a thread unless some is being done; its text or error is the answer."""
+    def start(self, task: str, do: Callable[[Say], object], place: str = "file") -> bool:
+        """Start a task in a thread unless one is running; its text or its error is the answer."""
         with self._lock:
-            if self.what is not None:
+            if self.task is not None:
                 return False
-            self.what, self.said, self.place = what, "", place
+            self.task, self.progress, self.place = task, "", place
             self.answers.pop(place, None)
         threading.Thread(target=self._run, args=(do,), name="workbench", daemon=True).start()
         return True
 
     def _run(self, do: Callable[[Say], object]) -> None:
         try:
-            result = do(lambda words: setattr(self, "said", words))
+            result = do(lambda text: setattr(self, "progress", text))
             answer = Answer(result) if isinstance(result, str) and result else None
         except HilcalError as error:
             answer = Answer(str(error), done=False)
         except Exception as error:
-            words = " ".join(str(error).split())
-            unexpected = f"unexpected {type(error).__name__}: {words}; please report it"
+            text = " ".join(str(error).split())
+            unexpected = f"unexpected {type(error).__name__}: {text}; please report it"
             answer = Answer(str(failure_of(error) or unexpected), done=False)
         with self._lock:
             if answer is not None:
                 self.answers[self.place] = answer
-            self.what, self.said = None, ""
+            self.task, self.progress = None, ""
 
     @property
     def line(self) -> str:
-        """What is being done, in one line; empty where nothing is."""
-        what, said = self.what, self.said
-        if what is None:
+        """The current task and its progress in a line; empty without a task."""
+        task, progress = self.task, self.progress
+        if task is None:
             return ""
-        return what if said.lower() in ("", what.lower()) else f"{what}: {said}"
+        return task if progress.lower() in ("", task.lower()) else f"{task}: {progress}"
 
     def failure(self, place: str = "file") -> str:
-        """Why the last piece of work that was asked for at a place failed; empty otherwise."""
+        """Return the error of the last task at a place; empty if it succeeded."""
         answer = self.answers.get(place)
-        return "" if answer is None or answer.done else answer.words
+        return "" if answer is None or answer.done else answer.text
 
     def wait(self, timeout: float) -> bool:
-        """Wait until nothing is being done; whether that came in time, s."""
+        """Wait up to `timeout`, s, for the end of the task; return whether it has ended."""
         end = time.monotonic() + timeout
-        while self.what is not None and time.monotonic() < end:
+        while self.task is not None and time.monotonic() < end:
             time.sleep(0.01)
-        return self.what is None
+        return self.task is None

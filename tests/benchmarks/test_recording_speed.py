@@ -47,7 +47,7 @@ def test_telling_a_live_viewer(tmp_path: Path, benchmark: Any, claim: Claim) -> 
     def tell() -> None:
         for wall, what in events(measuring(plan(100))):
             begun = time.perf_counter()
-            live._tell(wall, what)
+            live._send(wall, what)
             each.append(time.perf_counter() - begun)
 
     try:

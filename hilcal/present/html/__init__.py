@@ -1,4 +1,4 @@
-"""The report as one HTML page that loads nothing else: template, style, script and plotly.js."""
+"""Self-contained HTML pages: template, style, script and plotly.js in one file."""
 
 import json
 from collections.abc import Iterable
@@ -24,19 +24,19 @@ HERE = Path(__file__).parent
 
 @dataclass(frozen=True, slots=True)
 class FirstScreen:
-    """What the first screen says."""
+    """Contents of the first screen."""
 
     headline: str  # the verdict in a few words
-    tone: str  # "good", "doubt" or "bad", for the colour; the headline says it in words
+    tone: str  # "good", "doubt" or "bad"; sets the colour of the headline
     answers: tuple[tuple[str, str], ...]  # question and answer
     cards: tuple[tuple[str, str, str], ...]  # numbers: label, value with unit, note
-    limit: str = ""  # "PASSED" or "FAILED" and why; empty without a limit
+    limit: str = ""  # "PASSED" or "FAILED" with the reason; empty without a limit
     passed: bool | None = None  # whether the limit is kept; None without one
-    verdict: str | None = None  # of the diagnosis; None where nothing was diagnosed
+    verdict: str | None = None  # of the diagnosis; None without one
 
 
 def render(title: str, about: str, first: FirstScreen, parts: tuple[PageSection, ...]) -> str:
-    """Return a page of sections below a first screen; `about` is what it is of, in one line."""
+    """Return a page of sections below a first screen; `about` is its subject in one line."""
     looks = {"light": style.template(dark=False), "dark": style.template(dark=True)}
     return (
         _environment()
@@ -57,18 +57,18 @@ def render(title: str, about: str, first: FirstScreen, parts: tuple[PageSection,
 
 
 def fragment(blocks: Iterable[Block]) -> str:
-    """Return blocks as a piece of HTML without style or script, which charts would need."""
+    """Return blocks as a fragment of HTML without style and script, hence without charts."""
     part = _environment().get_template("blocks.html").module.part  # type: ignore[attr-defined]
     return "".join(str(part(block, _figure)) for block in captioned(blocks))
 
 
 def in_script(json: str) -> str:
-    """Return JSON that nothing in it can end the script that holds it, or turn its text."""
+    """Return JSON escaped for a script element: it cannot end the element or reverse its text."""
     return escaped(json).replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
 
 
 def _figure(chart: Chart) -> dict[str, object]:
-    """Return what the template needs of a chart: the figure, its sentence and height."""
+    """Return the data of a chart for the template: figure, sentence and height."""
     bare = go.Figure(chart.figure)
     bare.layout.template = None
     bare.layout.height = chart.height or chart.figure.layout.height
@@ -80,7 +80,7 @@ def _figure(chart: Chart) -> dict[str, object]:
 
 
 def _shown(value: object) -> object:
-    """Return what a page shows of a value; ends of lines are blanks in HTML anyway."""
+    """Return a text with its control characters escaped, except line breaks; other values as is."""
     if not isinstance(value, str) or isinstance(value, Markup):
         return value
     return "\n".join(map(escaped, value.split("\n")))
@@ -88,7 +88,7 @@ def _shown(value: object) -> object:
 
 @cache
 def _environment() -> Environment:
-    """Every text is escaped; what is markup is named in `render`."""
+    """Return the environment of the templates; it escapes all text except `Markup`."""
     return Environment(
         loader=FileSystemLoader(HERE),
         autoescape=True,

@@ -1,4 +1,4 @@
-"""The pages that compare two campaigns of one arm, or the arms of a fleet."""
+"""HTML pages of a comparison of two campaigns and of a fleet."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -43,26 +43,26 @@ Named = tuple[str, str]  # name and SHA-256 of a campaign's file
 
 
 def error_by_pose(c: Comparison) -> go.Figure:
-    """Draw the error of the earlier calibration at each later reading, and what it states."""
-    of = c.today.prediction
-    r, rows = of.readings, of.whitening.reading
-    error, stated = 1e6 * np.linalg.norm(of.raw[:, :3], axis=1), 1e6 * c.today.beyond.stated_m
+    """Draw error and stated standard deviation of the earlier calibration at each later reading."""
+    p = c.today.prediction
+    r, rows = p.readings, p.whitening.reading
+    error, stated = 1e6 * np.linalg.norm(p.raw[:, :3], axis=1), 1e6 * c.today.beyond.stated_m
     names = [r.pose_names[k] for k in r.pose[rows]]
     loads = [load_name(r.load_names[k]) for k in r.load[rows]]
     hover = [
         charts.label(f"{n}, {load}: {e:.0f} µm, stated {s:.0f} µm")
         for n, load, e, s in zip(names, loads, error, stated, strict=True)
     ]
-    poses, more = [charts.label(n) for n in names], {"hovertext": hover, "hoverinfo": "text"}
+    poses, options = [charts.label(n) for n in names], {"hovertext": hover, "hoverinfo": "text"}
     states = "standard deviation that the calibration states"
     traces = [
-        charts.marks(poses, error, charts.MEASURED, "circle", 7, name="error today", **more),
-        charts.marks(poses, stated, charts.NOISE, "line-ew-open", 7, name=states, **more),
+        charts.marks(poses, error, charts.MEASURED, "circle", 7, name="error today", **options),
+        charts.marks(poses, stated, charts.NOISE, "line-ew-open", 7, name=states, **options),
     ]
     worst = int(np.argmax(error))
     says = (
         f"The error today is {error[worst]:.0f} µm at most, at {names[worst]} ({loads[worst]}); "
-        f"{numbers.length(of.error.rms_m)} rms, where the calibration states "
+        f"{numbers.length(p.error.rms_m)} rms, where the calibration states "
         f"{numbers.length(c.today.stated_m)}."
     )
     kind = "error" if r.scalar.any() else "3-D error"
@@ -70,7 +70,7 @@ def error_by_pose(c: Comparison) -> go.Figure:
 
 
 def changes_chart(c: Comparison) -> go.Figure:
-    """Draw how far each change moves the target in the later readings."""
+    """Draw the rms displacement of the target by each change in the later readings."""
     moved = [1e6 * x.moved_m for x in c.changes.found]
     names = [words_of(x.candidate) for x in c.changes.found]
     hover = [f"{n}: {m:.0f} µm rms" for n, m in zip(names, moved, strict=True)]
@@ -79,11 +79,11 @@ def changes_chart(c: Comparison) -> go.Figure:
 
 
 def arms_chart(t: "Pooled") -> go.Figure:
-    """Draw each arm's parameters by their distance from the type, over what most arms have."""
+    """Draw each arm's parameters as distances from the type, over the range of most arms."""
     names, off = [p.parameter for p in t.parameters], t.distance
     odd = {(o.arm, o.parameter) for o in t.odd if not o.campaign}
     traces = []
-    for unlike, words, color, symbol in (
+    for unlike, group, color, symbol in (
         (False, "like its type", charts.MEASURED, "circle"),
         (True, "unlike its type", charts.RED, "x"),
     ):
@@ -95,12 +95,10 @@ def arms_chart(t: "Pooled") -> go.Figure:
         ]
         if chosen:
             x, y, hover = zip(*chosen, strict=True)
-            more: dict[str, Any] = {
-                "hovertext": list(map(charts.label, hover)),
-                "hoverinfo": "text",
-            }
-            at = (np.array(x), list(map(charts.label, y)), color, symbol, 9)
-            traces.append(charts.marks(*at, name=words, opacity=0.8, **more))
+            points = (np.array(x), list(map(charts.label, y)), color, symbol, 9)
+            options: dict[str, Any] = {"name": group, "opacity": 0.8, "hoverinfo": "text"}
+            text = list(map(charts.label, hover))
+            traces.append(charts.marks(*points, **options, hovertext=text))
     arms = sorted({arm for arm, _ in odd})
     says = f"The {len(t.arms)} arms of the type are alike within what they scatter by."
     if arms:
@@ -148,10 +146,10 @@ def comparison_page(
 
 
 def comparison_screen(c: Comparison, earlier: str) -> FirstScreen:
-    """Return what the first screen says."""
-    found, t, error = c.changes, c.today, c.today.prediction.error
+    """Return the contents of the first screen."""
+    changes, t, error = c.changes, c.today, c.today.prediction.error
     beyond = "more" if t.p_value < LEVEL else "no more"
-    good = (
+    accuracy = (
         f"The calibration of {earlier} is off by {numbers.length(error.rms_m)} rms today, "
         f"{numbers.digits(t.z, 2)} times what it states: {beyond} than its uncertainty."
     )
@@ -163,11 +161,11 @@ def comparison_screen(c: Comparison, earlier: str) -> FirstScreen:
     if t.drawing_m is not None:
         cards.append(("Uncalibrated", numbers.length(t.drawing_m), "rms of the arm as drawn"))
     answers = (
-        ("Is the calibration still good?", good),
-        ("What has changed?", " ".join(map(sentence, found.found)) or f"{headline(c)}."),
+        ("Is the calibration still good?", accuracy),
+        ("What has changed?", " ".join(map(sentence, changes.found)) or f"{headline(c)}."),
         ("What to do?", numbers.sentence(next_step(c, earlier))),
     )
-    tone = "good" if not found.found and found.explained else "bad"
+    tone = "good" if not changes.found and changes.explained else "bad"
     return FirstScreen(headline(c), tone, answers, tuple(cards))
 
 

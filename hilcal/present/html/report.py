@@ -58,52 +58,52 @@ from hilcal.store.plan import Plan
 from hilcal.types import Floats
 
 MOST_CURVES, MOST_LISTED, MOST_PARAMETERS, MOST_LAWS = 2, 6, 48, 4
-"""Curves, suspects, parameters and curves of laws that stand on the page; choices."""
+"""Most curves, suspects, parameters and curves of laws on the page; choices."""
 NOT_KEPT = "not kept: made by a program of one's own, at the workbench, or before hilcal kept it"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tested:
-    """A model against readings of another campaign: its file's name and hash, what was found."""
+    """A validation by another campaign, with the name and the hash of its file."""
 
     name: str
     sha256: str
-    found: CampaignValidation
+    validation: CampaignValidation
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReportContent:
-    """Everything that a report says."""
+    """The contents of a report."""
 
     name: str  # of the campaign's file
     sha256: str  # of that file
-    made: str  # when the report was made, ISO 8601, UTC
+    made: str  # time of the report, ISO 8601, UTC
     version: str  # of the program
     overview: Overview
     covariance: CovarianceParts
-    chapters: tuple[Chapter, ...]  # the revisions, oldest first; the report is about the last
-    stored: bool  # whether they are in the file; else the baseline was fitted for this alone
+    chapters: tuple[Chapter, ...]  # revisions, oldest first; the report is about the last one
+    stored: bool  # whether the file has the revisions; else the baseline, fitted for the report
     story: Story  # of the same revisions
-    left_out: StoryRevision  # the last of them with the errors of poses left out
-    scalings: Mapping[Scaling, Fit]  # the last model with each; empty without an appendix
+    left_out: StoryRevision  # the last revision with the errors of poses left out
+    scalings: Mapping[Scaling, Fit]  # fits of the last model; empty without an appendix
     plan: Plan | None
     tested: Tested | None  # on readings that were never fitted
     corrected: Mapping[str, Any] | None
-    """Error at uncorrected and at corrected joint targets, as `calibrate` measured it with this
-    revision and the file keeps it: a document of `Improvement`."""
-    limit_m: float | None  # the largest 3-D position error that is allowed
-    operator: str  # who answers for the measurement; empty where nobody is named
-    commands: tuple[str, ...]  # that lead to the same result
-    appendix: bool  # whether the page has one
+    """Errors at uncorrected and corrected joint targets that `calibrate` measured with this
+    revision: the stored JSON of `Improvement`."""
+    limit_m: float | None  # largest allowed 3-D position error
+    operator: str  # responsible for the measurement; empty if not stated
+    commands: tuple[str, ...]  # that reproduce the result
+    appendix: bool  # whether the page has an appendix
 
     @property
     def fit(self) -> Fit:
-        """The fit that the report is about."""
+        """The fit of the last revision."""
         return self.chapters[-1].fit
 
     @property
     def diagnosis(self) -> Diagnosis | None:
-        """Its diagnosis; None where it is not scaled by gc."""
+        """The diagnosis of the last revision; None unless it is scaled by gc."""
         return self.chapters[-1].diagnosis
 
 
@@ -120,7 +120,7 @@ def sections(m: ReportContent) -> tuple[PageSection, ...]:
 
 
 def first_screen(m: ReportContent) -> FirstScreen:
-    """Return what the first screen says."""
+    """Return the contents of the first screen."""
     answers = (
         ("Is the model good?", _how_good(m)),
         ("Where is it wrong?", where_wrong(m)),
@@ -132,94 +132,94 @@ def first_screen(m: ReportContent) -> FirstScreen:
 
 
 def _headline(d: Diagnosis | None) -> tuple[str, str]:
-    """Return the verdict in a few words, and its tone."""
+    """Return the verdict in a few words, with its tone."""
     if d is None:
         return "Not judged: only a model fitted with scaling gc can be", "doubt"
-    words = headline(d)
+    text = headline(d)
     if d.verdict == "missing_effect" and d.lead is not None:
-        words = f"{words}: {d.lead.effect}"
+        text = f"{text}: {d.lead.effect}"
     good, doubt = d.verdict == "adequate", d.verdict in ("ambiguous", "noise_misjudged")
     tone = "good" if good else "doubt" if doubt and not d.wrong_figures else "bad"
-    return f"{words[0].upper()}{words[1:]}", tone
+    return f"{text[0].upper()}{text[1:]}", tone
 
 
 def _how_good(m: ReportContent) -> str:
-    """Say in a sentence how well the model predicts."""
-    d, prior, words = m.diagnosis, m.fit.model.prior, misses(m.fit)
+    """Return a sentence on how well the model predicts."""
+    d, prior, text = m.diagnosis, m.fit.model.prior, misses(m.fit)
     if prior is not None:
-        words += f" It also rests on a prior: {prior.posterior.source.campaign or 'a posterior'}."
+        text += f" It also rests on a prior: {prior.posterior.source.campaign or 'a posterior'}."
     if d is None:
-        return words
+        return text
     if d.verdict == "noise_misjudged":
-        return f"It cannot be told, for the stated noise is wrong. {words}"
+        return f"It cannot be told, for the stated noise is wrong. {text}"
     good = d.verdict == "adequate" or d.reason == "inseparable_addition"
-    return f"{'Yes' if good else 'Not yet'}. {words}"
+    return f"{'Yes' if good else 'Not yet'}. {text}"
 
 
 def where_wrong(m: ReportContent) -> str:
-    """Say in a sentence where it is worst, and what the misfit follows."""
+    """Return sentences on the worst pose and on the variables that the misfit follows."""
     d, fit, error = m.diagnosis, m.fit, left_out_errors(m.fit)
     furthest = int(fit.whitening.reading[np.argmax(error)])
     pose, load = names(fit.readings[~fit.outlier], furthest)
-    at = f"{pose} {load_name(load, 'under ')}"
-    words = f"Of the poses left out, {at} is furthest off: {length(error.max())}."
+    place = f"{pose} {load_name(load, 'under ')}"
+    worst = f"Of the poses left out, {place} is furthest off: {length(error.max())}."
     if d is None:
-        return words
+        return worst
     if not d.residual_is_noise:
-        return f"{words} {follows(d.misfit_breakdown)}"
-    # With R whitened elements of standard deviation 1 their sum of squares is χ²(R).
+        return f"{worst} {follows(d.misfit_breakdown)}"
+    # The sum of squares of R whitened elements of standard deviation 1 is distributed as χ²(R).
     count = fit.whitening.rank
     if fit.holdout.rms_sigma**2 * count <= chi2.isf((1 - CONFIDENCE) / 2, count):
         return "Nowhere beyond the noise: all poses and loads are predicted within it."
     return (
         "Nowhere in particular: what is left of the fitted poses is noise. Poses left out are off "
         f"by {fit.holdout.rms_sigma:.2f} times the noise, more than by chance; more poses would "
-        f"lower that. {words}"
+        f"lower that. {worst}"
     )
 
 
 def _missing(d: Diagnosis | None) -> str:
-    """Say what is missing, and what that effect is."""
+    """Return sentences on the missing effect."""
     if d is None:
         return "Not judged; hilcal identify --scaling gc, then hilcal diagnose, say it."
     if d.verdict == "adequate":
         return "Nothing that these readings could show."
-    words = message(d)
+    text = message(d)
     if d.lead is None or d.wrong_figures:
-        return words
+        return text
     name = d.lead.coarse or d.lead.effect
-    return f"{words} {name} is: {d.fit.model.catalogue[name].summary}."
+    return f"{text} {name} is: {d.fit.model.catalogue[name].summary}."
 
 
 def _cards(m: ReportContent) -> Iterator[tuple[str, str, str]]:
-    def card(label: str, rms_m: float, max_m: float, more: str = "") -> tuple[str, str, str]:
-        return label, length(rms_m), f"rms; largest {length(max_m)}{more}"
+    def card(label: str, rms_m: float, max_m: float, remark: str = "") -> tuple[str, str, str]:
+        return label, length(rms_m), f"rms; largest {length(max_m)}{remark}"
 
-    before, held = error_before(m.fit), m.fit.holdout
-    what = "nominal arm, only its frames fitted"
+    nominal, held = error_before(m.fit), m.fit.holdout
+    model = "nominal arm, only its frames fitted"
     if m.fit.mode == "deflection":
-        what = "deflection under load; a rigid arm has none"
-    yield card("Before", before.rms_m, before.max_m, f"; {what}")
+        model = "deflection under load; a rigid arm has none"
+    yield card("Before", nominal.rms_m, nominal.max_m, f"; {model}")
     if m.tested is not None:
-        e, unseen = m.tested.found.prediction.error, m.tested.found.judged.unseen
+        e, unseen = m.tested.validation.prediction.error, m.tested.validation.judged.unseen
         kind = "never fitted" if unseen else "fitted, so no test"
         yield card("After, validation", e.rms_m, e.max_m, f"; {kind}")
     if m.corrected is not None:
-        of = m.corrected["error"]
-        was, now = (length(float(of[k]["rms_m"])) for k in ("before", "after"))
-        words = f"rms; {was} without correction; {of['count']} points"
-        yield "Measured at corrected targets", now, words
+        error = m.corrected["error"]
+        uncorrected, corrected = (length(float(error[k]["rms_m"])) for k in ("before", "after"))
+        text = f"rms; {uncorrected} without correction; {error['count']} points"
+        yield "Measured at corrected targets", corrected, text
     yield card("After, poses left out", held.rms_m, held.max_m)
     noise = "rms that the stated noise would leave"
     yield "Noise alone", length(m.story.noise_floor_m), noise
 
 
 def limit_words(m: ReportContent) -> tuple[str, bool | None]:
-    """Say whether the limit is kept, and by what that was judged."""
+    """Return the verdict on the limit with its basis, and whether it is kept; "", None without."""
     if m.limit_m is None:
         return "", None
-    if m.tested is not None and m.tested.found.judged.unseen:
-        a = m.tested.found.shares
+    if m.tested is not None and m.tested.validation.judged.unseen:
+        a = m.tested.validation.shares
         count, over, passed, most = a.everything.count, a.over, bool(a.passed), a.everything.max_m
         end = f" (campaign {m.tested.name}, never fitted; largest {length(most)})."
         if a.undecided:
@@ -240,7 +240,7 @@ def limit_words(m: ReportContent) -> tuple[str, bool | None]:
 
 
 def left_out_errors(fit: Fit) -> Floats:
-    """Return the 3-D errors (D,) of fitted measurements predicted without their pose, m."""
+    """Return the 3-D errors (D,) of the fitted measurements when their pose is left out, m."""
     return np.asarray(np.linalg.norm(fit.left_out[:, :3], axis=1))
 
 
@@ -259,10 +259,10 @@ def _certificate(m: ReportContent) -> PageSection:
     return PageSection("certificate", "Certificate", tuple(parts))
 
 
-def _corrected(found: Mapping[str, Any]) -> Table:
+def _corrected(document: Mapping[str, Any]) -> Table:
     heads = ("load", "n", "before, rms", "largest", "corrected, rms", "largest", "in 95 % band")
     out = table(*heads, caption="Measured at uncorrected and at corrected joint targets")
-    for part in (*found["loads"], found["error"]):
+    for part in (*document["loads"], document["error"]):
         sizes = [part[when][k] for when in ("before", "after") for k in ("rms_m", "max_m")]
         name, within = load_name(str(part["name"])), f"{part['inside']} of {part['count']}"
         out.add(name, str(part["count"]), *(length(float(x)) for x in sizes), within)
@@ -274,13 +274,12 @@ def _uncertainty(fit: Fit) -> Iterator[Block]:
         yield "No uncertainty is stated: the fit is not weighted by the full covariance."
         return
     b = budget(fit)
-    whole = ~fit.readings[~fit.outlier].scalar[fit.whitening.reading]
-    error = left_out_errors(fit)[whole]
+    error = left_out_errors(fit)[~fit.readings[~fit.outlier].scalar[fit.whitening.reading]]
     inside = int(np.sum(error <= b.expanded))
-    what = "deflection" if fit.mode == "deflection" else "position"
-    within = f"; {inside} of {len(error)} {what}s of poses left out are within it"
+    quantity = "deflection" if fit.mode == "deflection" else "position"
+    within = f"; {inside} of {len(error)} {quantity}s of poses left out are within it"
     yield Words(
-        f"Expected accuracy of a predicted {what} at a pose that was not fitted: expanded "
+        f"Expected accuracy of a predicted {quantity} at a pose that was not fitted: expanded "
         f"uncertainty U = {length(b.expanded)} (3-D, k = {COVERAGE:.0f})"
         f"{within * bool(len(error))}.",
         "strong",
@@ -304,17 +303,16 @@ def _uncertainty(fit: Fit) -> Iterator[Block]:
 
 
 def _limit(m: ReportContent) -> Iterator[Block]:
-    words, passed = limit_words(m)
+    verdict, passed = limit_words(m)
     if passed is None:
         yield "No limit was given (hilcal report --limit LENGTH), so nothing is passed or failed."
     else:
-        yield Words(words, "strong")
+        yield Words(verdict, "strong")
     if m.tested is not None:
-        t = m.tested.found
+        t = m.tested.validation
         yield f"Validation campaign {m.tested.name}"
         yield from opening(t.judged, t.prediction)
-        report = validation_report(t.judged, t.prediction, t.beyond)
-        yield from captioned(report, "Validation")
+        yield from captioned(validation_report(t.judged, t.prediction, t.beyond), "Validation")
         yield from captioned(loads_report(t.shares), "Errors of the validation campaign")
 
 
@@ -350,16 +348,15 @@ def _conditions(m: ReportContent) -> Iterator[Block]:
 
 def _by_load(m: ReportContent) -> Table:
     fit, error = m.fit, left_out_errors(m.fit)
-    kept = fit.readings[~fit.outlier][fit.whitening.reading]
-    limit = () if m.limit_m is None else ("limit",)
-    heads = ("load", "n", "rms", "largest", "at pose", *limit)
+    fitted = fit.readings[~fit.outlier][fit.whitening.reading]
+    heads = ("load", "n", "rms", "largest", "at pose", *["limit"] * (m.limit_m is not None))
     out = table(*heads, caption="Error of poses left out, by load")
-    for k in np.unique(kept.load):
-        under = np.flatnonzero(kept.load == k)
-        worst = under[int(np.argmax(error[under]))]
-        rms, most = (length(float(x)) for x in (np.sqrt(np.mean(error[under] ** 2)), error[worst]))
-        row = [load_name(fit.readings.load_names[k]), str(len(under)), rms, most]
-        row.append(fit.readings.pose_names[kept.pose[worst]])
+    for k in np.unique(fitted.load):
+        of_load = np.flatnonzero(fitted.load == k)
+        worst = of_load[int(np.argmax(error[of_load]))]
+        rms, most = float(np.sqrt(np.mean(error[of_load] ** 2))), float(error[worst])
+        row = [load_name(fit.readings.load_names[k]), str(len(of_load)), length(rms), length(most)]
+        row.append(fit.readings.pose_names[fitted.pose[worst]])
         if m.limit_m is not None:
             row.append("kept" if error[worst] <= m.limit_m else "over")
         out.add(*row)
@@ -367,11 +364,11 @@ def _by_load(m: ReportContent) -> Table:
 
 
 def _not_tested(m: ReportContent) -> Iterator[str]:
-    """Yield what these readings say nothing of."""
+    """Yield the conditions that these readings do not test."""
     s, fit, d = m.fit.readings.states, m.fit, m.diagnosis
     if m.tested is None:
         yield "No validation campaign: the errors are those of poses left out in turn."
-    elif not m.tested.found.judged.unseen:
+    elif not m.tested.validation.judged.unseen:
         yield f"{m.tested.name} was fitted itself: it tests nothing."
     yield "Joint angles outside of the ranges above, and loads other than those above."
     if not np.any(s.wrench):
@@ -401,8 +398,8 @@ def _instruments(m: ReportContent) -> Iterator[Block]:
         heads = ("part", "instrument", "serial number", "answered first (UTC)", "further")
         out = table(*heads, caption="Instruments")
         for i in o.instruments:
-            more = "; ".join(f"{k}: {v}" for k, v in i.facts.items() if k != "serial number")
-            out.add(i.device, i.name, i.serial_number or "not told", utc(i.utc), more)
+            facts = "; ".join(f"{k}: {v}" for k, v in i.facts.items() if k != "serial number")
+            out.add(i.device, i.name, i.serial_number or "not told", utc(i.utc), facts)
         yield out
     else:
         imported = ": the readings were imported from a table" if o.planned is None else ""
@@ -422,7 +419,7 @@ def _instruments(m: ReportContent) -> Iterator[Block]:
 
 
 def identity(*facts: tuple[str, str]) -> Table:
-    """Return what a report is of, and who made it."""
+    """Return the table that identifies the subject and the author of a report."""
     return table("", "", caption="Identity of this report", rows=facts)
 
 
@@ -440,20 +437,20 @@ def _revisions(m: ReportContent) -> PageSection:
 
 
 def _where(m: ReportContent) -> PageSection:
-    of, d = (m.story, m.left_out), m.diagnosis
+    held_out, d = (m.story, m.left_out), m.diagnosis
     parts: list[Block] = [
         "Errors are those of poses left out: each is predicted by a fit to the others."
         + (" Readings set aside as gross errors are drawn, too." * bool(m.fit.outlier.any())),
-        Chart("By pose", charts.residual_by_pose(*of), wide=True),
-        Chart("Measured against predicted", charts.measured_predicted(*of)),
+        Chart("By pose", charts.residual_by_pose(*held_out), wide=True),
+        Chart("Measured against predicted", charts.measured_predicted(*held_out)),
     ]
     if len(set(m.story.load_names)) > 1:
-        parts.append(Chart("By load", charts.residual_by_load(*of)))
+        parts.append(Chart("By load", charts.residual_by_load(*held_out)))
     if m.story.time_s is not None:
-        parts.append(Chart("Over time", charts.residual_by_time(*of)))
+        parts.append(Chart("Over time", charts.residual_by_time(*held_out)))
     parts += [
-        Chart("From above", charts.workspace(*of, "xy")),
-        Chart("From the side", charts.workspace(*of, "xz")),
+        Chart("From above", charts.workspace(*held_out, "xy")),
+        Chart("From the side", charts.workspace(*held_out, "xz")),
         Chart("Noise check: fitted poses", charts.noise_check(m.fit)),
     ]
     if d is not None:
@@ -466,7 +463,7 @@ def _where(m: ReportContent) -> PageSection:
 
 
 def _noise(m: ReportContent) -> str:
-    """Say what the repeats tell of the noise."""
+    """Return a sentence on the noise of repeated readings."""
     e = None if m.diagnosis is None else m.diagnosis.pure_error
     if e is not None:
         low, high = e.interval
@@ -475,24 +472,24 @@ def _noise(m: ReportContent) -> str:
             f"factor {e.factor:.2f}, 95 % interval {low:.2f} to {high:.2f}, {e.dof:.0f} degrees of "
             "freedom)."
         )
-    kept = m.fit.readings[~m.fit.outlier]
-    again = len(kept) - len(np.unique(classes(kept)))
-    if not again:
+    fitted = m.fit.readings[~m.fit.outlier]
+    repeats = len(fitted) - len(np.unique(classes(fitted)))
+    if not repeats:
         return "No reading was repeated: the noise is judged by the model alone."
-    what = "deflection" if m.fit.mode == "deflection" else "reading"
+    quantity = "deflection" if m.fit.mode == "deflection" else "reading"
     return (
-        f"{again} of {len(kept)} readings repeat an earlier one, too few to judge the noise of a "
-        f"{what} by them: the model alone does."
+        f"{repeats} of {len(fitted)} readings repeat an earlier one, too few to judge the noise of "
+        f"a {quantity} by them: the model alone does."
     )
 
 
 def _evidence(m: ReportContent) -> PageSection:
     d, title = m.diagnosis, "What is missing, with its evidence"
     if d is None:
-        words = "Not diagnosed: only a model fitted with scaling gc can be."
-        return PageSection("evidence", title, (words,))
+        reason = "Not diagnosed: only a model fitted with scaling gc can be."
+        return PageSection("evidence", title, (reason,))
     parts: list[Block] = []
-    if d.verdict == "adequate":  # else the first screen has it
+    if d.verdict == "adequate":  # other verdicts are on the first screen
         parts.append(message(d))
     parts.append(_suspects_table(d.suspects[:MOST_LISTED], "Suspects, best first"))
     parts += [*doubtful(d), *redundant_line(d)]
@@ -500,10 +497,10 @@ def _evidence(m: ReportContent) -> PageSection:
     return PageSection("evidence", title, tuple(parts))
 
 
-def _added_variables(d: Diagnosis, of: Sequence[Suspect]) -> Iterator[Chart]:
-    for s in of:
-        if (found := regressor(d.fit, s)) is not None:
-            yield Chart(f"Added variable: {s.effect}", charts.added_variable(found, s.effect))
+def _added_variables(d: Diagnosis, suspects: Sequence[Suspect]) -> Iterator[Chart]:
+    for s in suspects:
+        if (added := regressor(d.fit, s)) is not None:
+            yield Chart(f"Added variable: {s.effect}", charts.added_variable(added, s.effect))
 
 
 def _suspects_table(rows: Sequence[Suspect], caption: str) -> Table:
@@ -518,13 +515,13 @@ def _suspects_table(rows: Sequence[Suspect], caption: str) -> Table:
 
 
 def _laws(m: ReportContent) -> Iterator[PageSection]:
-    found = laws(m.fit)
-    if not found:
+    law_curves = laws(m.fit)
+    if not law_curves:
         return
     parts: list[Block] = []
-    for name, facts in {law.title: law.facts for law in found}.items():
+    for name, facts in {law.title: law.facts for law in law_curves}.items():
         parts.append(table("", "", rows=facts, caption=f"{name}, an effect of a file"))
-    for law in found[:MOST_LAWS]:
+    for law in law_curves[:MOST_LAWS]:
         parts.append(Chart(f"{law.title}: {law.y_label}", charts.curve_chart(law)))
     parts.append(
         note(
@@ -537,10 +534,10 @@ def _laws(m: ReportContent) -> Iterator[PageSection]:
 
 def _parameters(m: ReportContent) -> PageSection:
     fit, catalogue = m.fit, m.fit.model.catalogue
-    known = [name for name in fit.model.named if name in catalogue.names]
-    parts: list[Block] = [note(f"{name}: {catalogue[name].summary}.") for name in known]
-    more = "hilcal report --appendix"
-    for part in captioned(parameters(fit, MOST_PARAMETERS, more), "Parameters"):
+    effects = [name for name in fit.model.named if name in catalogue.names]
+    parts: list[Block] = [note(f"{name}: {catalogue[name].summary}.") for name in effects]
+    command = "hilcal report --appendix"
+    for part in captioned(parameters(fit, MOST_PARAMETERS, command), "Parameters"):
         parts += _halves(part) if isinstance(part, Table) else (part,)
     parts += background_line(fit)
     if sizes := family_sizes(fit):
@@ -549,11 +546,11 @@ def _parameters(m: ReportContent) -> PageSection:
 
 
 def _halves(t: Table) -> Iterator[Table]:
-    """Yield the two halves of a table of parameters, without what they mean."""
+    """Yield the two halves of a table of parameters, without the column of meanings."""
     middle = -(-len(t.rows) // 2)
-    for rows, more in ((t.rows[:middle], ""), (t.rows[middle:], ", continued")):
+    for rows, suffix in ((t.rows[:middle], ""), (t.rows[middle:], ", continued")):
         if rows:
-            cut, caption = [row[:-1] for row in rows], f"{t.caption}{more}"
+            cut, caption = [row[:-1] for row in rows], f"{t.caption}{suffix}"
             yield replace(t, caption=caption, heads=t.heads[:-1], rows=cut, narrow=True)
 
 
@@ -574,7 +571,7 @@ def _joints(m: ReportContent) -> Iterator[Block]:
     for j in range(m.story.arm.n):
         yield Chart(f"Over joint {j + 1}", charts.residual_by_joint(m.story, m.left_out, j))
     if m.tested is not None:
-        yield replace(worst_table(m.tested.found.shares), caption="Worst poses")
+        yield replace(worst_table(m.tested.validation.shares), caption="Worst poses")
 
 
 def _rejected(m: ReportContent) -> Iterator[Block]:
@@ -617,9 +614,9 @@ def _provenance(m: ReportContent) -> Iterator[Block]:
     heads = ("revision", "made (UTC)", "hilcal", "SHA-256 of its readings")
     rows = [(str(r.number), utc(r.created), r.program_version, r.data_hash) for r in o.revisions]
     yield table(*heads, rows=rows, caption="Revisions by time and program")
-    made = [("the campaign", o.command or NOT_KEPT)]
-    made += [(f"revision {r.number}", str(r.options.get(COMMAND, NOT_KEPT))) for r in o.revisions]
-    yield table("made", "by", rows=made, caption="Commands as they were typed")
+    typed = [("the campaign", o.command or NOT_KEPT)]
+    typed += [(f"revision {r.number}", str(r.options.get(COMMAND, NOT_KEPT))) for r in o.revisions]
+    yield table("made", "by", rows=typed, caption="Commands as they were typed")
     yield heading("Commands that show the same")
     yield from (Words(c, "code") for c in m.commands)
     info = info_report(o, m.name, covariance_words(m.covariance))

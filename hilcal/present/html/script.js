@@ -1,6 +1,6 @@
-// Draws each chart when it comes near the screen, in the colours of the page, and all of them
-// before the page is printed. The page is shown first; then the text of plotly.js gets an address
-// of its own, for a script with an address is compiled beside the page, one within it is not.
+// Draws each chart when it comes near the screen, in the colour scheme of the page, and all charts
+// before the page is printed. The page is shown first. Then the text of plotly.js gets a URL, since
+// browsers compile a script with a URL in the background, an inline script not.
 "use strict";
 const dark = window.matchMedia("(prefers-color-scheme: dark)");
 const paper = window.matchMedia("print");
@@ -40,7 +40,7 @@ function drawAll() {
   charts.forEach(draw);
 }
 
-// One chart per picture, that nearest to the middle of the screen first.
+// One chart per animation frame, first the chart nearest to the middle of the screen.
 let drawing = false;
 function next() {
   if (drawing || !window.Plotly || !waiting.size) return;

@@ -1,4 +1,4 @@
-"""The story in rerun: a recording file, or a server that viewers join."""
+"""The story in rerun, as a recording file or from a server for viewers."""
 
 from hilcal.optional import needed_by
 

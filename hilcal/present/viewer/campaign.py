@@ -1,4 +1,4 @@
-"""A campaign in rerun: its recording, in a file or served to viewers that join when they like."""
+"""A campaign in rerun: a recording in a file, or served to viewers."""
 
 import contextlib
 from collections.abc import Iterator
@@ -37,15 +37,15 @@ SERIES = {
     "largest": style.RED,
     "noise": style.NOISE,
 }
-"""Of the errors of revisions: entity and colour, see `ERRORS`."""
-BARS = 150  # bars of poses at most
-_BINS = 12  # of single readings over what they may follow, for their mean
-SIGMA_LENGTH, ARROW_CAP = 0.02, 0.40  # one σ is drawn this long, and no arrow longer, m
-DEFLECTION_LENGTH, DEFLECTION_CAP = 0.25, 0.6  # the same of a large measured deflection, m
+"""Entities and colours of the errors of revisions, see `ERRORS`."""
+BARS = 150  # most bars of poses
+_BINS = 12  # most bins for the means of single readings
+SIGMA_LENGTH, ARROW_CAP = 0.02, 0.40  # drawn length of one σ, and largest length of an arrow, m
+DEFLECTION_LENGTH, DEFLECTION_CAP = 0.25, 0.6  # the same for a large measured deflection, m
 ARROWS, BALLS, PAIRS = 150, 60, 150
-"""How much is drawn at most, so that a picture stays legible and a file small."""
+"""Most drawn residuals, balls and pairs of deflections, for legible pictures and small files."""
 _LABEL_ABOVE = np.array([0.0, 0.0, 0.3])
-_DOT = 0.012  # m, half the distance of two dots of a leader
+_DOT = 0.012  # m, half the pitch of the dots of a leader
 _MARKS = {"adequate": "✓ ", "missing_effect": "✗ ", "unknown_effect": "✗ "}
 _POSE_LOADS = 12
 GUIDE = """### How to read this
@@ -74,11 +74,10 @@ it, over the recorded variable that carries most of it; the line above names bot
 
 
 def save(story: Story, path: Path) -> None:
-    """Write a story as a recording file, whole or not at all; an existing file is replaced.
+    """Write a story as a recording file, atomically; an existing file is replaced.
 
     Raises:
-        InputError: the folder is missing.
-        HilcalError: the file cannot be written.
+        InputError: the folder is missing, or the file cannot be written.
     """
     rec = _opened(story)
     recording.write(rec, blueprint(story), lambda: tell(rec, story), Path(path))
@@ -86,27 +85,26 @@ def save(story: Story, path: Path) -> None:
 
 @contextlib.contextmanager
 def serve(story: Story, ip: str = "127.0.0.1", port: int = PORT) -> Iterator[str]:
-    """Serve a story at the address that is yielded until the block ends.
+    """Serve a story at the yielded address until the block ends.
 
-    Viewers, as `rerun ADDRESS`, may join late and rejoin; their analytics are switched off for
-    this user.
+    Viewers (`rerun ADDRESS`) may join late and rejoin; their analytics are disabled for this user.
 
     Raises:
-        InputError: the port is taken.
+        InputError: the port is occupied.
         HilcalError: the port cannot be served.
     """
-    at = f"viewer server {ip}:{port}"
+    server = f"viewer server {ip}:{port}"
     recording.disable_analytics()
     if (why := recording.refused(ip, port)) is not None:
-        raise InputError(f"{at}: {why}; choose a free port of this machine")
+        raise InputError(f"{server}: {why}; choose a free port of this machine")
     try:
         rec = _opened(story)
         rec.set_sinks(rr.GrpcServerSink(bind_ip=ip, port=port))
-        # Active, too: a viewer that has shown another recording would keep the layout of that one.
+        # Active, too: a viewer that showed another recording would keep its layout.
         rec.send_blueprint(blueprint(story), make_active=True, make_default=True)
         tell(rec, story)
     except (OSError, RuntimeError) as error:
-        raise HilcalError(f"{at}: {error}") from error
+        raise HilcalError(f"{server}: {error}") from error
     try:
         yield f"rerun+http://{ip}:{port}/proxy"
     finally:
@@ -116,12 +114,12 @@ def serve(story: Story, ip: str = "127.0.0.1", port: int = PORT) -> Iterator[str
 def _opened(story: Story) -> rr.RecordingStream:
     arrays = (story.q, story.pose, story.anchor, story.measured, story.covariance)
     names = (story.arm.name, story.mode, story.load_names, story.pose_names)
-    words = [(r.revision, r.change, r.verdict, r.cells, r.panels) for r in story.revisions]
-    return recording.opened(names, *arrays, words, *(r.residual for r in story.revisions))
+    texts = [(r.revision, r.change, r.verdict, r.cells, r.panels) for r in story.revisions]
+    return recording.opened(names, *arrays, texts, *(r.residual for r in story.revisions))
 
 
 def tell(rec: rr.RecordingStream, story: Story) -> None:
-    """Log the whole story, flushed after each revision."""
+    """Log the complete story, flushed after each revision."""
     rec.send_recording_name(f"hilcal: {style.safe(story.arm.name)}, {len(story)} readings")
     begin(rec, story)
     for r in story.revisions:
@@ -134,14 +132,13 @@ def tell(rec: rr.RecordingStream, story: Story) -> None:
 
 
 def begin(rec: rr.RecordingStream, story: Story) -> None:
-    """Log what is the same in every revision: shapes of the arm, axes of the world, the guide."""
+    """Log the static entities: shapes of the arm, axes of the world, the guide."""
     fixed(rec, "world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     parts = style.shapes(capsules(story.arm))
     style.log_shapes(rec, [*parts, *style.target_shapes(story.arm, story.targets)])
     if story.target is not None:
         names = [story.target_names[k] for k in np.unique(story.target)]
-        at = f"world/arm/body{story.arm.n + 1}/names"
-        fixed(rec, at, style.labels(story.targets, names))
+        fixed(rec, f"world/arm/body{story.arm.n + 1}/names", style.labels(story.targets, names))
     fixed(rec, "words/guide", style.document(GUIDE))
 
 
@@ -151,7 +148,7 @@ def tell_revision(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> No
     _error_bars(rec, story)
     _pose_bars(rec, story, r)
     _curve_bars(rec, "follows", r.follows)
-    if any(of.laws for of in story.revisions):
+    if any(x.laws for x in story.revisions):
         _curve_bars(rec, "law", r.laws[0] if r.laws else None)
     parameters = style.markdown(r.panels.get("parameters", ()))
     for name, text in (
@@ -165,14 +162,14 @@ def tell_revision(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> No
 
 
 def _poses(rec: rr.RecordingStream, story: Story) -> None:
-    """Tell the last revision on the timeline `pose`, and move the arm along it."""
+    """Log the last revision on the timeline `pose`, and move the arm along it."""
     rec.set_time("pose", sequence=int(story.poses[0]))
     tell_revision(rec, story, story.revisions[-1])
     rec.reset_time()
     _pose_scene(rec, story)
     time = rr.TimeColumn("pose", sequence=story.poses)
     along(rec, "words/verdict", time, style.documents(pose_cards(story)))
-    # the bar of the current pose; its name puts it in front of the others
+    # the bar of the current pose; its entity's name, last in order, puts it in front
     for pose, left, width, height in zip(*_bar_places(story, story.revisions[-1]), strict=True):
         rec.set_time("pose", sequence=int(pose))
         bar = rr.BarChart([height], abscissa=[left], widths=[width], color=style.MEASURED)
@@ -181,7 +178,7 @@ def _poses(rec: rr.RecordingStream, story: Story) -> None:
 
 
 def blueprint(story: Story) -> rrb.Blueprint:
-    """Left: 3-D over errors. Right: the verdict over details. A growing story is followed."""
+    """Return the blueprint: left 3-D over errors, right the verdict over details."""
     residual, deflection, bars = titles(story)
     left = rrb.Vertical(
         rrb.Tabs(_view3d(story, residual, "deflection"), _view3d(story, deflection, "residual")),
@@ -189,9 +186,9 @@ def blueprint(story: Story) -> rrb.Blueprint:
         row_shares=[11, 4],
     )
     laws = [_curve_view("law", LAW)] if any(r.laws for r in story.revisions) else []
-    words = (("verdict", "Verdict"), ("details", "Details"), ("guide", "How to read this"))
+    texts = (("verdict", "Verdict"), ("details", "Details"), ("guide", "How to read this"))
     right = rrb.Vertical(
-        rrb.Tabs(*(style.text(of, name) for of, name in words)),
+        rrb.Tabs(*(style.text(*t) for t in texts)),
         rrb.Tabs(
             _curve_view("follows", FOLLOWS),
             *laws,
@@ -202,27 +199,27 @@ def blueprint(story: Story) -> rrb.Blueprint:
         row_shares=[5, 4],
     )
     play: Literal["following", "paused"] = "following" if story.growing else "paused"
-    both = rrb.Horizontal(left, right, column_shares=[3, 2])
-    return style.whole(both, "revision", play, fps=1.0)
+    views = rrb.Horizontal(left, right, column_shares=[3, 2])
+    return style.whole(views, "revision", play, fps=1.0)
 
 
 def titles(story: Story) -> tuple[str, str, str]:
     """Return the titles of residuals, deflections and bars, with their scales and counts."""
     some, n = len(shown(story, story.revisions[0])), len(story)
     part = f" (about {some} of {n} readings)" if some < n else ""
-    what = "Deflection" if story.mode == "deflection" else "Deviation from nominal"
+    quantity = "Deflection" if story.mode == "deflection" else "Deviation from nominal"
     several = poses_per_bar(story)
     poses = f" ({several} poses per bar)" if several > 1 else ""
     return (
         f"Residual ×{residual_scale(story):g}{part}: an arrow that leaves its "
         "noise ball = model wrong",
-        f"{what} ×{deflection_scale(story):g}: blue measured, white predicted, red missed",
+        f"{quantity} ×{deflection_scale(story):g}: blue measured, white predicted, red missed",
         f"Worst reading of each pose, in σ{poses}: grey noise, amber doubtful, red model wrong",
     )
 
 
 def _view3d(story: Story, name: str, without: str) -> rrb.Spatial3DView:
-    """Return a view of the targets, the arm in its worst poses and the labels."""
+    """Return a 3-D view that shows the targets, the arm in its worst poses and the labels."""
     far = [worst(r) for r in story.revisions]
     stands = story.bodies[story.row[far], :, :3, 3].reshape(-1, 3)
     points = np.vstack([story.anchor, stands, story.anchor[far] + _LABEL_ABOVE])
@@ -238,24 +235,24 @@ def _bars(origin: str, name: str, titlebar: bool = True) -> rrb.BarChartView:
 
 
 def _curve_view(entity: str, name: str) -> rrb.Vertical:
-    """Return the bars of a curve below its axes in words, for which a bar chart has no place."""
+    """Return the bars of a curve below a description of its axes, which a bar chart lacks."""
     axes = rrb.TextDocumentView(origin=f"words/{entity}", name=f"{name}: axes", titlebar=False)
     return rrb.Vertical(axes, _bars(entity, name, titlebar=False), row_shares=[1, 6], name=name)
 
 
 def _error_bars(rec: rr.RecordingStream, story: Story) -> None:
-    """Log the errors of all revisions, µm: four bars beside each other for each."""
-    of, floor = story.revisions, story.noise_floor_m
-    sizes = np.array([(r.error.rms_m, r.holdout.rms_m, r.error.max_m, floor) for r in of])
-    at, wide = np.array([float(r.revision) for r in of]), 0.8 / len(SERIES)
+    """Log the errors of all revisions, µm, as four adjacent bars per revision."""
+    rows, floor = story.revisions, story.noise_floor_m
+    sizes = np.array([(r.error.rms_m, r.holdout.rms_m, r.error.max_m, floor) for r in rows])
+    number, width = np.array([float(r.revision) for r in rows]), 0.8 / len(SERIES)
     for k, (name, color) in enumerate(SERIES.items()):
-        left, widths = at - 0.4 + k * wide, np.full(len(at), wide)
+        left, widths = number - 0.4 + k * width, np.full(len(number), width)
         bars = rr.BarChart(1e6 * sizes[:, k], abscissa=left, widths=widths, color=color)
         rec.log(f"errors/{name}", bars)
 
 
 def _curve_bars(rec: rr.RecordingStream, entity: str, c: DependenceCurve | None) -> None:
-    """Log a curve, readings by their mean in bins, as bars, and beside each that of the law."""
+    """Log a curve as bars, single readings as means of bins, each next to the bar of the law."""
     bars: dict[str, Floats] = {}
     edges, axes = np.zeros(0), "Nothing is drawn of this revision."
     if c is not None and len(c.x):
@@ -268,10 +265,10 @@ def _curve_bars(rec: rr.RecordingStream, entity: str, c: DependenceCurve | None)
         bars["mean"] = y[order]
         if c.line is not None:
             bars["law"] = np.interp(x[order], *c.line)
-        at = order.astype(float) if c.names else x[order]
-        gaps = np.diff(at) if len(at) > 1 else np.ones(1)
-        wide = np.concatenate([at[:1] - gaps[:1], at, at[-1:] + gaps[-1:]])
-        edges = 0.5 * (wide[1:] + wide[:-1])
+        center = order.astype(float) if c.names else x[order]
+        gaps = np.diff(center) if len(center) > 1 else np.ones(1)
+        padded = np.concatenate([center[:1] - gaps[:1], center, center[-1:] + gaps[-1:]])
+        edges = 0.5 * (padded[1:] + padded[:-1])
     rec.log(f"words/{entity}", style.document(style.markdown([axes])))
     for k, (part, color) in enumerate((("mean", style.MEASURED), ("law", style.NOISE))):
         if part not in bars:
@@ -284,11 +281,11 @@ def _curve_bars(rec: rr.RecordingStream, entity: str, c: DependenceCurve | None)
 
 
 def _pose_bars(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
-    """Log the worst reading of each pose, or of a few, in σ, one series per level."""
+    """Log the worst reading of each bar's poses, in σ, one series per level."""
     _, left, width, height = _bar_places(story, r)
     for i, name in enumerate(style.LEVEL_NAMES):
         members = levels(height**2) == i
-        # a level without members has a bar without a height
+        # a level without members gets a bar of height 0
         some = members if members.any() else np.arange(len(height)) == 0
         color, tall = style.LEVEL_COLORS[i].tolist(), np.where(members, height, 0.0)[some]
         bar = rr.BarChart(tall, abscissa=left[some], widths=width[some], color=color)
@@ -296,12 +293,12 @@ def _pose_bars(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
 
 
 def poses_per_bar(story: Story) -> int:
-    """Consecutive poses that share one bar, so that bars stay wide enough to be read."""
+    """Return the number of consecutive poses that share one bar, so that bars stay legible."""
     return -(-len(story.poses) // BARS)
 
 
 def _bar_places(story: Story, r: StoryRevision) -> tuple[Ints, Floats, Floats, Floats]:
-    """First pose (its number), left edge, width and height, σ, of every bar."""
+    """Return number of the first pose, left edge, width, and height in σ of every bar."""
     starts = np.arange(0, len(story.poses), poses_per_bar(story))
     edges = np.append(story.poses[starts], story.poses[-1] + 1) - 0.5
     height = np.maximum.reduceat(r.sigma[story.last_of_poses(r.whitened_norm2)], starts)
@@ -309,30 +306,30 @@ def _bar_places(story: Story, r: StoryRevision) -> tuple[Ints, Floats, Floats, F
 
 
 def verdict(story: Story, r: StoryRevision) -> str:
-    """Return the verdict of a revision with its suspects; short, since a small window cuts it."""
-    numbers_of = [o.revision for o in story.revisions]
-    k, count = numbers_of.index(r.revision) + 1, len(numbers_of)
-    where = f" of {count}" if numbers_of == list(range(1, count + 1)) else f" ({k} of {count})"
-    place = "" if story.growing else f"{where}{', the last' * (k == count > 1)}"
+    """Return the verdict of a revision with its suspects; short, to fit a small window."""
+    order = [o.revision for o in story.revisions]
+    k, count = order.index(r.revision) + 1, len(order)
+    position = f" of {count}" if order == [*range(1, count + 1)] else f" ({k} of {count})"
+    place = "" if story.growing else f"{position}{', the last' * (k == count > 1)}"
     says = f"{_MARKS.get(r.verdict, '')}{r.verdict.replace('_', ' ')}"
     head = heading(f"Revision {r.revision}{place}: {says}")
     return style.markdown([head, *r.panels.get("verdict", ())])
 
 
 def details(story: Story, r: StoryRevision) -> str:
-    """Return what the verdict rests on, as the terminal has it, and the worst reading."""
+    """Return the worst reading of a revision, and the diagnosis as on the terminal."""
     outside, i = float(np.mean(r.level > 0)), worst(r)
-    words = (
+    summary = (
         f"{numbers.percent(outside)} of readings are outside their 99 % noise ball (noise alone: "
         f"1 %). Worst: pose {story.pose_name(i)}, load {story.load_names[i]}, "
         f"{numbers.length(float(r.size_m[i]))} ({r.sigma[i]:.1f} σ)."
     )
     head = heading(f"Revision {r.revision}: {r.name}")
-    return style.markdown([head, words, *r.panels.get("details", ())])
+    return style.markdown([head, summary, *r.panels.get("details", ())])
 
 
 def pose_cards(story: Story) -> list[str]:
-    """Return each pose of the last revision in words: residual of each load, and joints."""
+    """Return a description of each pose in the last revision: residual per load, and joints."""
     r, size = story.revisions[-1], story.revisions[-1].size_m
     sigma, level, out = r.sigma, r.level, []
     order = np.argsort(story.row, kind="stable")
@@ -355,7 +352,7 @@ def pose_cards(story: Story) -> list[str]:
 
 
 def revisions(story: Story, upto: int) -> str:
-    """Return the table of revisions up to one of them: errors falling, step by step."""
+    """Return the table of the revisions up to number `upto`."""
     rows = [r.cells for r in story.revisions if r.revision <= upto and r.cells]
     floor = f"Noise alone would leave {numbers.length(story.noise_floor_m)} rms."
     return style.markdown([table(*REVISION_HEADS, rows=rows, left=(0, 1, 7)), floor])
@@ -371,22 +368,22 @@ def log_line(story: Story, r: StoryRevision) -> str:
 
 
 def residual_scale(story: Story) -> float:
-    """Return the m that are drawn per m of residual."""
+    """Return the drawn length per length of a residual."""
     sigma = float(np.sqrt(np.median(np.trace(story.covariance, axis1=1, axis2=2)) / 3))
     return round_factor(SIGMA_LENGTH / sigma, style.FACTORS) if sigma > 0 else 1.0
 
 
 def deflection_scale(story: Story) -> float:
-    """Return the m that are drawn per m of deflection."""
+    """Return the drawn length per length of a deflection."""
     moved = np.linalg.norm(story.deviation(story.measured), axis=1)
     typical = float(np.quantile(moved, 0.95))
     return round_factor(DEFLECTION_LENGTH / typical, style.FACTORS) if typical > 0 else 1.0
 
 
 def noise_balls(story: Story, rows: Ints) -> tuple[Floats, Floats]:
-    """Half axes (K, 3), m, and quaternions (K, 4) of readings' noise balls, as they are drawn.
+    """Return half axes (K, 3) in m, to scale, and quaternions (K, 4) of readings' noise balls.
 
-    C = V diag(w) Vᵀ, V a proper rotation, has half axes of sqrt(w) at one σ.
+    C = V diag(w) Vᵀ, V a proper rotation, has half axes sqrt(w) at one σ.
     """
     w, v = np.linalg.eigh(story.covariance[rows])
     v[:, :, 0] *= np.sign(np.linalg.det(v))[:, None]
@@ -400,30 +397,30 @@ def worst(r: StoryRevision) -> int:
 
 
 def balled(story: Story, r: StoryRevision) -> Ints:
-    """Return the readings whose ball is drawn: of each chosen pose, its worst reading."""
+    """Return the readings whose balls are drawn: the worst reading of each chosen pose."""
     of_pose = story.last_of_poses(r.whitened_norm2)
     return np.asarray(of_pose[worst_and_even(r.whitened_norm2[of_pose], BALLS)])
 
 
 def shown(story: Story, r: StoryRevision) -> Ints:
-    """Return the readings whose arrows are drawn: the worst, the balled, an even rest."""
+    """Return the readings whose arrows are drawn: with balls, the worst, and evenly chosen ones."""
     return np.union1d(worst_and_even(r.whitened_norm2, ARROWS), balled(story, r))
 
 
 def _scene(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
-    """Log one revision at the recording's current time: arrows, balls, the arm at its worst."""
+    """Log one revision at the current time: arrows, balls, the arm in the worst pose."""
     far, drawn, balls = worst(r), shown(story, r), balled(story, r)
     style.stand(rec, story.bodies[story.row[far]])
-    of = story.anchor[drawn], arrows(story, r, drawn), r.level[drawn]
-    rec.log("world/residual/arrows", style.residual_arrows(*of))
+    residuals = story.anchor[drawn], arrows(story, r, drawn), r.level[drawn]
+    rec.log("world/residual/arrows", style.residual_arrows(*residuals))
     noise = style.noise_balls(story.anchor[balls], *noise_balls(story, balls))
     rec.log("world/residual/noise", noise)
-    at, words = story.anchor[far], f"worst: pose {story.pose_name(far)}, {_words(story, r, far)}"
-    rec.log("world/residual/worst", style.labels([at + _LABEL_ABOVE], [words]))
-    dots = list(leader(at, noise_balls(story, np.array([far]))[0]))
+    place, label = story.anchor[far], f"worst: pose {story.pose_name(far)}, {_size(story, r, far)}"
+    rec.log("world/residual/worst", style.labels([place + _LABEL_ABOVE], [label]))
+    dots = list(leader(place, noise_balls(story, np.array([far]))[0]))
     lines = rr.LineStrips3D(dots, colors=[style.LEADER], radii=rr.Radius.ui_points(0.5))
     rec.log("world/residual/leader", lines)
-    # a pair of arrows per chosen pose, of its largest deflection, and what is missed
+    # per chosen pose: measured and predicted arrow of its largest deflection, and their difference
     of_pose = story.last_of_poses(np.linalg.norm(story.deviation(story.measured), axis=1))
     some = of_pose[worst_and_even(r.whitened_norm2[of_pose], PAIRS)]
     feet, scale, tips = story.anchor[some], deflection_scale(story), []
@@ -441,49 +438,49 @@ def _scene(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
 
 
 def _pose_scene(rec: rr.RecordingStream, story: Story) -> None:
-    """Send the arm and the highlighted arrow of every pose, as columns on `pose`."""
+    """Send the arm and the highlighted arrow of every pose as columns on `pose`."""
     r, time = story.revisions[-1], rr.TimeColumn("pose", sequence=story.poses)
     style.send_stands(rec, time, story.bodies)
     far = story.last_of_poses(r.whitened_norm2)
-    at, (half, quaternions) = story.anchor[far], noise_balls(story, far)
-    now = rr.Arrows3D.columns(
-        origins=at,
+    place, (half, quaternions) = story.anchor[far], noise_balls(story, far)
+    current = rr.Arrows3D.columns(
+        origins=place,
         vectors=arrows(story, r, far),
         colors=style.LEVEL_COLORS[r.level[far]],
         radii=np.full(len(far), 0.012),
     )
-    along(rec, "world/residual/current", time, now)
+    along(rec, "world/residual/current", time, current)
     bright = np.tile(np.array(style.PREDICTED, dtype=np.uint8), (len(far), 1))
     ball = rr.Ellipsoids3D.columns(
-        centers=at, half_sizes=half, quaternions=quaternions, colors=bright
+        centers=place, half_sizes=half, quaternions=quaternions, colors=bright
     )
     along(rec, "world/residual/ball", time, ball)
-    dots = [leader(a, h) for a, h in zip(at, half, strict=True)]
+    dots = [leader(p, h) for p, h in zip(place, half, strict=True)]
     strips = rr.LineStrips3D.columns(strips=np.concatenate(dots))
     along(rec, "world/residual/leader", time, strips.partition([len(x) for x in dots]))
-    words = [f"pose {story.pose_name(i)}: {_words(story, r, i)}" for i in far.tolist()]
-    along(rec, "world/residual/worst", time, style.label_columns(at + _LABEL_ABOVE, words))
+    labels = [f"pose {story.pose_name(i)}: {_size(story, r, i)}" for i in far.tolist()]
+    along(rec, "world/residual/worst", time, style.label_columns(place + _LABEL_ABOVE, labels))
 
 
-def _words(story: Story, r: StoryRevision, i: int) -> str:
+def _size(story: Story, r: StoryRevision, i: int) -> str:
     name = "" if story.target is None else f"{story.target_names[story.target[i]]} "
     return f"{name}{numbers.length(float(r.size_m[i]))} ({r.sigma[i]:.1f} σ)"
 
 
-def leader(at: Floats, ball: Floats) -> Floats:
-    """(K, 2, 3) dots from above a noise ball to its label, m: nobody takes them for an arrow."""
+def leader(center: Floats, ball: Floats) -> Floats:
+    """Return dots (K, 2, 3) from above a noise ball to its label, m; unlike an arrow."""
     top = float(_LABEL_ABOVE[2])
     z = np.arange(min(1.1 * float(ball.max()), top - _DOT), top, 2.0 * _DOT)
     ends = np.stack([z, np.minimum(z + 0.5 * _DOT, top)], 1)
-    return np.asarray(at + ends[:, :, None] * np.array([0.0, 0.0, 1.0]))
+    return np.asarray(center + ends[:, :, None] * np.array([0.0, 0.0, 1.0]))
 
 
 def arrows(story: Story, r: StoryRevision, rows: Ints) -> Floats:
-    """(K, 3) residuals of readings as drawn: scaled, and capped in length, m."""
+    """Return the residuals (K, 3) of readings to scale, with limited length, m."""
     return capped(r.residual[rows] * residual_scale(story), ARROW_CAP)
 
 
 def capped(vectors: Floats, length: float) -> Floats:
-    """(K, 3) vectors, those longer than `length` shortened to it."""
+    """Return vectors (K, 3), shortened to `length` if they are longer."""
     norm = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.asarray(vectors * np.minimum(1.0, length / np.maximum(norm, 1e-300)))

@@ -1,4 +1,4 @@
-"""A fleet in rerun: which arm is unlike its type, in which joint, and since when."""
+"""A fleet in rerun: arms that differ from their type, by joint and date."""
 
 import math
 import re
@@ -26,10 +26,10 @@ if TYPE_CHECKING:  # above this layer
 
 _JOINT = re.compile(r"\.j(\d+)\b")
 _STANDS = (0.0, -1.4, 1.0, -1.2, -1.57, 0.0)
-"""Joint values of the drawn arms, rad: upright, so that many stand side by side; a choice."""
+"""Joint values of the drawn arms, rad: upright, so that many fit side by side; a choice."""
 _APART = (0.62, 0.95)  # distances of arms and of their rows, shares of the reach; a choice
 _NAMED, _ROWS = 40, 12
-"""Arms up to which each has its name beside it, and parameters that are drawn; choices."""
+"""Most arms that are all labelled; most parameters that are drawn; choices."""
 _LEAST_RANGE_S = 86400.0
 GUIDE = """### How to read this
 - **Arms**: one of each, side by side. A red joint is unlike the others of the type; its arm stands
@@ -41,31 +41,31 @@ GUIDE = """### How to read this
 
 
 class DrawnType:
-    """What the views of a type need; A arms, K pooled parameters, C campaigns of `members`."""
+    """Data of the views of a type: A arms, K pooled parameters, C campaigns of `members`."""
 
     def __init__(self, pooled: "Pooled", members: "tuple[Member, ...]") -> None:
         arms, links = list(pooled.arms), pooled.prior.links
         self.pooled, self.names = pooled, tuple(p.parameter for p in pooled.parameters)  # (K,)
-        # (K,) joint that a parameter is of, from 1; 0 for none
-        found = [_JOINT.search(name) for name in self.names]
-        self.joints = tuple(0 if of is None else int(of[1]) for of in found)
-        n = len(links) - 1  # an arm that has the links of the type, and nothing else
+        # (K,) joint of each parameter, from 1; 0 for none
+        matches = [_JOINT.search(name) for name in self.names]
+        self.joints = tuple(0 if m is None else int(m[1]) for m in matches)
+        n = len(links) - 1  # joints of an arm with the links of the type, without limits
         none, wide, joints = np.zeros(n), np.full(n, np.inf), tuple(f"j{k + 1}" for k in range(n))
         self.arm = Arm(
             pooled.type, links, none, np.zeros((n, 3)), -wide, wide, wide, 0.0, joints, ""
         )
-        self.reach = max(self.arm.reach, 0.1)  # m: sizes are drawn by it
-        # (A, K) what is unlike the type
+        self.reach = max(self.arm.reach, 0.1)  # m, scale of drawn sizes
+        # (A, K) whether a parameter of an arm is unlike the type
         self.odd: Bools = np.zeros((len(arms), len(self.names)), dtype=np.bool_)
         for o in pooled.odd:
             self.odd[arms.index(o.arm), self.names.index(o.parameter)] = True
         of_type = [m for m in members if m.type == pooled.type and m.name in pooled.campaigns]
         of_type.sort(key=lambda m: (arms.index(m.arm), seconds_of(m.date)))
-        # (C,) arm of each campaign, and when it was measured, s since 1970
+        # (C,) arm and date of each campaign, s since 1970
         self.owner = np.array([arms.index(m.arm) for m in of_type], dtype=np.int64)
         self.seconds = np.array([seconds_of(m.date) for m in of_type])
-        # (C, K) distance of each campaign from the mean of the type, in σ: the root of the spread
-        # from arm to arm and its own uncertainty; NaN where it tells nothing
+        # (C, K) distance of each campaign from the mean of the type, in σ, the root sum of squares
+        # of the spread between arms and of the campaign's uncertainty; NaN: not determined
         self.campaigns = np.full((len(of_type), len(self.names)), np.nan)
         for row, m in zip(self.campaigns, of_type, strict=True):
             p = m.posterior
@@ -76,7 +76,7 @@ class DrawnType:
 
 
 def places(d: DrawnType) -> Floats:
-    """(A, 3) where the arms stand, m: in rows, the first in front."""
+    """Return the positions (A, 3) of the arms, m: in rows, the first in front."""
     count = len(d.pooled.arms)
     wide = max(math.ceil(math.sqrt(2.0 * count)), 1)
     index = np.arange(count)
@@ -85,7 +85,7 @@ def places(d: DrawnType) -> Floats:
 
 
 def _arms(rec: rr.RecordingStream, path: str, d: DrawnType) -> None:
-    """Log the arms; a joint that is unlike the type is red, one beyond `FAR` σ amber."""
+    """Log the arms; joints unlike the type are red, those beyond `FAR` σ amber."""
     fixed(rec, path, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     parts = capsules(d.arm)
     poses = body_poses(d.arm, np.resize(np.array(_STANDS), d.arm.n)[None])[0]
@@ -95,25 +95,25 @@ def _arms(rec: rr.RecordingStream, path: str, d: DrawnType) -> None:
         for x in (np.array([s.start for s in parts]), np.array([s.end for s in parts]))
     )
     top = np.array([0.0, 0.0, 1.06 * float((np.maximum(start, end)[:, 2] + radius).max())])
-    at, marked = places(d), np.asarray(d.odd.any(axis=1))
-    low, high = (np.concatenate([x + p for p in at]) for x in (start, end))
-    colors = np.concatenate([_colors(d, a)[body] for a in range(len(at))])
-    fixed(rec, f"{path}/arms", style.drawn_capsules(low, high, np.tile(radius, len(at)), colors))
-    named = np.flatnonzero(marked | (len(at) <= _NAMED))
-    # Long words stand above the names of the neighbours, each arm's on a line of its own.
+    place, marked = places(d), np.asarray(d.odd.any(axis=1))
+    low, high = (np.concatenate([x + p for p in place]) for x in (start, end))
+    colors = np.concatenate([_colors(d, a)[body] for a in range(len(place))])
+    fixed(rec, f"{path}/arms", style.drawn_capsules(low, high, np.tile(radius, len(place)), colors))
+    named = np.flatnonzero(marked | (len(place) <= _NAMED))
+    # Long labels are placed above the names of the neighbours, at different heights.
     step = np.cumsum(marked)[named] * marked[named]
     above = np.outer(np.where(step > 0, 0.25 + 0.12 * step, 0.0) * d.reach, [0, 0, 1])
-    feet = at[named] + top
+    feet = place[named] + top
     thin = rr.Radius.ui_points(1.0)
     leaders = rr.LineStrips3D(np.stack([feet, feet + above], 1), colors=[style.RED], radii=thin)
     fixed(rec, f"{path}/names/leader", leaders)
     arms = [d.pooled.arms[a] for a in named]
     unlike = [[unlike_words(o) for o in d.pooled.odd if o.arm == arm] for arm in arms]
-    words = ["\n".join(lines[:3]) or arm for arm, lines in zip(arms, unlike, strict=True)]
-    fixed(rec, f"{path}/names", style.labels(feet + above, words))
+    texts = ["\n".join(lines[:3]) or arm for arm, lines in zip(arms, unlike, strict=True)]
+    fixed(rec, f"{path}/names", style.labels(feet + above, texts))
     if marked.any():
         frames = rr.Boxes3D(
-            centers=at[marked] + 0.5 * top,
+            centers=place[marked] + 0.5 * top,
             half_sizes=[(0.27 * d.reach, 0.27 * d.reach, 0.5 * top[2])] * int(marked.sum()),
             colors=[style.RED],
             radii=rr.Radius.ui_points(2.0),
@@ -123,7 +123,7 @@ def _arms(rec: rr.RecordingStream, path: str, d: DrawnType) -> None:
 
 
 def _colors(d: DrawnType, a: int) -> "np.ndarray[tuple[int, ...], np.dtype[np.uint8]]":
-    """(n + 1, 3) colours of the bodies of an arm."""
+    """Return the colours (n + 1, 3) of the bodies of an arm."""
     out = np.array([style.shade(i) for i in range(d.arm.n + 1)], dtype=np.uint8)
     far = np.abs(np.nan_to_num(d.pooled.distance[a])) > FAR
     for chosen, color in ((far, style.AMBER), (d.odd[a], style.RED)):
@@ -133,32 +133,31 @@ def _colors(d: DrawnType, a: int) -> "np.ndarray[tuple[int, ...], np.dtype[np.ui
 
 
 def _rows(d: DrawnType) -> list[int]:
-    """Return the parameters that are drawn: those with the farthest arms, in their order."""
+    """Return the parameters that are drawn: those with the largest distances, in their order."""
     far = np.nan_to_num(np.abs(d.pooled.distance), posinf=0.0).max(axis=0)
     return sorted(np.argsort(-far, kind="stable")[:_ROWS].tolist())
 
 
 def _drift(rec: rr.RecordingStream, path: str, d: DrawnType) -> None:
-    """Send each arm's campaigns along `date`, a view per parameter."""
+    """Send each arm's campaigns along `date`, with an entity per parameter."""
     for k in _rows(d):
         for a, arm in enumerate(d.pooled.arms):
-            known = (d.owner == a) & np.isfinite(d.campaigns[:, k])
-            if not known.any():
+            determined = (d.owner == a) & np.isfinite(d.campaigns[:, k])
+            if not determined.any():
                 continue
             odd = bool(d.odd[a, k])
             entity = f"{path}/{k}/{'zunlike' if odd else 'like'}/{a}"
             color, width = (style.RED, 3.0) if odd else (style.GREY, 1.2)
             fixed(rec, entity, *style.series(arm, color, width, 2 * width))
-            time = rr.TimeColumn("date", timestamp=d.seconds[known])
-            along(rec, entity, time, rr.Scalars.columns(scalars=d.campaigns[known, k]))
+            time = rr.TimeColumn("date", timestamp=d.seconds[determined])
+            along(rec, entity, time, rr.Scalars.columns(scalars=d.campaigns[determined, k]))
 
 
 def record_fleet(fleet: "Fleet", path: Path) -> None:
-    """Write what is known of a fleet as a recording file; equal fleets give equal recordings.
+    """Write a fleet as a recording file; equal fleets give equal recordings.
 
     Raises:
-        InputError: the folder is missing.
-        HilcalError: the file cannot be written.
+        InputError: the folder is missing, or the file cannot be written.
     """
     types = [DrawnType(t, fleet.members) for t in fleet.types]
     names = [(d.pooled.type, d.pooled.arms, d.pooled.odd, d.names) for d in types]
@@ -176,31 +175,31 @@ def _log(rec: rr.RecordingStream, types: list[DrawnType]) -> None:
         verb = "is" if len(odd) == 1 else "are"
         title = f"{numbers.names(odd)} {verb} unlike the others" if odd else "No arm is unlike"
         name, table, note, *lines = type_report(d.pooled)
-        words = style.markdown([heading(title), name, *lines, table, note])
-        fixed(rec, f"words/type{i}", style.document(words))
+        text = style.markdown([heading(title), name, *lines, table, note])
+        fixed(rec, f"words/type{i}", style.document(text))
     fixed(rec, "words/guide", style.document(GUIDE))
     recording.flush(rec)
 
 
 def _blueprint(types: list[DrawnType]) -> rrb.Blueprint:
-    """Left: the arms over their campaigns by date. Right: the verdict and the parameters."""
-    scenes, dates, words = [], [], []
+    """Return the blueprint: left the arms over the dates, right the verdict and the parameters."""
+    scenes, dates, texts = [], [], []
     for i, d in enumerate(types):
-        of = f"{d.pooled.type}: " if len(types) > 1 else ""
-        at = places(d)
-        middle = at.mean(axis=0) + np.array([0.0, 0.0, 0.35 * d.reach])
-        eye = middle + (np.ptp(at, axis=0).max() + d.reach) * np.array([0.68, 0.0, 0.36])
-        name = f"{of}{len(at)} arms; a red frame: unlike the others, the red joint says where"
+        title = f"{d.pooled.type}: " if len(types) > 1 else ""
+        place = places(d)
+        middle = place.mean(axis=0) + np.array([0.0, 0.0, 0.35 * d.reach])
+        eye = middle + (np.ptp(place, axis=0).max() + d.reach) * np.array([0.68, 0.0, 0.36])
+        name = f"{title}{len(place)} arms; a red frame: unlike the others, the red joint says where"
         scenes.append(style.view3d(f"arms{i}", name, eye, middle))
         low, high = float(d.seconds.min()), float(d.seconds.max())
         wide = max(0.05 * (high - low), _LEAST_RANGE_S)
         ends = [rrb.TimeRangeBoundary.absolute(seconds=t) for t in (low - wide, high + wide)]
         axis, quiet = rrb.TimeAxis(view_range=rrb.TimeRange(*ends)), rrb.PlotLegend(visible=False)
         for k in sorted(_rows(d), key=lambda k: (not d.odd[:, k].any(), k)):
-            at_k, name = f"date{i}/{k}", f"{of}{d.names[k]} by date [σ]"
-            view = rrb.TimeSeriesView(origin=at_k, name=name, plot_legend=quiet, axis_x=axis)
+            origin, name = f"date{i}/{k}", f"{title}{d.names[k]} by date [σ]"
+            view = rrb.TimeSeriesView(origin=origin, name=name, plot_legend=quiet, axis_x=axis)
             dates.append(view)
-        words.append(style.text(f"type{i}", f"{of}Unlike the type"))
+        texts.append(style.text(f"type{i}", f"{title}Unlike the type"))
     left = rrb.Vertical(rrb.Tabs(*scenes), rrb.Tabs(*dates), row_shares=[3, 2])
-    right = rrb.Tabs(*words, style.text("guide", "How to read this"))
+    right = rrb.Tabs(*texts, style.text("guide", "How to read this"))
     return style.whole(rrb.Horizontal(left, right, column_shares=[3, 2]), "date")

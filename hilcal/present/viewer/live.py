@@ -1,4 +1,4 @@
-"""A command drawn while it works, for viewers that come and go, and into a recording."""
+"""Live drawing of a running command, for connected viewers and into a recording."""
 
 import contextlib
 import math
@@ -30,28 +30,28 @@ from hilcal.robot.body import body_poses
 from hilcal.store.plan import Step
 from hilcal.types import Floats
 
-PORTS = 20  # ports that are tried, from the wanted one; a choice
+PORTS = 20  # number of ports that are tried; a choice
 MEMORY = "256MiB"
-"""What the server keeps for viewers that come late at most; a choice, some 5000 readings."""
+"""Most memory of the server for viewers that join late; a choice, some 5000 readings."""
 SHARE = 0.02
-"""A file is written whenever it has grown by this share, so that it consists of few, large pieces;
-what a killed process loses of it. A choice."""
+"""The file is flushed when it has grown by this share, so that it consists of few, large pieces. A
+killed process loses at most this share. A choice."""
 _FLUSH_S, _END_S = 5.0, 8.0
 SIGMA_LENGTH, ARROW_CAP = 0.02, 0.4
-"""One σ of a residual is drawn this long, and no arrow longer than that, m; choices."""
+"""Drawn length of one σ of a residual, and largest length of an arrow, m; choices."""
 BALL = SIGMA_LENGTH * style.BALL_SIGMAS
-"""Radius of the ball that holds 99 % of the readings where the model is right, m."""
+"""Radius of the ball that holds 99 % of the readings if the model is right, m."""
 LIMIT = style.BALL_SIGMAS / 3**0.5  # the same in the σ of a reading
 ALARM = 0.001
-"""Chance that noise alone leaves as many readings outside their balls as is called wrong."""
-WORST, REMARKS = 3, 3  # readings, and remarks, that are listed
+"""Probability of so many readings outside their balls below which the model is called wrong."""
+WORST, REMARKS = 3, 3  # listed readings and remarks
 BALLS, MANY = 60, 300
-"""Readings from which a ball, and an arrow, is drawn only where the arrow leaves its ball; choices,
-for legibility."""
+"""Number of readings above which balls, and above which arrows, are drawn only for arrows that
+leave their balls; choices, for legibility."""
 FLUENT = 1000
-"""Residuals that a viewer draws one by one. Of 10,000 each of its pictures took 3.5 times the
-processor time of 100 (tests/benchmarks/test_viewer_speed.py); of this many some 1.2 times."""
-GROUPS = 150  # groups that more of them are divided into: as many as a finished recording has bars
+"""Most residuals that a viewer draws one by one. A picture of 10,000 took 3.5 times the processor
+time of one of 100 (tests/benchmarks/test_viewer_speed.py), one of 1000 some 1.2 times."""
+GROUPS = 150  # number of groups of more residuals; the number of bars of a finished recording
 TIMELINE = "time"
 RESIDUALS = "in σ: an arrow that leaves its noise ball = model wrong"
 IN_TIME = "in σ: grey noise, amber doubtful, red model wrong"
@@ -79,17 +79,17 @@ What is missing in the model is not asked while measuring: `hilcal refine` does,
 
 @dataclass(frozen=True, slots=True)
 class LiveJudgement:
-    """A reading against the model."""
+    """The residual r of a reading against its prediction."""
 
     step: Step
-    target: str  # its name; empty where there is one
-    length: float  # of the residual r, m
+    target: str  # its name; empty if there is only one
+    length: float  # |r|, m
     norm2: float  # rᵀ V⁻¹ r, V the covariance of reading and prediction; 3 degrees of freedom
     stands_out: bool = True  # whether it is the worst of its group so far, see `LiveTally.group`
 
     @property
     def sigma(self) -> float:
-        """sqrt(rᵀ V⁻¹ r / 3), as the terminal has it: 1 where the model is right."""
+        """sqrt(rᵀ V⁻¹ r / 3), as on the terminal: 1 on average if the model is right."""
         return float(np.sqrt(self.norm2 / 3))
 
     @property
@@ -99,7 +99,7 @@ class LiveJudgement:
 
 
 def judged(step: Step, live: LiveResidual, target: str = "") -> LiveJudgement | None:
-    """Return a reading as `LiveJudgement`; None where it was not compared."""
+    """Return the judgement of a reading; None if the reading was not compared with a model."""
     if live.vector is None or live.covariance is None:
         return None
     r, v = np.array(live.vector), np.array(live.covariance).reshape(3, 3)
@@ -107,39 +107,41 @@ def judged(step: Step, live: LiveResidual, target: str = "") -> LiveJudgement | 
 
 
 class LiveTally:
-    """A campaign that is being measured: it begins, or goes on."""
+    """Running totals of a campaign that is being measured."""
 
     def __init__(self, measured: Measuring) -> None:
         plan, self.measured = measured.plan, measured
         # (P, n + 2, 4, 4) poses of the arm's bodies at each pose of the plan
         self.bodies = body_poses(measured.arm, plan.q)
         flange = self.bodies[:, -1]
-        at = flange[:, None, :3, 3] + np.einsum("pij,tj->pti", flange[:, :3, :3], measured.targets)
+        offset = np.einsum("pij,tj->pti", flange[:, :3, :3], measured.targets)
+        position = flange[:, None, :3, 3] + offset
         # nominal positions of the targets, base axes, m: (K, 3) in all poses, (T, 3) by pose
-        self.targets, self._anchor = at.reshape(-1, 3), dict(zip(plan.pose_names, at, strict=True))
-        # readings that are planned, and stored; real seconds that the rest takes
+        self.targets = position.reshape(-1, 3)
+        self._anchor = dict(zip(plan.pose_names, position, strict=True))
+        # numbers of planned and of stored readings; remaining real time, s
         self.total, self.done = len(plan.steps), len({step for _, step in measured.earlier})
         self.left, self.phase = 0.0, ""
         self.last: ReadingStored | None = None
-        # readings that were compared with a model, and how many of them are outside their ball
+        # numbers of readings that were compared with a model, and of those outside their ball
         self.judged, self.outside = 0, 0
         self.loads: dict[str, list[int]] = {}  # both by load
-        self.worst: list[LiveJudgement] = []  # farthest from the model
+        self.worst: list[LiveJudgement] = []  # worst first
         self.remarks: list[str] = []  # newest last
-        # residuals, one after the other, of which a viewer keeps those that stand out; 1: all
+        # number of successive residuals of which a viewer keeps those that stand out; 1: keeps all
         planned = self.total * len(measured.targets)
         self.group = 1 if planned <= FLUENT else math.ceil(planned / GROUPS)
         self._group_worst = 0.0  # largest `LiveJudgement.norm2` of the present group
 
     def place(self, step: Step, target: int = 0) -> Floats:
-        """(3,) where the nominal arm holds a target, m."""
+        """Return the nominal position (3,) of a target, m."""
         return np.asarray(self._anchor[step.pose][target])
 
     def add(self, event: ReadingStored) -> list[tuple[int, LiveResidual, LiveJudgement | None]]:
-        """Take note of a reading; returns each target's residual, judged where there is a model."""
+        """Count a reading; return each target's residual and its judgement, None without model."""
         self.last, self.done, self.left = event, event.done, event.left_real
-        read = ((event.target, event.live), *event.others)
-        return [(k, live, self._judge(event.step, k, live)) for k, live in read]
+        residuals = ((event.target, event.live), *event.others)
+        return [(k, live, self._judge(event.step, k, live)) for k, live in residuals]
 
     def _judge(self, step: Step, target: int, live: LiveResidual) -> LiveJudgement | None:
         j = judged(step, live, self.measured.names[target] if self.measured.names else "")
@@ -149,37 +151,37 @@ class LiveTally:
         self.judged, self.outside = self.judged + 1, self.outside + outside
         compared, beyond = self.loads.get(step.load, (0, 0))
         self.loads[step.load] = [compared + 1, beyond + outside]
-        self.worst = sorted([*self.worst, j], key=lambda other: -other.norm2)[:WORST]
+        self.worst = sorted([*self.worst, j], key=lambda x: -x.norm2)[:WORST]
         j = replace(j, stands_out=begins or j.norm2 > self._group_worst)
         self._group_worst = max(j.norm2, 0.0 if begins else self._group_worst)
         return j
 
     @property
     def wrong(self) -> bool:
-        """Whether more readings are outside than noise leaves there, see `ALARM`."""
+        """Whether more readings are outside of their balls than noise explains, see `ALARM`."""
         chance = stats.binom.sf(self.outside - 1, self.judged, 1.0 - LIMITS[0])
-        return self.outside > 0 and bool(chance < ALARM)
+        return bool(chance < ALARM)
 
     def words(self) -> Iterator[Block]:
-        """Yield how far the campaign is, and what the readings say so far."""
+        """Yield the progress of the campaign and the verdict so far."""
         if self.judged == 0:
             yield heading("Measuring: no judgement yet")
             yield "The first readings tell where tracker and target are; then each one is compared."
         else:
-            title, more = "✓ So far noise explains the readings", ""
+            title, advice = "✓ So far noise explains the readings", ""
             if self.wrong:
                 title = "✗ The simple model fails: look at the red arrows"
-                more = " Something is missing in it: hilcal refine says what, after measuring."
+                advice = " Something is missing in it: hilcal refine says what, after measuring."
             yield heading(title)
             yield (
                 f"{self.outside} of {self.judged} ({numbers.percent(self.outside / self.judged)}) "
-                "compared readings are outside their 99 % noise ball (noise alone: 1 %)." + more
+                "compared readings are outside their 99 % noise ball (noise alone: 1 %)." + advice
             )
-        left = f", {spoken(self.left)} left" if self.left > 0 else ""
-        yield f"{self.done} of {self.total} readings{left}. {self.phase}"
+        remaining = f", {spoken(self.left)} left" if self.left > 0 else ""
+        yield f"{self.done} of {self.total} readings{remaining}. {self.phase}"
         goal = None if self.last is None else self.last.goal
-        if goal is not None and (now := status_words(goal)):
-            yield f"Goal: {now}."
+        if goal is not None and (value := status_words(goal)):
+            yield f"Goal: {value}."
         if len(self.loads) > 1 and self.outside:
             rows = [(n, str(a), str(b), numbers.percent(b / a)) for n, (a, b) in self.loads.items()]
             yield table("load", "compared", "outside", "", rows=rows)
@@ -192,25 +194,25 @@ class LiveTally:
 
 
 def live_blueprint(d: LiveTally, world: str, series: str) -> rrb.Blueprint:
-    """Return the blueprint, of readings below `world` and residuals in time below `series`."""
-    ever, now = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()
-    every = archetypes.VisibleTimeRanges(timeline=TIMELINE, start=ever, end=now)
-    of = "Residual of each reading," if d.group == 1 else f"Worst of every {d.group} residuals,"
+    """Return the blueprint; `world`, `series`: entities of the readings and of the time series."""
+    infinite, cursor = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()
+    so_far = archetypes.VisibleTimeRanges(timeline=TIMELINE, start=infinite, end=cursor)
+    drawn = "Residual of each reading," if d.group == 1 else f"Worst of every {d.group} residuals,"
     middle, size = style.center(d.targets, 0.3 * d.measured.arm.reach)
     points = np.vstack([d.targets, d.bodies[0, :, :3, 3]])
     scene = style.view3d(
         "world",
-        f"{of} {RESIDUALS}",
+        f"{drawn} {RESIDUALS}",
         style.near(middle, style.EYE * size, points),
         middle,
         [f"+ {world}/**"],
-        overrides={f"{world}/{name}": every for name in ("arrows", "balls", "dots")},
+        overrides={f"{world}/{name}": so_far for name in ("arrows", "balls", "dots")},
     )
     in_time = rrb.TimeSeriesView(
         origin=series,
-        name=f"{of} {IN_TIME}",
+        name=f"{drawn} {IN_TIME}",
         plot_legend=rrb.PlotLegend(visible=False),
-        axis_x=archetypes.TimeAxis(view_range=rr.TimeRange(start=ever, end=ever)),
+        axis_x=archetypes.TimeAxis(view_range=rr.TimeRange(start=infinite, end=infinite)),
     )
     kinds = (rrb.encodings.TextLogColumnKind.LogLevel, rrb.encodings.TextLogColumnKind.Body)
     columns = archetypes.TextLogColumns(
@@ -218,52 +220,53 @@ def live_blueprint(d: LiveTally, world: str, series: str) -> rrb.Blueprint:
         text_log_columns=[rrb.encodings.TextLogColumn(kind=kind, visible=True) for kind in kinds],
     )
     log = rrb.TextLogView(origin="log", name="Log", columns=columns)
-    words = (("measuring", "So far"), ("live_guide", "How to read this"))
+    texts = (("measuring", "So far"), ("live_guide", "How to read this"))
     left = rrb.Vertical(scene, in_time, row_shares=[11, 4])
-    right = rrb.Vertical(rrb.Tabs(*(style.text(*w) for w in words)), log, row_shares=[3, 2])
+    right = rrb.Vertical(rrb.Tabs(*(style.text(*w) for w in texts)), log, row_shares=[3, 2])
     return style.whole(rrb.Horizontal(left, right, column_shares=[3, 2]), TIMELINE, "following")
 
 
 class LiveScene:
-    """What has been told so far, drawn into one recording along the time of day."""
+    """Draws events into one recording along the time of day."""
 
     def __init__(self, rec: rr.RecordingStream, batches: bool = False) -> None:
-        """Draw into an open recording; in `batches` the arm, and words, wait for `settle`."""
+        """Draw into an open recording; with `batches`, arm and texts wait for `settle`."""
         self._rec, self._batches = rec, batches
         self._arm: style.MovingArm | None = None
-        self._passed: list[tuple[float, tuple[float, ...]]] = []
-        self._since = 0  # those of them that came before the last reading
-        self._now: LiveTally | None = None
-        self._acts, self._world, self._series = 0, "", ""  # campaigns so far; entities of the last
+        self._passed: list[tuple[float, tuple[float, ...]]] = []  # (time, joint values), not sent
+        self._since = 0  # number of these before the last reading
+        self._tally: LiveTally | None = None
+        # number of campaigns so far, entities of the last one
+        self._campaigns, self._world, self._series = 0, "", ""
         self._story: Story | None = None
         self._titles: tuple[str, ...] = ()
 
-    def tell(self, wall: float, what: object) -> None:
-        """Draw what happened at a time of day, s."""
+    def tell(self, wall: float, event: object) -> None:
+        """Draw an event at a time of day, s."""
         self._rec.set_time(TIMELINE, timestamp=wall)
-        if isinstance(what, ArmAt):
-            self._passed.append((wall, what.q))
+        if isinstance(event, ArmAt):
+            self._passed.append((wall, event.q))
         if not self._batches:
             self._move()
-        if isinstance(what, Measuring):
+        if isinstance(event, Measuring):
             self.settle()
-            self._measuring(wall, what)
-        elif isinstance(what, Story):
-            self._revised(what)
-        elif self._now is not None:
-            self._event(self._now, what)
+            self._measuring(wall, event)
+        elif isinstance(event, Story):
+            self._revised(event)
+        elif self._tally is not None:
+            self._event(self._tally, event)
 
     def settle(self) -> None:
-        """Tell what waits for a batch to be handed on: where the arm has been, words, the limit."""
+        """Draw what waits for the end of a batch: motion of the arm, texts, the limit."""
         self._move()
-        if self._batches and self._now is not None and self._now.last is not None:
-            self._words(self._now)
+        if self._batches and self._tally is not None and self._tally.last is not None:
+            self._send_summary(self._tally)
             self._rec.log(f"{self._series}/limit", rr.Scalars(LIMIT))
 
     def end(self, to_open: bool) -> None:
-        """Tell the story once more, whole; `to_open`: at the first revision, as a file does."""
+        """Draw the complete story again; `to_open`: a file, which opens at its first revision."""
         self.settle()
-        self._now = None
+        self._tally = None
         if self._story is None:
             return
         self._rec.reset_time()
@@ -275,14 +278,14 @@ class LiveScene:
     def _show(self, views: rrb.Blueprint) -> None:
         self._rec.send_blueprint(views, make_active=True, make_default=True)
 
-    def _measuring(self, wall: float, what: Measuring) -> None:
-        rec, d = self._rec, LiveTally(what)
-        self._acts, self._now = self._acts + 1, d
-        self._series = f"live/{self._acts}"
+    def _measuring(self, wall: float, start: Measuring) -> None:
+        rec, d = self._rec, LiveTally(start)
+        self._campaigns, self._tally = self._campaigns + 1, d
+        self._series = f"live/{self._campaigns}"
         self._world = f"world/{self._series}"
-        rec.send_recording_name(f"hilcal: {style.safe(what.name)}")
+        rec.send_recording_name(f"hilcal: {style.safe(start.name)}")
         fixed(rec, "world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
-        self._arm = style.MovingArm(rec, f"{self._world}/arm", what.arm, what.targets)
+        self._arm = style.MovingArm(rec, f"{self._world}/arm", start.arm, start.targets)
         fixed(rec, "words/live_guide", style.document(GUIDE))
         planned = rr.Points3D(d.targets, colors=[style.GREY], radii=[0.006])
         fixed(rec, f"{self._world}/planned", planned)
@@ -290,8 +293,8 @@ class LiveScene:
             fixed(rec, f"{self._series}/{name}", style.series(name, color, 0.0, 4.0)[1])
         line = rr.SeriesLines(colors=[style.NOISE], widths=[1.5], names=["99 %"])
         fixed(rec, f"{self._series}/limit", line)
-        if what.earlier:  # what earlier sessions measured, as one batch
-            walls, steps = zip(*what.earlier, strict=True)
+        if start.earlier:  # readings of earlier sessions, as one batch
+            walls, steps = zip(*start.earlier, strict=True)
             dots = rr.Points3D.columns(
                 positions=[d.place(step) for step in steps],
                 colors=np.tile(np.array(style.MEASURED, dtype=np.uint8), (len(steps), 1)),
@@ -299,105 +302,104 @@ class LiveScene:
             )
             time = rr.TimeColumn(TIMELINE, timestamp=list(walls))
             along(rec, f"{self._world}/dots", time, dots)
-        self._passed.append((wall, tuple(what.plan.q[0].tolist())))
+        self._passed.append((wall, tuple(start.plan.q[0].tolist())))
         self._move()
-        self._words(d)
+        self._send_summary(d)
         self._show(live_blueprint(d, self._world, self._series))
 
     def _move(self) -> None:
-        """Send where the arm has been since the last time."""
+        """Send the motion of the arm since the last call."""
         passed, self._passed, self._since = self._passed, [], 0
-        if passed and self._arm is not None and self._now is not None:
-            bodies = body_poses(self._now.measured.arm, np.array([q for _, q in passed]))
+        if passed and self._arm is not None and self._tally is not None:
+            bodies = body_poses(self._tally.measured.arm, np.array([q for _, q in passed]))
             self._arm.send(TIMELINE, [wall for wall, _ in passed], bodies)
 
-    def _event(self, d: LiveTally, what: object) -> None:
-        if isinstance(what, ReadingStored):
+    def _event(self, d: LiveTally, event: object) -> None:
+        if isinstance(event, ReadingStored):
             if self._batches and d.done > MANY:
-                # the arm stands at each reading, and skips its ways
+                # only the arm's position at each reading is drawn, not its motion
                 del self._passed[self._since : -1]
             self._since = len(self._passed)
-            self._reading(d, what)
-            self._log(f"{what.done}/{what.total} {what.step}{figures(what)}")
-        elif isinstance(what, Phase):
-            d.phase = what.text
-        elif isinstance(what, Remark | GoalMet):
-            text = what.text if isinstance(what, Remark) else met_words(what)
+            self._reading(d, event)
+            self._log(f"{event.done}/{event.total} {event.step}{figures(event)}")
+        elif isinstance(event, Phase):
+            d.phase = event.text
+        elif isinstance(event, Remark | GoalMet):
+            text = event.text if isinstance(event, Remark) else met_words(event)
             d.remarks.append(text)
-            self._log(text, "WARN" if isinstance(what, Remark) else "INFO")
+            self._log(text, "WARN" if isinstance(event, Remark) else "INFO")
         else:
             return
         if not self._batches:
-            self._words(d)
+            self._send_summary(d)
 
     def _reading(self, d: LiveTally, event: ReadingStored) -> None:
-        """Draw a reading: each target's arrow in its ball and place in time, and a label."""
-        rec, before = self._rec, d.judged
-        dots, arrows, balls, now = [], [], [], []
-        read = d.add(event)
-        for target, live, j in read:
-            at = d.place(event.step, target)
+        """Draw a reading: each target's arrow, ball and point in time, and a label."""
+        rec, count = self._rec, d.judged
+        dots, arrows, balls, last = [], [], [], []
+        judgements = d.add(event)
+        for target, live, j in judgements:
+            place = d.place(event.step, target)
             if j is None:
-                dots.append(at)
+                dots.append(place)
                 continue
-            # its direction, and as long as sqrt(rᵀ V⁻¹ r) says
+            # along r, of length sqrt(rᵀ V⁻¹ r) in σ
             length = min(SIGMA_LENGTH * float(np.sqrt(j.norm2)), ARROW_CAP)
-            drawn = (at, length / (j.length or 1.0) * np.array(live.vector), j.level)
-            now.append(drawn)
+            arrow = (place, length / (j.length or 1.0) * np.array(live.vector), j.level)
+            last.append(arrow)
             if not j.stands_out:
                 continue
             if j.level or d.judged <= MANY:
-                arrows.append(drawn)
+                arrows.append(arrow)
             if d.judged <= (MANY if j.level else BALLS):
-                balls.append(at)
+                balls.append(place)
             rec.log(f"{self._series}/{style.LEVEL_NAMES[j.level]}", rr.Scalars(j.sigma))
         if dots:
-            dot = rr.Points3D(dots, colors=[style.MEASURED], radii=[0.01])
-            rec.log(f"{self._world}/dots", dot)
+            points = rr.Points3D(dots, colors=[style.MEASURED], radii=[0.01])
+            rec.log(f"{self._world}/dots", points)
         if arrows:
             rec.log(f"{self._world}/arrows", style.residual_arrows(*zip(*arrows, strict=True)))
         if balls:
             rec.log(f"{self._world}/balls", style.noise_balls(balls, [[BALL] * 3] * len(balls)))
-        if now and d.group > 1:  # the last reading, drawn until the next one comes
-            ball = style.noise_balls([at for at, *_ in now], [[BALL] * 3] * len(now))
-            rec.log(f"{self._world}/now/arrow", style.residual_arrows(*zip(*now, strict=True)))
+        if last and d.group > 1:  # the last reading, until the next one replaces it
+            ball = style.noise_balls([place for place, *_ in last], [[BALL] * 3] * len(last))
+            rec.log(f"{self._world}/now/arrow", style.residual_arrows(*zip(*last, strict=True)))
             rec.log(f"{self._world}/now/ball", ball)
-        if d.judged > before and not (self._batches and before):
+        if d.judged > count and not (self._batches and count):
             rec.log(f"{self._series}/limit", rr.Scalars(LIMIT))
-        target, _, worst = max(read, key=lambda r: -1.0 if r[2] is None else r[2].norm2)
-        words = f"{event.step.pose}, {event.step.load}"
+        target, _, worst = max(judgements, key=lambda r: -1.0 if r[2] is None else r[2].norm2)
+        label = f"{event.step.pose}, {event.step.load}"
         if worst is not None:
             size = f"{numbers.length(worst.length)} ({worst.sigma:.1f} σ)"
-            words += f"{', ' * bool(worst.target)}{worst.target}: {size}"
-        at = d.place(event.step, target) + _ABOVE
-        rec.log(f"{self._world}/last", style.labels([at], [words]))
+            label += f"{', ' * bool(worst.target)}{worst.target}: {size}"
+        above = d.place(event.step, target) + _ABOVE
+        rec.log(f"{self._world}/last", style.labels([above], [label]))
 
-    def _words(self, d: LiveTally) -> None:
+    def _send_summary(self, d: LiveTally) -> None:
         self._rec.log("words/measuring", style.document(style.markdown(d.words())))
 
     def _log(self, text: str, level: str = "INFO") -> None:
         self._rec.log("log", rr.TextLog(style.safe(text), level=level))
 
     def _revised(self, story: Story) -> None:
-        """Draw a revision with those before it, of the same readings."""
-        rec, before, new = self._rec, self._story, story.revisions[0]
-        same = before is not None and len(before) == len(story)
-        known = before.revisions if before is not None and same else ()
-        earlier = tuple(r for r in known if r.revision < new.revision)
-        self._story = story = replace(story, revisions=(*earlier, *story.revisions), growing=True)
-        if not earlier:
+        """Draw a revision after the previous ones of the same readings."""
+        rec, last, new = self._rec, self._story, story.revisions[0]
+        drawn = last.revisions if last is not None and len(last) == len(story) else ()
+        previous = tuple(r for r in drawn if r.revision < new.revision)
+        self._story = story = replace(story, revisions=(*previous, *story.revisions), growing=True)
+        if not previous:
             campaign.begin(rec, story)
         rec.set_time("revision", sequence=new.revision)
         campaign.tell_revision(rec, story, new)
         rec.disable_timeline("revision")
         titles = campaign.titles(story)
-        if titles != self._titles or not earlier:
+        if titles != self._titles or not previous:
             self._show(campaign.blueprint(story))
             self._titles = titles
 
 
 def follow(messages: BinaryIO, reply: Callable[..., None], record: Path, port: int) -> None:
-    """Show what pickled (time of day, s; event) tell, in a file and at a free port from `port`."""
+    """Draw pickled messages (time of day in s, event) into a file, and at a port from `port` on."""
     identifier = str(uuid.uuid4())
     outlets = [_Outlet(identifier, reply, f"recording {record}", file=record)]
     with contextlib.suppress(OSError):
@@ -412,16 +414,16 @@ def follow(messages: BinaryIO, reply: Callable[..., None], record: Path, port: i
         reply(url=f"rerun+http://127.0.0.1:{free}/proxy")
     with contextlib.suppress(EOFError, pickle.UnpicklingError):
         while True:
-            wall, what = pickle.load(messages)  # noqa: S301 - of the command that started us
+            wall, event = pickle.load(messages)  # noqa: S301 - of the command that started us
             for outlet in outlets:
-                outlet.tell(wall, what)
+                outlet.tell(wall, event)
     guard = threading.Thread(target=lambda: list(map(_Outlet.end, outlets)), daemon=True)
     guard.start()
     guard.join(_END_S)
 
 
 class _Outlet:
-    """One place where the pictures go; what fails here is told once, and the others go on."""
+    """A file or a port that gets the drawing; a failure is reported once, other outlets go on."""
 
     def __init__(
         self,
@@ -431,7 +433,7 @@ class _Outlet:
         file: Path | None = None,
         port: int = 0,
     ) -> None:
-        """Open it: a file that is read later, or a port."""
+        """Open a file or a port."""
         self._reply, self._name, self._file = reply, name, file
         self._scene: LiveScene | None = None
         self._drawn, self._written = 0, 0
@@ -447,20 +449,20 @@ class _Outlet:
         except (OSError, RuntimeError, ValueError) as error:
             self._fail(error)
 
-    def tell(self, wall: float, what: object) -> None:
-        """Draw what happened, and hand it on: now, or with what comes next."""
-        whole = not isinstance(what, ArmAt)  # places of the arm go on in batches
-        now = isinstance(what, Measuring | Story)
-        self._draw(lambda scene: scene.tell(wall, what), whole, now)
+    def tell(self, wall: float, event: object) -> None:
+        """Draw an event, and flush at once or with a later event."""
+        complete = not isinstance(event, ArmAt)  # positions of the arm are sent in batches
+        at_once = isinstance(event, Measuring | Story)
+        self._draw(lambda scene: scene.tell(wall, event), complete, at_once)
 
-    def _draw(self, draw: Callable[[LiveScene], None], whole: bool, now: bool) -> None:
+    def _draw(self, draw: Callable[[LiveScene], None], complete: bool, at_once: bool) -> None:
         if self._scene is None:
             return
         try:
             draw(self._scene)
-            self._drawn += whole
+            self._drawn += complete
             little = self._drawn - self._written < max(1.0, SHARE * self._drawn)
-            if not whole or (self._file and little and not now):
+            if not complete or (self._file and little and not at_once):
                 return
             self._written = self._drawn
             self._scene.settle()
@@ -472,14 +474,14 @@ class _Outlet:
         except (OSError, RuntimeError, ValueError, HilcalError) as error:
             if not recording.slow(error):
                 self._fail(error)
-            elif self._file and self._size() == size:  # rerun says no more of a write that failed
+            elif self._file and self._size() == size:  # rerun does not report a failed write
                 self._fail(f"nothing was written for {_FLUSH_S:.0f} s; is the disk full?")
-            # else slow; what does not fit in is dropped by the command
+            # else slow: the command drops messages that its queue cannot hold
 
     def end(self) -> None:
-        """End it, whole."""
-        self._draw(lambda scene: scene.end(self._file is not None), whole=True, now=True)
-        if self._scene is not None:  # else it would wait for what cannot be written
+        """Draw the complete story and close the outlet."""
+        self._draw(lambda scene: scene.end(self._file is not None), complete=True, at_once=True)
+        if self._scene is not None:  # after a failure `disconnect` would wait forever
             self._rec.disconnect()
 
     def _size(self) -> int:

@@ -1,4 +1,4 @@
-"""A plan in rerun, before anything is measured: the cell at each step, and the plan in words."""
+"""A plan in rerun: the cell at each step, and a description of the plan."""
 
 from functools import cached_property
 from itertools import pairwise
@@ -30,19 +30,19 @@ from hilcal.store.plan import UNLOADED, Plan
 from hilcal.types import Floats, Ints
 
 SEEN, TURNED, HIDDEN, UNKNOWN = range(4)
-"""Does the tracker see the target: yes; it is turned too far away; something is between; not
-known, as the tracker's place is not."""
+"""Sight of the target by the tracker: free; turned too far away; occluded; unknown, since the
+tracker's position is unknown."""
 SIGHT_COLORS = np.array([style.NOISE, style.AMBER, style.RED, style.GREY], dtype=np.uint8)
 SIGHT_WORDS = ("seen", "turned too far away", "hidden", "sight not checked")
-NOT_FIRST = ("", "takes about")  # rows of what a plan costs that stand with the details
+NOT_FIRST = ("", "takes about")  # rows of the cost of a plan that belong to the details
 STEPS = "Plan step by step: a bead per pose and load, beam green = seen"
 TRACKER = "From the tracker"
 SCHEDULE = "Schedule: minute of each reading by step, colour by load"
 BEAD, BEAD_GAP = 0.0075, 0.016
-"""Radius of a bead and distance of two in a stack, shares of the reach."""
-# Labels stand on a plate in the theme's colour: these have a contrast of about 3 on both.
+"""Radius of a bead, and distance of two beads in a stack, shares of the reach."""
+# Colours with a contrast of about 3 to the labels' background in both themes.
 _UNLOADED: style.Color = (225, 226, 230)
-# After Okabe & Ito's set for colour-blind readers, without the green, amber and red of the sight.
+# After Okabe & Ito's palette for colour-blind readers, without the colours of the sight.
 _LOADS = np.array(
     [
         *((86, 180, 233), (240, 228, 66), (204, 121, 167), (70, 110, 235)),
@@ -51,15 +51,15 @@ _LOADS = np.array(
 )
 _FADED = 0.62
 _OBSTACLE, _BOX, _TRACKER = (122, 112, 104), (64, 82, 108), (235, 235, 240)
-_SOLID = 90  # of 255: what stands behind an obstacle shows through
-_HEAD = 0.07  # m, of the drawn tracker
-_FORCE_LENGTH = 0.35  # the strongest pull is drawn this long, m
+_SOLID = 90  # opacity of an obstacle, of 255
+_HEAD = 0.07  # m, size of the drawn tracker
+_FORCE_LENGTH = 0.35  # drawn length of the strongest pull, m
 _LABEL_ABOVE = 0.24  # m
-_DIM = 0.42  # of a colour: lines have no transparency
+_DIM = 0.42  # factor on the colour of faint lines, since lines have no transparency
 _UP = np.array([0.0, 0.0, 1.0])
-_WAY_STEP_RAD = 0.08  # distance of the drawn points of a motion, of the leading joint
+_WAY_STEP_RAD = 0.08  # step of the leading joint between drawn points of a motion
 _DOT, _FPS = 3.5, 2.0
-_LOOKED_AT = 20  # steps whose arm is to be seen from the eye
+_LOOKED_AT = 20  # steps whose arm the eye should see
 GUIDE = """### How to read this
 **Plan step by step** (3-D): the arm stands in the pose of the step, as the capsules that are kept
 clear of everything. *Step* (bottom left) goes through the readings in the order in which they are
@@ -81,9 +81,9 @@ load changes by hand.
 
 
 class PlanView:
-    """A plan in its cell: where everything is at each of its S steps, base axes, SI.
+    """A plan in its cell: positions of everything at each of the S steps, base axes, SI.
 
-    `powers` are those of the suspects that the plan separates, pair by pair.
+    `powers` are those of the pairs of suspects that the plan separates.
 
     Raises:
         InputError: the plan's poses do not have as many joints as the arm.
@@ -105,45 +105,43 @@ class PlanView:
             )
         self.cell, self.config, self.plan = cell, config, plan
         self.summary, self.powers = summary, powers
-        self.reach = max(arm.reach, 0.1)  # m: sizes are drawn by it
-        self.shapes = Clearance(cell, config)  # as collisions are checked
+        self.reach = max(arm.reach, 0.1)  # m, scale of drawn sizes
+        self.shapes = Clearance(cell, config)  # the shapes of the collision check
         self.view = self.shapes.sight
-        # (3,) where the tracker stands; None where that is not known
+        # (3,) position of the tracker; None: unknown
         self.tracker = None if self.view is None else self.view.tracker
-        # (S,) index of the load and of the pose, joint angles (S, n), rad, and number, from 1
+        # (S,) indices of load and pose, joint angles (S, n), rad, and number of the step from 1
         self.load: Ints = np.array([loads.index(s.load) for s in steps], dtype=np.int64)
         row = {name: k for k, name in enumerate(plan.pose_names)}
         self.pose: Ints = np.array([row[s.pose] for s in steps], dtype=np.int64)
         self.q = plan.q[self.pose]
         self.steps = rr.TimeColumn("step", sequence=np.arange(1, len(self) + 1))
-        # (S, n + 2, 4, 4) base, bodies and flange; (S, 3) the target, or the flange where its
-        # place is not known
+        # (S, n + 2, 4, 4) base, bodies and flange; (S, 3) target, or flange if it is unknown
         self.bodies = body_poses(arm, self.q)
         self.target = chains.evaluate(arm, self.q).point(cell.target[:3, 3])
-        # (S,) angle between the target's normal and the beam; None where not given
+        # (S,) angle between the target's normal and the beam; None: unknown
         self.incidence = None if self.view is None else self.view.incidence(self.q)
         self.sight = self._sight()
         self.unseen = np.isin(self.sight, (TURNED, HIDDEN))  # (S,)
-        # (S,) how many other loads are measured before in the same pose: its bead's place
+        # (S,) number of loads measured before in the same pose: the bead's place in the stack
         order: dict[int, list[int]] = {}
         pairs = list(zip(self.pose.tolist(), self.load.tolist(), strict=True))
         for p, k in dict.fromkeys(pairs):
             order.setdefault(p, []).append(k)
         self.rank: Ints = np.array([order[p].index(k) for p, k in pairs], dtype=np.int64)
-        # (S,) middle of each reading since the start, s
-        margin = config.limits.joint_margin_rad
-        self.time = timeline(plan, arm, margin, pace(config))[1]
-        # (L, 3) a colour of each load; beyond seven, the same again and darker
+        # (S,) time of the middle of each reading, s
+        self.time = timeline(plan, arm, config.limits.joint_margin_rad, pace(config))[1]
+        # (L, 3) a colour of each load; after seven they repeat, darker
         hung = [name for name in loads if name != UNLOADED]
         rgb = {n: _LOADS[k % 7] * _FADED ** (k // 7) for k, n in enumerate(hung)}
-        each = [rgb.get(n, np.array(_UNLOADED)) for n in loads]
-        self.colors = np.array(each).round().astype(np.uint8)
+        colors = [rgb.get(n, np.array(_UNLOADED)) for n in loads]
+        self.colors = np.array(colors).round().astype(np.uint8)
 
     def __len__(self) -> int:
         return len(self.plan.steps)
 
     def _sight(self) -> Ints:
-        """(S,) `SEEN` and so on."""
+        """Return the sight (S,) of the target at each step."""
         if self.view is None:
             return np.full(len(self), UNKNOWN)
         free = np.zeros(len(self), dtype=np.bool_)
@@ -154,19 +152,19 @@ class PlanView:
         return np.where(~free, HIDDEN, np.where(turned, TURNED, SEEN)).astype(np.int64)
 
     def why(self, step: int) -> str:
-        """Return why the target is not seen at a step; empty where it is."""
+        """Return why the tracker does not see the target at a step; empty if it does."""
         if self.view is None or self.sight[step] == SEEN:
             return ""
         q, load = self.q[step : step + 1], self.plan.loads[self.load[step]]
         problems = self.view.problems(q, load, "")
-        if words := "; ".join(line.removeprefix(": ") for line in problems):
-            return words
+        if reasons := "; ".join(line.removeprefix(": ") for line in problems):
+            return reasons
         hidden = self.view.hidden(q, load)  # some of several targets
         return f"hidden: {', '.join(self.cell.target_names[k] for k in hidden)}"
 
     @cached_property
     def ways(self) -> tuple[Floats, ...]:
-        """Of each step, (K, 3) the target's way there from the step before, straight in joints."""
+        """Path (K, 3) of the target from the previous step to each step, linear in joint space."""
         stops = route(self.plan, self.cell.arm, self.config.limits.joint_margin_rad)
         legs: list[list[Floats]] = [[]]
         for a, b in pairwise(stops):
@@ -182,10 +180,10 @@ class PlanView:
 
 
 def _static_scene(rec: rr.RecordingStream, d: PlanView) -> None:
-    """Log what never changes: shapes of the arm, what stands around, and a bead per reading."""
+    """Log the static entities: shapes of the arm, surroundings, and a bead per reading."""
     fixed(rec, "world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
-    own, parts = len(body.capsules(d.cell.arm)), d.shapes.scene.parts
-    style.log_shapes(rec, style.shapes(parts[:own], parts[own:]))
+    of_arm, parts = len(body.capsules(d.cell.arm)), d.shapes.scene.parts
+    style.log_shapes(rec, style.shapes(parts[:of_arm], parts[of_arm:]))
     _obstacles(rec, d.config.obstacles)
     _workspace(rec, d)
     _beads(rec, d)
@@ -193,8 +191,8 @@ def _static_scene(rec: rr.RecordingStream, d: PlanView) -> None:
         low, high = ((d.tracker + k * _HEAD * _UP)[None] for k in (-1.2, 0.2))
         head = style.drawn_capsules(low, high, np.array([_HEAD]), [_TRACKER])
         fixed(rec, "world/tracker", head)
-        name = style.labels([d.tracker + 2.2 * _HEAD * _UP], ["tracker"])
-        fixed(rec, "world/tracker/name", name)
+        above = d.tracker + 2.2 * _HEAD * _UP
+        fixed(rec, "world/tracker/name", style.labels([above], ["tracker"]))
 
 
 def _obstacles(rec: rr.RecordingStream, things: tuple[Obstacle, ...]) -> None:
@@ -223,7 +221,7 @@ def _obstacles(rec: rr.RecordingStream, things: tuple[Obstacle, ...]) -> None:
 
 
 def _named_at(thing: Obstacle) -> Floats:
-    """(3,) where an obstacle's name is written: on its top, or on a flat one's front edge."""
+    """Return the position (3,) of an obstacle's name: its top, or the front edge of a flat one."""
     if thing.center_m is not None and thing.size_m is not None:
         center, half = np.array(thing.center_m), 0.5 * np.array(thing.size_m)
         flat = half[2] < 0.5 * min(half[:2])
@@ -232,7 +230,7 @@ def _named_at(thing: Obstacle) -> Floats:
 
 
 def _workspace(rec: rr.RecordingStream, d: PlanView) -> None:
-    """Log the outline of every side of the workspace that is given."""
+    """Log the outlines of the sides of the workspace, for stated limits only."""
     limits, reach = d.config.limits, 1.1 * d.reach
     ends = np.array(
         [
@@ -243,10 +241,10 @@ def _workspace(rec: rr.RecordingStream, d: PlanView) -> None:
     )
     low, high = ends.min(0), ends.max(0)
     sides = []
-    for given, at in ((limits.workspace_min_m, low), (limits.workspace_max_m, high)):
-        for axis in range(3) if given is not None else ():
+    for stated, corner in ((limits.workspace_min_m, low), (limits.workspace_max_m, high)):
+        for axis in range(3) if stated is not None else ():
             a, b = (axis + 1) % 3, (axis + 2) % 3
-            corners = np.tile(at, (5, 1))
+            corners = np.tile(corner, (5, 1))
             corners[:, a] = [low[a], high[a], high[a], low[a], low[a]]
             corners[:, b] = [low[b], low[b], high[b], high[b], low[b]]
             sides.append(corners)
@@ -256,16 +254,16 @@ def _workspace(rec: rr.RecordingStream, d: PlanView) -> None:
 
 
 def _beads(rec: rr.RecordingStream, d: PlanView) -> None:
-    """Log a bead per pose and load, and a cage around those that the tracker does not see."""
+    """Log a bead per pose and load, and a cage around each that the tracker does not see."""
     pairs = np.stack([d.pose, d.load], 1)
     steps = np.sort(np.unique(pairs, axis=0, return_index=True)[1])
-    at = d.target[steps] + d.rank[steps, None] * BEAD_GAP * d.reach * _UP
-    beads = rr.Points3D(at, colors=d.colors[d.load[steps]], radii=BEAD * d.reach)
+    center = d.target[steps] + d.rank[steps, None] * BEAD_GAP * d.reach * _UP
+    beads = rr.Points3D(center, colors=d.colors[d.load[steps]], radii=BEAD * d.reach)
     fixed(rec, "world/target/beads", beads)
     lost = d.unseen[steps]
     if lost.any():
         cages = rr.Ellipsoids3D(
-            centers=at[lost],
+            centers=center[lost],
             half_sizes=np.full((int(lost.sum()), 3), 1.9 * BEAD * d.reach),
             colors=SIGHT_COLORS[d.sight[steps[lost]]],
             fill_mode="majorwireframe",
@@ -275,25 +273,25 @@ def _beads(rec: rr.RecordingStream, d: PlanView) -> None:
 
 
 def _step_scene(rec: rr.RecordingStream, d: PlanView) -> None:
-    """Send what changes with every step, as columns on `step`."""
+    """Send the entities that change with every step, as columns on `step`."""
     style.send_stands(rec, d.steps, d.bodies[:, :-1])
     colors, beams = d.colors[d.load], SIGHT_COLORS[d.sight]
 
-    def lines(path: str, strips: object, of: object, radius: float) -> None:
+    def lines(path: str, strips: object, colors: object, radius: float) -> None:
         radii = np.full(len(d), radius * d.reach)
-        drawn = rr.LineStrips3D.columns(strips=strips, colors=of, radii=radii)  # type: ignore[arg-type]
+        drawn = rr.LineStrips3D.columns(strips=strips, colors=colors, radii=radii)  # type: ignore[arg-type]
         along(rec, path, d.steps, drawn)
 
-    now = np.full(len(d), 1.7 * BEAD * d.reach)
-    points = rr.Points3D.columns(positions=d.target, colors=colors, radii=now)
+    radii = np.full(len(d), 1.7 * BEAD * d.reach)
+    points = rr.Points3D.columns(positions=d.target, colors=colors, radii=radii)
     along(rec, "world/target/now", d.steps, points)
     above = d.target + (_LABEL_ABOVE + d.rank.max(initial=0) * BEAD_GAP * d.reach) * _UP
-    words = [
+    texts = [
         f"{k + 1}: {s.pose}, {load_name(s.load)}"
         + f": {SIGHT_WORDS[d.sight[k]]}" * bool(d.sight[k] != UNKNOWN)
         for k, s in enumerate(d.plan.steps)
     ]
-    labels = style.label_columns(above + 0.25 * _LABEL_ABOVE * _UP, words)
+    labels = style.label_columns(above + 0.25 * _LABEL_ABOVE * _UP, texts)
     along(rec, "world/label", d.steps, labels)
     lines("world/label/leader", np.stack([d.target, above], 1), beams, 0.0012)
     if d.tracker is not None:
@@ -301,7 +299,7 @@ def _step_scene(rec: rr.RecordingStream, d: PlanView) -> None:
         lines("world/beam", np.stack([start, d.target], 1), beams, 0.004)
     lines("world/way/last", list(d.ways), colors, 0.0022)
     _loads(rec, d)
-    # the target's whole way under the load of the step
+    # the target's complete path under the load of the step
     starts = [0, *(np.flatnonzero(np.diff(d.load)) + 1).tolist(), len(d)]
     for begin, end in pairwise(starts):
         rec.set_time("step", sequence=begin + 1)
@@ -313,7 +311,7 @@ def _step_scene(rec: rr.RecordingStream, d: PlanView) -> None:
 
 
 def _loads(rec: rr.RecordingStream, d: PlanView) -> None:
-    """Log what hangs or pulls, at the steps where there is some; cleared where there is none."""
+    """Log the hanging bodies or the pull of each step; without one the entity is cleared."""
     forces = {x.name: np.array(x.force_N) for x in d.config.loads}
     most = max((float(np.linalg.norm(f)) for f in forces.values()), default=0.0)
     hook = chains.evaluate(d.cell.arm, d.q).point(d.cell.load_point)
@@ -327,7 +325,7 @@ def _loads(rec: rr.RecordingStream, d: PlanView) -> None:
             pull: rr.AsComponents = rr.Clear(recursive=False)
             if hung:
                 start, end = (
-                    np.array([getattr(x, at)[i] for x in hung]) for at in ("start", "end")
+                    np.array([getattr(x, side)[i] for x in hung]) for side in ("start", "end")
                 )
                 load = style.drawn_capsules(start, end, np.array([x.radius for x in hung]), [color])
             if force.any():
@@ -348,15 +346,15 @@ def record_plan(
     path: Path,
     powers: tuple[PairPower, ...] = (),
 ) -> None:
-    """Write a plan as a recording file, whole or not at all; an existing file is replaced.
+    """Write a plan as a recording file, atomically; an existing file is replaced.
 
-    The timeline `step` goes through the readings in order, from 1: the arm in its pose, what
-    hangs, and the beam of the tracker, coloured by whether it sees the target. Equal plans give
-    equal recordings. `powers` of the suspects that the plan separates are shown first.
+    The timeline `step` counts the readings in their order from 1: the arm in its pose, the hanging
+    load, and the beam of the tracker, coloured by the sight of the target. Equal plans give equal
+    recordings. `powers` of the pairs of suspects that the plan separates are shown first.
 
     Raises:
-        InputError: the folder is missing, or the plan's poses do not fit the arm.
-        HilcalError: the file cannot be written.
+        InputError: the folder is missing, the file cannot be written, or the plan's poses do not
+            fit the arm.
     """
     d = PlanView(cell, config, plan, summary, powers)
     rec = recording.opened(d.config.to_json(), d.plan.to_json(), d.summary, d.powers)
@@ -379,7 +377,7 @@ def _log(rec: rr.RecordingStream, d: PlanView) -> None:
 
 
 def overview(d: PlanView) -> str:
-    """Return what a plan is for, its cost and efficiency; short, since a small window cuts it."""
+    """Return purpose, cost and efficiency of a plan; short, to fit a small window."""
     s, tracker = d.summary, NO_TRACKER
     title = f"Plan: {s.poses} poses, {s.readings} readings, {spoken(s.duration.total)}"
     if d.tracker is not None:
@@ -388,29 +386,29 @@ def overview(d: PlanView) -> str:
         if lost:
             tracker = f"✗ does not see the target in {lost} of {len(d)} readings"
     rows = [row for row in plan_blocks.cost_rows(s) if row[0] not in NOT_FIRST]
-    asked: list[Block] = []
+    task: list[Block] = []
     if d.powers:
         names = list(dict.fromkeys(t.effect for t in d.powers))
         question = heading(f"Which is it: {numbers.names(names, 'or')}?")
-        asked = [question, plan_blocks.power_table(d.powers)]
-    return style.markdown([*asked, heading(title), pairs([*rows, ("tracker", tracker)])])
+        task = [question, plan_blocks.power_table(d.powers)]
+    return style.markdown([*task, heading(title), pairs([*rows, ("tracker", tracker)])])
 
 
 def step_card(d: PlanView, k: int) -> str:
-    """Return step k (from 0) in words."""
+    """Return the description of step k (from 0)."""
     step = d.plan.steps[k]
     head = heading(f"Step {k + 1} of {len(d)}: {step.pose}, {load_name(step.load, 'under ')}")
     when = f"Minute {d.time[k] / 60.0:.0f} of {d.time[-1] / 60.0:.0f}."
     changes = bool(k) and d.load[k] != d.load[k - 1]
     change = "everything is taken off" if step.load == UNLOADED else f"{step.load} is hung"
-    before = [Words(f"Before it: {change}, by hand.", "strong")] if changes else []
+    by_hand = [Words(f"Before it: {change}, by hand.", "strong")] if changes else []
     angles = np.rad2deg(d.plan.joints(step.pose))
     rows = [(n, f"{a:.1f}") for n, a in zip(d.cell.arm.joint_names, angles, strict=True)]
     x, y, z = d.target[k]
-    what = "Target" if d.cell.target_known else "Flange (the target's place is not known)"
-    place = f"{what} at {x:.3f}, {y:.3f}, {z:.3f} m, base axes."
+    name = "Target" if d.cell.target_known else "Flange (the target's place is not known)"
+    place = f"{name} at {x:.3f}, {y:.3f}, {z:.3f} m, base axes."
     return style.markdown(
-        [head, when, *before, _sight(d, k), table("joint", "deg", rows=rows), place]
+        [head, when, *by_hand, _sight(d, k), table("joint", "deg", rows=rows), place]
     )
 
 
@@ -426,7 +424,7 @@ def _sight(d: PlanView, k: int) -> Words:
 
 
 def _schedule(rec: rr.RecordingStream, d: PlanView) -> None:
-    """Send the minute of each reading along `step`, one series per load; load changes are jumps."""
+    """Send the minute of each reading along `step`, a series per load; load changes are jumps."""
     series = [
         (f"load{k}", load_name(name), d.load == k, tuple(d.colors[k]), "circle", _DOT)
         for k, name in enumerate(d.plan.loads)
@@ -434,44 +432,43 @@ def _schedule(rec: rr.RecordingStream, d: PlanView) -> None:
     if d.unseen.any():
         name = "not seen by the tracker"
         series.append(("unseen", name, d.unseen, style.RED, "cross", 2 * _DOT))
-    for entity, name, of, color, marker, size in series:
+    for entity, name, members, color, marker, size in series:
         points = rr.SeriesPoints(
-            names=[f"{style.safe(name)}: {int(of.sum())}"],
+            names=[f"{style.safe(name)}: {int(members.sum())}"],
             colors=[color],
             markers=[marker],  # type: ignore[list-item]
             marker_sizes=[size],
         )
         fixed(rec, f"schedule/{entity}", points)
-        time = rr.TimeColumn("step", sequence=np.flatnonzero(of) + 1)
-        minutes = rr.Scalars.columns(scalars=d.time[of] / 60.0)
+        time = rr.TimeColumn("step", sequence=np.flatnonzero(members) + 1)
+        minutes = rr.Scalars.columns(scalars=d.time[members] / 60.0)
         along(rec, f"schedule/{entity}", time, minutes)
 
 
 def blueprint(d: PlanView) -> rrb.Blueprint:
-    """Left: 3-D over the schedule. Right: the plan in words over its tables."""
+    """Return the blueprint: left 3-D over the schedule, right the overview over the details."""
     points, turn = [d.target], float(np.deg2rad(-52.0))
-    if d.tracker is not None:  # a far one counts less
+    if d.tracker is not None:  # a distant tracker is drawn nearer
         far = float(np.linalg.norm(d.tracker))
         points.append((d.tracker * min(1.0, 1.6 * d.reach / max(far, 1e-9)))[None])
     middle, size = style.center(np.vstack(points), 0.35 * d.reach)
     if d.tracker is not None:  # look across the beam
         beam = d.tracker - middle
         turn = float(np.arctan2(beam[1], beam[0]) - np.deg2rad(62.0))
-    # and from where no obstacle hides the arm
+    # and from a side where no obstacle hides the arm
     some = np.unique(np.linspace(0, len(d) - 1, _LOOKED_AT).round().astype(np.int64))
     arm = np.vstack([d.bodies[some, 1:, :3, 3].reshape(-1, 3), d.target[some]])
     eye = style.direction(turn, middle, size, arm, d.config.obstacles)
     scenes = [style.view3d("world", STEPS, middle + size * eye, middle)]
     if d.tracker is not None:
         hidden = [f"- $origin/{x}/**" for x in ("tracker", "beam", "workspace", "way")]
-        at = d.target.mean(axis=0)
-        name = f"{TRACKER}, {numbers.length(float(np.linalg.norm(d.tracker - at)))} away"
-        view = style.view3d("world", name, d.tracker, at, ["+ $origin/**", *hidden])
-        scenes.append(view)
+        mean = d.target.mean(axis=0)
+        name = f"{TRACKER}, {numbers.length(float(np.linalg.norm(d.tracker - mean)))} away"
+        scenes.append(style.view3d("world", name, d.tracker, mean, ["+ $origin/**", *hidden]))
     legend = rrb.PlotLegend(rrb.Corner2D.RightBottom)
     times = rrb.TimeSeriesView(origin="schedule", name=SCHEDULE, plot_legend=legend)
-    words = (("plan", "Plan"), ("step", "This step"), ("guide", "How to read this"))
+    texts = (("plan", "Plan"), ("step", "This step"), ("guide", "How to read this"))
     left = rrb.Vertical(rrb.Tabs(*scenes), times, row_shares=[7, 2])
-    tabs = rrb.Tabs(*(style.text(*w) for w in words))
+    tabs = rrb.Tabs(*(style.text(*t) for t in texts))
     right = rrb.Vertical(tabs, style.text("details", "Details"), row_shares=[5, 4])
     return style.whole(rrb.Horizontal(left, right, column_shares=[3, 2]), "step", fps=_FPS)

@@ -1,4 +1,4 @@
-"""Recordings of any subject: opened, handed on, written whole; and the viewer that shows them."""
+"""Recordings of rerun: opening, sending, flushing and writing; and the viewer's executable."""
 
 import contextlib
 import hashlib
@@ -23,7 +23,7 @@ _LOG = logging.getLogger(__name__)
 
 
 def refused(ip: str, port: int) -> Exception | None:
-    """Return why a port cannot be bound; None where it can. A server itself would only log it."""
+    """Return why a port cannot be bound, None if it can; a server would only log the error."""
     try:
         with socket.socket() as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -34,18 +34,18 @@ def refused(ip: str, port: int) -> Exception | None:
 
 
 def opened(*content: object) -> rr.RecordingStream:
-    """Return a stream that is equal for equal content, values or arrays: it names the recording."""
+    """Return a stream whose identifier is a hash of the content, values or arrays."""
     sha = hashlib.sha256()
     for part in content:
         array = isinstance(part, np.ndarray)
         sha.update(np.ascontiguousarray(part).tobytes() if array else repr(part).encode())
     identifier = str(uuid.UUID(bytes=sha.digest()[:16]))
-    # Chunks end where the stream is flushed, not when a clock ticks: equal files.
+    # Chunks end at a flush, not at a clock tick, so that equal content gives equal files.
     return stream(identifier, rr.ChunkBatcherConfig.NEVER())
 
 
 def stream(identifier: str, batches: rr.ChunkBatcherConfig | None) -> rr.RecordingStream:
-    """Return a recording that has no other times than those that are set."""
+    """Return a recording without the default timelines of log time and log tick."""
     rec = rr.RecordingStream(
         APPLICATION, recording_id=identifier, send_properties=False, batcher_config=batches
     )
@@ -55,28 +55,28 @@ def stream(identifier: str, batches: rr.ChunkBatcherConfig | None) -> rr.Recordi
 
 
 def slow(error: Exception) -> bool:
-    """Whether a failure is only that somebody did not take the data in time."""
+    """Return whether an error is only a timeout of the receiver."""
     return "timeout" in str(error).lower() or "timed out" in str(error).lower()
 
 
 def fixed(rec: rr.RecordingStream, path: str, *drawn: rr.AsComponents) -> None:
-    """Log what never changes."""
+    """Log a static entity."""
     rec.log(path, *drawn, static=True)
 
 
 def along(
     rec: rr.RecordingStream, path: str, time: rr.TimeColumn, columns: rr.ComponentColumnList
 ) -> None:
-    """Send what an entity is at each of some times."""
+    """Send the states of an entity at several times."""
     rec.send_columns(path, indexes=[time], columns=columns)
 
 
 def write(
     rec: rr.RecordingStream, blueprint: rrb.Blueprint, tell: Callable[[], None], path: Path
 ) -> None:
-    """Write what is told to a stream as a file, whole or not at all, and close the stream.
+    """Write what `tell` logs to a file, atomically, and close the stream.
 
-    The recording is encoded in memory: rerun's own file sink can wait forever on a full disk.
+    The recording is encoded in memory, since rerun's file sink can wait forever on a full disk.
 
     Raises:
         InputError: the folder is missing, or the file cannot be written.
@@ -93,10 +93,10 @@ def write(
 
 
 def flush(rec: rr.RecordingStream) -> None:
-    """Hand everything logged so far to the sinks; a slow viewer only costs the time-out.
+    """Send everything logged so far to the sinks; a slow viewer costs at most the time-out.
 
     Raises:
-        HilcalError: a sink has failed: a full disk shows only here.
+        HilcalError: a sink has failed, e.g. because the disk is full.
     """
     try:
         rec.flush(timeout_sec=_FLUSH_TIMEOUT)
@@ -107,14 +107,14 @@ def flush(rec: rr.RecordingStream) -> None:
 
 
 def disable_analytics() -> None:
-    """Switch the viewer's usage statistics off for this user; they are on by default."""
+    """Disable the viewer's usage statistics for this user; they are enabled by default."""
     with contextlib.suppress(OSError, subprocess.SubprocessError, HilcalError):
         command = [executable(), "analytics", "disable"]
         subprocess.run(command, check=False, capture_output=True, timeout=10)  # noqa: S603
 
 
 def executable() -> str:
-    """Return the path of the rerun viewer that was installed with its SDK."""
+    """Return the path of the rerun viewer, preferably that of the installed SDK."""
     try:
         import rerun_cli  # type: ignore[import-untyped, unused-ignore]
     except ImportError:

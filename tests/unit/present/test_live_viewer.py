@@ -57,7 +57,7 @@ def tell(live, poses=24, paced=False):
         while paced and live._queue.qsize() > live_viewer.MOST // 2:
             time.sleep(0.01)
         begun = time.perf_counter()
-        live._tell(time.time(), what)
+        live._send(time.time(), what)
         slowest = max(slowest, time.perf_counter() - begun)
     return slowest
 
