@@ -1,8 +1,8 @@
 """Common parameters of the arms of one type, and arms that differ from them: see `hierarchy`.
 
 Effects in at least the share `COMMON` of the campaigns are pooled; parameters with a strength of
-their own (shrunk families) are not. A parameter is pooled if at least two arms determine it. Time is in
-years since the arm's first campaign.
+their own (shrunk families) are not. A parameter is pooled if at least two arms determine it. Time
+is in years since the arm's first campaign.
 """
 
 from collections import Counter
