@@ -94,7 +94,7 @@ def invert_nominal(
 ) -> Inverse:
     """Find joint values of the nominal arm for one target pose or N; else as `invert`."""
     goal = np.broadcast_to(rotation, (len(q), 3, 3)), np.broadcast_to(position, (len(q), 3))
-    return invert(arm, lambda at, _: nominal_pose(arm, tool, at), q, *goal)
+    return invert(arm, lambda joints, _: nominal_pose(arm, tool, joints), q, *goal)
 
 
 def singular(arm: Arm, chain: Chain, position: Floats) -> Bools:

@@ -111,8 +111,8 @@ def read_points(
     wrench, sensed = columns.pop("wrench", None), columns.pop("sensed", None)
     if "load" in table.text:
         wrench = np.stack([_load(table, k, loads) for k in range(len(table.rows))])
-    wanted = _poses(columns, q, arm)
-    if q is None and wanted is None:
+    poses = _poses(columns, q, arm)
+    if q is None and poses is None:
         raise InputError(
             f"{path}: neither joint values nor poses; valid: columns {groups[0][1][0]} … "
             f"{groups[0][1][-1]}, or x_m, y_m, z_m with rx_rad, ry_rad, rz_rad"
@@ -120,7 +120,7 @@ def read_points(
     if q is None:
         q = np.full((len(names), arm.n), np.nan)
     recorded = {k: v if v.shape[1] > 1 else v[:, 0] for k, v in columns.items()}
-    return Points(names, q, wanted, wrench, sensed, recorded, guess)
+    return Points(names, q, poses, wrench, sensed, recorded, guess)
 
 
 def _plain(path: Path, arm: Arm) -> tuple[ColumnTable | None, str]:
@@ -304,14 +304,14 @@ def _checked(
     path: Path, header: Sequence[str], groups: _Groups, arm: Arm
 ) -> tuple[Sequence[str], Sequence[str]]:
     """Check a header; return its text and its number columns."""
-    known = [name for _, names, _ in groups for name in names]
+    listed = [name for _, names, _ in groups for name in names]
     exchanged = set(known_columns(arm.units))
-    ours = {*known, *exchanged} - {"pose", "load", "target"}
+    ours = {*listed, *exchanged} - {"pose", "load", "target"}
     for name in header:
-        if name not in (*known, "pose", "load", *exchanged) and not name.startswith(OWN_PREFIX):
+        if name not in (*listed, "pose", "load", *exchanged) and not name.startswith(OWN_PREFIX):
             if not ours & set(header):
                 raise _OtherNamesError(f"{path}: no column of a table of points")
-            valid = ", ".join(("pose", "load", *known))
+            valid = ", ".join(("pose", "load", *listed))
             raise InputError(
                 f"{path}: unknown column '{name}'; valid: {valid}, columns of the exchange table, "
                 "and x_…; other tables: --format MAPPING, as for import"
@@ -332,7 +332,7 @@ def _checked(
                 f"{path}: both {alternatives[0]} and {alternatives[1]}; give one of them"
             )
     text = [name for name in ("pose", "load") if name in header]
-    return text, [name for name in header if name in known]
+    return text, [name for name in header if name in listed]
 
 
 def _load(table: ColumnTable, row: int, loads: Mapping[str, Floats]) -> Floats:

@@ -137,9 +137,9 @@ def program_points(
             raise InputError(f"{path}: line {w.line}: {w.left}; {_VALID}")
     no_joints, no_pose = np.full(JOINTS, np.nan), np.full((4, 4), np.nan)
     q = np.stack([no_joints if w.q is None else w.q for w in understood])
-    wanted = np.stack([no_pose if w.pose is None else w.pose for w in understood])
+    poses = np.stack([no_pose if w.pose is None else w.pose for w in understood])
     names = tuple(f"line {w.line}" for w in understood)
-    return program, every, Points(names, q, wanted), understood[0].tool
+    return program, every, Points(names, q, poses), understood[0].tool
 
 
 def with_joints(program: str, corrected: Sequence[Waypoint], q: Floats) -> str:
@@ -264,11 +264,11 @@ class _Program:
                 near = [*extra, *(n.value for n in named if n.arg == "qnear")]
                 if len(near) != len(extra) + len(named) or len(near) > 1:
                     return None
-                wanted = _pose(self.value(pose, k))
+                stated = _pose(self.value(pose, k))
                 branch = _six(self.value(near[0], k)) if near else None
-                if wanted is None or (near and branch is None):
+                if stated is None or (near and branch is None):
                     return None
-                return branch, wanted
+                return branch, stated
         value = self.value(node, k)
         q, goal = _six(value), _pose(value)
         return None if q is None and goal is None else (q, goal)

@@ -299,18 +299,18 @@ class Amplitude:
     def slopes(self) -> Iterator[tuple[tuple[int, int], str]]:
         """Yield slots and components of transmitted wrenches, with the derivatives as Python."""
         for i, f in enumerate(self.factors):
-            others = Amplitude((*self.factors[:i], *self.factors[i + 1 :]))
+            cofactor = Amplitude((*self.factors[:i], *self.factors[i + 1 :]))
             for slot, inner in f.variable.slopes():
                 parts = [f.written("slope_code"), *([inner] if inner else [])]
-                parts += [others.code()] if others.factors else []
+                parts += [cofactor.code()] if cofactor.factors else []
                 yield slot, " * ".join(f"({part})" for part in parts)
 
     def unit(self) -> str:
         """Unit of the product; "1" for none."""
         return unit_of(self.powers)
 
-    def of_joint(self, old: int, new: int, known: list[Variable]) -> "Amplitude | None":
-        """Return the law with the quantities of joint `new`; None if `known` lacks one."""
+    def of_joint(self, old: int, new: int, quantities: list[Variable]) -> "Amplitude | None":
+        """Return the law with the quantities of joint `new`; None if `quantities` lack one."""
         return self._with(
             lambda v: v.joint == old and v.kind != "sum",
             lambda v, w: (
@@ -318,29 +318,29 @@ class Amplitude:
                 and w.joint == new
                 and (w.slot is None or v.slot is None or w.slot[1] == v.slot[1])
             ),
-            known,
+            quantities,
         )
 
-    def of_axis(self, old: int, new: int, known: list[Variable]) -> "Amplitude | None":
+    def of_axis(self, old: int, new: int, quantities: list[Variable]) -> "Amplitude | None":
         """Return the law with the vectors' components along two axes exchanged."""
         swap = {old: new, new: old}
         return self._with(
             lambda v: bool(v.vector) and v.axis in swap,
             lambda v, w: w.vector == v.vector and w.axis == swap[v.axis],
-            known,
+            quantities,
         )
 
     def _with(
         self,
         changes: Callable[[Variable], bool],
         same: Callable[[Variable, Variable], bool],
-        known: list[Variable],
+        quantities: list[Variable],
     ) -> "Amplitude | None":
-        """Return the product with other quantities where `changes`; None if `known` lacks one."""
+        """Return the product with other quantities where `changes`; None if one is missing."""
         out = []
         for f in self.factors:
             v = f.variable
-            substitute = next((w for w in known if same(v, w)), None) if changes(v) else v
+            substitute = next((w for w in quantities if same(v, w)), None) if changes(v) else v
             if substitute is None:
                 return None
             out.append(replace(f, variable=substitute))

@@ -80,12 +80,12 @@ def _curve(
 ) -> Curve:
     site, first = parts[0].site, parts[0]
     varying = [(p, f) for p in parts for f in p.amplitude.factors if f.variable.symbol == symbol]
-    others = [f for f in first.amplitude.factors if f.variable.symbol != symbol]
+    cofactors = [f for f in first.amplitude.factors if f.variable.symbol != symbol]
     v = varying[0][1].variable
     orders = {f.numbers[0] if f.shape.name in ("cos", "sin") else 0.0 for _, f in varying}
     order = orders.pop() if len(orders) == 1 else 0.0
     x = _folded(v.read(s), order)
-    divisor = np.prod([f.values(s) for f in others], axis=0) if others else np.ones(len(x))
+    divisor = np.prod([f.values(s) for f in cofactors], axis=0) if cofactors else np.ones(len(x))
 
     def law(x: Floats) -> Floats:
         terms = [theta[p.coefficient] * f.shape.value(x, f.numbers) for p, f in varying]
@@ -96,13 +96,15 @@ def _curve(
     x, divisor = x[drawn], divisor[drawn]
     y, std = law(x) + deviation[drawn] / divisor, std[drawn] / np.abs(divisor)
     ends = np.linspace(float(x.min()), float(x.max()), LINE)
-    inner = "·".join(f.shape.text(f.variable.symbol, [f"{n:g}" for n in f.numbers]) for f in others)
-    of, unit = site.symbol, site.unit
-    if others:
-        of = f"{of}/({inner})" if "·" in inner else f"{of}/{inner}"
-        divided = type(first.amplitude)(tuple(others)).unit()
+    inner = "·".join(
+        f.shape.text(f.variable.symbol, [f"{n:g}" for n in f.numbers]) for f in cofactors
+    )
+    ordinate, unit = site.symbol, site.unit
+    if cofactors:
+        ordinate = f"{ordinate}/({inner})" if "·" in inner else f"{ordinate}/{inner}"
+        divided = type(first.amplitude)(tuple(cofactors)).unit()
         unit = unit if divided == "1" else f"{unit}/({divided})"
-    return _over(site, of, unit, v, order, x, y, std, np.vstack([ends, law(ends)]))
+    return _over(site, ordinate, unit, v, order, x, y, std, np.vstack([ends, law(ends)]))
 
 
 def _usable(std: Floats, divisor: Floats) -> Bools:
@@ -120,12 +122,12 @@ def _points(usable: Bools) -> Ints:
 
 
 def _over(
-    site: Site, of: str, unit: str, v: Variable, order: float, x: Floats, y: Floats, std: Floats,
-    line: Floats,
+    site: Site, ordinate: str, unit: str, v: Variable, order: float, x: Floats, y: Floats,
+    std: Floats, line: Floats,
 ) -> Curve:  # fmt: skip
     """Return a curve over a quantity, or over one period for a wave of high order."""
     name = f"{v.symbol} within a period of 2π/{order:g}" if order > HARMONICS else v.symbol
-    return Curve(site.words, of, unit, name, v.unit, x, y, std, binned(x, y, std), line)
+    return Curve(site.words, ordinate, unit, name, v.unit, x, y, std, binned(x, y, std), line)
 
 
 def partial_residuals(after: Fit, motion: Floats) -> tuple[Floats, Floats]:
@@ -244,13 +246,13 @@ def _drawn_curve(
         candidates.append((roughness, len(candidates), v, g, divisor, usable, x))
     roughness, _, v, g, divisor, usable, x = min(candidates, key=lambda t: (t[0] > SMOOTH, t[:2]))
     drawn = _points(usable)
-    x, of_law = x[drawn], law[drawn] / divisor[drawn]
-    y, error = of_law + partial[drawn] / divisor[drawn], std[drawn] / np.abs(divisor[drawn])
-    line = _line(x, of_law) if roughness <= SMOOTH else binned(x, of_law, error)[:2]
-    of, unit = site.symbol, site.unit
+    x, law_values = x[drawn], law[drawn] / divisor[drawn]
+    y, error = law_values + partial[drawn] / divisor[drawn], std[drawn] / np.abs(divisor[drawn])
+    line = _line(x, law_values) if roughness <= SMOOTH else binned(x, law_values, error)[:2]
+    ordinate, unit = site.symbol, site.unit
     if g is not None:
-        of, unit = f"{of}/{g.symbol}", unit if g.unit == "1" else f"{unit}/({g.unit})"
-    return _over(site, of, unit, v, _order(v, effect.summary), x, y, error, line)
+        ordinate, unit = f"{ordinate}/{g.symbol}", unit if g.unit == "1" else f"{unit}/({g.unit})"
+    return _over(site, ordinate, unit, v, _order(v, effect.summary), x, y, error, line)
 
 
 def _line(x: Floats, y: Floats) -> Floats:

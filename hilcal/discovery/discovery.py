@@ -190,7 +190,7 @@ def _silent(fit: Fit, screening: Screen, say: Callable[[str], None], searched: f
 
 def _laws(
     fit: Fit, problem: SearchProblem, selections: list[Selection], folds: FoldSearch,
-    known: KnownEffects, say: Callable[[str], None], name: str,
+    effects: KnownEffects, say: Callable[[str], None], name: str,
 ) -> Discovery:  # fmt: skip
     screen = problem.screen
     squares = left_out_by_pose(fit)
@@ -214,7 +214,7 @@ def _laws(
             continue
         squares_after = left_out_by_pose(after)
         share = float(np.clip((squares.sum() - squares_after.sum()) / misfit, -1.0, 1.0))
-        law = _law(problem, s, form, name, coefficients, share, after, folds, known, chance[kind])
+        law = _law(problem, s, form, name, coefficients, share, after, folds, effects, chance[kind])
         kinds.append(kind)
         evidence = (
             f"It explains {100 * share:.0f} % of the misfit on poses left out; p-value "
@@ -250,14 +250,14 @@ def _laws(
 def _law(
     problem: SearchProblem, s: Selection, form: Form, name: str,
     coefficients: tuple[Coefficient, ...], share: float, after: Fit, folds: FoldSearch,
-    known: KnownEffects, probability: float,
+    effects: KnownEffects, probability: float,
 ) -> Law:  # fmt: skip
     linear = problem.screen.linear
     x = np.hstack([problem.columns(t) for t in s.terms])
     score = score_family(linear.information(x), x.T @ linear.residual, linear.rss, linear.fit.dof)
     price = sum(t.price for t in s.terms)
     p_value = float(np.exp(min(np.log(max(score.p_value, 1e-300)) + price, 0.0)))
-    near = tuple(r for r in resembling(problem, s, known) if r.cosine >= NEAR)
+    near = tuple(r for r in resembling(problem, s, effects) if r.cosine >= NEAR)
     situation = linear.fit.solution.prediction.situation
     factors = (f for p in form.parts for f in p.amplitude.factors)
     read = {v.symbol: v for f in factors for v in f.variable.recorded}

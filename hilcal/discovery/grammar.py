@@ -294,15 +294,15 @@ def _key(a: Amplitude) -> frozenset[tuple[str, str, Numbers]]:
     return frozenset((f.variable.symbol, f.shape.name, f.numbers) for f in a.factors)
 
 
-def grammar(known: list[Variable], s: Situation, poses: int = 0) -> Grammar:
+def grammar(quantities: list[Variable], s: Situation, poses: int = 0) -> Grammar:
     """Return all products of functions of the quantities.
 
     The number of poses limits the multiples of an angle.
     """
-    singles = [f for v in known for f in functions(v, v.read(s), MOST)]
+    singles = [f for v in quantities for f in functions(v, v.read(s), MOST)]
     singles += [  # fine waves, as complex as a product: in no product
         Factor(v, f, (float(k),))
-        for v in known
+        for v in quantities
         if v.kind == "angle"
         for k in range(HARMONICS + 1, min(poses, FINEST) + 1)
         for f in (shapes.FINE_COS, shapes.FINE_SIN)
@@ -331,7 +331,7 @@ def grammar(known: list[Variable], s: Situation, poses: int = 0) -> Grammar:
     first, second = np.array(pairs)[nonzero].T
     less = np.where(second >= 0, [of_single[second + 1], of_single[first + 1]], -1)
     return Grammar(
-        known,
+        quantities,
         amplitudes,
         values,
         size,

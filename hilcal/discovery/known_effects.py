@@ -70,42 +70,42 @@ class Instead:
 
 
 def instead_of_law(
-    fit: Fit, problem: SearchProblem, law: Selection, known: KnownEffects
+    fit: Fit, problem: SearchProblem, law: Selection, effects: KnownEffects
 ) -> Instead:
     """Return the effects that explain the misfit as well as a law, at odds of 20 : 1; or none.
 
     A law whose exact refit fails is not preferred to effects whose refit does not.
     """
-    if known.total > law.total - LEAST:
-        return Instead(known.names)
-    alike = resembling(problem, law, known)
-    if alike and alike[0].cosine >= SAME and not tells_more(problem, law, known, alike[0].effect):
-        return Instead(known.names or (alike[0].effect,))
-    total, effects = _exact_effects(fit, known)
+    if effects.total > law.total - LEAST:
+        return Instead(effects.names)
+    alike = resembling(problem, law, effects)
+    if alike and alike[0].cosine >= SAME and not tells_more(problem, law, effects, alike[0].effect):
+        return Instead(effects.names or (alike[0].effect,))
+    total, explained = _exact_effects(fit, effects)
     if total > law.total - LEAST and total > _exact_law(fit, problem, law) - LEAST:
-        return effects
-    return replace(effects, names=())
+        return explained
+    return replace(explained, names=())
 
 
-def _exact_effects(fit: Fit, known: KnownEffects) -> tuple[float, Instead]:
+def _exact_effects(fit: Fit, effects: KnownEffects) -> tuple[float, Instead]:
     """Return the best odds of the first one, two, … effects by exact refits, and these effects.
 
     Refits that exclude further readings as gross errors do not count, since they do not explain
     these readings.
     """
-    after, odds, best, effects = fit, 0.0, -np.inf, Instead()
-    for k, name in enumerate(known.names):
+    after, odds, best, explained = fit, 0.0, -np.inf, Instead()
+    for k, name in enumerate(effects.names):
         try:
             after = add(after, name)
         except HilcalError as error:
-            return best, replace(effects, unfitted=((name, str(error)),))
-        odds += known.odds[k]
+            return best, replace(explained, unfitted=((name, str(error)),))
+        odds += effects.odds[k]
         if np.any(after.outlier & ~fit.outlier):
             continue
-        total = odds + _beyond(fit, known.left[k], after)
+        total = odds + _beyond(fit, effects.left[k], after)
         if total > best:
-            best, effects = total, Instead(known.names[: k + 1])
-    return best, effects
+            best, explained = total, Instead(effects.names[: k + 1])
+    return best, explained
 
 
 def _exact_law(fit: Fit, problem: SearchProblem, law: Selection) -> float:
@@ -116,24 +116,24 @@ def _exact_law(fit: Fit, problem: SearchProblem, law: Selection) -> float:
         after, form, *_ = exact(screen, form, "law")
     except HilcalError:
         return -np.inf
-    left = left_by(screen, form, fit.solution.prediction.situation)
-    return law.total + _beyond(fit, left / max(fit.dof - form.count, 1.0), after)
+    squares = left_by(screen, form, fit.solution.prediction.situation)
+    return law.total + _beyond(fit, squares / max(fit.dof - form.count, 1.0), after)
 
 
-def _beyond(fit: Fit, left: float, after: Fit) -> float:
+def _beyond(fit: Fit, factor: float, after: Fit) -> float:
     """Return the gain in log likelihood of a refit over its linearisation."""
-    return 0.5 * fit.dof * float(np.log(left / after.variance_factor))
+    return 0.5 * fit.dof * float(np.log(factor / after.variance_factor))
 
 
 def resembling(
-    problem: SearchProblem, s: Selection, known: KnownEffects
+    problem: SearchProblem, s: Selection, effects: KnownEffects
 ) -> tuple[Resemblance, ...]:
     """Return effects by how well they describe the motion of a law, the nearest first.
 
     An effect is fitted to the law without each fold of poses, and compared with it on that fold:
     without that, an effect of many parameters would describe anything at few poses.
     """
-    x, columns = known.white, known.columns
+    x, columns = effects.white, effects.columns
     linear = problem.screen.linear
     law = np.hstack([problem.columns(t) for t in s.terms])
     free = problem.model.project_out(law)
@@ -142,15 +142,15 @@ def resembling(
     total = float(np.sum(left_out_residuals(folds, linear.projection, y) ** 2))
     out = []
     for effect, part in columns.items():
-        left = left_out_residuals(folds, linear.projection, y, x[:, part])
-        share = 1.0 - float(np.sum(left**2)) / max(total, 1e-300)
+        residual = left_out_residuals(folds, linear.projection, y, x[:, part])
+        share = 1.0 - float(np.sum(residual**2)) / max(total, 1e-300)
         out.append(Resemblance(effect, float(np.sqrt(max(share, 0.0)))))
     return tuple(sorted(out, key=lambda r: -r.cosine))
 
 
-def tells_more(problem: SearchProblem, s: Selection, known: KnownEffects, effect: str) -> bool:
+def tells_more(problem: SearchProblem, s: Selection, effects: KnownEffects, effect: str) -> bool:
     """Whether odds of 20 : 1, corrected for the search, require a law beside a similar effect."""
-    x, columns = known.white, known.columns
+    x, columns = effects.white, effects.columns
     law = np.hstack([problem.columns(t) for t in s.terms])
     both = np.hstack([x[:, columns[effect]], law])
     count = both.shape[1] - law.shape[1]

@@ -171,8 +171,8 @@ def _pruned(problem: SearchProblem, s: Selection) -> Selection:
     while len(s.terms) > 1:
         worth = []
         for k, term in enumerate(s.terms):
-            others = (*s.terms[:k], *s.terms[k + 1 :])
-            worth.append(problem.beside(others).score([term])[0].odds)
+            remaining = (*s.terms[:k], *s.terms[k + 1 :])
+            worth.append(problem.beside(remaining).score([term])[0].odds)
         weakest = int(np.argmin(worth))
         if worth[weakest] >= LEAST:
             return replace(s, odds=chain(problem, s.terms))
@@ -185,11 +185,11 @@ def _pruned(problem: SearchProblem, s: Selection) -> Selection:
 def _exchanged(problem: SearchProblem, s: Selection, last: int) -> Selection:
     """Exchange each of the first `last` terms for a better one beside the others."""
     for k in range(last):
-        others = (*s.terms[:k], *s.terms[k + 1 :])
-        ordered = _ordered(problem, others)
+        remaining = (*s.terms[:k], *s.terms[k + 1 :])
+        ordered = _ordered(problem, remaining)
         if not ordered or ordered[0].term.parts == s.terms[k].parts:
             continue
-        terms = led((*others, ordered[0].term))
+        terms = led((*remaining, ordered[0].term))
         if sum(t.count for t in terms) > MOST_COEFFICIENTS:
             continue
         exchanged = replace(s, terms=terms, odds=chain(problem, terms))

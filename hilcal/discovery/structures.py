@@ -128,14 +128,14 @@ def _met(problem: SearchProblem, selections: Iterable[Selection]) -> list[tuple[
         if len(s.terms) < MOST_TERMS:
             bases[s.terms] = None
     out: dict[Hashable, tuple[float, Terms]] = {}
-    for others in bases:
-        base_odds = log_odds(problem, others)
-        for c in problem.scored(others):
-            terms = led((*others, plain(problem.screen, c.term)))
+    for base in bases:
+        base_odds = log_odds(problem, base)
+        for c in problem.scored(base):
+            terms = led((*base, plain(problem.screen, c.term)))
             if not c.score.rank or sum(t.count for t in terms) > MOST_COEFFICIENTS:
                 continue
-            odds = base_odds + c.score.marginal - c.term.price - LEAST * bool(others)
-            key = frozenset((t.parts, t.common) for t in (*others, c.term))
+            odds = base_odds + c.score.marginal - c.term.price - LEAST * bool(base)
+            key = frozenset((t.parts, t.common) for t in (*base, c.term))
             if key not in out or out[key][0] < odds:
                 out[key] = odds, terms
     least = max((odds for odds, _ in out.values()), default=0.0) - CLOSE

@@ -124,7 +124,7 @@ def effects_seen(members: Sequence[Member]) -> tuple[DiagnosedEffect, ...]:
     return tuple(sorted(out, key=lambda s: -len(s.arms)))
 
 
-def pooled(members: Sequence[Member], seen: Sequence[DiagnosedEffect]) -> Pooled:
+def pooled(members: Sequence[Member], diagnosed: Sequence[DiagnosedEffect]) -> Pooled:
     """Pool the campaigns of arms of one type.
 
     Raises:
@@ -176,7 +176,7 @@ def pooled(members: Sequence[Member], seen: Sequence[DiagnosedEffect]) -> Pooled
         campaigns=tuple(m.name for m in members),
         parameters=tuple(spreads),
         odd=tuple(odd),
-        seen=tuple(seen),
+        seen=tuple(diagnosed),
         wear=tuple(n for n, p in zip(names, certain, strict=True) if timed and p < FALSE_ALARM),
         prior=_prior(members, effects, names, scale, units, h, len(arms)),
         off=(h.arm_mean - h.mu) * scale,
