@@ -110,7 +110,7 @@ class Calibration(Brief):
         if model.prior is None:  # else the covariance does not follow from these readings alone
             stated = p.excess.of_readings(used, fit.mode)
             covariance_source = CovarianceSource(stated, p.prior, p.noise, kappa)
-        calibration = cls(
+        bare = cls(
             model=replace(model, readings=None, prior=None),
             theta=fit.theta,
             mode=fit.mode,
@@ -123,9 +123,7 @@ class Calibration(Brief):
             sensor=SensorMount.of(model.cell),
             learnt=covariance_source,
         )
-        return replace(
-            calibration, conditions=conditions_of(model, used.states, calibration._moves)
-        )
+        return replace(bare, conditions=conditions_of(model, used.states, bare._moves))
 
     @classmethod
     def load(cls, path: str | Path, catalogue: Catalogue | None = None) -> "Calibration":

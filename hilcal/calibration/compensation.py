@@ -177,8 +177,7 @@ class ToolPoses(Brief):
 def band(covariance: Floats) -> Floats:
     """(N,) radius that holds `BAND` of normal vectors with covariance (N, 3, 3).
 
-    |e|² is taken as a scaled χ² with the same mean and variance (Satterthwaite); 0 for a zero
-    covariance.
+    |e|² counts as a scaled χ² of the same mean and variance; 0 for a zero covariance.
     """
     size = np.trace(covariance, axis1=1, axis2=2)
     shape = covariance / np.where(size > 0, size, 1.0)[:, None, None]

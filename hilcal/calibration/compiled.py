@@ -74,8 +74,9 @@ class CompiledForm:
 
     def take(self, e: Effect, theta: Floats, s: Situation) -> bool:
         """Add an effect; return False where it has another form."""
-        if e.wrench_change(theta, s) is not None:
-            return self._sensed(e, theta, s)
+        change = e.wrench_change(theta, s)
+        if change is not None:
+            return self._sensed(change, s)
         d = e.deviation(theta, s)
         if all(x is None for x in (d.dq, d.twist, d.base, d.target)):
             return True  # effects of instruments move no tool
@@ -105,11 +106,9 @@ class CompiledForm:
             return False
         return self._soft(e, theta, s, deviation.dq) or self._by_torque(e, theta, s, deviation)
 
-    def _sensed(self, e: Effect, theta: Floats, s: Situation) -> bool:
+    def _sensed(self, change: Floats, s: Situation) -> bool:
         """Add the wrench error of a force sensor on the flange: R (bias + gain Rᵀ w)."""
-        change, r = e.wrench_change(theta, s), s.chain.rotation[-1]
-        if change is None:
-            return False
+        r = s.chain.rotation[-1]
         w, y = (
             np.einsum("nij,nki->nkj", r, x.reshape(-1, 2, 3)).reshape(-1, 6)
             for x in (s.states.wrench, change)
@@ -247,9 +246,8 @@ def _only(d: Deviation) -> bool:
 
 def _same(d: Deviation, dq: Floats, twist: Floats | None) -> bool:
     """Whether a deviation equals that of the form."""
-    zero = 0.0
-    a = (zero if d.dq is None else d.dq) - dq
-    b = (zero if d.twist is None else d.twist) - (zero if twist is None else twist)
+    a = (0.0 if d.dq is None else d.dq) - dq
+    b = (0.0 if d.twist is None else d.twist) - (0.0 if twist is None else twist)
     size = max(np.abs(dq).max(initial=0.0), 1e-3)
     return bool(np.abs(a).max() <= 1e3 * EXACT * size and np.abs(b).max(initial=0.0) <= EXACT)
 

@@ -78,13 +78,11 @@ class CovarianceSource:
     def to_json(self) -> dict[str, object]:
         """Return the source as JSON; numbers of the readings have 7 digits."""
         r, upper = self.readings, np.triu_indices(self.readings.m)
-        columns = {
-            f.name: a for f in fields(States) if (a := getattr(r.states, f.name)) is not None
-        }
+        state = {f.name: a for f in fields(States) if (a := getattr(r.states, f.name)) is not None}
         cov = r.covariance[:, upper[0], upper[1]]
         return {
             "elements": r.m,
-            "states": {name: _packed(a) for name, a in columns.items()},
+            "states": {name: _packed(a) for name, a in state.items()},
             "covariance": _packed(cov),
             "common": None if r.common is None else _packed(r.common),
             "serial_noise": None if r.serial is None else r.serial.to_json(),

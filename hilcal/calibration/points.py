@@ -61,8 +61,7 @@ STARTS = 300
 BEYOND = 1e3
 """rad; added to the distance of a solution beyond the joints' limits."""
 LEAST_REACH, LONGEST_TOOL = 0.05, 0.5
-"""The farthest point lies beyond this share of the reach, and within the reach plus this length, m;
-choices."""
+"""Least distance of the farthest point over the reach, and largest beyond it, m; choices."""
 LARGEST = 4.0 * np.pi
 """rad; a choice, twice the range of most joints: larger values in a column of rad are degrees."""
 
@@ -326,11 +325,9 @@ def _checked(
         if not missing:
             key = "hung" if quantity in ("wrench", "sensed") else quantity
             first.setdefault(key, []).append(names[0])
-    for alternatives in first.values():
-        if len(alternatives) > 1:
-            raise InputError(
-                f"{path}: both {alternatives[0]} and {alternatives[1]}; give one of them"
-            )
+    for options in first.values():
+        if len(options) > 1:
+            raise InputError(f"{path}: both {options[0]} and {options[1]}; give one of them")
     text = [name for name in ("pose", "load") if name in header]
     return text, [name for name in header if name in listed]
 

@@ -100,12 +100,9 @@ def _shown_by_repeats(fit: Fit) -> float | None:
     share = (1.0 - 1.0 / count)[kind]
     jacobian = joint_factors(fit.model.cell, inliers, np.ones(fit.model.cell.arm.n))[:, :3]
     scatter = float(np.sum(deviation**2))
-    stated = (
-        inliers.covariance[:, :3, :3]
-        if not inliers.scatter_stated
-        else np.zeros((len(inliers), 3, 3))
-    )
-    noise = float(share @ np.trace(stated, axis1=1, axis2=2))
+    noise = float(share @ np.trace(inliers.covariance[:, :3, :3], axis1=1, axis2=2))
+    if inliers.scatter_stated:
+        noise = 0.0
     gain = float(share @ np.sum(jacobian**2, axis=(1, 2)))
     unsure = max(scatter, noise) * np.sqrt(2.0 / dof)
     std = np.sqrt(max(scatter - noise, min(scatter, unsure)) / gain)

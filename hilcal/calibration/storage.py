@@ -150,11 +150,9 @@ def _small(c: Calibration) -> dict[str, object] | None:
     states = c.learnt.readings.states
     states = states[:: max(len(states) // TRIED, 1)]
     jacobian = c.model.jacobian(c.model.predict(states, c.theta), c.theta, 3)
-    restored = CovarianceSource.from_json(small).root(c.model, c.theta, c.mode)
-    stated, reproduced = (
-        np.linalg.norm(jacobian @ root, axis=(1, 2)) for root in (c.root, restored)
-    )
-    return small if np.all(np.abs(reproduced - stated) <= AGREES * stated) else None
+    copy = CovarianceSource.from_json(small).root(c.model, c.theta, c.mode)
+    stated, copied = (np.linalg.norm(jacobian @ root, axis=(1, 2)) for root in (c.root, copy))
+    return small if np.all(np.abs(copied - stated) <= AGREES * stated) else None
 
 
 def _cell(content: Mapping[str, Any], arm: Arm) -> Cell:

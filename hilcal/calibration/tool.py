@@ -36,21 +36,17 @@ class ToolPose:
 
 def tool_of(model: Model, theta: Floats, pose: Floats | None) -> ToolPose:
     """Return the tracked target as fitted, or a tool with another pose T_flange_tool (4, 4)."""
-    all_columns = np.arange(model.size)
+    index = np.arange(model.size)
     robot = robot_frames(model, theta)
     if pose is None:
-        nominal, tool_model, columns = robot.declared[0], model, all_columns
+        nominal, tool_model, columns = robot.declared[0], model, index
     else:
-        nominal, retained = pose, [e for e in model.effects if e.role != "target"]
-        parts = [
-            all_columns[s]
-            for e, s in zip(model.effects, model.slices(), strict=True)
-            if e in retained
-        ]
-        columns = np.concatenate([all_columns[:0], *parts])
+        nominal, used = pose, [e for e in model.effects if e.role != "target"]
+        parts = [index[s] for e, s in zip(model.effects, model.slices(), strict=True) if e in used]
+        columns = np.concatenate([index[:0], *parts])
         cell = replace(model.cell, targets=None, target_names=(), targets_known=())
         cell = replace(cell, target=robot.flange @ pose, target_known=True)
-        tool_model = replace(model, cell=cell, effects=tuple(retained))
+        tool_model = replace(model, cell=cell, effects=tuple(used))
     state = one_of_each(tool_model.cell)
     if tool_model.cell.targets is not None:
         state = replace(state, target=np.zeros(1, dtype=np.int64))

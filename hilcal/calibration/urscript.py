@@ -277,11 +277,9 @@ class _Program:
         """Say why a target is not understood."""
         reason = f"the waypoint '{s.written(node)[:40]}' is computed while the program runs"
         if isinstance(node, ast.Name) and node.id in self.bound:
-            assignments = self.bound[node.id]  # a line with several, of parameters, is named once
-            lines = list(
-                dict.fromkeys(str(self.statements[k].line) for k, _ in assignments[:NAMED])
-            )
-            more = f" and {len(assignments) - NAMED} more" if len(assignments) > NAMED else ""
+            bound = self.bound[node.id]  # a line with several, of parameters, is named once
+            lines = list(dict.fromkeys(str(self.statements[k].line) for k, _ in bound[:NAMED]))
+            more = f" and {len(bound) - NAMED} more" if len(bound) > NAMED else ""
             source = f"line{'s' * (len(lines) > 1)} {', '.join(lines)}{more}"
             reason += f" ('{node.id[:40]}' has its value from {source})"
         return reason
@@ -461,14 +459,12 @@ def doubts(
     on_line = np.array([k > 0 and w.straight and w.follows for k, w in enumerate(waypoints)])
     chosen = np.array([w.pose is not None for w in waypoints])
     chosen &= ~on_line | np.array([w.q is not None for w in waypoints])
-    ambiguous = chosen & ~_nearest(arm, tool, stated, q)
+    tied = chosen & ~_nearest(arm, tool, stated, q)
     bent = on_line & ~_straight(arm, tool, previous, q)
     out: list[str] = []
     for k, w in enumerate(waypoints):
         unknown = k > 0 and out[-1] and (on_line[k] or (w.q is None and w.pose is not None))
-        out.append(
-            UNKNOWN if unknown else NEAREST if ambiguous[k] else NOT_STRAIGHT if bent[k] else ""
-        )
+        out.append(UNKNOWN if unknown else NEAREST if tied[k] else NOT_STRAIGHT if bent[k] else "")
     return out
 
 

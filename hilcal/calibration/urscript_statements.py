@@ -155,14 +155,12 @@ def _parts(node: ast.stmt) -> Iterator[ast.AST]:
     match node:
         case ast.If(test=test) | ast.While(test=test):
             yield from ast.walk(test)
-        case ast.FunctionDef(args=signature) if (
-            not (
-                signature.kwonlyargs or signature.posonlyargs or signature.vararg or signature.kwarg
-            )
-            and all(a.annotation is None for a in signature.args)
+        case ast.FunctionDef(args=head) if (
+            not (head.kwonlyargs or head.posonlyargs or head.vararg or head.kwarg)
+            and all(a.annotation is None for a in head.args)
             and node.returns is None
         ):
-            for value in signature.defaults:
+            for value in head.defaults:
                 yield from ast.walk(value)
         case (
             ast.Assign(targets=[ast.Name()])

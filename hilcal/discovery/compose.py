@@ -4,9 +4,8 @@ f(u) with u = φ₁ + Σ w_i φ_i, where φ_i are products of functions of at mo
 single-index model, one step of projection pursuit (Friedman and Stuetzle 1981, JASA 76, 817).
 
 1. All bends and steps of single products are screened at all sites; see `bends`.
-2. The arguments u of the best are extended by a further product: f(u + w φ) ≈ f(u) + w φ f'(u). The
-   gain of the column φ f'(u) beside f(u) and its level f'(u) ranks all φ, and its coefficient gives
-   w (Gauss-Newton).
+2. The arguments of the best are extended by a further product: f(u + w φ) ≈ f(u) + w φ f'(u). The
+   gain of φ f'(u) beside f(u) and f'(u) ranks all φ, its coefficient gives w (Gauss-Newton).
 3. Levels, weights and an exponent of the very best are refined together, with the coefficient
    projected out.
 
@@ -386,13 +385,11 @@ def _other_values(factor: Factor, n: int, x: Floats) -> list[float]:
     return sorted({float(f"{v:.2g}") for v in values} - {factor.numbers[n]})
 
 
-def _best_terms(
-    candidates: Candidates, proposals: list[tuple[int, Amplitude, float]]
-) -> list[LawTerm]:
+def _best_terms(candidates: Candidates, pool: list[tuple[int, Amplitude, float]]) -> list[LawTerm]:
     screen = candidates.problem.screen
     ranked: list[tuple[float, int, Amplitude, float]] = []
-    for s in dict.fromkeys(s for s, _, _ in proposals):
-        of_site = [(a, price) for site, a, price in proposals if site == s]
+    for s in dict.fromkeys(s for s, _, _ in pool):
+        of_site = [(a, price) for site, a, price in pool if site == s]
         values = np.array([screen.grammar.values_of(a)[screen.readings] for a, _ in of_site])
         size = np.sqrt(np.mean(values**2, axis=1, keepdims=True))
         good = np.isfinite(size[:, 0]) & (size[:, 0] > 0)

@@ -186,17 +186,17 @@ def drawn_laws(fit: Fit) -> tuple[DrawnLaw, ...]:
 
 def _drawn(fit: Fit, index: int, sites: tuple[Site, ...], unit: Floats) -> DrawnLaw:
     effect, theta = fit.model.effects[index], fit.theta[fit.model.slices()[index]]
-    motions = _motions(effect, theta, fit, sites)
+    motion = _motions(effect, theta, fit, sites)
     size = {k: float(np.sqrt(np.mean((unit[:, :, k] / ORDINARY[sites[k].unit] * m[:, None]) ** 2)))
-            for k, m in motions.items()}  # fmt: skip
-    order = sorted(motions, key=lambda k: -size[k])
+            for k, m in motion.items()}  # fmt: skip
+    order = sorted(motion, key=lambda k: -size[k])
     quantities = variables(fit.solution.prediction.situation)
     named = [v for v in quantities if _named(v, effect.summary)]
     axes: list[Axes] = [(v, None) for v in named or quantities]
     axes += [(v, g) for v in named for g in named if g is not v]
     curves = tuple(
         _drawn_curve(
-            fit, sites[k], unit[:, :, k] / ORDINARY[sites[k].unit], motions[k], axes, effect
+            fit, sites[k], unit[:, :, k] / ORDINARY[sites[k].unit], motion[k], axes, effect
         )
         for k in order[:MOST_SITES]
         if axes and size[k] > 0

@@ -103,9 +103,9 @@ class Discovery(Shown):
 
     def average_m(self) -> tuple[float, float]:
         """Return rms of the averaged motion of the fitted readings, and of its std, m."""
-        mean, std = self.average(self.fit.readings)
-        rms = (np.sqrt(np.mean(np.sum(x[:, :3] ** 2, axis=1))) for x in (mean, std))
-        return float(next(rms)), float(next(rms))
+        motions = self.average(self.fit.readings)
+        mean, std = (np.sqrt(np.mean(np.sum(x[:, :3] ** 2, axis=1))) for x in motions)
+        return float(mean), float(std)
 
 
 def alternatives(d: Discovery, law: Law) -> tuple[Structure, ...]:

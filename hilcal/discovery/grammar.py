@@ -128,7 +128,7 @@ def _round(x: float) -> float:
 
 
 MOST = 3  # Complexity of a product; a choice: about 10⁶ candidates with all sites
-MOST_FACTORS = 2  # Factors of a product; a choice, likewise
+MOST_FACTORS = 2  # Factors of a product; a choice, for the same reason
 SOME = 2000  # Products that are formed at a time; a choice, by memory
 ARGUMENT = 2  # Complexity of a product in a composed quantity; a choice, by their number
 COMPOSED_OF = {
@@ -295,10 +295,7 @@ def _key(a: Amplitude) -> frozenset[tuple[str, str, Numbers]]:
 
 
 def grammar(quantities: list[Variable], s: Situation, poses: int = 0) -> Grammar:
-    """Return all products of functions of the quantities.
-
-    The number of poses limits the multiples of an angle.
-    """
+    """Return all products of functions of quantities; `poses` limits multiples of an angle."""
     singles = [f for v in quantities for f in functions(v, v.read(s), MOST)]
     singles += [  # fine waves, as complex as a product: in no product
         Factor(v, f, (float(k),))
@@ -350,8 +347,7 @@ def grammar(quantities: list[Variable], s: Situation, poses: int = 0) -> Grammar
 def _products(value: Floats, pairs: Ints) -> tuple[Floats, Floats, Ints]:
     """Products (F', N) of pairs (F, 2) of rows, scaled to root mean square 1, single precision.
 
-    Products that are zero are left out. Also returns (F',) root mean squares before scaling, and
-    the indices of the pairs.
+    Also (F',) root mean squares before scaling, and indices of the pairs: those that are not zero.
     """
     size = np.empty(len(pairs))
     for part in (slice(a, a + SOME) for a in range(0, len(pairs), SOME)):

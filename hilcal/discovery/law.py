@@ -150,10 +150,8 @@ def with_factors(form: Form, factors: dict[tuple[int, int], Factor]) -> Form:
 
 def with_coefficients(form: Form, retained: Sequence[int]) -> Form:
     """Return a law with some of its coefficients, in this order; the others are dropped."""
-    order = {old: new for new, old in enumerate(retained)}
-    parts = (
-        replace(p, coefficient=order[p.coefficient]) for p in form.parts if p.coefficient in order
-    )
+    new = {old: k for k, old in enumerate(retained)}
+    parts = (replace(p, coefficient=new[p.coefficient]) for p in form.parts if p.coefficient in new)
     return Form(tuple(parts))
 
 

@@ -10,8 +10,7 @@ coefficients (`FamilyScore.marginal`). The priors of the search are its price fo
 over the structures that the search meets: all of one term on the short list, and all that differ
 from a chosen law in one term, or have one more. Structures within odds of 20 : 1 of the likeliest
 are returned (Occam's window; Madigan and Raftery 1994, J. Am. Stat. Assoc. 89, 1535), and the best
-of each complexity. With mean μ_S and covariance V_S of a reading by a structure, the model average
-has
+of each complexity. With mean μ_S and covariance V_S of a reading by a structure, the average has
 
     mean Σ P(S) μ_S,    covariance Σ P(S) (V_S + μ_S μ_Sᵀ) − mean meanᵀ
 
@@ -84,12 +83,11 @@ def structures(problem: SearchProblem, selections: Sequence[Selection]) -> tuple
         groups.setdefault(structure_of(screen, terms), []).append((odds, terms))
     chosen = {structure_of(screen, s.terms): s.terms for s in selections}
     for s in selections:
-        member = log_odds(problem, s.terms), s.terms
-        groups.setdefault(structure_of(screen, s.terms), [member])
-    chance = posterior({kind: [odds for odds, _ in members] for kind, members in groups.items()})
+        law = log_odds(problem, s.terms), s.terms
+        groups.setdefault(structure_of(screen, s.terms), [law])
+    chance = posterior({kind: [odds for odds, _ in laws] for kind, laws in groups.items()})
     best = {
-        kind: chosen.get(kind, max(members, key=lambda m: m[0])[1])
-        for kind, members in groups.items()
+        kind: chosen.get(kind, max(laws, key=lambda m: m[0])[1]) for kind, laws in groups.items()
     }
     order = sorted(chance, key=lambda kind: -chance[kind])
     likely = [kind for kind in order if chance[kind] > np.exp(-LEAST) * chance[order[0]]]

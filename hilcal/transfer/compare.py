@@ -62,7 +62,7 @@ def compare(
             f"({run.cell.arm.name}): its errors differ everywhere; compare campaigns of one arm"
         )
     number, fit = run.fit_in_use(say, revision)
-    chosen, shared = _not_fitted(run, later, fit, number)
+    chosen, shared = _fresh(run, later, fit, number)
     nominal_rms = _nominal_rms(later, chosen)
     old, new = run.cell, later.cell
     if same_setup is None:
@@ -110,9 +110,7 @@ def _differences(
         return None
 
 
-def _not_fitted(
-    run: Campaign, later: Campaign, fit: Fit, number: int | None
-) -> tuple[Readings, int]:
+def _fresh(run: Campaign, later: Campaign, fit: Fit, number: int | None) -> tuple[Readings, int]:
     """Return the later readings that were not fitted, and the number of fitted ones."""
     readings, deflections = later.readings, fit.mode == "deflection"
     if deflections and readings.unloaded.all():

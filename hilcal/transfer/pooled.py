@@ -236,7 +236,7 @@ def _estimates(
 
 
 def _changes(estimates: FleetEstimates, h: Hierarchy) -> tuple[list[int], Sequence[Unlike]]:
-    """Repeated campaigns of arms, and those since whose predecessor the arm has changed."""
+    """Return the repeated campaigns of arms, and the changes of arms before them."""
     covariance = np.linalg.inv(estimates.information + 1e-8 * np.eye(estimates.mean.shape[1]))
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     late, change, spread = [], [], []

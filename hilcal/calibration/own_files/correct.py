@@ -49,22 +49,20 @@ def correct_file(
         edits, names = edits_of(steps, new.places)
     else:
         raise InputError(f"{path}: an XML file of <{kind[:40]}>; valid: {KINDS}")
-    remarks = f"{path}: {len(names)} places changed ({', '.join(names)}), all else as it was"
+    note = f"{path}: {len(names)} places changed ({', '.join(names)}), all else as it was"
     if new.rough > SAME:
-        remarks += (
-            f"; its axes lay up to {length(new.rough)} from those of the nominal {nominal.name}"
-        )
+        note += f"; its axes lay up to {length(new.rough)} from those of the nominal {nominal.name}"
     if (shift := moved(new.lost, np.eye(4))) > LEFT:
-        remarks += (
+        note += (
             f"; its tip is the last moving one, which has no place for the flange's own shift "
             f"({length(shift)}): --tip-link"
         )
     if moved(new.tip, np.eye(4)) > SAME:
-        remarks += (
+        note += (
             f"; its tip lies {length(float(np.linalg.norm(new.tip[:3, 3])))} from the flange of "
             f"{nominal.name}, and keeps that"
         )
-    return Correction(edited(document.text, edits).encode("latin-1"), remarks)
+    return Correction(edited(document.text, edits).encode("latin-1"), note)
 
 
 def _ur_conf(path: Path, nominal: Arm, arm: Arm) -> Correction:
@@ -93,9 +91,9 @@ def _ur_conf(path: Path, nominal: Arm, arm: Arm) -> Correction:
         (Span(0, m.start(3), m.end(3)), f" {', '.join(f'{v:.17g}' for v in values[key])}")
         for key, m in lines.items()
     ]
-    remarks = (
+    note = (
         f"{path}: the four lines delta_… changed, all else as it was. The rows have no place for "
         f"where joint 1's axis lies in the base (up to {length(new.base_moves)}) and how the "
         f"flange sits on the last axis (up to {length(new.flange_moves)})"
     )
-    return Correction(edited(text, edits).encode("latin-1"), remarks)
+    return Correction(edited(text, edits).encode("latin-1"), note)

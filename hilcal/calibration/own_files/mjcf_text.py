@@ -103,13 +103,11 @@ def _put_quat(document: Document, node: Node, r: Floats) -> Edits:
     """Edits that set the orientation of an element."""
     value = numbers(se3.quaternion(r))
     key = next((k for k in _TURNS if k in node.attributes), "quat")
-    place = document.attribute(node, key)
-    if key == "quat" or place is None:
+    old = document.attribute(node, key)
+    if key == "quat" or old is None:
         return [document.put(node, "quat", value)]
-    head = document.text.rfind(key, node.begin, place.begin)
-    return [
-        (Span(0, head, place.end), f"quat{document.text[head + len(key) : place.begin]}{value}")
-    ]
+    head = document.text.rfind(key, node.begin, old.begin)
+    return [(Span(0, head, old.end), f"quat{document.text[head + len(key) : old.begin]}{value}")]
 
 
 def _rotation(document: Document, node: Node) -> Floats:

@@ -1,11 +1,10 @@
 """Yaskawa INFORM jobs (`.jbi`).
 
-`//POS` has the positions, after lines that hold for all positions below them: `///TOOL n`,
-`///USER n`, `///POSTYPE` PULSE or ANGLE (joint values S, L, U, R, B, T), BASE, ROBOT or USER
-(X, Y, Z in mm; Rx, Ry, Rz in degrees about fixed axes), and `///RCONF l,m,n,o,p,q`: no flip (R axis
-beyond ±90°), lower arm (wrist centre behind the lower arm), wrist centre behind axis S, and R, T, S
-at 180° or more. Only MOVJ obeys RCONF. Pulses per degree, tools and user frames are not in the
-file.
+`//POS` has the positions, after lines that hold for all below them: `///TOOL n`, `///USER n`,
+`///POSTYPE` PULSE or ANGLE (joint values S, L, U, R, B, T), BASE, ROBOT or USER (X, Y, Z in mm;
+Rx, Ry, Rz in degrees about fixed axes), and `///RCONF l,m,n,o,p,q`: no flip (R axis beyond ±90°),
+lower arm (wrist centre behind the lower arm), wrist centre behind axis S, and R, T, S at 180° or
+more. Only MOVJ obeys RCONF. Pulses per degree, tools and user frames are not in the file.
 
 Source: Yaskawa, *NX100 and DX200 Instructions, Job Data Format* and *Manipulator Types*.
 """
@@ -74,7 +73,7 @@ class _InformReader(ProgramReader):
     def read(self) -> Program:
         """Read the job line by line."""
         self.positions: dict[str, ProgramPoint] = {}
-        header: dict[str, str] = {}
+        head: dict[str, str] = {}
         base_line, section, offset = 0, "", 0
         for line, full_line in enumerate(self.text.split("\n"), start=1):
             code = full_line.rstrip("\r")
@@ -82,10 +81,10 @@ class _InformReader(ProgramReader):
                 section = "".join(code[2:].split()[:1]).upper()
             elif section == "POS" and code.startswith("///"):
                 word, _, value = code[3:].strip().partition(" ")
-                header[word.upper()] = value.strip()
+                head[word.upper()] = value.strip()
             elif section == "POS" and (m := _POINT.match(code)):
                 if m[1].upper() in ("C", "P"):
-                    self.positions[_key(m[1], m[2])] = self._point(m, offset, line, header)
+                    self.positions[_key(m[1], m[2])] = self._point(m, offset, line, head)
                 elif m[1].upper() in ("BC", "BP") and any(map(float, _NUMBER.findall(m[3]))):
                     base_line = base_line or line
             elif section == "INST" and not code.strip().startswith("'"):
@@ -115,7 +114,7 @@ class _InformReader(ProgramReader):
             self.points[names[0]] = replace(old, obeyed=obeyed)
 
     def _point(
-        self, m: re.Match[str], offset: int, line: int, header: dict[str, str]
+        self, m: re.Match[str], offset: int, line: int, head: dict[str, str]
     ) -> ProgramPoint:
         """Return a position; its line begins at `offset`."""
         bare = ProgramPoint(line, f"{m[1]}{m[2]} (line {line})")
@@ -125,10 +124,7 @@ class _InformReader(ProgramReader):
         start = offset + m.start(3)
         spans = [Span(0, start + n.start(), start + n.end()) for n in numbers]
         values = np.array([float(n[0]) for n in numbers])
-        kind, number = (
-            header.get("POSTYPE", "").upper(),
-            header.get("TOOL", "0").split(",")[0].strip(),
-        )
+        kind, number = head.get("POSTYPE", "").upper(), head.get("TOOL", "0").split(",")[0].strip()
         tool = self.controller.pose("tools", number, f"tool {number}")
         if kind == "ANGLE":
             return bare.at_joints(spans, values, tool)
@@ -139,10 +135,10 @@ class _InformReader(ProgramReader):
             return replace(bare.at_joints(spans, values, tool), scale=self.controller.pulses)
         if kind not in ("BASE", "ROBOT", "USER"):
             return replace(bare, left=f"POSTYPE {kind} is not corrected")
-        user = header.get("USER", "0") if kind == "USER" else "0"
+        user = head.get("USER", "0") if kind == "USER" else "0"
         frame = self.controller.pose("bases", user, f"frame {user}")
         if kind == "USER" and user == "0":
             frame = "no ///USER"
-        stated = [int(n) for n in re.findall(r"\d+", header.get("RCONF", ""))][:JOINTS]
+        stated = [int(n) for n in re.findall(r"\d+", head.get("RCONF", ""))][:JOINTS]
         flags_ = tuple(stated) if len(stated) == JOINTS else (UNSTATED,) * JOINTS
         return bare.at_pose(spans, values, tool, frame, flags=flags_)

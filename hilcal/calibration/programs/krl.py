@@ -1,10 +1,9 @@
 """KUKA KRL: a module of a `.src` and a `.dat` file.
 
 Points are `E6POS`, `POS`, `FRAME` (X, Y, Z in mm; A, B, C about z, y', x'' in degrees; status S and
-turn T) and `E6AXIS`, `AXIS` (degrees), declared with a value, or written into a motion. Bit 0
-of `S` is set for a wrist centre behind axis 1, bit 1 for axis 3 beyond the stretched arm; `T` has a
-bit for each axis at a negative angle. The controller obeys both in PTP motions and neither on
-paths.
+turn T) and `E6AXIS`, `AXIS` (degrees), declared with a value, or written into a motion. `S` has
+bit 0 for a wrist centre behind axis 1 and bit 1 for axis 3 beyond the stretched arm, `T` a bit for
+each axis at a negative angle; the controller obeys both in PTP motions and neither on paths.
 
 Tool and base are `$TOOL` and `$BASE`, set earlier in the text by an assignment, `BAS(#TOOL, n)`,
 `BAS(#BASE, n)`, by an inline form (`FDAT`), or in the motion (`WITH`). Values that are set within a
@@ -301,10 +300,8 @@ class _KrlReader(ProgramReader):
             numbers = self._numbers(value)
             return f"${kind} of line {line} is computed" if numbers is None else of_euler(numbers)
         group, name = ("tools", "bases")[kind == "BASE"], f"{kind}_DATA[{m[2]}]"
-        if (
-            self.controller.stated(group, m[2]) is None
-            and (numbers := self._numbers(name)) is not None
-        ):
+        numbers = self._numbers(name)
+        if numbers is not None and self.controller.stated(group, m[2]) is None:
             return of_euler(numbers)
         return self.controller.pose(group, m[2], name)
 

@@ -87,14 +87,12 @@ class ProgramPoint:
         values: Floats,
         tool: Floats | str,
         frame: Floats | str,
-        **fields: Any,
+        **extra: Any,
     ) -> "ProgramPoint":
         """Return the point with a pose; it is not corrected if tool or frame is a reason (text)."""
         if isinstance(tool, str) or isinstance(frame, str):
             return replace(self, left=tool if isinstance(tool, str) else str(frame))
-        return replace(
-            self, numbers=tuple(numbers), values=values, tool=tool, frame=frame, **fields
-        )
+        return replace(self, numbers=tuple(numbers), values=values, tool=tool, frame=frame, **extra)
 
 
 def _as_written(_: Ints, texts: Sequence[str]) -> list[str]:
@@ -146,8 +144,7 @@ class Program:
     ) -> dict[str, bytes]:
         """Return the files by suffix, with N corrected points.
 
-        `old_q` and `q` (N, 6) are joint values before and after, rad; `flags` (N, F) is the new
-        configuration.
+        `old_q`, `q` (N, 6) are joint values before and after, rad; `flags` (N, F) the new flags.
         """
         edits: list[tuple[Span, str]] = []
         poses = evaluate(arm, q)
@@ -293,10 +290,8 @@ class ControllerFrames:
             return np.eye(4) if stated is None else stated
         if group == "tools" and self.tool is not None:
             return self.tool
-        option = " or --tool" if group == "tools" else ""
-        return (
-            f"{label} is not in the program; give it by --frames ({self.language.frames}){option}"
-        )
+        hint = " or --tool" if group == "tools" else ""
+        return f"{label} is not in the program; give it by --frames ({self.language.frames}){hint}"
 
 
 def controller_frames(

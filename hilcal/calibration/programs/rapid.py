@@ -239,11 +239,11 @@ class _RapidReader(ProgramReader):
         obeyed: bool,
     ) -> None:
         """Record one target; `frames` are its tool and its reference frame."""
-        computed, key, label = _MADE.match(text), f"line {line}, {offset}", f"line {line}"
+        call, key, label = _MADE.match(text), f"line {line}, {offset}", f"line {line}"
         if text.startswith("["):
             new = self._value(text, offset, label, joints)
-        elif computed and not joints:
-            new = self._computed(text, computed, offset, line)
+        elif call and not joints:
+            new = self._computed(text, call, offset, line)
         else:
             key, new = text.upper(), ProgramPoint(line, label)
             values = self.data.get(key, [])
@@ -265,10 +265,8 @@ class _RapidReader(ProgramReader):
 
     def _value(self, text: str, offset: int, name: str, joints: bool) -> ProgramPoint:
         """Return the point of an aggregate at an offset of the file."""
-        (values, spans), bare = (
-            _numbers(text, offset),
-            ProgramPoint(line_of(self.text, offset), name),
-        )
+        values, spans = _numbers(text, offset)
+        bare = ProgramPoint(line_of(self.text, offset), name)
         if _form(text) != (_JOINTTARGET if joints else _ROBTARGET):
             kind = "jointtarget" if joints else "robtarget"
             return replace(bare, left=f"it is no {kind} of numbers")
@@ -332,9 +330,9 @@ class _RapidReader(ProgramReader):
             ]
             if m := _MOTION.search(code):
                 for place, text in self._targets(code, m)[0]:
-                    computed = _MADE.match(text)  # of a point and numbers: replaced by a point
+                    call = _MADE.match(text)  # of a point and numbers: replaced by a point
                     if _NAME.fullmatch(text) or (
-                        computed and not self._computed(text, computed, 0, 1).left
+                        call and not self._computed(text, call, 0, 1).left
                     ):
                         skipped.append((place, place + len(text)))
             for n in _NAME.finditer(code):
