@@ -6,7 +6,7 @@ points, too: columns that are not listed here (covariances, cycles, actual joint
 ignored. Where no column has a name of this list or of the exchange format, a mapping is guessed as
 by `import --preview`, and used if nothing in it is unsure.
 
-- `pose`: name of the point; numbers if absent.
+- `pose`: name of the point; points without names are numbered.
 - `q1_rad` … or `q1_deg` …: joint values, of slides `q1_m` or `q1_mm`. Alone, they state the target
   as the pose of the tool on the nominal arm; together with a position they select the branch.
 - `x_m`, `y_m`, `z_m` (or `x_mm` …) and `rx_rad`, `ry_rad`, `rz_rad` (or `rx_deg` …), a rotation

@@ -1,8 +1,8 @@
 """The waypoints of a URScript program, and the program with other joint values in their place.
 
-A waypoint is the target of `movej`, `movel`, `movep` or `servoj`. It is understood if every run has
-the same: joint values `[q1, …, q6]`, a pose `p[x, y, z, rx, ry, rz]`, a variable that one of
-these is assigned to once in the whole program, before the waypoint and in a block around it, or
+A waypoint is the target of `movej`, `movel`, `movep` or `servoj`. It is understood if it is the
+same in every run: joint values `[q1, …, q6]`, a pose `p[x, y, z, rx, ry, rz]`, a variable that is
+assigned one of these once in the whole program, before the waypoint and in a block around it, or
 `get_inverse_kin(pose, qnear=joints)`. A list of joint values, which all of these functions accept,
 replaces its text; the rest of the program does not change, nor do other waypoints. The program is
 refused if anything in it may change the meaning of a corrected waypoint: an unknown function, a
@@ -65,7 +65,7 @@ _HARMLESS = re.compile(
     r"|get_tool_(temp|current)",
     re.ASCII,
 )
-"""Functions that do not move the arm, depend on its position, or change the meaning of a target."""
+"""Functions that neither move the arm, nor use its position, nor change the meaning of a target."""
 _WHERE = re.compile(r"get_(actual|target)_\w+|get_forward_kin|get_inverse_kin\w*", re.ASCII)
 _VALID = (
     "valid: joint values, a pose p[…], or a variable that is assigned one of them once, before it; "

@@ -129,8 +129,8 @@ def resembling(
 ) -> tuple[Resemblance, ...]:
     """Return effects by how well they describe the motion of a law, the nearest first.
 
-    An effect is fitted to the law without each fold of poses, and compared with it on that fold:
-    without that, an effect of many parameters would describe anything at few poses.
+    An effect is fitted to the law without each fold of poses, and compared with it on that fold,
+    since an effect of many parameters describes anything at few poses.
     """
     x, columns = effects.white, effects.columns
     linear = problem.screen.linear

@@ -61,14 +61,14 @@ class SearchProblem:
     @cached_property
     def thin(self) -> Floats:
         """The residual in the rows of the screening (R',)."""
-        return self._thinned(self._thin_residual)
+        return self._in_screening(self._thin_residual)
 
     @cached_property
     def slope(self) -> Floats:
         """(S, F) xᵀ r in the rows that are screened."""
         return self.screen.inner(self.thin)
 
-    def _thinned(self, v: Floats) -> Floats:
+    def _in_screening(self, v: Floats) -> Floats:
         """Expand values of this problem's screened rows to all rows of the screening (R',)."""
         expanded = np.zeros(len(self.rows))
         expanded[self.screened] = v
@@ -77,7 +77,7 @@ class SearchProblem:
     def directions_of(self, x: Floats) -> tuple[list[Floats], Floats, list[Floats]]:
         """Orthonormal directions u of columns (R', P): (S, F) xᵀ u each, uᵀ r, and u."""
         directions = orthonormal(self._thin, x[self.screened[self.rows]])
-        units = [self._thinned(u) for u in directions.T]
+        units = [self._in_screening(u) for u in directions.T]
         return [self.screen.inner(u) for u in units], directions.T @ self._thin_residual, units
 
     def columns(self, term: LawTerm) -> Floats:

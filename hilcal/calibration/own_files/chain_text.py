@@ -226,7 +226,7 @@ class ChainStep:
     line: int  # of it, from 1
     place: Floats  # (4, 4) in the previous frame
     joint: Floats | None
-    """(4, 4) pose of the joint axis (its z) in `place`; None without a moving joint."""
+    """(4, 4) pose of the joint axis (its z) in the frame of `place`; None without a joint."""
     write: Callable[[Floats], Edits]
     """Edits that write another place; raises `InputError` where the file cannot have one."""
 
