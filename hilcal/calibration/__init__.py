@@ -1,1 +1,1 @@
-"""An identified model put to use: where the tool is, and how to put it where it is asked to be."""
+"""Use of an identified model: predicted poses of the tool, and corrected joint values."""

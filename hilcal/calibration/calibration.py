@@ -4,14 +4,14 @@ The true position of the tool differs from the prediction by
 
     Σ = κ J C Jᵀ + s² 1 + J_q Σ_q J_qᵀ
 
-C the covariance of the parameters, what a family does at places that nobody measured included (see
-`identification.predictive`); κ ≥ 1 what positions of poses left out were farther off than by C, in
-metres; s² what the positions' residuals have beyond the noise, where χ² is larger than chance
-allows; Σ_q the arm's scatter from one arrival to the next.
+C is the covariance of the parameters, which includes what families of parameters may do where
+nothing was measured (see `identification.predictive`). κ ≥ 1 scales C to the mean square position
+error at held-out poses. s² is the variance of the position residuals beyond the noise, where χ² is
+larger than chance allows. Σ_q is the arm's scatter from one arrival to the next.
 
-What points do not tell of their state has a further share, see `calibration.measured`.
+Columns of `States` that the points lack add a further variance, see `calibration.measured`.
 
-Of a fit to deflections only what the load does is known: errors are then counted from the unloaded
+A fit to deflections knows only the effect of the load: errors are then relative to the unloaded
 arm.
 """
 
@@ -51,14 +51,14 @@ from hilcal.types import Bools, Floats, Ints
 
 @dataclass(frozen=True, eq=False)
 class Calibration(Brief):
-    """A fitted model with what is known of it.
+    """A fitted model with its uncertainty and the range that was measured.
 
     >>> with hc.Campaign.open(RUN) as run:
-    ...     found = hc.fit(hc.baseline(run.cell, run.readings), run.readings)
-    >>> calibration = hc.Calibration.of(found)
+    ...     fit = hc.fit(hc.baseline(run.cell, run.readings), run.readings)
+    >>> calibration = hc.Calibration.of(fit)
     >>> q = run.readings.states.q[:3]
-    >>> found = calibration.compensate(q, [0, 0, -50, 0, 0, 0])
-    >>> bool(found.after.error_m.max() < 1e-9), found.q.shape
+    >>> compensation = calibration.compensate(q, [0, 0, -50, 0, 0, 0])
+    >>> bool(compensation.after.error_m.max() < 1e-9), compensation.q.shape
     (True, (3, 6))
     """
 
@@ -66,16 +66,16 @@ class Calibration(Brief):
     theta: Floats  # (P,) its parameters
     mode: Mode  # kind of readings that it was fitted to
     root: Floats | None
-    """(P, K) R with κ C = R Rᵀ; None where it is computed when needed, from `learnt`."""
+    """(P, K) R with κ C = R Rᵀ; None where it is computed from `learnt`, when it is needed."""
     misfit: float  # s², m²
     scatter: Scatter  # of the arm
-    measured: Measured  # where the fitted readings lie
+    measured: Measured  # ranges of the fitted readings
     loads: Mapping[str, Floats]  # (6,) wrench at the load point, base axes, by load of the cell
-    source: Mapping[str, Any]  # what it is from, for people
-    sensor: SensorMount | None = None  # where the force sensor stands; None without one
-    learnt: CovarianceSource | None = None  # what the covariance follows from, where it does
+    source: Mapping[str, Any]  # origin of the calibration, for people
+    sensor: SensorMount | None = None  # pose of the force sensor; None without one
+    learnt: CovarianceSource | None = None  # from which the covariance is computed; else None
     conditions: Mapping[str, Condition] = field(default_factory=dict)
-    """What is taken where points lack a column of `States`, by column."""
+    """Means that replace columns of `States` that points lack, by column."""
 
     @cached_property
     def _tracked(self) -> ToolPose:
@@ -83,47 +83,47 @@ class Calibration(Brief):
         return tool_of(self.model, self.theta, None)
 
     @classmethod
-    def of(cls, found: Fit, source: Mapping[str, Any] | None = None) -> "Calibration":
-        """Make a calibration of a fit.
+    def of(cls, fit: Fit, source: Mapping[str, Any] | None = None) -> "Calibration":
+        """Make the calibration of a fit.
 
         Args:
-            source: what it is from, for people.
+            source: origin of the calibration, for people.
 
         Raises:
-            InputError: a fit of another scaling than gc.
+            InputError: the scaling of the fit is not gc.
         """
-        if found.scaling != "gc":
-            raise InputError(f"a calibration needs scaling gc, this fit has {found.scaling}")
-        used, model = found.readings[~found.outlier], found.model
+        if fit.scaling != "gc":
+            raise InputError(f"a calibration needs scaling gc, this fit has {fit.scaling}")
+        used, model = fit.readings[~fit.outlier], fit.model
         if not model.cell.measured_torques:  # nothing follows from them
             used = replace(used, states=replace(used.states, torque=None))
-        left_out = found.holdout.rms_sigma
-        prior = found.solution.prior
-        p = predictive(model, found.theta, prior, used, found.mode, left_out)
+        left_out = fit.holdout.rms_sigma
+        prior = fit.solution.prior
+        p = predictive(model, fit.theta, prior, used, fit.mode, left_out)
         values, vectors = np.linalg.eigh(p.covariance)
-        noise = np.trace(p.of_noise(found.whitening)[:, :3, :3], axis1=1, axis2=2)
-        kappa = position_factor(p, found.holdout.rms_m)
+        noise = np.trace(p.of_noise(fit.whitening)[:, :3, :3], axis1=1, axis2=2)
+        kappa = position_factor(p, fit.holdout.rms_m)
         # A deflection is the difference of two readings.
-        readings = 2 if found.mode == "deflection" else 1
+        readings = 2 if fit.mode == "deflection" else 1
         loads = () if model.cell.config is None else model.cell.config.loads
-        learnt = None
+        covariance_source = None
         if model.prior is None:  # else the covariance does not follow from these readings alone
-            stated = p.excess.of_readings(used, found.mode)
-            learnt = CovarianceSource(stated, p.prior, p.noise, kappa)
-        made = cls(
+            stated = p.excess.of_readings(used, fit.mode)
+            covariance_source = CovarianceSource(stated, p.prior, p.noise, kappa)
+        bare = cls(
             model=replace(model, readings=None, prior=None),
-            theta=found.theta,
-            mode=found.mode,
+            theta=fit.theta,
+            mode=fit.mode,
             root=vectors * np.sqrt(kappa * np.maximum(values, 0.0)),
             misfit=p.excess.position / readings,
-            scatter=scatter_of(found),
+            scatter=scatter_of(fit),
             measured=Measured.of(used.states, p, noise, model.cell.arm.units),
             loads={load.name: load.wrench(model.cell.gravity) for load in loads},
             source=dict(source or {}),
             sensor=SensorMount.of(model.cell),
-            learnt=learnt,
+            learnt=covariance_source,
         )
-        return replace(made, conditions=conditions_of(model, used.states, made._moves))
+        return replace(bare, conditions=conditions_of(model, used.states, bare._moves))
 
     @classmethod
     def load(cls, path: str | Path, catalogue: Catalogue | None = None) -> "Calibration":
@@ -131,10 +131,10 @@ class Calibration(Brief):
 
         Args:
             path: a calibration, or a campaign.
-            catalogue: has its effects; the installed ones unless given.
+            catalogue: effects to choose from; the installed ones if None.
 
         Raises:
-            InputError: no calibration, or one with effects that are not at hand.
+            InputError: no calibration, or the catalogue lacks an effect.
         """
         from hilcal.calibration.storage import from_json
 
@@ -146,7 +146,7 @@ class Calibration(Brief):
         return read_file(Path(path), "calibration", lambda c: from_json(c, catalogue))
 
     def save(self, path: str | Path) -> None:
-        """Write it as one JSON file, which needs nothing else to be loaded."""
+        """Write the calibration as one self-contained JSON file."""
         from hilcal.calibration.storage import to_json
 
         write_document(Path(path), to_json(self), indent=1)
@@ -160,24 +160,24 @@ class Calibration(Brief):
         std: bool = True,
         recorded: Mapping[str, Floats] | None = None,
     ) -> ToolPoses:
-        """Say where the tool is.
+        """Predict the pose of the tool.
 
         Args:
             q: (n,) or (N, n) joint values, rad.
             wrench: (6,) or (N, 6) force and moment of the load at the load point, base axes; none
                 where None.
             tool: (4, 4) T_flange_tool; the tracked target where None.
-            std: also state the uncertainty, and whether points lie far from what was measured.
-            recorded: other columns of `States` by name: `air_temperature`, `load_time`, ...; those
-                that the model needs and are not given are taken as in the middle of what was
-                measured, see `calibration.measured`.
+            std: also state the uncertainty, and whether points lie far from the measured ones.
+            recorded: other columns of `States` by name: `air_temperature`, `load_time`, ...; a
+                missing column that the model needs is replaced by its mean while measuring, see
+                `calibration.measured`.
 
         Raises:
-            InputError: another shape, or a column is missing that the model needs, and that the
-                calibration knows nothing of.
+            InputError: a wrong shape, or the model needs a missing column whose mean the
+                calibration does not know.
         """
-        (states, untold), of = self._states(q, wrench, recorded), self._tool(tool)
-        return self.poses(of, states, self.nominal(of, states), std, untold)
+        (states, untold), tool_pose = self._states(q, wrench, recorded), self._tool(tool)
+        return self.poses(tool_pose, states, self.nominal(tool_pose, states), std, untold)
 
     def compensate(
         self,
@@ -189,95 +189,95 @@ class Calibration(Brief):
         std: bool = True,
         recorded: Mapping[str, Floats] | None = None,
     ) -> Compensation:
-        """Find the joint values that put the tool where it is asked to be.
+        """Find the joint values that put the tool at its target pose.
 
         Arguments that are not named here are those of `predict`.
 
         Args:
-            q: (n,) or (N, n) joint values, rad; the nominal arm has the tool there. Those found
-                are on their branch.
-            wanted: (4, 4) or (N, 4, 4) T_base_tool to go to instead.
+            q: (n,) or (N, n) joint values, rad, for which the nominal arm has the tool at its
+                target pose. The solution stays on their branch.
+            wanted: (4, 4) or (N, 4, 4) T_base_tool, the target pose instead.
 
         Raises:
             InputError: as for `predict`.
         """
-        (states, untold), of = self._states(q, wrench, recorded), self._tool(tool)
+        (states, untold), tool_pose = self._states(q, wrench, recorded), self._tool(tool)
         goal = None
         if wanted is not None:
-            given = np.broadcast_to(np.asarray(wanted, dtype=float), (len(states), 4, 4))
-            goal = np.array(given[:, :3, :3]), np.array(given[:, :3, 3])
-        fast = self._kernel(of)
-        if isinstance(fast, Compiled):
-            found, left = fast.compensate(states, goal)
-            inverse = Inverse(found, left[:, 0], left[:, 1])
+            pose = np.broadcast_to(np.asarray(wanted, dtype=float), (len(states), 4, 4))
+            goal = np.array(pose[:, :3, :3]), np.array(pose[:, :3, 3])
+        kernel = self._kernel(tool_pose)
+        if isinstance(kernel, Compiled):
+            solution, residual = kernel.compensate(states, goal)
+            inverse = Inverse(solution, residual[:, 0], residual[:, 1])
         else:
-            inverse = self._invert(of, states, goal or self.nominal(of, states))
-        return Compensation(inverse, self, of, states, goal, std, untold)
+            inverse = self._invert(tool_pose, states, goal or self.nominal(tool_pose, states))
+        return Compensation(inverse, self, tool_pose, states, goal, std, untold)
 
     @cached_property
     def controller(self) -> Arm:
-        """The arm by which the controller computes poses, as far as known; else the nominal one."""
-        arm, told = self.model.cell.arm, self.source.get("kinematics")
-        if told is None or arm.sign is not None or arm.coupling is not None:
+        """The controller's own arm model where it is known, else the nominal arm."""
+        arm, stated = self.model.cell.arm, self.source.get("kinematics")
+        if stated is None or arm.sign is not None or arm.coupling is not None:
             return arm
-        other = with_factory(arm, of_dict(told, "the controller's kinematics"))
-        return other if flange_difference(other, arm)[1] > SAME else arm
+        with_stated = with_factory(arm, of_dict(stated, "the controller's kinematics"))
+        return with_stated if flange_difference(with_stated, arm)[1] > SAME else arm
 
     @cached_property
     def _compiled(self) -> Compiled | tuple[str, ...]:
         """The model for the compiled kernel, with the tracked target as the tool."""
         return compiled(self._tracked, self.mode)
 
-    def _kernel(self, of: ToolPose) -> Compiled | tuple[str, ...]:
-        return self._compiled if of is self._tracked else compiled(of, self.mode)
+    def _kernel(self, tool: ToolPose) -> Compiled | tuple[str, ...]:
+        return self._compiled if tool is self._tracked else compiled(tool, self.mode)
 
     def without_kernel(self, tool: Floats | None = None) -> tuple[str, ...]:
-        """Names of what the compiled kernel has no form for: some hundred times slower with it."""
-        found = self._kernel(self._tool(tool))
-        return () if isinstance(found, Compiled) else found
+        """Names of what the compiled kernel does not cover; some hundred times slower with it."""
+        kernel = self._kernel(self._tool(tool))
+        return () if isinstance(kernel, Compiled) else kernel
 
-    def _invert(self, of: ToolPose, states: States, goal: tuple[Floats, Floats]) -> Inverse:
-        def poses(at: Floats, points: Ints) -> Pose:
-            prediction = of.model.predict(replace(states[points], q=at), of.theta)
-            return (*in_chain(of, *tool_poses(of, prediction)), prediction.situation.chain)
+    def _invert(self, tool: ToolPose, states: States, goal: tuple[Floats, Floats]) -> Inverse:
+        def poses(q: Floats, points: Ints) -> Pose:
+            prediction = tool.model.predict(replace(states[points], q=q), tool.theta)
+            return (*in_chain(tool, *tool_poses(tool, prediction)), prediction.situation.chain)
 
-        return invert(self.model.cell.arm, poses, states.q, *in_chain(of, *goal))
+        return invert(self.model.cell.arm, poses, states.q, *in_chain(tool, *goal))
 
     def load_wrench(self, q: Floats, reading: Floats) -> Floats:
-        """Return the wrench of a load as the force sensor reads it, for `predict` and `compensate`.
+        """Convert a reading of the force sensor to the load's wrench for `predict`, `compensate`.
 
         Args:
-            q: (n,) or (N, n) joint values at which it was read, rad.
-            reading: (6,) or (N, 6) the sensor's reading with the load less that without it, sensor
-                axes, N and N·m.
+            q: (n,) or (N, n) joint values of the reading, rad.
+            reading: (6,) or (N, 6) reading with the load minus reading without, sensor axes, N and
+                N·m.
 
         Returns:
             (N, 6) force and moment at the load point, base axes.
 
         Raises:
-            InputError: the cell has no force sensor, or another shape.
+            InputError: the cell has no force sensor, or a wrong shape.
         """
         if self.sensor is None:
             raise InputError("the campaign's cell has no [force_sensor]: its place is not known")
-        at = self._states(q, None, None)[0].q
+        joints = self._states(q, None, None)[0].q
         reading = np.asarray(reading, dtype=float)
-        if reading.shape not in ((6,), (len(at), 6)) or not np.isfinite(reading).all():
-            raise InputError(f"reading: valid: finite, of shape (6,) or ({len(at)}, 6)")
-        every = np.broadcast_to(reading, (len(at), 6))
-        return self.sensor.load_wrench(self.model.cell, at, every)
+        if reading.shape not in ((6,), (len(joints), 6)) or not np.isfinite(reading).all():
+            raise InputError(f"reading: valid: finite, of shape (6,) or ({len(joints)}, 6)")
+        readings = np.broadcast_to(reading, (len(joints), 6))
+        return self.sensor.load_wrench(self.model.cell, joints, readings)
 
     def tool_pose(self, tool: Floats | None = None) -> Floats:
-        """(4, 4) T_flange_tool: as given, or the tracked target as stated, else as fitted."""
+        """(4, 4) T_flange_tool: `tool`, or the tracked target as stated, else as fitted."""
         return self._tool(tool).nominal
 
     @cached_property
     def frames(self) -> RobotFrames:
-        """Base and flange that everything is counted from."""
+        """Base and flange frames that all poses refer to."""
         return robot_frames(self.model, self.theta)
 
     @cached_property
     def turns(self) -> Bools:
-        """(n,) joints whose angles mean the same after whole turns, see `whole_turns`."""
+        """(n,) joints whose angles are equivalent modulo whole turns, see `whole_turns`."""
         return whole_turns(self.model, self.theta)
 
     def base_in_tracker(self) -> Floats:
@@ -297,15 +297,15 @@ class Calibration(Brief):
     def _states(
         self, q: Floats, wrench: Floats | None, recorded: Mapping[str, Floats] | None
     ) -> tuple[States, tuple[str, ...]]:
-        """Return points as states, and which columns were not told; raises as `predict` does."""
-        n, every = self.model.cell.arm.n, one_of_each(self.model.cell)
+        """Return points as states, and the columns that means fill; raises as `predict` does."""
+        n, example = self.model.cell.arm.n, one_of_each(self.model.cell)
         q = np.array(q, dtype=float, order="C", ndmin=2)
         if q.shape[1:] != (n,) or not len(q):
             raise InputError(f"q has shape {q.shape}; valid: ({n},) or (N, {n})")
-        given = {"wrench": np.zeros(6) if wrench is None else wrench, **(recorded or {})}
+        arguments = {"wrench": np.zeros(6) if wrench is None else wrench, **(recorded or {})}
         columns = {}
-        for name, value in given.items():
-            kind = None if name == "q" else getattr(every, name, None)
+        for name, value in arguments.items():
+            kind = None if name == "q" else getattr(example, name, None)
             if kind is None:
                 raise InputError(f"{name}: no column of hilcal.States that a prediction takes")
             shape, values = (len(q), *kind.shape[1:]), np.asarray(value, dtype=float)
@@ -328,39 +328,39 @@ class Calibration(Brief):
                 )
         return states, untold
 
-    def nominal(self, of: ToolPose, states: States) -> tuple[Floats, Floats]:
-        """Orientation and position of the tool that errors are counted from."""
+    def nominal(self, tool: ToolPose, states: States) -> tuple[Floats, Floats]:
+        """Orientation (N, 3, 3) and position (N, 3) of the tool that errors are relative to."""
         if self.mode == "deflection":
-            return tool_poses(of, of.model.predict(_unloaded(states), of.theta))
-        chain = evaluate(of.model.cell.arm, states.q)
-        rotation = se3.product(chain.rotation[-1], of.nominal[:3, :3])
-        return rotation, chain.point(of.nominal[:3, 3])
+            return tool_poses(tool, tool.model.predict(_unloaded(states), tool.theta))
+        chain = evaluate(tool.model.cell.arm, states.q)
+        rotation = se3.product(chain.rotation[-1], tool.nominal[:3, :3])
+        return rotation, chain.point(tool.nominal[:3, 3])
 
     def poses(
         self,
-        of: ToolPose,
+        tool: ToolPose,
         states: States,
         nominal: tuple[Floats, Floats],
         std: bool,
         untold: tuple[str, ...] = (),
     ) -> ToolPoses:
-        """Return where a tool is at N points.
+        """Return the poses of a tool at N points.
 
-        `nominal` (N, 3, 3) and (N, 3) are orientations and positions that errors are counted from,
-        `untold` columns of the states that are means of `conditions`.
+        Errors are relative to `nominal`, orientations (N, 3, 3) and positions (N, 3). `untold` are
+        columns of the states that are filled with means of `conditions`.
         """
-        prediction = of.model.predict(states, of.theta)
-        rotation, position = tool_poses(of, prediction)
-        known = covariance = None
+        prediction = tool.model.predict(states, tool.theta)
+        rotation, position = tool_poses(tool, prediction)
+        std_m = covariance = None
         if std:
-            known = self._by_parameters(of, states, prediction)
-            turn, chain = of.base[:3, :3], prediction.situation.chain
-            at = (position - of.base[:3, 3]) @ turn
-            scatter = self.scatter.covariance(of.model.cell, chain, at)
-            rest = self.misfit + sum(self.conditions[name].variance_m2 for name in untold)
-            covariance = turn @ (known + scatter) @ turn.T + rest * np.eye(3)
-            known = np.sqrt(np.trace(known, axis1=1, axis2=2))
-        outside = tuple(self.measured.outside(states, known, self.turns))
+            by_parameters = self._by_parameters(tool, states, prediction)
+            turn, chain = tool.base[:3, :3], prediction.situation.chain
+            point = (position - tool.base[:3, 3]) @ turn
+            scatter = self.scatter.covariance(tool.model.cell, chain, point)
+            isotropic = self.misfit + sum(self.conditions[name].variance_m2 for name in untold)
+            covariance = turn @ (by_parameters + scatter) @ turn.T + isotropic * np.eye(3)
+            std_m = np.sqrt(np.trace(by_parameters, axis1=1, axis2=2))
+        outside = tuple(self.measured.outside(states, std_m, self.turns))
         return ToolPoses(position, rotation, nominal[1], nominal[0], covariance, outside)
 
     @cached_property
@@ -368,50 +368,50 @@ class Calibration(Brief):
         """(P, K) R with κ C = R Rᵀ."""
         if self.root is not None:
             return self.root
-        assert self.learnt is not None  # noqa: S101  (one of both is there)
+        assert self.learnt is not None  # noqa: S101  (`root` or `learnt` is there)
         return self.learnt.root(self.model, self.theta, self.mode)
 
-    def _by_parameters(self, of: ToolPose, states: States, prediction: Prediction) -> Floats:
-        """(N, 3, 3) κ J C Jᵀ of the position, axes of the chain, m²."""
-        spread = self._spread(of, prediction)
+    def _by_parameters(self, tool: ToolPose, states: States, prediction: Prediction) -> Floats:
+        """(N, 3, 3) κ J C Jᵀ of the position, in axes of the chain, m²."""
+        spread = self._spread(tool, prediction)
         if self.mode == "deflection":
-            spread = spread - self._spread(of, of.model.predict(_unloaded(states), of.theta))
+            spread = spread - self._spread(tool, tool.model.predict(_unloaded(states), tool.theta))
         return spread @ np.swapaxes(spread, 1, 2)
 
     def _moves(self, states: States) -> tuple[Floats, Floats]:
-        """Position (N, 3) of the tool and J R (N, 3, K); in deflections what the load does."""
-        of = self._tracked
-        prediction = of.model.predict(states, of.theta)
-        position, spread = tool_poses(of, prediction)[1], self._spread(of, prediction)
+        """Position (N, 3) of the tool and J R (N, 3, K); changes by the load for deflections."""
+        tool = self._tracked
+        prediction = tool.model.predict(states, tool.theta)
+        position, spread = tool_poses(tool, prediction)[1], self._spread(tool, prediction)
         if self.mode == "deflection" and states.wrench.any():
-            free = self._moves(_unloaded(states))
-            position, spread = position - free[0], spread - free[1]
+            unloaded = self._moves(_unloaded(states))
+            position, spread = position - unloaded[0], spread - unloaded[1]
         return position, spread
 
-    def _spread(self, of: ToolPose, prediction: Prediction) -> Floats:
-        """(N, 3, K) J R of the position, axes of the chain."""
-        jacobian = of.model.jacobian(prediction, of.theta, 3)
+    def _spread(self, tool: ToolPose, prediction: Prediction) -> Floats:
+        """(N, 3, K) J R of the position, in axes of the chain."""
+        jacobian = tool.model.jacobian(prediction, tool.theta, 3)
         jacobian = np.swapaxes(prediction.observation.axes, 1, 2) @ jacobian
-        return np.asarray(jacobian @ self.covariance_root[of.kept])
+        return np.asarray(jacobian @ self.covariance_root[tool.columns])
 
 
 def _unloaded(states: States) -> States:
     return replace(states, wrench=np.zeros((len(states), 6)))
 
 
-def calibration_of_stream(found: StreamFit, source: Mapping[str, Any]) -> Calibration:
-    """Return the calibration: parameters and covariance of the stream, ranges of its sample.
+def calibration_of_stream(fit: StreamFit, source: Mapping[str, Any]) -> Calibration:
+    """Return a calibration with the stream's parameters and covariance and its sample's ranges.
 
-    The limit of the standard deviation is that of the sample, scaled to the number of readings.
+    The limit of the standard deviation is the sample's, scaled to the number of readings.
     """
-    of_sample = Calibration.of(found.sample, source)
-    values, vectors = np.linalg.eigh(found.covariance)
-    share = np.sqrt(len(found.sample.readings) / found.readings)
+    of_sample = Calibration.of(fit.sample, source)
+    values, vectors = np.linalg.eigh(fit.covariance)
+    share = np.sqrt(len(fit.sample.readings) / fit.readings)
     measured = of_sample.measured
     return replace(
         of_sample,
-        model=replace(found.model, readings=None, prior=None),
-        theta=found.theta,
+        model=replace(fit.model, readings=None, prior=None),
+        theta=fit.theta,
         root=vectors * np.sqrt(np.maximum(values, 0.0)),
         measured=replace(measured, most_std_m=float(share * measured.most_std_m)),
         learnt=None,

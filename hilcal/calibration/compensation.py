@@ -1,12 +1,12 @@
-"""The inverse of an identified model: joint values that put the tool where it was asked to be.
+"""The inverse of an identified model: joint values that put the tool at its target pose.
 
-Newton's method on the pose of the tool, T(q) = T_wanted, from the joint values that were given, so
-that the branch stays theirs:
+Newton's method on the pose of the tool, T(q) = T_wanted, starts from the commanded joint values
+and stays on their branch:
 
     q ← q + J⁺ e,   e = (p_wanted − p, Log(R_wanted Rᵀ)),   J = ∂(p, ω)/∂q by the chain alone
 
-Every residual is of the whole model at equilibrium, so the solution is exact; leaving the effects
-out of J only costs a step or two, each about 10³ times closer.
+Each residual e is of the full model at equilibrium, so the solution is exact. J lacks the effects,
+which costs a step or two more; each step reduces e about 10³ times.
 """
 
 from collections.abc import Callable, Sequence
@@ -35,7 +35,7 @@ TOLERANCE = 1e-10
 MOST_STEPS = 30
 """Newton steps at most; four are usual."""
 MOST_TURN = 0.2
-"""Largest step of a joint, rad: longer ones are shortened, so that no branch is left."""
+"""Largest step of a joint, rad; longer ones are shortened, so that the branch stays the same."""
 LEAST_SINGULAR = 1e-3
 """Ratio of the smallest to the largest singular value of J, lengths in units of the reach, below
 which a pose is singular: joints may turn a thousand times as far as the tool. A choice."""
@@ -49,42 +49,42 @@ class Inverse(Brief):
     """The solution for N points."""
 
     q: Floats  # (N, n) joint values
-    residual_m: Floats  # (N,) distance from the wanted position that is left
-    residual_rad: Floats  # (N,) angle from the wanted orientation that is left
+    residual_m: Floats  # (N,) distance from the target position
+    residual_rad: Floats  # (N,) angle from the target orientation
 
     @property
     def solved(self) -> Bools:
-        """(N,) points at which the tool is where it was asked to be."""
+        """(N,) points at which the tool reaches its target pose, within `TOLERANCE`."""
         return np.asarray(np.maximum(self.residual_m, self.residual_rad) <= TOLERANCE)
 
 
 def invert(
     arm: Arm, poses: Callable[[Floats, Ints], Pose], q: Floats, rotation: Floats, position: Floats
 ) -> Inverse:
-    """Find joint values for wanted orientations (N, 3, 3) and positions (N, 3), from q (N, n)."""
+    """Find joint values for target orientations (N, 3, 3) and positions (N, 3), from q (N, n)."""
     q, count = q.copy(), len(q)
-    left = np.full((count, 2), np.inf)
+    residual = np.full((count, 2), np.inf)
     active = np.arange(count)
     scale = np.array([arm.reach] * 3 + [1.0] * 3)
     for _ in range(MOST_STEPS):
         r, p, chain = poses(q[active], active)
-        turn = se3.rotation_vector(se3.product(rotation[active], np.swapaxes(r, 1, 2)))
-        e = np.concatenate([position[active] - p, turn], axis=1)  # what is missing, base axes
-        left[active] = np.linalg.norm(e.reshape(-1, 2, 3), axis=2)
+        rotvec = se3.rotation_vector(se3.product(rotation[active], np.swapaxes(r, 1, 2)))
+        e = np.concatenate([position[active] - p, rotvec], axis=1)  # base axes
+        residual[active] = np.linalg.norm(e.reshape(-1, 2, 3), axis=2)
         u, s, vt = np.linalg.svd(_jacobian(arm, chain, p), full_matrices=False)
         step = np.einsum("nji,nj,nkj,nk->ni", vt, 1.0 / np.maximum(s, 1e-6), u, e / scale)
-        going = left[active].max(axis=1) > TOLERANCE
-        if not going.any():
+        moving = residual[active].max(axis=1) > TOLERANCE
+        if not moving.any():
             break
         longest = np.abs(step).max(axis=1, keepdims=True)
         step *= np.minimum(1.0, MOST_TURN / np.maximum(longest, 1e-300))
-        q[active[going]] += step[going]
-        active = active[going]
-    return Inverse(q, left[:, 0], left[:, 1])
+        q[active[moving]] += step[moving]
+        active = active[moving]
+    return Inverse(q, residual[:, 0], residual[:, 1])
 
 
 def nominal_pose(arm: Arm, tool: Floats, q: Floats) -> Pose:
-    """Where the nominal arm has a tool T_flange_tool (4, 4) at joint values (N, n)."""
+    """Pose of a tool T_flange_tool (4, 4) on the nominal arm at joint values (N, n)."""
     chain = evaluate(arm, q)
     return se3.product(chain.rotation[-1], tool[:3, :3]), chain.point(tool[:3, 3]), chain
 
@@ -92,9 +92,9 @@ def nominal_pose(arm: Arm, tool: Floats, q: Floats) -> Pose:
 def invert_nominal(
     arm: Arm, tool: Floats, q: Floats, rotation: Floats, position: Floats
 ) -> Inverse:
-    """Find joint values at which the nominal arm has a tool; one pose or N, else as `invert`."""
+    """Find joint values of the nominal arm for one target pose or N; else as `invert`."""
     goal = np.broadcast_to(rotation, (len(q), 3, 3)), np.broadcast_to(position, (len(q), 3))
-    return invert(arm, lambda at, _: nominal_pose(arm, tool, at), q, *goal)
+    return invert(arm, lambda joints, _: nominal_pose(arm, tool, joints), q, *goal)
 
 
 def singular(arm: Arm, chain: Chain, position: Floats) -> Bools:
@@ -104,7 +104,7 @@ def singular(arm: Arm, chain: Chain, position: Floats) -> Bools:
 
 
 def _jacobian(arm: Arm, chain: Chain, position: Floats) -> Floats:
-    """(N, 6, n) derivative of displacement over reach, and turn, by the controller's values."""
+    """(N, 6, n) derivative of displacement/reach and rotation by the controller's joint values."""
     jacobian = joint_jacobian(chain, position)
     jacobian[:, :3] /= arm.reach
     return jacobian if arm.coupling is None else np.asarray(jacobian @ arm.coupling)
@@ -131,53 +131,53 @@ class ErrorSize:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ToolPoses(Brief):
-    """Where the tool is at N points, base axes."""
+    """Poses of the tool at N points, base axes."""
 
     position: Floats  # (N, 3) m
     rotation: Floats  # (N, 3, 3)
     nominal_position: Floats
-    """(N, 3) where it is asked to be: where the nominal arm has it, of a fit to deflections where
-    the unloaded arm has it."""
+    """(N, 3) target position: by the nominal arm, or by the unloaded arm for a fit to
+    deflections."""
     nominal_rotation: Floats  # (N, 3, 3)
     covariance: Floats | None
-    """(N, 3, 3) of the true position about `position`, m²; None where it was not asked for."""
-    outside: tuple[Outside, ...]  # what the points leave of that which was measured
+    """(N, 3, 3) of the true position about `position`, m²; None if `std` is false."""
+    outside: tuple[Outside, ...]  # measured ranges that the points leave
 
     @property
     def error_m(self) -> Floats:
-        """(N,) distance of the tool from where it is asked to be, m."""
+        """(N,) distance of the tool from its target position, m."""
         return np.asarray(np.linalg.norm(self.position - self.nominal_position, axis=1))
 
     @property
     def error_rad(self) -> Floats:
-        """(N,) angle between the two, rad."""
+        """(N,) angle of the tool from its target orientation, rad."""
         turn = se3.product(self.rotation, np.swapaxes(self.nominal_rotation, 1, 2))
         return np.asarray(np.linalg.norm(se3.rotation_vector(turn), axis=1))
 
     @property
     def std_m(self) -> Floats:
-        """(N,) standard deviation of the position, over three dimensions, m."""
-        return np.asarray(np.sqrt(np.trace(self._known(), axis1=1, axis2=2)))
+        """(N,) root of the trace of the position's covariance, m."""
+        return np.asarray(np.sqrt(np.trace(self._stated_covariance(), axis1=1, axis2=2)))
 
     @property
     def band_m(self) -> Floats:
-        """(N,) distance from `position` that `BAND` of the points stay within, m.
+        """(N,) radius about `position` that holds the true position with probability `BAND`, m.
 
-        Of a normal error with covariance Σ, |e|² ≈ g χ²_ν with the same mean and variance:
+        For a normal error e with covariance Σ, |e|² ≈ g χ²_ν with the same mean and variance:
         g = tr Σ²/tr Σ, ν = (tr Σ)²/tr Σ² (Satterthwaite, Biometrics Bulletin 2 (1946) 110-114).
         """
-        return band(self._known())
+        return band(self._stated_covariance())
 
-    def _known(self) -> Floats:
+    def _stated_covariance(self) -> Floats:
         if self.covariance is None:
             raise InputError("the uncertainty was left out; ask for it with std=True")
         return self.covariance
 
 
 def band(covariance: Floats) -> Floats:
-    """(N,) radius that `BAND` of normal vectors with covariance (N, 3, 3) stay within.
+    """(N,) radius that holds `BAND` of normal vectors with covariance (N, 3, 3).
 
-    By the χ² with the same mean and variance (Satterthwaite); 0 where the covariance is.
+    |e|² counts as a scaled χ² of the same mean and variance; 0 for a zero covariance.
     """
     size = np.trace(covariance, axis1=1, axis2=2)
     shape = covariance / np.where(size > 0, size, 1.0)[:, None, None]
@@ -188,16 +188,16 @@ def band(covariance: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class Compensation(Brief):
-    """Joint values that put the tool where it was asked to be, and what follows from them."""
+    """Joint values that put the tool at its target pose, with errors before and after."""
 
-    inverse: Inverse  # joint values, and what is left
+    inverse: Inverse  # joint values and residuals
     _calibration: "Calibration"
     _tool: ToolPose
     _states: States
     _wanted: tuple[Floats, Floats] | None
     _std: bool
     untold: tuple[str, ...] = ()
-    """Columns of `States` that the model needs and the points did not have."""
+    """Columns of `States` that the model needs and the points lack."""
 
     def _brief(self) -> dict[str, str]:
         return {
@@ -208,17 +208,17 @@ class Compensation(Brief):
 
     @property
     def q(self) -> Floats:
-        """(N, n) the joint values, rad."""
+        """(N, n) corrected joint values, rad."""
         return self.inverse.q
 
     @property
     def given(self) -> Floats:
-        """(N, n) the joint values that were given, rad."""
+        """(N, n) commanded joint values, rad."""
         return self._states.q
 
     @property
     def inside(self) -> Bools:
-        """(N,) whether the point lies within what was measured."""
+        """(N,) whether the point lies within the measured ranges."""
         out = np.ones(len(self.q), dtype=bool)
         for o in self.after.outside:
             out &= ~o.points
@@ -226,14 +226,14 @@ class Compensation(Brief):
 
     @cached_property
     def before(self) -> ToolPoses:
-        """The tool at the joint values that were given; without uncertainties."""
+        """The tool at the commanded joint values; without uncertainties."""
         return self._calibration.poses(self._tool, self._states, self._goal, std=False)
 
     @cached_property
     def after(self) -> ToolPoses:
-        """The tool at the joint values that were found."""
-        found = replace(self._states, q=self.q)
-        return self._calibration.poses(self._tool, found, self._goal, self._std, self.untold)
+        """The tool at the corrected joint values."""
+        states = replace(self._states, q=self.q)
+        return self._calibration.poses(self._tool, states, self._goal, self._std, self.untold)
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -242,7 +242,7 @@ class Compensation(Brief):
 
     @property
     def limits(self) -> Bools:
-        """(N, n) joint values that are beyond the arm's limits."""
+        """(N, n) joint values beyond the arm's limits."""
         arm = self._tool.model.cell.arm
         return np.asarray((self.q < arm.q_min) | (self.q > arm.q_max))
 
@@ -254,16 +254,18 @@ class Compensation(Brief):
 
     @property
     def turned_on(self) -> tuple[Outside, ...]:
-        """Joint angles that are inside of what was measured by whole turns alone."""
-        counted = self._calibration.measured.turned_on(replace(self._states, q=self.q))
-        left = {o.of.variable: o.points for o in self.after.outside}
+        """Joint angles that lie within the measured ranges only after whole turns."""
+        by_angle = self._calibration.measured.turned_on(replace(self._states, q=self.q))
+        outside = {o.of.variable: o.points for o in self.after.outside}
         nowhere = np.zeros(len(self.q), dtype=np.bool_)
-        found = [replace(o, points=o.points & ~left.get(o.of.variable, nowhere)) for o in counted]
-        return tuple(o for o in found if o.points.any())
+        remaining = [
+            replace(o, points=o.points & ~outside.get(o.of.variable, nowhere)) for o in by_angle
+        ]
+        return tuple(o for o in remaining if o.points.any())
 
     @property
     def usable(self) -> Bools:
-        """(N,) points that are solved, not singular, within limits and what was measured."""
+        """(N,) points that are solved, not singular, within limits and measured ranges."""
         good = self.inverse.solved & ~self.singular & ~self.limits.any(axis=1)
         return np.asarray(good & self.inside)
 
@@ -276,16 +278,16 @@ class Compensation(Brief):
     def to_dict(self, names: Sequence[str]) -> dict[str, object]:
         """Return the document of `compensate --json`, SI; `names` are those of the points.
 
-        `expected_error_m` is rms: what the inversion leaves, and the standard deviation of the
-        position.
+        `expected_error_m` is the root sum square of the inversion's residual and the position's
+        standard deviation.
         """
-        of, after, inside = self._calibration, self.after, self.inside
+        calibration, after, inside = self._calibration, self.after, self.inside
         expected = np.hypot(self.inverse.residual_m, after.std_m)
         return {
-            "calibration": dict(of.source),
-            "readings": of.mode,
-            "base_in_tracker": se3.six(of.base_in_tracker()),
-            "base_is": of.frames.base_is,
+            "calibration": dict(calibration.source),
+            "readings": calibration.mode,
+            "base_in_tracker": se3.six(calibration.base_in_tracker()),
+            "base_is": calibration.frames.base_is,
             "n_points": len(names),
             "error_before": asdict(ErrorSize.of(self.before.error_m)),
             "error_after": {

@@ -1,14 +1,14 @@
-"""A model brought into the form that the compiled kernel evaluates, where it has that form.
+"""Conversion of a model to the form that the compiled kernel evaluates, where it has that form.
 
-What an effect does is found by asking it, not by its name: its deviation at random states and
+An effect is recognised by its deviation, not by its name: the deviation at random states and
 wrenches is compared with
 
     dq_j = a_j + T_j(q_j) + Σ_i L_ji q_i + c_j · w_j + (s_j + P_j(q_j)) τ_j + G_j(τ_j)
     ξ_k = b_k + Q_k q + C_k w_k
 
 (tables T, P, G by cubic splines). An effect that needs times, temperatures or sides of approach
-gives a, b and s of each point. One of another form is not compiled; the model is
-then evaluated as everywhere else, some hundred times slower.
+gives a, b and s of each point. A model with an effect of another form is not compiled, but
+evaluated as everywhere else, some hundred times slower.
 """
 
 from dataclasses import dataclass, replace
@@ -31,14 +31,14 @@ NODES = 16385
 """Nodes of a table over angles: 120 waves per turn with amplitudes of 0.1 mrad are met to 1e-11."""
 TORQUE_NODES = 40001
 TORQUES = 3.0
-"""Tables over torques reach to so many times the joint's limit."""
+"""Range of tables over torques, in units of the joint's limit."""
 TRIALS = 64
 EXACT = 1e-12
-"""How far the form may be off, rad and m, for an effect to count as of that form."""
+"""Largest difference, rad and m, between an effect and the form that represents it."""
 
 
 class CompiledForm:
-    """The sum of the effects so far; arrays of what no effect has yet have no rows."""
+    """The sum of the effects so far; arrays that no effect has filled have no rows."""
 
     def __init__(self, n: int) -> None:
         """Begin with an arm of n joints without any effect."""
@@ -73,18 +73,19 @@ class CompiledForm:
         return grids, (*angles, self.by_torque, torque_slopes, *soft)
 
     def take(self, e: Effect, theta: Floats, s: Situation) -> bool:
-        """Add an effect; False where it has another form."""
-        if e.wrench_change(theta, s) is not None:
-            return self._sensed(e, theta, s)
-        found = e.deviation(theta, s)
-        if all(x is None for x in (found.dq, found.twist, found.base, found.target)):
-            return True  # what instruments do moves no tool
-        if e.needs or not _only(found):
+        """Add an effect; return False where it has another form."""
+        change = e.wrench_change(theta, s)
+        if change is not None:
+            return self._sensed(change, s)
+        d = e.deviation(theta, s)
+        if all(x is None for x in (d.dq, d.twist, d.base, d.target)):
+            return True  # effects of instruments move no tool
+        if e.needs or not _only(d):
             return False
-        of_kind = self._elastic if e.elastic else self._rigid
-        return of_kind(e, theta, s, found)
+        add = self._elastic if e.elastic else self._rigid
+        return add(e, theta, s, d)
 
-    def _elastic(self, e: Effect, theta: Floats, s: Situation, found: Deviation) -> bool:
+    def _elastic(self, e: Effect, theta: Floats, s: Situation, deviation: Deviation) -> bool:
         n = s.angle.shape[1]
         by_wrench, compliance = np.zeros((n, 6)), np.zeros((n + 1, 6, 6))
         for c in range(6):
@@ -97,43 +98,41 @@ class CompiledForm:
                 compliance[:, :, c] = d.twist[0]
         dq = np.einsum("je,nje->nj", by_wrench, s.wrench[:, :n])
         twist = np.einsum("kef,nkf->nke", compliance, s.wrench)
-        if _same(found, dq, twist):
+        if _same(deviation, dq, twist):
             self.by_wrench += by_wrench
             self.compliance += compliance
             return True
-        if found.twist is not None or found.dq is None:
+        if deviation.twist is not None or deviation.dq is None:
             return False
-        return self._soft(e, theta, s, found.dq) or self._by_torque(e, theta, s, found)
+        return self._soft(e, theta, s, deviation.dq) or self._by_torque(e, theta, s, deviation)
 
-    def _sensed(self, e: Effect, theta: Floats, s: Situation) -> bool:
-        """Take what a force sensor on the flange adds: R (bias + gain Rᵀ w)."""
-        change, r = e.wrench_change(theta, s), s.chain.rotation[-1]
-        if change is None:
-            return False
+    def _sensed(self, change: Floats, s: Situation) -> bool:
+        """Add the wrench error of a force sensor on the flange: R (bias + gain Rᵀ w)."""
+        r = s.chain.rotation[-1]
         w, y = (
             np.einsum("nij,nki->nkj", r, x.reshape(-1, 2, 3)).reshape(-1, 6)
             for x in (s.states.wrench, change)
         )
         rows = np.hstack([w, np.ones((TRIALS, 1))])
-        solved = np.linalg.lstsq(rows, y, rcond=None)[0]
-        if np.abs(rows @ solved - y).max() > 1e3 * EXACT * max(np.abs(y).max(), 1.0):
+        coefficients = np.linalg.lstsq(rows, y, rcond=None)[0]
+        if np.abs(rows @ coefficients - y).max() > 1e3 * EXACT * max(np.abs(y).max(), 1.0):
             return False
-        self.gain = _added(self.gain, solved[:-1].T)
-        self.bias = self.bias + solved[-1]
+        self.gain = _added(self.gain, coefficients[:-1].T)
+        self.bias = self.bias + coefficients[-1]
         return True
 
     def _soft(self, e: Effect, theta: Floats, s: Situation, dq: Floats) -> bool:
-        """Take compliances of joints that depend on the joint's own angle."""
+        """Add compliances of joints that depend on the joint's own angle."""
         n, unit = s.angle.shape[1], np.zeros_like(s.wrench)
         unit[:, :n, 5] = 1.0
-        values, here = _waves(e, theta, replace(s, wrench=unit))
-        if not _same(Deviation(dq=dq), here * s.wrench[:, :n, 5], None):
+        values, compliance = _waves(e, theta, replace(s, wrench=unit))
+        if not _same(Deviation(dq=dq), compliance * s.wrench[:, :n, 5], None):
             return False
         self.soft = _added(self.soft, values.T)
         return True
 
-    def _by_torque(self, e: Effect, theta: Floats, s: Situation, found: Deviation) -> bool:
-        """Take displacements that depend on the joint's own torque alone."""
+    def _by_torque(self, e: Effect, theta: Floats, s: Situation, deviation: Deviation) -> bool:
+        """Add displacements that depend on the joint's own torque alone."""
         n = s.angle.shape[1]
         torque = TORQUES * np.where(np.isfinite(s.cell.arm.torque_max), s.cell.arm.torque_max, 1e3)
         share = np.linspace(-1.0, 1.0, TORQUE_NODES)
@@ -141,65 +140,65 @@ class CompiledForm:
         wrench = np.zeros((TORQUE_NODES, n + 1, 6))
         wrench[:, :n, 5] = share[:, None] * torque
         values = e.deviation(theta, replace(grid, wrench=wrench)).dq
-        if values is None or found.dq is None:
+        if values is None or deviation.dq is None:
             return False
         splines = [_spline(share * torque[j], values[:, j]) for j in range(n)]
         dq = np.stack([splines[j](s.wrench[:, j, 5]) for j in range(n)], axis=1)
-        if not _same(found, dq, None):
+        if not _same(deviation, dq, None):
             return False
         self.torque = torque
         self.by_torque = _added(self.by_torque, values.T)
         return True
 
-    def _rigid(self, e: Effect, theta: Floats, s: Situation, found: Deviation) -> bool:
-        twist = np.zeros(self.b.shape) if found.twist is None else found.twist[0]
+    def _rigid(self, e: Effect, theta: Floats, s: Situation, deviation: Deviation) -> bool:
+        twist = np.zeros(self.b.shape) if deviation.twist is None else deviation.twist[0]
         n = s.angle.shape[1]
-        if found.dq is None and found.twist is not None:
+        if deviation.dq is None and deviation.twist is not None:
             rows = np.hstack([s.values, np.ones((TRIALS, 1))])
-            flat = np.broadcast_to(found.twist, (TRIALS, *twist.shape)).reshape(TRIALS, -1)
-            solved = np.linalg.lstsq(rows, flat, rcond=None)[0]
+            flat = np.broadcast_to(deviation.twist, (TRIALS, *twist.shape)).reshape(TRIALS, -1)
+            coefficients = np.linalg.lstsq(rows, flat, rcond=None)[0]
             if np.ptp(flat, axis=0).max() <= EXACT:
-                solved[:-1], solved[-1] = 0.0, flat[0]
-            if np.abs(rows @ solved - flat).max() > EXACT:
+                coefficients[:-1], coefficients[-1] = 0.0, flat[0]
+            if np.abs(rows @ coefficients - flat).max() > EXACT:
                 return False
-            self.b += solved[-1].reshape(twist.shape)
-            if solved[:-1].any():
-                by_values = np.moveaxis(solved[:-1].reshape(n, *twist.shape), 0, -1)
+            self.b += coefficients[-1].reshape(twist.shape)
+            if coefficients[:-1].any():
+                by_values = np.moveaxis(coefficients[:-1].reshape(n, *twist.shape), 0, -1)
                 self.by_values = _added(self.by_values, by_values)
             return True
-        values, each = _waves(e, theta, s)
-        # What is left may follow other joints in proportion.
-        left = np.asarray(found.dq) - each
+        values, by_angle = _waves(e, theta, s)
+        # The remainder may be linear in the other joints.
+        remainder = np.asarray(deviation.dq) - by_angle
         rows = np.hstack([s.angle, np.ones((TRIALS, 1))])
-        solved = np.linalg.lstsq(rows, left, rcond=None)[0]
-        if np.abs(left).max() < EXACT:
-            solved = np.zeros_like(solved)
-        dq = each + rows @ solved
-        if not _same(found, dq, np.broadcast_to(twist, (TRIALS, *twist.shape))):
+        coefficients = np.linalg.lstsq(rows, remainder, rcond=None)[0]
+        if np.abs(remainder).max() < EXACT:
+            coefficients = np.zeros_like(coefficients)
+        dq = by_angle + rows @ coefficients
+        if not _same(deviation, dq, np.broadcast_to(twist, (TRIALS, *twist.shape))):
             return False
         self.b += twist
-        self.a += solved[-1]
-        self.linear += solved[:-1].T
+        self.a += coefficients[-1]
+        self.linear += coefficients[:-1].T
         self.by_angle = _added(self.by_angle, values.T)
         return True
 
 
 def given_the_columns(e: Effect, theta: Floats, s: Situation) -> bool:
-    """Whether an effect is a constant, or a compliance of joints, once its columns are known."""
+    """Whether an effect, at fixed columns, is a constant or a compliance of joints."""
     turned = np.roll(s.angle, 1, axis=0)
-    other = replace(s, states=replace(s.states, q=turned), angle=turned)
+    permuted = replace(s, states=replace(s.states, q=turned), angle=turned)
     n = s.angle.shape[1]
-    unit, found = np.zeros_like(s.wrench), e.deviation(theta, s)
+    unit, d = np.zeros_like(s.wrench), e.deviation(theta, s)
     unit[..., 5] = 1.0
     if e.elastic:
-        here, there = (e.deviation(theta, replace(x, wrench=unit)) for x in (s, other))
-        if found.twist is not None or here.dq is None or there.dq is None or not _only(found):
+        soft, other = (e.deviation(theta, replace(x, wrench=unit)) for x in (s, permuted))
+        if d.twist is not None or soft.dq is None or other.dq is None or not _only(d):
             return False
-        return _same(there, here.dq, None) and _same(found, here.dq * s.wrench[:, :n, 5], None)
-    if not _only(found) or (found.dq is None and found.twist is None):
+        return _same(other, soft.dq, None) and _same(d, soft.dq * s.wrench[:, :n, 5], None)
+    if not _only(d) or (d.dq is None and d.twist is None):
         return False
-    dq = np.zeros((TRIALS, n)) if found.dq is None else found.dq
-    return _same(e.deviation(theta, other), dq, found.twist)
+    dq = np.zeros((TRIALS, n)) if d.dq is None else d.dq
+    return _same(e.deviation(theta, permuted), dq, d.twist)
 
 
 def _spline(x: Floats, y: Floats, axis: int = 0) -> Any:
@@ -208,24 +207,24 @@ def _spline(x: Floats, y: Floats, axis: int = 0) -> Any:
     return CubicSpline(x, y, axis=axis)
 
 
-def _added(to: Floats, more: Any) -> Floats:
-    return packed(more + to if len(to) else more)
+def _added(rows: Floats, added: Any) -> Floats:
+    return packed(added + rows if len(rows) else added)
 
 
 def _waves(e: Effect, theta: Floats, s: Situation) -> tuple[Floats, Floats]:
-    """Displacements with all joints at the angle of each of the NODES (NODES, n), and at s."""
+    """Displacements (NODES, n) with all joints at the angle of each node, and (N, n) at s."""
     angle, parts = np.linspace(-TURN, TURN, NODES), []
     for part in np.array_split(angle, 16):
         grid, q = repeated(s, len(part)), np.repeat(part[:, None], s.angle.shape[1], axis=1)
-        found = e.deviation(theta, replace(grid, states=replace(grid.states, q=q), angle=q)).dq
-        parts.append(np.zeros_like(q) if found is None else found)
+        dq = e.deviation(theta, replace(grid, states=replace(grid.states, q=q), angle=q)).dq
+        parts.append(np.zeros_like(q) if dq is None else dq)
     values = np.concatenate(parts)
     waves = _spline(angle, values)
     return values, np.stack([waves(a)[:, j] for j, a in enumerate(s.angle.T)], axis=1)
 
 
 def repeated(s: Situation, count: int) -> Situation:
-    """Return the first state, so many times."""
+    """Return the first state, repeated `count` times."""
     rows = np.zeros(count, dtype=np.int64)
     chain = replace(
         s.chain,
@@ -241,21 +240,20 @@ def repeated(s: Situation, count: int) -> Situation:
 
 
 def _only(d: Deviation) -> bool:
-    """Whether nothing but joints and slots moves."""
+    """Whether a deviation moves joints and slots alone."""
     return all(f is None for f in (d.base, d.station, d.target, d.scale, d.observer))
 
 
 def _same(d: Deviation, dq: Floats, twist: Floats | None) -> bool:
-    """Whether a deviation is what the form makes of it."""
-    zero = 0.0
-    a = (zero if d.dq is None else d.dq) - dq
-    b = (zero if d.twist is None else d.twist) - (zero if twist is None else twist)
+    """Whether a deviation equals that of the form."""
+    a = (0.0 if d.dq is None else d.dq) - dq
+    b = (0.0 if d.twist is None else d.twist) - (0.0 if twist is None else twist)
     size = max(np.abs(dq).max(initial=0.0), 1e-3)
     return bool(np.abs(a).max() <= 1e3 * EXACT * size and np.abs(b).max(initial=0.0) <= EXACT)
 
 
 def packed(x: Floats | np.ndarray) -> Floats:
-    """Return a copy of one layout: others, and those that are read-only, would be compiled anew."""
+    """Return a writable C-ordered copy: numba compiles each other layout anew."""
     return np.array(x, dtype=float, order="C")
 
 
@@ -264,57 +262,58 @@ class Compiled:
     """Arrays for `kernel.invert_all`."""
 
     arm: tuple[Floats, ...]  # links and centres of mass
-    load: tuple[Any, ...]  # where the load acts, and all weights
+    load: tuple[Any, ...]  # load point and all masses
     laws: tuple[Floats, ...]  # constants and compliances
-    tables: tuple[Any, ...]  # of what depends on one angle, or one torque
-    tool: ToolPose  # where it is on the flange, and where the base is
+    tables: tuple[Any, ...]  # of effects that depend on one angle, or one torque
+    tool: ToolPose
     nominal: tuple[tuple[Floats, ...], tuple[Any, ...]]
-    """The same laws with nothing in them, of the nominal arm."""
+    """Laws and tables of the nominal arm: without effects."""
     reach: float  # m
     mode: Mode  # kind of readings that the model was fitted to
     by_point: tuple[tuple[Effect, Floats], ...]
     """Effects that need times, temperatures or sides of approach, with their parameters."""
-    one: Situation  # a state, for these effects
+    one: Situation  # a state to evaluate these effects at
 
     def compensate(
         self, states: States, goal: tuple[Floats, Floats] | None
     ) -> tuple[Floats, Floats]:
         """Joint values (N, n) and residuals (N, 2), m and rad.
 
-        `goal` are wanted orientations (N, 3, 3) and positions (N, 3), m, base axes; those that the
-        nominal arm (for deflections: the unloaded arm) has at q where None.
+        `goal` are target orientations (N, 3, 3) and positions (N, 3), m, base axes; if None, those
+        of the nominal arm (for deflections: the unloaded arm) at q.
         """
         from hilcal.calibration.kernel import invert_all
 
         q, wrench, count = states.q, states.wrench, len(states)
-        own = self._own(states)
-        out, left = np.empty_like(q), np.zeros((count, 2))
+        by_point = self._at_points(states)
+        out, residual = np.empty_like(q), np.zeros((count, 2))
         still = self.mode == "deflection"
         rotation, position = goal or (np.empty((count, 3, 3)), np.empty((count, 3)))
         if goal is None:
             laws, tables = (self.laws, self.tables) if still else self.nominal
-            tool, nothing = self.tool.pose if still else self.tool.nominal, np.zeros((count, 6))
-            none = own if still else _nothing(q.shape[1])
+            tool, unloaded = self.tool.pose if still else self.tool.nominal, np.zeros((count, 6))
+            deviations = by_point if still else _zeros(q.shape[1])
             invert_all(
-                self.arm, self.load, laws, tables, none, packed(tool), self.reach, MOST_TURN,
-                TOLERANCE, q, nothing, rotation, position, False, out, left,
+                self.arm, self.load, laws, tables, deviations, packed(tool), self.reach, MOST_TURN,
+                TOLERANCE, q, unloaded, rotation, position, False, out, residual,
             )  # fmt: skip
         if goal is not None or not still:
             rotation, position = in_chain(self.tool, rotation, position)
         invert_all(
-            self.arm, self.load, self.laws, self.tables, own, packed(self.tool.pose), self.reach,
-            MOST_TURN, TOLERANCE, q, wrench, packed(rotation), packed(position), True, out, left,
+            self.arm, self.load, self.laws, self.tables, by_point, packed(self.tool.pose),
+            self.reach, MOST_TURN, TOLERANCE, q, wrench, packed(rotation), packed(position), True,
+            out, residual,
         )  # fmt: skip
-        return out, left
+        return out, residual
 
-    def _own(self, states: States) -> tuple[Floats, Floats, Floats]:
+    def _at_points(self, states: States) -> tuple[Floats, Floats, Floats]:
         """Displacements (N, n), twists (N, n + 1, 6) and compliances (N, n) of the points."""
-        own = _nothing(states.q.shape[1])
+        zeros = _zeros(states.q.shape[1])
         if not self.by_point:
-            return own
+            return zeros
         s = self.one if len(states) == 1 else repeated(self.one, len(states))
         s = replace(s, states=states, angle=states.q)
-        dq, twist, soft = own
+        dq, twist, soft = zeros
         for e, theta in self.by_point:
             d = e.deviation(theta, s)
             if e.elastic:
@@ -326,7 +325,7 @@ class Compiled:
 
 
 def compiled(tool: ToolPose, mode: Mode) -> Compiled | tuple[str, ...]:
-    """Return a model for the kernel; the names of what it has no form for where there is such."""
+    """Return a model for the kernel, or the names of what the kernel does not cover."""
     try:
         import numba  # noqa: F401
     except ImportError:
@@ -340,8 +339,8 @@ def compiled(tool: ToolPose, mode: Mode) -> Compiled | tuple[str, ...]:
     s, form = _situation(tool), CompiledForm(arm.n)
     first_moment, point = np.zeros((arm.n, 3)), cell.load_point
     by_point: list[tuple[Effect, Floats]] = []
-    for e, mine in zip(model.effects, model.slices(), strict=True):
-        theta = tool.theta[mine]
+    for e, columns in zip(model.effects, model.slices(), strict=True):
+        theta = tool.theta[columns]
         if e.role in FRAME_ROLES or not theta.any():
             continue
         change = e.load_change(theta)
@@ -369,8 +368,8 @@ def compiled(tool: ToolPose, mode: Mode) -> Compiled | tuple[str, ...]:
     )  # fmt: skip
 
 
-def _nothing(n: int) -> tuple[Floats, Floats, Floats]:
-    """Return what points have where no effect gives them anything of their own."""
+def _zeros(n: int) -> tuple[Floats, Floats, Floats]:
+    """Return zero displacements, twists and compliances for one point."""
     return np.zeros((1, n)), np.zeros((1, n + 1, 6)), np.zeros((1, n))
 
 

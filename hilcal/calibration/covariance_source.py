@@ -1,13 +1,13 @@
-"""The covariance of a calibration's parameters, stored as what it is computed from: small, exact.
+"""The covariance of a calibration's parameters, stored as the quantities it is computed from.
 
-A transmission error has over a thousand parameters, most of which the readings do not determine,
-and their covariance has a million numbers of very different sizes. It follows from few:
+A transmission error has over a thousand parameters, most of which the readings do not determine.
+Their covariance has a million numbers of very different sizes, but follows from few:
 
     κ C = κ σ² S V (E + σ²)⁻¹ Vᵀ S,      S AᵀA S = V E Vᵀ
 
-A (R, P) the whitened Jacobian of the fitted states, S the prior standard deviations, σ² the noise
-factor, κ as in `calibration`. States, their noise and S take some hundred kilobytes; computing A
-and its eigenvectors takes seconds, once, when an uncertainty is first asked for.
+A (R, P) is the whitened Jacobian of the fitted states, S the prior standard deviations, σ² the
+noise factor, κ as in `calibration`. States, their noise and S take some hundred kilobytes. A and
+its eigenvectors take seconds to compute, once, when an uncertainty is first needed.
 """
 
 import base64
@@ -30,15 +30,15 @@ from hilcal.types import Floats
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CovarianceSource:
-    """What the covariance follows from."""
+    """Quantities that the covariance is computed from."""
 
-    readings: Readings  # the fitted ones; their values are not used
+    readings: Readings  # fitted readings; their values are not used
     prior: Floats  # (P,) S
     noise: float  # σ²
     factor: float  # κ
 
     def root(self, model: Model, theta: Floats, mode: Mode) -> Floats:
-        """Return R (P, P) with κ C = R Rᵀ; `theta` (P,) are its parameters."""
+        """Return R (P, P) with κ C = R Rᵀ; `theta` (P,) are the model's parameters."""
         w = whitening(self.readings, mode, "gc")
         prediction = model.predict(self.readings.states, theta)
         a = whitened_jacobian(model, prediction, theta, w, np.arange(model.size))
@@ -48,7 +48,7 @@ class CovarianceSource:
         return np.asarray(self.prior[:, None] * vectors * np.sqrt(spread))
 
     def check(self, model: Model) -> None:
-        """Refuse what does not go with a model."""
+        """Refuse quantities whose shapes do not fit a model."""
         r, n = self.readings, model.cell.arm.n
         count = len(r.states)
         limits.check_numbers("what its covariance follows from", count * r.m * max(model.size, 1))
@@ -60,8 +60,8 @@ class CovarianceSource:
         for f in fields(States):
             values = getattr(r.states, f.name)
             if values is not None:
-                wide = (widths[f.name],) if f.name in widths else ()
-                numbers(f.name, values, (count, *wide))
+                width = (widths[f.name],) if f.name in widths else ()
+                numbers(f.name, values, (count, *width))
         numbers("covariance", r.covariance, (count, r.m, r.m))
         if r.common is not None:
             numbers("common", r.common, (count, r.m, r.common.shape[-1]))
@@ -71,18 +71,18 @@ class CovarianceSource:
             "target": (r.target, r.target_names or ("",)),
             "observer": (r.observer, r.observers or ("",)),
         }
-        for name, (index, known) in indices.items():
-            if index.shape != (count,) or np.any((index < 0) | (index >= len(known))):
+        for name, (index, names) in indices.items():
+            if index.shape != (count,) or np.any((index < 0) | (index >= len(names))):
                 raise ValueError(f"readings without a known {name}")
 
     def to_json(self) -> dict[str, object]:
-        """Return it as JSON; numbers of the readings with 7 digits."""
+        """Return the source as JSON; numbers of the readings have 7 digits."""
         r, upper = self.readings, np.triu_indices(self.readings.m)
-        given = {f.name: a for f in fields(States) if (a := getattr(r.states, f.name)) is not None}
+        state = {f.name: a for f in fields(States) if (a := getattr(r.states, f.name)) is not None}
         cov = r.covariance[:, upper[0], upper[1]]
         return {
             "elements": r.m,
-            "states": {name: _packed(a) for name, a in given.items()},
+            "states": {name: _packed(a) for name, a in state.items()},
             "covariance": _packed(cov),
             "common": None if r.common is None else _packed(r.common),
             "serial_noise": None if r.serial is None else r.serial.to_json(),
@@ -141,7 +141,7 @@ class CovarianceSource:
 
 
 def _packed(a: np.ndarray) -> dict[str, object]:
-    """Return an array of numbers as text: 32 bits each, columns together, deflated."""
+    """Return an array as text: 32 bits a number, column by column, deflated."""
     kind = "<i4" if a.dtype.kind == "i" else "<f4"
     data = np.ascontiguousarray(np.moveaxis(a, 0, -1)).astype(kind).tobytes()
     text = base64.b85encode(zlib.compress(data, 9)).decode("ascii")
@@ -161,5 +161,5 @@ def _unpacked(content: Mapping[str, Any]) -> Any:
     if len(data) != size:
         raise ValueError(f"{len(data)} bytes for shape {shape}")
     flat = np.frombuffer(data, dtype=content["type"]).reshape([*shape[1:], shape[0]])
-    whole = np.int64 if content["type"] == "<i4" else np.float64
-    return np.ascontiguousarray(np.moveaxis(flat, -1, 0).astype(whole))
+    wide = np.int64 if content["type"] == "<i4" else np.float64
+    return np.ascontiguousarray(np.moveaxis(flat, -1, 0).astype(wide))

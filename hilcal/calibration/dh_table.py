@@ -1,18 +1,18 @@
-"""An arm of any constant transforms as a Denavit-Hartenberg table, and what that cannot hold.
+"""An arm of any constant transforms as a Denavit-Hartenberg table, and its remainder.
 
 Between two joints every transform is, with the common normal of their axes,
 
     L = Rz(φ) Tz(s) Tx(a) Rx(α) Tz(t) Rz(ψ)
 
-and the parts about z join the joints' offsets and distances, so rows hold the relative places of
-all axes exactly. Nearly parallel axes have a far common normal: d of both joints is large there,
-and cancels. What rows cannot hold is where the first axis lies in the base, and how the flange sits
-on the last one:
+and the parts about z add to the joints' offsets and distances, so that rows represent the relative
+poses of all axes exactly. The common normal of nearly parallel axes is far away: d of both joints
+is then large, and cancels. Rows represent neither the pose of the first axis in the base nor that
+of the flange on the last axis:
 
     T_base_flange = B Π_i row_i(q_i) E
 
-with B without a part about z at its end, E without one at its beginning. They are stated beside the
-rows, as `base_m_rad` and `flange_m_rad`.
+B has no part about z at its end, E none at its beginning. `base_m_rad` and `flange_m_rad` state
+them beside the rows.
 
 Source: Craig, *Introduction to Robotics*, sections 3.3 and 3.4; Hayati, "Robot arm geometric link
 parameter estimation", IEEE CDC 1983, for parallel axes.
@@ -36,11 +36,11 @@ from hilcal.types import Floats
 Convention = Literal["standard", "modified"]
 CONVENTIONS: tuple[Convention, ...] = ("standard", "modified")
 PARALLEL = 1e-9
-"""rad; axes at a smaller angle are taken for parallel, which moves the tool by a nanometre."""
+"""rad; axes at a smaller angle count as parallel, which moves the tool by a nanometre."""
 CROSSED = 0.1
-"""rad; from this angle on the end of a chain is part of the rows, as a link is; a choice."""
+"""rad; above this tilt the end of a chain is represented by rows, as a link is; a choice."""
 EXACT = 1e-9
-"""m; differences below it are not worth a word."""
+"""m; smaller differences are not reported."""
 TRIALS = 200
 
 
@@ -55,37 +55,37 @@ class DhRows:
     offset: Floats  # (n,) rad
     base: Floats  # (4, 4) B
     flange: Floats  # (4, 4) E
-    base_moves: float = 0.0  # most that the flange moves where B is left out, m
-    flange_moves: float = 0.0  # the same of E, m
-    table_moves: float = 0.0  # the same of both together
-    disagreement: float = 0.0  # most that the flange is elsewhere with B and E, m: rounding
-    slides: tuple[int, ...] = ()  # joints that slide, counted from 0: q adds to d
+    base_moves: float = 0.0  # largest motion of the flange without B, m
+    flange_moves: float = 0.0  # the same without E, m
+    table_moves: float = 0.0  # the same without both, m
+    disagreement: float = 0.0  # largest error of the flange with B and E, m: rounding
+    slides: tuple[int, ...] = ()  # indices of joints that slide: q adds to d
 
 
 def dh_rows(arm: Arm, convention: Convention = "standard") -> DhRows:
-    """Return the table of an arm, of "standard" (classic) or "modified" (Craig) rows."""
+    """Return the table of an arm with "standard" (classic) or "modified" (Craig) rows."""
     if arm.coupling is not None or arm.drive is not None:
         raise InputError(f"{arm.name}: joints are coupled, which a DH table cannot hold")
     n = arm.n
-    before, after = np.zeros((n + 1, 2)), np.zeros((n + 1, 2))  # angle, distance along z
+    z_before, z_after = np.zeros((n + 1, 2)), np.zeros((n + 1, 2))  # angle, distance along z
     across = np.zeros((n + 1, 2))  # a, α
     for k in range(1, n):
-        before[k], across[k], after[k] = _common_normal(arm.links[k])
+        z_before[k], across[k], z_after[k] = _common_normal(arm.links[k])
     base, flange = np.eye(4), np.eye(4)
     first, last = arm.links[0], arm.links[n]
     if convention == "modified" and _tilt(first) > CROSSED:
-        start, across[0], after[0] = _common_normal(first)
+        start, across[0], z_after[0] = _common_normal(first)
         base = se3.screw(2, *start)
     else:
-        after[0] = _twist_last(first)
-        base = first @ se3.screw(2, *-after[0])
+        z_after[0] = _twist_last(first)
+        base = first @ se3.screw(2, *-z_after[0])
     if convention == "standard" and _tilt(last) > CROSSED:
-        before[n], across[n], end = _common_normal(last)
+        z_before[n], across[n], end = _common_normal(last)
         flange = se3.screw(2, *end)
     else:
-        before[n] = twist_first(last)
-        flange = se3.screw(2, *-before[n]) @ last
-    along = after[:n] + before[1:]
+        z_before[n] = twist_first(last)
+        flange = se3.screw(2, *-z_before[n]) @ last
+    along = z_after[:n] + z_before[1:]
     shift = 1 if convention == "standard" else 0
     a, alpha = across[shift : n + shift].T
     slides = tuple(np.flatnonzero(arm.slides).tolist())
@@ -108,7 +108,7 @@ def row_transforms(rows: DhRows, q: Floats) -> Floats:
 
 
 def flange_poses(rows: DhRows, q: Floats, *, whole: bool = True) -> Floats:
-    """(N, 4, 4) poses of the flange by the rows, with B and E unless `whole` is False."""
+    """(N, 4, 4) poses of the flange by the rows, with B and E if `whole`."""
     place = np.broadcast_to(rows.base if whole else np.eye(4), (len(q), 4, 4))
     for part in np.moveaxis(row_transforms(rows, q), 1, 0):
         place = place @ part
@@ -127,7 +127,7 @@ def to_csv(rows: DhRows, arm: Arm) -> str:
 
 
 def to_toml(rows: DhRows, arm: Arm, title: str) -> str:
-    """Return a file of the robot catalogue with masses, limits and payload of an arm."""
+    """Return a robot file with the rows, and masses, limits and payload of an arm."""
     com = _centres(rows, arm)
     content: dict[str, object] = {
         "title": escaped(title),
@@ -166,7 +166,7 @@ def to_toml(rows: DhRows, arm: Arm, title: str) -> str:
 
 
 def _ranges(arm: Arm, k: int) -> dict[str, object]:
-    """Kind, limits and torque of a joint, as a row has them."""
+    """Kind, limits and torque of a joint, as a row states them."""
     low, high, torque = (float(x[k]) for x in (arm.q_min, arm.q_max, arm.torque_max))
     if arm.slides[k]:
         out: dict[str, object] = {"type": "prismatic", "q_min_m": low, "q_max_m": high}
@@ -176,21 +176,21 @@ def _ranges(arm: Arm, k: int) -> dict[str, object]:
 
 
 def _judged(rows: DhRows, arm: Arm) -> DhRows:
-    """Return the rows with what they cannot hold, at random joint values."""
+    """Return the rows with the motions of the flange without B and E, at random joint values."""
     q = np.random.default_rng(20250309).uniform(-np.pi, np.pi, (TRIALS, arm.n))
     chain = evaluate(arm, q)
-    there = se3.matrix(chain.rotation[-1], chain.position[-1])
-    held = flange_poses(rows, q, whole=False)
+    flange = se3.matrix(chain.rotation[-1], chain.position[-1])
+    by_rows = flange_poses(rows, q, whole=False)
 
-    def moved(poses: Floats) -> float:
-        return float(np.linalg.norm((poses - there)[:, :3, 3], axis=1).max())
+    def largest_motion(poses: Floats) -> float:
+        return float(np.linalg.norm((poses - flange)[:, :3, 3], axis=1).max())
 
     return replace(
         rows,
-        base_moves=moved(held @ rows.flange),
-        flange_moves=moved(rows.base @ held),
-        table_moves=moved(held),
-        disagreement=moved(rows.base @ held @ rows.flange),
+        base_moves=largest_motion(by_rows @ rows.flange),
+        flange_moves=largest_motion(rows.base @ by_rows),
+        table_moves=largest_motion(by_rows),
+        disagreement=largest_motion(rows.base @ by_rows @ rows.flange),
     )
 
 
@@ -206,7 +206,7 @@ def _centres(rows: DhRows, arm: Arm) -> Floats:
 
 
 def _common_normal(link: Floats) -> tuple[Floats, Floats, Floats]:
-    """(φ, s), (a, α) and (ψ, t) of a transform; φ within a quarter turn."""
+    """(φ, s), (a, α) and (ψ, t) of a transform; |φ| ≤ π/2."""
     x, y, z = link[:3, 2]
     sine = float(np.hypot(x, y))
     p = link[:3, 3]
@@ -230,17 +230,17 @@ def _common_normal(link: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 def twist_first(link: Floats) -> Floats:
-    """Angle and distance of Rz Tz at the beginning of a transform, the rest having none."""
+    """Angle and distance of Rz Tz at the beginning of a transform."""
     return np.array([_about_z(link), link[2, 3]])
 
 
 def _twist_last(link: Floats) -> Floats:
-    """Angle and distance of Rz Tz at the end of a transform, the rest having none."""
+    """Angle and distance of Rz Tz at the end of a transform."""
     return np.array([_about_z(link), link[:3, 2] @ link[:3, 3]])
 
 
 def _about_z(link: Floats) -> float:
-    """Part of a rotation about z, the other being about a horizontal axis."""
+    """Angle about z of a rotation that is one about z and one about a horizontal axis."""
     from scipy.spatial.transform import Rotation  # slow to import
 
     z, w = Rotation.from_matrix(link[:3, :3]).as_quat()[2:]
@@ -252,6 +252,6 @@ def _tilt(link: Floats) -> float:
 
 
 def _wrapped(angle: Floats) -> Floats:
-    """Angles within half a turn; those that are nothing but rounding are zero."""
+    """Wrap angles to half a turn; rounding errors become zero."""
     out = angle - 2 * np.pi * np.rint(angle / (2 * np.pi))
     return np.where(np.abs(out) < 1e-15, 0.0, out)

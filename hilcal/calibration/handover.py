@@ -1,23 +1,23 @@
-"""The constant part of an identified arm, and how others read it: URDF, UR's kinematics, frames.
+"""The constant part of an identified arm as URDF, MATLAB, UR's kinematics file, and frames.
 
 URDF: fixed-axis roll, pitch, yaw and xyz of every joint's origin; every joint turns about its z.
 
 UR's kinematics file (`ur_description`, `config/*/default_kinematics.yaml`; written for a single arm
-by `ur_calibration`) has one origin per joint in the frames of that package: those of this program
-moved along the joints' axes. The first one counts from `base_link_inertia`, which is the
-controller's base (`base`), half a turn about z from `base_link`. It has no origin for the flange;
-what cannot be moved before the last joint is part of the tool, see `frames`.
+by `ur_calibration`) has one origin per joint in the frames of that package, which are those of this
+program moved along the joints' axes. The first origin is relative to `base_link_inertia`, which is
+the controller's base (`base`), half a turn about z from `base_link`. The file has no origin for the
+flange; the part of the last transform that cannot move before the last joint belongs to the tool,
+see `frames`.
 
 An effect whose deviation is the same in every state and under every load (an encoder's zero, a link
 of another length or angle) goes into the constant transforms, from the declared base to the
-declared flange, see `identification.robot_frames`. Everything else (compliances, waves of gears,
-temperature) cannot, and is named.
+declared flange, see `identification.robot_frames`. All other effects (compliances, gear waves,
+temperature) are listed as not included.
 """
 
 import hashlib
 import json
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
@@ -37,7 +37,7 @@ FULL_TURN = 2 * np.pi
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Corrected:
-    """An arm with what is constant of a calibration."""
+    """An arm with the constant effects of a calibration."""
 
     arm: Arm
     within: tuple[str, ...]  # effects that it contains
@@ -47,7 +47,9 @@ class Corrected:
 def corrected(calibration: Calibration) -> Corrected:
     """Return the arm with the constant effects of a calibration in its transforms.
 
-    Deflections do not show constant errors: of these it raises a CannotAnswerError.
+    Raises:
+        CannotAnswerError: the calibration is of deflections, which do not show constant errors.
+        InputError: joints are coupled.
     """
     if calibration.mode == "deflection":
         raise CannotAnswerError(
@@ -57,12 +59,12 @@ def corrected(calibration: Calibration) -> Corrected:
     arm = calibration.model.cell.arm
     if arm.coupling is not None or arm.drive is not None:
         raise InputError(f"{arm.name}: joints are coupled, which constant transforms cannot hold")
-    found = calibration.frames
-    return Corrected(replace(arm, links=found.links), found.within, found.beyond)
+    robot = calibration.frames
+    return Corrected(replace(arm, links=robot.links), robot.within, robot.beyond)
 
 
 def urdf(arm: Arm, note: str = "") -> str:
-    """Return an arm as URDF: links base_link, link_1 ..., tool0."""
+    """Return an arm as URDF with links base_link, link_1 …, tool0."""
     root = Element("robot", name=escaped(arm.name))
     SubElement(root, "link", name="base_link")
     links = ["base_link", *(f"link_{k}" for k in range(1, arm.n + 1)), "tool0"]
@@ -71,12 +73,12 @@ def urdf(arm: Arm, note: str = "") -> str:
         if arm.masses[k] > 0:
             _inertial(link, float(arm.masses[k]), arm.coms[k])
     SubElement(root, "link", name="tool0")
-    for k, place in enumerate(arm.links):
+    for k, transform in enumerate(arm.links):
         fixed = k == arm.n
         name = "flange" if fixed else escaped(arm.joint_names[k])
         kind = "fixed" if fixed else "prismatic" if arm.slides[k] else "revolute"
         joint = SubElement(root, "joint", name=name, type=kind)
-        xyz, rpy = origin_of(place)
+        xyz, rpy = origin_of(transform)
         SubElement(joint, "origin", xyz=_numbers(xyz), rpy=_numbers(rpy))
         SubElement(joint, "parent", link=links[k])
         SubElement(joint, "child", link=links[k + 1])
@@ -99,7 +101,7 @@ def matlab(arm: Arm, name: str, note: str = "") -> str:
         f"robot = rigidBodyTree('DataFormat', 'row', 'MaxNumBodies', {arm.n + 1});",
         "robot.Gravity = [0 0 -9.80665];",
     ]
-    for k, place in enumerate(arm.links):
+    for k, transform in enumerate(arm.links):
         moving = k < arm.n
         body, kind = (f"link_{k + 1}", "revolute") if moving else ("tool0", "fixed")
         joint = escaped(arm.joint_names[k]).replace("'", "''") if moving else "flange"
@@ -107,12 +109,12 @@ def matlab(arm: Arm, name: str, note: str = "") -> str:
             "",
             f"body = rigidBody('{body}');",
             f"joint = rigidBodyJoint('{joint}', '{kind}');",
-            f"setFixedTransform(joint, [{'; '.join(_numbers(row) for row in place)}]);",
+            f"setFixedTransform(joint, [{'; '.join(_numbers(row) for row in transform)}]);",
         ]
         if moving:
             low, high = float(arm.q_min[k]), float(arm.q_max[k])
-            known = np.isfinite(low) and np.isfinite(high)
-            limits = (low, high) if known else (-FULL_TURN, FULL_TURN)
+            limited = np.isfinite(low) and np.isfinite(high)
+            limits = (low, high) if limited else (-FULL_TURN, FULL_TURN)
             home = min(max(0.0, limits[0]), limits[1])
             out += [
                 "joint.JointAxis = [0 0 1];",
@@ -137,8 +139,8 @@ def ur_kinematics(
 ) -> tuple[str, Floats]:
     """Return UR's kinematics file, and (4, 4) from its last frame to the flange.
 
-    `digest` is the driver's name of the connected arm's own calibration, "calib_…"; the driver logs
-    an error where the file has another. One of the file's content where None.
+    `digest` is the driver's name of the connected arm's calibration, "calib_…"; the driver logs an
+    error if the file has another. If None, a hash of the file's content is used.
     """
     if not nominal.name.startswith("ur") or arm.n != len(UR_JOINTS):
         raise InputError(f"{nominal.name}: UR's kinematics file is for UR arms")
@@ -148,33 +150,33 @@ def ur_kinematics(
             "ur_calibration writes, or of the driver's message"
         )
     shift = np.zeros(arm.n)
-    for k in (0, 3, 4):  # the frames of the package lie that far along the axes
+    for k in (0, 3, 4):  # offsets of the package's frames along the axes
         shift[k] = nominal.links[k + 1][2, 3]
-    turn, shift[-1] = twist_first(arm.links[-1])  # a turn about the last axis can be made before it
+    turn, shift[-1] = twist_first(arm.links[-1])  # a turn about the last axis may precede it
     lines = ["kinematics:"]
     for k, name in enumerate(UR_JOINTS):
-        before = np.eye(4) if k == 0 else se3.screw(2, 0.0, -shift[k - 1])
-        after = se3.screw(2, turn if k == arm.n - 1 else 0.0, shift[k])
-        xyz, rpy = origin_of(before @ arm.links[k] @ after)
+        to_frame = np.eye(4) if k == 0 else se3.screw(2, 0.0, -shift[k - 1])
+        from_frame = se3.screw(2, turn if k == arm.n - 1 else 0.0, shift[k])
+        xyz, rpy = origin_of(to_frame @ arm.links[k] @ from_frame)
         lines.append(f"  {name}:")
         keys = ("x", "y", "z", "roll", "pitch", "yaw")
         lines += [f"    {key}: {_yaml(v)}" for key, v in zip(keys, (*xyz, *rpy), strict=True)]
-    own = int.from_bytes(hashlib.sha256("\n".join(lines).encode()).digest()[:8])
-    lines.append(f"  hash: {digest or f'calib_{own}'}")
+    content_hash = int.from_bytes(hashlib.sha256("\n".join(lines).encode()).digest()[:8])
+    lines.append(f"  hash: {digest or f'calib_{content_hash}'}")
     comment = [f"# {escaped(line)}" for line in note.split("\n")]
     return "\n".join([*comment, *lines]) + "\n", se3.screw(2, -turn, -shift[-1]) @ arm.links[-1]
 
 
-def frames(calibration: Calibration, found: Corrected, beyond_flange: Floats | None) -> str:
+def frames(calibration: Calibration, corrected_arm: Corrected, beyond_flange: Floats | None) -> str:
     """Return the frames that a controller asks for, as JSON: x, y, z, rx, ry, rz in m and rad.
 
-    `base_in_tracker` is the one base of all that is handed out, `base_is` how it is known.
-    `tool_on_flange` is that of the corrected arm. A controller computes with its own arm: its tool
-    centre point has the constant part of the last link with it, under "controller", in m and, as
-    PolyScope shows them, in mm. `beyond_flange` (4, 4) is what `ur_kinematics` returns, or None.
+    `base_in_tracker` is the base of everything that is exported, `base_is` its origin.
+    `tool_on_flange` is of the corrected arm. A controller computes with its own arm: under
+    "controller", its tool centre point includes the constant part of the last link, in m and, as
+    PolyScope shows it, in mm. `beyond_flange` (4, 4) is what `ur_kinematics` returns, or None.
     """
     tool, base = calibration.tool_pose(), calibration.base_in_tracker()
-    nominal, arm = calibration.model.cell.arm, found.arm
+    nominal, arm = calibration.model.cell.arm, corrected_arm.arm
     tcp = se3.inverse(nominal.links[-1]) @ arm.links[-1] @ tool
     tracker = se3.inverse(base)
     document = {
@@ -182,8 +184,8 @@ def frames(calibration: Calibration, found: Corrected, beyond_flange: Floats | N
         "tool_on_flange": se3.six(tool),
         "base_in_tracker": se3.six(base),
         "base_is": calibration.frames.base_is,
-        "in_transforms": list(found.within),
-        "not_in_transforms": list(found.beyond),
+        "in_transforms": list(corrected_arm.within),
+        "not_in_transforms": list(corrected_arm.beyond),
         "controller": {
             "tcp_m_rad": se3.six(tcp),
             "tcp_mm_rad": _millimetres(tcp),
@@ -199,7 +201,7 @@ def frames(calibration: Calibration, found: Corrected, beyond_flange: Floats | N
 
 
 def _millimetres(pose: Floats) -> list[float]:
-    """Position in mm to 0.1 nm and rotation vector in rad, as a person types them."""
+    """Position in mm to 0.1 nm and rotation vector in rad, for people to type."""
     values = se3.six(pose)
     return [round(1e3 * v, 7) for v in values[:3]] + [round(v, 9) for v in values[3:]]
 
@@ -211,9 +213,9 @@ def origin_of(place: Floats) -> tuple[Floats, Floats]:
     r = place[:3, :3]
     pitch = np.arctan2(-r[2, 0], np.hypot(r[0, 0], r[1, 0]))
     roll = np.arctan2(r[2, 1], r[2, 2])
-    # The rest turns about z, whatever roll rounding chose.
-    rest = r @ Rotation.from_euler("xyz", [roll, pitch, 0.0]).as_matrix().T
-    yaw = np.arctan2(rest[1, 0] - rest[0, 1], rest[0, 0] + rest[1, 1])
+    # The remainder is about z, whatever roll rounding chose.
+    about_z = r @ Rotation.from_euler("xyz", [roll, pitch, 0.0]).as_matrix().T
+    yaw = np.arctan2(about_z[1, 0] - about_z[0, 1], about_z[0, 0] + about_z[1, 1])
     return place[:3, 3], np.array([roll, pitch, yaw])
 
 
@@ -229,7 +231,7 @@ def _numbers(values: Floats) -> str:
 
 
 def _inertial(link: Element, mass: float, com: Floats) -> None:
-    """Add mass and centre of mass; moments of inertia are not known: those of a ball of 10 cm."""
+    """Add mass, centre of mass, and as moments of inertia those of a ball of 10 cm."""
     inertial = SubElement(link, "inertial")
     SubElement(inertial, "origin", xyz=_numbers(com), rpy="0 0 0")
     SubElement(inertial, "mass", value=f"{mass:.17g}")
@@ -239,9 +241,8 @@ def _inertial(link: Element, mass: float, com: Floats) -> None:
 
 
 def _limit(joint: Element, arm: Arm, k: int) -> None:
-    """Add limits; an unknown torque is 0, as `arm_from_urdf` reads it."""
-    known: Iterator[float] = (float(x[k]) for x in (arm.q_min, arm.q_max, arm.torque_max))
-    low, high, torque = known
+    """Add limits; 0 for an unknown torque, as `arm_from_urdf` reads it."""
+    low, high, torque = (float(x[k]) for x in (arm.q_min, arm.q_max, arm.torque_max))
     SubElement(
         joint,
         "limit",

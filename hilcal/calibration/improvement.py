@@ -1,20 +1,20 @@
-"""How far the tool was off before and after the correction, as the tracker has measured it.
+"""Position errors of the tool before and after the correction, as the tracker measured them.
 
-The error of a point is how far the tool was from where it was asked to be, by a reading y:
+The error of a point is the distance of the tool from its target position, by a reading y:
 
     e = (y − ŷ(x)) + p̂(x) − p_wanted
 
-x the state of the reading as recorded, ŷ the reading that the fitted model predicts in it, p̂ the
-tool's position by the same model, all in the tracker's axes. With a model that knows nothing of
-the instruments but the registration T, e = y − T p_wanted; what it knows of their drift and their
-scale is taken off.
+x is the recorded state of the reading, ŷ the reading that the fitted model predicts for x, p̂ the
+tool's position by the same model, all in the tracker's axes. For a model whose only part of the
+instruments is the registration T, e = y − T p_wanted; otherwise modelled drift and scale of the
+instruments are subtracted.
 
 Where deflections were fitted, y is a loaded reading minus the unloaded one of the same point, and
-p_wanted where the unloaded arm is: e is then the distance from the measured unloaded position.
+p_wanted is the position of the unloaded arm: e is then relative to the measured unloaded position.
 
-At corrected joint values p̂(x) = p_wanted as far as x is the state that was expected, and e is the
-prediction error of a reading that nobody has fitted: its covariance is that of the prediction, the
-tracker's noise and the arm's repeatability included.
+At corrected joint values p̂(x) = p_wanted if x is the expected state, and e is the prediction error
+of a reading that was not fitted: its covariance is that of the prediction, with the tracker's noise
+and the arm's repeatability.
 """
 
 from collections.abc import Sequence
@@ -43,10 +43,10 @@ class Improved:
         after: at the corrected ones.
         noise_m: root mean square error that the tracker's noise and the arm's repeatability alone
             would leave.
-        band_m: the largest distance within which `BAND` of the errors were predicted to be.
-        inside: how many of the points are within theirs.
-        removed: share of what exceeds the noise that the correction took away,
-            1 − x_after/x_before with x² = rms² − noise²; None where nothing exceeded it.
+        band_m: the largest predicted radius that holds `BAND` of the errors.
+        inside: number of points whose error is within their radius.
+        removed: share of the error beyond the noise that the correction removed,
+            1 − x_after/x_before with x² = rms² − noise²; None if x_before is zero.
     """
 
     name: str
@@ -64,11 +64,11 @@ class Improvement:
     """Errors of N points before and after the correction, as measured."""
 
     mode: Mode  # kind of readings of the model
-    poses: tuple[str, ...]  # their names
-    loads: tuple[str, ...]  # name of each one's load
-    before_m: Floats  # (N,) distance from where the tool was asked to be
+    poses: tuple[str, ...]  # (N,) names
+    loads: tuple[str, ...]  # (N,) names of their loads
+    before_m: Floats  # (N,) distance from the target position
     after_m: Floats  # (N,) the same at the corrected joint values
-    band_m: Floats  # (N,) distance within which `BAND` of such readings were predicted to be
+    band_m: Floats  # (N,) predicted radius that holds `BAND` of such errors
     noise_m: Floats
     """(N,) root mean square distance by the tracker's noise and the arm's repeatability."""
     left_out: tuple[tuple[str, str], ...] = ()
@@ -82,30 +82,30 @@ class Improvement:
     @property
     def by_load(self) -> tuple[Improved, ...]:
         """The points of each load."""
-        of = np.array(self.loads)
-        return tuple(self._part(name, of == name) for name in dict.fromkeys(self.loads))
+        loads = np.array(self.loads)
+        return tuple(self._part(name, loads == name) for name in dict.fromkeys(self.loads))
 
     def over(self, limit_m: float) -> int:
-        """Return how many points are farther off than a limit after the correction."""
+        """Return the number of points whose error exceeds a limit after the correction."""
         return int(np.sum(self.after_m > limit_m))
 
-    def _part(self, name: str, mine: Bools) -> Improved:
-        before, after = ErrorSize.of(self.before_m[mine]), ErrorSize.of(self.after_m[mine])
-        noise = float(np.sqrt(np.mean(self.noise_m[mine] ** 2)))
+    def _part(self, name: str, part: Bools) -> Improved:
+        before, after = ErrorSize.of(self.before_m[part]), ErrorSize.of(self.after_m[part])
+        noise = float(np.sqrt(np.mean(self.noise_m[part] ** 2)))
         first, last = (np.sqrt(max(s.rms_m**2 - noise**2, 0.0)) for s in (before, after))
         return Improved(
             name=name,
-            count=int(mine.sum()),
+            count=int(part.sum()),
             before=before,
             after=after,
             noise_m=noise,
-            band_m=float(self.band_m[mine].max()),
-            inside=int(np.sum(self.after_m[mine] <= self.band_m[mine])),
+            band_m=float(self.band_m[part].max()),
+            inside=int(np.sum(self.after_m[part] <= self.band_m[part])),
             removed=float(1.0 - last / first) if first > 0 else None,
         )
 
     def to_dict(self) -> dict[str, object]:
-        """Return it as JSON, SI."""
+        """Return the improvement as JSON, SI."""
         numbers = (x.tolist() for x in (self.before_m, self.after_m, self.band_m))
         rows = zip(self.poses, self.loads, *numbers, strict=True)
         return {
@@ -132,13 +132,12 @@ def improvement(
     """Compare readings of the same points at uncorrected and at corrected joint values.
 
     Both have the same poses in the same order, for deflections with the unloaded readings of the
-    points. `goal` are states of `before` at which the nominal arm has the tool where it was asked
-    to be; not used for deflections.
+    points. `goal` are states of `before` at which the nominal arm has the tool at its target; not
+    used for deflections.
     """
     first, _, _ = _errors(calibration, p, before, goal)
     last, covariance, noise = _errors(calibration, p, after, goal)
-    w = whitening(after, calibration.mode, "gc")
-    rows = w.reading
+    rows = whitening(after, calibration.mode, "gc").reading
     return Improvement(
         mode=calibration.mode,
         poses=tuple(after.pose_names[k] for k in after.pose[rows]),
@@ -154,16 +153,16 @@ def improvement(
 def _errors(
     calibration: Calibration, p: Predictive, readings: Readings, goal: States
 ) -> tuple[Floats, Floats, Floats]:
-    """Errors (D, 3), the covariances (D, m, m) predicted for them, and those of the noise."""
+    """Errors (D, 3), their predicted covariances (D, m, m), and those of the noise."""
     model, theta = calibration.model, calibration.theta
     w = whitening(readings, calibration.mode, "gc")
     prediction = model.predict(readings.states, theta)
     raw = residual(readings, prediction, w)[:, :3]
-    of = tool_of(model, theta, None)
-    position = tool_poses(of, prediction)[1]
-    wanted = 0.0 * position
+    tool = tool_of(model, theta, None)
+    position = tool_poses(tool, prediction)[1]
+    target = 0.0 * position
     if calibration.mode == "absolute":
-        wanted = calibration.nominal(of, replace(goal, target=None))[1]
-    moved = (position - wanted) @ calibration.base_in_tracker()[:3, :3].T
+        target = calibration.nominal(tool, replace(goal, target=None))[1]
+    offset = (position - target) @ calibration.base_in_tracker()[:3, :3].T
     total = p.of_reading(prediction, w)
-    return raw + w.raw(moved), total, w.covariance
+    return raw + w.raw(offset), total, w.covariance

@@ -1,14 +1,14 @@
 """One point at a time, compiled: the deviated chain at equilibrium, and its inverse.
 
-The same equations as `robot.chain`, `robot.statics` and `compensation`, for models whose effects
-`compiled` could bring into the form
+The equations of `robot.chain`, `robot.statics` and `compensation`, for models whose effects
+`compiled` could convert to the form
 
     dq_j = a_j + T_j(q_j) + Σ_i L_ji q_i + c_j · w_j + (s_j + P_j(q_j)) τ_j + G_j(τ_j)
     ξ_k = b_k + Q_k q + C_k w_k
 
-w_k the wrench through slot k, τ_j the torque about joint j; a, b and s may differ from point to
-point. Chain, wrenches and Newton step are iterated together: each is about
-10³ times closer after every round. Machine code is made by numba when a process first needs it.
+w_k is the wrench through slot k, τ_j the torque about joint j; a, b and s may differ from point to
+point. Chain, wrenches and Newton step are iterated together: every round reduces their errors about
+10³ times. numba makes machine code when a process first needs it.
 """
 
 import math
@@ -31,21 +31,21 @@ SETTLED = 1e-12
 def _interpolate(x: float, low: float, step: float, value: Floats, slope: Floats) -> float:
     """Cubic Hermite interpolation in a table with equal steps; linear outside."""
     last = len(value) - 1
-    at = (x - low) / step
-    k = math.floor(at)
+    position = (x - low) / step
+    k = math.floor(position)
     if k < 0:
         return float(value[0] + (x - low) * slope[0])
     if k >= last:
         return float(value[last] + (x - low - last * step) * slope[last])
-    t = at - k
+    t = position - k
     u = 1.0 - t
-    begin = value[k] * u * u * (1.0 + 2.0 * t) + value[k + 1] * t * t * (3.0 - 2.0 * t)
-    return float(begin + step * t * u * (slope[k] * u - slope[k + 1] * t))
+    ends = value[k] * u * u * (1.0 + 2.0 * t) + value[k + 1] * t * t * (3.0 - 2.0 * t)
+    return float(ends + step * t * u * (slope[k] * u - slope[k + 1] * t))
 
 
 @njit(cache=True)
 def _product(a: Floats, b: Floats, out: Floats) -> None:
-    """Write a b, (3, 3) each; `out` is none of both."""
+    """Write a b, (3, 3) each; `out` is another array."""
     for i in range(3):
         for j in range(3):
             out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
@@ -93,36 +93,36 @@ def _chain(
     """Write frames of the slots, axes of the bodies and their centres of mass."""
     (link_r, link_p, coms), (rotation, position, body, com) = arm, frames
     n = len(q)
-    step_r, start, before = scratch[0], scratch[1], scratch[2]
+    step_r, frame, previous = scratch[0], scratch[1], scratch[2]
     step_p = scratch[3, 0]
     for i in range(3):
         for j in range(3):
-            before[i, j] = 1.0 if i == j else 0.0
+            previous[i, j] = 1.0 if i == j else 0.0
     for k in range(n + 1):
         p = position[k]
         for i in range(3):
             p[i] = 0.0 if k == 0 else position[k - 1, i]
-        _add_turned(before, link_p[k], p)
+        _add_turned(previous, link_p[k], p)
         moved = False
         for i in range(6):
             moved = moved or twist[k, i] != 0.0
         if moved:
-            _product(before, link_r[k], start)
+            _product(previous, link_r[k], frame)
             _exp(twist[k], step_r, step_p)
-            _add_turned(start, step_p, p)
-            _product(start, step_r, rotation[k])
+            _add_turned(frame, step_p, p)
+            _product(frame, step_r, rotation[k])
         else:
-            _product(before, link_r[k], rotation[k])
+            _product(previous, link_r[k], rotation[k])
         if k < n:
             angle = q[k] + dq[k]
             co, si = math.cos(angle), math.sin(angle)
-            r, before = rotation[k], body[k]
+            r, previous = rotation[k], body[k]
             for i in range(3):
-                before[i, 0] = r[i, 0] * co + r[i, 1] * si
-                before[i, 1] = r[i, 1] * co - r[i, 0] * si
-                before[i, 2] = r[i, 2]
+                previous[i, 0] = r[i, 0] * co + r[i, 1] * si
+                previous[i, 1] = r[i, 1] * co - r[i, 0] * si
+                previous[i, 2] = r[i, 2]
                 com[k, i] = p[i]
-            _add_turned(before, coms[k], com[k])
+            _add_turned(previous, coms[k], com[k])
 
 
 @njit(cache=True)
@@ -131,16 +131,16 @@ def _add_sensed(
 ) -> None:
     """Add R (bias + gain Rᵀ w) to force and moment, R the flange's orientation."""
     for k in range(6):
-        here = bias[k]
+        error = bias[k]
         for j in range(6):
             block = 3 * (j // 3)
             for i in range(3):
-                here += gain[k, j] * r[i, j - block] * applied[block + i]
+                error += gain[k, j] * r[i, j - block] * applied[block + i]
         for i in range(3):
             if k < 3:
-                f[i] += r[i, k] * here
+                f[i] += r[i, k] * error
             else:
-                t[i] += r[i, k - 3] * here
+                t[i] += r[i, k - 3] * error
 
 
 @njit(cache=True)
@@ -186,20 +186,20 @@ def _wrenches(load: Any, applied: Floats, frames: Arrays, out: Floats, scratch: 
 def _deviations(
     laws: Arrays,
     tables: Any,
-    own: tuple[Floats, Floats, Floats],
+    by_point: tuple[Floats, Floats, Floats],
     q: Floats,
     wrench: Floats,
     dq: Floats,
     twist: Floats,
 ) -> float:
-    """Write the deviations; returns their largest change."""
+    """Write the deviations; return their largest change."""
     a, linear, by_wrench, b, compliance, by_values = laws
-    own_dq, own_twist, own_soft = own
+    point_dq, point_twist, point_soft = by_point
     angle_low, angle_step, torque_low, torque_step = tables[0]
     by_angle, angle_slopes, by_torque, torque_slopes, soft, soft_slopes = tables[1]
     n, change = len(q), 0.0
     for j in range(n):
-        new = a[j] + own_dq[j] + own_soft[j] * wrench[j, 5]
+        new = a[j] + point_dq[j] + point_soft[j] * wrench[j, 5]
         for i in range(n):
             new += linear[j, i] * q[i]
         for e in range(6):
@@ -207,8 +207,8 @@ def _deviations(
         if len(by_angle) > 0:
             new += _interpolate(q[j], angle_low, angle_step, by_angle[j], angle_slopes[j])
         if len(soft) > 0:
-            here = _interpolate(q[j], angle_low, angle_step, soft[j], soft_slopes[j])
-            new += here * wrench[j, 5]
+            joint_compliance = _interpolate(q[j], angle_low, angle_step, soft[j], soft_slopes[j])
+            new += joint_compliance * wrench[j, 5]
         if len(by_torque) > 0:
             new += _interpolate(
                 wrench[j, 5], torque_low[j], torque_step[j], by_torque[j], torque_slopes[j]
@@ -217,7 +217,7 @@ def _deviations(
         dq[j] = new
     for k in range(n + 1):
         for e in range(6):
-            new = b[k, e] + own_twist[k, e]
+            new = b[k, e] + point_twist[k, e]
             if len(by_values) > 0:
                 for i in range(n):
                     new += by_values[k, e, i] * q[i]
@@ -256,15 +256,15 @@ def _solve(matrix: Floats, right: Floats) -> bool:
 
 
 @njit(cache=True)
-def _turn(wanted: Floats, r: Floats, out: Floats) -> float:
-    """Write the rotation vector of wanted rᵀ, for angles below π; returns its length."""
+def _turn(target: Floats, r: Floats, out: Floats) -> float:
+    """Write the rotation vector of target rᵀ, for angles below π; return its length."""
     trace = 0.0
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
         out[i] = 0.0
         for c in range(3):
-            trace += wanted[i, c] * r[i, c]
-            out[i] += 0.5 * (wanted[k, c] * r[j, c] - wanted[j, c] * r[k, c])
+            trace += target[i, c] * r[i, c]
+            out[i] += 0.5 * (target[k, c] * r[j, c] - target[j, c] * r[k, c])
     s = math.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2])
     if s < 1e-9:
         return s
@@ -280,7 +280,7 @@ def invert_all(
     load: Any,
     laws: Arrays,
     tables: Any,
-    own: tuple[Floats, Floats, Floats],
+    by_point: tuple[Floats, Floats, Floats],
     tool: Floats,
     reach: float,
     most_turn: float,
@@ -291,42 +291,44 @@ def invert_all(
     positions: Floats,
     newton: bool,
     out_q: Floats,
-    left: Floats,
+    residual: Floats,
 ) -> None:
     """Invert N points; without `newton` write the poses at q into `rotations` and `positions`.
 
     Args:
         tool: (4, 4) T_flange_tool.
-        q: (N, n) joint values to begin with, rad.
+        by_point: displacements (N, n), twists (N, n + 1, 6) and compliances (N, n) of the points;
+            one row where all points have the same.
+        q: (N, n) joint values to start from, rad.
         applied: (N, 6) wrenches at the load point, base axes.
-        rotations: (N, 3, 3) wanted orientations.
-        positions: (N, 3) wanted positions, m.
-        out_q: (N, n) joint values found.
-        left: (N, 2) residuals, m and rad.
+        rotations: (N, 3, 3) target orientations.
+        positions: (N, 3) target positions, m.
+        out_q: (N, n) solved joint values.
+        residual: (N, 2) m and rad.
     """
     count, n = q.shape
     rotation, position = np.empty((n + 1, 3, 3)), np.empty((n + 1, 3))
     frames = rotation, position, np.empty((n, 3, 3)), np.empty((n, 3))
     wrench, dq, twist = np.empty((n + 1, 6)), np.empty(n), np.empty((n + 1, 6))
-    jacobian, e, at = np.empty((n, n)), np.empty(n), np.empty(n)
+    jacobian, e, joints = np.empty((n, n)), np.empty(n), np.empty(n)
     scratch, r = np.empty((4, 3, 3)), np.empty((3, 3))
     p, lever, column = np.empty(3), np.empty(3), np.empty(3)
     for point in range(count):
-        at[:] = q[point]
-        mine = (
-            own[0][min(point, len(own[0]) - 1)],
-            own[1][min(point, len(own[1]) - 1)],
-            own[2][min(point, len(own[2]) - 1)],
+        joints[:] = q[point]
+        at_point = (
+            by_point[0][min(point, len(by_point[0]) - 1)],
+            by_point[1][min(point, len(by_point[1]) - 1)],
+            by_point[2][min(point, len(by_point[2]) - 1)],
         )
         dq[:] = 0.0
         twist[:] = 0.0
         for _ in range(ROUNDS):
-            _chain(arm, dq, twist, at, frames, scratch)
+            _chain(arm, dq, twist, joints, frames, scratch)
             _product(rotation[n], tool[:3, :3], r)
             p[:] = position[n]
             _add_turned(rotation[n], tool[:3, 3], p)
             _wrenches(load, applied[point], frames, wrench, scratch)
-            change = _deviations(laws, tables, mine, at, wrench, dq, twist)
+            change = _deviations(laws, tables, at_point, joints, wrench, dq, twist)
             if not newton:
                 rotations[point] = r
                 positions[point] = p
@@ -338,9 +340,9 @@ def invert_all(
                 e[i] = positions[point, i] - p[i]
                 far += e[i] * e[i]
                 e[i] /= reach
-            left[point, 0] = math.sqrt(far)
-            left[point, 1] = _turn(rotations[point], r, e[3:])
-            if change < SETTLED and max(left[point, 0], left[point, 1]) < tolerance:
+            residual[point, 0] = math.sqrt(far)
+            residual[point, 1] = _turn(rotations[point], r, e[3:])
+            if change < SETTLED and max(residual[point, 0], residual[point, 1]) < tolerance:
                 break
             for j in range(n):
                 for i in range(3):
@@ -354,7 +356,7 @@ def invert_all(
             longest = 0.0
             for j in range(n):
                 longest = max(longest, abs(e[j]))
-            part = min(1.0, most_turn / max(longest, 1e-300))
+            share = min(1.0, most_turn / max(longest, 1e-300))
             for j in range(n):
-                at[j] += part * e[j]
-        out_q[point] = at
+                joints[j] += share * e[j]
+        out_q[point] = joints

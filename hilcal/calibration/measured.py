@@ -1,15 +1,15 @@
-"""What a calibration was measured at, which points lie outside of it, and what they leave untold.
+"""The measured ranges of a calibration, points outside of them, and means of missing columns.
 
-A table of points or a program seldom has them. A quantity x that an effect of the model needs is
-then taken as it was on the whole while measuring, x̄, and what it moves there counts as a variance
-of each axis of the tool's position p:
+A table of points or a program seldom states temperatures, times or sides of approach. Where an
+effect of the model needs such a quantity x, its mean x̄ while measuring is used. The motion of the
+tool by x − x̄ at measured states then counts as a variance of each axis of the tool's position p:
 
     v = mean over measured states of (|p(x) − p(x̄)|² + |(J(x) − J(x̄)) R|²) / 3
 
-J the derivative of p by the parameters, R Rᵀ their covariance.
+J is the derivative of p by the parameters, R Rᵀ their covariance.
 
-The force sensor stands between flange and tool. With R its axes and p its origin in base axes, r
-the load point, and (f, M) what the load adds to its reading, sensor axes:
+The force sensor is mounted between flange and tool. With R its axes and p its origin in base axes,
+r the load point, and (f, M) the change of its reading by the load, sensor axes:
 
     force = R f,   moment = R M − (r − p) × R f
 """
@@ -41,60 +41,60 @@ from hilcal.types import Bools, Floats
 
 @dataclass(frozen=True, slots=True)
 class Outside:
-    """Points outside of what was measured."""
+    """Points outside of a measured range."""
 
-    of: Range  # the range that they leave; for the uncertainty, its limit, m
-    points: Bools  # (N,) which points
-    values: Floats  # (N,) their values
+    of: Range  # the range; for the uncertainty, its limit, m
+    points: Bools  # (N,) points outside
+    values: Floats  # (N,) values of all points
 
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """Where the fitted readings lie."""
+    """Ranges of the fitted readings."""
 
     ranges: tuple[Range, ...]  # of joint angles, force, moment, temperatures
     most_std_m: float
-    """Standard deviation of a prediction, by the parameters alone, from which on a point is far
-    from all fitted ones; see `extrapolation`. For the tracked target."""
+    """Standard deviation of the tracked target's predicted position, by the parameters alone, above
+    which a point is far from all fitted ones."""
 
     @classmethod
     def of(cls, states: States, p: Predictive, noise: Floats, units: Sequence[str]) -> "Measured":
-        """Return where fitted states lie.
+        """Return the ranges of fitted states.
 
         Args:
-            noise: (D,) trace of the position's covariance of each measurement, by noise and misfit,
+            noise: (D,) trace of the position covariance of each measurement by noise and misfit,
                 m².
-            units: (n,) of the joints' values.
+            units: (n,) units of the joint values.
         """
         spread = noise * p.leverage / (1 - p.leverage)
         return cls(ranges_of(states, units), float(np.sqrt(FAR * np.quantile(spread, 0.99))))
 
     def middle(self, n: int) -> Floats:
-        """(n,) joint values in the middle of what was measured, rad or m; zero where unknown."""
-        known = {r.variable: 0.5 * (r.low + r.high) for r in self.ranges}
-        names = (travel_name(j) if travel_name(j) in known else angle_name(j) for j in range(n))
-        return np.array([known.get(name, 0.0) for name in names])
+        """(n,) joint values in the middle of their ranges, rad or m; zero where unknown."""
+        middles = {r.variable: 0.5 * (r.low + r.high) for r in self.ranges}
+        names = (travel_name(j) if travel_name(j) in middles else angle_name(j) for j in range(n))
+        return np.array([middles.get(name, 0.0) for name in names])
 
     def outside(self, states: States, std_m: Floats | None, turns: Bools) -> list[Outside]:
-        """Return what points leave, by variable.
+        """Return the variables whose ranges points leave.
 
-        `std_m` (N,) are the standard deviations of the predictions, None where they are not known;
-        `turns` (n,) joints that are the same whole turns on.
+        `std_m` (N,) are the standard deviations of the predictions, None if unknown; `turns` (n,)
+        are joints whose values are equivalent modulo whole turns.
         """
-        known, turning = {r.variable: r for r in self.ranges}, turning_variables(turns)
-        units = ["m" if travel_name(j) in known else "rad" for j in range(states.q.shape[1])]
-        found = [
-            Outside(known[name], known[name].beyond(values, turning=name in turning), values)
+        ranges, turning = {r.variable: r for r in self.ranges}, turning_variables(turns)
+        units = ["m" if travel_name(j) in ranges else "rad" for j in range(states.q.shape[1])]
+        outside = [
+            Outside(ranges[name], ranges[name].beyond(values, turning=name in turning), values)
             for name, _, values in variables(states, units)
-            if name in known
+            if name in ranges
         ]
         if std_m is not None:
             limit = Range("standard deviation of the position", "m", 0.0, self.most_std_m)
-            found.append(Outside(limit, std_m > self.most_std_m, std_m))
-        return [o for o in found if o.points.any()]
+            outside.append(Outside(limit, std_m > self.most_std_m, std_m))
+        return [o for o in outside if o.points.any()]
 
     def turned_on(self, states: States) -> list[Outside]:
-        """Return what points leave in joint angles that are counted without whole turns."""
+        """Return the joint angles outside of their ranges if whole turns count as different."""
         none = np.zeros(states.q.shape[1], dtype=np.bool_)
         return [o for o in self.outside(states, None, none) if o.of.unit == "rad"]
 
@@ -106,21 +106,21 @@ WORDS = {
     "joint_temperature": "joint temperatures",
     "approach": "sides of approach",
 }
-"""Columns of `States` that a calibration knows a mean of, as people call them."""
+"""Columns of `States` whose mean a calibration may know, with their names for people."""
 MOST = 200
-"""Measured states that are looked at, evenly spread; a choice."""
+"""Measured states at which variances are computed, evenly spread; a choice."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Condition:
-    """A quantity on the whole while measuring."""
+    """Mean of a quantity while measuring, and variance of the position about it."""
 
     mean: Floats  # x̄: a number, or (n,)
     variance_m2: float  # v, m²
 
 
 def needed(model: Model, states: States) -> tuple[str, ...]:
-    """Columns that effects of a model need and states do not have, in the order of `WORDS`."""
+    """Columns that effects of a model need and states lack, in the order of `WORDS`."""
     needs = {n for e in model.effects if not e.computable(states) for n in e.needs}
     columns = {column for need in needs for column in need.split(" or ")}
     return tuple(c for c in WORDS if c in columns and getattr(states, c) is None)
@@ -131,31 +131,31 @@ def conditions_of(
 ) -> dict[str, Condition]:
     """Return the conditions that effects of a model need, by column."""
     names = needed(model, States(states.q, states.wrench))
-    some = states[:: -(-len(states) // MOST)]
-    own = moves(some) if names else None
+    sample = states[:: -(-len(states) // MOST)]
+    reference = moves(sample) if names else None
     out = {}
     for name in names:
         column = getattr(states, name)
-        if column is None or own is None:
+        if column is None or reference is None:
             continue
         mean = column.mean(axis=0)
-        usual: dict[str, Any] = {name: np.broadcast_to(mean, getattr(some, name).shape).copy()}
-        position, spread = moves(replace(some, **usual))
-        moved = np.sum((own[0] - position) ** 2) + np.sum((own[1] - spread) ** 2)
-        out[name] = Condition(np.asarray(mean), float(moved) / (3 * len(some)))
+        constant: dict[str, Any] = {name: np.broadcast_to(mean, getattr(sample, name).shape).copy()}
+        position, spread = moves(replace(sample, **constant))
+        moved = np.sum((reference[0] - position) ** 2) + np.sum((reference[1] - spread) ** 2)
+        out[name] = Condition(np.asarray(mean), float(moved) / (3 * len(sample)))
     return out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorMount:
-    """Where the force sensor stands."""
+    """Pose of the force sensor."""
 
     origin_m: Floats  # (3,) its origin, flange axes, m
     rotvec_rad: Floats  # (3,) its axes in flange axes, a rotation vector, rad
 
     @classmethod
     def of(cls, cell: Cell) -> Self | None:
-        """Return where the sensor of a cell stands; None where it has none."""
+        """Return the pose of a cell's sensor; None without a sensor."""
         sensor = None if cell.config is None else cell.config.force_sensor
         if sensor is None:
             return None
@@ -164,8 +164,8 @@ class SensorMount:
     def load_wrench(self, cell: Cell, q: Floats, reading: Floats) -> Floats:
         """Return force and moment (N, 6) of the load at the load point, base axes, N and N·m.
 
-        At q (N, n), rad, it adds `reading` (N, 6) to the sensor's reading, sensor axes; the arm is
-        the nominal one.
+        `reading` (N, 6) is the change of the sensor's reading by the load at q (N, n), rad, sensor
+        axes. The arm is the nominal one.
         """
         chain = evaluate(cell.arm, q)
         axes = se3.product(chain.rotation[-1], se3.rotation(self.rotvec_rad))

@@ -1,19 +1,19 @@
-"""Points to put the tool at, as a table states them.
+"""Target points for the tool, read from a table.
 
-One row per point, with a header; kind of file, separator and decimal mark are what `import` takes.
-A table of readings, of the exchange format or by a mapping, is a table of points too: what is not
-listed here (covariances, cycles, actual joints, columns `x_…`) is passed over. Where no column has
-a name of ours, a mapping is guessed as `import --preview` does, and taken where nothing in it is
-unsure.
+The table has one row per point and a header; kind of file, separator and decimal mark may be those
+that `import` reads. A table of readings, of the exchange format or by a mapping, is a table of
+points, too: columns that are not listed here (covariances, cycles, actual joints, `x_…`) are
+ignored. Where no column has a name of this list or of the exchange format, a mapping is guessed as
+by `import --preview`, and used if nothing in it is unsure.
 
-- `pose`: its name; numbered without.
-- `q1_rad` … or `q1_deg` …: joint values, of slides `q1_m` or `q1_mm`. Alone, the point is where
-  the nominal arm has the tool there; together with a position they say on which branch.
+- `pose`: name of the point; points without names are numbered.
+- `q1_rad` … or `q1_deg` …: joint values, of slides `q1_m` or `q1_mm`. Alone, they state the target
+  as the pose of the tool on the nominal arm; together with a position they select the branch.
 - `x_m`, `y_m`, `z_m` (or `x_mm` …) and `rx_rad`, `ry_rad`, `rz_rad` (or `rx_deg` …), a rotation
-  vector: the pose of the tool in base axes. A position alone, beside joint values, has the
-  orientation that the nominal arm has there.
+  vector: the pose of the tool in base axes. A position with joint values and without a rotation has
+  the orientation of the nominal arm.
 - `load`: the name of a load, or `fx_N` … `mz_Nm`: force and moment at the load point, base axes, or
-  `sensor_fx_N` … `sensor_mz_Nm`: the force sensor's reading with the load less that without it, at
+  `sensor_fx_N` … `sensor_mz_Nm`: the force sensor's reading with the load minus the one without, at
   this point, sensor axes.
 - `air_degC`, `joint1_degC` …, `load_time_s`, `time_s`, `approach1` …: where the model needs them.
 """
@@ -55,15 +55,15 @@ NO_LOAD = "none"
 
 
 NEAR = 0.5
-"""rad; a solution as near as this to where it was sought is taken for the nearest. A choice."""
+"""rad; a solution within this distance of the start counts as the nearest. A choice."""
 STARTS = 300
-"""Joint values from which all branches are sought; a choice: an arm of six joints has up to 16."""
+"""Random starts to find all branches from; a choice: an arm of six joints has up to 16."""
 BEYOND = 1e3
-"""rad; what a solution beyond the joints' limits counts farther than any within."""
+"""rad; added to the distance of a solution beyond the joints' limits."""
 LEAST_REACH, LONGEST_TOOL = 0.05, 0.5
-"""Share of the arm's reach, and m beyond it, between which the farthest point is; choices."""
+"""Least distance of the farthest point over the reach, and largest beyond it, m; choices."""
 LARGEST = 4.0 * np.pi
-"""rad; a choice, twice what the joints of most arms turn: degrees in a column of rad are beyond."""
+"""rad; a choice, twice the range of most joints: larger values in a column of rad are degrees."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,16 +71,15 @@ class Points:
     """N points."""
 
     names: tuple[str, ...]
-    q: Floats  # (N, n) joint values, rad; rows of NaN where only a pose is given
+    q: Floats  # (N, n) joint values, rad; rows of NaN where only a pose is stated
     wanted: Floats | None = None
-    """(N, 4, 4) T_base_tool, NaN where the joint values say where to go; None for all."""
+    """(N, 4, 4) T_base_tool, NaN where joint values state the target; None if they do for all."""
     wrench: Floats | None = None
-    """(N, 6) force and moment at the load point, base axes; None where none are given."""
+    """(N, 6) force and moment at the load point, base axes; None if not stated."""
     sensed: Floats | None = None
-    """(N, 6) what the load adds to the force sensor's reading, sensor axes; None where it is not
-    given."""
+    """(N, 6) change of the force sensor's reading by the load, sensor axes; None if not stated."""
     recorded: Mapping[str, Floats] = field(default_factory=dict)  # other columns of `States`
-    taken: str = ""  # which columns were taken for what, where their names are not ours
+    taken: str = ""  # meaning of guessed columns, for people
 
 
 class _OtherNamesError(InputError):
@@ -90,46 +89,46 @@ class _OtherNamesError(InputError):
 def read_points(
     path: Path, arm: Arm, loads: Mapping[str, Floats], mapping: PointMapping | None = None
 ) -> Points:
-    """Read a table of points; `loads` are wrenches (6,) by the name of the load."""
-    table, taken = (None, "") if mapping is not None else _plain(path, arm)
+    """Read a table of points; `loads` are wrenches (6,) by name of the load."""
+    table, guess = (None, "") if mapping is not None else _plain(path, arm)
     if table is None:
         if mapping is None:
-            mapping, taken = _guessed(path, arm)
+            mapping, guess = _guessed(path, arm)
         table = _mapped(path, arm, mapping)
     groups = _groups(arm)
-    there = [group for group in groups if group[1][0] in table.number]
-    found = {what: table.matrix(names) * factor for what, names, factor in there}
-    q = found.pop("q", None)
+    present = [group for group in groups if group[1][0] in table.number]
+    columns = {quantity: table.matrix(names) * factor for quantity, names, factor in present}
+    q = columns.pop("q", None)
     if q is not None and np.any(large := (np.abs(q) > LARGEST) & ~arm.slides):
         k = int(np.argmax(np.any(large, axis=1)))
         raise InputError(
             f"{table.at(k)}: a joint at {np.abs(q[k]).max():.4g} rad; columns q1_rad … are in rad, "
             "q1_deg … in degrees"
         )
-    named = table.text.get("pose")
-    names = tuple(named) if named else tuple(str(k + 1) for k in range(len(table.rows)))
-    wrench, sensed = found.pop("wrench", None), found.pop("sensed", None)
+    pose_names = table.text.get("pose")
+    names = tuple(pose_names) if pose_names else tuple(str(k + 1) for k in range(len(table.rows)))
+    wrench, sensed = columns.pop("wrench", None), columns.pop("sensed", None)
     if "load" in table.text:
         wrench = np.stack([_load(table, k, loads) for k in range(len(table.rows))])
-    wanted = _poses(found, q, arm)
-    if q is None and wanted is None:
+    poses = _poses(columns, q, arm)
+    if q is None and poses is None:
         raise InputError(
             f"{path}: neither joint values nor poses; valid: columns {groups[0][1][0]} … "
             f"{groups[0][1][-1]}, or x_m, y_m, z_m with rx_rad, ry_rad, rz_rad"
         )
     if q is None:
         q = np.full((len(names), arm.n), np.nan)
-    recorded = {k: v if v.shape[1] > 1 else v[:, 0] for k, v in found.items()}
-    return Points(names, q, wanted, wrench, sensed, recorded, taken)
+    recorded = {k: v if v.shape[1] > 1 else v[:, 0] for k, v in columns.items()}
+    return Points(names, q, poses, wrench, sensed, recorded, guess)
 
 
 def _plain(path: Path, arm: Arm) -> tuple[ColumnTable | None, str]:
-    """Return a table whose columns are called as above; None where none of them is."""
+    """Return a table with the columns listed above; None if it has none of them."""
     groups = _groups(arm)
     chosen: list[Sequence[str]] = []
 
-    def check(given: Sequence[str]) -> None:
-        chosen.extend(_checked(path, given, groups, arm))
+    def check(header: Sequence[str]) -> None:
+        chosen.extend(_checked(path, header, groups, arm))
 
     try:
         return ColumnTable.of(open_grid(path, _form(path), check), *chosen), ""
@@ -140,86 +139,86 @@ def _plain(path: Path, arm: Arm) -> tuple[ColumnTable | None, str]:
 def on_branch(points: Points, arm: Arm, tool: Floats, near: Floats | None) -> Floats:
     """Return the joint values (N, n) at which the nominal arm has the tool (4, 4) at the points.
 
-    Of all solutions of a pose, that nearest to the joint values that are given with it, else to
-    those of the point before it, of the first one to `near` (n,), rad.
+    Of all solutions of a pose, the one nearest to the point's own joint values is returned; without
+    these the one nearest to the previous point, for the first point to `near` (n,), rad.
     """
     if points.wanted is None:
         return points.q
 
-    found: list[Floats] = []
+    out: list[Floats] = []
     for name, q, goal in zip(points.names, points.q, points.wanted, strict=True):
-        start = q if np.isfinite(q).all() else found[-1] if found else near
+        start = q if np.isfinite(q).all() else out[-1] if out else near
         if start is None:
             raise InputError(
                 f"point {name} is a pose without joint values; give joint columns, or --near with "
                 "the joint values that the first pose is near to"
             )
         if np.isfinite(goal[:3, 3]).all():
-            if not np.isfinite(goal).all():  # turned as the nominal arm has it
+            if not np.isfinite(goal).all():  # orientation of the nominal arm
                 goal = se3.matrix(nominal_pose(arm, tool, start[None])[0][0], goal[:3, 3])
             start = _nearest(arm, tool, name, start, goal)
-        found.append(start)
-    return np.stack(found)
+        out.append(start)
+    return np.stack(out)
 
 
 def solutions(arm: Arm, tool: Floats, near: Floats | None, goal: Floats) -> Floats:
     """Return joint values (K, n) at which the nominal arm has the tool (4, 4) at a pose (4, 4).
 
-    They are sought from `near` (K, n), rad; all over the range of the joints where None.
+    They are searched from `near` (K, n), rad, or from the whole range of the joints if None.
     """
     starts = _everywhere(arm) if near is None else near
-    found = invert_nominal(arm, tool, starts, goal[:3, :3], goal[:3, 3])
-    q = found.q[found.solved]
+    solved = invert_nominal(arm, tool, starts, goal[:3, :3], goal[:3, 3])
+    q = solved.q[solved.solved]
     if near is not None:
         return q
     q = (q + np.pi) % (2 * np.pi) - np.pi
-    kept: list[Floats] = []
-    for one in q:
-        if all(np.abs(np.sin((one - other) / 2)).max() > 1e-6 for other in kept):
-            kept.append(one)
-    return np.array(kept).reshape(-1, arm.n)
+    distinct: list[Floats] = []
+    for solution in q:
+        if all(np.abs(np.sin((solution - previous) / 2)).max() > 1e-6 for previous in distinct):
+            distinct.append(solution)
+    return np.array(distinct).reshape(-1, arm.n)
 
 
 def _everywhere(arm: Arm) -> Floats:
-    """(STARTS, n) joint values all over the range of the joints."""
+    """(STARTS, n) random joint values over the whole range of the joints."""
     low, high = arm.usual_range
     spread = np.random.default_rng(0).random((STARTS, arm.n))
     return arm.complete(low + spread * (high - low))
 
 
 def _nearest(arm: Arm, tool: Floats, name: str, near: Floats, goal: Floats) -> Floats:
-    """Return of all joint values (n,) of a pose those nearest to given ones."""
+    """Return the joint values (n,) of a pose that are nearest to `near` (n,)."""
     starts = near[None]
     for _ in range(2):
         solved = invert_nominal(arm, tool, starts, goal[:3, :3], goal[:3, 3])
         q = solved.q
-        if arm.coupling is None and arm.mimic is None:  # whole turns on it is the same pose
+        if arm.coupling is None and arm.mimic is None:  # whole turns do not change the pose
             q = q + 2 * np.pi * np.round((near - q) / (2 * np.pi)) * ~arm.slides
             q = np.where((q < arm.q_min) | (q > arm.q_max), solved.q, q)
         inside = ((q >= arm.q_min) & (q <= arm.q_max)).all(axis=1)
-        far = np.linalg.norm(q - near, axis=1) + np.where(inside, 0.0, BEYOND)
-        far = np.where(solved.solved, far, np.inf)
-        if far.min() < NEAR:
+        distance = np.linalg.norm(q - near, axis=1) + np.where(inside, 0.0, BEYOND)
+        distance = np.where(solved.solved, distance, np.inf)
+        if distance.min() < NEAR:
             break
         if len(starts) == 1:
             starts = np.concatenate([near[None], _everywhere(arm)])
-    if not np.isfinite(far).any():
+    if not np.isfinite(distance).any():
         k = int(np.argmin(solved.residual_m / arm.reach + solved.residual_rad))
         raise InputError(
             f"point {name}: the nominal arm does not reach it from anywhere; "
             f"{1e3 * solved.residual_m[k]:.3g} mm and "
             f"{np.degrees(solved.residual_rad[k]):.3g} degrees are left"
         )
-    return np.asarray(q[int(np.argmin(far))])
+    return np.asarray(q[int(np.argmin(distance))])
 
 
 def _form(path: Path) -> FileFormat:
-    """Return how a table is written: as plain CSV, or with the separator and mark that it has."""
+    """Return the format of a table: plain CSV, or its separator and decimal mark."""
     try:
         with path.open(encoding="utf-8", errors="replace") as stream:
             header = stream.readline(limits.LINE)
     except OSError:
-        return FileFormat()  # said by who reads it
+        return FileFormat()  # the reader reports it
     if not any(mark in header for mark in (";", "\t", "|")):
         return FileFormat()
     how = sniff(path).how
@@ -227,23 +226,23 @@ def _form(path: Path) -> FileFormat:
 
 
 def _guessed(path: Path, arm: Arm) -> tuple[PointMapping, str]:
-    """Return what the columns of a table seem to hold, and that in words."""
-    of = propose(path, joints=arm.n)
-    found = of.proposal
+    """Return the guessed mapping of a table, and its description for people."""
+    proposed = propose(path, joints=arm.n)
+    proposal = proposed.proposal
     understood = [
         f"{u.what} = {', '.join(u.columns)}" + f" ({u.meaning})" * bool(u.meaning)
-        for u in found.understood
+        for u in proposal.understood
     ]
-    # names of loads are compared with those of the campaign, and poses need none
-    certain = ["pose", "load", *["position"] * _certain_unit(of, arm)]
+    # names of loads are checked against the campaign, and names of poses are arbitrary
+    certain = ["pose", "load", *["position"] * _certain_unit(proposed, arm)]
     doubts = [
-        f"{about}: {'no convention stated' if words == GUESSED else words}"
-        for about, words in found.unsure
+        f"{about}: {'no convention stated' if doubt == GUESSED else doubt}"
+        for about, doubt in proposal.unsure
         if about not in certain
     ]
-    doubts += [f"{name} is not understood" for name, _ in found.unused]
-    if not {"joints", "position"} & found.sections.keys():
-        doubts = found.lacking
+    doubts += [f"{name} is not understood" for name, _ in proposal.unused]
+    if not {"joints", "position"} & proposal.sections.keys():
+        doubts = proposal.lacking
     if doubts:
         raise InputError(
             f"{path}: its columns are not those of a table of points, and cannot be guessed: "
@@ -252,23 +251,23 @@ def _guessed(path: Path, arm: Arm) -> tuple[PointMapping, str]:
             f"q1_rad … q{arm.n}_rad or q1_deg …, x_m, y_m, z_m or x_mm …, rx_rad, ry_rad, rz_rad "
             "or rx_deg …"
         )
-    return found.mapping(PointMapping), f"taken, in base axes: {'; '.join(understood)}"
+    return proposal.mapping(PointMapping), f"taken, in base axes: {'; '.join(understood)}"
 
 
-def _certain_unit(of: Proposed, arm: Arm) -> bool:
-    """Whether positions in the guessed unit are where the arm reaches, and in others are not."""
-    section = of.proposal.sections.get("position")
+def _certain_unit(proposed: Proposed, arm: Arm) -> bool:
+    """Whether positions lie within the arm's reach in the guessed unit alone."""
+    section = proposed.proposal.sections.get("position")
     if section is None or section["unit"] not in ("m", "mm"):
         return False
-    position = np.stack([of.grid.numbers(c) for c in section["columns"][:3]], axis=1)
+    position = np.stack([proposed.grid.numbers(c) for c in section["columns"][:3]], axis=1)
     far = float(np.nanmax(np.linalg.norm(position, axis=1))) * LENGTHS[section["unit"]]
     return LEAST_REACH * arm.reach < far < arm.reach + LONGEST_TOOL
 
 
 def _mapped(path: Path, arm: Arm, mapping: PointMapping) -> ColumnTable:
-    """Return a table by its mapping, with the columns of above."""
-    of = mapped_table(path, mapping, arm)
-    table = with_following(of.table, arm)
+    """Return a table by its mapping, with the columns listed above."""
+    mapped = mapped_table(path, mapping, arm)
+    table = with_following(mapped.table, arm)
     text = {"pose": table.text["pose"]}
     if mapping.load is not None:
         text["load"] = table.text["load"]
@@ -280,12 +279,12 @@ _Groups = list[tuple[str, tuple[str, ...], Floats | float]]
 
 
 def _groups(arm: Arm) -> _Groups:
-    """What columns give, their names, and the factor to SI; those of one group come together."""
+    """Groups of columns that come together: their quantity, their names, and the factor to SI."""
     q, n, degree = joint_columns(arm.units), arm.n, np.pi / 180
-    others = tuple(f"{c}m" if c.endswith("_m") else c.replace("_rad", "_deg") for c in q)
+    q_other = tuple(f"{c}m" if c.endswith("_m") else c.replace("_rad", "_deg") for c in q)
     return [
         ("q", q, 1.0),
-        ("q", others, np.where(arm.slides, 1e-3, degree)),
+        ("q", q_other, np.where(arm.slides, 1e-3, degree)),
         ("position", POSITION, 1.0),
         ("position", tuple(name.replace("_m", "_mm") for name in POSITION), 1e-3),
         ("rotation", ROTATION, 1.0),
@@ -303,15 +302,15 @@ def _groups(arm: Arm) -> _Groups:
 def _checked(
     path: Path, header: Sequence[str], groups: _Groups, arm: Arm
 ) -> tuple[Sequence[str], Sequence[str]]:
-    """Check a header; returns its text and its number columns."""
-    known = [name for _, names, _ in groups for name in names]
+    """Check a header; return its text and its number columns."""
+    listed = [name for _, names, _ in groups for name in names]
     exchanged = set(known_columns(arm.units))
-    ours = {*known, *exchanged} - {"pose", "load", "target"}
+    ours = {*listed, *exchanged} - {"pose", "load", "target"}
     for name in header:
-        if name not in (*known, "pose", "load", *exchanged) and not name.startswith(OWN_PREFIX):
+        if name not in (*listed, "pose", "load", *exchanged) and not name.startswith(OWN_PREFIX):
             if not ours & set(header):
                 raise _OtherNamesError(f"{path}: no column of a table of points")
-            valid = ", ".join(("pose", "load", *known))
+            valid = ", ".join(("pose", "load", *listed))
             raise InputError(
                 f"{path}: unknown column '{name}'; valid: {valid}, columns of the exchange table, "
                 "and x_…; other tables: --format MAPPING, as for import"
@@ -319,18 +318,18 @@ def _checked(
         if header.count(name) > 1:
             raise InputError(f"{path}: column '{name}' is there twice")
     first: dict[str, list[str]] = {"hung": ["load"] * ("load" in header)}
-    for what, names, _ in groups:
+    for quantity, names, _ in groups:
         missing = [name for name in names if name not in header]
         if missing and len(missing) < len(names):
             raise InputError(f"{path}: column '{missing[0]}' is missing beside its group")
         if not missing:
-            key = "hung" if what in ("wrench", "sensed") else what
+            key = "hung" if quantity in ("wrench", "sensed") else quantity
             first.setdefault(key, []).append(names[0])
-    for given in first.values():
-        if len(given) > 1:
-            raise InputError(f"{path}: both {given[0]} and {given[1]}; give one of them")
+    for options in first.values():
+        if len(options) > 1:
+            raise InputError(f"{path}: both {options[0]} and {options[1]}; give one of them")
     text = [name for name in ("pose", "load") if name in header]
-    return text, [name for name in header if name in known]
+    return text, [name for name in header if name in listed]
 
 
 def _load(table: ColumnTable, row: int, loads: Mapping[str, Floats]) -> Floats:
@@ -344,9 +343,9 @@ def _load(table: ColumnTable, row: int, loads: Mapping[str, Floats]) -> Floats:
     return loads[name]
 
 
-def _poses(found: dict[str, Floats], q: Floats | None, arm: Arm) -> Floats | None:
-    """(N, 4, 4) poses, taken out of what was found; None where there are none."""
-    position, rotation = found.pop("position", None), found.pop("rotation", None)
+def _poses(columns: dict[str, Floats], q: Floats | None, arm: Arm) -> Floats | None:
+    """Remove position and rotation from `columns`; return poses (N, 4, 4), None if absent."""
+    position, rotation = columns.pop("position", None), columns.pop("rotation", None)
     if position is None and rotation is None:
         return None
     if position is None or (rotation is None and q is None):

@@ -1,9 +1,9 @@
-"""A calibration as one JSON file: everything that predicting and compensating needs.
+"""A calibration as one JSON file with everything that predicting and compensating needs.
 
-The covariance is stored in the smaller of two forms: its factor, as 32-bit floats, each row scaled
-by its parameter's standard deviation; or what it follows from (`learnt`), where that gives the same
-standard deviations at fitted states to `AGREES`, which is tried before it is written. Everything
-else is decimal numbers, exactly.
+The covariance is stored in the smaller of two forms. One is its factor, as 32-bit floats, each row
+scaled by its parameter's standard deviation. The other is the source that it is computed from
+(`learnt`), if that reproduces the standard deviations at fitted states to `AGREES`, which is
+checked before writing. Everything else is decimal numbers, exactly.
 """
 
 import base64
@@ -32,11 +32,11 @@ from hilcal.types import Floats
 
 FORMAT, VERSION = "hilcal-calibration", 2
 BY_FACTOR = 1
-"""Version of a file with the factor of the covariance, which earlier programs read."""
+"""Version of a file with the factor of the covariance, which older programs read."""
 AGREES = 5e-3
-"""Share by which a standard deviation may change where the small form is written; a choice."""
+"""Largest relative change of a standard deviation by the source form; a choice."""
 TRIED = 40
-"""Fitted states at which that is tried."""
+"""Fitted states at which that is checked."""
 _CELL = (
     *("target", "load_point", "tool_mass", "tool_com", "gravity", "registration", "targets"),
     *("target_names", "known_targets", "registration_known", "measured_torques"),
@@ -47,11 +47,11 @@ def to_json(c: Calibration) -> dict[str, object]:
     """Return a calibration as JSON, SI."""
     cell = c.model.cell
     std, small = np.sqrt(np.einsum("pk,pk->p", c.covariance_root, c.covariance_root)), _small(c)
-    known: dict[str, object] = {"learnt": small}
+    covariance: dict[str, object] = {"learnt": small}
     if small is None:
         scaled = c.covariance_root / np.where(std > 0, std, 1.0)[:, None]
         text = base64.b64encode(scaled.astype("<f4").tobytes()).decode("ascii")
-        known = {"covariance_root": text}
+        covariance = {"covariance_root": text}
     observers = [
         {"kind": o.name.kind, "name": o.name.name, "free": o.free, "offset_m": o.offset}
         | {"frame": o.frame}
@@ -69,7 +69,7 @@ def to_json(c: Calibration) -> dict[str, object]:
         "parameters": [f"{e.name}.{p.name}" for e in c.model.effects for p in e.parameters],
         "theta": c.theta,
         "std": std,
-        **known,
+        **covariance,
         "misfit_m2": c.misfit,
         "scatter": {**encode(c.scatter), "known": c.scatter.known},
         "measured": c.measured,
@@ -91,17 +91,17 @@ def from_json(content: Mapping[str, Any], catalogue: Catalogue | None = None) ->
     )
 
 
-def _read(content: Mapping[str, Any], known: Catalogue) -> Calibration:
+def _read(content: Mapping[str, Any], catalogue: Catalogue) -> Calibration:
     cell = _cell(content["cell"], decode(Arm, content["arm"]))
     n, effects = cell.arm.n, []
     for e in content["effects"]:
-        if e["name"] not in known.names:
+        if e["name"] not in catalogue.names:
             raise InputError(
                 f"it has the effect {e['name']}, which is not in the catalogue; give the file "
                 "that defines it: --effects-from FILE.py"
             )
-        effects.append(known.make(e["name"], cell, one_of_each(cell), e["options"]))
-    model = Model(cell, tuple(effects), known)
+        effects.append(catalogue.make(e["name"], cell, one_of_each(cell), e["options"]))
+    model = Model(cell, tuple(effects), catalogue)
     names = [f"{e.name}.{p.name}" for e in effects for p in e.parameters]
     limits.check_parameters(len(names))
     if names != content["parameters"]:
@@ -118,7 +118,7 @@ def _read(content: Mapping[str, Any], known: Catalogue) -> Calibration:
         flat = np.frombuffer(base64.b64decode(content["covariance_root"]), dtype="<f4")
         root = flat.reshape(len(std), -1).astype(float) * std[:, None]
         numbers("covariance_root", root, root.shape)
-    stored = dict(content["scatter"])  # older programs told whether it was known alone
+    stored = dict(content["scatter"])  # older programs wrote `known` alone
     scatter = decode(Scatter, {"source": "stated" if stored["known"] else "unknown"} | stored)
     calibration = Calibration(
         model=model,
@@ -139,7 +139,7 @@ def _read(content: Mapping[str, Any], known: Catalogue) -> Calibration:
 
 
 def _small(c: Calibration) -> dict[str, object] | None:
-    """What the covariance follows from, as JSON; None where that is no smaller, or not the same."""
+    """Source of the covariance as JSON; None if it is not smaller or does not reproduce it."""
     if c.learnt is None:
         return None
     small = c.learnt.to_json()
@@ -150,13 +150,13 @@ def _small(c: Calibration) -> dict[str, object] | None:
     states = c.learnt.readings.states
     states = states[:: max(len(states) // TRIED, 1)]
     jacobian = c.model.jacobian(c.model.predict(states, c.theta), c.theta, 3)
-    again = CovarianceSource.from_json(small).root(c.model, c.theta, c.mode)
-    stated, found = (np.linalg.norm(jacobian @ root, axis=(1, 2)) for root in (c.root, again))
-    return small if np.all(np.abs(found - stated) <= AGREES * stated) else None
+    copy = CovarianceSource.from_json(small).root(c.model, c.theta, c.mode)
+    stated, copied = (np.linalg.norm(jacobian @ root, axis=(1, 2)) for root in (c.root, copy))
+    return small if np.all(np.abs(copied - stated) <= AGREES * stated) else None
 
 
 def _cell(content: Mapping[str, Any], arm: Arm) -> Cell:
-    """Return a cell as it was stored; refuses one that cannot be."""
+    """Return a stored cell; refuse impossible values."""
     _check_arm(arm)
     vectors: dict[str, Any] = {
         name: numbers(name, content[name], (3,)) for name in ("load_point", "tool_com", "gravity")
@@ -175,8 +175,8 @@ def _cell(content: Mapping[str, Any], arm: Arm) -> Cell:
     if content["targets"] is None:
         return cell
     targets = frames("targets", content["targets"], several=True)
-    several = replace(cell, targets=targets, target_names=tuple(content["target_names"]))
-    return several.with_targets(targets, content["known_targets"])
+    with_names = replace(cell, targets=targets, target_names=tuple(content["target_names"]))
+    return with_names.with_targets(targets, content["known_targets"])
 
 
 def _observer(content: Mapping[str, Any]) -> Observer:
@@ -186,7 +186,7 @@ def _observer(content: Mapping[str, Any]) -> Observer:
 
 
 def _check_arm(arm: Arm) -> None:
-    """Refuse an arm that cannot be."""
+    """Refuse an arm with impossible values."""
     n = arm.links.shape[0] - 1
     if n < 1:
         raise ValueError("the arm has no joints")
@@ -207,7 +207,7 @@ def _check_arm(arm: Arm) -> None:
 
 
 def _check(c: Calibration, n: int) -> None:
-    """Refuse numbers of a calibration of n joints that cannot be."""
+    """Refuse impossible numbers in a calibration of n joints."""
     numbers("misfit_m2", c.misfit, least=0.0)
     numbers("joint_std", c.scatter.joint_std, (n,), least=0.0)
     numbers("std_m", c.scatter.std_m, least=0.0)
@@ -223,5 +223,5 @@ def _check(c: Calibration, n: int) -> None:
     for name, wrench in c.loads.items():
         numbers(f"load {name}", wrench, (6,))
     if c.sensor is not None:
-        place = np.stack([c.sensor.origin_m, c.sensor.rotvec_rad])
-        numbers("force_sensor", place, (2, 3))
+        pose = np.stack([c.sensor.origin_m, c.sensor.rotvec_rad])
+        numbers("force_sensor", pose, (2, 3))

@@ -1,20 +1,18 @@
 """The waypoints of a URScript program, and the program with other joint values in their place.
 
-A waypoint is the target of `movej`, `movel`, `movep` or `servoj`. It is understood where it is the
-same whatever way the program takes: joint values `[q1, …, q6]`, a pose `p[x, y, z, rx, ry, rz]`, a
-variable that has one assignment in the whole program, of one of these, before the waypoint and in a
-block around it, or `get_inverse_kin(pose, qnear=joints)`. Its text becomes a list of joint values,
-which all of these functions take; nothing else of the program is changed. Every other waypoint is
-left. What could make a corrected waypoint another one (an unknown function, a tool or payload that
-changes on the way, a value that depends on where the arm stands) refuses the program.
+A waypoint is the target of `movej`, `movel`, `movep` or `servoj`. It is understood if it is the
+same in every run: joint values `[q1, …, q6]`, a pose `p[x, y, z, rx, ry, rz]`, a variable that is
+assigned one of these once in the whole program, before the waypoint and in a block around it, or
+`get_inverse_kin(pose, qnear=joints)`. A list of joint values, which all of these functions accept,
+replaces its text; the rest of the program does not change, nor do other waypoints. The program is
+refused if anything in it may change the meaning of a corrected waypoint: an unknown function, a
+change of tool or payload on the way, a value that depends on the arm's position.
 
-A pose is of the tool centre point that `set_tcp(p[…])` set before it. The controller takes the
-solution near to where the arm stands; that is the waypoint before where this one always follows it.
-
-A pose has up to eight solutions. `get_inverse_kin(pose, qnear=joints)` and `movej` to a pose take
-the one nearest to given joint values, or to where the arm stands; the manual does not say by which
-measure. A straight motion stays on the branch that it begins on, whatever joint values its target
-is stated by. A correction is right on one branch only.
+A pose is of the tool centre point that `set_tcp(p[…])` set before it. It has up to eight solutions.
+`get_inverse_kin(pose, qnear=joints)` takes the solution nearest to `joints`, `movej` to a pose the
+one nearest to the arm's position, which is the previous waypoint if this one always follows it. The
+manual does not state the measure of the distance. A straight motion stays on the branch on which it
+begins, whatever joint values state its target. A correction holds on one branch only.
 
 Source: Universal Robots, *The URScript Programming Language*, e-Series, software 5.11.
 """
@@ -42,11 +40,11 @@ from hilcal.types import Bools, Floats
 JOINTS = 6
 STRAIGHT = ("movel", "movep")
 MOVES = {"movej": 4, "movel": 4, "movep": 3, "servoj": None}
-"""Functions that move to a waypoint, and which of their arguments is the blend radius."""
+"""Functions that move to a waypoint, with the index of the argument that is the blend radius."""
 NAMED = 5
-"""Lines that an error names."""
+"""Most lines that an error names."""
 _OTHER_MOVES = ("movec", "servoc", "speedj", "speedl")
-"""Functions that move otherwise; they are left as they are."""
+"""Functions of other motions, which are not corrected."""
 _STOPS = ("stopj", "stopl")
 _TOOL = "set_tcp"
 _PAYLOAD = ("set_payload", "set_payload_mass", "set_payload_cog", "set_target_payload")
@@ -67,7 +65,7 @@ _HARMLESS = re.compile(
     r"|get_tool_(temp|current)",
     re.ASCII,
 )
-"""Functions that neither move the arm, nor tell where it stands, nor change what a target means."""
+"""Functions that neither move the arm, nor use its position, nor change the meaning of a target."""
 _WHERE = re.compile(r"get_(actual|target)_\w+|get_forward_kin|get_inverse_kin\w*", re.ASCII)
 _VALID = (
     "valid: joint values, a pose p[…], or a variable that is assigned one of them once, before it; "
@@ -83,10 +81,10 @@ _ARITHMETIC: dict[type[ast.operator], Callable[[float, float], float]] = {
     ast.Sub: operator.sub,
     ast.Mult: operator.mul,
 }
-"""Without division, of which it is not known whether whole numbers stay whole."""
+"""Without division: whether URScript divides integers to integers is not known."""
 
 _LARGEST = 2.0**31
-"""Whole numbers of a controller end here, what is beyond is not the sum that it should be."""
+"""Integers of a controller overflow here."""
 
 Value = float | tuple[str, tuple[float, ...]]
 """A number, or a list ("") or pose ("p") of numbers."""
@@ -97,27 +95,27 @@ class Waypoint:
     """One waypoint of a program, or another motion."""
 
     line: int  # of the program, from 1
-    begin: int  # where its target begins in the text
-    end: int  # where it ends
+    begin: int  # offset of its target in the text
+    end: int  # offset of the target's end
     q: Floats | None = None
-    """(6,) joint values, or those that its branch is near to, rad; None where neither is given."""
+    """(6,) joint values, or those that select the branch of `pose`, rad; None if not stated."""
     pose: Floats | None = None  # (4, 4) T_base_tool; None where the joint values are the target
-    tool: Floats | None = None  # (4, 4) T_flange_tool that was set; None where none was
-    blend_m: float = 0.0  # radius within which the arm passes it without a stop, m
-    left: str = ""  # why it is left as it is; empty where it is understood
-    straight: bool = False  # whether the tool moves to it on a straight line
-    follows: bool = False  # whether the waypoint before it in the text always comes right before it
+    tool: Floats | None = None  # (4, 4) T_flange_tool that was set; None if none
+    blend_m: float = 0.0  # radius within which the arm passes without a stop, m
+    left: str = ""  # why it is not corrected; empty if it is understood
+    straight: bool = False  # whether the motion to it is a straight line
+    follows: bool = False  # whether the previous waypoint of the text always comes right before it
 
 
 def waypoints(program: str) -> tuple[Waypoint, ...]:
     """Find the waypoints of a program, in the order of its text."""
     try:
-        found = _waypoints(_Program.of(statements(program)))
+        motions = _waypoints(_Program.of(statements(program)))
     except RecursionError:
         raise InputError("nested too deeply; valid: a URScript program") from None
-    if not found:
+    if not motions:
         raise InputError(f"no waypoints; valid: a URScript program with {', '.join(MOVES)}")
-    return found
+    return motions
 
 
 def program_points(
@@ -133,35 +131,35 @@ def program_points(
         every = waypoints(program)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    found = [w for w in every if not w.left]
+    understood = [w for w in every if not w.left]
     for w in every:
-        if w.left and not (leave and found):
+        if w.left and not (leave and understood):
             raise InputError(f"{path}: line {w.line}: {w.left}; {_VALID}")
-    none, nowhere = np.full(JOINTS, np.nan), np.full((4, 4), np.nan)
-    q = np.stack([none if w.q is None else w.q for w in found])
-    wanted = np.stack([nowhere if w.pose is None else w.pose for w in found])
-    names = tuple(f"line {w.line}" for w in found)
-    return program, every, Points(names, q, wanted), found[0].tool
+    no_joints, no_pose = np.full(JOINTS, np.nan), np.full((4, 4), np.nan)
+    q = np.stack([no_joints if w.q is None else w.q for w in understood])
+    poses = np.stack([no_pose if w.pose is None else w.pose for w in understood])
+    names = tuple(f"line {w.line}" for w in understood)
+    return program, every, Points(names, q, poses), understood[0].tool
 
 
-def with_joints(program: str, found: Sequence[Waypoint], q: Floats) -> str:
-    """Return the program with joint values (N, 6) in the place of its waypoints."""
-    parts, at = [], 0
-    for waypoint, values in zip(found, q, strict=True):
-        parts += [program[at : waypoint.begin], urscript_list(values)]
-        at = waypoint.end
-    return "".join([*parts, program[at:]])
+def with_joints(program: str, corrected: Sequence[Waypoint], q: Floats) -> str:
+    """Return the program with joint values (N, 6) in place of its waypoints."""
+    parts, end = [], 0
+    for waypoint, values in zip(corrected, q, strict=True):
+        parts += [program[end : waypoint.begin], urscript_list(values)]
+        end = waypoint.end
+    return "".join([*parts, program[end:]])
 
 
 def urscript_list(values: Floats) -> str:
-    """Return joint values as URScript writes them; 1 nrad is kept."""
+    """Return joint values in URScript, to 1 nrad."""
     return f"[{', '.join(f'{v:.9f}' for v in values)}]"
 
 
 def movej_program(names: Sequence[str], q: Floats) -> str:
-    """Return a program that moves to joint values (N, 6), one after the other.
+    """Return a program that moves to joint values (N, 6) one after the other.
 
-    The controller runs it as it is when it comes in on its script ports (30001 to 30003).
+    The controller runs it when it is sent to a script port (30001 to 30003).
     """
     rows = zip(names, q, strict=True)
     lines = [f"  movej({urscript_list(row)})  # {escaped(name)}" for name, row in rows]
@@ -170,49 +168,49 @@ def movej_program(names: Sequence[str], q: Floats) -> str:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Program:
-    """Statements, and what their names stand for."""
+    """Statements, and the values of their variables."""
 
     statements: tuple[Statement, ...]  # in the order of the text
-    functions: frozenset[str]  # names that it defines
+    functions: frozenset[str]  # names of functions that it defines
     bound: dict[str, list[tuple[int, ast.expr | None]]]
-    """By name, the number of each statement that gives it a value, with that value; None for a
+    """By name, the index of each statement that assigns a value, with that value; None for a
     parameter, an element or a function."""
-    aliased: bool  # whether an element is assigned of what may be another variable's list
-    known: dict[int, Value | None] = field(default_factory=dict)  # values that were computed
+    aliased: bool  # whether an assignment to an element may change another variable's list
+    computed: dict[int, Value | None] = field(default_factory=dict)  # values by statement
 
     @classmethod
-    def of(cls, found: tuple[Statement, ...]) -> "_Program":
+    def of(cls, program: tuple[Statement, ...]) -> "_Program":
         """Collect names."""
         bound: dict[str, list[tuple[int, ast.expr | None]]] = {}
         functions, elements = set(), set()
-        for k, s in enumerate(found):
-            given: dict[str, ast.expr | None] = {}
+        for k, s in enumerate(program):
+            values: dict[str, ast.expr | None] = {}
             match s.node:
                 case ast.FunctionDef(name=name):
                     functions.add(name)
-                    given = dict.fromkeys([name, *(a.arg for a in s.node.args.args)])
+                    values = dict.fromkeys([name, *(a.arg for a in s.node.args.args)])
                 case ast.Assign(targets=[ast.Name(name)]):
-                    given = {name: s.node.value}
+                    values = {name: s.node.value}
                 case ast.Assign(targets=[ast.Subscript(value=ast.Name(name))]):
-                    given = {name: None}
+                    values = {name: None}
                     elements.add(name)
-            for name, value in given.items():
-                words = ("p", *MOVES, *_OTHER_MOVES, *_STOPS, *_SETUP)
-                if name in words or _HARMLESS.fullmatch(name) or _WHERE.fullmatch(name):
+            for name, value in values.items():
+                reserved = ("p", *MOVES, *_OTHER_MOVES, *_STOPS, *_SETUP)
+                if name in reserved or _HARMLESS.fullmatch(name) or _WHERE.fullmatch(name):
                     raise InputError(
                         f"line {s.line}: '{name}' is a name of URScript's own; valid: another name"
                     )
                 bound.setdefault(name, []).append((k, value))
         aliased = any(
-            (value is None and not isinstance(found[k].node, ast.Assign))
+            (value is None and not isinstance(program[k].node, ast.Assign))
             or (value is not None and not isinstance(value, ast.List) and not _is_pose(value))
             for name in elements
             for k, value in bound[name]
         )  # fmt: skip
-        return cls(found, frozenset(functions), bound, aliased)
+        return cls(program, frozenset(functions), bound, aliased)
 
     def value(self, node: ast.expr, k: int) -> Value | None:
-        """Value of an expression in statement k, if it has the same one in every run."""
+        """Value of an expression in statement k; None if it may differ between runs."""
         match node:
             case ast.Constant(value=bool()):
                 return None
@@ -247,51 +245,51 @@ class _Program:
         bound = self.bound.get(name, [])
         if len(bound) != 1 or self.aliased:
             return None
-        ((at, node),) = bound
-        if node is None or at >= k or not self.around(at, k):
+        ((assignment, node),) = bound
+        if node is None or assignment >= k or not self.around(assignment, k):
             return None
-        if at not in self.known:
-            self.known[at] = self.value(node, at)
-        return self.known[at]
+        if assignment not in self.computed:
+            self.computed[assignment] = self.value(node, assignment)
+        return self.computed[assignment]
 
-    def around(self, at: int, k: int) -> bool:
-        """Whether statement `at` stands in a block that is around statement k, or the same."""
-        blocks = self.statements[at].blocks
+    def around(self, outer: int, k: int) -> bool:
+        """Whether the block of statement `outer` contains statement k."""
+        blocks = self.statements[outer].blocks
         return self.statements[k].blocks[: len(blocks)] == blocks
 
     def target(self, node: ast.expr, k: int) -> tuple[Floats | None, Floats | None] | None:
-        """Joint values (6,) and pose (4, 4) of a waypoint, each None where it has none."""
+        """Joint values (6,) and pose (4, 4) of a waypoint, None where absent; None if computed."""
         match node:
-            case ast.Call(func=ast.Name("get_inverse_kin"), args=[pose, *more], keywords=named):
-                near = [*more, *(n.value for n in named if n.arg == "qnear")]
-                if len(near) != len(more) + len(named) or len(near) > 1:
+            case ast.Call(func=ast.Name("get_inverse_kin"), args=[pose, *extra], keywords=named):
+                near = [*extra, *(n.value for n in named if n.arg == "qnear")]
+                if len(near) != len(extra) + len(named) or len(near) > 1:
                     return None
-                wanted = _pose(self.value(pose, k))
+                stated = _pose(self.value(pose, k))
                 branch = _six(self.value(near[0], k)) if near else None
-                if wanted is None or (near and branch is None):
+                if stated is None or (near and branch is None):
                     return None
-                return branch, wanted
+                return branch, stated
         value = self.value(node, k)
         q, goal = _six(value), _pose(value)
         return None if q is None and goal is None else (q, goal)
 
     def why_not(self, node: ast.expr, s: Statement) -> str:
         """Say why a target is not understood."""
-        what = f"the waypoint '{s.written(node)[:40]}' is computed while the program runs"
+        reason = f"the waypoint '{s.written(node)[:40]}' is computed while the program runs"
         if isinstance(node, ast.Name) and node.id in self.bound:
-            given = self.bound[node.id]  # of those in one line, a parameter's, the line comes once
-            lines = list(dict.fromkeys(str(self.statements[k].line) for k, _ in given[:NAMED]))
-            more = f" and {len(given) - NAMED} more" if len(given) > NAMED else ""
-            many = f"line{'s' * (len(lines) > 1)} {', '.join(lines)}{more}"
-            what += f" ('{node.id[:40]}' has its value from {many})"
-        return what
+            bound = self.bound[node.id]  # a line with several, of parameters, is named once
+            lines = list(dict.fromkeys(str(self.statements[k].line) for k, _ in bound[:NAMED]))
+            more = f" and {len(bound) - NAMED} more" if len(bound) > NAMED else ""
+            source = f"line{'s' * (len(lines) > 1)} {', '.join(lines)}{more}"
+            reason += f" ('{node.id[:40]}' has its value from {source})"
+        return reason
 
 
 def _waypoints(p: _Program) -> tuple[Waypoint, ...]:
-    """Go through the statements: motions in the order of the text."""
+    """Return the motions of all statements, in the order of the text."""
     out: list[Waypoint] = []
-    stands: tuple[int, ...] | None = None  # blocks of the waypoint at which the arm stands
-    begins = True  # it stands where the program found it
+    last_blocks: tuple[int, ...] | None = None  # of the waypoint that the arm is at, if known
+    at_start = True  # the arm has not moved yet
     setup: dict[str, tuple[int, list[Value | None]]] = {}
     moving = {*MOVES, *_OTHER_MOVES}
     called = {name for s in p.statements for name in s.called.values()}
@@ -305,7 +303,7 @@ def _waypoints(p: _Program) -> tuple[Waypoint, ...]:
     side_by_side = any(
         {"thread", "sec"} & set(s.kinds) and moved_by & set(s.called.values()) for s in p.statements
     )
-    idle = {  # blocks of functions within another that nothing calls
+    idle = {  # blocks of nested functions that are never called
         s.number
         for s in p.statements
         if isinstance(s.node, ast.FunctionDef) and s.blocks and s.node.name not in called
@@ -315,20 +313,20 @@ def _waypoints(p: _Program) -> tuple[Waypoint, ...]:
             _check_calls(p, s)
         name = "" if s.call is None else s.called[s.call]
         if p.functions & set(s.called.values()) or name in _STOPS:
-            stands, begins = None, False
+            last_blocks, at_start = None, False
         if name in _SETUP:
             _set_up(p, k, setup, moved=bool(out))
         elif name in moving:
-            found = _waypoint(p, k, setup)
-            again = "while" in s.kinds or s.kinds.count("def") > wrapped
-            follows = stands == s.blocks and not side_by_side
-            known = follows or (begins and not again and not side_by_side)
-            if found.pose is not None and found.q is None and not known:
-                found = replace(found, left=_NO_BRANCH)
-            found = replace(found, straight=name in STRAIGHT, follows=follows)
-            # servoj ends after its time, wherever the arm is then
-            stands, begins = None if found.left or name == "servoj" else s.blocks, False
-            out.append(found)
+            waypoint = _waypoint(p, k, setup)
+            repeated = "while" in s.kinds or s.kinds.count("def") > wrapped
+            follows = last_blocks == s.blocks and not side_by_side
+            branch_known = follows or (at_start and not repeated and not side_by_side)
+            if waypoint.pose is not None and waypoint.q is None and not branch_known:
+                waypoint = replace(waypoint, left=_NO_BRANCH)
+            waypoint = replace(waypoint, straight=name in STRAIGHT, follows=follows)
+            # servoj ends after its time, wherever the arm is
+            last_blocks, at_start = None if waypoint.left or name == "servoj" else s.blocks, False
+            out.append(waypoint)
     return tuple(out)
 
 
@@ -342,29 +340,29 @@ def _waypoint(p: _Program, k: int, setup: Mapping[str, tuple[int, list[Value | N
         return Waypoint(s.line, 0, 0, left=f"{name} is not corrected")
     (target,) = targets
     out = Waypoint(s.line, *s.place(target))
-    if (at := MOVES[name]) is not None:
-        radius = named.get("r", s.call.args[at] if len(s.call.args) > at else None)
+    if (index := MOVES[name]) is not None:
+        radius = named.get("r", s.call.args[index] if len(s.call.args) > index else None)
         blend = 0.0 if radius is None else p.value(radius, k)
         if not isinstance(blend, float):
             return replace(out, left="its blend radius is computed while the program runs")
         out = replace(out, blend_m=blend)
-    found = p.target(target, k)
-    if found is None or (name == "servoj" and found[1] is not None):
+    target_values = p.target(target, k)
+    if target_values is None or (name == "servoj" and target_values[1] is not None):
         return replace(out, left=p.why_not(target, s))
-    for at, _ in setup.values():
-        if not p.around(at, k):
+    for setting, _ in setup.values():
+        if not p.around(setting, k):
             raise InputError(
-                f"line {s.line}: the set_tcp or payload of line {p.statements[at].line} need not "
-                "come before it; valid: once before the first motion, not in if or while"
+                f"line {s.line}: the set_tcp or payload of line {p.statements[setting].line} need "
+                "not come before it; valid: once before the first motion, not in if or while"
             )
     tool = setup[_TOOL][1][0] if _TOOL in setup else None
-    return replace(out, q=found[0], pose=found[1], tool=_pose(tool))
+    return replace(out, q=target_values[0], pose=target_values[1], tool=_pose(tool))
 
 
 def _set_up(
     p: _Program, k: int, setup: dict[str, tuple[int, list[Value | None]]], *, moved: bool
 ) -> None:
-    """Take note of a tool centre point, a payload or gravity."""
+    """Record a tool centre point, a payload or gravity in `setup`."""
     s = p.statements[k]
     assert s.call is not None  # noqa: S101 - see `_check_calls`
     name = s.called[s.call]
@@ -376,9 +374,9 @@ def _set_up(
     elif None in values:
         raise InputError(f"line {s.line}: {name} is computed while it runs; valid: numbers")
     if setup.setdefault(name, (k, values))[1] != values or (moved and name != _TOOL):
-        what = "tool centre point" if name == _TOOL else name.removeprefix("set_")
+        quantity = "tool centre point" if name == _TOOL else name.removeprefix("set_")
         raise InputError(
-            f"line {s.line}: another {what} than before; valid: one {name} before the first "
+            f"line {s.line}: another {quantity} than before; valid: one {name} before the first "
             "waypoint, and a program for each load"
         )
     if moved and setup[name][0] == k:
@@ -386,7 +384,7 @@ def _set_up(
 
 
 def _check_calls(p: _Program, s: Statement) -> None:
-    """Refuse functions that are not known, and motions within expressions."""
+    """Refuse unknown functions, and motions within expressions."""
     moves = s.call is not None and s.called[s.call] in MOVES
     targets = [*s.call.args[:1], *(n.value for n in s.call.keywords)] if moves and s.call else []
     for call, name in s.called.items():
@@ -409,19 +407,19 @@ def _check_calls(p: _Program, s: Statement) -> None:
 
 
 def _is_pose(node: ast.expr) -> bool:
-    """Whether it is p[…]; `_known` has no other subscript of several parts."""
+    """Whether a node is p[…]; `_means_the_same` admits no other subscript of several parts."""
     return isinstance(node, ast.Subscript) and isinstance(node.slice, ast.Tuple)
 
 
 def _six(value: Value | None, kind: str = "") -> Floats | None:
-    """(6,) numbers of a list, or of a pose where `kind` is "p"; None of any other value."""
+    """(6,) numbers of a list, or of a pose if `kind` is "p"; None for any other value."""
     if isinstance(value, tuple) and value[0] == kind and len(value[1]) == JOINTS:
         return np.array(value[1])
     return None
 
 
 def _pose(value: Value | None) -> Floats | None:
-    """(4, 4) of a pose; None of any other value."""
+    """(4, 4) of a pose; None for any other value."""
     six = _six(value, "p")
     return None if six is None else se3.matrix(se3.rotation(six[3:]), six[:3])
 
@@ -429,16 +427,16 @@ def _pose(value: Value | None) -> Floats | None:
 STEPS = 40
 """Poses between two waypoints of a straight motion; a choice."""
 LARGEST_STEP = 0.5
-"""Turn of a joint from one of these to the next beyond which the motion passes a singularity, rad;
-a choice."""
+"""Turn of a joint between two of these poses above which the motion passes a singularity, rad; a
+choice."""
 SAME = 1e-6
-"""Joint values that are the same solution, rad: far above the residual of one, far below what is
-between two."""
+"""Largest difference of joint values of the same solution, rad: far above the residual of one, far
+below the distance of two."""
 AS_NEAR = 0.05
-"""What another solution must be farther for this one to be the nearest by any measure, rad. A
+"""Margin by which any other solution must be farther for this one to count as the nearest, rad. A
 controller has its own calibrated arm: of 1,024 motions of ur3e, ur5e and ur10e the branch is wrong
-in 1 at 0.02 and in none from 0.05 on, where each joint of each solution may be 10 mrad elsewhere;
-17 are left uncertain at 0.05, 33 at 0.1, 62 at 0.2."""
+in 1 at 0.02 and in none from 0.05 on, if each joint of each solution is up to 10 mrad off; 17
+remain uncertain at 0.05, 33 at 0.1, 62 at 0.2."""
 NEAREST = "another branch of the arm is as near; joint values in place of the pose say which"
 NOT_STRAIGHT = (
     "a straight motion from the waypoint before ends on another branch of the arm; use movej"
@@ -449,60 +447,60 @@ UNKNOWN = "the branch of the waypoint before it is not known"
 def doubts(
     arm: Arm, tool: Floats, waypoints: Sequence[Waypoint], q: Floats, near: Floats | None
 ) -> list[str]:
-    """Say why the branch of each of N waypoints is not certain; empty where it is.
+    """Return why the branch of each of N waypoints is not certain; empty where it is.
 
-    At joint values q (N, 6) the nominal arm has the tool (4, 4) there; `near` (6,) are those that
-    the first one is near to, rad, None where none are given.
+    Joint values q (N, 6) put the tool (4, 4) on the nominal arm at the waypoints. The first
+    waypoint is near to `near` (6,), rad, or to q if None.
     """
     if not waypoints:
         return []
-    before = np.concatenate([q[:1] if near is None else near[None], q[:-1]])
-    stated = np.stack([before[k] if w.q is None else w.q for k, w in enumerate(waypoints)])
-    led = np.array([k > 0 and w.straight and w.follows for k, w in enumerate(waypoints)])
+    previous = np.concatenate([q[:1] if near is None else near[None], q[:-1]])
+    stated = np.stack([previous[k] if w.q is None else w.q for k, w in enumerate(waypoints)])
+    on_line = np.array([k > 0 and w.straight and w.follows for k, w in enumerate(waypoints)])
     chosen = np.array([w.pose is not None for w in waypoints])
-    chosen &= ~led | np.array([w.q is not None for w in waypoints])
-    other = chosen & ~_nearest(arm, tool, stated, q)
-    bent = led & ~_straight(arm, tool, before, q)
+    chosen &= ~on_line | np.array([w.q is not None for w in waypoints])
+    tied = chosen & ~_nearest(arm, tool, stated, q)
+    bent = on_line & ~_straight(arm, tool, previous, q)
     out: list[str] = []
     for k, w in enumerate(waypoints):
-        unknown = k > 0 and out[-1] and (led[k] or (w.q is None and w.pose is not None))
-        out.append(UNKNOWN if unknown else NEAREST if other[k] else NOT_STRAIGHT if bent[k] else "")
+        unknown = k > 0 and out[-1] and (on_line[k] or (w.q is None and w.pose is not None))
+        out.append(UNKNOWN if unknown else NEAREST if tied[k] else NOT_STRAIGHT if bent[k] else "")
     return out
 
 
 def _nearest(arm: Arm, tool: Floats, near: Floats, q: Floats) -> Bools:
-    """(N,) whether no other solution of the poses at q (N, 6) is as near to joint values (N, 6)."""
+    """(N,) whether no other solution of the poses at q (N, 6) is as near to `near` (N, 6)."""
     rotation, position, _ = nominal_pose(arm, tool, q)
-    mine = _turn(q - near)
+    distance = _turn(q - near)
     out = np.ones(len(q), dtype=bool)
     for start in _flipped(q):
-        found = invert_nominal(arm, tool, start, rotation, position)
-        other = found.solved & (np.abs(_turn(found.q - q)).max(axis=1) > SAME)
-        theirs = _turn(found.q - near)
+        solution = invert_nominal(arm, tool, start, rotation, position)
+        different = solution.solved & (np.abs(_turn(solution.q - q)).max(axis=1) > SAME)
+        other_distance = _turn(solution.q - near)
         for order in (1, 2, np.inf):
-            least = np.linalg.norm(mine, order, axis=1) + AS_NEAR
-            farther = np.linalg.norm(theirs, order, axis=1) > least
-            out &= ~other | farther
+            least = np.linalg.norm(distance, order, axis=1) + AS_NEAR
+            farther = np.linalg.norm(other_distance, order, axis=1) > least
+            out &= ~different | farther
     return out
 
 
 def _flipped(q: Floats) -> list[Floats]:
-    """Joint values (N, 6) from which Newton's method finds the other solutions."""
+    """Joint values (N, 6) from which Newton's method converges to the other solutions."""
     wrist = q + np.array([0, 0, 0, np.pi, 0, np.pi])
     wrist[:, 4] = -q[:, 4]
     out = [q, wrist]
-    for one in (q, wrist):
-        elbow = one.copy()
+    for base in (q, wrist):
+        elbow = base.copy()
         elbow[:, 2] *= -1
-        elbow[:, [1, 3]] += one[:, 2:3]
+        elbow[:, [1, 3]] += base[:, 2:3]
         out.append(elbow)
-    for one in list(out):
-        shoulder = one.copy()
+    for base in list(out):
+        shoulder = base.copy()
         shoulder[:, 0] += np.pi
-        shoulder[:, 1] = -np.pi - one[:, 1]
+        shoulder[:, 1] = -np.pi - base[:, 1]
         shoulder[:, 2:4] *= -1
         out.append(shoulder)
-    return [_turn(one) for one in out[1:]]
+    return [_turn(base) for base in out[1:]]
 
 
 def _straight(arm: Arm, tool: Floats, begin: Floats, q: Floats) -> Bools:
@@ -510,13 +508,13 @@ def _straight(arm: Arm, tool: Floats, begin: Floats, q: Floats) -> Bools:
     r0, p0, _ = nominal_pose(arm, tool, begin)
     r1, p1, _ = nominal_pose(arm, tool, q)
     turn = se3.rotation_vector(se3.product(r1, np.swapaxes(r0, 1, 2)))
-    at, out = begin, np.ones(len(q), dtype=bool)
+    joints, out = begin, np.ones(len(q), dtype=bool)
     for share in np.arange(1, STEPS + 1) / STEPS:
         rotation = se3.product(se3.rotation(share * turn), r0)
-        found = invert_nominal(arm, tool, at, rotation, p0 + share * (p1 - p0))
-        out &= found.solved & (np.abs(found.q - at).max(axis=1) < LARGEST_STEP)
-        at = found.q
-    return np.asarray(out & (np.abs(_turn(at - q)).max(axis=1) < SAME))
+        solution = invert_nominal(arm, tool, joints, rotation, p0 + share * (p1 - p0))
+        out &= solution.solved & (np.abs(solution.q - joints).max(axis=1) < LARGEST_STEP)
+        joints = solution.q
+    return np.asarray(out & (np.abs(_turn(joints - q)).max(axis=1) < SAME))
 
 
 def _turn(angle: Floats) -> Floats:

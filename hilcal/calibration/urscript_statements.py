@@ -1,7 +1,7 @@
-"""The statements of a URScript program, one per line, of the part of the language that is known.
+"""The statements of a URScript program, one per line, of a supported part of the language.
 
-URScript's expressions are written as Python's, so that Python's own parser reads them; what is
-not in the list of known forms is refused by its line, not guessed. A statement stands on one line.
+URScript's expressions have Python's syntax, so that Python's own parser reads them. Every form that
+is not in the list of supported ones is refused by its line, not guessed. A statement is one line.
 Source: Universal Robots, *The URScript Programming Language*, e-Series, software 5.11, chapter 1.
 """
 
@@ -36,29 +36,29 @@ class Statement:
     """One statement."""
 
     line: int  # of the program, from 1
-    number: int  # of the block that it opens, where it opens one
-    begin: int  # where in the program the text begins that `node` is of
-    text: str  # that text
-    node: ast.stmt  # as parsed; of `if`, `while` and `def` only the head
-    blocks: tuple[int, ...]  # numbers of the blocks that it stands in, the outermost first
-    kinds: tuple[str, ...]  # the words that these begin with
+    number: int  # of the block that it opens, if any
+    begin: int  # offset of `text` in the program
+    text: str  # from which `node` was parsed
+    node: ast.stmt  # of `if`, `while` and `def` only the head
+    blocks: tuple[int, ...]  # numbers of the blocks around it, the outermost first
+    kinds: tuple[str, ...]  # first words of these blocks
     called: dict[ast.Call, str]  # all calls in it, with the names of their functions
 
     @property
     def call(self) -> ast.Call | None:
-        """The call that it is."""
+        """The call that the statement consists of; None for other statements."""
         value = self.node.value if isinstance(self.node, ast.Expr) else None
         return value if isinstance(value, ast.Call) else None
 
     def place(self, node: ast.expr) -> tuple[int, int]:
-        """Where an expression of it begins and ends in the program."""
+        """Offsets of the beginning and end of one of its expressions in the program."""
         ends = (node.col_offset, node.end_col_offset or 0)
         first, last = (len(self.text.encode()[:end].decode()) for end in ends)
         return self.begin + first, self.begin + last
 
     def written(self, node: ast.expr) -> str:
         """Return the text of an expression."""
-        first, last = (at - self.begin for at in self.place(node))
+        first, last = (offset - self.begin for offset in self.place(node))
         return self.text[first:last]
 
 
@@ -66,13 +66,13 @@ def statements(program: str) -> tuple[Statement, ...]:
     """Parse a program."""
     out: list[Statement] = []
     open_blocks: list[tuple[str, int]] = []
-    at = made = 0
-    for number, whole in enumerate(program.split("\n"), start=1):
-        line = whole.removesuffix("\r")
+    offset = count = 0
+    for number, full_line in enumerate(program.split("\n"), start=1):
+        line = full_line.removesuffix("\r")
         check_name(line.replace("\t", " "), f"line {number}")
         body = line.strip(" \t")
-        begin = at + len(line) - len(line.lstrip(" \t"))
-        at += len(whole) + 1
+        begin = offset + len(line) - len(line.lstrip(" \t"))
+        offset += len(full_line) + 1
         if not body or body.startswith("#") or _MARK.fullmatch(body):
             continue
         if len(body) > limits.STATEMENT:
@@ -81,8 +81,8 @@ def statements(program: str) -> tuple[Statement, ...]:
             raise _refused(number, f"more than {limits.STATEMENTS} statements before it")
         if len(open_blocks) > limits.BLOCKS:
             raise _refused(number, f"it stands in more than {limits.BLOCKS} blocks")
-        found = _WORD.match(body)
-        word = found[0] if found else ""
+        match = _WORD.match(body)
+        word = match[0] if match else ""
         plain = _STRING_OR_COMMENT.sub("", body).strip()
         if word in ("else", "elif"):
             if not open_blocks or open_blocks[-1][0] not in ("if", "elif"):
@@ -93,10 +93,10 @@ def statements(program: str) -> tuple[Statement, ...]:
                 raise _refused(number, "end without a beginning")
             open_blocks.pop()
             continue
-        made += 1
+        count += 1
         blocks, kinds = tuple(b for _, b in open_blocks), tuple(kind for kind, _ in open_blocks)
         if word in (*_OPENS, "elif", "else"):
-            open_blocks.append((word, made))
+            open_blocks.append((word, count))
         if word == "else":
             if "".join(plain.split()) != "else:":
                 raise _refused(number, f"'{body[:40]}' is not understood")
@@ -105,21 +105,21 @@ def statements(program: str) -> tuple[Statement, ...]:
         node = _parsed(text, number, word)
         calls = (n for n in ast.walk(node) if isinstance(n, ast.Call))
         called = {n: n.func.id for n in calls if isinstance(n.func, ast.Name)}
-        out.append(Statement(number, made, begin + shift, text, node, blocks, kinds, called))
+        out.append(Statement(number, count, begin + shift, text, node, blocks, kinds, called))
     if open_blocks:
         raise _refused(number, f"the program ends inside of {open_blocks[-1][0]}")
     return tuple(out)
 
 
 def _as_python(body: str, word: str) -> tuple[str, int]:
-    """Return what Python's parser takes for a line, and how many signs it leaves out before."""
+    """Return a line as Python, and the number of characters removed at its beginning."""
     if word in ("thread", "sec"):  # nothing in this line is ever replaced
         return "def" + body.removeprefix(word), 0
     if word == "elif":
         return body[2:], 2
     if word in ("global", "local", "run", "join", "kill"):
-        rest = body.removeprefix(word).lstrip(" \t")
-        return rest, len(body) - len(rest)
+        statement = body.removeprefix(word).lstrip(" \t")
+        return statement, len(body) - len(statement)
     return re.sub(r"=(\s*)run\s", lambda m: m[0].replace("run", "   "), body, count=1), 0
 
 
@@ -127,40 +127,40 @@ def _parsed(text: str, number: int, word: str) -> ast.stmt:
     """Parse one line, which begins with a word."""
     for sign in _OTHER_SIGN.findall(_STRING_OR_COMMENT.sub("", text)):
         raise _refused(number, f"the sign {sign!a} outside of a comment")
-    what, header = f"'{text[:40]}' is not understood", word in (*_OPENS, "elif")
+    reason, header = f"'{text[:40]}' is not understood", word in (*_OPENS, "elif")
     try:
         (node,) = ast.parse(text + "\n pass" * header).body
         _check_depth(node)
-        known = all(_known(n, text) for n in _parts(node))
+        supported = all(_means_the_same(n, text) for n in _parts(node))
     except (SyntaxError, ValueError, RecursionError, MemoryError):
-        raise _refused(number, what) from None
-    alone = isinstance(node, ast.Expr) and isinstance(node.value, ast.Name)
-    known &= not alone or word in ("join", "kill", *_ALONE)
-    if not known or isinstance(node, ast.If | ast.While | ast.FunctionDef) != header:
-        raise _refused(number, what)
+        raise _refused(number, reason) from None
+    bare_name = isinstance(node, ast.Expr) and isinstance(node.value, ast.Name)
+    supported &= not bare_name or word in ("join", "kill", *_ALONE)
+    if not supported or isinstance(node, ast.If | ast.While | ast.FunctionDef) != header:
+        raise _refused(number, reason)
     return node
 
 
 def _check_depth(node: ast.AST) -> None:
-    """Refuse an expression in expressions without end: how many Python itself reads varies."""
+    """Refuse deeply nested expressions: the depth that Python itself reads varies."""
     level: list[ast.AST] = [node]
     for _ in range(limits.NESTED):
-        level = [part for one in level for part in ast.iter_child_nodes(one)]
+        level = [part for parent in level for part in ast.iter_child_nodes(parent)]
     if level:
         raise ValueError
 
 
 def _parts(node: ast.stmt) -> Iterator[ast.AST]:
-    """Yield all nodes of a statement but the `pass` that `_parsed` put into it."""
+    """Yield all nodes of a statement except the `pass` that `_parsed` added."""
     match node:
         case ast.If(test=test) | ast.While(test=test):
             yield from ast.walk(test)
-        case ast.FunctionDef(args=given) if (
-            not (given.kwonlyargs or given.posonlyargs or given.vararg or given.kwarg)
-            and all(a.annotation is None for a in given.args)
+        case ast.FunctionDef(args=head) if (
+            not (head.kwonlyargs or head.posonlyargs or head.vararg or head.kwarg)
+            and all(a.annotation is None for a in head.args)
             and node.returns is None
         ):
-            for value in given.defaults:
+            for value in head.defaults:
                 yield from ast.walk(value)
         case (
             ast.Assign(targets=[ast.Name()])
@@ -177,8 +177,8 @@ def _parts(node: ast.stmt) -> Iterator[ast.AST]:
             raise ValueError
 
 
-def _known(node: ast.AST, text: str) -> bool:
-    """Whether a part of an expression means in URScript what Python reads."""
+def _means_the_same(node: ast.AST, text: str) -> bool:
+    """Whether a part of an expression means the same in URScript and Python."""
     match node:
         case ast.Constant(value=bool() | str()):
             return True
@@ -199,5 +199,5 @@ def _known(node: ast.AST, text: str) -> bool:
     return isinstance(node, _EXPRESSIONS)
 
 
-def _refused(line: int, what: str) -> InputError:
-    return InputError(f"line {line}: {what}; {VALID}")
+def _refused(line: int, reason: str) -> InputError:
+    return InputError(f"line {line}: {reason}; {VALID}")

@@ -1,1 +1,1 @@
-"""Laws in readable form for what no effect of the catalogue explains."""
+"""Laws in readable form for misfit that no effect of the catalogue explains."""

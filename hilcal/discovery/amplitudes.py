@@ -1,10 +1,10 @@
 """The amplitude of a law: a product of functions of recorded quantities.
 
-A function of one quantity has the complexity of its shape, a sum of two joints one more; a product
-has the sum of its factors'.
+The complexity of a function of one quantity is that of its shape; a sum of joint angles as quantity
+adds 1. The complexity of a product is the sum of those of its factors.
 
-Functions of u are what sums of products do not reach: a hose that pulls beyond some length, which
-two joints make together, is max(u − u0, 0) with u = cos q_5·cos q_6. A function f(u) depends on the
+A function of a composed quantity u = Σ w_i φ_i is no sum of products: a hose that pulls beyond some
+length, which depends on two joints, is max(u − u0, 0) with u = cos q_5·cos q_6. f(u) depends on the
 transmitted wrenches W by the chain rule, ∂f/∂W = f'(u) Σ w_i ∂φ_i/∂W.
 """
 
@@ -39,26 +39,26 @@ _COMPONENTS = tuple(
 class Variable:
     """A recorded quantity."""
 
-    kind: Kind  # what functions of it are tried
-    names: tuple[str, ...]  # what the diagnosis calls it, or those that it is a sum of
+    kind: Kind  # selects the functions that are tried
+    names: tuple[str, ...]  # in the diagnosis; for a sum those of its summands
     symbol: str  # in formulas
-    latex: str  # likewise
+    latex: str  # in LaTeX formulas
     unit: str  # SI; °C for temperatures, "1" for a number
-    code: str  # how an effect reads it of its situation s; the search reads it so, too
+    code: str  # Python expression of a situation s, for effects and for the search
     need: str = ""  # column of the readings that it needs; empty for none
-    slot: tuple[int, int] | None = None  # slot and component of the wrench that it is
-    joint: int = -1  # index of the joint that it belongs to; −1 for none
-    vector: str = ""  # what it is a component of; empty for none
-    axis: int = -1  # along which; −1 for none
+    slot: tuple[int, int] | None = None  # slot and component, for a component of a wrench
+    joint: int = -1  # index of its joint; −1 for none
+    vector: str = ""  # vector of which it is a component; empty for none
+    axis: int = -1  # axis of the component; −1 for none
 
     def read(self, s: Situation) -> Floats:
-        """(N,) it in the states."""
-        known = {"np": np, "recorded": recorded, "s": s}
-        return np.asarray(eval(_compiled(self.code), known))  # noqa: S307 - made below
+        """(N,) values in the states."""
+        namespace = {"np": np, "recorded": recorded, "s": s}
+        return np.asarray(eval(_compiled(self.code), namespace))  # noqa: S307 - made below
 
     @property
     def cost(self) -> int:
-        """Complexity that it adds to a function of it."""
+        """Complexity that the quantity adds to its functions."""
         return int(self.kind == "sum")
 
     @property
@@ -68,11 +68,11 @@ class Variable:
 
     @property
     def recorded(self) -> tuple["Variable", ...]:
-        """The recorded quantities that it is made of: itself."""
+        """The recorded quantities of which it consists: itself."""
         return (self,)
 
     def slopes(self) -> tuple[tuple[tuple[int, int], str], ...]:
-        """Slots and components of the transmitted wrenches, and ∂x by each as Python."""
+        """Slots and components of transmitted wrenches, each with ∂x as Python; "" for 1."""
         return () if self.slot is None else ((self.slot, ""),)
 
 
@@ -84,13 +84,13 @@ def _compiled(code: str) -> CodeType:
 def variables(s: Situation) -> list[Variable]:
     """Return all quantities that vary over the states of a situation."""
     n = s.angle.shape[1]
-    every = chain(_angles(s), _wrenches(n), _attitude(n), _recorded(s, n), _places())
-    found = ((v, v.read(s)) for v in every)
-    return [v for v, x in found if np.ptp(x) > VARIES * max(float(np.abs(x).max()), 1e-300)]
+    quantities = chain(_angles(s), _wrenches(n), _attitude(n), _recorded(s, n), _places())
+    values = ((v, v.read(s)) for v in quantities)
+    return [v for v, x in values if np.ptp(x) > VARIES * max(float(np.abs(x).max()), 1e-300)]
 
 
 def _angles(s: Situation) -> Iterator[Variable]:
-    """Angles of joints and their sums; of a joint that slides the phase of its travel, φ."""
+    """Angles of joints and their sums; for a joint that slides, the phase φ of its travel."""
     arm = s.cell.arm
     for j, slides in enumerate(arm.slides.tolist()):
         letter, latex = ("φ", r"\phi") if slides else ("q", "q")
@@ -105,15 +105,15 @@ def _angles(s: Situation) -> Iterator[Variable]:
             code = f"(s.angle[:, {i}] {sign} s.angle[:, {j}])"
             yield Variable("sum", names, text, text, "rad", code)
     for a, b in ((i, i + k) for k in range(3, arm.n + 1) for i in range(arm.n - k + 1)):
-        # The turn of a link against another one: of consecutive joints.
+        # Rotation of a link relative to another one: sum over consecutive joints.
         if not arm.slides[a:b].any():
             text = f"({' + '.join(f'q_{j + 1}' for j in range(a, b))})"
-            mine = tuple(f"joint {j + 1} angle" for j in range(a, b))
-            yield Variable("sum", mine, text, text, "rad", f"s.angle[:, {a}:{b}].sum(axis=1)")
+            summands = tuple(f"joint {j + 1} angle" for j in range(a, b))
+            yield Variable("sum", summands, text, text, "rad", f"s.angle[:, {a}:{b}].sum(axis=1)")
 
 
 def _wrenches(n: int) -> Iterator[Variable]:
-    """Torques of the drives, wrenches through joints and flange, the load, the force sensor's."""
+    """Torques of drives, wrenches through joints and flange, load, and force sensor readings."""
     for j in range(n):
         yield Variable(
             "torque", (f"joint {j + 1} torque",), f"τ_{j + 1}", rf"\tau_{j + 1}", "N·m",
@@ -142,7 +142,7 @@ def _wrenches(n: int) -> Iterator[Variable]:
 
 
 def _attitude(n: int) -> Iterator[Variable]:
-    """Direction of gravity along the axes of the joints, and across the flange."""
+    """Components of gravity's direction along the joint axes and the flange axes."""
     places = [(k, 2, f"axis of joint {k + 1} to gravity", f"g{k + 1}") for k in range(n)]
     places += [(n, c, "flange attitude", f"gF_{_AXES[c]}") for c in range(3)]
     for k, c, name, symbol in places:
@@ -155,51 +155,51 @@ def _attitude(n: int) -> Iterator[Variable]:
 
 
 def _recorded(s: Situation, n: int) -> Iterator[Variable]:
-    """Temperatures, times, and sides of approach: columns that readings may have."""
-    of = s.states
-    if of.air_temperature is not None:
-        zero = round(float(np.median(of.air_temperature)), 1)
+    """Temperatures, times, and sides of approach: optional columns of readings."""
+    states = s.states
+    if states.air_temperature is not None:
+        zero = round(float(np.median(states.air_temperature)), 1)
         yield Variable(
             "temperature", ("air temperature",), f"(T_air - {zero})",
             rf"(T_\mathrm{{air}} - {zero})", "°C", f"(s.states.air_temperature - {zero})",
             "air_temperature",
         )  # fmt: skip
-    if of.joint_temperature is not None:
-        zero = round(float(np.median(of.joint_temperature)), 1)
+    if states.joint_temperature is not None:
+        zero = round(float(np.median(states.joint_temperature)), 1)
         for j in range(n):
             name, text = (f"joint {j + 1} temperature",), f"(T_{j + 1} - {zero})"
             code = f"(s.states.joint_temperature[:, {j}] - {zero})"
             yield Variable(
                 "temperature", name, text, text, "°C", code, "joint_temperature", joint=j
             )
-    if of.time is not None:
-        zero = float(np.floor(of.time.min()))
+    if states.time is not None:
+        zero = float(np.floor(states.time.min()))
         text = "t" if zero == 0 else f"(t - {zero:.0f})"
         yield Variable("time", ("time",), text, text, "s", f"(s.states.time - {zero})", "time")
-    if of.load_time is not None:
+    if states.load_time is not None:
         latex, code = r"t_\mathrm{load}", "s.states.load_time"
         yield Variable("hanging", ("time under load",), "t_load", latex, "s", code, "load_time")
-    for j in range(n if of.approach is not None else 0):
+    for j in range(n if states.approach is not None else 0):
         name, text, code = (f"joint {j + 1} approach",), f"s_{j + 1}", f"s.states.approach[:, {j}]"
         yield Variable("side", name, text, text, "1", code, "approach", joint=j)
 
 
 def _places() -> Iterator[Variable]:
-    """Where the target is: from the base, and as the tracker sees it."""
-    at = "s.chain.point(s.cell.target[:3, 3])"
-    seen = f"({at} @ s.cell.registration[:3, :3].T + s.cell.registration[:3, 3])"
+    """Position of the target, from the base and from the tracker."""
+    target = "s.chain.point(s.cell.target[:3, 3])"
+    in_tracker = f"({target} @ s.cell.registration[:3, :3].T + s.cell.registration[:3, 3])"
     for name, text, latex, code in (
-        ("reach", "ρ", r"\rho", f"np.linalg.norm({at}[:, :2], axis=1)"),
-        ("height", "z", "z", f"{at}[:, 2]"),
-        ("distance", "d", "d", f"np.linalg.norm({seen}, axis=1)"),
-        ("target x", "x", "x", f"{at}[:, 0]"),
-        ("target y", "y", "y", f"{at}[:, 1]"),
+        ("reach", "ρ", r"\rho", f"np.linalg.norm({target}[:, :2], axis=1)"),
+        ("height", "z", "z", f"{target}[:, 2]"),
+        ("distance", "d", "d", f"np.linalg.norm({in_tracker}, axis=1)"),
+        ("target x", "x", "x", f"{target}[:, 0]"),
+        ("target y", "y", "y", f"{target}[:, 1]"),
     ):
         axis = _AXES.find(text)
         vector = "target" if axis >= 0 else ""
         yield Variable("place", (name,), text, latex, "m", code, vector=vector, axis=axis)
-    flat = f"np.hypot({seen}[:, 0], {seen}[:, 1])"
-    turns = f"{seen}[:, 1], {seen}[:, 0]", f"{seen}[:, 2], {flat}"
+    flat = f"np.hypot({in_tracker}[:, 0], {in_tracker}[:, 1])"
+    turns = f"{in_tracker}[:, 1], {in_tracker}[:, 0]", f"{in_tracker}[:, 2], {flat}"
     yield Variable("sight", ("azimuth",), "az", r"\alpha", "rad", f"np.arctan2({turns[0]})")
     yield Variable("sight", ("elevation",), "el", r"\varepsilon", "rad", f"np.arctan2({turns[1]})")
 
@@ -218,16 +218,16 @@ class Factor:
         return self.shape.cost + self.variable.cost
 
     def values(self, s: Situation) -> Floats:
-        """(N,) of the states."""
+        """(N,) values in the states."""
         return self.shape.value(self.variable.read(s), self.numbers)
 
     @property
     def power(self) -> float:
-        """Power of the variable's unit that the factor has."""
+        """Power of the variable's unit in the unit of the factor."""
         return self.shape.power(self.numbers)
 
     def written(self, way: str) -> str:
-        """Return it as "text", "latex", Python "code" of a situation s, or its "slope_code"."""
+        """Return the factor as "text", "latex" or Python "code", or its slope as "slope_code"."""
         v = self.variable
         if way in ("text", "latex"):
             x, numbers = v.symbol if way == "text" else v.latex, [f"{x:g}" for x in self.numbers]
@@ -249,17 +249,17 @@ class Amplitude:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the quantities that it depends on."""
+        """Names of its quantities."""
         return tuple(dict.fromkeys(n for f in self.factors for n in f.variable.names))
 
     @property
     def elastic(self) -> bool:
-        """Whether it depends on transmitted wrenches."""
+        """Whether the amplitude depends on transmitted wrenches."""
         return any(f.variable.slot is not None for f in self.factors)
 
     @property
     def sensed(self) -> bool:
-        """Whether it depends on what the force sensor reads in its own axes."""
+        """Whether the amplitude depends on the force sensor's reading in sensor axes."""
         return any(f.variable.kind == "sensor" for f in self.factors)
 
     @property
@@ -268,7 +268,7 @@ class Amplitude:
         return tuple(dict.fromkeys(n for f in self.factors for n in f.variable.needs))
 
     def values(self, s: Situation) -> Floats:
-        """(N,) of the states."""
+        """(N,) values in the states."""
         out = np.ones(len(s.angle))
         for f in self.factors:
             out = out * f.values(s)
@@ -276,7 +276,7 @@ class Amplitude:
 
     @property
     def powers(self) -> dict[str, float]:
-        """Powers of the units that the product has."""
+        """Powers of the units in the unit of the product."""
         powers: dict[str, float] = {}
         for f in self.factors:
             if f.power and f.variable.unit != "1":
@@ -292,25 +292,25 @@ class Amplitude:
         return r"\,".join(f.written("latex") for f in self.factors)
 
     def code(self) -> str:
-        """Return the product as Python, of a situation s."""
+        """Return the product as Python expression of a situation s."""
         parts = [f.written("code") for f in self.factors] or ["np.ones(len(s.angle))"]
         return parts[0] if len(parts) == 1 else " * ".join(f"({part})" for part in parts)
 
     def slopes(self) -> Iterator[tuple[tuple[int, int], str]]:
-        """Yield slots and components of transmitted wrenches, and its derivative by each."""
+        """Yield slots and components of transmitted wrenches, with the derivatives as Python."""
         for i, f in enumerate(self.factors):
-            others = Amplitude((*self.factors[:i], *self.factors[i + 1 :]))
+            cofactor = Amplitude((*self.factors[:i], *self.factors[i + 1 :]))
             for slot, inner in f.variable.slopes():
                 parts = [f.written("slope_code"), *([inner] if inner else [])]
-                parts += [others.code()] if others.factors else []
+                parts += [cofactor.code()] if cofactor.factors else []
                 yield slot, " * ".join(f"({part})" for part in parts)
 
     def unit(self) -> str:
-        """Unit of the product; "1" where it has none."""
+        """Unit of the product; "1" for none."""
         return unit_of(self.powers)
 
-    def of_joint(self, old: int, new: int, known: list[Variable]) -> "Amplitude | None":
-        """Return the same law of another joint's own quantities; None where it has none."""
+    def of_joint(self, old: int, new: int, quantities: list[Variable]) -> "Amplitude | None":
+        """Return the law with the quantities of joint `new`; None if `quantities` lack one."""
         return self._with(
             lambda v: v.joint == old and v.kind != "sum",
             lambda v, w: (
@@ -318,37 +318,37 @@ class Amplitude:
                 and w.joint == new
                 and (w.slot is None or v.slot is None or w.slot[1] == v.slot[1])
             ),
-            known,
+            quantities,
         )
 
-    def of_axis(self, old: int, new: int, known: list[Variable]) -> "Amplitude | None":
-        """Return the same law of another axis: vectors' components along both change places."""
+    def of_axis(self, old: int, new: int, quantities: list[Variable]) -> "Amplitude | None":
+        """Return the law with the vectors' components along two axes exchanged."""
         swap = {old: new, new: old}
         return self._with(
             lambda v: bool(v.vector) and v.axis in swap,
             lambda v, w: w.vector == v.vector and w.axis == swap[v.axis],
-            known,
+            quantities,
         )
 
     def _with(
         self,
         changes: Callable[[Variable], bool],
         same: Callable[[Variable, Variable], bool],
-        known: list[Variable],
+        quantities: list[Variable],
     ) -> "Amplitude | None":
-        """Return the product with other quantities where they change; None where there is none."""
+        """Return the product with other quantities where `changes`; None if one is missing."""
         out = []
         for f in self.factors:
             v = f.variable
-            found = next((w for w in known if same(v, w)), None) if changes(v) else v
-            if found is None:
+            substitute = next((w for w in quantities if same(v, w)), None) if changes(v) else v
+            if substitute is None:
                 return None
-            out.append(replace(f, variable=found))
+            out.append(replace(f, variable=substitute))
         return Amplitude(tuple(out))
 
 
 def unit_of(powers: dict[str, float]) -> str:
-    """Return a product of units by their powers; "1" where there is none."""
+    """Return a product of units by their powers; "1" for none."""
     parts = {u: f"({u})" if "·" in u else u for u in powers}
     return "·".join(u if p == 1 else f"{parts[u]}^{p:g}" for u, p in powers.items()) or "1"
 
@@ -367,7 +367,7 @@ class Composed(Variable):
     terms: tuple[tuple[float, Amplitude], ...] = ()  # weights, the first 1, and products
 
     def read(self, s: Situation) -> Floats:
-        """(N,) it in the states."""
+        """(N,) values in the states."""
         return np.asarray(sum(w * a.values(s) for w, a in self.terms))
 
     @property
@@ -377,17 +377,17 @@ class Composed(Variable):
 
     @property
     def recorded(self) -> tuple[Variable, ...]:
-        """The recorded quantities that it is made of."""
+        """The recorded quantities of which it consists."""
         return tuple(dict.fromkeys(f.variable for _, a in self.terms for f in a.factors))
 
     def slopes(self) -> tuple[tuple[tuple[int, int], str], ...]:
-        """Slots and components of the transmitted wrenches, and ∂u by each as Python."""
-        found = [(slot, w, code) for w, a in self.terms for slot, code in a.slopes()]
-        return tuple((slot, code if w == 1 else f"{w!r} * {code}") for slot, w, code in found)
+        """Slots and components of transmitted wrenches, each with ∂u as Python."""
+        slopes = [(slot, w, code) for w, a in self.terms for slot, code in a.slopes()]
+        return tuple((slot, code if w == 1 else f"{w!r} * {code}") for slot, w, code in slopes)
 
     @property
     def cost(self) -> int:
-        """Complexity: that of its products, and one for each weight."""
+        """Complexity: that of its products, and 1 for each free weight."""
         return sum(a.cost for _, a in self.terms) + len(self.terms) - 1
 
 
@@ -406,7 +406,7 @@ def composed(terms: tuple[tuple[float, Amplitude], ...]) -> Composed:
 
 
 def _sum(terms: list[tuple[float, str]], times: str) -> str:
-    """Weighted sum as text, in brackets where it has several products."""
+    """Weighted sum as text, in brackets if it has several products."""
     out = terms[0][1]
     for w, text in terms[1:]:
         size = "" if abs(w) == 1 else f"{abs(w):g}{times}"

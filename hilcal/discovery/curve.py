@@ -1,16 +1,16 @@
-"""The curve of a law over a quantity that it depends on, with what the readings say beside it.
+"""The curve of a law over one of its quantities, with the partial residuals of the readings.
 
 A law moves site s by Σ_p θ_p f_p(x) g(·), where x is the quantity and g the product of the other
 factors. With T the whitened motion of one reading by a unit motion of the site and r the whitened
-residual of the fit with the law, that reading alone would have
+residual of the fit with the law, the partial residual of this reading is
 
     y = Σ_p θ_p f_p(x) + Tᵀ r / (TᵀT g),    std = 1 / (|T| |g|)
 
-(a partial residual). Waves of high order are drawn over one period.
+Waves of high order are drawn over one period.
 
-Of an effect of a file, as `discover` or a user wrote it, the motion m of a site is drawn over a
-quantity x that its formula names, divided by another one g where the formula is a product: of all
-such pairs that in which m/g follows x most smoothly (von Neumann's ratio).
+For an effect from a file, written by `discover` or a user, the motion m of a site is drawn over a
+quantity x that its formula names, divided by another one g if the formula is a product. Of all such
+pairs (x, g) the one with the smoothest m/g over x is drawn (von Neumann's ratio).
 """
 
 import re
@@ -29,34 +29,34 @@ from hilcal.types import Bools, Floats, Ints
 
 MOST_CURVES = 3
 BINS = 12
-LINE = 101  # Points of the drawn law; a choice, as the two above
-MOST_POINTS = 2000  # Readings that are drawn at most; a choice, by memory
-LEAST = 0.02  # share of the largest of the other factors below which nothing is said; a choice
+LINE = 101  # Points of the drawn law; a choice, as are the two above
+MOST_POINTS = 2000  # Most readings that are drawn; a choice, by memory
+LEAST = 0.02  # Least size of g, as share of its largest, for a reading to count; a choice
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Curve:
     """A law over one quantity."""
 
-    site: str  # where it acts
-    of: str  # symbol of what is drawn: the site's motion, over the other factors
-    unit: str  # of it, SI
+    site: str  # site of the law, in words
+    of: str  # symbol of y: the site's motion divided by the other factors
+    unit: str  # of y, SI
     quantity: str  # symbol of the quantity
     quantity_unit: str  # SI; "1" for a number
     x: Floats  # (P,) the quantity at readings
-    y: Floats  # (P,) what each reading by itself says
+    y: Floats  # (P,) partial residual of each reading
     std: Floats  # (P,) its standard deviation by the noise
     binned: Floats  # (4, B) mean of x, mean of y, its standard deviation, number of readings
     line: Floats  # (2, L) quantity and law
 
 
 def curves(after: Fit, form: Form, most: int = MOST_CURVES) -> tuple[Curve, ...]:
-    """Return the curves of a law, the last effect of a fit, those of its surest parts first."""
+    """Return the curves of a law, the last effect of a fit, most significant parts first."""
     rows = after.model.slices()[-1]
     theta, std = after.theta[rows], after.uncertainty.std[rows]
-    sure = sorted(form.parts, key=lambda p: -abs(theta[p.coefficient]) / std[p.coefficient])
+    ordered = sorted(form.parts, key=lambda p: -abs(theta[p.coefficient]) / std[p.coefficient])
     groups: dict[tuple[Site, str, frozenset[tuple[object, ...]]], list[LawPart]] = {}
-    for p in sure:
+    for p in ordered:
         for f in p.amplitude.factors:
             others = frozenset(
                 (x.variable.symbol, x.shape.name, x.numbers)
@@ -70,8 +70,8 @@ def curves(after: Fit, form: Form, most: int = MOST_CURVES) -> tuple[Curve, ...]
     situation = after.solution.prediction.situation
     out = []
     for (site, symbol, _), parts in list(groups.items())[:most]:
-        own = motion[:, :, sites.index(site)] / ORDINARY[site.unit]
-        out.append(_curve(after, situation, own, parts, symbol, theta))
+        of_site = motion[:, :, sites.index(site)] / ORDINARY[site.unit]
+        out.append(_curve(after, situation, of_site, parts, symbol, theta))
     return tuple(out)
 
 
@@ -79,67 +79,70 @@ def _curve(
     after: Fit, s: Situation, motion: Floats, parts: list[LawPart], symbol: str, theta: Floats
 ) -> Curve:
     site, first = parts[0].site, parts[0]
-    own = [(p, f) for p in parts for f in p.amplitude.factors if f.variable.symbol == symbol]
-    others = [f for f in first.amplitude.factors if f.variable.symbol != symbol]
-    v = own[0][1].variable
-    orders = {f.numbers[0] if f.shape.name in ("cos", "sin") else 0.0 for _, f in own}
+    varying = [(p, f) for p in parts for f in p.amplitude.factors if f.variable.symbol == symbol]
+    cofactors = [f for f in first.amplitude.factors if f.variable.symbol != symbol]
+    v = varying[0][1].variable
+    orders = {f.numbers[0] if f.shape.name in ("cos", "sin") else 0.0 for _, f in varying}
     order = orders.pop() if len(orders) == 1 else 0.0
     x = _folded(v.read(s), order)
-    other = np.prod([f.values(s) for f in others], axis=0) if others else np.ones(len(x))
+    divisor = np.prod([f.values(s) for f in cofactors], axis=0) if cofactors else np.ones(len(x))
 
-    def law(at: Floats) -> Floats:
-        terms = [theta[p.coefficient] * f.shape.value(at, f.numbers) for p, f in own]
+    def law(x: Floats) -> Floats:
+        terms = [theta[p.coefficient] * f.shape.value(x, f.numbers) for p, f in varying]
         return np.asarray(np.sum(terms, axis=0))
 
-    said, std = said_by_readings(after, motion)
-    at = _points(_sayable(std, other))
-    x, y, std = x[at], law(x[at]) + said[at] / other[at], std[at] / np.abs(other[at])
+    deviation, std = partial_residuals(after, motion)
+    drawn = _points(_usable(std, divisor))
+    x, divisor = x[drawn], divisor[drawn]
+    y, std = law(x) + deviation[drawn] / divisor, std[drawn] / np.abs(divisor)
     ends = np.linspace(float(x.min()), float(x.max()), LINE)
-    inner = "·".join(f.shape.text(f.variable.symbol, [f"{n:g}" for n in f.numbers]) for f in others)
-    of, unit = site.symbol, site.unit
-    if others:
-        of = f"{of}/({inner})" if "·" in inner else f"{of}/{inner}"
-        divided = type(first.amplitude)(tuple(others)).unit()
+    inner = "·".join(
+        f.shape.text(f.variable.symbol, [f"{n:g}" for n in f.numbers]) for f in cofactors
+    )
+    ordinate, unit = site.symbol, site.unit
+    if cofactors:
+        ordinate = f"{ordinate}/({inner})" if "·" in inner else f"{ordinate}/{inner}"
+        divided = type(first.amplitude)(tuple(cofactors)).unit()
         unit = unit if divided == "1" else f"{unit}/({divided})"
-    return _over(site, of, unit, v, order, x, y, std, np.vstack([ends, law(ends)]))
+    return _over(site, ordinate, unit, v, order, x, y, std, np.vstack([ends, law(ends)]))
 
 
-def _sayable(std: Floats, divisor: Floats) -> Bools:
-    """(N,) which readings say something of a motion that is divided by the other factors."""
+def _usable(std: Floats, divisor: Floats) -> Bools:
+    """(N,) which readings determine a motion that is divided by the other factors."""
     size = np.abs(divisor)
     return np.asarray(np.isfinite(std) & (size > LEAST * float(size.max())))
 
 
-def _points(kept: Bools) -> Ints:
-    """Return which readings are drawn: all of those kept, or some at random."""
-    at = np.flatnonzero(kept)
-    if len(at) <= MOST_POINTS:
-        return at
-    return np.random.default_rng(20261122).choice(at, MOST_POINTS, replace=False)
+def _points(usable: Bools) -> Ints:
+    """Return which readings are drawn: all usable ones, or some at random."""
+    indices = np.flatnonzero(usable)
+    if len(indices) <= MOST_POINTS:
+        return indices
+    return np.random.default_rng(20261122).choice(indices, MOST_POINTS, replace=False)
 
 
 def _over(
-    site: Site, of: str, unit: str, v: Variable, order: float, x: Floats, y: Floats, std: Floats,
-    line: Floats,
+    site: Site, ordinate: str, unit: str, v: Variable, order: float, x: Floats, y: Floats,
+    std: Floats, line: Floats,
 ) -> Curve:  # fmt: skip
-    """Return a curve over a quantity, within a period of a wave of high order."""
+    """Return a curve over a quantity, or over one period for a wave of high order."""
     name = f"{v.symbol} within a period of 2π/{order:g}" if order > HARMONICS else v.symbol
-    return Curve(site.words, of, unit, name, v.unit, x, y, std, binned(x, y, std), line)
+    return Curve(site.words, ordinate, unit, name, v.unit, x, y, std, binned(x, y, std), line)
 
 
-def said_by_readings(after: Fit, motion: Floats) -> tuple[Floats, Floats]:
-    """What the residual of each reading says of the site's motion (N,), and its std."""
+def partial_residuals(after: Fit, motion: Floats) -> tuple[Floats, Floats]:
+    """Partial residual (N,) of each reading, as motion of the site, and its std."""
     w, white = after.whitening, after.white
-    said, square = np.zeros(len(motion)), np.zeros(len(motion))
+    partial, square = np.zeros(len(motion)), np.zeros(len(motion))
     for start in range(0, len(motion), 200):
-        some = np.arange(start, min(start + 200, len(motion)))
-        spread = np.zeros((*motion.shape, len(some)))
-        spread[some, :, some - start] = motion[some]
+        part = np.arange(start, min(start + 200, len(motion)))
+        spread = np.zeros((*motion.shape, len(part)))
+        spread[part, :, part - start] = motion[part]
         t = w.whiten_readings(spread)
-        said[some], square[some] = t.T @ white, np.sum(t**2, axis=0)
-    seen = square > 0
-    safe = np.where(seen, square, 1.0)
-    return said / safe, np.where(seen, 1.0 / np.sqrt(safe), np.inf)
+        partial[part], square[part] = t.T @ white, np.sum(t**2, axis=0)
+    visible = square > 0
+    safe = np.where(visible, square, 1.0)
+    return partial / safe, np.where(visible, 1.0 / np.sqrt(safe), np.inf)
 
 
 def binned(x: Floats, y: Floats, std: Floats) -> Floats:
@@ -154,10 +157,10 @@ def binned(x: Floats, y: Floats, std: Floats) -> Floats:
     return np.array(out).T
 
 
-MOST_SITES = 2  # Sites of a law that are drawn, those that it moves most; a choice
-SMOOTH = 0.05  # von Neumann's ratio below which the law is a line, else means in bins; a choice
+MOST_SITES = 2  # Sites of a law that are drawn, those with the largest motion; a choice
+SMOOTH = 0.05  # von Neumann's ratio below which a law is drawn as line, not binned; a choice
 
-Way = tuple[Variable, Variable | None]  # What a law is drawn over, and what it is divided by
+Axes = tuple[Variable, Variable | None]  # Quantity of the abscissa, and divisor of the ordinate
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -165,42 +168,44 @@ class DrawnLaw:
     """An effect of a file in a fitted model."""
 
     name: str
-    formula: str  # its summary; that of a proposed law is its formula
-    acts_on: tuple[str, ...]  # where it acts, in words
-    curves: tuple[Curve, ...]  # over what it depends on, where a site moves with something recorded
+    formula: str  # summary of the effect; for a proposed law its formula
+    acts_on: tuple[str, ...]  # its sites, in words
+    curves: tuple[Curve, ...]  # over recorded quantities
 
 
 def drawn_laws(fit: Fit) -> tuple[DrawnLaw, ...]:
-    """Return the effects of a fit that are from files, each with its curves."""
+    """Return the effects of a fit that are from files, with their curves."""
     files = fit.model.catalogue.files
-    own = {e.name for f in files for e in f.effects}
-    mine = [k for k, e in enumerate(fit.model.effects) if e.name in own]
-    if not mine:
+    names = {e.name for f in files for e in f.effects}
+    indices = [k for k, e in enumerate(fit.model.effects) if e.name in names]
+    if not indices:
         return ()
     sites, unit = site_motions(fit)
-    return tuple(_drawn(fit, k, sites, unit) for k in mine)
+    return tuple(_drawn(fit, k, sites, unit) for k in indices)
 
 
 def _drawn(fit: Fit, index: int, sites: tuple[Site, ...], unit: Floats) -> DrawnLaw:
     effect, theta = fit.model.effects[index], fit.theta[fit.model.slices()[index]]
-    moved = _motions(effect, theta, fit, sites)
+    motion = _motions(effect, theta, fit, sites)
     size = {k: float(np.sqrt(np.mean((unit[:, :, k] / ORDINARY[sites[k].unit] * m[:, None]) ** 2)))
-            for k, m in moved.items()}  # fmt: skip
-    order = sorted(moved, key=lambda k: -size[k])
-    found = variables(fit.solution.prediction.situation)
-    named = [v for v in found if _named(v, effect.summary)]
-    ways: list[Way] = [(v, None) for v in named or found]
-    ways += [(v, g) for v in named for g in named if g is not v]
+            for k, m in motion.items()}  # fmt: skip
+    order = sorted(motion, key=lambda k: -size[k])
+    quantities = variables(fit.solution.prediction.situation)
+    named = [v for v in quantities if _named(v, effect.summary)]
+    axes: list[Axes] = [(v, None) for v in named or quantities]
+    axes += [(v, g) for v in named for g in named if g is not v]
     curves = tuple(
-        _drawn_curve(fit, sites[k], unit[:, :, k] / ORDINARY[sites[k].unit], moved[k], ways, effect)
+        _drawn_curve(
+            fit, sites[k], unit[:, :, k] / ORDINARY[sites[k].unit], motion[k], axes, effect
+        )
         for k in order[:MOST_SITES]
-        if ways and size[k] > 0
+        if axes and size[k] > 0
     )
     return DrawnLaw(effect.name, effect.summary, tuple(sites[k].words for k in order), curves)
 
 
 def _motions(effect: Effect, theta: Floats, fit: Fit, sites: tuple[Site, ...]) -> dict[int, Floats]:
-    """Motion (N,) of each site, by its index, by the effect."""
+    """Motions (N,) by the effect, by index of the site."""
     s = fit.solution.prediction.situation
     place: dict[tuple[Place, int, int], int] = {
         (x.field, x.element, x.axis): k for k, x in enumerate(sites)
@@ -211,10 +216,10 @@ def _motions(effect: Effect, theta: Floats, fit: Fit, sites: tuple[Site, ...]) -
             flat = c.field in ("dq", "scale")
             values = c.values[:, k, None] if flat else c.values[:, k]
             for axis in range(values.shape[1]):
-                at = place.get((c.field, 0 if c.field == "scale" else int(element), axis))
-                if at is not None and np.any(values[:, axis]):
-                    now = np.broadcast_to(theta[p] * values[:, axis], len(s.angle))
-                    out[at] = out.get(at, np.zeros(len(s.angle))) + now
+                site = place.get((c.field, 0 if c.field == "scale" else int(element), axis))
+                if site is not None and np.any(values[:, axis]):
+                    motion = np.broadcast_to(theta[p] * values[:, axis], len(s.angle))
+                    out[site] = out.get(site, np.zeros(len(s.angle))) + motion
     change = effect.wrench_change(theta, s)
     if change is not None:
         error = sensor_error(s, change)
@@ -228,48 +233,48 @@ def _named(v: Variable, formula: str) -> bool:
 
 
 def _drawn_curve(
-    fit: Fit, site: Site, motion: Floats, law: Floats, ways: list[Way], effect: Effect
+    fit: Fit, site: Site, motion: Floats, law: Floats, axes: list[Axes], effect: Effect
 ) -> Curve:
     s = fit.solution.prediction.situation
-    said, std = said_by_readings(fit, motion)
-    tried: list[tuple[float, int, Variable, Variable | None, Floats, Bools, Floats]] = []
-    for v, g in ways:
+    partial, std = partial_residuals(fit, motion)
+    candidates: list[tuple[float, int, Variable, Variable | None, Floats, Bools, Floats]] = []
+    for v, g in axes:
         divisor = np.ones(len(law)) if g is None else g.read(s)
-        kept = _sayable(std, divisor)
+        usable = _usable(std, divisor)
         x = _folded(v.read(s), _order(v, effect.summary))
-        rough = _roughness(x[kept], law[kept] / divisor[kept])
-        tried.append((rough, len(tried), v, g, divisor, kept, x))
-    rough, _, v, g, divisor, kept, x = min(tried, key=lambda t: (t[0] > SMOOTH, t[:2]))
-    at = _points(kept)
-    x, known = x[at], law[at] / divisor[at]
-    y, error = known + said[at] / divisor[at], std[at] / np.abs(divisor[at])
-    line = _line(x, known) if rough <= SMOOTH else binned(x, known, error)[:2]
-    of, unit = site.symbol, site.unit
+        roughness = _roughness(x[usable], law[usable] / divisor[usable])
+        candidates.append((roughness, len(candidates), v, g, divisor, usable, x))
+    roughness, _, v, g, divisor, usable, x = min(candidates, key=lambda t: (t[0] > SMOOTH, t[:2]))
+    drawn = _points(usable)
+    x, law_values = x[drawn], law[drawn] / divisor[drawn]
+    y, error = law_values + partial[drawn] / divisor[drawn], std[drawn] / np.abs(divisor[drawn])
+    line = _line(x, law_values) if roughness <= SMOOTH else binned(x, law_values, error)[:2]
+    ordinate, unit = site.symbol, site.unit
     if g is not None:
-        of, unit = f"{of}/{g.symbol}", unit if g.unit == "1" else f"{unit}/({g.unit})"
-    return _over(site, of, unit, v, _order(v, effect.summary), x, y, error, line)
+        ordinate, unit = f"{ordinate}/{g.symbol}", unit if g.unit == "1" else f"{unit}/({g.unit})"
+    return _over(site, ordinate, unit, v, _order(v, effect.summary), x, y, error, line)
 
 
 def _line(x: Floats, y: Floats) -> Floats:
-    """(2, L) a law that is known at some places (K,), interpolated without overshooting."""
+    """(2, L) law at some points (K,), interpolated without overshooting."""
     from scipy.interpolate import PchipInterpolator  # slow to import
 
-    places, which = np.unique(x, return_inverse=True)
-    if len(places) < 2:
+    points, index = np.unique(x, return_inverse=True)
+    if len(points) < 2:
         return np.vstack([x[:1], y[:1]])
-    mean = np.bincount(which, y) / np.bincount(which)
-    ends = np.linspace(places[0], places[-1], LINE)
-    return np.vstack([ends, PchipInterpolator(places, mean)(ends)])
+    mean = np.bincount(index, y) / np.bincount(index)
+    ends = np.linspace(points[0], points[-1], LINE)
+    return np.vstack([ends, PchipInterpolator(points, mean)(ends)])
 
 
 def _order(v: Variable, formula: str) -> float:
-    """The multiple of an angle that a formula has, largest if several; 0 for none."""
-    found = re.findall(rf"([\d.]+)·{re.escape(v.symbol)}(?!\w)", formula)
-    return max((float(k) for k in found), default=0.0)
+    """Largest multiple of an angle in a formula; 0 for none."""
+    orders = re.findall(rf"([\d.]+)·{re.escape(v.symbol)}(?!\w)", formula)
+    return max((float(k) for k in orders), default=0.0)
 
 
 def _folded(x: Floats, order: float) -> Floats:
-    """Waves of high order are drawn over one period."""
+    """Return x within one period for a wave of high order."""
     if order <= HARMONICS:
         return x
     period = 2 * np.pi / order

@@ -1,10 +1,10 @@
-"""All amplitudes that are tried: products of functions, to a stated complexity.
+"""All amplitudes that are tried: products of functions, up to a stated complexity.
 
 All products of at most `MOST_FACTORS` factors of different quantities up to the complexity `MOST`
 are tried.
 
-What a law costs for the search that found it is the logarithm of the number of candidates of its
-complexity, and log 2 for each unit of complexity: simple laws are few, and pay little.
+The price of a law, for the size of the search, is the logarithm of the number of candidates of its
+complexity, plus log 2 for each unit of complexity: simple laws are few, and cheap.
 """
 
 from collections.abc import Callable
@@ -21,11 +21,11 @@ from hilcal.effects.protocol import Situation
 from hilcal.types import Floats, Ints
 
 HARMONICS = 4  # Multiples of an angle; as in the diagnosis
-FINEST = 512  # highest multiple of an angle, at most one per pose; a choice, as of encoders
+FINEST = 512  # Highest multiple of an angle, at most one per pose; a choice, as for encoders
 
 
 def functions(v: Variable, x: Floats, most: int) -> list[Factor]:
-    """Return the functions of a quantity x (N,); those of complexity `most` are in no product."""
+    """Return the functions of a quantity x (N,); those of complexity `most` enter no product."""
     linear = Factor(v, shapes.LINEAR)
     if v.kind in WAVES:
         waves = [
@@ -40,29 +40,24 @@ def functions(v: Variable, x: Floats, most: int) -> list[Factor]:
 
 
 WAVES = {"angle": HARMONICS, "sum": 2, "sight": 2}  # multiples of an angle; a choice
-BENDS = (0.3, 0.7)  # shares of the readings below a bend to begin with; a choice
-_Made = Callable[[Variable, Floats], list[Factor]]
+BENDS = (0.3, 0.7)  # Initial bends, as quantiles; a choice
+_Functions = Callable[[Variable, Floats], list[Factor]]
 
 
 def _bent(v: Variable, x: Floats, most: int) -> list[Factor]:
-    """Return functions that are zero up to some value, by either side, and symmetric ones."""
-    alone = v.kind in (
-        "force",
-        "load",
-        "sensor",
-        "place",
-    )  # many, and rarely with a bend: in no product
-    made = [
-        Factor(v, replace(f, cost=most) if alone else f, (_round(at),))
-        for at in np.quantile(x, BENDS).tolist()
+    """Return functions that are zero up to some value, from either side, and symmetric ones."""
+    alone = v.kind in ("force", "load", "sensor", "place")  # many, rarely bent: in no product
+    out = [
+        Factor(v, replace(f, cost=most) if alone else f, (_round(bend),))
+        for bend in np.quantile(x, BENDS).tolist()
         for f in (shapes.ABOVE, shapes.BELOW)
     ]
     if x.min() < 0 < x.max() and v.kind in ("angle", "torque"):
         near = _round(0.01 * _middle(x))
-        made.append(Factor(v, shapes.THRESHOLD, (_round(0.5 * _middle(x)),)))
-        made.append(Factor(v, shapes.SATURATION, (_round(_middle(x)),)))
-        made += [Factor(v, shapes.EVEN, (p, near)) for p in (1.0, 2.0)]
-    return list({(f.shape.name, f.numbers): f for f in made}.values())
+        out.append(Factor(v, shapes.THRESHOLD, (_round(0.5 * _middle(x)),)))
+        out.append(Factor(v, shapes.SATURATION, (_round(_middle(x)),)))
+        out += [Factor(v, shapes.EVEN, (p, near)) for p in (1.0, 2.0)]
+    return list({(f.shape.name, f.numbers): f for f in out}.values())
 
 
 def _middle(x: Floats) -> float:
@@ -84,7 +79,7 @@ def _wrench(v: Variable, x: Floats) -> list[Factor]:
 
 
 def _read_by_sensor(v: Variable, x: Floats) -> list[Factor]:
-    """Curvature, and a sensor that is another one for pull and push."""
+    """Return curvatures, and different gains of the sensor for pull and push."""
     if not x.min() < 0 < x.max():
         return _even(v, x, 2.0)
     return [Factor(v, shapes.PLUS), *_even(v, x, 1.0, 2.0)]
@@ -121,7 +116,7 @@ def _lasting(v: Variable, x: Floats) -> list[Factor]:
     return out
 
 
-_CURVED: dict[str, _Made] = {
+_CURVED: dict[str, _Functions] = {
     "torque": _wrench, "force": _wrench, "load": _wrench, "sensor": _read_by_sensor,
     "gravity": _gravity, "temperature": _temperature, "time": _lasting, "hanging": _lasting,
     "place": _grown,
@@ -132,17 +127,17 @@ def _round(x: float) -> float:
     return float(f"{x:.2g}")
 
 
-MOST = 3  # complexity of a product; a choice: about 10⁶ candidates with all sites
-MOST_FACTORS = 2  # Factors of a product; a choice, likewise
-SOME = 2000  # Products that are formed at a time; a choice, for memory
-ARGUMENT = 2  # Complexity of a product in a composed quantity; a choice, by the number of them
+MOST = 3  # Complexity of a product; a choice: about 10⁶ candidates with all sites
+MOST_FACTORS = 2  # Factors of a product; a choice, for the same reason
+SOME = 2000  # Products that are formed at a time; a choice, by memory
+ARGUMENT = 2  # Complexity of a product in a composed quantity; a choice, by their number
 COMPOSED_OF = {
     "angle", "torque", "load", "gravity", "temperature", "time", "hanging", "place",
 }  # fmt: skip
-"""Quantities of which others are composed; a choice: components in joint axes are too many."""
+"""Kinds of quantities in composed ones; a choice: components in joint axes are too many."""
 WAVES_OF_ARGUMENT = 2  # Multiples of an angle in a composed quantity; a choice
 SHAPES = 5  # of a composed quantity: bends to both sides, also with an exponent, steps
-FLAT = 0.1  # spread by size of factors that are in no product, as good as constant; a choice
+FLAT = 0.1  # Spread over size of nearly constant factors, which enter no product; a choice
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,31 +146,31 @@ class Grammar:
 
     known: list[Variable]
     amplitudes: tuple[Amplitude, ...]
-    values: Floats  # (F, N) their values, single precision, each with root mean square 1
-    size: Floats  # (F,) what they were divided by
+    values: Floats  # (F, N) their values, single precision, each scaled to root mean square 1
+    size: Floats  # (F,) root mean squares before scaling
     cost: Ints  # (F,) complexities
-    partner: Ints  # (F,) with sine for cosine in the first periodic factor; −1 for none
-    less: Ints  # (2, F) of a product of two without its first, and its second factor; else −1
+    partner: Ints  # (F,) index with sine for cosine in the first periodic factor; −1 for none
+    less: Ints  # (2, F) index of a product of two without first, and second factor; else −1
     situation: Situation
-    singles: tuple[Factor, ...]  # the functions of one quantity from which products are made
+    singles: tuple[Factor, ...]  # functions of one quantity from which products are formed
     _more: list[tuple[Amplitude, Floats, float]] = field(default_factory=list)
     _read: dict[str, Floats] = field(default_factory=dict)
 
     def at(self, k: int) -> Amplitude:
         """Return an amplitude by its index."""
-        own = len(self.amplitudes)
-        return self.amplitudes[k] if k < own else self._more[k - own][0]
+        count = len(self.amplitudes)
+        return self.amplitudes[k] if k < count else self._more[k - count][0]
 
     def rows(self, which: list[int]) -> Floats:
         """(P, N) values of amplitudes, each with root mean square 1."""
-        own = len(self.amplitudes)
-        return np.array([self.values[k] if k < own else self._more[k - own][1] for k in which])
+        count = len(self.amplitudes)
+        return np.array([self.values[k] if k < count else self._more[k - count][1] for k in which])
 
     def index(self, amplitude: Amplitude) -> int | None:
-        """Return the index of an amplitude, added where it is new; None where it is zero."""
-        known = self.place(amplitude)
-        if known is not None:
-            return known
+        """Return the index of an amplitude, adding a new one; None if it is zero."""
+        index = self.place(amplitude)
+        if index is not None:
+            return index
         values = self.values_of(amplitude)
         size = float(np.sqrt(np.mean(values**2)))
         if not np.isfinite(size) or size == 0:
@@ -186,14 +181,14 @@ class Grammar:
         return k
 
     def values_of(self, a: Amplitude) -> Floats:
-        """(N,) of an amplitude at the readings."""
+        """(N,) values of an amplitude at the readings."""
         out = np.ones(self.values.shape[1])
         for f in a.factors:
             out = out * f.shape.value(self.read(f.variable), f.numbers)
         return out
 
     def read(self, v: Variable) -> Floats:
-        """(N,) of a quantity at the readings."""
+        """(N,) values of a quantity at the readings."""
         if v.symbol not in self._read:
             self._read[v.symbol] = v.read(self.situation)
         return self._read[v.symbol]
@@ -202,11 +197,11 @@ class Grammar:
         """Return the amplitude with sine for cosine in its first periodic factor."""
         if k < len(self.amplitudes):
             return int(self.partner[k]) if self.partner[k] >= 0 else None
-        other = _turned(self.at(k))
-        return None if other is None else self.index(other)
+        partner = _turned(self.at(k))
+        return None if partner is None else self.index(partner)
 
     def place(self, amplitude: Amplitude) -> int | None:
-        """Return the index of an amplitude; None where it is not tried."""
+        """Return the index of an amplitude; None if it was not tried."""
         return self._places.get(_key(amplitude))
 
     @cached_property
@@ -214,7 +209,7 @@ class Grammar:
         return {_key(a): k for k, a in enumerate(self.amplitudes)}
 
     def tuned(self, a: Amplitude) -> int:
-        """Return how many factors have numbers that are not of the grid."""
+        """Return the number of factors whose numbers are not on the grid."""
         return sum(k not in self._grid for k in _key(a))
 
     @cached_property
@@ -222,20 +217,20 @@ class Grammar:
         return frozenset(k for a in self.amplitudes if len(a.factors) == 1 for k in _key(a))
 
     def inner(self, k: int) -> list[int]:
-        """Return the amplitudes with one factor less."""
+        """Return the indices of the amplitudes with one factor less."""
         factors = self.at(k).factors
         less = (Amplitude((*factors[:i], *factors[i + 1 :])) for i in range(len(factors)))
-        return [at for a in less if (at := self.place(a)) is not None]
+        return [index for a in less if (index := self.place(a)) is not None]
 
     def price(self, sites: int) -> Floats:
-        """(F,) log of the number of candidates of the same complexity, and of 2 per unit of it."""
+        """(F,) price: log of the number of candidates of this complexity, plus log 2 per unit."""
         count = np.bincount(self.cost) * sites
         return np.asarray(np.log(count[self.cost]) + log(2.0) * self.cost)
 
     def price_of(self, a: Amplitude, sites: int) -> float:
-        """Return the same of any product: as if all of its complexity had been tried."""
+        """Return the price of any product, as if all of its complexity had been tried."""
         if len(a.factors) == 1 and isinstance(u := a.factors[0].variable, Composed):
-            # Further products of a sum are paid for where they are added.
+            # Further products of a sum are priced where they are added.
             argument = float(self.price_of_argument(np.array(u.terms[0][1].cost)))
             return argument + log(SHAPES * sites) + log(2.0) * a.factors[0].shape.cost
         kind = a.cost, len(a.factors)
@@ -244,40 +239,40 @@ class Grammar:
 
     @cached_property
     def _counts(self) -> dict[tuple[int, int], int]:
-        """Number of products by complexity and factors; by complexity, those of `amplitudes`."""
+        """Number of products by complexity and factors; with 0 factors, of `amplitudes`."""
         n = np.bincount([f.cost for f in self.singles], minlength=4).tolist()
-        own = np.bincount(self.cost).tolist()
+        by_cost = np.bincount(self.cost).tolist()
         return {
             (4, 2): comb(n[2], 2) + n[1] * n[3],
             (3, 3): comb(n[1], 3),
             (4, 3): comb(n[1], 2) * n[2],
-            **{(cost, 0): count for cost, count in enumerate(own)},
+            **{(cost, 0): count for cost, count in enumerate(by_cost)},
         }
 
     def price_of_argument(self, cost: Ints) -> Floats:
-        """Log of the number of arguments of complexities (…), and of 2 per unit of them."""
+        """Log of the number of arguments of complexities (…), plus log 2 per unit."""
         return np.asarray(self._of_argument[cost])
 
     @cached_property
     def _of_argument(self) -> Floats:
-        """(C,) log of the number of products in arguments, and of 2 per unit, by complexity."""
+        """(C,) log of the number of products in arguments, plus log 2 per unit, by complexity."""
         count = np.bincount(self.cost[self.smooth], minlength=ARGUMENT + 1)
         return np.asarray(np.log(np.maximum(count, 1)) + log(2.0) * np.arange(len(count)))
 
     @cached_property
     def smooth(self) -> Ints:
-        """(F',) products of which composed quantities are made: without a bend, and simple."""
-        found = [k for k, a in enumerate(self.amplitudes) if _smooth(a)]
-        return np.array(sorted(found, key=lambda k: self.cost[k]), dtype=np.int_)
+        """(F',) indices of simple products without a bend, for composed quantities."""
+        indices = [k for k, a in enumerate(self.amplitudes) if _smooth(a)]
+        return np.array(sorted(indices, key=lambda k: self.cost[k]), dtype=np.int_)
 
     @cached_property
     def unit_of_smooth(self) -> dict[int, str]:
-        """Unit of each of these."""
+        """Units of `smooth`, by index."""
         return {k: self.at(k).unit() for k in self.smooth.tolist()}
 
     @cached_property
     def depends(self) -> tuple[frozenset[str], ...]:
-        """Names of the quantities that each amplitude depends on."""
+        """Names of the quantities of each amplitude."""
         return tuple(frozenset(a.names) for a in self.amplitudes)
 
 
@@ -299,12 +294,12 @@ def _key(a: Amplitude) -> frozenset[tuple[str, str, Numbers]]:
     return frozenset((f.variable.symbol, f.shape.name, f.numbers) for f in a.factors)
 
 
-def grammar(known: list[Variable], s: Situation, poses: int = 0) -> Grammar:
-    """Return all products of functions of the quantities; poses limit the multiples of an angle."""
-    singles = [f for v in known for f in functions(v, v.read(s), MOST)]
-    singles += [  # fine waves, as complex as a product, so in none
+def grammar(quantities: list[Variable], s: Situation, poses: int = 0) -> Grammar:
+    """Return all products of functions of quantities; `poses` limits multiples of an angle."""
+    singles = [f for v in quantities for f in functions(v, v.read(s), MOST)]
+    singles += [  # fine waves, as complex as a product: in no product
         Factor(v, f, (float(k),))
-        for v in known
+        for v in quantities
         if v.kind == "angle"
         for k in range(HARMONICS + 1, min(poses, FINEST) + 1)
         for f in (shapes.FINE_COS, shapes.FINE_SIN)
@@ -316,24 +311,24 @@ def grammar(known: list[Variable], s: Situation, poses: int = 0) -> Grammar:
         (i, -1) for i in range(len(singles)) if cost[i] <= MOST
     ]
     curved = np.flatnonzero((cost < MOST) & ~flat).tolist()
-    for at, i in enumerate(curved):
-        for k in curved[at + 1 :]:
+    for start, i in enumerate(curved, start=1):
+        for k in curved[start:]:
             if cost[i] + cost[k] <= MOST and different(singles[i], singles[k]):
                 pairs.append((i, k))
     value = np.vstack([value, np.ones(value.shape[1])])
-    values, size, kept = _products(value, np.array(pairs))
+    values, size, nonzero = _products(value, np.array(pairs))
     amplitudes = tuple(
-        Amplitude(tuple(singles[i] for i in pairs[k] if i >= 0)) for k in kept.tolist()
+        Amplitude(tuple(singles[i] for i in pairs[k] if i >= 0)) for k in nonzero.tolist()
     )
-    place = {pairs[k]: at for at, k in enumerate(kept.tolist())}
-    named = {_key(a): k for k, a in enumerate(amplitudes)}
+    place = {pairs[k]: index for index, k in enumerate(nonzero.tolist())}
+    by_key = {_key(a): k for k, a in enumerate(amplitudes)}
     turned = (_turned(a) for a in amplitudes)
-    partner = np.array([-1 if t is None else named.get(_key(t), -1) for t in turned])
-    alone = np.array([place.get((i, -1), -1) for i in range(-1, len(singles))])
-    first, second = np.array(pairs)[kept].T
-    less = np.where(second >= 0, [alone[second + 1], alone[first + 1]], -1)
+    partner = np.array([-1 if t is None else by_key.get(_key(t), -1) for t in turned])
+    of_single = np.array([place.get((i, -1), -1) for i in range(-1, len(singles))])
+    first, second = np.array(pairs)[nonzero].T
+    less = np.where(second >= 0, [of_single[second + 1], of_single[first + 1]], -1)
     return Grammar(
-        known,
+        quantities,
         amplitudes,
         values,
         size,
@@ -350,24 +345,24 @@ def grammar(known: list[Variable], s: Situation, poses: int = 0) -> Grammar:
 
 
 def _products(value: Floats, pairs: Ints) -> tuple[Floats, Floats, Ints]:
-    """Products (F', N) of pairs (F, 2) of rows, each with root mean square 1, in single precision.
+    """Products (F', N) of pairs (F, 2) of rows, scaled to root mean square 1, single precision.
 
-    Also (F',) what they were divided by, and which of the pairs they are: those that are not zero.
+    Also (F',) root mean squares before scaling, and indices of the pairs: those that are not zero.
     """
     size = np.empty(len(pairs))
     for part in (slice(a, a + SOME) for a in range(0, len(pairs), SOME)):
         first, second = pairs[part].T
         size[part] = np.sqrt(np.mean((value[first] * value[second]) ** 2, axis=1))
-    kept = np.flatnonzero(size > 0)
-    out: Floats = np.empty((len(kept), value.shape[1]), dtype=np.float32)
-    for part in (slice(a, a + SOME) for a in range(0, len(kept), SOME)):
-        first, second = pairs[kept[part]].T
-        out[part] = value[first] * value[second] / size[kept[part], None]
-    return out, size[kept], kept
+    nonzero = np.flatnonzero(size > 0)
+    out: Floats = np.empty((len(nonzero), value.shape[1]), dtype=np.float32)
+    for part in (slice(a, a + SOME) for a in range(0, len(nonzero), SOME)):
+        first, second = pairs[nonzero[part]].T
+        out[part] = value[first] * value[second] / size[nonzero[part], None]
+    return out, size[nonzero], nonzero
 
 
 def _turned(a: Amplitude) -> Amplitude | None:
-    """Return the amplitude with sine for cosine in its first periodic factor; None without any."""
+    """Return the amplitude with sine for cosine in its first periodic factor; None for none."""
     for i, f in enumerate(a.factors):
         if f.shape.name == "cos":
             sine = replace(f, shape=replace(shapes.SIN, cost=f.shape.cost))

@@ -1,9 +1,9 @@
-"""Whether effects of the catalogue explain the misfit as well as a law that is proposed.
+"""Comparison of a proposed law with effects of the catalogue as explanations of the misfit.
 
-They are added by algebra, at the linearisation of the fit, as the terms of a law are. Where that
-prefers the law, both are refitted in the exact model as well: an effect that is large, as a load
-that acts 20 cm from where it is thought to, is not linear in its parameters, and what it does
-beyond the linearisation looks like a law of its own.
+Effects are added by algebra, at the linearisation of the fit, as the terms of a law are. If that
+prefers the law, both are also refitted in the exact model: a large effect, such as a load point
+that is 20 cm off, is not linear in its parameters, and its deviation from the linearisation looks
+like another law.
 """
 
 from dataclasses import dataclass, replace
@@ -24,22 +24,22 @@ from hilcal.regression.forward_selection import families_beside
 from hilcal.regression.leave_out import left_out_residuals
 from hilcal.types import Floats
 
-MOST_TOGETHER = 6  # Effects that are added at most; a choice
+MOST_TOGETHER = 6  # Most effects that are added; a choice
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KnownEffects:
     """The effects of the catalogue beside a fit."""
 
-    names: tuple[str, ...]  # of those that explain the misfit together, in the order of adding them
-    odds: tuple[float, ...]  # that each adds: log evidence less the choice
-    left: tuple[float, ...]  # variance factor that the linearisation leaves with each of them
-    white: Floats  # (R, P) columns of all that could be added
-    columns: dict[str, slice]  # which are whose
+    names: tuple[str, ...]  # effects that explain the misfit together, in the order of adding
+    odds: tuple[float, ...]  # that each adds: log evidence minus the log of the choice
+    left: tuple[float, ...]  # variance factor of the linearisation after each
+    white: Floats  # (R, P) whitened columns of all effects that could be added
+    columns: dict[str, slice]  # of each effect
 
     @property
     def total(self) -> float:
-        """Logarithm of the odds of all that are added against none."""
+        """Logarithm of the odds of all added effects against none."""
         return float(sum(self.odds))
 
 
@@ -63,93 +63,93 @@ def known_effects(fit: Fit) -> KnownEffects:
 
 @dataclass(frozen=True, slots=True)
 class Instead:
-    """What the catalogue has in the place of a law."""
+    """Effects of the catalogue in place of a law."""
 
-    names: tuple[str, ...] = ()  # that explain as well; none where the law is preferred
-    unfitted: tuple[tuple[str, str], ...] = ()  # that could not be refitted, and why
+    names: tuple[str, ...] = ()  # effects that explain as well; none if the law is preferred
+    unfitted: tuple[tuple[str, str], ...] = ()  # effects that could not be refitted, and why
 
 
 def instead_of_law(
-    fit: Fit, problem: SearchProblem, law: Selection, known: KnownEffects
+    fit: Fit, problem: SearchProblem, law: Selection, effects: KnownEffects
 ) -> Instead:
     """Return the effects that explain the misfit as well as a law, at odds of 20 : 1; or none.
 
-    A law that the exact model cannot be fitted with is not preferred to effects that it can.
+    A law whose exact refit fails is not preferred to effects whose refit does not.
     """
-    if known.total > law.total - LEAST:
-        return Instead(known.names)
-    near = resembling(problem, law, known)
-    if near and near[0].cosine >= SAME and not tells_more(problem, law, known, near[0].effect):
-        return Instead(known.names or (near[0].effect,))
-    total, found = _exact_effects(fit, known)
+    if effects.total > law.total - LEAST:
+        return Instead(effects.names)
+    alike = resembling(problem, law, effects)
+    if alike and alike[0].cosine >= SAME and not tells_more(problem, law, effects, alike[0].effect):
+        return Instead(effects.names or (alike[0].effect,))
+    total, explained = _exact_effects(fit, effects)
     if total > law.total - LEAST and total > _exact_law(fit, problem, law) - LEAST:
-        return found
-    return replace(found, names=())
+        return explained
+    return replace(explained, names=())
 
 
-def _exact_effects(fit: Fit, known: KnownEffects) -> tuple[float, Instead]:
-    """Return the best odds of the first one, two, … effects by their exact refits, and which.
+def _exact_effects(fit: Fit, effects: KnownEffects) -> tuple[float, Instead]:
+    """Return the best odds of the first one, two, … effects by exact refits, and these effects.
 
-    A refit that sets further readings aside as gross errors does not explain these.
+    Refits that exclude further readings as gross errors do not count.
     """
-    after, odds, best, found = fit, 0.0, -np.inf, Instead()
-    for k, name in enumerate(known.names):
+    after, odds, best, explained = fit, 0.0, -np.inf, Instead()
+    for k, name in enumerate(effects.names):
         try:
             after = add(after, name)
         except HilcalError as error:
-            return best, replace(found, unfitted=((name, str(error)),))
-        odds += known.odds[k]
+            return best, replace(explained, unfitted=((name, str(error)),))
+        odds += effects.odds[k]
         if np.any(after.outlier & ~fit.outlier):
             continue
-        total = odds + _beyond(fit, known.left[k], after)
+        total = odds + _beyond(fit, effects.left[k], after)
         if total > best:
-            best, found = total, Instead(known.names[: k + 1])
-    return best, found
+            best, explained = total, Instead(effects.names[: k + 1])
+    return best, explained
 
 
 def _exact_law(fit: Fit, problem: SearchProblem, law: Selection) -> float:
-    """Return the odds of a law by its exact refit; -inf without one, as `discover` tells."""
+    """Return the odds of a law by its exact refit; −inf if it fails, as `discover` reports."""
     screen = problem.screen
     form = refine(screen, form_of(screen, law.terms))
     try:
         after, form, *_ = exact(screen, form, "law")
     except HilcalError:
         return -np.inf
-    left = left_by(screen, form, fit.solution.prediction.situation)
-    return law.total + _beyond(fit, left / max(fit.dof - form.count, 1.0), after)
+    squares = left_by(screen, form, fit.solution.prediction.situation)
+    return law.total + _beyond(fit, squares / max(fit.dof - form.count, 1.0), after)
 
 
-def _beyond(fit: Fit, left: float, after: Fit) -> float:
-    """Return the log likelihood that a refit gains over the variance factor of its algebra."""
-    return 0.5 * fit.dof * float(np.log(left / after.variance_factor))
+def _beyond(fit: Fit, factor: float, after: Fit) -> float:
+    """Return the gain in log likelihood of a refit over its linearisation."""
+    return 0.5 * fit.dof * float(np.log(factor / after.variance_factor))
 
 
 def resembling(
-    problem: SearchProblem, s: Selection, known: KnownEffects
+    problem: SearchProblem, s: Selection, effects: KnownEffects
 ) -> tuple[Resemblance, ...]:
-    """Effects that describe what a law does, the nearest first.
+    """Return effects by how well they describe the motion of a law, the nearest first.
 
-    An effect is fitted to the law without each fold of poses, and predicts it there: an effect of
-    many parameters describes anything else in few poses.
+    An effect is fitted to the law without each fold of poses, and compared with it on that fold,
+    since an effect of many parameters describes anything at few poses.
     """
-    x, columns = known.white, known.columns
+    x, columns = effects.white, effects.columns
     linear = problem.screen.linear
     law = np.hstack([problem.columns(t) for t in s.terms])
     free = problem.model.project_out(law)
     y = (law @ np.linalg.lstsq(free, problem.residual, rcond=1e-8)[0])[:, None]
     folds = linear.folds
-    whole = float(np.sum(left_out_residuals(folds, linear.projection, y) ** 2))
+    total = float(np.sum(left_out_residuals(folds, linear.projection, y) ** 2))
     out = []
     for effect, part in columns.items():
-        left = left_out_residuals(folds, linear.projection, y, x[:, part])
-        share = 1.0 - float(np.sum(left**2)) / max(whole, 1e-300)
+        residual = left_out_residuals(folds, linear.projection, y, x[:, part])
+        share = 1.0 - float(np.sum(residual**2)) / max(total, 1e-300)
         out.append(Resemblance(effect, float(np.sqrt(max(share, 0.0)))))
     return tuple(sorted(out, key=lambda r: -r.cosine))
 
 
-def tells_more(problem: SearchProblem, s: Selection, known: KnownEffects, effect: str) -> bool:
-    """Whether odds of 20 : 1, corrected for the search, ask for a law beside an effect near it."""
-    x, columns = known.white, known.columns
+def tells_more(problem: SearchProblem, s: Selection, effects: KnownEffects, effect: str) -> bool:
+    """Whether odds of 20 : 1, corrected for the search, require a law beside a similar effect."""
+    x, columns = effects.white, effects.columns
     law = np.hstack([problem.columns(t) for t in s.terms])
     both = np.hstack([x[:, columns[effect]], law])
     count = both.shape[1] - law.shape[1]
@@ -160,5 +160,5 @@ def tells_more(problem: SearchProblem, s: Selection, known: KnownEffects, effect
     score = families.scores()["effect"]
     if not score.rank:
         return True
-    beside = families.with_family("effect", score).scores()["law"]
-    return bool(beside.log_evidence - sum(t.price for t in s.terms) > LEAST)
+    law_score = families.with_family("effect", score).scores()["law"]
+    return bool(law_score.log_evidence - sum(t.price for t in s.terms) > LEAST)

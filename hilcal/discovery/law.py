@@ -1,4 +1,4 @@
-"""A law in readable form: where it acts, its formula, its parameters, what speaks for it."""
+"""A law in readable form: its sites, formula, parameters and evidence."""
 
 import re
 from collections.abc import Callable, Iterator, Sequence
@@ -54,32 +54,32 @@ class Form:
 
     @property
     def elastic(self) -> bool:
-        """Whether it depends on transmitted wrenches."""
+        """Whether the law depends on transmitted wrenches."""
         return any(p.amplitude.elastic for p in self.parts)
 
     @property
     def of_setup(self) -> bool:
-        """Whether all of it is of how a campaign was set up, not of the arm."""
+        """Whether the whole law belongs to the setup of a campaign, not to the arm."""
         return all(p.site.of_setup for p in self.parts)
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Columns of the readings that it needs."""
+        """Columns of the readings that the law needs."""
         return tuple(dict.fromkeys(n for p in self.parts for n in p.amplitude.needs))
 
     @property
     def variables(self) -> tuple[str, ...]:
-        """What it depends on, as the diagnosis calls it."""
+        """Names of its quantities in the diagnosis."""
         return tuple(dict.fromkeys(n for p in self.parts for n in p.amplitude.names))
 
     @property
     def acts_on(self) -> tuple[str, ...]:
-        """Where it acts."""
+        """Its sites, in words."""
         return tuple(dict.fromkeys(p.site.words for p in self.parts))
 
     @property
     def complexity(self) -> int:
-        """Coefficients, and complexity of the amplitudes that they multiply."""
+        """Number of coefficients plus complexity of the amplitudes."""
         return self.count + sum(p.amplitude.cost for p in self.parts)
 
     def unit(self, coefficient: int) -> str:
@@ -87,10 +87,10 @@ class Form:
         part = next(p for p in self.parts if p.coefficient == coefficient)
         site, powers = part.site.unit, dict(part.amplitude.powers)
         if part.site.field == "sensor" and site in powers:
-            # A force by a force; an angle by an angle is left as people write it.
-            left = powers.pop(site) - 1.0
-            powers |= {site: left} if left > 0 else {}
-            site = "1" if left >= 0 else unit_of({site: -left})
+            # Cancel a force by a force; people do not cancel an angle by an angle.
+            power = powers.pop(site) - 1.0
+            powers |= {site: power} if power > 0 else {}
+            site = "1" if power >= 0 else unit_of({site: -power})
         inner = unit_of(powers)
         if inner == "1":
             return site
@@ -114,15 +114,15 @@ class Form:
         return [f"{symbol} = {' + '.join(terms)}" for symbol, terms in out.items()]
 
     def motion(self, sites: tuple[Site, ...], motion: Floats, s: Situation) -> Floats:
-        """(N, m, P) motion of each reading, by ordinary motions (N, m, S) of the sites."""
+        """(N, m, P) motion of readings by unit coefficients, from motions (N, m, S) of sites."""
         out = np.zeros((*motion.shape[:2], self.count))
         for p in self.parts:
-            by = p.amplitude.values(s)[:, None]
-            out[:, :, p.coefficient] += motion[:, :, sites.index(p.site)] * by
+            amplitude = p.amplitude.values(s)[:, None]
+            out[:, :, p.coefficient] += motion[:, :, sites.index(p.site)] * amplitude
         return out
 
     def columns(self, screen: Screen, s: Situation) -> Floats:
-        """(R, P) whitened columns by ordinary motions, at the fit of a screen."""
+        """(R, P) whitened columns of the coefficients, in ordinary motions, at the screen's fit."""
         w = screen.linear.fit.whitening
         return w.whiten_readings(self.motion(screen.sites, screen.motion, s))
 
@@ -133,25 +133,25 @@ def form_of(screen: Screen, terms: tuple[LawTerm, ...]) -> Form:
     count = 0
     for t in terms:
         for k, (site, amplitude) in enumerate(t.parts):
-            at = count if t.common else count + k
-            parts.append(LawPart(screen.sites[site], screen.grammar.at(amplitude), at))
+            coefficient = count if t.common else count + k
+            parts.append(LawPart(screen.sites[site], screen.grammar.at(amplitude), coefficient))
         count += 1 if t.common else len(t.parts)
     return Form(tuple(parts))
 
 
 def with_factors(form: Form, factors: dict[tuple[int, int], Factor]) -> Form:
-    """Return a law with other factors, by part and place in its product."""
+    """Return a law with other factors, by (part, index in its product)."""
     parts = []
     for k, p in enumerate(form.parts):
-        own = tuple(factors.get((k, i), f) for i, f in enumerate(p.amplitude.factors))
-        parts.append(replace(p, amplitude=Amplitude(own)))
+        replaced = tuple(factors.get((k, i), f) for i, f in enumerate(p.amplitude.factors))
+        parts.append(replace(p, amplitude=Amplitude(replaced)))
     return Form(tuple(parts))
 
 
-def with_coefficients(form: Form, kept: Sequence[int]) -> Form:
-    """Return a law with some of its coefficients, in their order; the others are zero."""
-    at = {old: new for new, old in enumerate(kept)}
-    parts = (replace(p, coefficient=at[p.coefficient]) for p in form.parts if p.coefficient in at)
+def with_coefficients(form: Form, retained: Sequence[int]) -> Form:
+    """Return a law with some of its coefficients, in this order; the others are dropped."""
+    new = {old: k for k, old in enumerate(retained)}
+    parts = (replace(p, coefficient=new[p.coefficient]) for p in form.parts if p.coefficient in new)
     return Form(tuple(parts))
 
 
@@ -166,7 +166,7 @@ class Coefficient:
 
 
 def coefficients(form: Form, step: Floats, std: Floats) -> tuple[Coefficient, ...]:
-    """Return the coefficients of a law, SI, from (P,) means and uncertainties, ordinary motions."""
+    """Return coefficients in SI from means and stds (P,) in ordinary motions."""
     size = np.ones(form.count)
     for p in form.parts:
         size[p.coefficient] = ORDINARY[p.site.unit]
@@ -178,32 +178,32 @@ def coefficients(form: Form, step: Floats, std: Floats) -> tuple[Coefficient, ..
 
 @dataclass(frozen=True, slots=True)
 class Again:
-    """How often a cause was found again."""
+    """How often the searches without a fold found a cause again."""
 
     acts_on: str
-    variables: tuple[str, ...]  # the quantities that move it
-    share: float  # share of the searches without some poses that find the same
+    variables: tuple[str, ...]  # quantities that move it
+    share: float  # of the searches without some poses
 
 
 @dataclass(frozen=True, slots=True)
 class Resemblance:
-    """An effect of the catalogue, and how near a law is to what it can describe."""
+    """An effect of the catalogue, and how well it describes a law."""
 
     effect: str
-    cosine: float  # correlation of the law with what the effect predicts of it on poses left out
+    cosine: float  # of the law with the effect's prediction of it on poses left out
 
 
 @dataclass(frozen=True, eq=False)
 class Law:
-    """A law that the readings speak for."""
+    """A law that the readings support."""
 
     name: str  # of its effect
-    form: Form  # where it acts, and how
+    form: Form
     parameters: tuple[Coefficient, ...]
     p_value: float  # of the joint test of its columns, times the number of candidates
     odds: float  # logarithm of the odds against no law, corrected for the size of the search
     holdout_share: float  # share of the misfit that it explains on poses left out
-    left: float  # variance factor that is left
+    left: float  # variance factor of the fit with the law
     probability: float  # posterior, of its structure
     resembles: tuple[Resemblance, ...]  # effects of the catalogue that are near, the nearest first
     ranges: tuple[tuple[str, float, float, str], ...]  # of each quantity in the readings
@@ -216,36 +216,36 @@ class Law:
 
     @property
     def expressions(self) -> dict[str, str]:
-        """Its value by site, in the site's unit, where plain arithmetic says it.
+        """Its value by site as plain arithmetic, in the site's unit.
 
-        E.g. {"dq_3": "0.0002*(sin(3 * q4))"}. Quantities are `q1` ... (rad), `tau1` ... (torques
-        of the drives, N·m), `force` (of the load, N), `time` (s) and `air` (air temperature, °C);
-        operators are Python's, functions have numpy's names, but for `max`. Other sites are left
-        out.
+        E.g. {"dq_3": "0.0002*(sin(3 * q4))"}. Quantities are `q1` … (rad), `tau1` … (torques of the
+        drives, N·m), `force` (of the load, N), `time` (s) and `air` (air temperature, °C).
+        Operators are Python's, functions have numpy's names, except `max`. Sites that need more are
+        left out.
         """
         terms: dict[str, list[str]] = {}
         for p in self.form.parts:
             value = self.parameters[p.coefficient].value
             terms.setdefault(p.site.symbol, []).append(f"{value!r}*({p.amplitude.code()})")
         plain = {}
-        for symbol, own in terms.items():
-            text = " + ".join(own).replace("np.ones(len(s.angle))", "1.0")
+        for symbol, summands in terms.items():
+            text = " + ".join(summands).replace("np.ones(len(s.angle))", "1.0")
             text = _JOINT.sub(_joints, text.replace("np.maximum", "max"))
             plain[symbol] = _RECORDED.sub(lambda m: m[1] or "", _FORCE.sub("force", text))
         return {symbol: text for symbol, text in plain.items() if not _OTHER.search(text)}
 
     @property
     def acts_on(self) -> tuple[str, ...]:
-        """Where it acts."""
+        """Its sites, in words."""
         return self.form.acts_on
 
     @property
     def variables(self) -> tuple[str, ...]:
-        """What it depends on."""
+        """Names of its quantities."""
         return self.form.variables
 
 
-USUAL = 1e-4  # Ordinary magnitude of a coefficient that nothing is known of, SI; a choice
+USUAL = 1e-4  # Ordinary magnitude of an unknown coefficient, SI; a choice
 _HEAD = '''"""`{name}`: {formula}
 
 Proposed by `hilcal discover`; change it as you like. Every command takes it:
@@ -315,8 +315,8 @@ _FLOATS = "from hilcal.types import Floats\n"
 def source_of_form(
     form: Form,
     name: str,
-    found: tuple[Coefficient, ...] = (),  # its coefficients, for their ordinary magnitudes
-    evidence: str = "Nothing is stated of its evidence.",  # what speaks for it, in lines
+    values: tuple[Coefficient, ...] = (),  # for ordinary magnitudes
+    evidence: str = "Nothing is stated of its evidence.",  # lines for its docstring
     file: str = "F.py",
 ) -> str:
     """Return the Python file of a law."""
@@ -333,13 +333,13 @@ def source_of_form(
         evidence="\n".join(map(_in_docstring, evidence.split("\n"))),
         imports=", Response" if form.elastic else "",
         class_name="".join(part.capitalize() for part in name.split("_")),
-        attributes="".join(attributes), parameters="\n".join(_parameters(form, found)),
-        columns="\n".join(_moving(form)),
+        attributes="".join(attributes), parameters="\n".join(_parameters(form, values)),
+        columns="\n".join(_column_code(form)),
     )  # fmt: skip
     if form.elastic:
-        source += _RESPONSE.format(body="\n".join(_responses(form)))
+        source += _RESPONSE.format(body="\n".join(_response_code(form)))
     if any(p.site.field == "sensor" for p in form.parts):
-        source += _SENSOR.format(count=form.count, body="\n".join(_misread(form)))
+        source += _SENSOR.format(count=form.count, body="\n".join(_sensor_code(form)))
         names = _IMPORTED if "recorded(s)" in source else _IMPORTED.replace(", recorded", "")
         source = source.replace(_PROTOCOL, names + _PROTOCOL, 1)
     elif not form.elastic:
@@ -352,20 +352,20 @@ def _in_docstring(line: str) -> str:
 
 
 def effect_class(source: str, name: str) -> type[Effect]:
-    """Return the effect of a source, as a file with it would give it."""
+    """Return the effect of a source, as if from a file."""
     return effects_of(source.encode(), Path(f"<law {name}>")).effects[0]
 
 
-def _parameters(form: Form, found: tuple[Coefficient, ...]) -> Iterator[str]:
-    size = {c.name: abs(c.value) for c in found}
+def _parameters(form: Form, values: tuple[Coefficient, ...]) -> Iterator[str]:
+    size = {c.name: abs(c.value) for c in values}
     scales = {k: float(f"{x:.0e}") for k, x in size.items() if x > 0 and np.isfinite(x)}
     for k, letter in enumerate(LETTERS[: form.count]):
-        where = ", ".join(dict.fromkeys(p.site.words for p in form.parts if p.coefficient == k))
+        sites = ", ".join(dict.fromkeys(p.site.words for p in form.parts if p.coefficient == k))
         scale = scales.get(letter, USUAL)
-        yield f'            Parameter("{letter}", "{form.unit(k)}", {scale!r}, "{where}"),'
+        yield f'            Parameter("{letter}", "{form.unit(k)}", {scale!r}, "{sites}"),'
 
 
-def _moving(form: Form) -> Iterator[str]:
+def _column_code(form: Form) -> Iterator[str]:
     parts = [(k, p) for k, p in enumerate(form.parts) if p.site.field != "sensor"]
     if not parts:
         yield "        return ()"
@@ -376,7 +376,7 @@ def _moving(form: Form) -> Iterator[str]:
     yield "        )"
 
 
-def _misread(form: Form) -> Iterator[str]:
+def _sensor_code(form: Form) -> Iterator[str]:
     for p in form.parts:
         if p.site.field == "sensor":
             yield f"        by = {p.amplitude.code()}"
@@ -391,11 +391,11 @@ def _columns(k: int, p: LawPart) -> str:
     return f'Columns("{p.site.field}", {index}, by_{k}[:, None, None] * np.array({axis}))'
 
 
-def _responses(form: Form) -> Iterator[str]:
+def _response_code(form: Form) -> Iterator[str]:
     for p in form.parts:
         for (slot, component), slope in p.amplitude.slopes():
-            to = f"dq[:, :, {p.site.element}]"
+            target = f"dq[:, :, {p.site.element}]"
             if p.site.field != "dq":
-                to = f"twist[:, :, {p.site.element}, {p.site.axis}]"
+                target = f"twist[:, :, {p.site.element}, {p.site.axis}]"
             yield f"        slope = theta[{p.coefficient}] * {slope}"
-            yield f"        {to} += slope[:, None] * change[:, :, {slot}, {component}]"
+            yield f"        {target} += slope[:, None] * change[:, :, {slot}, {component}]"

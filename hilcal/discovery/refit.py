@@ -1,9 +1,9 @@
-"""A law refined and refitted: free exponents and scales, then the exact model.
+"""Refinement of a law's free numbers, and its refit in the exact model.
 
-Numbers in the functions of a law, as an exponent or a saturation, are taken from a coarse grid by
-the search. They are refined where the sum of squares that the law leaves is least, its coefficients
-and the model's projected out. A refined number is kept where it gains more evidence than a number
-costs, else the one of the grid, which is simpler.
+The search takes the numbers in the functions of a law, such as an exponent or a saturation, from a
+coarse grid. They are refined to the least sum of squares, with the coefficients of law and model
+projected out. Refined numbers are used if they gain more evidence than they cost, else those of the
+grid, which are simpler.
 """
 
 from collections.abc import Sequence
@@ -30,15 +30,15 @@ from hilcal.identification.fit import Fit, fit
 from hilcal.identification.linearisation import Linearisation
 from hilcal.types import Floats
 
-WORTH = 3.0  # Gain in log likelihood that a refined number needs, beside ½ ln ν; 20 : 1
+WORTH = 3.0  # Gain in log likelihood that refined numbers need, beyond ½ ln ν each; 20 : 1
 DIGITS = 3
 SPANNED = 1e-10  # Directions of a law's columns below this share of the largest are rounding
 FACTOR = 30.0  # Factor by which a positive number may change at most; a choice
-SPREADS = 3.0  # Standard deviations of its quantity by which a level may move at most; a choice
+SPREADS = 3.0  # Largest change of a level, in standard deviations of its quantity; a choice
 
 
 def refine(screen: Screen, form: Form) -> Form:
-    """Return the law with its free numbers refined, where the readings ask for it."""
+    """Return the law with refined numbers if the readings require it, else the law."""
     from scipy.optimize import minimize  # slow to import
 
     linear = screen.linear
@@ -48,21 +48,21 @@ def refine(screen: Screen, form: Form) -> Form:
         return form
     best = left_by(screen, form, s)
 
-    def at(x: Floats) -> list[float]:
+    def numbers_at(x: Floats) -> list[float]:
         return [number.at(v) for number, v in zip(free, x.tolist(), strict=True)]
 
     def objective(x: Floats) -> float:
-        values = at(x)
+        values = numbers_at(x)
         if not np.isfinite(values).all():
             return np.inf
         return left_by(screen, with_values(form, free, values), s)
 
-    found = minimize(
+    result = minimize(
         objective, np.zeros(len(free)), method="Nelder-Mead",
         options={"maxfev": 60 * len(free), "xatol": 1e-3, "fatol": 1e-3,
                  "initial_simplex": np.eye(len(free) + 1, len(free), -1) * 0.3},
     )  # fmt: skip
-    values = [float(f"{v:.{DIGITS}g}") for v in at(found.x)]
+    values = [float(f"{v:.{DIGITS}g}") for v in numbers_at(result.x)]
     refined = with_values(form, free, values)
     after = left_by(screen, refined, s)
     dof = linear.fit.dof
@@ -71,7 +71,7 @@ def refine(screen: Screen, form: Form) -> Form:
 
 
 def left_by(screen: Screen, form: Form, s: Situation) -> float:
-    """Sum of squares that a law leaves, by algebra; infinite where it is not finite."""
+    """Sum of squares with a law, by algebra; infinite if the law is not finite."""
     linear = screen.linear
     x = form.columns(screen, s)
     if not np.isfinite(x).all():
@@ -81,12 +81,12 @@ def left_by(screen: Screen, form: Form, s: Situation) -> float:
 
 def _step(linear: Linearisation, x: Floats) -> Floats:
     """(P,) coefficients of columns (R, P) by algebra."""
-    found = np.linalg.lstsq(linear.information(x), x.T @ linear.residual, rcond=SPANNED)
-    return np.asarray(found[0], dtype=float)
+    step = np.linalg.lstsq(linear.information(x), x.T @ linear.residual, rcond=SPANNED)[0]
+    return np.asarray(step, dtype=float)
 
 
 def at_linearisation(screen: Screen, form: Form) -> tuple[Coefficient, ...]:
-    """Return the coefficients by algebra, without their uncertainties."""
+    """Return the coefficients by algebra, without uncertainties."""
     x = form.columns(screen, screen.linear.fit.solution.prediction.situation)
     return coefficients(form, _step(screen.linear, x), np.full(form.count, np.nan))
 
@@ -94,10 +94,13 @@ def at_linearisation(screen: Screen, form: Form) -> tuple[Coefficient, ...]:
 def exact(
     screen: Screen, form: Form, name: str
 ) -> tuple[Fit, Form, tuple[Coefficient, ...], type[Effect]]:
-    """Refit the model with the law as an effect that keeps to the protocol; return both.
+    """Refit the exact model with the law as an effect, after checking the effect.
 
-    A coefficient that the model absorbs is dropped, as the zero of a compliance that grows with
-    time beside a compliance of the model: it is no part of what is found.
+    Coefficients that the model absorbs are dropped, e.g. the zero of a compliance that grows with
+    time, beside a compliance of the model.
+
+    Returns:
+        The fit, the law, its coefficients, and the class of its effect.
     """
     before = screen.linear.fit
     s = before.solution.prediction.situation
@@ -117,33 +120,33 @@ def exact(
         if not determined.any():
             raise CannotAnswerError("the readings do not determine it beside the model")
         form = with_coefficients(form, np.flatnonzero(determined).tolist())
-    found = tuple(
+    estimates = tuple(
         Coefficient(letter, float(values[k]), float(std[k]), form.unit(k))
         for k, letter in enumerate(letters)
     )
-    return after, form, found, kind
+    return after, form, estimates, kind
 
 
 @dataclass(frozen=True, slots=True)
 class FreeNumber:
-    """A number, wherever it is in a law."""
+    """A free number of a law."""
 
-    places: tuple[tuple[int, int], ...]  # (part, factor) of each function that has it
-    index: int  # of it among the function's numbers, or among the weights of its quantity
+    places: tuple[tuple[int, int], ...]  # (part, factor) of each function with this number
+    index: int  # among the function's numbers, or among the weights of its quantity
     weight: bool  # whether it is a weight
     begin: float
-    scale: float  # one unit of its change; 0 where it changes by factors instead, eˣ
-    least: float = -np.inf  # value that it has at least
+    scale: float  # unit of its change; 0 if it changes by factors eˣ instead
+    least: float = -np.inf  # lower bound
 
     def at(self, x: float) -> float:
-        """Return its value after a change; infinite where that is too large."""
+        """Return the value after a change x; infinite for too large a change."""
         if abs(x) > (SPREADS if self.scale else np.log(FACTOR)):
             return float("inf")
         value = self.begin + self.scale * x if self.scale else self.begin * float(np.exp(x))
         return value if value >= self.least else float("inf")
 
     def put(self, factor: Factor, value: float) -> Factor:
-        """Return a function with another value of it."""
+        """Return a function with another value of the number."""
         if not self.weight:
             n = factor.numbers
             return replace(factor, numbers=(*n[: self.index], value, *n[self.index + 1 :]))
@@ -157,21 +160,21 @@ def _terms(factor: Factor) -> tuple[tuple[float, Amplitude], ...]:
 
 
 def free_numbers(form: Form, s: Situation) -> list[FreeNumber]:
-    """Return the free numbers of a law; the same function in several products has one number."""
+    """Return the free numbers of a law; equal functions in several products share theirs."""
     groups: dict[tuple[str, str, tuple[float, ...]], list[tuple[int, int]]] = {}
     for k, p in enumerate(form.parts):
         for i, f in enumerate(p.amplitude.factors):
             key = f.variable.symbol, f.shape.name, f.numbers
             groups.setdefault(key, []).append((k, i))
     out = []
-    for found in groups.values():
-        places = tuple(found)
+    for members in groups.values():
+        places = tuple(members)
         f = form.parts[places[0][0]].amplitude.factors[places[0][1]]
-        made = isinstance(f.variable, Composed)
-        # Below an exponent of 1 the slope at a bend would have no limit, nor an equilibrium.
+        is_composed = isinstance(f.variable, Composed)
+        # Below an exponent of 1 the slope at a bend is unbounded: there is no equilibrium.
         steep = f.shape.name.endswith("_power") and f.variable.slot is not None
         for n in f.shape.free:
-            level = n in f.shape.places and (made or f.numbers[n] <= 0)
+            level = n in f.shape.places and (is_composed or f.numbers[n] <= 0)
             scale = float(np.std(f.variable.read(s))) if level else 0.0
             if scale or f.numbers[n] > 0:
                 least = 1.0 if steep and n not in f.shape.places else -np.inf

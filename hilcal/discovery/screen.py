@@ -6,12 +6,12 @@ of each reading by an ordinary motion of the site. So for all amplitudes A (F, N
     xᵀ v  = A (T_sᵀ v),        xᵀ M x = diag(A Q_s Aᵀ),    Q_s = T_sᵀ M T_s (N, N)
 
 and no column is formed: a million candidates take seconds. Many readings are thinned to whole poses
-for this; what is short-listed is scored on all of them.
+for this; the short list is scored on all readings.
 
-What happens beyond a level that two quantities make together, as a hose that is taut beyond the
-length that two joints give it, is no product of functions of each. So products φ of two quantities
-are arguments themselves: max(φ − φ0, 0), max(φ0 − φ, 0) and tanh((φ − φ0)/w), at some levels φ0.
-Their sums of squares at every site are formed once, as those of the products (see `screen`).
+A bend at a level of a function of two quantities, as of a hose that is taut beyond a length that
+depends on two joints, is no product of functions of each. So products φ of two quantities are
+arguments themselves: max(φ − φ0, 0), max(φ0 − φ, 0) and tanh((φ − φ0)/w), at some levels φ0. Their
+sums of squares at every site are formed once, as are those of the products (see `screen`).
 """
 
 from dataclasses import dataclass
@@ -37,9 +37,9 @@ class LawTerm:
     """Columns of a law that are chosen together."""
 
     parts: tuple[tuple[int, int], ...]  # (site, amplitude) of each column, by index
-    price: float  # what the search costs it
+    price: float  # for the size of the search
     common: bool = False  # whether all columns have one coefficient
-    alone: float = 0.0  # what it would cost as the first term
+    alone: float = 0.0  # price as the first term
 
     @property
     def count(self) -> int:
@@ -49,14 +49,14 @@ class LawTerm:
 
 @dataclass(frozen=True, eq=False)
 class Scored:
-    """A term beside others."""
+    """A term with its score beside chosen terms."""
 
     term: LawTerm
-    score: FamilyScore  # its score as a family
+    score: FamilyScore
 
     @property
     def odds(self) -> float:
-        """Evidence less what the search costs."""
+        """Log evidence minus the price."""
         return self.score.log_evidence - self.term.price
 
 
@@ -69,10 +69,10 @@ class ScreenedTerm:
     odds: float
 
 
-MOST_READINGS = 400  # that the screening uses; a choice, by time: it takes their square
-SEEN = 1e-4  # share of a column's square that must be left, for single precision
-ALIKE = 1 - 1e-9  # Cosine of two sites' motions from which on they are the same; rounding
-LEAST_MOTION = 1e-4  # square of a column, in the noise, that counts as none
+MOST_READINGS = 400  # Most readings of the screening; a choice: time grows with their square
+VISIBLE = 1e-4  # Least share of a column's square beside the model, for single precision
+ALIKE = 1 - 1e-9  # Least cosine of the motions of equivalent sites; rounding
+LEAST_MOTION = 1e-4  # Square of a whitened column that counts as zero
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,8 +82,8 @@ class Bends:
     argument: Ints  # (C,) index of the product in the grammar
     shape: tuple[Shape, ...]  # function of each
     numbers: tuple[tuple[float, ...], ...]
-    values: Floats  # (C, K) at the readings of the screening, with root mean square 1
-    square: Floats  # (S, C) xᵀ M x; zero where a site does not take it
+    values: Floats  # (C, K) at the readings of the screening, scaled to root mean square 1
+    square: Floats  # (S, C) xᵀ M x; zero where a site does not allow the function
     across_one: Floats  # (S, C) xᵀ M x' with a constant at the site
 
 
@@ -91,39 +91,39 @@ class Bends:
 class Screen:
     """All candidates beside a model."""
 
-    linear: Linearisation  # the fit as a linear problem
+    linear: Linearisation  # of the fit
     grammar: Grammar  # amplitudes
-    sites: tuple[Site, ...]  # where they act
+    sites: tuple[Site, ...]
     motion: Floats  # (N, m, S) motion of each reading by an ordinary motion of each site
-    rows: Bools  # (R,) which of the whitened rows the screening uses
-    readings: Ints  # (K,) which of the fitted readings it uses
+    rows: Bools  # (R,) whitened rows that the screening uses
+    readings: Ints  # (K,) indices of the fitted readings that it uses
     form: Floats  # (S, R', K) T_s of these rows and readings, single precision
     free: Floats  # (S, K, K) Q_s of these
     square: Floats  # (S, F) xᵀ M x; zero where the model explains a column
     across: Floats  # (S, F) xᵀ M x' with the partner of each amplitude
     across_one: Floats  # (S, F) xᵀ M x' with a constant at the site
-    across_less: Floats  # (2, S, F) xᵀ M x' of a product with what is left without either factor
+    across_less: Floats  # (2, S, F) xᵀ M x' of a product with that without first, and second factor
 
     @cached_property
     def price(self) -> Floats:
-        """(F,) what the search costs a candidate, see `grammar`."""
+        """(F,) prices of the candidates, see `grammar`."""
         return self.grammar.price(len(self.sites))
 
     @cached_property
     def alias(self) -> tuple[int, ...]:
-        """(S,) the simplest site that moves every reading as each does, up to a factor.
+        """(S,) index of the simplest site with the same motion of all readings, up to a factor.
 
-        So the tilt of a bearing about the axis of the joint before it is that joint's displacement.
+        E.g. a bearing's tilt about the axis of the previous joint is that joint's displacement.
         """
         flat = self.motion.reshape(-1, len(self.sites))
         size = np.linalg.norm(flat, axis=0)
         unit = flat / np.where(size > 0, size, 1.0)
-        same = np.abs(unit.T @ unit) > ALIKE
+        alike = np.abs(unit.T @ unit) > ALIKE
         takes = [(s.takes(False), s.takes(True), s.takes(False, True)) for s in self.sites]
         out = []
         for k in range(len(self.sites)):
-            others = [o for o in np.flatnonzero(same[k]).tolist() if takes[o] == takes[k]]
-            out.append(min([k, *others], key=lambda o: (self.sites[o].rank, o)))
+            equivalent = [o for o in np.flatnonzero(alike[k]).tolist() if takes[o] == takes[k]]
+            out.append(min([k, *equivalent], key=lambda o: (self.sites[o].rank, o)))
         return tuple(out)
 
     @cached_property
@@ -132,11 +132,11 @@ class Screen:
         return self.grammar.amplitudes.index(Amplitude(()))
 
     def visible(self, site: int, amplitude: int) -> bool:
-        """Whether the model leaves something of a candidate; unknown where it is grown."""
+        """Whether a candidate is visible beside the model; True for grown ones, unchecked."""
         return amplitude >= len(self.price) or bool(self.square[site, amplitude] > 0)
 
     def price_of(self, amplitude: int) -> float:
-        """Return what the search costs a candidate, in no or in further products too."""
+        """Return the price of a candidate, also of a grown one."""
         if amplitude < len(self.price):
             return float(self.price[amplitude])
         return self.grammar.price_of(self.grammar.at(amplitude), len(self.sites))
@@ -145,7 +145,7 @@ class Screen:
     def bends(self) -> Bends:
         """Bends and steps of composed quantities."""
         return bends(
-            self.grammar, self.sites, self.readings, self.form, self.free, (SEEN, LEAST_MOTION)
+            self.grammar, self.sites, self.readings, self.form, self.free, (VISIBLE, LEAST_MOTION)
         )
 
     @cached_property
@@ -159,7 +159,7 @@ class Screen:
         return int(np.count_nonzero(self.square))
 
     def inner(self, v: Floats) -> Floats:
-        """(S, F) xᵀ v of all candidates, v (R',) of the rows of the screening, single precision."""
+        """(S, F) xᵀ v of all candidates, with v (R',) in the rows of the screening."""
         by_reading = np.einsum("srn,r->sn", self.form, v)
         return np.asarray(by_reading @ self.values)
 
@@ -183,107 +183,107 @@ def screen(linear: Linearisation) -> Screen:
     fit = linear.fit
     situation = fit.solution.prediction.situation
     poses = len(np.unique(fit.pose))
-    words = grammar(variables(situation), situation, poses)
-    return screened(linear, words, *site_motions(fit), *_thinned(fit))
+    products = grammar(variables(situation), situation, poses)
+    return screened(linear, products, *site_motions(fit), *_thinned(fit))
 
 
 def screened(
-    linear: Linearisation, words: Grammar, places: tuple[Site, ...], motion: Floats, rows: Bools,
+    linear: Linearisation, products: Grammar, places: tuple[Site, ...], motion: Floats, rows: Bools,
     readings: Ints,
 ) -> Screen:  # fmt: skip
-    """Return all candidates of some amplitudes and sites, as `Screen` has them."""
+    """Return all candidates of some amplitudes and sites."""
     w = linear.fit.whitening
-    own = projection(linear.rows[rows], linear.projection.ridge)
+    model = projection(linear.rows[rows], linear.projection.ridge)
     form: Floats = np.empty((len(places), int(rows.sum()), len(readings)), dtype=np.float32)
-    square: Floats = np.empty((len(places), len(words.size)), dtype=np.float32)
+    square: Floats = np.empty((len(places), len(products.size)), dtype=np.float32)
     across: Floats = np.zeros_like(square)
     across_one: Floats = np.zeros_like(square)
     across_less: Floats = np.zeros((2, *square.shape), dtype=np.float32)
-    every: Floats = np.empty((len(places), len(readings), len(readings)), dtype=np.float32)
-    a = words.values[:, readings]
+    information: Floats = np.empty((len(places), len(readings), len(readings)), dtype=np.float32)
+    a = products.values[:, readings]
     squares = a**2
-    has = np.flatnonzero(words.partner >= 0)
-    kinds = np.array([(x.elastic, x.sensed) for x in words.amplitudes])
-    every_kind = {(bool(e), bool(d)) for e, d in np.unique(kinds, axis=0)}
+    paired = np.flatnonzero(products.partner >= 0)
+    kinds = np.array([(x.elastic, x.sensed) for x in products.amplitudes])
+    distinct_kinds = {(bool(e), bool(d)) for e, d in np.unique(kinds, axis=0)}
     for k in range(len(places)):
         spread = np.zeros((len(motion), w.m, len(readings)))
         spread[readings, :, np.arange(len(readings))] = motion[readings, :, k]
         t = w.whiten_readings(spread)[rows]
         form[k] = t
-        every[k] = free = own.information(t).astype(np.float32)
+        information[k] = free = model.information(t).astype(np.float32)
         lifted = a @ free
         across_one[k] = lifted.sum(axis=1)  # a constant has the value 1
-        across_less[:, k] = _across_factors(words, a, lifted)
+        across_less[:, k] = _across_factors(products, a, lifted)
         square[k] = np.einsum("fn,fn->f", lifted, a)
-        across[k, has] = np.einsum("fn,fn->f", lifted[has], a[words.partner[has]])
-        seen = SEEN * (squares @ np.sum(t**2, axis=0).astype(np.float32)) + LEAST_MOTION
-        square[k, square[k] < seen] = 0.0
-        for kind in every_kind:
+        across[k, paired] = np.einsum("fn,fn->f", lifted[paired], a[products.partner[paired]])
+        least = VISIBLE * (squares @ np.sum(t**2, axis=0).astype(np.float32)) + LEAST_MOTION
+        square[k, square[k] < least] = 0.0
+        for kind in distinct_kinds:
             if not places[k].takes(*kind):
                 square[k, (kinds == kind).all(axis=1)] = 0.0
     return Screen(
-        linear, words, places, motion, rows, readings, form, every, square, across, across_one,
-        across_less,
+        linear, products, places, motion, rows, readings, form, information, square, across,
+        across_one, across_less,
     )  # fmt: skip
 
 
-def _across_factors(words: Grammar, values: Floats, lifted: Floats) -> Floats:
-    """(2, F) xᵀ Q x' of products with what is left without the first, and the second factor.
+def _across_factors(amplitudes: Grammar, values: Floats, lifted: Floats) -> Floats:
+    """(2, F) xᵀ Q x' of products with the amplitude without first, and second factor.
 
     With a product f g and Q symmetric, (f g)ᵀ Q g = fᵀ (g ∘ Q g): no product is formed.
     """
-    out: Floats = np.zeros((2, len(words.size)), dtype=np.float32)
-    products = np.flatnonzero((words.less >= 0).all(axis=0))
+    out: Floats = np.zeros((2, len(amplitudes.size)), dtype=np.float32)
+    products = np.flatnonzero((amplitudes.less >= 0).all(axis=0))
     if not len(products):
         return out
-    second, first = words.less[:, products]
-    alone, place = np.unique(words.less[:, products], return_inverse=True)
+    second, first = amplitudes.less[:, products]
+    singles, place = np.unique(amplitudes.less[:, products], return_inverse=True)
     g, f = place.reshape(2, -1)
-    v = values[alone]
-    both = v @ (v * lifted[alone]).T
-    scale = words.size[second] * words.size[first] / words.size[products]
+    v = values[singles]
+    both = v @ (v * lifted[singles]).T
+    scale = amplitudes.size[second] * amplitudes.size[first] / amplitudes.size[products]
     out[0, products] = both[f, g] * scale
     out[1, products] = both[g, f] * scale
     return out
 
 
 def _thinned(fit: Fit) -> tuple[Bools, Ints]:
-    """Return the rows (R,) and readings (K,) that are used: whole poses, at random."""
-    w, kept = fit.whitening, fit.readings[~fit.outlier]
-    if len(kept) <= MOST_READINGS:
-        return np.ones(w.m * len(w), dtype=np.bool_), np.arange(len(kept))
-    group = kept.pose
+    """Return rows (R,) and readings (K,) of random whole poses for the screening."""
+    w, inliers = fit.whitening, fit.readings[~fit.outlier]
+    if len(inliers) <= MOST_READINGS:
+        return np.ones(w.m * len(w), dtype=np.bool_), np.arange(len(inliers))
+    group = inliers.pose
     order = np.random.default_rng(20261122).permutation(int(group.max()) + 1)
     count = np.cumsum(np.bincount(group, minlength=len(order))[order])
     chosen = order[: max(int(np.searchsorted(count, MOST_READINGS)), 1)]
-    mine = np.isin(group, chosen)
-    return np.repeat(mine[w.reading], w.m), np.flatnonzero(mine)
+    used = np.isin(group, chosen)
+    return np.repeat(used[w.reading], w.m), np.flatnonzero(used)
 
 
 LEVELS = (0.2, 0.35, 0.5, 0.65, 0.8)
-STEPS = (0.25, 0.5, 0.75)  # shares of the readings below a bend, and a step; a choice, by time
-WIDTH = 0.3  # Of a step, by the standard deviation of the argument; a choice
-MOST_ARGUMENTS = 4000  # Arguments at most, the simplest first; a choice, by memory
+STEPS = (0.25, 0.5, 0.75)  # Bends, and steps, as quantiles; a choice, by time
+WIDTH = 0.3  # Width of a step, in standard deviations of the argument; a choice
+MOST_ARGUMENTS = 4000  # Most arguments, the simplest first; a choice, by memory
 
 
 def bends(
     grammar: Grammar, sites: tuple[Site, ...], readings: Ints, form: Floats, free: Floats,
-    seen: tuple[float, float],
+    limits: tuple[float, float],
 ) -> Bends:  # fmt: skip
-    """Form all bends of (K,) readings, motions (S, R', K) of the sites, products (S, K, K)."""
-    which = grammar.smooth[:MOST_ARGUMENTS]
-    argument, made, numbers, rows = [], [], [], []
-    for k in which.tolist():
+    """Form all bends at readings (K,), with `Screen.form` and `Screen.free`."""
+    arguments = grammar.smooth[:MOST_ARGUMENTS]
+    argument, functions, numbers, rows = [], [], [], []
+    for k in arguments.tolist():
         u = grammar.values[k][readings].astype(float) * grammar.size[k]
-        for shape, each in _starts(u):
-            of: list[Any] = [n[:, None] for n in each]
-            argument += [k] * len(each[0])
-            made += [shape] * len(each[0])
-            numbers += list(zip(*(n.tolist() for n in each), strict=True))
-            rows.append(unit_rows(shape.value(u, tuple(of))))
+        for shape, starts in _starts(u):
+            parameters: list[Any] = [n[:, None] for n in starts]
+            argument += [k] * len(starts[0])
+            functions += [shape] * len(starts[0])
+            numbers += list(zip(*(n.tolist() for n in starts), strict=True))
+            rows.append(unit_rows(shape.value(u, tuple(parameters))))
     values: Floats = np.vstack(rows) if rows else np.zeros((0, len(readings)), dtype=np.float32)
-    elastic = np.array([grammar.at(k).elastic for k in which.tolist()], dtype=np.bool_)
-    bent = np.repeat(elastic, len(values) // max(len(which), 1))
+    elastic = np.array([grammar.at(k).elastic for k in arguments.tolist()], dtype=np.bool_)
+    bent = np.repeat(elastic, len(values) // max(len(arguments), 1))
     square: Floats = np.empty((len(sites), len(values)), dtype=np.float32)
     across: Floats = np.empty_like(square)
     squares = values**2
@@ -292,12 +292,12 @@ def bends(
         across[s] = lifted.sum(axis=1)
         square[s] = np.einsum("ck,ck->c", lifted, values)
         moved = squares @ np.sum(form[s] ** 2, axis=0)
-        square[s, square[s] < seen[0] * moved + seen[1]] = 0.0
+        square[s, square[s] < limits[0] * moved + limits[1]] = 0.0
         for kind in (False, True):
             if not site.takes(kind):
                 square[s, bent == kind] = 0.0
     return Bends(
-        np.array(argument, dtype=np.int_), tuple(made), tuple(numbers), values, square, across
+        np.array(argument, dtype=np.int_), tuple(functions), tuple(numbers), values, square, across
     )
 
 
@@ -308,7 +308,7 @@ def _starts(u: Floats) -> list[tuple[Shape, tuple[Floats, ...]]]:
 
 
 def unit_rows(values: Floats) -> Floats:
-    """Rows with root mean square 1, single precision; zero where they are not finite."""
+    """Rows scaled to root mean square 1, single precision; zero if not finite."""
     size = np.sqrt(np.mean(values**2, axis=-1, keepdims=True))
     good = np.isfinite(size) & (size > 0)
     return np.where(good, values / np.where(good, size, 1.0), 0.0).astype(np.float32)

@@ -1,8 +1,7 @@
 """Forward selection of laws with backward pruning, corrected for the size of the search.
 
-At each step the term with the best odds beside those that are chosen is added (see `problem`), and
-terms are taken out again where the others make them needless. Of terms that odds of 20 : 1 do not
-tell apart the simplest is taken.
+At each step the term with the best odds beside the chosen ones is added (see `problem`), and terms
+that the others make needless are removed. Of terms within odds of 20 : 1 the simplest is chosen.
 """
 
 from collections.abc import Iterable
@@ -17,20 +16,20 @@ from hilcal.regression.evidence import FamilyScore
 from hilcal.regression.forward_selection import families_beside
 from hilcal.types import Floats
 
-BEAM = 3  # First terms with which selections are begun; a choice
-MOST_TERMS = 3  # Terms of a law at most; a choice
-MOST_COEFFICIENTS = 8  # Coefficients of a law at most; a choice: more is no law that one reads
-LEAST = 3.0  # Logarithm of the odds, corrected for the search, that a further term needs: 20 : 1
-FALSE_ALARM = 1e-3  # Chance of a first term where nothing is hidden, over the whole search
-SAME = 0.98  # Correlation of two projected columns from which on they count as the same law
+BEAM = 3  # First terms that start a selection each; a choice
+MOST_TERMS = 3  # Most terms of a law; a choice
+MOST_COEFFICIENTS = 8  # Most coefficients of a law; a choice: more are not readable
+LEAST = 3.0  # Log odds, corrected for the search, that a further term needs: 20 : 1
+FALSE_ALARM = 1e-3  # Chance of a first term if nothing is hidden, over the whole search
+SAME = 0.98  # Correlation of projected columns above which they count as the same law
 
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """Terms that were chosen."""
+    """Chosen terms."""
 
-    terms: tuple[LawTerm, ...]  # in the order of choosing them
-    odds: tuple[float, ...]  # that each added
+    terms: tuple[LawTerm, ...]  # in the order of choosing
+    odds: tuple[float, ...]  # log odds that each added
 
     @property
     def total(self) -> float:
@@ -39,14 +38,14 @@ class Selection:
 
 
 def search(problem: SearchProblem, most: int = MOST_TERMS, beam: int = BEAM) -> list[Selection]:
-    """Return the best selection of each number of terms, from one on; none where chance would do.
+    """Return the best selection for each number of terms; none if chance explains the first term.
 
-    A longer one is returned only where odds of 20 : 1 ask for it beside every shorter one.
+    A longer selection is returned only if it has odds of 20 : 1 over every shorter one.
     """
-    found = _ordered(problem)
-    if not found or not _sure(found[0]):
+    ordered = _ordered(problem)
+    if not ordered or not _sure(ordered[0]):
         return []
-    starts = _distinct(problem, found, beam)
+    starts = _distinct(problem, ordered, beam)
     best: dict[int, Selection] = {}
     for start in starts:
         s = Selection((start.term,), (start.odds,))
@@ -55,14 +54,13 @@ def search(problem: SearchProblem, most: int = MOST_TERMS, beam: int = BEAM) -> 
             further = _ordered(problem, s.terms)
             if not further or further[0].odds < LEAST:
                 break
-            more = further[0]
-            terms = (*s.terms, more.term)
+            terms = (*s.terms, further[0].term)
             if sum(t.count for t in terms) > MOST_COEFFICIENTS:
                 break
             grown = _pruned(problem, replace(s, terms=terms, odds=chain(problem, terms)))
             if grown.total < s.total + LEAST:
                 break
-            # What was added last is the best beside the others already.
+            # The last term is already the best beside the others.
             s = _exchanged(problem, grown, last=len(grown.terms) - 1)
             _keep(problem, best, s)
     return [
@@ -72,7 +70,7 @@ def search(problem: SearchProblem, most: int = MOST_TERMS, beam: int = BEAM) -> 
 
 
 def worth_their_length(selections: Iterable[Selection]) -> list[Selection]:
-    """Return those that odds of 20 : 1 ask for beside every one before, which is shorter."""
+    """Return the selections that have odds of 20 : 1 over every shorter one."""
     out: list[Selection] = []
     for s in selections:
         if all(s.total >= shorter.total + LEAST for shorter in out):
@@ -81,17 +79,17 @@ def worth_their_length(selections: Iterable[Selection]) -> list[Selection]:
 
 
 def _ordered(problem: SearchProblem, chosen: tuple[LawTerm, ...] = ()) -> list[Scored]:
-    """Return the short list, best first; the simplest of those that odds of 20 : 1 do not tell."""
-    found = problem.scored(chosen)
-    if not found:
+    """Return the short list, best first; the first is the simplest within odds of 20 : 1."""
+    scored = problem.scored(chosen)
+    if not scored:
         return []
-    as_good = [c for c in found if c.odds > found[0].odds - LEAST]
+    as_good = [c for c in scored if c.odds > scored[0].odds - LEAST]
     first = min(as_good, key=lambda c: _preference(problem.screen, c))
-    return [first, *(c for c in found if c is not first)]
+    return [first, *(c for c in scored if c is not first)]
 
 
 def _preference(screen: Screen, c: Scored) -> tuple[float, ...]:
-    """Which of terms as good is taken: the simplest, and of equally simple ones the likeliest."""
+    """Sort key of terms that are as good: the simplest, then the likeliest first."""
     *simple, functions = _simplicity(screen, c.term)
     return (*simple, -round(c.odds), functions, -c.odds)
 
@@ -99,26 +97,25 @@ def _preference(screen: Screen, c: Scored) -> tuple[float, ...]:
 def _simplicity(screen: Screen, t: LawTerm) -> tuple[float, ...]:
     """Numbers and complexity, rank of sites, joints apart, rank of functions; smaller is simpler.
 
-    A coefficient, and a number that is not of the grid, count as much as a unit of complexity. Of
-    causes that the readings do not tell apart, the one of the joint itself is simpler than that of
-    another. A joint's temperature stands for whatever else changes with time: elsewhere it counts a
-    unit more.
+    A coefficient, and a number that is not on the grid, count as a unit of complexity each. A
+    quantity of the site's own joint is simpler than one of another joint. A joint's temperature
+    correlates with everything that changes with time: at another joint it counts a unit more.
     """
     amplitudes = [screen.grammar.at(a) for _, a in t.parts]
     cost = max(a.cost + screen.grammar.tuned(a) for a in amplitudes)
     sites = max(screen.sites[s].rank for s, _ in t.parts)
     functions = max(sum(f.shape.rank for f in a.factors) for a in amplitudes)
-    far = [
+    distances = [
         [
-            # of the site's own joint, of none, or of another one
+            # 0 for the site's own joint, 1 for none, 2 for another one
             (0 if f.variable.joint == screen.sites[s].joint else 1 + (f.variable.joint >= 0),
              f.variable.kind)
             for f in a.factors
         ]
         for a, (s, _) in zip(amplitudes, t.parts, strict=True)
     ]  # fmt: skip
-    apart = max(sum(distance for distance, _ in each) for each in far)
-    cost += any((2, "temperature") in each for each in far)
+    apart = max(sum(distance for distance, _ in part) for part in distances)
+    cost += any((2, "temperature") in part for part in distances)
     return t.count + cost, sites, apart, functions
 
 
@@ -129,7 +126,7 @@ def _keep(problem: SearchProblem, best: dict[int, Selection], s: Selection) -> N
 
 
 def plain(screen: Screen, t: LawTerm) -> LawTerm:
-    """Name the simplest site that moves all readings alike; terms of several sites keep theirs."""
+    """Replace the site of a term by its simplest alias; terms of several sites keep theirs."""
     places = {place for place, _ in t.parts}
     if len(places) > 1:
         return t
@@ -137,7 +134,7 @@ def plain(screen: Screen, t: LawTerm) -> LawTerm:
 
 
 def _better(problem: SearchProblem, s: Selection, other: Selection) -> bool:
-    """Whether a law is more likely, or simpler where odds of 20 : 1 do not tell them apart."""
+    """Whether a law is likelier than another one, or simpler if within odds of 20 : 1."""
     if abs(s.total - other.total) > LEAST:
         return s.total > other.total
     return _extent(problem, s.terms) < _extent(problem, other.terms)
@@ -149,10 +146,10 @@ def _sure(c: Scored) -> bool:
     )
 
 
-def _distinct(problem: SearchProblem, found: list[Scored], count: int) -> list[Scored]:
+def _distinct(problem: SearchProblem, scored: list[Scored], count: int) -> list[Scored]:
     out: list[Scored] = []
     units: list[Floats] = []
-    for c in found[:SHORT_LIST]:
+    for c in scored[:SHORT_LIST]:
         if c.odds < LEAST:
             break
         x = problem.columns(c.term)
@@ -170,12 +167,12 @@ def _distinct(problem: SearchProblem, found: list[Scored], count: int) -> list[S
 
 
 def _pruned(problem: SearchProblem, s: Selection) -> Selection:
-    """Take out terms that the others make needless."""
+    """Remove terms that the others make needless."""
     while len(s.terms) > 1:
         worth = []
         for k, term in enumerate(s.terms):
-            others = (*s.terms[:k], *s.terms[k + 1 :])
-            worth.append(problem.beside(others).score([term])[0].odds)
+            remaining = (*s.terms[:k], *s.terms[k + 1 :])
+            worth.append(problem.beside(remaining).score([term])[0].odds)
         weakest = int(np.argmin(worth))
         if worth[weakest] >= LEAST:
             return replace(s, odds=chain(problem, s.terms))
@@ -186,49 +183,49 @@ def _pruned(problem: SearchProblem, s: Selection) -> Selection:
 
 
 def _exchanged(problem: SearchProblem, s: Selection, last: int) -> Selection:
-    """Exchange each of the first terms for a better one beside the others, which came later."""
+    """Exchange each of the first `last` terms for a better one beside the others."""
     for k in range(last):
-        others = (*s.terms[:k], *s.terms[k + 1 :])
-        found = _ordered(problem, others)
-        if not found or found[0].term.parts == s.terms[k].parts:
+        remaining = (*s.terms[:k], *s.terms[k + 1 :])
+        ordered = _ordered(problem, remaining)
+        if not ordered or ordered[0].term.parts == s.terms[k].parts:
             continue
-        terms = led((*others, found[0].term))
+        terms = led((*remaining, ordered[0].term))
         if sum(t.count for t in terms) > MOST_COEFFICIENTS:
             continue
-        other = replace(s, terms=terms, odds=chain(problem, terms))
-        if _better(problem, other, s):
-            s = other
+        exchanged = replace(s, terms=terms, odds=chain(problem, terms))
+        if _better(problem, exchanged, s):
+            s = exchanged
     return s
 
 
 def led(terms: tuple[LawTerm, ...]) -> tuple[LawTerm, ...]:
-    """Return terms of which the first pays the price of one that stands alone."""
+    """Return terms with the first at its price as first term."""
     return (replace(terms[0], price=terms[0].alone), *terms[1:])
 
 
 def _extent(problem: SearchProblem, terms: tuple[LawTerm, ...]) -> tuple[float, ...]:
-    """Number of quantities, of sites, of coefficients; how simple the terms are."""
+    """Sort key: number of quantities, of sites, and the summed simplicity of the terms."""
     screen = problem.screen
     parts = [part for t in terms for part in t.parts]
     names = {n for _, f in parts for n in screen.grammar.at(f).names}
-    each = np.sum([_simplicity(screen, t) for t in terms], axis=0)
-    return len(names), len({s for s, _ in parts}), *each.tolist()
+    simplicity = np.sum([_simplicity(screen, t) for t in terms], axis=0)
+    return len(names), len({s for s, _ in parts}), *simplicity.tolist()
 
 
 def chain(problem: SearchProblem, terms: tuple[LawTerm, ...]) -> tuple[float, ...]:
-    """Odds of each term beside those before it; they add up to the odds of the whole law."""
+    """Log odds of each term beside the previous ones; their sum is that of the whole law."""
     scores = chained(problem, terms)
     return tuple(s.log_evidence - t.price for s, t in zip(scores, terms, strict=True))
 
 
 def chained(problem: SearchProblem, terms: tuple[LawTerm, ...]) -> list[FamilyScore]:
-    """Score each term beside those before it."""
+    """Score each term beside the previous ones."""
     x = [problem.columns(t) for t in terms]
     ends = np.cumsum([0, *(c.shape[1] for c in x)])
     places = {str(k): slice(int(a), int(b)) for k, (a, b) in enumerate(pairwise(ends))}
-    whole = np.hstack(x)
+    columns = np.hstack(x)
     families = families_beside(
-        problem.model.information(whole), problem.residual, problem.dof, whole, places, {}
+        problem.model.information(columns), problem.residual, problem.dof, columns, places, {}
     )
     out = []
     for name in places:

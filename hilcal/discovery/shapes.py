@@ -1,17 +1,17 @@
-"""Functions of one recorded quantity from which laws are made, each with its derivative.
+"""Functions of one recorded quantity from which laws are formed, with their derivatives.
 
 linear      x
 cos, sin    cos k x, sin k x
 odd, even   sign(x) |x|^p, |x|^p, rounded off at zero where p < 1
 plus, minus max(x, 0), max(−x, 0)
 above       max(x − x0, 0), and a power of it
-below       max(x0 − x, 0), likewise
-saturation  tanh(x/x0), which for a small x0 is the sign of x
+below       max(x0 − x, 0), and a power of it
+saturation  tanh(x/x0), for small x0 the sign of x
 log         log10(1 + x/unit)
-approach    1 − exp(−x/T)
+relaxation  1 − exp(−x/T)
 step        tanh((x − x0)/w)
 
-A function is written once, as Python: the search evaluates the code that a law's effect has.
+Each function is Python code: the search evaluates the same code as a law's effect.
 """
 
 import re
@@ -33,21 +33,21 @@ _Written = Callable[[str, list[str]], str]
 class Shape:
     """A function f(x; p) of one quantity."""
 
-    name: str  # e.g. "saturation".
-    cost: int  # its complexity
-    code: _Written  # f as Python, of the name of x and the numbers p as Python
-    slope_code: _Written  # ∂f/∂x likewise
-    text: _Written  # f as text, likewise
-    power: Callable[[Numbers], float] = lambda p: 0.0  # p of the unit of x that f has
-    free: tuple[int, ...] = ()  # which of the numbers p a refinement may change
-    places: tuple[int, ...] = ()  # which of these are values of x, which may be zero or negative
+    name: str  # e.g. "saturation"
+    cost: int  # complexity
+    code: _Written  # f as Python, from Python for x and for each of p
+    slope_code: _Written  # ∂f/∂x as Python
+    text: _Written  # f as text, from text for x and for each of p
+    power: Callable[[Numbers], float] = lambda p: 0.0  # power of the unit of x in the unit of f
+    free: tuple[int, ...] = ()  # indices of p that a refinement may change
+    places: tuple[int, ...] = ()  # indices of p that are values of x, which may be zero or negative
 
     def value(self, x: Floats, p: Any) -> Floats:
         """Return f at x; numbers may be arrays that broadcast with it."""
         return np.asarray(eval(_compiled(self.code), {"np": np, "x": x, "p": p}))  # noqa: S307
 
     def slope(self, x: Floats, p: Any) -> Floats:
-        """Return ∂f/∂x likewise."""
+        """Return ∂f/∂x at x; numbers may be arrays that broadcast with it."""
         return np.asarray(eval(_compiled(self.slope_code), {"np": np, "x": x, "p": p}))  # noqa: S307
 
     def latex(self, x: str, p: list[str]) -> str:
@@ -91,9 +91,9 @@ def _times(k: str, x: str, sign: str = "·") -> str:
 
 
 def _root(x: str, p: list[str]) -> str:
-    """Return |x|; rounded off at zero by p[1] where the exponent p[0] is below 1.
+    """Return |x|, rounded off at zero by p[1] if the exponent p[0] is below 1.
 
-    A slope without limit at zero would have no equilibrium.
+    With an unbounded slope at zero there would be no equilibrium.
     """
     if p[0] == "p[0]":
         return f"np.hypot({x}, p[1] * (p[0] < 1))"

@@ -16,11 +16,11 @@ from hilcal.readings.readings import States
 from hilcal.types import Floats
 
 ORDINARY = {"rad": 1e-4, "m": 1e-4, "1": 1e-5, "N": 1.0, "N·m": 0.1}
-"""An ordinary motion, by unit: 0.1 mrad, 0.1 mm, 10 ppm of the distance, and an ordinary error of
-a force sensor; a choice. It only sets the range of strengths that the evidence tries, which is a
-million wide."""
+"""Ordinary motions by unit: 0.1 mrad, 0.1 mm, 10 ppm of the distance; and ordinary errors of a
+force sensor. A choice: it only places the range of strengths that the evidence tries, which spans a
+factor of a million."""
 Place = Field | Literal["sensor"]
-SETUP = ("target", "tracker", "force sensor")  # set up anew for another campaign
+SETUP = ("target", "tracker", "force sensor")  # groups that are new in each campaign
 _AXES = "xyz"
 
 
@@ -29,14 +29,14 @@ class Site:
     """A unit motion."""
 
     field: Place  # of `Deviation`; "sensor" for the recorded wrench, flange axes
-    element: int  # joint or slot; 0 where the field has none
+    element: int  # joint or slot; 0 if the field has none
     axis: int  # component of the twist; 0 for joints and the scale
-    group: str  # what moves, e.g. "joint 2 bearing tilts".
+    group: str  # moving part, e.g. "joint 2, tilt of its axis"
     words: str  # the same with the axis
     symbol: str  # in formulas
-    latex: str  # likewise
+    latex: str  # in LaTeX formulas
     unit: str  # rad, m, 1, N or N·m
-    joint: int = -1  # index of the joint that it belongs to; −1 for none
+    joint: int = -1  # index of its joint; −1 for none
 
     @property
     def rank(self) -> int:
@@ -48,15 +48,15 @@ class Site:
 
     @property
     def of_setup(self) -> bool:
-        """Whether it is of the setup of a campaign, not of the arm."""
+        """Whether the site belongs to the setup of a campaign, not to the arm."""
         return self.group.split(",")[0] in SETUP
 
     def takes(self, elastic: bool, sensed: bool = False) -> bool:
-        """Whether a law that depends on transmitted or on recorded wrenches, or not, may act here.
+        """Whether a law may act here, by its causes.
 
-        Transmitted wrenches move parts of the arm only, the base as the frame of joint 1; other
-        causes move it as the frame of the base. What the force sensor reads is the cause of its own
-        errors only.
+        Transmitted wrenches (`elastic`) move only parts of the arm; they move the base as the frame
+        of joint 1, other causes move it as the frame of the base. Readings of the force sensor
+        (`sensed`) cause only the sensor's own errors.
         """
         if self.field == "sensor" or sensed:
             return self.field == "sensor" and not elastic
@@ -115,7 +115,7 @@ def _twists(
 
 
 class UnitMotions(Effect):
-    """A constant unit motion at every site; for its Jacobian at the equilibrium of a fit."""
+    """A constant unit motion at every site, for its Jacobian at the equilibrium of a fit."""
 
     name = "unit_motions"
     summary = "a constant at every site"
@@ -130,24 +130,24 @@ class UnitMotions(Effect):
         return tuple(Parameter(s.words, s.unit, ORDINARY[s.unit]) for s in self.sites)
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:
-        """Return a one in the place of each site."""
+        """Return a unit deviation at each site."""
         out = []
         for field in dict.fromkeys(x.field for x in self.sites):
             if field == "sensor":
                 continue
-            mine = [k for k, site in enumerate(self.sites) if site.field == field]
-            mine.sort(key=lambda k: self.sites[k].element)
+            indices = [k for k, site in enumerate(self.sites) if site.field == field]
+            indices.sort(key=lambda k: self.sites[k].element)
             wide = field not in ("dq", "scale")
-            values = np.zeros((1, len(mine), 6)) if wide else np.ones((1, len(mine)))
+            values = np.zeros((1, len(indices), 6)) if wide else np.ones((1, len(indices)))
             if wide:
-                for at, k in enumerate(mine):
-                    values[0, at, self.sites[k].axis] = 1.0
-            element = np.array([self.sites[k].element for k in mine])
-            out.append(Columns(field, np.array(mine), element, values))
+                for column, k in enumerate(indices):
+                    values[0, column, self.sites[k].axis] = 1.0
+            element = np.array([self.sites[k].element for k in indices])
+            out.append(Columns(field, np.array(indices), element, values))
         return tuple(out)
 
     def wrench_columns(self, theta: Floats, s: Situation) -> Floats:
-        """Return what unit errors of the force sensor do to the slot wrenches."""
+        """Return the change of the slot wrenches by unit errors of the force sensor."""
         errors = np.zeros((1, len(self.sites), 6))
         for k, site in enumerate(self.sites):
             if site.field == "sensor":
@@ -161,9 +161,9 @@ def site_motions(fit: Fit) -> tuple[tuple[Site, ...], Floats]:
 
 
 def motions_of(
-    model: Model, at: Prediction, theta: Floats, m: int
+    model: Model, prediction: Prediction, theta: Floats, m: int
 ) -> tuple[tuple[Site, ...], Floats]:
-    """Return the same of any readings of m elements, at a prediction of them."""
-    unit = UnitMotions(model.cell, at.situation.states)
+    """Return the same for any readings of m elements, at their prediction."""
+    unit = UnitMotions(model.cell, prediction.situation.states)
     scale = np.array([p.scale for p in unit.parameters])
-    return unit.sites, model.jacobian_of((unit,), at, theta, m) * scale
+    return unit.sites, model.jacobian_of((unit,), prediction, theta, m) * scale

@@ -1,1 +1,1 @@
-"""Between campaigns: what has changed on an arm, fleets of arms."""
+"""Comparison of campaigns: changes of an arm, fleets of arms."""

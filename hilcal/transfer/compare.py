@@ -1,4 +1,4 @@
-"""Two campaigns of one arm: the error of the earlier calibration today, and what has changed."""
+"""Two campaigns of one arm: the current error of the earlier calibration, and what has changed."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -30,28 +30,28 @@ def compare(
     same_setup: bool | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> Comparison:
-    """Say what has changed on an arm between two campaigns, and whether it is more than chance.
+    """Find what has changed on an arm between two campaigns, beyond chance.
 
     >>> with hc.Campaign.open(RUN) as run, hc.Campaign.open(LATER) as later:
-    ...     found = hc.compare(run, later)
-    >>> [(c.candidate.part, c.candidate.effect) for c in found.changes.found]
+    ...     comparison = hc.compare(run, later)
+    >>> [(c.candidate.part, c.candidate.effect) for c in comparison.changes.found]
     [('joint 2', 'joint_compliance')]
-    >>> found.lacked, found.anew
+    >>> comparison.lacked, comparison.anew
     (('joint_tilt_compliance',), True)
 
     Args:
         run: the earlier campaign, or its path.
-        later: the later one; 15 readings will do.
-        revision: of the earlier campaign; the one in use where None, and the baseline without any.
-        same_setup: whether tracker and base stand as they did; where None, only if both cells
-            configure the same place of the tracker. Else its place is estimated from the later
+        later: the later campaign, or its path; 15 readings are enough.
+        revision: of the earlier campaign; if None, the one in use, or the baseline without any.
+        same_setup: whether neither tracker nor base has moved; if None, true only if both cells
+            configure the same pose of the tracker. If false, this pose is estimated from the later
             readings.
 
     Raises:
-        InputError: another arm, another scaling than gc, a column or unloaded readings that the
-            earlier model needs, or readings that do not fit the description of the arm.
-        CannotAnswerError: the earlier revision was fitted to all later readings; or they do not
-            determine the tracker's place.
+        InputError: the arms differ, the scaling is not gc, a column or the unloaded readings that
+            the earlier model needs are missing, or the readings contradict the arm's description.
+        CannotAnswerError: the earlier revision was fitted to all later readings, or the later
+            readings do not determine the tracker's pose.
     """
     if not isinstance(run, Campaign) or not isinstance(later, Campaign):
         with opened(run) as first, opened(later) as second:
@@ -62,22 +62,22 @@ def compare(
             f"({run.cell.arm.name}): its errors differ everywhere; compare campaigns of one arm"
         )
     number, fit = run.fit_in_use(say, revision)
-    chosen, shared = _unseen(run, later, fit, number)
-    drawing = _drawn(later, chosen)
-    one, other = run.cell, later.cell
+    chosen, shared = _fresh(run, later, fit, number)
+    nominal_rms = _nominal_rms(later, chosen)
+    old, new = run.cell, later.cell
     if same_setup is None:
-        stated = one.registration_known and other.registration_known
-        anew = not (stated and np.allclose(one.registration, other.registration, atol=1e-9))
+        stated = old.registration_known and new.registration_known
+        anew = not (stated and np.allclose(old.registration, new.registration, atol=1e-9))
     else:
         anew = not same_setup
     say("predicting what the earlier calibration leaves")
-    before = run.in_use(revision)
-    judged: Mapping[str, Any] = {} if before is None else before.result_json.get("diagnose", {})
-    # A model that a diagnosis found to lack nothing that it can name is taken as it is.
+    in_use = run.in_use(revision)
+    judged: Mapping[str, Any] = {} if in_use is None else in_use.result_json.get("diagnose", {})
+    # A model is not extended if its diagnosis named no missing effect.
     lacks = judged.get("verdict", "missing_effect") == "missing_effect"
-    whole, lacked = completed(fit, changing(run.catalogue) if lacks else (), say)
-    at = setting(earlier_fit(whole), chosen, anew=anew, cell=later.cell)
-    changes = find_changes(at, say)
+    extended, lacked = completed(fit, changing(run.catalogue) if lacks else (), say)
+    later_setting = setting(earlier_fit(extended), chosen, anew=anew, cell=later.cell)
+    changes = find_changes(later_setting, say)
     record, tool = later.in_use(), run.config.tool
     keys = type(tool).model_fields
     return Comparison(
@@ -91,7 +91,7 @@ def compare(
         anew=anew,
         told=same_setup is not None,
         tool=tuple(k for k in keys if getattr(tool, k) != getattr(later.config.tool, k)),
-        today=error_today(at, changes, drawing),
+        today=error_today(later_setting, changes, nominal_rms),
         changes=changes,
         differences=None if record is None else _differences(fit, later, record, say),
     )
@@ -100,7 +100,7 @@ def compare(
 def _differences(
     fit: Fit, later: Campaign, record: RevisionRecord, say: Callable[[str], None]
 ) -> Differences | None:
-    """Compare the parameters of both fits; None where they are tied, or there is nothing to."""
+    """Compare the parameters of both fits; None if they are tied or cannot be compared."""
     if record.parameters_json.get(CARRIED):
         return None
     say("comparing the parameters of both fits")
@@ -110,27 +110,27 @@ def _differences(
         return None
 
 
-def _unseen(run: Campaign, later: Campaign, fit: Fit, number: int | None) -> tuple[Readings, int]:
-    """Return the later readings that were not fitted, and the number of the others."""
-    there, deflections = later.readings, fit.mode == "deflection"
-    if deflections and there.unloaded.all():
+def _fresh(run: Campaign, later: Campaign, fit: Fit, number: int | None) -> tuple[Readings, int]:
+    """Return the later readings that were not fitted, and the number of fitted ones."""
+    readings, deflections = later.readings, fit.mode == "deflection"
+    if deflections and readings.unloaded.all():
         raise InputError(
             f"{later.path}: no loaded reading, and {run.path} was fitted to deflections: they "
             "cannot be compared; measure with a load, or fit absolute readings: hilcal identify "
             f"{quoted(run.path)} --readings absolute"
         )
-    known, fresh = never_fitted(there, fit.readings, deflections)
+    fitted, fresh = never_fitted(readings, fit.readings, deflections)
     if not fresh.any():
         model = "the baseline" if number is None else f"revision {number}"
         raise CannotAnswerError(
-            f"{later.path}: {model} of {run.path} was fitted to all its {len(there)} readings; "
+            f"{later.path}: {model} of {run.path} was fitted to all its {len(readings)} readings; "
             "what has changed is seen only in later ones"
         )
-    return there[fresh], int(known.sum())
+    return readings[fresh], int(fitted.sum())
 
 
-def _drawn(later: Campaign, readings: Readings) -> float | None:
-    """Rms error of the arm as drawn, m; refuses readings that do not fit its description."""
+def _nominal_rms(later: Campaign, readings: Readings) -> float | None:
+    """Rms error of the nominal arm, m; refuse readings that contradict its description."""
     try:
         registered = register(later.cell, readings)
     except CannotAnswerError:

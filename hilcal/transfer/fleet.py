@@ -1,4 +1,4 @@
-"""A fleet: its campaigns fitted and diagnosed on the engine, and pooled by type of arm."""
+"""A fleet: campaigns are fitted and diagnosed by the engine, and pooled by type of arm."""
 
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
@@ -25,18 +25,18 @@ from hilcal.transfer.pooled import Pooled, effects_seen, pooled
 Counting = Callable[[str, int], AbstractContextManager[Advance]]
 
 
-def _unseen(what: str, total: int) -> AbstractContextManager[Advance]:
+def _silent(label: str, total: int) -> AbstractContextManager[Advance]:
     """Show no progress."""
     return nullcontext(lambda step: None)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fleet:
-    """What is known of a fleet."""
+    """Pooled results of a fleet."""
 
-    types: tuple[Pooled, ...]  # by type of arm; those that were pooled
-    members: tuple[Member, ...]  # the campaigns that were used
-    failures: tuple[Failure, ...]  # those that were not, and types that could not be pooled
+    types: tuple[Pooled, ...]  # by type of arm
+    members: tuple[Member, ...]  # campaigns that were used
+    failures: tuple[Failure, ...]  # campaigns that were not, and types that could not be pooled
 
     def _repr_html_(self) -> str:
         from hilcal.present.comparison import fleet_report  # notebooks alone need them
@@ -45,20 +45,23 @@ class Fleet:
         return fragment(fleet_report(self))
 
 
-def fleet(directory: Path, engine: Engine, counting: Counting = _unseen) -> Fleet:
+def fleet(directory: Path, engine: Engine, counting: Counting = _silent) -> Fleet:
     """Fit and diagnose the campaigns in a directory and below it, and pool them by type of arm.
 
-    Nothing is stored in them. A campaign that fails is listed with its reason; so is one whose arm
-    is described otherwise than the first of its type. Two of the same readings, copies, or one and
-    its extension, are refused: they would count twice. Raises a CannotAnswerError where nothing can
-    be said of any type. `counting` shows how far it is, as `present.progress.counting` does.
+    Nothing is stored in the campaigns. Campaigns that fail are listed with the reason, and so are
+    those whose nominal links differ from the first of their type. `counting` shows progress, as
+    `present.progress.counting` does.
+
+    Raises:
+        InputError: campaigns share readings, as copies and extensions do, which would count twice.
+        CannotAnswerError: no type can be pooled.
     """
     listed = entries(directory)
     if same := shared(engine.map(prints_of, listed)):
-        one, other = sorted(listed[k].name for k in same)
+        first_name, second_name = sorted(listed[k].name for k in same)
         raise InputError(
-            f"{directory}: {one} and {other} have readings in common: one measurement counts "
-            "once; leave one of them out"
+            f"{directory}: {first_name} and {second_name} have readings in common: one measurement "
+            "counts once; leave one of them out"
         )
     with counting("campaigns", len(listed)) as advance:
         results = engine.map(member_of, listed, advance=advance)
@@ -67,51 +70,52 @@ def fleet(directory: Path, engine: Engine, counting: Counting = _unseen) -> Flee
     for entry, result in zip(listed, results, strict=True):
         if isinstance(result, Failure):
             continue
-        of = kinds.setdefault(result.type, [])
-        links, others = result.posterior.links, (of[0][1] if of else result).posterior.links
-        if links.shape == others.shape and np.abs(links - others).max() <= SAME_M:
-            of.append((entry, result))
+        pairs = kinds.setdefault(result.type, [])
+        links = result.posterior.links
+        reference = (pairs[0][1] if pairs else result).posterior.links
+        if links.shape == reference.shape and np.abs(links - reference).max() <= SAME_M:
+            pairs.append((entry, result))
         else:
-            why = f"its {result.type} has other nominal links than that of {of[0][1].name}"
-            failures.append(Failure(result.name, why))
+            reason = f"its {result.type} has other nominal links than that of {pairs[0][1].name}"
+            failures.append(Failure(result.name, reason))
     types, members = [], []
-    for kind, of in kinds.items():
+    for kind, pairs in kinds.items():
         try:
-            found, mine, lost = _type(of, engine, counting)
+            pooled_type, pooled_members, lost = _type(pairs, engine, counting)
         except CannotAnswerError as error:
             failures.append(Failure(f"type {kind}", str(error)))
-            members += [member for _, member in of]
+            members += [member for _, member in pairs]
             continue
-        types.append(found)
-        members += mine
+        types.append(pooled_type)
+        members += pooled_members
         failures += lost
     if not types:
         first = failures[0]
-        what = f"{first.name}: {first.reason}"
+        message = f"{first.name}: {first.reason}"
         more = f" ({len(failures) - 1} more)" if len(failures) > 1 else ""
-        raise CannotAnswerError(f"{directory}: nothing can be pooled: {what}{more}")
+        raise CannotAnswerError(f"{directory}: nothing can be pooled: {message}{more}")
     return Fleet(tuple(types), tuple(members), tuple(failures))
 
 
 def _type(
-    of: list[tuple[Entry, Member]], engine: Engine, counting: Counting
+    pairs: list[tuple[Entry, Member]], engine: Engine, counting: Counting
 ) -> tuple[Pooled, list[Member], list[Failure]]:
-    """Pool a type; campaigns that lack a trait of it are fitted again with it."""
-    members = [member for _, member in of]
-    seen = effects_seen(members)
-    traits = tuple(s.effect for s in seen if s.kind == "trait")
+    """Pool a type; fit campaigns that lack one of its traits again, with all traits."""
+    members = [member for _, member in pairs]
+    diagnosed = effects_seen(members)
+    traits = tuple(s.effect for s in diagnosed if s.kind == "trait")
     lacking = [k for k, m in enumerate(members) if not set(traits) <= set(m.added)]
     lost: list[Failure] = []
     if traits and lacking:
         run = partial(member_of, effects=traits)
         with counting(f"campaigns again, with {', '.join(traits)}", len(lacking)) as advance:
-            again = engine.map(run, [of[k][0] for k in lacking], advance=advance)
-        for k, result in zip(lacking, again, strict=True):
+            results = engine.map(run, [pairs[k][0] for k in lacking], advance=advance)
+        for k, result in zip(lacking, results, strict=True):
             if isinstance(result, Failure):
                 lost.append(replace(result, reason=f"with {', '.join(traits)}: {result.reason}"))
             else:
                 members[k] = replace(result, added=members[k].added)
-    return pooled(members, seen), members, lost
+    return pooled(members, diagnosed), members, lost
 
 
 def to_json(fleet: Fleet, priors: Mapping[str, str]) -> dict[str, object]:

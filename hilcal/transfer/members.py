@@ -1,14 +1,13 @@
-"""One campaign of a fleet: whose arm it is of, when it was measured, what it taught.
+"""One campaign of a fleet: its arm, its date, its fit, and its evidence on sizes of effects.
 
-How large the effects of a type of arm are, beside those of other arms: with x_i the log standard
-deviations of the families of campaign i (`hilcal.mixed.families`),
-
+The sizes of effects of a type of arm, relative to other arms, follow from the log standard
+deviations x_i of the families of campaign i (`hilcal.mixed.families`):
 
     x_i = mean + B b + d_i,    d_i ~ N(0, Λ⁻¹),    b ~ N(0, ARM² + EFFECT² 1)
 
-mean and Λ are those that hold for any arm, B tells the effect of each family, and b is what the
-arms of the type have in common. The restricted likelihood of a campaign is taken as quadratic about
-its estimate, with information I and, there, slope Λ (x_i − mean). Without d_i it says
+mean and Λ are the prior for any arm, B maps each family to its effect, and b is common to the arms
+of the type. The restricted likelihood of a campaign is approximated as quadratic about its estimate
+x_i, with information I and slope Λ (x_i − mean) there. Marginalising d_i gives
 
     J = I − I (I + Λ)⁻¹ I,    j = h − I (I + Λ)⁻¹ h,    h = I x_i + Λ (x_i − mean)
 
@@ -48,12 +47,12 @@ from hilcal.store.revision import seconds_of
 from hilcal.types import Floats
 
 WIDTH = 1.96
-"""Standard deviations of b that a 95 % interval reaches on either side."""
+"""Half width of a 95 % interval, in standard deviations of b."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SizeEvidence:
-    """What a campaign tells of the sizes of E effects."""
+    """Evidence of a campaign on the sizes of E effects."""
 
     effects: tuple[str, ...]  # their names
     information: Floats  # (E, E) Bᵀ J B
@@ -64,8 +63,8 @@ class SizeEvidence:
 class TypeSize:
     """The size of an effect on arms of a type, divided by that on other arms."""
 
-    effect: str  # its name
-    factor: float  # the size
+    effect: str  # name
+    factor: float  # relative size
     low: float  # lower end of its 95 % interval
     high: float  # upper end
 
@@ -75,23 +74,23 @@ class TypeSize:
         return self.low > 1.0 or self.high < 1.0
 
 
-def size_evidence(start: Model, found: Fit) -> SizeEvidence | None:
-    """Return what the readings of a fit tell; None where they do not determine its frames."""
-    kept = found.readings[~found.outlier].as_stated()
-    poses = np.unique(kept.pose)
-    most = max(2, int(len(poses) * MOST_ROWS / (len(kept) * kept.m)))
-    some = poses[np.unique(np.linspace(0, len(poses) - 1, most).astype(np.int64))]
+def size_evidence(start: Model, fitted: Fit) -> SizeEvidence | None:
+    """Return the evidence of a fit's readings; None if they do not determine its frames."""
+    inliers = fitted.readings[~fitted.outlier].as_stated()
+    poses = np.unique(inliers.pose)
+    most = max(2, int(len(poses) * MOST_ROWS / (len(inliers) * inliers.m)))
+    sample = poses[np.unique(np.linspace(0, len(poses) - 1, most).astype(np.int64))]
     try:
-        variances = mixed_fit(start, kept[np.isin(kept.pose, some)], found.mode).variances
+        variances = mixed_fit(start, inliers[np.isin(inliers.pose, sample)], fitted.mode).variances
     except CannotAnswerError:
         return None
     config = start.cell.config
     return evidence_of(variances, {} if config is None else config.ordinary)
 
 
-def evidence_of(of: Variances, ordinary: dict[str, float]) -> SizeEvidence:
-    """Return what estimated variances tell."""
-    problem, x = of.equations.problem, of.log_std
+def evidence_of(variances: Variances, ordinary: dict[str, float]) -> SizeEvidence:
+    """Return the evidence of estimated variances."""
+    problem, x = variances.equations.problem, variances.log_std
     mean, precision = problem.log_std_prior
     families = [f for f in problem.families.random if not f.known]
     effects = tuple(dict.fromkeys(f.effect for f in families))
@@ -100,8 +99,8 @@ def evidence_of(of: Variances, ordinary: dict[str, float]) -> SizeEvidence:
         if not f.known:
             b[k, effects.index(f.effect)] = 1.0
     slope = precision @ (x - mean)
-    # What logarithms add to the curvature of a falling likelihood; see `mixed.variances`.
-    information = of.equations.information + np.diag(np.maximum(-2.0 * slope, 0.0))
+    # Curvature that the logarithm adds where the likelihood falls; see `mixed.variances`.
+    information = variances.equations.information + np.diag(np.maximum(-2.0 * slope, 0.0))
     shipped = mean - b @ np.log([ordinary.get(e, 1.0) for e in effects])
     gain = information @ np.linalg.inv(information + precision)
     j = information - gain @ information
@@ -109,18 +108,18 @@ def evidence_of(of: Variances, ordinary: dict[str, float]) -> SizeEvidence:
     return SizeEvidence(effects, b.T @ j @ b, b.T @ (h - gain @ h - j @ shipped))
 
 
-def type_sizes(of: Sequence[SizeEvidence]) -> tuple[TypeSize, ...]:
-    """Return the sizes that the campaigns of a type tell together, by the effects' names."""
-    effects = sorted({e for x in of for e in x.effects})
+def type_sizes(evidence: Sequence[SizeEvidence]) -> tuple[TypeSize, ...]:
+    """Return sizes from the joint evidence of a type's campaigns, by names of effects."""
+    effects = sorted({e for x in evidence for e in x.effects})
     if not effects:
         return ()
     count = len(effects)
     precision = np.linalg.inv(np.full((count, count), ARM**2) + EFFECT**2 * np.eye(count))
     vector = np.zeros(count)
-    for x in of:
-        at = np.array([effects.index(e) for e in x.effects])
-        precision[np.ix_(at, at)] += x.information
-        vector[at] += x.vector
+    for x in evidence:
+        indices = np.array([effects.index(e) for e in x.effects])
+        precision[np.ix_(indices, indices)] += x.information
+        vector[indices] += x.vector
     covariance = np.linalg.inv(precision)
     b, std = covariance @ vector, np.sqrt(np.diag(covariance))
     ends = np.exp(b[:, None] + WIDTH * std[:, None] * np.array([0.0, -1.0, 1.0]))
@@ -128,33 +127,33 @@ def type_sizes(of: Sequence[SizeEvidence]) -> tuple[TypeSize, ...]:
 
 
 LIST = "arms.csv"
-"""File beside the campaigns that says which arm each is of, and when it was measured."""
+"""File beside the campaigns that states the arm and the date of each."""
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A campaign file, and what the list beside it says."""
+    """A campaign file, with its row of `LIST`."""
 
     path: Path
     name: str  # its path within the directory
-    arm: str = ""  # which arm; empty where that is not stated
-    date: str = ""  # when it was measured, ISO 8601; empty where that is not stated
+    arm: str = ""  # empty if not stated
+    date: str = ""  # of the measurement, ISO 8601; empty if not stated
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Member:
-    """What a campaign taught."""
+    """The fit of a campaign."""
 
     name: str  # its path within the directory
     arm: str
-    known: str  # how that is known: "list", "serial number", "folder" or "file"
+    known: str  # source of `arm`: "list", "serial number", "folder" or "file"
     type: str  # name of the arm's type
-    date: str  # when it was measured, ISO 8601
+    date: str  # of the measurement, ISO 8601
     posterior: Posterior  # of the arm's parameters
     added: tuple[str, ...]  # effects of the arm that the diagnosis added to the baseline
     verdict: str
     rms_m: float  # 3-D position error on poses left out
-    sizes: SizeEvidence | None = None  # what it tells of the sizes of effects; None where nothing
+    sizes: SizeEvidence | None = None  # None if there is no evidence
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,10 +181,10 @@ def entries(directory: Path) -> tuple[Entry, ...]:
 
 @limits.bounded
 def _listed(path: Path) -> Mapping[str, tuple[str, str]]:
-    """Arm and date by campaign."""
+    """Arm and date, by campaign."""
     if not path.exists():
         return {}
-    found = {}
+    out = {}
     try:
         with path.open(encoding="utf-8-sig", newline="") as stream:
             lines = limits.Lines(str(path), stream)
@@ -199,14 +198,14 @@ def _listed(path: Path) -> Mapping[str, tuple[str, str]]:
                 date = (row.get("date") or "").strip()
                 if date:
                     seconds_of(date, f"{path}: row {k}, column 'date'")
-                found[row["campaign"]] = ((row["arm"] or "").strip(), date)
+                out[row["campaign"]] = ((row["arm"] or "").strip(), date)
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: cannot be read ({error})") from None
-    return found
+    return out
 
 
 def prints_of(entry: Entry) -> Floats:
-    """Return what the readings of a campaign are known by; none where it cannot be read."""
+    """Return the prints of a campaign's readings; none if it cannot be read."""
     try:
         with CampaignFile.open(entry.path, read_only=True, check_revisions=False) as file:
             return prints(file.readings())
@@ -215,10 +214,9 @@ def prints_of(entry: Entry) -> Floats:
 
 
 def member_of(entry: Entry, effects: tuple[str, ...] = ()) -> Member | Failure:
-    """Fit and diagnose a campaign; its revision in use, where it has one. Nothing is stored.
+    """Fit and diagnose a campaign, or restore its revision in use. Nothing is stored.
 
-    Args:
-        effects: that most arms of its type have: it is fitted with them and those it has itself.
+    `effects` are traits of the arm's type: the model is fitted with its own effects and these.
     """
     try:
         with Campaign.open(entry.path, read_only=True) as run:
@@ -226,8 +224,8 @@ def member_of(entry: Entry, effects: tuple[str, ...] = ()) -> Member | Failure:
     except HilcalError as error:
         return Failure(entry.name, str(error).removeprefix(f"{entry.path}: "))
     except Exception as error:  # one campaign must not end the others'
-        known = failure_of(error)
-        return Failure(entry.name, str(known or f"unexpected {type(error).__name__}: {error}"))
+        of_effect = failure_of(error)
+        return Failure(entry.name, str(of_effect or f"unexpected {type(error).__name__}: {error}"))
 
 
 def _member(entry: Entry, run: Campaign, effects: tuple[str, ...]) -> Member:
@@ -236,35 +234,37 @@ def _member(entry: Entry, run: Campaign, effects: tuple[str, ...]) -> Member:
     start = baseline(run.cell, run.readings, mode, run.catalogue)
     if record is None:
         path = refine(start, run.readings, mode)
-        found, verdict = path.fit, str(path.verdict)
+        fitted, verdict = path.fit, str(path.verdict)
     else:
-        found = run.restore(record)
+        fitted = run.restore(record)
         judged = record.result_json.get("diagnose")
-        verdict = str(judged["verdict"]) if judged else diagnose(found).verdict
+        verdict = str(judged["verdict"]) if judged else diagnose(fitted).verdict
     if effects:
-        names = dict.fromkeys((*(e.name for e in found.model.effects), *effects))
-        options = {e.name: e.options for e in found.model.effects}
-        model = with_effects(run.cell, found.readings, mode, names, options, run.catalogue)
-        found = fit(model, found.readings, mode)
-    of, folder = overview(run.file), Path(entry.name).parent
-    serials = (i.serial_number or "" for i in of.instruments if i.device == "arm")
+        names = dict.fromkeys((*(e.name for e in fitted.model.effects), *effects))
+        options = {e.name: e.options for e in fitted.model.effects}
+        model = with_effects(run.cell, fitted.readings, mode, names, options, run.catalogue)
+        fitted = fit(model, fitted.readings, mode)
+    about, folder = overview(run.file), Path(entry.name).parent
+    serials = (i.serial_number or "" for i in about.instruments if i.device == "arm")
     named = {
         "list": entry.arm,
         "serial number": next(filter(None, serials), ""),
         "folder": "" if folder == Path() else str(folder),
         "file": Path(entry.name).stem,
     }
-    known, arm = next((how, name) for how, name in named.items() if name)
-    posterior = Posterior.of(found, Source(entry.name, 0, of.created))
+    source, arm = next((how, name) for how, name in named.items() if name)
+    posterior = Posterior.of(fitted, Source(entry.name, 0, about.created))
     return Member(
         name=entry.name,
         arm=arm,
-        known=known,
+        known=source,
         type=run.cell.arm.name,
-        date=entry.date or of.created,
+        date=entry.date or about.created,
         posterior=replace(posterior, scatter=None),
-        added=tuple(e.name for e in found.model.effects if of_arm(e) and e.name not in start.names),
+        added=tuple(
+            e.name for e in fitted.model.effects if of_arm(e) and e.name not in start.names
+        ),
         verdict=verdict,
-        rms_m=found.holdout.rms_m,
-        sizes=size_evidence(start, found),
+        rms_m=fitted.holdout.rms_m,
+        sizes=size_evidence(start, fitted),
     )

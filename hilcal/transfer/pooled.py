@@ -1,8 +1,8 @@
-"""What the campaigns of arms of one type have in common, and what is unlike: see `hierarchy`.
+"""Common parameters of the arms of one type, and arms that differ from them: see `hierarchy`.
 
-Effects that at least `COMMON` of the arms have are estimated together; parameters with a strength
-of their own (shrunk families) are not pooled. A parameter enters where at least two arms determine
-it. Time is in years since the arm's first campaign.
+Effects in at least the share `COMMON` of the campaigns are pooled; parameters with a strength of
+their own (shrunk families) are not. A parameter is pooled if at least two arms determine it. Time
+is in years since the arm's first campaign.
 """
 
 from collections import Counter
@@ -32,26 +32,25 @@ from hilcal.transfer.members import Member, TypeSize, type_sizes
 from hilcal.types import Floats
 
 COMMON = 0.5
-"""Share of the arms that have an effect from which on it is taken as a trait of the type; a
-choice."""
+"""Least share of the arms with an effect for it to count as a trait of the type; a choice."""
 RARE = 0.1
-"""Share up to which it is taken as a defect of single arms; a choice."""
+"""Largest share of the arms with an effect for it to count as a defect of single arms; a choice."""
 FEWEST_ARMS = 3
-"""Arms without which nothing can be said of a type; a choice: two have no spread."""
+"""Least number of arms to pool a type; a choice: two have no spread."""
 YEAR_S = 365.25 * 86400.0
 
 
 @dataclass(frozen=True, slots=True)
 class Odd:
-    """A parameter of one arm that is unlike those of the others of its type."""
+    """A parameter of one arm that differs from the other arms of its type."""
 
     arm: str
-    campaign: str  # in which campaign, where it is a change of the arm; empty where it is the arm
+    campaign: str  # campaign before which the arm changed; empty if the arm itself is unlike
     parameter: str  # "effect.parameter"
-    off: float  # by how much, SI
+    off: float  # difference from the expected value, SI
     unit: str
-    sigma: float  # the same in standard deviations of what the other arms let expect
-    p_value: float  # of that among all that were looked at
+    sigma: float  # the same in standard deviations of the prediction from the other arms
+    p_value: float  # among all parameters and arms that were tested
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,9 +64,8 @@ class Spread:
     between: float  # standard deviation from arm to arm
     between_std: float  # its standard error
     within: float | None
-    """Standard deviation from campaign to campaign of an arm; None where none was measured
-    twice."""
-    per_year: float | None  # β, common drift; None where no arm was measured at two times
+    """Standard deviation between campaigns of an arm; None if no arm was measured twice."""
+    per_year: float | None  # β, common drift; None if no arm was measured at two times
     per_year_std: float | None  # its standard uncertainty
 
 
@@ -76,58 +74,62 @@ class DiagnosedEffect:
     """An effect that diagnoses added."""
 
     effect: str
-    arms: tuple[str, ...]  # the arms that have it
-    of: int
+    arms: tuple[str, ...]  # arms with the effect
+    of: int  # number of all arms
     kind: str  # "trait" of the type, "defect" of single arms, or "some"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pooled:
-    """What is known of arms of one type."""
+    """Pooled parameters of the arms of one type."""
 
     type: str
     arms: tuple[str, ...]
     campaigns: tuple[str, ...]
     parameters: tuple[Spread, ...]
-    odd: tuple[Odd, ...]  # what is unlike, the arms' first, most certain first
+    odd: tuple[Odd, ...]  # differences of arms, then changes of arms; most certain first
     seen: tuple[DiagnosedEffect, ...]  # effects that diagnoses added, most frequent first
     wear: tuple[str, ...]  # parameters whose common drift is certain
-    prior: Posterior  # what to expect of another arm
-    off: Floats  # (A, K) each arm's parameters minus the mean of the type, SI
+    prior: Posterior  # prediction for another arm
+    off: Floats  # (A, K) parameters of each arm minus the mean of the type, SI
     off_std: Floats
-    """(A, K) their standard uncertainties; infinite where an arm did not determine one."""
+    """(A, K) their standard uncertainties; infinite where the arm did not determine them."""
     sizes: tuple[TypeSize, ...]  # of the effects of the type, by their names
 
     @property
     def distance(self) -> Floats:
-        """(A, K) `off` over the root of the spread between arms and the arm's own uncertainty, σ.
+        """(A, K) `off` over the combined spread between arms and uncertainty of the arm, σ.
 
-        NaN where an arm did not determine the parameter.
+        NaN where the arm did not determine the parameter.
         """
         between = np.array([p.between for p in self.parameters])
-        seen = np.isfinite(self.off_std)
-        std = np.hypot(between, np.where(seen, self.off_std, 1.0))
-        return np.where(seen, self.off / std, np.nan)
+        determined = np.isfinite(self.off_std)
+        std = np.hypot(between, np.where(determined, self.off_std, 1.0))
+        return np.where(determined, self.off / std, np.nan)
 
 
 def effects_seen(members: Sequence[Member]) -> tuple[DiagnosedEffect, ...]:
-    """Return the effects that diagnoses added, and on how many arms."""
+    """Return the effects that diagnoses added, with the arms that have them."""
     arms: dict[str, list[str]] = {}
     for m in members:
         for name in m.added:
             arms.setdefault(name, []).append(m.arm)
     count = len({m.arm for m in members})
-    found = []
-    for name, of in arms.items():
-        some = tuple(dict.fromkeys(of))
-        share = len(some) / count
+    out = []
+    for name, names in arms.items():
+        with_effect = tuple(dict.fromkeys(names))
+        share = len(with_effect) / count
         kind = "trait" if share >= COMMON else "defect" if share <= RARE else "some"
-        found.append(DiagnosedEffect(name, some, count, kind))
-    return tuple(sorted(found, key=lambda s: -len(s.arms)))
+        out.append(DiagnosedEffect(name, with_effect, count, kind))
+    return tuple(sorted(out, key=lambda s: -len(s.arms)))
 
 
-def pooled(members: Sequence[Member], seen: Sequence[DiagnosedEffect]) -> Pooled:
-    """Pool the campaigns of arms of one type; two arms have no spread: a CannotAnswerError."""
+def pooled(members: Sequence[Member], diagnosed: Sequence[DiagnosedEffect]) -> Pooled:
+    """Pool the campaigns of arms of one type.
+
+    Raises:
+        CannotAnswerError: fewer than three arms, or no parameter that two arms determine.
+    """
     first = members[0].posterior
     arms = tuple(dict.fromkeys(m.arm for m in members))
     if len(arms) < FEWEST_ARMS:
@@ -142,9 +144,9 @@ def pooled(members: Sequence[Member], seen: Sequence[DiagnosedEffect]) -> Pooled
         )
     scales, units = _by_name(members, "scale"), _by_name(members, "units")
     scale = np.array([scales[name] for name in names])
-    found = _found(members, arms, names, scale)
-    h, unlike_arms = hierarchy(found)
-    late, changed = _changed(found, h)
+    estimates = _estimates(members, arms, names, scale)
+    h, unlike_arms = hierarchy(estimates)
+    late, changed = _changes(estimates, h)
     of_arms = [(o, arms[o.unit], "") for o in unlike_arms]
     of_campaigns = [(o, members[late[o.unit]].arm, members[late[o.unit]].name) for o in changed]
     odd = []
@@ -162,7 +164,7 @@ def pooled(members: Sequence[Member], seen: Sequence[DiagnosedEffect]) -> Pooled
             mean_std=float(np.sqrt(h.covariance[k, k]) * scale[k]),
             between=float(np.sqrt(h.between[k]) * scale[k]),
             between_std=float(h.between_std_error[k] * scale[k]),
-            within=float(np.sqrt(h.within[k]) * scale[k]) if found.repeated else None,
+            within=float(np.sqrt(h.within[k]) * scale[k]) if estimates.repeated else None,
             per_year=float(h.slope[k] * scale[k]) if timed else None,
             per_year_std=float(years[k] * scale[k]) if timed else None,
         )
@@ -174,7 +176,7 @@ def pooled(members: Sequence[Member], seen: Sequence[DiagnosedEffect]) -> Pooled
         campaigns=tuple(m.name for m in members),
         parameters=tuple(spreads),
         odd=tuple(odd),
-        seen=tuple(seen),
+        seen=tuple(diagnosed),
         wear=tuple(n for n, p in zip(names, certain, strict=True) if timed and p < FALSE_ALARM),
         prior=_prior(members, effects, names, scale, units, h, len(arms)),
         off=(h.arm_mean - h.mu) * scale,
@@ -188,15 +190,15 @@ def _common(members: Sequence[Member]) -> tuple[tuple[PosteriorEffect, ...], tup
     count = Counter(e.name for m in members for e in m.posterior.effects)
     effects = []
     for name, n in count.items():
-        of = [e for m in members for e in m.posterior.effects if e.name == name]
-        if n >= COMMON * len(members) and all(e.options == of[0].options for e in of):
-            effects.append(of[0])
-    known = {e.name for e in effects}
+        alike = [e for m in members for e in m.posterior.effects if e.name == name]
+        if n >= COMMON * len(members) and all(e.options == alike[0].options for e in alike):
+            effects.append(alike[0])
+    pooled_names = {e.name for e in effects}
     arms: dict[str, set[str]] = {}
     for m in members:
         p = m.posterior
-        for name, std, own in zip(p.names, p.std, p.own_precision, strict=True):
-            if name.split(".", 1)[0] in known and own == 0 and np.isfinite(std):
+        for name, std, own_precision in zip(p.names, p.std, p.own_precision, strict=True):
+            if name.split(".", 1)[0] in pooled_names and own_precision == 0 and np.isfinite(std):
                 arms.setdefault(name, set()).add(m.arm)
     order = dict.fromkeys(name for m in members for name in m.posterior.names)
     names = tuple(name for name in order if len(arms.get(name, ())) > 1)
@@ -206,47 +208,47 @@ def _common(members: Sequence[Member]) -> tuple[tuple[PosteriorEffect, ...], tup
 
 def _by_name(members: Sequence[Member], field: str) -> dict[str, Any]:
     """Values of a field of the posteriors, by the names of the parameters."""
-    found: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for m in members:
-        found |= dict(zip(m.posterior.names, getattr(m.posterior, field), strict=True))
-    return found
+        values |= dict(zip(m.posterior.names, getattr(m.posterior, field), strict=True))
+    return values
 
 
-def _found(
+def _estimates(
     members: Sequence[Member], arms: Sequence[str], names: Sequence[str], scale: Floats
 ) -> FleetEstimates:
-    """The members' parameters in ordinary magnitudes; others than `names` marginalised out."""
+    """The members' parameters in ordinary magnitudes, with all but `names` marginalised out."""
     k = len(names)
     mean, information = np.zeros((len(members), k)), np.zeros((len(members), k, k))
     place = {name: i for i, name in enumerate(names)}
     for c, m in enumerate(members):
         p = m.posterior
-        mine = np.array([i for i, name in enumerate(p.names) if name in place], dtype=np.int64)
-        at = np.array([place[p.names[i]] for i in mine], dtype=np.int64)
+        columns = np.array([i for i, name in enumerate(p.names) if name in place], dtype=np.int64)
+        indices = np.array([place[p.names[i]] for i in columns], dtype=np.int64)
         scaled = p.information * (p.scale[:, None] * p.scale)
-        information[c][np.ix_(at, at)] = schur_complement(scaled, mine)
-        mean[c, at] = p.mean[mine] / scale[at]
+        information[c][np.ix_(indices, indices)] = schur_complement(scaled, columns)
+        mean[c, indices] = p.mean[columns] / scale[indices]
     seconds = np.array([seconds_of(m.date) for m in members])
     arm = np.array([arms.index(m.arm) for m in members])
-    begun = np.full(len(arms), np.inf)
-    np.minimum.at(begun, arm, seconds)
-    return FleetEstimates(mean, information, arm, (seconds - begun[arm]) / YEAR_S)
+    first = np.full(len(arms), np.inf)
+    np.minimum.at(first, arm, seconds)
+    return FleetEstimates(mean, information, arm, (seconds - first[arm]) / YEAR_S)
 
 
-def _changed(found: FleetEstimates, h: Hierarchy) -> tuple[list[int], Sequence[Unlike]]:
-    """Later campaigns of arms, and those in which one has changed since before, unlike others."""
-    covariance = np.linalg.inv(found.information + 1e-8 * np.eye(found.mean.shape[1]))
+def _changes(estimates: FleetEstimates, h: Hierarchy) -> tuple[list[int], Sequence[Unlike]]:
+    """Return the repeated campaigns of arms, and the changes of arms before them."""
+    covariance = np.linalg.inv(estimates.information + 1e-8 * np.eye(estimates.mean.shape[1]))
     variance = np.diagonal(covariance, axis1=1, axis2=2)
-    after, change, spread = [], [], []
-    for a in range(int(found.arm.max()) + 1):
-        mine = np.flatnonzero(found.arm == a)
-        mine = mine[np.argsort(found.time[mine], kind="stable")]
-        for before, now in pairwise(mine):
-            years = found.time[now] - found.time[before]
-            after.append(int(now))
-            change.append(found.mean[now] - found.mean[before] - years * h.slope)
-            spread.append(variance[now] + variance[before])
-    return after, unlike(np.array(change), np.array(spread)) if after else []
+    late, change, spread = [], [], []
+    for a in range(int(estimates.arm.max()) + 1):
+        campaigns = np.flatnonzero(estimates.arm == a)
+        campaigns = campaigns[np.argsort(estimates.time[campaigns], kind="stable")]
+        for previous, current in pairwise(campaigns):
+            years = estimates.time[current] - estimates.time[previous]
+            late.append(int(current))
+            change.append(estimates.mean[current] - estimates.mean[previous] - years * h.slope)
+            spread.append(variance[current] + variance[previous])
+    return late, unlike(np.array(change), np.array(spread)) if late else []
 
 
 def _prior(
@@ -258,14 +260,14 @@ def _prior(
     h: Hierarchy,
     arms: int,
 ) -> Posterior:
-    """What to expect of another arm: N(μ, Cov μ + τ² + ω²)."""
+    """Prediction for another arm: N(μ, Cov μ + τ² + ω²)."""
     information = np.linalg.inv(h.predictive)
     information = (information + information.T) / 2
-    low: dict[tuple[str, str], tuple[float, float]] = {}
+    ranges: dict[tuple[str, str], tuple[float, float]] = {}
     for m in members:
         for r in m.posterior.ranges:
-            a, b = low.get((r.variable, r.unit), (np.inf, -np.inf))
-            low[r.variable, r.unit] = min(a, r.low), max(b, r.high)
+            a, b = ranges.get((r.variable, r.unit), (np.inf, -np.inf))
+            ranges[r.variable, r.unit] = min(a, r.low), max(b, r.high)
     first = members[0].posterior
     modes = Counter(m.posterior.mode for m in members)
     return Posterior(
@@ -280,7 +282,7 @@ def _prior(
         information=information / (scale[:, None] * scale),
         own_precision=np.zeros(len(names)),
         scatter=None,
-        ranges=tuple(Range(v, u, a, b) for (v, u), (a, b) in low.items()),
+        ranges=tuple(Range(v, u, a, b) for (v, u), (a, b) in ranges.items()),
         prints=np.concatenate([m.posterior.prints for m in members]),
         source=Source(
             campaign=f"{len(members)} campaigns of {arms} arms of the type {first.arm}",

@@ -1,1 +1,1 @@
-"""Robot descriptions of the user, corrected where their numbers stand."""
+"""Robot descriptions of the user, corrected in place."""

@@ -1,17 +1,17 @@
-"""A description file with the places of its numbers, and its chain with a corrected arm.
+"""A robot description file with the places of its numbers, and its chain with a corrected arm.
 
-A file has steps from its base link to its tip link: a place, and behind it a joint or none. Its
-frames are not those of the arm (a mesh wants its own), but where it is the same arm, they lie on
-the same axes: with M_k the links of the nominal arm, C_k of the corrected one, N_k of the file, all
-with the joints' axes along z,
+A file has steps from its base link to its tip link: a transform, and after it a joint or none. Its
+frames differ from those of the arm (meshes have their own), but its joint axes are the same. With
+M_k the links of the nominal arm, C_k of the corrected one, N_k of the file, all with the joint axes
+along z,
 
     N_k = H_{k−1}⁻¹ M_k G_k,   G_k = Rz(·) Tz(·),   H_k = Rz(o_k) G_k,   N'_k = H_{k−1}⁻¹ C_k G_k
 
-with o_k where the file has another zero of the joint than the controller, H_{−1} from the base of
-the arm to that of the file, the identity or half a turn about z (as between `base` and `base_link`
-of a UR arm), and G_n from the flange to the tip. What a file has wrong by millimetres is left out
-of G and H, so that N' is exact. Each N'_k is made by one place: that of its joint, behind the last
-joint that of the first step there.
+o_k is the difference between the joint's zeros in the file and in the controller. H_{−1} is from
+the base of the arm to that of the file: the identity, or half a turn about z (as between `base` and
+`base_link` of a UR arm). G_n is from the flange to the tip. G and H do not contain the file's own
+errors, which may be millimetres, so that N' is exact. One transform is changed for each N'_k: that
+of its joint, after the last joint that of the first step.
 """
 
 import re
@@ -34,15 +34,15 @@ from hilcal.robot.conventions import as_drawn
 from hilcal.types import Floats
 
 SAME = 1e-6
-"""m, rad; frames that differ by less are the same: descriptions are written with six decimals."""
+"""m, rad; frames that differ by less count as the same: descriptions have six decimals."""
 NEAR_M, NEAR_RAD = 5e-3, 1e-2
-"""m, rad; a file whose axes lie as near as this is of the same arm: many are rounded to
-millimetres, others are corrected already. A choice; what is written is exact in any case."""
+"""m, rad; a file with axes within these distances is of the same arm: many files are rounded to
+millimetres, others are corrected already. A choice; the corrected file is exact in any case."""
 LEFT = 1e-9
-"""m, rad; a place that moves less is left as it is."""
+"""m, rad; a transform that changes less keeps its text."""
 Edits = list[tuple[Span, str]]
 LARGEST, SMALLEST = 1e6, 1e-6
-"""Of numbers, and of the length of a direction; choices."""
+"""Largest number, and least length of a direction; choices."""
 TURNING = ("revolute", "continuous")
 """Types of a joint that turns."""
 EXPRESSION = re.compile(r"\$\{([^{}]*)\}")
@@ -57,18 +57,18 @@ class Node:
     tag: str
     attributes: dict[str, str]  # by name, as written
     line: int  # from 1
-    begin: int  # where its start tag begins
-    end: int  # where its start tag ends
-    close: int = 0  # where its end tag begins
+    begin: int  # offset of its start tag
+    end: int  # offset of the start tag's end
+    close: int = 0  # offset of its end tag
     parent: "Node | None" = None  # None for the root
     children: list["Node"] = field(default_factory=list)  # in the order of the text
 
     def first(self, tag: str) -> "Node | None":
-        """Return the first child of a name."""
+        """Return the first child with a tag."""
         return next((c for c in self.children if c.tag == tag), None)
 
     def every(self, *tags: str) -> Iterator["Node"]:
-        """Yield elements of some names below it, in the order of the text."""
+        """Yield descendants with some tags, in the order of the text."""
         for child in self.children:
             if child.tag in tags:
                 yield child
@@ -83,12 +83,12 @@ class Document:
     text: str  # with one character per byte
     root: Node
 
-    def refused(self, node: Node, what: str) -> InputError:
+    def refused(self, node: Node, reason: str) -> InputError:
         """Return the error of an element."""
-        return InputError(f"{self.name}: line {node.line}: {what}")
+        return InputError(f"{self.name}: line {node.line}: {reason}")
 
     def attribute(self, node: Node, name: str) -> Span | None:
-        """Where the value of an attribute stands."""
+        """Place of the value of an attribute; None if absent."""
         tag = self.text[node.begin : node.end]
         m = re.search(rf"\s{re.escape(name)}\s*=\s*(\"([^\"]*)\"|'([^']*)')", tag)
         if m is None:
@@ -96,10 +96,10 @@ class Document:
         return Span(0, node.begin + m.start(1) + 1, node.begin + m.end(1) - 1)
 
     def put(self, node: Node, name: str, value: str) -> tuple[Span, str]:
-        """Return the edit that gives an attribute a value, where there is none a new one."""
-        at = self.attribute(node, name)
-        if at is not None:
-            return at, value
+        """Return the edit that sets an attribute, or adds it."""
+        place = self.attribute(node, name)
+        if place is not None:
+            return place, value
         begin = node.begin + 1 + len(node.tag)
         return Span(0, begin, begin), f' {name}="{value}"'
 
@@ -110,8 +110,8 @@ class Document:
         except ValueError:
             values = np.empty(0)
         if len(values) != count or not (np.abs(values) <= LARGEST).all():
-            what = f"<{escaped(node.tag)}> has '{escaped(text[:40])}'; valid: {count} numbers"
-            raise self.refused(node, what)
+            reason = f"<{escaped(node.tag)}> has '{escaped(text[:40])}'; valid: {count} numbers"
+            raise self.refused(node, reason)
         return values
 
     def direction(self, node: Node, values: Floats) -> Floats:
@@ -133,11 +133,11 @@ def read_xml(path: Path) -> Document:
     open_ = [top]
 
     def start(tag: str, attributes: dict[str, str]) -> None:
-        begin, above = parser.CurrentByteIndex, open_[-1]
+        begin, parent = parser.CurrentByteIndex, open_[-1]
         m = _TAG.match(text, begin)
         node = Node(tag, attributes, parser.CurrentLineNumber, begin, m.end() if m else begin)
-        node.parent = None if above is top else above
-        above.children.append(node)
+        node.parent = None if parent is top else parent
+        parent.children.append(node)
         open_.append(node)
         if len(open_) > limits.NESTED + 1:
             raise InputError(f"{path}: nested too deeply; valid: a robot's description")
@@ -168,20 +168,20 @@ class LinkTree:
     leads: Mapping[str, tuple[str, Node]]  # by child link: its parent link, and the joint
 
     def chain(self, base: str | None, tip: str | None) -> tuple[list[Node], list[Node]]:
-        """Return the joints up from a base to where it meets the way to a tip, and down from there.
+        """Return the joints from a base up to its common ancestor with a tip, and down to the tip.
 
-        By default the base is the root, the tip the last link behind the moving joints.
+        By default the base is the root, the tip the last link after the moving joints.
         """
         to_tip = self._up(self._last() if tip is None else self._link(tip))
         to_base = to_tip[-1:] if base is None else self._up(self._link(base))
         common = next((name for name in to_base if name in to_tip), None)
         if common is None:
             raise InputError(f"{self.document.name}: no chain from '{base}' to '{to_tip[0]}'")
-        back, down = (links[: links.index(common)] for links in (to_base, to_tip))
-        return [self.leads[k][1] for k in back], [self.leads[k][1] for k in reversed(down)]
+        up, down = (links[: links.index(common)] for links in (to_base, to_tip))
+        return [self.leads[k][1] for k in up], [self.leads[k][1] for k in reversed(down)]
 
     def _up(self, link: str) -> list[str]:
-        """Return a link and those above it, the root last."""
+        """Return a link and its ancestors, the root last."""
         out = [link]
         while out[-1] in self.leads:
             out.append(self.leads[out[-1]][0])
@@ -190,17 +190,17 @@ class LinkTree:
         return out
 
     def _link(self, name: str) -> str:
-        """Return the link of a name, which may leave out the expressions of a xacro."""
+        """Return the link of a name, which may omit the expressions of a xacro."""
         links = {*self.leads, *(parent for parent, _ in self.leads.values())}
-        same = [link for link in links if name in (link, EXPRESSION.sub("", link))]
-        if len(same) != 1:
+        matching = [link for link in links if name in (link, EXPRESSION.sub("", link))]
+        if len(matching) != 1:
             valid = ", ".join(sorted(escaped(EXPRESSION.sub("", link)) for link in links))
-            what = f"link '{escaped(name)}' is there {len(same)} times; valid: {valid}"
-            raise InputError(f"{self.document.name}: {what}")
-        return same[0]
+            reason = f"link '{escaped(name)}' is there {len(matching)} times; valid: {valid}"
+            raise InputError(f"{self.document.name}: {reason}")
+        return matching[0]
 
     def _last(self) -> str:
-        """Return the only link behind moving joints that nothing is attached to."""
+        """Return the only link after moving joints that has no children."""
         parents = {parent for parent, _ in self.leads.values()}
 
         def moves(link: str) -> bool:
@@ -219,30 +219,30 @@ class LinkTree:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ChainPlace:
-    """One place of a chain."""
+class ChainStep:
+    """One step of a chain: a transform, and after it a joint or none."""
 
     name: str  # of the element, for people
     line: int  # of it, from 1
-    place: Floats  # (4, 4) in the frame before it
+    place: Floats  # (4, 4) in the previous frame
     joint: Floats | None
-    """(4, 4) where the axis is behind it, z along the axis; None where nothing turns."""
+    """(4, 4) pose of the joint axis (its z) in the frame of `place`; None without a joint."""
     write: Callable[[Floats], Edits]
-    """Edits that give it another place; raises `InputError` where it cannot have one."""
+    """Edits that write another place; raises `InputError` where the file cannot have one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Redrawn:
     """A chain with a corrected arm."""
 
-    places: tuple[Floats, ...]  # (4, 4) the new place of each step
+    places: tuple[Floats, ...]  # (4, 4) new place of each step
     tip: Floats  # (4, 4) from the flange of the arm to the tip of the file
-    lost: Floats  # (4, 4) what the file has no place for, behind its last joint
-    rough: float  # by how much its axes lay elsewhere than those of the nominal arm, m
+    lost: Floats  # (4, 4) transform after the last joint that the file cannot represent
+    rough: float  # largest distance of the file's axes from those of the nominal arm, m
 
 
-def redrawn(steps: Sequence[ChainPlace], nominal: Arm, arm: Arm, file: str) -> Redrawn:
-    """Return the places that a corrected arm has in a file."""
+def redrawn(steps: Sequence[ChainStep], nominal: Arm, arm: Arm, file: str) -> Redrawn:
+    """Return the places of a corrected arm in a file."""
     turning = [k for k, s in enumerate(steps) if s.joint is not None]
     if len(turning) != arm.n:
         names = ", ".join(escaped(steps[k].name) for k in turning)
@@ -251,7 +251,7 @@ def redrawn(steps: Sequence[ChainPlace], nominal: Arm, arm: Arm, file: str) -> R
             f"{arm.n}; valid: --base-link and --tip-link that are the ends of the arm"
         )
     old, new = as_drawn(nominal).links, as_drawn(arm).links
-    drawn, before, after = [], [], []
+    drawn, starts, axes = [], [], []
     last, joint = 0, np.eye(4)
     for k in (*turning, len(steps)):
         place, end = np.eye(4), np.eye(4)
@@ -259,42 +259,42 @@ def redrawn(steps: Sequence[ChainPlace], nominal: Arm, arm: Arm, file: str) -> R
             place, end = steps[k].place, np.asarray(steps[k].joint)
         fixed = _product(steps[last:k])
         drawn.append(se3.inverse(joint) @ fixed @ place @ end)
-        before.append((joint, fixed))
-        after.append(end)
+        starts.append((joint, fixed))
+        axes.append(end)
         last, joint = k + 1, end
     left, right, rough = _frames(steps, turning, old, drawn, file, nominal.name)
     places = [s.place for s in steps]
     lost = np.eye(4)
-    for k, (joint, fixed) in enumerate(before):
-        wanted = se3.inverse(left[k]) @ new[k] @ right[k]
+    for k, (joint, fixed) in enumerate(starts):
+        target = se3.inverse(left[k]) @ new[k] @ right[k]
         if k < len(turning):
-            places[turning[k]] = se3.inverse(fixed) @ joint @ wanted @ se3.inverse(after[k])
+            places[turning[k]] = se3.inverse(fixed) @ joint @ target @ se3.inverse(axes[k])
         elif len(steps) > turning[-1] + 1:
-            rest = _product(steps[turning[-1] + 2 :])
-            places[turning[-1] + 1] = joint @ wanted @ se3.inverse(rest)
+            following = _product(steps[turning[-1] + 2 :])
+            places[turning[-1] + 1] = joint @ target @ se3.inverse(following)
         else:
-            lost = joint @ wanted
+            lost = joint @ target
     return Redrawn(tuple(places), right[-1], lost, rough)
 
 
 def _frames(
-    steps: Sequence[ChainPlace],
+    steps: Sequence[ChainStep],
     turning: Sequence[int],
     old: Floats,
     drawn: Sequence[Floats],
     file: str,
     name: str,
 ) -> tuple[list[Floats], list[Floats], float]:
-    """H_{−1} … H_{n−1}, G_0 … G_n, and how rough the file is; raises as `redrawn` does."""
+    """H_{−1} … H_{n−1}, G_0 … G_n, and `Redrawn.rough`; raises as `redrawn` does."""
     half = np.diag([-1.0, -1.0, 1.0, 1.0])
-    found: list[tuple[int, list[Floats], list[Floats], float]] = []
+    solutions: list[tuple[int, list[Floats], list[Floats], float]] = []
     misses: list[tuple[int, float, float]] = []
     for base in (np.eye(4), half):
         left, right, zeros, rough = [base], [], 0, 0.0
         for k in range(len(turning)):
             g = se3.inverse(old[k]) @ left[-1] @ drawn[k]
             if k > 0 and not _near(g):
-                left[-1], zeros = _other_zero(old[k], left[-1], drawn[k]), zeros + 1
+                left[-1], zeros = _with_zero(old[k], left[-1], drawn[k]), zeros + 1
                 g = se3.inverse(old[k]) @ left[-1] @ drawn[k]
             if not _near(g):
                 misses.append((k, *_off(g)))
@@ -306,8 +306,8 @@ def _frames(
         else:
             tip = se3.inverse(old[-1]) @ left[-1] @ drawn[-1]
             tip = np.eye(4) if moved(tip, np.eye(4)) < NEAR_M else tip
-            found.append((zeros, left, [*right, tip], rough))
-    if not found:
+            solutions.append((zeros, left, [*right, tip], rough))
+    if not solutions:
         k, away, tilt = max(misses)
         step = steps[turning[k]]
         raise InputError(
@@ -315,43 +315,43 @@ def _frames(
             f"{round(float(np.degrees(tilt)), 4):g}° from that of joint {k + 1} of {name}; valid: "
             "a description of the arm that was measured, from the link of its base on (--base-link)"
         )
-    return min(found, key=lambda f: f[0])[1:]
+    return min(solutions, key=lambda f: f[0])[1:]
 
 
 def _near(g: Floats) -> bool:
-    away, tilt = _off(g)
-    return away < NEAR_M and tilt < NEAR_RAD
+    distance, tilt = _off(g)
+    return distance < NEAR_M and tilt < NEAR_RAD
 
 
 def _off(g: Floats) -> tuple[float, float]:
-    """Distance and angle of the z axis of a frame from that which it is seen from, m and rad."""
+    """Distance and angle between the z axes of a frame and its reference, m and rad."""
     return float(np.hypot(*g[:2, 3])), float(np.arctan2(np.hypot(g[0, 2], g[1, 2]), g[2, 2]))
 
 
-def _other_zero(link: Floats, before: Floats, drawn: Floats) -> Floats:
-    """H with the turn about z by which the next axis of the file lies on that of the arm."""
-    seen = before @ drawn
+def _with_zero(link: Floats, h: Floats, drawn: Floats) -> Floats:
+    """Return H with the turn about z that aligns the next axis of the file with that of the arm."""
+    of_file = h @ drawn
     parallel = np.hypot(link[0, 2], link[1, 2]) <= NEAR_RAD
-    column = 3 if parallel else 2  # parallel axes: by where they are
+    column = 3 if parallel else 2  # parallel axes: by their position
     turn = np.arctan2(link[1, column], link[0, column])
-    turn -= np.arctan2(seen[1, column], seen[0, column])
-    return se3.screw(2, float(turn)) @ before
+    turn -= np.arctan2(of_file[1, column], of_file[0, column])
+    return se3.screw(2, float(turn)) @ h
 
 
-def edits_of(steps: Sequence[ChainPlace], places: Sequence[Floats]) -> tuple[Edits, list[str]]:
-    """Edits of all steps that move, and the names of these."""
+def edits_of(steps: Sequence[ChainStep], places: Sequence[Floats]) -> tuple[Edits, list[str]]:
+    """Edits of all steps that change, and the names of these steps."""
     pairs = [(s, p) for s, p in zip(steps, places, strict=True) if moved(s.place, p) > LEFT]
     return [edit for s, place in pairs for edit in s.write(place)], [s.name for s, _ in pairs]
 
 
 def moved(a: Floats, b: Floats) -> float:
-    """By how much places differ, m or rad, whichever is more."""
+    """Difference of two poses: distance in m or angle in rad, whichever is larger."""
     turn = se3.rotation_vector(a[:3, :3].T @ b[:3, :3])
     return float(max(np.linalg.norm(a[:3, 3] - b[:3, 3]), np.linalg.norm(turn)))
 
 
 def z_to(axis: Floats) -> Floats:
-    """(4, 4) the smallest rotation that takes z to a unit vector; half a turn about x for −z."""
+    """(4, 4) smallest rotation of z to a unit vector; half a turn about x for −z."""
     about = np.cross([0.0, 0.0, 1.0], axis)
     size = float(np.linalg.norm(about))
     if size < 1e-12:
@@ -360,15 +360,15 @@ def z_to(axis: Floats) -> Floats:
 
 
 def not_between(name: str, kind: str) -> str:
-    """Say that a joint may not stand between base and tip."""
-    what = f"joint '{escaped(name)}' is {escaped(kind) or 'nothing'}"
-    return f"{what}; valid between base and tip: revolute, continuous, fixed"
+    """Return why a joint is not allowed between base and tip."""
+    joint = f"joint '{escaped(name)}' is {escaped(kind) or 'nothing'}"
+    return f"{joint}; valid between base and tip: revolute, continuous, fixed"
 
 
 def numbers(values: Floats) -> str:
-    """Numbers as a description has them, to a nanometre and better."""
+    """Numbers in a description's notation, to a nanometre or better."""
     return " ".join(f"{0.0 if abs(v) < 1e-13 else v:.12g}" for v in values.tolist())
 
 
-def _product(steps: Sequence[ChainPlace]) -> Floats:
+def _product(steps: Sequence[ChainStep]) -> Floats:
     return reduce(np.matmul, (s.place for s in steps), np.eye(4))

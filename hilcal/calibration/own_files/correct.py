@@ -1,4 +1,4 @@
-"""A description of the user, corrected: which kind it is, and what changes in it."""
+"""Correction of a user's robot description, of any supported kind."""
 
 import re
 from dataclasses import dataclass
@@ -25,48 +25,48 @@ _DELTA = re.compile(r"^(\s*delta_(theta|a|d|alpha)\s*=\s*\[)([^\]\n]*)(\].*)$", 
 
 @dataclass(frozen=True, slots=True)
 class Correction:
-    """A file with another arm in it."""
+    """A corrected file."""
 
     content: bytes
-    said: str  # what was changed, and what the file has no place for
+    said: str  # changes, and what the file cannot represent, for people
 
 
 def correct_file(
-    path: Path, nominal: Arm, found: Corrected, base: str | None = None, tip: str | None = None
+    path: Path, nominal: Arm, corrected: Corrected, base: str | None = None, tip: str | None = None
 ) -> Correction:
-    """Return a file with the corrected geometry in the place of its own."""
+    """Return a file with the corrected geometry in place of its own."""
     if path.suffix == ".conf":
-        return _ur_conf(path, nominal, found.arm)
+        return _ur_conf(path, nominal, corrected.arm)
     document = read_xml(path)
     kind = document.root.tag
     if kind == "sdf":
         chain = sdf_chain(document, base, tip)
-        new = redrawn(chain.steps, nominal, found.arm, document.name)
+        new = redrawn(chain.steps, nominal, corrected.arm, document.name)
         edits, names = chain.edits(list(new.places))
     elif kind in _STEPS:
         steps = _STEPS[kind](document, base, tip)
-        new = redrawn(steps, nominal, found.arm, document.name)
+        new = redrawn(steps, nominal, corrected.arm, document.name)
         edits, names = edits_of(steps, new.places)
     else:
         raise InputError(f"{path}: an XML file of <{kind[:40]}>; valid: {KINDS}")
-    said = f"{path}: {len(names)} places changed ({', '.join(names)}), all else as it was"
+    note = f"{path}: {len(names)} places changed ({', '.join(names)}), all else as it was"
     if new.rough > SAME:
-        said += f"; its axes lay up to {length(new.rough)} from those of the nominal {nominal.name}"
-    if (away := moved(new.lost, np.eye(4))) > LEFT:
-        said += (
+        note += f"; its axes lay up to {length(new.rough)} from those of the nominal {nominal.name}"
+    if (shift := moved(new.lost, np.eye(4))) > LEFT:
+        note += (
             f"; its tip is the last moving one, which has no place for the flange's own shift "
-            f"({length(away)}): --tip-link"
+            f"({length(shift)}): --tip-link"
         )
     if moved(new.tip, np.eye(4)) > SAME:
-        said += (
+        note += (
             f"; its tip lies {length(float(np.linalg.norm(new.tip[:3, 3])))} from the flange of "
             f"{nominal.name}, and keeps that"
         )
-    return Correction(edited(document.text, edits).encode("latin-1"), said)
+    return Correction(edited(document.text, edits).encode("latin-1"), note)
 
 
 def _ur_conf(path: Path, nominal: Arm, arm: Arm) -> Correction:
-    """Return UR's `calibration.conf` with what the arm's DH rows differ by from the catalogue's.
+    """Return UR's `calibration.conf` with the differences between the arm's and nominal DH rows.
 
     The controller adds `delta_theta`, `delta_a`, `delta_d`, `delta_alpha` to the classic rows of
     its model.
@@ -75,8 +75,8 @@ def _ur_conf(path: Path, nominal: Arm, arm: Arm) -> Correction:
         text = limits.read_bytes(path, limits.SETTINGS).decode("latin-1")
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
-    found = {m[2]: m for m in _DELTA.finditer(text)}
-    if set(found) != {"theta", "a", "d", "alpha"}:
+    lines = {m[2]: m for m in _DELTA.finditer(text)}
+    if set(lines) != {"theta", "a", "d", "alpha"}:
         raise InputError(
             f"{path}: not the four lines delta_theta, delta_a, delta_d, delta_alpha; valid: UR's "
             "calibration.conf"
@@ -89,11 +89,11 @@ def _ur_conf(path: Path, nominal: Arm, arm: Arm) -> Correction:
         values[key] = (turn + np.pi) % (2 * np.pi) - np.pi
     edits = [
         (Span(0, m.start(3), m.end(3)), f" {', '.join(f'{v:.17g}' for v in values[key])}")
-        for key, m in found.items()
+        for key, m in lines.items()
     ]
-    said = (
+    note = (
         f"{path}: the four lines delta_… changed, all else as it was. The rows have no place for "
         f"where joint 1's axis lies in the base (up to {length(new.base_moves)}) and how the "
         f"flange sits on the last axis (up to {length(new.flange_moves)})"
     )
-    return Correction(edited(text, edits).encode("latin-1"), said)
+    return Correction(edited(text, edits).encode("latin-1"), note)

@@ -1,8 +1,8 @@
-"""An MJCF of the user (MuJoCo): `pos` and `quat` of the bodies that its joints turn.
+"""A user's MJCF (MuJoCo): `pos` and `quat` of the bodies that its joints move.
 
-Orientations may be written as `quat`, `axisangle`, `euler`, `xyaxes` or `zaxis`, with the angles of
-`<compiler>`; where one has to change, `quat` takes its place. Axes come from the joint, else from
-its class in `<default>`.
+Orientations may be `quat`, `axisangle`, `euler`, `xyaxes` or `zaxis`, with the angle settings of
+`<compiler>`; a changed orientation is written as `quat`. Axes come from the joint, else from its
+class in `<default>`.
 
 Source: MuJoCo, *XML Reference*: body, joint, site, compiler, frame orientations, default settings.
 """
@@ -11,7 +11,7 @@ import re
 
 import numpy as np
 
-from hilcal.calibration.own_files.chain_text import ChainPlace, Document, Edits, Node, numbers, z_to
+from hilcal.calibration.own_files.chain_text import ChainStep, Document, Edits, Node, numbers, z_to
 from hilcal.calibration.programs.program import Span
 from hilcal.errors import InputError
 from hilcal.names import escaped
@@ -21,7 +21,7 @@ from hilcal.types import Floats
 _TURNS = {"quat": 4, "axisangle": 4, "euler": 3, "xyaxes": 6, "zaxis": 3}
 
 
-def mjcf_steps(document: Document, base: str | None, tip: str | None) -> list[ChainPlace]:
+def mjcf_steps(document: Document, base: str | None, tip: str | None) -> list[ChainStep]:
     """Return the steps from a base body to a tip, a body or a site."""
     world = document.root.first("worldbody")
     if world is None:
@@ -47,7 +47,7 @@ def mjcf_steps(document: Document, base: str | None, tip: str | None) -> list[Ch
 
 
 def _up(node: Node) -> list[Node]:
-    """An element and those that it stands in."""
+    """An element and its ancestors."""
     out = [node]
     while out[-1].parent is not None:
         out.append(out[-1].parent)
@@ -59,21 +59,21 @@ def _name(node: Node) -> str:
 
 
 def _named(document: Document, world: Node, name: str, tags: tuple[str, ...]) -> Node:
-    found = [n for n in world.every(*tags) if n.attributes.get("name") == name]
-    if len(found) != 1:
+    nodes = [n for n in world.every(*tags) if n.attributes.get("name") == name]
+    if len(nodes) != 1:
         valid = ", ".join(_name(n) for n in world.every(*tags) if "name" in n.attributes)
         raise InputError(
             f"{document.name}: no {' or '.join(tags)} '{escaped(name)}'; valid: {valid}"
         )
-    return found[0]
+    return nodes[0]
 
 
-def _step(document: Document, node: Node) -> ChainPlace:
+def _step(document: Document, node: Node) -> ChainStep:
     """Return the step of a body or a site; raises as `mjcf_steps` does."""
     joints = [c for c in node.children if c.tag in ("joint", "freejoint")]
     if node.tag == "frame" or len(joints) > 1:
-        what = f"{_name(node)} is a frame or has several joints; valid: one hinge in a body"
-        raise document.refused(node, what)
+        reason = f"{_name(node)} is a frame or has several joints; valid: one hinge in a body"
+        raise document.refused(node, reason)
     pos = document.numbers(node, node.attributes.get("pos", "0 0 0"), 3)
     place = se3.matrix(_rotation(document, node), pos)
     turn = None
@@ -81,11 +81,11 @@ def _step(document: Document, node: Node) -> ChainPlace:
         (joint,) = joints
         kind = _default(document, joint, "type") or "hinge"
         if joint.tag != "joint" or kind != "hinge":
-            what = f"joint '{_name(joint)}' is no hinge; valid: hinges between base and tip"
-            raise document.refused(joint, what)
+            reason = f"joint '{_name(joint)}' is no hinge; valid: hinges between base and tip"
+            raise document.refused(joint, reason)
         axis = document.numbers(joint, _default(document, joint, "axis") or "0 0 1", 3)
-        at = document.numbers(joint, _default(document, joint, "pos") or "0 0 0", 3)
-        turn = se3.matrix(np.eye(3), at) @ z_to(document.direction(joint, axis))
+        origin = document.numbers(joint, _default(document, joint, "pos") or "0 0 0", 3)
+        turn = se3.matrix(np.eye(3), origin) @ z_to(document.direction(joint, axis))
 
     def write(new: Floats) -> Edits:
         out: Edits = []
@@ -96,18 +96,18 @@ def _step(document: Document, node: Node) -> ChainPlace:
             out += _put_quat(document, node, new[:3, :3])
         return out
 
-    return ChainPlace(_name(node), node.line, place, turn, write)
+    return ChainStep(_name(node), node.line, place, turn, write)
 
 
 def _put_quat(document: Document, node: Node, r: Floats) -> Edits:
-    """Edits that give an element an orientation."""
+    """Edits that set the orientation of an element."""
     value = numbers(se3.quaternion(r))
     key = next((k for k in _TURNS if k in node.attributes), "quat")
-    at = document.attribute(node, key)
-    if key == "quat" or at is None:
+    old = document.attribute(node, key)
+    if key == "quat" or old is None:
         return [document.put(node, "quat", value)]
-    head = document.text.rfind(key, node.begin, at.begin)
-    return [(Span(0, head, at.end), f"quat{document.text[head + len(key) : at.begin]}{value}")]
+    head = document.text.rfind(key, node.begin, old.begin)
+    return [(Span(0, head, old.end), f"quat{document.text[head + len(key) : old.begin]}{value}")]
 
 
 def _rotation(document: Document, node: Node) -> Floats:
@@ -140,20 +140,20 @@ def _rotation(document: Document, node: Node) -> Floats:
 
 
 def _default(document: Document, joint: Node, key: str) -> str | None:
-    """Attribute of a joint, else of its class, of the class of its bodies, of the main class."""
+    """Attribute of a joint, else of its class, of its bodies' class, or of the main class."""
     if key in joint.attributes:
         return joint.attributes[key]
     name = joint.attributes.get("class") or next(
         (n.attributes["childclass"] for n in _up(joint) if "childclass" in n.attributes), None
     )
     classes = list(document.root.every("default"))
-    at = next(
+    default = next(
         (d for d in classes if d.attributes.get("class") == name),
         next((d for d in classes if d.parent is document.root), None),
     )
-    while at is not None and at.tag == "default":
-        found = at.first("joint")
-        if found is not None and key in found.attributes:
-            return found.attributes[key]
-        at = at.parent
+    while default is not None and default.tag == "default":
+        joint_default = default.first("joint")
+        if joint_default is not None and key in joint_default.attributes:
+            return joint_default.attributes[key]
+        default = default.parent
     return None

@@ -1,8 +1,8 @@
-"""An SDF of the user (Gazebo): `<pose>` of its joints and links.
+"""A user's SDF (Gazebo): `<pose>` of its joints and links.
 
-A pose counts from what `relative_to` names; without it, that of a link from the model, that of a
-joint from its child link, as the specification says. A joint that has its place from another frame
-than its child has its pose changed, of every other one the pose of the child link.
+A pose is relative to the frame that `relative_to` names; without it, that of a link is relative to
+the model, that of a joint to its child link, as the specification says. Every link and joint whose
+pose in its own reference frame changes is edited.
 
 Source: *SDFormat Specification* 1.7 and later, "Pose frame semantics".
 """
@@ -13,7 +13,7 @@ from hilcal.calibration.handover import origin_of
 from hilcal.calibration.own_files.chain_text import (
     LEFT,
     TURNING,
-    ChainPlace,
+    ChainStep,
     Document,
     Edits,
     LinkTree,
@@ -34,12 +34,12 @@ MODEL = "__model__"
 
 
 class SdfModel:
-    """Frames of a model: links, joints, frames; and its chain from a base link to a tip link."""
+    """Links, joints and frames of a model, and its chain from a base link to a tip link."""
 
     def __init__(self, document: Document, node: Node):
-        """Take the frames of a model; the chain is found by `sdf_chain`."""
+        """Collect the frames of a model; `sdf_chain` sets the chain."""
         self.document = document
-        self.steps: list[ChainPlace] = []
+        self.steps: list[ChainStep] = []
         self.chain: list[Node] = []
         self.nodes: dict[str, Node] = {}
         for child in node.children:
@@ -55,7 +55,7 @@ class SdfModel:
         self.joints = [n for n in self.nodes.values() if n.tag == "joint"]
 
     def text(self, node: Node | None) -> str:
-        """Text of an element; empty where it is none."""
+        """Text of an element; empty for None."""
         if node is None:
             return ""
         return self.document.text[node.end : node.close].strip()
@@ -64,36 +64,36 @@ class SdfModel:
         """Names of the parent and the child link."""
         return self.text(joint.first("parent")), self.text(joint.first("child"))
 
-    def own(self, name: str) -> Floats:
-        """(4, 4) pose as written."""
+    def written_pose(self, name: str) -> Floats:
+        """(4, 4) pose in its reference frame, as written."""
         pose = self.nodes[name].first("pose")
         if pose is None or not self.text(pose):
             return np.eye(4)
         if pose.attributes.get("degrees") == "true" or "rotation_format" in pose.attributes:
-            what = "a <pose> in degrees or quaternions; valid: x y z r p y, rad"
-            raise self.document.refused(pose, what)
+            reason = "a <pose> in degrees or quaternions; valid: x y z r p y, rad"
+            raise self.document.refused(pose, reason)
         v = self.document.numbers(pose, self.text(pose), 6)
         return se3.matrix(se3.of_rpy(v[3:]), v[:3])
 
     def axis(self, joint: Node) -> tuple[Node | None, str]:
-        """`<xyz>` of a joint, and the frame that it is written in where that is not the joint's."""
+        """`<xyz>` of a joint, and its frame where that is not the joint's."""
         axis = joint.first("axis")
         xyz = None if axis is None else axis.first("xyz")
         return xyz, "" if xyz is None else xyz.attributes.get("expressed_in", "")
 
     def reference(self, name: str) -> str:
-        """Name of the frame that a pose counts from."""
+        """Name of the frame that a pose is relative to."""
         node = self.nodes[name]
         pose = node.first("pose")
-        given = "" if pose is None else pose.attributes.get("relative_to", "")
-        if given:
-            return given
+        relative_to = "" if pose is None else pose.attributes.get("relative_to", "")
+        if relative_to:
+            return relative_to
         if node.tag == "joint":
             return self.ends(node)[1]
         return node.attributes.get("attached_to", "") or MODEL
 
     def place(self, name: str, new: dict[str, Floats] | None = None, depth: int = 0) -> Floats:
-        """(4, 4) of a frame in the model; those in `new` as they are there."""
+        """(4, 4) pose of a frame in the model; `new` overrides poses of frames."""
         if new is not None and name in new:
             return new[name]
         if name in (MODEL, "world"):
@@ -103,52 +103,52 @@ class SdfModel:
                 f"{self.document.name}: frame '{escaped(name)}' is not there, or counts from "
                 "itself; valid: links, joints, frames of the model"
             )
-        return self.place(self.reference(name), new, depth + 1) @ self.own(name)
+        return self.place(self.reference(name), new, depth + 1) @ self.written_pose(name)
 
     def ordered(self) -> list[Node]:
-        """Joints, each behind that which leads to its parent."""
+        """Joints in order from parent to child."""
         out: list[Node] = []
-        left = list(self.joints)
-        while left:
-            children = {self.ends(j)[1] for j in left}
-            ready = [j for j in left if self.ends(j)[0] not in children]
+        remaining = list(self.joints)
+        while remaining:
+            children = {self.ends(j)[1] for j in remaining}
+            ready = [j for j in remaining if self.ends(j)[0] not in children]
             if not ready:
                 raise InputError(f"{self.document.name}: joints go round in a circle")
             out += ready
-            left = [j for j in left if j not in ready]
+            remaining = [j for j in remaining if j not in ready]
         return out
 
     def edits(self, places: list[Floats]) -> tuple[Edits, list[str]]:
-        """Edits that give the steps other places, and the names of what moves."""
+        """Edits that give the steps other places, and the names of changed links and joints."""
         new: dict[str, Floats] = {}
-        given = dict(zip(self.chain, places, strict=True))
+        new_places = dict(zip(self.chain, places, strict=True))
         for joint in self.ordered():
             parent, child = self.ends(joint)
-            place = given.get(joint)
+            place = new_places.get(joint)
             if place is None:
                 if parent not in new:
                     continue
                 place = se3.inverse(self.place(parent)) @ self.place(child)
             name = joint.attributes.get("name", "")
-            behind = se3.inverse(self.place(child)) @ self.place(name)
+            from_child = se3.inverse(self.place(child)) @ self.place(name)
             new[child] = (new[parent] if parent in new else self.place(parent)) @ place
-            new[name] = new[child] @ behind
+            new[name] = new[child] @ from_child
         out: Edits = []
         names = []
-        for name, at in new.items():
+        for name, frame in new.items():
             node = self.nodes[name]
-            pose = se3.inverse(self.place(self.reference(name), new)) @ at
-            if moved(self.own(name), pose) > LEFT:
+            pose = se3.inverse(self.place(self.reference(name), new)) @ frame
+            if moved(self.written_pose(name), pose) > LEFT:
                 xyz, rpy = origin_of(pose)
                 out.append(_pose_edit(node, f"{numbers(xyz)} {numbers(rpy)}"))
                 names.append(name)
-            along, other = self.axis(node)
-            if along is not None and other:  # an axis in another frame turns with its joint
-                was = self.document.numbers(along, self.text(along), 3)
-                local = self.place(name)[:3, :3].T @ self.place(other)[:3, :3] @ was
-                now = self.place(other, new)[:3, :3].T @ at[:3, :3] @ local
-                if np.abs(now - was).max() > LEFT:
-                    out.append((Span(0, along.end, along.close), numbers(now)))
+            along, axis_frame = self.axis(node)
+            if along is not None and axis_frame:  # an axis in another frame turns with its joint
+                old_axis = self.document.numbers(along, self.text(along), 3)
+                local = self.place(name)[:3, :3].T @ self.place(axis_frame)[:3, :3] @ old_axis
+                new_axis = self.place(axis_frame, new)[:3, :3].T @ frame[:3, :3] @ local
+                if np.abs(new_axis - old_axis).max() > LEFT:
+                    out.append((Span(0, along.end, along.close), numbers(new_axis)))
         return out, names
 
 
@@ -160,35 +160,35 @@ def sdf_chain(document: Document, base: str | None, tip: str | None) -> SdfModel
     model = SdfModel(document, models[0])
     ends = {joint: model.ends(joint) for joint in model.joints}
     leads = {child: (parent, j) for j, (parent, child) in ends.items() if parent != "world"}
-    back, model.chain = LinkTree(document, leads).chain(base, tip)
-    if back:
+    up, model.chain = LinkTree(document, leads).chain(base, tip)
+    if up:
         raise InputError(f"{document.name}: no chain from '{base}' down to its tip")
     model.steps = [_step(model, j) for j in model.chain]
     return model
 
 
 def _pose_edit(node: Node, text: str) -> tuple[Span, str]:
-    """Edit that gives a link or joint a pose, where it has none a new one."""
+    """Edit that sets the pose of a link or joint, or adds it."""
     pose = node.first("pose")
     if pose is None or pose.close < pose.end:  # <pose/>
-        at = node.end if pose is None else pose.begin
-        return Span(0, at, at if pose is None else pose.end), f"<pose>{text}</pose>"
+        begin = node.end if pose is None else pose.begin
+        return Span(0, begin, begin if pose is None else pose.end), f"<pose>{text}</pose>"
     return Span(0, pose.end, pose.close), text
 
 
-def _step(model: SdfModel, joint: Node) -> ChainPlace:
+def _step(model: SdfModel, joint: Node) -> ChainStep:
     """Return the step of a joint; raises as `sdf_chain` does."""
     kind, name = joint.attributes.get("type", ""), joint.attributes.get("name", "")
     parent, child = model.ends(joint)
     place = se3.inverse(model.place(parent)) @ model.place(child)
     turn = None
     if kind in TURNING:
-        xyz, other = model.axis(joint)
+        xyz, axis_frame = model.axis(joint)
         along = model.document.numbers(xyz or joint, model.text(xyz) or "0 0 1", 3)
-        along, at = model.document.direction(xyz or joint, along), model.place(name)
-        if other:
-            along = at[:3, :3].T @ model.place(other)[:3, :3] @ along
-        turn = se3.inverse(model.place(child)) @ at @ z_to(along)
+        along, frame = model.document.direction(xyz or joint, along), model.place(name)
+        if axis_frame:
+            along = frame[:3, :3].T @ model.place(axis_frame)[:3, :3] @ along
+        turn = se3.inverse(model.place(child)) @ frame @ z_to(along)
     elif kind != "fixed":
         raise model.document.refused(joint, not_between(name, kind))
-    return ChainPlace(name, joint.line, place, turn, lambda _: [])
+    return ChainStep(name, joint.line, place, turn, lambda _: [])

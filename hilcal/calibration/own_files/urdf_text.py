@@ -1,7 +1,7 @@
-"""A URDF or xacro of the user: `<origin xyz rpy>` of its joints.
+"""A user's URDF or xacro: `<origin xyz rpy>` of its joints.
 
-Of a xacro, places that are written as numbers change; an expression `${…}` of numbers and `pi` is
-read, and refused by its line where it would have to change.
+In a xacro, only numbers are changed. An expression `${…}` of numbers and `pi` is evaluated, but
+refused by its line if it would have to change.
 """
 
 import ast
@@ -16,7 +16,7 @@ from hilcal.calibration.handover import origin_of
 from hilcal.calibration.own_files.chain_text import (
     EXPRESSION,
     TURNING,
-    ChainPlace,
+    ChainStep,
     Document,
     Edits,
     LinkTree,
@@ -37,7 +37,7 @@ _ARITHMETIC: dict[type[ast.operator], Callable[[float, float], float]] = {
 _FIXED = "fixed"
 
 
-def urdf_steps(document: Document, base: str | None, tip: str | None) -> list[ChainPlace]:
+def urdf_steps(document: Document, base: str | None, tip: str | None) -> list[ChainStep]:
     """Return the steps from a base link to a tip link."""
     parents: dict[str, tuple[str, Node]] = {}
     for joint in document.root.every("joint"):
@@ -47,24 +47,24 @@ def urdf_steps(document: Document, base: str | None, tip: str | None) -> list[Ch
             continue
         parent, child = (str(n) for n in names)
         if child in parents:
-            what = f"a second joint leads to link '{escaped(child)}'; valid: a tree"
-            raise document.refused(joint, what)
+            reason = f"a second joint leads to link '{escaped(child)}'; valid: a tree"
+            raise document.refused(joint, reason)
         parents[child] = (parent, joint)
-    back, down = LinkTree(document, parents).chain(base, tip)
-    turned = [_step(document, joint, turned=True) for joint in back]
+    up, down = LinkTree(document, parents).chain(base, tip)
+    turned = [_step(document, joint, turned=True) for joint in up]
     return [*turned, *(_step(document, joint) for joint in down)]
 
 
-def _step(document: Document, joint: Node, *, turned: bool = False) -> ChainPlace:
-    """Return the step of a joint; `turned`: from its child to its parent."""
+def _step(document: Document, joint: Node, *, turned: bool = False) -> ChainStep:
+    """Return the step of a joint; if `turned`, from its child to its parent."""
     kind, name = joint.attributes.get("type", ""), joint.attributes.get("name", "")
     axis = joint.first("axis")
     if kind not in (*TURNING, _FIXED) or (turned and kind != _FIXED):
         raise document.refused(joint, not_between(name, kind))
     along = "1 0 0" if axis is None else axis.attributes.get("xyz", "1 0 0")
     origin = joint.first("origin")
-    given = {} if origin is None else origin.attributes
-    xyz, rpy = (_values(document, origin or joint, given.get(k, "0 0 0")) for k in ("xyz", "rpy"))
+    written = {} if origin is None else origin.attributes
+    xyz, rpy = (_values(document, origin or joint, written.get(k, "0 0 0")) for k in ("xyz", "rpy"))
     place = se3.matrix(se3.of_rpy(rpy), xyz)
     turn = None
     if kind != _FIXED:
@@ -82,21 +82,21 @@ def _step(document: Document, joint: Node, *, turned: bool = False) -> ChainPlac
         for key, old in (("xyz", xyz), ("rpy", rpy)):
             if np.abs(old - values[key]).max() < 1e-12:
                 continue
-            if "$" in given.get(key, ""):
+            if "$" in written.get(key, ""):
                 raise document.refused(
                     origin,
-                    f"the place of joint '{escaped(name)}' is '{escaped(given[key][:60])}', and "
+                    f"the place of joint '{escaped(name)}' is '{escaped(written[key][:60])}', and "
                     f"becomes '{numbers(values[key])}'; write numbers there, or correct what "
                     "xacro makes of it: xacro F.xacro > F.urdf",
                 )
             out.append(document.put(origin, key, numbers(values[key])))
         return out
 
-    return ChainPlace(name, joint.line, se3.inverse(place) if turned else place, turn, write)
+    return ChainStep(name, joint.line, se3.inverse(place) if turned else place, turn, write)
 
 
 def _values(document: Document, node: Node, text: str) -> Floats:
-    """Return three numbers, of which a xacro may compute some."""
+    """Return three numbers, which may be expressions of a xacro."""
 
     def computed(m: re.Match[str]) -> str:
         try:

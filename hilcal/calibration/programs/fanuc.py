@@ -1,10 +1,10 @@
 """FANUC TP programs as text (`.ls`).
 
-Positions stand in `/POS`, with their user frame UF and tool UT: `X, Y, Z` in mm and `W, P, R` in
+`/POS` has the positions with their user frame UF and tool UT: `X, Y, Z` in mm and `W, P, R` in
 degrees about the fixed axes x, y, z, with `CONFIG`, or `J1` to `J6` in degrees. CONFIG has N for a
-wrist that is not flipped (J5 negative) or F, U for an arm that is up (wrist centre in front of the
-lower arm) or D, T for a wrist centre in front of axis 1 or B, and three turn numbers: of which
-axes, `$SCR_GRP[1].$TURN_AXIS` says. Frames and tools themselves are not in the file.
+wrist that is not flipped (J5 negative), else F; U for an arm that is up (wrist centre in front of
+the lower arm), else D; T for a wrist centre in front of axis 1, else B; and three turn numbers,
+whose axes `$SCR_GRP[1].$TURN_AXIS` states. The poses of frames and tools are not in the file.
 
 Source: FANUC, *R-30iB HandlingTool Operator's Manual*, chapters on position data and motion
 instructions.
@@ -79,81 +79,83 @@ def read_ls(path: Path, frames_file: Path | None, tool: Floats | None) -> Progra
 
 
 class _FanucReader(ProgramReader):
-    def read(self, at: int) -> Program:
-        """Read the program, whose positions begin at a place."""
-        positions = {m[1]: (m, at + m.start(2)) for m in _POSITION.finditer(self.text[at:])}
-        for line, code in self._instructions(self.text[:at]):
+    def read(self, offset: int) -> Program:
+        """Read the program; its positions begin at an offset."""
+        positions = {m[1]: (m, offset + m.start(2)) for m in _POSITION.finditer(self.text[offset:])}
+        for line, code in self._instructions(self.text[:offset]):
             m = _MOTION.match(code)
             names = [(p[1], p[2]) for p in _P.finditer(code)]
-            chosen = any(other for _, other in names)
-            if m is None or _OPTION.search(code) or chosen:
-                for name in positions if chosen else [n for n, _ in names]:
+            variable = any(index for _, index in names)
+            if m is None or _OPTION.search(code) or variable:
+                for name in positions if variable else [n for n, _ in names]:
                     self.otherwise.setdefault(name, line)
             if m is None:
                 continue
             if m[2] or not names:
                 self.leave(line, "a position register")
                 continue
-            for name, other in names:
+            for name, index in names:
                 if name is None:
-                    self.leave(line, f"the point P[{other[:20]}] is chosen while the program runs")
+                    self.leave(line, f"the point P[{index[:20]}] is chosen while the program runs")
                 elif name not in positions:
                     left = f"P[{name}] is not in /POS"
-                    self.found.setdefault(name, ProgramPoint(line, f"P[{name}]", left=left))
-                elif name not in self.found:
+                    self.points.setdefault(name, ProgramPoint(line, f"P[{name}]", left=left))
+                elif name not in self.points:
                     position, place = positions[name]
                     at_line = line_of(self.text, place)
                     point = ProgramPoint(at_line, f"P[{name}] (line {at_line})")
-                    self.found[name] = self._point(point, position[2], place)
+                    self.points[name] = self._point(point, position[2], place)
         return self.program()
 
     def _instructions(self, text: str) -> Iterator[tuple[int, str]]:
         """Yield line and text of each instruction, without comments."""
         start = re.search(r"^/MN\b[^\n]*\n", text, re.M)
-        at = start.end() if start else len(text)
-        for m in re.finditer(r"[^;]*;", text[at:]):
+        begin = start.end() if start else len(text)
+        for m in re.finditer(r"[^;]*;", text[begin:]):
             body = m[0].lstrip("\r\n")
-            line = line_of(text, at + m.end() - len(body))
+            line = line_of(text, begin + m.end() - len(body))
             if re.match(r"\s*\d*\s*:\s*(!|//|--eg)", body):
                 continue
             if r := _REFUSED.search(body):
-                what = f"'{r[0]}' changes a frame while the program runs"
-                raise self.refused(line, what, "a program without it")
+                reason = f"'{r[0]}' changes a frame while the program runs"
+                raise self.refused(line, reason, "a program without it")
             yield line, re.sub(r"^\s*\d*\s*:\s*", "", body)
 
-    def _point(self, bare: ProgramPoint, text: str, place: int) -> ProgramPoint:
-        """Return a position of `/POS`; `place` is where its text begins."""
+    def _point(self, bare: ProgramPoint, text: str, offset: int) -> ProgramPoint:
+        """Return a position of `/POS`; its text begins at `offset`."""
         group = _GROUP.search(text)
         if group is None:
             return replace(bare, left="no group GP1")
-        body, at = group[1], place + group.start(1)
+        body, begin = group[1], offset + group.start(1)
         fields = {m[1]: m for m in _FIELD.finditer(body)}
-        if moved := [k for k, m in fields.items() if k.startswith("E") and float(m[2]) != 0]:
-            return replace(bare, left=f"{moved[0]} moves, and it is not known what that carries")
+        if moving := [k for k, m in fields.items() if k.startswith("E") and float(m[2]) != 0]:
+            return replace(bare, left=f"{moving[0]} moves, and it is not known what that carries")
         keys = J if all(k in fields for k in J) else XYZWPR
         frame, tool, config = (x.search(body) for x in (_FRAME, _TOOL, _CONFIG))
-        known = all(k in fields for k in keys)
-        if keys is XYZWPR and not (known and config and frame and tool):
+        complete = all(k in fields for k in keys)
+        if keys is XYZWPR and not (complete and config and frame and tool):
             return replace(bare, left="not a position of numbers with UF, UT and CONFIG")
-        numbers = [Span(0, at + fields[k].start(2), at + fields[k].end(2)) for k in keys]
+        numbers = [Span(0, begin + fields[k].start(2), begin + fields[k].end(2)) for k in keys]
         values = np.array([float(fields[k][2]) for k in keys])
-        used = self.known.pose("tools", tool[1] if tool else "0", f"tool {tool and tool[1]}")
+        tool_pose = self.controller.pose(
+            "tools", tool[1] if tool else "0", f"tool {tool and tool[1]}"
+        )
         if config is None or frame is None or keys is J:
-            return bare.at_joints(numbers, values, used)
+            return bare.at_joints(numbers, values, tool_pose)
         stated = self._flags(config)
         if isinstance(stated, str):
             return replace(bare, left=stated)
-        base = self.known.pose("bases", frame[1], f"frame {frame[1]}")
-        return bare.at_pose(numbers, values, used, base, flags=stated)
+        base = self.controller.pose("bases", frame[1], f"frame {frame[1]}")
+        return bare.at_pose(numbers, values, tool_pose, base, flags=stated)
 
     def _flags(self, config: re.Match[str]) -> tuple[int, ...] | str:
-        """Flags of a CONFIG, or why they are not known."""
+        """Flags of a CONFIG, or why they are unknown."""
         letters, turns = config[1].split(), [int(t) for t in re.findall(r"-?\d+", config[2])]
         out = [
             next((k for k, sign in enumerate(pair) if sign in letters), UNSTATED)
             for pair in (("N", "F"), ("U", "D"), ("T", "B"))
         ]
-        axes = self.known.turn_axes
+        axes = self.controller.turn_axes
         if axes is None and any(turns):
             return (
                 "a turn number other than 0; give turn_axes = [1, 4, 6], or what "

@@ -1,10 +1,10 @@
 """Yaskawa INFORM jobs (`.jbi`).
 
-Positions stand in `//POS`, after lines that say what those below are: `///TOOL n`, `///USER n`,
+`//POS` has the positions, after lines that hold for all below them: `///TOOL n`, `///USER n`,
 `///POSTYPE` PULSE or ANGLE (joint values S, L, U, R, B, T), BASE, ROBOT or USER (X, Y, Z in mm;
 Rx, Ry, Rz in degrees about fixed axes), and `///RCONF l,m,n,o,p,q`: no flip (R axis beyond ±90°),
 lower arm (wrist centre behind the lower arm), wrist centre behind axis S, and R, T, S at 180° or
-more. It is taken in MOVJ alone. Pulses per degree, tools and user frames are not in the file.
+more. Only MOVJ obeys RCONF. Pulses per degree, tools and user frames are not in the file.
 
 Source: Yaskawa, *NX100 and DX200 Instructions, Job Data Format* and *Manipulator Types*.
 """
@@ -72,31 +72,31 @@ def _key(kind: str, number: str) -> str:
 class _InformReader(ProgramReader):
     def read(self) -> Program:
         """Read the job line by line."""
-        self.points: dict[str, ProgramPoint] = {}
-        said: dict[str, str] = {}
-        carried, section, at = 0, "", 0
-        for line, whole in enumerate(self.text.split("\n"), start=1):
-            code = whole.rstrip("\r")
+        self.positions: dict[str, ProgramPoint] = {}
+        head: dict[str, str] = {}
+        base_line, section, offset = 0, "", 0
+        for line, full_line in enumerate(self.text.split("\n"), start=1):
+            code = full_line.rstrip("\r")
             if code.startswith("//") and not code.startswith("///"):
                 section = "".join(code[2:].split()[:1]).upper()
             elif section == "POS" and code.startswith("///"):
-                word, _, rest = code[3:].strip().partition(" ")
-                said[word.upper()] = rest.strip()
+                word, _, value = code[3:].strip().partition(" ")
+                head[word.upper()] = value.strip()
             elif section == "POS" and (m := _POINT.match(code)):
                 if m[1].upper() in ("C", "P"):
-                    self.points[_key(m[1], m[2])] = self._point(m, at, line, said)
+                    self.positions[_key(m[1], m[2])] = self._point(m, offset, line, head)
                 elif m[1].upper() in ("BC", "BP") and any(map(float, _NUMBER.findall(m[3]))):
-                    carried = carried or line
+                    base_line = base_line or line
             elif section == "INST" and not code.strip().startswith("'"):
                 self._instruction(code, line)
-            at += len(whole) + 1
-        if carried:
-            what = "a base axis moves the arm, and it is not known where to"
-            raise self.refused(carried, what, "jobs of an arm that stands")
+            offset += len(full_line) + 1
+        if base_line:
+            reason = "a base axis moves the arm, and it is not known where to"
+            raise self.refused(base_line, reason, "jobs of an arm that stands")
         return self.program()
 
     def _instruction(self, code: str, line: int) -> None:
-        """Take note of an instruction."""
+        """Process an instruction."""
         if r := _REFUSED.match(code):
             raise self.refused(line, f"{r[1]} changes what points mean", "a job without it")
         m = _MOTION.match(code)
@@ -106,37 +106,39 @@ class _InformReader(ProgramReader):
                 self.otherwise.setdefault(name, line)
             if m is not None:
                 self.leave(line, "IMOV is not corrected")
-        elif len(names) != 1 or names[0] not in self.points:
+        elif len(names) != 1 or names[0] not in self.positions:
             self.leave(line, f"the point '{m[2][:20].strip()}' is not in this job")
         else:
-            old = self.found.get(names[0], replace(self.points[names[0]], obeyed=False))
+            old = self.points.get(names[0], replace(self.positions[names[0]], obeyed=False))
             obeyed = old.obeyed or m[1].upper() == "MOVJ"
-            self.found[names[0]] = replace(old, obeyed=obeyed)
+            self.points[names[0]] = replace(old, obeyed=obeyed)
 
-    def _point(self, m: re.Match[str], at: int, line: int, said: dict[str, str]) -> ProgramPoint:
-        """Return a position; `at` is where its line begins."""
+    def _point(
+        self, m: re.Match[str], offset: int, line: int, head: dict[str, str]
+    ) -> ProgramPoint:
+        """Return a position; its line begins at `offset`."""
         bare = ProgramPoint(line, f"{m[1]}{m[2]} (line {line})")
         numbers = list(_NUMBER.finditer(m[3]))
         if len(numbers) != JOINTS or not re.fullmatch(r"[-+\d.,\s]+", m[3]):
             return replace(bare, left=f"not {JOINTS} numbers")
-        start = at + m.start(3)
+        start = offset + m.start(3)
         spans = [Span(0, start + n.start(), start + n.end()) for n in numbers]
         values = np.array([float(n[0]) for n in numbers])
-        kind, number = said.get("POSTYPE", "").upper(), said.get("TOOL", "0").split(",")[0].strip()
-        tool = self.known.pose("tools", number, f"tool {number}")
+        kind, number = head.get("POSTYPE", "").upper(), head.get("TOOL", "0").split(",")[0].strip()
+        tool = self.controller.pose("tools", number, f"tool {number}")
         if kind == "ANGLE":
             return bare.at_joints(spans, values, tool)
         if kind == "PULSE":
-            if self.known.pulses is None:
+            if self.controller.pulses is None:
                 left = "in pulses; give pulses_per_degree = [S, L, U, R, B, T] by --frames F.toml"
                 return replace(bare, left=left)
-            return replace(bare.at_joints(spans, values, tool), scale=self.known.pulses)
+            return replace(bare.at_joints(spans, values, tool), scale=self.controller.pulses)
         if kind not in ("BASE", "ROBOT", "USER"):
             return replace(bare, left=f"POSTYPE {kind} is not corrected")
-        user = said.get("USER", "0") if kind == "USER" else "0"
-        frame = self.known.pose("bases", user, f"frame {user}")
+        user = head.get("USER", "0") if kind == "USER" else "0"
+        frame = self.controller.pose("bases", user, f"frame {user}")
         if kind == "USER" and user == "0":
             frame = "no ///USER"
-        stated = [int(n) for n in re.findall(r"\d+", said.get("RCONF", ""))][:JOINTS]
+        stated = [int(n) for n in re.findall(r"\d+", head.get("RCONF", ""))][:JOINTS]
         flags_ = tuple(stated) if len(stated) == JOINTS else (UNSTATED,) * JOINTS
         return bare.at_pose(spans, values, tool, frame, flags=flags_)

@@ -1,14 +1,14 @@
 """KUKA KRL: a module of a `.src` and a `.dat` file.
 
 Points are `E6POS`, `POS`, `FRAME` (X, Y, Z in mm; A, B, C about z, y', x'' in degrees; status S and
-turn T) and `E6AXIS`, `AXIS` (degrees), declared with a value, or written into a motion. `S` has bit
-0 for the wrist centre behind axis 1 and bit 1 for axis 3 beyond the stretched arm, `T` a bit for
-each axis at a negative angle; the controller takes both in PTP motions and neither on paths.
+turn T) and `E6AXIS`, `AXIS` (degrees), declared with a value, or written into a motion. `S` has
+bit 0 for a wrist centre behind axis 1 and bit 1 for axis 3 beyond the stretched arm, `T` a bit for
+each axis at a negative angle; the controller obeys both in PTP motions and neither on paths.
 
-Tool and base are `$TOOL` and `$BASE`, as they are set before the motion in the text by an
-assignment, `BAS(#TOOL, n)`, `BAS(#BASE, n)`, by an inline form (`FDAT`), or in the motion (`WITH`).
-What is set within a branch or a loop is forgotten at its end, and everything at a call of a
-subprogram, which may set both.
+Tool and base are `$TOOL` and `$BASE`, set earlier in the text by an assignment, `BAS(#TOOL, n)`,
+`BAS(#BASE, n)`, by an inline form (`FDAT`), or in the motion (`WITH`). Values that are set within a
+branch or a loop are unknown after its end, and both after the call of a subprogram, which may set
+them.
 
 Source: KUKA, *KUKA System Software 8.3, Operating and Programming Instructions for System
 Integrators*, chapters 10 to 12; *Expert Programming*, status and turn.
@@ -55,7 +55,7 @@ _MOTION = re.compile(
 )
 _NAME = re.compile(r"\$?[A-Za-z_]\w*(?:\s*\[\s*\d+\s*\])?")
 _PLAIN = re.compile(rf"({_NAME.pattern})?\s*(C_\w+\b|WITH\b|\{{|$)", re.IGNORECASE)
-"""A target that is a name or an aggregate, before what else a motion has."""
+"""A target that is a name or an aggregate, at the beginning of a motion's arguments."""
 _SET = re.compile(r"^\s*\$(TOOL|BASE)\s*=\s*(.+)$", re.IGNORECASE)
 _BAS = re.compile(r"^\s*BAS\s*\(\s*#(\w+)\s*(?:,\s*([^)]*))?\)", re.IGNORECASE)
 _FDAT = re.compile(r"^\s*FDAT_ACT\s*=\s*(\w+)", re.IGNORECASE)
@@ -76,7 +76,7 @@ _FORBIDDEN = re.compile(
     re.IGNORECASE,
 )
 _INERT = re.compile(r"^\s*(\$H_POS|\$POS_RET)\s*=\s*\w+\s*$", re.IGNORECASE)
-"""Statements that read a point and move nothing."""
+"""Statements that read a point without a motion."""
 _BEFORE = "before it in the same subprogram"
 
 
@@ -86,7 +86,7 @@ def flags(q: Floats, shape: Ints) -> Ints:
 
 
 def _written(new: Ints, texts: Sequence[str]) -> list[str]:
-    """T with the bits of the flags."""
+    """Return T with the bits of the flags."""
     (text,) = texts
     turn = int(_value(text)) & ~0b111111
     return [str(turn | sum(1 << k for k, bit in enumerate(new[2:]) if bit == 1))]
@@ -108,15 +108,15 @@ KRL = Language(
 
 def read_krl(path: Path, frames_file: Path | None, tool: Floats | None) -> Program:
     """Read a `.src` file with the `.dat` file beside it."""
-    beside = (p for p in sorted(path.parent.glob("*")) if p.stem == path.stem)
-    paths = [path, *[p for p in beside if p.suffix.lower() == ".dat"][:1]]
+    same_stem = (p for p in sorted(path.parent.glob("*")) if p.stem == path.stem)
+    paths = [path, *[p for p in same_stem if p.suffix.lower() == ".dat"][:1]]
     texts, encodings = zip(*(read_text(p) for p in paths), strict=True)
     encoding = "latin-1" if "latin-1" in encodings else "utf-8"
     if len(set(encodings)) > 1:
         texts = tuple(p.read_bytes().decode(encoding) for p in paths)
     config = frames_file is not None and frames_file.suffix.lower() == ".dat"
-    known = controller_frames(None if config else frames_file, KRL, tool)
-    reader = _KrlReader(path, known)
+    controller = controller_frames(None if config else frames_file, KRL, tool)
+    reader = _KrlReader(path, controller)
     reader.text, reader.encoding = texts[0], encoding
     reader.files = [p.name for p in paths]
     for k, text in enumerate(texts):
@@ -128,7 +128,7 @@ def read_krl(path: Path, frames_file: Path | None, tool: Floats | None) -> Progr
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Value:
-    """An aggregate {…}: where it stands, its type, and its fields with their places."""
+    """An aggregate {…}: its place, its type, and its fields with their text and offsets."""
 
     file: int
     line: int
@@ -136,33 +136,33 @@ class _Value:
     fields: Mapping[str, tuple[str, int, int]]
 
     @classmethod
-    def of(cls, code: str, at: int, file: int, line: int, kind: str = "") -> "_Value":
-        """Return the aggregate that begins a text; `at` is its place in the file."""
+    def of(cls, code: str, offset: int, file: int, line: int, kind: str = "") -> "_Value":
+        """Return the aggregate at the beginning of a text, which is at `offset` in the file."""
         body = code[: code.index("}") + 1] if "}" in code else code
-        found = _FIELD.finditer(body)
-        fields = {m[1].upper(): (m[2], at + m.start(2), at + m.end(2)) for m in found}
+        matches = _FIELD.finditer(body)
+        fields = {m[1].upper(): (m[2], offset + m.start(2), offset + m.end(2)) for m in matches}
         return cls(file, line, kind.upper(), fields)
 
     def numbers(self, keys: Sequence[str]) -> Floats | None:
-        """Values of some fields; None where one is missing."""
+        """Values of some fields; None if one is missing."""
         try:
             return np.array([_value(self.fields[k][0]) for k in keys])
         except (KeyError, ValueError):
             return None
 
     def spans(self, keys: Sequence[str]) -> tuple[Span, ...]:
-        """Where the numbers of some fields stand."""
+        """Places of the numbers of some fields."""
         return tuple(Span(self.file, *self.fields[k][1:]) for k in keys)
 
 
 def _code(text: str) -> Iterator[tuple[int, int, str]]:
-    """Yield number, place and code of each line: comments and texts blanked, of the same length."""
-    at = 0
+    """Yield number, offset and code of each line, with comments and texts replaced by blanks."""
+    offset = 0
     for number, line in enumerate(text.split("\n"), start=1):
         code = _TEXT.sub(lambda m: " " * len(m[0]), line.rstrip("\r"))
         if code.strip() and not code.lstrip().startswith("&"):
-            yield number, at, code
-        at += len(line) + 1
+            yield number, offset, code
+        offset += len(line) + 1
 
 
 def _key(name: str) -> str:
@@ -171,13 +171,13 @@ def _key(name: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _State:
-    """Tool and base that are set: a pose, or why it is not known."""
+    """Tool and base that are set: a pose, or why it is unknown."""
 
     tool: Floats | str = f"the program does not set $TOOL {_BEFORE}"
     base: Floats | str = f"the program does not set $BASE {_BEFORE}"
 
     def same(self, other: "_State") -> bool:
-        """Whether both are known and the same as elsewhere, or unknown there, too."""
+        """Whether tool and base are the same as in another state, or unknown in both."""
         return all(
             a is b
             or (isinstance(a, np.ndarray) and isinstance(b, np.ndarray) and np.array_equal(a, b))
@@ -187,27 +187,27 @@ class _State:
 
 @dataclass(slots=True, eq=False)
 class _Block:
-    """A block that is open: the state at its beginning, and at the ends of its branches."""
+    """An open block: the state at its beginning, and at the ends of its branches."""
 
     begin: _State
     ends: list[_State] = field(default_factory=list)
 
 
 class _KrlReader(ProgramReader):
-    """Goes through the statements of a `.src` file in the order of its text."""
+    """Reader of the statements of a `.src` file, in the order of its text."""
 
-    def __init__(self, path: Path, known: ControllerFrames):
-        super().__init__(path, known)
+    def __init__(self, path: Path, controller: ControllerFrames):
+        super().__init__(path, controller)
         self.files: list[str] = []
         self.data: dict[str, list[_Value]] = {}
         self.state = _State()
         self.form: str | None = None
 
     def collect(self, text: str, file: int) -> None:
-        """Take all aggregates that names are given in a file; −1 for that of --frames."""
-        for line, at, code in _code(text):
+        """Collect all named aggregates of a file; `file` is −1 for that of --frames."""
+        for line, offset, code in _code(text):
             if m := _DATA.match(code):
-                value = _Value.of(m[3], at + m.start(3), file, line, m[1] or "")
+                value = _Value.of(m[3], offset + m.start(3), file, line, m[1] or "")
                 self.data.setdefault(_key(m[2]), []).append(value)
 
     def read(self, texts: Sequence[str], suffixes: Sequence[str]) -> Program:
@@ -215,7 +215,7 @@ class _KrlReader(ProgramReader):
         lines = list(_code(texts[0]))
         self.used = self._used_otherwise(lines)
         blocks: list[_Block] = []
-        for k, (line, at, code) in enumerate(lines):
+        for k, (line, offset, code) in enumerate(lines):
             word = _word(code)
             if word in ("DEF", "DEFFCT", "GLOBAL") and re.search(r"\bDEF(FCT)?\b", code, re.I):
                 self.state, blocks = _State(), []
@@ -233,32 +233,32 @@ class _KrlReader(ProgramReader):
             elif word and re.fullmatch(r"\s*\w+\s*:\s*", code):
                 self._forget(f"line {line} is a label, which may be reached from elsewhere")
             else:
-                self._statement(line, at, code)
+                self._statement(line, offset, code)
         return self.program(texts, suffixes)
 
     def _forget(self, because: str) -> None:
-        why = f"its tool and base are not known: {because}"
-        self.state = _State(why, why)
+        reason = f"its tool and base are not known: {because}"
+        self.state = _State(reason, reason)
 
-    def _statement(self, line: int, at: int, code: str) -> None:
-        """Take note of one statement."""
+    def _statement(self, line: int, offset: int, code: str) -> None:
+        """Process one statement."""
         if m := _MOTION.match(code):
-            self._motion(line, at, code, m)
+            self._motion(line, offset, code, m)
         elif m := _SET.match(code):
-            self._set(m[1].upper(), m[2].strip(), line, at + m.start(2))
+            self._set(m[1].upper(), m[2].strip(), line, offset + m.start(2))
         elif m := _FDAT.match(code):
             self.form = m[1]
         elif m := _BAS.match(code):
-            what, number = m[1].upper(), (m[2] or "").strip()
-            if what in ("TOOL", "BASE"):
-                self._set(what, f"{what}_DATA[{number}]", line, at)
-            elif what in ("PTP_PARAMS", "CP_PARAMS", "PTP_DAT", "CP_DAT", "FRAMES"):
+            topic, number = m[1].upper(), (m[2] or "").strip()
+            if topic in ("TOOL", "BASE"):
+                self._set(topic, f"{topic}_DATA[{number}]", line, offset)
+            elif topic in ("PTP_PARAMS", "CP_PARAMS", "PTP_DAT", "CP_DAT", "FRAMES"):
                 self._of_form(self.form, line)
-            elif what == "INITMOV":
+            elif topic == "INITMOV":
                 self._forget(f"BAS(#INITMOV) of line {line} sets them to what $config.dat has")
         elif m := _FORBIDDEN.search(code):
-            what = f"'{m[0].strip()}' changes what points mean"
-            raise self.refused(line, what, "$TOOL and $BASE as a whole, a tool on the flange")
+            reason = f"'{m[0].strip()}' changes what points mean"
+            raise self.refused(line, reason, "$TOOL and $BASE as a whole, a tool on the flange")
         elif (m := _CALL.match(code)) and m[1].upper() not in _NO_CALLS:
             self._forget(f"{m[1][:40]} of line {line} may set them")
 
@@ -266,58 +266,59 @@ class _KrlReader(ProgramReader):
         """Set tool and base of an inline form."""
         values = self.data.get(_key(name or ""), [])
         if len(values) != 1 or "TOOL_NO" not in values[0].fields:
-            why = f"the FDAT of line {line} is not in the .dat file"
-            self.state = _State(why, why)
+            reason = f"the FDAT of line {line} is not in the .dat file"
+            self.state = _State(reason, reason)
             return
         fields = values[0].fields
         if fields.get("IPO_FRAME", ("#BASE",))[0].upper() != "#BASE":
-            what = f"{name} has its tool outside of the arm (IPO_FRAME #TCP)"
-            raise self.refused(line, what, "a tool on the flange")
-        for what in ("TOOL", "BASE"):
-            if only in ("", what):
-                number = fields.get(f"{what}_NO", ("0",))[0]
-                self._set(what, f"{what}_DATA[{number}]", line, 0)
+            reason = f"{name} has its tool outside of the arm (IPO_FRAME #TCP)"
+            raise self.refused(line, reason, "a tool on the flange")
+        for kind in ("TOOL", "BASE"):
+            if only in ("", kind):
+                number = fields.get(f"{kind}_NO", ("0",))[0]
+                self._set(kind, f"{kind}_DATA[{number}]", line, 0)
 
-    def _set(self, what: str, value: str, line: int, at: int) -> None:
+    def _set(self, kind: str, value: str, line: int, offset: int) -> None:
         """Set `$TOOL` or `$BASE`."""
-        out = self._frame(what, value, line, at)
-        self.state = replace(self.state, **{what.lower(): out})
+        out = self._frame(kind, value, line, offset)
+        self.state = replace(self.state, **{kind.lower(): out})
 
     def _numbers(self, name: str) -> Floats | None:
-        """Numbers of a pose that a name has; None where it has none, or several."""
+        """Numbers of the pose of a name; None if it has none, or several."""
         values = self.data.get(_key(name), [])
         return values[0].numbers(POSE) if len(values) == 1 else None
 
-    def _frame(self, what: str, value: str, line: int, at: int) -> Floats | str:
-        """Pose of a value, or why it is not known."""
+    def _frame(self, kind: str, value: str, line: int, offset: int) -> Floats | str:
+        """Pose of a value, or why it is unknown."""
         if value.upper() == "$NULLFRAME":
             return np.eye(4)
         if value.startswith("{"):
-            numbers = _Value.of(value, at, 0, line).numbers(POSE)
-            return f"${what} of line {line} is not whole" if numbers is None else of_euler(numbers)
+            numbers = _Value.of(value, offset, 0, line).numbers(POSE)
+            return f"${kind} of line {line} is not whole" if numbers is None else of_euler(numbers)
         m = _INDEX.match(value)
-        if m is None or m[1].upper() != what:
+        if m is None or m[1].upper() != kind:
             numbers = self._numbers(value)
-            return f"${what} of line {line} is computed" if numbers is None else of_euler(numbers)
-        group, name = ("tools", "bases")[what == "BASE"], f"{what}_DATA[{m[2]}]"
-        if self.known.given(group, m[2]) is None and (numbers := self._numbers(name)) is not None:
+            return f"${kind} of line {line} is computed" if numbers is None else of_euler(numbers)
+        group, name = ("tools", "bases")[kind == "BASE"], f"{kind}_DATA[{m[2]}]"
+        numbers = self._numbers(name)
+        if numbers is not None and self.controller.stated(group, m[2]) is None:
             return of_euler(numbers)
-        return self.known.pose(group, m[2], name)
+        return self.controller.pose(group, m[2], name)
 
-    def _motion(self, line: int, at: int, code: str, m: re.Match[str]) -> None:
-        """Take the targets of a motion."""
+    def _motion(self, line: int, offset: int, code: str, m: re.Match[str]) -> None:
+        """Record the targets of a motion."""
         word = m[1].upper()
         head, *with_ = re.split(r"\bWITH\b", code[m.end() :], maxsplit=1, flags=re.I)
-        before = self.state
-        for what in ("TOOL", "BASE"):
-            given = re.search(rf"\${what}\s*=\s*(.+?)(?=,\s*\$|$)", "".join(with_), re.I)
-            if given:
-                text = given[1].strip()
+        previous = self.state
+        for kind in ("TOOL", "BASE"):
+            setting = re.search(rf"\${kind}\s*=\s*(.+?)(?=,\s*\$|$)", "".join(with_), re.I)
+            if setting:
+                text = setting[1].strip()
                 form = re.match(r"\w+\s*\(.*?\b(\w+)(?:\.\w+)?\s*\)", text)
                 if form and _key(form[1]) in self.data:
-                    self._of_form(form[1], line, what)
+                    self._of_form(form[1], line, kind)
                 else:
-                    self._set(what, text, line, 0)
+                    self._set(kind, text, line, 0)
         left = ""
         if word.endswith("_REL") or word == "ASYPTP":
             left = f"{word} is not corrected"
@@ -326,42 +327,42 @@ class _KrlReader(ProgramReader):
         targets = [
             (b, t) for b, t in arguments_of(head) if not re.match(r"\s*(CA|C_\w+)\b", t, re.I)
         ]
-        for offset, target in targets[: 2 if "CIRC" in word else 1]:
-            self._target(line, at + m.end() + offset, target, word in ("PTP", "SPTP"), left)
-        self.state = before
+        for begin, target in targets[: 2 if "CIRC" in word else 1]:
+            self._target(line, offset + m.end() + begin, target, word in ("PTP", "SPTP"), left)
+        self.state = previous
 
-    def _target(self, line: int, at: int, text: str, obeyed: bool, left: str) -> None:
-        """Take one target."""
+    def _target(self, line: int, offset: int, text: str, obeyed: bool, left: str) -> None:
+        """Record one target."""
         body = re.sub(r"\s+C_(PTP|DIS|VEL|ORI|SPL)\b.*", "", text, flags=re.I).strip()
-        at += len(text) - len(text.lstrip())
+        offset += len(text) - len(text.lstrip())
         key, name, value = _key(body), f"line {line}", _Value(0, line, "", {})
         if body.startswith("{"):
-            value, key = _Value.of(text.strip(), at, 0, line), f"line {line}, {at}"
+            value, key = _Value.of(text.strip(), offset, 0, line), f"line {line}, {offset}"
         else:
             values = self.data.get(key, [])
             if not _NAME.fullmatch(body):
                 left = left or f"the point '{body[:40]}' is computed while the program runs"
             elif len(values) != 1 or values[0].file < 0:
-                what = "is not in this program" if not values else "has several values"
-                left = left or f"the point '{body[:40]}' {what}"
+                reason = "is not in this program" if not values else "has several values"
+                left = left or f"the point '{body[:40]}' {reason}"
             elif key in self.used:
                 left = left or f"line {self.used[key]} uses or changes '{body[:40]}' otherwise"
             if len(values) == 1 and values[0].file >= 0:
                 value = values[0]
                 name = f"{body} ({self.files[value.file]} line {value.line})"
         bare = ProgramPoint(value.line if value.fields else line, name, left=left)
-        self.take(key, bare if left else self._point(bare, value, obeyed), line, obeyed)
+        self.record(key, bare if left else self._point(bare, value, obeyed), line, obeyed)
 
     def _point(self, bare: ProgramPoint, value: _Value, obeyed: bool) -> ProgramPoint:
-        """Return a point of an aggregate."""
-        moved = [k for k, f in value.fields.items() if re.fullmatch(r"E[1-6]", k) and _moves(f[0])]
-        if moved:
-            return replace(bare, left=f"{moved[0]} moves, and it is not known what that carries")
+        """Return the point of an aggregate."""
+        moving = [k for k, f in value.fields.items() if re.fullmatch(r"E[1-6]", k) and _moves(f[0])]
+        if moving:
+            return replace(bare, left=f"{moving[0]} moves, and it is not known what that carries")
         keys = AXES if AXES[0] in value.fields else POSE
         numbers = value.numbers(keys)
         if numbers is None:
-            what = "A1 to A6" if keys is AXES else "X, Y, Z, A, B, C"
-            return replace(bare, left=f"not all of {what} are written")
+            names = "A1 to A6" if keys is AXES else "X, Y, Z, A, B, C"
+            return replace(bare, left=f"not all of {names} are written")
         tool, spans = self.state.tool, value.spans(keys)
         if keys is AXES:
             return bare.at_joints(spans, numbers, tool)
@@ -373,7 +374,7 @@ class _KrlReader(ProgramReader):
         return bare.at_pose(spans, numbers, tool, self.state.base, **stated)
 
     def _used_otherwise(self, lines: Sequence[tuple[int, int, str]]) -> dict[str, int]:
-        """Names of points that statements use which are no motions to them, with their lines."""
+        """Names of points that statements other than motions use, with their lines."""
         out: dict[str, int] = {}
         keys: dict[str, list[str]] = {}
         for key in self.data:
@@ -413,7 +414,7 @@ def _word(code: str) -> str:
 
 
 def _sets(lines: Sequence[tuple[int, int, str]]) -> bool:
-    """Whether a loop, whose statements these begin with, may set tool or base."""
+    """Whether a loop may set tool or base; `lines` begin with its statements."""
     depth = 0
     for _, _, code in lines:
         word = _word(code)

@@ -1,11 +1,11 @@
-"""A program by the end of its name: read, its branches found, what is not understood refused.
+"""Reading of programs in the language of the file's suffix, and the branches of their poses.
 
-A pose has up to eight solutions, and each again whole turns of its joints on. Programs state which
-by flags: turns or quadrants of joints, which follow from the joint values, and the shape of the
-arm: wrist in front of axis 1 or behind, elbow, sign of a wrist joint. The shape means something for
-arms of the maker's form alone: axes as `Language.axes` with all joint values zero, the last three
-of which meet. Elsewhere, and where nothing is stated or the controller does not look at it (on
-straight lines), the solution is the nearest to the point before.
+A pose has up to eight solutions, each of which repeats at whole turns of its joints. Programs
+select one by flags: turns or quadrants of joints, which follow from the joint values, and the shape
+of the arm: wrist in front of axis 1 or behind, elbow, sign of a wrist joint. The shape is defined
+only for arms of the maker's form: axes as `Language.axes` at zero joint values, the last three of
+which intersect. For other arms, where nothing is stated, and where the controller ignores the flags
+(on straight lines), the solution is the one nearest to the previous point.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -28,7 +28,7 @@ from hilcal.robot.chain import evaluate
 from hilcal.types import Bools, Floats, Ints
 
 LARGEST = 1e7
-"""Of a number of a point: mm, degrees or pulses; a choice."""
+"""Largest number of a point: mm, degrees or pulses; a choice."""
 READERS: Mapping[str, Callable[[Path, Path | None, Floats | None], Program]] = {
     ".src": read_krl,
     ".mod": read_rapid,
@@ -38,18 +38,18 @@ READERS: Mapping[str, Callable[[Path, Path | None, Floats | None], Program]] = {
     ".ls": read_ls,
     ".jbi": read_jbi,
 }
-"""By the end of a file's name in lower case."""
+"""By suffix in lower case."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UnderstoodProgram:
-    """A program with N points that are understood."""
+    """A program with N understood points."""
 
-    program: Program  # the program; what is not understood of it is left
+    program: Program
     arm: Arm
-    q: Floats  # (N, 6) joint values at which it is at them, rad
+    q: Floats  # (N, 6) joint values at the points, rad
     tool: Floats  # (4, 4) T_flange_tool that errors are stated for
-    said: tuple[str, ...]  # what is to be said of their branches
+    said: tuple[str, ...]  # remarks on the branches, for people
 
     @property
     def points(self) -> Points:
@@ -57,20 +57,20 @@ class UnderstoodProgram:
         return Points(tuple(p.name for p in self.program.understood), self.q)
 
     def without(self, refused: list[str]) -> "UnderstoodProgram":
-        """Return the program without points that are refused; "" for those that are not."""
-        why = iter(refused)
-        points = tuple(p if p.left else replace(p, left=next(why)) for p in self.program.points)
-        kept = [k for k, words in enumerate(refused) if not words]
-        return replace(self, program=replace(self.program, points=points), q=self.q[kept])
+        """Return the program without refused points; `refused` has "" for the others."""
+        reasons = iter(refused)
+        points = tuple(p if p.left else replace(p, left=next(reasons)) for p in self.program.points)
+        retained = [k for k, reason in enumerate(refused) if not reason]
+        return replace(self, program=replace(self.program, points=points), q=self.q[retained])
 
     def corrected(self, q: Floats) -> dict[str, bytes]:
         """Return the files by suffix, with joint values (N, 6) in place of `q`."""
         points, language = self.program.understood, self.program.language
-        none = (UNSTATED,) * len(language.of_shape)
-        stated = np.array([p.flags or none for p in points])
-        made = np.array([bool(p.made) for p in points])
-        stated[made] = flags_of(self.arm, language, self.q[made])
-        flags = kept_flags(self.arm, language, self.q, q, stated)
+        unstated = (UNSTATED,) * len(language.of_shape)
+        stated = np.array([p.flags or unstated for p in points])
+        computed = np.array([bool(p.template) for p in points])
+        stated[computed] = flags_of(self.arm, language, self.q[computed])
+        flags = flags_after(self.arm, language, self.q, q, stated)
         return self.program.corrected(self.arm, points, self.q, q, flags)
 
 
@@ -85,8 +85,8 @@ def understood(
 ) -> UnderstoodProgram:
     """Read a program.
 
-    `tool` (4, 4) T_flange_tool is that of tools that neither it nor `frames` has; `near` (6,) are
-    joint values that the first pose is near to, rad.
+    `tool` (4, 4) T_flange_tool replaces tools that neither the program nor `frames` has; the first
+    pose is near to joint values `near` (6,), rad.
     """
     try:
         program = READERS[path.suffix.lower()](path, frames, tool)
@@ -94,44 +94,44 @@ def understood(
         raise InputError(escaped(str(error))) from None
     points = []
     for p in program.points:
-        every = np.concatenate([p.values, p.frame.ravel(), p.tool.ravel()])
-        usable = (np.abs(every) < LARGEST).all()
+        numbers = np.concatenate([p.values, p.frame.ravel(), p.tool.ravel()])
+        usable = (np.abs(numbers) < LARGEST).all()
         left = p.left if usable else "numbers that are none, in it, its tool or its base"
         points.append(replace(p, left=left))
     program = replace(program, points=tuple(points))
     _refuse(path, program.points, leave)
     q, doubts, said = resolve(program, arm, near)
-    longest, more = longest_tool(program.understood)
-    found = UnderstoodProgram(program, arm, q, longest, said + more).without(doubts)
-    _refuse(path, found.program.points, leave)
-    return found
+    longest, remarks = longest_tool(program.understood)
+    result = UnderstoodProgram(program, arm, q, longest, said + remarks).without(doubts)
+    _refuse(path, result.program.points, leave)
+    return result
 
 
 def _refuse(path: Path, points: tuple[ProgramPoint, ...], leave: bool) -> None:
-    """Refuse points that are left; raises as `understood` does."""
+    """Refuse points that cannot be corrected; raises as `understood` does."""
     left = [p for p in points if p.left]
     if left and not (leave and len(left) < len(points)):
         p = left[0]
         where = p.name if "line" in p.name else f"{p.name}, line {p.line}"
-        rest = f"; and {len(left) - 1} more" if len(left) > 1 else ""
-        said = escaped(f"{where}: {p.left}{rest}")
-        raise InputError(f"{path}: {said}; --leave keeps such points as they are")
+        further = f"; and {len(left) - 1} more" if len(left) > 1 else ""
+        reason = escaped(f"{where}: {p.left}{further}")
+        raise InputError(f"{path}: {reason}; --leave keeps such points as they are")
 
 
 ALONG = 0.02
-"""By how much the direction of an axis may differ from that of the maker's arms; a choice, more
-than any calibrated arm is off."""
+"""Largest difference of an axis direction from that of the maker's arms; a choice, above that of
+any calibrated arm."""
 MEET = 1e-3
-"""m; distance at which axes meet; a choice."""
+"""m; largest distance of intersecting axes; a choice."""
 BORDER = 1e-4
-"""rad; joint values as near to where a flag changes have both; a choice, above what numbers of four
-decimals leave open."""
+"""rad; joint values within this distance of a flag's border have both values; a choice, above the
+rounding of numbers with four decimals."""
 AS_NEAR = 0.05
 """rad, see `calibration.urscript.AS_NEAR`."""
 
 
 def unlike(arm: Arm, language: Language) -> str:
-    """Say why an arm is not of the maker's form; empty where it is."""
+    """Return why an arm is not of the maker's form; empty if it is."""
     chain = evaluate(arm, np.zeros((1, JOINTS)))
     axes = chain.rotation[:JOINTS, 0, :, 2]
     wrong = np.linalg.norm(axes - np.array(language.axes), axis=1) > ALONG
@@ -145,15 +145,15 @@ def unlike(arm: Arm, language: Language) -> str:
     p = chain.position[:JOINTS, 0]
     normals = {k: np.cross(axes[k], axes[4]) for k in (3, 5)}
     gaps = [abs((p[k] - p[4]) @ n) / np.linalg.norm(n) for k, n in normals.items()]
-    missed = max(gaps)
-    return f"axes 4 to 6 miss each other by {1e3 * missed:.3g} mm" if missed > MEET else ""
+    gap = max(gaps)
+    return f"axes 4 to 6 miss each other by {1e3 * gap:.3g} mm" if gap > MEET else ""
 
 
 def shape(arm: Arm, q: Floats) -> Ints:
-    """(K, 2) 1 where the wrist centre is behind axis 1; 1 where it is behind the lower arm.
+    """(K, 2) 1 where the wrist centre is behind axis 1, and 1 where it is behind the lower arm.
 
-    Both as seen in the plane of the arm, which turns with axis 1 and whose forward direction has
-    axis 2 to its left: `behind` at values q of all joints.
+    Both are meant in the plane of the arm, which turns with axis 1; its forward direction has axis
+    2 to its left.
     """
     chain = evaluate(arm, q)
     z, p = chain.rotation[:JOINTS, :, :, 2], chain.position[:JOINTS]
@@ -176,127 +176,132 @@ def flags_of(arm: Arm, language: Language, q: Floats) -> Ints:
 def resolve(
     program: Program, arm: Arm, near: Floats | None
 ) -> tuple[Floats, list[str], tuple[str, ...]]:
-    """Return joint values (N, 6) at which the nominal arm is at the points, doubts, and remarks.
+    """Return joint values (N, 6) that take the nominal arm to the points, doubts, and remarks.
 
-    A doubt says why the values of a point are not certain, "" where they are. `near` (6,) are joint
-    values that the first pose is near to, rad; None where none are given.
+    A doubt is why the values of a point are not certain, "" if they are. The first pose is near to
+    joint values `near` (6,), rad; None if unknown.
     """
     language = program.language
     if arm.n != JOINTS or arm.mimic is not None:
         raise InputError(f"{arm.name}: {arm.n} joints; a {language.name} program is for {JOINTS}")
     foreign = unlike(arm, language)
-    known = np.array([not (foreign and of) for of in language.of_shape])
-    found: list[Floats] = []
+    readable = np.array([not (foreign and by_shape) for by_shape in language.of_shape])
+    joints: list[Floats] = []
     doubts: list[str] = []
     ignored = unfit = 0
     for p in program.understood:
-        before = found[-1] if found and not doubts[-1] else None if found else near
+        previous = joints[-1] if joints and not doubts[-1] else None if joints else near
         if p.joints:
-            found.append(p.values / p.scale)
+            joints.append(p.values / p.scale)
             doubts.append("")
             continue
-        stated = np.array(p.flags or (UNSTATED,) * len(known))
-        asked = (stated != UNSTATED) & known
-        ignored += bool(np.any((stated != UNSTATED) & ~known))
-        if not p.obeyed and before is not None:
-            asked[:] = False
-        q, why = _one(arm, language, p, before, stated, asked)
+        stated = np.array(p.flags or (UNSTATED,) * len(readable))
+        required = (stated != UNSTATED) & readable
+        ignored += bool(np.any((stated != UNSTATED) & ~readable))
+        if not p.obeyed and previous is not None:
+            required[:] = False
+        q, doubt = _solve(arm, language, p, previous, stated, required)
         unfit += bool(
-            not why
-            and not asked.any()
-            and not _fits(arm, language, q[None], stated, (stated != UNSTATED) & known)[0]
+            not doubt
+            and not required.any()
+            and not _fits(arm, language, q[None], stated, (stated != UNSTATED) & readable)[0]
         )
-        found.append(q)
-        doubts.append(why)
-    said = []
+        joints.append(q)
+        doubts.append(doubt)
+    remarks = []
     if ignored:
-        said.append(
+        remarks.append(
             f"{ignored} points state a shape of the arm that is read for {language.name} arms of "
             f"the usual form alone, and of {arm.name} {foreign}; their branch is the one that the "
             "other flags and the point before say"
         )
     if unfit:
-        said.append(
+        remarks.append(
             f"{unfit} points on straight lines state another configuration than that which the "
             "point before leads to; the controller does not look at it, and it stays as written"
         )
-    return np.array(found).reshape(-1, JOINTS), doubts, tuple(said)
+    return np.array(joints).reshape(-1, JOINTS), doubts, tuple(remarks)
 
 
-def _one(
-    arm: Arm, language: Language, p: ProgramPoint, before: Floats | None, stated: Ints, asked: Bools
+def _solve(
+    arm: Arm,
+    language: Language,
+    p: ProgramPoint,
+    previous: Floats | None,
+    stated: Ints,
+    required: Bools,
 ) -> tuple[Floats, str]:
     """Joint values of a pose, and why they are not certain; raises as `resolve` does."""
     goal = p.frame @ language.pose(p.values)
-    nothing = np.full(JOINTS, np.nan)
-    if before is None and not asked.any():
-        return nothing, (
+    unknown = np.full(JOINTS, np.nan)
+    if previous is None and not required.any():
+        return unknown, (
             "no configuration is stated, and no point before it is known; give --near with the "
             "joint values that the first pose is near to"
         )
-    if before is not None:
-        q = solutions(arm, p.tool, before[None], goal)
-        good = len(q) and np.abs(q[0] - before).max() < np.pi / 2
-        if good and _fits(arm, language, q, stated, asked)[0]:
-            close = np.abs(q[0] - before).max() < 0.5
-            if close or asked.all():
+    if previous is not None:
+        q = solutions(arm, p.tool, previous[None], goal)
+        good = len(q) and np.abs(q[0] - previous).max() < np.pi / 2
+        if good and _fits(arm, language, q, stated, required)[0]:
+            close = np.abs(q[0] - previous).max() < 0.5
+            if close or required.all():
                 return q[0], ""
-    every = solutions(arm, p.tool, None, goal)
-    if not len(every):
+    all_solutions = solutions(arm, p.tool, None, goal)
+    if not len(all_solutions):
         raise InputError(f"{p.name}: the nominal arm does not reach it from anywhere")
-    turned = np.concatenate([_turned(arm, q) for q in every])
-    fit = turned[_fits(arm, language, turned, stated, asked)]
-    if not len(fit):
-        return nothing, (
+    turned = np.concatenate([_turned(arm, q) for q in all_solutions])
+    fitting = turned[_fits(arm, language, turned, stated, required)]
+    if not len(fitting):
+        return unknown, (
             f"no solution of {arm.name} has the configuration that is stated: the description "
             "counts joints otherwise than the controller, or it is another arm"
         )
-    from_ = np.zeros(JOINTS) if before is None else before
-    far = np.abs(fit - from_).max(axis=1)
-    order = np.argsort(far, kind="stable")
-    best = fit[order[0]]
-    poses = np.abs(np.sin((fit - best) / 2)).max(axis=1) > 1e-6  # other than by whole turns
-    others = far[poses].min(initial=np.inf)
-    certain = not poses.any() if before is None else others > far[order[0]] + AS_NEAR
+    reference = np.zeros(JOINTS) if previous is None else previous
+    distance = np.abs(fitting - reference).max(axis=1)
+    order = np.argsort(distance, kind="stable")
+    best = fitting[order[0]]
+    poses = np.abs(np.sin((fitting - best) / 2)).max(axis=1) > 1e-6  # other than by whole turns
+    nearest_other = distance[poses].min(initial=np.inf)
+    certain = not poses.any() if previous is None else nearest_other > distance[order[0]] + AS_NEAR
     if not certain:
         return best, "several branches of the arm are possible; joint values in its place say which"
     return best, ""
 
 
-def kept_flags(arm: Arm, language: Language, given: Floats, q: Floats, stated: Ints) -> Ints:
-    """(N, F) configuration to be stated after a correction: others where those were left alone.
+def flags_after(arm: Arm, language: Language, old_q: Floats, q: Floats, stated: Ints) -> Ints:
+    """(N, F) configuration to state after a correction: new where the correction left the old one.
 
-    `given` and `q` are joint values (N, 6) before and after, rad; `stated` (N, F) is as it was.
+    `old_q` and `q` are joint values (N, 6) before and after, rad; `stated` (N, F) is the old one.
     """
-    left = _agree(arm, language, given, stated) & ~_agree(arm, language, q, stated)
+    changed = _agree(arm, language, old_q, stated) & ~_agree(arm, language, q, stated)
     if unlike(arm, language):
-        left &= ~np.array(language.of_shape)
-    return np.where(left & (stated != UNSTATED), flags_of(arm, language, q), stated)
+        changed &= ~np.array(language.of_shape)
+    return np.where(changed & (stated != UNSTATED), flags_of(arm, language, q), stated)
 
 
 def _agree(arm: Arm, language: Language, q: Floats, stated: Ints) -> Bools:
-    """(K, F) which flags joint values (K, 6) have, those of a border on both of its sides."""
-    formed = shape(arm, q)
-    near = (language.flags(q + d, formed) for d in (0.0, -BORDER, BORDER))
+    """(K, F) which flags joint values (K, 6) agree with; at a border, those of both sides."""
+    shapes = shape(arm, q)
+    near = (language.flags(q + d, shapes) for d in (0.0, -BORDER, BORDER))
     return np.asarray(np.any([have == stated for have in near], axis=0))
 
 
-def _fits(arm: Arm, language: Language, q: Floats, stated: Ints, asked: Bools) -> Bools:
-    """(K,) whether joint values (K, 6) have the flags that are asked for."""
-    return np.asarray(_agree(arm, language, q, stated)[:, asked].all(axis=1))
+def _fits(arm: Arm, language: Language, q: Floats, stated: Ints, required: Bools) -> Bools:
+    """(K,) whether joint values (K, 6) agree with the required flags."""
+    return np.asarray(_agree(arm, language, q, stated)[:, required].all(axis=1))
 
 
 def _turned(arm: Arm, q: Floats) -> Floats:
-    """(K, 6) joint values whole turns on that are within the limits."""
-    every = [
+    """(K, 6) joint values that differ by whole turns and are within the limits."""
+    choices = [
         [v + 2 * np.pi * k for k in range(-3, 4) if low <= v + 2 * np.pi * k <= high]
         for v, low, high in zip(q, arm.q_min, arm.q_max, strict=True)
     ]
-    return np.array(list(product(*every))).reshape(-1, JOINTS)
+    return np.array(list(product(*choices))).reshape(-1, JOINTS)
 
 
 def longest_tool(points: Sequence[ProgramPoint]) -> tuple[Floats, tuple[str, ...]]:
-    """(4, 4) T_flange_tool of the points, of several the longest, and what is to be said."""
+    """(4, 4) T_flange_tool of the points, the longest of several, and remarks."""
     poses = [p for p in points if not p.joints] or list(points)
     first = max(poses, key=lambda p: float(np.linalg.norm(p.tool[:3, 3])))
     if all(np.allclose(p.tool, first.tool, atol=1e-9) for p in poses):

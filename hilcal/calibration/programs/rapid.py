@@ -2,12 +2,12 @@ r"""ABB RAPID: a module (`.mod`, `.modx`, `.sys`, `.prg`).
 
 Points are `robtarget` ([x, y, z] in mm, unit quaternion [q1, q2, q3, q4], configuration [cf1, cf4,
 cf6, cfx], external axes) and `jointtarget` (degrees), declared with a value, or written into a
-motion, or `Offs` and `RelTool` of one with numbers, which become the point that they make. cf1,
-cf4, cf6 are the quadrants of axes 1, 4, 6, from 0 for 0° to 90° on; cfx has bits for axis 5
-negative, the wrist centre behind the lower arm, and behind axis 1.
+motion, or `Offs` and `RelTool` of one with numbers, which the resulting point replaces. cf1, cf4,
+cf6 are the quadrants of axes 1, 4, 6, 0 for 0° to 90°; cfx has bits for a negative axis 5, a wrist
+centre behind the lower arm, and one behind axis 1.
 
-A robtarget counts from the object frame of the motion's `\WObj`, a tool is the motion's last
-argument; both are `tooldata` and `wobjdata` of this module or of `--frames`.
+A robtarget is relative to the object frame of the motion's `\WObj`; its tool is the motion's last
+argument. This module or `--frames` has their `wobjdata` and `tooldata`.
 
 Source: ABB, *Technical reference manual: RAPID Instructions, Functions and Data types*, robtarget,
 confdata, tooldata, wobjdata, MoveL, Offs, RelTool; *RAPID Overview*.
@@ -42,9 +42,9 @@ from hilcal.types import Floats, Ints
 POSE = 7
 """Numbers of a pose."""
 LEAST = 4
-"""Arguments that a motion has: point, speed, zone, tool."""
+"""Least number of arguments of a motion: point, speed, zone, tool."""
 UNUSED = 8e8
-"""A number from which on an external axis is none: 9E9."""
+"""Numbers of external axes above this mean no axis: 9E9."""
 _STATEMENT = re.compile(r"[^;]*;")
 _BLANK = re.compile(r'"[^"]*"|!.*')
 _DATA = re.compile(
@@ -76,13 +76,13 @@ _COMPUTED = "the point '{}' is computed while the program runs"
 def of_quaternion(values: Floats) -> Floats:
     """T (4, 4) of x, y, z in mm and a unit quaternion, its real part first."""
     q = np.asarray(values[3:7], dtype=float)
-    with np.errstate(all="ignore"):  # what is not finite is refused by its line
+    with np.errstate(all="ignore"):  # the caller refuses values that are not finite
         q = q / np.linalg.norm(q)
     return se3.matrix(se3.of_quaternion(q), 1e-3 * np.asarray(values[:3], dtype=float))
 
 
 def to_quaternion(t: Floats, near: Floats) -> Floats:
-    """Inverse of `of_quaternion`, of the sign that was there."""
+    """Inverse of `of_quaternion`, with the sign of the old quaternion."""
     q = se3.quaternion(t[:3, :3])
     return np.concatenate([1e3 * t[:3, 3], q if q @ near[3:7] >= 0 else -q])
 
@@ -112,26 +112,26 @@ RAPID = Language(
 def read_rapid(path: Path, frames_file: Path | None, tool: Floats | None) -> Program:
     """Read a module."""
     module = frames_file is not None and frames_file.suffix.lower() != ".toml"
-    known = controller_frames(None if module else frames_file, RAPID, tool)
-    more = read_text(frames_file)[0] if frames_file is not None and module else ""
-    return _RapidReader(path, known).read(more)
+    controller = controller_frames(None if module else frames_file, RAPID, tool)
+    frames_text = read_text(frames_file)[0] if frames_file is not None and module else ""
+    return _RapidReader(path, controller).read(frames_text)
 
 
 def _statements(text: str) -> list[tuple[int, str]]:
-    """Place and code of each statement: comments and texts blanked, of the same length."""
+    """Offset and code of each statement, with comments and texts replaced by blanks."""
     code = _BLANK.sub(lambda m: " " * len(m[0]), text)
     return [(m.start(), m[0]) for m in _STATEMENT.finditer(code)]
 
 
-def _numbers(text: str, at: int = 0) -> tuple[Floats, list[Span]]:
-    """All numbers of an aggregate, and where they stand; `at` is its place in the file."""
-    found = list(_NUMBER.finditer(text))
-    values = np.array([float(m[0]) for m in found])
-    return values, [Span(0, at + m.start(), at + m.end()) for m in found]
+def _numbers(text: str, offset: int = 0) -> tuple[Floats, list[Span]]:
+    """All numbers of an aggregate at an offset of the file, with their places."""
+    matches = list(_NUMBER.finditer(text))
+    values = np.array([float(m[0]) for m in matches])
+    return values, [Span(0, offset + m.start(), offset + m.end()) for m in matches]
 
 
 def _form(text: str) -> str:
-    """An aggregate with its numbers as 0, to compare its form."""
+    """Return an aggregate with its numbers as 0, to compare its form."""
     return re.sub(r"\s", "", _NUMBER.sub("0", text))
 
 
@@ -139,119 +139,119 @@ _ROBTARGET = "[[0,0,0],[0,0,0,0],[0,0,0,0],[0,0,0,0,0,0]]"
 _JOINTTARGET = "[[0,0,0,0,0,0],[0,0,0,0,0,0]]"
 _FRAMES = {"tooldata": "tool", "wobjdata": "work object"}
 _Data = dict[str, list[tuple[str, str, int]]]
-"""Declarations by name: type, text of the value, its place."""
+"""Declarations by name: type, text and offset of the value."""
 
 
 class _RapidReader(ProgramReader):
-    """Goes through the statements of a module in the order of its text."""
+    """Reader of the statements of a module, in the order of its text."""
 
-    def read(self, more: str) -> Program:
-        """Read the module; `more` is the text of one with tools and work objects."""
+    def read(self, frames_text: str) -> Program:
+        """Read the module; `frames_text` is the text of one with tools and work objects."""
         self.statements = _statements(self.text)
         self.data = self._collected(self.statements)
-        self.frames = self._collected(_statements(more))
+        self.frames = self._collected(_statements(frames_text))
         self.assigned = {
-            m[1].upper(): line_of(self.text, at + m.start())
-            for at, code in self.statements
+            m[1].upper(): line_of(self.text, offset + m.start())
+            for offset, code in self.statements
             for m in _ASSIGNED.finditer(code)
             if not _NO_ASSIGNMENT.search(code[: m.start()])
         }
         self.used, obeyed = self._used_otherwise(), True
-        for at, code in self.statements:
+        for offset, code in self.statements:
             if m := _REFUSED.search(code):
-                line = line_of(self.text, at + m.start())
+                line = line_of(self.text, offset + m.start())
                 raise self.refused(line, f"{m[1]} changes what points mean", "a program without it")
             if m := _CONF.search(code):
                 obeyed = m[2].upper() == "ON"
             elif m := _MOTION.search(code):
-                self._motion(at, code, m, obeyed)
+                self._motion(offset, code, m, obeyed)
             elif (m := _OTHER_MOTION.search(code)) and m[1].upper() not in _MOVES_NOTHING:
-                self.leave(line_of(self.text, at + m.start()), f"{m[1]} is not corrected")
+                self.leave(line_of(self.text, offset + m.start()), f"{m[1]} is not corrected")
         return self.program()
 
     def _collected(self, statements: Sequence[tuple[int, str]]) -> _Data:
-        """Last declaration of each statement: before it a header without `;` may stand."""
+        """Last declaration of each statement, which a header without `;` may precede."""
         out: _Data = {}
-        for at, code in statements:
+        for offset, code in statements:
             for m in re.finditer(r"\b(?:LOCAL\s+|TASK\s+)?(?:CONST|PERS|VAR)\s", code, re.I):
                 if d := _DATA.match(code[m.start() :]):
                     value = d[4] if d[4] is not None and d[3] is None else ""
-                    place = at + m.start() + (d.start(4) if d[4] is not None else 0)
+                    place = offset + m.start() + (d.start(4) if d[4] is not None else 0)
                     out.setdefault(d[2].upper(), []).append((d[1].lower(), value, place))
                     break
         return out
 
     def _targets(self, code: str, m: re.Match[str]) -> tuple[list[tuple[int, str]], str, str]:
-        """Targets of a motion with their places in the code, its tool, its options."""
-        options, given = "", []
+        """Targets of a motion with their offsets in the code, its tool, its options."""
+        options, arguments = "", []
         for begin, part in arguments_of(code[m.end() : code.rindex(";")]):
             outer = re.sub(r"\([^()]*\)", lambda m: "(" + "." * (len(m[0]) - 2) + ")", part)
             cut = outer.find("\\") if "\\" in outer else len(part)
             plain, options = part[:cut], options + part[cut:]
             if plain.strip():
                 lead = len(plain) - len(plain.lstrip())
-                given.append((m.end() + begin + lead, plain.strip()))
+                arguments.append((m.end() + begin + lead, plain.strip()))
         count = 2 if m[1].upper().endswith("C") else 1
-        return given[:count], given[-1][1] if len(given) >= LEAST else "", options
+        return arguments[:count], arguments[-1][1] if len(arguments) >= LEAST else "", options
 
-    def _motion(self, at: int, code: str, m: re.Match[str], obeyed: bool) -> None:
-        """Take the targets of a motion."""
-        line = line_of(self.text, at + m.start())
-        targets, held, options = self._targets(code, m)
-        if not held:
+    def _motion(self, offset: int, code: str, m: re.Match[str], obeyed: bool) -> None:
+        """Record the targets of a motion."""
+        line = line_of(self.text, offset + m.start())
+        targets, tool, options = self._targets(code, m)
+        if not tool:
             self.leave(line, f"{m[1]} without its arguments")
             return
-        named = re.search(r"\\\s*WObj\s*:=\s*(\w+)", options, re.I)
+        work_object = re.search(r"\\\s*WObj\s*:=\s*(\w+)", options, re.I)
         frames = (
-            self._frame("tooldata", held),
-            self._frame("wobjdata", named[1] if named else "wobj0"),
+            self._frame("tooldata", tool),
+            self._frame("wobjdata", work_object[1] if work_object else "wobj0"),
         )
         for place, text in targets:
-            self._target(line, at + place, text, m[1].upper() == "MOVEABSJ", frames, obeyed)
+            self._target(line, offset + place, text, m[1].upper() == "MOVEABSJ", frames, obeyed)
 
     def _frame(self, kind: str, name: str) -> Floats | str:
-        """Pose of a tool or of an object frame, or why it is not known."""
-        key, tool = name.upper(), kind == "tooldata"
-        group, words = "tools" if tool else "bases", f"the {_FRAMES[kind]} '{name[:40]}'"
+        """Pose of a tool or of an object frame, or why it is unknown."""
+        key, is_tool = name.upper(), kind == "tooldata"
+        group, label = "tools" if is_tool else "bases", f"the {_FRAMES[kind]} '{name[:40]}'"
         values = self.data.get(key) or self.frames.get(key) or []
-        if not values or self.known.given(group, name) is not None:
-            return self.known.pose(group, name, words, "TOOL0" if tool else "WOBJ0")
+        if not values or self.controller.stated(group, name) is not None:
+            return self.controller.pose(group, name, label, "TOOL0" if is_tool else "WOBJ0")
         if len(values) != 1 or values[0][0] != kind:
-            return f"{words} is not one {kind} of the program"
+            return f"{label} is not one {kind} of the program"
         if key in self.assigned:
-            return f"line {self.assigned[key]} changes {words}"
+            return f"line {self.assigned[key]} changes {label}"
         numbers, start = _numbers(values[0][1])[0], re.sub(r"\s", "", values[0][1]).upper()
-        if tool:
+        if is_tool:
             if not start.startswith("[TRUE,[[") or len(numbers) < POSE:
-                return f"{words} is not one on the flange with numbers"
+                return f"{label} is not one on the flange with numbers"
             return of_quaternion(numbers[:POSE])
         if not start.startswith("[FALSE,TRUE,") or len(numbers) != 2 * POSE:
-            return f"{words} is not fixed, or not of numbers"
+            return f"{label} is not fixed, or not of numbers"
         return of_quaternion(numbers[:POSE]) @ of_quaternion(numbers[POSE:])
 
     def _target(
         self,
         line: int,
-        at: int,
+        offset: int,
         text: str,
         joints: bool,
         frames: tuple[Floats | str, Floats | str],
         obeyed: bool,
     ) -> None:
-        """Take one target; `frames` are its tool and what it counts from."""
-        made, key, here = _MADE.match(text), f"line {line}, {at}", f"line {line}"
+        """Record one target; `frames` are its tool and its reference frame."""
+        call, key, label = _MADE.match(text), f"line {line}, {offset}", f"line {line}"
         if text.startswith("["):
-            new = self._value(text, at, here, joints)
-        elif made and not joints:
-            new = self._made(text, made, at, line)
+            new = self._value(text, offset, label, joints)
+        elif call and not joints:
+            new = self._computed(text, call, offset, line)
         else:
-            key, new = text.upper(), ProgramPoint(line, here)
+            key, new = text.upper(), ProgramPoint(line, label)
             values = self.data.get(key, [])
             if not _NAME.fullmatch(text):
                 new = replace(new, left=_COMPUTED.format(text[:40]))
             elif len(values) != 1 or not values[0][1]:
-                what = "has several values" if values else "is not in this module"
-                new = replace(new, left=f"the point '{text[:40]}' {what}")
+                reason = "has several values" if values else "is not in this module"
+                new = replace(new, left=f"the point '{text[:40]}' {reason}")
             elif key in self.used:
                 left = f"line {self.used[key]} uses or changes '{text[:40]}' otherwise"
                 new = replace(new, left=left)
@@ -261,11 +261,12 @@ class _RapidReader(ProgramReader):
                 new = self._value(value, place, name, kind == "jointtarget")
         if not new.left and not joints:
             new = new.at_pose(new.numbers, new.values, *frames, obeyed=obeyed)
-        self.take(key, new, line)
+        self.record(key, new, line)
 
-    def _value(self, text: str, at: int, name: str, joints: bool) -> ProgramPoint:
-        """Return a point of an aggregate."""
-        (values, spans), bare = _numbers(text, at), ProgramPoint(line_of(self.text, at), name)
+    def _value(self, text: str, offset: int, name: str, joints: bool) -> ProgramPoint:
+        """Return the point of an aggregate at an offset of the file."""
+        values, spans = _numbers(text, offset)
+        bare = ProgramPoint(line_of(self.text, offset), name)
         if _form(text) != (_JOINTTARGET if joints else _ROBTARGET):
             kind = "jointtarget" if joints else "robtarget"
             return replace(bare, left=f"it is no {kind} of numbers")
@@ -284,11 +285,11 @@ class _RapidReader(ProgramReader):
             config=tuple(spans[POSE : POSE + 3]),
         )
 
-    def _made(self, text: str, made: re.Match[str], at: int, line: int) -> ProgramPoint:
-        """Return the point that `Offs` or `RelTool` makes, to be written in its place."""
+    def _computed(self, text: str, match: re.Match[str], offset: int, line: int) -> ProgramPoint:
+        """Return the point that `Offs` or `RelTool` computes, to replace the call."""
         bare = ProgramPoint(line, f"line {line}")
-        base, *moves = [part.strip() for _, part in arguments_of(re.sub(r"\\", ",\\\\", made[2]))]
-        values, relative = self.data.get(base.upper(), []), made[1].upper() == "RELTOOL"
+        base, *moves = [part.strip() for _, part in arguments_of(re.sub(r"\\", ",\\\\", match[2]))]
+        values, relative = self.data.get(base.upper(), []), match[1].upper() == "RELTOOL"
         turn = rf"\\\s*R[xyz]\s*:=\s*{_NUMBER.pattern}" if relative else "-"
         shift = [m for m in moves if _NUMBER.fullmatch(m)]
         turns = [m for m in moves if m and m not in shift]
@@ -300,40 +301,42 @@ class _RapidReader(ProgramReader):
         if point.left:
             return replace(bare, left=point.left)
         places = [Span(0, s.begin - begin, s.end - begin) for s in (*point.numbers, *point.config)]
-        t, by = of_quaternion(point.values), np.array([float(m) for m in shift])
+        t, displacement = of_quaternion(point.values), np.array([float(m) for m in shift])
         if relative:
             angle = {m[1:].strip()[:2].lower(): float(m.partition(":=")[2]) for m in turns}
-            t = t @ of_euler(np.array([*by, 0.0, 0.0, 0.0]))
+            t = t @ of_euler(np.array([*displacement, 0.0, 0.0, 0.0]))
             for k, key in enumerate(("rx", "ry", "rz")):  # about x, then the new y, then the new z
                 t = t @ of_euler(angle.get(key, 0.0) * np.eye(6)[5 - k])
         else:
-            t[:3, 3] += 1e-3 * by
+            t[:3, 3] += 1e-3 * displacement
         return replace(
             point,
             line=line,
             name=bare.name,
-            numbers=(Span(0, at, at + len(text)),),
+            numbers=(Span(0, offset, offset + len(text)),),
             values=to_quaternion(t, point.values),
             config=(),
-            flags=(UNSTATED,) * 3 + point.flags[3:],  # quadrants follow from where it moves to
-            made=re.sub(r"\s", "", edited(value, [(place, "{}") for place in places])),
+            flags=(UNSTATED,) * 3 + point.flags[3:],  # quadrants follow from the new joint values
+            template=re.sub(r"\s", "", edited(value, [(place, "{}") for place in places])),
         )
 
     def _used_otherwise(self) -> dict[str, int]:
-        """Names of points that statements use which are no motions to them, with their lines."""
+        """Names of points that statements other than motions use, with their lines."""
         out: dict[str, int] = {}
         points = {k for k, v in self.data.items() if v[0][0] in ("robtarget", "jointtarget")}
-        for at, code in self.statements:
+        for offset, code in self.statements:
             skipped = [
                 d.span(1) for d in re.finditer(r"\b(?:robtarget|jointtarget)\s+(\w+)", code, re.I)
             ]
             if m := _MOTION.search(code):
                 for place, text in self._targets(code, m)[0]:
-                    made = _MADE.match(text)  # of a point and numbers, it becomes one by itself
-                    if _NAME.fullmatch(text) or (made and not self._made(text, made, 0, 1).left):
+                    call = _MADE.match(text)  # of a point and numbers: replaced by a point
+                    if _NAME.fullmatch(text) or (
+                        call and not self._computed(text, call, 0, 1).left
+                    ):
                         skipped.append((place, place + len(text)))
             for n in _NAME.finditer(code):
                 inside = any(a <= n.start() < b for a, b in skipped)
                 if n[0].upper() in points and not inside:
-                    out.setdefault(n[0].upper(), line_of(self.text, at + n.start()))
+                    out.setdefault(n[0].upper(), line_of(self.text, offset + n.start()))
         return out
