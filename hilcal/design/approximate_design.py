@@ -17,7 +17,7 @@ from hilcal.design.criterion import (
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.types import Bools, Floats, Ints
 
-# Choices, usual in interior-point methods (Wright 1997); none has a study of its own.
+# choices, usual in interior-point methods (Wright 1997), without a study
 _STEPS = 80
 _BACK = 0.995  # share of the way to the boundary
 _CENTRAL = 1.0  # squared Newton decrement, over μ, below which μ may fall
@@ -166,9 +166,7 @@ def solve(program: BarrierProgram, start: Floats, tolerance: float, order: float
             top = program.most - w
             y = np.clip(y, mu / (_CLAMP * top), _CLAMP * mu / top)
             complement = 0.5 * (complement + float(y @ top) / n)
-        if (
-            program.criterion.kinked
-        ):  # μ is also the width of the kink, and falls only at central points
+        if program.criterion.kinked:  # μ, also the width of the kink, falls at central points only
             central = push <= _CENTRAL * mu
         else:
             fall = 0.1 if length > 0.9 else 0.3 if length > 0.5 else 0.8
@@ -188,14 +186,11 @@ def _newton(program: BarrierProgram, matrix: Floats, lean: Floats, w: Floats) ->
             factor = sl.cho_factor(matrix, lower=True, check_finite=False)
         except (np.linalg.LinAlgError, ValueError):
             continue
-        solved = sl.cho_solve(
-            factor, np.column_stack([lean, program.units.cost]), check_finite=False
-        )
+        cost = program.units.cost
+        solved = sl.cho_solve(factor, np.column_stack([lean, cost]), check_finite=False)
         if np.isfinite(solved).all():
-            short = program.budget - float(program.units.cost @ w)
-            price = (float(program.units.cost @ solved[:, 0]) - short) / float(
-                program.units.cost @ solved[:, 1]
-            )
+            unspent = program.budget - float(cost @ w)
+            price = (float(cost @ solved[:, 0]) - unspent) / float(cost @ solved[:, 1])
             return np.asarray(solved[:, 0] - price * solved[:, 1])
     return None
 
@@ -262,13 +257,13 @@ class ApproximateDesign:
         return self.bound / self.value - 1.0 if self.value > 0.0 else np.inf
 
     def among(self, subset: Bools) -> "ApproximateDesign | None":
-        """Return the design restricted to a subset (K,) of units; None if too much weight is lost."""
+        """Return the design on a subset (K,) of the units; None if too much weight is lost."""
         place, inside = np.cumsum(subset) - 1, subset[self.index]
         if float(self.weight[inside].sum()) < _LEFT * float(self.weight.sum()):
             return None
         return replace(
-            self, index=place[self.index[inside]], weight=self.weight[inside], price=self.price[subset],
-            value=self.value if inside.all() else 0.0,
+            self, index=place[self.index[inside]], weight=self.weight[inside],
+            price=self.price[subset], value=self.value if inside.all() else 0.0,
         )  # fmt: skip
 
 

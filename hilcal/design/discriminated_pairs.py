@@ -141,8 +141,8 @@ def not_ruled_out(pairs: Sequence[tuple[str, str]]) -> str:
     """Return a message on pairs (present effect, rival) whose rival cannot be ruled out."""
     listed = [f"{fs} where {e} is there" for e, fs in _by_effect(pairs).items()]
     return (
-        f"no measurement in this cell rules out {', nor '.join(listed)}: {MANY} of the best readings "
-        f"would do so with a chance of less than {100 * LEAST_POWER:.0f} %"
+        f"no measurement in this cell rules out {', nor '.join(listed)}: {MANY} of the best "
+        f"readings would do so with a chance of less than {100 * LEAST_POWER:.0f} %"
     )
 
 
