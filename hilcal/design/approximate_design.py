@@ -414,10 +414,10 @@ def _exchanged(
     retained = (share > 1e-5 / len(active)) | (rate[active] > 0.999 * price)
     outside = rate.copy()
     outside[active] = -np.inf
-    new = best_first(outside, 2 * program.units.size)
-    new = new[outside[new] > price * (1.0 + 1e-12)]
-    small = 0.02 * program.budget / (cost[new] * max(len(new), 1))
-    index = np.concatenate([active[retained], new])
+    entering = best_first(outside, 2 * program.units.size)
+    entering = entering[outside[entering] > price * (1.0 + 1e-12)]
+    small = 0.02 * program.budget / (cost[entering] * max(len(entering), 1))
+    index = np.concatenate([active[retained], entering])
     order = np.argsort(index)
     return index[order], np.concatenate([weight[retained], small])[order]
 

@@ -150,18 +150,18 @@ def draw(
 
     sequence = qmc.Sobol(len(low), scramble=False)
     shift = rng.random(len(low))
-    left, lost = dict.fromkeys(REASONS, 0), dict[str, Floats]()
+    remaining, lost = dict.fromkeys(REASONS, 0), dict[str, Floats]()
     parts = [np.empty((0, len(low)))]
     drawn = have = 0
     most = max(_MOST[0], _MOST[1] * count) if most is None else most
     while have < count and drawn < (most if have else _VAIN):
         u = (sequence.random(_CHUNK) + shift) % 1.0
         q = space.cell.arm.complete(low + u * (high - low))
-        parts.append(_allowed_unloaded(space, q, left, lost))
+        parts.append(_allowed_unloaded(space, q, remaining, lost))
         drawn += _CHUNK
         have += len(parts[-1])
     if have < least:
-        raise CannotAnswerError(_too_few(space, drawn, left, lost, least))
+        raise CannotAnswerError(_too_few(space, drawn, remaining, lost, least))
     q = np.vstack(parts)[:count]
     allowed = np.ones((len(q), len(space.loads)), dtype=np.bool_)
     remarks = [*space.remarks]
@@ -173,29 +173,29 @@ def draw(
             remarks.append(_unusable(space, q, load))
     if len(space.loads) > 1 and not allowed[:, 1:].any():
         raise CannotAnswerError("; ".join(remarks[-(len(space.loads) - 1) :]))
-    return DrawnPoses(q, space.loads, allowed, drawn, left, tuple(remarks))
+    return DrawnPoses(q, space.loads, allowed, drawn, remaining, tuple(remarks))
 
 
 def _allowed_unloaded(
-    space: Space, q: Floats, left: dict[str, int], lost: dict[str, Floats]
+    space: Space, q: Floats, remaining: dict[str, int], lost: dict[str, Floats]
 ) -> Floats:
     """Return the states allowed unloaded; count those left, and keep samples of those rejected."""
     for reason in REASONS:
         if len(q):
-            keeps = space.keeps(reason, q, UNLOADED)
-            if not keeps.all():
-                lost[reason] = q[~keeps][:_LOOK]
-            q = q[keeps]
-        left[reason] += len(q)
+            passes = space.keeps(reason, q, UNLOADED)
+            if not passes.all():
+                lost[reason] = q[~passes][:_LOOK]
+            q = q[passes]
+        remaining[reason] += len(q)
     return q
 
 
 def _too_few(
-    space: Space, drawn: int, left: dict[str, int], lost: dict[str, Floats], least: int
+    space: Space, drawn: int, remaining: dict[str, int], lost: dict[str, Floats], least: int
 ) -> str:
     """Return a message: the first reason that leaves no state, else the one that rejects most."""
-    counts = list(left.values())
-    names = list(left)
+    counts = list(remaining.values())
+    names = list(remaining)
     checked = [drawn, *counts[:-1]]
     share = np.array(counts) / np.maximum(checked, 1)
     worst = counts.index(0) if 0 in counts else int(np.argmin(share))

@@ -83,20 +83,20 @@ def reading_derivatives(
     nominal: NominalModel,  # the model, whose live parameters come first
     config: CellConfig,
     candidates: Candidates,
-    more: tuple[Effect, ...],  # effects that are not in the model
+    added: tuple[Effect, ...],  # effects that are not in the model
     scale: Floats,  # (P,) of the parameters, SI
 ) -> Iterator[ReadingDerivatives]:
     """Yield derivatives and covariances of candidates, some poses at a time."""
     model, m, loads = nominal.model, nominal.elements, len(candidates.loads)
     states, repeats = nominal.arrivals(candidates.states()), nominal.each
-    live = np.concatenate([nominal.live, np.arange(model.size, model.size + sizes(more))])
+    live = np.concatenate([nominal.live, np.arange(model.size, model.size + sizes(added))])
     step = max(CHUNK // (loads * repeats), 1)
     for start in range(0, len(candidates), step):
         rows = slice(start, min(start + step, len(candidates)))
         count = rows.stop - rows.start
         per_pose = loads * repeats
         p = model.predict(states[slice(rows.start * per_pose, rows.stop * per_pose)], nominal.theta)
-        jacobian = model.jacobian_of((*model.effects, *more), p, nominal.theta, nominal.m, live)
+        jacobian = model.jacobian_of((*model.effects, *added), p, nominal.theta, nominal.m, live)
         covariance = arrival_covariance(nominal, config, p)
         yield ReadingDerivatives(
             rows,
@@ -297,19 +297,19 @@ def problem(
     )
     terms = _terms(nominal, against)
     scale = np.array([t.scale for t in terms])
-    what, height, layout_notes = _layout(candidates, mode, nominal.elements, len(terms))
-    rows = np.zeros((len(what), height, len(terms)))
+    contents, height, layout_notes = _layout(candidates, mode, nominal.elements, len(terms))
+    rows = np.zeros((len(contents), height, len(terms)))
     parts = reading_derivatives(nominal, config, candidates, against.effects, scale)
-    for units, block in unit_rows(parts, candidates.loads, what, mode):
+    for units, block in unit_rows(parts, candidates.loads, contents, mode):
         rows[units, : block.shape[1]] = block
     measured = information_of(nominal, against.effects, scale)
     count = len(nominal.live)
     precision = np.ones(len(terms))
     precision[:count] = (scale[:count] / nominal.prior_std[nominal.live]) ** 2
-    cost = np.array([float(len(readings_of(unit, mode))) for unit in what])
+    cost = np.array([float(len(readings_of(unit, mode))) for unit in contents])
     return DesignProblem(
         nominal=nominal, mode=mode, candidates=candidates, units=CandidateSet(rows, cost),
-        what=what, terms=terms, families=against.effects,
+        what=contents, terms=terms, families=against.effects,
         prior=measured + np.diag(precision), measured=measured,
         notes=(*nominal.notes, *against.notes, *layout_notes),
     )  # fmt: skip
@@ -389,16 +389,16 @@ def _subsets(allowed: Ints, mode: Mode, kinds: set[str]) -> Iterator[tuple[int, 
 def unit_rows(
     parts: Iterable[ReadingDerivatives],  # of every `step`-th candidate pose
     loads: tuple[str, ...],  # names of all loads, "none" first
-    what: Sequence[tuple[int, tuple[str, ...]]],  # pose and loads per unit
+    contents: Sequence[tuple[int, tuple[str, ...]]],  # pose and loads per unit
     mode: Mode,
     step: int = 1,
 ) -> Iterator[tuple[Ints, Floats]]:
     """Yield indices of units and their whitened rows (k, R, P), some poses at a time."""
     by_loads: dict[tuple[str, ...], list[int]] = {}
-    for k, (pose, names) in enumerate(what):
+    for k, (pose, names) in enumerate(contents):
         if pose % step == 0:
             by_loads.setdefault(names, []).append(k)
-    pose_of = np.array([pose // step for pose, _ in what])
+    pose_of = np.array([pose // step for pose, _ in contents])
     for part in parts:
         single = absolute_rows(part) if mode == "absolute" else np.empty(0)
         for names, members in by_loads.items():
@@ -480,10 +480,10 @@ def _strengths(
     return [float(np.sqrt(s / max(count, 1))) for s in sums]
 
 
-def information_of(nominal: NominalModel, more: tuple[Effect, ...], scale: Floats) -> Floats:
+def information_of(nominal: NominalModel, added: tuple[Effect, ...], scale: Floats) -> Floats:
     """Return the information (P, P) AᵀA of the readings so far, plus that of a carried prior.
 
-    A is the Jacobian at the fit by the live parameters and those of `more` effects over `scale`
+    A is the Jacobian at the fit by the live parameters and those of `added` effects over `scale`
     (P,), whitened by the readings' covariances. Effects whose variables the readings lack have no
     information.
     """
@@ -497,7 +497,7 @@ def information_of(nominal: NominalModel, more: tuple[Effect, ...], scale: Float
     s = fit.solution
     jacobian = whitened_jacobian(fit.model, s.prediction, s.theta, fit.whitening, nominal.live)
     columns = [jacobian * magnitudes[0]]
-    for e in more:
+    for e in added:
         magnitudes.append(np.array([p.scale for p in e.parameters]))
         missing = np.zeros((len(fit.white), len(e.parameters)))
         columns.append(effect_columns(fit, e).white if computable(fit, e) else missing)

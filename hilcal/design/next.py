@@ -66,7 +66,7 @@ def measure_next(
     suspects: Sequence[str],  # two effects or more
     request: Request,  # readings, or poses under every load
     rng: np.random.Generator,
-    say: Say = lambda words: None,
+    say: Say = lambda _: None,
     reference: Floats | None = None,  # (n,) reference pose of the campaign, rad; else a new one
 ) -> Next:
     """Plan the measurements that separate suspects.
@@ -144,11 +144,11 @@ def _pair_powers(
             if e not in observable:
                 yield PairPower(e, f, LEVEL, LEVEL, True)
                 continue
-            before, reached = (
+            so_far, planned = (
                 expected(problem, (e, f), betas, m) for m in (discriminated.prior, information)
             )
-            never = (e, f) in discriminated.not_separable and reached < LEAST_POWER
-            yield PairPower(e, f, before, reached, never)
+            never = (e, f) in discriminated.not_separable and planned < LEAST_POWER
+            yield PairPower(e, f, so_far, planned, never)
 
 
 def _from_reference(
@@ -240,7 +240,7 @@ def measure_poses(
     fit: Fit,  # of the absolute readings so far
     poses: int,
     rng: np.random.Generator,
-    say: Say = lambda words: None,
+    say: Say = lambda _: None,
     reference: Floats | None = None,  # (n,) reference pose of the campaign, rad; else a new one
 ) -> Planned:
     """Plan distinct poses spread evenly over the joint space, each read once without a load.

@@ -214,11 +214,11 @@ class _Search:
                     continue
                 counts = plan.counts.copy()
                 counts[unit] -= 1
-                new = self.refilled(counts, int(unit))
-                effort -= max(1, int(new.counts.sum() - counts.sum()))
+                varied = self.refilled(counts, int(unit))
+                effort -= max(1, int(varied.counts.sum() - counts.sum()))
                 stale += 1
-                if new.value > plan.value * (1.0 + _BETTER):
-                    plan, stale = new, 0
+                if varied.value > plan.value * (1.0 + _BETTER):
+                    plan, stale = varied, 0
                 if effort <= 0 or plan.value >= goal or stale >= len(queue):
                     break
             queue = rng.permutation(np.flatnonzero(plan.counts))
@@ -238,11 +238,11 @@ class _Search:
             removed = rng.choice(units, min(int(rng.integers(1, 4)), len(units)), replace=False)
             counts = plan.counts.copy()
             np.subtract.at(counts, removed, 1)
-            varied = rng.random() < max(_VARIED, 2.0 / len(units))
-            new = self.refilled(counts, int(removed[0]), rng if varied else None)
-            effort -= max(1, int(new.counts.sum() - counts.sum()))
-            if new.value > best.value * (1.0 - worse):
-                plan = new
-            if new.value > best.value * (1.0 + _BETTER):
-                best = new
+            at_random = rng.random() < max(_VARIED, 2.0 / len(units))
+            varied = self.refilled(counts, int(removed[0]), rng if at_random else None)
+            effort -= max(1, int(varied.counts.sum() - counts.sum()))
+            if varied.value > best.value * (1.0 - worse):
+                plan = varied
+            if varied.value > best.value * (1.0 + _BETTER):
+                best = varied
         return best, effort

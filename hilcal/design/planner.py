@@ -67,10 +67,10 @@ class UndeterminedParameter:
             why = f"no reading in this cell separates it from {', '.join(self.confounded)}"
         elif self.joint:
             slides = self.unit == "m/N"
-            what = "force along the travel of" if slides else "torque about"
+            action = "force along the travel of" if slides else "torque about"
             needs = "need" if self.joint.startswith("joints") else "needs"
             pull, across = ("pull along it", "") if slides else ("side pull", " across the axis")
-            why = f"no load of this cell makes a {what} {self.joint}"
+            why = f"no load of this cell makes a {action} {self.joint}"
             remedy = f": {self.joint} {needs} a {pull}, [[loads]] with force_N{across}, e.g. "
             remedy += "[80.0, 0.0, 0.0]"
         return f"{self.name}: not determined; {why}. The plan goes on without it{remedy}"
@@ -193,7 +193,7 @@ def make(
     request: Request,
     rng: np.random.Generator,
     known: Fit | None = None,  # of the readings so far
-    say: Say = lambda words: None,
+    say: Say = lambda _: None,
     catalogue: Catalogue | None = None,  # by default that of `known`, or the installed effects
     prior: CarriedPrior | None = None,  # of another campaign, without `known`
     reference: Floats | None = None,  # (n,) reference pose of the campaign, rad; else a new one

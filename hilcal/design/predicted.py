@@ -68,18 +68,18 @@ def prediction_poses(
 
 
 def position_derivative(
-    nominal: NominalModel, at: PredictionPoses, more: tuple[Effect, ...], scale: Floats
+    nominal: NominalModel, poses: PredictionPoses, added: tuple[Effect, ...], scale: Floats
 ) -> Floats:
-    """Return the derivative (T, 3, P) of the prediction, m, by live parameters and `more`."""
+    """Return the derivative (T, 3, P) of predictions, m, by live parameters and `added` effects."""
     model, count = nominal.model, len(scale) - len(nominal.live)
     live = np.concatenate([nominal.live, model.size + np.arange(count)])
 
     def of(wrench: Floats) -> Floats:
-        p = model.predict(nominal_states(at.q, wrench), nominal.theta)
-        return model.jacobian_of((*model.effects, *more), p, nominal.theta, 3, live) * scale
+        p = model.predict(nominal_states(poses.q, wrench), nominal.theta)
+        return model.jacobian_of((*model.effects, *added), p, nominal.theta, 3, live) * scale
 
-    loaded = of(at.wrench)
-    return loaded - of(np.zeros_like(at.wrench)) if at.deflection else loaded
+    loaded = of(poses.wrench)
+    return loaded - of(np.zeros_like(poses.wrench)) if poses.deflection else loaded
 
 
 def _poses(

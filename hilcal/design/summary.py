@@ -110,7 +110,7 @@ class CurvePoint:
     """A point of the sample-size curve.
 
     Attributes:
-        poses: number of poses beside the reference.
+        poses: number of poses without the reference.
         position_std_m: standard uncertainty of the position at the prediction poses, m.
         efficiency: certified efficiency with this number of poses; None without.
     """
@@ -124,7 +124,7 @@ class CurvePoint:
 class PlanSummary:
     """Cost, predicted precision and efficiency of a plan."""
 
-    poses: int  # number of poses beside the reference
+    poses: int  # number of poses without the reference
     readings: int  # number of all readings, with those at the reference
     loads: dict[str, int]  # readings by load, with "none", in order
     duration: Duration
@@ -186,7 +186,7 @@ def summarise(
     planned: Planned,
     config: CellConfig,
     rng: np.random.Generator,
-    say: Say = lambda words: None,
+    say: Say = lambda _: None,
     *,
     compare: bool = True,  # whether to compute the criterion comparison
     curve: bool = True,  # whether to compute the sample-size curve

@@ -86,10 +86,8 @@ class Feasibility:
         self.margins = Margins() if margins is None else margins
         self.shapes = Clearance(cell, config)
         self.sight = self.shapes.sight
-        known = is_known(cell.arm)
-        self._guessed = (
-            "" if known else f"the shape of {cell.arm.name} is not known: its links are guessed"
-        )
+        guess = f"the shape of {cell.arm.name} is not known: its links are guessed"
+        self._guessed = "" if is_known(cell.arm) else guess
         low, high = config.limits.workspace_min_m, config.limits.workspace_max_m
         self._floor = low is None
         self._box = (low or (-np.inf, -np.inf, 0.0), high or (np.inf, np.inf, np.inf))

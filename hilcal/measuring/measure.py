@@ -286,24 +286,23 @@ class Measurer:
         """Wait until arm and readings have settled; return the settling time, cell s."""
         acquire, clock = self._config.acquire, self._clock
         start = clock.now()
-        rest: float | None = None
+        rest_start: float | None = None
         count = 0
         window = SettleWindow(acquire.samples)
         while True:
             if not self._mover.at_rest(self._mover.look()):
-                rest, window = None, SettleWindow(acquire.samples)
+                rest_start, window = None, SettleWindow(acquire.samples)
                 clock.sleep(POLL_S * clock.scale)
             else:
-                rest = clock.now() if rest is None else rest
+                rest_start = clock.now() if rest_start is None else rest_start
                 window.add(self._tracker.measure())
                 count += 1
-                if clock.now() - rest >= acquire.settle_s and window.settled():
+                if clock.now() - rest_start >= acquire.settle_s and window.settled():
                     return clock.now() - start
             late = clock.now() - start > acquire.settle_timeout_s
-            if late and (rest is None or count >= PATIENCE * acquire.samples):
-                reason = (
-                    "the arm does not rest at its goal" if rest is None else "the readings drift"
-                )
+            if late and (rest_start is None or count >= PATIENCE * acquire.samples):
+                moving = "the arm does not rest at its goal"
+                reason = moving if rest_start is None else "the readings drift"
                 raise DeviceError(
                     f"{name}: not settled within {acquire.settle_timeout_s:g} s: {reason}. Look "
                     "for a swinging load, a loose target or a warming tracker"

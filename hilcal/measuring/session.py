@@ -194,13 +194,13 @@ class Session:
         the arm may be moved by hand. In a resumed campaign, people are asked if the arm does not
         stand at its last reading.
         """
-        first, last = start[0], self._state.last_q
+        first, last_q = start[0], self._state.last_q
         sample = self._mover.free_way(first.q, first.name)
         if self._temperatures is None:
             self._temperatures = bool(np.isfinite(sample.joint_temperature).all())
         self._hook.begin()
-        left = sample.q if last is None else last
-        self._mover.goal = self._mover.agreed(first.q, first.name, left, self._hook.confirm)
+        expected = sample.q if last_q is None else last_q
+        self._mover.goal = self._mover.agreed(first.q, first.name, expected, self._hook.confirm)
         self.in_control = True
         self._rig.arm.take_control(*payload(self._cell, None))
         self._watched(self._zero)
@@ -450,7 +450,7 @@ class Session:
     ) -> None:
         number = int(reading.target[0])
         deflection = self._state.deflection(step, reading.value[0, :3], number)
-        (_, live), *others = self._compared(reading)
+        (_, live), *following = self._compared(reading)
         self._watcher.notify(
             ReadingStored(
                 step,
@@ -463,7 +463,7 @@ class Session:
                 settling,
                 self._goal,
                 number,
-                tuple(others),
+                tuple(following),
             )
         )
 
