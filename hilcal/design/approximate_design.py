@@ -172,8 +172,7 @@ def solve(program: BarrierProgram, start: Floats, tolerance: float, order: float
             fall = 0.1 if length > 0.9 else 0.3 if length > 0.5 else 0.8
             mu = max(min(fall * complement, mu), 0.05 * tolerance / n)
     if best is None:
-        smooth_none = Smooth(0.0, m * 0.0, (), (), m * 0.0)
-        return Optimum(w, smooth_none, 0.0, np.inf, mu)
+        return Optimum(w, Smooth(0.0, m * 0.0, (), (), m * 0.0), 0.0, np.inf, mu)
     return best
 
 

@@ -87,18 +87,15 @@ def objective_of(
         return replace(of_all, criterion=E(unknown(problem)))
     if name == "K":  # of the model alone: information on other parameters may lower it
         free = unknown(problem)
-        units = CandidateSet(
-            np.ascontiguousarray(problem.units.rows[:, :, free]), problem.units.cost
-        )
-        prior = problem.measured[np.ix_(free, free)]
+        rows, prior = problem.units.rows[:, :, free], problem.measured[np.ix_(free, free)]
+        units = CandidateSet(np.ascontiguousarray(rows), problem.units.cost)
         return Objective(K(), units, prior, tuple(names[k] for k in free))
     raise InputError(f"criterion {name!r}; valid: {', '.join(CRITERIA)}")
 
 
 def unknown(problem: DesignProblem) -> Ints:
     """Return the indices of the model's parameters that have no prior."""
-    live = problem.nominal.live
-    return np.flatnonzero(np.isinf(problem.nominal.prior_std[live]))
+    return np.flatnonzero(np.isinf(problem.nominal.prior_std[problem.nominal.live]))
 
 
 def choose(
@@ -136,11 +133,8 @@ def pose_units(objective: Objective, problem: DesignProblem) -> PoseUnits:
     for out, members in zip(rows, by_pose.values(), strict=True):
         stacked = objective.units.rows[members].reshape(-1, size)
         out[: len(stacked)] = stacked
-    return PoseUnits(
-        CandidateSet(rows, np.ones(len(by_pose))),
-        np.array(list(by_pose)),
-        tuple(map(np.array, by_pose.values())),
-    )
+    units = CandidateSet(rows, np.ones(len(by_pose)))
+    return PoseUnits(units, np.array(list(by_pose)), tuple(map(np.array, by_pose.values())))
 
 
 def choose_poses(
@@ -197,12 +191,9 @@ def promising(objective: Objective, budget: float) -> tuple[Ints, ApproximateDes
 
 
 def costly_loads(
-    objective: Objective,
-    problem: DesignProblem,
-    budget: float,
-    change: float,
+    objective: Objective, problem: DesignProblem, budget: float, change: float,
     rng: np.random.Generator,
-) -> tuple[tuple[str, float], ...]:
+) -> tuple[tuple[str, float], ...]:  # fmt: skip
     """Return the loads whose omission raises φ at the same time spent, with the relative gain.
 
     Hanging a load costs as much time as `change` readings; a plan without the load takes these
@@ -210,8 +201,7 @@ def costly_loads(
     the other.
     """
     poses = np.array([pose for pose, _ in problem.what])
-    drawn = rng.permutation(len(problem.candidates))[:SAMPLE]
-    sample = np.isin(poses, drawn)
+    sample = np.isin(poses, rng.permutation(len(problem.candidates))[:SAMPLE])
     used = {name for _, names in problem.what for name in names}
     loads = tuple(name for name in problem.candidates.loads[1:] if name in used)
     costly: list[tuple[str, float]] = []
@@ -237,23 +227,18 @@ def _without(loads: tuple[str, ...], name: str) -> tuple[str, ...]:
 
 def only(objective: Objective, subset: Bools) -> Objective:
     """Return the objective with a subset of the units."""
-    return replace(
-        objective, units=CandidateSet(objective.units.rows[subset], objective.units.cost[subset])
-    )
+    units = objective.units
+    return replace(objective, units=CandidateSet(units.rows[subset], units.cost[subset]))
 
 
 def _value(
-    objective: Objective,
-    problem: DesignProblem,
-    sample: Bools,
-    loads: tuple[str, ...],
+    objective: Objective, problem: DesignProblem, sample: Bools, loads: tuple[str, ...],
     budget: float,
-) -> float:
+) -> float:  # fmt: skip
     """Return φ of the continuous optimum; 0 where the loads do not determine all parameters."""
     allowed = {*loads, problem.candidates.loads[0]}
-    sampled = only(
-        objective, sample & np.array([set(names) <= allowed for _, names in problem.what])
-    )
+    possible = np.array([set(names) <= allowed for _, names in problem.what])
+    sampled = only(objective, sample & possible)
     try:
         return sampled.relaxed(budget).value
     except (CannotAnswerError, InputError):

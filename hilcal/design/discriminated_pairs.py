@@ -100,30 +100,29 @@ def supported_parameters(problem: DesignProblem, count: int) -> dict[str, Floats
     return out
 
 
-def _separable(problem: DesignProblem, discriminated: DiscriminatedPairs) -> DiscriminatedPairs:
-    spread = discriminated.prior + problem.units.information(
+def _separable(problem: DesignProblem, pairs: DiscriminatedPairs) -> DiscriminatedPairs:
+    spread = pairs.prior + problem.units.information(
         np.full(len(problem.units), MANY / float(problem.units.cost.sum()))
     )
     not_separable = []
-    for names in dict.fromkeys(discriminated.names):
-        pair = discriminated.pairs[discriminated.names.index(names)]
+    for names in dict.fromkeys(pairs.names):
+        pair = pairs.pairs[pairs.names.index(names)]
         best = power(pair, spread)
         if best < LEAST_POWER:
             with suppress(CannotAnswerError):
                 relaxed = relax(
-                    problem.units, Separate((pair,)), MANY, discriminated.prior, tolerance=_LOOSE
+                    problem.units, Separate((pair,)), MANY, pairs.prior, tolerance=_LOOSE
                 )
                 best = power(pair, relaxed.information)
         if best < LEAST_POWER:
             not_separable.append(names)
-    separable = [k for k, names in enumerate(discriminated.names) if names not in not_separable]
+    separable = [k for k, names in enumerate(pairs.names) if names not in not_separable]
     if not separable:
         raise CannotAnswerError(not_separable_message(not_separable))
-    pairs, pair_names = (
-        tuple(discriminated.pairs[k] for k in separable),
-        tuple(discriminated.names[k] for k in separable),
-    )
-    return DiscriminatedPairs(pairs, pair_names, discriminated.prior, tuple(not_separable))
+    return DiscriminatedPairs(
+        tuple(pairs.pairs[k] for k in separable), tuple(pairs.names[k] for k in separable),
+        pairs.prior, tuple(not_separable),
+    )  # fmt: skip
 
 
 def _by_effect(pairs: Sequence[tuple[str, str]]) -> dict[str, str]:
@@ -162,8 +161,7 @@ def _directions(problem: DesignProblem, effect: str) -> list[Floats]:
     )
     flat = rows.reshape(-1, len(columns))
     gram = flat.T @ flat / elements
-    rng = np.random.default_rng(_SEED)
-    drawn = rng.standard_normal((DRAWS, len(columns)))
+    drawn = np.random.default_rng(_SEED).standard_normal((DRAWS, len(columns)))
     return [d / np.sqrt(float(d @ gram @ d)) for d in drawn]
 
 

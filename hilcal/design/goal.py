@@ -107,8 +107,7 @@ class Goal:
         return status
 
     def _status(self, ratio: float, worst: str, std: float, unit: str, quantity: str) -> GoalStatus:
-        met = bool(ratio <= 1.0)
-        return GoalStatus(self.text, met, worst, std, ratio, unit, quantity=quantity)
+        return GoalStatus(self.text, bool(ratio <= 1.0), worst, std, ratio, unit, quantity=quantity)
 
 
 def parse_goal(text: str) -> Goal:

@@ -89,12 +89,12 @@ def reading_derivatives(
     """Yield derivatives and covariances of candidates, some poses at a time."""
     model, m, loads = nominal.model, nominal.elements, len(candidates.loads)
     states, repeats = nominal.arrivals(candidates.states()), nominal.each
-    live = np.concatenate([nominal.live, np.arange(model.size, model.size + sizes(added))])
+    count = len(scale) - len(nominal.live)
+    live = np.concatenate([nominal.live, model.size + np.arange(count)])
     step = max(CHUNK // (loads * repeats), 1)
     for start in range(0, len(candidates), step):
         rows = slice(start, min(start + step, len(candidates)))
-        count = rows.stop - rows.start
-        per_pose = loads * repeats
+        count, per_pose = rows.stop - rows.start, loads * repeats
         p = model.predict(states[slice(rows.start * per_pose, rows.stop * per_pose)], nominal.theta)
         jacobian = model.jacobian_of((*model.effects, *added), p, nominal.theta, nominal.m, live)
         covariance = arrival_covariance(nominal, config, p)
@@ -103,11 +103,6 @@ def reading_derivatives(
             (jacobian * scale).reshape(count, loads, m, len(scale)),
             covariance.reshape(count, loads, m, m),
         )
-
-
-def sizes(effects: tuple[Effect, ...]) -> int:
-    """Return the number of parameters of effects."""
-    return sum(len(e.parameters) for e in effects)
 
 
 def absolute_rows(part: ReadingDerivatives) -> Floats:
@@ -186,9 +181,8 @@ def _instrument(nominal: NominalModel, config: CellConfig, predicted: Prediction
         of_observer = number == k
         if observer.name.kind == "station":
             station = np.zeros(3) if k else nominal.station
-            out[of_observer] = tracker_covariance(
-                o.position[of_observer], tracker_noise(t), station, m
-            )
+            position = o.position[of_observer]
+            out[of_observer] = tracker_covariance(position, tracker_noise(t), station, m)
             continue
         to_point = observer.name.kind == "point"
         section = (config.points if to_point else config.gauges).get(observer.name.name)
@@ -287,14 +281,10 @@ def problem(
     wrenches = (load.wrench(nominal.cell.gravity) for load in config.loads)
     if allowed is None:
         allowed = np.ones((len(q), len(loads)), dtype=np.bool_)
-    candidates = Candidates(
-        np.asarray(q, dtype=float), loads, np.array([np.zeros(6), *wrenches]), allowed
-    )
-    against = (
-        potential(nominal, config, candidates)
-        if len(candidates)
-        else Potential((), np.zeros(0), ())
-    )
+    wrench = np.array([np.zeros(6), *wrenches])
+    candidates = Candidates(np.asarray(q, dtype=float), loads, wrench, allowed)
+    none = Potential((), np.zeros(0), ())
+    against = potential(nominal, config, candidates) if len(candidates) else none
     terms = _terms(nominal, against)
     scale = np.array([t.scale for t in terms])
     contents, height, layout_notes = _layout(candidates, mode, nominal.elements, len(terms))

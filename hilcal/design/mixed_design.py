@@ -113,11 +113,8 @@ def other_effects(nominal: NominalModel, config: CellConfig) -> tuple[tuple[Effe
     """
     model, catalogue = nominal.model, nominal.model.catalogue
     names = () if model.background else potential_names(config, model)
-    finest = {
-        name: {"harmonics": HARMONICS}
-        for name in names
-        if "harmonics" in catalogue[name].option_help
-    }
+    periodic = [name for name in names if "harmonics" in catalogue[name].option_help]
+    finest = {name: {"harmonics": HARMONICS} for name in periodic}
     effects = tuple(
         build(catalogue, name, nominal.cell, nominal.m, finest.get(name, {})) for name in names
     )

@@ -96,17 +96,17 @@ def measure_next(
     if reference is not None and not np.array_equal(reference, planned.ordered.plan.q[0]):
         planned = _from_reference(cell, config, planned, reference, rng, request)
     say("predicting the powers")
-    discriminated = planned.asked.apart
-    assert discriminated is not None  # noqa: S101  (by the criterion)
-    information = discriminated.prior + planned.problem.units.information(planned.counts)
-    powers = tuple(_pair_powers(planned.problem, discriminated, names, information))
+    pairs = planned.asked.apart
+    assert pairs is not None  # noqa: S101  (by the criterion)
+    information = pairs.prior + planned.problem.units.information(planned.counts)
+    powers = tuple(_pair_powers(planned.problem, pairs, names, information))
     observable = {e.name for e in planned.problem.families}
     omitted = [n for n in names if n not in observable]
     notes = tuple(n for n in planned.problem.notes if n.split(":")[0] in omitted)
     never = tuple((p.effect, p.rival) for p in powers if p.not_separable and p.effect in observable)
     if never:
         notes = (*notes, not_ruled_out(never))
-    weakest = min(discriminated.pairs, key=lambda pair: power(pair, information))
+    weakest = min(pairs.pairs, key=lambda pair: power(pair, information))
     shares, reach_ratio = _where(planned, weakest, information)
     return Next(planned, powers, shares, reach_ratio, notes)
 
@@ -124,18 +124,14 @@ def expected(
 
 def _pair_powers(
     problem: DesignProblem,
-    discriminated: DiscriminatedPairs,
+    pairs: DiscriminatedPairs,
     names: tuple[str, ...],
     information: Floats,
 ) -> Iterator[PairPower]:
     observable = {e.name for e in problem.families}
     supported = supported_parameters(problem, DRAWS)
     for e in names:
-        betas = [
-            p.beta
-            for p, n in zip(discriminated.pairs, discriminated.names, strict=True)
-            if n[0] == e
-        ]
+        betas = [p.beta for p, n in zip(pairs.pairs, pairs.names, strict=True) if n[0] == e]
         if e in supported:
             betas = list(supported[e] / problem.scale[problem.of_effect(e)])
         for f in names:
@@ -145,9 +141,9 @@ def _pair_powers(
                 yield PairPower(e, f, LEVEL, LEVEL, True)
                 continue
             so_far, planned = (
-                expected(problem, (e, f), betas, m) for m in (discriminated.prior, information)
+                expected(problem, (e, f), betas, m) for m in (pairs.prior, information)
             )
-            never = (e, f) in discriminated.not_separable and planned < LEAST_POWER
+            never = (e, f) in pairs.not_separable and planned < LEAST_POWER
             yield PairPower(e, f, so_far, planned, never)
 
 

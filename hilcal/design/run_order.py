@@ -466,9 +466,8 @@ class OrderDraws:
 
     def figures(self, plan: Plan) -> tuple[Duration, Confounding]:
         """Return duration and confounding of a plan."""
-        margin = self.config.limits.joint_margin_rad
+        margin, how = self.config.limits.joint_margin_rad, self.how
         time, times = timeline(plan, self.cell.arm, margin, self.pace)
-        how = self.how
         return time, confounding(plan, times, self.wrenches, how.drift, how.reading_std)
 
 

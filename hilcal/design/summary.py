@@ -373,17 +373,11 @@ def detectable_effects(planned: Planned, config: CellConfig) -> Iterator[Detecta
     model_prior = problem.prior[:size, :size] - problem.measured[:size, :size]
     information[:size, :size] += model_prior
     chosen = problem.candidates[sorted({problem.what[k][0] for k in used})]
-    blocks = [
-        part.jacobian[:, 1:] - part.jacobian[:, :1]
-        if problem.mode == "deflection"
-        else part.jacobian
-        for part in reading_derivatives(
-            problem.nominal, config, chosen, problem.families, problem.scale
-        )
-    ]
-    displacement = np.concatenate(
-        [block[..., :3, :].reshape(-1, len(problem.terms)) for block in blocks]
-    )
+    parts = reading_derivatives(problem.nominal, config, chosen, problem.families, problem.scale)
+    blocks = [part.jacobian[..., :3, :] for part in parts]
+    if problem.mode == "deflection":
+        blocks = [block[:, 1:] - block[:, :1] for block in blocks]
+    displacement = np.concatenate([block.reshape(-1, len(problem.terms)) for block in blocks])
     rng = np.random.default_rng(_SEED)
     for effect in problem.families:
         columns = problem.of_effect(effect.name)
@@ -393,11 +387,8 @@ def detectable_effects(planned: Planned, config: CellConfig) -> Iterator[Detecta
             beta = rng.standard_normal(len(columns))
             noncentrality = float(beta @ schur @ beta)
             size_m = float(np.sqrt(3.0 * np.mean((displacement[:, columns] @ beta) ** 2)))
-            strengths.append(
-                size_m / np.sqrt(noncentrality)
-                if noncentrality > VISIBLE * len(columns)
-                else np.inf
-            )
+            visible = noncentrality > VISIBLE * len(columns)
+            strengths.append(size_m / np.sqrt(noncentrality) if visible else np.inf)
         smallest = float(np.median(strengths))
         yield DetectableEffect(effect.name, smallest if np.isfinite(smallest) else None)
 

@@ -26,8 +26,7 @@ def payload(cell: Cell, load: CellLoad | None) -> tuple[float, Floats]:
     mass = cell.tool_mass + hung
     if mass == 0.0:
         return 0.0, np.zeros(3)
-    com = (cell.tool_mass * cell.tool_com + hung * cell.load_point) / mass
-    return mass, com
+    return mass, (cell.tool_mass * cell.tool_com + hung * cell.load_point) / mass
 
 
 class Hook:

@@ -168,7 +168,7 @@ class SettleWindow:
         return self._settled
 
     def _judge(self) -> bool:
-        window = self._window()
+        window = self._samples[-max(self._count, len(self._samples) // 2) :]
         trend = _trend(window)
         if trend.moment == 0.0:
             return False  # all at one time: no trend
@@ -188,10 +188,6 @@ class SettleWindow:
             p = float(stats.f.sf(drift / (m * noise), m, trend.dof))
         self._has_drifted = self._has_drifted or p <= DRIFT_P
         return bool(p > (AFTER_DRIFT_P if self._has_drifted else DRIFT_P))
-
-    def _window(self) -> Sequence[TrackerSample]:
-        """Return the last half of all samples, at least K."""
-        return self._samples[-max(self._count, len(self._samples) // 2) :]
 
     def _shrinking(self) -> bool:
         """Test whether the second half of all samples scatters less than the first (F test)."""

@@ -323,8 +323,7 @@ class Mover:
 
     def move(self, q: Floats, name: str) -> None:
         """Move straight to `q` (n,), rad; the way is checked from the arm's actual position."""
-        sample = self.look()
-        start = sample.q
+        start = self.look().q
         if self.goal is not None and np.abs(start - self.goal).max() <= self._motion.arrival_rad:
             start = self.goal
         self.check_way(start, q, name)

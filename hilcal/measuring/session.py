@@ -298,9 +298,8 @@ class Session:
         """Measure and store all targets; return the first reading and the total settling time."""
         self._watcher.notify(Phase(f"measuring {step}"))
         measurements = self._reader.read(stop.q, stop.name)
-        rows, details = map(
-            list, zip(*(self._row(stop, step, reading) for reading in measurements), strict=True)
-        )
+        pairs = [self._row(stop, step, reading) for reading in measurements]
+        rows, details = map(list, zip(*pairs, strict=True))
         self._check(measurements, details)
         self._store.record(Readings.joined(rows), step, details[0], *details[1:])
         self._done += 1
@@ -326,10 +325,8 @@ class Session:
         for raw in details:
             self._event("doubted", {"why": str(wrong), "reading": raw})
         for reading in measurements:
-            position = reading.measured.mean.value[:3]
-            self._state.registration.doubt_repeated(
-                reading.measured.q, position, reading.target or 0
-            )
+            q, position = reading.measured.q, reading.measured.mean.value[:3]
+            self._state.registration.doubt_repeated(q, position, reading.target or 0)
         self._look_back()
         raise wrong
 
@@ -406,11 +403,9 @@ class Session:
         if load is None:
             return np.zeros(6)
         sensor = self._config.force_sensor
-        pull = any((*load.force_N, *load.moment_Nm))
-        use_measured = sensor is not None and (
-            sensor.use == "all" or (sensor.use == "pulls" and pull)
-        )
-        if use_measured and self._meter is not None and tared is not None:
+        pulls = any((*load.force_N, *load.moment_Nm))
+        measured = sensor is not None and (sensor.use == "all" or (sensor.use == "pulls" and pulls))
+        if measured and self._meter is not None and tared is not None:
             return self._meter.load_wrench(tared)
         return load.wrench(self._cell.gravity)
 
