@@ -1,4 +1,4 @@
-"""The approximate design: optimal weights of units, with a certified bound of φ."""
+"""The approximate design: optimal real weights of units, with a certified bound of φ."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -17,11 +17,11 @@ from hilcal.design.criterion import (
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.types import Bools, Floats, Ints
 
-# Choices, usual in interior-point methods (Wright 1997); none has a study of its own.
+# choices, usual in interior-point methods (Wright 1997), without a study
 _STEPS = 80
 _BACK = 0.995  # share of the way to the boundary
-_CENTRAL = 1.0  # square of Newton's decrement at which μ may fall
-_CLAMP = 1e4  # how far a dual may be from μ / w
+_CENTRAL = 1.0  # squared Newton decrement, over μ, below which μ may fall
+_CLAMP = 1e4  # largest ratio of a dual and μ / w
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +31,7 @@ class BarrierProgram:
     criterion: Criterion  # φ
     units: CandidateSet  # n of them
     budget: float  # B
-    most: float  # bound of each weight; infinity for none
+    most: float  # upper bound of each weight; may be infinite
     prior: Floats  # (P, P) M0
 
     def information(self, weight: Floats) -> Floats:
@@ -39,7 +39,7 @@ class BarrierProgram:
         return np.asarray(self.prior + self.change(weight))
 
     def change(self, weight: Floats) -> Floats:
-        """Return (P, P) Σ w_k A_kᵀA_k; weights of either sign."""
+        """Return (P, P) Σ w_k A_kᵀA_k; weights may be negative."""
         rows = self.units.rows
         flat = rows.reshape(-1, rows.shape[2])
         return np.asarray((flat * np.repeat(weight, rows.shape[1])[:, None]).T @ flat)
@@ -61,13 +61,13 @@ class BarrierProgram:
         for c, x, y in smooth.products:
             out -= c * _product(rows, x, y)
         for factor, v in smooth.squares:
-            each = np.sum((flat @ v).reshape(n, size, -1) ** 2, axis=1)
-            out -= each @ factor @ each.T
+            squares = np.sum((flat @ v).reshape(n, size, -1) ** 2, axis=1)
+            out -= squares @ factor @ squares.T
         return np.asarray(0.5 * (out + out.T))
 
 
 def _product(rows: Floats, x: Floats, y: Floats) -> Floats:
-    """Return (n, n) tr(X H_k Y H_l) of (n, R, P) rows, for X and Y by their roots (P, r)."""
+    """Return (n, n) tr(X H_k Y H_l) of (n, R, P) rows; x and y are roots (P, r) of X and Y."""
     left = rows @ x
     right = left if y is x else rows @ y
     size = rows.shape[1]
@@ -75,13 +75,13 @@ def _product(rows: Floats, x: Floats, y: Floats) -> Floats:
         out = np.zeros((len(rows), len(rows)))
         for i in range(size):
             for j in range(i + 1):
-                seen = left[:, i] @ left[:, j].T
-                seen *= seen if y is x else right[:, i] @ right[:, j].T
-                out += seen if i == j else seen + seen.T
+                products = left[:, i] @ left[:, j].T
+                products *= products if y is x else right[:, i] @ right[:, j].T
+                out += products if i == j else products + products.T
         return out
-    # By the matrices T_k = L_xᵀ H_k L_y: the sum of T_k ∘ T_l.
+    # by the matrices T_k = L_xᵀ H_k L_y: the sum of T_k ∘ T_l
     n, t = len(rows), np.matmul(left.transpose(0, 2, 1), right)
-    if y is x:  # symmetric: half of each does
+    if y is x:  # symmetric: half of each is enough
         up, across = np.triu_indices(t.shape[1])
         half = np.take(t.reshape(n, -1), up * t.shape[1] + across, axis=1)
         half *= np.where(up == across, 1.0, np.sqrt(2.0))
@@ -99,23 +99,23 @@ class Optimum:
     """A continuous optimum."""
 
     weight: Floats  # (n,) w
-    smooth: Smooth  # f there, with the matrices of the bound
+    smooth: Smooth  # f at w, with the matrices of the bound
     value: float  # φ
     bound: float  # of φ over these units
     order: float
 
     @property
     def gap(self) -> float:
-        """How far φ may be below the optimum, relative."""
+        """Largest relative distance of φ from the optimum."""
         return self.bound / self.value - 1.0 if self.value > 0.0 else np.inf
 
 
 def solve(program: BarrierProgram, start: Floats, tolerance: float, order: float = 1.0) -> Optimum:
-    """Return the optimum to a relative gap, from (n,) weights over 0, under `most`, that spend B.
+    """Return the optimum to a relative gap, from weights (n,) in (0, most) that spend B.
 
     Newton's method on the barrier problem f(w) + μ Σ log w_k + μ Σ log(most − w_k), with the duals
-    z of the bounds as variables of their own (Wright 1997, Primal-Dual Interior-Point Methods), μ
-    falling to 0 from `order` / n. Criteria with a kink have a surrogate of order μ.
+    z of the bounds as separate variables (Wright 1997, Primal-Dual Interior-Point Methods); μ falls
+    to 0 from `order` / n. Criteria with a kink have a surrogate of order μ.
     """
     w, n = start, len(start)
     capped = np.isfinite(program.most)
@@ -131,10 +131,10 @@ def solve(program: BarrierProgram, start: Floats, tolerance: float, order: float
         if smooth is None:
             break
         value = float(program.criterion.value(m))
-        found = Optimum(w, smooth, value, program.scan(smooth)[1], mu)
-        if best is None or found.gap < best.gap:
-            best = found
-        if found.gap <= tolerance or step == _STEPS - 1:
+        iterate = Optimum(w, smooth, value, program.scan(smooth)[1], mu)
+        if best is None or iterate.gap < best.gap:
+            best = iterate
+        if iterate.gap <= tolerance or step == _STEPS - 1:
             break
         if central:
             mu = max(0.2 * mu, 0.1 * tolerance / n)
@@ -166,14 +166,13 @@ def solve(program: BarrierProgram, start: Floats, tolerance: float, order: float
             top = program.most - w
             y = np.clip(y, mu / (_CLAMP * top), _CLAMP * mu / top)
             complement = 0.5 * (complement + float(y @ top) / n)
-        if program.criterion.kinked:  # μ is also the width of the kink: it falls only where central
+        if program.criterion.kinked:  # μ, also the width of the kink, falls at central points only
             central = push <= _CENTRAL * mu
         else:
             fall = 0.1 if length > 0.9 else 0.3 if length > 0.5 else 0.8
             mu = max(min(fall * complement, mu), 0.05 * tolerance / n)
     if best is None:
-        smooth_none = Smooth(0.0, m * 0.0, (), (), m * 0.0)
-        return Optimum(w, smooth_none, 0.0, np.inf, mu)
+        return Optimum(w, Smooth(0.0, m * 0.0, (), (), m * 0.0), 0.0, np.inf, mu)
     return best
 
 
@@ -186,13 +185,12 @@ def _newton(program: BarrierProgram, matrix: Floats, lean: Floats, w: Floats) ->
             factor = sl.cho_factor(matrix, lower=True, check_finite=False)
         except (np.linalg.LinAlgError, ValueError):
             continue
-        both = sl.cho_solve(factor, np.column_stack([lean, program.units.cost]), check_finite=False)
-        if np.isfinite(both).all():
-            short = program.budget - float(program.units.cost @ w)
-            price = (float(program.units.cost @ both[:, 0]) - short) / float(
-                program.units.cost @ both[:, 1]
-            )
-            return np.asarray(both[:, 0] - price * both[:, 1])
+        cost = program.units.cost
+        solved = sl.cho_solve(factor, np.column_stack([lean, cost]), check_finite=False)
+        if np.isfinite(solved).all():
+            unspent = program.budget - float(cost @ w)
+            price = (float(cost @ solved[:, 0]) - unspent) / float(cost @ solved[:, 1])
+            return np.asarray(solved[:, 0] - price * solved[:, 1])
     return None
 
 
@@ -206,65 +204,65 @@ def _dual(z: Floats, move: Floats) -> Floats:
 
 
 def _search(
-    program: BarrierProgram, surrogate: Callable[[Floats], Smooth | None], here: Smooth,
-    at: tuple[Floats, Floats], step: tuple[Floats, Floats], length: float, mu: float,
+    program: BarrierProgram, surrogate: Callable[[Floats], Smooth | None], current: Smooth,
+    point: tuple[Floats, Floats], step: tuple[Floats, Floats], length: float, mu: float,
     slope: float,
 ) -> float:  # fmt: skip
-    """Return the length of a step of weights and information: halved until it helps; 0 if never."""
+    """Return the step length, halved until the barrier function rises; 0 if it never does."""
     capped = np.isfinite(program.most)
-    (w, m), (move, moved) = at, step
+    (w, m), (move, moved) = point, step
 
     def barrier(x: Floats) -> float:
         out = float(np.log(x).sum())
         return out + (float(np.log(program.most - x).sum()) if capped else 0.0)
 
     start = barrier(w)
-    noise = 1e-13 * (1.0 + abs(here.value))
+    noise = 1e-13 * (1.0 + abs(current.value))
     for _ in range(30):
         x = w + length * move
-        there = surrogate(m + length * moved)
-        if there is not None:
-            gain = there.value - here.value + mu * (barrier(x) - start)
+        trial = surrogate(m + length * moved)
+        if trial is not None:
+            gain = trial.value - current.value + mu * (barrier(x) - start)
             if gain >= 1e-4 * length * slope - noise:
                 return length
         length *= 0.5
     return 0.0
 
 
-TOLERANCE = 1e-7  # Relative gap between the continuous optimum and its bound
+TOLERANCE = 1e-7  # relative gap between the continuous optimum and its bound
 KINKED_TOLERANCE = 1e-3  # the same with kinks, where the bound closes slowly; a choice
 
 _ROUNDS = 200
-_STALE = 4  # rounds in which the gap must fall; this and the next two are choices
-_SHORT = 2000  # units among which the first ones are sought
-_LEFT = 0.9  # share of the weight with which an optimum is worth starting from; a choice
-_WARM = 12  # multiplicative steps that find where the weight goes
+_STALE = 4  # rounds in which the gap must fall; a choice
+_SHORT = 2000  # units from which the first active ones are chosen; a choice
+_LEFT = 0.9  # least remaining share of weight of an optimum to start from; a choice
+_WARM = 12  # multiplicative steps that choose the first active units
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ApproximateDesign:
     """A continuous optimum with its certificate."""
 
-    index: Ints  # (S,) ascending indices of the units that have weight
+    index: Ints  # (S,) ascending indices of the units of positive weight
     weight: Floats  # (S,) their weights w; Σ w c ≤ B
     value: float  # φ of these weights
-    bound: float  # φ of no plan within the budget exceeds it
-    price: Floats  # (K,) marginal value of each unit, ∂f/∂w_k: units with little are never taken
+    bound: float  # upper bound of φ of all plans within the budget
+    price: Floats  # (K,) marginal value ∂f/∂w_k of each unit
     information: Floats  # (P, P) M0 + Σ w_k A_kᵀA_k
 
     @property
     def gap(self) -> float:
-        """Relative distance of value and bound."""
+        """Relative distance between value and bound."""
         return self.bound / self.value - 1.0 if self.value > 0.0 else np.inf
 
-    def among(self, kept: Bools) -> "ApproximateDesign | None":
-        """Return the same over some (K,) of the units; None where too much weight is lost."""
-        place, whole = np.cumsum(kept) - 1, kept[self.index]
-        if float(self.weight[whole].sum()) < _LEFT * float(self.weight.sum()):
+    def among(self, subset: Bools) -> "ApproximateDesign | None":
+        """Return the design on a subset (K,) of the units; None if too much weight is lost."""
+        place, inside = np.cumsum(subset) - 1, subset[self.index]
+        if float(self.weight[inside].sum()) < _LEFT * float(self.weight.sum()):
             return None
         return replace(
-            self, index=place[self.index[whole]], weight=self.weight[whole], price=self.price[kept],
-            value=self.value if whole.all() else 0.0,
+            self, index=place[self.index[inside]], weight=self.weight[inside],
+            price=self.price[subset], value=self.value if inside.all() else 0.0,
         )  # fmt: skip
 
 
@@ -272,17 +270,17 @@ def relax(
     units: CandidateSet,
     criterion: Criterion,  # φ
     budget: float,  # B, in the units of the cost
-    prior: Floats | None = None,  # (P, P) M0, what is known before; zero by default
+    prior: Floats | None = None,  # (P, P) M0; zero by default
     *,
-    most: int | None = None,  # how often a unit may be taken; any number of times by default
+    most: int | None = None,  # largest weight of a unit; unlimited by default
     names: Sequence[str] | None = None,
-    tolerance: float | None = None,  # relative gap to stop at; by default 1e-7, of kinks 1e-3
+    tolerance: float | None = None,  # relative gap to stop at; by default 1e-7, with kinks 1e-3
     start: ApproximateDesign | None = None,  # optimum of a similar problem over the same units
 ) -> ApproximateDesign:
     """Return the continuous optimum of φ(M0 + Σ w_k A_kᵀA_k), Σ w_k c_k ≤ B, 0 ≤ w_k ≤ most.
 
-    Column generation: the optimum over few units, then a scan of all for units whose price exceeds
-    those in use, until none is left (equivalence theorem). The bound is of the scan of all units.
+    Column generation: find the optimum over few active units, then scan all units for prices above
+    the active ones, until there are none (equivalence theorem). The bound is over all units.
     """
     if tolerance is None:
         tolerance = KINKED_TOLERANCE if criterion.kinked else TOLERANCE
@@ -293,17 +291,15 @@ def relax(
     criterion.require(spread, names)
     criterion = criterion.relevant(units, prior, budget)
     if share == cap and criterion.monotone:
-        value = float(criterion.value(spread))  # all there is
-        all_of_them = np.arange(len(units))
-        return ApproximateDesign(
-            all_of_them, np.full(len(units), cap), value, value, np.ones(len(units)), spread
-        )
+        value = float(criterion.value(spread))
+        index, weight, price = np.arange(len(units)), np.full(len(units), cap), np.ones(len(units))
+        return ApproximateDesign(index, weight, value, value, price, spread)
     most_spent = (1.0 - 1e-9) * cap * float(units.cost.sum())
-    whole = BarrierProgram(criterion, units, min(budget, most_spent), cap, prior)
+    program = BarrierProgram(criterion, units, min(budget, most_spent), cap, prior)
     if start is None or not criterion.value(
         prior + units.information(start.weight, start.index)
     ) > 0.0:  # fmt: skip
-        active, weight = _first(whole, spread)
+        active, weight = _first(program, spread)
         order = 0.3
     else:
         active, weight, order = start.index, start.weight, 0.03
@@ -312,26 +308,26 @@ def relax(
     for _ in range(_ROUNDS):
         last = len(active) == len(units)
         goal = 0.3 * tolerance if last else max(0.3 * tolerance, 0.1 * order)
-        found = _solved(whole, active, weight, goal, order)
-        price, bound = whole.scan(found.smooth)
-        if found.smooth.below is not None:
-            price = prices(units.rows, found.smooth.gradient)
+        optimum = _solved(program, active, weight, goal, order)
+        price, bound = program.scan(optimum.smooth)
+        if optimum.smooth.below is not None:
+            price = prices(units.rows, optimum.smooth.gradient)
         best = min(best, bound)
-        if top is None or found.value > top[0].value:
-            top = found, active
+        if top is None or optimum.value > top[0].value:
+            top = optimum, active
         gap = best / top[0].value - 1.0 if top[0].value > 0.0 else np.inf
         gaps.append(gap)
         if gap <= tolerance or last or (len(gaps) > _STALE and gap > 0.8 * min(gaps[:-_STALE])):
             break
-        active, weight = _exchanged(whole, active, found.weight, price / units.cost)
+        active, weight = _exchanged(program, active, optimum.weight, price / units.cost)
         order = max(min(0.5 * gap, order), tolerance)
     if top is None or not top[0].value > 0.0:
         raise CannotAnswerError("the candidates determine too little: the criterion stays 0")
-    return _pruned(whole, top[1], top[0].weight, best)
+    return _pruned(program, top[1], top[0].weight, best)
 
 
 def given_prior(units: CandidateSet, budget: float, prior: Floats | None) -> Floats:
-    """Return the prior information (P, P); refuse a budget that no unit fits into."""
+    """Return the prior information (P, P); refuse a budget below the least cost."""
     least = float(units.cost.min())
     if budget < least * (1.0 - 1e-12):
         raise InputError(f"a budget of {budget:g}; valid: at least {least:g}, the least cost")
@@ -339,22 +335,22 @@ def given_prior(units: CandidateSet, budget: float, prior: Floats | None) -> Flo
 
 
 def _solved(
-    whole: BarrierProgram, active: Ints, weight: Floats, goal: float, order: float
+    program: BarrierProgram, active: Ints, weight: Floats, goal: float, order: float
 ) -> Optimum:
-    """Return the optimum over some units; what is not monotone may leave budget."""
-    rows, cost = whole.units.rows[active], whole.units.cost[active]
-    start = _feasible(weight, cost, whole.budget, whole.most)
-    if not whole.criterion.monotone:  # one more unit without information
+    """Return the optimum over active units; a criterion that is not monotone may spend less."""
+    rows, cost = program.units.rows[active], program.units.cost[active]
+    start = _feasible(weight, cost, program.budget, program.most)
+    if not program.criterion.monotone:  # one more unit without information
         rows = np.concatenate([rows, np.zeros((1, *rows.shape[1:]))])
-        cost = np.append(cost, whole.budget)
-        left = min(max(1.0 - float(weight @ cost[:-1]) / whole.budget, 0.01), 0.99)
-        start = np.append((1.0 - left) * start, left)
-    found = solve(replace(whole, units=CandidateSet(rows, cost)), start, goal, order)
-    return replace(found, weight=found.weight[: len(active)])
+        cost = np.append(cost, program.budget)
+        unspent = min(max(1.0 - float(weight @ cost[:-1]) / program.budget, 0.01), 0.99)
+        start = np.append((1.0 - unspent) * start, unspent)
+    optimum = solve(replace(program, units=CandidateSet(rows, cost)), start, goal, order)
+    return replace(optimum, weight=optimum.weight[: len(active)])
 
 
 def _feasible(weight: Floats, cost: Floats, budget: float, cap: float) -> Floats:
-    """Return weights over 0 and under the cap that spend the budget."""
+    """Return weights in (0, cap) that spend the budget."""
     w = np.clip(weight, 1e-2 * budget / float(cost.sum()), 0.95 * cap)
     spent = float(w @ cost)
     if spent >= budget or not np.isfinite(cap):
@@ -362,76 +358,80 @@ def _feasible(weight: Floats, cost: Floats, budget: float, cap: float) -> Floats
     return np.asarray(w + (budget - spent) / float((cap - w) @ cost) * (cap - w))
 
 
-def _first(whole: BarrierProgram, spread: Floats) -> tuple[Ints, Floats]:
-    """Return units that a few multiplicative steps give the most weight.
+def _first(program: BarrierProgram, spread: Floats) -> tuple[Ints, Floats]:
+    """Return the units, and weights, that are largest after a few multiplicative steps.
 
     w_k <- w_k (price_k / mean price)^(2/3). Silvey, Titterington & Torsney (1978), Comm. Statistics
     A7.
     """
-    units, budget = whole.units, whole.budget
-    count = min(len(units), max(_SHORT, int(4 * budget / (whole.most * float(units.cost.min())))))
-    smooth = whole.criterion.surrogate(spread, 0.1)(spread)
+    units, budget = program.units, program.budget
+    count = min(len(units), max(_SHORT, int(4 * budget / (program.most * float(units.cost.min())))))
+    smooth = program.criterion.surrogate(spread, 0.1)(spread)
     if smooth is None or count == len(units):
-        some = np.arange(len(units))
+        short = np.arange(len(units))
     else:
         rate = prices(units.rows, smooth.gradient) / units.cost
         even = np.linspace(0, len(units) - 1, count // 4).astype(np.int64)
-        some = np.union1d(best_first(rate, count - len(even)), even)
-    rows, cost = units.rows[some], units.cost[some]
-    program = replace(whole, units=CandidateSet(rows, cost))
-    w = np.full(len(some), budget / float(cost.sum()))
+        short = np.union1d(best_first(rate, count - len(even)), even)
+    rows, cost = units.rows[short], units.cost[short]
+    shortened = replace(program, units=CandidateSet(rows, cost))
+    w = np.full(len(short), budget / float(cost.sum()))
     for _ in range(_WARM):
-        m = program.information(w)
-        smooth = whole.criterion.surrogate(m, 0.1)(m)
+        m = shortened.information(w)
+        smooth = program.criterion.surrogate(m, 0.1)(m)
         if smooth is None:
             break
         rate = np.maximum(prices(rows, smooth.gradient) / cost, 0.0)
         w = w * (rate + 1e-3 * float(rate.max())) ** (2 / 3)
         w *= budget / float(w @ cost)
-    needed = budget / whole.most
+    needed = budget / program.most
     order = np.argsort(-w * cost, kind="stable")
     size = max(units.size, int(np.searchsorted(np.cumsum(cost[order]), 2 * needed)) + 1)
-    while size < len(some):
+    while size < len(short):
         chosen = order[:size]
-        m = program.information(np.where(np.isin(np.arange(len(w)), chosen), w, 0.0))
-        smooth = whole.criterion.surrogate(m, 0.1)(m)
-        if smooth is not None and float(whole.criterion.value(m)) > 0.0:
+        m = shortened.information(np.where(np.isin(np.arange(len(w)), chosen), w, 0.0))
+        smooth = program.criterion.surrogate(m, 0.1)(m)
+        if smooth is not None and float(program.criterion.value(m)) > 0.0:
             break
         size *= 2
     chosen = np.sort(order[:size])
-    return some[chosen], w[chosen]
+    return short[chosen], w[chosen]
 
 
 def _exchanged(
-    whole: BarrierProgram, active: Ints, weight: Floats, rate: Floats
+    program: BarrierProgram, active: Ints, weight: Floats, rate: Floats
 ) -> tuple[Ints, Floats]:
-    """Return the units without those of no weight, with those of the best prices, and weights."""
-    cost = whole.units.cost
+    """Return the active units and weights: drop units of no weight, add units of best prices."""
+    cost = program.units.cost
     inner = (
-        weight < 0.99 * whole.most if np.isfinite(whole.most) else np.ones(len(weight), np.bool_)
+        weight < 0.99 * program.most
+        if np.isfinite(program.most)
+        else np.ones(len(weight), np.bool_)
     )
     price = float(rate[active[inner]].max()) if inner.any() else float(rate[active].min())
-    share = weight * cost[active] / whole.budget
-    kept = (share > 1e-5 / len(active)) | (rate[active] > 0.999 * price)
+    share = weight * cost[active] / program.budget
+    retained = (share > 1e-5 / len(active)) | (rate[active] > 0.999 * price)
     outside = rate.copy()
     outside[active] = -np.inf
-    new = best_first(outside, 2 * whole.units.size)
-    new = new[outside[new] > price * (1.0 + 1e-12)]
-    little = 0.02 * whole.budget / (cost[new] * max(len(new), 1))
-    index = np.concatenate([active[kept], new])
+    entering = best_first(outside, 2 * program.units.size)
+    entering = entering[outside[entering] > price * (1.0 + 1e-12)]
+    small = 0.02 * program.budget / (cost[entering] * max(len(entering), 1))
+    index = np.concatenate([active[retained], entering])
     order = np.argsort(index)
-    return index[order], np.concatenate([weight[kept], little])[order]
+    return index[order], np.concatenate([weight[retained], small])[order]
 
 
-def _pruned(whole: BarrierProgram, active: Ints, weight: Floats, bound: float) -> ApproximateDesign:
-    """Return the optimum without weights that change nothing."""
-    units, criterion = whole.units, whole.criterion
-    share = weight * units.cost[active] / whole.budget
-    kept = share > 1e-8 * float(share.max())
-    index, w = active[kept], weight[kept]
+def _pruned(
+    program: BarrierProgram, active: Ints, weight: Floats, bound: float
+) -> ApproximateDesign:
+    """Return the optimum without negligible weights."""
+    units, criterion = program.units, program.criterion
+    share = weight * units.cost[active] / program.budget
+    retained = share > 1e-8 * float(share.max())
+    index, w = active[retained], weight[retained]
     if criterion.monotone:
-        w = np.minimum(w * (whole.budget / float(w @ units.cost[index])), whole.most)
-    m = whole.prior + units.information(w, index)
+        w = np.minimum(w * (program.budget / float(w @ units.cost[index])), program.most)
+    m = program.prior + units.information(w, index)
     smooth = criterion.surrogate(m, 1e-3)(m)
     value = float(criterion.value(m))
     price = np.ones(len(units)) if smooth is None else prices(units.rows, smooth.gradient)

@@ -1,12 +1,12 @@
-"""Criteria by name, the choice of units, and of the loads that are worth their change.
+"""Criteria by name, and the choice of units and of the loads that are worth a change of load.
 
-Potential terms make a plan good at more than its model, and so less good at the model alone. A
-compound criterion is the mean of both: of the logarithms of the two D-efficiencies, so that
-neither optimum is needed, or of the two inefficiencies in the parameters' mean variance,
+A plan with potential terms is good for more than its model, and so less good for the model alone.
+A compound criterion is the mean of both: of the logarithms of the two D-efficiencies, which needs
+neither optimum, or of the two inefficiencies in the parameters' mean variance,
 
     φ = det(M)^(1/2P) · det(M_ss)^(1/2s)          1/φ = ½ q(M)/q* + ½ q(M_ss)/q_s*
 
-with q(M) = tr(C M⁻¹), the first s of P parameters those of the model, and q* and q_s* the least
+with q(M) = tr(C M⁻¹), the first s of P parameters those of the model, and q* and q_s* the minima
 of both. Source: Atkinson, Donev and Tobias, *Optimum Experimental Designs, with SAS* (2007),
 chapter 21.
 """
@@ -28,30 +28,30 @@ from hilcal.errors import CannotAnswerError, InputError
 from hilcal.types import Bools, Floats, Ints
 
 CRITERIA = ("D", "A", "E", "K", "I", "separate")
-LOOSE = 1e-2  # relative gap of the bound of a plan, and of the comparison of loads; a choice
+LOOSE = 1e-2  # relative duality gap, for a plan's bound and for comparing loads; a choice
 EFFORT = 200  # of the exchange search: 98 % of the bound of the demo's plan in a second
-SAMPLE = 75  # Poses by which sets of loads are compared. A choice.
+SAMPLE = 75  # poses at which sets of loads are compared; a choice
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Objective:
     """A design problem with its criterion.
 
-    D and A are of all parameters, the potential terms with their priors among them (nuisance
-    parameters in A), I of predictions with all effects (`mixed_design`), E and K of the model's
-    parameters without a prior.
+    D and A judge all parameters, including the potential terms with their priors (nuisance
+    parameters in A); I judges predictions with all effects (`mixed_design`); E and K judge the
+    model's parameters without a prior.
     """
 
     criterion: Criterion  # φ
-    units: CandidateSet  # the units by the parameters that φ is of
-    prior: Floats  # (P, P) prior information of these
-    names: tuple[str, ...]  # of the parameters; none where they are combinations
-    apart: DiscriminatedPairs | None = None  # the pairs of "separate"; None of others
+    units: CandidateSet  # the units, their columns by the parameters of φ
+    prior: Floats  # (P, P) prior information
+    names: tuple[str, ...]  # of the parameters; empty where they are combinations
+    apart: DiscriminatedPairs | None = None  # the pairs of "separate", else None
 
     def relaxed(
         self, budget: float, tolerance: float = LOOSE, start: ApproximateDesign | None = None
     ) -> ApproximateDesign:
-        """Return the continuous optimum of so many readings; see `approximate_design.relax`."""
+        """Return the continuous optimum of a budget of readings; see `approximate_design.relax`."""
         return relax(
             self.units, self.criterion, budget, self.prior, names=self.names,
             tolerance=tolerance, start=start,
@@ -59,7 +59,7 @@ class Objective:
 
 
 def canonical(name: str) -> str:
-    """Return the name of a criterion: I-optimality was called "test" before."""
+    """Return the name of a criterion; "test" is an old name of I."""
     return "I" if name == "test" else name
 
 
@@ -69,11 +69,11 @@ def objective_of(
     """Return a design problem with a criterion by its name; "I" needs prediction poses."""
     name = canonical(name)
     names = tuple(t.name for t in problem.terms)
-    whole = Objective(D(), problem.units, problem.prior, names)
+    of_all = Objective(D(), problem.units, problem.prior, names)
     if name == "D":
-        return whole
+        return of_all
     if name == "A":
-        return replace(whole, criterion=MeanVariance(problem.mean_variance, "A"))
+        return replace(of_all, criterion=MeanVariance(problem.mean_variance, "A"))
     if name == "I":
         if work is None:
             raise InputError('criterion "I" needs prediction poses; see [planning] work_q_rad')
@@ -84,157 +84,163 @@ def objective_of(
         units, pairs, prior = condensed(problem.units, apart.pairs, apart.prior)
         return Objective(Separate(pairs), units, prior, (), apart)
     if name == "E":
-        return replace(whole, criterion=E(unknown(problem)))
-    if name == "K":  # of the model alone: more information, also of the others, may make it worse
+        return replace(of_all, criterion=E(unknown(problem)))
+    if name == "K":  # of the model alone: information on other parameters may lower it
         free = unknown(problem)
-        own = CandidateSet(np.ascontiguousarray(problem.units.rows[:, :, free]), problem.units.cost)
-        known = problem.measured[np.ix_(free, free)]
-        return Objective(K(), own, known, tuple(names[k] for k in free))
+        rows, prior = problem.units.rows[:, :, free], problem.measured[np.ix_(free, free)]
+        units = CandidateSet(np.ascontiguousarray(rows), problem.units.cost)
+        return Objective(K(), units, prior, tuple(names[k] for k in free))
     raise InputError(f"criterion {name!r}; valid: {', '.join(CRITERIA)}")
 
 
 def unknown(problem: DesignProblem) -> Ints:
     """Return the indices of the model's parameters that have no prior."""
-    live = problem.nominal.live
-    return np.flatnonzero(np.isinf(problem.nominal.prior_std[live]))
+    return np.flatnonzero(np.isinf(problem.nominal.prior_std[problem.nominal.live]))
 
 
 def choose(
-    asked: Objective, budget: float, rng: np.random.Generator, effort: int = EFFORT,
+    objective: Objective, budget: float, rng: np.random.Generator, effort: int = EFFORT,
     relaxed: ApproximateDesign | None = None,
 ) -> Design:  # fmt: skip
     """Return the exact design; see `optimum.best`."""
     return best(
-        asked.units, asked.criterion, budget, asked.prior, rng, names=asked.names, effort=effort,
-        relaxed=relaxed,
+        objective.units, objective.criterion, budget, objective.prior, rng,
+        names=objective.names, effort=effort, relaxed=relaxed,
     )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseUnits:
-    """Candidate poses as units, each with all readings that it bears."""
+    """Candidate poses as units, each with all its readings."""
 
     units: CandidateSet  # of the poses
-    poses: Ints  # (N,) their numbers
-    members: tuple[Ints, ...]  # of each, the units of the problem
+    poses: Ints  # (N,) numbers of the poses
+    members: tuple[Ints, ...]  # per pose, indices of the problem's units
 
 
-def pose_units(asked: Objective, problem: DesignProblem) -> PoseUnits:
+def pose_units(objective: Objective, problem: DesignProblem) -> PoseUnits:
     """Return the poses of a design problem as units of cost 1."""
-    of: dict[int, list[int]] = {}
+    by_pose: dict[int, list[int]] = {}
     for k, (pose, loads) in enumerate(problem.what):
-        mine = of.setdefault(pose, [])
-        if problem.mode == "deflection" and mine:  # a unit with all loads holds the others
-            if len(loads) <= len(problem.what[mine[0]][1]):
+        members = by_pose.setdefault(pose, [])
+        if problem.mode == "deflection" and members:  # the unit with all loads includes the others
+            if len(loads) <= len(problem.what[members[0]][1]):
                 continue
-            mine.clear()
-        mine.append(k)
-    _, height, size = asked.units.rows.shape
-    rows = np.zeros((len(of), max(map(len, of.values())) * height, size))
-    for out, mine in zip(rows, of.values(), strict=True):
-        stacked = asked.units.rows[mine].reshape(-1, size)
+            members.clear()
+        members.append(k)
+    _, height, size = objective.units.rows.shape
+    rows = np.zeros((len(by_pose), max(map(len, by_pose.values())) * height, size))
+    for out, members in zip(rows, by_pose.values(), strict=True):
+        stacked = objective.units.rows[members].reshape(-1, size)
         out[: len(stacked)] = stacked
-    members = tuple(np.array(mine) for mine in of.values())
-    return PoseUnits(CandidateSet(rows, np.ones(len(of))), np.array(list(of)), members)
+    units = CandidateSet(rows, np.ones(len(by_pose)))
+    return PoseUnits(units, np.array(list(by_pose)), tuple(map(np.array, by_pose.values())))
 
 
 def choose_poses(
-    asked: Objective,
-    of: PoseUnits,
-    usable: Bools,  # (N,) which poses there are to choose from
+    objective: Objective,
+    candidates: PoseUnits,
+    usable: Bools,  # (N,) poses to choose from
     poses: int,
     rng: np.random.Generator,
     effort: int = EFFORT,
-    start: ApproximateDesign | None = None,  # the optimum over poses (N,) at an earlier choice
+    start: ApproximateDesign | None = None,  # optimum over poses (N,) of the previous choice
 ) -> tuple[Ints, ApproximateDesign]:
-    """Return how often each unit (K,) is taken, and the optimum over poses (N,).
+    """Return the count of each unit (K,), and the optimum over poses (N,).
 
-    So many poses are each read once under all that they bear; where the cell leaves fewer, some are
-    read again.
+    Each of `poses` poses is read once under all its loads; where fewer are usable, some are read
+    again.
     """
-    units = CandidateSet(of.units.rows[usable], of.units.cost[usable])
-    found = best(
-        units, asked.criterion, float(poses), asked.prior, rng,
-        most=-(-poses // max(len(units), 1)), names=asked.names, effort=effort,
+    units = CandidateSet(candidates.units.rows[usable], candidates.units.cost[usable])
+    design = best(
+        units, objective.criterion, float(poses), objective.prior, rng,
+        most=-(-poses // max(len(units), 1)), names=objective.names, effort=effort,
         relaxed=None if start is None else start.among(usable),
     )  # fmt: skip
-    counts = np.zeros(len(asked.units), dtype=np.int64)
+    counts = np.zeros(len(objective.units), dtype=np.int64)
     index = np.flatnonzero(usable)
-    for k, count in zip(index, found.counts.tolist(), strict=True):
-        counts[of.members[k]] = count
+    for k, count in zip(index, design.counts.tolist(), strict=True):
+        counts[candidates.members[k]] = count
     price = np.zeros(len(usable))
-    price[usable] = found.relaxed.price
-    return counts, replace(found.relaxed, index=index[found.relaxed.index], price=price)
+    price[usable] = design.relaxed.price
+    return counts, replace(design.relaxed, index=index[design.relaxed.index], price=price)
 
 
 def certified(
-    asked: Objective, counts: Ints, usable: Bools, start: ApproximateDesign | None = None
+    objective: Objective, counts: Ints, usable: Bools, start: ApproximateDesign | None = None
 ) -> Design:
-    """Return the design of (K,) counts among usable units, with a bound of as many readings.
+    """Return the design of (K,) counts among usable units, with the bound for its cost.
 
-    The bound holds for any number of poses, under any loads.
+    The bound holds for any number of poses and any loads.
     """
-    free, taken = only(asked, usable), counts[usable]
-    cost = float(taken @ free.units.cost)
-    information = asked.prior + free.units.information(taken.astype(float))
-    value = float(asked.criterion.value(information))
-    relaxed = free.relaxed(cost, start=None if start is None else start.among(usable))
-    return Design(taken, value, max(relaxed.bound, value), information, cost, relaxed)
+    among, chosen = only(objective, usable), counts[usable]
+    cost = float(chosen @ among.units.cost)
+    information = objective.prior + among.units.information(chosen.astype(float))
+    value = float(objective.criterion.value(information))
+    relaxed = among.relaxed(cost, start=None if start is None else start.among(usable))
+    return Design(chosen, value, max(relaxed.bound, value), information, cost, relaxed)
 
 
-def promising(asked: Objective, budget: float) -> tuple[Ints, ApproximateDesign]:
-    """Return the units that a plan is likely to be made of, those of the best prices, and why."""
-    tolerance = min(KINKED_TOLERANCE, LOOSE) if asked.criterion.kinked else LOOSE
-    found = asked.relaxed(budget, tolerance)
-    count = min(2 * len(found.index), len(asked.units))
-    best_first = np.argsort(-found.price / asked.units.cost, kind="stable")
-    return np.union1d(found.index, best_first[:count]), found
+def promising(objective: Objective, budget: float) -> tuple[Ints, ApproximateDesign]:
+    """Return the units of the best prices, of which a plan is likely made, and the optimum."""
+    tolerance = min(KINKED_TOLERANCE, LOOSE) if objective.criterion.kinked else LOOSE
+    relaxed = objective.relaxed(budget, tolerance)
+    count = min(2 * len(relaxed.index), len(objective.units))
+    best_first = np.argsort(-relaxed.price / objective.units.cost, kind="stable")
+    return np.union1d(relaxed.index, best_first[:count]), relaxed
 
 
 def costly_loads(
-    asked: Objective, problem: DesignProblem, budget: float, change: float, rng: np.random.Generator
-) -> tuple[tuple[str, float], ...]:
-    """Return loads without which the same time buys more, with the gain as a share of φ.
+    objective: Objective, problem: DesignProblem, budget: float, change: float,
+    rng: np.random.Generator,
+) -> tuple[tuple[str, float], ...]:  # fmt: skip
+    """Return the loads whose omission raises φ at the same time spent, with the relative gain.
 
-    Hanging a load costs as much time as `change` readings; a plan without it takes these instead.
-    Compared are the continuous optima over some of the poses, one load after the other.
+    Hanging a load costs as much time as `change` readings; a plan without the load takes these
+    readings instead. The continuous optima over a sample of the poses are compared, one load after
+    the other.
     """
     poses = np.array([pose for pose, _ in problem.what])
-    few = rng.permutation(len(problem.candidates))[:SAMPLE]
-    sample = np.isin(poses, few)
+    sample = np.isin(poses, rng.permutation(len(problem.candidates))[:SAMPLE])
     used = {name for _, names in problem.what for name in names}
-    keep = tuple(name for name in problem.candidates.loads[1:] if name in used)
+    loads = tuple(name for name in problem.candidates.loads[1:] if name in used)
     costly: list[tuple[str, float]] = []
-    if len(keep) < 2 or change <= 0:
+    if len(loads) < 2 or change <= 0:
         return ()
-    now = _value(asked, problem, sample, keep, budget)
-    while len(keep) > 1 and now > 0:
-        tried = [
-            (_value(asked, problem, sample, tuple(k for k in keep if k != name), budget + change),
-             name)
-            for name in keep
-        ]  # fmt: skip
-        value, name = max(tried)
-        if not value > now * (1.0 + LOOSE):
+    current = _value(objective, problem, sample, loads, budget)
+    while len(loads) > 1 and current > 0:
+        trials = [
+            (_value(objective, problem, sample, _without(loads, name), budget + change), name)
+            for name in loads
+        ]
+        value, name = max(trials)
+        if not value > current * (1.0 + LOOSE):
             break
-        costly.append((name, value / now - 1.0))
-        keep, now, budget = tuple(k for k in keep if k != name), value, budget + change
+        costly.append((name, value / current - 1.0))
+        loads, current, budget = _without(loads, name), value, budget + change
     return tuple(costly)
 
 
-def only(asked: Objective, wanted: Bools) -> Objective:
-    """Return the question with some of the units."""
-    return replace(asked, units=CandidateSet(asked.units.rows[wanted], asked.units.cost[wanted]))
+def _without(loads: tuple[str, ...], name: str) -> tuple[str, ...]:
+    return tuple(load for load in loads if load != name)
+
+
+def only(objective: Objective, subset: Bools) -> Objective:
+    """Return the objective with a subset of the units."""
+    units = objective.units
+    return replace(objective, units=CandidateSet(units.rows[subset], units.cost[subset]))
 
 
 def _value(
-    asked: Objective, problem: DesignProblem, sample: Bools, loads: tuple[str, ...], budget: float
-) -> float:
-    """φ of the continuous optimum; 0 where these loads do not determine everything."""
+    objective: Objective, problem: DesignProblem, sample: Bools, loads: tuple[str, ...],
+    budget: float,
+) -> float:  # fmt: skip
+    """Return φ of the continuous optimum; 0 where the loads do not determine all parameters."""
     allowed = {*loads, problem.candidates.loads[0]}
-    some = only(asked, sample & np.array([set(names) <= allowed for _, names in problem.what]))
+    possible = np.array([set(names) <= allowed for _, names in problem.what])
+    sampled = only(objective, sample & possible)
     try:
-        return some.relaxed(budget).value
+        return sampled.relaxed(budget).value
     except (CannotAnswerError, InputError):
         return 0.0
 
@@ -244,21 +250,23 @@ def compound_objective(
     config: CellConfig,
     name: str,
     work: PredictionPoses | None,  # the prediction poses, for "I"
-    budget: float,  # readings, for which the two optima of A are found
-    rng: np.random.Generator,  # generator; they are found among some of the poses
+    budget: float,  # readings of the two optima of A
+    rng: np.random.Generator,  # draws the poses of these optima
 ) -> Objective:
     """Return a design problem with a criterion; D and A are compound with potential terms."""
     name = canonical(name)
-    asked, size = objective_of(problem, config, name, work), problem.model_size
+    objective, size = objective_of(problem, config, name, work), problem.model_size
     if size == len(problem.terms) or name not in ("A", "D"):
-        return asked
+        return objective
     if name == "D":
-        return replace(asked, criterion=D(size))
+        return replace(objective, criterion=D(size))
     c = problem.mean_variance
-    whole, own = MeanVariance(c, name), MeanVariance(c[:size, :size], name)
+    of_all, of_model = MeanVariance(c, name), MeanVariance(c[:size, :size], name)
     poses = np.array([pose for pose, _ in problem.what])
-    some = only(asked, np.isin(poses, rng.permutation(len(problem.candidates))[:SAMPLE]))
-    units = CandidateSet(some.units.rows[:, :, :size], some.units.cost)
-    alone = Objective(own, units, asked.prior[:size, :size], asked.names[:size])
-    a, b = (q.relaxed(budget).value / 2.0 for q in (replace(some, criterion=whole), alone))
-    return replace(asked, criterion=MeanVariance(a * c, name, b * c[:size, :size]))
+    sampled = only(objective, np.isin(poses, rng.permutation(len(problem.candidates))[:SAMPLE]))
+    units = CandidateSet(sampled.units.rows[:, :, :size], sampled.units.cost)
+    model_alone = Objective(of_model, units, objective.prior[:size, :size], objective.names[:size])
+    total, alone = (
+        q.relaxed(budget).value / 2.0 for q in (replace(sampled, criterion=of_all), model_alone)
+    )
+    return replace(objective, criterion=MeanVariance(total * c, name, alone * c[:size, :size]))

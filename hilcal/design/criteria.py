@@ -1,4 +1,4 @@
-"""Smooth criteria of a plan: determinants of information matrices, and mean variances."""
+"""Criteria of a plan: determinant, mean variance, eigenvalues, and separation of effects."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
@@ -48,11 +48,11 @@ class D(SmoothCriterion):
     Research 10(6). With a model that may be complete, φ(M) = det(M)^(1/2P) · det(M_ss)^(1/2s).
     """
 
-    model: int | None = None  # s of a model that comes first; None where all are unknown
+    model: int | None = None  # s, the first parameters; None: one determinant
     name = "D"
 
     def blocks(self, size: int) -> tuple[tuple[float, Ints], ...]:
-        """Return exponents and indices of the determinants, for M of this size."""
+        """Return exponents and indices of the determinants, for P = `size`."""
         if self.model is None:
             return ((1.0 / size, np.arange(size)),)
         return (0.5 / size, np.arange(size)), (0.5 / self.model, np.arange(self.model))
@@ -61,24 +61,24 @@ class D(SmoothCriterion):
         """Return φ of (..., P, P) matrices."""
         flat = m.reshape(-1, *m.shape[-2:])
         log, good = np.zeros(len(flat)), np.ones(len(flat), dtype=np.bool_)
-        for c, at in self.blocks(m.shape[-1]):
-            factor, regular = factors(flat[:, at[:, None], at])
+        for c, index in self.blocks(m.shape[-1]):
+            factor, regular = factors(flat[:, index[:, None], index])
             log += 2.0 * c * np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
             good &= regular
-        found = np.where(good, np.exp(np.where(good, log, 0.0)), 0.0)
-        return np.asarray(found.reshape(m.shape[:-2]))
+        phi = np.where(good, np.exp(np.where(good, log, 0.0)), 0.0)
+        return np.asarray(phi.reshape(m.shape[:-2]))
 
     def __call__(self, m: Floats) -> Smooth | None:
         """Return f = log φ with gradient Σ c M_bb⁻¹."""
         value, gradient = 0.0, np.zeros_like(m)
         products: list[tuple[float, Floats, Floats]] = []
-        for c, at in self.blocks(len(m)):
-            found = inverse_factor(m[np.ix_(at, at)])
-            if found is None:
+        for c, index in self.blocks(len(m)):
+            inverted = inverse_factor(m[np.ix_(index, index)])
+            if inverted is None:
                 return None
-            root = np.zeros((len(m), len(at)))
-            root[at] = found[0]
-            value += c * found[1]
+            root = np.zeros((len(m), len(index)))
+            root[index] = inverted[0]
+            value += c * inverted[1]
             gradient += c * root @ root.T
             products.append((-c, root, root))
         return Smooth(value, gradient, tuple(products), (), float(np.exp(value)) * gradient)
@@ -89,14 +89,14 @@ class MeanVariance(SmoothCriterion):
     """φ(M) = 1 / tr(C M⁻¹), the inverse of a mean variance: A- and I-optimality.
 
     With C = 1/s at s parameters it is O5 of Sun & Hollerbach (2008), IEEE ICRA; with C the mean of
-    VᵀV over prediction poses, V the Jacobian of the position, the predicted variance there:
+    VᵀV over prediction poses, V the Jacobian of the position, the mean predicted variance:
     Atkinson, Donev and Tobias, *Optimum Experimental Designs, with SAS* (2007), chapter 10. With a
     model that may be complete, φ(M) = 1 / (tr(C M⁻¹) + tr(C_s M_ss⁻¹)).
     """
 
     c: Floats  # (P, P) C, positive semidefinite
-    name: str = "I"  # name by which a configuration calls it
-    model: Floats | None = None  # (s, s) C_s of a model that comes first; None for none
+    name: str = "I"
+    model: Floats | None = None  # (s, s) C_s of the first parameters; None: no second term
 
     @cached_property
     def roots(self) -> tuple[Floats, ...]:
@@ -104,8 +104,8 @@ class MeanVariance(SmoothCriterion):
         out = []
         for c in (self.c,) if self.model is None else (self.c, self.model):
             values, vectors = np.linalg.eigh(c)
-            kept = values > 1e-15 * values[-1]
-            out.append(vectors[:, kept] * np.sqrt(values[kept]))
+            positive = values > 1e-15 * values[-1]
+            out.append(vectors[:, positive] * np.sqrt(values[positive]))
         return tuple(out)
 
     def value(self, m: Floats) -> Floats:
@@ -125,18 +125,18 @@ class MeanVariance(SmoothCriterion):
         q = 0.0
         for c in self.roots:
             b = len(c)
-            found = inverse_factor(m[:b, :b])
-            if found is None:
+            inverted = inverse_factor(m[:b, :b])
+            if inverted is None:
                 return None
-            half = found[0].T @ c
+            half = inverted[0].T @ c
             q += float(np.sum(half**2))
             unused = ((0, len(m) - b), (0, 0))
-            pairs.append((np.pad(found[0] @ half, unused), np.pad(found[0], unused)))
+            pairs.append((np.pad(inverted[0] @ half, unused), np.pad(inverted[0], unused)))
         if not q > 0.0:
             return None
         v = np.hstack([inner for inner, _ in pairs])
         gradient = v @ v.T / q
-        products = tuple((-2.0 / q, inner, inverted) for inner, inverted in pairs)
+        products = tuple((-2.0 / q, inner, root) for inner, root in pairs)
         squares = ((np.full((v.shape[1],) * 2, q**-2), v),)
         return Smooth(-float(np.log(q)), gradient, products, squares, gradient / q)
 
@@ -146,7 +146,7 @@ _FLOOR = 1e-14
 
 @dataclass(frozen=True, slots=True, eq=False)
 class E(Criterion):
-    """φ(M) = λ_min(S): the worst determined direction of the parameters of interest.
+    """φ(M) = λ_min(S): the worst-determined direction of the parameters of interest.
 
     O3 of Nahvi & Hollerbach (1996), IEEE ICRA; S is the Schur complement of the other parameters.
     The surrogate is the barrier of the semidefinite program max t, S ⪰ t 1: F = max over t of t + μ
@@ -171,9 +171,9 @@ class E(Criterion):
             values, vectors = np.linalg.eigh(s.matrix)
             part = _smooth_least(values, s.lift @ vectors, order * scale)
             if s.inverse is not None and self.interest is not None:
-                others = np.setdiff1d(np.arange(len(m)), self.interest)
-                root = np.zeros((len(m), len(others)))
-                root[others] = inverse_root(m[np.ix_(others, others)]).T
+                nuisance = np.setdiff1d(np.arange(len(m)), self.interest)
+                root = np.zeros((len(m), len(nuisance)))
+                root[nuisance] = inverse_root(m[np.ix_(nuisance, nuisance)]).T
                 lifted = (-2.0, part.products[0][1], root)
                 part = replace(part, products=(*part.products, lifted))
             return part.scaled(1.0 / scale)
@@ -186,8 +186,8 @@ class K(Criterion):
     """φ(M) = λ_min(M) / λ_max(M), the inverse of the condition number.
 
     The square of O2 of Driels & Pathre (1990), J. Robotic Systems 7(2). Quasi-concave: the
-    surrogate is F_min − κ F_max with the ratio κ reached so far (Dinkelbach 1967), and with
-    the densities Z and Y of the extreme eigenvalues φ(N) ≤ tr(Z N) / tr(Y N).
+    surrogate is F_min − κ F_max with the current ratio κ (Dinkelbach 1967). With
+    the densities Z and Y of the extreme eigenvalues, φ(N) ≤ tr(Z N) / tr(Y N).
     """
 
     name = "K"
@@ -221,7 +221,7 @@ class K(Criterion):
 
 
 def _smooth_least(values: Floats, vectors: Floats, width: float) -> Smooth:
-    """Return the smooth least of eigenvalues (I,); their vectors (P, I) as M moves them.
+    """Return the smooth least of eigenvalues (I,), with vectors (P, I) lifted to the space of M.
 
     With S = M − t 1, μ the width, the second derivative is
 
@@ -234,22 +234,22 @@ def _smooth_least(values: Floats, vectors: Floats, width: float) -> Smooth:
     return Smooth(value, gradient, ((-1.0 / width, root, root),), (squares,), gradient)
 
 
-_FELT = 1e-5  # weight from which a pair enters the curvature
+_WEIGHTY = 1e-5  # weight above which a pair enters the curvature
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pair:
-    """An effect that is there, and the parameters that are fitted in its place."""
+    """A present effect, and the parameters that are fitted in its place."""
 
     effect: Ints  # (E,) indices of the effect's parameters
     beta: Floats  # (E,) their values
     nuisance: Ints  # (F,) indices of the parameters of the model and of the rival effect
-    name: str = "an effect from its rival"  # for messages where no candidate separates the two
+    name: str = "an effect from its rival"  # for messages
 
     def residual(self, m: Floats) -> Floats:
-        """Return the parameters u (P,) of the residual after model and rival are fitted at M.
+        """Return the parameters u (P,) of the residual of fitting model and rival, at M.
 
-        u has β at the effect and −M_nn⁻ M_ne β at the nuisance: uᵀ M u = βᵀ S β, S the Schur
+        u is β at the effect and −M_nn⁻ M_ne β at the nuisance: uᵀ M u = βᵀ S β, S the Schur
         complement.
         """
         u = np.zeros(len(m))
@@ -261,21 +261,21 @@ class Pair:
 class Separate(Criterion):
     """φ(M) = the least over pairs of uᵀ M u: the weakest non-centrality.
 
-    What an effect of the size β adds to the sum of squares beyond what the model and its rival can
-    explain. Atkinson & Fedorov (1975), Biometrika 62(1), T-optimality, for linear rivals.
+    The non-centrality is the sum of squares of an effect of size β that the model and the rival do
+    not explain. Atkinson & Fedorov (1975), Biometrika 62(1), T-optimality, for linear rivals.
     """
 
-    pairs: tuple[Pair, ...]  # what is to be separated, one or more
+    pairs: tuple[Pair, ...]  # to be separated, one or more
     name = "separate"
 
     @cached_property
     def _common(self) -> Ints:
-        """The nuisance of all pairs: the model."""
+        """The nuisance parameters common to all pairs: the model."""
         return reduce(np.intersect1d, (pair.nuisance for pair in self.pairs))
 
     @cached_property
     def _groups(self) -> tuple[tuple[Ints, Ints], ...]:
-        """The rest of their nuisance, the rival, and which pairs have it."""
+        """Per rival: its parameters, the remaining nuisance, and the indices of its pairs."""
         out: dict[bytes, tuple[Ints, list[int]]] = {}
         for k, pair in enumerate(self.pairs):
             rival = np.setdiff1d(pair.nuisance, self._common)
@@ -284,7 +284,7 @@ class Separate(Criterion):
 
     @cached_property
     def _betas(self) -> Floats:
-        """(N, P) parameters of the effect of each pair, zero elsewhere."""
+        """(N, P) β of each pair's effect, zero elsewhere."""
         out = np.zeros((len(self.pairs), 1 + max(int(p.effect.max()) for p in self.pairs)))
         for row, pair in zip(out, self.pairs, strict=True):
             row[pair.effect] = pair.beta
@@ -293,45 +293,46 @@ class Separate(Criterion):
     def parts(self, m: Floats) -> Floats:
         """Return (..., N) the non-centrality of each pair, of (..., P, P) matrices.
 
-        βᵀ S_ee β − |T S_fe β|² with S what is left beyond the model, S_ff⁻ = Tᵀ T of the rival.
+        βᵀ S_ee β − |T S_fe β|² with S the Schur complement of the model, S_ff⁻ = Tᵀ T of the rival.
         """
         flat = m.reshape(-1, *m.shape[-2:])
         out = np.empty((len(flat), len(self.pairs)))
         betas = np.zeros((len(self.pairs), m.shape[-1]))
         betas[:, : self._betas.shape[1]] = self._betas
-        rest = np.setdiff1d(np.arange(m.shape[-1]), self._common)
-        known = flat[:, rest[:, None], rest]
-        left = known - _explained(flat, self._common, rest)
+        outside = np.setdiff1d(np.arange(m.shape[-1]), self._common)
+        block = flat[:, outside[:, None], outside]
+        schur = block - _explained(flat, self._common, outside)
         for rival, which in self._groups:
-            beta, own = betas[which][:, rest].T, np.searchsorted(rest, rival)
-            moved = left @ beta
-            explained = _rival_root(left, known, own) @ moved[:, own]
+            beta, of_rival = betas[which][:, outside].T, np.searchsorted(outside, rival)
+            moved = schur @ beta
+            explained = _rival_root(schur, block, of_rival) @ moved[:, of_rival]
             out[:, which] = np.einsum("pj,npj->nj", beta, moved)
             out[:, which] -= np.einsum("nfj,nfj->nj", explained, explained)
         return np.maximum(out, 0.0).reshape(*m.shape[:-2], len(self.pairs))
 
     def _solved(self, m: Floats) -> tuple[Floats, Floats, list[tuple[Ints, Floats]]]:
-        """Return the residuals (N, P) of the pairs, and roots of the inverse of their nuisance.
+        """Return the residuals u (N, P) of the pairs, and roots of their M_nn⁻.
 
-        M_nn⁻ is that of the model, and by rival L S_ff⁻ Lᵀ more with L = (−M_mm⁻ M_mf, 1).
+        M_nn⁻ = M_mm⁻ of the model + L S_ff⁻ Lᵀ of the rival, with L = (−M_mm⁻ M_mf, 1). The root of
+        the first term is common; the second comes with the indices of the rival's pairs.
         """
         size, model = len(m), self._common
-        own = np.zeros((size, len(model)))
-        own[model] = inverse_root(m[np.ix_(model, model)]).T
+        model_root = np.zeros((size, len(model)))
+        model_root[model] = inverse_root(m[np.ix_(model, model)]).T
         us = np.zeros((len(self.pairs), size))
         us[:, : self._betas.shape[1]] = self._betas
-        us -= (us @ m @ own) @ own.T
+        us -= (us @ m @ model_root) @ model_root.T
         added = []
         for rival, which in self._groups:
             if not len(rival):
                 continue
             lift = np.eye(size)[:, rival]
-            lift -= own @ (own.T @ m[:, rival])
-            left, known = m[rival] @ lift, m[np.ix_(rival, rival)]
-            root = lift @ _rival_root(left[None], known[None], np.arange(len(rival)))[0].T
+            lift -= model_root @ (model_root.T @ m[:, rival])
+            schur, block = m[rival] @ lift, m[np.ix_(rival, rival)]
+            root = lift @ _rival_root(schur[None], block[None], np.arange(len(rival)))[0].T
             us[which] -= (us[which] @ m @ root) @ root.T
             added.append((which, root))
-        return us, own, added
+        return us, model_root, added
 
     def value(self, m: Floats) -> Floats:
         """Return φ of (..., P, P) matrices."""
@@ -344,41 +345,41 @@ class Separate(Criterion):
         return lambda m: self._smooth(m, order * scale, scale)
 
     def _smooth(self, m: Floats, width: float, scale: float) -> Smooth | None:
-        """Return the smooth least of the pairs, its derivative Σ p u uᵀ."""
-        us, own, added = self._solved(m)
+        """Return the smooth least of the pairs, with derivative Σ p u uᵀ."""
+        us, model_root, added = self._solved(m)
         parts = np.einsum("ni,ij,nj->n", us, m, us)
         if not np.isfinite(parts).all() or width <= 0.0:
             return None
         value, p = soft_least(parts, width)
         gradient = (us.T * p) @ us
         # F'' = Σ p s'' − Σ p²/μ (s' − mean)(s' − mean)ᵀ, the mean weighted by p²
-        felt = p > _FELT
-        about = np.eye(int(felt.sum())) - p[felt] ** 2 / float(p[felt] @ p[felt])
-        curved = -(about.T * p[felt] ** 2) @ about / (width * scale)
-        weighted = us.T * np.sqrt(np.where(felt, p, 0.0))
-        products = [(-2.0 / scale, weighted[:, felt], own)]
+        weighty = p > _WEIGHTY
+        about = np.eye(int(weighty.sum())) - p[weighty] ** 2 / float(p[weighty] @ p[weighty])
+        curved = -(about.T * p[weighty] ** 2) @ about / (width * scale)
+        weighted = us.T * np.sqrt(np.where(weighty, p, 0.0))
+        products = [(-2.0 / scale, weighted[:, weighty], model_root)]
         products += [
-            (-2.0 / scale, weighted[:, which[felt[which]]], root)
+            (-2.0 / scale, weighted[:, which[weighty[which]]], root)
             for which, root in added
-            if felt[which].any()
+            if weighty[which].any()
         ]
-        squares = ((curved, us[felt].T),)
+        squares = ((curved, us[weighty].T),)
         return Smooth(value / scale, gradient / scale, tuple(products), squares, gradient)
 
     def relevant(self, units: CandidateSet, prior: Floats, budget: float) -> "Separate":
-        """Return φ without the pairs that what is known already separates well enough.
+        """Return φ without the pairs that the prior M0 already separates well enough.
 
-        No plan brings the weakest pair over the least of the bounds uᵀ M0 u + B max |A_k u|² / c_k
-        of single pairs, and no pair falls below its value at M0.
+        No plan raises the weakest pair above the least bound uᵀ M0 u + B max |A_k u|² / c_k of a
+        pair, and no pair falls below its value at M0.
         """
         spread = prior + units.information(np.full(len(units), budget / float(units.cost.sum())))
         us = self._solved(spread)[0]
-        seen = (units.rows.reshape(-1, units.size) @ us.T).reshape(len(units), -1, len(us))
-        gain = np.sum(seen**2, axis=1) / units.cost[:, None]
-        known = np.einsum("ni,ij,nj->n", us, prior, us)
-        most = float(np.min(known + budget * gain.max(axis=0)))
-        felt = self.parts(prior) <= most
-        return Separate(tuple(p for p, f in zip(self.pairs, felt, strict=True) if f))
+        effects = (units.rows.reshape(-1, units.size) @ us.T).reshape(len(units), -1, len(us))
+        gain = np.sum(effects**2, axis=1) / units.cost[:, None]
+        prior_parts = np.einsum("ni,ij,nj->n", us, prior, us)
+        most = float(np.min(prior_parts + budget * gain.max(axis=0)))
+        binding = self.parts(prior) <= most
+        return Separate(tuple(p for p, bind in zip(self.pairs, binding, strict=True) if bind))
 
     def require(self, m: Floats, names: Sequence[str] | None) -> None:
         """Refuse pairs that no candidate separates."""
@@ -392,19 +393,19 @@ class Separate(Criterion):
                 )
 
 
-def _explained(m: Floats, model: Ints, rest: Ints) -> Floats:
-    """Return (N, R, R) what the model explains of the rest of matrices M: M_rm M_mm⁻ M_mr."""
-    cross = m[:, model[:, None], rest]
-    # one by one: of large blocks that is faster than all at once
-    seen = np.stack(
+def _explained(m: Floats, model: Ints, block: Ints) -> Floats:
+    """Return (N, R, R) M_rm M_mm⁻ M_mr: the part of the block r that the model m explains."""
+    cross = m[:, model[:, None], block]
+    # one matrix at a time is faster for large blocks
+    half = np.stack(
         [inverse_root(b) @ c for b, c in zip(m[:, model[:, None], model], cross, strict=True)]
     )
-    return np.asarray(np.swapaxes(seen, -1, -2) @ seen)
+    return np.asarray(np.swapaxes(half, -1, -2) @ half)
 
 
-def _rival_root(left: Floats, m: Floats, rival: Ints) -> Floats:
-    """Return T (N, F, F) with Tᵀ T = S_ff⁻ of what the model leaves of matrices M."""
-    block = left[:, rival[:, None], rival].copy()
+def _rival_root(schur: Floats, m: Floats, rival: Ints) -> Floats:
+    """Return T (N, F, F) with Tᵀ T = S_ff⁻, from the Schur complements S of the model in M."""
+    block = schur[:, rival[:, None], rival].copy()
     lost = block[:, range(len(rival)), range(len(rival))] <= DETERMINED * m[:, rival, rival]
     block[lost[:, :, None] | lost[:, None, :]] = 0.0
     return inverse_root(block)
@@ -413,39 +414,37 @@ def _rival_root(left: Floats, m: Floats, rival: Ints) -> Floats:
 def condensed(
     units: CandidateSet, pairs: Sequence[Pair], prior: Floats
 ) -> tuple[CandidateSet, tuple[Pair, ...], Floats]:
-    """Return the same problem by fewer parameters, in which its information is well conditioned.
+    """Return the same problem in fewer parameters, in which the information is well conditioned.
 
-    The model, common to the nuisance of all pairs, is made orthogonal by the information of all
-    units together, and so is each suspect beyond the model. Directions that no unit determines are
-    dropped. Every non-centrality of every plan stays what it is.
+    The information of all units orthogonalises the model, which is common to the nuisance of all
+    pairs, and each suspect beyond the model. Directions that no unit determines are dropped. The
+    non-centralities of all plans are unchanged.
     """
-    model = pairs[0].nuisance
-    for pair in pairs:
-        model = np.intersect1d(model, pair.nuisance)
+    model = reduce(np.intersect1d, (pair.nuisance for pair in pairs))
     m = prior + units.information(np.full(len(units), 1.0 / float(units.cost.sum())))
     blocks = {model.tobytes(): model}
     for pair in pairs:
         for block in (pair.effect, np.setdiff1d(pair.nuisance, model)):
             blocks.setdefault(block.tobytes(), block)
     beyond = np.eye(len(m)) - nuisance_inverse(m, model) @ m
-    columns, back, place, at = [], {}, {}, 0
+    columns, to_scaled, indices, start = [], {}, {}, 0
     for key, block in blocks.items():
         lift = np.eye(len(m))[:, block] if block is model else beyond[:, block]
         scale = np.sqrt(np.maximum(np.diag(m)[block], np.finfo(float).tiny))
         values, vectors = np.linalg.eigh((lift.T @ m @ lift) / np.outer(scale, scale))
-        kept = values > DETERMINED
-        columns.append(lift @ (vectors[:, kept] / scale[:, None]))
-        back[key] = vectors[:, kept].T * scale
-        place[key] = np.arange(at, at + int(kept.sum()))
-        at += int(kept.sum())
+        determined = values > DETERMINED
+        columns.append(lift @ (vectors[:, determined] / scale[:, None]))
+        to_scaled[key] = vectors[:, determined].T * scale
+        indices[key] = np.arange(start, start + int(determined.sum()))
+        start += int(determined.sum())
     turn = np.hstack(columns)
 
     def turned(pair: Pair) -> Pair:
         effect = pair.effect.tobytes()
-        rival = place[np.setdiff1d(pair.nuisance, model).tobytes()]
-        nuisance = np.concatenate([place[model.tobytes()], rival])
-        return Pair(place[effect], back[effect] @ pair.beta, nuisance, pair.name)
+        rival = indices[np.setdiff1d(pair.nuisance, model).tobytes()]
+        nuisance = np.concatenate([indices[model.tobytes()], rival])
+        return Pair(indices[effect], to_scaled[effect] @ pair.beta, nuisance, pair.name)
 
     rows = np.ascontiguousarray(units.rows @ turn)
-    known = turn.T @ prior @ turn
-    return CandidateSet(rows, units.cost), tuple(map(turned, pairs)), 0.5 * (known + known.T)
+    prior = turn.T @ prior @ turn
+    return CandidateSet(rows, units.cost), tuple(map(turned, pairs)), 0.5 * (prior + prior.T)

@@ -1,4 +1,4 @@
-"""The protocol of a design criterion: concave in the information, with a smooth surrogate."""
+"""The protocol of a design criterion: a concave function of information, and its surrogate."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -15,9 +15,9 @@ _CHUNK = 2048
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CandidateSet:
-    """K units, each of which a plan may take any whole number of times n_k.
+    """K units; a plan takes unit k n_k times, an integer.
 
-    A unit is one reading, or one pose with its unloaded reading and some loads (deflections).
+    A unit is one reading, or the readings of one pose unloaded and under some loads (deflections).
 
         M = M0 + Σ n_k A_kᵀ A_k,    cost = Σ n_k c_k
     """
@@ -25,7 +25,7 @@ class CandidateSet:
     # (K, R, P) whitened Jacobians A_k by the parameters in ordinary magnitudes (pure numbers);
     # units with fewer rows are filled up with zeros
     rows: Floats
-    cost: Floats  # (K,) what taking the unit once costs, over 0: readings, or seconds
+    cost: Floats  # (K,) of taking the unit once, over 0: readings, or seconds
 
     def __len__(self) -> int:
         """Return the number of units K."""
@@ -37,7 +37,7 @@ class CandidateSet:
         return int(self.rows.shape[2])
 
     def information(self, weight: Floats, which: Ints | None = None) -> Floats:
-        """Return (P, P) Σ w_k A_kᵀ A_k of all units, or of those of some indices."""
+        """Return (P, P) Σ w_k A_kᵀ A_k of all units, or of those with the indices `which`."""
         rows, out = self.rows if which is None else self.rows[which], np.zeros((self.size,) * 2)
         for start in range(0, len(rows), _CHUNK):
             part = slice(start, start + _CHUNK)
@@ -63,12 +63,12 @@ class Smooth:
     above: Floats  # (P, P) Z such that φ(N) ≤ tr(Z N) for every information N ⪰ 0,
     below: Floats | None = None  # or with Y (P, P): φ(N) ≤ tr(Z N) / tr(Y N)
 
-    def scaled(self, by: float) -> "Smooth":
+    def scaled(self, factor: float) -> "Smooth":
         """Return a multiple of f, with the same bound."""
-        products = tuple((by * c, x, y) for c, x, y in self.products)
-        squares = tuple((by * c, v) for c, v in self.squares)
+        products = tuple((factor * c, x, y) for c, x, y in self.products)
+        squares = tuple((factor * c, v) for c, v in self.squares)
         return replace(
-            self, value=by * self.value, gradient=by * self.gradient, products=products,
+            self, value=factor * self.value, gradient=factor * self.gradient, products=products,
             squares=squares,
         )  # fmt: skip
 
@@ -80,7 +80,7 @@ class Criterion(ABC):
     ratio of eigenvalues (`K`) is quasi-concave and of degree 0.
     """
 
-    name: str  # by which a configuration calls it
+    name: str  # in a configuration
     monotone = True  # whether more information is never worse
     kinked = True  # whether φ has kinks, so that the surrogate depends on its order
 
@@ -93,16 +93,16 @@ class Criterion(ABC):
         """Return f near φ / φ(m), or log φ, and nearer as `order` tends to 0; None if undefined."""
 
     def relevant(self, units: CandidateSet, prior: Floats, budget: float) -> "Criterion":
-        """Return φ without what is decided: equal near the optimum of the plans of a budget."""
+        """Return a criterion without parts that cannot bind, equal to φ near the optimum."""
         return self
 
     def require(self, m: Floats, names: Sequence[str] | None) -> None:
-        """Refuse an M, the information of all candidates, that does not determine φ."""
+        """Refuse M, the information of all candidates, if it does not determine φ."""
         require_determined(m, names)
 
 
 def require_determined(m: Floats, names: Sequence[str] | None = None) -> None:
-    """Refuse a singular information matrix (P, P), and name what is not determined."""
+    """Refuse a singular information matrix (P, P), and name the undetermined parameters."""
     label = tuple(f"parameter {k + 1}" for k in range(len(m))) if names is None else names
     diagonal = np.diag(m)
     blind = np.flatnonzero(diagonal <= 0.0)
@@ -125,8 +125,8 @@ def require_determined(m: Floats, names: Sequence[str] | None = None) -> None:
 
 
 def _listed(names: Sequence[str]) -> str:
-    more = f" and {len(names) - 6} more" if len(names) > 6 else ""
-    return ", ".join(names[:6]) + more
+    suffix = f" and {len(names) - 6} more" if len(names) > 6 else ""
+    return ", ".join(names[:6]) + suffix
 
 
 def inverse_factor(m: Floats) -> tuple[Floats, float] | None:
@@ -144,27 +144,27 @@ def inverse_factor(m: Floats) -> tuple[Floats, float] | None:
 def factors(m: Floats) -> tuple[Floats, Bools]:
     """Return Cholesky factors of (N, P, P) matrices, and which (N,) of them are regular.
 
-    A pivot is what is left of a parameter's information when those before it are unknown; in place
-    of zero, rounding leaves about 1e-16 P of it.
+    A pivot is a parameter's information when all parameters before it are unknown; rounding turns a
+    zero pivot into about 1e-16 P of the diagonal element.
     """
     try:
         factor = np.linalg.cholesky(m)
     except np.linalg.LinAlgError:
         if len(m) == 1:
             return np.eye(m.shape[-1])[None], np.zeros(1, dtype=np.bool_)
-        parts = [factors(one[None]) for one in m]
+        parts = [factors(matrix[None]) for matrix in m]
         return np.concatenate([f for f, _ in parts]), np.concatenate([good for _, good in parts])
     pivots = np.diagonal(factor, axis1=1, axis2=2) ** 2
-    left = 0.1 * DETERMINED * np.diagonal(m, axis1=1, axis2=2)
-    good = np.all(pivots > left, axis=1) & np.isfinite(factor).all(axis=(1, 2))
+    floor = 0.1 * DETERMINED * np.diagonal(m, axis1=1, axis2=2)
+    good = np.all(pivots > floor, axis=1) & np.isfinite(factor).all(axis=(1, 2))
     return np.asarray(factor, dtype=np.float64), np.asarray(good, dtype=np.bool_)
 
 
 def soft_least(values: Floats, width: float) -> tuple[float, Floats]:
     """Return the smooth least F = max over t of t + μ Σ log((s_i − t) / μ) of numbers s, and p.
 
-    Its derivatives p_i = μ / (s_i − t) sum to 1, so that min s' ≤ Σ p_i s'_i for any other numbers
-    s'. Σ p_i s_i exceeds min s by at most (n − 1) μ.
+    Its derivatives p_i = μ / (s_i − t) sum to 1, so that min s' ≤ Σ p_i s'_i for any
+    numbers s'. Σ p_i s_i exceeds min s by at most (n − 1) μ.
     """
     least = float(values.min())
     gap = values - least
@@ -191,9 +191,9 @@ def prices(rows: Floats, matrix: Floats) -> Floats:
         root, minus = np.linalg.cholesky(matrix), None
     except np.linalg.LinAlgError:
         values, vectors = np.linalg.eigh(matrix)
-        kept = np.abs(values) > 1e-15 * float(np.abs(values).max(initial=0.0))
-        root = vectors[:, kept] * np.sqrt(np.abs(values[kept]))
-        minus = np.flatnonzero(values[kept] < 0.0)
+        nonzero = np.abs(values) > 1e-15 * float(np.abs(values).max(initial=0.0))
+        root = vectors[:, nonzero] * np.sqrt(np.abs(values[nonzero]))
+        minus = np.flatnonzero(values[nonzero] < 0.0)
     count, size = rows.shape[:2]
     out = np.empty(count)
     for start in range(0, count, _CHUNK):
@@ -211,41 +211,41 @@ def upper_bound(
     gains: Floats,  # (K,) tr(Z H_k)
     cost: Floats,  # (K,) c
     budget: float,  # B
-    most: float,  # how often a unit may be taken
+    most: float,  # largest count of a unit
     below: Floats | None = None,  # (K,) tr(Y H_k)
 ) -> float:
-    """Return what φ of no plan within the budget exceeds, whole or not.
+    """Return an upper bound of φ of all plans within the budget, with real counts too.
 
-    φ(M0 + Σ n_k H_k) ≤ tr(Z M0) + max of Σ n_k tr(Z H_k) over n ≥ 0, Σ n_k c_k ≤ B: the budget goes
-    to the best prices per cost. Kiefer & Wolfowitz (1960), Canadian J. Math. 12; Pukelsheim (1993),
-    Optimal Design of Experiments, ch. 7. Of a ratio tr(Z N)/tr(Y N) of eigenvalues, the largest
-    value over the same plans (Dinkelbach 1967), at most 1.
+    φ(M0 + Σ n_k H_k) ≤ tr(Z M0) + max of Σ n_k tr(Z H_k) over n ≥ 0, Σ n_k c_k ≤ B: the budget is
+    spent on the largest gains per cost. Kiefer & Wolfowitz (1960), Canadian J. Math. 12; Pukelsheim
+    (1993), Optimal Design of Experiments, ch. 7. For a ratio of eigenvalues, the largest
+    tr(Z N)/tr(Y N) over the same plans (Dinkelbach 1967), at most 1.
     """
-    known = float(np.sum(smooth.above * prior))
+    fixed = float(np.sum(smooth.above * prior))
     if below is None or smooth.below is None:
-        return known + float(gains @ spend(gains, cost, budget, most))
-    known_below = float(np.sum(smooth.below * prior))
-    if known_below <= 0.0:  # the best unit alone
+        return fixed + float(gains @ spend(gains, cost, budget, most))
+    fixed_below = float(np.sum(smooth.below * prior))
+    if fixed_below <= 0.0:  # the best unit alone
         return min(1.0, float(np.max(gains / np.maximum(below, np.finfo(float).tiny))))
-    ratio = known / known_below
+    ratio = fixed / fixed_below
     for _ in range(100):
         weight = spend(gains - ratio * below, cost, budget, most)
-        new = (known + float(gains @ weight)) / (known_below + float(below @ weight))
-        if new <= ratio * (1.0 + 1e-13):
+        raised = (fixed + float(gains @ weight)) / (fixed_below + float(below @ weight))
+        if raised <= ratio * (1.0 + 1e-13):
             break
-        ratio = new
+        ratio = raised
     return min(1.0, ratio)
 
 
 def spend(gains: Floats, cost: Floats, budget: float, most: float) -> Floats:
     """Return the weights (K,) of the fractional knapsack: best gain per cost first."""
     rate = gains / cost
-    # no more than so many of the best are reached by the budget
+    # the budget reaches at most so many of the best
     best = best_first(rate, int(np.ceil(budget / (most * float(cost.min())))) + 1)
-    before = np.concatenate([[0.0], np.cumsum(most * cost[best[:-1]])])
-    taken = np.clip((budget - before) / cost[best], 0.0, most)
+    spent = np.concatenate([[0.0], np.cumsum(most * cost[best[:-1]])])
+    amount = np.clip((budget - spent) / cost[best], 0.0, most)
     weight = np.zeros(len(gains))
-    weight[best] = np.where(rate[best] > 0.0, taken, 0.0)
+    weight[best] = np.where(rate[best] > 0.0, amount, 0.0)
     return weight
 
 

@@ -1,16 +1,16 @@
-"""Pairs of effects that a campaign is to discriminate, and the power of doing so.
+"""Pairs of effects that a campaign is to discriminate, and the power of the test.
 
-An effect e with the parameters β is there; the model and a rival f are fitted. The test of e beyond
-both follows a noncentral χ² of non-centrality
+An effect e with parameters β is present; the model and a rival f are fitted. The statistic of the
+test of e beyond both follows a noncentral χ² of non-centrality
 
     λ = βᵀ S β,   S = M_ee − M_en M_nn⁻ M_ne,   n: the model and f
 
-with as many degrees of freedom as S has visible directions (`regression.evidence`). S at the
-readings so far is the one that a diagnosis tests e with, with f in its model.
+whose degrees of freedom are the number of visible directions of S (`regression.evidence`). At the
+readings so far, S is that of a diagnosis that tests e with f in the model.
 
 β of an effect that the readings so far support is drawn from its posterior beside the fitted
-model, at the prior strength of most evidence: what adding the effect would estimate, to first
-order. Evidence, mean and scale are those that a diagnosis scores the effect with.
+model, at the prior strength of highest evidence: the estimate after adding the effect, to first
+order. A diagnosis scores the effect by the same evidence, mean and scale.
 """
 
 from collections.abc import Sequence
@@ -31,56 +31,57 @@ from hilcal.regression.schur import schur_complement
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Floats
 
-LEVEL = 0.01  # Chance of a false alarm of the test
+LEVEL = 0.01  # of the test
 DRAWS = 3
-MANY = 100  # Readings by which a pair counts as not separable ...
-LEAST_POWER = 0.2  # ... where the best plan of so many has less power than this. Guesses, both.
+# a pair is not separable if the best plan of MANY readings has a lower power; both are guesses
+MANY = 100
+LEAST_POWER = 0.2
 _LOOSE = 0.05
 _SEED = 20240609
-SUPPORTED = 3.0  # Log evidence from which the readings support an effect: odds of 20 : 1, e³
+SUPPORTED = 3.0  # log evidence above which readings support an effect: odds of e³, 20 : 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DiscriminatedPairs:
     """Pairs of effects to discriminate."""
 
-    pairs: tuple[Pair, ...]  # as the criterion takes them
-    names: tuple[tuple[str, str], ...]  # (effect that is there, rival that is fitted) of each pair
-    # (P, P) information before, without the priors of potential terms: neither must an effect be
-    # found by what was supposed of it, nor a rival be held small
+    pairs: tuple[Pair, ...]  # of the criterion
+    names: tuple[tuple[str, str], ...]  # (present effect, fitted rival) of each pair
+    # (P, P) prior information without that of potential terms, which would favour an assumed effect
+    # and shrink a rival
     prior: Floats
-    not_separable: tuple[tuple[str, str], ...] = ()  # names of pairs that are left out
+    not_separable: tuple[tuple[str, str], ...] = ()  # names of omitted pairs
 
 
 def discriminated_pairs(problem: DesignProblem) -> DiscriminatedPairs:
-    """Return the pairs of potential terms, both ways round, that some measurement separates.
+    """Return the ordered pairs of potential terms that some measurement separates.
 
-    None does where the best plan of `MANY` readings, with the prior information, has a power below
-    `LEAST_POWER` at the first parameters of the effect. Parameters are those that the readings so
-    far support; of other effects a few directions are drawn, the same every time, each of an RMS
-    strength of 1 σ of a measured element over all units.
+    A pair is not separable where the best plan of `MANY` readings, with the prior information, has
+    a power below `LEAST_POWER` at the effect's first parameters. Parameters are drawn from the
+    posterior of supported effects. For other effects, a few directions are drawn with a fixed seed,
+    each with an RMS of 1 σ over the measured elements of all units.
     """
     names = tuple(e.name for e in problem.families)
     if len(names) < 2:
         raise InputError(f"{len(names)} effects to tell apart; valid: two or more")
-    given = supported_parameters(problem, DRAWS)
-    pairs, both = [], []
+    supported = supported_parameters(problem, DRAWS)
+    pairs, pair_names = [], []
     for e in names:
-        where = problem.of_effect(e)
+        columns = problem.of_effect(e)
         betas = _directions(problem, e)
-        if e in given:
-            betas = [x / problem.scale[where] for x in given[e]]
+        if e in supported:
+            betas = [x / problem.scale[columns] for x in supported[e]]
         for f in names:
             if f != e:
                 pairs += [pair_of(problem, (e, f), beta) for beta in betas]
-                both += [(e, f)] * len(betas)
+                pair_names += [(e, f)] * len(betas)
     prior, size = problem.measured.copy(), problem.model_size
     prior[:size, :size] = problem.prior[:size, :size]
-    return _separable(problem, DiscriminatedPairs(tuple(pairs), tuple(both), prior))
+    return _separable(problem, DiscriminatedPairs(tuple(pairs), tuple(pair_names), prior))
 
 
 def pair_of(problem: DesignProblem, names: tuple[str, str], beta: Floats) -> Pair:
-    """Return a pair of an effect with the parameters β, in the problem's units, and a rival."""
+    """Return the pair of an effect with parameters β, over the problem's scales, and a rival."""
     effect, rival = names
     nuisance = np.concatenate([np.arange(problem.model_size), problem.of_effect(rival)])
     return Pair(problem.of_effect(effect), beta, nuisance, f"{effect} from {rival}")
@@ -93,31 +94,35 @@ def supported_parameters(problem: DesignProblem, count: int) -> dict[str, Floats
         return {}
     linear = linearise(fit)
     for family in problem.families:
-        found = estimate(linear, family)
-        if found is not None and found.supported:
-            out[family.name] = found.draws(count, np.random.default_rng(_SEED))
+        estimated = estimate(linear, family)
+        if estimated is not None and estimated.supported:
+            out[family.name] = estimated.draws(count, np.random.default_rng(_SEED))
     return out
 
 
-def _separable(problem: DesignProblem, of: DiscriminatedPairs) -> DiscriminatedPairs:
-    spread = of.prior + problem.units.information(
+def _separable(problem: DesignProblem, pairs: DiscriminatedPairs) -> DiscriminatedPairs:
+    spread = pairs.prior + problem.units.information(
         np.full(len(problem.units), MANY / float(problem.units.cost.sum()))
     )
     not_separable = []
-    for names in dict.fromkeys(of.names):
-        pair = of.pairs[of.names.index(names)]
+    for names in dict.fromkeys(pairs.names):
+        pair = pairs.pairs[pairs.names.index(names)]
         best = power(pair, spread)
         if best < LEAST_POWER:
             with suppress(CannotAnswerError):
-                found = relax(problem.units, Separate((pair,)), MANY, of.prior, tolerance=_LOOSE)
-                best = power(pair, found.information)
+                relaxed = relax(
+                    problem.units, Separate((pair,)), MANY, pairs.prior, tolerance=_LOOSE
+                )
+                best = power(pair, relaxed.information)
         if best < LEAST_POWER:
             not_separable.append(names)
-    keep = [k for k, names in enumerate(of.names) if names not in not_separable]
-    if not keep:
+    separable = [k for k, names in enumerate(pairs.names) if names not in not_separable]
+    if not separable:
         raise CannotAnswerError(not_separable_message(not_separable))
-    pairs, both = tuple(of.pairs[k] for k in keep), tuple(of.names[k] for k in keep)
-    return DiscriminatedPairs(pairs, both, of.prior, tuple(not_separable))
+    return DiscriminatedPairs(
+        tuple(pairs.pairs[k] for k in separable), tuple(pairs.names[k] for k in separable),
+        pairs.prior, tuple(not_separable),
+    )  # fmt: skip
 
 
 def _by_effect(pairs: Sequence[tuple[str, str]]) -> dict[str, str]:
@@ -125,18 +130,18 @@ def _by_effect(pairs: Sequence[tuple[str, str]]) -> dict[str, str]:
 
 
 def not_separable_message(pairs: Sequence[tuple[str, str]]) -> str:
-    """Name the pairs that no measurement separates."""
-    both = [pair for k, pair in enumerate(pairs) if pair[::-1] not in pairs[:k]]
-    each = [f"{e} from {fs}" for e, fs in _by_effect(both).items()]
-    return f"no measurement in this cell separates {', nor '.join(each)}"
+    """Return a message that names the pairs that no measurement separates."""
+    unordered = [pair for k, pair in enumerate(pairs) if pair[::-1] not in pairs[:k]]
+    listed = [f"{e} from {fs}" for e, fs in _by_effect(unordered).items()]
+    return f"no measurement in this cell separates {', nor '.join(listed)}"
 
 
 def not_ruled_out(pairs: Sequence[tuple[str, str]]) -> str:
-    """Say of pairs (effect that is there, rival) that no measurement rules out the rival."""
-    each = [f"{fs} where {e} is there" for e, fs in _by_effect(pairs).items()]
+    """Return a message on pairs (present effect, rival) whose rival cannot be ruled out."""
+    listed = [f"{fs} where {e} is there" for e, fs in _by_effect(pairs).items()]
     return (
-        f"no measurement in this cell rules out {', nor '.join(each)}: {MANY} of the best readings "
-        f"would do so with a chance of less than {100 * LEAST_POWER:.0f} %"
+        f"no measurement in this cell rules out {', nor '.join(listed)}: {MANY} of the best "
+        f"readings would do so with a chance of less than {100 * LEAST_POWER:.0f} %"
     )
 
 
@@ -147,17 +152,16 @@ def power(pair: Pair, information: Floats) -> float:
 
 
 def _directions(problem: DesignProblem, effect: str) -> list[Floats]:
-    """Directions (E,) of an effect whose RMS over all measured elements is 1 σ."""
-    where = problem.of_effect(effect)
-    rows = problem.units.rows[:, :, where]
+    """Return directions (E,) of an effect with an RMS of 1 σ over all measured elements."""
+    columns = problem.of_effect(effect)
+    rows = problem.units.rows[:, :, columns]
     elements = problem.nominal.elements * sum(
         len([name for name in loads if name != UNLOADED or problem.mode == "absolute"])
         for _, loads in problem.what
     )
-    flat = rows.reshape(-1, len(where))
+    flat = rows.reshape(-1, len(columns))
     gram = flat.T @ flat / elements
-    rng = np.random.default_rng(_SEED)
-    drawn = rng.standard_normal((DRAWS, len(where)))
+    drawn = np.random.default_rng(_SEED).standard_normal((DRAWS, len(columns)))
     return [d / np.sqrt(float(d @ gram @ d)) for d in drawn]
 
 
@@ -166,8 +170,8 @@ class EffectEstimate:
     """Posterior of the P parameters of an effect that is not in the model."""
 
     mean: Floats  # (P,) SI
-    root: Floats  # (P, P) root of their scale matrix, SI
-    log_evidence: float  # gain in log evidence by adding the effect
+    root: Floats  # (P, P) root of the scale matrix, SI
+    log_evidence: float  # gain by adding the effect
 
     @property
     def supported(self) -> bool:
@@ -182,12 +186,12 @@ class EffectEstimate:
 
 
 def estimate(linear: Linearisation, effect: Effect) -> EffectEstimate | None:
-    """Estimate an effect beside the model of a gc-scaled fit; None where its readings cannot."""
+    """Estimate an effect beside the model of a gc-scaled fit; None if its readings cannot."""
     if not computable(linear.fit, effect):
         return None
     columns = effect_columns(linear.fit, effect)
-    found = linear.score(columns.white, most=effect.most())
-    if not found.rank:
+    score = linear.score(columns.white, most=effect.most())
+    if not score.rank:
         return None
     scale = columns.scale
-    return EffectEstimate(scale * found.step, scale[:, None] * found.root, found.log_evidence)
+    return EffectEstimate(scale * score.step, scale[:, None] * score.root, score.log_evidence)

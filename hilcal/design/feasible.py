@@ -1,4 +1,4 @@
-"""Which states a plan may use: those that the cell allows with margins; candidates among them."""
+"""Feasible states: those that the cell allows with margins; candidates among them."""
 
 from collections import Counter
 from collections.abc import Iterable
@@ -34,12 +34,12 @@ REASONS = {
     "sight": ("leave the beam free", "[sight] clearance_m, [[obstacles]], the tracker's place"),
     "hanging": ("let what hangs or pulls hang free", "[[loads]] hang_m, radius_m, cable_m"),
 }
-"""Why a state may be left out, in the order of checking (cheap ones and those that leave little
-first): what the states that stay do, and what in the cell's configuration decides it."""
+"""Reasons to reject a state, in the order of checking (cheap and frequent ones first): a phrase on
+the states that pass, and the keys of the configuration that decide."""
 
 
 class Space(Feasibility):
-    """The states that a plan may use: `Feasibility` with margins, at most half a turn a joint."""
+    """Feasible states of a plan: `Feasibility` with margins, at most half a turn per joint."""
 
     def __init__(self, cell: Cell, config: CellConfig, margins: Margins = PLANNED) -> None:
         """Build the shapes once."""
@@ -66,15 +66,15 @@ class Space(Feasibility):
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What is not checked, or is guessed, since it is not configured."""
+        """Checks that are omitted, or use guesses, for lack of configuration."""
         return (*(() if self.sight is not None else (TRACKER_UNKNOWN,)), *super().remarks)
 
     def reasons(self, q: Floats, load: str = UNLOADED) -> dict[str, Bools]:
-        """Return by reason, in the order of `REASONS`, (N,) which states (N, n) keep it."""
+        """Return which of (N, n) states pass each reason (N,), in the order of `REASONS`."""
         return {reason: self.keeps(reason, q, load) for reason in REASONS}
 
     def keeps(self, kind: str, q: Floats, load: str = UNLOADED) -> Bools:
-        """Return (N,) which states keep one of `REASONS` under a load."""
+        """Return (N,) which states pass one of `REASONS` under a load."""
         if kind == "joint limits":
             return np.asarray(np.all((q >= self.low) & (q <= self.high), axis=1))
         return self._regular(q) if kind == "singularity" else super().keeps(kind, q, load)
@@ -82,11 +82,11 @@ class Space(Feasibility):
     def allowed(
         self, q: Floats, load: str = UNLOADED, kinds: tuple[str, ...] = tuple(REASONS)
     ) -> Bools:
-        """Return (N,) which states keep all of some reasons under a load; cheap ones first."""
+        """Return (N,) which states pass all of some reasons under a load; cheap ones first."""
         return super().allowed(q, load, kinds)
 
     def clear(self, q: Floats) -> Bools:
-        """Return (N,) which states keep all but torques and sensor, under every load."""
+        """Return (N,) which states pass the geometric reasons under every load."""
         geometry = tuple(r for r in REASONS if r not in ("torque", "payload", "force sensor"))
         good = self.allowed(q, UNLOADED, geometry)
         for load in self.loads[1:]:
@@ -102,7 +102,7 @@ class Space(Feasibility):
         )
 
     def _regular(self, q: Floats) -> Bools:
-        """σ_min ≥ [planning] singularity · σ_max of the flange's Jacobian, lengths by the reach."""
+        """Check σ_min ≥ [planning] singularity · σ_max of the flange's Jacobian over the reach."""
         least = self.config.planning.singularity
         if least == 0.0 or not len(q):
             return np.ones(len(q), dtype=np.bool_)
@@ -114,34 +114,34 @@ class Space(Feasibility):
 
 
 _CHUNK = 1 << 12
-_VAIN = 1 << 15  # drawn states after which nothing will come
-_MOST = 1 << 19, 64  # drawn at most: so many states, or so many per candidate
+_VAIN = 1 << 15  # drawn states, all rejected, after which drawing stops
+_MOST = 1 << 19, 64  # drawn states at most, whichever is larger: in all, and per candidate
 _OF_PAIRS = ("self-collision", "obstacle")
-_LOOK = 64  # states of which is told what touches
+_LOOK = 64  # rejected states whose contacts are counted for a message
 _OF_LOADS = ("payload", "torque", "force sensor", "hanging", "sight")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DrawnPoses:
-    """K poses that are allowed unloaded, and the loads that each may bear."""
+    """K poses that are allowed unloaded, and the loads that each can bear."""
 
     q: Floats  # (K, n) joint angles, rad
     loads: tuple[str, ...]  # 1 + L names, "none" first
-    allowed: Bools  # (K, 1 + L) which loads each pose bears
-    drawn: int  # how many states were looked at
-    left: dict[str, int]  # by reason, how many of them were left after it, in the order of checking
-    remarks: tuple[str, ...]  # what people should know
+    allowed: Bools  # (K, 1 + L) loads that each pose bears
+    drawn: int  # number of states
+    left: dict[str, int]  # number of states left after each reason, in the order of checking
+    remarks: tuple[str, ...]  # for people
 
 
 def draw(
     space: Space,
-    count: int,  # poses wanted; fewer where the cell leaves fewer
+    count: int,  # poses at most
     rng: np.random.Generator,  # shift of the sequence
     *,
-    least: int = 1,  # so many have to be found
-    most: int | None = None,  # so many states are drawn at most; by default many times `count`
+    least: int = 1,  # poses at least
+    most: int | None = None,  # states drawn at most; by default many times `count`
 ) -> DrawnPoses:
-    """Return poses from a Sobol sequence over the joint space, turned by a random shift."""
+    """Return poses from a Sobol sequence over the joint space, shifted at random modulo 1."""
     low, high = space.low, space.high
     if np.any(low >= high):
         j = int(np.argmax(low - high)) + 1
@@ -150,19 +150,19 @@ def draw(
 
     sequence = qmc.Sobol(len(low), scramble=False)
     shift = rng.random(len(low))
-    left, lost = dict.fromkeys(REASONS, 0), dict[str, Floats]()
-    found = [np.empty((0, len(low)))]
+    remaining, lost = dict.fromkeys(REASONS, 0), dict[str, Floats]()
+    parts = [np.empty((0, len(low)))]
     drawn = have = 0
     most = max(_MOST[0], _MOST[1] * count) if most is None else most
     while have < count and drawn < (most if have else _VAIN):
         u = (sequence.random(_CHUNK) + shift) % 1.0
         q = space.cell.arm.complete(low + u * (high - low))
-        found.append(_kept(space, q, left, lost))
+        parts.append(_allowed_unloaded(space, q, remaining, lost))
         drawn += _CHUNK
-        have += len(found[-1])
+        have += len(parts[-1])
     if have < least:
-        raise CannotAnswerError(_too_few(space, drawn, left, lost, least))
-    q = np.vstack(found)[:count]
+        raise CannotAnswerError(_too_few(space, drawn, remaining, lost, least))
+    q = np.vstack(parts)[:count]
     allowed = np.ones((len(q), len(space.loads)), dtype=np.bool_)
     remarks = [*space.remarks]
     if len(q) < count:
@@ -173,46 +173,48 @@ def draw(
             remarks.append(_unusable(space, q, load))
     if len(space.loads) > 1 and not allowed[:, 1:].any():
         raise CannotAnswerError("; ".join(remarks[-(len(space.loads) - 1) :]))
-    return DrawnPoses(q, space.loads, allowed, drawn, left, tuple(remarks))
+    return DrawnPoses(q, space.loads, allowed, drawn, remaining, tuple(remarks))
 
 
-def _kept(space: Space, q: Floats, left: dict[str, int], lost: dict[str, Floats]) -> Floats:
-    """Return the states that are allowed unloaded; note what each reason leaves and takes."""
+def _allowed_unloaded(
+    space: Space, q: Floats, remaining: dict[str, int], lost: dict[str, Floats]
+) -> Floats:
+    """Return the states allowed unloaded; count those left, and keep samples of those rejected."""
     for reason in REASONS:
         if len(q):
-            keeps = space.keeps(reason, q, UNLOADED)
-            if not keeps.all():
-                lost[reason] = q[~keeps][:_LOOK]
-            q = q[keeps]
-        left[reason] += len(q)
+            passes = space.keeps(reason, q, UNLOADED)
+            if not passes.all():
+                lost[reason] = q[~passes][:_LOOK]
+            q = q[passes]
+        remaining[reason] += len(q)
     return q
 
 
 def _too_few(
-    space: Space, drawn: int, left: dict[str, int], lost: dict[str, Floats], least: int
+    space: Space, drawn: int, remaining: dict[str, int], lost: dict[str, Floats], least: int
 ) -> str:
-    """What leaves too few: the first reason that leaves none, else the one that takes most."""
-    counts = list(left.values())
-    names = list(left)
-    before = [drawn, *counts[:-1]]
-    share = np.array(counts) / np.maximum(before, 1)
+    """Return a message: the first reason that leaves no state, else the one that rejects most."""
+    counts = list(remaining.values())
+    names = list(remaining)
+    checked = [drawn, *counts[:-1]]
+    share = np.array(counts) / np.maximum(checked, 1)
     worst = counts.index(0) if 0 in counts else int(np.argmin(share))
-    told = [
+    phrases = [
         f"{n:,} {REASONS[reason][0]}"
-        for reason, n, b in zip(names[: worst + 1], counts, before, strict=False)
-        if n < b
+        for reason, n, n_before in zip(names[: worst + 1], counts, checked, strict=False)
+        if n < n_before
     ]
     head = "no pose" if counts[-1] == 0 else f"only {counts[-1]:,} poses, {least:,} are needed"
     why = _touching(space, names[worst], lost) or REASONS[names[worst]][1]
-    return f"{head}: of {drawn:,} drawn states {', '.join(told)} ({why})"
+    return f"{head}: of {drawn:,} drawn states {', '.join(phrases)} ({why})"
 
 
 def _touching(space: Space, reason: str, lost: dict[str, Floats]) -> str:
-    """Name the bodies that touch in most of the states that were lost, and what to look at."""
+    """Name the bodies that touch in most of the rejected states, and the keys to look at."""
     if reason not in _OF_PAIRS or reason not in lost:
         return ""
     met = Counter(
-        found.of for q in lost[reason] for found in space.findings(q[None], UNLOADED, (reason,))
+        finding.of for q in lost[reason] for finding in space.findings(q[None], UNLOADED, (reason,))
     )
     if not met:
         return ""
@@ -223,16 +225,16 @@ def _touching(space: Space, reason: str, lost: dict[str, Floats]) -> str:
 def _unusable(space: Space, q: Floats, load: str) -> str:
     if (heavy := space.unbearable(load).get("payload")) is not None:
         return heavy
-    told = []
-    before = len(q)
+    phrases = []
+    count = len(q)
     for reason in _OF_LOADS:
         q = q[space.keeps(reason, q, load)]
-        if len(q) < before:
-            told.append(f"{len(q):,} {REASONS[reason][0]}")
+        if len(q) < count:
+            phrases.append(f"{len(q):,} {REASONS[reason][0]}")
         if not len(q):
             return (
-                f'load "{load}": no pose: of {before:,} feasible poses {", ".join(told)} '
+                f'load "{load}": no pose: of {count:,} feasible poses {", ".join(phrases)} '
                 f"({REASONS[reason][1]})"
             )
-        before = len(q)
+        count = len(q)
     return f'load "{load}": no pose'

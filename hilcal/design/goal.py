@@ -1,4 +1,4 @@
-"""A goal of a campaign: how well parameters or positions are to be known."""
+"""The goal of a campaign: standard uncertainties of parameters or positions to be reached."""
 
 import re
 import time
@@ -25,12 +25,12 @@ from hilcal.readings.whitening import Mode, has_unloaded
 from hilcal.tables.units import METRIC
 from hilcal.types import Floats
 
-JOINTS = JointCompliance.name  # The effect that "joint" and "j3" are short for
+JOINTS = JointCompliance.name  # the effect that "joint" and "j3" abbreviate
 FORMS = (
     '"joint std < 2 %"', '"j3 std < 3 %"', '"joint_compliance.j3 std < 1e-7 rad/(N·m)"',
     '"joint_tilt_compliance std < 10 %"', '"position std < 20 um"', '"deflection std < 20 um"',
 )  # fmt: skip
-POSITIONS = ("position", "deflection")  # predicted where the robot will work
+POSITIONS = ("position", "deflection")  # of predictions where the robot will work
 _ANGLES = {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "µrad": 1e-6, "μrad": 1e-6}
 _SHAPE = re.compile(
     r"\s*(?P<what>[\w.]+)\s+std\s*(?:<=|<|≤)\s*(?P<number>[-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*"
@@ -42,30 +42,30 @@ _SHAPE = re.compile(
 class Goal:
     """Standard uncertainties to be reached."""
 
-    text: str  # as it was given
+    text: str  # as the user wrote it
     what: str  # "position" or "deflection", or a parameter or an effect by name
     limit: float  # largest standard uncertainty: a share of the value, or SI
     relative: bool  # whether it is a share of the parameter's value
-    unit: str  # SI unit that the limit was given in; "" for a share
+    unit: str  # SI unit of the limit; "" for a share
 
     @property
     def of_position(self) -> bool:
-        """Whether it is about what is predicted where the robot will work, not about parameters."""
+        """Whether the goal is about predictions where the robot will work, not about parameters."""
         return self.what in POSITIONS
 
-    def names(self, known: Mapping[str, float]) -> tuple[str, ...]:
-        """Return the parameters that the goal is about, of those that are known."""
-        found = tuple(n for n in known if n == self.what or n.split(".")[0] == self.what)
-        if not found:
-            effects = dict.fromkeys(name.split(".")[0] for name in known)
+    def names(self, parameters: Mapping[str, float]) -> tuple[str, ...]:
+        """Return the parameters that the goal is about, out of `parameters`."""
+        names = tuple(n for n in parameters if n == self.what or n.split(".")[0] == self.what)
+        if not names:
+            effects = dict.fromkeys(name.split(".")[0] for name in parameters)
             raise InputError(
                 f'goal "{self.text}": {self.what} is not in the model; valid: position, '
-                f"{', '.join(effects)}, or one parameter, e.g. {next(iter(known), 'none')}"
+                f"{', '.join(effects)}, or one parameter, e.g. {next(iter(parameters), 'none')}"
             )
-        return found
+        return names
 
     def check(self, units: Mapping[str, str]) -> None:
-        """Refuse a goal that does not fit the parameters of a model, by the SI unit of each."""
+        """Refuse a goal that does not fit the parameters of a model, given the SI unit of each."""
         if self.of_position or self.relative:
             if not self.of_position:
                 self.names(dict.fromkeys(units, 0.0))
@@ -80,8 +80,8 @@ class Goal:
         self,
         stds: Mapping[str, float],  # of each parameter, SI; infinite where not identifiable
         values: Mapping[str, float],
-        position: float | None = None,  # of what is predicted, m; infinite if undetermined
-        predicted: str = "",  # what that is, e.g. "deflection under 5kg at 100 poses"
+        position: float | None = None,  # of the predictions, m; infinite if undetermined
+        predicted: str = "",  # their name, e.g. "deflection under 5kg at 100 poses"
     ) -> GoalStatus:
         """Judge standard uncertainties."""
         if self.of_position:
@@ -107,12 +107,11 @@ class Goal:
         return status
 
     def _status(self, ratio: float, worst: str, std: float, unit: str, quantity: str) -> GoalStatus:
-        met = bool(ratio <= 1.0)
-        return GoalStatus(self.text, met, worst, std, ratio, unit, quantity=quantity)
+        return GoalStatus(self.text, bool(ratio <= 1.0), worst, std, ratio, unit, quantity=quantity)
 
 
 def parse_goal(text: str) -> Goal:
-    """Read a goal, e.g. "joint std < 2 %"; `joint` are all joint compliances, `j3` is one."""
+    """Parse a goal, e.g. "joint std < 2 %"; `joint`: all joint compliances, `j3`: the third."""
     match = _SHAPE.fullmatch(text)
     if match is None:
         raise _wrong(text, "not understood")
@@ -122,27 +121,27 @@ def parse_goal(text: str) -> Goal:
         raise _wrong(text, f"{match['number']} is no number") from None
     if not (np.isfinite(number) and number > 0):
         raise _wrong(text, f"{match['number']} cannot be a standard uncertainty")
-    what, unit = match["what"], _plain(match["unit"] or "")
+    quantity, unit = match["what"], _plain(match["unit"] or "")
     if not unit:
         raise _wrong(text, "the unit is missing")
-    if what in POSITIONS:
+    if quantity in POSITIONS:
         if unit not in METRIC:
-            raise _wrong(text, f"a {what} is in {', '.join(list(METRIC)[:3])}, not {unit}")
-        return Goal(text, what, number * METRIC[unit], False, "m")
-    if what == "joint":
-        what = JOINTS
-    elif re.fullmatch(r"j\d+", what):
-        what = f"{JOINTS}.{what}"
+            raise _wrong(text, f"a {quantity} is in {', '.join(list(METRIC)[:3])}, not {unit}")
+        return Goal(text, quantity, number * METRIC[unit], False, "m")
+    if quantity == "joint":
+        quantity = JOINTS
+    elif re.fullmatch(r"j\d+", quantity):
+        quantity = f"{JOINTS}.{quantity}"
     if unit == "%":
-        return Goal(text, what, number / 100, True, "")
+        return Goal(text, quantity, number / 100, True, "")
     for base, prefixes in (("m", METRIC), ("rad", _ANGLES)):
         if unit in prefixes:
-            return Goal(text, what, number * prefixes[unit], False, base)
-    return Goal(text, what, number, False, unit)
+            return Goal(text, quantity, number * prefixes[unit], False, base)
+    return Goal(text, quantity, number, False, unit)
 
 
 def figures(fit: Fit) -> tuple[dict[str, float], dict[str, float]]:
-    """Standard uncertainties and values of a fit's parameters by name, SI."""
+    """Return the standard uncertainties and values of a fit's parameters by name, SI."""
     names = [f"{e.name}.{p.name}" for e in fit.model.effects for p in e.parameters]
     stds = {n: float(s) for n, s in zip(names, fit.uncertainty.std, strict=True)}
     return stds, {n: float(v) for n, v in zip(names, fit.theta, strict=True)}
@@ -153,7 +152,7 @@ def _ratio(std: float, limit: float) -> float:
 
 
 def _plain(unit: str) -> str:
-    """Write a unit in one way: rad/(N*m), rad/Nm and rad/(N·m) are the same."""
+    """Normalise a unit: rad/(N*m) and rad/Nm become rad/(N·m)."""
     text = unit.replace(" ", "").replace("*", "·").replace("Nm", "N·m").replace("^3", "³")
     return text.replace("/N·m", "/(N·m)")
 
@@ -162,27 +161,27 @@ def _wrong(text: str, why: str) -> InputError:
     return InputError(f'goal "{text}": {why}; valid: {", ".join(FORMS)}')
 
 
-SHARE = 0.1  # Share of the time that may be spent on fits while measuring
+SHARE = 0.1  # of the time, for fits while measuring, at most
 
 
 class GoalRule:
-    """Judges a campaign by its goal, with the fit that `hilcal identify` would make at its end.
+    """Stopping rule of a campaign: a goal, checked with the fit of `hilcal identify`.
 
-    The goal counts as met by a fit that converged, to readings that determine what the goal is
-    about. Where the residual is more than noise, the stated uncertainty is itself an estimate, and
-    a check after every reading will once find it small by chance: then two fits in a row have to
-    meet the goal, except at the plan's end. Fits take at most a tenth of the time (`SHARE`).
+    The goal is met if the fit converged and the readings determine the goal's quantity. Where the
+    residual exceeds the noise, the stated uncertainty is itself an estimate, and one of many checks
+    finds it small by chance: then two consecutive fits have to meet the goal, except at the plan's
+    end. Fits take at most a share `SHARE` of the time.
     """
 
     def __init__(
         self,
-        text: str,  # the goal, e.g. "joint std < 2 %".
+        text: str,  # the goal, e.g. "joint std < 2 %"
         cell: Cell,
         config: CellConfig,  # `[planning]`, loads, repeatability
         catalogue: Catalogue | None = None,  # the installed effects by default
-        now: Callable[[], float] = time.monotonic,  # seconds that pass for people
+        now: Callable[[], float] = time.monotonic,  # clock of the people, s
     ) -> None:
-        """Read a goal, and check it against the cell's model."""
+        """Parse a goal, and check it against the cell's model."""
         self.goal: Goal = parse_goal(text)
         self.status = GoalStatus(text)
         self._cell, self._config, self._now = cell, config, now
@@ -203,39 +202,39 @@ class GoalRule:
             planning = config.planning
             if not planning.work_q_rad and planning.work_min_m is None:
                 self.goal.met({}, {})  # raises: names the missing keys
-            some = prediction_poses(
+            work = prediction_poses(
                 model, config, np.zeros((0, cell.arm.n)), Space(cell, config).clear
             )
-            self._work_q = tuple(dict.fromkeys(tuple(q) for q in some.q.tolist()))
-            self._predicted = some.what
-        self._good = False  # whether the fit before met the goal
+            self._work_q = tuple(dict.fromkeys(tuple(q) for q in work.q.tolist()))
+            self._predicted = work.what
+        self._good = False  # whether the last fit met the goal
         self._ended = self._took = -np.inf
 
     def __call__(self, readings: Readings, last: bool) -> GoalStatus:
         """Return the status of the goal, see `measuring.stopping_rule.StoppingRule`."""
-        begun = self._now()
-        if last or (begun - self._ended >= self._took / SHARE and self._news(readings)):
-            found = self._fit(readings)
-            if found is None:
+        start = self._now()
+        if last or (start - self._ended >= self._took / SHARE and self._news(readings)):
+            outcome = self._fit(readings)
+            if outcome is None:
                 self.status, self._good = GoalStatus(self.goal.text), False
             else:
-                status, fitted = found
+                status, fitted = outcome
                 good = status.met and fitted.solution.converged
                 sure = last or self._good or not fitted.uncertainty.inflated
                 self.status, self._good = replace(status, met=good and sure), good
             self._ended = self._now()
-            self._took = self._ended - begun
+            self._took = self._ended - start
         return self.status
 
     def _fitted(self, readings: Readings) -> tuple[Readings, Mode]:
-        """Return the readings that are judged, and how; deflections need an unloaded one."""
+        """Return the readings to fit, and the mode; deflections need an unloaded reading."""
         if self._config.planning.readings == "absolute":
             return readings, "absolute"
-        kept = readings[has_unloaded(readings)]
-        return kept, "absolute" if kept.unloaded.all() else "deflection"
+        paired = readings[has_unloaded(readings)]
+        return paired, "absolute" if paired.unloaded.all() else "deflection"
 
     def _news(self, readings: Readings) -> bool:
-        """Whether the last reading is more than an unloaded one that no deflection has yet."""
+        """Whether the last reading adds data: not an unloaded one without a loaded one yet."""
         free = readings.unloaded
         if not free[-1] or self._fitted(readings)[1] == "absolute":
             return True
@@ -246,41 +245,40 @@ class GoalRule:
         try:
             readings, mode = self._fitted(readings)
             readings = with_joint_scatter(self._cell, readings, self._scatter)
-            wanted = planned_effects(self._config, self._catalogue)
-            model = with_effects(self._cell, readings, mode, wanted, wanted, self._catalogue)
-            found = fit(model, readings, mode)
-            std, value = figures(found)
-            held = dict(zip(std, found.solution.prior == 0, strict=True))
+            effects = planned_effects(self._config, self._catalogue)
+            model = with_effects(self._cell, readings, mode, effects, effects, self._catalogue)
+            fitted = fit(model, readings, mode)
+            std, value = figures(fitted)
+            held = dict(zip(std, fitted.solution.prior == 0, strict=True))
             std = {name: s for name, s in std.items() if not held[name]}
-            position = self._position(found) if self._work_q else None
+            position = self._position(fitted) if self._work_q else None
             status = self.goal.met(std, value, position, self._predicted)
-            return replace(status, model=found.model.named, fitted=found.mode), found
+            return replace(status, model=fitted.model.named, fitted=fitted.mode), fitted
         except (HilcalError, np.linalg.LinAlgError):
             return None
 
-    def _position(self, found: Fit) -> float:
-        """RMS standard uncertainty of what is predicted where the robot will work, m.
+    def _position(self, fitted: Fit) -> float:
+        """Return the RMS standard uncertainty of the predictions where the robot will work, m.
 
-        That of the fit's covariance T H⁻¹ Tᵀ, widened as `identify` widens the parameters'.
-        Infinite where directions that the readings do not determine move it, and where there are no
-        more degrees of freedom than a family has parameters that the fit holds at zero for want of
-        readings.
+        From the fit's covariance T H⁻¹ Tᵀ, inflated as `identify` inflates that of the parameters.
+        Infinite where undetermined directions move the predictions, and where the degrees of
+        freedom do not exceed the number of parameters that the fit holds at zero.
         """
-        if found.mode != self._config.planning.readings:
+        if fitted.mode != self._config.planning.readings:
             return float(np.inf)
-        if found.dof <= max(int((found.solution.prior == 0).sum()), 1):
+        if fitted.dof <= max(int((fitted.solution.prior == 0).sum()), 1):
             return float(np.inf)
         where = {"work_q_rad": self._work_q, "work_min_m": None, "work_max_m": None}
         planning = self._config.planning.model_copy(update=where)
         config = self._config.model_copy(update={"planning": planning})
-        model = after(found, config)
+        model = after(fitted, config)
         work = prediction_poses(model, config, np.zeros((0, self._cell.arm.n)))
-        solution, u = found.solution, found.uncertainty
-        basis, scale = solution.equations.basis, scales_of(found.model)
-        least = np.sqrt(max(found.variance_factor, 1.0)) if u.inflated else 1.0
-        seen = u.identifiable & (u.formal > 0)
+        solution, u = fitted.solution, fitted.uncertainty
+        basis, scale = solution.equations.basis, scales_of(fitted.model)
+        least = np.sqrt(max(fitted.variance_factor, 1.0)) if u.inflated else 1.0
+        determined = u.identifiable & (u.formal > 0)
         wider = np.full(len(scale), least)
-        wider[seen] = u.std[seen] / u.formal[seen]
+        wider[determined] = u.std[determined] / u.formal[determined]
         root: Floats = basis.transform * (wider / scale)[:, None]
         covariance = root @ solution.equations.inverse(solution.beta) @ root.T
         live = model.live

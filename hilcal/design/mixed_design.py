@@ -1,20 +1,20 @@
 """I-optimality under the mixed model: the mean variance of predictions with all effects.
 
-    y = A b + Z u + e,    (b, u) known before by M = [F G; Gᵀ H],    e ~ N(0, 1)
+    y = A b + Z u + e,    (b, u) with prior information M = [F G; Gᵀ H],    e ~ N(0, 1)
 
-A, Z are whitened rows of a unit; b are the parameters without a prior, u those with one: of the
-model, and of every other effect of the catalogue, each family of the size that arms have
-(`Effect.log_std_prior`) or that the readings so far tell. Completing the square,
+A, Z are the whitened rows of a unit. b are the parameters without a prior; u are those with a
+prior, of the model and of every other effect of the catalogue. The size of a family is the one
+usual for arms (`Effect.log_std_prior`) or the estimate of the readings so far. Complete the square:
 
-    A' = A − Z H⁻¹ Gᵀ,    v = H^½ (u + H⁻¹ Gᵀ b) ~ N(0, 1),    b known before by F − G H⁻¹ Gᵀ
+    A' = A − Z H⁻¹ Gᵀ,    v = H^½ (u + H⁻¹ Gᵀ b) ~ N(0, 1),    b with information F − G H⁻¹ Gᵀ
 
-are independent. Of v the directions Q that move the units most are kept; the others act as noise,
-in each unit by itself:
+b and v are independent. The directions Q of v that move the units most are retained; the others act
+as noise, independent between units:
 
     rows [A', Z H^−½ Q] whitened by 1 + T Tᵀ,    T = Z H^−½ (1 − Q Qᵀ)
 
-The criterion is 1 / tr(C M⁻¹), C the mean of VᵀV with V the derivative of the predicted positions
-by the same coordinates. Source: Chaloner and Verdinelli, *Bayesian experimental design: a review*,
+The criterion is 1 / tr(C M⁻¹), C the mean of VᵀV, V the derivative of predicted positions by the
+same coordinates. Source: Chaloner and Verdinelli, *Bayesian experimental design: a review*,
 Statistical Science 10 (1995) 273-304.
 """
 
@@ -38,9 +38,9 @@ from hilcal.effects.protocol import Effect
 from hilcal.identification.mixed_fit import HARMONICS, SCATTER_RAD
 from hilcal.types import Bools, Floats, Ints
 
-DIRECTIONS = 150  # most of Q; a choice: of a real UR10 (920) the others move 0.5 σ (rms)
-SAMPLE = 300  # Candidate poses by which they are found. A choice.
-LEAST = 1e-3  # directions that move the units by less, in their noise (rms), are left out
+DIRECTIONS = 150  # in Q at most; a choice: of a real UR10 (920) the others move 0.5 σ (rms)
+SAMPLE = 300  # candidate poses that determine Q; a choice
+LEAST = 1e-3  # least motion of the units by a direction of Q, RMS, over the noise
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,77 +48,77 @@ class MixedDesign:
     """A design problem in the coordinates (b, Qᵀ v)."""
 
     units: CandidateSet  # the units of the problem
-    prior: Floats  # (P, P) what is known before
+    prior: Floats  # (P, P) prior information
     c: Floats  # (P, P) C, m²
-    names: tuple[str, ...]  # of b, then of Qᵀ v by number; by number alone of `balanced`
+    names: tuple[str, ...]  # of b, then numbers of Qᵀ v; numbers only after `balanced`
 
 
-def mixed_design(of: DesignProblem, config: CellConfig, work: PredictionPoses) -> MixedDesign:
+def mixed_design(problem: DesignProblem, config: CellConfig, work: PredictionPoses) -> MixedDesign:
     """Return the design problem of predictions with all effects."""
-    nominal, config = of.nominal, _with_scatter(of.nominal, config)
-    more, std = other_effects(nominal, config)
+    nominal, config = problem.nominal, _with_scatter(problem.nominal, config)
+    effects, std = other_effects(nominal, config)
     prior_std = nominal.prior_std[nominal.live]
     flat = np.concatenate([np.isinf(prior_std), np.zeros(len(std), dtype=bool)])
-    own = np.where(np.isinf(prior_std), of.scale[: len(prior_std)], prior_std)
-    scale = np.concatenate([own, std])
-    known = information_of(nominal, more, scale) + np.diag(~flat)
+    model_scale = np.where(np.isinf(prior_std), problem.scale[: len(prior_std)], prior_std)
+    scale = np.concatenate([model_scale, std])
+    information = information_of(nominal, effects, scale) + np.diag(~flat)
 
-    def whole_rows(step: int = 1) -> Iterator[tuple[Ints, Floats]]:
-        """Rows of the units of every `step`-th pose, with the columns of all effects."""
-        some = of.candidates[slice(None, None, step)]
-        parts = reading_derivatives(nominal, config, some, more, scale)
-        return unit_rows(parts, of.candidates.loads, of.what, of.mode, step)
+    def all_rows(step: int = 1) -> Iterator[tuple[Ints, Floats]]:
+        """Yield rows of the units of every `step`-th pose, with the columns of all effects."""
+        poses = problem.candidates[slice(None, None, step)]
+        parts = reading_derivatives(nominal, config, poses, effects, scale)
+        return unit_rows(parts, problem.candidates.loads, problem.what, problem.mode, step)
 
-    sample = whole_rows(max(1, len(of.candidates) // SAMPLE))
-    coordinates = _coordinates(known, flat, sample)
+    sample = all_rows(max(1, len(problem.candidates) // SAMPLE))
+    coordinates = _coordinates(information, flat, sample)
     count = int(flat.sum()) + coordinates.random.shape[1]
-    rows = np.zeros((*of.units.rows.shape[:2], count))
-    for place, some in whole_rows():
-        rows[place, : some.shape[1]] = coordinates.whitened(some)
-    v = coordinates.columns(position_derivative(nominal, work, more, scale)).reshape(-1, count)
+    rows = np.zeros((*problem.units.rows.shape[:2], count))
+    for units, part in all_rows():
+        rows[units, : part.shape[1]] = coordinates.whitened(part)
+    v = coordinates.columns(position_derivative(nominal, work, effects, scale)).reshape(-1, count)
     prior = np.eye(count)
     prior[: coordinates.flat.shape[1], : coordinates.flat.shape[1]] = coordinates.prior
-    names = [t.name for t, free in zip(of.terms, flat, strict=False) if free]
+    names = [t.name for t, free in zip(problem.terms, flat, strict=False) if free]
     names += [f"direction {k}" for k in range(1, coordinates.random.shape[1] + 1)]
     c = v.T @ v / len(work.q)
-    return MixedDesign(CandidateSet(rows, of.units.cost), prior, c, tuple(names))
+    return MixedDesign(CandidateSet(rows, problem.units.cost), prior, c, tuple(names))
 
 
-def balanced(of: MixedDesign) -> MixedDesign:
-    """Return the problem in coordinates in which all units together tell as much of each.
+def balanced(design: MixedDesign) -> MixedDesign:
+    """Return the problem in coordinates in which the information of all units is the identity.
 
-    tr(C M⁻¹) is the same in any; after a fit some directions are known 10⁶ times as well as others,
-    and rounding would decide. Where they determine nothing of one it stays as it is, by its name.
+    tr(C M⁻¹) does not depend on coordinates. After a fit, some directions are known 10⁶ times as
+    well as others, and rounding would decide. A problem that leaves a coordinate undetermined is
+    returned unchanged, with its names.
     """
-    units = of.units
-    every = of.prior + units.information(np.full(len(units), 1.0 / len(units)))
-    size = np.sqrt(np.diag(every))
+    units = design.units
+    total = design.prior + units.information(np.full(len(units), 1.0 / len(units)))
+    size = np.sqrt(np.diag(total))
     if not np.all(size > 0):
-        return of
-    found = inverse_factor(every / np.outer(size, size))
-    if found is None:
-        return of
-    turn = np.linalg.cholesky(found[0] @ found[0].T) / size[:, None]
+        return design
+    inverted = inverse_factor(total / np.outer(size, size))
+    if inverted is None:
+        return design
+    turn = np.linalg.cholesky(inverted[0] @ inverted[0].T) / size[:, None]
     rows = units.rows @ turn
     names = tuple(f"direction {k}" for k in range(1, len(size) + 1))
-    prior, c = (0.5 * (m + m.T) for m in (turn.T @ m @ turn for m in (of.prior, of.c)))
+    prior, c = (0.5 * (m + m.T) for m in (turn.T @ m @ turn for m in (design.prior, design.c)))
     return MixedDesign(CandidateSet(rows, units.cost), prior, c, names)
 
 
 def other_effects(nominal: NominalModel, config: CellConfig) -> tuple[tuple[Effect, ...], Floats]:
-    """Return the effects beside the model, and the standard deviations of their parameters, SI.
+    """Return the effects of `[planning] against`, and standard deviations of their parameters, SI.
 
-    Those of `[planning] against`; none where a fit has a background, which holds them already.
+    No effects if the fit has a background, which includes them.
     """
-    model, known = nominal.model, nominal.model.catalogue
+    model, catalogue = nominal.model, nominal.model.catalogue
     names = () if model.background else potential_names(config, model)
-    finest = {
-        name: {"harmonics": HARMONICS} for name in names if "harmonics" in known[name].option_help
-    }
-    more = tuple(
-        build(known, name, nominal.cell, nominal.m, finest.get(name, {})) for name in names
+    periodic = [name for name in names if "harmonics" in catalogue[name].option_help]
+    finest = {name: {"harmonics": HARMONICS} for name in periodic}
+    effects = tuple(
+        build(catalogue, name, nominal.cell, nominal.m, finest.get(name, {})) for name in names
     )
-    return more, expected_std(model, more)
+    return effects, expected_std(model, effects)
 
 
 def _with_scatter(nominal: NominalModel, config: CellConfig) -> CellConfig:
@@ -127,11 +127,11 @@ def _with_scatter(nominal: NominalModel, config: CellConfig) -> CellConfig:
     if np.any(stated):
         return config
     std: tuple[float, ...] = (SCATTER_RAD,)
-    found = None if nominal.fit is None else nominal.fit.readings.arm_scatter
-    if found is not None and found.kind != "isotropic":
-        std = found.std
-    each = std if len(std) > 1 else std[0]
-    repeatability = config.repeatability.model_copy(update={"joint_std_rad": each})
+    scatter = None if nominal.fit is None else nominal.fit.readings.arm_scatter
+    if scatter is not None and scatter.kind != "isotropic":
+        std = scatter.std
+    per_joint = std if len(std) > 1 else std[0]
+    repeatability = config.repeatability.model_copy(update={"joint_std_rad": per_joint})
     return config.model_copy(update={"repeatability": repeatability})
 
 
@@ -139,7 +139,7 @@ def _with_scatter(nominal: NominalModel, config: CellConfig) -> CellConfig:
 class _Coordinates:
     """The change of coordinates."""
 
-    flat: Floats  # (P, b) columns of A' by those of all parameters
+    flat: Floats  # (P, b) columns of A' in terms of all columns
     random: Floats  # (P, r) columns Z H^−½ Q
     root: Floats  # (P, u) columns Z H^−½
     prior: Floats  # (b, b) F − G H⁻¹ Gᵀ
@@ -148,32 +148,36 @@ class _Coordinates:
         return np.concatenate([rows @ self.flat, rows @ self.random], axis=-1)
 
     def whitened(self, rows: Floats) -> Floats:
-        """(k, R, b + r) of units (k, R, P), with the other directions as noise."""
-        whole, kept = rows @ self.root, rows @ self.random
-        noise = whole @ np.swapaxes(whole, 1, 2) - kept @ np.swapaxes(kept, 1, 2)
+        """Return (k, R, b + r) of units (k, R, P), with the directions outside of Q as noise."""
+        full, retained = rows @ self.root, rows @ self.random
+        noise = full @ np.swapaxes(full, 1, 2) - retained @ np.swapaxes(retained, 1, 2)
         noise += np.eye(rows.shape[1])
         low = np.linalg.cholesky(noise)
-        return np.asarray(np.linalg.solve(low, np.concatenate([rows @ self.flat, kept], axis=-1)))
+        return np.asarray(
+            np.linalg.solve(low, np.concatenate([rows @ self.flat, retained], axis=-1))
+        )
 
 
-def _coordinates(known: Floats, flat: Bools, sample: Iterable[tuple[Ints, Floats]]) -> _Coordinates:
-    """Complete the square, and find the directions that move the units most."""
-    size, free = len(known), np.flatnonzero(flat)
-    held = np.flatnonzero(~flat)
-    g = known[np.ix_(free, held)]
-    factor = cho_factor(known[np.ix_(held, held)], lower=True)
+def _coordinates(
+    information: Floats, flat: Bools, sample: Iterable[tuple[Ints, Floats]]
+) -> _Coordinates:
+    """Complete the square, and find the directions Q that move the units most."""
+    size, free = len(information), np.flatnonzero(flat)
+    random = np.flatnonzero(~flat)
+    g = information[np.ix_(free, random)]
+    factor = cho_factor(information[np.ix_(random, random)], lower=True)
     lifted = cho_solve(factor, g.T)
     columns = np.zeros((size, len(free)))
     columns[free, np.arange(len(free))] = 1.0
-    columns[held] = -lifted
-    root = np.zeros((size, len(held)))
-    root[held] = solve_triangular(factor[0], np.eye(len(held)), lower=True).T
-    gram, elements = np.zeros((len(held), len(held))), 0
+    columns[random] = -lifted
+    root = np.zeros((size, len(random)))
+    root[random] = solve_triangular(factor[0], np.eye(len(random)), lower=True).T
+    gram, elements = np.zeros((len(random), len(random))), 0
     for _, rows in sample:
         moved = rows @ root
         gram += np.einsum("kri,krj->ij", moved, moved, optimize=True)
         elements += moved.shape[0] * moved.shape[1]
     values, vectors = np.linalg.eigh(gram / max(elements, 1))
-    kept = np.flatnonzero(values > LEAST**2)[-DIRECTIONS:]
-    prior = known[np.ix_(free, free)] - g @ lifted
-    return _Coordinates(columns, root @ vectors[:, kept], root, (prior + prior.T) / 2)
+    retained = np.flatnonzero(values > LEAST**2)[-DIRECTIONS:]
+    prior = information[np.ix_(free, free)] - g @ lifted
+    return _Coordinates(columns, root @ vectors[:, retained], root, (prior + prior.T) / 2)

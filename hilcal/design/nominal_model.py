@@ -1,4 +1,4 @@
-"""The nominal model of a plan: what will be fitted, at ordinary parameters."""
+"""The nominal model of a plan: the effects to be fitted, at ordinary parameters."""
 
 from dataclasses import dataclass, replace
 
@@ -21,33 +21,32 @@ from hilcal.readings.readings import ObserverKind, ObserverName, States
 from hilcal.robot import se3
 from hilcal.types import Floats, Ints
 
-DISTANCE = 2.0  # Reaches from the base to a tracker whose place is not given. A choice.
+DISTANCE = 2.0  # reaches from the base to a tracker of unknown place; a choice
 FRAME_PRIOR = {"prior_m": 3e-3, "prior_rad": 6e-3}
-"""In deflections the frames act only by turning them; they are known from the positions, about
-as well as the arm's elastic sag lets them be."""
+"""Frames only rotate deflections. Positions determine them up to the arm's elastic sag."""
 DURATION_S = 3600.0
 LOAD_TIMES_S = (5.0, 100.0)
-TEMPERATURES = (25.0, 35.0)  # Of joints that warm up while they are measured, °C
+TEMPERATURES = (25.0, 35.0)  # of joints that warm up during a campaign, °C
 _SEED = 20240607
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NominalModel:
-    """The model that is planned for."""
+    """The model that a plan is made for."""
 
-    model: Model  # frames where unknown, and effects; its cell has a tracker in its place
+    model: Model  # of unknown frames and effects, with a registered cell
     theta: Floats  # (P,) parameters, SI
-    live: Ints  # (L,) indices of the parameters that are not held at zero
-    prior_std: Floats  # (P,) prior standard deviations, infinite where nothing is known, SI
-    station: Floats  # (3,) where the beam starts, sensor axes, m
+    live: Ints  # (L,) indices of the parameters not held at zero
+    prior_std: Floats  # (P,) prior standard deviations, SI; infinite without a prior
+    station: Floats  # (3,) start of the beam, sensor axes, m
     m: int  # elements of a reading: 3 or 6
-    fit: Fit | None  # of what has been measured already; None at first
-    notes: tuple[str, ...]  # what was assumed, one line each
+    fit: Fit | None  # of the readings so far; None without readings
+    notes: tuple[str, ...]  # on assumptions, one line each
     carried: Floats | None = None  # (L, L) information of a carried prior, 1/SI²
 
     @property
     def elements(self) -> int:
-        """Elements that are read in one arrival: m of each target by each observer."""
+        """Elements measured in one arrival: m of each target by each observer."""
         return self.m * self.each
 
     @property
@@ -56,7 +55,7 @@ class NominalModel:
         return len(self.cell.all_targets) * max(len(self.cell.observers), 1)
 
     def arrivals(self, states: States) -> States:
-        """Return N states, each as often as it is read in one arrival, in succession."""
+        """Return N states, each repeated for every reading of its arrival."""
         targets, observers = len(self.cell.all_targets), len(self.cell.observers)
         if targets == 1 and not observers:
             return states
@@ -77,37 +76,38 @@ def nominal_model(
     config: CellConfig,
     m: int = 3,  # 3 for positions, 6 for poses
     catalogue: Catalogue | None = None,  # the installed effects by default
-    # what another campaign taught. Its effects are in the model, too, but for families that share a
-    # prior, which a plan is not made for unless they are named, and those that need what a plan
-    # does not fix.
+    # of another campaign. Its effects enter the model, except families with a shared prior, which
+    # enter only if named, and effects that need variables which a plan does not fix.
     prior: CarriedPrior | None = None,
 ) -> NominalModel:
-    """Return the model of `[planning]`: the baseline's parameters ordinary, all others zero.
+    """Return the model of `[planning]`: baseline parameters at ordinary values, others zero.
 
-    What is planned hardly depends on them: deflections are linear in them to about 1e-3.
+    A plan hardly depends on the values: deflections are linear in them to about 1e-3.
     """
-    known = catalogue or installed()
-    place, given = nominal_tracker_place(cell, config)
+    catalogue = catalogue or installed()
+    place, configured = nominal_tracker_place(cell, config)
     notes = []
     cell = _observed(cell, config, place)
-    if not given and not (cell.observers and all(o.tied for o in cell.observers)):
+    if not configured and not (cell.observers and all(o.tied for o in cell.observers)):
         shown = ", ".join(f"{v:.2g}" for v in place)
         notes.append(
             f"the tracker's place is not configured: taken to be [{shown}] m in base axes "
             "(give [sight] tracker_m)"
         )
     registered, station = _registered(cell, config, place)
-    frames = known.unknown_frames(registered)
-    wanted = {name: dict[str, object]() for name in frames} | planned_effects(config, known)
-    learnt = {} if prior is None else _learnt(prior, registered, known, m)
-    wanted = {name: options or learnt.get(name, {}) for name, options in wanted.items()}
-    wanted |= {name: o for name, o in learnt.items() if name not in wanted}
-    framed = FRAME_PRIOR if config.planning.readings == "deflection" else {}
+    frames = catalogue.unknown_frames(registered)
+    chosen = {name: dict[str, object]() for name in frames} | planned_effects(config, catalogue)
+    of_prior = {} if prior is None else _effects_of_prior(prior, registered, catalogue, m)
+    chosen = {name: options or of_prior.get(name, {}) for name, options in chosen.items()}
+    chosen |= {name: o for name, o in of_prior.items() if name not in chosen}
+    frame_prior = FRAME_PRIOR if config.planning.readings == "deflection" else {}
     effects = tuple(
-        build(known, name, registered, m, {**(framed if name in frames else {}), **options})
-        for name, options in wanted.items()
+        build(
+            catalogue, name, registered, m, {**(frame_prior if name in frames else {}), **options}
+        )
+        for name, options in chosen.items()
     )
-    model = Model(registered, effects, known, prior=prior)
+    model = Model(registered, effects, catalogue, prior=prior)
     parts = [(e.role == "baseline") * np.array([p.scale for p in e.parameters]) for e in effects]
     notes += random_columns(effects)
     theta = np.concatenate(parts)
@@ -115,26 +115,26 @@ def nominal_model(
     prior_std = np.where(groups >= 0, scales_of(model), prior_std)
     if prior is not None:
         s = prior.posterior.source
-        called = f"{s.campaign}: " if s.campaign else ""
-        notes.append(f"planned with what is known already ({called}{s.n_readings} readings)")
+        prefix = f"{s.campaign}: " if s.campaign else ""
+        notes.append(f"planned with what is known already ({prefix}{s.n_readings} readings)")
     live = np.arange(model.size)
     carried = carried_information(model, live)
     return NominalModel(model, theta, live, prior_std, station, m, None, tuple(notes), carried)
 
 
-def _learnt(
+def _effects_of_prior(
     prior: CarriedPrior, cell: Cell, catalogue: Catalogue, m: int
 ) -> dict[str, dict[str, object]]:
-    """Return the effects of a prior that a plan takes in, with their options."""
+    """Return the effects of a prior that a plan can include, with their options."""
     check_arm(prior, cell.arm)
     plain = nominal_states(np.zeros((1, 1)), np.zeros((1, 6)))
-    found = {}
+    included = {}
     for e in prior.posterior.effects:
         if catalogue[e.name].computable(plain):
             options = dict(e.options)
             if build(catalogue, e.name, cell, m, options).groups() is None:
-                found[e.name] = options
-    return found
+                included[e.name] = options
+    return included
 
 
 def carried_information(model: Model, live: Ints) -> Floats | None:
@@ -143,20 +143,20 @@ def carried_information(model: Model, live: Ints) -> Floats | None:
         return None
     if model.prior.drift is None:
         model = replace(model, prior=model.prior.with_drift(least(model.prior)))
-    of = coordinates_of(model)
-    known = of.inverse[of.std == 1.0]
-    whole = np.zeros((model.size, model.size))
-    whole[np.ix_(of.index, of.index)] = known.T @ known
-    return whole[np.ix_(live, live)]
+    coordinates = coordinates_of(model)
+    rows = coordinates.inverse[coordinates.std == 1.0]
+    information = np.zeros((model.size, model.size))
+    information[np.ix_(coordinates.index, coordinates.index)] = rows.T @ rows
+    return information[np.ix_(live, live)]
 
 
 def after(fit: Fit, config: CellConfig) -> NominalModel:
-    """Return the model and the parameters of what has been measured already, by its newest fit."""
+    """Return the nominal model of further readings, from the fit of the readings so far."""
     if fit.scaling != "gc":
         raise InputError(f"planning on needs a fit with scaling gc, this one has {fit.scaling}")
     cell, prior = replace(fit.model.cell, registration_known=True), fit.solution.prior
     _, station = _registered(cell, config, nominal_tracker_place(cell, config)[0])
-    # The fit weighs its priors against the noise factor β.
+    # the fit scales its priors by the noise factor β
     std = np.where(np.isinf(prior), np.inf, prior / np.sqrt(fit.solution.beta))
     std[fit.solution.space.index] = np.inf
     names = " + ".join(fit.model.names)
@@ -174,17 +174,17 @@ def after(fit: Fit, config: CellConfig) -> NominalModel:
 def build(
     catalogue: Catalogue, name: str, cell: Cell, m: int, options: Options | None = None
 ) -> Effect:
-    """Make an effect for a plan: set up for the first and the last reading, in one pose."""
+    """Make an effect for a plan, from a first and a last reading in one pose."""
     once = nominal_states(np.zeros((1, cell.arm.n)), np.zeros((1, 6)))
     states = replace(once[np.zeros(2, dtype=int)], time=np.array([0.0, DURATION_S]))
     return catalogue.make(name, cell, states, options, m)
 
 
 def random_columns(effects: tuple[Effect, ...]) -> tuple[str, ...]:
-    """Say of which effects a plan has to guess what they need, one line each."""
-    known = nominal_states(np.zeros((1, 1)), np.zeros((1, 6)))
+    """Name the effects whose variables a plan has to draw at random, one line each."""
+    fixed = nominal_states(np.zeros((1, 1)), np.zeros((1, 6)))
     for e in effects:
-        if e.role not in FRAME_ROLES and not type(e).computable(known):
+        if e.role not in FRAME_ROLES and not type(e).computable(fixed):
             raise InputError(
                 f"effect {e.name} needs {', '.join(e.needs)}, which a plan does not fix; leave "
                 "it out"
@@ -198,7 +198,7 @@ def random_columns(effects: tuple[Effect, ...]) -> tuple[str, ...]:
 
 
 def planned_effects(config: CellConfig, catalogue: Catalogue) -> dict[str, dict[str, object]]:
-    """Return the effects of `[planning] model` with their options, written as for `--effects`."""
+    """Return the effects of `[planning] model` with their options, in the syntax of `--effects`."""
     try:
         return read_effects_text(", ".join(config.planning.model), "effects", catalogue)
     except InputError as error:
@@ -206,7 +206,7 @@ def planned_effects(config: CellConfig, catalogue: Catalogue) -> dict[str, dict[
 
 
 def known_effects(names: tuple[str, ...], key: str, catalogue: Catalogue) -> tuple[str, ...]:
-    """Return the names of effects, each once."""
+    """Return the names of effects without duplicates; refuse unknown ones."""
     for name in names:
         try:
             catalogue[name]
@@ -216,40 +216,39 @@ def known_effects(names: tuple[str, ...], key: str, catalogue: Catalogue) -> tup
 
 
 def check_effects(cell: Cell, config: CellConfig, catalogue: Catalogue) -> None:
-    """Refuse effects of a configuration that cannot be planned with, before anything is done."""
+    """Refuse effects of a configuration that a plan cannot include."""
     try:
         model = nominal_model(cell, config, catalogue=catalogue).model
     except InputError as error:
-        words = str(error)
-        known = words.startswith("[planning]")
-        raise InputError(words if known else f"[planning] model: {words}") from None
+        message = str(error)
+        prefix = "" if message.startswith("[planning]") else "[planning] model: "
+        raise InputError(prefix + message) from None
     potential_names(config, model)
     for section in ("plausible", "ordinary"):
         known_effects(tuple(getattr(config, section)), f"[{section}]", catalogue)
 
 
 def potential_names(config: CellConfig, model: Model) -> tuple[str, ...]:
-    """Names of the effects of `[planning] against`, without those of the model.
+    """Return the names of the effects of `[planning] against`, without those of the model.
 
-    Of the whole catalogue those are left out that need what the order of a plan determines, as
-    time.
+    "catalogue" excludes effects whose variables, such as time, depend on the order of a plan.
     """
-    asked = config.planning.against
-    if asked == "catalogue":
+    against = config.planning.against
+    if against == "catalogue":
         names = tuple(
             kind.name
             for kind in model.catalogue.effects
             if kind.applies(model.cell) and not kind.needs and kind.role != "observer"
         )
     else:
-        names = known_effects(asked, "[planning] against", model.catalogue)
+        names = known_effects(against, "[planning] against", model.catalogue)
     return tuple(name for name in names if name not in model.names)
 
 
 def expected_std(model: Model, effects: tuple[Effect, ...]) -> Floats:
-    """Return the standard deviations (F,) that parameters of arms have, of effects beside a model.
+    """Return the standard deviations (F,), SI, of the parameters of effects outside of a model.
 
-    Those of the mixed model's families, SI.
+    They are those of the mixed model's families.
     """
     alone = replace(model, effects=effects, random={}, background=frozenset(), prior=None)
     std = np.zeros(alone.size)
@@ -259,7 +258,7 @@ def expected_std(model: Model, effects: tuple[Effect, ...]) -> Floats:
 
 
 def nominal_tracker_place(cell: Cell, config: CellConfig) -> tuple[Floats, bool]:
-    """Return where the tracker stands, (3,) base axes in m, and whether that is configured."""
+    """Return the tracker's place (3,), base axes, m, and whether it is configured."""
     place, reach = tracker_place(cell, config), cell.arm.reach
     if place is not None:
         return place, True
@@ -267,7 +266,7 @@ def nominal_tracker_place(cell: Cell, config: CellConfig) -> tuple[Floats, bool]
 
 
 def nominal_states(q: Floats, wrench: Floats) -> States:
-    """Return states (N) with times, temperatures and sides, as a shuffled order would have them."""
+    """Return N states with random times, temperatures and directions of approach."""
     rng = np.random.default_rng(_SEED)
     time = rng.uniform(0.0, DURATION_S, len(q))
     approach = rng.choice([-1.0, 1.0], q.shape)
@@ -278,7 +277,7 @@ def nominal_states(q: Floats, wrench: Floats) -> States:
 
 
 def _registered(cell: Cell, config: CellConfig, place: Floats) -> tuple[Cell, Floats]:
-    """Cell with a registration, and the beam's start (3,) in sensor axes."""
+    """Return the cell with a registration, and the start of the beam (3,), sensor axes, m."""
     if config.tracker.frame == "base":
         return cell, place
     if cell.registration_known or cell.observers:
@@ -289,20 +288,20 @@ def _registered(cell: Cell, config: CellConfig, place: Floats) -> tuple[Cell, Fl
 
 
 def _observed(cell: Cell, config: CellConfig, place: Floats) -> Cell:
-    """Return the cell with what `[tracker] observes`; a plane of unknown place is level."""
+    """Return the cell with the observers of `[tracker]`; a plane of unknown place is level."""
     kind: ObserverKind = "point" if config.tracker.observes == "distance" else "gauge"
     if config.tracker.observes == "position":
         return cell
     listed = tuple(config.points if kind == "point" else config.gauges) or ("tracker",)
-    seen = cell.observed_by([ObserverName(kind, name) for name in listed])
-    found = []
-    for k, o in enumerate(seen.observers):
+    observed = cell.observed_by([ObserverName(kind, name) for name in listed])
+    observers = []
+    for k, o in enumerate(observed.observers):
         if o.tied:
-            found.append(o)
+            observers.append(o)
             continue
         turn = se3.rotation(np.array([0.0, 0.0, 2.0 * np.pi * k / len(listed)]))
         frame = plane_frame(np.array([0.0, 0.0, 1.0]), place)
         if kind == "point":
             frame = se3.matrix(np.eye(3), -turn @ place)
-        found.append(replace(o, frame=frame))
-    return replace(seen, observers=tuple(found))
+        observers.append(replace(o, frame=frame))
+    return replace(observed, observers=tuple(observers))

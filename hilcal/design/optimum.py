@@ -17,18 +17,18 @@ TOLERANCE = 1e-3  # relative gap of the continuous optimum: whole numbers lose 1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Design:
-    """What is taken, and how good it is."""
+    """A plan as counts of units, its value, and a bound of the value."""
 
-    counts: Ints  # (K,) how often each unit is taken
-    value: float  # φ of it
-    bound: float  # φ of no plan within the budget exceeds it
-    information: Floats  # (P, P) of it, with what was known before
+    counts: Ints  # (K,) of units
+    value: float  # φ of the plan
+    bound: float  # upper bound of φ of all plans within the budget
+    information: Floats  # (P, P) of the plan, with the prior
     cost: float  # Σ n_k c_k
     relaxed: ApproximateDesign
 
     @property
     def efficiency(self) -> float:
-        """Share of the best possible that is certainly reached, at most 1."""
+        """Certified lower bound of φ over the largest φ, at most 1."""
         return min(1.0, self.value / self.bound)
 
 
@@ -36,20 +36,20 @@ def best(
     units: CandidateSet,
     criterion: Criterion,  # φ
     budget: float,  # B, in the units of the cost
-    prior: Floats | None = None,  # (P, P) M0: what is known before, or taken in any case
-    rng: np.random.Generator | None = None,  # nothing else is random
+    prior: Floats | None = None,  # (P, P) M0: prior information, or of fixed readings
+    rng: np.random.Generator | None = None,  # the only source of randomness
     *,
-    most: int | None = None,  # how often a unit may be taken; any number of times by default
+    most: int | None = None,  # largest count of a unit; unlimited by default
     names: Sequence[str] | None = None,
-    effort: int | None = None,  # units put into a plan before the search ends; by default `EFFORT`
+    effort: int | None = None,  # units put into plans until the search ends; `EFFORT` by default
     relaxed: ApproximateDesign | None = None,  # the continuous optimum, or a start near it
 ) -> Design:
     """Return a plan with Σ n_k c_k ≤ B whose φ(M0 + Σ n_k A_kᵀA_k) is nearly the largest.
 
-    The whole parts of the continuous weights are completed unit by unit: the next one is that with
-    which the plan, ideally completed by the continuous optimum, is best. Then each unit is taken
-    out in turn and its budget spent anew (Fedorov 1972); where this no longer helps, a few random
-    ones are taken out at once, and what is a little worse is gone on from for a while.
+    The integer parts of the continuous weights are completed unit by unit: the next unit is the one
+    with which the plan is best if the continuous optimum spends the remaining budget. Then each
+    unit is removed in turn and its budget spent anew (Fedorov 1972). Where this stops improving,
+    a few random units are removed at once, and slightly worse plans are accepted for a while.
     """
     rng = np.random.default_rng(0) if rng is None else rng
     tolerance = KINKED_TOLERANCE if criterion.kinked else TOLERANCE
@@ -58,21 +58,21 @@ def best(
             units, criterion, budget, prior, most=most, names=names, tolerance=tolerance,
             start=relaxed,
         )  # fmt: skip
-    known = given_prior(units, budget, prior)
-    felt = criterion.relevant(units, known, budget)
-    search = _Search(units, felt, budget, known, relaxed, most)
-    usual, enough = (KINKED_EFFORT, KINKED_ENOUGH) if felt.kinked else (EFFORT, ENOUGH)
+    prior = given_prior(units, budget, prior)
+    relevant = criterion.relevant(units, prior, budget)
+    search = _Search(units, relevant, budget, prior, relaxed, most)
+    usual, enough = (KINKED_EFFORT, KINKED_ENOUGH) if relevant.kinked else (EFFORT, ENOUGH)
     counts = search.counts(rng, usual if effort is None else effort, relaxed.bound, enough)
     used = np.flatnonzero(counts)
-    information = known + units.information(counts[used].astype(float), used)
+    information = prior + units.information(counts[used].astype(float), used)
     value = float(criterion.value(information))
     cost = float(counts @ units.cost)
     try:
         criterion.require(information, names)
-        enough = value > 0.0
+        determined = value > 0.0
     except CannotAnswerError:
-        enough = False
-    if not enough:
+        determined = False
+    if not determined:
         raise CannotAnswerError(
             f"a budget of {budget:g} takes {int(counts.sum())} units, too few to determine "
             f"{units.size} parameters by criterion {criterion.name}; raise the budget"
@@ -80,31 +80,31 @@ def best(
     return Design(counts, value, max(relaxed.bound, value), information, cost, relaxed)
 
 
-EFFORT = 6000  # units that are put into a plan at most, fewer of small plans; a choice
-KINKED_EFFORT = 1500  # The same for criteria with kinks, whose values cost more
-ENOUGH, KINKED_ENOUGH = 1.0 - 1e-6, 0.99  # share of the bound to end at; with kinks, a choice
+EFFORT = 6000  # units put into plans at most, less for small plans; a choice
+KINKED_EFFORT = 1500  # the same for criteria with kinks, whose values cost more
+ENOUGH, KINKED_ENOUGH = 1.0 - 1e-6, 0.99  # share of the bound that ends the search; a choice
 
 # Choices for speed; the certificate does not depend on them.
-_POOL = 4000  # units of the best prices, among which a plan is sought
+_POOL = 4000  # units of the best prices, in which a plan is sought
 _TABLE = 10_000_000  # numbers in the pool's table
-_TRIED = 8  # units whose value is worked out, of those of the best price
+_TRIED = 8  # units of the best prices whose φ is computed
 _SLACK = 1e-9
-_ORDER = 0.02  # of the surrogate whose prices lead the search
+_ORDER = 0.02  # of the surrogate whose prices guide the search
 _BETTER = 1e-9  # relative improvement that counts
-_EACH = 150  # of the effort, for each unit of a plan
-_VARIED = 0.1  # share of the plans that vary at random; more of small ones
-_WORSE = 0.12  # of the distance to the bound, by which a plan may be worse and be gone on from
+_EACH = 150  # effort for each unit of a plan, at most
+_VARIED = 0.1  # share of plans that are completed at random; larger for small plans
+_WORSE = 0.12  # accepted loss, as a share of the distance to the bound
 
 
 class _Plan(NamedTuple):
-    """Whole numbers (S,) of the pool's units, and their value φ."""
+    """Counts (S,) of the pool's units, and their φ."""
 
     counts: Ints
     value: float
 
 
 class _Search:
-    """The pool of units in which a plan is sought: those of weight and of the best prices."""
+    """The search for a plan in a pool: the units of positive weight or of the best prices."""
 
     def __init__(
         self, units: CandidateSet, criterion: Criterion, budget: float, prior: Floats,
@@ -128,9 +128,9 @@ class _Search:
         scaled = relaxed.information / np.outer(scale, scale) + 1e-9 * np.eye(units.size)
         self.root = scale[:, None] * np.linalg.cholesky(scaled)
         self.triangle = first, second = np.triu_indices(units.size)
-        # (S, P (P + 1) / 2) upper triangles of L⁻¹ A_kᵀA_k L⁻ᵀ, off the diagonal doubled:
-        # tr(G A_kᵀA_k) of all units is one product with the triangle of Lᵀ G L, for whose order
-        # single precision is enough
+        # (S, P (P + 1) / 2) upper triangles of L⁻¹ A_kᵀA_k L⁻ᵀ, off-diagonal elements doubled:
+        # tr(G A_kᵀA_k) of all units is one product with the triangle of Lᵀ G L; single precision
+        # is enough to order the units
         self.table: Floats = np.empty((len(index), len(first)), dtype=np.float32)
         for start in range(0, len(index), 256):
             part = self.pool.rows[start : start + 256]
@@ -141,13 +141,13 @@ class _Search:
             self.table[start : start + 256] = squares
 
     def counts(self, rng: np.random.Generator, effort: int, bound: float, enough: float) -> Ints:
-        """Return (K,) how often each of all units is taken."""
+        """Return the counts (K,) of all units."""
         floor = np.floor(self.ideal_weight + 1e-6).astype(np.int64)
         plan, goal = self.refilled(np.minimum(floor, self.most)), enough * bound
-        left = min(effort, _EACH * int(plan.counts.sum()))
-        plan, left = self.polished(plan, rng, left, goal)
-        plan, left = self.wandered(plan, rng, left, bound, goal)
-        plan, left = self.polished(plan, rng, max(left, 0) + int(plan.counts.sum()), goal)
+        remaining = min(effort, _EACH * int(plan.counts.sum()))
+        plan, remaining = self.polished(plan, rng, remaining, goal)
+        plan, remaining = self.wandered(plan, rng, remaining, bound, goal)
+        plan, remaining = self.polished(plan, rng, max(remaining, 0) + int(plan.counts.sum()), goal)
         out = np.zeros(self.count, dtype=np.int64)
         out[self.index] = plan.counts
         return out
@@ -165,84 +165,84 @@ class _Search:
     def refilled(
         self, counts: Ints, banned: int = -1, rng: np.random.Generator | None = None
     ) -> _Plan:
-        """Return the plan after its free budget is spent unit by unit, `banned` not first.
+        """Return the plan with its free budget spent unit by unit, `banned` not first.
 
-        The best unit is taken; with `rng`, some are passed over at random.
+        The best unit is taken; with `rng`, some units are passed over at random.
         """
         counts = counts.copy()
         m = self._information(counts)
-        slack = self.budget - float(counts @ self.pool.cost)
-        tiny = _SLACK * self.budget
+        free = self.budget - float(counts @ self.pool.cost)
+        slack = _SLACK * self.budget
         least = float(self.pool.cost.min())
-        while slack >= least - tiny:
-            fits = (self.pool.cost <= slack + tiny) & (counts < self.most)
+        while free >= least - slack:
+            fits = (self.pool.cost <= free + slack) & (counts < self.most)
             if banned >= 0:
                 fits[banned], banned = False, -1
             allowed = np.flatnonzero(fits)
             if not len(allowed):
                 break
-            base = m + slack * self.ideal
+            base = m + free * self.ideal
             smooth = self.criterion.surrogate(base, _ORDER)(base)
             if smooth is None:
                 break
-            rest = slack - self.pool.cost
-            rest = np.where(rest >= least - tiny, rest, 0.0)
+            remaining = free - self.pool.cost
+            remaining = np.where(remaining >= least - slack, remaining, 0.0)
             gain = self._prices(smooth.gradient)
-            gain += rest * float(np.sum(smooth.gradient * self.ideal))
+            gain += remaining * float(np.sum(smooth.gradient * self.ideal))
             tried = allowed[best_first(gain[allowed], _TRIED)]
             ends = m + np.matmul(self.pool.rows[tried].transpose(0, 2, 1), self.pool.rows[tried])
-            values = self.criterion.value(ends + rest[tried, None, None] * self.ideal)
+            values = self.criterion.value(ends + remaining[tried, None, None] * self.ideal)
             if rng is not None:
                 values = np.where(rng.random(len(values)) < rng.random(), -1.0, values)
             k = int(np.argmax(values))
             if not self.criterion.monotone and values[k] <= float(self.criterion.value(m)) > 0.0:
                 break
             counts[tried[k]] += 1
-            slack -= float(self.pool.cost[tried[k]])
+            free -= float(self.pool.cost[tried[k]])
             m = ends[k]
         return _Plan(counts, float(self.criterion.value(self._information(counts))))
 
     def polished(
-        self, plan: _Plan, rng: np.random.Generator, left: int, goal: float
+        self, plan: _Plan, rng: np.random.Generator, effort: int, goal: float
     ) -> tuple[_Plan, int]:
-        """Return the plan after exchanges of single units, and the effort that is left."""
+        """Return the plan after exchanges of single units, and the remaining effort."""
         stale = 0
         queue = rng.permutation(np.flatnonzero(plan.counts))
-        while len(queue) and stale < len(queue) and left > 0 and plan.value < goal:
+        while len(queue) and stale < len(queue) and effort > 0 and plan.value < goal:
             for unit in queue:
                 if plan.counts[unit] == 0:
                     continue
                 counts = plan.counts.copy()
                 counts[unit] -= 1
-                new = self.refilled(counts, int(unit))
-                left -= max(1, int(new.counts.sum() - counts.sum()))
+                varied = self.refilled(counts, int(unit))
+                effort -= max(1, int(varied.counts.sum() - counts.sum()))
                 stale += 1
-                if new.value > plan.value * (1.0 + _BETTER):
-                    plan, stale = new, 0
-                if left <= 0 or plan.value >= goal or stale >= len(queue):
+                if varied.value > plan.value * (1.0 + _BETTER):
+                    plan, stale = varied, 0
+                if effort <= 0 or plan.value >= goal or stale >= len(queue):
                     break
             queue = rng.permutation(np.flatnonzero(plan.counts))
-        return plan, left
+        return plan, effort
 
     def wandered(
-        self, plan: _Plan, rng: np.random.Generator, left: int, bound: float, goal: float
+        self, plan: _Plan, rng: np.random.Generator, effort: int, bound: float, goal: float
     ) -> tuple[_Plan, int]:
-        """Return the best of plans in which a few random units give way to others, again and again.
+        """Return the best plan of random exchanges of a few units, and the remaining effort.
 
         Record-to-record travel, Dueck (1993), J. Computational Physics 104(1).
         """
-        best, whole = plan, left
-        while left > 0 and 0.0 < best.value < goal:
-            worse = _WORSE * (1.0 - best.value / bound) * left / whole
-            every = np.repeat(np.arange(len(plan.counts)), plan.counts)
-            out = rng.choice(every, min(int(rng.integers(1, 4)), len(every)), replace=False)
+        best, total = plan, effort
+        while effort > 0 and 0.0 < best.value < goal:
+            worse = _WORSE * (1.0 - best.value / bound) * effort / total
+            units = np.repeat(np.arange(len(plan.counts)), plan.counts)
+            removed = rng.choice(units, min(int(rng.integers(1, 4)), len(units)), replace=False)
             counts = plan.counts.copy()
-            np.subtract.at(counts, out, 1)
-            varied = rng.random() < max(_VARIED, 2.0 / len(every))
-            new = self.refilled(counts, int(out[0]), rng if varied else None)
-            left -= max(1, int(new.counts.sum() - counts.sum()))
-            if new.value > best.value * (1.0 - worse):
-                plan = new
-            if new.value > best.value * (1.0 + _BETTER):
-                best = new
-        return best, left
+            np.subtract.at(counts, removed, 1)
+            at_random = rng.random() < max(_VARIED, 2.0 / len(units))
+            varied = self.refilled(counts, int(removed[0]), rng if at_random else None)
+            effort -= max(1, int(varied.counts.sum() - counts.sum()))
+            if varied.value > best.value * (1.0 - worse):
+                plan = varied
+            if varied.value > best.value * (1.0 + _BETTER):
+                best = varied
+        return best, effort

@@ -17,7 +17,7 @@ from hilcal.robot.chain import evaluate
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Bools, Floats
 
-COUNT = 500  # poses that are drawn where none is named; a choice: 100 are learnt by the plan
+COUNT = 500  # poses drawn where none is named; a choice: a plan overfits 100
 _DRAWN = 4096
 _ROUNDS = 60
 _SEED = 20240608
@@ -29,57 +29,57 @@ class PredictionPoses:
 
     q: Floats  # (T, n) joint angles, rad
     wrench: Floats  # (T, 6) at the load point, base axes, N and N·m
-    deflection: bool  # whether it is the change from the unloaded position that is predicted
-    derivative: Floats  # (T, 3, L) V, by the model's live parameters in their scales, m
-    what: str  # in words, e.g. "deflection under 5kg at 100 poses".
+    deflection: bool  # whether the change from the unloaded position is predicted
+    derivative: Floats  # (T, 3, L) V, by the live parameters over their scales, m
+    what: str  # in words, e.g. "deflection under 5kg at 100 poses"
 
 
 def prediction_poses(
     nominal: NominalModel,
     config: CellConfig,  # `[planning] work_*`, loads
-    feasible: Floats,  # (N, n) states that are feasible, rad; test poses are drawn from them
-    may: Callable[[Floats], Bools] | None = None,  # which (N, n) are feasible, for a box
+    feasible: Floats,  # (N, n) feasible states to draw from, rad
+    may: Callable[[Floats], Bools] | None = None,  # which of (N, n) states are feasible, for a box
 ) -> PredictionPoses:
-    """Return the test poses of `[planning]`: named, within a box, or of the candidates.
+    """Return the prediction poses of `[planning]`: named, within a box, or of the candidates.
 
-    In deflections it is the deflection under `work_load` that is predicted; under "none" that under
-    each of the loads in turn.
+    With deflections, the deflection under `work_load` is predicted; with `work_load = "none"`, the
+    deflection under each load in turn.
     """
     q, where = _poses(nominal, config, feasible, may)
     cell, planning = nominal.cell, config.planning
-    pulls = {load.name: load.wrench(cell.gravity) for load in config.loads}
+    of_loads = {load.name: load.wrench(cell.gravity) for load in config.loads}
     deflection = planning.readings == "deflection"
     if planning.work_load == UNLOADED:
-        wanted = pulls if deflection else {UNLOADED: np.zeros(6)}
+        wrenches = of_loads if deflection else {UNLOADED: np.zeros(6)}
         under = "each load" if deflection else ""
-    elif planning.work_load in pulls:
-        wanted, under = {planning.work_load: pulls[planning.work_load]}, planning.work_load
+    elif planning.work_load in of_loads:
+        wrenches, under = {planning.work_load: of_loads[planning.work_load]}, planning.work_load
     else:
-        valid = ", ".join((UNLOADED, *pulls))
+        valid = ", ".join((UNLOADED, *of_loads))
         raise InputError(f"[planning] work_load = {planning.work_load!r}; valid: {valid}")
-    if not wanted:
+    if not wrenches:
         raise InputError('[planning] readings = "deflection" needs [[loads]]')
-    each = np.tile(q, (len(wanted), 1))
-    wrench = np.repeat(np.array(list(wanted.values())), len(q), axis=0)
+    states = np.tile(q, (len(wrenches), 1))
+    wrench = np.repeat(np.array(list(wrenches.values())), len(q), axis=0)
     scale = np.array([p.scale for e in nominal.model.effects for p in e.parameters])[nominal.live]
-    what = ("deflection" if deflection else "position") + (f" under {under}" if under else "")
-    bare = PredictionPoses(each, wrench, deflection, np.zeros(0), f"{what} {where}")
-    return replace(bare, derivative=position_derivative(nominal, bare, (), scale))
+    quantity = ("deflection" if deflection else "position") + (f" under {under}" if under else "")
+    poses = PredictionPoses(states, wrench, deflection, np.zeros(0), f"{quantity} {where}")
+    return replace(poses, derivative=position_derivative(nominal, poses, (), scale))
 
 
 def position_derivative(
-    nominal: NominalModel, at: PredictionPoses, more: tuple[Effect, ...], scale: Floats
+    nominal: NominalModel, poses: PredictionPoses, added: tuple[Effect, ...], scale: Floats
 ) -> Floats:
-    """Return the derivative (T, 3, P) of what is predicted, m, by live parameters and `more`."""
+    """Return the derivative (T, 3, P) of predictions, m, by live parameters and `added` effects."""
     model, count = nominal.model, len(scale) - len(nominal.live)
     live = np.concatenate([nominal.live, model.size + np.arange(count)])
 
     def of(wrench: Floats) -> Floats:
-        p = model.predict(nominal_states(at.q, wrench), nominal.theta)
-        return model.jacobian_of((*model.effects, *more), p, nominal.theta, 3, live) * scale
+        p = model.predict(nominal_states(poses.q, wrench), nominal.theta)
+        return model.jacobian_of((*model.effects, *added), p, nominal.theta, 3, live) * scale
 
-    loaded = of(at.wrench)
-    return loaded - of(np.zeros_like(at.wrench)) if at.deflection else loaded
+    loaded = of(poses.wrench)
+    return loaded - of(np.zeros_like(poses.wrench)) if poses.deflection else loaded
 
 
 def _poses(
@@ -88,7 +88,7 @@ def _poses(
     feasible: Floats,
     may: Callable[[Floats], Bools] | None,
 ) -> tuple[Floats, str]:
-    """Test poses (T, n), and where they are in words."""
+    """Return prediction poses (T, n), and in words where they are."""
     planning, cell = config.planning, nominal.cell
     n = cell.arm.n
     if planning.work_q_rad:
@@ -106,71 +106,71 @@ def _poses(
         chosen = rng.permutation(len(feasible))[:COUNT]
         return feasible[np.sort(chosen)], f"at {len(chosen)} feasible poses"
     box = np.array(planning.work_min_m), np.array(planning.work_max_m)
-    found = _inside(nominal, feasible, *box)
+    inside = _inside(nominal, feasible, *box)
     low, high = cell.arm.usual_range
     margin = config.limits.joint_margin_rad
     low, high = low + margin, high - margin
     for _ in range(_ROUNDS if may is not None else 0):
-        if len(found) >= COUNT:
+        if len(inside) >= COUNT:
             break
         drawn = cell.arm.complete(rng.uniform(low, high, (_DRAWN, n)))
         drawn = _inside(nominal, drawn, *box)
         if may is not None and len(drawn):
-            found = np.concatenate([found, drawn[may(drawn)]])
-    if not len(found):
+            inside = np.concatenate([inside, drawn[may(drawn)]])
+    if not len(inside):
         raise CannotAnswerError(
             f"no feasible pose holds the target between work_min_m = {box[0].tolist()} and "
             f"work_max_m = {box[1].tolist()}; widen the box or move it within reach"
         )
-    chosen = rng.permutation(len(found))[:COUNT]
-    return found[np.sort(chosen)], f"at {len(chosen)} poses in the work box"
+    chosen = rng.permutation(len(inside))[:COUNT]
+    return inside[np.sort(chosen)], f"at {len(chosen)} poses in the work box"
 
 
 def _inside(nominal: NominalModel, q: Floats, low: Floats, high: Floats) -> Floats:
-    """Those of the states (N, n) whose target lies in a box, base axes."""
+    """Return the states, of (N, n), whose target lies in a box, base axes."""
     cell = nominal.cell
-    at = evaluate(cell.arm, q).point(cell.target[:3, 3])
-    return np.asarray(q[np.all((at >= low) & (at <= high), axis=1)])
+    target = evaluate(cell.arm, q).point(cell.target[:3, 3])
+    return np.asarray(q[np.all((target >= low) & (target <= high), axis=1)])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PredictedUncertainty:
     """Standard uncertainties that a fit to the planned readings will have.
 
-    With the model complete, as identification will state them, and with the potential terms, as
-    they are where any of those effects is there and has to be estimated as well.
+    If the model is complete, as identification will state them; and with the potential terms, which
+    have to be estimated too if any of their effects is present.
     """
 
     names: tuple[str, ...]  # of the model's live parameters, as identification prints them
     units: tuple[str, ...]
-    values: Floats  # at which they are assumed, SI
+    values: Floats  # assumed values, SI
     std: Floats  # with the model complete, SI; infinite where not identifiable
-    position: float | None  # with the model complete, RMS where the robot works, m
+    position: float | None  # with the model complete, RMS at the prediction poses, m
     position_open: float | None  # the same with the potential terms
-    positions: Floats  # (T,) per such pose, with the model complete
+    positions: Floats  # (T,) per prediction pose, m, with the model complete
 
     def by_name(self) -> dict[str, float]:
-        """Standard uncertainties with the model complete, SI."""
+        """Return standard uncertainties with the model complete, SI."""
         return dict(zip(self.names, (float(s) for s in self.std), strict=True))
 
 
 def predicted(
     problem: DesignProblem,
-    counts: Floats | None = None,  # (K,) how often each unit is taken
+    counts: Floats | None = None,  # (K,) of units
     *,
-    information: Floats | None = None,  # (P, P) instead, prior included; else the prior
+    information: Floats | None = None,  # (P, P) instead of counts, with the prior
     work: PredictionPoses | None = None,
 ) -> PredictedUncertainty:
     """Predict the standard uncertainties that a plan reaches."""
     if information is None:
         information = problem.prior if counts is None else problem.information(counts)
     size = problem.model_size
-    own = information[:size, :size]
+    of_model = information[:size, :size]
     flat = np.isinf(problem.nominal.prior_std[problem.nominal.live])
     scale = problem.scale
-    closed, null = covariance(own, flat)
-    whole = np.append(flat, np.zeros(len(scale) - size, dtype=bool))
-    opened, null_open = covariance(information, whole)
+    closed, null = covariance(of_model, flat)
+    flat_all = np.append(flat, np.zeros(len(scale) - size, dtype=bool))
+    opened, null_open = covariance(information, flat_all)
     opened, null_open = opened[:size, :size], null_open[:size]
     prior = problem.nominal.prior_std[problem.nominal.live] / scale[:size]
     terms = problem.terms[:size]
@@ -187,32 +187,34 @@ def predicted(
 
 
 def covariance(information: Floats, flat: Bools) -> tuple[Floats, Floats]:
-    """Invert an information matrix (P, P) as identification does; also (P, U) directions left out.
+    """Invert an information matrix (P, P) as identification does; also return (P, U) null space.
 
-    Directions of the `flat` parameters, which have no prior, that move all data together by less
-    than 0.2 σ at an ordinary magnitude (see `regression.normal_equations`) are held at zero.
+    Directions of the `flat` parameters, which have no prior, are held at zero where they move all
+    data together by less than 0.2 σ at an ordinary magnitude (see `regression.normal_equations`).
     """
     size = len(information)
     columns, held = np.flatnonzero(flat), np.flatnonzero(~flat)
     values, vectors = np.linalg.eigh(information[np.ix_(columns, columns)])
-    # Squares of singular values; products have lost what lies below rounding.
+    # eigenvalues are squared singular values, and lose digits to rounding in the product
     floor = max(INFORMATION**2, ROUNDING * float(values.max(initial=0.0)) * 1e-3)
-    seen = values > floor
-    transform = np.zeros((size, int(seen.sum()) + len(held)))
-    transform[columns, : int(seen.sum())] = vectors[:, seen] / np.sqrt(values[seen])
-    transform[held, int(seen.sum()) + np.arange(len(held))] = 1.0 / np.sqrt(
+    determined = values > floor
+    transform = np.zeros((size, int(determined.sum()) + len(held)))
+    transform[columns, : int(determined.sum())] = vectors[:, determined] / np.sqrt(
+        values[determined]
+    )
+    transform[held, int(determined.sum()) + np.arange(len(held))] = 1.0 / np.sqrt(
         np.maximum(np.diag(information)[held], 1e-300)
     )
     root = transform @ inverse_root(transform.T @ information @ transform).T
-    null = np.zeros((size, int((~seen).sum())))
-    null[columns] = vectors[:, ~seen]
+    null = np.zeros((size, int((~determined).sum())))
+    null[columns] = vectors[:, ~determined]
     return np.asarray(root @ root.T), null
 
 
 def positions_of(work: PredictionPoses, covariance: Floats, null: Floats) -> Floats:
     """Return (T,) standard deviations of positions, sqrt(tr(V Cov Vᵀ)), m; Cov (L, L).
 
-    Infinite where a direction of `null` (L, U) moves one by a tenth of it at an ordinary magnitude.
+    Infinite where directions of `null` (L, U) move a position by over `NULL_SHARE` of its std.
     """
     variance = np.einsum("tip,pq,tiq->t", work.derivative, covariance, work.derivative)
     std = np.sqrt(np.maximum(variance, 0.0))
@@ -221,7 +223,7 @@ def positions_of(work: PredictionPoses, covariance: Floats, null: Floats) -> Flo
 
 
 def _stated(covariance: Floats, null: Floats, prior: Floats) -> Floats:
-    """Standard uncertainties in ordinary magnitudes; infinite where identification refuses."""
+    """Return standard uncertainties over the scales; infinite where identification refuses."""
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     flat, unseen = np.isinf(prior), np.linalg.norm(null, axis=1)
     good = np.where(flat, (unseen <= NULL_SHARE * std) & (std < MEANINGLESS), std < LEARNT * prior)
@@ -229,5 +231,5 @@ def _stated(covariance: Floats, null: Floats, prior: Floats) -> Floats:
 
 
 def rms(std: Floats) -> float:
-    """Root mean square of standard deviations."""
+    """Return the root mean square."""
     return float(np.sqrt(np.mean(std**2)))

@@ -1,4 +1,4 @@
-"""The order in which chosen readings are taken: short, and little correlated with drift.
+"""The order of chosen readings: short, and little correlated with drift.
 
 The poses under one load are a block of loops from the reference, along straight motions that are
 clear; the blocks follow each other in random order.
@@ -24,15 +24,15 @@ from hilcal.types import Bools, Floats, Ints
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """What motions, readings and load changes take."""
+    """Speeds of motions, and times of readings and load changes."""
 
     speed: float  # of the leading joint, rad/s
     acceleration: float  # of the leading joint, rad/s²
-    reading_s: float  # seconds at rest for one step: the readings of all targets
-    change_s: float  # seconds that a person needs for another load
+    reading_s: float  # time at rest for one step: the readings of all targets
+    change_s: float  # time of a person for changing the load
 
     def legs(self, starts: Floats, ends: Floats) -> Floats:
-        """Return (N, M) seconds of straight motions; `route.duration` for many."""
+        """Return the times (N, M) of straight motions, s; vectorised `route.duration`."""
         way = np.abs(starts[:, None] - ends[None]).max(axis=-1, initial=0.0)
         long = way / self.speed + self.speed / self.acceleration
         short = 2.0 * np.sqrt(way / self.acceleration)
@@ -49,11 +49,11 @@ class Duration:
 
     @property
     def total(self) -> float:
-        """All of it, s."""
+        """Total time, s."""
         return self.motion + self.readings + self.load_changes
 
     def about(self) -> dict[str, float]:
-        """Return it for a plan's file, s."""
+        """Return the durations for a plan's file, s."""
         split = {"total": self.total, **asdict(self)}
         return {key: round(value, 1) for key, value in split.items()}
 
@@ -64,18 +64,18 @@ def pace(config: CellConfig) -> Pace:
     return Pace(motion.speed_rad_s, motion.acceleration_rad_s2, seconds_at_rest(config), change)
 
 
-def timeline(plan: Plan, arm: Arm, margin: float, at: Pace) -> tuple[Duration, Floats]:
-    """Return the duration of a plan and (S,) the middle of each step's reading, s."""
+def timeline(plan: Plan, arm: Arm, margin: float, pace: Pace) -> tuple[Duration, Floats]:
+    """Return the duration of a plan and the middle (S,) of each step's reading, s."""
     stops = route(plan, arm, margin)
     motion = readings = changes = 0.0
     times = []
-    for before, stop in pairwise(stops):
-        motion += duration(before.q, stop.q, at.speed, at.acceleration)
+    for previous, stop in pairwise(stops):
+        motion += duration(previous.q, stop.q, pace.speed, pace.acceleration)
         if stop.change_to is not None:
-            changes += at.change_s
+            changes += pace.change_s
         if stop.step is not None:
-            times.append(motion + readings + changes + at.reading_s / 2)
-            readings += at.reading_s
+            times.append(motion + readings + changes + pace.reading_s / 2)
+            readings += pace.reading_s
     return Duration(motion, readings, changes), np.array(times)
 
 
@@ -84,32 +84,32 @@ _WRENCH = ("fx", "fy", "fz", "mx", "my", "mz")
 
 @dataclass(frozen=True, slots=True)
 class Confounding:
-    """Time against what the model explains, and the error that a linear drift makes.
+    """Confounding of time with the model's regressors, and the error of a linear drift.
 
-    A deflection's lag is the time from its unloaded to its loaded reading.
+    The lag of a deflection is the time from its unloaded to its loaded reading.
     """
 
-    deflections: int  # beside the reference pose; 0: what follows is of readings and their time
-    # the largest |correlation| ρ of the lag with a regressor; ρ² is the share of its information
-    # that a parameter with this regressor loses where a drift has to be estimated as well
+    deflections: int  # outside of the reference pose; 0: lags below are times of readings
+    # the largest |correlation| ρ of the lag with a regressor; ρ² is the share of information that a
+    # parameter with this regressor loses if a drift is estimated, too
     correlation: float
-    regressor: str  # which one, e.g. "fz cos q3".
-    lag_mean_s: float  # times a constant drift this is common to all deflections
-    lag_rms_s: float  # root mean square of the lag, s
-    drift: float  # rate of the stated drift in one coordinate, m/s
-    error_m: float  # rms error of a deflection from that drift, m
-    bias_m: float  # mean error, m
-    drift_std: float | None  # of a rate estimated by the reference poses, m/s
+    regressor: str  # e.g. "fz cos q3"
+    lag_mean_s: float
+    lag_rms_s: float  # root mean square
+    drift: float  # rate of the assumed drift in one coordinate, m/s
+    error_m: float  # RMS error of a deflection from that drift
+    bias_m: float  # mean error
+    drift_std: float | None  # of a rate estimated at the reference pose, m/s
 
     def about(self) -> dict[str, object]:
-        """Return it for a plan's file."""
+        """Return the figures for a plan's file."""
         rate = self.drift_std
-        left = None if rate is None else rate * self.lag_rms_s
+        remaining = None if rate is None else rate * self.lag_rms_s
         return {
             "deflections": self.deflections, "correlation": round(self.correlation, 4),
             "correlated_with": self.regressor, "lag_mean_s": round(self.lag_mean_s, 1),
             "lag_rms_s": round(self.lag_rms_s, 1), "drift_m_per_h": 3600.0 * self.drift,
-            "error_m": self.error_m, "bias_m": self.bias_m, "error_with_returns_m": left,
+            "error_m": self.error_m, "bias_m": self.bias_m, "error_with_returns_m": remaining,
             "drift_std_m_per_h": None if rate is None else 3600.0 * rate,
         }  # fmt: skip
 
@@ -124,22 +124,22 @@ def confounding(
     """Return how a plan's time is confounded with its joints and loads.
 
     A drift v moves a deflection by v τ, with the lag τ = t_loaded - t_unloaded. Regressors are the
-    components of the load's wrench and their products with cos and sin of every joint; the
-    correlation is the uncentred one, since a deflection has no constant term:
+    components of the load's wrench and their products with cos and sin of every joint. The
+    correlation is uncentred, since a deflection has no constant term:
 
         ρ = |τᵀx| / (|τ| |x|)
 
-    and estimating v beside a parameter with the column x leaves 1 - ρ² of its information. Without
-    deflections it is the centred correlation of t with the cos, the sin and the wrench. A slope
-    fitted to readings at the reference pose, each load with its own mean, has the variance σ²/Σ(t -
+    Estimating v, too, leaves a parameter with the column x a share 1 - ρ² of its information.
+    Without deflections, ρ is the centred correlation of t with cos, sin and the wrench. A drift
+    fitted to readings at the reference pose, with a mean for each load, has the variance σ²/Σ(t -
     t̄)².
     """
-    when = dict(zip(plan.steps, times.tolist(), strict=True))
-    unloaded = {(s.pose, s.cycle): t for s, t in when.items() if s.load == UNLOADED}
-    taken = [s for s in plan.steps if s.pose != REFERENCE]
-    pairs = [s for s in taken if s.load != UNLOADED and (s.pose, s.cycle) in unloaded]
-    rows = pairs or taken
-    lag = np.array([when[s] - (unloaded[s.pose, s.cycle] if pairs else 0.0) for s in rows])
+    time_of = dict(zip(plan.steps, times.tolist(), strict=True))
+    unloaded = {(s.pose, s.cycle): t for s, t in time_of.items() if s.load == UNLOADED}
+    measured = [s for s in plan.steps if s.pose != REFERENCE]
+    pairs = [s for s in measured if s.load != UNLOADED and (s.pose, s.cycle) in unloaded]
+    rows = pairs or measured
+    lag = np.array([time_of[s] - (unloaded[s.pose, s.cycle] if pairs else 0.0) for s in rows])
     q = np.array([plan.joints(s.pose) for s in rows]).reshape(len(rows), plan.q.shape[1])
     wrench = np.array([wrenches[s.load] if s.load != UNLOADED else np.zeros(6) for s in rows])
     slope = _slope_std(plan, times, reading_std)
@@ -149,8 +149,8 @@ def confounding(
     if not pairs:
         lag, columns = lag - lag.mean(), columns - columns.mean(axis=0)
     size = np.linalg.norm(lag) * np.linalg.norm(columns, axis=0)
-    tiny = 1e-12 * np.linalg.norm(lag) * np.sqrt(len(lag))
-    rho = np.abs(lag @ columns) / np.where(size > tiny, size, np.inf)
+    floor = 1e-12 * np.linalg.norm(lag) * np.sqrt(len(lag))
+    rho = np.abs(lag @ columns) / np.where(size > floor, size, np.inf)
     worst, mean, rms = int(np.argmax(rho)), float(lag.mean()), float(np.sqrt(np.mean(lag**2)))
     return Confounding(
         len(pairs), float(rho[worst]), names[worst], mean, rms, drift, drift * rms, drift * mean,
@@ -159,7 +159,7 @@ def confounding(
 
 
 def _regressors(q: Floats, wrench: Floats, *, product: bool) -> tuple[list[str], Floats]:
-    """Names and (N, k) columns; cos and sin times the wrench where they are products."""
+    """Return names and columns (N, k); with `product`, cos and sin multiply the wrench."""
     turns = (("cos", np.cos), ("sin", np.sin))
     turned = [(f"{w} q{j + 1}", f(q[:, j])) for w, f in turns for j in range(q.shape[1])]
     live = np.flatnonzero(np.any(wrench != 0, axis=0)).tolist()
@@ -172,21 +172,21 @@ def _regressors(q: Floats, wrench: Floats, *, product: bool) -> tuple[list[str],
 
 
 def _slope_std(plan: Plan, times: Floats, reading_std: float) -> float | None:
-    """Standard uncertainty of a drift's rate from the readings at the reference pose, m/s."""
-    here: dict[str, list[float]] = {}
+    """Return the standard uncertainty, m/s, of a drift from readings at the reference pose."""
+    by_load: dict[str, list[float]] = {}
     for s, t in zip(plan.steps, times.tolist(), strict=True):
         if s.pose == REFERENCE:
-            here.setdefault(s.load, []).append(t)
-    moment = sum(len(some) * float(np.var(some)) for some in here.values())
+            by_load.setdefault(s.load, []).append(t)
+    moment = sum(len(load_times) * float(np.var(load_times)) for load_times in by_load.values())
     return reading_std / float(np.sqrt(moment)) if moment > 0 else None
 
 
-_SHRINK = 0.75  # of the time given to the walks, where a draw became too long; a choice
-_TRIES = 10  # draws of one order that may become too long; a choice
-_MOVES = 30  # steps of a random walk per stop; a choice: each stop is moved many times
+_SHRINK = 0.75  # factor on the time of the walks after a draw that is too long; a choice
+_TRIES = 10  # draws of one order that may be too long; a choice
+_MOVES = 30  # steps of a random walk per stop; a choice
 Passable = Callable[[Floats, Floats, str], Bools]  # start (n,), ends (M, n), load -> (M,)
-NEAR = 24  # neighbours to which motions are tested, else by the reference; a choice
-_ALL = 6  # loads up to which every order is tried
+NEAR = 24  # neighbours with tested motions; to others by the reference; a choice
+_ALL = 6  # number of loads up to which every order is tried
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,11 +199,11 @@ class PlannedStop:
 
 @dataclass(frozen=True, slots=True)
 class LoadBlock:
-    """What is measured while one load hangs."""
+    """The readings under one load."""
 
     load: str
     loops: tuple[tuple[PlannedStop, ...], ...]  # stops of each loop from the reference
-    seconds: float  # what the loops take, s
+    seconds: float  # of all loops
 
     @property
     def count(self) -> int:
@@ -215,13 +215,13 @@ class LoadBlock:
 class Ways:
     """Ways under one load between the reference, index 0, and P poses."""
 
-    direct: Floats  # (P + 1, P + 1) seconds of straight motions, `NEVER` where none is known clear
-    seconds: Floats  # the same, or by the reference with a reading there where that is needed
+    direct: Floats  # (P + 1, P + 1) times of straight motions, s; `NEVER` if not known to be clear
+    seconds: Floats  # the same, or by the reference with a reading there if that is needed
 
     def among(self, which: Ints) -> "Ways":
-        """Return the ways between the reference and some stops, poses (m,) from 1.
+        """Return the ways between the reference and stops at poses (m,), from 1.
 
-        Between two stops at the same pose the arm goes by the reference: it is to arrive anew.
+        Between two stops at one pose, the arm moves by the reference, to arrive anew.
         """
         grid = np.ix_(*[np.concatenate([[0], which])] * 2)
         return Ways(self.direct[grid], self.seconds[grid])
@@ -232,37 +232,36 @@ class Chosen:
     """Readings to take at a pose."""
 
     pose: str
-    loads: tuple[str, ...]  # under which loads, "none" among them where it is measured unloaded
-    count: int = 1  # how often all of it; each time is a cycle of its own
+    loads: tuple[str, ...]  # "none" for an unloaded reading
+    count: int = 1  # cycles
 
 
 @dataclass(frozen=True, slots=True)
 class Ordering:
-    """How to order."""
+    """Options of the order."""
 
-    # share of the shortest campaign that may be spent on a random order; 0 for the shortest order.
-    # With 40 poses and four loads ρ falls from 0.64 to 0.14 for 2 %, and no further for 30 %.
+    # additional time of a random order as a share of the shortest; 0: the shortest order. With 40
+    # poses and four loads, ρ falls from 0.64 to 0.14 for 2 %, and no further for 30 %.
     slack: float = 0.05
-    # "around" takes half of the unloaded readings before the loads and half after, "first" all
-    # before: deflections are then known while the loads are measured
+    # "around": half of the unloaded readings before the loads and half after; "first": all before,
+    # so that deflections are available during the loads
     unloaded: Literal["around", "first"] = "around"
-    reference_every_s: float = 900.0  # longest time between two readings at the reference pose, s
-    repeats: int = 2  # poses that are measured unloaded a second time, for the arm's repeatability
-    draws: int = 16  # random orders of which the least confounded is taken
-    # rate of the drift that figures are stated for, in one coordinate, m/s. There is no figure for
-    # all cells; 20 µm/h is a tenth of the drift that the effect `tracker_drift` takes as ordinary
-    # in a campaign of an hour.
+    reference_every_s: float = 900.0  # longest time between two readings at the reference pose
+    repeats: int = 2  # poses with a second unloaded reading, for the arm's repeatability
+    draws: int = 16  # random orders, of which the least confounded is chosen
+    # assumed rate of drift in one coordinate, m/s. No figure holds for all cells; 20 µm/h is a
+    # tenth of the ordinary drift of the effect `tracker_drift` in a campaign of an hour.
     drift: float = 20e-6 / 3600
     reading_std: float = 15e-6  # standard uncertainty of a reading in one coordinate, m
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ordered:
-    """A plan and what its order costs and loses."""
+    """A plan, with duration and confounding of its order."""
 
-    plan: Plan  # the plan; `about` holds these figures too
+    plan: Plan  # its `about` holds these figures, too
     duration: Duration
-    shortest: Duration  # of the shortest order with the same readings
+    shortest: Duration  # of the shortest order of the same readings
     confounding: Confounding
     confounding_shortest: Confounding  # of the shortest order
 
@@ -285,34 +284,34 @@ def order_plan(
 ) -> Ordered:
     """Put chosen readings in order.
 
-    Every load is hung once. Under a load the arm goes along a short tour in the metric of the
-    leading joint's time, cut into loops from the reference pose so that this is read every so many
-    minutes; where no straight motion is clear it goes by the reference, which then counts as a
-    return.
+    Every load is hung once. Under a load, the arm follows a short tour in the metric of the leading
+    joint's time. The tour is cut into loops from the reference pose, which limits the time between
+    readings there. Where no straight motion is clear, the arm moves by the reference, and reads it.
 
-    Readings of a pose under different loads are far apart in time, so that a drift looks like a
-    load, or like a pose. What is lost is stated as ρ², see `Confounding`. It is kept small by
+    Readings of a pose under different loads are far apart in time, so that a drift resembles the
+    effect of a load, or of a pose. The loss of information is ρ², see `Confounding`. It is reduced
+    by
     - half of the unloaded readings, drawn at random, after the loads: lags of both signs;
-    - loads in the order that is least correlated with time;
-    - random orders of campaigns that take at most 1 + slack times the shortest; of some draws the
-      one with the least ρ (rerandomisation, Morgan & Rubin 2012, Ann. Statist. 40, 1263), so that
-      it stays random towards everything that is no regressor, such as temperatures.
+    - the order of loads that is least correlated with time;
+    - random orders that take at most 1 + slack times the shortest; of several draws, the one with
+      the least ρ (rerandomisation, Morgan & Rubin 2012, Ann. Statist. 40, 1263), which is still
+      random with respect to other variables, such as temperatures.
     """
     how = how or Ordering()
     used = [name for name in names if any(c.pose == name for c in chosen)]
-    at = np.array([names.index(name) for name in used])
-    draws = OrderDraws(cell, config, tuple(used), np.vstack([reference, q[at]]), how, rng)
+    indices = np.array([names.index(name) for name in used])
+    draws = OrderDraws(cell, config, tuple(used), np.vstack([reference, q[indices]]), how, rng)
     draws.prepare(stops_of(used, chosen, how.repeats, rng), passable)
-    plain = draws.shortest()
-    plain_time, plain_loss = draws.figures(plain)
-    best = (plain_loss.correlation, plain, plain_time, plain_loss)
-    spare = how.slack * plain_time.total
+    shortest = draws.shortest()
+    shortest_time, shortest_loss = draws.figures(shortest)
+    best = (shortest_loss.correlation, shortest, shortest_time, shortest_loss)
+    allowance = how.slack * shortest_time.total
     for _ in range(how.draws if how.slack > 0 else 0):
-        extra = spare * rng.random()
+        extra = allowance * rng.random()
         for _ in range(_TRIES):
             plan = draws.draw(extra)
             time, loss = draws.figures(plan)
-            if time.total <= plain_time.total + spare:
+            if time.total <= shortest_time.total + allowance:
                 if loss.correlation < best[0]:
                     best = loss.correlation, plan, time, loss
                 break
@@ -323,35 +322,35 @@ def order_plan(
         "order": {
             **loss.about(),
             "reference_every_s": how.reference_every_s,
-            "shortest_s": round(plain_time.total, 1),
-            "longer": round(time.total / plain_time.total - 1.0, 4),
-            "correlation_shortest": round(plain_loss.correlation, 4),
+            "shortest_s": round(shortest_time.total, 1),
+            "longer": round(time.total / shortest_time.total - 1.0, 4),
+            "correlation_shortest": round(shortest_loss.correlation, 4),
         },
     }
-    made = Plan(plan.pose_names, plan.q, plan.steps, about)
-    return Ordered(made, time, plain_time, loss, plain_loss)
+    plan = Plan(plan.pose_names, plan.q, plan.steps, about)
+    return Ordered(plan, time, shortest_time, loss, shortest_loss)
 
 
 def stops_of(
     used: Sequence[str], chosen: Sequence[Chosen], repeats: int, rng: np.random.Generator
 ) -> dict[str, list[PlannedStop]]:
-    """Return the stops by load; each taking gets the first cycle that has none of its loads."""
-    taken: dict[tuple[int, str], set[int]] = {}
+    """Return the stops by load; each visit gets the first cycle without any of its loads."""
+    cycles_of: dict[tuple[int, str], set[int]] = {}
     for c in chosen:
         pose = used.index(c.pose) + 1
         for _ in range(c.count):
-            full = [taken.setdefault((pose, load), set()) for load in c.loads]
-            cycle = next(k for k in range(10**9) if not any(k in cycles for cycles in full))
-            for cycles in full:
+            used_cycles = [cycles_of.setdefault((pose, load), set()) for load in c.loads]
+            cycle = next(k for k in range(10**9) if not any(k in cycles for cycles in used_cycles))
+            for cycles in used_cycles:
                 cycles.add(cycle)
-    once = [p for (p, load), cycles in taken.items() if load == UNLOADED and len(cycles) == 1]
-    again = sum(load == UNLOADED and len(cycles) > 1 for (_, load), cycles in taken.items())
-    more = min(max(repeats - again, 0), len(once))
-    for pose in rng.choice(once, more, replace=False) if more else ():
-        mine = [cycles for (p, _), cycles in taken.items() if p == pose]
-        taken[int(pose), UNLOADED].add(max(max(cycles) for cycles in mine) + 1)
+    single = [p for (p, load), cycles in cycles_of.items() if load == UNLOADED and len(cycles) == 1]
+    repeated = sum(load == UNLOADED and len(cycles) > 1 for (_, load), cycles in cycles_of.items())
+    added = min(max(repeats - repeated, 0), len(single))
+    for pose in rng.choice(single, added, replace=False) if added else ():
+        of_pose = [cycles for (p, _), cycles in cycles_of.items() if p == pose]
+        cycles_of[int(pose), UNLOADED].add(max(max(cycles) for cycles in of_pose) + 1)
     out: dict[str, list[PlannedStop]] = {}
-    for (pose, load), cycles in taken.items():
+    for (pose, load), cycles in cycles_of.items():
         out.setdefault(load, []).extend(PlannedStop(pose, cycle) for cycle in sorted(cycles))
     return out
 
@@ -362,8 +361,8 @@ class OrderDraws:
 
     cell: Cell
     config: CellConfig  # its loads, motion and acquisition
-    names: tuple[str, ...]  # (P) names of the poses that are measured
-    q: Floats  # (P + 1, n) joint angles of the reference and of these, rad
+    names: tuple[str, ...]  # (P) names of the poses
+    q: Floats  # (P + 1, n) joint angles of the reference and of the poses, rad
     how: Ordering
     rng: np.random.Generator
     stops: dict[str, list[PlannedStop]] = field(default_factory=dict)  # by load
@@ -372,28 +371,28 @@ class OrderDraws:
 
     @property
     def pace(self) -> Pace:
-        """Seconds of motions, readings and load changes."""
+        """Pace of the cell."""
         return pace(self.config)
 
     @property
     def wrenches(self) -> Mapping[str, Floats]:
-        """(6,) wrench at the load point by load, base axes, N and N·m."""
+        """Wrench (6,) at the load point by load, base axes, N and N·m."""
         return {load.name: load.wrench(self.cell.gravity) for load in self.config.loads}
 
     def prepare(self, stops: dict[str, list[PlannedStop]], passable: Passable) -> None:
         """Find the ways and the shortest tour under each load."""
         self.stops = stops
-        for load, here in stops.items():
-            poses = np.array([s.pose for s in here])
-            every = np.unique(poses)
-            found = ways(self.q[[0, *every]], load, passable, self.pace)
-            self.ways[load] = found.among(np.searchsorted(every, poses) + 1)
+        for load, load_stops in stops.items():
+            poses = np.array([s.pose for s in load_stops])
+            visited = np.unique(poses)
+            between = ways(self.q[[0, *visited]], load, passable, self.pace)
+            self.ways[load] = between.among(np.searchsorted(visited, poses) + 1)
             self.short[load] = tour.shortest(self.ways[load].seconds, self.rng)
-            way = [0, *self.short[load], 0]
-            legs = self.ways[load].seconds[way[:-1], way[1:]]
+            order = [0, *self.short[load], 0]
+            legs = self.ways[load].seconds[order[:-1], order[1:]]
             if legs.max() >= tour.NEVER:
                 k = int(np.argmax(legs >= tour.NEVER))
-                pose = self.names[here[max(way[k], way[k + 1]) - 1].pose - 1]
+                pose = self.names[load_stops[max(order[k], order[k + 1]) - 1].pose - 1]
                 raise CannotAnswerError(
                     f"pose {pose} is not reached from the reference pose along clear straight "
                     f"motions under {load}; leave it out or move the reference"
@@ -404,20 +403,20 @@ class OrderDraws:
         return self._plan(self.short, half=False, mixed=False)
 
     def _plan(self, orders: Mapping[str, Sequence[int]], *, half: bool, mixed: bool) -> Plan:
-        """Return the plan for an order of the stops; loops may be mixed at random."""
+        """Return the plan for an order of the stops, with `mixed` loops at random."""
         loads = [load for load in self.stops if load != UNLOADED]
         free = list(orders.get(UNLOADED, ()))
         cut = (len(free) + 1) // 2 if half else len(free)
         before = self._block(UNLOADED, free[:cut], mixed)
         after = self._block(UNLOADED, free[cut:], mixed)
         loaded = [self._block(load, orders[load], mixed) for load in loads]
-        turn = load_order(before, loaded, after, self.wrenches, self.pace)
-        steps = assembled(self.names, before, [loaded[k] for k in turn], after)
+        order = load_order(before, loaded, after, self.wrenches, self.pace)
+        steps = assembled(self.names, before, [loaded[k] for k in order], after)
         return Plan((REFERENCE, *self.names), self.q, steps)
 
     def draw(self, extra: float) -> Plan:
-        """Return a random plan that takes about so many seconds longer than the shortest."""
-        total = sum(len(here) for here in self.stops.values())
+        """Return a random plan that takes about `extra` s longer than the shortest."""
+        total = sum(len(load_stops) for load_stops in self.stops.values())
         half = self.how.unloaded == "around"
         orders = {}
         for load, short in self.short.items():
@@ -428,48 +427,47 @@ class OrderDraws:
                 continue
             first = set(self.rng.permutation(short)[: (len(short) + 1) // 2].tolist())
             parts = [
-                tour.improved(seconds, [k for k in short if (k in first) == own])
-                for own in (True, False)
+                tour.improved(seconds, [k for k in short if (k in first) == in_first])
+                for in_first in (True, False)
             ]
-            now = [tour.length(seconds, part) for part in parts]
-            if max(now) >= tour.NEVER:  # a pose was parted from the only one that leads to it
+            lengths = [tour.length(seconds, part) for part in parts]
+            if max(lengths) >= tour.NEVER:  # a pose is in another part than its only access
                 half, orders[load] = False, self._walk(seconds, short, spare)
                 continue
-            spare -= sum(now) - tour.length(seconds, short)
+            spare -= sum(lengths) - tour.length(seconds, short)
             orders[load] = [k for part in parts for k in self._walk(seconds, part, spare / 2)]
         return self._plan(orders, half=half, mixed=True)
 
     def _walk(self, seconds: Floats, order: Sequence[int], spare: float) -> list[int]:
-        """Return a random tour of some stops, at most so many seconds longer than this one."""
+        """Return a random tour of some stops, at most `spare` s longer than `order`."""
         budget = tour.length(seconds, order) + max(spare, 0.0)
         return tour.shaken(seconds, order, budget, self.rng, _MOVES * len(order))
 
     def _block(self, load: str, order: Sequence[int], mixed: bool) -> LoadBlock:
-        """Cut an order into loops; mixed ones come in random order and direction."""
+        """Cut an order into loops; `mixed` loops are in random order and direction."""
         if not order:
             return LoadBlock(load, (), 0.0)
         direct, pace = self.ways[load].direct, self.pace
         parts = tour.loops(direct, order, pace.reading_s, self.how.reference_every_s)
-        if parts is None:  # a pose that is reached by another one only, and takes too long
+        if parts is None:  # the loop of a pose without a direct way takes too long
             parts = tour.loops(direct, order, pace.reading_s, np.inf)
         assert parts is not None  # noqa: S101 - every way of the order exists
         if mixed:
             parts = [parts[int(k)] for k in self.rng.permutation(len(parts))]
-            back = self.rng.random(len(parts)) < 0.5
+            reversals = self.rng.random(len(parts)) < 0.5
             parts = [
-                p[::-1] if turn and tour.length(direct, p[::-1]) < tour.NEVER else p
-                for p, turn in zip(parts, back, strict=True)
+                p[::-1] if reverse and tour.length(direct, p[::-1]) < tour.NEVER else p
+                for p, reverse in zip(parts, reversals, strict=True)
             ]
         seconds = sum(tour.length(direct, p) + pace.reading_s * (len(p) + 1) for p in parts)
-        here = self.stops.get(load, [])
-        stops = tuple(tuple(here[k - 1] for k in part) for part in parts)
+        load_stops = self.stops.get(load, [])
+        stops = tuple(tuple(load_stops[k - 1] for k in part) for part in parts)
         return LoadBlock(load, stops, seconds)
 
     def figures(self, plan: Plan) -> tuple[Duration, Confounding]:
         """Return duration and confounding of a plan."""
-        margin = self.config.limits.joint_margin_rad
+        margin, how = self.config.limits.joint_margin_rad, self.how
         time, times = timeline(plan, self.cell.arm, margin, self.pace)
-        how = self.how
         return time, confounding(plan, times, self.wrenches, how.drift, how.reading_std)
 
 
@@ -495,44 +493,44 @@ def ways(q: Floats, load: str, passable: Passable, pace: Pace) -> Ways:
 
 def load_order(
     before: LoadBlock, loaded: Sequence[LoadBlock], after: LoadBlock,
-    wrenches: Mapping[str, Floats], at: Pace,
+    wrenches: Mapping[str, Floats], pace: Pace,
 ) -> list[int]:  # fmt: skip
     """Return the order of the loads whose wrenches are least correlated with their lags.
 
-    With the middle t_l of the time of each load, t0 the mean time of the unloaded readings and n_l
-    readings it is the least max over components k of |Σ n w_k (t - t0)| / (|w_k| |t - t0|), the
-    lengths weighted by n as well.
+    It minimises the largest |Σ n w_k (t - t0)| / (|w_k| |t - t0|) of the wrench components k, with
+    t_l the middle of the time of load l, n_l its number of readings, t0 the mean time of the
+    unloaded readings, and norms weighted by n.
     """
     count = len(loaded)
     if count < 2:
         return list(range(count))
-    span = np.array([at.change_s + block.seconds for block in loaded])
+    span = np.array([pace.change_s + block.seconds for block in loaded])
     n = np.array([float(block.count) for block in loaded])
     w = np.array([wrenches[block.load] for block in loaded])
     w = w[:, np.any(w != 0, axis=0)]
     if count <= _ALL:
         tries = np.array(list(permutations(range(count))))
     else:
-        draws = np.random.default_rng(0)
-        tries = np.array([np.arange(count), *(draws.permutation(count) for _ in range(2000))])
+        rng = np.random.default_rng(0)
+        tries = np.array([np.arange(count), *(rng.permutation(count) for _ in range(2000))])
     end = before.seconds + np.cumsum(span[tries], axis=1)
     middle = end - span[tries] / 2
     free = before.count * before.seconds / 2
-    free += after.count * (before.seconds + span.sum() + at.change_s + after.seconds / 2)
+    free += after.count * (before.seconds + span.sum() + pace.change_s + after.seconds / 2)
     lag = middle - free / max(before.count + after.count, 1)
     top = np.abs(np.einsum("tl,tlk->tk", n[tries] * lag, w[tries]))
-    size = np.sqrt(np.einsum("tl,tl->t", n[tries], lag**2))[:, None]
-    size = size * np.sqrt(np.einsum("l,lk->k", n, w**2))
-    worst = (top / size).max(axis=1)
+    norm = np.sqrt(np.einsum("tl,tl->t", n[tries], lag**2))[:, None]
+    norm = norm * np.sqrt(np.einsum("l,lk->k", n, w**2))
+    worst = (top / norm).max(axis=1)
     return [int(k) for k in tries[int(np.argmin(np.round(worst, 9)))]]
 
 
 def assembled(
     names: Sequence[str], before: LoadBlock, loaded: Sequence[LoadBlock], after: LoadBlock
 ) -> tuple[Step, ...]:
-    """Return the steps of the blocks; the reference is read before and after every loop.
+    """Return the steps of the blocks, with a reading at the reference before and after every loop.
 
-    Unloaded readings there are cycles 0, 1, ...; those under a load share their cycles.
+    Its unloaded readings are cycles 0, 1, ...; readings under a load share these cycles.
     """
     free = (*before.loops, *after.loops)
     passes = max([len(block.loops) + 1 for block in loaded], default=0)
@@ -545,14 +543,14 @@ def assembled(
             steps.extend(Step(names[s.pose - 1], block.load, s.cycle) for s in loop)
             steps.append(Step(REFERENCE, block.load, next(cycles)))
 
-    at = iter(range(returns))
-    steps.append(Step(REFERENCE, UNLOADED, next(at)))
-    read(before, at)
+    free_cycles = iter(range(returns))
+    steps.append(Step(REFERENCE, UNLOADED, next(free_cycles)))
+    read(before, free_cycles)
     for block in loaded:
         share = np.round(np.linspace(0, returns - 1, len(block.loops) + 1)).astype(int).tolist()
         steps.append(Step(REFERENCE, block.load, share[0]))
         read(block, iter(share[1:]))
     if loaded:
-        steps.append(Step(REFERENCE, UNLOADED, next(at)))
-    read(after, at)
-    return (*steps, *(Step(REFERENCE, UNLOADED, k) for k in at))
+        steps.append(Step(REFERENCE, UNLOADED, next(free_cycles)))
+    read(after, free_cycles)
+    return (*steps, *(Step(REFERENCE, UNLOADED, k) for k in free_cycles))

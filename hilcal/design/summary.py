@@ -1,6 +1,6 @@
 """The summary of a plan: predicted precision, criterion comparison, sample-size curve, cost.
 
-One value, computed once; terminal, JSON and viewer read it directly, the plan's file holds `about`.
+Terminal, JSON and viewer read one summary, computed once; the plan's file holds `about`.
 """
 
 from collections.abc import Iterator
@@ -35,13 +35,13 @@ from hilcal.types import Floats
 from hilcal.whole_file import replace_file
 
 COMPARED = ("D", "A", "E", "K", "I")  # all but T-optimality, which needs suspects
-SHARES = (0.5, 1.0, 1.5, 2.0, 3.0)  # budgets of the curve by the plan's; a choice
-WORTH = 0.9  # Efficiency of a plan below which it is said what another one would give; a choice
+SHARES = (0.5, 1.0, 1.5, 2.0, 3.0)  # budgets of the curve over that of the plan; a choice
+WORTH = 0.9  # efficiency below which a remark states what a better plan would give; a choice
 _LEFT_OUT = {
     "deflection": "geometry, registration, repeatability and effects outside of the model",
     "position": "repeatability and effects outside of the model",
 }
-DRAWS = 5  # random directions of an effect, of whose strengths the median counts; a choice
+DRAWS = 5  # random directions of an effect, over which the strength's median is taken; a choice
 _SEED = 20240611
 
 
@@ -51,8 +51,8 @@ class DetectableEffect:
 
     Attributes:
         effect: its name.
-        least_m: rms displacement of the target, m, whose whitened residual after fitting the
-            model is one sigma; None where the model absorbs the effect.
+        least_m: RMS displacement of the target, m, that leaves a whitened residual of one sigma
+            after the model is fitted; None where the model absorbs the effect.
     """
 
     effect: str
@@ -65,8 +65,8 @@ class PredictedParameter:
 
     Attributes:
         name: e.g. "joint_compliance.j2".
-        std: in `unit`, SI; infinite where the readings do not determine it.
-        value: estimated or ordinary magnitude, SI; None where there is none.
+        std: in `unit`; infinite where the readings do not determine the parameter.
+        value: estimated or ordinary magnitude, in `unit`; None without.
         unit: SI.
     """
 
@@ -80,16 +80,16 @@ class PredictedParameter:
 class CriterionResult:
     """The design that a criterion chooses for the same number of readings.
 
-    The observability indices are those of Sun & Hollerbach (2008), of the whitened Jacobian by
-    the parameters in ordinary magnitudes with the singular values σ.
+    The observability indices are those of Sun & Hollerbach (2008), with σ the singular values of
+    the whitened Jacobian by the parameters in ordinary magnitudes.
 
     Attributes:
         criterion: its name.
         position_std_m: standard uncertainty of the position at the prediction poses, m.
-        position_open_m: the same with all potential terms estimated as well.
+        position_open_m: the same with all potential terms estimated, too.
         joint_share: largest relative standard uncertainty of a joint compliance; None without.
         o1: (Π σ)^(1/P) / √N, which D maximises; σ² are the eigenvalues of the Schur complement
-            of the model's parameters without prior.
+            of the model's parameters without a prior.
         o2: σ_min / σ_max, which K maximises; of the model alone.
         o3: σ_min, which E maximises.
         efficiency: certified lower bound of the efficiency by its own criterion; None without.
@@ -110,9 +110,9 @@ class CurvePoint:
     """A point of the sample-size curve.
 
     Attributes:
-        poses: number of poses beside the reference.
+        poses: number of poses without the reference.
         position_std_m: standard uncertainty of the position at the prediction poses, m.
-        efficiency: certified efficiency with so many poses; None without.
+        efficiency: certified efficiency with this number of poses; None without.
     """
 
     poses: int
@@ -124,60 +124,60 @@ class CurvePoint:
 class PlanSummary:
     """Cost, predicted precision and efficiency of a plan."""
 
-    poses: int  # number of poses beside the reference
-    readings: int  # of all, those at the reference included
-    loads: dict[str, int]  # readings by load, "none" among them, in their order
+    poses: int  # number of poses without the reference
+    readings: int  # number of all readings, with those at the reference
+    loads: dict[str, int]  # readings by load, with "none", in order
     duration: Duration
     criterion: str
     efficiency: float | None  # certified lower bound of the efficiency; None without a certificate
     parameters: tuple[PredictedParameter, ...]  # predicted precision by parameter
-    # RMS standard uncertainty of the prediction at the prediction poses, m; None without. It is not
-    # the accuracy of the robot, see `position_note`.
+    # RMS standard uncertainty of the prediction at the prediction poses, m; None without. Not the
+    # accuracy of the robot: see `position_note`.
     position_std_m: float | None
-    position: str = ""  # what is predicted there, e.g. "deflection under 5kg at 100 poses".
-    criteria: tuple[CriterionResult, ...] = ()  # criterion comparison, the plan's own among them
+    position: str = ""  # predicted quantity, e.g. "deflection under 5kg at 100 poses"
+    criteria: tuple[CriterionResult, ...] = ()  # criterion comparison, with that of the plan
     curve: tuple[CurvePoint, ...] = ()  # sample-size curve, fewest poses first
     detectable: tuple[DetectableEffect, ...] = ()  # minimum detectable effects
     longer: float = 0.0  # share of time beyond the shortest order
     confounding: Confounding | None = None  # of the order with a linear drift
     shortest: Confounding | None = None  # confounding of the shortest order
     remarks: tuple[str, ...] = ()  # assumptions and omissions, one sentence each
-    asked_poses: int | None = None  # see `planner.Request`; None where readings were
+    asked_poses: int | None = None  # requested number of poses; None if readings were requested
 
     @property
     def quantity(self) -> str:
-        """What is predicted at the prediction poses: "deflection" or "position"."""
+        """Quantity predicted at the prediction poses: "deflection" or "position"."""
         return self.position.split(" ")[0] or "position"
 
     @property
     def position_note(self) -> str:
-        """What `position_std_m` is, and what it leaves out, in a sentence."""
+        """A sentence on the meaning of `position_std_m`, and on what it excludes."""
         return position_note(self.quantity)
 
     @property
     def load_changes(self) -> int:
-        """How often a load is changed by hand, the removal of the last one included."""
+        """Number of load changes by hand, with the removal of the last load."""
         return len(self.loads) if len(self.loads) > 1 else 0
 
     def to_dict(self) -> dict[str, object]:
         """Return the JSON document."""
-        known, own, shortest = asdict(self), self.confounding, self.shortest
+        fields, of_plan, shortest = asdict(self), self.confounding, self.shortest
         order = None
-        if own is not None and shortest is not None:
+        if of_plan is not None and shortest is not None:
             order = {
                 "longer": self.longer,
-                "lost": own.correlation**2,
+                "lost": of_plan.correlation**2,
                 "lost_shortest": shortest.correlation**2,
-                **{key: getattr(own, key) for key in ("drift", "error_m", "bias_m")},
-                "told": own.drift_std,
+                **{key: getattr(of_plan, key) for key in ("drift", "error_m", "bias_m")},
+                "told": of_plan.drift_std,
             }
-        same = ("poses", "readings", "criterion", "efficiency", "position_std_m", "parameters")
+        keys = ("poses", "readings", "criterion", "efficiency", "position_std_m", "parameters")
         return {
-            **{key: known[key] for key in same}, "asked_poses": self.asked_poses,
+            **{key: fields[key] for key in keys}, "asked_poses": self.asked_poses,
             "position": self.position, "position_note": self.position_note,
             "predicted_std": {p.name: p.std for p in self.parameters},
-            "readings_by_load": self.loads, "criteria": known["criteria"],
-            "curve": known["curve"], "detectable": known["detectable"], "order": order,
+            "readings_by_load": self.loads, "criteria": fields["criteria"],
+            "curve": fields["curve"], "detectable": fields["detectable"], "order": order,
             "remarks": list(self.remarks),
         }  # fmt: skip
 
@@ -186,13 +186,13 @@ def summarise(
     planned: Planned,
     config: CellConfig,
     rng: np.random.Generator,
-    say: Say = lambda words: None,
+    say: Say = lambda _: None,
     *,
     compare: bool = True,  # whether to compute the criterion comparison
     curve: bool = True,  # whether to compute the sample-size curve
 ) -> PlanSummary:
     """Return the summary of a plan."""
-    plan, knows = planned.ordered.plan, planned.predicted
+    plan, precision = planned.ordered.plan, planned.predicted
     if compare or curve:
         say("comparing criteria and numbers of poses" if compare else "comparing numbers of poses")
     return PlanSummary(
@@ -200,7 +200,7 @@ def summarise(
         loads={name: sum(s.load == name for s in plan.steps) for name in plan.loads},
         duration=planned.ordered.duration, criterion=planned.criterion,
         efficiency=planned.design.efficiency, parameters=_parameters(planned),
-        position_std_m=_finite(knows.position), position=planned.work.what,
+        position_std_m=_finite(precision.position), position=planned.work.what,
         criteria=tuple(_criteria(planned, config, rng)) if compare else (),
         curve=tuple(_curve(planned)) if curve else (),
         detectable=tuple(detectable_effects(planned, config)), longer=planned.ordered.longer,
@@ -210,7 +210,7 @@ def summarise(
 
 
 def position_note(quantity: str) -> str:
-    """Return what the uncertainty of a predicted "deflection" or "position" leaves out."""
+    """Return a sentence on what the uncertainty of a "deflection" or "position" excludes."""
     return (
         f"standard uncertainty (rms) of the {quantity} that the fitted model predicts; it is not "
         f"the accuracy of the robot: {_LEFT_OUT[quantity]} are not in it"
@@ -218,20 +218,20 @@ def position_note(quantity: str) -> str:
 
 
 def _parameters(planned: Planned) -> tuple[PredictedParameter, ...]:
-    knows, frames = planned.predicted, _prefixes(planned.problem, *FRAME_ROLES)
-    known = {
+    precision, frames = planned.predicted, _prefixes(planned.problem, *FRAME_ROLES)
+    by_name = {
         name: PredictedParameter(name, float(std), float(value) or None, unit)
         for name, std, value, unit in zip(
-            knows.names, knows.std, knows.values, knows.units, strict=True
+            precision.names, precision.std, precision.values, precision.units, strict=True
         )
-        # deflections do not determine where a frame is
+        # deflections do not determine the origin of a frame
         if np.isfinite(std) or not name.startswith(frames)
     }
     for u in planned.undetermined:
-        known[u.name] = PredictedParameter(u.name, np.inf, u.value or None, u.unit)
+        by_name[u.name] = PredictedParameter(u.name, np.inf, u.value or None, u.unit)
     effects = planned.problem.nominal.model.effects
     names = (f"{e.name}.{p.name}" for e in effects for p in e.parameters)
-    return tuple(known[name] for name in names if name in known)
+    return tuple(by_name[name] for name in names if name in by_name)
 
 
 def remarks(planned: Planned) -> tuple[str, ...]:
@@ -242,39 +242,39 @@ def remarks(planned: Planned) -> tuple[str, ...]:
         for name, gain in planned.costly
     )
     readings, efficiency = int(planned.design.cost), planned.design.efficiency
-    worth = planned.asked_poses is not None and efficiency < WORTH
+    suboptimal = planned.asked_poses is not None and efficiency < WORTH
     if planned.criterion == "I":
         std = 1e6 / np.sqrt(planned.design.value)
-        what = planned.work.what.split(" ")[0]
+        quantity = planned.work.what.split(" ")[0]
         best = (
             f"; as many readings, at the most informative poses and loads (--readings "
             f"{readings}), to no less than {std * np.sqrt(efficiency):.3g} µm"
         )
         omitted += (
-            f"with every effect of the catalogue as large as arms have it, the {what} is predicted "
-            f"to {std:.3g} µm (rms){best if worth else ''}",
+            f"with every effect of the catalogue as large as arms have it, the {quantity} is "
+            f"predicted to {std:.3g} µm (rms){best if suboptimal else ''}",
         )
-    elif worth:
+    elif suboptimal:
         omitted += (
             f"as many readings, at the most informative poses and loads (--readings "
             f"{readings}), are up to {100 / efficiency - 100:.0f} % more efficient",
         )
-    without = tuple(u.remark for u in planned.undetermined)
-    notes = (*without, *omitted, *planned.drawn.remarks, *planned.problem.notes)
+    undetermined = tuple(u.remark for u in planned.undetermined)
+    notes = (*undetermined, *omitted, *planned.drawn.remarks, *planned.problem.notes)
     return tuple(dict.fromkeys(notes))
 
 
 def about(planned: Planned) -> dict[str, object]:
-    """Return what a plan's file holds of its origin."""
-    knows = planned.predicted
+    """Return the origin of a plan, as its file stores it."""
+    precision = planned.predicted
     return {
         **planned.ordered.plan.about,
         "made_by": "optimal design",
         "criterion": planned.criterion,
         "efficiency": round(planned.design.efficiency, 6),
-        "predicted_std": {n: _finite(s) for n, s in knows.by_name().items()}
+        "predicted_std": {n: _finite(s) for n, s in precision.by_name().items()}
         | {u.name: None for u in planned.undetermined},
-        "position_std_m": _finite(knows.position),
+        "position_std_m": _finite(precision.position),
         "position": planned.work.what,
         "position_note": position_note(planned.work.what.split(" ")[0]),
         "candidates": len(planned.drawn.q),
@@ -288,50 +288,50 @@ def _finite(value: float | None) -> float | None:
 def _criteria(
     planned: Planned, config: CellConfig, rng: np.random.Generator
 ) -> Iterator[CriterionResult]:
-    of = planned.problem
+    problem = planned.problem
     usable_poses = [
-        pose for (pose, _), usable in zip(of.what, planned.usable, strict=True) if usable
+        pose for (pose, _), usable in zip(problem.what, planned.usable, strict=True) if usable
     ]
     for name in dict.fromkeys((*COMPARED, planned.criterion)):
         if name == planned.criterion:
             yield _result(planned, name, planned.counts, planned.design.efficiency)
             continue
         try:
-            asked = compound_objective(of, config, name, planned.work, planned.budget, rng)
+            objective = compound_objective(problem, config, name, planned.work, planned.budget, rng)
             if planned.asked_poses is not None:
-                whole = pose_units(asked, of)
-                among = np.isin(whole.poses, usable_poses)
-                taken, _ = choose_poses(asked, whole, among, planned.asked_poses, rng, 1)
-                design = certified(asked, taken, planned.usable)
+                candidates = pose_units(objective, problem)
+                among = np.isin(candidates.poses, usable_poses)
+                chosen, _ = choose_poses(objective, candidates, among, planned.asked_poses, rng, 1)
+                design = certified(objective, chosen, planned.usable)
             else:
-                design = choose(only(asked, planned.usable), planned.budget, rng, 1)
+                design = choose(only(objective, planned.usable), planned.budget, rng, 1)
         except CannotAnswerError:
             continue
-        counts = np.zeros(len(of.units))
+        counts = np.zeros(len(problem.units))
         counts[planned.usable] = design.counts
         yield _result(planned, name, counts, design.efficiency)
 
 
 def _result(planned: Planned, name: str, counts: Floats, efficiency: float) -> CriterionResult:
-    of, free = planned.problem, unknown(planned.problem)
-    knows = predicted(of, counts, work=planned.work)
-    taken = np.flatnonzero(counts)
-    known = of.units.information(counts[taken], taken)
-    left = schur_complement(of.prior + known, free)
-    sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(left), 0.0))
-    alone = np.sqrt(np.maximum(np.linalg.eigvalsh(known[np.ix_(free, free)]), 0.0))
-    readings = float(counts @ of.units.cost)
-    baseline = _prefixes(of, "baseline")
+    problem, free = planned.problem, unknown(planned.problem)
+    precision = predicted(problem, counts, work=planned.work)
+    used = np.flatnonzero(counts)
+    information = problem.units.information(counts[used], used)
+    schur = schur_complement(problem.prior + information, free)
+    sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(schur), 0.0))
+    alone = np.sqrt(np.maximum(np.linalg.eigvalsh(information[np.ix_(free, free)]), 0.0))
+    readings = float(counts @ problem.units.cost)
+    baseline = _prefixes(problem, "baseline")
     shares = [
         std / abs(value)
-        for name, std, value in zip(knows.names, knows.std, knows.values, strict=True)
+        for name, std, value in zip(precision.names, precision.std, precision.values, strict=True)
         if name.startswith(baseline) and value
     ]
     volume = float(np.exp(np.mean(np.log(np.maximum(sigma, 1e-300)))))
     return CriterionResult(
         criterion=name,
-        position_std_m=_finite(knows.position),
-        position_open_m=_finite(knows.position_open),
+        position_std_m=_finite(precision.position),
+        position_open_m=_finite(precision.position_open),
         joint_share=_finite(max(shares)) if shares else None,
         o1=volume / np.sqrt(readings),
         o2=float(alone[0] / alone[-1]),
@@ -340,23 +340,23 @@ def _result(planned: Planned, name: str, counts: Floats, efficiency: float) -> C
     )
 
 
-def _prefixes(of: DesignProblem, *roles: Role) -> tuple[str, ...]:
-    return tuple(f"{e.name}." for e in of.nominal.model.effects if e.role in roles)
+def _prefixes(problem: DesignProblem, *roles: Role) -> tuple[str, ...]:
+    return tuple(f"{e.name}." for e in problem.nominal.model.effects if e.role in roles)
 
 
 def _curve(planned: Planned) -> Iterator[CurvePoint]:
-    of = planned.problem
-    asked, usable = only(planned.asked, planned.usable), np.flatnonzero(planned.usable)
-    own = len({of.what[k][0] for k in np.flatnonzero(planned.counts)})
-    last, before = planned.design.relaxed, 0
+    problem = planned.problem
+    objective, usable = only(planned.asked, planned.usable), np.flatnonzero(planned.usable)
+    n_poses = len({problem.what[k][0] for k in np.flatnonzero(planned.counts)})
+    last, previous = planned.design.relaxed, 0
     for share in SHARES:
-        budget, poses = share * planned.budget, max(1, round(share * own))
-        if budget < asked.units.cost.max() or poses == before:
+        budget, poses = share * planned.budget, max(1, round(share * n_poses))
+        if budget < objective.units.cost.max() or poses == previous:
             continue
-        before = poses
-        last = asked.relaxed(budget, start=last)
-        whole = of.prior + of.units.information(last.weight, usable[last.index])
-        position = _finite(predicted(of, information=whole, work=planned.work).position)
+        previous = poses
+        last = objective.relaxed(budget, start=last)
+        information = problem.prior + problem.units.information(last.weight, usable[last.index])
+        position = _finite(predicted(problem, information=information, work=planned.work).position)
         if position is not None:
             yield CurvePoint(poses, position)
 
@@ -364,31 +364,32 @@ def _curve(planned: Planned) -> Iterator[CurvePoint]:
 def detectable_effects(planned: Planned, config: CellConfig) -> Iterator[DetectableEffect]:
     """Yield the minimum detectable strength of each effect outside of the model.
 
-    The median over some directions of its parameters: rms of the displacement over the plan's poses
-    and loads, divided by the root of the non-centrality beyond the model.
+    It is the RMS displacement over the plan's poses and loads, divided by the root of the
+    non-centrality beyond the model; the median over random directions of the parameters.
     """
-    of, size = planned.problem, planned.problem.model_size
-    taken = np.flatnonzero(planned.counts)
-    information = of.measured + of.units.information(planned.counts[taken], taken)
-    model = of.prior[:size, :size] - of.measured[:size, :size]
-    information[:size, :size] += model
-    chosen = of.candidates[sorted({of.what[k][0] for k in taken})]
-    moves = [
-        part.jacobian[:, 1:] - part.jacobian[:, :1] if of.mode == "deflection" else part.jacobian
-        for part in reading_derivatives(of.nominal, config, chosen, of.families, of.scale)
-    ]
-    moved = np.concatenate([block[..., :3, :].reshape(-1, len(of.terms)) for block in moves])
+    problem, size = planned.problem, planned.problem.model_size
+    used = np.flatnonzero(planned.counts)
+    information = problem.measured + problem.units.information(planned.counts[used], used)
+    model_prior = problem.prior[:size, :size] - problem.measured[:size, :size]
+    information[:size, :size] += model_prior
+    chosen = problem.candidates[sorted({problem.what[k][0] for k in used})]
+    parts = reading_derivatives(problem.nominal, config, chosen, problem.families, problem.scale)
+    blocks = [part.jacobian[..., :3, :] for part in parts]
+    if problem.mode == "deflection":
+        blocks = [block[:, 1:] - block[:, :1] for block in blocks]
+    displacement = np.concatenate([block.reshape(-1, len(problem.terms)) for block in blocks])
     rng = np.random.default_rng(_SEED)
-    for effect in of.families:
-        where = of.of_effect(effect.name)
-        left = schur_complement(information, where, np.arange(size))
-        least = []
+    for effect in problem.families:
+        columns = problem.of_effect(effect.name)
+        schur = schur_complement(information, columns, np.arange(size))
+        strengths = []
         for _ in range(DRAWS):
-            beta = rng.standard_normal(len(where))
-            apart = float(beta @ left @ beta)
-            size_m = float(np.sqrt(3.0 * np.mean((moved[:, where] @ beta) ** 2)))
-            least.append(size_m / np.sqrt(apart) if apart > VISIBLE * len(where) else np.inf)
-        smallest = float(np.median(least))
+            beta = rng.standard_normal(len(columns))
+            noncentrality = float(beta @ schur @ beta)
+            size_m = float(np.sqrt(3.0 * np.mean((displacement[:, columns] @ beta) ** 2)))
+            visible = noncentrality > VISIBLE * len(columns)
+            strengths.append(size_m / np.sqrt(noncentrality) if visible else np.inf)
+        smallest = float(np.median(strengths))
         yield DetectableEffect(effect.name, smallest if np.isfinite(smallest) else None)
 
 
@@ -396,7 +397,7 @@ def detectable_effects(planned: Planned, config: CellConfig) -> Iterator[Detecta
 class CheckedPlan(Shown, Tabular):
     """A plan whose dry run passed, and its summary."""
 
-    plan: Plan  # poses, loads and steps, as a plan file holds them
+    plan: Plan  # poses, loads and steps
     dry: DryRun
     summary: PlanSummary  # cost, predicted precision and efficiency
 
@@ -417,7 +418,7 @@ class CheckedPlan(Shown, Tabular):
         return self.summary.efficiency
 
     def save(self, path: str | Path) -> None:
-        """Write the plan file, which `hilcal run --plan` takes."""
+        """Write the plan file of `hilcal run --plan`."""
         replace_file(path, self.plan.to_json() + "\n")
 
     def to_dict(self) -> dict[str, object]:
@@ -441,10 +442,10 @@ def checked(cell: Cell, config: CellConfig, plan: Plan, summary: PlanSummary) ->
 
 def refuse(dry: DryRun, what: str) -> None:
     """Refuse a plan that did not pass its dry run."""
-    if (found := refusal(dry, what)) is not None:
-        raise found
+    if (error := refusal(dry, what)) is not None:
+        raise error
 
 
 def refusal(dry: DryRun, what: str) -> InputError | None:
-    """Return the same without raising it; None where the plan has passed."""
+    """Return the error of `refuse` without raising it; None if the dry run passed."""
     return InputError(f"{what} cannot be run: {dry.first}") if dry.problems else None

@@ -1,6 +1,6 @@
-"""Tours from the reference pose through stops and back: short ones, random ones, and their loops.
+"""Tours from the reference pose through stops and back: short tours, random tours, and loops.
 
-All work on a matrix of seconds, (m + 1, m + 1), whose row i and column j hold the way from
+All functions use a matrix of travel times, s, (m + 1, m + 1), whose element (i, j) is the way from
 stop i to stop j; 0 is the reference. A way that does not exist costs `NEVER`.
 """
 
@@ -11,9 +11,9 @@ import numpy as np
 
 from hilcal.types import Floats
 
-NEVER = 1e7  # Seconds of a way that does not exist: more than any campaign, so that sums stay exact
+NEVER = 1e7  # s, of a way that does not exist: longer than any campaign, and sums stay exact
 _EXACT = 7  # stops up to which every order is tried
-_LONGEST = 3  # stops of a segment that is moved as one
+_LONGEST = 3  # stops of a segment that is moved, at most
 _KICKS = 20  # double bridges
 _GAIN = 1e-9  # s, below which a change is rounding
 
@@ -25,10 +25,10 @@ def length(seconds: Floats, order: Sequence[int]) -> float:
 
 
 def shortest(seconds: Floats, rng: np.random.Generator) -> list[int]:
-    """Return an order of stops 1 to m whose tour is short; the shortest up to 7 stops.
+    """Return an order of stops 1 to m whose tour is short; up to 7 stops, the shortest.
 
-    Nearest insertion, then 2-opt and Or-opt exchanges until none helps, then the same again after
-    each of some double bridges (Martin, Otto & Felten 1991), of which the best is kept.
+    Nearest insertion, then 2-opt and Or-opt exchanges until none helps. The exchanges are repeated
+    after each of several double bridges (Martin, Otto & Felten 1991); the best tour is returned.
     """
     count = len(seconds) - 1
     if count <= _EXACT:
@@ -38,8 +38,8 @@ def shortest(seconds: Floats, rng: np.random.Generator) -> list[int]:
     for _ in range(_KICKS):
         a, b, c = sorted(int(k) for k in rng.choice(np.arange(1, count), 3, replace=False))
         order = improved(seconds, best[:a] + best[b:c] + best[a:b] + best[c:])
-        if (here := length(seconds, order)) < least - _GAIN:
-            best, least = order, here
+        if (total := length(seconds, order)) < least - _GAIN:
+            best, least = order, total
     return best
 
 
@@ -54,50 +54,50 @@ def _by_trial(seconds: Floats) -> list[int]:
 
 
 def _inserted(seconds: Floats) -> list[int]:
-    """Insert the stop that is nearest to the tour where it costs least, until all are in."""
+    """Repeatedly insert the stop nearest to the tour at the place where it costs least."""
     count = len(seconds) - 1
     near = np.minimum(seconds, seconds.T)
-    gap, left = near[0].copy(), np.ones(count + 1, dtype=np.bool_)
-    left[0] = False
+    gap, outside = near[0].copy(), np.ones(count + 1, dtype=np.bool_)
+    outside[0] = False
     way = [0, 0]
     for _ in range(count):
-        k = int(np.argmin(np.where(left, gap, np.inf)))
+        k = int(np.argmin(np.where(outside, gap, np.inf)))
         a, b = way[:-1], way[1:]
         place = int(np.argmin(seconds[a, k] + seconds[k, b] - seconds[a, b]))
         way.insert(place + 1, k)
-        left[k] = False
+        outside[k] = False
         gap = np.minimum(gap, near[k])
     return way[1:-1]
 
 
 def improved(seconds: Floats, order: Sequence[int]) -> list[int]:
-    """Return an order that no 2-opt or Or-opt exchange makes shorter; the best one first."""
+    """Return an order that no 2-opt or Or-opt exchange shortens; the best exchange first."""
     way = np.array([0, *order, 0])
     while len(way) > 3:
-        found = min(_turned(seconds[np.ix_(way, way)]), _moved(seconds[np.ix_(way, way)]))
-        if found[0] > -_GAIN:
+        change = min(_turned(seconds[np.ix_(way, way)]), _moved(seconds[np.ix_(way, way)]))
+        if change[0] > -_GAIN:
             break
-        _, i, j, after, turn = found
+        _, i, j, place, turn = change
         part = way[i : j + 1][::-1] if turn else way[i : j + 1]
-        rest = np.concatenate([way[:i], way[j + 1 :]])
-        at = after + 1 if after < i else after - (j - i)
-        way = np.concatenate([rest[:at], part, rest[at:]])
+        remaining = np.concatenate([way[:i], way[j + 1 :]])
+        index = place + 1 if place < i else place - (j - i)
+        way = np.concatenate([remaining[:index], part, remaining[index:]])
     return [int(k) for k in way[1:-1]]
 
 
-_Change = tuple[float, int, int, int, bool]  # s gained, part, place to be put, turned
+_Change = tuple[float, int, int, int, bool]  # added s; first and last of part; place; turned
 
 
 def _turn_cost(p: Floats) -> Floats:
-    """Return (k, k): what turning the inside of the part from place i to j costs, s."""
-    there = np.concatenate([[0.0], np.cumsum(np.diagonal(p, 1))])
+    """Return (k, k), s: the cost of reversing the part from place i to j, without its ends."""
+    forward = np.concatenate([[0.0], np.cumsum(np.diagonal(p, 1))])
     back = np.concatenate([[0.0], np.cumsum(np.diagonal(p, -1))])
-    extra = back - there
+    extra = back - forward
     return np.asarray(extra[None, :] - extra[:, None])
 
 
 def _turned(p: Floats) -> _Change:
-    """Return the best turn of a part (2-opt); `p` holds the ways between places of the tour."""
+    """Return the best reversal of a part (2-opt); `p`, s: times between places of the tour."""
     k = len(p)
     i, j = np.triu_indices(k - 2, 1)
     i, j = i + 1, j + 1
@@ -109,34 +109,34 @@ def _turned(p: Floats) -> _Change:
 def _moved(p: Floats) -> _Change:
     """Return the best move of a part of up to three stops to another place (Or-opt)."""
     k, turn_cost = len(p), _turn_cost(p)
-    after = np.arange(k - 1)
+    places = np.arange(k - 1)
     best: _Change = (np.inf, 0, 0, 0, False)
     for size in range(1, min(_LONGEST, k - 3) + 1):
         i = np.arange(1, k - size)[:, None]
         j = i + size - 1
-        out = p[i - 1, j + 1] - p[i - 1, i] - p[j, j + 1] - p[after, after + 1]
-        inside = (after >= i - 1) & (after <= j)
+        out = p[i - 1, j + 1] - p[i - 1, i] - p[j, j + 1] - p[places, places + 1]
+        inside = (places >= i - 1) & (places <= j)
         for turn in (False, True) if size > 1 else (False,):
             a, b = (j, i) if turn else (i, j)
-            gain = out + p[after, a] + p[b, after + 1] + (turn_cost[i, j] if turn else 0.0)
+            gain = out + p[places, a] + p[b, places + 1] + (turn_cost[i, j] if turn else 0.0)
             gain = np.where(inside, np.inf, gain)
-            at = int(np.argmin(gain))
-            row, place = divmod(at, k - 1)
-            found = (float(gain[row, place]), row + 1, row + size, place, turn)
-            best = min(best, found)
+            index = int(np.argmin(gain))
+            row, place = divmod(index, k - 1)
+            change = (float(gain[row, place]), row + 1, row + size, place, turn)
+            best = min(best, change)
     return best
 
 
 def shaken(
     seconds: Floats, order: Sequence[int], budget: float, rng: np.random.Generator, moves: int
 ) -> list[int]:
-    """Return a random order whose tour takes at most `budget`, s, or no longer than `order`'s.
+    """Return a random order whose tour takes at most `budget`, s, or no more than that of `order`.
 
-    A random walk by turns and moves of parts, which are as probable as their inverses; a step that
-    would exceed the budget is not taken.
+    A random walk by reversals and moves of parts, each as probable as its inverse; a step that
+    exceeds the budget is not taken.
     """
     way = [0, *order, 0]
-    here, count = length(seconds, order), len(order)
+    total, count = length(seconds, order), len(order)
     if count < 2:
         return list(order)
     symmetric = bool(np.array_equal(seconds, seconds.T))
@@ -148,28 +148,28 @@ def shaken(
             continue
         i, j = min(a, b), max(a, b)
         part = way[i : j + 1]
-        # either turned, or the stop at a goes to b
+        # the part is reversed, or the stop at a moves to b
         new = part[::-1] if turn else [*part[1:], part[0]] if a < b else [part[-1], *part[:-1]]
-        before, after = way[i - 1], way[j + 1]
-        gain = w[before][new[0]] - w[before][part[0]] + w[new[-1]][after] - w[part[-1]][after]
-        if not turn:  # within the part one way is new, and one was there before
-            one, other = (new[-2:], part[:2]) if a < b else (new[:2], part[-2:])
-            gain += w[one[0]][one[1]] - w[other[0]][other[1]]
+        start, end = way[i - 1], way[j + 1]
+        gain = w[start][new[0]] - w[start][part[0]] + w[new[-1]][end] - w[part[-1]][end]
+        if not turn:  # within the part, one way is added and one removed
+            added, removed = (new[-2:], part[:2]) if a < b else (new[:2], part[-2:])
+            gain += w[added[0]][added[1]] - w[removed[0]][removed[1]]
         elif not symmetric:
             gain += sum(w[x][y] for x, y in pairwise(new))
             gain -= sum(w[x][y] for x, y in pairwise(part))
-        if here + gain <= max(budget, here):
+        if total + gain <= max(budget, total):
             way[i : j + 1] = new
-            here += gain
+            total += gain
     return way[1:-1]
 
 
 def loops(
     direct: Floats, order: Sequence[int], reading_s: float, limit_s: float
 ) -> list[list[int]] | None:
-    """Return a tour cut into loops from the reference in least time; None if there is none.
+    """Return a tour cut into loops from the reference of least total time; None if impossible.
 
-    Dynamic programming over the places where the tour may be cut (Beasley 1983): T(j) = min over i
+    Dynamic programming over the places to cut the tour (Beasley 1983): T(j) = min over i
     of T(i) + loop(i + 1 … j). A loop of one stop is always allowed.
     """
     count = len(order)
@@ -185,11 +185,11 @@ def loops(
             out += reading_s
             if out >= NEVER or (j > i and out > limit_s):
                 break
-            whole = out + direct[order[j], 0]
-            if whole >= NEVER or (j > i and whole > limit_s):
+            closed = out + direct[order[j], 0]
+            if closed >= NEVER or (j > i and closed > limit_s):
                 continue
-            if best[i] + whole + reading_s < best[j + 1]:
-                best[j + 1], cut[j + 1] = best[i] + whole + reading_s, i
+            if best[i] + closed + reading_s < best[j + 1]:
+                best[j + 1], cut[j + 1] = best[i] + closed + reading_s, i
     if not np.isfinite(best[count]):
         return None
     out, j = [], count

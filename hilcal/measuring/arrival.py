@@ -1,4 +1,4 @@
-"""What is read in one arrival of the arm, and where the tracker roughly stands, to be aimed."""
+"""The readings of one arrival of the arm, and a rough registration to aim the tracker by."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -17,37 +17,37 @@ from hilcal.robot.chain import drive_jacobian
 from hilcal.store.plan import Step
 from hilcal.types import Floats
 
-ENOUGH = 4  # readings from which a registration is computed: three fix it, one more checks it
-WITNESSES = 2  # readings by whose distances another one is judged, at least
-SPREAD_M = 0.05  # second extent of a cloud of positions that fixes a rotation, m
-PLAUSIBLE_M = 0.1  # a reading so far from where the nominal arm holds the target is not believed, m
+ENOUGH = 4  # least readings of a registration: three fix it, one more checks it
+WITNESSES = 2  # least readings whose distances check another one
+SPREAD_M = 0.05  # least second extent of a cloud of positions that fixes a rotation, m
+PLAUSIBLE_M = 0.1  # largest distance of a reading from the nominal position of its target, m
 FITS_M = 0.02
 """Largest residual of a reading that fits a registration, m; a nominal arm errs by less."""
-STRAYS = 3  # readings that a registration leaves out at most; beyond that the nominal arm is wrong
+STRAYS = 3  # readings that a registration omits at most; beyond that the nominal arm is wrong
 APART_M = 0.05  # largest error of a distance between two readings, m
-STUCK_M = 1e-5  # two readings so close to each other at poses that are not are one old reading, m
+STUCK_M = 1e-5  # readings closer than this, m, at different poses are one old reading
 STUCK_SHARE = 0.2
-"""A target that moves by less than this share of what the arm moves it by is not on the arm."""
+"""A target that moves by less than this share of the arm's motion is not on the arm."""
 MOVES_M = 0.005
-"""The arm has to move a target by so much before that is asked, m; geometric errors are less."""
+"""Least motion of a target by the arm for that check, m; geometric errors are smaller."""
 
 
 @dataclass(slots=True, eq=False)
 class _Sighting:
-    """A reading, as far as it tells where the tracker stands."""
+    """A reading, for the registration."""
 
-    held: Floats  # (3,) where the nominal arm held the target, base axes, m
-    position: Floats  # (3,) where the tracker saw it, sensor axes, m
+    held: Floats  # (3,) nominal position of the target, base axes, m
+    position: Floats  # (3,) measured position, sensor axes, m
     target: int
     step: Step | None
     doubted: bool = False
 
 
 class RoughRegistration:
-    """The registration T_sensor_base as far as it is known while a campaign is measured.
+    """A rough registration T_sensor_base during a campaign.
 
-    Good enough to notice that the tracker follows something else, and to judge a drift by the
-    arm's repeatability; identification does not use it.
+    It detects a tracker that follows another object, and a drift beyond the arm's repeatability;
+    identification does not use it.
     """
 
     def __init__(self, cell: Cell) -> None:
@@ -56,35 +56,36 @@ class RoughRegistration:
         self._repeated: list[tuple[Step, str]] = []
 
     def add(self, q: Floats, position: Floats, target: int = 0, step: Step | None = None) -> None:
-        """Take note of a reading for a step: joint angles (n,) and position (3,), sensor axes, m.
+        """Add a reading for a step: joint angles (n,), rad, and position (3,), sensor axes, m.
 
-        One that repeats an earlier one is left out; older versions stored such.
+        A reading that repeats the previous one is skipped; older versions stored such readings.
         """
         held = self._positions(q)[target]
         if self._stuck(held, position, target) is None:
             self._sightings.append(_Sighting(held, np.asarray(position), target, step))
 
     def late_doubts(self) -> list[tuple[Step, str]]:
-        """Return the stored readings that may not be of their target, each once, and why.
+        """Return the stored readings that may not be of their target, each once, with the reason.
 
-        They were stored while nothing told where the tracker stands: those that do not fit as soon
-        as that is known, and until then the one that the next reading repeated.
+        Once the registration is known: readings stored earlier that do not fit it. Until then: a
+        reading that the next one repeated.
         """
         pose = self.pose()
         if pose is None:
             repeated, self._repeated = self._repeated, []
             return repeated
         out = []
-        for one in self._sightings:
-            far = float(_far(pose, one.held[None], one.position[None])[0])
-            if far > PLAUSIBLE_M and self._cell.known_targets[one.target] and not one.doubted:
-                one.doubted = True
+        for sighting in self._sightings:
+            far = float(_far(pose, sighting.held[None], sighting.position[None])[0])
+            known_target = self._cell.known_targets[sighting.target]
+            if far > PLAUSIBLE_M and known_target and not sighting.doubted:
+                sighting.doubted = True
                 why = f"its target was {far:.3g} m from where the arm held it; another reflector?"
-                out += [] if one.step is None else [(one.step, why)]
+                out += [] if sighting.step is None else [(sighting.step, why)]
         return out
 
     def doubt_repeated(self, q: Floats, position: Floats, target: int = 0) -> None:
-        """Doubt the reading that a refused one repeats, unless the tracker's place is known."""
+        """Doubt the reading that a refused reading repeats, unless the registration is known."""
         if self._stuck(self._positions(q)[target], position, target) is None or self.pose():
             return
         last = self._last(target)
@@ -99,33 +100,33 @@ class RoughRegistration:
         Least squares over the nominal positions p: min Σ |x − R p − t|², R from the singular
         value decomposition of Σ (x − x̄)(p − p̄)ᵀ (Kabsch 1976).
         """
-        known = self._cell.registration
+        registration = self._cell.registration
         if self._cell.registration_known:
-            return known[:3, :3], known[:3, 3]
-        held, seen = self._places()
+            return registration[:3, :3], registration[:3, 3]
+        held, measured = self._places()
         if len(held) < ENOUGH:
             return None
-        whole = _kabsch(held, seen)
-        if not all(self._cell.known_targets):  # a guessed place on the flange fits nowhere
-            return whole
+        of_all = _kabsch(held, measured)
+        if not all(self._cell.known_targets):  # a guessed target position has large residuals
+            return of_all
         for _ in range(STRAYS + 1):
-            found = _kabsch(held, seen)
-            if found is None or _far(found, held, seen).max() <= FITS_M:
-                return found
+            fitted = _kabsch(held, measured)
+            if fitted is None or _far(fitted, held, measured).max() <= FITS_M:
+                return fitted
             if len(held) == ENOUGH:
                 return None
-            rest = [(np.delete(held, k, 0), np.delete(seen, k, 0)) for k in range(len(held))]
-            worst = [np.inf if (p := _kabsch(*x)) is None else _far(p, *x).max() for x in rest]
-            held, seen = rest[int(np.argmin(worst))]
-        return whole
+            fewer = [(np.delete(held, k, 0), np.delete(measured, k, 0)) for k in range(len(held))]
+            worst = [np.inf if (p := _kabsch(*x)) is None else _far(p, *x).max() for x in fewer]
+            held, measured = fewer[int(np.argmin(worst))]
+        return of_all
 
     def expected(self, q: Floats) -> Floats | None:
-        """Return (T, 3) where the targets are expected, sensor axes, m; None while unknown."""
+        """Return the expected positions (T, 3) of targets, sensor axes, m; None while unknown."""
         pose = self.pose()
         return None if pose is None else self._positions(q) @ pose[0].T + pose[1]
 
     def implausible(self, q: Floats, position: Floats, target: int = 0) -> str | None:
-        """Return in one line why a reading cannot be of the target on the arm, or None."""
+        """Return why a reading cannot be of the target on the arm, in one line; else None."""
         stuck = self._stuck(self._positions(q)[target], position, target)
         if stuck is not None:
             return stuck
@@ -133,60 +134,60 @@ class RoughRegistration:
             return None
         places = self.expected(q)
         if places is None:
-            off = self._apart(self._positions(q)[target], position)
+            error = self._apart(self._positions(q)[target], position)
         else:
-            off = float(np.linalg.norm(position - places[target]))
-        if off <= (APART_M if places is None else PLAUSIBLE_M):
+            error = float(np.linalg.norm(position - places[target]))
+        if error <= (APART_M if places is None else PLAUSIBLE_M):
             return None
-        least = " or more" if places is None else ""
+        suffix = " or more" if places is None else ""
         return (
-            f"tracker: it sees its target {off:.3g} m{least} from where the arm holds it; does it "
-            "follow another reflector, or has it been moved? Have it see the target; where it has "
-            "been moved, go on in a new campaign"
+            f"tracker: it sees its target {error:.3g} m{suffix} from where the arm holds it; does "
+            "it follow another reflector, or has it been moved? Have it see the target; where it "
+            "has been moved, go on in a new campaign"
         )
 
     def _stuck(self, held: Floats, position: Floats, target: int) -> str | None:
-        """Why a reading is the one before it, or of something at rest; or None."""
+        """Return why a reading repeats the previous one, or is of an object at rest; else None."""
         last = self._last(target)
         if last is None:
             return None
         moved = float(np.linalg.norm(held - last.held))
-        seen = float(np.linalg.norm(position - last.position))
-        known = self._cell.known_targets[target]
-        limit = max(STUCK_M, STUCK_SHARE * moved if known else 0.0)
-        if moved <= MOVES_M or seen > limit:
+        measured = float(np.linalg.norm(position - last.position))
+        known_target = self._cell.known_targets[target]
+        limit = max(STUCK_M, STUCK_SHARE * moved if known_target else 0.0)
+        if moved <= MOVES_M or measured > limit:
             return None
         return (
-            f"tracker: its target has moved by {1e3 * seen:.3g} mm where the arm has moved it by "
-            f"{1e3 * moved:.3g} mm: it repeats an old reading, or follows a reflector that is not "
-            "on the arm. Have it see the target"
+            f"tracker: its target has moved by {1e3 * measured:.3g} mm where the arm has moved it "
+            f"by {1e3 * moved:.3g} mm: it repeats an old reading, or follows a reflector that is "
+            "not on the arm. Have it see the target"
         )
 
     def _apart(self, held: Floats, position: Floats) -> float:
-        """Median of how much distances from the other readings are not those of the arm, m.
+        """Return the median error of the distances from other readings, m.
 
-        Zero with fewer than two, of which one may be wrong itself.
+        Zero with fewer than two other readings, one of which may be wrong.
         """
         places, positions = self._places()
         if len(places) < WITNESSES:
             return 0.0
         moved = np.linalg.norm(places - held, axis=1)
-        seen = np.linalg.norm(positions - position, axis=1)
-        off = np.sort(np.abs(seen - moved))
-        return float(off[(len(off) - 1) // 2])
+        measured = np.linalg.norm(positions - position, axis=1)
+        errors = np.sort(np.abs(measured - moved))
+        return float(errors[(len(errors) - 1) // 2])
 
     def _last(self, target: int) -> _Sighting | None:
         return next((x for x in reversed(self._sightings) if x.target == target), None)
 
     def _places(self) -> tuple[Floats, Floats]:
-        """(K, 3) where the arm held the targets, and where they were seen, without doubted ones."""
-        kept = [x for x in self._sightings if not x.doubted]
-        return np.array([x.held for x in kept]), np.array([x.position for x in kept])
+        """Return the nominal and measured positions (K, 3) of the readings without doubt."""
+        trusted = [x for x in self._sightings if not x.doubted]
+        return np.array([x.held for x in trusted]), np.array([x.position for x in trusted])
 
     def repeatability(self, q: Floats, joint_std: Floats) -> Floats:
-        """Return the (3, 3) covariance that the joints' scatter adds to a position, sensor axes.
+        """Return the covariance (3, 3) of a position by the joints' scatter, sensor axes, m².
 
-        J Σ_q Jᵀ at the target; while the tracker's axes are unknown tr(J Σ_q Jᵀ)/3.
+        J Σ_q Jᵀ at the target; tr(J Σ_q Jᵀ)/3 · 1 while the tracker's axes are unknown.
         """
         chain = chains.evaluate(self._cell.arm, np.asarray(q)[None])
         point = chain.point(self._cell.target[:3, 3])
@@ -196,48 +197,48 @@ class RoughRegistration:
         return joint_scatter(jac, joint_std, pose[0], 3)
 
     def _positions(self, q: Floats) -> Floats:
-        """(T, 3) nominal positions of the targets, base axes, m."""
+        """Return the nominal positions (T, 3) of the targets, base axes, m."""
         chain = chains.evaluate(self._cell.arm, np.asarray(q)[None])
         return np.array([chain.point(t[:3, 3])[0] for t in self._cell.all_targets])
 
 
-def _kabsch(held: Floats, seen: Floats) -> tuple[Floats, Floats] | None:
-    """Rotation (3, 3) and translation (3,) that take positions to positions (K, 3) best."""
-    h, s = held - held.mean(axis=0), seen - seen.mean(axis=0)
+def _kabsch(held: Floats, measured: Floats) -> tuple[Floats, Floats] | None:
+    """Return the rotation (3, 3) and translation (3,) of the best fit of positions (K, 3)."""
+    h, s = held - held.mean(axis=0), measured - measured.mean(axis=0)
     if np.linalg.svd(h, compute_uv=False)[1] < SPREAD_M:
         return None
     u, _, vt = np.linalg.svd(s.T @ h)
     flip = np.diag([1.0, 1.0, np.linalg.det(u @ vt)])
     rotation = u @ flip @ vt
-    return rotation, seen.mean(axis=0) - rotation @ held.mean(axis=0)
+    return rotation, measured.mean(axis=0) - rotation @ held.mean(axis=0)
 
 
-def _far(pose: tuple[Floats, Floats], held: Floats, seen: Floats) -> Floats:
-    """(K,) how far readings are from where a registration expects them, m."""
-    return np.asarray(np.linalg.norm(seen - held @ pose[0].T - pose[1], axis=1))
+def _far(pose: tuple[Floats, Floats], held: Floats, measured: Floats) -> Floats:
+    """Return the residuals (K,) of readings by a registration, m."""
+    return np.asarray(np.linalg.norm(measured - held @ pose[0].T - pose[1], axis=1))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TargetReading:
     """One reading of an arrival."""
 
-    target: int | None  # number of the target, by the cell; None where there is one
-    measured: MeasuredStop  # what was measured
-    ended: float  # when, cell s
+    target: int | None  # index in the cell; None where there is one target
+    measured: MeasuredStop
+    ended: float  # cell s
 
 
 class ArrivalReader:
     """Reads the targets of a tool at one stop, in the order of the cell.
 
-    The tracker is told where each is expected. Until the first readings tell where the tracker
-    stands, only the target that it holds is read, which has to be the first. A target that is
-    hidden, or taken for another one, is a missing reading, not a failure.
+    The tracker is aimed at the expected position of each target. Until the registration is known,
+    only the first target is read, which the tracker must hold. A target that is hidden, or
+    mistaken for another one, is a missing reading, not a failure.
     """
 
     def __init__(self, setup: Setup, measurer: Measurer, registration: RoughRegistration) -> None:
         cell, tracker = setup.cell, setup.rig.tracker
         self._cell, self._measurer, self._registration = cell, measurer, registration
-        self._clock, self._watcher, self._said = setup.clock, setup.watcher, False
+        self._clock, self._watcher, self._announced = setup.clock, setup.watcher, False
         self._tracker: PointingTracker | None = None
         if cell.targets is None:
             return
@@ -248,43 +249,43 @@ class ArrivalReader:
                 'target, or a driver that can, as "geocom"'
             )
         self._tracker = tracker
-        at = cell.targets[:, :3, 3]
-        apart = np.linalg.norm(at[:, None] - at, axis=2)
-        self._radius = 0.5 * float(apart[apart > 0].min(initial=np.inf))
+        places = cell.targets[:, :3, 3]
+        distance = np.linalg.norm(places[:, None] - places, axis=2)
+        self._radius = 0.5 * float(distance[distance > 0].min(initial=np.inf))
 
     def read(self, q: Floats, name: str) -> list[TargetReading]:
-        """Read at the present pose, called `name`; q (n,) are the commanded joint angles, rad."""
+        """Read at the pose `name`, where the arm stands; q (n,) are commanded joint angles, rad."""
         if self._tracker is None:
             return [TargetReading(None, self._measurer.measure(name), self._clock.now())]
         places = self._registration.expected(q)
         if places is None:
-            if not self._said:
-                held, *others = self._cell.target_names
+            if not self._announced:
+                first, *following = self._cell.target_names
                 text = (
-                    f"only target {held} is read until the first positions have located the "
-                    f"tracker; {', '.join(others)} after that"
+                    f"only target {first} is read until the first positions have located the "
+                    f"tracker; {', '.join(following)} after that"
                 )
                 self._watcher.notify(Remark(text))
-                self._said = True
+                self._announced = True
             return [TargetReading(0, self._measurer.measure(name), self._clock.now())]
-        found: list[TargetReading] = []
+        readings: list[TargetReading] = []
         lost: list[str] = []
         force: WrenchSample | None = None
         for k, target in enumerate(self._cell.target_names):
             try:
-                measured = self._one(self._tracker, places, k, name, force)
+                measured = self._read_target(self._tracker, places, k, name, force)
             except TargetLostError as error:
                 lost.append(f"target {target} is not read: {error}")
                 continue
             force = measured.force
-            found.append(TargetReading(k, measured, self._clock.now()))
-        if not found:
+            readings.append(TargetReading(k, measured, self._clock.now()))
+        if not readings:
             raise DeviceError(f"{name}: {lost[0]} (and so are all others)")
-        for words in lost:
-            self._watcher.notify(Remark(f"{name}: {words}"))
-        return found
+        for reason in lost:
+            self._watcher.notify(Remark(f"{name}: {reason}"))
+        return readings
 
-    def _one(
+    def _read_target(
         self,
         tracker: PointingTracker,
         places: Floats,
@@ -295,11 +296,11 @@ class ArrivalReader:
         aim = partial(tracker.aim, places[k], self._radius)
         try:
             aim()
-        except TargetLostError:  # once more: somebody may have walked through the beam
+        except TargetLostError:  # once more: a person may have walked through the beam
             aim()
         measured = self._measurer.measure(name, aim, force)
-        away = np.linalg.norm(places - measured.mean.value[:3], axis=1)
-        if int(np.argmin(away)) != k:
-            seen = self._cell.target_names[int(np.argmin(away))]
-            raise TargetLostError(f"tracker: it sees {seen} in its place")
+        nearest = int(np.argmin(np.linalg.norm(places - measured.mean.value[:3], axis=1)))
+        if nearest != k:
+            name = self._cell.target_names[nearest]
+            raise TargetLostError(f"tracker: it sees {name} in its place")
         return measured

@@ -1,4 +1,4 @@
-"""What must not touch, nor stand in the beam: arm, tool, obstacles, hanging loads and cables."""
+"""Shapes that must not touch or hide the target: arm, tool, obstacles, hanging loads, cables."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,9 +14,9 @@ from hilcal.robot.scene import Scene, Segment, on_flange
 from hilcal.types import Bools, Floats
 
 TOOL_RADIUS = 0.03
-"""Radius of the ways from flange to target and load point, m: a plate or a reflector's nest."""
-CABLE_RADIUS = 0.01  # radius that is kept for a cable, m
-_NEAR = 0.02  # m, beyond touching
+"""Radius of the capsules from flange to target and load point, m: a plate or a reflector's nest."""
+CABLE_RADIUS = 0.01  # of a cable, m
+_NEAR = 0.02  # gap that counts as touching, m
 _AT_TARGET, _AT_LOAD = "tool at the target", "tool at the load point"
 _TINY = 1e-18  # m², below which a segment is a point
 
@@ -28,65 +28,66 @@ class Clearance:
         """Build the shapes once."""
         self.cell, self.config = cell, config
         self.scene = Scene(cell.arm, _tool(cell), config.obstacles)
-        # What is as good as touched at the load point, by the radius of what is there, m.
+        # names of the shapes that touch the load point, by the radius of the load or cable, m
         radii = {CABLE_RADIUS, *(load.radius_m for load in config.loads)}
         self._at_hook = {radius: self.near(cell.load_point, radius) for radius in radii}
 
     @cached_property
     def sight(self) -> "LineOfSight | None":
-        """The tracker's view; None where its place is not known."""
+        """The tracker's view; None where its place is unknown."""
         place = tracker_place(self.cell, self.config)
         return None if place is None else LineOfSight(self, place)
 
     def load(self, name: str) -> CellLoad | None:
-        """Return a load by name; None unloaded, and for a name that the cell lacks."""
+        """Return a load by name; None for "none" and unknown names."""
         return next((load for load in self.config.loads if load.name == name), None)
 
     def segments(self, q: Floats, load: str) -> tuple[Segment, ...]:
-        """Return what hangs or pulls at the load point in N states (N, n)."""
+        """Return hanging load and cable in N states (N, n)."""
         if self.load(load) is None:
             return ()
         chain = chains.evaluate(self.cell.arm, q)
         return self.segments_at(chain.point(self.cell.load_point), load)
 
-    def segments_at(self, at: Floats, load: str) -> tuple[Segment, ...]:
-        """Return what hangs or pulls at the load point where that is (N, 3), base axes, m.
+    def segments_at(self, points: Floats, load: str) -> tuple[Segment, ...]:
+        """Return hanging load and cable at N load points (N, 3), base axes, m.
 
-        A weight takes an upright capsule below the load point (along gravity), a pull's cable goes
-        in the pull's direction. What is always that close to the load point may touch them: the
-        shape of the hook there is not known.
+        A weight is an upright capsule below the load point (along gravity); the cable of a pull has
+        the pull's direction. Shapes that are always close to the load point may touch them, as the
+        shape of the hook is unknown.
         """
-        known = self.load(load)
-        if known is None:
+        hung = self.load(load)
+        if hung is None:
             return ()
         out = []
-        gravity, force = self.cell.gravity, np.asarray(known.force_N)
-        if known.hanging_m > 0.0 and gravity.any():
-            down, long = gravity / np.linalg.norm(gravity), known.hanging_m
-            rim = min(known.radius_m, 0.5 * long)
-            ends = at + rim * down, at + (long - rim) * down
-            near = self._at_hook[known.radius_m]
-            out.append(Segment(f"what hangs ({load})", *ends, known.radius_m, near))
-        if known.cable_m > 0.0:
-            end = at + known.cable_m * force / np.linalg.norm(force)
+        gravity, force = self.cell.gravity, np.asarray(hung.force_N)
+        if hung.hanging_m > 0.0 and gravity.any():
+            down, length = gravity / np.linalg.norm(gravity), hung.hanging_m
+            rim = min(hung.radius_m, 0.5 * length)
+            ends = points + rim * down, points + (length - rim) * down
+            near = self._at_hook[hung.radius_m]
+            out.append(Segment(f"what hangs ({load})", *ends, hung.radius_m, near))
+        if hung.cable_m > 0.0:
+            end = points + hung.cable_m * force / np.linalg.norm(force)
             near = self._at_hook[CABLE_RADIUS]
-            out.append(Segment(f"the cable ({load})", at, end, CABLE_RADIUS, near))
+            out.append(Segment(f"the cable ({load})", points, end, CABLE_RADIUS, near))
         return tuple(out)
 
     def near(self, point: Floats, radius: float) -> frozenset[str]:
-        """Return what moves with the flange and is as good as touched at a point (3,) of it, m."""
+        """Return names of the shapes on the flange that touch a point (3,), flange axes, m."""
         arm = self.cell.arm
-        at = on_flange(arm, point)
+        centre = on_flange(arm, point)
         return frozenset(
             part.name
             for part in self.scene.parts
             if part.body == arm.n
-            and segment_distance(at, at, part.start, part.end) < part.radius + radius + _NEAR
+            and segment_distance(centre, centre, part.start, part.end)
+            < part.radius + radius + _NEAR
         )
 
 
 def _tool(cell: Cell) -> tuple[Capsule, ...]:
-    """The ways from flange to load point and targets; a rough place counts as well."""
+    """Return capsules from the flange to load point and targets, rough positions included."""
     names = [f" {name}" for name in cell.target_names] or [""]
     places = zip(names, cell.all_targets, strict=True)
     ways = [(_AT_LOAD, cell.load_point), *((_AT_TARGET + x, at[:3, 3]) for x, at in places)]
@@ -100,7 +101,7 @@ TRACKER_UNKNOWN = (
     "the tracker's place is not known: whether it sees the target is not checked; give [sight] "
     "tracker_m"
 )
-_SHY = 1.5  # the beam ends so many radii of tool and beam before the target
+_SHY = 1.5  # distance from the end of the beam to the target, over the radii of tool and beam
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,13 +109,13 @@ class LineOfSight:
     """The tracker's view of the target."""
 
     clearance: Clearance  # the cell's shapes
-    tracker: Floats  # (3,) where the tracker stands, base axes, m
+    tracker: Floats  # (3,) place of the tracker, base axes, m
 
     def free(self, q: Floats, load: str) -> Bools:
-        """Return (N,) in which states nothing is closer to any beam than [sight] clearance_m.
+        """Return (N,) in which states all shapes keep [sight] clearance_m from every beam.
 
-        A beam ends shortly before its target. Not in its way are what of the tool is next to the
-        target, whose shape is not known, and obstacles that the tracker stands in or on.
+        A beam ends shortly before its target. Ignored are parts of the tool next to the target,
+        whose shape is unknown, and obstacles that the tracker stands in or on.
         """
         return np.asarray(np.all([self.sees(q, load, k) for k in self._targets], axis=0))
 
@@ -122,13 +123,13 @@ class LineOfSight:
         """Return (N,) in which states the beam to one target is free."""
         beam = self.beam(q, target)
         out = ~self.clearance.scene.free.touching(q, 0.0, beam)
-        for other in self.clearance.segments(q, load):
-            gap = segment_distance(beam.start, beam.end, other.start, other.end)
-            out &= gap > beam.radius + other.radius
+        for hung in self.clearance.segments(q, load):
+            gap = segment_distance(beam.start, beam.end, hung.start, hung.end)
+            out &= gap > beam.radius + hung.radius
         return np.asarray(out)
 
     def incidence(self, q: Floats) -> Floats | None:
-        """Return (N,) largest angles of a reflector's normal and its beam, rad; None without."""
+        """Return the largest angles (N,) of beam and reflector normal, rad; None without one."""
         normal = self.clearance.config.sight.target_normal
         if normal is None:
             return None
@@ -142,7 +143,7 @@ class LineOfSight:
         return np.asarray(np.max(out, axis=0))
 
     def problems(self, q: Floats, load: str, where: str) -> list[str]:
-        """Return why the tracker would not see the target in one state (1, n)."""
+        """Return why the tracker does not see the target in one state (1, n)."""
         out = []
         most = self.clearance.config.sight.incidence_max_rad
         angle = self.incidence(q)
@@ -152,16 +153,16 @@ class LineOfSight:
                 f"incidence_max_rad is {most:g}"
             )
         hidden = self.hidden(q, load)
-        if len(hidden) == len(self._targets):  # a hidden one is a reading less
-            found = self.clearance.scene.free.named(q, 0.0, self.beam(q))
-            names = tuple(dict.fromkeys(name for name, _ in found))
+        if len(hidden) == len(self._targets):  # some hidden targets only cost readings
+            hits = self.clearance.scene.free.named(q, 0.0, self.beam(q))
+            names = tuple(dict.fromkeys(name for name, _ in hits))
             names += tuple(x.name for x in self.clearance.segments(q, load) if not names)
-            what = "target" if len(hidden) == 1 else "targets"
-            out.append(f"{where}: {' and '.join(names)} between tracker and {what}")
+            noun = "target" if len(hidden) == 1 else "targets"
+            out.append(f"{where}: {' and '.join(names)} between tracker and {noun}")
         return out
 
     def hidden(self, q: Floats, load: str) -> tuple[int, ...]:
-        """Return the numbers of the targets that the tracker does not see in one state (1, n)."""
+        """Return the indices of the targets that are hidden in one state (1, n)."""
         return tuple(k for k in self._targets if not self.sees(q, load, k).all())
 
     @property
@@ -185,7 +186,7 @@ class LineOfSight:
 
 
 def holds(thing: Obstacle, points: Floats, margin: float = 0.0) -> Bools:
-    """Return which of some points (..., 3) an obstacle holds, made larger by `margin`, m."""
+    """Return which points (..., 3) are inside of an obstacle enlarged by `margin`, m."""
     if thing.center_m is not None and thing.size_m is not None:
         off = np.abs(points - np.array(thing.center_m)) - 0.5 * np.array(thing.size_m)
         return np.asarray(np.all(off <= margin, axis=-1))

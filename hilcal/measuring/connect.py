@@ -1,4 +1,4 @@
-"""The devices that a configuration names, opened; the kinematics that an arm's controller tells."""
+"""Opening the devices of a configuration; comparing the kinematics of an arm's controller."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -39,7 +39,7 @@ class Rig:
 
     arm: ArmDevice
     tracker: TrackerDevice
-    force: ForceSensorDevice | None  # the force sensor; None where the cell has none
+    force: ForceSensorDevice | None  # None in a cell without a force sensor
     operator: OperatorDevice
 
     def close(self) -> None:
@@ -51,7 +51,7 @@ class Rig:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Setup:
-    """What all parts of a session use: open devices, the cell, its time, and who watches."""
+    """Common resources of a session: open devices, cell, clock and watcher."""
 
     rig: Rig
     cell: Cell
@@ -67,14 +67,14 @@ Factory = Callable[[CellConfig], Any]
 class ConnectionResult:
     """The result of opening one device."""
 
-    device: str  # its part in the cell
-    driver: str  # the driver's name
-    report: Report | None  # its name, facts and problems; None where it did not answer
-    failure: str = ""  # why it did not, one line; empty where it did
+    device: str  # part of the cell
+    driver: str  # name
+    report: Report | None  # None if the device did not answer
+    failure: str = ""  # why it did not answer, one line; else empty
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """What hinders a run, one line each, with the device."""
+        """Obstacles to a run, one line each, with the device."""
         if self.failure or self.report is None:
             return (self.failure,)
         return tuple(
@@ -84,23 +84,23 @@ class ConnectionResult:
 
 
 def driver(group: str, name: str | None, key: str) -> Factory:
-    """Return the factory of a driver by its name, or its place "module:function"."""
-    found = {point.name: point for point in entry_points(group=group)}
-    valid = ", ".join(sorted(found)) or "none is installed"
+    """Return the factory of a driver by its name, or by "module:function"."""
+    points = {point.name: point for point in entry_points(group=group)}
+    valid = ", ".join(sorted(points)) or "none is installed"
     if name is None:
         part = group.removeprefix("hilcal.").removesuffix("s").replace("_", " ")
         raise InputError(f"{key} is missing, so there is no {part}; valid: {valid}")
     if ":" in name:
-        found[name] = EntryPoint(name, name, group)
-    if name not in found:
-        hint = suggest(name, sorted(found))
+        points[name] = EntryPoint(name, name, group)
+    if name not in points:
+        hint = suggest(name, sorted(points))
         raise InputError(f'{key} = "{name}" is unknown{hint}; valid: {valid}')
     try:
-        factory: Factory = found[name].load()
-    except Exception as error:  # a driver of somebody else's may fail in any way
-        words = " ".join(str(error).split())
+        factory: Factory = points[name].load()
+    except Exception as error:  # a third-party driver may raise anything
+        reason = " ".join(str(error).split())
         raise InputError(
-            f'{key} = "{name}": the driver {found[name].value} cannot be loaded ({words})'
+            f'{key} = "{name}": the driver {points[name].value} cannot be loaded ({reason})'
         ) from error
     return factory
 
@@ -108,8 +108,8 @@ def driver(group: str, name: str | None, key: str) -> Factory:
 def connect(config: CellConfig) -> tuple[Rig | None, tuple[ConnectionResult, ...]]:
     """Open every device at once; nothing moves.
 
-    Returns the rig, None where a device did not open (the others are closed again), and what
-    became of each. InputError: the configuration names no driver for a part, or an unknown one.
+    Returns the rig, or None if a device did not open (the others are closed again), and the result
+    of each device. InputError: a driver is missing in the configuration, or unknown.
     """
     parts = [
         ("arm", devices.ARMS, config.robot.driver, "[robot] driver"),
@@ -122,17 +122,19 @@ def connect(config: CellConfig) -> tuple[Rig | None, tuple[ConnectionResult, ...
     factories = [driver(group, name, key) for _, group, name, key in parts]
     with ThreadPoolExecutor(len(parts)) as pool:
         opened = list(pool.map(lambda factory: _tried(factory, config), factories))
-    made: dict[str, Any] = {}
+    by_part: dict[str, Any] = {}
     answers: list[ConnectionResult] = []
     for (part, _, name, _), (device, error) in zip(parts, opened, strict=True):
-        made[part] = device
+        by_part[part] = device
         report, why = (None, error) if error is not None else _tried(methodcaller("report"), device)
         failure = "" if why is None else _failure(part, why)
         answers.append(ConnectionResult(part, name or "", report, failure))
     if not any(answer.failure for answer in answers):
-        rig = Rig(made["arm"], made["tracker"], made.get("force sensor"), made["operator"])
+        rig = Rig(
+            by_part["arm"], by_part["tracker"], by_part.get("force sensor"), by_part["operator"]
+        )
         return rig, tuple(answers)
-    for device in made.values():
+    for device in by_part.values():
         if device is not None:
             device.close()
     for _, error in opened:
@@ -141,30 +143,30 @@ def connect(config: CellConfig) -> tuple[Rig | None, tuple[ConnectionResult, ...
     return None, tuple(answers)
 
 
-def _tried(do: Callable[..., Any], *given: object) -> tuple[Any, Exception | None]:
-    """Return what a driver answers, or its error: one of somebody else's may fail in any way."""
+def _tried(do: Callable[..., Any], *arguments: object) -> tuple[Any, Exception | None]:
+    """Return the result of a driver's function, or its error: third parties may raise anything."""
     try:
-        return do(*given), None
+        return do(*arguments), None
     except Exception as error:
         return None, error
 
 
 def _failure(device: str, why: Exception) -> str:
-    words = str(why)
+    text = str(why)
     if not isinstance(why, HilcalError):
-        words = f"{type(why).__name__}: {' '.join(words.split())}"
-    return words if words.startswith(device) else f"{device}: {words}"
+        text = f"{type(why).__name__}: {' '.join(text.split())}"
+    return text if text.startswith(device) else f"{device}: {text}"
 
 
 def told_by(answers: tuple[ConnectionResult, ...]) -> FactoryKinematics | None:
-    """Return the kinematics that the arm's controller tells; None where it does not."""
+    """Return the kinematics of the arm's controller; None where unknown."""
     return next((a.report.kinematics for a in answers if a.report and a.report.kinematics), None)
 
 
 def with_kinematics(
     answers: tuple[ConnectionResult, ...], cell: Cell
 ) -> tuple[ConnectionResult, ...]:
-    """Return what the devices said, with how the arm's kinematics differ from the cell's."""
+    """Return the results with a comparison of the arm's kinematics with those of the cell."""
     return tuple(
         replace(a, report=_compared(a.report, a.report.kinematics, cell))
         if a.report is not None and a.report.kinematics is not None
@@ -174,44 +176,44 @@ def with_kinematics(
 
 
 def nominal_arm(cell: Cell) -> Arm:
-    """Return the arm as its maker designed it, its joints not yet counted as the cell says."""
+    """Return the arm as designed, with its maker's conventions of joint values."""
     robot = cell.configured().robot
     return load_arm(robot.model, cell.base_dir, base_link=robot.base_link, tip_link=robot.tip_link)
 
 
-def _compared(report: Report, held: FactoryKinematics, cell: Cell) -> Report:
-    """Add how the kinematics that the controller holds differ from the cell's."""
-    robot, what = cell.configured().robot, "its kinematics"
+def _compared(report: Report, kinematics: FactoryKinematics, cell: Cell) -> Report:
+    """Add the difference of the kinematics in the controller from those of the cell."""
+    robot, fact = cell.configured().robot, "its kinematics"
     problems = list(report.problems)
     try:
         nominal = nominal_arm(cell)
-        ours = with_factory(nominal, held)
+        controller_arm = with_factory(nominal, kinematics)
     except InputError as error:  # an arm with other joints, or a campaign without its file
-        return replace(report, facts=(*report.facts, (what, str(error))))
-    rms, most = flange_difference(ours, nominal)
-    measured = "measured" if held.status == LINEARISED else "not measured"
-    words = (
+        return replace(report, facts=(*report.facts, (fact, str(error))))
+    rms, most = flange_difference(controller_arm, nominal)
+    measured = "measured" if kinematics.status == LINEARISED else "not measured"
+    text = (
         f"{measured} by the factory: the flange is {1e3 * rms:.2f} mm (rms; most "
         f"{1e3 * most:.2f} mm) from nominal"
     )
-    off = 0.0
+    difference = 0.0
     if cell.factory is not None:
-        off = flange_difference(ours, with_factory(nominal, cell.factory))[1]
+        difference = flange_difference(controller_arm, with_factory(nominal, cell.factory))[1]
     if robot.model in robot_names() and most > FAR:
         problems.append(
             f"its kinematics are not those of a {robot.model}: the flange is up to "
             f"{1e3 * most:.0f} mm elsewhere; check [robot] model"
         )
-    elif off > SAME:
+    elif difference > SAME:
         problems.append(
             f"its kinematics are not those of [robot] calibration = {robot.calibration!r}: the "
-            f"flange is up to {1e3 * off:.3f} mm elsewhere; hilcal check CELL.toml "
+            f"flange is up to {1e3 * difference:.3f} mm elsewhere; hilcal check CELL.toml "
             "--save-calibration FILE.toml writes what the controller holds"
         )
     names = ("kinematics_from_nominal_rms_m", "kinematics_from_nominal_max_m")
     return replace(
         report,
-        facts=(*report.facts, (what, words)),
+        facts=(*report.facts, (fact, text)),
         problems=tuple(problems),
         fields=(*report.fields, *zip(names, (rms, most), strict=True)),
     )

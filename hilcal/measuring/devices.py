@@ -1,8 +1,8 @@
 """Protocols of the devices of a run (arm, tracker, force sensor, operator), and cell time.
 
-A driver is a factory `open(config: CellConfig) -> device`, found by the name that the
-configuration gives, as an entry point of the groups below. Opening connects and moves nothing;
-a device that does not answer raises `DeviceError` with one clear line, within its deadline.
+A driver is a factory `open(config: CellConfig) -> device`, an entry point of the groups below with
+the name in the configuration. Opening connects and moves nothing; a device that does not answer
+raises `DeviceError` with one clear line, within its deadline.
 """
 
 import time
@@ -18,10 +18,10 @@ from hilcal.types import Floats
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """Cell time in s; every duration of physics (motion, settling, windows) is measured in it.
+    """Cell time, s, for all physical durations (motion, settling, windows).
 
-    Time-outs of communication are not: a wire is as fast in a simulated cell as in a real one,
-    so those use `time.monotonic` directly.
+    Time-outs of communication use `time.monotonic` directly: a wire is as fast in a simulated cell
+    as in a real one.
     """
 
     scale: float = 1.0  # cell seconds per real second; 1 for a real cell
@@ -31,11 +31,11 @@ class Clock:
         return time.monotonic() * self.scale
 
     def sleep(self, seconds: float) -> None:
-        """Wait for so many cell seconds."""
+        """Wait; `seconds` are cell seconds."""
         time.sleep(max(0.0, seconds) / self.scale)
 
     def real(self, seconds: float) -> float:
-        """Return how many real seconds so many cell seconds take."""
+        """Convert cell seconds to real seconds."""
         return seconds / self.scale
 
 
@@ -50,30 +50,30 @@ class TargetLostError(DeviceError):
 
 
 class WrongLoadError(DeviceError):
-    """What hangs is not what was asked for."""
+    """The load is not the requested one."""
 
 
 class LoadChangedError(DeviceError):
-    """What hangs is no longer what should hang; worth another try once a person has mended it."""
+    """The load has changed during a run; worth another try once a person has restored it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Report:
     """Identity, state and problems of a device, read without any motion."""
 
-    device: str  # its part in the cell: "arm", "tracker", "force sensor", "operator"
-    name: str  # the maker's name for it, with its serial number where known
+    device: str  # part of the cell: "arm", "tracker", "force sensor", "operator"
+    name: str  # by its maker, with the serial number where known
     facts: tuple[tuple[str, str], ...] = ()
     """(what, value) for people: versions, modes, rates, temperatures."""
-    problems: tuple[str, ...] = ()  # what has to be put right before a run, one clear line each
+    problems: tuple[str, ...] = ()  # to be solved before a run, one clear line each
     fields: tuple[tuple[str, object], ...] = ()
     """(name, value) of the facts for scripts: numbers with their unit in the name."""
     kinematics: FactoryKinematics | None = None
-    """of an arm, by which its controller computes poses; None where it does not tell."""
+    """kinematics in the arm's controller; None where unknown."""
 
 
 Row = tuple[str, str, str, object]
-"""Of a report: what and how it is, for people; its name and value for scripts; "": not for them."""
+"""Of a report: fact and value for people, name and value for scripts; "": not for them."""
 
 
 def report_of(
@@ -85,7 +85,7 @@ def report_of(
 ) -> Report:
     """Return a report of rows."""
     rows = tuple(rows)
-    facts = tuple((what, text) for what, text, *_ in rows if what)
+    facts = tuple((fact, text) for fact, text, *_ in rows if fact)
     fields = tuple((key, value) for *_, key, value in rows if key)
     return Report(device, name, facts, tuple(problems), fields, kinematics)
 
@@ -94,33 +94,33 @@ def report_of(
 class ArmSample:
     """One consistent sample of the arm's state, SI."""
 
-    host_ns: int  # `time.monotonic_ns` right after the sample came
-    timestamp: float  # the controller's own clock, s
+    host_ns: int  # `time.monotonic_ns` at arrival
+    timestamp: float  # of the controller's clock, s
     q: Floats  # (n,) actual joint angles, rad
     q_target: Floats  # (n,) commanded joint angles, rad
     qd: Floats  # (n,) actual joint speeds, rad/s
-    target_moment: Floats  # (n,) torques that the controller computes, N·m
+    target_moment: Floats  # (n,) computed by the controller, N·m
     current: Floats  # (n,) actual motor currents, A
     target_current: Floats  # (n,) commanded motor currents, A
     joint_temperature: Floats  # (n,) °C
     tcp_pose: Floats  # (6,) position and rotation vector of the tool point, m and rad
-    tcp_force: Floats  # (6,) wrench as the controller estimates it, N and N·m
+    tcp_force: Floats  # (6,) wrench estimated by the controller, N and N·m
     ft_raw_wrench: Floats | None
     """(6,) raw wrench of a sensor built into the arm; None where unknown."""
-    payload: float  # payload that is set in the controller, kg
+    payload: float  # set in the controller, kg
     payload_com: Floats | None  # (3,) its centre of mass, flange axes, m; None where unknown
     speed_scaling: float  # factor that the controller applies to the speed, 0 to 1
-    safety: str  # the safety state in the maker's words, "normal" where all is well
+    safety: str  # safety state in the maker's words; "normal" without problems
     torque: Floats | None = None
-    """(n,) mean torques that the drives were measured to exert since the sample before, N·m,
-    positive in the direction in which the joint's value grows; None where unknown."""
+    """(n,) measured torques of the drives, averaged since the previous sample, N·m, positive in the
+    direction of larger joint values; None where unknown."""
 
 
 class ArmDevice(Protocol):
     """An arm that moves in joint space.
 
-    Without `take_control` nothing can move. Any failure of the arm or of its link raises
-    DeviceError that names the cause, after a stop has been commanded.
+    Nothing moves before `take_control`. Any failure of the arm or of its link raises a DeviceError
+    that names the cause, after a stop has been commanded.
     """
 
     def report(self) -> Report:
@@ -142,37 +142,36 @@ class ArmDevice(Protocol):
         """
 
     def moving(self) -> bool:
-        """Whether the motion is still going on; call at least every 0.1 s (real time).
+        """Whether the arm is moving; call at least every 0.1 s (real time).
 
-        If nobody calls for 0.5 s (real time) while the arm moves, the arm stops by itself.
-        DeviceError, the arm stopped: the motion failed, or the robot is not in a state to move
-        (protective stop, emergency stop, program stopped, link lost).
+        The arm stops by itself if this is not called for 0.5 s (real time) during a motion.
+        DeviceError, with the arm stopped: the motion failed, or the robot cannot move (protective
+        stop, emergency stop, program stopped, link lost).
         """
 
     def stop(self) -> None:
-        """Stop the arm by every way there is; DeviceError: not sure that it stands."""
+        """Stop the arm by all available ways; DeviceError: it may still move."""
 
     def close(self) -> None:
-        """Stop, give control back, end all helpers. Never raises, may be called twice."""
+        """Stop, release control, end all helpers. Never raises, may be called twice."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackerSample:
     """One measurement of the target."""
 
-    host_ns: int  # `time.monotonic_ns` right after it came
+    host_ns: int  # `time.monotonic_ns` at arrival
     value: Floats  # (m,) position in m and, for m = 6, rotation vector in rad, sensor axes
     covariance: Floats
-    """(m, m) of this one measurement, from the instrument's specification and what it says of
-    itself."""
-    warning: str = ""  # what the instrument remarked, empty where nothing
+    """(m, m) of this measurement, from the instrument's specification and its own statements."""
+    warning: str = ""  # of the instrument; empty without
 
 
 class TrackerDevice(Protocol):
     """An instrument that measures the position (or pose) of one target."""
 
     def report(self) -> Report:
-        """Say who answered, versions, lock state, and every problem at once."""
+        """Return identity, versions, lock state, and every problem at once."""
 
     def measure(self) -> TrackerSample:
         """Measure once; TargetLostError: no target, beam broken, lock lost, no distance."""
@@ -181,7 +180,7 @@ class TrackerDevice(Protocol):
         """Search and lock the target again; TargetLostError: not found."""
 
     def close(self) -> None:
-        """Give the port back. Never raises, may be called twice."""
+        """Release the port. Never raises, may be called twice."""
 
 
 @runtime_checkable
@@ -189,9 +188,9 @@ class PointingTracker(TrackerDevice, Protocol):
     """A tracker that can be told which of several targets to measure."""
 
     def aim(self, position: Floats, radius: float) -> None:
-        """Turn to where a target is expected (3,), sensor axes, m; find and lock it.
+        """Turn to the expected position (3,) of a target, sensor axes, m; find and lock it.
 
-        One farther than `radius` from there is another one; TargetLostError: there is none.
+        A reflector farther away than `radius`, m, is another one; TargetLostError: none found.
         """
 
 
@@ -199,68 +198,68 @@ class PointingTracker(TrackerDevice, Protocol):
 class WrenchSample:
     """The raw reading of a force sensor, averaged over a window."""
 
-    host_ns: int  # `time.monotonic_ns` right after the last frame came
-    wrench: Floats  # (6,) mean force and moment, sensor axes, N and N·m; the sensor's own zero
+    host_ns: int  # `time.monotonic_ns` at arrival of the last frame
+    wrench: Floats  # (6,) mean force and moment, sensor axes, N and N·m; not tared
     covariance: Floats  # (6, 6) of one frame in the window (not of the mean); zero for one frame
     frames: int  # number of frames in the window
-    temperature: float | None = None  # of the sensor, °C; None where it does not tell
+    temperature: float | None = None  # of the sensor, °C; None where unknown
 
 
 @dataclass(frozen=True, slots=True)
 class Losses:
-    """What went wrong on the line since it was opened."""
+    """Errors of the line since it was opened."""
 
     frames: int  # good frames
-    lost: int  # frames that should have come and did not
-    corrupt: int  # frames whose checksum was wrong
-    skipped: int  # bytes that belonged to no frame
+    lost: int  # frames that did not arrive
+    corrupt: int  # frames with a wrong checksum
+    skipped: int  # bytes outside of frames
 
 
 class ForceSensorDevice(Protocol):
     """A six-component wrench sensor that streams."""
 
     def report(self) -> Report:
-        """Say who answered, versions, rate, temperature, and every problem at once."""
+        """Return identity, versions, rate, temperature, and every problem at once."""
 
     def latest(self) -> WrenchSample:
         """Return the newest frame, younger than 0.2 s; DeviceError: the stream is dead or stale."""
 
     def average(self, seconds: float) -> WrenchSample:
-        """Return the mean of the frames of the next so many real seconds; DeviceError: too few."""
+        """Return the mean of the frames of the next real seconds; DeviceError: too few frames."""
 
     def losses(self) -> Losses:
         """Return the counters."""
 
     def close(self) -> None:
-        """Stop the stream, give the port back. Never raises, may be called twice."""
+        """Stop the stream, release the port. Never raises, may be called twice."""
 
 
 class OperatorDevice(Protocol):
     """The person who hangs the loads."""
 
     def report(self) -> Report:
-        """Say who is asked."""
+        """Return the operator's identity."""
 
     def hang(self, load: CellLoad | None, why: str) -> None:
-        """Ask for a load (None: take everything off) and wait until it is said to be done.
+        """Ask for a load (None: take everything off) and wait for the person's confirmation.
 
-        `why` tells why it is asked for again; DeviceError: the person gives up.
+        `why` is the reason of a repeated request; DeviceError: the person gives up.
         """
 
     def close(self) -> None:
-        """Give the terminal back. Never raises, may be called twice."""
+        """Release the terminal. Never raises, may be called twice."""
 
 
 @runtime_checkable
 class ConfirmingOperator(OperatorDevice, Protocol):
-    """An operator who can be asked whether the arm may go on."""
+    """An operator who can confirm the arm's next action."""
 
     def confirm(self, question: str) -> None:
-        """Ask about what the arm does next, and wait; DeviceError: the person gives up."""
+        """Ask about the arm's next action, and wait; DeviceError: the person gives up."""
 
 
 @runtime_checkable
 class TerminalPerson(OperatorDevice, Protocol):
-    """An operator who is asked at the terminal on which the campaign is shown."""
+    """An operator who may be asked at the terminal that shows the campaign."""
 
-    at_terminal: bool  # whether that is so now; the live display gives way to the question then
+    at_terminal: bool  # whether this is the case; the live display then pauses for the question

@@ -1,4 +1,4 @@
-"""What a state and a motion of a cell must keep: one rule for planner, dry run and guard."""
+"""Feasibility of states and motions of a cell: one rule for planner, dry run and guard."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -22,62 +22,62 @@ JOINTS, WORKSPACE, ITSELF = "joint limits", "workspace", "self-collision"
 OBSTACLE, HANGING, TORQUE = "obstacle", "hanging", "torque"
 SENSOR, PAYLOAD, SIGHT, INCIDENCE = "force sensor", "payload", "sight", "incidence"
 STATE = (JOINTS, WORKSPACE, TORQUE, SENSOR, ITSELF, OBSTACLE, HANGING)
-"""What every state must keep, in motion too."""
+"""Checks of every state, in motion too."""
 WAY = tuple(kind for kind in STATE if kind != JOINTS)
-"""What a straight motion must keep whose ends keep `STATE`: it keeps joint limits by itself."""
+"""Checks of a straight motion between ends that pass `STATE`: joint limits hold between them."""
 
 BETWEEN_M = 0.001
-"""A motion that is allowed comes nowhere closer than its margin by more than this, m."""
+"""Largest undershoot of a margin by an allowed motion, m."""
 BETWEEN_SHARE = 0.01
-"""The same of torques and of the force sensor's moment, share of what is usable."""
-_COARSE_M = 0.5  # m, the farthest that any point goes in the first parts of a motion
-_SHOWN = 101  # points at which the worst of a motion is looked for, for people
+"""The same for torques and the force sensor's moment, as a share of the usable value."""
+_COARSE_M = 0.5  # largest motion of any point in the first parts of a motion, m
+_SHOWN = 101  # points of a motion that are searched for its worst finding
 _ROUNDING = 1e-9
 _SIDES = tuple((axis, low) for axis in range(3) for low in (True, False))
 
 
 @dataclass(frozen=True, slots=True)
 class Margins:
-    """What is kept beyond the limits; negative is slack."""
+    """Margins beyond the limits; negative: slack."""
 
     joint: float = 0.0  # from `[limits] joint_margin_rad`, rad
     inside: float = 0.0  # from the sides of the workspace and from the floor, m
-    clear: float = 0.005  # between arm, obstacles and what hangs, m
+    clear: float = 0.005  # between arm, obstacles and hanging load, m
     itself: float = 0.005  # between parts of the arm, m
     bear: float = 1.0  # share of the usable torque and of the force sensor's moment
 
 
 @dataclass(frozen=True, slots=True)
 class Violation:
-    """What a state or a motion does not keep."""
+    """A limit that a state or a motion violates."""
 
     kind: str  # one of `STATE`
-    of: str  # which body, side or joint
-    load: str  # name of the load where the finding is due to its weight or pull
-    text: str  # which body, how far, and which limit, without the place
+    of: str  # body, side or joint
+    load: str  # name of the load if its weight or pull is the cause
+    text: str  # body, distance and limit, without the place
 
     @property
     def what(self) -> tuple[str, str, str]:
-        """What tells it from others of the same place."""
+        """Key among the violations of one place."""
         return self.kind, self.of, self.load
 
     def at(self, where: str) -> str:
-        """Return the line for people: the place, under which load, and the text."""
+        """Return the line for people: place, load and text."""
         return f"{where}{'' if self.load == UNLOADED else f' under {self.load}'}: {self.text}"
 
 
 class Feasibility:
     """The states and straight motions that a cell allows.
 
-    A body is held to the workspace and to the obstacles with its capsule. Base and shoulder are
-    not, which stand where the arm is mounted; the upper arm is held to those sides of the workspace
-    that the shoulder keeps however it turns. Without `workspace_min_m` the mounting plane
-    z = 0 is the floor.
+    The capsules of all bodies are checked against workspace and obstacles, except base and
+    shoulder, which stand where the arm is mounted. The upper arm is checked against those sides of
+    the workspace that the shoulder respects at any angle. Without `workspace_min_m`, the mounting
+    plane z = 0 is the floor.
 
-    Between the samples of a motion a gap changes by at most Σ |Δθ_i| r_i, with r_i how far the
-    body is from the axis of joint i at most (`Scene.rates`). A part of a motion is done where the
-    gap in its middle is larger than that, and halved otherwise, until it is `BETWEEN_M` at most;
-    torques and moments by their own rates likewise.
+    Between the samples of a motion, a gap changes by at most Σ |Δθ_i| r_i, with r_i the largest
+    distance of the body from the axis of joint i (`Scene.rates`). A part of a motion passes if the
+    gap in its middle is larger than that; otherwise it is halved, until the change is `BETWEEN_M`
+    at most. Torques and moments are checked in the same way by their rates.
     """
 
     def __init__(self, cell: Cell, config: CellConfig, margins: Margins | None = None) -> None:
@@ -86,10 +86,8 @@ class Feasibility:
         self.margins = Margins() if margins is None else margins
         self.shapes = Clearance(cell, config)
         self.sight = self.shapes.sight
-        known = is_known(cell.arm)
-        self._guessed = (
-            "" if known else f"the shape of {cell.arm.name} is not known: its links are guessed"
-        )
+        guess = f"the shape of {cell.arm.name} is not known: its links are guessed"
+        self._guessed = "" if is_known(cell.arm) else guess
         low, high = config.limits.workspace_min_m, config.limits.workspace_max_m
         self._floor = low is None
         self._box = (low or (-np.inf, -np.inf, 0.0), high or (np.inf, np.inf, np.inf))
@@ -98,13 +96,13 @@ class Feasibility:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What is guessed."""
+        """Guesses, one sentence each."""
         return (self._guessed,) if self._guessed else ()
 
     # states
 
     def keeps(self, kind: str, q: Floats, load: str = UNLOADED) -> Bools:
-        """Return (N,) which states (N, n) keep one of `STATE`, payload, sight or incidence."""
+        """Return (N,) which states (N, n) pass one of `STATE`, payload, sight or incidence."""
         if kind == SIGHT:
             return self._always(q) if self.sight is None else self.sight.free(q, load)
         if kind == INCIDENCE:
@@ -116,33 +114,34 @@ class Feasibility:
         return self._always(q) if kind == PAYLOAD else ~self._beyond(kind, q, load)
 
     def allowed(self, q: Floats, load: str = UNLOADED, kinds: tuple[str, ...] = STATE) -> Bools:
-        """Return (N,) which states keep all of some kinds under a load, in their order."""
+        """Return (N,) which states pass all of some kinds under a load, in their order."""
         good = self._always(q)
         for kind in kinds:
-            left = np.flatnonzero(good)
-            if not len(left):
+            remaining = np.flatnonzero(good)
+            if not len(remaining):
                 break
-            good[left] = self.keeps(kind, q[left], load)
+            good[remaining] = self.keeps(kind, q[remaining], load)
         return good
 
     def findings(self, q: Floats, load: str, kinds: tuple[str, ...] = STATE) -> Iterator[Violation]:
-        """Yield what any of the states (N, n) does not keep under a load, each at its worst."""
-        at = _Placed(self.cell.arm, q)
+        """Yield the violations of the states (N, n) under a load, each at its worst."""
+        placed = _Placed(self.cell.arm, q)
         for kind in kinds:
-            for part in self._parts(kind, at, load):
+            for part in self._parts(kind, placed, load):
                 yield from part.findings(kind)
 
     def unbearable(self, load: str) -> dict[str, str]:
-        """Return why arm or force sensor do not bear a load in any state, a line by kind."""
-        arm, tool, hung = self.cell.arm, self.cell.tool_mass, self.shapes.load(load)
-        mass = tool + (0.0 if hung is None else hung.mass_kg)
+        """Return why arm or force sensor bear a load in no state, a line per kind."""
+        arm, tool, hung_load = self.cell.arm, self.cell.tool_mass, self.shapes.load(load)
+        mass = tool + (0.0 if hung_load is None else hung_load.mass_kg)
         out = {}
         if mass > arm.payload + _ROUNDING:
-            what = f'load "{load}": tool and load are' if hung else "the tool is"
-            out[PAYLOAD] = f"{what} {mass:.4g} kg; the payload of {arm.name} is {arm.payload:g} kg"
+            subject = f'load "{load}": tool and load are' if hung_load else "the tool is"
+            limit = f"the payload of {arm.name} is {arm.payload:g} kg"
+            out[PAYLOAD] = f"{subject} {mass:.4g} kg; {limit}"
         sensor = self.config.force_sensor
         force = float(np.linalg.norm(self._pull(load)[:3] + tool * self.cell.gravity))
-        if sensor is not None and hung is not None and force > sensor.max_force_N:
+        if sensor is not None and hung_load is not None and force > sensor.max_force_N:
             out[SENSOR] = (
                 f'load "{load}": tool and load pull with {force:.4g} N; [force_sensor] '
                 f"max_force_N is {sensor.max_force_N:g}"
@@ -152,15 +151,15 @@ class Feasibility:
     # motions
 
     def passable(self, start: Floats, ends: Floats, load: str) -> Bools:
-        """Return (M,) to which of `ends` (M, n) a straight motion under a load is clear."""
+        """Return (M,) which straight motions to `ends` (M, n) are clear under a load."""
         good = self._always(ends)
         for kind in WAY:
-            left = np.flatnonzero(good)
-            good[left] = self._search(kind, start, ends[left], load)[0]
+            remaining = np.flatnonzero(good)
+            good[remaining] = self._search(kind, start, ends[remaining], load)[0]
         return good
 
     def findings_between(self, start: Floats, end: Floats, load: str) -> Iterator[Violation]:
-        """Yield what a straight motion between two states (n,) does not keep, at its worst."""
+        """Yield the violations of a straight motion between two states (n,), at their worst."""
         for kind in WAY:
             good, bad = self._search(kind, start, end[None], load)
             if not good[0]:
@@ -170,83 +169,84 @@ class Feasibility:
                 )
 
     def _search(self, kind: str, start: Floats, ends: Floats, load: str) -> tuple[Bools, Floats]:
-        """Which motions (M,) keep a kind, and states (K, n) that show why others do not."""
+        """Return which motions (M,) pass a kind, and states (K, n) of the others that do not."""
         good = self._always(ends)
         turn = np.abs(self.cell.arm.chain_angles(ends - start))
         count = np.maximum(np.ceil((turn @ self._farthest) / _COARSE_M), 1).astype(np.int64)
-        owner = np.repeat(np.arange(len(ends)), count)
-        width = 1.0 / count[owner]
-        at = (np.arange(len(owner)) - (np.cumsum(count) - count)[owner] + 0.5) * width
+        motion = np.repeat(np.arange(len(ends)), count)
+        width = 1.0 / count[motion]
+        share = (np.arange(len(motion)) - (np.cumsum(count) - count)[motion] + 0.5) * width
         shown = [np.empty((0, ends.shape[1]))]
-        while len(owner):
-            q = start + at[:, None] * (ends[owner] - start)
-            close = np.flatnonzero(self._beyond(kind, q, load, 0.5 * width[:, None] * turn[owner]))
+        while len(motion):
+            q = start + share[:, None] * (ends[motion] - start)
+            close = np.flatnonzero(self._beyond(kind, q, load, 0.5 * width[:, None] * turn[motion]))
             bad = close[self._beyond(kind, q[close], load)]
-            good[owner[bad]] = False
+            good[motion[bad]] = False
             shown.append(q[bad])
-            left = close[good[owner[close]]]
-            owner, width = np.repeat(owner[left], 2), 0.5 * np.repeat(width[left], 2)
-            at = np.repeat(at[left], 2) + 0.5 * width * np.tile([-1.0, 1.0], len(left))
+            remaining = close[good[motion[close]]]
+            motion, width = np.repeat(motion[remaining], 2), 0.5 * np.repeat(width[remaining], 2)
+            sides = np.tile([-1.0, 1.0], len(remaining))
+            share = np.repeat(share[remaining], 2) + 0.5 * width * sides
         return good, np.vstack(shown)
 
     def _beyond(self, kind: str, q: Floats, load: str, turn: Floats | None = None) -> Bools:
-        """(N,) which states break a kind, or might within turns (N, n) of the chain's joints."""
+        """Return (N,) which states violate a kind, or may within turns (N, n) of the joints."""
         out = ~self._always(q)
         for part in self._parts(kind, _Placed(self.cell.arm, q), load):
-            left = np.flatnonzero(~out)
-            if len(left):
-                out[left] = part.beyond(left, None if turn is None else turn[left])
+            remaining = np.flatnonzero(~out)
+            if len(remaining):
+                out[remaining] = part.beyond(remaining, None if turn is None else turn[remaining])
         return out
 
-    # what is checked
+    # checks
 
-    def _parts(self, kind: str, at: "_Placed", load: str) -> Iterator["_Bounds | _Touch"]:
-        scene, margins, q = self.shapes.scene, self.margins, at.q
+    def _parts(self, kind: str, placed: "_Placed", load: str) -> Iterator["_Bounds | _Touch"]:
+        scene, margins, q = self.shapes.scene, self.margins, placed.q
         if not len(q):
             return
         if kind == JOINTS:
             yield self._joints(q)
         elif kind == WORKSPACE:
-            places = self._places(body_poses(self.cell.arm, q, at.chain), slice(None))
+            places = self._places(body_poses(self.cell.arm, q, placed.chain), slice(None))
             yield self._inside(self._names, places, self._radius, self._held, self._rates)
         elif kind == TORQUE:
-            yield self._torque(at.chain, load)
+            yield self._torque(placed.chain, load)
         elif kind == SENSOR and (sensor := self.config.force_sensor) is not None:
-            yield self._moment(sensor, at.chain, load)
+            yield self._moment(sensor, placed.chain, load)
         elif kind == ITSELF:
             yield _Touch(scene.itself, q, margins.itself, scene.itself.rates, guessed=self._guessed)
         elif kind == OBSTACLE:
             yield _Touch(scene.around, q, margins.clear, scene.around.rates)
         elif kind == HANGING:
-            hung = self.shapes.segments_at(at.chain.point(self.cell.load_point), load)
-            if hung:
-                places = np.stack([np.stack([x.start, x.end], axis=1) for x in hung], axis=1)
-                held = np.ones((len(hung), len(_SIDES)), dtype=np.bool_)
-                rates = np.tile(self._at_hook, (len(hung), 1))
-                radius = np.array([x.radius for x in hung])
-                yield self._inside([x.name for x in hung], places, radius, held, rates)
-            for segment in hung:
+            segments = self.shapes.segments_at(placed.chain.point(self.cell.load_point), load)
+            if segments:
+                places = np.stack([np.stack([x.start, x.end], axis=1) for x in segments], axis=1)
+                held = np.ones((len(segments), len(_SIDES)), dtype=np.bool_)
+                rates = np.tile(self._at_hook, (len(segments), 1))
+                radius = np.array([x.radius for x in segments])
+                yield self._inside([x.name for x in segments], places, radius, held, rates)
+            for segment in segments:
                 yield _Touch(scene.free, q, margins.clear, self._towards, segment)
 
     def _joints(self, q: Floats) -> "_Bounds":
-        arm, kept = self.cell.arm, self.config.limits.joint_margin_rad
-        low, high = arm.q_min + kept, arm.q_max - kept
-        more = self.margins.joint
+        arm, margin = self.cell.arm, self.config.limits.joint_margin_rad
+        low, high = arm.q_min + margin, arm.q_max - margin
+        extra = self.margins.joint
 
         def violation(k: int, state: int) -> Violation:
             return Violation(
                 JOINTS, arm.joint_names[k], UNLOADED,
                 f"{arm.joint_names[k]} is at {q[state, k]:.4g} {arm.unit(k)}; usable are "
-                f"{low[k]:.4g} to {high[k]:.4g} (joint_margin_rad {kept:g})",
+                f"{low[k]:.4g} to {high[k]:.4g} (joint_margin_rad {margin:g})",
             )  # fmt: skip
 
-        over = np.maximum(low - q, q - high) + more
+        over = np.maximum(low - q, q - high) + extra
         return _Bounds(over, np.zeros((arm.n, arm.n)), np.zeros(arm.n), violation)
 
     def _inside(
         self, names: list[str], places: Floats, radius: Floats, held: Bools, rates: Floats
     ) -> "_Bounds":
-        """Capsules (N, B, 2, 3) with radii (B,) within the sides that each is held to (B, 6)."""
+        """Check capsules (N, B, 2, 3) with radii (B,) against sides; `held` (B, 6): which sides."""
         low, high = places.min(axis=2) - radius[:, None], places.max(axis=2) + radius[:, None]
         over = np.stack([self._box[0] - low, high - self._box[1]], axis=3)
         body, side = np.nonzero(held)
@@ -288,13 +288,13 @@ class Feasibility:
             )
             return Violation(TORQUE, name, load, text)
 
-        # A joint turns what is beyond it, or, before the axis, the axis against the forces.
+        # a joint turns the forces' points beyond it, or, before the axis, the axis itself
         gravity, joint = float(np.linalg.norm(cell.gravity)), np.arange(arm.n)
         weights = gravity * np.append(arm.masses, cell.tool_mass)
-        beyond = self._levers @ np.append(weights, np.linalg.norm(pull[:3]))
-        rates = beyond[np.maximum(joint[:, None], joint)]
+        torque_rate = self._levers @ np.append(weights, np.linalg.norm(pull[:3]))
+        rates = torque_rate[np.maximum(joint[:, None], joint)]
         rates += np.linalg.norm(pull[3:]) * (joint < joint[:, None])
-        # A slide shifts the forces beyond it; what turns it turns the forces against its travel.
+        # a slide shifts the points beyond it; a joint before a slide turns its travel
         force = weights.sum() + np.linalg.norm(pull[:3])
         rates = np.where(slides[:, None] | slides, force, rates)
         drive = np.eye(arm.n) if arm.drive is None else np.abs(arm.drive)
@@ -303,8 +303,8 @@ class Feasibility:
 
     def _moment(self, sensor: ForceSensor, chain: Chain, load: str) -> "_Bounds":
         cell, pull = self.cell, self._pull(load)
-        at = np.asarray(sensor.origin_m)
-        weight, origin = cell.tool_mass * cell.gravity, chain.point(at)
+        origin_on_flange = np.asarray(sensor.origin_m)
+        weight, origin = cell.tool_mass * cell.gravity, chain.point(origin_on_flange)
         moment = pull[3:] + se3.cross(chain.point(cell.load_point) - origin, pull[:3])
         moment = moment + se3.cross(chain.point(cell.tool_com) - origin, weight)
         size = np.linalg.norm(moment, axis=1)[:, None]
@@ -314,7 +314,10 @@ class Feasibility:
             text = f"{size[state, k]:.4g} N·m on the force sensor; max_moment_Nm is {most:g}"
             return Violation(SENSOR, "moment", load, text)
 
-        levers = (cell.load_point - at, pull[:3]), (cell.tool_com - at, weight)
+        levers = (
+            (cell.load_point - origin_on_flange, pull[:3]),
+            (cell.tool_com - origin_on_flange, weight),
+        )
         rate = sum(float(np.linalg.norm(a) * np.linalg.norm(f)) for a, f in levers)
         rates = np.full((1, cell.arm.n), rate)
         limit = self.margins.bear * most
@@ -323,7 +326,7 @@ class Feasibility:
     # helpers
 
     def _set_bodies(self) -> None:
-        """Which capsules are held to which sides of the workspace, and how they move."""
+        """Set the capsules, the sides of the workspace to check each against, and their rates."""
         scene, arm = self.shapes.scene, self.cell.arm
         parts = scene.parts
         self._names = [part.name for part in parts]
@@ -344,18 +347,18 @@ class Feasibility:
         names = [self._names[k] for k in np.flatnonzero(mount)]
         fixed = self._inside(names, ends, self._radius[mount], everywhere, self._rates[mount])
         outside = fixed.over.reshape(-1, len(_SIDES)) - self.margins.inside
-        kept = mount.any() & np.all(outside <= 0.0, axis=0)
-        self._held |= (~moving & ~mount)[:, None] & kept
+        respected = mount.any() & np.all(outside <= 0.0, axis=0)
+        self._held |= (~moving & ~mount)[:, None] & respected
         hook = on_flange(arm, self.cell.load_point)[None]
         self._at_hook = np.array([from_axis(arm, arm.n, hook, i + 1) for i in range(arm.n)])
         self._towards = scene.towards(self.cell.load_point)
         self._farthest = np.vstack([self._rates, self._at_hook]).max(axis=0)
 
     def _set_levers(self) -> None:
-        """(n, n + 2) how far weights and the load point are from each axis before them, m."""
+        """Set the distances (n, n + 2), m, of weights and load point from each axis before them."""
         cell, arm = self.cell, self.cell.arm
         points = [(k + 1, com) for k, com in enumerate(arm.coms)]
-        points += [(arm.n, on_flange(arm, at)) for at in (cell.tool_com, cell.load_point)]
+        points += [(arm.n, on_flange(arm, x)) for x in (cell.tool_com, cell.load_point)]
         self._levers = np.array(
             [
                 [from_axis(arm, b, x[None], i) if b >= i else 0.0 for b, x in points]
@@ -364,22 +367,22 @@ class Feasibility:
         )
 
     def _places(self, poses: Floats, which: Bools | slice) -> Floats:
-        """(N, B, 2, 3) ends of some capsules, by the poses (N, n + 1, 4, 4) of all bodies."""
-        at = poses[:, self._body[which]]
-        ends = at[:, :, None, :3, :3] @ self._ends[which][..., None]
-        return np.asarray(ends[..., 0] + at[:, :, None, :3, 3])
+        """Return ends (N, B, 2, 3) of some capsules, from poses (N, n + 1, 4, 4) of all bodies."""
+        bodies = poses[:, self._body[which]]
+        ends = bodies[:, :, None, :3, :3] @ self._ends[which][..., None]
+        return np.asarray(ends[..., 0] + bodies[:, :, None, :3, 3])
 
     def _always(self, q: Floats) -> Bools:
         return np.ones(len(q), dtype=np.bool_)
 
     def _pull(self, load: str) -> Floats:
-        """(6,) wrench of a load at the load point, base axes; zero unloaded."""
+        """Return the wrench (6,) of a load at the load point, base axes; zero unloaded."""
         hung = self.shapes.load(load)
         return np.zeros(6) if hung is None else hung.wrench(self.cell.gravity)
 
 
 class _Placed:
-    """An arm in N states q (N, n); where it is, is evaluated once for all checks that ask."""
+    """An arm in N states q (N, n), with one forward kinematics for all checks."""
 
     def __init__(self, arm: Arm, q: Floats) -> None:
         self.arm, self.q = arm, q
@@ -391,19 +394,19 @@ class _Placed:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Bounds:
-    """Numbers that must not be over zero in N states."""
+    """Constraints x ≤ 0 in N states."""
 
-    over: Floats  # (N, K)
-    rates: Floats  # (K, n) they change by no more than this per radian of a joint of the chain
-    fine: Floats  # (K,) by how much they may be over zero between the samples of a motion
+    over: Floats  # (N, K) x
+    rates: Floats  # (K, n) largest |∂x/∂θ| by the joints of the chain
+    fine: Floats  # (K,) allowed x > 0 between the samples of a motion
     violation: Callable[[int, int], Violation]  # of column k in a state
 
     def beyond(self, rows: Ints, turn: Floats | None) -> Bools:
-        """(R,) whether states are over zero, or might be within turns (R, n)."""
+        """Return (R,) which states violate a constraint, or may within turns (R, n)."""
         over = self.over[rows]
         if turn is not None:
             over = over + np.maximum(turn @ self.rates.T - self.fine, 0.0)
-        return np.asarray(~np.all(over <= _ROUNDING, axis=1))  # what is not a number is beyond
+        return np.asarray(~np.all(over <= _ROUNDING, axis=1))  # NaN is a violation
 
     def findings(self, kind: str) -> Iterator[Violation]:
         worst: dict[str, tuple[float, Violation]] = {}
@@ -418,25 +421,25 @@ class _Bounds:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Touch:
-    """Shapes that must not be closer than a margin in N states; `_Bounds` of their gaps."""
+    """Pairs of shapes that must keep a margin in N states; see `_Bounds`."""
 
     pairs: Pairs
     q: Floats  # (N, n) joint angles, rad
     margin: float  # m
-    rates: Floats  # (K, n) how fast each pair may near, m/rad
-    segment: Segment | None = None  # what hangs in the N states, of `Scene.free`
-    guessed: str = ""  # says that the shapes are; empty where they are known
+    rates: Floats  # (K, n) largest rate of approach of each pair, m/rad
+    segment: Segment | None = None  # hanging load or cable in the N states, for `Scene.free`
+    guessed: str = ""  # remark on guessed shapes; empty where they are known
 
     def beyond(self, rows: Ints, turn: Floats | None) -> Bools:
-        """(R,) whether shapes are too close, or might come so within turns (R, n)."""
+        """Return (R,) in which states shapes are too close, or may be within turns (R, n)."""
         if turn is None:
-            return self.pairs.touching(self.q[rows], self.margin, self._of(rows))
+            return self.pairs.touching(self.q[rows], self.margin, self._segment(rows))
         out = np.zeros(len(rows), dtype=np.bool_)
         first = np.flatnonzero(np.append(True, np.any(np.diff(turn, axis=0) != 0.0, axis=1)))
         for a, b in zip(first, [*first[1:], len(rows)], strict=True):  # parts of one motion
             near = self.margin + np.maximum(self.rates @ turn[a] - BETWEEN_M, 0.0)
-            some = rows[a:b]
-            out[a:b] = self.pairs.touching(self.q[some], near, self._of(some))
+            states = rows[a:b]
+            out[a:b] = self.pairs.touching(self.q[states], near, self._segment(states))
         return out
 
     def findings(self, kind: str) -> Iterator[Violation]:
@@ -448,7 +451,7 @@ class _Touch:
             text += f" ({self.guessed})" if self.guessed else ""
             yield Violation(kind, f"{a} and {b}", UNLOADED, f"{a} and {b} collide: {text}")
 
-    def _of(self, rows: Ints) -> Segment | None:
+    def _segment(self, rows: Ints) -> Segment | None:
         x = self.segment
         if x is None:
             return None

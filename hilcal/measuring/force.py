@@ -1,13 +1,13 @@
-"""The force sensor as a campaign uses it: its zero, the tool it carries, what hangs.
+"""The force sensor in a campaign: its zero, the tool that it carries, and the load.
 
-The sensor reads what tool and load exert on it, in its own axes at its origin, plus its zero:
+The sensor reads the wrench of tool and load, in its axes at its origin, plus its zero:
 
     f = b_f + m u + f_load,   u = R_base_sensorᵀ g
     M = b_M + m c × u + M_load
 
-Without a load this is linear in the ten parameters x = (b_f, b_M, m, m c). Turning the sensor
-in gravity tells them apart (J. Swevers et al., Dynamic model identification for industrial
-robots, IEEE Control Systems 27 (2007) 58, for payloads alike).
+Without a load this is linear in the ten parameters x = (b_f, b_M, m, m c). Rotations of the sensor
+against gravity separate them (J. Swevers et al., Dynamic model identification for industrial
+robots, IEEE Control Systems 27 (2007) 58, for payloads).
 """
 
 from dataclasses import dataclass, replace
@@ -25,20 +25,20 @@ from hilcal.types import Floats
 
 PARAMETERS = 10
 MIN_SPREAD = 0.02
-"""Root mean square by which directions of gravity have to differ, rad: about one degree."""
+"""Least RMS difference of the directions of gravity, rad: about one degree."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ToolLoad:
-    """A sensor's zero and the tool it carries."""
+    """A sensor's zero and its tool."""
 
-    bias: Floats  # (6,) what the sensor reads with nothing on it, N and N·m, sensor axes
+    bias: Floats  # (6,) zero, N and N·m, sensor axes
     mass: float  # of the tool beyond the sensor, kg
     moment: Floats  # (3,) mass times centre of mass, kg·m, sensor axes from its origin
-    covariance: Floats  # (10, 10) of (bias, mass, moment); zero for what was not estimated
+    covariance: Floats  # (10, 10) of (bias, mass, moment); zero for fixed parameters
     gravity: Floats  # (3,) base axes, m/s²
     chi2: float  # sum of squared whitened residuals
-    dof: int  # its degrees of freedom; 0 after a tare
+    dof: int  # degrees of freedom; 0 after a tare
 
     @property
     def com(self) -> Floats:
@@ -49,7 +49,7 @@ class ToolLoad:
 
     @property
     def com_std(self) -> Floats:
-        """(3,) standard uncertainty of `com`, m, to first order; infinite where it is unknown."""
+        """(3,) standard uncertainty of `com`, m, to first order; infinite where unknown."""
         if not np.any(self.com) and self.mass <= 3.0 * np.sqrt(self.covariance[6, 6]):
             return np.full(3, np.inf)
         J = np.hstack([-self.com[:, None], np.eye(3)]) / self.mass
@@ -57,19 +57,19 @@ class ToolLoad:
 
     @property
     def variance_factor(self) -> float:
-        """chi2 / dof: 1 where the model and the stated noise explain the readings."""
+        """chi2 / dof: 1 if the model and the stated noise explain the readings."""
         return self.chi2 / self.dof if self.dof else float("nan")
 
     def tool_wrench(self, rotation: Floats) -> Floats:
-        """Return what the sensor reads without a load, for R_base_sensor (..., 3, 3): (..., 6)."""
+        """Return the reading (..., 6) without a load, for R_base_sensor (..., 3, 3)."""
         x = np.concatenate([self.bias, [self.mass], self.moment])
         return np.asarray(design(np.asarray(rotation), self.gravity) @ x)
 
     def load_wrench(self, wrench: Floats, rotation: Floats) -> Floats:
         """Return the load's wrench (..., 6) at the sensor, base axes, of a reading."""
-        own = np.asarray(wrench) - self.tool_wrench(rotation)
-        parts = own.reshape(*own.shape[:-1], 2, 3)
-        return np.asarray((parts @ np.swapaxes(rotation, -1, -2)).reshape(own.shape))
+        of_load = np.asarray(wrench) - self.tool_wrench(rotation)
+        parts = of_load.reshape(*of_load.shape[:-1], 2, 3)
+        return np.asarray((parts @ np.swapaxes(rotation, -1, -2)).reshape(of_load.shape))
 
     def load_covariance(self, covariance: Floats, rotation: Floats) -> Floats:
         """Return the covariance (6, 6) of `load_wrench`, from reading and parameters.
@@ -82,7 +82,7 @@ class ToolLoad:
 
 
 def design(rotation: Floats, gravity: Floats) -> Floats:
-    """Return D (..., 6, 10): reading = D x, x = (b_f, b_M, m, m c), no load, in R_base_sensor."""
+    """Return D (..., 6, 10): unloaded reading = D x, x = (b_f, b_M, m, m c), at R_base_sensor."""
     u = np.swapaxes(rotation, -1, -2) @ np.asarray(gravity, dtype=np.float64)
     out = np.zeros((*u.shape[:-1], 6, PARAMETERS))
     out[..., :6] = np.eye(6)
@@ -129,9 +129,9 @@ def identify_tool_load(
 def tare(
     wrench: Floats, covariance: Floats, rotation: Floats, gravity: Floats, mass: float, com: Floats
 ) -> ToolLoad:
-    """Return the sensor's zero from one mean reading (6,) without a load; the tool is known.
+    """Return the sensor's zero from one mean reading (6,) without a load, with a known tool.
 
-    Its centre of mass (3,) is in sensor axes from the sensor's origin, m.
+    The tool's centre of mass (3,) is in sensor axes from the sensor's origin, m.
     """
     _check_finite(wrench, covariance, rotation)
     moment = mass * com
@@ -142,7 +142,7 @@ def tare(
 
 
 def shift(wrench: Floats, arm: Floats) -> Floats:
-    """Return a wrench (..., 6) at a point `arm` (..., 3) further: f' = f, M' = M - arm × f."""
+    """Return a wrench (..., 6) at a point displaced by `arm` (..., 3): f' = f, M' = M - arm × f."""
     force, moment = wrench[..., :3], wrench[..., 3:]
     return np.concatenate([force, moment - np.cross(arm, force)], axis=-1)
 
@@ -153,7 +153,7 @@ def _check_finite(*readings: Floats) -> None:
 
 
 def _root(covariance: Floats) -> Floats:
-    """Cholesky factors (K, 6, 6), after units of one standard deviation each."""
+    """Return Cholesky factors (K, 6, 6), computed from the correlation matrices."""
     std = np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 0.0))
     try:
         with np.errstate(divide="raise", invalid="raise"):
@@ -167,10 +167,10 @@ def _root(covariance: Floats) -> Floats:
 
 
 def _check_orientations(rotation: Floats, gravity: Floats) -> None:
-    """Refuse orientations whose directions of gravity are too much alike.
+    """Refuse orientations whose directions of gravity are too similar.
 
-    Differences of u along one direction only: they tell the mass, and the centre of mass but
-    for its part along that direction.
+    If u varies in one direction only, the readings determine the mass, and the centre of mass
+    except its component in that direction.
     """
     size = float(np.linalg.norm(gravity))
     K = len(rotation)
@@ -193,13 +193,13 @@ def _check_orientations(rotation: Floats, gravity: Floats) -> None:
     )
 
 
-MOMENT_LEVER_M = 0.1  # lever by which a tolerance in N becomes one in N·m
+MOMENT_LEVER_M = 0.1  # lever that converts a tolerance in N to N·m
 
 
 def judged_part(expected: Floats) -> tuple[slice, str, float]:
-    """Return by what a load (6,) is judged: elements of its wrench, their unit, and N to the unit.
+    """Return the elements of a load's wrench (6,) to compare, their unit, and its ratio to N.
 
-    By its force; a load that is a moment alone by its moment, acting at `MOMENT_LEVER_M`.
+    The force; for a load that is a moment alone the moment, with `MOMENT_LEVER_M`.
     """
     if expected[3:].any() and not expected[:3].any():
         return slice(3, 6), "N·m", MOMENT_LEVER_M
@@ -214,59 +214,59 @@ def compare(
     tolerance_share: float,
     gravity: Floats,
 ) -> tuple[bool, str]:
-    """Return whether the load is the one asked for, and the finding in one line.
+    """Return whether the load is the requested one, and the finding in one line.
 
-    It is, where |f - f_expected| <= max(tolerance_N, tolerance_share |f_expected|); three sigma
-    of the measurement have to fit into that too; of a moment see `judged_part`. Wrenches are at one
+    It is, if |f - f_expected| <= max(tolerance_N, tolerance_share |f_expected|), which three sigma
+    of the measurement must not exceed either; for a moment see `judged_part`. Wrenches are at one
     point, base axes.
     """
     part, unit, lever = judged_part(expected)
     e, f = expected[part], measured[part]
-    asked, felt = float(np.linalg.norm(e)), float(np.linalg.norm(f))
-    limit = max(tolerance_N * lever, tolerance_share * asked)
-    words = f"asked for {_asked(e, unit, gravity)}, felt {felt:.1f} {unit}"
+    expected_size, measured_size = float(np.linalg.norm(e)), float(np.linalg.norm(f))
+    limit = max(tolerance_N * lever, tolerance_share * expected_size)
+    text = f"asked for {_expected_text(e, unit, gravity)}, felt {measured_size:.1f} {unit}"
     if not np.all(np.isfinite([*f, *std[part]])):
-        return False, f"{words}: the sensor gives no number"
+        return False, f"{text}: the sensor gives no number"
     noise = 3.0 * float(np.max(std[part]))
     if noise > limit:
         return False, (
-            f"{words} ± {noise:.1f} {unit}: too uncertain to tell, the load may differ by "
+            f"{text} ± {noise:.1f} {unit}: too uncertain to tell, the load may differ by "
             f"{limit:.1f} {unit}; average longer (force_window_s in [acquire])"
         )
     difference = float(np.linalg.norm(f - e))
     if difference <= limit:
-        return True, words
-    return False, f"{words}: {_found(e, f, limit, unit, gravity)}"
+        return True, text
+    return False, f"{text}: {_measured_text(e, f, limit, unit, gravity)}"
 
 
-def _asked(e: Floats, unit: str, gravity: Floats) -> str:
-    """What was asked for, in kg too where it is a dead weight."""
-    asked, mass = float(np.linalg.norm(e)), _mass(e, gravity)
-    if asked == 0.0:
+def _expected_text(e: Floats, unit: str, gravity: Floats) -> str:
+    """Return the requested load, in kg too if it is a weight."""
+    size, mass = float(np.linalg.norm(e)), _mass(e, gravity)
+    if size == 0.0:
         return "nothing"
+    return f"{size:.1f} {unit}" if mass is None or unit != "N" else f"{mass:.4g} kg ({size:.1f} N)"
+
+
+def _measured_text(e: Floats, f: Floats, limit: float, unit: str, gravity: Floats) -> str:
+    """Return a description of the measured vector f where e was expected."""
+    expected_size, measured_size = float(np.linalg.norm(e)), float(np.linalg.norm(f))
+    if measured_size <= limit:
+        return "that is nothing"
+    along, g = float(f @ gravity), float(np.linalg.norm(gravity))
+    is_weight = unit == "N" and g > 0.0 and along >= np.cos(np.radians(15.0)) * measured_size * g
+    kilograms = f"about {along / g**2:.1f} kg"
+    if expected_size == 0.0:
+        return f"{kilograms} still hangs" if is_weight else "something still pulls"
+    if is_weight and _mass(e, gravity) is not None:
+        return f"that is {kilograms}"
+    angle = np.degrees(np.arccos(np.clip(e @ f / (expected_size * measured_size), -1.0, 1.0)))
     return (
-        f"{asked:.1f} {unit}" if mass is None or unit != "N" else f"{mass:.4g} kg ({asked:.1f} N)"
+        f"that is {100 * measured_size / expected_size:.0f} % of it, {angle:.0f}° off its direction"
     )
 
 
-def _found(e: Floats, f: Floats, limit: float, unit: str, gravity: Floats) -> str:
-    """What the measured vector f looks like where e was asked for."""
-    asked, felt = float(np.linalg.norm(e)), float(np.linalg.norm(f))
-    if felt <= limit:
-        return "that is nothing"
-    along, size = float(f @ gravity), float(np.linalg.norm(gravity))
-    weighed = unit == "N" and size > 0.0 and along >= np.cos(np.radians(15.0)) * felt * size
-    kilograms = f"about {along / size**2:.1f} kg"
-    if asked == 0.0:
-        return f"{kilograms} still hangs" if weighed else "something still pulls"
-    if weighed and _mass(e, gravity) is not None:
-        return f"that is {kilograms}"
-    angle = np.degrees(np.arccos(np.clip(e @ f / (asked * felt), -1.0, 1.0)))
-    return f"that is {100 * felt / asked:.0f} % of it, {angle:.0f}° off its direction"
-
-
 def _mass(force: Floats, gravity: Floats) -> float | None:
-    """The mass in kg whose weight a force is, None where it does not point along gravity."""
+    """Return the mass, kg, whose weight a force is; None if it does not point along gravity."""
     size = float(np.linalg.norm(gravity))
     if size == 0.0:
         return None
@@ -274,36 +274,36 @@ def _mass(force: Floats, gravity: Floats) -> float | None:
     return along / size if along >= 0.9999 * np.linalg.norm(force) else None
 
 
-MIN_FRAMES = 20  # frames that a mean wrench is made of at least
-ENOUGH_POSES = 4  # unloaded readings from which the tool is identified at least
+MIN_FRAMES = 20  # frames of a mean wrench, at least
+ENOUGH_POSES = 4  # unloaded readings to identify the tool, at least
 TOOL_OFF_M = 0.01
-"""A tool whose centre of mass is so far from the configured one is remarked, m; a guess."""
+"""Distance of the centre of mass from the configured one that is remarked, m; a guess."""
 _FLOOR = np.diag([1e-3**2] * 3 + [1e-4**2] * 3)
-"""Variance of a mean wrench at least, N² and N²·m²: a line that rounds shows no noise at all."""
+"""Least variance of a mean wrench, N² and N²·m²: rounding can hide all noise."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TaredWrench:
-    """One mean wrench against the zero of its session, and the pose where it was felt."""
+    """A mean wrench, tared by the zero of its session, with its pose."""
 
     wrench: Floats  # (6,) sensor axes, N and N·m
-    covariance: Floats  # (6, 6) of this mean
+    covariance: Floats  # (6, 6) of the mean
     q: Floats  # (n,) joint angles, rad
 
 
 class ForceMeter:
     """A force sensor with its zero.
 
-    The zero of a session is what the sensor reads at the reference pose with nothing on the
-    hook, less the tool of the configuration. Wrenches of sessions are comparable after it,
-    whatever the sensor's own zero did while it was off; how the real tool differs from the
-    configured one stays in them. Once `identified`, the tool is the one that was weighed.
+    The zero of a session is the unloaded reading at the reference pose, less the wrench of the
+    configured tool. It makes the wrenches of sessions comparable if the sensor's own zero drifts
+    while it is off; they retain the difference of the real tool from the configured one. Once
+    `identified`, the tool is the weighed one.
     """
 
     def __init__(
         self, sensor: ForceSensorDevice, settings: Settings, cell: Cell, window: float
     ) -> None:
-        """Use an open sensor, averaged over a window in real seconds."""
+        """Use an open sensor, averaged over a window, real s."""
         self.sensor = sensor
         self.zero = np.zeros(6)
         self._cell, self._seconds = cell, window
@@ -317,11 +317,11 @@ class ForceMeter:
         self.tool = ToolLoad(np.zeros(6), cell.tool_mass, moment, nothing, cell.gravity, 0.0, 0)
 
     def felt(self) -> Floats:
-        """Return the present wrench (6,) against the zero, sensor axes."""
+        """Return the present tared wrench (6,), sensor axes."""
         return np.asarray(self.sensor.latest().wrench - self.zero)
 
     def average(self) -> WrenchSample:
-        """Return a mean of at least `MIN_FRAMES` frames, as the sensor gives it."""
+        """Return a mean of at least `MIN_FRAMES` frames, not tared."""
         sample = self.sensor.average(self._seconds)
         if sample.frames < MIN_FRAMES:  # a fast clock's window is too short for the real line
             self._seconds *= 1.2 * MIN_FRAMES / max(sample.frames, 1)
@@ -335,22 +335,22 @@ class ForceMeter:
         return sample
 
     def tared(self, sample: WrenchSample, q: Floats) -> TaredWrench:
-        """Return a mean wrench against the zero, at joint angles (n,)."""
+        """Return a tared mean wrench, at joint angles (n,)."""
         covariance = sample.covariance / max(sample.frames, 1) + _FLOOR
         return TaredWrench(sample.wrench - self.zero, covariance, np.asarray(q))
 
     def frame(self, q: Floats) -> tuple[Floats, Floats]:
-        """Return R_base_sensor and the way from the sensor to the load point (3,), base axes, m."""
+        """Return R_base_sensor and the vector (3,) from sensor to load point, base axes, m."""
         chain = chains.evaluate(self._cell.arm, np.asarray(q)[None])
         arm = chain.point(self._cell.load_point) - chain.point(self._origin)
         return chain.rotation[-1][0] @ self._axes, arm[0]
 
     def to_flange(self, point: Floats) -> Floats:
-        """Return a point (3,) of the sensor's axes in flange axes, m."""
+        """Convert a point (3,) from sensor axes to flange axes, m."""
         return np.asarray(self._origin + self._axes @ point)
 
     def set_zero(self, sample: WrenchSample, q: Floats) -> None:
-        """Take a mean wrench without load, at joint angles (n,), as the zero."""
+        """Set the zero by an unloaded mean wrench at joint angles (n,)."""
         cell, rotation = self._cell, self.frame(q)[0]
         self._tared_down = rotation.T @ cell.gravity
         covariance = sample.covariance / max(sample.frames, 1) + _FLOOR
@@ -360,10 +360,10 @@ class ForceMeter:
             self.tool = replace(zero, bias=np.zeros(6))
 
     def turned(self, q: Floats) -> float:
-        """Return how far gravity has turned in the sensor's axes since the tare, m/s², at q (n,).
+        """Return the change of gravity in sensor axes since the tare, m/s², at q (n,).
 
-        |R(q)ᵀ g - R_tareᵀ g|, by which each kg is felt that [tool] does not say; twice gravity, the
-        most that it can be, before any tare.
+        |R(q)ᵀ g - R_tareᵀ g| is the force of each kg that [tool] lacks; before any tare it is twice
+        gravity, its maximum.
         """
         gravity = self._cell.gravity
         if self._tared_down is None:
@@ -371,23 +371,23 @@ class ForceMeter:
         return float(np.linalg.norm(self.frame(q)[0].T @ gravity - self._tared_down))
 
     def identify(self, unloaded: list[TaredWrench], tolerance_N: float) -> tuple[int, ...] | None:
-        """Find the real tool from unloaded readings; the numbers of those left out, None: too few.
+        """Identify the tool from unloaded readings; return the indices of outliers; None: too few.
 
-        A reading whose force the tool does not explain to the tolerance was not unloaded, or
-        somebody leaned on the tool: the worst is left out until all are explained.
+        A reading whose force the tool does not explain to the tolerance was not unloaded, or a
+        person touched the tool: the worst one is removed until all are explained.
         """
-        kept = list(range(len(unloaded)))
-        while len(kept) >= ENOUGH_POSES:
-            used = [unloaded[k] for k in kept]
+        retained = list(range(len(unloaded)))
+        while len(retained) >= ENOUGH_POSES:
+            used = [unloaded[k] for k in retained]
             rotation = np.array([self.frame(f.q)[0] for f in used])
             wrench = np.array([f.wrench for f in used])
             covariance = np.array([f.covariance for f in used])
             tool = identify_tool_load(wrench, covariance, rotation, self._cell.gravity)
-            off = np.linalg.norm((wrench - tool.tool_wrench(rotation))[:, :3], axis=1)
-            if off.max() <= tolerance_N:
+            residual = np.linalg.norm((wrench - tool.tool_wrench(rotation))[:, :3], axis=1)
+            if residual.max() <= tolerance_N:
                 self.tool, self.identified = tool, True
-                return tuple(sorted(set(range(len(unloaded))) - set(kept)))
-            del kept[int(np.argmax(off))]
+                return tuple(sorted(set(range(len(unloaded))) - set(retained)))
+            del retained[int(np.argmax(residual))]
         if len(unloaded) < ENOUGH_POSES:
             return None
         raise CannotAnswerError(
@@ -396,14 +396,14 @@ class ForceMeter:
         )
 
     def load_wrench(self, tared: TaredWrench) -> Floats:
-        """Return the (6,) wrench of the load at the load point, base axes, N and N·m."""
+        """Return the wrench (6,) of the load at the load point, base axes, N and N·m."""
         rotation, arm = self.frame(tared.q)
         return shift(self.tool.load_wrench(tared.wrench, rotation), arm)
 
     def verify(
         self, load: CellLoad | None, tared: TaredWrench, operator: Operator
     ) -> tuple[bool, str]:
-        """Whether a load is what hangs, within the operator's tolerance; and the finding."""
+        """Return whether a load hangs, within the operator's tolerance, and the finding."""
         gravity, (rotation, arm) = self._cell.gravity, self.frame(tared.q)
         expected = np.zeros(6) if load is None else load.wrench(gravity)
         moved = np.eye(6)
@@ -414,19 +414,20 @@ class ForceMeter:
         return compare(expected, self.load_wrench(tared), std, *limits, gravity)
 
     def tool_differs(self, tolerance_N: float) -> str | None:
-        """Return in one line how the tool differs from [tool]; None where it does not.
+        """Return the difference of the tool from [tool] in one line; None without a difference.
 
-        It differs by a weight over the tolerance or, where that much could be felt, by a centre
-        of mass over `TOOL_OFF_M`; and by more than three standard deviations.
+        A difference of weight exceeds the tolerance. A difference of the centre of mass exceeds
+        `TOOL_OFF_M`, for a tool whose weight exceeds the tolerance. Both exceed three standard
+        deviations.
         """
         cell, tool = self._cell, self.tool
         size = float(np.linalg.norm(cell.gravity))
         std = float(np.sqrt(tool.covariance[6, 6]))
         heavier = abs(tool.mass - cell.tool_mass)
         com, com_std = self.to_flange(tool.com), float(np.linalg.norm(tool.com_std))
-        off = float(np.linalg.norm(com - cell.tool_com))
+        displacement = float(np.linalg.norm(com - cell.tool_com))
         weight = heavier * size > tolerance_N and heavier > 3 * std
-        place = tool.mass * size > tolerance_N and off > max(TOOL_OFF_M, 3 * com_std)
+        place = tool.mass * size > tolerance_N and displacement > max(TOOL_OFF_M, 3 * com_std)
         if not weight and not place:
             return None
         return (

@@ -17,24 +17,23 @@ from hilcal.store.plan import UNLOADED
 from hilcal.types import Floats
 
 TRIES = 3
-SWINGING_S = 2.0  # a load that seems wrong is weighed once more after so long, cell seconds
+SWINGING_S = 2.0  # time until a load that seems wrong is weighed once more, cell s
 
 
 def payload(cell: Cell, load: CellLoad | None) -> tuple[float, Floats]:
-    """Return mass (kg) and centre of mass (3,) at the flange of the tool with a dead weight."""
+    """Return mass, kg, and centre of mass (3,), flange axes, m, of the tool with a weight."""
     hung = 0.0 if load is None else load.mass_kg
     mass = cell.tool_mass + hung
     if mass == 0.0:
         return 0.0, np.zeros(3)
-    com = (cell.tool_mass * cell.tool_com + hung * cell.load_point) / mass
-    return mass, com
+    return mass, (cell.tool_mass * cell.tool_com + hung * cell.load_point) / mass
 
 
 class Hook:
-    """What hangs at the arm; WrongLoadError where what hangs is wrong `TRIES` times."""
+    """The hanging load and its changes; WrongLoadError after `TRIES` wrong loads."""
 
     def __init__(self, setup: Setup, meter: ForceMeter | None, mover: Mover) -> None:
-        """Nothing is known of what hangs before `begin`."""
+        """Start with an unknown load, until `begin`."""
         self.hanging, self.since, self._doubted = UNLOADED, setup.clock.now(), False
         self._arm, self._operator, self._meter = setup.rig.arm, setup.rig.operator, meter
         self._cell, self._config, self._mover = setup.cell, setup.config, mover
@@ -42,43 +41,43 @@ class Hook:
         self._loads = {load.name: load for load in setup.config.loads}
 
     def load(self, name: str) -> CellLoad | None:
-        """Return a load by name, None for the unloaded state."""
+        """Return a load by name; None for the unloaded state."""
         return self._loads.get(name)
 
     def begin(self) -> None:
-        """Have every load taken off before anything moves, for what hangs is unknown."""
+        """Have every load taken off before anything moves, as the load is unknown."""
         self._ask(None, self._still_hangs)
         self.hanging, self.since = UNLOADED, self._clock.now()
 
     def change(self, name: str) -> None:
         """Have another load hung, at the present pose.
 
-        A heavier payload is set in the controller before it is hung, a lighter one as soon as it is
-        said that the heavier has been taken off, before anything moves.
+        A heavier payload is set in the controller before it is hung, a lighter one after the person
+        has confirmed the change, before anything moves.
         """
         new, old = self.load(name), self.load(self.hanging)
         heavier = payload(self._cell, new)[0] > payload(self._cell, old)[0]
         if heavier:
-            self._carry(new)
+            self._set_payload(new)
         self._suspend(self.hanging, name)
-        self._ask(new, lambda: self._differs(new), answered=None if heavier else self._carry)
+        self._ask(new, lambda: self._differs(new), answered=None if heavier else self._set_payload)
         self._hangs(name)
 
     def restore(self, why: str) -> None:
-        """Have what should hang put right, where the arm stands, after it was found wrong.
+        """Have a wrong load corrected, where the arm stands.
 
-        The controller is told at once if nothing hangs any more, and that it hangs again as soon as
-        that is answered.
+        The payload in the controller is set at once if nothing hangs any more, and again after the
+        person has confirmed the load.
         """
         name, load = self.hanging, self.load(self.hanging)
         self._suspend(UNLOADED, name)
         if load is not None and not self._differs(None):
-            self._carry(None)
-        self._ask(load, lambda: self._differs(load), why, self._carry)
+            self._set_payload(None)
+        self._ask(load, lambda: self._differs(load), why, self._set_payload)
         self._hangs(name)
 
     def confirm(self, question: str) -> None:
-        """Ask whether the arm may go on."""
+        """Ask a person whether the arm may go on."""
         operator = self._operator
         if not isinstance(operator, ConfirmingOperator):
             raise DeviceError(f"arm: {question}: look at it, and start again")
@@ -91,24 +90,24 @@ class Hook:
     def _at_terminal(self) -> bool:
         return isinstance(self._operator, TerminalPerson) and self._operator.at_terminal
 
-    def _carry(self, load: CellLoad | None) -> None:
+    def _set_payload(self, load: CellLoad | None) -> None:
         self._arm.set_payload(*payload(self._cell, load))
 
     def _suspend(self, *hanging: str) -> None:
-        """Take note that one of some loads hangs, and do not watch it."""
+        """Note that one of some loads hangs, and stop comparing the force with a load."""
         self._mover.hanging = hanging
         if self._mover.watch is not None:
             self._mover.watch.suspend()
 
     def _hangs(self, name: str) -> None:
-        """Take note that a load hangs, and watch it from now on."""
+        """Note that a load hangs, and compare the force with it."""
         self.hanging, self.since = name, self._clock.now()
         self._mover.hanging = (name,)
         if self._mover.watch is not None:
             self._mover.watch.expect(self.load(name))
 
     def _asked(self, ask: Callable[[], None]) -> None:
-        """Ask a person; one at the terminal gets it from the display."""
+        """Ask a person; the display pauses if the person is at its terminal."""
         if self._at_terminal:
             self._watcher.notify(Question())
         ask()
@@ -122,14 +121,14 @@ class Hook:
         why: str = "",
         answered: Callable[[CellLoad | None], None] | None = None,
     ) -> None:
-        """Ask until nothing is wrong, `TRIES` times; an arm moved meanwhile is put back.
+        """Ask until the load is correct, `TRIES` times; an arm moved meanwhile is moved back.
 
-        `wrong` returns what is wrong in one line, empty where nothing is. `answered` is told what
-        hangs after each answer, before anything moves.
+        `wrong` returns the problem in one line, or an empty text. `answered` is called with the
+        load after each answer, before anything moves.
         """
-        what = "take everything off" if load is None else f"hang {load.name}"
+        task = "take everything off" if load is None else f"hang {load.name}"
         for _ in range(TRIES):
-            self._watcher.notify(Phase(f"waiting for the operator to {what}"))
+            self._watcher.notify(Phase(f"waiting for the operator to {task}"))
             self._asked(partial(self._operator.hang, load, why))
             self._watcher.notify(Phase("checking what hangs"))
             if answered is not None:
@@ -140,13 +139,13 @@ class Hook:
             if not why:
                 return
             if not self._at_terminal:  # a person is told with the next question
-                self._watcher.notify(Remark(f"asked to {what}: {why}"))
+                self._watcher.notify(Remark(f"asked to {task}: {why}"))
         if load is None:
             why += ". If nothing does, the tool was touched while the sensor was tared"
-        raise WrongLoadError(f"operator: asked {TRIES} times to {what}; {why}")
+        raise WrongLoadError(f"operator: asked {TRIES} times to {task}; {why}")
 
     def _differs(self, load: CellLoad | None) -> str:
-        """Why the measured wrench is not that of a load; weighed twice, for it may swing."""
+        """Return why the measured wrench is not that of a load; tried twice, as it may swing."""
         if self._meter is None:
             return ""
         text = ""
@@ -160,15 +159,15 @@ class Hook:
         return text
 
     def _still_hangs(self) -> str:
-        """What seems to hang still: a load that fits better than nothing does.
+        """Return a message on a load that seems to hang still: one that fits better than nothing.
 
-        By the zero of an earlier session. Without one it is the sensor's own, which may be far off:
-        then a second answer that nothing hangs is believed, and said to be.
+        The zero is that of an earlier session. Without one it is the sensor's zero, which may be
+        far off: then a second answer that nothing hangs is believed, with a remark.
         """
         if self._meter is None:
             return ""
-        known = bool(np.any(self._meter.zero))
-        believed, self._doubted = self._doubted and not known, True
+        has_zero = bool(np.any(self._meter.zero))
+        believed, self._doubted = self._doubted and not has_zero, True
         sample = self._mover.look()
         tared = self._meter.tared(self._meter.average(), sample.q)
         force = self._meter.load_wrench(tared)[:3]
@@ -185,9 +184,9 @@ class Hook:
                         )
                     )
                     return ""
-                since = "in the unloaded readings so far" if known else "the tool weighs"
+                reference = "in the unloaded readings so far" if has_zero else "the tool weighs"
                 return (
-                    f"the force sensor feels {felt:.1f} N more than {since}; {load.name} seems to "
-                    "hang still"
+                    f"the force sensor feels {felt:.1f} N more than {reference}; {load.name} seems "
+                    "to hang still"
                 )
         return ""

@@ -1,27 +1,25 @@
 """Measuring one reading: wait until everything has settled, average, check.
 
-**Settling.** Whether the tracker's readings are at rest, judged by their own trend and scatter.
-The window is the last half of what has been measured since the arm stopped, at least K samples:
-so a disturbance that fades is forgotten after twice the time that it took to fade, and a slow
-one is looked at for longer. In the window, a line x_k = x̄ + b (t_k - t̄) + noise is fitted:
+**Settling.** The trend and scatter of the tracker's samples decide whether they are at rest. The
+window is the last half of the samples since the arm stopped, at least K samples: a disturbance
+leaves the window after twice its duration, and a slow disturbance is watched for longer. In the
+window, a line x_k = x̄ + b (t_k - t̄) + noise is fitted:
 
-- drift: D = S b Σ̄⁻¹ bᵀ with S = Σ (t_k - t̄)² is chi² with m degrees of freedom at rest; the
-  readings drift if that is less probable than `DRIFT_P` (`AFTER_DRIFT_P` once they did), unless
-  the drift over the window is below half the standard deviation of the mean: then it does not
-  matter.
-- scatter about the line: if it cannot be the stated noise (p < `SCATTER_P`), the arm may still
-  vibrate, or the instrument be worse than stated. It is taken for the instrument's once there
-  are 2 K samples (2 K log10 of the excess where it is larger) and their second half does not
-  scatter less than the first; drift is then judged relative to the scatter (an F test).
+- drift: D = S b Σ̄⁻¹ bᵀ with S = Σ (t_k - t̄)² is chi² with m degrees of freedom at rest. The
+  readings drift if p < `DRIFT_P` (`AFTER_DRIFT_P` after a drift). A drift over the window of less
+  than half the standard deviation of the mean is negligible.
+- scatter about the line: if the stated noise cannot explain it (p < `SCATTER_P`), the arm may still
+  vibrate, or the instrument may be worse than stated. It is attributed to the instrument once there
+  are 2 K samples (2 K log10 of the excess if that is larger) and their second half does not scatter
+  less than the first; drift is then judged relative to the scatter (an F test).
 
 At rest and with the stated noise, the first full window is refused with a probability of
-DRIFT_P + SCATTER_P at most. A first window that moves by less than about four sigmas of a
-sample is not detected; more samples detect smaller drifts.
+DRIFT_P + SCATTER_P at most. A motion of less than about four sigmas of a sample is not detected in
+the first window; more samples detect smaller drifts.
 
-**Averaging.** Several measurements at rest become one reading with the covariance of their mean.
-The covariance of the mean is `readings.covariance.covariance_of_mean`. Its factor τ is 1 unless the
-scatter cannot be explained by the stated noise (chi² test, p < 0.001): then it is their ratio, so
-that an instrument that is far worse than stated is not believed.
+**Averaging.** Several measurements at rest become one reading with the covariance of their mean,
+`readings.covariance.covariance_of_mean`. Its factor τ is 1 unless the stated noise cannot explain
+the scatter (chi² test, p < 0.001); then τ is the ratio of scatter and stated noise.
 """
 
 from collections.abc import Callable, Sequence
@@ -42,11 +40,11 @@ from hilcal.robot import se3
 from hilcal.types import Bools, Floats
 
 UNEXPLAINED = 1e-3
-"""Scatter less probable than this disproves the stated noise; a choice, no study set it."""
+"""Level of the test of the scatter against the stated noise; a choice, no study set it."""
 GROSS_SIGMA = 6.0
-"""A sample so far off (as improbable as so many sigmas of a single number) is left out; a guess."""
+"""Distance of a gross outlier, as the equivalent number of sigmas of a scalar; a guess."""
 MOST_LEFT_OUT = 0.2
-"""Share of the samples that may be left out; one always may. A guess."""
+"""Largest share of omitted samples; one sample is always allowed. A guess."""
 _MEAN_STEPS = 10
 
 
@@ -56,33 +54,33 @@ class Average:
 
     value: Floats  # (m,) position in m and, for m = 6, rotation vector in rad, sensor axes
     covariance: Floats  # (m, m) of `value`; rotations as small rotations about the sensor's axes
-    scatter: float  # mean square of the scatter over what is stated; 1 is expected
-    scatter_p: float  # how probable at least as much scatter is under the stated noise
-    left_out: tuple[int, ...]  # numbers of the samples (from 0) that were gross outliers
-    warnings: tuple[str, ...]  # what a person should know, one line each
+    scatter: float  # mean square of the scatter over the stated noise; 1 is expected
+    scatter_p: float  # p-value of the scatter under the stated noise
+    left_out: tuple[int, ...]  # indices of the gross outliers
+    warnings: tuple[str, ...]  # for people, one line each
 
 
 def average(samples: Sequence[TrackerSample], systematic_share: float = 0.0) -> Average:
-    """Average at least 2 samples of one target at rest; the law is that of the module.
+    """Average at least 2 samples of one target at rest; see the module.
 
-    A gross outlier among them is left out: its squared distance from the median, whitened by
-    Σ̄ and relative to what is usual in the window (never less than stated), is less probable
-    than `GROSS_SIGMA`. DeviceError: they are more than one in five (and more than one).
+    Gross outliers are omitted: samples whose squared distance from the median, whitened by Σ̄ and
+    relative to the median distance of the window (at least that of the stated noise), is less
+    probable than `GROSS_SIGMA`. DeviceError: more than one outlier, and more than one in five.
     """
     values = np.array([sample.value for sample in samples])
     stated = np.array([sample.covariance for sample in samples])
-    keep = _not_gross(values, stated.mean(axis=0))
-    left_out = tuple(int(k) for k in np.flatnonzero(~keep))
-    if len(left_out) > max(1.0, MOST_LEFT_OUT * len(samples)) or keep.sum() < 2:
+    retained = _not_gross(values, stated.mean(axis=0))
+    left_out = tuple(int(k) for k in np.flatnonzero(~retained))
+    if len(left_out) > max(1.0, MOST_LEFT_OUT * len(samples)) or retained.sum() < 2:
         raise DeviceError(
             f"tracker: its readings scatter: {len(left_out)} of {len(samples)} at one pose are "
             "gross outliers; is the beam disturbed, or does something move?"
         )
-    prior = stated[keep].mean(axis=0)
-    mean, residuals = deviations(values[keep])
+    prior = stated[retained].mean(axis=0)
+    mean, residuals = deviations(values[retained])
     ratio, p = _trace_test(residuals, prior)
-    believed = 1.0 if p >= UNEXPLAINED else ratio
-    covariance = covariance_of_mean(prior, residuals, systematic_share, believed)
+    factor = 1.0 if p >= UNEXPLAINED else ratio
+    covariance = covariance_of_mean(prior, residuals, systematic_share, factor)
     warnings = [f"reading {k + 1} of {len(samples)} is a gross outlier, left out" for k in left_out]
     if p < UNEXPLAINED:
         warnings.append(
@@ -90,34 +88,34 @@ def average(samples: Sequence[TrackerSample], systematic_share: float = 0.0) -> 
             f"(p = {p:.1g}); the reading's covariance was enlarged"
         )
     warnings += dict.fromkeys(
-        s.warning for s, kept in zip(samples, keep, strict=True) if kept and s.warning
+        s.warning for s, used in zip(samples, retained, strict=True) if used and s.warning
     )
     return Average(mean, covariance, ratio, p, left_out, tuple(warnings))
 
 
 def deviations(values: Floats) -> tuple[Floats, Floats]:
-    """Mean (m,) of values (K, m), and each one's deviation from it (K, m).
+    """Return the mean (m,) of values (K, m), and the deviations from it (K, m).
 
-    Rotations average in the tangent space: R̄ is where the rotation vectors of R_k R̄ᵀ have
-    the mean zero (the Fréchet mean; Barfoot, *State Estimation for Robotics*, section 7.3).
+    Rotations are averaged in the tangent space: the rotation vectors of R_k R̄ᵀ have the mean zero
+    (Fréchet mean; Barfoot, *State Estimation for Robotics*, section 7.3).
     """
     mean = values.mean(axis=0)
     residuals = values - mean
     if values.shape[1] == 6:
-        turns = se3.rotation(values[:, 3:])
-        middle = turns[0]
+        rotations = se3.rotation(values[:, 3:])
+        mean_rotation = rotations[0]
         for _ in range(_MEAN_STEPS):
-            residuals[:, 3:] = se3.rotation_vector(turns @ middle.T)
+            residuals[:, 3:] = se3.rotation_vector(rotations @ mean_rotation.T)
             step = residuals[:, 3:].mean(axis=0)
             if np.linalg.norm(step) < 1e-14:
                 break
-            middle = se3.rotation(step) @ middle
-        mean[3:] = se3.rotation_vector(middle)
+            mean_rotation = se3.rotation(step) @ mean_rotation
+        mean[3:] = se3.rotation_vector(mean_rotation)
     return mean, residuals
 
 
 def _trace_test(residuals: Floats, prior: Floats) -> tuple[float, float]:
-    """T / (m (K - 1)), T = Σ_k r_kᵀ Σ̄⁻¹ r_k, and P(chi² >= T) with as many degrees of freedom."""
+    """Return T / (m (K - 1)), T = Σ_k r_kᵀ Σ̄⁻¹ r_k, and P(chi² >= T), m (K - 1) dof."""
     count, m = residuals.shape
     white = residuals @ inverse_root(prior).T
     total, dof = float(np.sum(white**2)), m * (count - 1)
@@ -125,7 +123,7 @@ def _trace_test(residuals: Floats, prior: Floats) -> tuple[float, float]:
 
 
 def _not_gross(values: Floats, stated: Floats) -> Bools:
-    """Which samples (K,) are no gross outliers."""
+    """Return which samples (K,) are no gross outliers."""
     m = values.shape[1]
     white = deviations(values)[1] @ inverse_root(stated).T
     square = np.sum((white - np.median(white, axis=0)) ** 2, axis=1)
@@ -137,24 +135,24 @@ _LOG_GROSS = float(np.log(2) + stats.norm.logsf(GROSS_SIGMA))
 
 
 DRIFT_P = 0.04
-"""False alarm rate of the drift test. The constants here are choices, traded by hand in
-tests/unit/measuring/test_measure.py: time lost at rest against the bias that a decay leaves."""
+"""False alarm rate of the drift test. The constants here are choices, balanced by hand in
+tests/unit/measuring/test_measure.py: time lost at rest against the bias by a decay."""
 AFTER_DRIFT_P = 0.3
-"""The same after readings have drifted: the test is repeated at every sample, and none of the
-repeated tests may miss a drift that is there."""
+"""The same after a drift: the test is repeated at every sample, and none of the repeated tests may
+miss a drift."""
 SCATTER_P = 0.001
 SHRINKING_P = 0.05
 NEGLIGIBLE = 0.5
-"""Drift over the window that does not matter, as a share of the standard deviation of a mean."""
-FEW = 12  # fewer samples than this do not estimate a scatter
-LONGEST = 10  # the window grows to at most so many times K samples
+"""Negligible drift over the window, as a share of the standard deviation of the mean."""
+FEW = 12  # least number of samples to estimate a scatter
+LONGEST = 10  # largest window, over K samples
 
 
 class SettleWindow:
     """Collects samples after the arm has stopped, and tests whether they are at rest."""
 
     def __init__(self, count: int) -> None:
-        """Start empty; `count` samples or more are judged, at least 3 for a trend."""
+        """Start empty; `count` is K, at least 3 for a trend."""
         self._count = count
         self._samples: list[TrackerSample] = []
         self._settled = self._has_drifted = False
@@ -170,10 +168,10 @@ class SettleWindow:
         return self._settled
 
     def _judge(self) -> bool:
-        window = self._window()
+        window = self._samples[-max(self._count, len(self._samples) // 2) :]
         trend = _trend(window)
         if trend.moment == 0.0:
-            return False  # all at one time: no word on a trend
+            return False  # all at one time: no trend
         noise = 1.0
         if trend.scatter_p < SCATTER_P:
             enough = max(2 * self._count, FEW) * max(1.0, np.log10(trend.scatter))
@@ -191,12 +189,8 @@ class SettleWindow:
         self._has_drifted = self._has_drifted or p <= DRIFT_P
         return bool(p > (AFTER_DRIFT_P if self._has_drifted else DRIFT_P))
 
-    def _window(self) -> Sequence[TrackerSample]:
-        """The last half of all, at least K."""
-        return self._samples[-max(self._count, len(self._samples) // 2) :]
-
     def _shrinking(self) -> bool:
-        """Whether the second half of all samples scatters less than the first (F test)."""
+        """Test whether the second half of all samples scatters less than the first (F test)."""
         half = len(self._samples) // 2
         first = _trend(self._samples[:half])
         second = _trend(self._samples[-half:])
@@ -211,8 +205,8 @@ class _Trend:
     white_slope: Floats  # (m,) per s, whitened by the mean stated covariance
     moment: float  # Σ (t_k - t̄)², s²
     span: float  # from the first to the last sample, s
-    scatter: float  # mean square about the line over what is stated
-    scatter_p: float  # how probable at least as much is
+    scatter: float  # mean square about the line over the stated noise
+    scatter_p: float  # its p-value
     dof: int  # m (K - 2)
 
 
@@ -231,30 +225,29 @@ def _trend(samples: Sequence[TrackerSample]) -> _Trend:
     return _Trend(root @ slope, moment, span, scatter, p, dof)
 
 
-SEARCHES = 2  # how often a lost target is searched for in one reading
-AGAIN = 3  # how often a reading is tried that is void: the arm moved, or the samples disagree
-PATIENCE = 4  # settling is given up after its time and at least so many windows of measurements
+SEARCHES = 2  # searches of a lost target in one reading, at most
+AGAIN = 3  # attempts at a reading, if void: the arm moved, or the samples disagree
+PATIENCE = 4  # windows of measurements after which, and after its time-out, settling fails
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeasuredStop:
-    """What was measured at one stop."""
+    """The measurement at one stop."""
 
-    mean: Average  # of the tracker's measurements, with its covariance, sensor axes
-    q: Floats  # (n,) mean actual joint angles meanwhile, rad
+    mean: Average  # of the tracker's measurements, sensor axes
+    q: Floats  # (n,) mean actual joint angles, rad
     before: ArmSample
     after: ArmSample
     tracker: tuple[TrackerSample, ...]
     force: WrenchSample | None  # mean wrench of the force sensor; None without one
-    settling: float  # how long it took until all was settled, cell seconds
+    settling: float  # settling time, cell s
     remarks: tuple[str, ...]
     torque: Floats | None = None
-    """(n,) mean torques that the drives were measured to exert meanwhile, N·m; None where the arm
-    does not tell them."""
+    """(n,) mean measured torques of the drives, N·m; None where the arm does not report them."""
 
 
 class Measurer:
-    """Measures readings of an arm that stands at its goal."""
+    """Measures readings with the arm standing at its goal."""
 
     def __init__(self, setup: Setup, meter: ForceMeter | None, mover: Mover) -> None:
         self._mover, self._tracker, self._meter = mover, setup.rig.tracker, meter
@@ -263,9 +256,9 @@ class Measurer:
     def measure(
         self, name: str, find: Callable[[], None] | None = None, force: WrenchSample | None = None
     ) -> MeasuredStop:
-        """Measure at the present pose, called `name`.
+        """Measure at the pose `name`, where the arm stands.
 
-        `find` finds a lost target again; `force` is the wrench where it was averaged already.
+        `find` searches a lost target; `force` is the mean wrench if it was measured already.
         """
         remarks: list[str] = []
         searches = repeats = 0
@@ -286,40 +279,41 @@ class Measurer:
             self._watcher.notify(Remark(f"{name}: {why}; measuring again"))
 
     def _settle(self, name: str) -> float:
-        """Wait until arm and readings have settled; returns how long it took, cell seconds."""
+        """Wait until arm and readings have settled; return the settling time, cell s."""
         acquire, clock = self._config.acquire, self._clock
-        begun = clock.now()
-        rest: float | None = None
-        taken = 0
+        start = clock.now()
+        rest_start: float | None = None
+        count = 0
         window = SettleWindow(acquire.samples)
         while True:
             if not self._mover.at_rest(self._mover.look()):
-                rest, window = None, SettleWindow(acquire.samples)
+                rest_start, window = None, SettleWindow(acquire.samples)
                 clock.sleep(POLL_S * clock.scale)
             else:
-                rest = clock.now() if rest is None else rest
+                rest_start = clock.now() if rest_start is None else rest_start
                 window.add(self._tracker.measure())
-                taken += 1
-                if clock.now() - rest >= acquire.settle_s and window.settled():
-                    return clock.now() - begun
-            late = clock.now() - begun > acquire.settle_timeout_s
-            if late and (rest is None or taken >= PATIENCE * acquire.samples):
-                what = "the arm does not rest at its goal" if rest is None else "the readings drift"
+                count += 1
+                if clock.now() - rest_start >= acquire.settle_s and window.settled():
+                    return clock.now() - start
+            late = clock.now() - start > acquire.settle_timeout_s
+            if late and (rest_start is None or count >= PATIENCE * acquire.samples):
+                moving = "the arm does not rest at its goal"
+                reason = moving if rest_start is None else "the readings drift"
                 raise DeviceError(
-                    f"{name}: not settled within {acquire.settle_timeout_s:g} s: {what}. Look for "
-                    "a swinging load, a loose target or a warming tracker"
+                    f"{name}: not settled within {acquire.settle_timeout_s:g} s: {reason}. Look "
+                    "for a swinging load, a loose target or a warming tracker"
                 )
 
     def _averaged(
         self, settling: float, remarks: tuple[str, ...], force: WrenchSample | None
     ) -> tuple[MeasuredStop | None, str]:
-        """Average over the window; None and the reason where that cannot be a reading."""
+        """Average over the window; None and the reason where the reading is void."""
         differed, before = self._mover.differed, self._mover.look()
         tracker: list[TrackerSample] = []
-        looks: list[ArmSample] = []
+        arm_samples: list[ArmSample] = []
         for _ in range(self._config.acquire.samples):
             tracker.append(self._tracker.measure())
-            looks.append(self._mover.look())
+            arm_samples.append(self._mover.look())
         if force is None and self._meter is not None:
             force = self._meter.average()
         after = self._mover.look()
@@ -342,26 +336,26 @@ class Measurer:
             return None, str(error)
         if not (np.isfinite(mean.value).all() and np.isfinite(mean.covariance).all()):
             return None, "the tracker gives what is not a number"
-        looks.append(after)
-        q = np.mean([before.q, *(look.q for look in looks)], axis=0)
-        torques = [look.torque for look in looks if look.torque is not None]
-        torque = np.mean(torques, axis=0) if len(torques) == len(looks) else None
-        said = (*remarks, *mean.warnings)
+        arm_samples.append(after)
+        q = np.mean([before.q, *(sample.q for sample in arm_samples)], axis=0)
+        torques = [sample.torque for sample in arm_samples if sample.torque is not None]
+        torque = np.mean(torques, axis=0) if len(torques) == len(arm_samples) else None
+        all_remarks = (*remarks, *mean.warnings)
         return MeasuredStop(
-            mean, q, before, after, tuple(tracker), force, settling, said, torque
+            mean, q, before, after, tuple(tracker), force, settling, all_remarks, torque
         ), ""
 
-    def _wrong(self, force: WrenchSample | None, at: ArmSample) -> bool:
-        """Whether the mean wrench is not that of what hangs either: such a reading is kept."""
+    def _wrong(self, force: WrenchSample | None, sample: ArmSample) -> bool:
+        """Whether the mean wrench, too, is not that of the load; such a reading is kept."""
         watch, meter = self._mover.watch, self._meter
         if watch is None or meter is None or force is None:
             return False
-        return bool(watch.wrong(meter.tared(force, at.q)))
+        return bool(watch.wrong(meter.tared(force, sample.q)))
 
     def _search(
         self, error: TargetLostError, name: str, searches: int, find: Callable[[], None]
     ) -> int:
-        """Search the target; returns how often that has been done."""
+        """Search the target; return the number of searches so far."""
         while searches < SEARCHES:
             searches += 1
             self._watcher.notify(Remark(f"{name}: {error}; searching the target"))

@@ -1,4 +1,4 @@
-"""Moving the arm from pose to pose while every limit, and that the load hangs, is checked."""
+"""Moving the arm from pose to pose, with checks of every limit and of the load."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -17,12 +17,12 @@ from hilcal.measuring.route import Stop, duration, on_route
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Floats
 
-NORMAL = "normal"  # the safety state of an arm where all is well
+NORMAL = "normal"  # safety state of an arm without problems
 HOW_ON = "drive it by hand to a free place in the middle of its workspace"
-SLACK_M = 0.005  # an arm that sags at the edge of its workspace is not stopped for it, m
+SLACK_M = 0.005  # allowed sag beyond the edge of the workspace, m
 SLACK = Margins(joint=-0.01, inside=-SLACK_M, clear=0.0, itself=0.0, bear=1.02)
-"""How much less is kept in motion than in a dry run: an arm sags and follows late, and a motion is
-checked at samples. Nothing may touch."""
+"""Margins in motion, smaller than those of a dry run: an arm sags and lags, and a motion is checked
+at samples. Nothing may touch."""
 
 
 class Guard:
@@ -35,7 +35,7 @@ class Guard:
     def check(
         self, sample: ArmSample, felt: Floats | None = None, hanging: str = UNLOADED
     ) -> str | None:
-        """Return in one line what is wrong, or None; `felt` is the wrench (6,) of the sensor."""
+        """Return the violated limit in one line, or None; `felt` is the sensor's wrench (6,)."""
         return (
             self.state(sample)
             or self._speed(sample)
@@ -44,7 +44,7 @@ class Guard:
         )
 
     def state(self, sample: ArmSample) -> str | None:
-        """Return in one line why a sample is not one of this arm, ready to move; or None."""
+        """Return why a sample is not one of this arm, ready to move, in one line; or None."""
         if sample.safety != NORMAL:
             return f"arm: its safety state is {sample.safety}; put that right on the pendant"
         n = self.cell.arm.n
@@ -63,8 +63,8 @@ class Guard:
         return f"arm: {name} moves at {speed[k]:.3g} rad/s; joint_speed_rad_s is {limit:g}"
 
     def _place(self, q: Floats, hanging: str) -> str | None:
-        found = next(self._limits.findings(q[None], hanging), None)
-        return None if found is None else f"{found.at('arm')}; {HOW_ON}"
+        violation = next(self._limits.findings(q[None], hanging), None)
+        return None if violation is None else f"{violation.at('arm')}; {HOW_ON}"
 
     def _pull(self, felt: Floats | None) -> str | None:
         sensor = self.config.force_sensor
@@ -75,7 +75,7 @@ class Guard:
             (felt[3:], "N·m", "max_moment_Nm", sensor.max_moment_Nm),
         ):
             size = float(np.linalg.norm(part))
-            if not size <= limit:  # negated, so that what is not a number is refused
+            if not size <= limit:  # negated, to refuse NaN
                 return (
                     f"force sensor: {size:.4g} {unit}; {key} is {limit:g}. Look what the arm or "
                     "its load touches"
@@ -83,31 +83,31 @@ class Guard:
         return None
 
 
-# Choices, no study set them; tests/unit/measuring/test_run_watched.py shows what they find.
+# choices, no study set them; tests/unit/measuring/test_run_watched.py shows what they detect
 ALLOWED = 2.0
-"""A hung load may differ by so many times what it may when it is hung: a sensor's zero drifts."""
-SWING = 0.3  # share of the load that it exerts to the side while it swings in motion: 17°
+"""Tolerance of a hanging load, over the tolerance when it is hung: a sensor's zero drifts."""
+SWING = 0.3  # lateral force of a load that swings in motion, as a share of its weight: 17°
 PULL = 0.5
-"""Share by which a pull may differ: its rope turns with the arm, its weight is on a pulley."""
+"""Tolerance of a pull, as a share: its rope turns with the arm, its weight is on a pulley."""
 UNKNOWN_KG = 1.0
-"""A tool that has not been weighed yet may differ from [tool] by so much, or by half of it, kg."""
-HOLD_S = 0.2  # in motion and between readings a difference has to last for so long, real seconds
-LOOKS = 3  # the same in looks
+"""Tolerance of a tool that is not weighed yet, kg, or half of its mass in [tool] if larger."""
+HOLD_S = 0.2  # least duration of a difference in motion and between readings, real s
+LOOKS = 3  # the same, in samples
 
 
 class LoadWatch:
-    """Compares the force that the sensor feels with tool and load, at every look and reading.
+    """Compares the measured force with tool and load, at every sample and reading.
 
-    d = |R (f - f_tool) - f_load| with f the force felt, sensor axes, f_tool that of the tool and R
-    the sensor's orientation; of a load that is a moment alone see `judged_part`. The limit is
-    `ALLOWED` times the one of `[operator]` when a load is hung, and more for a pull (`PULL`) and in
-    motion for what swings to the side (`SWING`) and is accelerated.
-    A tool that is not weighed yet may differ from [tool] by `UNKNOWN_KG`: the tare holds that at
-    its pose, so the limit grows by how far the sensor has turned against gravity since.
+    d = |R (f - f_tool) - f_load| with f the measured force, sensor axes, f_tool that of the tool
+    and R the sensor's orientation; for a load that is a moment alone see `judged_part`. The limit
+    is `ALLOWED` times that of `[operator]` for hanging a load; it is larger for a pull (`PULL`),
+    and in motion for swinging (`SWING`) and acceleration. A tool that is not weighed yet may differ
+    from [tool] by `UNKNOWN_KG`. The tare removes that difference at its pose, so the limit grows
+    with the rotation of the sensor against gravity since then.
     """
 
     def __init__(self, meter: ForceMeter, cell: Cell, config: CellConfig) -> None:
-        """Nothing is compared before `expect`."""
+        """Start without comparison, until `expect`."""
         self._meter, self._cell, self._config = meter, cell, config
         self._load: CellLoad | None = None
         self.watching = False
@@ -115,15 +115,15 @@ class LoadWatch:
         self._since: tuple[int, int] | None = None
 
     def expect(self, load: CellLoad | None) -> None:
-        """Compare with this load from now on; None: nothing hangs."""
+        """Start to compare with a load; None: without a load."""
         self._load, self.watching, self._since = load, True, None
 
     def suspend(self) -> None:
-        """Compare nothing: what hangs is being changed."""
+        """Stop comparing, for a change of the load."""
         self.watching = False
 
     def look(self, sample: ArmSample, felt: Floats, *, moving: bool) -> None:
-        """Compare a frame of the sensor: a wrench (6,) against the zero, sensor axes, N and N·m."""
+        """Compare a frame of the sensor: a tared wrench (6,), sensor axes, N and N·m."""
         if not self.watching:
             return
         tared = TaredWrench(felt, np.zeros((6, 6)), sample.q)
@@ -135,26 +135,26 @@ class LoadWatch:
         first, count = self._since or (sample.host_ns, 0)
         self._since = first, count + 1
         if count + 1 >= LOOKS and sample.host_ns - first >= HOLD_S * 1e9:
-            raise LoadChangedError(self._words(tared))
+            raise LoadChangedError(self._message(tared))
 
     def wrong(self, tared: TaredWrench) -> str:
-        """Return in one line why a mean wrench is not that of what should hang, or nothing."""
+        """Return why a mean wrench is not that of the expected load, in one line; else ""."""
         if not self.watching:
             return ""
         difference, limit = self._compared(tared, moving=False)
         noise = 3.0 * float(np.sqrt(np.linalg.eigvalsh(tared.covariance[:3, :3]).max()))
-        return self._words(tared) if difference - noise > limit else ""
+        return self._message(tared) if difference - noise > limit else ""
 
     def _compared(self, tared: TaredWrench, *, moving: bool) -> tuple[float, float]:
-        """How far force (or moment) is from what should hang, and how far it may be, N.
+        """Return the deviation of the force (or moment) from the expected load, and its limit, N.
 
-        A weight that swings pulls to the side; its vertical force is compared by itself in motion.
+        A swinging weight pulls sideways; in motion, its vertical force is compared separately.
         """
         load, operator, cell = self._load, self._config.operator, self._cell
         hung = self._hung()
-        beyond = self._meter.load_wrench(tared) - hung
+        difference = self._meter.load_wrench(tared) - hung
         part, _, lever = judged_part(hung)
-        size, unlike = (float(np.linalg.norm(w[part])) / lever for w in (hung, beyond))
+        size, deviation = (float(np.linalg.norm(w[part])) / lever for w in (hung, difference))
         pulled = load is not None and any((*load.force_N, *load.moment_Nm))
         share = max(ALLOWED * operator.tolerance_share, PULL if pulled else 0.0)
         limit = max(ALLOWED * operator.tolerance_N, share * size)
@@ -165,59 +165,61 @@ class LoadWatch:
         if moving:
             motion = self._config.motion
             brief = motion.speed_rad_s < HOLD_S * motion.acceleration_rad_s2
-            ramp = 0.0 if brief else motion.acceleration_rad_s2  # over before it has lasted enough
+            ramp = 0.0 if brief else motion.acceleration_rad_s2  # brief: shorter than HOLD_S
             limit += mass * cell.arm.reach * (ramp + motion.speed_rad_s**2)
-            down = abs(float(beyond[:3] @ cell.gravity)) / float(np.linalg.norm(cell.gravity))
+            down = abs(float(difference[:3] @ cell.gravity)) / float(np.linalg.norm(cell.gravity))
             lifted = limit + SWING**2 / 2 * size
             limit += SWING * size
-            if load is not None and not pulled and down / lifted > unlike / limit:
+            if load is not None and not pulled and down / lifted > deviation / limit:
                 return down, lifted
-        return unlike, limit
+        return deviation, limit
 
     def _hung(self) -> Floats:
-        """(6,) wrench of what should hang, at the load point, base axes."""
+        """Return the wrench (6,) of the expected load at the load point, base axes."""
         return np.zeros(6) if self._load is None else self._load.wrench(self._cell.gravity)
 
-    def _words(self, tared: TaredWrench) -> str:
-        """What is felt and what should hang, in one line."""
+    def _message(self, tared: TaredWrench) -> str:
+        """Return measured and expected load in one line."""
         hung, felt = self._hung(), self._meter.load_wrench(tared)
         part, unit, _ = judged_part(hung)
-        what = "nothing" if self._load is None else self._load.name
-        words = (
-            f"the force sensor feels {np.linalg.norm(felt[part]):.1f} {unit} where {what} should "
+        name = "nothing" if self._load is None else self._load.name
+        message = (
+            f"the force sensor feels {np.linalg.norm(felt[part]):.1f} {unit} where {name} should "
             f"hang ({np.linalg.norm(hung[part]):.1f} {unit}): has a load fallen off, or does "
             "somebody touch the tool?"
         )
-        return words if self._meter.identified else f"{words} Or is [tool] mass_kg or com_m wrong?"
+        return (
+            message if self._meter.identified else f"{message} Or is [tool] mass_kg or com_m wrong?"
+        )
 
 
-POLL_S = 0.02  # between two looks at the devices while the arm moves, real seconds
-GRACE_S = 15.0  # what a motion may take longer than three times its time, real seconds
-SLOWEST = 0.02  # the speed slider is not waited for below this share
-STILL_RAD = 1e-4  # joints of an arm at rest vary by less, rad (some steps of an encoder)
+POLL_S = 0.02  # between two samples of the devices while the arm moves, real s
+GRACE_S = 15.0  # allowed excess of a motion over three times its usual time, real s
+SLOWEST = 0.02  # share of the speed slider below which the time limit does not grow
+STILL_RAD = 1e-4  # largest variation of the joints of an arm at rest, rad (some encoder steps)
 MOVED_RAD = 0.005
-"""A joint that stands farther from where hilcal left it has been moved, rad; brakes and sagging
+"""Largest distance of a joint from its last goal, rad, beyond which it was moved; brakes and sag
 move it by less. A choice, no study set it: 7 mm at the end of an arm of 1.3 m."""
 OFF_WAY_RAD = 0.05
-"""A joint so far from the straight line of its motion has left it, rad; an arm follows its command
+"""Largest distance of a joint from the straight line of its motion, rad; an arm follows its command
 to about 0.01. A choice."""
 FOLLOW_S = 0.05
-"""So long after its command a joint is where it was commanded to, at most, s. A choice."""
+"""Largest lag of a joint behind its command, s. A choice."""
 FROZEN_S = 0.6
-"""Joint angles or a clock that stand still for so long where they have to change, real seconds."""
-FROZEN_RAD = 1e-5  # joint angles that change by less stand still, rad
+"""Time after which joint angles or a clock that should change are frozen, real s."""
+FROZEN_RAD = 1e-5  # change of the joint angles below which they stand still, rad
 
 
 class Mover:
-    """Commands the arm, and keeps where it left it and from which side each joint arrived.
+    """Commands the arm; knows its last goal and the approach side of each joint.
 
-    Every motion is checked from where the arm stands when it starts. Nothing here stops the arm:
-    whatever is wrong is raised at once, and the run stops the arm before it does anything else.
-    `goal` (n,) is where the arm has been left, or goes; None while that is unknown.
+    Every motion is checked from the actual position of the arm. Nothing here stops the arm: any
+    problem is raised at once, and the run stops the arm before anything else. `goal` (n,) is the
+    last or current goal; None while unknown.
     """
 
     def __init__(self, setup: Setup, meter: ForceMeter | None) -> None:
-        """Use an open arm; the watcher is told where it is while it moves, and must not wait."""
+        """Use an open arm; the watcher gets its position during motions, and must not block."""
         cell, config = setup.cell, setup.config
         self.goal: Floats | None = None
         self.hanging: tuple[str, ...] = (UNLOADED,)
@@ -230,14 +232,14 @@ class Mover:
         self._ticked: tuple[float, int] = (-1.0, 0)
 
     def look(self) -> ArmSample:
-        """Return a sample of the arm after it and the force sensor have been checked."""
+        """Return a sample of the arm, after checks of the arm and of the force sensor."""
         sample = self._arm.sample()
         felt = None if self._meter is None else self._meter.felt()
         checked = (self.guard.check(sample, felt, load) for load in self.hanging)
         reason = next(filter(None, checked), None) or self._clock_stands(sample)
         if reason is not None:
             if sample.safety != NORMAL:
-                self._arm.moving()  # in motion the driver raises the cause and what to do
+                self._arm.moving()  # in motion the driver raises the cause and the remedy
             raise DeviceError(reason)
         if not self._under_way:
             moved = self.moved(sample)
@@ -248,47 +250,47 @@ class Mover:
         return sample
 
     def moved(self, sample: ArmSample) -> str | None:
-        """Return who seems to have moved the arm since it was left, and how far; None if nobody."""
+        """Return who seems to have moved the arm from its goal, and how far; else None."""
         if self.goal is None:
             return None
-        for where, who in (
+        for q, subject in (
             (sample.q_target, "another program, or somebody at the pendant, has commanded"),
             (sample.q, "somebody has moved"),
         ):
-            name, off = self._worst(where - self.goal)
-            if not off <= MOVED_RAD:
-                return f"{who} it since it came here: {name} by {off:.3g} rad"
+            name, distance = self._worst(q - self.goal)
+            if not distance <= MOVED_RAD:
+                return f"{subject} it since it came here: {name} by {distance:.3g} rad"
         return None
 
     def wait(self, seconds: float) -> None:
-        """Wait for so many cell seconds, with a look every half a real second."""
+        """Wait `seconds`, cell s, with a check every half a real second."""
         end = self._clock.now() + seconds
-        while (left := end - self._clock.now()) > 0:
-            self._clock.sleep(min(left, 0.5 * self._clock.scale))
+        while (remaining := end - self._clock.now()) > 0:
+            self._clock.sleep(min(remaining, 0.5 * self._clock.scale))
             self.look()
 
     def is_at(self, q: Floats) -> bool:
-        """Whether the last motion went to just these joint angles (n,)."""
+        """Whether the last motion went to exactly these joint angles (n,)."""
         return self.goal is not None and np.array_equal(q, self.goal)
 
     def agreed(self, goal: Floats, name: str, left: Floats, ask: Callable[[str], None]) -> Floats:
-        """Return where the arm stands (n,), once its way to a goal is free and people have agreed.
+        """Return the position (n,) of the arm, once its way to a goal is free and people agree.
 
-        Where it does not stand where it was `left`, that is asked first, and checked anew after.
+        If it does not stand where it was `left`, people are asked first, and it is checked anew.
         """
         while True:
             q = self.free_way(goal, name).q
-            joint, off = self._worst(q - left)
-            if off <= MOVED_RAD:
+            joint, distance = self._worst(q - left)
+            if distance <= MOVED_RAD:
                 return q
             ask(
-                f"the arm does not stand where it was left: {joint} is {off:.3g} rad off. Its "
+                f"the arm does not stand where it was left: {joint} is {distance:.3g} rad off. Its "
                 f"way from there to {name} has been checked. It goes there next"
             )
             left = q
 
     def free_way(self, goal: Floats, name: str) -> ArmSample:
-        """Return a sample of an arm in good order, whose way to a goal (n,) is free."""
+        """Return a sample of the arm; refuse one not ready, or whose way to `goal` is not free."""
         sample = self._arm.sample()
         unfit = self.guard.state(sample)
         if unfit is not None:
@@ -297,7 +299,7 @@ class Mover:
         return sample
 
     def put_back(self, ask: Callable[[str], None]) -> None:
-        """Have an arm that was moved during a question go back; see `agreed`."""
+        """Move an arm back that was moved during a question; see `agreed`."""
         if self.goal is None or self.moved(self._arm.sample()) is None:
             return
         goal, name = self.goal, "where it was left"
@@ -305,7 +307,7 @@ class Mover:
         self.move(goal, name)
 
     def left_here(self) -> None:
-        """Take note of where the arm stands after it was stopped on its way."""
+        """Set the goal to the position of an arm that was stopped in motion."""
         if self.goal is None:
             self.goal = self._arm.sample().q
 
@@ -320,13 +322,12 @@ class Mover:
                 )
 
     def move(self, q: Floats, name: str) -> None:
-        """Move straight to `q` (n,), rad; the way is checked from where the arm stands."""
-        sample = self.look()
-        start = sample.q
+        """Move straight to `q` (n,), rad; the way is checked from the arm's actual position."""
+        start = self.look().q
         if self.goal is not None and np.abs(start - self.goal).max() <= self._motion.arrival_rad:
             start = self.goal
         self.check_way(start, q, name)
-        self.goal = None  # wherever it ends, if it does not arrive
+        self.goal = None  # unknown until it arrives
         self._under_way = True
         try:
             self._go(start, q, name)
@@ -340,7 +341,7 @@ class Mover:
         motion = self._motion
         self._arm.start_move(q, motion.speed_rad_s, motion.acceleration_rad_s2)
         usual = duration(start, q, motion.speed_rad_s, motion.acceleration_rad_s2)
-        begun, slowest = self._clock.now(), 1.0
+        start_time, slowest = self._clock.now(), 1.0
         last: ArmSample | None = None
         while self._arm.moving():
             sample = self.look()
@@ -348,7 +349,7 @@ class Mover:
             self._watcher.notify(ArmAt(tuple(sample.q.tolist())))
             slowest = min(slowest, max(sample.speed_scaling, SLOWEST))
             allowed = 3.0 * usual / slowest + GRACE_S * self._clock.scale
-            if self._clock.now() - begun > allowed:
+            if self._clock.now() - start_time > allowed:
                 raise DeviceError(
                     f"arm: the motion to {name} is not finished after {allowed:.0f} s; "
                     f"{usual:.0f} s are usual"
@@ -356,34 +357,34 @@ class Mover:
             self._clock.sleep(POLL_S * self._clock.scale)
         arrived = self.look().q
         self._watcher.notify(ArmAt(tuple(arrived.tolist())))
-        joint, off = self._worst(arrived - q)
-        if not off <= motion.arrival_rad:
+        joint, distance = self._worst(arrived - q)
+        if not distance <= motion.arrival_rad:
             raise DeviceError(
-                f"arm: {joint} stands {off:.3g} rad off {name}; arrival_rad is "
+                f"arm: {joint} stands {distance:.3g} rad off {name}; arrival_rad is "
                 f"{motion.arrival_rad:g}"
             )
 
-    def _worst(self, off: Floats) -> tuple[str, float]:
-        """Name of the joint that is off the most, and by how much, rad."""
-        k = int(np.argmax(np.abs(off)))
-        return self.guard.cell.arm.joint_names[k], float(np.abs(off[k]))
+    def _worst(self, deviation: Floats) -> tuple[str, float]:
+        """Return name and size of the largest deviation of a joint, rad."""
+        k = int(np.argmax(np.abs(deviation)))
+        return self.guard.cell.arm.joint_names[k], float(np.abs(deviation[k]))
 
     def _check_progress(
         self, start: Floats, goal: Floats, sample: ArmSample, last: ArmSample | None, name: str
     ) -> ArmSample:
-        """Check that a motion keeps its line and goes on; the first sample that stood here."""
+        """Check that a motion follows its line; return the last sample with progress."""
         way = goal - start
         share = np.clip((sample.q - start) @ way / max(float(way @ way), 1e-30), 0.0, 1.0)
-        joint, off = self._worst(sample.q - start - share * way)
-        if not off <= OFF_WAY_RAD:
+        joint, deviation = self._worst(sample.q - start - share * way)
+        if not deviation <= OFF_WAY_RAD:
             raise DeviceError(
-                f"arm: {joint} has left the straight way to {name} by {off:.3g} rad; does "
+                f"arm: {joint} has left the straight way to {name} by {deviation:.3g} rad; does "
                 "another program command the arm, or does somebody push it?"
             )
-        joint, behind = self._worst(sample.q_target - sample.q)
-        if not behind <= OFF_WAY_RAD + FOLLOW_S * self._motion.speed_rad_s:
+        joint, lag = self._worst(sample.q_target - sample.q)
+        if not lag <= OFF_WAY_RAD + FOLLOW_S * self._motion.speed_rad_s:
             raise DeviceError(
-                f"arm: {joint} is told to be {behind:.3g} rad from where it is, on the way to "
+                f"arm: {joint} is told to be {lag:.3g} rad from where it is, on the way to "
                 f"{name}: its angle is old, or something holds the joint"
             )
         if last is None or np.abs(sample.q - last.q).max() > FROZEN_RAD:
@@ -399,7 +400,7 @@ class Mover:
         return last
 
     def _clock_stands(self, sample: ArmSample) -> str | None:
-        """Return that the controller's clock stands still, or None."""
+        """Return a message if the controller's clock stands still, or None."""
         stamp, since = self._ticked
         if sample.timestamp != stamp:
             self._ticked = sample.timestamp, sample.host_ns
@@ -408,22 +409,22 @@ class Mover:
         return None
 
     def at_rest(self, sample: ArmSample) -> bool:
-        """Whether the arm stands where it has been commanded to, by a sample."""
+        """Whether the arm stands at its goal, by a sample."""
         goal = sample.q if self.goal is None else self.goal
-        there = np.abs(sample.q - goal).max() <= self._motion.arrival_rad
-        return bool(there and np.abs(sample.qd).max() <= self._motion.speed_rad_s / 50)
+        arrived = np.abs(sample.q - goal).max() <= self._motion.arrival_rad
+        return bool(arrived and np.abs(sample.qd).max() <= self._motion.speed_rad_s / 50)
 
     @property
     def differed(self) -> int:
-        """How many looks so far have felt something else than what should hang."""
+        """Number of samples so far with a wrong load."""
         return 0 if self.watch is None else self.watch.differed
 
     def check_still(self, before: ArmSample, after: ArmSample) -> str | None:
-        """Return in one line why a reading between two samples is void, or None."""
+        """Return why a reading between two samples is void, in one line; or None."""
         if self.goal is not None:
-            off = float(np.abs(after.q_target - self.goal).max())
-            if off > self._motion.arrival_rad:
-                return f"arm: somebody else commanded it by {off:.3g} rad during the reading"
+            deviation = float(np.abs(after.q_target - self.goal).max())
+            if deviation > self._motion.arrival_rad:
+                return f"arm: somebody else commanded it by {deviation:.3g} rad during the reading"
         moved = float(np.abs(after.q - before.q).max())
         if not moved <= STILL_RAD:
             return f"arm: it moved by {moved:.3g} rad during the reading"

@@ -1,4 +1,4 @@
-"""Events of a campaign while it is measured, for those who watch it."""
+"""Events of a running campaign, for watchers."""
 
 from dataclasses import asdict, dataclass
 from math import isfinite
@@ -9,60 +9,59 @@ from hilcal.store.plan import Step
 
 @dataclass(frozen=True, slots=True)
 class Phase:
-    """What is being done now, in words."""
+    """The present activity, in words."""
 
     text: str
 
 
 @dataclass(frozen=True, slots=True)
 class Remark:
-    """Something that people should look at; the campaign goes on."""
+    """A remark for people; the campaign continues."""
 
     text: str
 
 
 @dataclass(frozen=True, slots=True)
 class ArmAt:
-    """Where the arm is on its way: joint angles, rad; told many times a second."""
+    """Joint angles of the moving arm, rad; several times a second."""
 
     q: tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class LiveResidual:
-    """A new reading against the prediction of a model that was fitted to the readings before it."""
+    """Residual of a new reading by a model fitted to the previous readings."""
 
     residual: float | None = None
-    """Distance of the reading from the prediction, m; None without a model yet."""
+    """Distance of the reading from the prediction, m; None without a model."""
     sigma: float | None = None
-    """The same in standard deviations of a prediction: 1 where the model is right."""
+    """The same in standard deviations of the prediction: 1 for a correct model."""
     uncertain: bool = False
-    """Whether the model's own uncertainty is the larger part of them, because it is fitted to few
-    readings."""
+    """Whether the uncertainty of a model of few readings dominates that standard deviation."""
     deflection: float | None = None
     """Distance of the reading from the predicted unloaded position, m; None for an unloaded
     reading, and without a model."""
     deflection_std: float = 0.0  # standard deviation of that distance, m
     vector: tuple[float, ...] | None = None
-    """The residual as a vector, measured − predicted, base axes, m."""
+    """Residual, measured − predicted, base axes, m."""
     covariance: tuple[float, ...] | None = None
-    """Of that vector where the model is right, rows one after the other, m²."""
+    """Of that vector by a correct model, rows concatenated, m²."""
 
 
 @dataclass(frozen=True, slots=True)
 class GoalStatus:
-    """How far a campaign is from its goal; without `worst` that is not known yet.
+    """Status of a campaign's goal; without `worst`, unknown.
 
     Attributes:
-        text: the goal as it was given.
+        text: the goal as the user wrote it.
         met: whether it is met.
-        worst: the name of the parameter, "position" or "deflection", whose uncertainty is worst.
+        worst: name of the parameter, or "position" or "deflection", of the worst uncertainty.
         std: its standard uncertainty, in `unit`; infinite where the readings do not determine it.
-        ratio: std over what is asked for; at most 1 where the goal is met.
+        ratio: std over the limit; at most 1 where the goal is met.
         unit: "%" or SI.
-        model: names of the effects that were fitted.
-        fitted: "deflection" or "absolute", the kind of readings that was fitted.
-        quantity: what `std` is, in full; empty while it is not known.
+        model: names of the fitted effects.
+        fitted: "deflection" or "absolute", the kind of the fitted readings.
+        quantity: full name of the quantity of `std`; empty while unknown.
     """
 
     text: str
@@ -76,14 +75,14 @@ class GoalStatus:
     quantity: str = ""
 
     def to_dict(self) -> dict[str, Any]:
-        """Return it as JSON; a number that is not finite becomes null."""
+        """Return a JSON object; a number that is not finite becomes null."""
         out = asdict(self)
         return {k: None if isinstance(v, float) and not isfinite(v) else v for k, v in out.items()}
 
 
 @dataclass(frozen=True, slots=True)
 class GoalMet:
-    """Event: the goal is met after so many readings of those that were planned."""
+    """The goal is met after `readings` of `planned` readings."""
 
     status: GoalStatus
     readings: int
@@ -94,36 +93,36 @@ class GoalMet:
 class ReadingStored:
     """A reading has been stored."""
 
-    step: Step  # its step
-    done: int  # readings that are stored now, in the whole campaign
+    step: Step
+    done: int  # stored readings of the whole campaign
     total: int  # readings of the plan
-    left_real: float  # real seconds that the rest will take, from the time taken so far
-    left_cell: float  # the same in cell seconds; differs in a simulated cell only
+    left_real: float  # estimated remaining time, real s
+    left_cell: float  # the same, cell s; differs in a simulated cell only
     deflection: float | None = None
     """Distance from the unloaded reading of the same pose and cycle, m; None for an unloaded
     reading, and where there is none yet."""
     live: LiveResidual = LiveResidual()
-    """The reading, of the first target that was read, against a model; empty without one."""
-    settling: float = 0.0  # how long the readings took to settle, cell seconds
+    """Residual of the first target read; empty without a model."""
+    settling: float = 0.0  # settling time of the readings, cell s
     goal: GoalStatus | None = None  # status of the campaign's goal; None without one
-    target: int = 0  # index of that target in the cell
+    target: int = 0  # index of the first target read, in the cell
     others: tuple[tuple[int, LiveResidual], ...] = ()
-    """Those that were read in the same arrival, each with its index."""
+    """Residuals of the other targets of the arrival, with their indices."""
 
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """Somebody is about to be asked at the terminal: the display gives way until `Answered`."""
+    """A person will be asked at the terminal: the display pauses until `Answered`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Answered:
-    """The question has been answered: the terminal is the display's again."""
+    """The question is answered: the display continues."""
 
 
 class Watcher(Protocol):
     """Receives the events of a campaign."""
 
     def notify(self, event: object) -> None:
-        """Receive any event of this module; returns soon."""
+        """Receive any event of this module; return soon."""
         ...

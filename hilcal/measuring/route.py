@@ -1,4 +1,4 @@
-"""The way of the arm through a plan, and its dry run: every limit is checked, and nothing moves."""
+"""The route of the arm through a plan, and its dry run, which checks every limit without motion."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from hilcal.toml import suggest
 from hilcal.types import Floats
 
 APPROACH_RAD = 0.02
-"""How far each joint goes at the start so that the side it arrives from is known, rad."""
+"""First motion of each joint, which determines its approach side, rad."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,19 +25,19 @@ class Stop:
 
     name: str
     q: Floats  # (n,) commanded joint angles, rad
-    hanging: str  # name of the load under which the arm comes here
+    hanging: str  # name of the load during the motion to the stop
     change_to: str | None = None
-    """Name of the load that is hung here; None where nothing is changed."""
-    step: Step | None = None  # the reading that is taken here; None where none is
+    """Name of the load that is hung at the stop; None without a change."""
+    step: Step | None = None  # the reading at the stop; None without
 
 
 def home(plan: Plan) -> str:
-    """Return the pose where loads are changed: "reference", or the first one without it."""
+    """Return the pose where loads are changed: "reference", or else the first pose."""
     return REFERENCE if REFERENCE in plan.pose_names else plan.pose_names[0]
 
 
 def beside(q: Floats, arm: Arm, margin: float) -> Floats:
-    """Return (n,) whence the arm comes to a reference pose, `margin` from its limits, rad."""
+    """Return (n,) the stop before a reference pose, `margin` from the limits, rad."""
     side = np.where(q - APPROACH_RAD >= arm.q_min + margin, 1.0, -1.0)
     return np.asarray(q - side * APPROACH_RAD)
 
@@ -45,9 +45,9 @@ def beside(q: Floats, arm: Arm, margin: float) -> Floats:
 def route(plan: Plan, arm: Arm, margin: float = 0.0) -> tuple[Stop, ...]:
     """Return every stop for the steps of a plan.
 
-    The first two stops, at a little distance from the reference pose and there, move every joint,
-    so that the approach sides of all readings are known. Loads are changed there. A reading that
-    repeats the one before it is approached anew.
+    The first two stops, beside the reference pose and at it, move every joint, so that the approach
+    sides of all readings are known. Loads are changed at the reference pose. A repeated reading is
+    approached anew.
     """
     base = home(plan)
     q_home = plan.joints(base)
@@ -66,13 +66,13 @@ def route(plan: Plan, arm: Arm, margin: float = 0.0) -> tuple[Stop, ...]:
 
 
 def approach_sides(stops: Sequence[Stop]) -> Floats:
-    """Return (S, n) from which side each joint arrives at the readings of a route, -1 or +1.
+    """Return the approach side (S, n) of each joint at the readings of a route, -1 or +1.
 
-    It is the direction of the joint's last motion; 0 where it has not moved.
+    It is the direction of the joint's last motion; 0 if the joint has not moved.
     """
     side, sides = np.zeros(len(stops[0].q)), []
-    for before, stop in pairwise(stops):
-        moved = np.sign(stop.q - before.q)
+    for previous, stop in pairwise(stops):
+        moved = np.sign(stop.q - previous.q)
         side = np.where(moved == 0.0, side, moved)
         if stop.step is not None:
             sides.append(side)
@@ -80,9 +80,9 @@ def approach_sides(stops: Sequence[Stop]) -> Floats:
 
 
 def duration(start: Floats, end: Floats, speed: float, acceleration: float) -> float:
-    """Return how long a motion takes whose leading joint has a trapezoid of speed, s.
+    """Return the duration of a motion with a trapezoidal speed of the leading joint, s.
 
-    t = d/v + v/a where the speed v is reached, else 2 sqrt(d/a).
+    t = d/v + v/a if the speed v is reached, else 2 sqrt(d/a).
     """
     way = float(np.abs(end - start).max(initial=0.0))
     if way >= speed**2 / acceleration:
@@ -91,33 +91,33 @@ def duration(start: Floats, end: Floats, speed: float, acceleration: float) -> f
 
 
 MEASURING_S = 1.0
-"""How long one tracker measurement is taken to last, s; only for the estimate of time."""
-AIMING_S = 2.0  # how long turning the tracker to another target is taken to last, s; a choice
+"""Assumed duration of one tracker measurement, s, for estimates of time."""
+AIMING_S = 2.0  # assumed time to aim the tracker at another target, s; a choice
 
 
 @dataclass(frozen=True, slots=True)
 class DryRun:
-    """What a plan would do."""
+    """The result of a dry run."""
 
-    problems: tuple[str, ...]  # why it must not be run, one line each; empty where it may
-    remarks: tuple[str, ...]  # what people should know of it
-    duration: float  # how long it takes, roughly, cell seconds
-    motions: int  # how often the arm moves
-    load_changes: int  # how often a person is asked for another load
+    problems: tuple[str, ...]  # why the plan must not be run, one line each; else empty
+    remarks: tuple[str, ...]  # for people
+    duration: float  # estimated, cell s
+    motions: int  # number of motions
+    load_changes: int  # number of load changes by a person
 
     @property
     def first(self) -> str:
-        """The first problem, and how many others there are."""
-        more = len(self.problems) - 1
-        others = f" (and {more} more: hilcal check --plan shows all)" if more else ""
-        return f"{self.problems[0]}{others}"
+        """The first problem, and the number of others."""
+        others = len(self.problems) - 1
+        suffix = f" (and {others} more: hilcal check --plan shows all)" if others else ""
+        return f"{self.problems[0]}{suffix}"
 
 
 def dry_run(cell: Cell, config: CellConfig, plan: Plan) -> DryRun:
     """Check a plan against every limit of the cell; all problems at once.
 
-    Checked are all stops of the route and the straight paths in joint space between them by
-    `Feasibility`, the tracker's sight of the target at each reading, the speed, and the loads.
+    `Feasibility` checks all stops of the route and the straight paths in joint space between them.
+    The tracker's sight of the target at each reading, the speed and the loads are checked, too.
     """
     limits = Feasibility(cell, config)
     problems = _cell_problems(config) + _load_problems(limits, plan)
@@ -161,51 +161,51 @@ def _cell_problems(config: CellConfig) -> list[str]:
 
 
 def _load_problems(limits: Feasibility, plan: Plan) -> list[str]:
-    """Names, payload, and what the sensor's force would be."""
-    known = [load.name for load in limits.config.loads]
+    """Check names, payload, and force on the sensor."""
+    names = [load.name for load in limits.config.loads]
     out: list[str] = []
     for name in (UNLOADED, *plan.loads):
-        if name in known or name == UNLOADED:
+        if name in names or name == UNLOADED:
             out += limits.unbearable(name).values()
         else:
-            valid = ", ".join((UNLOADED, *known))
-            hint = suggest(name, known)
+            valid = ", ".join((UNLOADED, *names))
+            hint = suggest(name, names)
             out.append(f'load "{name}" is not in [[loads]] of the cell{hint}; valid: {valid}')
     return out
 
 
 def route_problems(cell: Cell, config: CellConfig, stops: tuple[Stop, ...]) -> list[str]:
-    """Return what is wrong with stops and with the paths between them, one line each."""
+    """Return the problems of stops and of the paths between them, one line each."""
     return on_route(Feasibility(cell, config), stops)
 
 
 def on_route(limits: Feasibility, stops: tuple[Stop, ...]) -> list[str]:
-    """Return what is wrong with stops and the paths between them, one line each."""
+    """Return the problems of stops and of the paths between them, one line each."""
     lines, at_stops = [], []
     for stop in stops:
         where, loads = f"pose {stop.name}", {stop.hanging: None, stop.change_to: None}
-        found = [x for load in loads if load for x in limits.findings(stop.q[None], load)]
-        at_stops.append({x.what for x in found})
-        lines += [x.at(where) for x in found]
+        violations = [x for load in loads if load for x in limits.findings(stop.q[None], load)]
+        at_stops.append({x.what for x in violations})
+        lines += [x.at(where) for x in violations]
         if stop.step is not None and limits.sight is not None:
             lines += limits.sight.problems(stop.q[None], stop.step.load, where)
     for (a, b), (at_a, at_b) in zip(pairwise(stops), pairwise(at_stops), strict=True):
         if not np.array_equal(a.q, b.q):
             where = f"between {a.name} and {b.name}"
-            on_way = limits.findings_between(a.q, b.q, b.hanging)
-            lines += [x.at(where) for x in on_way if x.what not in at_a | at_b]
+            between = limits.findings_between(a.q, b.q, b.hanging)
+            lines += [x.at(where) for x in between if x.what not in at_a | at_b]
     return list(dict.fromkeys(lines))
 
 
 def _remarks(plan: Plan, limits: Feasibility) -> list[str]:
     out = []
-    tests = "purpose" in plan.about  # of a model: what it is compared with may be in another file
+    is_test = "purpose" in plan.about  # of a model: unloaded readings may be in another file
     unloaded = {(s.pose, s.cycle) for s in plan.steps if s.load == UNLOADED}
-    lacking = [s for s in plan.steps if (s.pose, s.cycle) not in unloaded]
-    if lacking and not tests and limits.config.fitted == "deflection":
-        first = Step(lacking[0].pose, UNLOADED, lacking[0].cycle)
+    unpaired = [s for s in plan.steps if (s.pose, s.cycle) not in unloaded]
+    if unpaired and not is_test and limits.config.fitted == "deflection":
+        first = Step(unpaired[0].pose, UNLOADED, unpaired[0].cycle)
         out.append(
-            f"{len(lacking)} loaded readings have no unloaded one of the same pose and cycle, "
+            f"{len(unpaired)} loaded readings have no unloaded one of the same pose and cycle, "
             f'which a deflection needs; the first: "{first}"'
         )
     if REFERENCE not in plan.pose_names:
@@ -219,38 +219,37 @@ def _remarks(plan: Plan, limits: Feasibility) -> list[str]:
 
 
 def seconds_at_rest(config: CellConfig) -> float:
-    """Return how long the arm rests at a step for the readings of all targets, cell seconds."""
+    """Return the time of the arm at rest for the readings of one step, cell s."""
     acquire, targets = config.acquire, max(len(config.tool.targets), 1)
     once = 0.0 if config.force_sensor is None else acquire.force_window_s
-    each = config.planning.reading_s
-    if each is not None:
-        return targets * each
-    each = acquire.settle_s + acquire.samples * MEASURING_S + (targets > 1) * AIMING_S
-    return targets * each + once
+    if config.planning.reading_s is not None:
+        return targets * config.planning.reading_s
+    per_target = acquire.settle_s + acquire.samples * MEASURING_S + (targets > 1) * AIMING_S
+    return targets * per_target + once
 
 
 def way_home(
     cell: Cell, config: CellConfig, plan: Plan, behind: Sequence[Stop], done: frozenset[Step]
 ) -> tuple[Stop, ...]:
-    """Return the way to the reference pose, where the load is taken off and the drift is read.
+    """Return the route to the reference pose, where the load is taken off and the drift is read.
 
-    The arm goes straight where that is clear; else back the way it came, which is clear, until the
-    straight way is. The reading is the next return to the reference pose that the plan holds.
-    `behind` is where the arm has been in this session; it stands at the last of these stops.
+    The arm moves straight if that is clear; else back along its route, which is clear, until the
+    straight motion is. The reading is the plan's next return to the reference pose. `behind` are
+    the stops of this session; the arm stands at the last one.
     """
     base = home(plan)
-    q_home, here = plan.joints(base), behind[-1]
-    hanging = here.hanging if here.change_to is None else here.change_to
-    to = Stop(base, q_home, hanging, change_to=None if hanging == UNLOADED else UNLOADED)
+    q_home, last = plan.joints(base), behind[-1]
+    hanging = last.hanging if last.change_to is None else last.change_to
+    destination = Stop(base, q_home, hanging, change_to=None if hanging == UNLOADED else UNLOADED)
     way: list[Stop] = []
     limits = Feasibility(cell, config)
     for stop in reversed(behind):
-        at = Stop(stop.name, stop.q, hanging)
-        way.append(at)
-        if np.array_equal(at.q, q_home) or not on_route(limits, (at, to)):
+        candidate = Stop(stop.name, stop.q, hanging)
+        way.append(candidate)
+        if np.array_equal(candidate.q, q_home) or not on_route(limits, (candidate, destination)):
             break
-    way = [*way[1:], to]
-    returned = here.step is not None and (here.step.pose, here.step.load) == (base, UNLOADED)
+    way = [*way[1:], destination]
+    returned = last.step is not None and (last.step.pose, last.step.load) == (base, UNLOADED)
     missing = [s for s in plan.steps if s not in done and (s.pose, s.load) == (base, UNLOADED)]
     if missing and not returned:
         way.append(Stop(base, q_home, UNLOADED, step=missing[0]))

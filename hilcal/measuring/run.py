@@ -1,4 +1,4 @@
-"""Running a campaign: nothing moves without a checked plan, and whatever fails stops the arm."""
+"""Running a campaign: nothing moves without a checked plan, and any failure stops the arm."""
 
 import time
 import traceback
@@ -34,29 +34,29 @@ def run(
     goal: StoppingRule | None = None,
     epoch: float | None = None,
 ) -> None:
-    """Measure what is missing of a plan, or as much of it as a goal needs.
+    """Measure the missing steps of a plan, until the goal is met.
 
-    Every reading is stored before the next motion. Whatever is raised, also an interrupt from the
-    keyboard, the arm is stopped before anything else is done. The rig stays open. `live` compares
-    each reading with a model. As soon as the `goal` is met the arm goes home, the load is taken
-    off, and the rest is not measured. `wall` is the time of day, s, which carries the campaign's
-    time over a pause; it counts from `epoch`, the first session's beginning unless given.
+    Every reading is stored before the next motion. After any exception, a keyboard interrupt
+    included, the arm is stopped before anything else. The rig stays open. `live` compares each
+    reading with a model. Once the `goal` is met, the arm moves home, the load is taken off, and the
+    other steps are not measured. `wall` is the time of day, s, which continues the campaign's time
+    after a pause; it counts from `epoch`, by default the start of the first session.
 
     Raises:
         InputError: the plan is not safe (names the first problem), or the store fails.
         DeviceError: a device failed, a limit was exceeded, a person gave up.
-        KeyboardInterrupt: as it came; the arm stands.
+        KeyboardInterrupt: unchanged; the arm stands.
     """
-    whole = dry_run(cell, config, plan)
-    refuse(whole)
-    left = plan.without(store.done())
-    if not left.steps:
+    full = dry_run(cell, config, plan)
+    refuse(full)
+    missing = plan.without(store.done())
+    if not missing.steps:
         watcher.notify(Phase("nothing is missing"))
         return
-    refuse(dry_run(cell, config, left))  # the way past what is done is another one
-    for text in whole.remarks:
+    refuse(dry_run(cell, config, missing))  # its route differs
+    for text in full.remarks:
         watcher.notify(Remark(text))
-    stops = route(left, cell.arm, config.limits.joint_margin_rad)
+    stops = route(missing, cell.arm, config.limits.joint_margin_rad)
     setup = Setup(rig, cell, config, clock, watcher)
     session = Session(setup, plan, store, live, wall, goal, epoch)
     try:
@@ -74,20 +74,20 @@ def refuse(checked: DryRun) -> None:
 
 
 def _stop(arm: ArmDevice) -> str:
-    """Stop the arm; returns why it may not stand, empty where it does."""
+    """Stop the arm; return why it may still move, or an empty text."""
     for _ in range(_STOPS):
         try:
             arm.stop()
-        except KeyboardInterrupt:  # impatience must not keep the arm from stopping
+        except KeyboardInterrupt:  # an interrupt must not prevent the stop
             continue
-        except Exception as error:  # whatever it is, people have to know
+        except Exception as error:  # any error is reported
             return _line(error)
         return ""
     return "interrupted"
 
 
 def _note(store: RunLog, error: BaseException, trouble: str) -> None:
-    """Store why the session ended, as far as that is possible."""
+    """Store why the session ended, if possible."""
     content: dict[str, Any] = {"wall_s": time.time(), "reason": _line(error)}
     if trouble:
         content["arm_not_stopped"] = trouble
@@ -96,7 +96,7 @@ def _note(store: RunLog, error: BaseException, trouble: str) -> None:
     kind = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
     try:
         store.event(kind, content)
-    except Exception:  # the error that is raised is the one that came first
+    except Exception:  # the first error is raised
         return
 
 
@@ -113,12 +113,12 @@ def _raise(error: BaseException, trouble: str) -> None:
 
 
 def _sentence(text: str) -> str:
-    """Return a text with what ends a sentence, for another to follow."""
+    """Return a text that ends a sentence, with a space."""
     return f"{text} " if text.endswith(("?", "!")) else f"{text}. "
 
 
 def _line(error: BaseException) -> str:
     if isinstance(error, KeyboardInterrupt):
         return "interrupted"
-    words = " ".join(str(error).split()).rstrip(".;")
-    return words if isinstance(error, HilcalError) else f"{type(error).__name__}: {words}"
+    text = " ".join(str(error).split()).rstrip(".;")
+    return text if isinstance(error, HilcalError) else f"{type(error).__name__}: {text}"

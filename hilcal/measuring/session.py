@@ -41,14 +41,14 @@ from hilcal.types import Floats
 
 Done = TypeVar("Done")
 LiveModel = Callable[[Readings], LiveResidual]
-"""Returns the last reading against a model fitted to those before it."""
+"""Returns the residual of the last reading by a model fitted to the previous ones."""
 StoppingRule = Callable[[Readings, bool], GoalStatus]
-"""Tells from all readings so far how far the goal is. Unless it is told that the plan has no more,
-the answer may be that of a few readings before, so that judging does not delay the campaign."""
+"""Returns the status of the goal from all readings. The second argument tells that the plan has no
+further readings; else the status may be of fewer readings, as fits must not delay the campaign."""
 
 
 class Session:
-    """Follows a route and stores a reading at every stop that has a step."""
+    """Follows a route, and stores a reading at every stop with a step."""
 
     def __init__(
         self,
@@ -60,7 +60,7 @@ class Session:
         goal: StoppingRule | None = None,
         epoch: float | None = None,
     ) -> None:
-        """Read what earlier sessions stored; no device is used yet."""
+        """Read the stored readings of earlier sessions; no device is used yet."""
         self.in_control = False
         self._rig, self._cell, self._config = rig, cell, config = (
             setup.rig,
@@ -87,31 +87,31 @@ class Session:
         self._torques_lost = False
         self._done = 0
         self._tared = False
-        now = wall()
-        self._epoch = now if epoch is None else epoch
-        self._begun = setup.clock.now()
-        self._elapsed = (now - self._epoch) * setup.clock.scale
+        start = wall()
+        self._epoch = start if epoch is None else epoch
+        self._start = setup.clock.now()
+        self._elapsed = (start - self._epoch) * setup.clock.scale
         self._remember()
 
     # earlier sessions
 
     def _remember(self) -> None:
-        """Take over from the stored readings: times, tool, reference, unloaded positions."""
+        """Restore times, tool, reference and unloaded positions from the stored readings."""
         details = self._store.details()
         stored = self._store.readings()
         if not details or stored is None:
             return
         self._epoch = float(details[0]["epoch_wall_s"])
         last = 0.0 if stored.states.time is None else float(stored.states.time[-1])
-        passed = (self._wall() - self._epoch) * self._clock.scale
-        self._elapsed = max(last, passed)
+        since_epoch = (self._wall() - self._epoch) * self._clock.scale
+        self._elapsed = max(last, since_epoch)
         self._temperatures = stored.states.joint_temperature is not None
         self._torques = stored.states.torque is not None
         self._done = len(self._store.done())
-        for old, value, target in zip(details, stored.value, stored.target.tolist(), strict=True):
-            step = Step(old["pose"], old["load"], old["cycle"])
-            q, covariance = np.array(old["q_actual"]), np.array(old["tracker_covariance"])
-            self._state.add(step, q, value, covariance, stored_wrench(old), target)
+        for raw, value, target in zip(details, stored.value, stored.target.tolist(), strict=True):
+            step = Step(raw["pose"], raw["load"], raw["cycle"])
+            q, covariance = np.array(raw["q_actual"]), np.array(raw["tracker_covariance"])
+            self._state.add(step, q, value, covariance, stored_wrench(raw), target)
         felt = details[-1].get("felt")
         if self._meter is not None and felt is not None:
             self._meter.zero = np.array(felt["zero"])
@@ -120,44 +120,43 @@ class Session:
     # the way
 
     def walk(self, stops: tuple[Stop, ...]) -> None:
-        """Go through all stops, or home as soon as the goal is met."""
+        """Visit all stops; move home as soon as the goal is met."""
         total = len(self._plan.steps)
         self._event("start", {"missing": sum(s.step is not None for s in stops)})
         self._begin(stops[:2])
         pace = self._pace = Eta(self._clock)
         behind, ahead = list(stops[:2]), stops[2:]
-        if self._goal_newly_met(last=False):  # an earlier session was stopped on its way home
+        if self._goal_newly_met(last=False):  # the last session was stopped on its way home
             ahead = way_home(self._cell, self._config, self._plan, behind, self._store.done())
         while ahead:
-            stop, *rest = ahead
-            ahead = tuple(rest)
+            stop, ahead = ahead[0], ahead[1:]
             behind.append(stop)
-            read = self._watched(partial(self._visit, stop))
-            if stop.step is not None and read is not None:
-                reading, settling = read
+            result = self._watched(partial(self._visit, stop))
+            if stop.step is not None and result is not None:
+                reading, settling = result
                 pace.read()
                 if self._goal_newly_met(last=all(s.step is None for s in ahead)):
                     done = self._store.done()
                     ahead = way_home(self._cell, self._config, self._plan, behind, done)
-                left = pace.left(
+                remaining = pace.left(
                     sum(s.step is not None for s in ahead),
                     sum(s.change_to is not None for s in ahead),
                 )
-                self._tell(stop.step, reading, total, left, settling)
+                self._tell(stop.step, reading, total, remaining, settling)
         self._finish()
 
     def _goal_newly_met(self, last: bool) -> bool:
-        """Apply the stopping rule; whether the goal has just been met, which is stored and told."""
+        """Apply the stopping rule; return whether the goal has just been met, which is reported."""
         readings = None if self._rule is None else self._store.readings()
         if self._rule is None or readings is None or (self._goal is not None and self._goal.met):
             return False
-        now = self._goal = self._rule(readings, last)
+        status = self._goal = self._rule(readings, last)
         count, planned = len(readings), len(self._plan.steps)
-        if now.met or last:
-            self._event("goal", {**now.to_dict(), "readings": count, "planned": planned})
-        if now.met:
-            self._watcher.notify(GoalMet(now, count, planned))
-        return now.met
+        if status.met or last:
+            self._event("goal", {**status.to_dict(), "readings": count, "planned": planned})
+        if status.met:
+            self._watcher.notify(GoalMet(status, count, planned))
+        return status.met
 
     def _visit(self, stop: Stop) -> tuple[Readings, float] | None:
         self._move(stop)
@@ -172,13 +171,13 @@ class Session:
         return None if stop.step is None else self._reading(stop, stop.step)
 
     def _watched(self, do: Callable[[], Done]) -> Done:
-        """Do something; again after what hangs was found wrong and has been put right."""
-        for left in reversed(range(TRIES)):
+        """Call a function; call it again after a wrong load has been corrected."""
+        for remaining in reversed(range(TRIES)):
             try:
                 return do()
             except LoadChangedError as error:
                 self._rig.arm.stop()
-                if not left:
+                if not remaining:
                     raise
                 self._mover.left_here()
                 self._event("load", {"hanging": None, "why": str(error)})
@@ -188,40 +187,40 @@ class Session:
         raise AssertionError("unreachable")
 
     def _begin(self, start: tuple[Stop, ...]) -> None:
-        """Check where the arm stands, have the load taken off, go to the reference, tare.
+        """Check the arm's position, have the load taken off, move to the reference, tare.
 
-        The force sensor is tared before the first motion, too, so that it is watched from then on.
-        What is checked is checked again after every question and, by the mover, before each motion:
-        the arm may be moved by hand meanwhile. In a campaign that goes on, people are asked where
-        it does not stand where it was read last.
+        The force sensor is tared before the first motion, too, so that it is compared from then on.
+        The position is checked again after every question and, by the mover, before each motion, as
+        the arm may be moved by hand. In a resumed campaign, people are asked if the arm does not
+        stand at its last reading.
         """
-        first, last = start[0], self._state.last_q
+        first, last_q = start[0], self._state.last_q
         sample = self._mover.free_way(first.q, first.name)
         if self._temperatures is None:
             self._temperatures = bool(np.isfinite(sample.joint_temperature).all())
         self._hook.begin()
-        left = sample.q if last is None else last
-        self._mover.goal = self._mover.agreed(first.q, first.name, left, self._hook.confirm)
+        expected = sample.q if last_q is None else last_q
+        self._mover.goal = self._mover.agreed(first.q, first.name, expected, self._hook.confirm)
         self.in_control = True
         self._rig.arm.take_control(*payload(self._cell, None))
         self._watched(self._zero)
-        seen = []
+        positions = []
         for stop in start:
             self._watched(partial(self._move, stop))
-            with suppress(TargetLostError):  # it is searched for when it is to be read
-                seen.append((stop.q, self._rig.tracker.measure().value[:3]))
-        self._check_tracker(seen)
+            with suppress(TargetLostError):  # a reading will search it
+                positions.append((stop.q, self._rig.tracker.measure().value[:3]))
+        self._check_tracker(positions)
         self._watched(self._tare)
 
-    def _check_tracker(self, seen: list[tuple[Floats, Floats]]) -> None:
-        """Refuse a tracker whose target did not move with the arm; readings are held to these."""
+    def _check_tracker(self, positions: list[tuple[Floats, Floats]]) -> None:
+        """Refuse a tracker whose target did not move with the arm; else add to the registration."""
         registration = RoughRegistration(self._cell)
-        for q, position in seen:
+        for q, position in positions:
             wrong = registration.implausible(q, position)
             if wrong is not None:
                 raise DeviceError(wrong)
             registration.add(q, position)
-        for q, position in seen:
+        for q, position in positions:
             self._state.registration.add(q, position)
 
     def _move(self, stop: Stop) -> None:
@@ -231,14 +230,14 @@ class Session:
 
     def _tare(self) -> None:
         """Set the force sensor's zero at the reference pose, and store it."""
-        found = self._zero()
+        zero = self._zero()
         self._tared = True
-        if found is not None:
-            sample, q = found
+        if zero is not None:
+            sample, q = zero
             self._event("tare", {"force": sample_json(sample), "q": q.tolist()})
 
     def _zero(self) -> tuple[WrenchSample, Floats] | None:
-        """Set the zero at the present pose, with nothing on the hook; mean wrench and joints."""
+        """Set the zero at the present pose, unloaded; return mean wrench and joint angles."""
         meter, watch = self._meter, self._mover.watch
         if meter is None or watch is None:
             return None
@@ -296,75 +295,78 @@ class Session:
     # one reading
 
     def _reading(self, stop: Stop, step: Step) -> tuple[Readings, float]:
-        """Measure and store all targets; the arm has arrived. Returns the first one's reading."""
+        """Measure and store all targets; return the first reading and the total settling time."""
         self._watcher.notify(Phase(f"measuring {step}"))
-        found = self._reader.read(stop.q, stop.name)
-        rows, details = map(list, zip(*(self._row(stop, step, one) for one in found), strict=True))
-        self._check(found, details)
+        measurements = self._reader.read(stop.q, stop.name)
+        pairs = [self._row(stop, step, reading) for reading in measurements]
+        rows, details = map(list, zip(*pairs, strict=True))
+        self._check(measurements, details)
         self._store.record(Readings.joined(rows), step, details[0], *details[1:])
         self._done += 1
-        for one in found:
-            measured, mean = one.measured, one.measured.mean
-            name = f"{step}" if one.target is None else f"{step}, {self._name(one.target)}"
+        for reading in measurements:
+            measured, mean = reading.measured, reading.measured.mean
+            name = f"{step}" if reading.target is None else f"{step}, {self._name(reading.target)}"
             for text in measured.remarks:
                 self._remark(f"{name}: {text}")
-            tared = None if one.target else self._tared_wrench(measured)
+            tared = None if reading.target else self._tared_wrench(measured)
             shift = self._state.add(
-                step, measured.q, mean.value, mean.covariance, tared, one.target or 0
+                step, measured.q, mean.value, mean.covariance, tared, reading.target or 0
             )
             if shift is not None:
                 self._tell_drift(step, shift)
         self._look_back()
-        return rows[0], sum(one.measured.settling for one in found)
+        return rows[0], sum(reading.measured.settling for reading in measurements)
 
-    def _check(self, found: Sequence[TargetReading], details: list[dict[str, Any]]) -> None:
-        """Refuse the readings of an arrival of another target or load; they are doubted."""
-        wrong = next(filter(None, map(self._doubt, found)), None)
+    def _check(self, measurements: Sequence[TargetReading], details: list[dict[str, Any]]) -> None:
+        """Refuse the readings of an arrival if one is of another target or load."""
+        wrong = next(filter(None, map(self._doubt, measurements)), None)
         if wrong is None:
             return
         for raw in details:
             self._event("doubted", {"why": str(wrong), "reading": raw})
-        for one in found:
-            position = one.measured.mean.value[:3]
-            self._state.registration.doubt_repeated(one.measured.q, position, one.target or 0)
+        for reading in measurements:
+            q, position = reading.measured.q, reading.measured.mean.value[:3]
+            self._state.registration.doubt_repeated(q, position, reading.target or 0)
         self._look_back()
         raise wrong
 
     def _look_back(self) -> None:
-        """Tell of stored readings that are seen to be doubtful now."""
+        """Report stored readings that have become doubtful."""
         for step, why in self._state.registration.late_doubts():
             self._event("doubted", {"why": why, "reading": asdict(step), "stored": True})
             self._remark(f"{step}, stored before: {why} A fit sets gross errors aside")
 
-    def _doubt(self, one: TargetReading) -> DeviceError | None:
-        """Why a reading cannot be of its target under its load, or None."""
-        measured, watch = one.measured, self._mover.watch
+    def _doubt(self, reading: TargetReading) -> DeviceError | None:
+        """Return why a reading cannot be of its target under its load, or None."""
+        measured, watch = reading.measured, self._mover.watch
         position = measured.mean.value[:3]
-        stray = self._state.registration.implausible(measured.q, position, one.target or 0)
+        stray = self._state.registration.implausible(measured.q, position, reading.target or 0)
         if stray is not None:
             return DeviceError(stray)
         tared = self._tared_wrench(measured)
         wrong = "" if watch is None or tared is None else watch.wrong(tared)
         return LoadChangedError(wrong) if wrong else None
 
-    def _row(self, stop: Stop, step: Step, one: TargetReading) -> tuple[Readings, dict[str, Any]]:
-        """One reading, whose covariance is the instrument's alone, and everything raw behind it."""
-        measured, tared = one.measured, self._tared_wrench(one.measured)
-        elapsed = self._elapsed + one.ended - self._begun
+    def _row(
+        self, stop: Stop, step: Step, reading: TargetReading
+    ) -> tuple[Readings, dict[str, Any]]:
+        """Return one reading, with the instrument's covariance, and its raw data."""
+        measured, tared = reading.measured, self._tared_wrench(reading.measured)
+        elapsed = self._elapsed + reading.ended - self._start
         temperature, torque = self._temperature(measured), self._torque(measured)
         states = States(
             q=stop.q[None].copy(),
             wrench=self._wrench(step, tared)[None].copy(),
             time=np.array([elapsed]),
-            load_time=np.array([one.ended - self._hook.since]),
+            load_time=np.array([reading.ended - self._hook.since]),
             joint_temperature=None if temperature is None else temperature[None],
             approach=self._mover.side[None].copy(),
             q_actual=measured.q[None].copy(),
             torque=None if torque is None else torque[None].copy(),
-            target=None if one.target is None else np.array([one.target]),
+            target=None if reading.target is None else np.array([reading.target]),
         )
         number = np.zeros(1, dtype=np.int64)
-        reading = Readings(
+        row = Readings(
             states=states,
             pose=number,
             load=number,
@@ -373,7 +375,7 @@ class Session:
             covariance=measured.mean.covariance[None].copy(),
             load_names=(step.load,),
             pose_names=(step.pose,),
-            target_names=() if one.target is None else self._cell.target_names,
+            target_names=() if reading.target is None else self._cell.target_names,
         )
         session: dict[str, Any] = {
             "epoch_wall_s": self._epoch,
@@ -382,10 +384,10 @@ class Session:
             "side": self._mover.side.tolist(),
             "losses": None if self._rig.force is None else sample_json(self._rig.force.losses()),
         }
-        if one.target is not None:
-            session["target"] = self._name(one.target)
+        if reading.target is not None:
+            session["target"] = self._name(reading.target)
         zero = None if self._meter is None else self._meter.zero
-        return reading, detail(step, measured, tared, zero) | session
+        return row, detail(step, measured, tared, zero) | session
 
     def _name(self, target: int) -> str:
         return self._cell.target_names[target]
@@ -396,19 +398,19 @@ class Session:
         return self._meter.tared(measured.force, measured.q)
 
     def _wrench(self, step: Step, tared: TaredWrench | None) -> Floats:
-        """(6,) wrench of the load at the load point, base axes: configured or measured."""
+        """Return the load's wrench (6,) at the load point, base axes: configured or measured."""
         load = self._hook.load(step.load)
         if load is None:
             return np.zeros(6)
         sensor = self._config.force_sensor
-        pull = any((*load.force_N, *load.moment_Nm))
-        wanted = sensor is not None and (sensor.use == "all" or (sensor.use == "pulls" and pull))
-        if wanted and self._meter is not None and tared is not None:
+        pulls = any((*load.force_N, *load.moment_Nm))
+        measured = sensor is not None and (sensor.use == "all" or (sensor.use == "pulls" and pulls))
+        if measured and self._meter is not None and tared is not None:
             return self._meter.load_wrench(tared)
         return load.wrench(self._cell.gravity)
 
     def _temperature(self, measured: MeasuredStop) -> Floats | None:
-        """(n,) °C, or None in a campaign without."""
+        """Return the joint temperatures (n,), °C, or None in a campaign without."""
         if not self._temperatures:
             return None
         mean = (measured.before.joint_temperature + measured.after.joint_temperature) / 2
@@ -417,14 +419,15 @@ class Session:
         return np.asarray(mean)
 
     def _torque(self, measured: MeasuredStop) -> Floats | None:
-        """(n,) measured torques of the drives, N·m, NaN where lost; None in a campaign without."""
+        """Return measured torques (n,) of the drives, N·m, NaN if lost; None without any."""
         if self._torques is None:
             self._torques = measured.torque is not None
         if not self._torques:
             return None
         if measured.torque is None and not self._torques_lost:
-            lost = "arm: it no longer tells the torques of its joints; readings go on without them"
-            self._remark(lost)
+            self._remark(
+                "arm: it no longer tells the torques of its joints; readings go on without them"
+            )
         self._torques_lost = measured.torque is None
         return np.full(self._cell.arm.n, np.nan) if measured.torque is None else measured.torque
 
@@ -438,45 +441,45 @@ class Session:
     # people
 
     def _tell(
-        self, step: Step, reading: Readings, total: int, left: float, settling: float
+        self, step: Step, reading: Readings, total: int, remaining: float, settling: float
     ) -> None:
         number = int(reading.target[0])
         deflection = self._state.deflection(step, reading.value[0, :3], number)
-        (_, live), *others = self._compared(reading)
+        (_, live), *following = self._compared(reading)
         self._watcher.notify(
             ReadingStored(
                 step,
                 self._done,
                 total,
-                self._clock.real(left),
-                left,
+                self._clock.real(remaining),
+                remaining,
                 deflection,
                 live,
                 settling,
                 self._goal,
                 number,
-                tuple(others),
+                tuple(following),
             )
         )
 
     def _compared(self, reading: Readings) -> list[tuple[int, LiveResidual]]:
-        """Each target that was read in an arrival against the readings before the arrival."""
+        """Return the residual of each target of an arrival, by a model of the previous readings."""
         out = [(int(k), LiveResidual()) for k in reading.target]
         readings = None if self._live is None else self._store.readings()
         if self._live is None or readings is None:
             return out
-        before = np.arange(len(readings) - len(reading))
+        previous = np.arange(len(readings) - len(reading))
         for k, (target, _) in enumerate(out):
-            with suppress(HilcalError):  # too early for a model; nothing depends on it
-                one = readings[np.append(before, len(before) + k)]
-                out[k] = target, self._live(one)
+            with suppress(HilcalError):  # too few readings for a model
+                selected = readings[np.append(previous, len(previous) + k)]
+                out[k] = target, self._live(selected)
         return out
 
     def _finish(self) -> None:
-        found = self._state.repeatability()
-        if found is not None:
-            self._event("repeatability", asdict(found))
-            self._remark(found.words(self._joint_std))
+        estimate = self._state.repeatability()
+        if estimate is not None:
+            self._event("repeatability", asdict(estimate))
+            self._remark(estimate.words(self._joint_std))
         self._event("finished", {"readings": self._done})
         self._watcher.notify(Phase("finished"))
 

@@ -1,4 +1,4 @@
-"""What is carried from reading to reading, and a reading as it is stored, with all behind it."""
+"""The state of a session from reading to reading, and the raw data stored with a reading."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
@@ -23,31 +23,31 @@ class UnloadedVisit:
 
     pose: str
     position: Floats  # (3,) m, sensor axes
-    tracker: Floats  # (3, 3) covariance of the instrument alone, m²
+    tracker: Floats  # (3, 3) covariance of the instrument, m²
     gain: float  # tr(J Jᵀ) of the target's translation, m²/rad²
 
 
 @dataclass(frozen=True, slots=True)
 class RepeatabilityEstimate:
-    """The scatter from one arrival to the next."""
+    """The scatter between arrivals at one pose."""
 
     poses: int  # poses with several readings
     dof: int  # readings less poses
-    scatter: float  # rms distance of a reading from its pose's mean, m, unbiased
-    instrument: float  # the same as the instrument alone would make it, m
-    joint_std: float  # the scatter of every joint that explains the rest, rad; 0 where none is left
+    scatter: float  # RMS distance of a reading from its pose's mean, m, unbiased
+    instrument: float  # the same by the instrument's noise alone, m
+    joint_std: float  # scatter of every joint that explains the excess, rad; 0 without excess
     iso_9283: float = float("nan")
-    """The worst pose's RP = mean distance + 3 standard deviations of it, m (ISO 9283, 7.2.2), the
-    instrument's noise included; NaN in campaigns of older versions."""
+    """RP of the worst pose = mean + 3 standard deviations of the distance, m (ISO 9283, 7.2.2),
+    with the instrument's noise; NaN in campaigns of older versions."""
 
     @property
     def shown(self) -> bool:
-        """Whether the arm scatters beyond what the instrument does by chance, about 1 in 100."""
+        """Whether the scatter exceeds the instrument's noise (false alarms: about 1 in 100)."""
         total, noise = self.scatter**2, self.instrument**2
         return bool(total - noise > 3.0 * noise * np.sqrt(2.0 / (3.0 * max(self.dof, 1))))
 
     def words(self, configured: Floats) -> str:
-        """Return it for people, beside the configured standard deviations (n,), rad."""
+        """Return the estimate for people, with the configured standard deviations (n,), rad."""
         stated = float(np.sqrt(np.mean(configured**2)))
         joints = f"is about {self.joint_std:.1g}" if self.shown else "is too small to be seen"
         return (
@@ -58,43 +58,43 @@ class RepeatabilityEstimate:
 
     @property
     def returns(self) -> str:
-        """How many returns to how many poses, in words."""
+        """Numbers of returns and poses, in words."""
         dof, poses = self.dof, self.poses
         return f"{dof} return{'s' * (dof != 1)} to {poses} pose{'s' * (poses != 1)}"
 
 
 def repeatability(visits: Sequence[UnloadedVisit]) -> RepeatabilityEstimate | None:
-    """Estimate it from unloaded readings; None where no pose has two.
+    """Estimate the repeatability from unloaded readings; None if no pose has two.
 
-    With S = Σ |x − x̄|² over the readings of a pose that was visited k times,
+    With S = Σ |x − x̄|² over the readings of a pose visited k times,
 
         E S = (1 − 1/k) Σ (tr C + σ² tr(J Jᵀ))
 
-    which is solved for σ², one for all joints, over all poses together.
+    summed over all poses and solved for σ², which all joints have in common.
     """
     spread = instrument = gain = worst = 0.0
     poses = dof = 0
     for name in dict.fromkeys(v.pose for v in visits):
-        mine = [v for v in visits if v.pose == name]
-        k = len(mine)
+        repeated = [v for v in visits if v.pose == name]
+        k = len(repeated)
         if k < 2:
             continue
-        at = np.array([v.position for v in mine])
-        away = np.linalg.norm(at - at.mean(axis=0), axis=1)
-        spread += float(np.sum(away**2))
-        instrument += (1 - 1 / k) * sum(float(np.trace(v.tracker)) for v in mine)
-        gain += (1 - 1 / k) * sum(v.gain for v in mine)
-        worst = max(worst, float(away.mean() + 3 * away.std(ddof=1)))
+        positions = np.array([v.position for v in repeated])
+        distance = np.linalg.norm(positions - positions.mean(axis=0), axis=1)
+        spread += float(np.sum(distance**2))
+        instrument += (1 - 1 / k) * sum(float(np.trace(v.tracker)) for v in repeated)
+        gain += (1 - 1 / k) * sum(v.gain for v in repeated)
+        worst = max(worst, float(distance.mean() + 3 * distance.std(ddof=1)))
         poses, dof = poses + 1, dof + k - 1
     if not poses:
         return None
-    left = max(spread - instrument, 0.0)
+    excess = max(spread - instrument, 0.0)
     return RepeatabilityEstimate(
         poses=poses,
         dof=dof,
         scatter=float(np.sqrt(spread / dof)),
         instrument=float(np.sqrt(instrument / dof)),
-        joint_std=float(np.sqrt(left / gain)) if gain > 0 else 0.0,
+        joint_std=float(np.sqrt(excess / gain)) if gain > 0 else 0.0,
         iso_9283=worst,
     )
 
@@ -102,7 +102,7 @@ def repeatability(visits: Sequence[UnloadedVisit]) -> RepeatabilityEstimate | No
 def detail(
     step: Step, measured: MeasuredStop, tared: TaredWrench | None, zero: Floats | None
 ) -> dict[str, Any]:
-    """Return everything raw behind a reading; `zero` (6,) is the force sensor's of the session."""
+    """Return the raw data of a reading; `zero` (6,) is the session's zero of the force sensor."""
     mean = measured.mean
     out: dict[str, Any] = {
         **asdict(step),
@@ -126,7 +126,7 @@ def detail(
 
 
 def stored_wrench(stored: dict[str, Any]) -> TaredWrench | None:
-    """Return the mean wrench in a stored detail; None without one."""
+    """Return the mean wrench of stored raw data; None without one."""
     felt = stored.get("felt")
     if felt is None:
         return None
@@ -143,7 +143,7 @@ def sample_json(sample: ArmSample | TrackerSample | WrenchSample | Losses | None
 
 
 def _value(value: Any) -> Any:
-    """Return a JSON value; what is not a finite number becomes null."""
+    """Return a JSON value; a number that is not finite becomes null."""
     if isinstance(value, np.ndarray):
         return [_value(x) for x in value.tolist()]
     if isinstance(value, list):
@@ -157,13 +157,13 @@ def _value(value: Any) -> Any:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shift:
-    """How far a return lies from the first reading at the reference pose."""
+    """Difference d of a return from the first reading at the reference pose."""
 
-    metres: Floats  # (3,) difference of the positions, sensor axes, m
-    sigma: float  # its size d in standard deviations, sqrt(dᵀ (C₁ + C)⁻¹ d)
+    metres: Floats  # (3,) d, sensor axes, m
+    sigma: float  # in standard deviations, sqrt(dᵀ (C₁ + C)⁻¹ d)
 
     def words(self, limit: float) -> str:
-        """Return for people that it is over a limit, sigma."""
+        """Return a sentence for people on a shift over a limit, sigma."""
         micrometres = 1e6 * float(np.linalg.norm(self.metres))
         return (
             f"the reference pose has moved by {micrometres:.0f} µm, {self.sigma:.1f} sigma "
@@ -173,11 +173,11 @@ class Shift:
 
 
 LOADING_S = 60.0
-"""How long a person is taken to need for a change of the load until one was seen, s."""
+"""Assumed time of a change of the load before the first one, s."""
 
 
 class Eta:
-    """Measures readings with the motions to them, and changes of the load, in cell seconds."""
+    """Durations of readings with their motions, and of load changes, cell s; estimates the rest."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
@@ -187,31 +187,31 @@ class Eta:
         self._changes: list[float] = []
 
     def arrived(self) -> None:
-        """A motion to where the load is changed is over; it counts for the next reading."""
+        """Note the end of a motion to a load change; it counts for the next reading."""
         self._moving += self._lap()
 
     def changed(self) -> None:
-        """A change of the load is over."""
+        """Note the end of a load change."""
         self._changes.append(self._lap())
 
     def read(self) -> None:
-        """A reading is stored."""
+        """Note a stored reading."""
         self._readings.append(self._moving + self._lap())
         self._moving = 0.0
 
     def left(self, readings: int, changes: int) -> float:
-        """Return how long so many readings and changes take at this pace, cell seconds."""
-        each = float(np.mean(self._readings)) if self._readings else 0.0
+        """Return the expected time of readings and changes, cell s."""
+        reading = float(np.mean(self._readings)) if self._readings else 0.0
         change = float(np.mean(self._changes)) if self._changes else LOADING_S
-        return readings * each + changes * change
+        return readings * reading + changes * change
 
     def _lap(self) -> float:
-        before, self._mark = self._mark, self._clock.now()
-        return self._mark - before
+        previous, self._mark = self._mark, self._clock.now()
+        return self._mark - previous
 
 
 class SessionState:
-    """Everything that is carried from reading to reading, and from session to session."""
+    """The state of a campaign from reading to reading, and from session to session."""
 
     def __init__(self, cell: Cell, joint_std: Floats) -> None:
         """Start empty; `joint_std` (n,) is the arm's repeatability as configured, rad."""
@@ -232,10 +232,10 @@ class SessionState:
         tared: TaredWrench | None,
         target: int = 0,
     ) -> Shift | None:
-        """Add a reading; returns its shift where it is a return to the reference.
+        """Add a reading; return its shift if it is a return to the reference pose.
 
-        `q` (n,) are the actual joint angles; `covariance` (m, m) is the instrument's alone. Drift,
-        scatter and wrench are taken from the first target.
+        `q` (n,) are actual joint angles; `covariance` (m, m) is the instrument's. Drift, scatter
+        and wrench are those of the first target.
         """
         position = value[:3]
         self.last_q = q
@@ -262,11 +262,11 @@ class SessionState:
         return Shift(d, float(np.sqrt(max(square, 0.0))))
 
     def deflection(self, step: Step, position: Floats, target: int = 0) -> float | None:
-        """Return how far a loaded reading is from its unloaded one, m; None where that lacks."""
-        before = self._unloaded.get((step.pose, step.cycle, target))
-        if step.load == UNLOADED or before is None:
+        """Return the distance of a loaded reading from its unloaded one, m; None without one."""
+        unloaded = self._unloaded.get((step.pose, step.cycle, target))
+        if step.load == UNLOADED or unloaded is None:
             return None
-        return float(np.linalg.norm(position - before))
+        return float(np.linalg.norm(position - unloaded))
 
     def repeatability(self) -> RepeatabilityEstimate | None:
         """Return the scatter of the unloaded readings; None where no pose has two."""

@@ -24,9 +24,9 @@ def missing(
     weighed: bool,
     unlimited: Sequence[str],
     weak: Sequence[str],  # joints without a torque or effort
-    forceless: Sequence[str] = (),  # prismatic ones without a force or effort
+    forceless: Sequence[str] = (),  # prismatic joints without a force or effort
 ) -> tuple[str, ...]:
-    """Return what a description lacks, and what that means, a sentence each."""
+    """Return the gaps of a description and their consequences, a sentence each."""
     out = [] if weighed else [NO_MASSES.format(file)]
     if unlimited:
         out.append(f"no limits in {file} for {', '.join(unlimited)}: ±360° is assumed")
@@ -50,11 +50,11 @@ class Arm(Brief):
 
     with constant rigid transforms L_k; coupled joints move by `chain_angles`. *Slot* k (k = 0..n)
     is the frame right after L_k: for k < n its origin is a point of the axis of joint k + 1 and its
-    z is that axis; slot n is the flange. Body i (i = 1..n) is what joint i moves; its frame is slot
+    z is that axis; slot n is the flange. Body i (i = 1..n) is moved by joint i; its frame is slot
     i - 1 moved by joint i.
 
-    Of a prismatic joint, angles (rad) are displacements (m), and torques (N·m) forces along its
-    axis (N); speeds and tolerances in the configuration are the same number in m as in rad.
+    For a prismatic joint, angles (rad) are displacements (m), and torques (N·m) are forces along
+    its axis (N); speeds and tolerances of the configuration have the same number in m as in rad.
     """
 
     name: str  # catalogue name or file stem
@@ -67,20 +67,20 @@ class Arm(Brief):
     payload: float  # rated payload, kg
     joint_names: tuple[str, ...]  # (n,) names
     source: str  # where the figures come from
-    # (n, n) C with θ = C q: the angles of the chain from the controller's values, where joints
-    # follow others (see `conventions`); None where each turns by itself
+    # (n, n) C with θ = C q: the angles of the chain from the controller's values, if joints follow
+    # others (see `conventions`); None without couplings
     coupling: Floats | None = None
-    # (n, n) D with dθ = D dδ: displacements of the chain's joints from those of the drives, where
-    # drives turn several joints; None where each turns its own
+    # (n, n) D with dθ = D dδ: displacements of the chain's joints from those of the drives, if
+    # drives turn several joints; None if each drive turns one joint
     drive: Floats | None = None
-    # (n, n + 1) [F, f] with q = F q + f for the controller's values, where joints have no value of
-    # their own (`<mimic>` of a URDF): their rows say what it would be, those of the others are of
-    # the identity; None where every joint has one
+    # (n, n + 1) [F, f] with q = F q + f for the controller's values, if joints have no independent
+    # value (`<mimic>` of a URDF): their rows give the value, other rows are the identity; None if
+    # all values are independent
     mimic: Floats | None = None
-    sign: Floats | None = None  # (n,) −1 where the axis is the drawn one turned round
-    notes: tuple[str, ...] = ()  # what its description lacks, and what that means, a sentence each
+    sign: Floats | None = None  # (n,) −1 where the axis is opposite to the drawn one
+    notes: tuple[str, ...] = ()  # gaps of the description and their consequences, a sentence each
     repeatability: float | None = None  # pose repeatability RP of ISO 9283, m, as stated
-    prismatic: Bools | None = None  # (n,) which joints slide; None where all turn
+    prismatic: Bools | None = None  # (n,) which joints slide; None if all turn
 
     @property
     def slides(self) -> Bools:
@@ -88,7 +88,7 @@ class Arm(Brief):
         return np.zeros(self.n, np.bool_) if self.prismatic is None else self.prismatic
 
     def unit(self, joint: int) -> str:
-        """Unit of the value of a joint, counted from 0: "rad", or "m" where it slides."""
+        """Return the unit of the value of a joint, counted from 0: "rad", or "m" of a slide."""
         return "m" if self.slides[joint] else "rad"
 
     @property
@@ -97,32 +97,32 @@ class Arm(Brief):
         return tuple(map(self.unit, range(self.n)))
 
     def kind(self, joint: int) -> str:
-        """What the value of a joint, counted from 0, is called: "angle" or "travel"."""
+        """Return the name of the value of a joint, counted from 0: "angle" or "travel"."""
         return "travel" if self.slides[joint] else "angle"
 
     @property
     def usual_range(self) -> tuple[Floats, Floats]:
-        """(n,) lowest and highest joint values in use: within half a turn, or the whole travel."""
+        """(n,) lowest and highest usual joint values: within half a turn, or the whole travel."""
         low, high = np.maximum(self.q_min, -np.pi), np.minimum(self.q_max, np.pi)
         slides = self.slides
         return np.where(slides, self.q_min, low), np.where(slides, self.q_max, high)
 
     @property
     def ratings(self) -> Floats:
-        """(n,) rated torques or forces; where unknown 150 N·m and 1500 N, a middle size."""
+        """(n,) rated torques or forces; 150 N·m and 1500 N where unknown, for a medium size."""
         rated = np.asarray(self.torque_max, dtype=float)
         known = np.isfinite(rated) & (rated > 0)
         return np.where(known, rated, np.where(self.slides, UNKNOWN_FORCE, UNKNOWN_TORQUE))
 
     def along(self, wrench: Floats) -> Floats:
-        """Torques or forces (..., n) along the joints, of wrenches (..., n + 1, 6)."""
+        """Return torques or forces (..., n) along the joints, from wrenches (..., n + 1, 6)."""
         torque = wrench[..., :-1, 5]
         if self.prismatic is None:
             return torque
         return np.where(self.prismatic, wrench[..., :-1, 2], torque)
 
     def phases(self, q: Floats) -> Floats:
-        """Phases (..., n) that periodic laws depend on, rad; of a slide a turn over its travel."""
+        """Return phases (..., n) for periodic laws, rad; of a slide, one turn over its travel."""
         angle = self.drive_angles(q)
         if self.prismatic is None:
             return angle
@@ -130,11 +130,11 @@ class Arm(Brief):
         return np.where(self.prismatic, angle * turn, angle)
 
     def chain_angles(self, q: Floats) -> Floats:
-        """Angles (..., n) that the axes of the chain turn by, from the controller's values."""
+        """Return angles (..., n) θ of the chain's joints, from the controller's values."""
         return q if self.coupling is None else q @ self.coupling.T
 
     def drive_angles(self, q: Floats) -> Floats:
-        """Angles (..., n) φ of the drives: D φ = C q; q where all couplings are mechanical."""
+        """Return angles (..., n) φ of the drives: D φ = C q; q if all couplings are mechanical."""
         if self.drive is None:
             return self.chain_angles(q)
         if self.coupling is not None and np.array_equal(self.drive, self.coupling):
@@ -142,29 +142,29 @@ class Arm(Brief):
         return np.asarray(self.chain_angles(q) @ np.linalg.pinv(self.drive).T)
 
     def driven(self, dq: Floats) -> Floats:
-        """Displacements (..., n) of the chain's joints by those of the drives."""
+        """Return displacements (..., n) of the chain's joints, from those of the drives."""
         return dq if self.drive is None else np.asarray(dq @ self.drive.T)
 
     def drive_torques(self, torque: Floats) -> Floats:
-        """Torques (..., n) that the drives carry, Dᵀ τ, from those about the joints' axes."""
+        """Return torques (..., n) of the drives, Dᵀ τ, from those about the joints' axes."""
         return torque if self.drive is None else np.asarray(torque @ self.drive)
 
     @property
     def own(self) -> Bools:
-        """(n,) which joints have a value of their own."""
+        """(n,) which joints have an independent value."""
         if self.mimic is None:
             return np.ones(self.n, dtype=np.bool_)
         return np.asarray(np.diag(self.mimic) != 0)
 
     def complete(self, q: Floats) -> Floats:
-        """Return joint values (..., n) with those of mimic joints from the others."""
+        """Return joint values (..., n) with those of mimic joints computed from the others."""
         if self.mimic is None:
             return q
-        given = np.where(self.own, q, 0.0)
-        return np.asarray(given @ self.mimic[:, :-1].T + self.mimic[:, -1])
+        independent = np.where(self.own, q, 0.0)
+        return np.asarray(independent @ self.mimic[:, :-1].T + self.mimic[:, -1])
 
     def __post_init__(self) -> None:
-        """Refuse an arm of more joints than any has, or a slide without an end."""
+        """Refuse too many joints, and a slide without limits."""
         if self.prismatic is not None:
             travel = (self.q_max - self.q_min)[self.prismatic]
             if not np.all(np.isfinite(travel) & (travel > 0.0)):
@@ -179,12 +179,12 @@ class Arm(Brief):
 
     @property
     def reach(self) -> float:
-        """Sum of the lengths of all link transforms, and of how far slides go, m."""
+        """Sum of the lengths of all link transforms and of the travels of slides, m."""
         return float(np.linalg.norm(self.links[:, :3, 3], axis=1).sum() + self.travels.sum())
 
     @property
     def travels(self) -> Floats:
-        """(n,) how far slides go from their zeros at most, m; 0 of joints that turn."""
+        """(n,) largest distances of slides from their zeros, m; 0 of revolute joints."""
         if self.prismatic is None:
             return np.zeros(self.n)
         far = np.maximum(np.abs(self.q_min), np.abs(self.q_max))

@@ -1,10 +1,9 @@
-"""Batches of N states: their layout in memory, and the chunks they are worked off in.
+"""Batches of N states: their layout in memory, and chunks.
 
-Arrays (N, ...) are kept in Fortran order: shapes name the states first, and memory runs along
-them. Every elementwise operation and every `einsum` then works on long contiguous vectors,
-however small the matrices are that a formula is written in; numpy hands the order on by
-itself, only new arrays have to be made with it. Chunks keep temporaries in the processor's
-cache.
+Arrays (N, ...) are in Fortran order: the states are the first axis, and memory runs along them.
+Every elementwise operation and every `einsum` then works on long contiguous vectors, even for small
+matrices. numpy preserves the order; only new arrays have to be created with it. Chunks keep
+temporaries in the processor's cache.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -15,9 +14,9 @@ import numpy as np
 
 from hilcal.types import Floats
 
-CHUNK = 8200  # states, by timing; no power of two, which would all fall in few cache lines
-BUDGET = 1 << 20  # Numbers of a chunk's largest array, 8 MB; a choice by timing
-LEAST_CHUNK = 256  # states of a chunk, at least: Python's share grows with their number
+CHUNK = 8200  # states, by timing; powers of two collide in few cache lines
+BUDGET = 1 << 20  # numbers in a chunk's largest array, 8 MB; a choice by timing
+LEAST_CHUNK = 256  # states, at least: Python's overhead grows with the number of chunks
 
 
 class Record(Protocol):
@@ -45,23 +44,23 @@ def along_states(x: Floats) -> Floats:
 
 
 def chunks(count: int, numbers: int = 0) -> Iterator[slice]:
-    """Yield slices that cover `count` states, at least one; smaller for many numbers each."""
+    """Yield slices that cover `count` states, at least one slice; `numbers` per state."""
     size = CHUNK if numbers == 0 else max(LEAST_CHUNK, min(CHUNK, BUDGET // numbers))
     for start in range(0, max(count, 1), size):
         yield slice(start, min(start + size, count))
 
 
 def take(record: R, rows: slice, axis: int = 0) -> R:
-    """Return the chosen states of a record whose arrays have the states on `axis`."""
+    """Return the states `rows` of a record whose arrays have the states on `axis`."""
     index = (*(slice(None),) * axis, rows)
-    return by_field([record], lambda given: given[0][index])
+    return by_field([record], lambda arrays: arrays[0][index])
 
 
 def by_field(records: Sequence[R], combine: Callable[[Sequence[Floats]], Floats]) -> R:
-    """Combine records array by array, leaving out what is None; other fields are the first's."""
+    """Combine records array by array, without None; other fields are those of the first record."""
     combined = {}
     for f in fields(records[0]):
-        given = [a for r in records if isinstance(a := getattr(r, f.name), np.ndarray)]
-        if given:
-            combined[f.name] = combine(given)
+        arrays = [a for r in records if isinstance(a := getattr(r, f.name), np.ndarray)]
+        if arrays:
+            combined[f.name] = combine(arrays)
     return replace(records[0], **combined)

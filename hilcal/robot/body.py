@@ -1,7 +1,7 @@
-"""The room that an arm takes: capsules on its bodies.
+"""The shape of an arm: capsules on its bodies.
 
-Universal Robots' arms have figures of their own; any other arm gets a capsule per link whose
-radius is a share of its reach. A capsule is all points within `radius` of a segment.
+Arms of Universal Robots have known sizes; any other arm gets a capsule per link with a radius in
+proportion to the arm's reach. A capsule is all points within `radius` of a segment.
 """
 
 from dataclasses import dataclass, replace
@@ -15,18 +15,18 @@ from hilcal.types import Floats
 
 BASE = "base"
 _JOINTS = 6
-_RIM = 0.5  # of the radius: a housing's rounded end; so much shorter is the capsule's segment
-_THICK, _THIN = 0.047, 0.03  # radii of an unknown arm at base and flange, shares of its reach
+_RIM = 0.5  # of the radius: rounded end of a housing, by which the capsule's segment is shorter
+_THICK, _THIN = 0.047, 0.03  # radii of an unknown arm at base and flange, over its reach
 _SHORT = 1e-6  # m
-TURNED = np.array([1.0, -1.0, -1.0])  # of a point in a frame turned round x
+TURNED = np.array([1.0, -1.0, -1.0])  # half a turn about x
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Capsule:
     """A capsule that moves with a body."""
 
-    name: str  # what it is, for people
-    body: int  # 0 the base, i what joint i moves
+    name: str  # for people
+    body: int  # 0 is the base, i the body moved by joint i
     start: Floats  # (3,) one end of the segment in the body's frame, m
     end: Floats  # (3,) the other end, m
     radius: float  # m
@@ -44,14 +44,14 @@ class Figures:
 
 # Offsets: the manufacturer's ROS 2 description package, config/*/physical_parameters.yaml,
 # `offsets`. Radii of UR5e and UR10e: the collision capsules of the MuJoCo Menagerie
-# (universal_robots_ur5e, universal_robots_ur10e); those of their CB3 predecessors and of the
-# UR16e, which share the joints, are taken equal. Radii of UR3(e), UR20 and UR30: a housing of
-# the joint torque T has 78 mm (T / 330 N·m)^0.27, which gives 60 mm for the 150 N·m joint and
-# 40 mm for the 28 N·m joint of those two arms within 3 mm. All radii are below half of the data
-# sheets' footprints of 128 (UR3e), 149 (UR5e), 190 (UR10e) and 245 mm (UR20), as they must be.
-# Of UR8 Long, UR15 and UR18 no tubes are published (their `offsets` are of the meshes). Their radii
-# are by the same rule from 433, 204 and 70 N·m; the offsets of their tubes are guessed: as far
-# beyond the links' centres of mass (0.193 and 0.071 m) as those of UR10e and UR20 are on average.
+# (universal_robots_ur5e, universal_robots_ur10e), also for their CB3 predecessors and the UR16e,
+# which have the same joints. Radii of UR3(e), UR20 and UR30: a housing of a joint of torque T has
+# 78 mm (T / 330 N·m)^0.27, which gives 60 mm for the 150 N·m joint and 40 mm for the 28 N·m joint
+# of those two arms within 3 mm. All radii are below half of the data sheets' footprints of 128
+# (UR3e), 149 (UR5e), 190 (UR10e) and 245 mm (UR20), as they must be.
+# Tubes of UR8 Long, UR15 and UR18 are not published (their `offsets` are of the meshes). Their
+# radii follow from the same rule with 433, 204 and 70 N·m; the offsets of their tubes are guessed:
+# as far beyond the links' centres of mass (0.193 and 0.071 m) as the mean of UR10e and UR20.
 _UR5 = ((0.060, 0.060, 0.055, 0.040), (0.050, 0.038))
 _UR10 = ((0.078, 0.078, 0.058, 0.050), (0.060, 0.043))
 _UR3 = ((0.049, 0.049, 0.041, 0.033), (0.040, 0.030))
@@ -70,7 +70,7 @@ _GUESSED = frozenset({"ur8long", "ur15", "ur18"})
 
 
 def is_known(arm: Arm) -> bool:
-    """Whether the arm's sizes are known; else they are guessed, as a rule from its reach."""
+    """Return whether the arm's sizes are known; else they are guessed, mostly from its reach."""
     return arm.name not in _GUESSED and _has_figures(arm)
 
 
@@ -82,14 +82,14 @@ def _has_figures(arm: Arm) -> bool:
 
 
 def capsules(arm: Arm) -> tuple[Capsule, ...]:
-    """Return the capsules of base and bodies, those of one body side by side.
+    """Return the capsules of base and bodies, in the order of the bodies.
 
-    They hold the real housings but for a rim of at most an eighth of the radius, which the margins
-    of collision checks cover.
+    They contain the real housings except a rim of at most an eighth of the radius, which the
+    margins of collision checks cover.
     """
     if arm.sign is None:
         return _of_ur(arm, _FIGURES[arm.name]) if _has_figures(arm) else _of_any(arm)
-    # The shapes are those of the drawn arm; the bodies of turned axes have turned frames.
+    # shapes of the drawn arm; bodies of opposite axes have frames turned about x
     turned = np.append(False, arm.sign < 0)
     return tuple(
         replace(c, start=TURNED * c.start, end=TURNED * c.end) if turned[c.body] else c
@@ -98,7 +98,7 @@ def capsules(arm: Arm) -> tuple[Capsule, ...]:
 
 
 def body_poses(arm: Arm, q: Floats, chain: Chain | None = None) -> Floats:
-    """Poses T_base_body (N, n + 2, 4, 4) of base, bodies and flange at joint values (N, n).
+    """Return poses T_base_body (N, n + 2, 4, 4) of base, bodies and flange at (N, n) joint values.
 
     T_base_body0 = 1, T_base_bodyi = L_0 M_1(θ_1) ... L_{i-1} M_i(θ_i).
     """
@@ -120,7 +120,7 @@ def body_poses(arm: Arm, q: Floats, chain: Chain | None = None) -> Floats:
 
 
 def flange_capsule(arm: Arm, name: str, start: Floats, end: Floats, radius: float) -> Capsule:
-    """Return a capsule that the flange carries, between two ends (3,) in its axes, m."""
+    """Return a capsule fixed to the flange, between two ends (3,), flange axes, m."""
     axes, origin = arm.links[arm.n][:3, :3], arm.links[arm.n][:3, 3]
     return Capsule(name, arm.n, origin + axes @ start, origin + axes @ end, radius)
 
@@ -160,16 +160,16 @@ _Z = np.array([0.0, 0.0, 1.0])
 def _housing(
     name: str, body: int, origin: Floats, low: float, high: float, radius: float
 ) -> Capsule:
-    """Capsule in a housing about an axis along z through `origin`, from `low` to `high`.
+    """Return a capsule for a housing about an axis along z through `origin`, from `low` to `high`.
 
-    Its segment ends half a radius within, or in its middle.
+    Its segment ends half a radius inside of the housing, or in the middle of a short one.
     """
     rim = min(_RIM * radius, 0.5 * (high - low))
     return Capsule(name, body, origin + (low + rim) * _Z, origin + (high - rim) * _Z, radius)
 
 
 def _of_any(arm: Arm) -> tuple[Capsule, ...]:
-    """One capsule per link, from its joint's frame to the next one's."""
+    """Return one capsule per link, from one joint's frame to the next."""
     reach = max(arm.reach - float(arm.travels.sum()), 0.1)
     radii = np.linspace(_THICK, _THIN, arm.n + 1) * reach
     names = (BASE, *arm.joint_names)

@@ -1,4 +1,4 @@
-"""The arms that come with the program, and the way to load any other."""
+"""The arms of the catalogue, and loading of other arms."""
 
 import math
 from collections.abc import Iterator
@@ -23,7 +23,7 @@ Pose = tuple[Number, Number, Number, Number, Number, Number]
 
 
 class JointRow(Section):
-    """One joint of a DH table: row i, and the body that joint i moves."""
+    """One joint of a DH table: row i, and the body moved by joint i."""
 
     name: str = Field(min_length=1, description="a name")
     type: Literal["revolute", "prismatic"] = Field(
@@ -54,18 +54,18 @@ class JointRow(Section):
             if getattr(self, key) is not None:
                 raise ValueError(f"{key} of a {self.type} joint; valid: {', '.join(keys[slides])}")
         low, high = (getattr(self, key) for key in keys[slides][:2])
-        of = " and ".join(keys[slides][:2])
+        names = " and ".join(keys[slides][:2])
         if slides and (low is None or high is None):
-            raise ValueError(f"{of} are missing; a prismatic joint needs both")
+            raise ValueError(f"{names} are missing; a prismatic joint needs both")
         if (low is None) != (high is None):
-            raise ValueError(f"{of}: give both or neither")
+            raise ValueError(f"{names}: give both or neither")
         if low is not None and high is not None and low >= high:
-            raise ValueError(f"{of.replace(' and', f' = {low} must be less than')} = {high}")
+            raise ValueError(f"{names.replace(' and', f' = {low} must be less than')} = {high}")
         return self
 
     @property
     def range(self) -> tuple[float, float]:
-        """Lowest and highest joint value, rad or m; a whole turn to either side if not given."""
+        """Lowest and highest joint value, rad or m; by default ±360°."""
         if self.q_min_m is not None and self.q_max_m is not None:
             return self.q_min_m, self.q_max_m
         if self.q_min_deg is None or self.q_max_deg is None:
@@ -96,16 +96,16 @@ class DhTable(Conventions):
 def arm_from_dh(path: Path) -> Arm:
     """Read an arm from a DH table in TOML.
 
-    Classic rows: T_base_flange = Π_i Rz(q_i + offset_i) Tz(d_i) Tx(a_i) Rx(alpha_i), hence the
+    Classic rows: T_base_flange = Π_i Rz(q_i + offset_i) Tz(d_i) Tx(a_i) Rx(alpha_i), with the
     constant transforms L_0 = Rz(offset_1), L_i = Tz(d_i) Tx(a_i) Rx(alpha_i) Rz(offset_{i+1}).
-    Centres of mass come in DH frame i; in the body frame they are Tz(d) Tx(a) Rx(alpha) com.
+    Centres of mass are in DH frame i; in the body frame they are Tz(d) Tx(a) Rx(alpha) com.
 
     Modified rows (Craig, *Introduction to Robotics*, section 3.4): T_base_flange = Π_i Rx(alpha_i)
     Tx(a_i) Rz(q_i + offset_i) Tz(d_i), with alpha and a of the link before the joint; L_n =
-    Tz(d_n); in the body frame centres of mass are Tz(d) com.
+    Tz(d_n); in the body frame, centres of mass are Tz(d) com.
 
     A prismatic joint has Tz(d_i + q_i) and Rz(offset_i). With `base_m_rad` = B and `flange_m_rad` =
-    E, as calibrated arms have, T_base_flange = B Π … E. What rows leave out is said in `Arm.notes`.
+    E of calibrated arms, T_base_flange = B Π … E. `Arm.notes` lists what rows lack.
     """
     table = load_section(path, DhTable)
     rows = table.joints
@@ -113,11 +113,12 @@ def arm_from_dh(path: Path) -> Arm:
     shifts = [se3.screw(2, 0.0, row.d_m) for row in rows]
     turns = [se3.screw(0, math.radians(row.alpha_deg), row.a_m) for row in rows]
     if table.convention == "modified":
-        fixed, after = shifts, [*turns[1:], np.eye(4)]
+        fixed, trailing = shifts, [*turns[1:], np.eye(4)]
     else:
-        fixed, after = [a @ b for a, b in zip(shifts, turns, strict=True)], [np.eye(4)] * len(rows)
+        fixed = [a @ b for a, b in zip(shifts, turns, strict=True)]
+        trailing = [np.eye(4)] * len(rows)
     spins = [*(se3.screw(2, offset) for offset in offsets), np.eye(4)]
-    parts = zip(fixed, after, spins[1:], strict=True)
+    parts = zip(fixed, trailing, spins[1:], strict=True)
     links = np.array([spins[0], *(a @ b @ spin for a, b, spin in parts)])
     if table.convention == "modified":
         links[0] = turns[0] @ links[0]
@@ -160,27 +161,27 @@ UNPUBLISHED = {
     "ur17g-1300": "the lengths, masses, centres of mass and torques of its joints",
     "ur18g-950": "the lengths and torques of its joints",
 }
-"""Arms that are on sale, and what of them was not found in a published source (November 2026)."""
+"""Arms on sale, and their figures without a published source (November 2026)."""
 _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def configs_dir() -> Path:
-    """Return the directory of configurations: in the package, or beside it in a checkout."""
+    """Return the directory of configurations: in the package, or next to it in a checkout."""
     inside = _PACKAGE / "configs"
     return inside if inside.is_dir() else _PACKAGE.parent / "configs"
 
 
 def robot_names() -> tuple[str, ...]:
-    """Names of the arms in the catalogue."""
+    """Return the names of the arms in the catalogue."""
     return tuple(sorted(path.stem for path in (configs_dir() / "robots").glob("*.toml")))
 
 
 def other_arms(arm: Arm) -> Iterator[Arm]:
-    """Yield the arms of the catalogue with as many joints as an arm, and other lengths."""
+    """Yield the other arms of the catalogue with the same number of joints and other lengths."""
     for name in robot_names():
-        other = load_arm(name)
-        if name != arm.name and other.n == arm.n and not np.array_equal(other.links, arm.links):
-            yield other
+        listed = load_arm(name)
+        if name != arm.name and listed.n == arm.n and not np.array_equal(listed.links, arm.links):
+            yield listed
 
 
 def load_arm(
@@ -189,7 +190,7 @@ def load_arm(
     *,
     base_link: str | None = None,  # first link of a URDF's chain
     tip_link: str | None = None,  # last link of a URDF's chain
-    text: str | None = None,  # what the file holds, as a campaign keeps it
+    text: str | None = None,  # content of the file, as stored in a campaign
 ) -> Arm:
     """Load an arm by catalogue name, or from a file: `.urdf`, or `.toml` with a DH table."""
     path = (base_dir or Path()) / model

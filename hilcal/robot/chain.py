@@ -1,11 +1,9 @@
-"""The deviated chain, batched over N states, and what moves its target.
+"""The deviated chain, batched over N states, and its Jacobians.
 
     T_base_flange = L_0 exp(ξ_0) M_1(q_1 + dq_1) L_1 exp(ξ_1) ... M_n(q_n + dq_n) L_n exp(ξ_n)
 
-with M = Rz of a revolute and Tz of a prismatic joint, evaluated exactly; there is no loop over
-states, only over the n joints.
-
-Deviations add exactly: the chain is evaluated once, on the sum.
+with M = Rz of a revolute and Tz of a prismatic joint, evaluated exactly. Only the n joints are
+looped over, not the states. Deviations are added before the chain is evaluated, once.
 """
 
 from collections.abc import Sequence
@@ -23,21 +21,20 @@ from hilcal.types import Bools, Floats
 class Deviation:
     """Departure of N states from the nominal chain; None stands for zero."""
 
-    dq: Floats | None = None  # (N, n) of the drives' joints, rad, where coupled `Arm.drive`
-    # (N, n + 1, 6) small rigid displacement of everything beyond slot k, in the axes of slot k, m
-    # and rad
+    dq: Floats | None = None  # (N, n) of the drives, rad, see `Arm.drive`
+    # (N, n + 1, 6) small rigid displacement beyond slot k, in the axes of slot k, m and rad
     twist: Floats | None = None
     base: Floats | None = None  # (N, 6) twist of the base relative to its registration, base axes
     station: Floats | None = None  # (N, 6) twist of the readings about the sensor's origin
     target: Floats | None = None  # (N, 6) displacement of the tracked target, flange axes
     scale: Floats | None = None  # (N,) relative scale error of the sensor's ranges
-    # (N, 6) twist of the position in the axes of what observes it, where there are several; of a
-    # distance, which no turn changes, element 3 is the offset, m
+    # (N, 6) twist of the position in the axes of its observer, if there are several; of a distance,
+    # which is invariant to rotation, element 3 is the offset, m
     observer: Floats | None = None
 
     def __add__(self, other: "Deviation") -> "Deviation":
         """Add two deviations element by element."""
-        return by_field((self, other), lambda given: np.asarray(sum(given[1:], given[0])))
+        return by_field((self, other), lambda arrays: np.asarray(sum(arrays[1:], arrays[0])))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,11 +44,11 @@ class Chain:
     rotation: Floats  # (n + 1, N, 3, 3) orientation of slot k, after its twist
     position: Floats  # (n + 1, N, 3) origin of slot k, after its twist, m
     com: Floats  # (n, N, 3) centre of mass of body i + 1, m
-    twist: Floats | None  # (n + 1, N, 6) the twists that were applied, or None
-    slides: tuple[int, ...] = ()  # which joints are prismatic, counted from 0
+    twist: Floats | None  # (n + 1, N, 6) applied twists, or None
+    slides: tuple[int, ...] = ()  # prismatic joints, counted from 0
 
     def point(self, offset: Floats) -> Floats:
-        """Position of a point fixed in flange axes, offset (3,) or (N, 3) -> (N, 3)."""
+        """Return positions of a point fixed in flange axes, offset (3,) or (N, 3) -> (N, 3)."""
         return np.asarray(self.position[-1] + se3.apply(self.rotation[-1], offset))
 
 
@@ -68,7 +65,7 @@ def turns(arm: Arm, q: Floats) -> Turns:
 
 
 def _turned(nominal: Turns, dq: Floats, prismatic: Bools | None) -> Turns:
-    """Move on by displacements (N, n), by the addition theorems: they cost less where small."""
+    """Add displacements (N, n), by the addition theorems, which cost less than cos and sin."""
     cos, sin, slid = nominal
     if prismatic is not None and slid is not None:
         dq, slid = dq * ~prismatic, slid + dq * prismatic
@@ -81,7 +78,7 @@ def _turned(nominal: Turns, dq: Floats, prismatic: Bools | None) -> Turns:
 def evaluate(
     arm: Arm, q: Floats, deviation: Deviation | None = None, nominal: Turns | None = None
 ) -> Chain:
-    """Evaluate the deviated chain at the controller's values q (N, n), `turns` there if known."""
+    """Evaluate the deviated chain at the controller's values q (N, n); `nominal`: `turns` at q."""
     deviation = deviation or Deviation()
     moved = turns(arm, q) if nominal is None else nominal
     if deviation.dq is not None:
@@ -127,15 +124,15 @@ def evaluate(
 
 
 def _combine(axes: Floats, weights: Sequence[float], out: Floats) -> None:
-    """Write Σ_j w_j axes_j of axes (N, 3, 3), in their columns, to (N, 3); most w are zero."""
-    first, *others = [j for j in range(3) if weights[j]] or [0]
+    """Write Σ_j w_j a_j, a_j the columns of axes (N, 3, 3), to (N, 3); most w are zero."""
+    first, *following = [j for j in range(3) if weights[j]] or [0]
     np.multiply(axes[..., first], weights[first], out=out)
-    for j in others:
+    for j in following:
         out += axes[..., j] * weights[j]
 
 
 def _offset(p: Floats, axes: Floats, offset: Sequence[float]) -> Floats:
-    """Points p (N, 3), or one, moved by an offset (3,) along axes (N, 3, 3)."""
+    """Return points p (N, 3) or (3,) displaced by an offset (3,) along axes (N, 3, 3)."""
     for j in range(3):
         if offset[j]:
             p = p + axes[..., j] * offset[j]
@@ -143,7 +140,7 @@ def _offset(p: Floats, axes: Floats, offset: Sequence[float]) -> Floats:
 
 
 def joint_jacobian(chain: Chain, x: Floats) -> Floats:
-    """Geometric Jacobian (N, 6, n) of a flange-fixed point now at x (N, 3), by the chain's angles.
+    """Return the geometric Jacobian (N, 6, n) of a flange-fixed point at x (N, 3) by chain angles.
 
     Column j is (z_j × (x − p_j), z_j), of a prismatic joint (z_j, 0); base axes, m/rad and rad/rad.
     """
@@ -159,18 +156,18 @@ def joint_jacobian(chain: Chain, x: Floats) -> Floats:
 
 
 def drive_jacobian(arm: Arm, chain: Chain, x: Floats) -> Floats:
-    """Geometric Jacobian (N, 6, n) by displacements of the drives, see `joint_jacobian`."""
+    """Return the geometric Jacobian (N, 6, n) by displacements of the drives."""
     out = joint_jacobian(chain, x)
     return out if arm.drive is None else np.asarray(out @ arm.drive)
 
 
 def twist_jacobian(r: Floats, lever: Floats, twist: Floats | None) -> Floats:
-    """Motion (N, 6, 6) of a point carried by a frame, per change of the frame's twist.
+    """Return the motion (N, 6, 6) of a point fixed to a frame, per change of the frame's twist.
 
         (v, ω) = [R, −[l]× R; 0, R] [J(ξ), Q(ξ); 0, J(ξ)] dξ
 
     with R (N, 3, 3) the frame's orientation after its twist ξ (N, 6), l (N, 3) the lever from its
-    origin to the point, and J, Q of the right Jacobian (`se3`), in the axes that R leads to.
+    origin to the point, and J, Q the blocks of the right Jacobian (`se3`), in the outer axes of R.
     """
     out = empty(len(lever), 6, 6)
     shift: Floats | float = 0.0

@@ -1,4 +1,4 @@
-"""How a controller counts joints: signs, zeros, and joints that follow others.
+"""Joint conventions of a controller: signs, zeros, and joints that follow others.
 
 The joint j of the chain moves by
 
@@ -7,10 +7,10 @@ The joint j of the chain moves by
 with q the controller's values, s = ±1, o the zero offset and k the couplings (a parallelogram: the
 forearm keeps its direction in space while joint 2 moves, k_32 = −1; bevel gears in a wrist).
 
-A coupling is mechanical where the motor of joint i turns joint j along: what the drives are off
-by, δ, turns the joints by D δ, and drive i carries the torque (Dᵀ τ)_i, with D = 1 + K of the
-mechanical couplings. One that only the controller counts (a forearm counted from the horizontal,
-with its drive in the elbow) is in θ alone: each drive carries the torque of its joint.
+A coupling is mechanical if the motor of joint i also turns joint j: errors δ of the drives turn the
+joints by D δ, and drive i carries the torque (Dᵀ τ)_i, with D = 1 + K of the mechanical couplings.
+A coupling in the controller only (a forearm angle relative to the horizontal, with the drive in the
+elbow) affects θ only: each drive carries the torque of its joint.
 """
 
 from dataclasses import replace
@@ -26,15 +26,15 @@ from hilcal.types import Floats
 _HALF_TURN = np.diag([1.0, -1.0, -1.0, 1.0])  # Rx(π): Rz(−θ) = Rx(π) Rz(θ) Rx(π)
 
 
-def as_counted(arm: Arm, by: Conventions) -> Arm:
-    """Return the arm as the controller counts its joints."""
+def as_counted(arm: Arm, conventions: Conventions) -> Arm:
+    """Return the arm with the controller's joint conventions."""
     for key in ("joint_sign", "joint_offset_deg"):
-        given = getattr(by, key)
-        if given is not None and len(given) != arm.n:
+        values = getattr(conventions, key)
+        if values is not None and len(values) != arm.n:
             raise InputError(
-                f"{key} has {len(given)} values; {arm.name} has {arm.n} joints, one value each"
+                f"{key} has {len(values)} values; {arm.name} has {arm.n} joints, one value each"
             )
-    for c in by.joint_coupling:
+    for c in conventions.joint_coupling:
         if max(c.joint, c.follows) > arm.n:
             raise InputError(
                 f"joint_coupling names joint {max(c.joint, c.follows)}; {arm.name} has joints "
@@ -45,15 +45,17 @@ def as_counted(arm: Arm, by: Conventions) -> Arm:
                 f"joint_coupling: of joints {c.joint} and {c.follows} one slides and one turns; "
                 "valid: two that slide, or two that turn"
             )
-    for j in np.flatnonzero(arm.slides & (np.array(by.joint_offset_deg or (0.0,) * arm.n) != 0)):
+    for j in np.flatnonzero(
+        arm.slides & (np.array(conventions.joint_offset_deg or (0.0,) * arm.n) != 0)
+    ):
         raise InputError(
             f"joint_offset_deg of joint {j + 1}, which slides; valid: 0, with its zero in d_m or "
             "in the <origin> of the joint"
         )
-    sign = np.array(by.joint_sign or (1,) * arm.n, dtype=float)
-    offset = np.radians(by.joint_offset_deg or (0.0,) * arm.n)
+    sign = np.array(conventions.joint_sign or (1,) * arm.n, dtype=float)
+    offset = np.radians(conventions.joint_offset_deg or (0.0,) * arm.n)
     coupling, counted = np.zeros((2, arm.n, arm.n))
-    for c in by.joint_coupling:
+    for c in conventions.joint_coupling:
         coupling[c.joint - 1, c.follows - 1] += c.factor
         counted[c.joint - 1, c.follows - 1] += 0.0 if c.mechanical else c.factor
     return with_conventions(arm, sign, offset, coupling, counted)
@@ -62,48 +64,48 @@ def as_counted(arm: Arm, by: Conventions) -> Arm:
 def with_conventions(
     arm: Arm, sign: Floats, offset: Floats, coupling: Floats, counted: Floats | float = 0.0
 ) -> Arm:
-    """Return the arm whose joint values are the controller's: (n,) s and o, (n, n) k.
+    """Return the arm with the controller's joint values: (n,) s and o, (n, n) k.
 
-    Signs and zeros go into the constant links:
+    Signs and zeros enter the constant links:
 
         M(s q + o) = M(o) X M(q) X⁻¹,  X = Rx(π) for s = −1, else 1;  M = Rz or Tz
 
-    Limits are those of the controller's values and stay. Couplings C that the arm has already are
-    applied to the converted values: θ = C (S q + o + K q). `counted` is the part of K that is not
+    Limits are unchanged, as they are those of the controller's values. Existing couplings C of the
+    arm apply to the converted values: θ = C (S q + o + K q). `counted` is the part of K that is not
     mechanical.
     """
     links, coms = arm.links.copy(), arm.coms.copy()
-    own = np.eye(arm.n) if arm.coupling is None else arm.coupling
-    for j, zero in enumerate(own @ offset):
+    existing = np.eye(arm.n) if arm.coupling is None else arm.coupling
+    for j, zero in enumerate(existing @ offset):
         if zero:
             links[j] = links[j] @ se3.screw(2, *((0.0, zero) if arm.slides[j] else (zero,)))
         if sign[j] < 0:
             links[j] = links[j] @ _HALF_TURN
             links[j + 1] = _HALF_TURN @ links[j + 1]
             coms[j] = _HALF_TURN[:3, :3] @ coms[j]
-    # θ = C (S q + o + K q), and S θ is what turns the links.
-    follows = sign[:, None] * (own @ (np.diag(sign) + coupling))
-    before = np.eye(arm.n) if arm.drive is None else arm.drive
-    drives = sign[:, None] * (before @ (np.diag(sign) + coupling - counted))
+    # θ = C (S q + o + K q), and S θ turns the links
+    combined = sign[:, None] * (existing @ (np.diag(sign) + coupling))
+    existing_drive = np.eye(arm.n) if arm.drive is None else arm.drive
+    drives = sign[:, None] * (existing_drive @ (np.diag(sign) + coupling - counted))
     signs = sign if arm.sign is None else sign * arm.sign
     mimic = arm.mimic
     if mimic is not None:  # v = F v + f for the drawn values v = S q + o + K q
-        by, rest = mimic[:, :-1], mimic[:, -1]
-        turned = sign[:, None] * (by @ (np.diag(sign) + coupling) - coupling)
-        moved = sign * (by @ offset + rest - offset)
+        factors, constants = mimic[:, :-1], mimic[:, -1]
+        turned = sign[:, None] * (factors @ (np.diag(sign) + coupling) - coupling)
+        moved = sign * (factors @ offset + constants - offset)
         mimic = np.where(arm.own[:, None], mimic, np.column_stack([turned, moved]))
     return replace(
-        arm, links=links, coms=coms, coupling=_unless_one(follows), drive=_unless_one(drives),
+        arm, links=links, coms=coms, coupling=_unless_one(combined), drive=_unless_one(drives),
         mimic=mimic, sign=signs if np.any(signs < 0) else None,
     )  # fmt: skip
 
 
 def as_drawn(arm: Arm) -> Arm:
-    """Return the arm with all axes as drawn, for what does not depend on the joint values."""
+    """Return the arm with all axes as drawn, for quantities independent of joint values."""
     if arm.sign is None:
         return arm
-    nothing = np.zeros((arm.n, arm.n))
-    return with_conventions(replace(arm, coupling=None, drive=None), arm.sign, nothing[0], nothing)
+    zeros = np.zeros((arm.n, arm.n))
+    return with_conventions(replace(arm, coupling=None, drive=None), arm.sign, zeros[0], zeros)
 
 
 def _unless_one(matrix: Floats) -> Floats | None:
@@ -111,9 +113,9 @@ def _unless_one(matrix: Floats) -> Floats | None:
 
 
 def may_follow(n: int) -> tuple[tuple[int, int], ...]:
-    """Joints of arms with couplings, and the joints that they follow, from 1.
+    """Return pairs of a joint that may follow another, and the other one, counted from 1.
 
-    The one before it (parallelograms, wrists driven through one another), and the last joint the
-    last but two (a wrist whose three motors stand in the forearm).
+    Each joint may follow the previous one (parallelograms, wrists driven through one another); the
+    last joint may follow the last but two (a wrist with three motors in the forearm).
     """
     return tuple((j, j - 1) for j in range(2, n + 1)) + (((n, n - 2),) if n > 2 else ())

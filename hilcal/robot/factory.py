@@ -1,16 +1,16 @@
-"""The kinematics that a maker has measured of one arm, by which its controller computes poses.
+"""Factory kinematics: those that a maker has measured of one arm and stored in its controller.
 
-A controller of Universal Robots holds them as classic rows,
-T_base_flange = Π_i Rz(q_i + θ_i) Tz(d_i) Tx(a_i) Rx(α_i); its `calibration.conf` has what is to be
-added to the nominal rows, and `ur_calibration` of the ROS driver writes the transforms between the
-joints, x, y, z, roll, pitch, yaw each. Axes 2 to 4 are nearly parallel, so that their d are up to
-some kilometres and cancel. A joint's frame may be moved along its axis and turned about it without
-any change of the arm:
+A controller of Universal Robots stores classic rows,
+T_base_flange = Π_i Rz(q_i + θ_i) Tz(d_i) Tx(a_i) Rx(α_i). Its `calibration.conf` has the
+differences from the nominal rows; `ur_calibration` of the ROS driver writes the transforms between
+the joints, each as x, y, z, roll, pitch, yaw. As axes 2 to 4 are nearly parallel, their d are up
+to some kilometres and cancel. Moving a joint's frame along its axis and about it does not change
+the arm:
 
     L_k → Z_k⁻¹ L_k Z_{k+1},   Z_k = Tz(s_k) Rz(φ_k), which Rz(q_k) commutes with,
 
-and s_k, φ_k are chosen so that each frame is as near as can be to that of the nominal arm. So all
-that belongs to frames (masses, compliances, shapes) keeps its meaning.
+and s_k, φ_k are chosen to bring each frame as near as possible to that of the nominal arm. So all
+quantities in frames (masses, compliances, shapes) keep their meaning.
 
 Sources: Universal Robots, "Remote Control via TCP/IP", kinematics info; `ur_calibration` of the
 Universal Robots ROS 2 driver; `ur_description`, urdf/inc and config/*/default_kinematics.yaml.
@@ -34,9 +34,9 @@ from hilcal.types import Floats
 
 N = 6
 KINDS = "a calibration.conf, a .yaml of ur_calibration, or a .toml of check --save-calibration"
-SAME = 1e-6  # m; flanges that are nearer are of the same kinematics: files keep 12 digits and more
-LINEARISED = 2  # Calibration status of an arm that the factory has measured
-FAR = 0.05  # m, of another arm; a factory's figures move the flange by some millimetres
+SAME = 1e-6  # m, flange difference of equal kinematics: files have at least 12 digits
+LINEARISED = 2  # calibration status of an arm that the factory has measured
+FAR = 0.05  # m, flange difference of another arm; factory kinematics differ by some millimetres
 _KEYS = ("theta_rad", "a_m", "d_m", "alpha_rad")
 _DELTAS = ("delta_theta", "delta_a", "delta_d", "delta_alpha")
 _BODIES = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
@@ -50,19 +50,19 @@ class FactoryKinematics:
     """The kinematics of one arm."""
 
     links: Floats  # (7, 4, 4) constant transforms L_k, see `Arm`; their frames may be far away
-    rows: Floats | None  # (4, 6) θ, a, d, α of classic rows, rad and m; None if not given
-    status: int  # of the calibration, 2 where the factory has measured the arm
-    checksum: tuple[int, ...]  # of the joints by the controller; empty where not known
-    source: str  # where they come from
+    rows: Floats | None  # (4, 6) θ, a, d, α of classic rows, rad and m; None if unknown
+    status: int  # of the calibration, 2 if the factory has measured the arm
+    checksum: tuple[int, ...]  # of the joints by the controller; empty if unknown
+    source: str
 
     def to_dict(self) -> dict[str, object]:
-        """Return the numbers as a file and a campaign keep them; there have to be rows."""
+        """Return the numbers for files and campaigns; `rows` must not be None."""
         assert self.rows is not None  # noqa: S101 - for the type checker
         out: dict[str, object] = dict(zip(_KEYS, self.rows.tolist(), strict=True))
         return {**out, "calibration_status": self.status, "joint_checksum": list(self.checksum)}
 
     def to_toml(self) -> str:
-        """Return a file that `[robot] calibration` reads; there have to be rows."""
+        """Return a file for `[robot] calibration`; `rows` must not be None."""
         head = (
             f"# Kinematics of one arm: {self.source}.\n"
             "# T_base_flange = product over i of Rz(q_i + theta_i) Tz(d_i) Tx(a_i) Rx(alpha_i).\n"
@@ -85,7 +85,7 @@ def of_rows(
 
 
 def of_dict(content: Any, source: str) -> FactoryKinematics:
-    """Return the kinematics that `FactoryKinematics.to_dict` has written."""
+    """Return the kinematics of a `FactoryKinematics.to_dict`."""
     try:
         rows = np.array([content[key] for key in _KEYS], dtype=float)
         checksum = tuple(map(int, content["joint_checksum"]))
@@ -109,58 +109,58 @@ def read_factory(path: Path, nominal: Arm, text: str | None = None) -> FactoryKi
     try:
         text = limits.read_text(path, limits.PROGRAM) if text is None else text
     except (OSError, UnicodeDecodeError) as error:
-        words = getattr(error, "strerror", None) or error
-        raise InputError(f"{path}: {words}; expected {KINDS}") from None
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{path}: {reason}; expected {KINDS}") from None
     try:
-        found = reader(text, nominal, str(path))
+        factory = reader(text, nominal, str(path))
     except (ValueError, KeyError, TypeError, configparser.Error) as error:
         raise InputError(
             f"{path}: not the kinematics of an arm ({_why(error)}); valid: {KINDS}"
         ) from None
-    check_of(found, nominal)
-    return found
+    check_of(factory, nominal)
+    return factory
 
 
 def check_of(factory: FactoryKinematics, nominal: Arm) -> None:
     """Refuse the kinematics of another arm."""
-    off = flange_difference(with_factory(nominal, factory), nominal)[1]
-    if not off < FAR:
+    difference = flange_difference(with_factory(nominal, factory), nominal)[1]
+    if not difference < FAR:
         raise InputError(
             f"{factory.source}: of another arm than {nominal.name}: its flange lies up to "
-            f"{1e3 * off:.0f} mm from where that one's does"
+            f"{1e3 * difference:.0f} mm from where that one's does"
         )
 
 
 def with_factory(nominal: Arm, factory: FactoryKinematics) -> Arm:
-    """Return an arm with measured kinematics, its frames as near to the nominal ones as can be."""
+    """Return an arm with measured kinematics, with frames as near as possible to nominal."""
     if nominal.n != N or nominal.coupling is not None or nominal.drive is not None:
         raise InputError(
             f"{factory.source}: kinematics of an arm of {N} joints that turn each by itself; "
             f"{nominal.name} is another one"
         )
-    ours, theirs = nominal.links[0], factory.links[0]
+    nominal_frame, frame = nominal.links[0], factory.links[0]
     links = factory.links.copy()
     for k in range(N):
         # both frames at zero angles: the nominal one's origin and x axis, in the measured frame
-        near = se3.inverse(theirs) @ ours
-        move = se3.screw(2, float(np.arctan2(near[1, 0], near[0, 0])), float(near[2, 3]))
+        offset = se3.inverse(frame) @ nominal_frame
+        move = se3.screw(2, float(np.arctan2(offset[1, 0], offset[0, 0])), float(offset[2, 3]))
         links[k] = links[k] @ move
         links[k + 1] = se3.inverse(move) @ links[k + 1]
-        theirs = theirs @ move @ links[k + 1]
-        ours = ours @ nominal.links[k + 1]
+        frame = frame @ move @ links[k + 1]
+        nominal_frame = nominal_frame @ nominal.links[k + 1]
     return replace(nominal, links=links, source=f"{nominal.source}; kinematics: {factory.source}")
 
 
-def flange_difference(one: Arm, other: Arm, states: int = 400) -> tuple[float, float]:
-    """Return how far apart the flanges of two arms are, rms and largest, m, at random states."""
-    q = np.random.default_rng(20251126).uniform(-np.pi, np.pi, (states, one.n))
-    apart = evaluate(one, q).position[-1] - evaluate(other, q).position[-1]
-    off = np.linalg.norm(apart, axis=1)
-    return float(np.sqrt(np.mean(off**2))), float(off.max())
+def flange_difference(first: Arm, second: Arm, states: int = 400) -> tuple[float, float]:
+    """Return the distance of the flanges of two arms, RMS and largest, m, over random states."""
+    q = np.random.default_rng(20251126).uniform(-np.pi, np.pi, (states, first.n))
+    difference = evaluate(first, q).position[-1] - evaluate(second, q).position[-1]
+    distance = np.linalg.norm(difference, axis=1)
+    return float(np.sqrt(np.mean(distance**2))), float(distance.max())
 
 
 def nominal_rows(arm: Arm) -> Floats:
-    """(4, 6) θ, a, d, α of an arm of classic rows without offsets."""
+    """Return θ, a, d, α (4, 6) of an arm of classic rows without offsets."""
     rows = np.zeros((4, arm.n))
     for k, link in enumerate(arm.links[1:]):
         rows[1:, k] = link[0, 3], link[2, 3], np.arctan2(link[2, 1], link[1, 1])
@@ -188,7 +188,7 @@ def _of_toml(text: str, nominal: Arm, source: str) -> FactoryKinematics:
 
 
 def _of_yaml(text: str, nominal: Arm, source: str) -> FactoryKinematics:
-    """Of the one layout that is written: a mapping of bodies, each with its six numbers."""
+    """Parse the layout of `ur_calibration`: a mapping of bodies, each with six numbers."""
     places: dict[str, dict[str, float]] = {}
     body = ""
     for line in text.splitlines():

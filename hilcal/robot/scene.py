@@ -1,4 +1,4 @@
-"""The arm among obstacles: which parts touch, by Pinocchio and Coal."""
+"""Collisions of the arm with itself and with obstacles, by Pinocchio and Coal."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,8 +21,8 @@ FLANGE = "flange"
 def pinocchio_model(arm: Arm) -> "pin.Model":
     """Build a Pinocchio model with the same chain, masses and limits.
 
-    Joint i turns about z or slides along it, with the placement L_{i-1} in body i - 1; bodies are
-    point masses at their centres of mass; the frame "flange" has the placement L_n in the last
+    Joint i turns about z or slides along z, with the placement L_{i-1} in body i - 1. Bodies are
+    point masses at their centres of mass. The frame "flange" has the placement L_n in the last
     body.
     """
     import pinocchio as pin
@@ -42,17 +42,17 @@ def pinocchio_model(arm: Arm) -> "pin.Model":
     return model
 
 
-_SAMPLES = 256  # states that tell which pairs touch by their crude shape alone
-_SHORT = 1e-12  # m, of a segment without a direction
-_ALWAYS = 0.3  # share of those states from which on a pair is not checked
-_NEAR = 0.03  # m; guessed shapes that are so near in every state are neighbours, a choice
+_SAMPLES = 256  # states to detect pairs that touch because their shapes are crude
+_SHORT = 1e-12  # m, length of a segment without a direction
+_ALWAYS = 0.3  # share of states with contact above which a pair is not checked
+_NEAR = 0.03  # m; guessed shapes that are closer in every state are neighbours; a choice
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Segment:
-    """What does not move with a body, as a capsule in every one of N states, base axes."""
+    """A capsule that no body carries, with its own place in each of N states, base axes."""
 
-    name: str  # what it is, for people
+    name: str  # for people
     start: Floats  # (N, 3) or (3,) one end, m
     end: Floats  # (N, 3) or (3,) the other end, m
     radius: float  # m
@@ -60,17 +60,17 @@ class Segment:
 
 
 class Scene:
-    """Parts of the arm, what it carries, and obstacles, as Coal's shapes on a Pinocchio model.
+    """Parts of the arm, the tool, and obstacles, as Coal's shapes on a Pinocchio model.
 
-    Pairs within one body and of neighbouring bodies are not checked, nor are pairs of which the
-    crude shapes touch in a large share of all states, as those about a spherical wrist.
+    Pairs within one body and of neighbouring bodies are not checked, nor are pairs whose crude
+    shapes touch in a large share of all states, as about a spherical wrist.
 
     Attributes:
-        parts: capsules of the arm, then what the flange carries.
-        rates: (P, n) no point of a part goes farther than this per radian of a joint, m.
+        parts: capsules of the arm, then those on the flange.
+        rates: (P, n) largest motion of a point of a part per radian of a joint, m.
         itself: pairs of parts.
-        around: parts and obstacles; base and shoulder stand where the arm is mounted.
-        free: parts and obstacles against a segment that is given with the states.
+        around: parts and obstacles, without base and shoulder, which stand at the mounting.
+        free: parts and obstacles against a segment that comes with the states.
     """
 
     def __init__(
@@ -80,14 +80,14 @@ class Scene:
         self.arm, self.model = arm, pinocchio_model(arm)
         self.parts = (*capsules(arm), *carried)
         self.things = [(thing.name, *_obstacle(thing)) for thing in obstacles]
-        joints = range(1, arm.n + 1)  # bounds on how far parts are from their axes
+        joints = range(1, arm.n + 1)
         ends = [(part.body, np.array([part.start, part.end])) for part in self.parts]
         far = np.array([[from_axis(arm, body, end, i) for i in joints] for body, end in ends])
         bodies = np.array([part.body for part in self.parts])
         self.rates = np.where(np.arange(1, arm.n + 1) <= bodies[:, None], far, 0.0)
         count = len(self.parts)
         last = count + len(self.things)
-        reach = [
+        distant = [
             (a, b)
             for a in range(count)
             for b in range(a + 1, count)
@@ -96,55 +96,55 @@ class Scene:
         around = [
             (a, b) for a in range(count) if self.parts[a].body > 1 for b in range(count, last)
         ]
-        own = self._not_always(reach)
-        self.itself = Pairs(self, own, [self._apart(a, b, far) for a, b in own])
+        checked = self._not_always(distant)
+        self.itself = Pairs(self, checked, [self._approach(a, b, far) for a, b in checked])
         self.around = Pairs(self, around, [self.rates[a] for a, _ in around])
         self.free = Pairs(self, [(a, last) for a in range(last)])
 
     def towards(self, point: Floats) -> Floats:
-        """Return (P + obstacles, n) how fast all near what hangs from a point of the flange, m/rad.
+        """Return rates of approach (P + obstacles, n) to a load at a point of the flange, m/rad.
 
-        It moves with the point and does not turn. A joint that turns a part turns the point with
-        it, so that they near each other by no more than their distance per radian.
+        The load moves with the point and does not turn. A joint that turns a part turns the point
+        with it, so that their rate of approach is at most their distance per radian.
         """
-        arm, fixed = self.arm, len(self.things)
-        at = on_flange(arm, point)
-        moves = np.array([from_axis(arm, arm.n, at[None], i) for i in range(1, arm.n + 1)])
-        out = np.tile(moves, (len(self.parts) + fixed, 1))
+        arm, n_obstacles = self.arm, len(self.things)
+        hook = on_flange(arm, point)
+        moves = np.array([from_axis(arm, arm.n, hook[None], i) for i in range(1, arm.n + 1)])
+        out = np.tile(moves, (len(self.parts) + n_obstacles, 1))
         for row, part in zip(out, self.parts, strict=False):
             ends = np.array([part.start, part.end])
             if part.body == arm.n:
-                far = np.linalg.norm(ends - at, axis=1).max()
+                farthest = np.linalg.norm(ends - hook, axis=1).max()
             else:
-                far = _along(arm, part.body, ends, arm.n) + np.linalg.norm(at)
-            row[: part.body] = far
+                farthest = _along(arm, part.body, ends, arm.n) + np.linalg.norm(hook)
+            row[: part.body] = farthest
         return out
 
-    def _apart(self, a: int, b: int, far: Floats) -> Floats:
-        """(n,) how fast two parts near each other by a joint between them, m/rad."""
+    def _approach(self, a: int, b: int, far: Floats) -> Floats:
+        """Return the rates (n,) of approach of two parts by the joints between them, m/rad."""
         low, high = sorted((self.parts[a].body, self.parts[b].body))
         joint = np.arange(1, self.arm.n + 1)
         between = (joint > low) & (joint <= high)
         return np.where(between, np.minimum(far[a], far[b]), 0.0)
 
     def _not_always(self, pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
-        """Leave out what touches in many states, whatever the arm does."""
+        """Return the pairs without those that touch in a large share of all states."""
         drawn = _spread(_SAMPLES, self.arm.n)
         low, high = self.arm.usual_range
-        q, of = low + drawn * (high - low), Pairs(self, pairs)
-        often = of.how_often(q)
-        near = np.zeros(len(pairs)) if is_known(self.arm) else of.how_often(q, _NEAR)
-        kept = (often < _ALWAYS) & (near < 1.0)
-        return [pair for pair, keep in zip(pairs, kept, strict=True) if keep]
+        q, tested = low + drawn * (high - low), Pairs(self, pairs)
+        often = tested.how_often(q)
+        near = np.zeros(len(pairs)) if is_known(self.arm) else tested.how_often(q, _NEAR)
+        checked = (often < _ALWAYS) & (near < 1.0)
+        return [pair for pair, check in zip(pairs, checked, strict=True) if check]
 
 
 class Pairs:
-    """Pairs of shapes that are checked together; `rates` (K, n): how fast they near, m/rad."""
+    """Pairs of shapes that are checked together; `rates` (K, n): rates of approach, m/rad."""
 
     def __init__(
         self, scene: Scene, pairs: Sequence[tuple[int, int]], rates: Sequence[Floats] = ()
     ) -> None:
-        """Build the shapes of a scene: its parts, its obstacles, and a segment that is free."""
+        """Build the shapes of a scene: parts, obstacles, and a free segment."""
         import pinocchio as pin
 
         self.rates = np.reshape(rates, (-1, scene.arm.n))
@@ -173,9 +173,9 @@ class Pairs:
         if not self._pairs:
             return out
         self._prepare(margin, segment)
-        lies = None if segment is None else _lies(segment, len(q))
+        placements = None if segment is None else _placements(segment, len(q))
         for i, turned in enumerate(np.ascontiguousarray(self._arm.chain_angles(q))):
-            self._place(turned, lies, i)
+            self._place(turned, placements, i)
             out[i] = pin.computeCollisions(self._geometry, self._state, True)
         return out
 
@@ -186,12 +186,12 @@ class Pairs:
         import pinocchio as pin
 
         out: dict[tuple[str, str], float] = {}
-        hit = np.flatnonzero(self.touching(q, margin, segment))
-        if not len(hit):
+        hits = np.flatnonzero(self.touching(q, margin, segment))
+        if not len(hits):
             return out
-        lies = None if segment is None else _lies(segment, len(q))
-        for i in hit.tolist():
-            self._place(self._arm.chain_angles(q[i]), lies, i)
+        placements = None if segment is None else _placements(segment, len(q))
+        for i in hits.tolist():
+            self._place(self._arm.chain_angles(q[i]), placements, i)
             for k, (a, b) in enumerate(self._pairs):
                 active = self._state.activeCollisionPairs[k]
                 if active and pin.computeCollision(self._geometry, self._state, k):
@@ -200,7 +200,7 @@ class Pairs:
         return out
 
     def how_often(self, q: Floats, margin: float = 0.0) -> Floats:
-        """(K,) share of the states in which each pair is closer than a margin, m."""
+        """Return the share (K,) of the states in which each pair is closer than a margin, m."""
         import pinocchio as pin
 
         count = np.zeros(len(self._pairs))
@@ -214,7 +214,7 @@ class Pairs:
     def distance(self, q: Floats, segment: Segment | None = None) -> float:
         """Return the least distance in one state (n,), m; negative where shapes overlap."""
         self._prepare(0.0, segment)
-        self._place(self._arm.chain_angles(q), None if segment is None else _lies(segment, 1))
+        self._place(self._arm.chain_angles(q), None if segment is None else _placements(segment, 1))
         active = self._state.activeCollisionPairs
         return min(
             (self._gap(k) for k in range(len(self._pairs)) if active[k]), default=float("inf")
@@ -226,33 +226,33 @@ class Pairs:
         return float(pin.computeDistance(self._geometry, self._state, k).min_distance)
 
     def _prepare(self, margin: float | Floats, segment: Segment | None) -> None:
-        """Set the margins of all pairs, and which of them count."""
-        each = np.broadcast_to(margin, len(self._pairs)).tolist()
-        if each != self._margins:
-            for request, kept in zip(self._state.collisionRequests, each, strict=True):
-                request.security_margin = kept
-            self._margins = each
+        """Set the margins of all pairs, and activate the pairs to check."""
+        margins = np.broadcast_to(margin, len(self._pairs)).tolist()
+        if margins != self._margins:
+            for request, value in zip(self._state.collisionRequests, margins, strict=True):
+                request.security_margin = value
+            self._margins = margins
         if segment is not None:
             self._geometry.geometryObjects[self._free].geometry.radius = segment.radius
             for k, (a, _) in enumerate(self._pairs):
                 self._state.activeCollisionPairs[k] = self._names[a] not in segment.ignored
 
-    def _place(self, turned: Floats, lies: "_Lies | None" = None, i: int = 0) -> None:
+    def _place(self, turned: Floats, placements: "_Placements | None" = None, i: int = 0) -> None:
         import pinocchio as pin
 
         pin.updateGeometryPlacements(self._model, self._data, self._geometry, self._state, turned)
-        if lies is not None:
-            half, turn, middle = lies
+        if placements is not None:
+            half, turn, middle = placements
             self._geometry.geometryObjects[self._free].geometry.halfLength = half[i]
             self._state.oMg[self._free] = pin.SE3(turn[i], middle[i])
 
 
 def from_axis(arm: Arm, body: int, points: Floats, joint: int) -> float:
-    """Return a bound on how far points (K, 3) of a body are from the axis of a joint, m.
+    """Return a bound of the distance of points (K, 3) of a body from the axis of a joint, m.
 
-    So far they go at most per radian of the joint; 1 of a joint that slides. It is the length of
-    the way along the links, |L_k| each; exact for a body that the joint carries, or that carries
-    it. Bodies count from 0, the base; joints from 1.
+    The bound is the largest motion per radian of the joint; 1 for a joint that slides. It is the
+    length of the path along the links, |L_k| each; exact for the body moved by the joint, and for
+    the body that carries it. Bodies are counted from 0, the base; joints from 1.
     """
     if arm.slides[joint - 1]:
         return 1.0
@@ -260,31 +260,31 @@ def from_axis(arm: Arm, body: int, points: Floats, joint: int) -> float:
         if joint > body + 1:
             return _along(arm, body, points, joint)
         link = arm.links[body]
-        off = (points - link[:3, 3]) @ link[:3, :3]
-        return float(np.hypot(off[:, 0], off[:, 1]).max())
+        offset = (points - link[:3, 3]) @ link[:3, :3]
+        return float(np.hypot(offset[:, 0], offset[:, 1]).max())
     if joint == body:
         return float(np.hypot(points[:, 0], points[:, 1]).max())
     lengths = np.linalg.norm(arm.links[joint + 1 : body, :3, 3], axis=1)
     first = float(np.hypot(*arm.links[joint][:2, 3]))
-    slid = arm.travels[joint:body].sum()
-    return float(first + lengths.sum() + slid + np.linalg.norm(points, axis=1).max())
+    travel = arm.travels[joint:body].sum()
+    return float(first + lengths.sum() + travel + np.linalg.norm(points, axis=1).max())
 
 
 def on_flange(arm: Arm, point: Floats) -> Floats:
-    """Return (3,) a point in flange axes in the frame of the last body, m."""
+    """Convert a point (3,) from flange axes to the frame of the last body, m."""
     flange = arm.links[arm.n]
     return np.asarray(flange[:3, :3] @ point + flange[:3, 3])
 
 
 def _along(arm: Arm, body: int, points: Floats, last: int) -> float:
-    """The longest way from points of a body along the links to the frame of a later body, m."""
+    """Return the longest path from points of a body along the links to a later body, m."""
     lengths = np.linalg.norm(arm.links[body + 1 : last, :3, 3], axis=1).sum()
     lengths += arm.travels[body:last].sum()
     return float(np.linalg.norm(points - arm.links[body][:3, 3], axis=1).max() + lengths)
 
 
 def _spread(count: int, n: int) -> Floats:
-    """(count, n) points that fill the unit cube evenly: frac(1/2 + k φ^-i), φ^(n+1) = φ + 1.
+    """Return points (count, n) that fill the unit cube evenly: frac(1/2 + k φ^-i), φ^(n+1) = φ + 1.
 
     Source: Roberts (2018), The unreasonable effectiveness of quasirandom sequences.
     """
@@ -294,10 +294,10 @@ def _spread(count: int, n: int) -> Floats:
     return np.asarray((0.5 + np.outer(np.arange(count), phi ** -np.arange(1.0, n + 1))) % 1.0)
 
 
-_Lies = tuple[Floats, Floats, Floats]  # half lengths (N,), axes (N, 3, 3), middles (N, 3)
+_Placements = tuple[Floats, Floats, Floats]  # half lengths (N,), axes (N, 3, 3), middles (N, 3)
 
 
-def _lies(segment: Segment, count: int) -> _Lies:
+def _placements(segment: Segment, count: int) -> _Placements:
     shape = (count, 3)
     start, end = np.broadcast_to(segment.start, shape), np.broadcast_to(segment.end, shape)
     way = end - start
@@ -305,7 +305,7 @@ def _lies(segment: Segment, count: int) -> _Lies:
 
 
 def _capsule(start: Floats, end: Floats, radius: float) -> tuple[Any, Any]:
-    """Coal's capsule, which lies along z about its middle, and where it is."""
+    """Return Coal's capsule, along z about its middle, and its placement."""
     import pinocchio as pin
 
     way = end - start
@@ -314,19 +314,19 @@ def _capsule(start: Floats, end: Floats, radius: float) -> tuple[Any, Any]:
 
 
 def _obstacle(thing: Obstacle) -> tuple[Any, Any]:
-    """Coal's shape of an obstacle, and where its middle is."""
+    """Return Coal's shape of an obstacle, and its placement."""
     import pinocchio as pin
 
     if thing.center_m is not None and thing.size_m is not None:
         return pin.coal.Box(*thing.size_m), pin.SE3(np.eye(3), np.array(thing.center_m))
     if thing.bottom_m is None or thing.radius_m is None or thing.height_m is None:
-        raise ValueError(f"obstacle {thing.name} has no shape")  # its section refuses that
+        raise ValueError(f"obstacle {thing.name} has no shape")  # refused by its section
     middle = np.array(thing.bottom_m) + 0.5 * thing.height_m * np.array([0.0, 0.0, 1.0])
     return pin.coal.Cylinder(thing.radius_m, thing.height_m), pin.SE3(np.eye(3), middle)
 
 
 def _turn(way: Floats) -> Floats:
-    """(N, 3, 3) rotations that lead z to directions (N, 3); 1 for none."""
+    """Return rotations (N, 3, 3) that turn z to directions (N, 3); 1 for zero vectors."""
     length = np.linalg.norm(way, axis=1, keepdims=True)
     z = np.where(length > _SHORT, way / np.where(length > _SHORT, length, 1.0), [0.0, 0.0, 1.0])
     x = se3.cross(np.eye(3)[np.argmin(np.abs(z), axis=1)], z)

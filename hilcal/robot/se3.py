@@ -1,9 +1,8 @@
 """Rigid displacements, batched: exponential, logarithm, adjoint, right Jacobian.
 
 Twists are (v, ω): translation first. All functions take arrays with any leading shape; the
-memory of new arrays runs along the first axis (see `batch`). With θ = |ω| everything
-follows from b = (1 − cos θ)/θ² and c = (θ − sin θ)/θ³, two functions of θ² without a
-singularity:
+memory of new arrays runs along the first axis (see `batch`). With θ = |ω|, all formulas use
+b = (1 − cos θ)/θ² and c = (θ − sin θ)/θ³, two functions of θ² without a singularity:
 
     sin θ/θ = 1 − c θ²        cos θ = 1 − b θ²
 
@@ -19,17 +18,17 @@ import numpy as np
 from hilcal.robot.batch import empty, zeros
 from hilcal.types import Floats
 
-_NEAR = 0.25  # θ² below which b and c are summed as series: the closed forms cancel near zero
+_NEAR = 0.25  # θ² below which b and c are series: the closed forms cancel near zero
 _TERMS = 8
 _B = [(-1) ** k / factorial(2 * k + 2) for k in range(_TERMS)]
 _C = [(-1) ** k / factorial(2 * k + 3) for k in range(_TERMS)]
-_B_SLOPE, _C_SLOPE = ([k * c for k, c in enumerate(of)][1:] for of in (_B, _C))
+_B_SLOPE, _C_SLOPE = ([k * c for k, c in enumerate(series)][1:] for series in (_B, _C))
 
 
 def cross(a: Floats, b: Floats) -> Floats:
-    """Cross product a × b over the last axis; (..., 3), broadcast."""
+    """Return the cross product a × b over the last axis; (..., 3), broadcast."""
     out = empty(*_shape(a.shape, b.shape))
-    # Into memory along the states even where one of both is the same in all states.
+    # memory runs along the states, even if a or b is the same in all states
     part = empty(*out.shape[:-1])
     for axis in range(3):
         j, k = (axis + 1) % 3, (axis + 2) % 3
@@ -40,13 +39,13 @@ def cross(a: Floats, b: Floats) -> Floats:
 
 
 def apply(r: Floats, v: Floats) -> Floats:
-    """Matrices times vectors; (..., 3, 3), (..., 3) -> (..., 3), broadcast."""
+    """Return matrices times vectors; (..., 3, 3), (..., 3) -> (..., 3), broadcast."""
     out = empty(*_shape(r.shape[:-1], v.shape))
     return np.asarray(np.einsum("...ij,...j->...i", r, v, out=out))
 
 
 def product(a: Floats, b: Floats) -> Floats:
-    """Matrices times matrices; (..., i, j), (..., j, k) -> (..., i, k), broadcast."""
+    """Return matrices times matrices; (..., i, j), (..., j, k) -> (..., i, k), broadcast."""
     lead = _shape(a.shape[:-2], b.shape[:-2])
     out = empty(*lead, a.shape[-2], b.shape[-1])
     return np.asarray(np.einsum("...ij,...jk->...ik", a, b, out=out))
@@ -69,10 +68,10 @@ def rotation(w: Floats) -> Floats:
 
 
 def rotation_vector(r: Floats) -> Floats:
-    """Rotation vector of a rotation matrix, angle in [0, π]; (..., 3, 3) -> (..., 3).
+    """Return the rotation vector of a rotation matrix, angle in [0, π]; (..., 3, 3) -> (..., 3).
 
-    By the unit quaternion (v, w): of 4 (v, w)(v, w)ᵀ the row with the largest diagonal element is
-    taken, so that nothing cancels (Shepperd 1978, J. Guidance and Control 1); θ = 2 atan2(|v|, w).
+    From the unit quaternion (v, w), the row of 4 (v, w)(v, w)ᵀ with the largest diagonal element,
+    which avoids cancellation (Shepperd 1978, J. Guidance and Control 1); θ = 2 atan2(|v|, w).
     """
     m = r.reshape(-1, 3, 3)
     square = np.empty((len(m), 4, 4))
@@ -93,7 +92,7 @@ def rotation_vector(r: Floats) -> Floats:
 
 
 def exp(twist: Floats) -> tuple[Floats, Floats]:
-    """Rotation (..., 3, 3) and translation (..., 3) of exp of a twist (..., 6).
+    """Return rotation (..., 3, 3) and translation (..., 3) of exp of a twist (..., 6).
 
     R = exp([ω]×),  p = v + b ω × v + c ω × (ω × v); pure rotations cost less.
     """
@@ -108,31 +107,31 @@ def exp(twist: Floats) -> tuple[Floats, Floats]:
 
 
 def matrix(r: Floats, p: Floats) -> Floats:
-    """Homogeneous (..., 4, 4) from rotation and translation."""
+    """Return the homogeneous matrix (..., 4, 4) of rotation and translation."""
     t = np.zeros((*p.shape[:-1], 4, 4))
     t[..., :3, :3], t[..., :3, 3], t[..., 3, 3] = r, p, 1.0
     return t
 
 
 def inverse(t: Floats) -> Floats:
-    """Inverse of a homogeneous rigid transform (..., 4, 4)."""
+    """Return the inverse of a homogeneous rigid transform (..., 4, 4)."""
     r = np.swapaxes(t[..., :3, :3], -1, -2)
     return matrix(r, -(r @ t[..., :3, 3, None])[..., 0])
 
 
 def six(t: Floats) -> list[float]:
-    """x, y, z and rotation vector of a pose (4, 4), m and rad, as UR's controller writes poses."""
+    """Return x, y, z and rotation vector of a pose (4, 4), m and rad, as UR controllers do."""
     return [*t[:3, 3].tolist(), *rotation_vector(t[:3, :3]).tolist()]
 
 
 def of_six(values: Sequence[float]) -> Floats:
-    """Pose (4, 4) of what `six` returns."""
-    given = np.asarray(values, dtype=float)
-    return matrix(rotation(given[3:]), given[:3])
+    """Return the pose (4, 4) of x, y, z and a rotation vector, m and rad."""
+    pose = np.asarray(values, dtype=float)
+    return matrix(rotation(pose[3:]), pose[:3])
 
 
 def screw(axis: int, angle: float, along: float = 0.0) -> Floats:
-    """(4, 4) turn by an angle about axis 0, 1 or 2, and shift along it, m."""
+    """Return the transform (4, 4) of a turn, rad, about axis 0, 1 or 2, and a shift along it, m."""
     out, (j, k) = np.eye(4), ((axis + 1) % 3, (axis + 2) % 3)
     out[j, j] = out[k, k] = cos(angle)
     out[k, j] = sin(angle)
@@ -142,26 +141,26 @@ def screw(axis: int, angle: float, along: float = 0.0) -> Floats:
 
 
 def of_rpy(rpy: Floats) -> Floats:
-    """(3, 3) Rz(yaw) Ry(pitch) Rx(roll) of the turns about fixed axes (3,), as in URDF."""
+    """Return Rz(yaw) Ry(pitch) Rx(roll) (3, 3) of turns about fixed axes (3,), as in URDF."""
     turns = [screw(axis, angle)[:3, :3] for axis, angle in enumerate(rpy)]
     return np.asarray(turns[2] @ turns[1] @ turns[0])
 
 
 def of_quaternion(q: Floats) -> Floats:
-    """(3, 3) of a unit quaternion (4,), its real part first."""
+    """Return the rotation (3, 3) of a unit quaternion (4,), its real part first."""
     k = skew(q[1:])
     return np.asarray(np.eye(3) + 2 * q[0] * k + 2 * k @ k)
 
 
 def quaternion(r: Floats) -> Floats:
-    """(4,) unit quaternion of a rotation (3, 3), its real part first and not negative."""
+    """Return the unit quaternion (4,) of a rotation (3, 3), its real part first, not negative."""
     w = rotation_vector(r)
     angle = float(np.linalg.norm(w))
     return np.array([cos(angle / 2), *(sin(angle / 2) * (w / angle if angle > 0 else w))])
 
 
 def adjoint(r: Floats, p: Floats) -> Floats:
-    """Ad with Ad ξ the twist in the outer frame of ξ in the inner one; (..., 6, 6)."""
+    """Return Ad (..., 6, 6): Ad ξ is the twist in the outer frame of ξ in the inner frame."""
     ad = np.zeros((*p.shape[:-1], 6, 6))
     ad[..., :3, :3] = r
     ad[..., 3:, 3:] = r
@@ -170,7 +169,7 @@ def adjoint(r: Floats, p: Floats) -> Floats:
 
 
 def right_jacobian_blocks(twist: Floats) -> tuple[Floats, Floats]:
-    """Blocks J(ω) and Q(v, ω) of the right Jacobian J_r = [J, Q; 0, J], both (..., 3, 3).
+    """Return the blocks J(ω), Q(v, ω) (..., 3, 3) of the right Jacobian J_r = [J, Q; 0, J].
 
     exp(ξ + δ) = exp(ξ) exp(J_r(ξ) δ) to first order.
 
@@ -178,7 +177,7 @@ def right_jacobian_blocks(twist: Floats) -> tuple[Floats, Floats]:
         Q = dJ(ω + ε v)/dε = −b [v]× + c (v ωᵀ + ω vᵀ) − 2 c d I
                              + 2 d (−b' [ω]× + c' (ω ωᵀ − θ² I)),   d = ω · v
 
-    with b', c' the slopes of b and c over θ²: a twist is the dual number ω + ε v.
+    with b', c' the derivatives of b and c by θ²: a twist is the dual number ω + ε v.
     """
     v, w = twist[..., :3], twist[..., 3:]
     t2 = _square(w)
@@ -210,11 +209,11 @@ def _combine(i: Floats, k: Floats, s: Floats, w: Floats) -> Floats:
     out = empty(*w.shape, 3)
     for row in range(3):
         right, left = (row + 1) % 3, (row + 2) % 3
-        turn, both = k * w[..., left], s * w[..., row]
-        both_sides = both * w[..., right]
-        np.add(i, both * w[..., row], out=out[..., row, row])
-        np.subtract(both_sides, turn, out=out[..., row, right])
-        np.add(both_sides, turn, out=out[..., right, row])
+        skew_part, scaled = k * w[..., left], s * w[..., row]
+        symmetric = scaled * w[..., right]
+        np.add(i, scaled * w[..., row], out=out[..., row, row])
+        np.subtract(symmetric, skew_part, out=out[..., row, right])
+        np.add(symmetric, skew_part, out=out[..., right, row])
     return out
 
 
@@ -243,7 +242,7 @@ def _slopes(t2: Floats, b: Floats, c: Floats) -> tuple[Floats, Floats]:
 
 
 def _series(coefficients: Sequence[float], t2: Floats, largest: float = _NEAR) -> Floats:
-    """Power series in θ² ≤ `largest`, as far as its terms show in double precision."""
+    """Return a power series in θ² ≤ `largest`, to double precision."""
     last, power = 0, 1.0
     for k, coefficient in enumerate(coefficients):
         if abs(coefficient) * power > 1e-18:

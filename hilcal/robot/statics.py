@@ -1,16 +1,16 @@
-"""Static wrenches through each slot of the deviated arm, and how they change where it moves.
+"""Static wrenches through each slot of the deviated arm, and their change by its motion.
 
-Geometric stiffness: everything beyond slot j is displaced by v, at p_j, and turned by ω; forces,
-weights and the load's moment m keep their directions in base axes. With f_k the force through slot
-k and D_k = Σ l fᵀ − (Σ l · f) I over all that is beyond slot k (l: lever from p_k), the components
-in slot axes change as
+Geometric stiffness: all beyond slot j is displaced by v, at p_j, and turned by ω; forces, weights
+and the load's moment m keep their directions in base axes. With f_k the force through slot k and
+D_k = Σ l fᵀ − (Σ l · f) I, summed over all forces beyond slot k (l: lever from p_k), the components
+in slot axes change by
 
     k < j:  δf_k = 0,             δt_k = v × f_j + D_j ω         (slot k stands still)
     k ≥ j:  δf_k = −ω × f_k,      δt_k = D_kᵀ ω − ω × m          (slot k moves along)
 
-The displacement of joint j + 1 is a turn about z_j, of a prismatic joint a shift along z_j, that
-leaves slot j standing still. What is computed is the transpose: the gradient by the motions of a
-linear form of the slot wrenches. Source: Chen and Kao, *Conservative congruence transformation for
+The displacement of joint j + 1 is a turn about z_j, of a prismatic joint a shift along z_j; slot j
+stands still. The code computes the transpose: the gradient, by the motions, of a linear form of the
+slot wrenches. Source: Chen and Kao, *Conservative congruence transformation for
 joint and Cartesian stiffness matrices of robotic hands and fingers*, Int. J. Robotics Research 19
 (2000) 835-847.
 """
@@ -30,25 +30,25 @@ from hilcal.types import Floats
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Load:
-    """What pulls at the arm beside its own weight."""
+    """The load and the tool of an arm."""
 
     wrench: Floats  # (N, 6) force and moment on the tool at the load point, base axes, N, N·m
     point: Floats  # (3,) or (N, 3) load point, flange axes, m
-    tool_mass: float  # mass carried permanently, kg
-    tool_com: Floats  # (3,) its centre of mass, flange axes, m
+    tool_mass: float  # kg
+    tool_com: Floats  # (3,) centre of mass, flange axes, m
     gravity: Floats  # (3,) acceleration, base axes, m/s²
-    first_moment: Floats | None = None  # (n, 3) of the bodies beyond the arm's, kg·m
+    first_moment: Floats | None = None  # (n, 3) of the bodies, added to those of the arm, kg·m
 
 
 def slot_wrenches(arm: Arm, chain: Chain, load: Load) -> Floats:
-    """Wrench (N, n + 1, 6) of everything beyond slot k, at its origin, in its axes.
+    """Return the wrench (N, n + 1, 6) of all beyond slot k, at its origin, in its axes.
 
         f_k = f_{k+1} + m_{k+1} g
         t_k = t_{k+1} + (p_{k+1} − p_k) × f_{k+1} + (c_{k+1} − p_k) × m_{k+1} g
 
-    at the configuration of `chain`; a first moment s_{k+1} of body k + 1 beyond the arm's adds
-    s_{k+1} × g to t_k. Element (k, 5) for k < n is the static torque τ_{k+1} that load and
-    weight exert about the axis of joint k + 1, element (k, 2) the force along it (`Arm.along`).
+    at the configuration of `chain`; an additional first moment s_{k+1} of body k + 1 adds
+    s_{k+1} × g to t_k. Element (k, 5) for k < n is the static torque τ_{k+1} of load and weight
+    about the axis of joint k + 1, element (k, 2) the force along it (`Arm.along`).
     """
     n, count = arm.n, len(load.wrench)
     flange = chain.position[n]
@@ -74,15 +74,15 @@ def slot_wrenches(arm: Arm, chain: Chain, load: Load) -> Floats:
 
 
 def _add_moment(t: Floats, lever: Floats, force: Floats) -> None:
-    """Add l × f of a force f (3,) that is the same in all states: along one axis mostly."""
+    """Add l × f of a force f (3,) that is the same in all states, mostly along one axis."""
     for axis in np.flatnonzero(force):
-        after, before = (axis + 1) % 3, (axis + 2) % 3
-        t[:, after] += lever[:, before] * force[axis]
-        t[:, before] -= lever[:, after] * force[axis]
+        j, k = (axis + 1) % 3, (axis + 2) % 3
+        t[:, j] += lever[:, k] * force[axis]
+        t[:, k] -= lever[:, j] * force[axis]
 
 
 def slot_wrench_change(chain: Chain, force: Floats, moment: Floats) -> Floats:
-    """Change (N, P, n + 1, 6) of slot wrenches by forces and moments (N, P, 3) at the flange."""
+    """Return the change (N, P, n + 1, 6) of slot wrenches by force and moment at the flange."""
     slots, count = chain.position.shape[:2]
     out = empty(count, force.shape[1], slots, 6)
     for k in range(slots):
@@ -94,14 +94,14 @@ def slot_wrench_change(chain: Chain, force: Floats, moment: Floats) -> Floats:
 
 
 def load_wrench_change(chain: Chain, load: Load, change: Floats) -> Floats:
-    """Change (N, P, n + 1, 6) of slot wrenches by changes (N, P, 6) of the load's, base axes."""
+    """Return the change (N, P, n + 1, 6) of slot wrenches by that of the load (N, P, 6)."""
     lever = (chain.point(load.point) - chain.position[-1])[:, None, :]
     force = change[..., :3]
     return slot_wrench_change(chain, force, change[..., 3:] + se3.cross(lever, force))
 
 
 def first_moment_change(arm: Arm, chain: Chain, gravity: Floats) -> Floats:
-    """Change (N, 3 n, n + 1, 6) of the slot wrenches by unit first moments of the bodies.
+    """Return the change (N, 3 n, n + 1, 6) of slot wrenches by unit first moments of the bodies.
 
     A unit along axis e of body k + 1 is a moment (R_k e) × g that slots 0..k carry.
     """
@@ -115,7 +115,7 @@ def first_moment_change(arm: Arm, chain: Chain, gravity: Floats) -> Floats:
 
 
 def body_axes(arm: Arm, chain: Chain, k: int) -> Floats:
-    """Orientation (N, 3, 3) of body k + 1, base axes: back from slot k + 1, past its twist."""
+    """Return the orientation (N, 3, 3) of body k + 1, base axes, from that of slot k + 1."""
     r = chain.rotation[k + 1]
     if chain.twist is not None and np.any(chain.twist[k + 1]):
         r = se3.product(r, se3.rotation(-chain.twist[k + 1, :, 3:]))
@@ -124,18 +124,21 @@ def body_axes(arm: Arm, chain: Chain, k: int) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GeometricStiffness:
-    """The load of a chain as its motions see it; base axes."""
+    """The quantities of a loaded chain that its geometric stiffness depends on; base axes."""
 
     chain: Chain
     force: list[Floats]  # (n + 1,) list of (N, 3) f_k, N
     dyad: list[Floats]  # (n + 1,) list of (N, 3, 3) D_k, N·m
     carried: list[Floats]  # (n + 1,) list of (N, 3, 3) D_k − [m]×, N·m, m the load's moment
     spun: list[Floats]  # (n,) list of (N, 3) D_j z_j, N·m
-    load_point: Floats  # (N, 3) where the load acts, m
-    following: Floats | None = None  # (N, 6, 6) of the load's wrench by the flange's motion
+    load_point: Floats  # (N, 3) m
+    following: Floats | None = None  # (N, 6, 6) change of the load's wrench by the flange's motion
 
     def gradient(self, form: Mapping[tuple[int, bool], Floats]) -> "MotionGradient":
-        """Gradient by the motions of a linear form (N, m, 3) of slots' force and moment."""
+        """Return the gradient, by motions, of a linear form of forces and moments of slots.
+
+        `form` has coefficients (N, m, 3) by slot, and by whether they are of the moment.
+        """
         chain, slots = self.chain, len(self.force)
         still: list[Floats | None] = [None]
         along: list[Floats | None] = [None] * (slots + 1)
@@ -155,11 +158,11 @@ class GeometricStiffness:
                 along[k] = _sum(along[k], se3.cross(by_force, self.force[k][:, None]))
                 load = _sum(load, by_force) if self.following is not None else None
         for k in range(slots - 1, -1, -1):
-            mine, beyond = along[k], along[k + 1]
-            if mine is None or beyond is None:
-                along[k] = _sum(mine, beyond)
+            of_slot, beyond = along[k], along[k + 1]
+            if of_slot is None or beyond is None:
+                along[k] = _sum(of_slot, beyond)
             else:
-                mine += beyond
+                of_slot += beyond
         flange = None
         if self.following is not None and load is not None and still[-1] is not None:
             flange = rows_times(np.concatenate([load, still[-1]], axis=2), self.following)
@@ -173,31 +176,31 @@ class MotionGradient:
 
     stiffness: GeometricStiffness
     rows: tuple[int, ...]  # N and m
-    # (n + 2,) sums (N, m, 3) over the slots i < k of the moments' coefficients, base axes; None for
-    # zero, here and below
+    # (n + 2,) sums (N, m, 3) of the moments' coefficients over the slots i < k, base axes; None
+    # stands for zero, also below
     still: list[Floats | None]
-    along: list[Floats | None]  # (n + 2,) gradients (N, m, 3) by a turn with slots i ≥ k
-    flange: Floats | None  # (N, m, 6) of the load's wrench by the flange's motion
+    along: list[Floats | None]  # (n + 2,) gradients (N, m, 3) by a turn of slots i ≥ k
+    flange: Floats | None  # (N, m, 6) gradient by the flange's motion through the load's wrench
 
     def joint(self, j: int) -> Floats:
-        """(N, m) gradient by the displacement of joint j + 1."""
-        z, arm = self.stiffness.chain.rotation[j, :, :, 2], self.stiffness
-        if j in arm.chain.slides:
-            # Slot j stands still, and the force through it is shifted along z against p_j.
+        """Return the gradient (N, m) by the displacement of joint j + 1."""
+        z, stiffness = self.stiffness.chain.rotation[j, :, :, 2], self.stiffness
+        if j in stiffness.chain.slides:
+            # slot j stands still; the force through it is shifted along z relative to p_j
             still = self.still[j + 1]
-            found = None if still is None else _rows_dot(still, se3.cross(z, arm.force[j]))
+            out = None if still is None else _rows_dot(still, se3.cross(z, stiffness.force[j]))
             if self.flange is not None:
-                found = _sum(found, _rows_dot(self.flange[..., :3], z))
-            return zeros(*self.rows) if found is None else found
-        parts = [(self.along[j + 1], z), (self.still[j + 1], arm.spun[j])]
+                out = _sum(out, _rows_dot(self.flange[..., :3], z))
+            return zeros(*self.rows) if out is None else out
+        parts = [(self.along[j + 1], z), (self.still[j + 1], stiffness.spun[j])]
         if self.flange is not None:
-            lever = arm.chain.position[-1] - arm.chain.position[j]
+            lever = stiffness.chain.position[-1] - stiffness.chain.position[j]
             parts += [(self.flange[..., 3:], z), (self.flange[..., :3], se3.cross(z, lever))]
-        out = reduce(_sum, (None if a is None else _rows_dot(a, by) for a, by in parts))
+        out = reduce(_sum, (None if a is None else _rows_dot(a, b) for a, b in parts))
         return zeros(*self.rows) if out is None else out
 
     def displacement(self, j: int) -> Floats | None:
-        """(N, m, 3) gradient by the displacement of all beyond slot j, base axes."""
+        """Return the gradient (N, m, 3) by the displacement of all beyond slot j, base axes."""
         out = None if self.flange is None else self.flange[..., :3]
         still = self.still[j]
         if still is not None:
@@ -205,7 +208,7 @@ class MotionGradient:
         return out
 
     def turn(self, j: int) -> Floats:
-        """(N, m, 3) gradient by the turn of all beyond slot j about p_j, base axes."""
+        """Return the gradient (N, m, 3) by the turn of all beyond slot j about p_j, base axes."""
         out, still = self.along[j], self.still[j]
         chain, flange = self.stiffness.chain, self.flange
         if still is not None:
@@ -248,14 +251,14 @@ def geometric_stiffness(
 
 
 def rows_times(rows: Floats, matrix: Floats, *, transposed: bool = False) -> Floats:
-    """Rows (N, m, i) times matrices (N, i, j), or their transposes."""
+    """Return rows (N, m, i) times matrices (N, i, j), or their transposes."""
     out = empty(*rows.shape[:2], matrix.shape[1 if transposed else 2])
-    by = "nmi,nji->nmj" if transposed else "nmi,nij->nmj"
-    return np.asarray(np.einsum(by, rows, matrix, out=out))
+    subscripts = "nmi,nji->nmj" if transposed else "nmi,nij->nmj"
+    return np.asarray(np.einsum(subscripts, rows, matrix, out=out))
 
 
 def rows_times_constant(rows: Floats, matrix: Floats) -> Floats:
-    """Rows (N, m, i) times one matrix (i, j), which is zero for the most part."""
+    """Return rows (N, m, i) times one matrix (i, j), which is mostly zero."""
     if np.array_equal(matrix, np.eye(len(matrix))):
         return rows
     out = zeros(*rows.shape[:2], matrix.shape[1])
@@ -265,7 +268,7 @@ def rows_times_constant(rows: Floats, matrix: Floats) -> Floats:
 
 
 def _rows_dot(rows: Floats, vector: Floats) -> Floats:
-    """Rows (N, m, i) times vectors (N, i)."""
+    """Return rows (N, m, i) times vectors (N, i)."""
     return np.einsum("nmi,ni->nm", rows, vector, out=empty(*rows.shape[:2]))
 
 

@@ -1,6 +1,6 @@
-"""Arms from URDF files: any serial chain of revolute and prismatic joints, any axes.
+"""Arms from URDF files: serial chains of revolute and prismatic joints with any axes.
 
-Joints of a URDF that follow another one: `<mimic joint="i" multiplier="k" offset="o"/>`.
+Joints may follow another one: `<mimic joint="i" multiplier="k" offset="o"/>`.
 """
 
 import math
@@ -34,11 +34,11 @@ def arm_from_urdf(path: Path, base_link: str | None = None, tip_link: str | None
 
     With M_k the placement of joint k in its predecessor and R_k a rotation that takes z to the
     joint's axis, the constant transforms are L_0 = T_base_root M_1 R_1, L_k = R_kᵀ M_{k+1} R_{k+1}
-    and L_n = R_nᵀ M_tip. Masses rigidly attached to a moving link are merged into it; joints
-    outside the chain are held at zero. A continuous joint gets the range ±2π, also one whose limits
-    are both 0; an effort of 0 means unknown (infinite). What is missing is said in `Arm.notes`. A
-    joint of the chain that mimics another turns by multiplier · q_i + offset: that is a coupling of
-    the arm, and the joint has no value of its own (`Arm.mimic`).
+    and L_n = R_nᵀ M_tip. Masses fixed to a moving link are merged into it; joints outside of the
+    chain are held at zero. Continuous joints, and joints whose limits are both 0, get the range
+    ±2π; an effort of 0 means unknown (infinite). `Arm.notes` lists what is missing. A joint of the
+    chain that mimics another turns by multiplier · q_i + offset: this is a coupling of the arm, and
+    the joint has no independent value (`Arm.mimic`).
     """
     model, mimics = _read(path)
     names = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
@@ -50,34 +50,34 @@ def arm_from_urdf(path: Path, base_link: str | None = None, tip_link: str | None
                 f"valid: {', '.join(names)}"
             )
     chain = _chain(model, base, tip, path)
-    others = [joint for joint in range(1, model.njoints) if joint not in chain]
-    reduced = pin.buildReducedModel(model, others, pin.neutral(model))
+    outside = [joint for joint in range(1, model.njoints) if joint not in chain]
+    reduced = pin.buildReducedModel(model, outside, pin.neutral(model))
     arm = _arm(reduced, _link(reduced, base).placement, _link(reduced, tip).placement, path)
     return with_mimics(arm, mimics, path.name)
 
 
 def _arm(model: pin.Model, base: pin.SE3, tip: pin.SE3, path: Path) -> Arm:
-    """Turn the frames of a model whose joints are just the chain so that z is the axis."""
+    """Return the arm of a model of the chain's joints, with z of the frames along the axes."""
     joints = range(1, model.njoints)
     axes = _axes(model)
     slides = np.array([bool(np.any(axis[:3])) for axis in axes])
-    turns = np.tile(np.eye(4), (len(axes), 1, 1))  # the smallest that take z to the axes
-    for turn, axis, s in zip(turns, axes, slides, strict=True):
-        to = axis[:3] if s else axis[3:]
-        turn[:3, :3] = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), to).matrix()
+    turns = np.tile(np.eye(4), (len(axes), 1, 1))  # the smallest rotations that take z to the axes
+    for turn, axis, slide in zip(turns, axes, slides, strict=True):
+        direction = axis[:3] if slide else axis[3:]
+        turn[:3, :3] = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), direction).matrix()
     coms = [
         turn[:3, :3].T @ model.inertias[joint].lever
         for turn, joint in zip(turns, joints, strict=True)
     ]
-    before = [base.inverse().homogeneous, *(turn.T for turn in turns)]
+    leading = [base.inverse().homogeneous, *(turn.T for turn in turns)]
     placements = [*(model.jointPlacements[joint].homogeneous for joint in joints), tip.homogeneous]
-    after = [*turns, np.eye(4)]
+    trailing = [*turns, np.eye(4)]
     lower, upper, effort = zip(*(_limits(model, joint) for joint in joints), strict=True)
     masses = np.array([model.inertias[joint].mass for joint in joints])
     names = tuple(check_name(model.names[joint], f"{path.name}: a joint") for joint in joints)
     return Arm(
         name=path.stem,
-        links=np.array([b @ m @ a for b, m, a in zip(before, placements, after, strict=True)]),
+        links=np.array([b @ m @ a for b, m, a in zip(leading, placements, trailing, strict=True)]),
         masses=masses, coms=np.array(coms), q_min=np.array(lower), q_max=np.array(upper),
         torque_max=np.array(effort), payload=math.inf, joint_names=names,
         source=f"URDF {path.name}", notes=_missing(model, masses, slides),
@@ -110,12 +110,12 @@ def _limits(model: pin.Model, joint: int) -> tuple[float, float, float]:
 
 
 def _axes(model: pin.Model) -> list[Floats]:
-    """(6,) unit twist of each joint in its own frame, of the first degree of freedom."""
+    """Return the unit twist (6,) of each joint's first degree of freedom, in its frame."""
     data = model.createData()
     pin.computeJointJacobians(model, data, pin.neutral(model))
     frame = pin.ReferenceFrame.LOCAL
     return [
-        # of a model with one degree of freedom Pinocchio returns (6,)
+        # for a model with one degree of freedom, Pinocchio returns (6,)
         pin.getJointJacobian(model, data, joint, frame).reshape(6, -1)[:, model.joints[joint].idx_v]
         for joint in range(1, model.njoints)
     ]
@@ -173,29 +173,29 @@ def _only_leaf(model: pin.Model, path: Path) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Mimic:
-    """What a joint follows: q = multiplier · q of `joint` + offset."""
+    """A `<mimic>` element: q = multiplier · q of `joint` + offset."""
 
-    joint: str  # name of the joint that it follows
-    multiplier: str  # 1 where it is not written
-    offset: str  # 0 where it is not written, rad or m
+    joint: str  # name of the joint to follow
+    multiplier: str  # 1 by default
+    offset: str  # rad or m; 0 by default
 
 
 @limits.bounded
 def _read(path: Path) -> tuple[pin.Model, dict[str, Mimic]]:
-    """Return Pinocchio's model, and the joints with a `<mimic>` element and what they follow."""
+    """Return Pinocchio's model, and the `<mimic>` elements by joint."""
     joints = moving = 0
     within, mimics = [""], dict[str, Mimic]()
 
-    def start(tag: str, given: dict[str, str]) -> None:
+    def start(tag: str, attributes: dict[str, str]) -> None:
         nonlocal joints, moving
         if tag == "joint":
-            within.append(given.get("name", ""))
+            within.append(attributes.get("name", ""))
             joints += 1
-            moving += given.get("type") != "fixed"
+            moving += attributes.get("type") != "fixed"
         elif tag == "mimic":
-            factor, offset = given.get("multiplier", "1"), given.get("offset", "0")
-            mimics[within[-1]] = Mimic(given.get("joint", ""), factor, offset)
-        # Pinocchio calls itself for each joint, and needs memory by the third power of the moving.
+            factor, offset = attributes.get("multiplier", "1"), attributes.get("offset", "0")
+            mimics[within[-1]] = Mimic(attributes.get("joint", ""), factor, offset)
+        # Pinocchio recurses for each joint; its memory grows with the cube of the moving joints
         if joints > limits.DESCRIBED or moving > limits.MOVING:
             raise InputError(
                 f"{path.name}: too many joints; valid: at most {limits.DESCRIBED}, "
@@ -226,7 +226,7 @@ def _read(path: Path) -> tuple[pin.Model, dict[str, Mimic]]:
 
 @contextmanager
 def _captured_stderr() -> Iterator[IO[str]]:
-    """Keep what the C++ parser writes to file descriptor 2, to put it into one message."""
+    """Capture the output of the C++ parser to file descriptor 2, for a message."""
     sys.stderr.flush()
     saved = os.dup(2)
     with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as log:
@@ -238,27 +238,29 @@ def _captured_stderr() -> Iterator[IO[str]]:
             os.close(saved)
 
 
-def with_mimics(arm: Arm, given: Mapping[str, Mimic], where: str) -> Arm:
-    """Return the arm whose joints follow others as a URDF says, turned along by their motors."""
+def with_mimics(arm: Arm, mimics: Mapping[str, Mimic], where: str) -> Arm:
+    """Return the arm whose joints follow others, turned by their motors, as in a URDF."""
     names, n = list(arm.joint_names), arm.n
-    follows = {names.index(name): m for name, m in given.items() if name in names}
+    follows = {names.index(name): mimic for name, mimic in mimics.items() if name in names}
     if not follows:
         return arm
-    own = [name for j, name in enumerate(names) if j not in follows]
+    independent = [name for j, name in enumerate(names) if j not in follows]
     links, turns, values = arm.links.copy(), np.eye(n), np.eye(n, n + 1)
-    for j, m in follows.items():
-        said = f'{where}: joint "{names[j]}" of the arm mimics joint "{m.joint}"'
-        if m.joint not in own:
-            why = "which follows another one itself" if m.joint in names else "which is not there"
-            raise InputError(
-                f"{said}, {why}{suggest(m.joint, own)}; valid: a joint between base_link and "
-                f"tip_link with a value of its own: {', '.join(own)}"
+    for j, mimic in follows.items():
+        prefix = f'{where}: joint "{names[j]}" of the arm mimics joint "{mimic.joint}"'
+        if mimic.joint not in independent:
+            why = (
+                "which follows another one itself" if mimic.joint in names else "which is not there"
             )
-        i = names.index(m.joint)
+            raise InputError(
+                f"{prefix}, {why}{suggest(mimic.joint, independent)}; valid: a joint between "
+                f"base_link and tip_link with a value of its own: {', '.join(independent)}"
+            )
+        i = names.index(mimic.joint)
         turns[j], values[j] = 0.0, 0.0
-        turns[j, i] = values[j, i] = float(m.multiplier)
-        values[j, n] = offset = float(m.offset)
+        turns[j, i] = values[j, i] = float(mimic.multiplier)
+        values[j, n] = offset = float(mimic.offset)
         if arm.slides[i] != arm.slides[j]:
-            raise InputError(f"{said}, of which one slides and one turns; valid: two of a kind")
+            raise InputError(f"{prefix}, of which one slides and one turns; valid: two of a kind")
         links[j] = links[j] @ se3.screw(2, *((0.0, offset) if arm.slides[j] else (offset,)))
     return replace(arm, links=links, coupling=turns, drive=turns, mimic=values)
