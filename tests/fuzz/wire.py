@@ -279,7 +279,7 @@ def _emscon() -> Parser:
         tracker._clock = None  # type: ignore[assignment]
         tracker._soon = tracker._ready  # type: ignore[method-assign]
         kind, status, body = line.result(until=np.inf)
-        tracker._measure = lambda: tracker._sound(kind, status, body)  # type: ignore[method-assign]
+        tracker._measure = lambda: tracker._checked(kind, status, body)  # type: ignore[method-assign]
         sample = tracker.measure()
         if not (np.isfinite(sample.value).all() and np.linalg.eigvalsh(sample.covariance)[0] > 0.0):
             raise Accepted("emscon: a reading that cannot be")
@@ -393,7 +393,7 @@ def _force(name: str) -> Parser:
 
     def parse(data: bytes) -> bool:
         stream._deframer, stream._counter = fresh(form), sensor.losses()
-        stream._kept, stream._failure = 0, ""
+        stream._count, stream._failure = 0, ""
         at, seen = 1, []
         push = stream._deframer.push
 
@@ -408,14 +408,14 @@ def _force(name: str) -> Parser:
             stream._take(data[at : at + step], time.monotonic_ns())
             at += step
         if not data[0]:
-            kept = {tuple(row) for row in stream._wrench[: min(stream._kept, RING)].tolist()}
+            kept = {tuple(row) for row in stream._wrench[: min(stream._count, RING)].tolist()}
             for body in seen:
                 if body not in sound and wrench_of(body) in kept - measured:
                     whole = [framed(one) for one in sound] if name != "hex" else []
                     raise passed(f"{name}: a frame", framed(body), whole)
-        if not stream._kept:
+        if not stream._count:
             return False
-        kept = stream._wrench[: stream._kept]
+        kept = stream._wrench[: stream._count]
         if not np.all(np.isfinite(kept)):
             raise Accepted(f"{name}: a wrench that is not finite")
         stream._running = True
@@ -492,7 +492,7 @@ def _geocom() -> Parser:
     def parse(data: bytes) -> bool:
         port.held = data[1:]
         link._instrument.transaction_counter = 0
-        tracker._full_known, tracker._last_ms = True, 0.0
+        tracker._has_full, tracker._last_ms = True, 0.0
         with quiet():
             sample = tracker.measure()
         distance = float(np.linalg.norm(sample.value))
