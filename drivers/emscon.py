@@ -348,7 +348,7 @@ class EmsconTracker:
         return time.monotonic() + DEADLINE_S + seconds
 
     def _ready(self, seconds: float = 0.0) -> float:
-        """Restore connection and settings where lost; return the deadline, `seconds` and more away."""
+        """Restore connection and settings where lost; return a deadline, extended by `seconds`."""
         until = self._soon(seconds)
         again = not self._line.open
         if again:
@@ -397,7 +397,7 @@ class EmsconTracker:
         self._line.changes = [c for c in self._line.changes if c in es.CLOSING]
 
     def _check_reflector(self, until: float) -> None:
-        """Set the reflector at the first call; later refuse another one: its centre is elsewhere."""
+        """Set the reflector at the first call; later refuse another, whose centre is elsewhere."""
         body = self._do("reading its reflector", es.GET_REFLECTOR, until=until)
         (number,) = self._line.unpack("<i", body)
         names = self._reflectors(until)

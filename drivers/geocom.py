@@ -5,9 +5,9 @@ A reading is hz, v (from the zenith) and slope distance d, turned into
     x = d sin(v) sin(hz)    y = d sin(v) cos(hz)    z = d cos(v)
 
 geocompy writes the requests and checks the replies. This module adds: a reply without checksum is
-refused, failures of the line are recorded, damaged exchanges are repeated after draining the line, and
-every exchange has a deadline. geocompy never raises from a request, and `bool` of its response is
-False for usable codes too: only codes count.
+refused, failures of the line are recorded, damaged exchanges are repeated after draining the line,
+and every exchange has a deadline. geocompy never raises from a request, and `bool` of its response
+is False for usable codes too: only codes count.
 Source: Leica Geosystems, GeoCOM Reference Manual (return codes; TMC, AUT, BAP, CSV, COM).
 """
 
@@ -577,5 +577,5 @@ def plausible(polar: PolarReading) -> PolarReading:
     return polar
 
 
-def _strange(values: str) -> NoReturn:
-    raise DeviceError(f"{DEVICE}: measuring: the instrument gives {values}; is it a GeoCOM station?")
+def _strange(data: str) -> NoReturn:
+    raise DeviceError(f"{DEVICE}: measuring: the instrument gives {data}; is it a GeoCOM station?")

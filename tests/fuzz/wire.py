@@ -270,7 +270,7 @@ def _emscon() -> Parser:
     def parse(data: bytes) -> bool:
         line = EmsconConnection.__new__(EmsconConnection)
         line.where, line.changes, line.open = "fuzz", [], True
-        line._came, line._socket = bytearray(), Socket(data[1:])  # type: ignore[assignment]
+        line._buffer, line._socket = bytearray(), Socket(data[1:])  # type: ignore[assignment]
         tracker = EmsconTracker.__new__(EmsconTracker)
         target = "pose" if data[0] else "position"
         tracker._options = emscon.EmsconOptions(target=target)  # type: ignore[arg-type]
@@ -314,7 +314,7 @@ def _natnet() -> Parser:
             return any(b.number == BODY for b in bodies or ())
         tracker._options = type("Options", (), {"rigid_body": "tool"})()  # type: ignore[assignment]
         tracker._ask = lambda request, answer: data[5:]  # type: ignore[method-assign]
-        return tracker._found()[1] == "tool"
+        return tracker._rigid_body()[1] == "tool"
 
     return Parser("natnet", make, parse)
 
