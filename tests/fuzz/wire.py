@@ -291,7 +291,7 @@ def _emscon() -> Parser:
 def _natnet() -> Parser:
     rng = np.random.default_rng(1)
     cameras = Cameras(None, rng, None, (4, 1), 0.0, np.zeros((6, 4)), 0.0)  # type: ignore[arg-type]
-    cameras.paused, cameras.seen, cameras.others = True, (TARGET, np.array([0, 0, 0, 1.0])), 2
+    cameras.paused, cameras.newest, cameras.extra = True, (TARGET, np.array([0, 0, 0, 1.0])), 2
     cameras.board = type("Board", (), {"time": 1.0})()  # type: ignore[assignment]
     versions: tuple[nn.Version, ...] = ((3, 0), (4, 0), (4, 1), (4, 2))
     sound = [nn.message(nn.FRAME, cameras.frame(v)) for v in versions]
