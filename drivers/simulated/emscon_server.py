@@ -175,7 +175,8 @@ class SimulatedTracker:
             observed = error * Rotation.from_matrix(rotation)
             turn, angles = np.roll(observed.as_quat(), 1), observed.as_euler("xyz")
             J = _rates(angles)
-            angle_covariance = (b * noise.orientation_std) ** 2 * np.linalg.inv(J.T @ J)
+            variance = (b * noise.orientation_std) ** 2
+            angle_covariance = np.asarray(variance * np.linalg.inv(J.T @ J))
         m = es.Measurement(a * (position + origin), covariance, turn, b * angles, angle_covariance)
         kind, packed = es.pack_measurement(m, mode, self.environment())
         self.send(kind, struct.pack("<I", es.OK) + packed)

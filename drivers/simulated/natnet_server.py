@@ -143,10 +143,10 @@ class Cameras:
             self._answer(sender, nn.message(nn.DESCRIPTIONS, self.descriptions(version)))
         elif number == nn.REQUEST:
             command = content.split(b"\0")[0].decode("ascii", "replace")
-            requested = command.removeprefix("Bitstream,").split(".")
+            numbers = command.removeprefix("Bitstream,").split(".")
             good = command.startswith("Bitstream,") and self.version >= (4, 0) and not self.group
             if good:
-                version = int(requested[0]), int(requested[1])
+                version = int(numbers[0]), int(numbers[1])
             self._answer(sender, nn.message(nn.RESPONSE, struct.pack("<i", 0 if good else 1)))
         elif number != nn.KEEP_ALIVE or sender not in self.clients:
             return

@@ -101,7 +101,7 @@ def check_hash(path: Path, sha256: str) -> None:
 
 
 def own_names(catalogue: Catalogue, known: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the effects of a catalogue that are not `known`, i.e. without mechanics in the world."""
+    """Return the effects of a catalogue that are not `known`, without mechanics in the world."""
     return tuple(k.name for k in catalogue.with_role("effect") if k.name not in known)
 
 
