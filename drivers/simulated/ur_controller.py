@@ -37,8 +37,8 @@ STOP_TIME = 0.25  # world time within which the arm stops at the end of a progra
 UNLOCK_AFTER = 5.0
 """Real time before a protective stop can be unlocked, s (from the dashboard's answer)."""
 PATIENCE = 0.5
-"""Additional delay of a connected client that the watchdog tolerates, real s: this controller, unlike
-a real one, shares its computer with the client."""
+"""Additional delay of a connected client that the watchdog tolerates, real s: this controller,
+unlike a real one, shares its computer with the client."""
 _COMPILE = 0.05  # s of real time from the upload of a program to its start
 _POWER_UP = 0.3  # s of real time per step of powering up; real arms take some seconds
 _READ = 1 << 16  # bytes

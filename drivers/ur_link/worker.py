@@ -1,4 +1,4 @@
-"""A child process that may hang or crash without harm: first the parent's side, then its own.
+"""A child process that may hang or crash without harm: first the parent's side, then the child's.
 
 In the child the client library can hold the interpreter's lock for ever, so that no thread and no
 signal handler in Python can notice the end of the parent. The kernel therefore ends the child: the
