@@ -21,9 +21,9 @@ _STATUS = ((2, "is loaded over its range; take the load off"), (4, "measures not
 
 def _overload(wrench: Floats, status: int) -> str:
     """The error that the status reports; bit 0 (fewer samples averaged) is none."""
-    for bit, words in _STATUS:
+    for bit, problem in _STATUS:
         if status & bit:
-            return f"the Bota sensor {words} (status {status:#06x})"
+            return f"the Bota sensor {problem} (status {status:#06x})"
     if status & ~SKIPPED:
         return f"the Bota sensor reports the unknown status {status:#06x}"
     return ""

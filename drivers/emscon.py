@@ -170,10 +170,10 @@ class EmsconConnection:
 
     def _receive(self, until: float) -> None:
         with self._failures():
-            left = until - time.monotonic()
-            if until and left <= 0.0:
+            remaining = until - time.monotonic()
+            if until and remaining <= 0.0:
                 raise TimeoutError
-            self._socket.settimeout(left if until else 0.0)
+            self._socket.settimeout(remaining if until else 0.0)
             try:
                 data = self._socket.recv(es.LARGEST)
             except BlockingIOError:  # until is 0

@@ -297,8 +297,8 @@ class ForceStream:
         since = first = self._count
         runs: list[tuple[Floats, Ints, Ints]] = []
         while True:
-            left = end - time.monotonic()
-            time.sleep(max(0.0, min(SLICE_S, left)) if left > 0.0 else POLL_S)
+            remaining = end - time.monotonic()
+            time.sleep(max(0.0, min(SLICE_S, remaining)) if remaining > 0.0 else POLL_S)
             self._check()
             with self._lock:
                 rows = np.arange(since, self._count) % RING

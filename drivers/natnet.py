@@ -250,8 +250,8 @@ class NatNetTracker:
         for _ in range(TRIES):
             self._send(request)
             end = time.monotonic() + ANSWER_S
-            while (left := end - time.monotonic()) > 0.0:
-                content = self._receive(self._line, answer, left)
+            while (remaining := end - time.monotonic()) > 0.0:
+                content = self._receive(self._line, answer, remaining)
                 if content is not None:
                     return content
         raise TimeoutError

@@ -305,11 +305,11 @@ def _devices(
     tracker = config.tracker.driver or TRACKERS[0]
 
     def device(name: str, server: str, stream: int, options: dict[str, Any]) -> DeviceProcess:
-        words = ["--seed", str(seed + stream)]
+        command = ["--seed", str(seed + stream)]
         for key, value in options.items():
             values = value if isinstance(value, tuple) else (value,)
-            words += [f"--{key.replace('_', '-')}", *map(str, values)]
-        return DeviceProcess(name, f"hilcal.drivers.simulated.{server}", directory, tuple(words))
+            command += [f"--{key.replace('_', '-')}", *map(str, values)]
+        return DeviceProcess(name, f"hilcal.drivers.simulated.{server}", directory, tuple(command))
 
     controller, facts = "arm", dict[str, Any]()
     if is_ur(world.cell.arm):

@@ -69,8 +69,8 @@ class Connection:
         with contextlib.suppress(OSError), self._socket:
             self._socket.shutdown(socket.SHUT_WR)
             end = time.monotonic() + 0.1
-            while (left := end - time.monotonic()) > 0:
-                self._socket.settimeout(left)
+            while (remaining := end - time.monotonic()) > 0:
+                self._socket.settimeout(remaining)
                 if not self._socket.recv(65536):
                     break
 
