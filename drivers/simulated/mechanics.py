@@ -178,7 +178,7 @@ class Elasticity:
     linear: Floats  # (v, v) C, symmetric, rad/(N·m), or in m and N for the tips of beams
     cubic: Floats  # (v,) s, rad/(N·m)³; negative for a gear that stiffens under load
     play: Floats  # (v,) b, rad: half of the play
-    crossing: Floats  # (v,) tau_0 > 0, torque at which 76 % of the play are crossed, N·m
+    crossing: Floats  # (v,) tau_0 > 0, torque at which 76 % of b are reached, N·m
     extra: Floats | None = None
     """(N, v) x, additional compliance in each of N states, rad/(N·m); None: 0."""
     turns: Floats | None = None  # (v, v) T; None: identity

@@ -310,8 +310,9 @@ def simulated_cell(
 
     The world's time starts at `begun`, s.
     """
-    with tempfile.TemporaryDirectory(prefix="hilcal-") as temporary:
-        with SimulatedCell.start(
+    with (
+        tempfile.TemporaryDirectory(prefix="hilcal-") as temporary,
+        SimulatedCell.start(
             case.world,
             case.config,
             directory or Path(temporary),
@@ -319,5 +320,6 @@ def simulated_cell(
             base_dir=base_dir,
             start_s=begun,
             home=case.home,
-        ) as cell:
-            yield cell
+        ) as cell,
+    ):
+        yield cell
