@@ -1,8 +1,8 @@
 """Bota Systems Rokubi and SensONE over serial: they stream from power-on.
 
 Frame (Bota Systems' public ROS drivers): `AA`; `<H6fIf` of status, wrench in N and N·m, device
-time in µs, temperature in °C; CRC-16/X-25 of these 34 bytes, little-endian: 37 bytes. Bits of
-the status: 0 skipped samples, 1 over range, 2 invalid measurement, 3 raw values.
+time in µs, temperature in °C; CRC-16/X-25 of these 34 bytes, little-endian: 37 bytes. Status
+bits: 0 skipped samples, 1 over range, 2 invalid measurement, 3 raw values.
 """
 
 import numpy as np
@@ -20,10 +20,10 @@ _STATUS = ((2, "is loaded over its range; take the load off"), (4, "measures not
 
 
 def _overload(wrench: Floats, status: int) -> str:
-    """The status in words; bit 0 (fewer samples behind a value) does not make it wrong."""
-    for bit, words in _STATUS:
+    """The error that the status reports; bit 0 (fewer samples averaged) is none."""
+    for bit, problem in _STATUS:
         if status & bit:
-            return f"the Bota sensor {words} (status {status:#06x})"
+            return f"the Bota sensor {problem} (status {status:#06x})"
     if status & ~SKIPPED:
         return f"the Bota sensor reports the unknown status {status:#06x}"
     return ""

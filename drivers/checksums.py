@@ -15,7 +15,7 @@ def _table(polynomial: int) -> tuple[int, ...]:
 
 
 def crc16(data: bytes, start: int = 0, polynomial: int = 0xA001) -> int:
-    """Return a CRC-16 by a reflected polynomial; of the default ones CRC-16/ARC."""
+    """Return the CRC-16 with a reflected polynomial; the defaults give CRC-16/ARC."""
     crc, table = start, _table(polynomial)
     for byte in data:
         crc = (crc >> 8) ^ table[(crc ^ byte) & 0xFF]
@@ -23,10 +23,10 @@ def crc16(data: bytes, start: int = 0, polynomial: int = 0xA001) -> int:
 
 
 def crc_modbus(data: bytes) -> bytes:
-    """Return the two bytes of CRC-16/MODBUS: start FFFF."""
+    """Return the two bytes of CRC-16/MODBUS: initial value FFFF."""
     return crc16(data, 0xFFFF).to_bytes(2, "little")
 
 
 def crc_x25(data: bytes) -> bytes:
-    """Return the two bytes of CRC-16/X-25: polynomial 1021, start FFFF, inverted in the end."""
+    """Return the two bytes of CRC-16/X-25: polynomial 1021, initial value FFFF, inverted."""
     return (crc16(data, 0xFFFF, 0x8408) ^ 0xFFFF).to_bytes(2, "little")

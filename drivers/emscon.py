@@ -1,8 +1,8 @@
 """Leica laser trackers by emScon over TCP: AT40x, AT901, LTD; reflectors, and 6-D targets.
 
-Readings are Cartesian in the tracker's own axes, in m. The covariance of each is the one that the
-tracker expects of it (a priori, one standard deviation), that of its orientation stated of rotation
-angles about x, y and z; with the angles a and the rotation R(a),
+Readings are Cartesian in the tracker's own axes, in m. Their covariance is the one that the tracker
+states a priori. For the orientation, the tracker states the covariance of the rotation angles a
+about x, y and z; with the rotation R(a),
 
     Cov(small rotation about the tracker's axes) = J Cov(a) Jᵀ,    J_k = log(R(a + h e_k) Rᵀ) / h
 
@@ -32,11 +32,11 @@ from hilcal.toml import Positive, Section, check_section
 from hilcal.types import Floats
 
 DEVICE = "tracker"
-CONNECT_S = 2.0  # how long the connection may take, real s
-DEADLINE_S = 4.0  # how long a command may take beside what is measured or moved, real s
+CONNECT_S = 2.0  # longest wait for the connection, real s
+DEADLINE_S = 4.0  # longest wait for an answer, without time of measuring or moving, real s
 SEARCHING_S = 30.0
-"""How long turning or a search for the reflector may take, cell s; at least `_LEAST_S` real s."""
-HOMING_S = 120.0  # how long the tracker may take to find its zeros, cell s
+"""Longest turn or search for the reflector, cell s; at least `_LEAST_S` real s."""
+HOMING_S = 120.0  # longest search for the tracker's zeros, cell s
 HOMED = "the tracker was initialised again before this reading: its axes may have moved"
 _LEAST_S, _PAUSE_S = 1.0, 0.1
 _FARTHEST_M = 500.0  # beyond the reach of any tracker
@@ -67,24 +67,24 @@ class EmsconOptions(Section):
 
 
 class EmsconConnection:
-    """One connection to an emScon server; `changes` of its state wait to be looked at."""
+    """A connection to an emScon server; `changes`: state changes received, not yet handled."""
 
     def __init__(self, host: str, port: int) -> None:
-        """Connect; raises DeviceError where nobody answers within `CONNECT_S`."""
+        """Connect; raises DeviceError without an answer within `CONNECT_S`."""
         self.where = f"{host}:{port}"
         with network_failures(DEVICE, self.where):
             self._socket = socket.create_connection((host, port), CONNECT_S)
-        self._came = bytearray()
+        self._buffer = bytearray()
         self.changes: list[int] = []
         self.open = True
 
     def close(self) -> None:
-        """Close it. Never raises, may be called twice."""
+        """Close the connection. Never raises; may be called twice."""
         self.open = False
         self._socket.close()
 
     def ask(self, command: int, parameters: bytes = b"", *, until: float) -> tuple[int, bytes]:
-        """Send a command; return its status and what it returns. Waits while the server is busy."""
+        """Send a command, again while the server is busy; return its status and content."""
         while True:
             body = struct.pack("<I", command) + parameters
             self._send(es.HEADER.pack(es.HEADER.size + len(body), es.COMMAND) + body)
@@ -94,7 +94,7 @@ class EmsconConnection:
             time.sleep(_PAUSE_S)
 
     def answer(self, command: int, *, until: float) -> tuple[int, bytes]:
-        """Return the next answer to a command; late ones to others are left out."""
+        """Return the next answer to a command; late answers to other commands are dropped."""
         while True:
             kind, body = self._packet(until)
             if kind in (es.COMMAND, es.ERROR):
@@ -103,7 +103,7 @@ class EmsconConnection:
                     return status, body[8:]
 
     def result(self, *, until: float) -> tuple[int, int, bytes]:
-        """Return type, status and content of the result of the measurement that was started."""
+        """Return type, status and content of the result of the running measurement."""
         while True:
             kind, body = self._packet(until)
             if kind in (es.SINGLE, es.SINGLE2, es.PROBE):
@@ -114,7 +114,7 @@ class EmsconConnection:
                 return kind, self._two(body)[1], b""
 
     def drain(self) -> None:
-        """Take what the server has sent by itself; an old result among it is thrown away."""
+        """Read what the server has sent by itself; old results are dropped."""
         while True:
             try:
                 self._packet(0.0)
@@ -122,7 +122,7 @@ class EmsconConnection:
                 return
 
     def unpack(self, layout: str, body: bytes) -> tuple[Any, ...]:
-        """Unpack what a command returned; it may be longer."""
+        """Unpack the content of an answer, which may be longer than the layout."""
         try:
             return struct.unpack_from(layout, body)
         except struct.error:
@@ -136,7 +136,7 @@ class EmsconConnection:
 
     @contextlib.contextmanager
     def _failures(self) -> Iterator[None]:
-        """Turn what the socket raises into DeviceError; the connection is closed then."""
+        """Turn what the socket raises into DeviceError, and close the connection."""
         try:
             with network_failures(DEVICE, self.where):
                 yield
@@ -150,18 +150,18 @@ class EmsconConnection:
             self._socket.sendall(data)
 
     def _packet(self, until: float) -> tuple[int, bytes]:
-        """Type and content of the next packet; changes of state are kept aside.
+        """Type and content of the next packet; state changes go to `changes`.
 
-        With `until` 0, BlockingIOError tells that none waits.
+        With `until` 0, raises BlockingIOError if no packet waits.
         """
         while True:
-            if len(self._came) >= es.HEADER.size:
-                size, kind = es.HEADER.unpack_from(self._came)
+            if len(self._buffer) >= es.HEADER.size:
+                size, kind = es.HEADER.unpack_from(self._buffer)
                 if not es.HEADER.size <= size <= es.LARGEST:
                     self._strange("what is no packet of emScon")
-                if len(self._came) >= size:
-                    body = bytes(self._came[es.HEADER.size : size])
-                    del self._came[:size]
+                if len(self._buffer) >= size:
+                    body = bytes(self._buffer[es.HEADER.size : size])
+                    del self._buffer[:size]
                     if kind == es.CHANGE and len(body) == 4:
                         self.changes.append(int.from_bytes(body, "little"))
                         continue
@@ -170,25 +170,25 @@ class EmsconConnection:
 
     def _receive(self, until: float) -> None:
         with self._failures():
-            left = until - time.monotonic()
-            if until and left <= 0.0:
+            remaining = until - time.monotonic()
+            if until and remaining <= 0.0:
                 raise TimeoutError
-            self._socket.settimeout(left if until else 0.0)
+            self._socket.settimeout(remaining if until else 0.0)
             try:
                 data = self._socket.recv(es.LARGEST)
-            except BlockingIOError:  # of a socket that does not wait
+            except BlockingIOError:  # until is 0
                 data = None
         if data is None:
             raise BlockingIOError
         if not data:
             self.close()
             raise DeviceError(f"{DEVICE} at {self.where}: the tracker has closed the connection")
-        self._came += data
+        self._buffer += data
 
-    def _strange(self, what: str) -> NoReturn:
+    def _strange(self, content: str) -> NoReturn:
         self.close()
         raise DeviceError(
-            f"{DEVICE} at {self.where}: {what} comes; is an emScon server at this address?"
+            f"{DEVICE} at {self.where}: {content} comes; is an emScon server at this address?"
         )
 
 
@@ -215,23 +215,23 @@ class EmsconTracker:
             raise
 
     def measure(self) -> TrackerSample:
-        """Measure once; a reading of another reflector than the one that was set is refused."""
-        found = self._measure()
-        self._distance = float(np.linalg.norm(found.position))
-        stated = found.covariance
-        if not _positive(stated):
-            stated = tracker_covariance(found.position[None], tracker_noise(self._config))[0]
-        value, covariance = found.position, stated
-        if found.quaternion is not None:
-            turn = Rotation.from_quat(np.roll(found.quaternion, -1))  # scalar last
+        """Measure once; a reading of a reflector that has been changed is refused."""
+        result = self._measure()
+        self._distance = float(np.linalg.norm(result.position))
+        stated = result.covariance
+        if not _positive_definite(stated):
+            stated = tracker_covariance(result.position[None], tracker_noise(self._config))[0]
+        value, covariance = result.position, stated
+        if result.quaternion is not None:
+            turn = Rotation.from_quat(np.roll(result.quaternion, -1))  # scalar last
             value = np.concatenate([value, turn.as_rotvec()])
             covariance = np.zeros((6, 6))
-            covariance[:3, :3], covariance[3:, 3:] = stated, self._turn_covariance(found, turn)
+            covariance[:3, :3], covariance[3:, 3:] = stated, self._turn_covariance(result, turn)
         remarks, self._remarks = "; ".join(dict.fromkeys(self._remarks)), []
         return TrackerSample(time.monotonic_ns(), value, covariance, remarks)
 
     def aim(self, position: Floats, radius: float) -> None:
-        """Turn to where a reflector is expected and hold it; see `PointingTracker.aim`."""
+        """Turn to an expected reflector and hold it; see `PointingTracker.aim`."""
         moving = max(_LEAST_S, self._clock.real(SEARCHING_S))
         until = self._ready(moving)
         self._search(min(radius, self._options.search_m), until)
@@ -239,7 +239,7 @@ class EmsconTracker:
         self._find("turning to the target", es.GO_POSITION, place, until)
 
     def find_target(self) -> None:
-        """Find the zeros again where they are lost, and search for the reflector."""
+        """Find the zeros again if they are lost, and search for the reflector."""
         moving = max(_LEAST_S, self._clock.real(SEARCHING_S))
         until = self._ready(moving)
         if self._system(until)[1] != es.INITIALIZED:
@@ -256,13 +256,13 @@ class EmsconTracker:
         )
 
     def report(self) -> Report:
-        """Ask the tracker who it is and how it is, and measure once; nothing turns."""
+        """Report identity and state of the tracker, and measure once; nothing turns."""
         until = self._ready()
         status, body = self._line.ask(es.GET_TRACKER_INFO, until=until)
         name, serial = "emScon tracker", 0
         if status == es.OK:
-            _, words, number = self._line.unpack("<I64si", body)
-            name, serial = es.text(words) or name, number
+            _, field, number = self._line.unpack("<I64si", body)
+            name, serial = es.text(field) or name, number
         rows: list[Row] = [("", "", "name", name), ("", "", "serial_number", serial or None)]
         problems: list[str] = []
         if self._reflector is not None:
@@ -300,56 +300,55 @@ class EmsconTracker:
         return report_of(DEVICE, full, rows, problems)
 
     def close(self) -> None:
-        """Close the connection; the tracker stays as it is. Never raises, may be called twice."""
+        """Close the connection only. Never raises; may be called twice."""
         self._line.close()
 
     def _measure(self) -> es.Measurement:
         until = self._ready(self._clock.real(self._options.measuring_s))
         self._do("measuring", es.START_MEASUREMENT, until=until)
-        return self._sound(*self._line.result(until=until))
+        return self._checked(*self._line.result(until=until))
 
-    def _sound(self, kind: int, status: int, body: bytes) -> es.Measurement:
-        """Return a result that can be; else raise why it failed, or is none of this tracker."""
+    def _checked(self, kind: int, status: int, body: bytes) -> es.Measurement:
+        """Return a plausible result; raise DeviceError for a failed or impossible one."""
         if status != es.OK or kind == es.ERROR:
             raise es.failure("measuring", status)
-        wanted = es.STATIONARY_6D if self._options.target == "pose" else es.STATIONARY
         try:
-            found = es.measurement(kind, body)
+            result = es.measurement(kind, body)
         except struct.error:
             self._line.close()
             raise DeviceError(
                 f"{DEVICE}: measuring: a result of {len(body)} bytes comes; is this emScon?"
             ) from None
-        if (found.quaternion is None) == (wanted == es.STATIONARY_6D):
+        if (result.quaternion is None) == (self._options.target == "pose"):
             raise DeviceError(f"{DEVICE}: measuring: the tracker measures in another mode than set")
-        size = float(np.linalg.norm(found.position))
-        turn = 1.0 if found.quaternion is None else float(np.linalg.norm(found.quaternion))
+        size = float(np.linalg.norm(result.position))
+        turn = 1.0 if result.quaternion is None else float(np.linalg.norm(result.quaternion))
         if not (0.0 < size < _FARTHEST_M and abs(turn - 1.0) < 0.01):
             raise DeviceError(
                 f"{DEVICE}: measuring: the tracker gives a target {size:.4g} m away with a "
                 f"quaternion of length {turn:.3g}; are its units or its mode being changed?"
             )
-        return found
+        return result
 
-    def _turn_covariance(self, found: es.Measurement, turn: Rotation) -> Floats:
-        """(3, 3) of a small rotation about the tracker's axes, rad²."""
-        stated = found.angle_covariance
-        if not (_positive(stated) and np.isfinite(found.angles).all()):
+    def _turn_covariance(self, result: es.Measurement, turn: Rotation) -> Floats:
+        """(3, 3) covariance of a small rotation about the tracker's axes, rad²."""
+        stated = result.angle_covariance
+        if not (_positive_definite(stated) and np.isfinite(result.angles).all()):
             return self._config.orientation_std_rad**2 * np.eye(3)
         for order in _ORDERS:
-            there = Rotation.from_euler(order, found.angles)
-            if (there * turn.inv()).magnitude() < _SAME:
-                moved = Rotation.from_euler(order, found.angles + _STEP * np.eye(3))
-                J = (moved * there.inv()).as_rotvec().T / _STEP
+            nominal = Rotation.from_euler(order, result.angles)
+            if (nominal * turn.inv()).magnitude() < _SAME:
+                moved = Rotation.from_euler(order, result.angles + _STEP * np.eye(3))
+                J = (moved * nominal.inv()).as_rotvec().T / _STEP
                 C = J @ stated @ J.T
                 return np.asarray(0.5 * (C + C.T))
-        return float(np.linalg.eigvalsh(stated)[-1]) * np.eye(3)  # angles of another kind
+        return float(np.linalg.eigvalsh(stated)[-1]) * np.eye(3)  # unknown order of the angles
 
     def _soon(self, seconds: float = 0.0) -> float:
         return time.monotonic() + DEADLINE_S + seconds
 
     def _ready(self, seconds: float = 0.0) -> float:
-        """See that the tracker is connected and set as at first; a deadline so much later."""
+        """Restore connection and settings where lost; return a deadline, extended by `seconds`."""
         until = self._soon(seconds)
         again = not self._line.open
         if again:
@@ -373,21 +372,21 @@ class EmsconTracker:
         return until
 
     def _set_up(self, until: float) -> None:
-        """Set units, axes, statistics and mode where they are not what is needed."""
+        """Set units, axes, statistics and mode where they differ from those needed."""
         mode = es.STATIONARY_6D if self._options.target == "pose" else es.STATIONARY
         measuring = struct.pack("<2i", max(1, math.ceil(1e3 * self._options.measuring_s)), 1)
-        for what, get, put, wanted in (
+        for setting, get, put, value in (
             ("units", es.GET_UNITS, es.SET_UNITS, _UNITS),
             ("coordinate system", es.GET_COORDINATES, es.SET_COORDINATES, struct.pack("<I", 0)),
             ("statistics", es.GET_STATISTICS, es.SET_STATISTICS, struct.pack("<2I", 1, 1)),
             ("mode", es.GET_MODE, es.SET_MODE, struct.pack("<I", mode)),
             ("time of a measurement", es.GET_STATIONARY, es.SET_STATIONARY, measuring),
         ):
-            if self._do(f"reading its {what}", get, until=until) != wanted:
-                self._do(f"setting its {what}", put, wanted, until=until)
+            if self._do(f"reading its {setting}", get, until=until) != value:
+                self._do(f"setting its {setting}", put, value, until=until)
         body = self._do("reading its settings", es.GET_SETTINGS, until=until)
         old = self._line.unpack("<I8i", body)
-        # own axes, not those of a station or of an object; tells changes; single results only
+        # own axes, not those of a station or of an object; reports changes; single results only
         new = (old[0], 0, 0, old[3], 1, 0, 0, *old[7:])
         if new != old:
             packed = struct.pack("<I8i", *new)
@@ -398,43 +397,43 @@ class EmsconTracker:
         self._line.changes = [c for c in self._line.changes if c in es.CLOSING]
 
     def _check_reflector(self, until: float) -> None:
-        """Set the reflector at first; later refuse another one, whose centre is elsewhere."""
+        """Set the reflector at the first call; later refuse another, whose centre is elsewhere."""
         body = self._do("reading its reflector", es.GET_REFLECTOR, until=until)
         (number,) = self._line.unpack("<i", body)
         names = self._reflectors(until)
         if self._reflector is None:
-            wanted = self._options.reflector
-            if wanted is not None and names.get(number) != wanted:
-                known = {name: k for k, name in names.items()}
-                if wanted not in known:
+            name = self._options.reflector
+            if name is not None and names.get(number) != name:
+                numbers = {name: number for number, name in names.items()}
+                if name not in numbers:
                     raise InputError(
-                        f'[tracker] options: the tracker has no reflector "{wanted}"; valid: '
-                        f"{', '.join(known)}"
+                        f'[tracker] options: the tracker has no reflector "{name}"; valid: '
+                        f"{', '.join(numbers)}"
                     )
-                number = known[wanted]
+                number = numbers[name]
                 packed = struct.pack("<i", number)
                 self._do("setting its reflector", es.SET_REFLECTOR, packed, until=until)
             self._reflector = number, names.get(number, f"number {number}")
         elif number != self._reflector[0]:
-            self._line.changes.append(es.REFLECTOR_CHANGED)  # asked again at the next call
+            self._line.changes.append(es.REFLECTOR_CHANGED)  # checked again at the next call
             raise DeviceError(
                 f'{DEVICE}: its reflector was changed to "{names.get(number, number)}", '
                 f'readings so far are of "{self._reflector[1]}"; set that one again'
             )
 
     def _reflectors(self, until: float) -> dict[int, str]:
-        """Names of the reflectors in the tracker's list; it answers with one packet for each."""
-        found: dict[int, str] = {}
+        """Names of the reflectors by number; the tracker answers with a packet for each."""
+        out: dict[int, str] = {}
         body = self._do("reading its reflectors", es.GET_REFLECTORS, until=until)
-        for left in range(es.LARGEST):
+        for k in range(es.LARGEST):
             total, number, _, _, name = self._line.unpack("<iiId64s", body)
-            found[number] = es.text(name)
-            if left + 1 >= total:
+            out[number] = es.text(name)
+            if k + 1 >= total:
                 break
             status, body = self._line.answer(es.GET_REFLECTORS, until=until)
             if status != es.OK:
                 raise es.failure("reading its reflectors", status)
-        return found
+        return out
 
     def _system(self, until: float) -> tuple[int, ...]:
         """Last status, state of tracker, laser and distance meter, version (3), weather, 2 more."""
@@ -458,15 +457,15 @@ class EmsconTracker:
             raise TargetLostError(f"{DEVICE}: {doing}: it is not found (status {status})")
 
     def _do(self, doing: str, command: int, parameters: bytes = b"", *, until: float) -> bytes:
-        """Carry out a command and return what it returns; a failure is raised."""
+        """Carry out a command and return its content; raises DeviceError if it fails."""
         status, body = self._line.ask(command, parameters, until=until)
         if status not in es.GOOD:
             raise es.failure(doing, status)
         return body
 
 
-def _positive(covariance: Floats) -> bool:
-    """Whether it is a covariance of something that scatters in all directions."""
+def _positive_definite(covariance: Floats) -> bool:
+    """Whether a covariance is finite and positive definite."""
     return bool(np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance)[0] > 0.0)
 
 

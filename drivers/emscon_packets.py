@@ -1,9 +1,9 @@
-"""Leica emScon: packets, numbers of commands and results, and what they mean for a measurement.
+"""Leica emScon: packets, numbers of commands and results, and their meaning.
 
-Every packet is little-endian, packed to 4 bytes, and begins with its size (int32, with this header)
-and its type (uint32). Of a command goes out: its number, then its parameters; back come its number,
-its status, then what it returns. A result has its status, then the measurement. The server also
-sends by itself: errors (command, status) and changes of its state.
+Every packet is little-endian, packed to 4 bytes, and begins with its size (int32, header included)
+and its type (uint32). A command is sent as its number and its parameters; the answer is its number,
+its status and its content. A result is its status and the measurement. Unasked, the server sends
+errors (command, status) and changes of its state.
 
 Source: Leica Geosystems, emScon TPI V3.6, `ES_C_API_Def.h` (LTD, AT901 and AT40x trackers).
 """
@@ -19,7 +19,7 @@ from hilcal.types import Floats
 
 PORT = 700
 HEADER = struct.Struct("<iI")
-LARGEST = 1 << 16  # bytes that no packet has
+LARGEST = 1 << 16  # bytes; no packet is longer
 
 # types of packets
 COMMAND, ERROR, SINGLE, PROBE, CHANGE, SINGLE2 = 0, 1, 2, 4, 8, 9
@@ -46,10 +46,10 @@ CLOSING = {
 REFLECTOR_FOUND, LEVELLED = 2048, 32768
 BOOTED, INITIALIZED = 3, 5  # states of the tracker in GET_SYSTEM_STATUS
 WEATHER = ("none: temperature, pressure, humidity as set", "read, but not used", "used")
-"""States of the weather station there."""
+"""States of the weather station in GET_SYSTEM_STATUS."""
 
 OK, BUSY, NOT_IMPLEMENTED, NOT_INITIALIZED = 0, 1, 2, 39
-GOOD = frozenset({OK, *range(11, 22, 2)})  # done; or a parameter is out of its range, and done
+GOOD = frozenset({OK, *range(11, 22, 2)})  # odd 11 to 21: done, though a parameter is out of range
 NO_DISTANCE, NO_RESULT = 37, 10009
 
 LOST = {
@@ -60,7 +60,7 @@ LOST = {
     NO_RESULT: "no measurement (beam broken, or no reflector?)",
     10014: "it is not ready to measure (no reflector in the beam?)",
 }
-"""No reading, but another try after a search may give one."""
+"""Statuses without a reading; another try after a search may give one."""
 
 _MEANING = {
     BUSY: "busy with something else",
@@ -86,31 +86,31 @@ _MEANING = {
 
 
 def failure(doing: str, status: int) -> DeviceError:
-    """Return the exception for a status that is not `OK`, e.g. of "measuring"."""
+    """Return the exception for a status that is not `OK`; `doing`: e.g. "measuring"."""
     if status in LOST:
         return TargetLostError(f"tracker: {doing}: {LOST[status]} (status {status})")
-    words = _MEANING.get(status)
-    if words is None and (3 <= status <= 22 or 47 <= status <= 55):
-        words = "a parameter is refused"
-    told = f"{words} (status {status})" if words else f"status {status}"
-    return DeviceError(f"tracker: {doing}: the tracker reports: {told}")
+    meaning = _MEANING.get(status)
+    if meaning is None and (3 <= status <= 22 or 47 <= status <= 55):
+        meaning = "a parameter is refused"
+    cause = f"{meaning} (status {status})" if meaning else f"status {status}"
+    return DeviceError(f"tracker: {doing}: the tracker reports: {cause}")
 
 
 def text(field: bytes) -> str:
-    """Return a text of 16-bit characters up to its end."""
+    """Decode a null-terminated text of 16-bit characters."""
     return field.decode("utf-16-le", "replace").split("\0")[0].strip()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measurement:
-    """A result of one stationary measurement, in the units that were set (m, rad, °C, mbar, %)."""
+    """The result of a stationary measurement, in the units set (m, rad, °C, mbar, %)."""
 
     position: Floats  # (3,) m
     covariance: Floats
-    """(3, 3) that the instrument expects of it (a priori), m²; zero: it states none."""
-    quaternion: Floats | None  # (4,) scalar first, of a 6-D target; None of a reflector
-    angles: Floats  # (3,) the same as rotations about x, y, z, rad
-    angle_covariance: Floats  # (3, 3) of these, rad²; zero: it states none
+    """(3, 3) as the instrument states it a priori, m²; zero: none stated."""
+    quaternion: Floats | None  # (4,) scalar first; None for a reflector
+    angles: Floats  # (3,) the orientation as rotations about x, y, z, rad
+    angle_covariance: Floats  # (3, 3) of these, rad²; zero: none stated
 
 
 _SINGLE, _SINGLE2 = struct.Struct("<Ii17d"), struct.Struct("<Ii23d")
@@ -118,12 +118,12 @@ _PROBE = struct.Struct("<IiIiiiIii41d")
 
 
 def measurement(kind: int, body: bytes) -> Measurement:
-    """Return what a result of type `SINGLE`, `SINGLE2` or `PROBE` says, without its status."""
+    """Parse a result of type `SINGLE`, `SINGLE2` or `PROBE`, without its status."""
     none = np.zeros((3, 3))
     if kind == PROBE:
         d = np.array(_PROBE.unpack(body)[9:])
-        turned = _covariance(d[31:34], d[35:38])
-        return Measurement(d[:3], _covariance(d[10:13], d[14:17]), d[17:21], d[21:24], turned)
+        angular = _covariance(d[31:34], d[35:38])
+        return Measurement(d[:3], _covariance(d[10:13], d[14:17]), d[17:21], d[21:24], angular)
     if kind == SINGLE2:
         d = np.array(_SINGLE2.unpack(body)[2:])
         return Measurement(d[:3], _covariance(d[13:16], d[17:20]), None, np.zeros(3), none)
@@ -134,7 +134,7 @@ def measurement(kind: int, body: bytes) -> Measurement:
 def pack_measurement(
     m: Measurement, mode: int, environment: tuple[float, float, float]
 ) -> tuple[int, bytes]:
-    """Return type and content of the result that tells a measurement; the inverse of the above.
+    """Return type and content of the result of a measurement; the inverse of `measurement`.
 
     `environment` is temperature °C, pressure mbar, relative humidity %.
     """
@@ -142,8 +142,8 @@ def pack_measurement(
     if m.quaternion is None:
         values = (*m.position, *stated, 0.0, 0.0, 0.0, *stated, *environment)
         return SINGLE2, _SINGLE2.pack(mode, 0, *values)
-    turned = _stated(m.angle_covariance)
-    values = (*m.position, *stated, *stated, *m.quaternion, *m.angles, *turned, *turned)
+    angular = _stated(m.angle_covariance)
+    values = (*m.position, *stated, *stated, *m.quaternion, *m.angles, *angular, *angular)
     return PROBE, _PROBE.pack(mode, 0, 0, 0, 1, 0, 0, 0, 0, *values, *environment)
 
 

@@ -1,7 +1,7 @@
-"""A force sensor that sends by itself, read in the background: newest frame, means, counters.
+"""A force sensor that streams, read in the background: newest frame, means, counters.
 
-One thread takes what waits on the line every few milliseconds (the kernel keeps 4096 bytes,
-110 frames of the longest kind), finds the frames and keeps the last ones in a ring.
+Every few milliseconds one thread reads the waiting bytes (the kernel keeps 4096, 110 frames of the
+longest kind), finds the frames in them and writes them to a ring buffer.
 """
 
 import math
@@ -25,36 +25,36 @@ from hilcal.types import Floats, Ints
 
 @dataclass(frozen=True, slots=True)
 class FrameFormat:
-    """What a frame of fixed length looks like: header, body, two bytes of checksum."""
+    """Layout of a frame of fixed length: header, body, two bytes of checksum."""
 
     header: bytes  # the bytes that every frame begins with
-    size: int  # of a whole frame, bytes
+    size: int  # of the frame, with header and checksum, bytes
     checksum: Callable[[bytes], bytes]
-    """What the last two bytes must be, from all the bytes before them."""
+    """From all bytes but the last two: what these two must be."""
     weak: bool = False
-    """Whether the checksum is a mere sum; then a frame counts only once the header of the next one
-    follows it directly."""
+    """Whether the checksum is a mere sum; then a frame counts only if the next header follows it
+    directly."""
 
 
 class Deframer:
-    """Finds frames in bytes that come in pieces; after a bad one it gives up one byte only.
+    """Finds frames in a stream of bytes; after a bad frame it skips one byte only.
 
-    A 16-bit checksum passes 1 of 65536 wrong candidates, and while looking for the next header
-    every byte is a candidate. So a frame that does not follow a good one directly counts only
-    once a second good frame follows it directly. `corrupt` frames (several candidates inside one
-    length are one) and `skipped` bytes count from the first good frame on.
+    A 16-bit checksum passes 1 of 65536 wrong candidates, and during a search for a header every
+    byte is a candidate. A frame that does not directly follow a good one therefore counts only if a
+    second good frame directly follows it. `corrupt` frames (candidates within one frame length
+    count as one) and `skipped` bytes are counted from the first good frame on.
     """
 
     def __init__(self, frame: FrameFormat) -> None:
         self.frames = self.corrupt = self.skipped = 0
         self._format = frame
         self._buffer = bytearray()
-        self._in_step = self._begun = False
-        self._taken = 0  # position in the stream of the buffer's first byte
+        self._in_step = self._synchronised = False
+        self._offset = 0  # position in the stream of the buffer's first byte
         self._bad_until = 0  # stream position up to which a bad frame has been counted
 
     def push(self, data: bytes) -> list[bytes]:
-        """Take bytes, return the bodies (without header and checksum) of the frames they end."""
+        """Add bytes; return the bodies (without header and checksum) of the frames now complete."""
         buffer, size, header = self._buffer, self._format.size, self._format.header
         buffer += data
         out: list[bytes] = []
@@ -74,42 +74,42 @@ class Deframer:
             if good and (not self._in_step or self._format.weak):
                 needed = len(header) if self._in_step else size
                 if len(buffer) - at < size + needed:
-                    break  # the next frame will tell
-                next_ = at + size
-                good = buffer.startswith(header, next_) if self._in_step else self._good(next_)
+                    break  # decided when the next frame has come
+                end = at + size
+                good = buffer.startswith(header, end) if self._in_step else self._good(end)
             if good:
-                self._in_step = self._begun = True
+                self._in_step = self._synchronised = True
                 out.append(bytes(buffer[at + len(header) : at + size - 2]))
                 at += size
             else:
-                if self._taken + at >= self._bad_until:
-                    self.corrupt += self._begun
-                    self._bad_until = self._taken + at + size
+                if self._offset + at >= self._bad_until:
+                    self.corrupt += self._synchronised
+                    self._bad_until = self._offset + at + size
                 self._skip(1)
                 at += 1
         del buffer[:at]
-        self._taken += at
+        self._offset += at
         self.frames += len(out)
         return out
 
     def _skip(self, count: int) -> None:
         """Count bytes that belong to no frame."""
         if count:
-            self.skipped += count * self._begun
+            self.skipped += count * self._synchronised
             self._in_step = False
 
     def _good(self, at: int) -> bool:
-        """Whether a frame with a right checksum begins there."""
+        """Whether a frame with a right checksum begins at this index of the buffer."""
         frame = bytes(self._buffer[at : at + self._format.size])
         checksum = self._format.checksum
         return frame.startswith(self._format.header) and checksum(frame[:-2]) == frame[-2:]
 
 
 class ByDeviceClock:
-    """From the device's own time stamps, whose counter may wrap.
+    """Counts lost frames by the device's time stamps, whose counter may wrap.
 
-    A frame whose time is not shortly after its predecessor's is out of place, unless its
-    successor follows on it (then the device has begun to count anew).
+    A frame is out of place if its time is not shortly after its predecessor's, unless its successor
+    continues it: then the device has restarted its counter.
     """
 
     LEARN = 20
@@ -121,15 +121,15 @@ class ByDeviceClock:
         self._last: int | None = None
         self._stray: int | None = None
         self._steps: list[int] = []
-        self._period = 0.0  # ticks; 0 until `LEARN` steps have been seen
+        self._period = 0.0  # ticks; 0 until `LEARN` steps have come
 
     @property
     def rate(self) -> float:
-        """Frames per second of device time; 0 while that is unknown."""
+        """Frames per second of device time; 0 while unknown."""
         return 1.0 / (self._period * self._tick) if self._period else 0.0
 
     def follow(self, count: int, ticks: Sequence[int], now: float) -> list[bool]:
-        """Return which of the frames that came together, read at `now`, s, are in their place."""
+        """Return which of the `count` frames read together at the time `now`, s, are in place."""
         return [self._in_place(tick) for tick in ticks]
 
     def _in_place(self, tick: int) -> bool:
@@ -139,7 +139,7 @@ class ByDeviceClock:
                 stray, self._stray = self._stray, tick
                 if stray is None or not 0 < (tick - stray) % self._wrap * self._tick <= 1.0:
                     return False
-                self._last = stray  # it counts anew; the stray one stays out, and is lost
+                self._last = stray  # the counter has restarted; the stray frame is lost
                 self.lost += 1
                 step = (tick - stray) % self._wrap
             self._count(step)
@@ -153,18 +153,17 @@ class ByDeviceClock:
         self._steps.append(step)
         if len(self._steps) == self.LEARN:
             self._period = float(np.median(self._steps))
-            for known in self._steps:
-                self.lost += max(0, round(known / self._period) - 1)
+            self.lost += sum(max(0, round(step / self._period) - 1) for step in self._steps)
 
 
 class ByArrival:
-    """From the times of arrival, for a device without a clock whose rate is known.
+    """Counts lost frames by times of arrival, for a device of known rate without a clock.
 
-    Each frame has a time when it is due, one period after the one before; the schedule follows
-    frames that come early at once and late ones slowly (sender and host have different
-    clocks). One that is late by almost a period or more shows how many are missing. Frames that
-    were only held up come early by this schedule, and are taken off the count again; for that
-    the schedule stays for ten times as long as they were late.
+    Each frame is due one period after its predecessor. The schedule follows early frames at once
+    and late ones slowly (sender and host have different clocks). A frame late by `LATE` periods or
+    more shows how many are missing. Frames that were only delayed then come early by this schedule,
+    and are subtracted from the count again; to see them, the schedule is held for `DOUBT` times the
+    delay.
     """
 
     LATE = 0.9
@@ -175,10 +174,10 @@ class ByArrival:
         self.lost = 0
         self.rate = rate
         self._due: float | None = None  # when the newest frame was due
-        self._doubt_until = -math.inf  # until then missing ones may only be held up
+        self._doubt_until = -math.inf  # until then missing frames may only be delayed
 
     def follow(self, count: int, ticks: Sequence[int], now: float) -> list[bool]:
-        """See `ByDeviceClock.follow`; all are in their place."""
+        """See `ByDeviceClock.follow`; all are in place."""
         period = 1.0 / self.rate
         self._due = now if self._due is None else self._due + count * period
         late = (now - self._due) / period  # periods
@@ -197,39 +196,39 @@ class ByArrival:
         return [True] * count
 
 
-LossCounter = ByDeviceClock | ByArrival  # counts from what comes
+LossCounter = ByDeviceClock | ByArrival
 
 DEVICE = "force sensor"
 STALE_S = 0.5
-"""Older than this, a frame is not the present. A busy computer hands bytes over late: the kernel
-passes them on in a thread that competes with all programs; 0.2 s are not rare."""
+"""Age at which the newest frame is stale. A busy computer hands bytes over late: the kernel passes
+them on in a thread that competes with all programs; 0.2 s are not rare."""
 POLL_S = 0.005
 LOOK_S = 1.0
-"""The reader gets so long to look once more; it takes two passes where the computer is idle."""
+"""Time for the reader to look once more; an idle computer needs two passes, 2 `POLL_S`."""
 SLICE_S = 0.05
-MIN_SHARE = 0.5  # share of the frames due in a window that has to come for a mean
-FEW, MAX_LOST = 5, 0.01  # so many lost frames, and this share of all, are no problem yet
+MIN_SHARE = 0.5  # least share of the frames due in a window for a mean
+FEW, MAX_LOST = 5, 0.01  # this number of lost frames plus this share of all is no problem
 RING = 4096
 FIRST_FRAME_S, OLD_S = 1.0, 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorFormat:
-    """What a sensor puts on its line."""
+    """What a sensor sends, and what its values mean."""
 
     name: str  # the maker's, for people
-    frame: FrameFormat  # its frames; of no meaning where they come as datagrams
+    frame: FrameFormat  # unused where records come as datagrams
     body: np.dtype[Any]
-    """What is between header and checksum; field `wrench` (6), and where it gives them `status`,
-    `ticks` (device clock) and `temperature` (°C)."""
+    """Fields between header and checksum: `wrench` (6); optionally `status`, `ticks` (device clock)
+    and `temperature` (°C)."""
     unit: Floats  # (6,) N and N·m per count of `wrench`
     losses: Callable[[], LossCounter]  # makes the counter of lost frames
     overload: Callable[[Floats, int], str]
-    """(wrench (6,), status) to what is wrong with such a frame, "" where nothing."""
+    """From wrench (6,) and status: what is wrong with the frame, "" if nothing."""
 
 
 class ForceStream:
-    """A sensor that is sending; see `hilcal.measuring.devices.ForceSensorDevice`."""
+    """A streaming sensor; see `hilcal.measuring.devices.ForceSensorDevice`."""
 
     def __init__(
         self,
@@ -242,10 +241,10 @@ class ForceStream:
         failures: Callable[[str, str], AbstractContextManager[None]] = line_failures,
         before_close: Callable[[], None] = lambda: None,
     ) -> None:
-        """Start to read an open port, which `close` closes: a serial one, or what has its names.
+        """Start to read an open port, serial or with the same interface; `close` closes it.
 
-        `deframer` takes the frames out of the bytes where `sensor.frame` does not tell how;
-        `failures` turns what the port raises into DeviceError; `before_close` must not raise.
+        `deframer` replaces a `Deframer` of `sensor.frame`; `failures` turns what the port raises
+        into DeviceError; `before_close` must not raise.
         """
         self._name, self._facts, self._before_close = name or sensor.name, facts, before_close
         self._port, self._sensor, self._failures = port, sensor, failures
@@ -255,7 +254,7 @@ class ForceStream:
         self._lock = threading.Lock()
         self._failure = ""
         self._passes = 0
-        self._bytes = self._impossible = self._kept = 0
+        self._bytes = self._impossible = self._count = 0
         self._byte_time = self._frame_time = self._start = time.monotonic()
         self._wrench = np.zeros((RING, 6))
         self._stamp = np.zeros(RING, dtype=np.int64)
@@ -266,12 +265,12 @@ class ForceStream:
         self._thread.start()
 
     def started(self, seconds: float = FIRST_FRAME_S) -> Self:
-        """Return when a frame has come; closes where none came, or where the line failed."""
+        """Wait for the first frame; without one in time, close the port and raise DeviceError."""
         end = time.monotonic() + seconds
         try:
-            while not self._kept and not self._failure and time.monotonic() < end:
+            while not self._count and not self._failure and time.monotonic() < end:
                 time.sleep(POLL_S)
-            if not self._kept:
+            if not self._count:
                 raise DeviceError(self._silence())
         except BaseException:
             self.close()
@@ -282,30 +281,30 @@ class ForceStream:
         """Return the newest frame, at most `STALE_S` old."""
         self._check()
         with self._lock:
-            at = (self._kept - 1) % RING
+            at = (self._count - 1) % RING
             wrench, stamp, status = self._wrench[at].copy(), self._stamp[at], self._status[at]
             temperature = self._temperature
         self._check_load(wrench, int(status))
         return WrenchSample(int(stamp), wrench, np.zeros((6, 6)), 1, temperature)
 
     def average(self, seconds: float) -> WrenchSample:
-        """Return the mean of the frames of the next so many real seconds."""
+        """Return mean and covariance of the frames of the next `seconds` (real time)."""
         if not np.isfinite(seconds) or seconds < 0.0:
             raise ValueError(f"seconds = {seconds}; valid: 0 or more")
         self._check()
         end = time.monotonic() + seconds
         least = max(1.0, MIN_SHARE * np.floor(self.rate * seconds))
-        since = first = self._kept
+        since = first = self._count
         runs: list[tuple[Floats, Ints, Ints]] = []
         while True:
-            left = end - time.monotonic()
-            time.sleep(max(0.0, min(SLICE_S, left)) if left > 0.0 else POLL_S)
+            remaining = end - time.monotonic()
+            time.sleep(max(0.0, min(SLICE_S, remaining)) if remaining > 0.0 else POLL_S)
             self._check()
             with self._lock:
-                rows = np.arange(since, self._kept) % RING
-                since = self._kept
+                rows = np.arange(since, self._count) % RING
+                since = self._count
                 runs.append((self._wrench[rows], self._stamp[rows], self._status[rows]))
-            late = time.monotonic() - end  # frames may be late, too
+            late = time.monotonic() - end  # wait also for frames that come late
             if late >= 0.0 and (since - first >= least or late > STALE_S):
                 break
         wrench, stamp, status = (np.concatenate(parts) for parts in zip(*runs, strict=True))
@@ -315,36 +314,34 @@ class ForceStream:
                 f"{DEVICE}: port {self._path} gave {K} of {self.rate * seconds:.0f} frames in "
                 f"{seconds:.3g} s; check its cable"
             )
-        for one, word in zip(wrench, status, strict=True):
-            self._check_load(one, int(word))
+        for values, bits in zip(wrench, status, strict=True):
+            self._check_load(values, int(bits))
         covariance = np.cov(wrench, rowvar=False) if K > 1 else np.zeros((6, 6))
         return WrenchSample(
             int(stamp[-1]), wrench.mean(axis=0), np.asarray(covariance), K, self._temperature
         )
 
     def losses(self) -> Losses:
-        """Return the counters; `lost` are all that did not come whole, corrupt ones included."""
+        """Return the counters; `lost` includes corrupt frames."""
         with self._lock:
-            found = self._deframer
-            return Losses(
-                self._kept, self._counter.lost, found.corrupt + self._impossible, found.skipped
-            )
+            corrupt = self._deframer.corrupt + self._impossible
+            return Losses(self._count, self._counter.lost, corrupt, self._deframer.skipped)
 
     @property
     def rate(self) -> float:
-        """Frames per second as the sensor sends them; 0 while that is unknown."""
+        """Frames per second that the sensor sends; 0 while unknown."""
         return self._counter.rate
 
     def report(self) -> Report:
         """Say who answered, rate, temperature, counters, and every problem."""
-        count, warm, rate = self.losses(), self._temperature, self.rate
-        rows: list[Row] = [(what, x, what.replace(" ", "_"), x) for what, x in self._facts]
+        count, celsius, rate = self.losses(), self._temperature, self.rate
+        rows: list[Row] = [(key, value, key.replace(" ", "_"), value) for key, value in self._facts]
         counted = f"{count.frames}, lost {count.lost}, corrupt {count.corrupt}"
-        heat = "" if warm is None else f"{warm:.1f} °C"
+        temperature = "" if celsius is None else f"{celsius:.1f} °C"
         rows += [
             ("port", self._path, "port", self._path),
             ("rate" if rate else "", f"{rate:.0f} Hz", "rate_Hz", rate or None),
-            ("temperature" if heat else "", heat, "temperature_degC", warm),
+            ("temperature" if temperature else "", temperature, "temperature_degC", celsius),
             ("frames", counted, "frames", count.frames),
             ("", "", "lost", count.lost),
             ("", "", "corrupt", count.corrupt),
@@ -365,7 +362,7 @@ class ForceStream:
         )
 
     def close(self) -> None:
-        """Stop to read, give the port back. Never raises, may be called twice."""
+        """Stop reading and close the port. Never raises; may be called twice."""
         if self._running:
             self._running = False
             self._thread.join(2.0)
@@ -374,7 +371,7 @@ class ForceStream:
             close_port(self._port)
 
     def _read(self) -> None:
-        """Take what waits on the line, again and again (the thread)."""
+        """Read waiting bytes until closed (runs in the thread)."""
         try:
             with self._failures(DEVICE, self._path):
                 while self._running:
@@ -388,16 +385,16 @@ class ForceStream:
             self._failure = str(error)
 
     def _take(self, data: bytes, stamp: int) -> None:
-        """Find frames in bytes read at a time, and keep them."""
+        """Store the frames that these bytes complete; `stamp`: time of reading, ns."""
         bodies = self._deframer.push(data)
         self._bytes += len(data)
         self._byte_time = stamp * 1e-9
         if not bodies:
             return
         rows = np.frombuffer(b"".join(bodies), dtype=self._sensor.body)
-        known = self._sensor.body.names or ()
+        fields = self._sensor.body.names or ()
         wrench = rows["wrench"] * self._sensor.unit
-        ticks = rows["ticks"].tolist() if "ticks" in known else []
+        ticks = rows["ticks"].tolist() if "ticks" in fields else []
         possible = np.all(np.abs(wrench) < 1e5, axis=1)  # False for NaN
         with self._lock:
             possible &= self._counter.follow(len(rows), ticks, self._byte_time)
@@ -406,21 +403,21 @@ class ForceStream:
                 rows, wrench = rows[possible], wrench[possible]
                 if not len(rows):
                     return
-            at = np.arange(self._kept, self._kept + len(rows)) % RING
+            at = np.arange(self._count, self._count + len(rows)) % RING
             self._wrench[at] = wrench
             self._stamp[at] = stamp
-            self._status[at] = rows["status"] if "status" in known else 0
-            if "temperature" in known:
-                warm = float(rows["temperature"][-1])
-                self._temperature = warm if -100.0 < warm < 200.0 else None
+            self._status[at] = rows["status"] if "status" in fields else 0
+            if "temperature" in fields:
+                celsius = float(rows["temperature"][-1])
+                self._temperature = celsius if -100.0 < celsius < 200.0 else None
             self._frame_time = self._byte_time
-            self._kept += len(rows)
+            self._count += len(rows)
 
     def _check(self) -> None:
-        """Refuse a dead or stale stream.
+        """Raise DeviceError for a dead or stale stream.
 
-        On a busy computer it may be the reader that was late, not the sensor: it looks once more
-        first, in a pass that begins after this call.
+        On a busy computer the reader may be late, not the sensor. So the reader first gets one
+        complete pass that begins after this call.
         """
         enough, end = self._passes + 2, time.monotonic() + LOOK_S
         while self._failure or time.monotonic() - self._frame_time > STALE_S:
@@ -430,8 +427,7 @@ class ForceStream:
 
     def _check_load(self, wrench: Floats, status: int) -> None:
         """Refuse a frame that the sensor could not measure."""
-        wrong = self._sensor.overload(wrench, status)
-        if wrong:
+        if wrong := self._sensor.overload(wrench, status):
             raise DeviceError(f"{DEVICE}: {wrong}")
 
     def _silence(self) -> str:
@@ -458,7 +454,7 @@ def open_streaming(section: Section, baud: int, sensor: SensorFormat) -> ForceSt
     port = open_port(DEVICE, path, section.baud or baud)
     try:
         with line_failures(DEVICE, path):
-            drain(port, quiet=OLD_S, limit=OLD_S)  # adapters keep some of what came before
+            drain(port, quiet=OLD_S, limit=OLD_S)  # adapters buffer old bytes
     except BaseException:
         close_port(port)
         raise
@@ -473,7 +469,7 @@ def serial_port(section: Section) -> str:
 
 
 def checked_config(config: CellConfig, options: tuple[str, ...] = ()) -> Section:
-    """Return [force_sensor], with no option that the driver does not know."""
+    """Return [force_sensor]; raise InputError for an option that the driver does not have."""
     section = config.force_sensor
     if section is None:
         raise InputError("[force_sensor] is missing; give driver and port")

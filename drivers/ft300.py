@@ -1,10 +1,10 @@
 """Robotiq FT 300 and FT 300-S over serial: registers over Modbus RTU, then a stream.
 
 Robotiq FT 300 Instruction Manual: 19200 Bd, slave 9, registers 500 firmware, 510 to 513 serial
-number; 0x0200 in register 410 starts the stream of 100 frames per second, fifty bytes FF end
-it. Frame: `20 4E`; six int16, N × 100 and N·m × 1000; CRC-16/MODBUS; all little-endian. While
-it streams it answers no request, and it streams on when the program that started it has died.
-Requests go by minimalmodbus, on a line that may be noisy or streaming. Modbus over Serial Line,
+number; 0x0200 in register 410 starts the stream of 100 frames per second; fifty bytes FF end the
+stream. Frame: `20 4E`; six int16, N × 100 and N·m × 1000; CRC-16/MODBUS; all little-endian. A
+streaming sensor answers no request; it streams on after the program that started it has died.
+minimalmodbus makes the requests, on a line that may be noisy or streaming. Modbus over Serial Line,
 Specification and Implementation Guide V1.02 (modbus.org, 2006).
 """
 
@@ -40,7 +40,7 @@ QUIET_S, TRIES, WRITE_MULTIPLE = 0.03, 2, 16
 
 
 class NoAnswerError(DeviceError):
-    """No sound answer came; `heard` is whether anything came at all."""
+    """No valid answer came; `heard`: whether any bytes came."""
 
     def __init__(self, heard: bool) -> None:
         super().__init__("no answer")
@@ -48,11 +48,11 @@ class NoAnswerError(DeviceError):
 
 
 class RefusedError(DeviceError):
-    """The device answered that it does not do this."""
+    """The device answered that it refuses the request."""
 
 
 def read_registers(port: serial.Serial, slave: int, address: int, count: int) -> tuple[int, ...]:
-    """Return `count` holding registers (16 bits each) from an address on."""
+    """Return `count` holding registers (16 bits each) from `address` on."""
     return tuple(_ask(port, slave, lambda device: device.read_registers(address, count)))
 
 
@@ -78,7 +78,7 @@ def _ask(port: serial.Serial, slave: int, request: Callable[[minimalmodbus.Instr
 
 
 def _overload(wrench: Floats, status: int) -> str:
-    """Whether a component is at the end of its range, where it measures no more."""
+    """What to report where a component is at the end of its range, else an empty string."""
     worst = int(np.argmax(np.abs(wrench) / RANGE))
     if abs(wrench[worst]) < 0.9999 * RANGE[worst]:
         return ""
@@ -100,7 +100,7 @@ SENSOR = fs.SensorFormat(
 
 
 def open_force_sensor(config: CellConfig) -> ForceSensorDevice:
-    """Open the port of [force_sensor], ask who is there, and start the stream."""
+    """Open the port of [force_sensor], identify the sensor, and start the stream."""
     section = fs.checked_config(config)
     path = fs.serial_port(section)
     port = open_port(DEVICE, path, section.baud or BAUD, timeout=0.1)
@@ -118,14 +118,14 @@ def open_force_sensor(config: CellConfig) -> ForceSensorDevice:
 
 
 def _begin(port: serial.Serial) -> tuple[str, str]:
-    """Return firmware and serial number, with the stream started."""
+    """Start the stream; return firmware and serial number."""
     heard = False
     for _ in range(2):
-        port.write(STOP)  # it may be streaming still, for a program that was killed
+        port.write(STOP)  # it may still stream for a program that was killed
         drain(port, quiet=0.06, limit=0.25)
         try:
-            firmware = _words(port, *FIRMWARE)
-            number = _words(port, *SERIAL_NUMBER)
+            firmware = _text(port, *FIRMWARE)
+            number = _text(port, *SERIAL_NUMBER)
             write_register(port, SLAVE, STREAM_REGISTER, STREAM)
             return firmware, number
         except NoAnswerError as error:
@@ -134,27 +134,27 @@ def _begin(port: serial.Serial) -> tuple[str, str]:
             raise DeviceError(
                 f"{DEVICE}: port {port.port}: it does not stream, {error}; is it an FT 300?"
             ) from None
-    said = (
+    complaint = (
         "what comes is no answer; the rate is wrong, the line is disturbed, or it is no FT 300"
         if heard
         else "nobody answers; check the sensor's power, its cable and the rate"
     )
-    raise DeviceError(f"{DEVICE}: port {port.port} at {port.baudrate} Bd: {said}")
+    raise DeviceError(f"{DEVICE}: port {port.port} at {port.baudrate} Bd: {complaint}")
 
 
-def _words(port: serial.Serial, address: int, count: int) -> str:
-    """Registers as text, two letters in each; in hexadecimal digits where they are none."""
+def _text(port: serial.Serial, address: int, count: int) -> str:
+    """Registers as text, two letters in each; as hexadecimal digits where they are not ASCII."""
     try:
-        words = read_registers(port, SLAVE, address, count)
+        registers = read_registers(port, SLAVE, address, count)
     except RefusedError:
         return "unknown"
-    data = b"".join(word.to_bytes(2, "big") for word in words)
+    data = b"".join(value.to_bytes(2, "big") for value in registers)
     text = data.rstrip(b"\0 ").decode("latin-1")
     return text if text and text.isascii() and text.isprintable() else data.hex()
 
 
 def _end(port: serial.Serial) -> None:
-    """Tell it to be silent; never raises."""
+    """End the stream; never raises."""
     with contextlib.suppress(OSError, termios.error):
         port.write(STOP)
         port.flush()

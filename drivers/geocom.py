@@ -4,10 +4,10 @@ A reading is hz, v (from the zenith) and slope distance d, turned into
 
     x = d sin(v) sin(hz)    y = d sin(v) cos(hz)    z = d cos(v)
 
-geocompy writes the requests and checks the replies; what it leaves open is settled here: a reply
-without checksum is refused, whatever fails on the line is remembered, damaged exchanges are
-repeated after the line has been drained, and every exchange has a deadline. geocompy never raises
-from a request, and `bool` of its response is False for usable codes too: only codes are looked at.
+geocompy writes the requests and checks the replies. This module adds: a reply without checksum is
+refused, failures of the line are recorded, damaged exchanges are repeated after draining the line,
+and every exchange has a deadline. geocompy never raises from a request, and `bool` of its response
+is False for usable codes too: only codes count.
 Source: Leica Geosystems, GeoCOM Reference Manual (return codes; TMC, AUT, BAP, CSV, COM).
 """
 
@@ -42,17 +42,17 @@ MEASURE_DISTANCE_ANGLE, SEARCH = 17017, 17020
 
 OK = 0
 UNKNOWN = frozenset({5, 27, 3081})
-"""Not implemented, not available, no such request: this instrument does without it."""
+"""Not implemented, not available, no such request: the instrument lacks the request."""
 BUSY = frozenset({13, 1293})
-"""Another process inside the instrument is at work; ask again a little later."""
+"""Another process inside the instrument is at work; repeat the request later."""
 GARBLED = frozenset({3073, 3074, 3076, 3078, 3080, 3082, 3085, 3087, 3093, 3094, 3101, 3102})
-"""Request or reply were damaged or out of step on the line; ask again after draining it."""
+"""Request or reply was damaged or out of step; repeat the request after draining the line."""
 
 WARNINGS = {
     1283: "not all corrections were applied (code 1283: level or compensator?)",
     1284: "the instrument does not guarantee its accuracy (code 1284)",
 }
-"""A full measurement that may be used, with a remark."""
+"""Codes of a full measurement that is usable, with a remark."""
 
 LOST = {
     1285: "only angles were measured, no distance (beam broken?)",
@@ -68,7 +68,7 @@ LOST = {
     8712: "the target cannot be made out (stray light?)",
     8725: "the lock on the target was lost",
 }
-"""No reading, but another try after a search may give one."""
+"""Codes without a reading; another try after a search may give one."""
 
 _ADVICE = {
     16: "charge or change its battery",
@@ -91,21 +91,21 @@ _MEANING = {
     25: "asleep",
     1293: "still busy measuring",
 }
-"""What the commonest codes say, alone or after a colon."""
+"""Meaning of the commonest codes, to stand alone or after a colon."""
 
 
 def words(code: int) -> str:
-    """Return a return code for people: what it means, and the number."""
+    """Return meaning and number of a return code, for people."""
     try:
         name = GeoComCode(code).name.replace("_", " ").lower()
-        known = _MEANING.get(code) or f'"{name}"'
-        return f"{known} (code {code})"
+        meaning = _MEANING.get(code) or f'"{name}"'
+        return f"{meaning} (code {code})"
     except ValueError:
         return f"code {code}"
 
 
 def failure(doing: str, code: int) -> DeviceError:
-    """Return the exception for a return code that gave no reading, e.g. of "measuring"."""
+    """Return the exception for a return code without a reading; `doing`: e.g. "measuring"."""
     if code in LOST:
         return TargetLostError(f"tracker: {doing}: {LOST[code]} (code {code})")
     advice = f"; {_ADVICE[code]}" if code in _ADVICE else ""
@@ -113,7 +113,7 @@ def failure(doing: str, code: int) -> DeviceError:
 
 
 DEVICE = "tracker"
-ANSWER_S = 1.0  # how long an answer may take beside motors and measurements, real s
+ANSWER_S = 1.0  # longest wait for an answer, without time of measuring or moving, real s
 _FIRST_ANSWER_S = 0.7
 _TRIES = 8
 _PAUSE_S = 0.1
@@ -127,23 +127,23 @@ _MISMATCH, _CLIENT_CHECKSUM = 3093, 3102
 class Reply:
     """A reply whose checksum and transaction were right."""
 
-    code: int  # the return code, of the line if that is not 0, else of the request
+    code: int  # return code of the line if not 0, else of the request
     values: tuple[Any, ...]
-    """What came with it; empty where it is not of the form that was asked for."""
-    host_ns: int  # `time.monotonic_ns` right after it came
+    """Parsed values; empty where the reply does not have the requested form."""
+    host_ns: int  # `time.monotonic_ns` right after arrival
 
 
 class _Connection(SerialConnection):
-    """geocompy's serial connection; remembers what came and what failed."""
+    """geocompy's serial connection; keeps the bytes received and the failure."""
 
     def __init__(self, port: serial.Serial) -> None:
         super().__init__(port)
-        self.came = b""
+        self.received = b""
         self.failure: Exception | None = None
 
     def exchange(self, cmd: str) -> str:
-        """Send a request and return the reply, as geocompy asks for it."""
-        self.came, self.failure = b"", None
+        """Send a request and return the reply (called by geocompy)."""
+        self.received, self.failure = b"", None
         try:
             return super().exchange(cmd)
         except (OSError, termios.error, UnicodeDecodeError) as error:
@@ -151,24 +151,24 @@ class _Connection(SerialConnection):
             raise
 
     def receive_binary(self) -> bytes:
-        """Return a line without its end; what came instead is kept in `came`."""
-        self.came = self._port.read_until(self.eoabytes)
-        if not self.came.endswith(self.eoabytes):
+        """Return a line without its end; `received` keeps all bytes."""
+        self.received = self._port.read_until(self.eoabytes)
+        if not self.received.endswith(self.eoabytes):
             raise TimeoutError
-        return self.came.removesuffix(self.eoabytes)
+        return self.received.removesuffix(self.eoabytes)
 
     @property
     def broken(self) -> Exception | None:
-        """What the port itself raised in the last exchange, if it did."""
+        """What the port raised in the last exchange, if anything."""
         quiet = isinstance(self.failure, TimeoutError | UnicodeDecodeError)
         return None if quiet else self.failure
 
 
 class Link:
-    """A GeoCOM instrument at the other end of a serial port."""
+    """A GeoCOM instrument on a serial port."""
 
     def __init__(self, path: str, baud: int) -> None:
-        """Open the port for this program alone and see that an instrument answers."""
+        """Open the port for this program alone; raises DeviceError if no instrument answers."""
         self._path, self._baud = path, baud
         self._port = open_port(DEVICE, path, baud, _FIRST_ANSWER_S)
         try:
@@ -193,9 +193,9 @@ class Link:
         until: float,
         seconds: float = ANSWER_S,
     ) -> Reply:
-        """Send a request until it is answered without damage, by `until`, `time.monotonic` s.
+        """Repeat a request until an undamaged reply comes, by `until`, `time.monotonic` s.
 
-        `parsers` are one per value of the reply; one answer may take `seconds`.
+        `parsers`: one per value of the reply; `seconds`: longest wait for one reply.
         """
         complaint, silent, damaged = "", 0, 0
         while damaged < _TRIES and time.monotonic() < until:
@@ -213,11 +213,11 @@ class Link:
         raise DeviceError(f"{DEVICE} at {self._path}: {complaint or 'no answer in time'}")
 
     def close(self) -> None:
-        """Give the port back. Never raises, may be called twice."""
+        """Close the port. Never raises; may be called twice."""
         close_port(self._port)
 
     def _greet(self) -> GeoCom:
-        """Let geocompy make its acquaintance with the instrument."""
+        """Let geocompy connect to the instrument."""
         with line_failures(DEVICE, self._path):
             try:
                 return GeoCom(self._connection, attempts=2, checksum=True)
@@ -233,7 +233,7 @@ class Link:
         seconds: float,
         until: float,
     ) -> tuple[Reply | None, str]:
-        """One exchange; a good answer, or the complaint about what came instead."""
+        """One exchange: a valid reply or None, and the complaint about an invalid one."""
         with line_failures(DEVICE, self._path):
             self._port.timeout = max(0.05, min(seconds, until - time.monotonic()))
             response = self._instrument.request(request, values, parsers)
@@ -241,16 +241,16 @@ class Link:
             self._raise_if_broken()
             reply = _REPLY.match(response.response)
             code = 0 if reply is None else int(reply[1]) or int(reply[2])
-            local = int(response.error)  # geocompy's own finding, or the instrument's
+            local = int(response.error)  # geocompy's error, or the instrument's
             if (
                 reply is not None
                 and self._connection.failure is None
                 and local not in (_MISMATCH, _CLIENT_CHECKSUM)
                 and code not in GARBLED
             ):
-                found = response.params
-                several = found if isinstance(found, tuple) else (found,)
-                return Reply(code, () if found is None else several, host_ns), words(code)
+                params = response.params
+                several = params if isinstance(params, tuple) else (params,)
+                return Reply(code, () if params is None else several, host_ns), words(code)
             drain(self._port, _QUIET_S, min(_DRAIN_S, max(0.0, until - time.monotonic())))
             self._connection.reset()
         if self._connection.failure is not None or reply is None:
@@ -258,7 +258,7 @@ class Link:
         return None, f"answers stay damaged or out of step ({words(code or local)}); {self._hint()}"
 
     def _mute(self, until: float) -> bool:
-        """Whether nothing comes to the simplest request either."""
+        """Whether even the simplest request gets no reply."""
         self._once(NULL, (), (), ANSWER_S, until)
         return isinstance(self._connection.failure, TimeoutError)
 
@@ -267,15 +267,15 @@ class Link:
             raise self._connection.broken
 
     def _silence(self) -> str:
-        came = self._connection.came
-        if not came:
+        received = self._connection.received
+        if not received:
             return (
                 f"no answer; is it switched on, connected there, and set to GeoCOM at "
                 f"{self._baud} Bd?"
             )
-        if _UNPROTECTED.match(came):
+        if _UNPROTECTED.match(received):
             return "it answers without checksum, so damage on the line would go unnoticed"
-        if came.startswith(b"%R1P,"):
+        if received.startswith(b"%R1P,"):
             return f"answers arrive damaged or cut short; {self._hint()}"
         return f"what comes is no GeoCOM; {self._hint()}"
 
@@ -284,29 +284,29 @@ class Link:
 
 
 BAUD = 115200
-DEADLINE_S = 4.0  # how long a call may take beside what is measured or moved, real s
-MEASURING_S = 3.0  # how long a distance may take to measure, cell s
+DEADLINE_S = 4.0  # longest call, without time of measuring or moving, real s
+MEASURING_S = 3.0  # longest measurement of a distance, cell s
 SEARCHING_S = 20.0
-"""How long one search for the target may take, cell s; at least `_LEAST_S` real s."""
+"""Longest search for the target, cell s; at least `_LEAST_S` real s."""
 _LEAST_S = 1.0
 _DISTANCE, _CORRECTED, _DISTANCE_PROGRAM = 1, 1, 2  # TMC_DEF_DIST, TMC_AUTO_INC, BAP_DEF_DIST
 _LOW_BATTERY, _INTERNAL = 10, 2  # %, power source
-CIRCLE = 2.0 * np.pi + 1e-6  # of a full circle, rad, with what rounding adds
+CIRCLE = 2.0 * np.pi + 1e-6  # full circle with rounding error, rad
 LARGEST_STD = 0.01  # rad; a choice, a thousand times what the poorest total station states (2 mgon)
 LARGEST_TILT = 0.5 * np.pi  # rad; no station measures upside down
 
 
 @dataclass(frozen=True, slots=True)
 class PolarReading:
-    """One measurement as the instrument gives it."""
+    """A measurement as the instrument gives it."""
 
-    host_ns: int  # `time.monotonic_ns` right after it came
+    host_ns: int  # `time.monotonic_ns` right after arrival
     hz: float  # horizontal angle, rad
     v: float  # angle from the zenith, rad
     distance: float  # slope distance, m; 0 is none
-    angle_std: float = 0.0  # what it states of both angles, rad; 0 where it does not tell
+    angle_std: float = 0.0  # of both angles, as stated, rad; 0 if not stated
     tilt: tuple[float, float] | None = None  # inclination across and along, rad
-    warning: str = ""  # what it remarks
+    warning: str = ""  # the instrument's remark
 
 
 class GeoComOptions(Section):
@@ -331,16 +331,16 @@ class GeoComTracker:
         self, link: Link, config: TrackerConfig, options: GeoComOptions, clock: Clock
     ) -> None:
         self._link, self._config, self._options, self._clock = link, config, options, clock
-        self._full_known = True
+        self._has_full = True
         self._last_ms = 0.0
 
     def measure(self) -> TrackerSample:
-        """Measure angles and distance once, with the covariance of this very reading.
+        """Measure angles and distance once, with the covariance of this reading.
 
             Cov = J diag(σ_hz², σ_v², (a + b d)²) Jᵀ,    d sin(v) σ_hz = d σ_v = σ_t
 
-        with σ_t = c + e d from the configuration, or d times the standard deviation that the
-        instrument states of its angles if that is larger; J = d(x, y, z)/d(hz, v, d).
+        with σ_t = c + e d from the configuration, or d times the standard deviation of the
+        angles that the instrument states, if larger; J = d(x, y, z)/d(hz, v, d).
         """
         polar = self._measure()
         sine = np.sin(polar.v)
@@ -351,7 +351,7 @@ class GeoComTracker:
         return TrackerSample(polar.host_ns, value, covariance, polar.warning)
 
     def aim(self, position: Floats, radius: float) -> None:
-        """Turn to where a target is expected, aim at it, lock on it; see `PointingTracker.aim`."""
+        """Turn to an expected target, aim at it, lock on it; see `PointingTracker.aim`."""
         x, y, z = (float(v) for v in position)
         moving = max(_LEAST_S, self._clock.real(SEARCHING_S))
         hz, v = np.arctan2(x, y) % (2 * np.pi), np.arctan2(np.hypot(x, y), z)
@@ -365,7 +365,7 @@ class GeoComTracker:
         self._find(min(2 * radius / distance, self._options.search_rad), search=False)
 
     def find_target(self) -> None:
-        """Aim at the target, search for it where it is not in sight, lock on it."""
+        """Aim at the target, search for it if it is not in sight, lock on it."""
         self._find(self._options.search_rad, search=True)
 
     def _find(self, window: float, search: bool) -> None:
@@ -392,31 +392,31 @@ class GeoComTracker:
                 raise TargetLostError(f"{DEVICE}: the instrument does not hold its target locked")
 
     def report(self) -> Report:
-        """Ask the instrument who it is and how it is, and measure once; nothing turns."""
+        """Report identity and state of the instrument, and measure once; nothing turns."""
         until = time.monotonic() + DEADLINE_S + self._clock.real(MEASURING_S)
-        name = self._told(until, NAME, lambda said: said.strip('"')) or ("GeoCOM instrument",)
-        serial = self._told(until, SERIAL_NUMBER, int)
+        name = self._values(until, NAME, lambda text: text.strip('"')) or ("GeoCOM instrument",)
+        serial = self._values(until, SERIAL_NUMBER, int)
         rows: list[Row] = [("", "", "name", name[0])]
         if serial:
             rows.append(("", "", "serial_number", str(serial[0])))
-        for what, request in (("firmware", FIRMWARE), ("GeoCOM", GEOCOM_VERSION)):
-            numbers = self._told(until, request, int, int, int)
+        for label, request in (("firmware", FIRMWARE), ("GeoCOM", GEOCOM_VERSION)):
+            numbers = self._values(until, request, int, int, int)
             if numbers:
                 version = ".".join(map(str, numbers))
-                rows.append((what, version, what.lower(), version))
-        face = self._told(until, FACE, int)
+                rows.append((label, version, label.lower(), version))
+        face = self._values(until, FACE, int)
         if face:
             rows.append(("face", "second" if face[0] else "first", "face", 2 if face[0] else 1))
         problems: list[str] = []
-        power = self._told(until, POWER, int, int, int)
+        power = self._values(until, POWER, int, int, int)
         if power:
             rows.append(("battery", f"{power[0]} %", "battery_percent", power[0]))
             if power[0] < _LOW_BATTERY and power[1] == _INTERNAL:
                 problems.append(f"its battery is at {power[0]} %; change it or connect power")
-        air = self._told(until, GET_ATMOSPHERE, float, float, float, float)
+        air = self._values(until, GET_ATMOSPHERE, float, float, float, float)
         if air:
-            said = f"{air[1]:.1f} hPa, {air[2]:.1f} °C"
-            rows.append(("atmosphere set", said, "pressure_hPa", air[1]))
+            text = f"{air[1]:.1f} hPa, {air[2]:.1f} °C"
+            rows.append(("atmosphere set", text, "pressure_hPa", air[1]))
             rows.append(("", "", "temperature_degC", air[2]))
         locked = self._locked(until)
         if locked is not None:
@@ -433,14 +433,14 @@ class GeoComTracker:
         return report_of(DEVICE, full_name, rows, problems)
 
     def close(self) -> None:
-        """Give the port back. Never raises, may be called twice."""
+        """Close the port. Never raises; may be called twice."""
         self._link.close()
 
     def _measure(self) -> PolarReading:
-        """One plausible measurement with a distance of its own."""
+        """Return a plausible measurement with a new distance."""
         measuring = self._clock.real(MEASURING_S)
         until = time.monotonic() + DEADLINE_S + measuring
-        polar = self._full(until, measuring) if self._full_known else None
+        polar = self._full(until, measuring) if self._has_full else None
         if polar is None:
             polar = self._simple(until, measuring)
         nearest, farthest = self._options.min_distance_m, self._options.max_distance_m
@@ -454,10 +454,10 @@ class GeoComTracker:
         return plausible(polar)
 
     def _full(self, until: float, measuring: float) -> PolarReading | None:
-        """Measurement with the standard deviation of the angles; None if it is unknown."""
+        """Measure, with the standard deviation of the angles; None if the request is unknown."""
         started = self._link.ask(DO_MEASURE, (_DISTANCE, _CORRECTED), until=until)
         if started.code in UNKNOWN:
-            self._full_known = False
+            self._has_full = False
             return None
         if started.code != OK:
             raise failure("starting a measurement", started.code)
@@ -469,7 +469,7 @@ class GeoComTracker:
             seconds=ANSWER_S + measuring,
         )
         if answer.code in UNKNOWN:
-            self._full_known = False
+            self._has_full = False
             return None
         warning = usable(answer)
         hz, v, std, cross, length, _, distance, ms = numbers(answer, 8)
@@ -482,7 +482,7 @@ class GeoComTracker:
         return PolarReading(answer.host_ns, hz, v, distance, std, (cross, length), warning)
 
     def _simple(self, until: float, measuring: float) -> PolarReading:
-        """Measurement that does not state its accuracy, as older instruments know it."""
+        """Measure without stated accuracy, by a request that older instruments have, too."""
         answer = self._link.ask(
             MEASURE_DISTANCE_ANGLE,
             (_DISTANCE_PROGRAM,),
@@ -496,33 +496,32 @@ class GeoComTracker:
 
     def _spread(self, polar: PolarReading) -> tuple[float, float]:
         """Standard deviations along and across the beam, m."""
-        known, d = self._config, polar.distance
-        across = known.transverse_std_m + known.transverse_std_per_m * d
-        return known.range_std_m + known.range_std_per_m * d, max(across, polar.angle_std * d)
+        noise, d = self._config, polar.distance
+        across = noise.transverse_std_m + noise.transverse_std_per_m * d
+        return noise.range_std_m + noise.range_std_per_m * d, max(across, polar.angle_std * d)
 
     def _sight(self, polar: PolarReading) -> list[Row]:
         along, across = self._spread(polar)
-        seen = (
+        target = (
             f"{polar.distance:.4f} m away; standard deviation {1e6 * along:.1f} µm along the "
             f"beam, {1e6 * across:.1f} µm across"
         )
         tilt = polar.tilt
-        leans = tuple(f"{1e3 * angle:.3f} mrad" for angle in tilt or ())
-        said = " across, ".join(leans) + " along"
+        angles = " across, ".join(f"{1e3 * angle:.3f} mrad" for angle in tilt or ())
         return [
-            ("target", seen, "distance_m", polar.distance),
-            ("inclination" if tilt else "", said, "tilt_rad", tilt),
+            ("target", target, "distance_m", polar.distance),
+            ("inclination" if tilt else "", f"{angles} along", "tilt_rad", tilt),
             ("remark" if polar.warning else "", polar.warning, "std_along_m", along),
             ("", "", "std_across_m", across),
         ]
 
     def _locked(self, until: float) -> bool | None:
-        """Whether it follows the target; None where the instrument does not report it."""
-        state = self._told(until, LOCK_STATE, int)
+        """Whether the instrument follows the target; None if it does not report this."""
+        state = self._values(until, LOCK_STATE, int)
         return None if state is None else bool(state[0])
 
-    def _told(self, until: float, request: int, *parsers: Any) -> tuple[Any, ...] | None:
-        """What the instrument answers to a simple question; None where it does not know."""
+    def _values(self, until: float, request: int, *parsers: Any) -> tuple[Any, ...] | None:
+        """Return the values of a reply; None where the instrument gives none."""
         answer = self._link.ask(request, (), parsers, until=until)
         return answer.values if answer.code == OK and answer.values else None
 
@@ -568,7 +567,7 @@ def numbers(answer: Reply, count: int) -> Floats:
 
 
 def plausible(polar: PolarReading) -> PolarReading:
-    """Return a measurement whose angles are some that an instrument can have."""
+    """Return the measurement; raise DeviceError for impossible angles, accuracy or tilt."""
     if not (abs(polar.hz) <= CIRCLE and 0.0 <= polar.v <= CIRCLE):
         _strange(f"angles of {polar.hz:.6g} and {polar.v:.6g} rad")
     if not 0.0 <= polar.angle_std <= LARGEST_STD:
@@ -578,5 +577,5 @@ def plausible(polar: PolarReading) -> PolarReading:
     return polar
 
 
-def _strange(what: str) -> NoReturn:
-    raise DeviceError(f"{DEVICE}: measuring: the instrument gives {what}; is it a GeoCOM station?")
+def _strange(data: str) -> NoReturn:
+    raise DeviceError(f"{DEVICE}: measuring: the instrument gives {data}; is it a GeoCOM station?")

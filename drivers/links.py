@@ -1,8 +1,8 @@
-"""Serial ports and network addresses of instruments; whatever goes wrong is one clear line.
+"""Serial ports and network addresses of instruments; every failure becomes an error of one line.
 
-Every read and write of a driver is inside `with line_failures(device, path):` or
-`network_failures`. pyserial reports an unplugged adapter as SerialException (read, write), OSError
-(in_waiting) or termios.error (reset_input_buffer), which is no OSError: all become DeviceError.
+Drivers read and write inside `with line_failures(device, path):` or `network_failures`. pyserial
+reports an unplugged adapter as SerialException (read, write), OSError (in_waiting) or termios.error
+(reset_input_buffer), which is not an OSError: all become DeviceError.
 """
 
 import contextlib
@@ -21,11 +21,11 @@ from hilcal.config.cell import Tracker
 from hilcal.errors import DeviceError, InputError
 
 BY_ID = Path("/dev/serial/by-id")
-"""Where Linux lists serial adapters by names that do not change when they are replugged."""
+"""Where Linux lists serial adapters by names that replugging does not change."""
 
 
 def open_port(device: str, path: str, baud: int, timeout: float = 0.5) -> serial.Serial:
-    """Open a serial port, 8N1, raw, locked against every other program that asks."""
+    """Open a serial port, 8N1, raw, locked against other programs."""
     try:
         return serial.Serial(
             path, baud, timeout=timeout, write_timeout=max(timeout, 0.5), exclusive=True
@@ -40,7 +40,7 @@ def open_port(device: str, path: str, baud: int, timeout: float = 0.5) -> serial
 
 @contextlib.contextmanager
 def line_failures(device: str, path: str) -> Iterator[None]:
-    """Turn whatever pyserial and termios raise on a broken line into DeviceError."""
+    """Turn what pyserial and termios raise on a broken line into DeviceError."""
     try:
         yield
     except serial.SerialTimeoutException:
@@ -52,15 +52,15 @@ def line_failures(device: str, path: str) -> Iterator[None]:
 
 
 def drain(port: serial.Serial, quiet: float, limit: float) -> bool:
-    """Throw away what comes until the line has been quiet for so long, s; False after `limit` s."""
+    """Discard input until the line has been quiet for `quiet` s; return False after `limit` s."""
     now = time.monotonic()
-    end, still_since = now + limit, now
+    end, quiet_since = now + limit, now
     while now < end:
         waiting = port.in_waiting
         if waiting:
             port.read(waiting)
-            still_since = time.monotonic()
-        elif now - still_since >= quiet:
+            quiet_since = time.monotonic()
+        elif now - quiet_since >= quiet:
             return True
         time.sleep(min(0.005, quiet))
         now = time.monotonic()
@@ -68,7 +68,7 @@ def drain(port: serial.Serial, quiet: float, limit: float) -> bool:
 
 
 def close_port(port: Any) -> None:
-    """Give the port back, whatever state it is in. Never raises, may be called twice."""
+    """Close the port in whatever state it is. Never raises; may be called twice."""
     with contextlib.suppress(OSError, termios.error):
         port.close()
 
@@ -107,7 +107,7 @@ _ADDRESS = re.compile(r"([\w.-]+)(?::(\d{1,5}))?")
 
 
 def address(section: str, driver: str, host: str | None, port: int) -> tuple[str, int]:
-    """Return the host and the port of an instrument: "address" or "address:port"."""
+    """Split `host`, "address" or "address:port"; `port` is the default."""
     if host is None:
         raise InputError(
             f'{section} driver = "{driver}" lacks "host": the address of the instrument in the '
@@ -136,12 +136,12 @@ def network_failures(device: str, where: str) -> Iterator[None]:
             f"{device} at {where}: it refuses the connection; is this its address and its port?"
         ) from None
     except OSError as error:
-        said = error.strerror or str(error)
-        raise DeviceError(f"{device} at {where}: the connection failed ({said})") from None
+        reason = error.strerror or str(error)
+        raise DeviceError(f"{device} at {where}: the connection failed ({reason})") from None
 
 
 def check_own_axes(tracker: Tracker) -> None:
-    """Refuse another frame for a tracker that measures in its own axes."""
+    """Refuse any [tracker] frame but "tracker", for instruments that measure in their own axes."""
     if tracker.frame != "tracker":
         raise InputError(
             f'[tracker] frame = "{tracker.frame}": this instrument measures in its own axes; it '

@@ -1,9 +1,10 @@
 """OptiTrack (Motive) by NatNet as a tracker: a rigid body's pose, or the position of its pivot.
 
-A measurement is the mean of the frames that come after it was asked for; its covariance is what
-these frames scatter, divided by their number. That is no statement of its accuracy: a camera system
-errs by the same amount in all frames of one pose. Leave the noise in [tracker] open, so that it is
-estimated from the campaign. Frames of 3.0 to 4.2; a server that knows later ones is asked for 4.2.
+A measurement is the mean of the frames that come after the request; its covariance is that of
+these frames, divided by their number. The covariance does not state the accuracy: a camera system
+has the same error in all frames of one pose. Leave the noise in [tracker] open, so that it is
+estimated from the campaign. Reads frames of 3.0 to 4.2; a server of a later version is asked for
+4.2.
 
 Source: see `natnet_frames`.
 """
@@ -30,11 +31,11 @@ from hilcal.toml import Section, check_section
 
 DEVICE = "tracker"
 ANSWER_S, TRIES = 0.5, 4
-"""How long an answer may take, real s, and how often it is asked for: datagrams may be lost."""
-DEADLINE_S = 4.0  # how long frames may take, real s
+"""Longest wait for an answer, real s, and number of requests: datagrams may be lost."""
+DEADLINE_S = 4.0  # longest wait for a frame, real s
 SLOWEST_HZ = 20.0
-LOST_S = 1.0  # a body that is not seen for so long is lost, real s
-FLOOR = 1e-7  # least standard deviation of a frame, m and rad: frames are in single precision
+LOST_S = 1.0  # a body not seen for this time is lost, real s
+FLOOR = 1e-7  # least standard deviation of a frame, m and rad: frames have single precision
 
 
 class NatNetOptions(Section):
@@ -74,13 +75,13 @@ class NatNetTracker:
                 self._server = self._greet()
                 if self._server.group:
                     self._data = self._joined(self._server)
-                self._body, self._name = self._found()
+                self._body, self._name = self._rigid_body()
             except BaseException:
                 self.close()
                 raise
 
     def measure(self) -> TrackerSample:
-        """Average the next frames, see the module; one that comes again and again is refused."""
+        """Average the next frames, see the module; identical frames are refused."""
         bodies = self._frames(self._options.frames)
         position = np.array([b.position for b in bodies])
         turns = Rotation.from_quat(np.array([b.quaternion for b in bodies]))
@@ -90,10 +91,11 @@ class NatNetTracker:
                 "recording?"
             )
         turn = turns.mean()
-        off = (turns * turn.inv()).as_rotvec()
+        shift = position - position.mean(axis=0)
+        tilt = (turns * turn.inv()).as_rotvec()
         K = len(bodies)
         covariance = np.zeros((6, 6))
-        for part, scatter in ((slice(0, 3), position - position.mean(axis=0)), (slice(3, 6), off)):
+        for part, scatter in ((slice(0, 3), shift), (slice(3, 6), tilt)):
             variance = max(float(np.sum(scatter**2)) / (3 * max(K - 1, 1)), FLOOR**2)
             covariance[part, part] = variance / K * np.eye(3)
         value = np.concatenate([position.mean(axis=0), turn.as_rotvec()])
@@ -118,14 +120,14 @@ class NatNetTracker:
         try:
             sample = self.measure()
             std = float(np.sqrt(self._options.frames * sample.covariance[0, 0]))
-            said = f"a frame scatters by {1e6 * std:.0f} µm along each axis"
-            rows.append(("target", said, "frame_std_m", std))
+            text = f"a frame scatters by {1e6 * std:.0f} µm along each axis"
+            rows.append(("target", text, "frame_std_m", std))
         except TargetLostError as error:
             problems.append(str(error).removeprefix(f"{DEVICE} at {self.where}: "))
         return report_of(DEVICE, f"{s.name} {s.program}", rows, problems)
 
     def close(self) -> None:
-        """Close the sockets. Never raises, may be called twice."""
+        """Close the sockets. Never raises; may be called twice."""
         self._line.close()
         if self._data is not None:
             self._data.close()
@@ -137,39 +139,38 @@ class NatNetTracker:
             self._send(nn.message(nn.KEEP_ALIVE))
             _drain(line)
             self._newest = -1
-            begun = heard = seen = time.monotonic()
-            until = begun + DEADLINE_S + count / SLOWEST_HZ
-            asked = begun
-            found: list[nn.Body] = []
-            others: set[int] = set()
-            while len(found) < count:
+            start = heard = tracked = requested = time.monotonic()
+            until = start + DEADLINE_S + count / SLOWEST_HZ
+            out: list[nn.Body] = []
+            foreign: set[int] = set()
+            while len(out) < count:
                 now = time.monotonic()
                 if now - heard > DEADLINE_S or now > until:
                     raise self._error(
                         "no frames come; is streaming switched on, and does a firewall let them "
                         "through?"
                     )
-                if now - max(heard, asked) > ANSWER_S:  # it may have forgotten this client
-                    asked = now
+                if now - max(heard, requested) > ANSWER_S:  # the server may have dropped us
+                    requested = now
                     self._send(nn.connect(nn.NEWEST))
-                if now - seen > LOST_S and heard > seen:
-                    there = f"; in the frames: {sorted(others)}" if others else ""
+                if now - tracked > LOST_S and heard > tracked:
+                    listed = f"; in the frames: {sorted(foreign)}" if foreign else ""
                     raise TargetLostError(
-                        f"{DEVICE} at {self.where}: the rigid body {self._name} is not seen{there}"
+                        f"{DEVICE} at {self.where}: the rigid body {self._name} is not seen{listed}"
                     )
                 bodies = self._next(line)
                 if bodies is None:
                     continue
                 heard = time.monotonic()
-                others |= {b.number for b in bodies if b.number != self._body}
+                foreign |= {b.number for b in bodies if b.number != self._body}
                 for body in bodies:
                     if body.number == self._body and body.tracked:
-                        seen = heard
-                        found.append(body)
-        return found
+                        tracked = heard
+                        out.append(body)
+        return out
 
     def _next(self, line: socket.socket) -> list[nn.Body] | None:
-        """Return the rigid bodies of the next frame that is newer; None where none came."""
+        """Return the rigid bodies of the next new frame; None where none came."""
         content = self._receive(line, nn.FRAME, 0.1)
         if content is None:
             return None
@@ -188,9 +189,9 @@ class NatNetTracker:
         with self._parsing("what answers is no NatNet server; is this its command port?"):
             server = nn.server(content)
         if server.version > nn.NEWEST:
-            words = f"Bitstream,{nn.NEWEST[0]}.{nn.NEWEST[1]}".encode() + b"\0"
-            answer = self._ask(nn.message(nn.REQUEST, words), nn.RESPONSE)
-            if server.group or answer[:4] not in (bytes(4), words[:4]):
+            command = f"Bitstream,{nn.NEWEST[0]}.{nn.NEWEST[1]}".encode() + b"\0"
+            answer = self._ask(nn.message(nn.REQUEST, command), nn.RESPONSE)
+            if server.group or answer[:4] not in (bytes(4), command[:4]):
                 self._refuse(server)
             server = replace(server, version=nn.NEWEST)
         if server.version < nn.OLDEST:
@@ -207,12 +208,12 @@ class NatNetTracker:
     def _version(self) -> str:
         return ".".join(map(str, self._server.version))
 
-    def _error(self, what: str) -> DeviceError:
-        return DeviceError(f"{DEVICE} at {self.where}: {what}")
+    def _error(self, complaint: str) -> DeviceError:
+        return DeviceError(f"{DEVICE} at {self.where}: {complaint}")
 
     @contextlib.contextmanager
     def _parsing(self, wrong: str) -> Iterator[None]:
-        """Raise DeviceError where what is parsed inside is cut short."""
+        """Raise DeviceError where the parsed content is cut short."""
         try:
             yield
         except struct.error:
@@ -230,27 +231,27 @@ class NatNetTracker:
             raise
         return line
 
-    def _found(self) -> tuple[int, str]:
+    def _rigid_body(self) -> tuple[int, str]:
         content = self._ask(nn.message(nn.REQUEST_DESCRIPTIONS), nn.DESCRIPTIONS)
         with self._parsing(f"its descriptions are not of NatNet {self._version}"):
             names = nn.names(content, self._server.version)
-        wanted = self._options.rigid_body
-        if wanted is None and len(names) == 1:
+        body = self._options.rigid_body
+        if body is None and len(names) == 1:
             return next(iter(names.items()))
         for number, name in names.items():
-            if wanted in (name, str(number)):
+            if body in (name, str(number)):
                 return number, name
         listed = ", ".join(f'"{name}"' for name in names.values()) or "none is streamed"
-        what = "rigid_body is missing" if wanted is None else f'no rigid body "{wanted}"'
-        raise InputError(f"[tracker] options: {what}; valid: {listed}")
+        wrong = "rigid_body is missing" if body is None else f'no rigid body "{body}"'
+        raise InputError(f"[tracker] options: {wrong}; valid: {listed}")
 
     def _ask(self, request: bytes, answer: int) -> bytes:
-        """Ask until it is answered; the frames that come meanwhile are left out."""
+        """Repeat a request until its answer comes; frames that come meanwhile are dropped."""
         for _ in range(TRIES):
             self._send(request)
             end = time.monotonic() + ANSWER_S
-            while (left := end - time.monotonic()) > 0.0:
-                content = self._receive(self._line, answer, left)
+            while (remaining := end - time.monotonic()) > 0.0:
+                content = self._receive(self._line, answer, remaining)
                 if content is not None:
                     return content
         raise TimeoutError
@@ -259,14 +260,14 @@ class NatNetTracker:
         self._line.setblocking(True)
         self._line.send(data)
 
-    def _receive(self, line: socket.socket, wanted: int, seconds: float) -> bytes | None:
-        """Return the content of the next message where it is one that is wanted."""
+    def _receive(self, line: socket.socket, kind: int, seconds: float) -> bytes | None:
+        """Return the content of the next message if it is of the kind, else None."""
         line.settimeout(max(seconds, 1e-3))
         try:
             number, content = nn.opened(line.recv(nn.LARGEST))
         except (TimeoutError, struct.error):
             return None
-        return content if number == wanted else None
+        return content if number == kind else None
 
 
 def _drain(line: socket.socket) -> None:

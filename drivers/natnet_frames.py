@@ -1,7 +1,7 @@
 """OptiTrack NatNet 3.0 to 4.2: messages, and the rigid bodies in them.
 
 A message is little-endian: number (uint16), bytes that follow (uint16), content. From 4.1 on each
-list in a frame or in the descriptions also tells its length in bytes.
+list in a frame or in the descriptions also states its length in bytes.
 
 Source: OptiTrack, NatNet SDK 4.x (NatNetTypes.h and the depacketization samples).
 """
@@ -20,7 +20,7 @@ REQUEST_DESCRIPTIONS, DESCRIPTIONS, FRAME, KEEP_ALIVE = 4, 5, 7, 10
 Version = tuple[int, int]
 OLDEST: Version = (3, 0)
 NEWEST: Version = (4, 2)
-SIZED: Version = (4, 1)  # from here on lists tell their length in bytes
+SIZED: Version = (4, 1)  # first version whose lists state their length in bytes
 LARGEST = 1 << 16
 MARKER_SET, RIGID_BODY = 0, 1
 _HEAD = struct.Struct("<HH")
@@ -35,7 +35,7 @@ def message(number: int, content: bytes = b"") -> bytes:
 
 
 def opened(data: bytes) -> tuple[int, bytes]:
-    """Return number and content of a message; raises struct.error where it is cut short."""
+    """Return number and content of a message; raises struct.error if cut short."""
     number, size = _HEAD.unpack_from(data)
     if len(data) < _HEAD.size + size:
         raise struct.error("cut short")
@@ -43,7 +43,7 @@ def opened(data: bytes) -> tuple[int, bytes]:
 
 
 def connect(version: Version) -> bytes:
-    """Return the request to connect that asks for frames of a version."""
+    """Return the request to connect and to receive frames of a version."""
     content = bytearray(271)
     content[:4] = b"Ping"
     content[265:267] = bytes(version)
@@ -56,13 +56,13 @@ class NatNetServer:
 
     name: str
     program: str
-    version: Version  # of NatNet in which it sends frames
-    data_port: int  # where it sends frames to; 0 where it does not tell
+    version: Version  # of NatNet, of its frames
+    data_port: int  # to which it sends frames; 0 if not stated
     group: str  # multicast address; empty where it sends to each client
 
 
 def server(content: bytes) -> NatNetServer:
-    """Return what the answer to a connection says; raises struct.error where it is cut short."""
+    """Parse the answer to `connect`; raises struct.error if cut short."""
     name, *numbers = _SERVER.unpack_from(content)
     version = numbers[4], numbers[5]
     called = name.split(b"\0")[0].decode("utf-8", "replace")
@@ -84,7 +84,7 @@ class Body:
 
 
 class Reader:
-    """Reads a content from its beginning on; raises struct.error where that ends before."""
+    """Reads a content from its beginning; raises struct.error at a premature end."""
 
     def __init__(self, content: bytes, version: Version) -> None:
         self.content, self.version, self.at = content, version, 0
@@ -100,7 +100,7 @@ class Reader:
         return int(self.take(_COUNT)[0])
 
     def listed(self) -> tuple[int, int]:
-        """Return how many elements a list has, and where it ends (0: it does not tell)."""
+        """Return the number of elements of a list, and where it ends (0: not stated)."""
         count = self.count()
         size = self.count() if self.version >= SIZED else 0
         return count, self.at + size if size else 0
@@ -110,12 +110,12 @@ class Reader:
         end = self.content.find(b"\0", self.at)
         if end < 0:
             raise struct.error("a text without an end")
-        words = self.content[self.at : end].decode("utf-8", "replace")
+        text = self.content[self.at : end].decode("utf-8", "replace")
         self.at = end + 1
-        return words
+        return text
 
     def skip(self, size: int) -> None:
-        """Leave bytes out."""
+        """Skip bytes."""
         self.at += size
         if not 0 <= self.at <= len(self.content):
             raise struct.error("cut short")
@@ -135,26 +135,26 @@ def frame(content: bytes, version: Version) -> tuple[int, list[Body]]:
         for _ in range(sets):
             r.text()
             r.skip(12 * r.count())
-    others, _ = r.listed()
-    r.skip(12 * others)
+    markers, _ = r.listed()  # unlabelled
+    r.skip(12 * markers)
     bodies = []
     for _ in range(r.listed()[0]):
-        known, *v = r.take(_BODY)
-        tracked = bool(int(v[8]) & 1)
-        bodies.append(Body(int(known), np.array(v[:3]), np.array(v[3:7]), tracked))
+        v = r.take(_BODY)
+        tracked = bool(int(v[9]) & 1)
+        bodies.append(Body(int(v[0]), np.array(v[1:4]), np.array(v[4:8]), tracked))
     return number, bodies
 
 
 def names(content: bytes, version: Version) -> dict[int, str]:
     """Return the names of the rigid bodies by their streaming IDs, from the descriptions."""
     r = Reader(content, version)
-    found: dict[int, str] = {}
+    out: dict[int, str] = {}
     for _ in range(r.count()):
         kind = r.count()
         end = r.count() + r.at if version >= SIZED else 0
         if kind == RIGID_BODY:
             name = r.text()
-            found[r.count()] = name
+            out[r.count()] = name
             if not end:
                 r.skip(16)
                 markers = r.count()
@@ -166,7 +166,7 @@ def names(content: bytes, version: Version) -> dict[int, str]:
             for _ in range(r.count()):
                 r.text()
         elif not end:
-            break  # skeletons, plates, cameras: they come last, and tell no length
+            break  # skeletons, plates, cameras: they come last, without a length
         if end:
             r.skip(end - r.at)
-    return found
+    return out

@@ -1,9 +1,9 @@
 """ATI Net F/T and Ethernet Axia: force and moment by UDP (Raw Data Transfer, RDT).
 
-A request is `>HHI`: 1234 hex, command (2: send at the sensor's rate, 0: stop), count (0: without
-end). Each datagram is a record `>3I6i`: number of the record, number of the measurement, status,
-force and moment in counts. Counts per unit, the units and the rate are on the sensor's page
-`netftapi2.xml`.
+A request is `>HHI`: 1234 hex, command (2: send at the sensor's rate, 0: stop), count (0: endless).
+Each datagram is a record `>3I6i`: number of the record, number of the measurement, status, force
+and moment in counts. The sensor's web page `netftapi2.xml` gives the units, the counts per unit and
+the rate.
 
 Source: ATI Industrial Automation, Net F/T manual 9620-05-NET FT, sections 9 to 11 and 17; Ethernet
 Axia manual 9610-05, table 4.7.
@@ -33,13 +33,13 @@ PORT = 49152
 RECORD = 36
 START, STOP = 2, 0
 AGAIN_S = 0.3
-"""Silence after which the sensor is told again to send: the request may be lost, it may restart."""
+"""Silence, s, after which the request to send is repeated: it may be lost, the sensor restarted."""
 _PAGE_S = 2.0
 _LARGEST = 1 << 16
 _BUFFER = 1 << 22
 ERROR, LATCHED, SATURATED = 1 << 31, 1 << 16, (1 << 17, 1 << 27 | 1 << 30)
-"""Bits of the status: any error; a threshold was passed once (none); gages over their range, of a
-Net F/T and of an Axia."""
+"""Bits of the status: any error; a threshold was once exceeded (no error); gauges over their range,
+of a Net F/T and of an Axia."""
 _LBF, _KGF, _INCH = 4.4482216152605, 9.80665, 0.0254
 _FORCE = {
     **{"1": _LBF, "2": 1.0, "3": 1e3 * _LBF, "4": 1e3, "5": _KGF},
@@ -50,7 +50,7 @@ _MOMENT = {
     **{"lbfin": _LBF * _INCH, "lbfft": 12 * _LBF * _INCH, "nm": 1.0, "nmm": 1e-3, "knm": 1e3},
     **{"kgcm": 0.01 * _KGF, "kgfcm": 0.01 * _KGF},
 }
-"""N and N·m per unit, by its name without hyphen, or its number on the page."""
+"""N and N·m per unit. Keys: the unit's name without hyphen, or its number on the page."""
 
 
 class NetFtOptions(Section):
@@ -65,7 +65,7 @@ class NetFtOptions(Section):
 
 
 class Datagrams:
-    """Records as they come, behind the names of a port and of a deframer (`force_stream`)."""
+    """Records from UDP, with the interface of a port and of a deframer (`force_stream`)."""
 
     baudrate = 0
     skipped = 0
@@ -73,7 +73,7 @@ class Datagrams:
     def __init__(self, host: str, port: int) -> None:
         self.port = f"{host}:{port}"
         self.frames = self.corrupt = 0
-        self._came = bytearray()
+        self._received = bytearray()
         self._heard = time.monotonic()
         with network_failures(DEVICE, self.port):
             self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -88,38 +88,38 @@ class Datagrams:
 
     @property
     def in_waiting(self) -> int:
-        """Bytes of the records that have come; asks again where none come."""
+        """Number of bytes received and not yet read; repeats the request after silence."""
         while True:
             try:
                 data = self._socket.recv(_LARGEST)
             except BlockingIOError:
                 break
-            except ConnectionRefusedError:  # nobody listens there yet, or no longer
+            except ConnectionRefusedError:  # nobody listens on that port
                 break
             self._heard = time.monotonic()
             if data and len(data) % RECORD == 0:
-                self._came += data
+                self._received += data
             else:
                 self.corrupt += 1
         if time.monotonic() - self._heard > AGAIN_S:
             self._heard = time.monotonic()
             with contextlib.suppress(ConnectionRefusedError):
                 self._ask(START)
-        return len(self._came)
+        return len(self._received)
 
     def read(self, size: int) -> bytes:
-        """Return the first bytes that have come."""
-        data = bytes(self._came[:size])
-        del self._came[:size]
+        """Return the oldest received bytes, at most `size`."""
+        data = bytes(self._received[:size])
+        del self._received[:size]
         return data
 
     def push(self, data: bytes) -> list[bytes]:
-        """Return the records in whole ones."""
+        """Split whole records, as `read` returns them."""
         self.frames += len(data) // RECORD
         return [data[at : at + RECORD] for at in range(0, len(data), RECORD)]
 
     def close(self) -> None:
-        """Ask the sensor to be silent. Never raises, may be called twice."""
+        """Ask the sensor to stop. Never raises; may be called twice."""
         with contextlib.suppress(OSError):
             self._ask(STOP)
         self._socket.close()
@@ -129,70 +129,70 @@ class Datagrams:
 
 
 def _overload(wrench: Floats, status: int) -> str:
-    """The status in words; a threshold that was passed once (bit 16) does not make it wrong."""
+    """The error that the status reports; a threshold once exceeded (bit 16) is none."""
     if status in (0, LATCHED, ERROR | LATCHED) or not status & (ERROR | SATURATED[0]):
-        return ""  # an Axia also tells in other bits that it changes a setting
+        return ""  # other bits of an Axia report a change of settings
     over = any(status & bits for bits in SATURATED)
     hint = "is it loaded over its range?" if over else "see the status on its page"
     return f"the sensor reports an error (status {status:#010x}); {hint}"
 
 
 def page(host: str, port: int) -> str:
-    """Return the sensor's page."""
+    """Return the sensor's web page `netftapi2.xml`."""
     where = f"{host}:{port}"
-    line = http.client.HTTPConnection(host, port, timeout=_PAGE_S)
-    with network_failures(DEVICE, where), contextlib.closing(line):
+    connection = http.client.HTTPConnection(host, port, timeout=_PAGE_S)
+    with network_failures(DEVICE, where), contextlib.closing(connection):
         try:
-            line.request("GET", "/netftapi2.xml")
-            answer = line.getresponse()
-            words = answer.read(_LARGEST).decode("utf-8", "replace")
+            connection.request("GET", "/netftapi2.xml")
+            answer = connection.getresponse()
+            xml = answer.read(_LARGEST).decode("utf-8", "replace")
             wrong = f"it has no page netftapi2.xml (HTTP status {answer.status})"
-            there = answer.status == http.client.OK
+            ok = answer.status == http.client.OK
         except http.client.HTTPException as error:
-            wrong, there = f"what comes is no web page ({type(error).__name__})", False
-    if not there:
+            wrong, ok = f"what comes is no web page ({type(error).__name__})", False
+    if not ok:
         raise DeviceError(f"{DEVICE} at {where}: {wrong}; is this a Net F/T?")
-    return words
+    return xml
 
 
-def _value(words: str, *names: str) -> str:
-    """Return the text of the first of the elements that there is, or nothing."""
+def _value(xml: str, *names: str) -> str:
+    """Return the text of the first element that the page has, else an empty string."""
     for name in names:
-        match = re.search(rf"<{name}>\s*([^<]*?)\s*</{name}>", words)
+        match = re.search(rf"<{name}>\s*([^<]*?)\s*</{name}>", xml)
         if match:
             return match[1]
     return ""
 
 
-def _number(words: str, *names: str) -> float:
+def _number(xml: str, *names: str) -> float:
     try:
-        number = float(_value(words, *names))
+        number = float(_value(xml, *names))
     except ValueError:
         return 0.0
     return number if np.isfinite(number) and number > 0.0 else 0.0
 
 
-def sensor_format(words: str, options: NetFtOptions, where: str) -> fs.SensorFormat:
-    """Return what the sensor sends, by its page."""
-    counts = [_number(words, name) for name in ("cfgcpf", "cfgcpt")]
-    names = [_value(words, f"s{name}", name) for name in ("cfgfu", "cfgtu")]
+def sensor_format(xml: str, options: NetFtOptions, where: str) -> fs.SensorFormat:
+    """Return the format of the sensor's records, from its page."""
+    counts = [_number(xml, name) for name in ("cfgcpf", "cfgcpt")]
+    names = [_value(xml, f"s{name}", name) for name in ("cfgfu", "cfgtu")]
     units = [
-        known.get(name.lower().replace("-", ""), 0.0)
-        for name, known in zip(names, (_FORCE, _MOMENT), strict=True)
+        factors.get(name.lower().replace("-", ""), 0.0)
+        for name, factors in zip(names, (_FORCE, _MOMENT), strict=True)
     ]
     if not all(counts) or not all(units):
         raise DeviceError(
             f"{DEVICE} at {where}: its page tells no counts per unit, or in units that are not "
             f'known ("{names[0]}" and "{names[1]}"); set N and N-m there'
         )
-    rate = options.rate_hz or _number(words, "comrdtrate")
+    rate = options.rate_hz or _number(xml, "comrdtrate")
     if not rate:
         raise DeviceError(
             f"{DEVICE} at {where}: its page does not tell its rate; give [force_sensor.options] "
             "rate_hz, records per second"
         )
     return fs.SensorFormat(
-        name=_value(words, "prodname") or "ATI Net F/T",
+        name=_value(xml, "prodname") or "ATI Net F/T",
         frame=fs.FrameFormat(b"", RECORD, lambda record: b""),
         body=np.dtype(
             [("ticks", ">u4"), ("number", ">u4"), ("status", ">u4"), ("wrench", ">i4", 6)]
@@ -208,20 +208,20 @@ def open_force_sensor(config: CellConfig) -> ForceSensorDevice:
     section = fs.checked_config(config, tuple(NetFtOptions.model_fields))
     options = check_section(section.options, NetFtOptions, "[force_sensor] options")
     host, port = address("[force_sensor]", "netft", section.host, PORT)
-    words = page(host, options.web_port)
-    sensor = sensor_format(words, options, f"{host}:{options.web_port}")
-    if _value(words, "comrdte").lower() in ("disabled", "0"):
+    xml = page(host, options.web_port)
+    sensor = sensor_format(xml, options, f"{host}:{options.web_port}")
+    if _value(xml, "comrdte").lower() in ("disabled", "0"):
         raise DeviceError(
             f"{DEVICE} at {host}: its RDT interface is disabled; enable it (page Communications)"
         )
-    facts = [("calibration", _value(words, "cfgcalsn", "setserial"))]
-    moved = _value(words, "cfgtfx")
+    facts = [("calibration", _value(xml, "cfgcalsn", "setserial"))]
+    moved = _value(xml, "cfgtfx")
     if moved.strip("0;. "):
-        units = f"{_value(words, 'scfgtdu')}, {_value(words, 'scfgtau')}"
+        units = f"{_value(xml, 'scfgtdu')}, {_value(xml, 'scfgtau')}"
         facts.append(
             ("tool transformation", f"{moved} ({units}): origin_m and rotvec_rad must include it")
         )
     line = Datagrams(host, port)
-    known = tuple((what, told) for what, told in facts if told)
-    stream = fs.ForceStream(line, sensor, facts=known, deframer=line, failures=network_failures)
+    stated = tuple((key, value) for key, value in facts if value)
+    stream = fs.ForceStream(line, sensor, facts=stated, deframer=line, failures=network_failures)
     return stream.started()

@@ -1,8 +1,8 @@
 """OptoForce and OnRobot HEX over serial, streaming.
 
 Frame (OptoForce General DAQ protocol): `AA 07 08 10`; `>HH6h` of counter, status and wrench in
-counts; the sum of all bytes before it as a big-endian u16: 22 bytes at 1 MBd. What a count is
-stands in each sensor's own sheet, so the configuration has to give it:
+counts; the sum of all these bytes as a big-endian u16: 22 bytes at 1 MBd. The counts per unit are
+on the data sheet of each sensor, so the configuration has to give them:
 
     [force_sensor]
     driver = "hex"

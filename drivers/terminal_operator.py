@@ -1,4 +1,4 @@
-"""A person at the terminal hangs the loads: is asked, does it, and presses Enter."""
+"""A person at the terminal hangs the loads on request, and confirms with Enter."""
 
 import contextlib
 import math
@@ -31,25 +31,25 @@ class TerminalOperator:
         self._console = Console(stderr=True, highlight=False)
 
     def report(self) -> Report:
-        """Say who is asked, and whether anybody can be."""
-        there = _is_terminal()
+        """Report who is asked, and a problem where standard input is no terminal."""
+        answerable = _is_terminal()
         return Report(
             "operator",
             "the person at this terminal",
             (("asked on", "standard error"), ("answers with", "Enter, or q to give up")),
-            () if there else (_NO_TERMINAL,),
+            () if answerable else (_NO_TERMINAL,),
         )
 
     def hang(self, load: CellLoad | None, why: str) -> None:
-        """Ask for a load and wait for Enter; what was typed before the question is dropped."""
-        said = "nothing hangs" if load is None else f"{load.name} hangs"
-        self._ask(f"Not yet: {why}" if why else "", self._request(load), said)
+        """Ask for a load and wait for Enter; input typed before the question is dropped."""
+        done = "nothing hangs" if load is None else f"{load.name} hangs"
+        self._ask(f"Not yet: {why}" if why else "", self._request(load), done)
 
     def confirm(self, question: str) -> None:
         """Ask whether the arm may go on; see `hilcal.measuring.devices.ConfirmingOperator`."""
         self._ask(f"Look at the arm: {question}.", ["May it go on?"], "it goes on")
 
-    def _ask(self, warning: str, request: list[str], said: str) -> None:
+    def _ask(self, warning: str, request: list[str], done: str) -> None:
         if not _is_terminal():
             raise DeviceError(_NO_TERMINAL)
         self._say()
@@ -72,7 +72,7 @@ class TerminalOperator:
                 raise DeviceError("operator: the terminal was closed before it was answered")
             answer = answer.strip().lower()
             if answer == "":
-                self._say(f"Done: {said}.")
+                self._say(f"Done: {done}.")
                 return
             if answer in ("q", "quit"):
                 self._say("Given up.")
@@ -81,17 +81,17 @@ class TerminalOperator:
                 f"{answer!r} is no answer. Press Enter when it is done, or q and Enter to give up."
             )
 
-    def _say(self, words: str = "", *, style: str | None = None, end: str = "\n") -> None:
-        """Print above nothing: the live display is gone. A terminal's lines break between words."""
-        whole = not self._console.is_terminal
-        words = "\n".join(map(escaped, words.split("\n")))
-        self._console.print(words, style=style, end=end, markup=False, soft_wrap=whole)
+    def _say(self, text: str = "", *, style: str | None = None, end: str = "\n") -> None:
+        """Print on standard error; only a terminal gets line breaks, between words."""
+        text = "\n".join(map(escaped, text.split("\n")))
+        wrap = not self._console.is_terminal
+        self._console.print(text, style=style, end=end, markup=False, soft_wrap=wrap)
 
     def close(self) -> None:
-        """Nothing to give back."""
+        """Nothing to close."""
 
     def _request(self, load: CellLoad | None) -> list[str]:
-        """Return what is asked for, line by line."""
+        """Return the lines of the request to hang a load."""
         if load is None:
             return ["Take every load off the tool, and do not touch the arm."]
         out = [f"Hang the load {load.name} at the load point {_numbers(self._point)} m (flange)."]

@@ -1,10 +1,10 @@
 """UR arm on ur_rtde: driver `ur` of the group `hilcal.arms`.
 
-Every call into ur_rtde is made in a child process with a deadline, since it can hang, crash,
-or go on with old values: the receive interface in one, the control interface, which exists
-only after `take_control`, in another. The arm can be stopped in three independent ways: by the
-control interface, by the dashboard server or Robot API, by a program on the script port; and the
-controller's watchdog stops it 0.1 s after the control process has ended.
+ur_rtde can hang, crash, or repeat old values. Every call into it is therefore made in a child
+process, with a deadline: one process has the receive interface; another, which exists only after
+`take_control`, the control interface. The arm can be stopped in three independent ways: by the
+control interface, by the dashboard server or Robot API, and by a program on the script port. The
+controller's watchdog also stops it 0.1 s after the control process has ended.
 """
 
 import contextlib
@@ -44,12 +44,12 @@ _PROBE_S, _ASK_S, _RECEIVE_S = 2.5, 1.5, 4.0  # 8 s together
 _PAYLOAD_S = 1.5
 _ORPHAN_S = 1.6
 _PULSE_S = 0.1
-"""Deadline for asking the control process why the program ended, real s; the stop waits for it."""
-_MASS_KG, _COM_M = 1e-3, 1e-4  # how well a payload has to be read back
+"""Deadline for asking the control process why the program ended, real s; it delays the stop."""
+_MASS_KG, _COM_M = 1e-3, 1e-4  # tolerances of a payload read back
 _MAX_Q, _MAX_SPEED, _MAX_ACCELERATION = 6.34, 3.2, 40.0
 
 NO_WHEEL = (3, 13)
-"""First Python that ur-rtde 1.6.5 has no wheel for; pyproject.toml asks for it below this one."""
+"""First Python without a wheel of ur-rtde 1.6.5; pyproject.toml requires it below this version."""
 
 
 class UrArm:
@@ -80,12 +80,13 @@ class UrArm:
 
     @property
     def workers(self) -> tuple[int, ...]:
-        """Numbers of the processes that receive and, under control, command."""
-        told = () if self._torques is None else self._torques.pids
-        return (self._receiver.pid, *(() if self._control is None else (self._control.pid,)), *told)
+        """Process numbers of all child processes."""
+        control = () if self._control is None else (self._control.pid,)
+        torques = () if self._torques is None else self._torques.pids
+        return (self._receiver.pid, *control, *torques)
 
     def report(self) -> Report:
-        """Say who answered, versions, state, and every problem at once; moves nothing."""
+        """Report identity, versions, state and every problem; moves nothing."""
         report = self._survey()
         if self._control is None:
             end = time.monotonic() + _ORPHAN_S
@@ -93,8 +94,8 @@ class UrArm:
                 time.sleep(0.2)  # the program of a killed hilcal ends by its watchdog
                 report = self._survey()
             return report
-        ours = tuple(p for p in report.problems if not _is_foreign(p))
-        return replace(report, problems=ours)
+        problems = tuple(p for p in report.problems if not _is_foreign(p))
+        return replace(report, problems=problems)
 
     def _survey(self) -> Report:
         return survey(
@@ -108,7 +109,7 @@ class UrArm:
         )
 
     def sample(self) -> ArmSample:
-        """Return a sample that is newer than the call; see `ArmDevice.sample`."""
+        """Return a sample newer than the call; see `ArmDevice.sample`."""
         sample = self._read().sample
         if self._torques is None or self._motion is not None:
             return sample
@@ -142,7 +143,7 @@ class UrArm:
             raise
 
     def set_payload(self, mass: float, com: Floats) -> None:
-        """Tell the controller what hangs at the flange, kg and m; read back and compared."""
+        """Set mass, kg, and centre of mass, m, at the flange; read back and compared."""
         com = np.asarray(com, dtype=np.float64)
         if com.shape != (3,) or not np.isfinite([mass, *com]).all() or mass < 0:
             raise InputError(
@@ -159,19 +160,20 @@ class UrArm:
         end = time.monotonic() + _PAYLOAD_S
         while True:
             reading = self._read()
-            sample, told = reading.sample, reading.sample.payload_com
-            if told is None:
+            sample, reported = reading.sample, reading.sample.payload_com
+            if reported is None:
                 raise failure(
                     self._host,
                     "it does not report its payload; that needs PolyScope 5.5.1 or newer",
                 )
-            if abs(sample.payload - mass) <= _MASS_KG and np.abs(told - com).max() <= _COM_M:
+            com_error = np.abs(reported - com).max()
+            if abs(sample.payload - mass) <= _MASS_KG and com_error <= _COM_M:
                 return
             if reading.runtime != states.PLAYING:
                 self._not_done("it did not take the payload")
             if time.monotonic() > end:
                 self._fail(
-                    f"it says {sample.payload:g} kg at {np.round(told, 4).tolist()} m after a "
+                    f"it says {sample.payload:g} kg at {np.round(reported, 4).tolist()} m after a "
                     f"payload of {mass:g} kg at {np.round(com, 4).tolist()} m was set"
                 )
 
@@ -200,10 +202,10 @@ class UrArm:
         )
         self._motion, self._brake = motion, motion.brake
         try:
-            taken = control.move(q, speed, acceleration, motion.brake)
+            accepted = control.move(q, speed, acceleration, motion.brake)
         except WorkerError as error:
             self._not_done(command.not_commanded(error))
-        if not taken:
+        if not accepted:
             self._not_done("it did not take the motion")
 
     def moving(self) -> bool:
@@ -214,7 +216,7 @@ class UrArm:
                 self._in_control()
             return False
         control = self._in_control()
-        reading = self._read()  # first: the control process can hang once the program has ended
+        reading = self._read()  # first: the control process can hang after the program's end
         self._check_state(reading)
         if reading.runtime != states.PLAYING:
             self._fail(_why_ended(reading, control))
@@ -226,7 +228,7 @@ class UrArm:
             self._fail(command.UNWATCHED)
         if motion.arrived(reading):
             self._motion = None
-            with contextlib.suppress(WorkerError):  # at rest; the next command tells
+            with contextlib.suppress(WorkerError):  # at rest; the next command shows a failure
                 control.rest()
             return False
         late = motion.overdue(reading)
@@ -235,7 +237,7 @@ class UrArm:
         return True
 
     def stop(self) -> None:
-        """Stop the arm by every way there is; returns when it stands."""
+        """Stop the arm in every available way; returns when it stands."""
         if self._control is None and self._stands_already():
             return
         if self._control is not None and self._brakes.ease(self._control, self._brake):
@@ -274,21 +276,21 @@ class UrArm:
             control.give_back()
 
     def _end_program(self) -> None:
-        """End a program of ours that ur_rtde may have uploaded again after a lost link."""
+        """End our program, which ur_rtde may have uploaded again after a lost link."""
         if self._was_ours and not self._silent:
             with contextlib.suppress(LinkError):
                 self._generation.supervision.stop(_ASK_S)
                 self._was_ours = False
 
     def _stands_already(self) -> bool:
-        """Whether an arm that is not under control stands."""
+        """Whether an arm not under control stands."""
         with contextlib.suppress(LinkError):
             first, second = self._receiver.read(), self._receiver.read()
             return command.stands(first) and command.stands(second)
         return False
 
     def _read(self) -> Reading:
-        """Return a new reading; a dead link is a failure of the motion, if there is one."""
+        """Return a new reading; a dead link ends a motion with a failure."""
         try:
             return self._receiver.read(PATIENCE_S if self._motion is None else STALE_S)
         except LinkError as error:
@@ -301,26 +303,26 @@ class UrArm:
         if reading.sample.safety != states.NORMAL or reading.mode != states.RUNNING:
             self._fail("it is not ready to move")
 
-    def _not_done(self, noticed: str) -> NoReturn:
-        """Fail on a command without effect, which a program that does not play explains."""
-        with contextlib.suppress(LinkError):  # the stop finds it lost, too
+    def _not_done(self, symptom: str) -> NoReturn:
+        """Fail on a command without effect; the cause may be that the program has ended."""
+        with contextlib.suppress(LinkError):  # the stop detects the lost link, too
             reading = self._receiver.read(STALE_S)
             if reading.runtime != states.PLAYING:
-                noticed = f"{noticed}: {command.program_ended(reading, 0.0)}"
-        self._fail(noticed)
+                symptom = f"{symptom}: {command.program_ended(reading, 0.0)}"
+        self._fail(symptom)
 
-    def _fail(self, noticed: str, lost: str = "") -> NoReturn:
-        """Stop the arm first, then find out the cause and raise it."""
+    def _fail(self, symptom: str, lost: str = "") -> NoReturn:
+        """Stop the arm, then find the cause and raise DeviceError."""
         halt = self._brakes.halt(self._control, self._brake, lost)
         self._control = self._motion = None
-        self._fault, advice = command.cause_of(self._generation.supervision, halt, noticed)
+        self._fault, advice = command.cause_of(self._generation.supervision, halt, symptom)
         if not halt.stands:
             advice = f"{HOLD_ON}; {advice}"
         raise failure(self._host, self._fault, advice)
 
 
 def _why_ended(reading: Reading, control: command.Control) -> str:
-    """Return why the robot's program does not play any more, as far as both sides know it."""
+    """Return why the robot's program ended, from the controller and the control process."""
     try:
         pulse = control.alive(_PULSE_S)
     except WorkerError:
@@ -333,11 +335,11 @@ def _is_foreign(problem: str) -> bool:
 
 
 def _lacking(python: tuple[int, ...]) -> str:
-    why, mend = "is not installed", install("rtde_control")
+    cause, remedy = "is not installed", install("rtde_control")
     if python >= NO_WHEEL:
-        why = f"has no wheel for Python {python[0]}.{python[1]}"
-        mend = "use Python 3.11 or 3.12 for the cell's computer"
-    return f"arm: driver ur needs ur-rtde, which {why}; {mend}"
+        cause = f"has no wheel for Python {python[0]}.{python[1]}"
+        remedy = "use Python 3.11 or 3.12 for the cell's computer"
+    return f"arm: driver ur needs ur-rtde, which {cause}; {remedy}"
 
 
 def open_arm(config: CellConfig) -> UrArm:
@@ -359,13 +361,13 @@ def open_arm(config: CellConfig) -> UrArm:
         if missing:
             version = states.version_word(controller.version)
             raise failure(host, f"its version {version} lacks {', '.join(sorted(missing))}")
-        how = generation(host, controller.version, options.robot_api_port)
-        silent = why_silent(how.supervision, _ASK_S)
+        kind = generation(host, controller.version, options.robot_api_port)
+        silent = why_silent(kind.supervision, _ASK_S)
         receiver = Receiver(host, options.receive_hz, outputs, _RECEIVE_S)
     except LinkError as error:
         raise failure(
             host, str(error), "check that the controller is on and [robot] host"
         ) from None
-    told = TORQUE in controller.outputs
-    torques = TorqueReader(host, options.receive_hz) if told else None
-    return UrArm(config, host, options.receive_hz, controller, how, silent, receiver, torques)
+    has_torque = TORQUE in controller.outputs
+    torques = TorqueReader(host, options.receive_hz) if has_torque else None
+    return UrArm(config, host, options.receive_hz, controller, kind, silent, receiver, torques)

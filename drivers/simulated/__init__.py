@@ -1,1 +1,1 @@
-"""The simulated cell: a physical world of its own, apart from hilcal's effects and model."""
+"""The simulated cell: a physical world independent of hilcal's effects and model."""

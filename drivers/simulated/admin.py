@@ -1,6 +1,6 @@
-"""What the processes of simulated devices share: the admin line, and their end.
+"""Common parts of the processes of simulated devices: the admin line, and the end with the parent.
 
-The admin line, for faults and tests, has JSON lines over a Unix socket.
+The admin line, for faults and tests, takes JSON lines over a Unix socket.
 """
 
 import argparse
@@ -36,15 +36,15 @@ def ask(path: Path, op: str, timeout: float = 5.0, **arguments: Any) -> Any:
 
 
 def serve(path: Path, handler: Handler) -> None:
-    """Answer requests in a daemon thread; `handler(op, arguments)` returns what JSON can hold.
+    """Answer requests in a daemon thread; `handler(op, arguments)` returns a value for JSON.
 
-    An exception is returned to the client. The socket appears only when it answers.
+    An exception is returned to the client. The socket file appears only when it answers.
     """
     new = path.with_name(path.name + ".new")
     new.unlink(missing_ok=True)
     server = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     server.bind(str(new))
-    new.chmod(0o600)  # of the user who started it; a bound socket does not answer yet
+    new.chmod(0o600)  # for this user only; a bound socket does not answer yet
     server.listen(16)
     os.replace(new, path)
 
@@ -55,7 +55,7 @@ def serve(path: Path, handler: Handler) -> None:
                     arguments = json.loads(request)
                     result = handler(str(arguments.pop("op")), arguments)
                     answer = {"result": result}
-                except Exception as error:  # whatever it is, the asker has to know
+                except Exception as error:  # any failure is reported to the client
                     answer = {"error": f"{type(error).__name__}: {error}"}
                 try:
                     stream.write(json.dumps(answer).encode() + b"\n")
@@ -72,9 +72,9 @@ def serve(path: Path, handler: Handler) -> None:
 
 
 class Operations:
-    """What can be asked of a device by name, a function each; None is answered with the state.
+    """The operations of a device: functions by name, with named arguments.
 
-    Arguments are given by name. `die` ends the process at once, as a crash does.
+    A result None is answered with the state. `die` ends the process at once, like a crash.
     """
 
     def __init__(
@@ -94,10 +94,10 @@ class Operations:
 
 
 def setter(target: object, name: str, kind: Callable[[Any], Any] = bool) -> Callable[..., None]:
-    """Return the operation that sets an attribute to its one argument, whatever that is called."""
+    """Return the operation that sets an attribute to its single argument, of any name."""
 
-    def store(**given: Any) -> None:
-        (value,) = given.values()
+    def store(**arguments: Any) -> None:
+        (value,) = arguments.values()
         setattr(target, name, kind(value))
 
     return store
@@ -111,42 +111,42 @@ NOISE: dict[str, dict[str, Any]] = {
 
 
 Device = tuple[Handler, Callable[[], None]]
-"""What can be asked of a device, and what it does over and over."""
+"""The operations of a device, and the step that it repeats."""
 
 
 def run(
     doc: str | None,
     name: str,
     start: Callable[[argparse.Namespace], Device],
-    more: Mapping[str, dict[str, Any]] | None = None,
+    options: Mapping[str, dict[str, Any]] | None = None,
 ) -> int:
     """Run the process of a device; its admin line is DIR/NAME.sock.
 
-    It ends at once when standard input closes, whose other end the parent holds. `more` options are
-    arguments of `add_argument` by name. Returns the exit code where `start`, which is given the
-    options, cannot make the device.
+    It ends at once when standard input closes, whose other end the parent holds. `options`:
+    arguments of `add_argument` by option. `start` makes the device from the parsed options; if it
+    cannot, its exit code is returned.
     """
     parser = argparse.ArgumentParser(
         description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--directory", type=Path, required=True, help="where the devices meet")
     parser.add_argument("--seed", type=int, default=0, help="of everything random")
-    for option, how in (more or {}).items():
-        parser.add_argument(option, **how)
-    options = parser.parse_args()
+    for option, keywords in (options or {}).items():
+        parser.add_argument(option, **keywords)
+    parsed = parser.parse_args()
 
     def wait() -> None:
         while os.read(sys.stdin.fileno(), 4096):
             pass
         os._exit(0)
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the one who started it
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent only
     threading.Thread(target=wait, daemon=True).start()
     try:
-        asked, step = start(options)
+        handler, step = start(parsed)
     except HilcalError as error:
         sys.stderr.write(f"{error}\n")
         return error.exit_code
-    serve(options.directory / f"{name}.sock", asked)
+    serve(parsed.directory / f"{name}.sock", handler)
     while True:
         step()

@@ -1,12 +1,12 @@
-"""The simulated arm of any make, of any number of joints, also of slides, and its controller.
+"""The simulated arm of any maker, with any number of joints and slides, and its controller.
 
     python -m hilcal.drivers.simulated.arm --directory DIR [--seed N]
 
-is the controller of the arm in DIR/world.json. It speaks no maker's protocol: the driver `open_arm`
-asks it on its admin line, DIR/arm.sock. Operations: `sample`, `move {q, speed, acceleration}`,
-`stop`, `payload {mass, com}`, `state`, `jog {q}` as somebody who moves the arm by hand,
-`protective_stop`, `release`, `die`. A motion stops where nobody asks for half a second. Arms of
-Universal Robots have a controller of their own, which speaks their protocols.
+runs the controller of the arm in DIR/world.json. It speaks no maker's protocol: the driver
+`open_arm` uses its admin line, DIR/arm.sock. Operations: `sample`, `move {q, speed, acceleration}`,
+`stop`, `payload {mass, com}`, `state`, `jog {q}` (a motion by hand), `protective_stop`, `release`,
+`die`. A motion stops after half a second without a request. Arms of Universal Robots have another
+controller, which speaks their protocols.
 """
 
 import argparse
@@ -30,43 +30,43 @@ from hilcal.robot.arm import Arm
 from hilcal.robot.se3 import six
 from hilcal.types import Floats
 
-WATCHDOG_S = 0.5  # a motion that nobody has looked at for so long is stopped, real s
+WATCHDOG_S = 0.5  # without a request for this time a motion is stopped, real s
 PROTECTIVE = "protective stop"
 _STEP_S, _REFRESH_S = 0.004, 0.01  # real s between steps in motion, and at rest
 _STOPPING = 2.0  # rad/s² of the leading joint (a slide: m/s²)
 
 
 class ArmController:
-    """The trajectory of the arm, and who may command it; every method from any thread."""
+    """The trajectory, payload and safety state of the arm; thread-safe."""
 
     def __init__(self, arm: Arm, board: Blackboard, rng: np.random.Generator) -> None:
-        kept = board.read("arm")
+        state = board.read("arm")
         self._board, self._clock, self._lock = board, WorldClock(board), threading.RLock()
         self._arm, self._kinematics = arm, Kinematics(arm)
-        side = kept["side"] if kept["alive"] else rng.choice([-1.0, 1.0], arm.n)
-        arrivals = int(kept["arrivals"]) + bool(kept["moving"])
-        self._motion = Trajectory(kept["q"], side, arrivals, self._clock.now)
-        self._payload, self._com = float(kept["payload"]), kept["payload_com"].copy()
-        self._safety, self._asked = "normal", time.monotonic()
+        side = state["side"] if state["alive"] else rng.choice([-1.0, 1.0], arm.n)
+        arrivals = int(state["arrivals"]) + bool(state["moving"])
+        self._motion = Trajectory(state["q"], side, arrivals, self._clock.now)
+        self._payload, self._com = float(state["payload"]), state["payload_com"].copy()
+        self._safety, self._last_request = "normal", time.monotonic()
 
     def step(self) -> bool:
-        """Go on to now, and publish; returns whether the arm moves."""
+        """Advance to the present, and publish; return whether the arm moves."""
         with self._lock:
             motion = self._motion
-            if motion.moving and time.monotonic() - self._asked > WATCHDOG_S:
+            if motion.moving and time.monotonic() - self._last_request > WATCHDOG_S:
                 motion.stop(_STOPPING, self._clock.now)
             motion.advance(self._clock.now)
             motion.publish(self._board, self._payload, self._com)
             return motion.moving
 
     def sample(self) -> dict[str, Any]:
-        """Return what the controller knows of the arm now, as JSON can hold it."""
+        """Return the present state of the arm as the controller knows it, for JSON."""
         with self._lock:
-            self._asked = time.monotonic()
+            self._last_request = time.monotonic()
             self.step()
             motion, truth = self._motion, self._board.read("truth")
-            told = int(truth["arrivals"]) == motion.arrivals and truth["flange"][3, 3] == 1.0
-            q = truth["encoder"] if told and not motion.moving else motion.q
+            current = int(truth["arrivals"]) == motion.arrivals and truth["flange"][3, 3] == 1.0
+            q = truth["encoder"] if current and not motion.moving else motion.q
             return {
                 "timestamp": self._clock.now,
                 "q": q.tolist(),
@@ -83,12 +83,12 @@ class ArmController:
             }
 
     def move(self, q: list[float], speed: float, acceleration: float) -> None:
-        """Begin a straight line in joint space."""
+        """Start a straight line in joint space."""
         goal = self._joints(q)
         with self._lock:
             if self._safety != "normal":
                 raise DeviceError(f"the arm is in a {self._safety}")
-            self._asked = time.monotonic()
+            self._last_request = time.monotonic()
             self._motion.start(goal, speed, acceleration, self._clock.now)
 
     def stop(self) -> None:
@@ -97,12 +97,12 @@ class ArmController:
             self._motion.stop(_STOPPING, self._clock.now)
 
     def payload(self, mass: float, com: list[float]) -> None:
-        """Set what hangs at the flange, kg and m (flange axes)."""
+        """Set the payload, kg and m (flange axes)."""
         with self._lock:
             self._payload, self._com = float(mass), np.array(com, dtype=float)
 
     def jog(self, q: list[float]) -> None:
-        """Stand elsewhere at once, as an arm that somebody has moved."""
+        """Place the arm elsewhere at once, as if moved by hand."""
         with self._lock:
             self._motion.place(self._joints(q))
 
@@ -126,7 +126,7 @@ class ArmController:
         return goal
 
 
-_STOPPED_S = 5.0  # in which a stopped arm has to stand, real s
+_STOPPED_S = 5.0  # longest time from the stop to a standstill, real s
 
 
 class SimulatedArm:
@@ -136,34 +136,34 @@ class SimulatedArm:
         self._socket, self._ours = socket, False
 
     def report(self) -> Report:
-        """Say which arm answers; moves nothing."""
-        now = self._ask("sample")
-        problems = () if now["safety"] == "normal" else (f"it is in a {now['safety']}",)
-        facts = (("joints", str(len(now["q"]))), ("payload", f"{now['payload']:g} kg"))
-        return Report("arm", "simulated arm", facts, problems, (("joints", len(now["q"])),))
+        """Report joints, payload and safety state; moves nothing."""
+        state = self._ask("sample")
+        problems = () if state["safety"] == "normal" else (f"it is in a {state['safety']}",)
+        facts = (("joints", str(len(state["q"]))), ("payload", f"{state['payload']:g} kg"))
+        return Report("arm", "simulated arm", facts, problems, (("joints", len(state["q"])),))
 
     def sample(self) -> ArmSample:
-        """Return what the controller knows now; currents and tool forces are zero."""
-        now = self._ask("sample")
-        still = np.zeros(len(now["q"]))
+        """Return the controller's present state; currents and tool forces are zero."""
+        state = self._ask("sample")
+        zeros = np.zeros(len(state["q"]))
         names = ("q", "q_target", "qd", "joint_temperature", "payload_com")
         return ArmSample(
             host_ns=time.monotonic_ns(),
-            timestamp=float(now["timestamp"]),
-            target_moment=np.array(now["torque"]),
-            current=still,
-            target_current=still,
-            tcp_pose=np.array(now["flange"]),
+            timestamp=float(state["timestamp"]),
+            target_moment=np.array(state["torque"]),
+            current=zeros,
+            target_current=zeros,
+            tcp_pose=np.array(state["flange"]),
             tcp_force=np.zeros(6),
             ft_raw_wrench=None,
-            payload=float(now["payload"]),
+            payload=float(state["payload"]),
             speed_scaling=1.0,
-            safety=str(now["safety"]),
-            **{name: np.array(now[name]) for name in names},
+            safety=str(state["safety"]),
+            **{name: np.array(state[name]) for name in names},
         )
 
     def take_control(self, mass: float, com: Floats) -> None:
-        """Become the one who commands the arm, and set its payload, kg and m."""
+        """Take control of the arm, and set its payload, kg and m."""
         self._ours = True
         self.set_payload(mass, com)
 
@@ -172,17 +172,17 @@ class SimulatedArm:
         self._ask("payload", mass=float(mass), com=np.asarray(com, dtype=float).tolist())
 
     def start_move(self, q: Floats, speed: float, acceleration: float) -> None:
-        """Start a straight line in joint space; `speed` is that of the leading joint."""
+        """Start a straight line in joint space; `speed`: of the leading joint."""
         if not self._ours:
             raise DeviceError("arm: a motion without control; call take_control first")
         self._ask("move", q=q.tolist(), speed=float(speed), acceleration=float(acceleration))
 
     def moving(self) -> bool:
-        """Whether the motion goes on."""
-        now = self._ask("sample")
-        if now["safety"] != "normal":
-            raise DeviceError(f"arm: {now['safety']}; release it, then go on with --resume")
-        return bool(now["moving"])
+        """Whether the arm is moving."""
+        state = self._ask("sample")
+        if state["safety"] != "normal":
+            raise DeviceError(f"arm: {state['safety']}; release it, then go on with --resume")
+        return bool(state["moving"])
 
     def stop(self) -> None:
         """Stop the arm and wait until it stands."""
@@ -194,7 +194,7 @@ class SimulatedArm:
             time.sleep(0.01)
 
     def close(self) -> None:
-        """Stop the arm where it was under control."""
+        """Stop the arm if it is under control."""
         if self._ours:
             with contextlib.suppress(DeviceError):
                 self._ask("stop")
@@ -208,7 +208,7 @@ class SimulatedArm:
 
 
 def open_arm(config: CellConfig) -> SimulatedArm:
-    """Return the simulated arm of a configuration, whose [robot] options have its `socket`."""
+    """Return the simulated arm of a configuration, whose [robot] options name its `socket`."""
     socket = config.robot.options.get("socket")
     if not isinstance(socket, str) or not socket:
         raise InputError(
@@ -227,12 +227,12 @@ def start(options: argparse.Namespace) -> admin.Device:
     controller = ArmController(world.cell.arm, board, np.random.default_rng(options.seed))
     controller.step()
     names = ("move", "stop", "payload", "jog", "protective_stop", "release", "sample")
-    asked = {name: getattr(controller, name) for name in names}
+    functions = {name: getattr(controller, name) for name in names}
 
     def step() -> None:
         time.sleep(_STEP_S if controller.step() else _REFRESH_S)
 
-    return admin.Operations(asked, controller.sample), step
+    return admin.Operations(functions, controller.sample), step
 
 
 if __name__ == "__main__":

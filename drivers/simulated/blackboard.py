@@ -1,8 +1,8 @@
-"""The one physical world, as all simulated devices see it: a small shared file.
+"""The state of the physical world that all simulated devices share: a small memory-mapped file.
 
-Each section has one writer and any number of readers, in other processes. A sequence number
-that is odd while the section is being written makes readers read again (a seqlock; see
-Linux kernel documentation, "Sequence counters and sequential locks").
+Each section has one writer and any number of readers, in other processes. Its sequence number is
+odd during a write, which makes readers read again (a seqlock; see Linux kernel documentation,
+"Sequence counters and sequential locks").
 """
 
 import mmap
@@ -18,7 +18,7 @@ _TRIES = 10_000
 
 
 def sections(n: int) -> dict[str, np.dtype[Any]]:
-    """Return the sections of the world of an arm of n joints; angles of a slide are in m."""
+    """Return the sections for an arm of n joints; for slides read m in place of rad."""
     return {
         # written once by the world
         "world": np.dtype([("joints", "<i8"), ("start_ns", "<i8"), ("scale", "<f8")]),
@@ -26,7 +26,7 @@ def sections(n: int) -> dict[str, np.dtype[Any]]:
         "arm": np.dtype(
             [
                 ("alive", "<f8"),  # 1 once the controller has written its state
-                ("q", "<f8", n),  # where the commanded trajectory is, rad
+                ("q", "<f8", n),  # present point of the commanded trajectory, rad
                 ("qd", "<f8", n),  # its speed, rad/s
                 ("side", "<f8", n),  # direction of each joint's last motion, -1 or +1
                 ("arrivals", "<i8"),  # motions that have ended (also by a stop)
@@ -35,22 +35,22 @@ def sections(n: int) -> dict[str, np.dtype[Any]]:
                 ("payload_com", "<f8", 3),  # flange axes, m
             ]
         ),
-        # written by the world: what is true
+        # written by the world: the true state
         "truth": np.dtype(
             [
-                ("time", "<f8"),  # world time of the content, s
+                ("time", "<f8"),  # world time of this section, s
                 ("load", "<i8"),  # number of the load in the cell's [[loads]] + 1, 0 is none
                 ("load_since", "<f8"),  # world time of its last change, s
                 ("target", "<f8", 3),  # tracked target, sensor (tracker) axes, m
                 ("target_rotation", "<f8", (3, 3)),
-                ("targets", "<f8", (MOST_TARGETS, 3)),  # of several all, `target` first; else NaN
+                ("targets", "<f8", (MOST_TARGETS, 3)),  # all, if several, `target` first; else NaN
                 ("flange", "<f8", (4, 4)),  # T_base_flange
-                ("sensor_wrench", "<f8", 6),  # on the force sensor by tool and load, sensor axes
+                ("sensor_wrench", "<f8", 6),  # of tool and load on the force sensor, sensor axes
                 ("drive_torque", "<f8", n),  # N·m
                 ("encoder", "<f8", n),  # what the encoders read, rad
                 ("joint_temperature", "<f8", n),  # °C
                 ("air_temperature", "<f8"),  # °C
-                ("arrivals", "<i8"),  # the arm's `arrivals` that the content belongs to
+                ("arrivals", "<i8"),  # the arm's `arrivals` that this section belongs to
             ]
         ),
     }
@@ -83,20 +83,20 @@ class Blackboard:
         }
 
     @classmethod
-    def create(cls, path: Path, scale: float, begun: float = 0.0, joints: int = 6) -> "Blackboard":
-        """Make the file; the clock begins at `begun`, s, and goes `scale` s per real second."""
+    def create(cls, path: Path, scale: float, start: float = 0.0, joints: int = 6) -> "Blackboard":
+        """Make the file; its clock starts at `start`, s, with `scale` s per real second."""
         number = np.array([0, joints], "<i8").tobytes()
         path.write_bytes(number + bytes(_offsets(joints)[1] - len(number)))
         board = cls(path)
-        start = time.monotonic_ns() - round(1e9 * begun / scale)
-        board.write("world", start_ns=start, scale=scale)
+        start_ns = time.monotonic_ns() - round(1e9 * start / scale)
+        board.write("world", start_ns=start_ns, scale=scale)
         return board
 
     def write(self, section: str, **fields: Any) -> None:
-        """Set fields of a section, all at once for readers; only its one writer may."""
+        """Set fields of a section, for readers all at once; for its single writer only."""
         sequence, content = self._sequence[section], self._content[section]
-        begun = int(sequence[0]) | 1
-        sequence[0] = begun + 2 if begun == int(sequence[0]) else begun
+        odd = int(sequence[0]) | 1
+        sequence[0] = odd + 2 if odd == int(sequence[0]) else odd
         for name, value in fields.items():
             content[name][0] = value
         sequence[0] = int(sequence[0]) + 1
@@ -105,10 +105,10 @@ class Blackboard:
         """Return a consistent copy of a section, a record with the fields of `sections`."""
         sequence, content = self._sequence[section], self._content[section]
         for _ in range(_TRIES):
-            before = int(sequence[0])
-            if before % 2 == 0:
+            number = int(sequence[0])
+            if number % 2 == 0:
                 copy = content[0].copy()
-                if int(sequence[0]) == before:
+                if int(sequence[0]) == number:
                     return copy
             time.sleep(0)
         raise RuntimeError(f"blackboard: section {section} is never at rest (its writer died?)")
@@ -129,13 +129,13 @@ class Blackboard:
         return float(self._content["world"]["scale"][0])
 
 
-_LATE_S = 0.2  # how long an instrument waits for the world to catch up with an arm that has arrived
+_LATE_S = 0.2  # longest wait of an instrument until the world shows an arm's arrival, real s
 
 
 def settled_truth(board: Blackboard) -> Any:
-    """Return the truth; where the arm has just arrived, that of its arrival.
+    """Return the truth; after an arrival of the arm, wait until it belongs to the arrival.
 
-    The world looks at the arm some hundred times a second of real time; its clock may be faster.
+    The world reads the arm's state some hundred times per real second; its clock may run faster.
     """
     end = time.monotonic() + _LATE_S
     while True:

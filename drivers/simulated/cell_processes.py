@@ -1,4 +1,4 @@
-"""A whole simulated cell: one process per device, all looking into one physical world."""
+"""A simulated cell: one process per device, all sharing one physical world."""
 
 import contextlib
 import secrets
@@ -22,27 +22,27 @@ from hilcal.errors import DeviceError, InputError
 from hilcal.robot.arm import Arm
 from hilcal.types import Floats
 
-START_TIMEOUT = 60.0  # s; the simulated devices are ready by then on a busy machine, too
+START_TIMEOUT = 60.0  # s; enough for the simulated devices on a busy machine
 UR_PORTS = (29999, 30001, 30003, 30004)
 UR_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
-EMSCON_PORT = 7000  # of the simulated tracker: the real one, 700, is for the administrator alone
+EMSCON_PORT = 7000  # of the simulated tracker; the real port, 700, needs the administrator's rights
 RDT_PORT, WEB_PORT, NATNET_PORT = 49152, 8081, 1510
 PORTS = (*UR_PORTS, EMSCON_PORT, WEB_PORT)
 TRACKERS = ("geocom", "emscon", "natnet")
 FORCE_SENSORS = ("ft300", "bota", "hex", "netft")
 _STALE = ("world.json", "world.bin", "tracker", "force", "world.sock", "arm.sock", "tracker.sock",
           "force.sock")  # fmt: skip
-_SOCKET_PATH = 100  # bytes; Linux allows 107 (unix(7)), and the line is made as "*.sock.new"
-_HOSTS = 3  # addresses tried when another program is faster
+_SOCKET_PATH = 100  # bytes; Linux allows 107 (unix(7)), and the socket is made as "*.sock.new"
+_HOSTS = 3  # addresses tried if another program takes their ports first
 _POLL = 0.01  # s
-_END = 2.0  # s that a process has to end by itself, and again after it was asked to
+_END = 2.0  # longest wait for the end of a process, before each harsher signal, s
 
 
 class DeviceProcess:
     """Starts, watches and ends `python -m MODULE --directory DIR ...`.
 
-    It ends with its standard input, a pipe held here; its output goes to DIR/NAME.log; it is ready
-    when DIR/NAME.sock appears.
+    The process ends when its standard input closes, a pipe held here. Its output goes to
+    DIR/NAME.log; it is ready when DIR/NAME.sock appears.
     """
 
     def __init__(self, name: str, module: str, directory: Path, arguments: tuple[str, ...]) -> None:
@@ -62,12 +62,12 @@ class DeviceProcess:
                 stdout=log,
                 stderr=log,
                 env={**environment(), "OMP_NUM_THREADS": "1"},
-                start_new_session=True,  # Ctrl-C is for the one who started it
+                start_new_session=True,  # Ctrl-C is for the parent only
             )
 
     @property
     def pid(self) -> int | None:
-        """Its number while it runs."""
+        """Process number while it runs."""
         return None if self._process is None or self.ended else self._process.pid
 
     @property
@@ -76,36 +76,36 @@ class DeviceProcess:
         return self._process is not None and self._process.poll() is not None
 
     def running_unready(self) -> bool:
-        """Whether it was started and is not ready yet."""
+        """Whether it has been started and is not yet ready."""
         return self._process is not None and not self.socket.exists()
 
     def check(self) -> None:
-        """Raise DeviceError with the last line that it said where it has ended."""
+        """Raise DeviceError with the last line of its output if it has ended."""
         if self._process is None or not self.ended:
             return
-        words = self.log.read_text(encoding="utf-8", errors="replace").split("\n")
-        last = next((line.strip() for line in reversed(words) if line.strip()), "no message")
+        output = self.log.read_text(encoding="utf-8", errors="replace").split("\n")
+        last = next((line.strip() for line in reversed(output) if line.strip()), "no message")
         raise DeviceError(
             f"simulated {self.name}: ended with exit code {self._process.returncode}: {last}"
         )
 
-    def let_go(self) -> None:
-        """Close its standard input: it ends by itself."""
+    def close_input(self) -> None:
+        """Close its standard input, on which it ends by itself."""
         if self._process is not None and self._process.stdin is not None:
             with contextlib.suppress(OSError):
                 self._process.stdin.close()
 
     def end(self) -> None:
-        """End it, whatever it takes."""
+        """End it, by force if needed."""
         if self._process is None:
             return
-        self.let_go()
-        for harder in (self._process.terminate, self._process.kill, lambda: None):
+        self.close_input()
+        for force in (self._process.terminate, self._process.kill, lambda: None):
             try:
                 self._process.wait(_END)
                 break
             except subprocess.TimeoutExpired:
-                harder()
+                force()
         self._process = None
         self.socket.unlink(missing_ok=True)
 
@@ -117,7 +117,7 @@ class DeviceProcess:
 
 
 class SimulatedCell:
-    """The running processes of a simulated cell; `config` leads to them."""
+    """The running processes of a simulated cell; drivers reach them by `config`."""
 
     def __init__(
         self,
@@ -137,14 +137,14 @@ class SimulatedCell:
         seed: int,
         *,
         base_dir: Path | None = None,
-        begun: float = 0.0,
+        start_s: float = 0.0,
         home: Floats | None = None,
     ) -> Self:
-        """Start every device of the cell, and return when all of them are ready.
+        """Start all devices of the cell, and return when they are ready.
 
-        The world's cell was made from `config`, whose robot's file path is relative to `base_dir`;
-        `directory` is for this cell alone. The world's time begins at `begun`, s: over 0 where it
-        was there before. At `home` (n,) the arm stands at first; an arm of UR stands upright.
+        The world's cell was made from `config`, whose file paths are relative to `base_dir`;
+        `directory` must be for this cell alone. The world's time starts at `start_s`, s, over 0 for
+        a world continued. The arm starts at `home` (n,); an arm of UR starts upright.
         """
         _check(world, config, directory)
         try:
@@ -152,10 +152,10 @@ class SimulatedCell:
             for name in _STALE:
                 (directory / name).unlink(missing_ok=True)
             write_world(directory / "world.json", world, config, base_dir)
-            board = open_board(directory, config.simulation.clock, begun, world.cell.arm.n)
+            board = open_board(directory, config.simulation.clock, start_s, world.cell.arm.n)
             if not is_ur(world.cell.arm):
-                usual = np.mean(world.cell.arm.usual_range, axis=0)
-                board.write("arm", q=usual if home is None else home)
+                middle = np.mean(world.cell.arm.usual_range, axis=0)
+                board.write("arm", q=middle if home is None else home)
         except OSError as error:
             raise InputError(
                 f"simulated cell: {directory} cannot be used ({error}); "
@@ -164,14 +164,14 @@ class SimulatedCell:
         for attempt in range(1, _HOSTS + 1):
             host = free_host()
             devices = _devices(world, config, directory, seed, host, base_dir or Path())
-            filled = _filled_in(config, directory, host, is_ur(world.cell.arm))
-            cell = cls(filled, directory, devices, board)
+            connected = _connected(config, directory, host, is_ur(world.cell.arm))
+            cell = cls(connected, directory, devices, board)
             try:
-                cell._begin(devices.values())
+                cell._start(devices.values())
             except BaseException as error:
-                taken = "in use" in str(error) and any(d.ended for d in devices.values())
+                in_use = "in use" in str(error) and any(d.ended for d in devices.values())
                 cell.close()
-                if attempt == _HOSTS or not taken:
+                if attempt == _HOSTS or not in_use:
                     raise
             else:
                 return cell
@@ -186,19 +186,19 @@ class SimulatedCell:
         self._device(device).kill()
 
     def restart(self, device: str) -> None:
-        """Start a device again, after ending it where it still runs; returns when it is ready."""
+        """Restart a device, ended first if it still runs; return when it is ready."""
         process = self._device(device)
         process.kill()
-        self._begin([process])
+        self._start([process])
 
     def processes(self) -> dict[str, int]:
-        """Return the process numbers of the devices that run."""
+        """Return the process numbers of the running devices."""
         return {name: d.pid for name, d in self._devices.items() if d.pid is not None}
 
     def close(self) -> None:
-        """End every process. Never raises, may be called twice."""
+        """End every process. Never raises; may be called twice."""
         for device in self._devices.values():
-            device.let_go()
+            device.close_input()
         for device in self._devices.values():
             device.end()
 
@@ -208,12 +208,12 @@ class SimulatedCell:
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    def _begin(self, devices: Iterable[DeviceProcess]) -> None:
-        """Start devices side by side, and wait until they are ready and agree."""
+    def _start(self, devices: Iterable[DeviceProcess]) -> None:
+        """Start devices in parallel; wait until they are ready, and arm and world agree."""
         deadline = time.monotonic() + START_TIMEOUT
 
-        def wait(checked: Iterable[DeviceProcess], late: str) -> None:
-            for device in checked:
+        def wait(starting: Iterable[DeviceProcess], late: str) -> None:
+            for device in starting:
                 device.check()
             if time.monotonic() > deadline:
                 raise DeviceError(late)
@@ -232,7 +232,7 @@ class SimulatedCell:
             )
 
     def _agree(self) -> bool:
-        """Whether the truth belongs to what the arm does (where both run)."""
+        """Whether the world shows the arm's present state; True unless both run."""
         if not {"world", "arm"} <= set(self.processes()):
             return True
         arm, truth = self._board.read("arm"), self._board.read("truth")
@@ -247,7 +247,7 @@ class SimulatedCell:
 
 
 def free_host() -> str:
-    """Return a loopback address whose ports of devices are free now."""
+    """Return a loopback address where all ports of devices are free."""
     for _ in range(50):
         parts = (secrets.randbelow(254) + 1, secrets.randbelow(256), secrets.randbelow(254) + 1)
         host = "127.{}.{}.{}".format(*parts)
@@ -262,7 +262,7 @@ def free_host() -> str:
 
 
 def _check(world: World, config: CellConfig, directory: Path) -> None:
-    """Refuse what the wire-level devices cannot be."""
+    """Raise InputError for a cell that the simulated devices cannot represent."""
     if not np.array_equal(world.station, np.eye(4)):
         raise InputError(
             "simulated cell: a station measures from where it stands, but the readings' origin "
@@ -270,19 +270,19 @@ def _check(world: World, config: CellConfig, directory: Path) -> None:
             "is unknown or farther away than the arm reaches"
         )
     sensor = config.force_sensor
-    for what, driver, valid in (
+    for device, driver, valid in (
         ("tracker", config.tracker.driver or TRACKERS[0], TRACKERS),
         ("force sensor", "ft300" if sensor is None else sensor.driver, FORCE_SENSORS),
     ):
         if driver not in valid:
             raise InputError(
-                f"simulated cell: no simulated {what} {driver!r}; valid: {', '.join(valid)}"
+                f"simulated cell: no simulated {device} {driver!r}; valid: {', '.join(valid)}"
             )
-    longest = len(str((directory / "tracker.sock").absolute()).encode())
-    if longest > _SOCKET_PATH:
+    size = len(str((directory / "tracker.sock").absolute()).encode())
+    if size > _SOCKET_PATH:
         raise InputError(
             f"simulated cell: the path {directory} is too long for its sockets by "
-            f"{longest - _SOCKET_PATH} bytes; valid: a directory nearer to the root"
+            f"{size - _SOCKET_PATH} bytes; valid: a directory nearer to the root"
         )
     with contextlib.suppress(DeviceError):
         admin.ask(directory / "world.sock", "state", timeout=1.0)
@@ -300,26 +300,26 @@ def _devices(
             **{"host": host, "port": EMSCON_PORT, "orientation_std": noise.orientation_std},
             **std,
         },
-        "natnet": {"host": host, "port": NATNET_PORT},  # its errors are its own
+        "natnet": {"host": host, "port": NATNET_PORT},  # with its own default errors
     }
     tracker = config.tracker.driver or TRACKERS[0]
 
-    def device(name: str, server: str, more: int, options: dict[str, Any]) -> DeviceProcess:
-        words = ["--seed", str(seed + more)]
+    def device(name: str, server: str, stream: int, options: dict[str, Any]) -> DeviceProcess:
+        command = ["--seed", str(seed + stream)]
         for key, value in options.items():
             values = value if isinstance(value, tuple) else (value,)
-            words += [f"--{key.replace('_', '-')}", *map(str, values)]
-        return DeviceProcess(name, f"hilcal.drivers.simulated.{server}", directory, tuple(words))
+            command += [f"--{key.replace('_', '-')}", *map(str, values)]
+        return DeviceProcess(name, f"hilcal.drivers.simulated.{server}", directory, tuple(command))
 
-    controller, about = "arm", dict[str, Any]()
+    controller, facts = "arm", dict[str, Any]()
     if is_ur(world.cell.arm):
         version = config.simulation.controller_version
-        controller, about = "ur_server", {"host": host, "robot": arm.model, "version": version}
+        controller, facts = "ur_server", {"host": host, "robot": arm.model, "version": version}
         if arm.calibration is not None:
-            about["calibration"] = base_dir / arm.calibration
+            facts["calibration"] = base_dir / arm.calibration
     out = {
         "world": device("world", "world_server", 0, {}),
-        "arm": device("arm", controller, 3, about),
+        "arm": device("arm", controller, 3, facts),
         "tracker": device("tracker", f"{tracker}_server", 1, trackers[tracker]),
     }
     if sensor is not None:
@@ -331,23 +331,28 @@ def _devices(
 
 
 def is_ur(arm: Arm) -> bool:
-    """Whether an arm is one of Universal Robots in the catalogue: its own protocol is simulated."""
+    """Whether an arm is one of Universal Robots in the catalogue, whose protocols are simulated."""
     return arm.name.startswith("ur") and arm.joint_names == UR_JOINTS
 
 
-def _filled_in(config: CellConfig, directory: Path, host: str, ur: bool) -> CellConfig:
-    """Return the configuration that leads to the simulated devices."""
+def _connected(config: CellConfig, directory: Path, host: str, ur: bool) -> CellConfig:
+    """Return the configuration whose drivers connect to the simulated devices."""
     from hilcal.drivers.simulated.ur_server import API, POLYSCOPE_X  # loads asyncio
 
     directory = directory.absolute()
     tracker = config.tracker.driver or TRACKERS[0]
-    at = {"emscon": {"host": f"{host}:{EMSCON_PORT}"}, "natnet": {"host": f"{host}:{NATNET_PORT}"}}
+    ports = {"emscon": EMSCON_PORT, "natnet": NATNET_PORT}
+    line = (
+        {"host": f"{host}:{ports[tracker]}"}
+        if tracker in ports
+        else {"port": str(directory / "tracker")}
+    )
     changes: dict[str, dict[str, Any]] = {
         "robot": {
             "driver": "hilcal.drivers.simulated.arm:open_arm",
             "options": {"socket": str(directory / "arm.sock")},
         },
-        "tracker": {"driver": tracker, **at.get(tracker, {"port": str(directory / "tracker")})},
+        "tracker": {"driver": tracker, **line},
         "operator": {
             "driver": "simulated",
             "options": {**config.operator.options, "socket": str(directory / "world.sock")},
@@ -365,5 +370,7 @@ def _filled_in(config: CellConfig, directory: Path, host: str, ur: bool) -> Cell
         if sensor.driver == "netft":
             web = {**sensor.options, "web_port": WEB_PORT}
             changes["force_sensor"] = {"host": f"{host}:{RDT_PORT}", "options": web}
-    filled = {name: getattr(config, name).model_copy(update=new) for name, new in changes.items()}
-    return config.model_copy(update=filled)
+    sections = {
+        name: getattr(config, name).model_copy(update=change) for name, change in changes.items()
+    }
+    return config.model_copy(update=sections)

@@ -5,11 +5,11 @@
 
 One client at a time, as an AT40x. Admin operations: `beam {on}` blocks it, `hide {targets}`,
 `lock_lost`, `freeze {on}`, `stray {on}`, `uninitialize` loses the zeros, `reflector {number}` sets
-another one at the controller, `fail {command, status, count}`, `change {number}` tells a change of
-state, `transform {on}` sets an object's coordinate system, `drop` closes the connection,
-`mute {on}`, `rubbish {data}` sends what is no packet, `log`, `state`.
+another one at the controller, `fail {command, status, count}`, `change {number}` reports a change
+of state, `transform {on}` sets an object's coordinate system, `drop` closes the connection,
+`mute {on}`, `rubbish {data}` sends data that are no packet, `log`, `state`.
 
-Source: as `hilcal.drivers.emscon_packets`. CESAPI, a client of others, is tested against it.
+Source: as `hilcal.drivers.emscon_packets`. CESAPI, an independent client, is tested against it.
 """
 
 import argparse
@@ -60,43 +60,43 @@ SETS = {
     es.SET_REFLECTOR: (es.GET_REFLECTOR, es.REFLECTOR_CHANGED),
     es.SET_SEARCH: (44, 4),
 }
-"""By command: what it sets, and the change of state that is told."""
+"""By command: the command that reads the setting, and the change of state reported."""
 
 
 @dataclass(slots=True, eq=False)
 class SimulatedTracker:
-    """What the tracker is set to and what it answers."""
+    """Settings and answers of the tracker."""
 
     station: Station
     noise: SimulatedNoise
     rng: np.random.Generator  # of the orientation's noise
     initialized: bool = True
     settings: dict[int, bytes] = field(default_factory=lambda: dict(DEFAULTS))
-    """What the commands have set, by the command that reads it."""
+    """Settings by the command that reads them."""
     failing: dict[int, tuple[int, int]] = field(default_factory=dict)
-    """Status and how many next answers have it, by command."""
+    """By command: status, and number of next answers that have it."""
     mute: bool = False
     client: socket.socket | None = None
-    asked: deque[int] = field(default_factory=lambda: deque(maxlen=10_000))
+    log: deque[int] = field(default_factory=lambda: deque(maxlen=10_000))
 
     def setting(self, command: int, layout: str) -> tuple[Any, ...]:
         """Return the values that a command reads."""
         return struct.unpack(layout, self.settings[command])
 
     def send(self, kind: int, body: bytes) -> None:
-        """Send a packet to who is connected."""
+        """Send a packet to the client, if any."""
         if self.client is not None and not self.mute:
-            with contextlib.suppress(OSError):  # gone; seen when it is read from
+            with contextlib.suppress(OSError):  # a lost client is noticed when reading
                 self.client.sendall(es.HEADER.pack(es.HEADER.size + len(body), kind) + body)
 
-    def tell(self, change: int) -> None:
-        """Tell a change of state, where the client wants to hear of it."""
+    def report(self, change: int) -> None:
+        """Report a change of state, if the client has enabled reports."""
         if self.setting(es.GET_SETTINGS, "<I8i")[4]:
             self.send(es.CHANGE, struct.pack("<I", change))
 
     def carry_out(self, command: int, body: bytes) -> None:
         """Carry out a command and answer it."""
-        self.asked.append(command)
+        self.log.append(command)
         status, count = self.failing.pop(command, (es.OK, 0))
         if count > 1:
             self.failing[command] = status, count - 1
@@ -106,14 +106,14 @@ class SimulatedTracker:
         elif command in self.settings:
             answers = [self.settings[command]]
         elif command in SETS:
-            what, change = SETS[command]
-            if len(body) != len(self.settings[what]):
+            reader, change = SETS[command]
+            if len(body) != len(self.settings[reader]):
                 status = WRONG_PARAMETER
             else:
-                changed = change if self.settings[what] != body else None
-                self.settings[what] = body
-        elif command in _TELL:
-            answers = _TELL[command](self)
+                changed = change if self.settings[reader] != body else None
+                self.settings[reader] = body
+        elif command in _QUERIES:
+            answers = _QUERIES[command](self)
         elif command == es.INITIALIZE:
             self.station.wait(5.0)
             self.initialized, changed = True, es.INITIALIZATION_CHANGED
@@ -126,7 +126,7 @@ class SimulatedTracker:
         for answer in answers:
             self.send(es.COMMAND, struct.pack("<II", command, status) + answer)
         if changed is not None:
-            self.tell(changed)
+            self.report(changed)
         if command == es.START_MEASUREMENT and status == es.OK:
             self._measure()
 
@@ -136,48 +136,48 @@ class SimulatedTracker:
         return (air if air != 0.0 else ROOM), MBAR, HUMIDITY
 
     def _acquire(self, command: int, body: bytes) -> int:
-        """Go to where a reflector is expected, and search for it; return the status."""
+        """Turn to the expected reflector, and search for it; return the status."""
         station = self.station
         if command == es.GO_POSITION:
-            at = PolarPoint.of(np.array(struct.unpack("<3di", body)[:3]))
-            station.turn(at.hz, at.v)
-            station.pointing = at
+            goal = PolarPoint.of(np.array(struct.unpack("<3di", body)[:3]))
+            station.turn(goal.hz, goal.v)
+            station.pointing = goal
             if not self.initialized:
                 return es.NOT_INITIALIZED
         distance = station.pointing.distance or station.distance or 2.0
         radius = self.setting(44, "<di")[0]
-        found = station.acquire(float(np.arctan2(radius, distance)))
-        return es.OK if found else es.NO_RESULT
+        acquired = station.acquire(float(np.arctan2(radius, distance)))
+        return es.OK if acquired else es.NO_RESULT
 
     def _measure(self) -> None:
-        """Measure and send the result, in the units and coordinates that are set."""
+        """Measure and send the result, in the units and coordinates set."""
         station, noise = self.station, self.noise
         station.meas_s = self.setting(es.GET_STATIONARY, "<2i")[0] * 1e-3
         station.start_ranging()
         station.finish_ranging(station.meas_s)
-        seen = station.seen
-        if seen is None or station.distance == 0.0:
+        polar = station.newest
+        if polar is None or station.distance == 0.0:
             self.send(es.ERROR, struct.pack("<II", es.START_MEASUREMENT, es.NO_RESULT))
             return
         (mode,) = self.setting(es.GET_MODE, "<I")
         length, angle, *_ = self.setting(es.GET_UNITS, "<5I")
         a, b = (1.0, 1e3, 1e6)[length], (1.0, np.rad2deg(1.0), 200 / np.pi)[angle]
         transformed = self.setting(es.GET_SETTINGS, "<I8i")[1]
-        moved = np.array([1.0, 2.0, 3.0]) if transformed else np.zeros(3)
-        position: Floats = seen.distance * seen.direction()
+        origin = np.array([1.0, 2.0, 3.0]) if transformed else np.zeros(3)
+        position: Floats = polar.distance * polar.direction()
         covariance = a * a * noise.covariance(position[None], 3)[0]
         turn: Floats | None = None
-        turned: Floats = np.zeros((3, 3))
+        angle_covariance: Floats = np.zeros((3, 3))
         angles: Floats = np.zeros(3)
         if mode == es.STATIONARY_6D:
             rotation = settled_truth(station.board)["target_rotation"]
-            off = Rotation.from_rotvec(noise.orientation_std * self.rng.normal(size=3))
-            seen_turn = off * Rotation.from_matrix(rotation)
-            turn, angles = np.roll(seen_turn.as_quat(), 1), seen_turn.as_euler("xyz")
+            error = Rotation.from_rotvec(noise.orientation_std * self.rng.normal(size=3))
+            observed = error * Rotation.from_matrix(rotation)
+            turn, angles = np.roll(observed.as_quat(), 1), observed.as_euler("xyz")
             J = _rates(angles)
-            turned = np.asarray((b * noise.orientation_std) ** 2 * np.linalg.inv(J.T @ J))
-        at = a * (position + moved)
-        m = es.Measurement(at, covariance, turn, b * angles, turned)
+            variance = (b * noise.orientation_std) ** 2
+            angle_covariance = np.asarray(variance * np.linalg.inv(J.T @ J))
+        m = es.Measurement(a * (position + origin), covariance, turn, b * angles, angle_covariance)
         kind, packed = es.pack_measurement(m, mode, self.environment())
         self.send(kind, struct.pack("<I", es.OK) + packed)
 
@@ -189,8 +189,8 @@ def _rates(angles: Floats) -> Floats:
     return np.array([[cc * cb, -sc, 0.0], [sc * cb, cc, 0.0], [-sb, 0.0, 1.0]])
 
 
-def _text(words: str) -> bytes:
-    return words.encode("utf-16-le").ljust(64, b"\0")
+def _text(text: str) -> bytes:
+    return text.encode("utf-16-le").ljust(64, b"\0")
 
 
 def _reflectors(t: SimulatedTracker) -> list[bytes]:
@@ -201,8 +201,8 @@ def _reflectors(t: SimulatedTracker) -> list[bytes]:
 
 
 def _info(t: SimulatedTracker) -> list[bytes]:
-    rest = struct.pack("<iiiidddiiddIii", 1, 1, 1, 1, 0.0, 160.0, 0.8, 10, 2, 3.14, 3.14, 1, 1, 0)
-    return [struct.pack("<I64si", 70, _text(NAME), SERIAL) + rest]
+    facts = struct.pack("<iiiidddiiddIii", 1, 1, 1, 1, 0.0, 160.0, 0.8, 10, 2, 3.14, 3.14, 1, 1, 0)
+    return [struct.pack("<I64si", 70, _text(NAME), SERIAL) + facts]
 
 
 def _system(t: SimulatedTracker) -> list[bytes]:
@@ -215,33 +215,33 @@ def _status(t: SimulatedTracker) -> list[bytes]:
     return [struct.pack("<Ii", es.OK, 15 | 4096 | es.LEVELLED | held)]
 
 
-_TELL: dict[int, Callable[[SimulatedTracker], list[bytes]]] = {
+_QUERIES: dict[int, Callable[[SimulatedTracker], list[bytes]]] = {
     es.GET_SYSTEM_STATUS: _system,
     es.GET_REFLECTORS: _reflectors,
     es.GET_TRACKER_INFO: _info,
     es.GET_ENVIRONMENT: lambda t: [struct.pack("<3d", *t.environment())],
     es.GET_STATUS_INFO: _status,
 }
-"""What answers a question, a packet each."""
+"""By query command: the packets of its answer."""
 
 
 def operations(t: SimulatedTracker) -> admin.Operations:
-    """Return what can be asked of the tracker."""
+    """Return the admin operations of the tracker."""
     station = t.station
 
     def uninitialize() -> None:
         t.initialized = False
-        t.tell(es.INITIALIZATION_CHANGED)
+        t.report(es.INITIALIZATION_CHANGED)
 
     def reflector(number: int) -> None:
         t.settings[es.GET_REFLECTOR] = struct.pack("<i", number)
-        t.tell(es.REFLECTOR_CHANGED)
+        t.report(es.REFLECTOR_CHANGED)
 
     def transform(on: bool) -> None:
         settings = list(t.setting(es.GET_SETTINGS, "<I8i"))
         settings[1] = int(on)
         t.settings[es.GET_SETTINGS] = struct.pack("<I8i", *settings)
-        t.tell(8)
+        t.report(8)
 
     def drop() -> None:
         if t.client is not None:
@@ -260,26 +260,26 @@ def operations(t: SimulatedTracker) -> admin.Operations:
             "settings": {str(k): v.hex() for k, v in t.settings.items()},
         }
 
-    own: dict[str, Callable[..., object]] = {
+    functions: dict[str, Callable[..., object]] = {
         **station.faults(),
         "uninitialize": uninitialize,
         "reflector": reflector,
         "fail": lambda command, status, count=1: t.failing.update({command: (status, count)}),
-        "change": lambda number: t.tell(int(number)),
+        "change": lambda number: t.report(int(number)),
         "transform": transform,
         "drop": drop,
         "mute": admin.setter(t, "mute"),
         "rubbish": rubbish,
-        "log": lambda: list(t.asked),
+        "log": lambda: list(t.log),
     }
-    return admin.Operations(own, state)
+    return admin.Operations(functions, state)
 
 
 def serve(t: SimulatedTracker, door: socket.socket) -> None:
-    """Answer the next client until it goes."""
+    """Answer the next client until it disconnects."""
     t.client, _ = door.accept()
     with t.client:
-        came = bytearray()
+        buffer = bytearray()
         while True:
             t.station.tick()
             if not select.select([t.client], [], [], _PULSE)[0]:
@@ -290,28 +290,28 @@ def serve(t: SimulatedTracker, door: socket.socket) -> None:
                 data = b""
             if not data:
                 break
-            came += data
-            while len(came) >= 12:
-                size, kind, command = struct.unpack_from("<iII", came)
+            buffer += data
+            while len(buffer) >= 12:
+                size, kind, command = struct.unpack_from("<iII", buffer)
                 if not 12 <= size <= es.LARGEST or kind != es.COMMAND:
-                    came.clear()
+                    buffer.clear()
                     break
-                if len(came) < size:
+                if len(buffer) < size:
                     break
-                body = bytes(came[12:size])
-                del came[:size]
+                body = bytes(buffer[12:size])
+                del buffer[:size]
                 t.carry_out(command, body)
     t.client = None
 
 
 def start(options: argparse.Namespace) -> admin.Device:
-    """Return a tracker that listens."""
-    measuring, turning = np.random.default_rng(options.seed).spawn(2)
+    """Return the tracker, listening."""
+    polar, orientation = np.random.default_rng(options.seed).spawn(2)
     along, across = tuple(options.range_std), tuple(options.transverse_std)
     board = Blackboard(options.directory / "world.bin")
-    station = Station(board, Beam(along, across), measuring)
+    station = Station(board, Beam(along, across), polar)
     noise = SimulatedNoise(along, across, options.orientation_std)
-    tracker = SimulatedTracker(station, noise, turning)
+    tracker = SimulatedTracker(station, noise, orientation)
     door = socket.create_server((options.host, options.port or 7000), backlog=1)
     return operations(tracker), partial(serve, tracker, door)
 
@@ -319,5 +319,5 @@ def start(options: argparse.Namespace) -> admin.Device:
 ORIENTATION: dict[str, dict[str, Any]] = {"--orientation-std": {"type": float, "default": 8.7e-5}}
 
 if __name__ == "__main__":
-    more = {**admin.NETWORK, **admin.NOISE, **ORIENTATION}
-    sys.exit(admin.run(__doc__, "tracker", start, more))
+    options = {**admin.NETWORK, **admin.NOISE, **ORIENTATION}
+    sys.exit(admin.run(__doc__, "tracker", start, options))

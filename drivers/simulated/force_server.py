@@ -5,13 +5,13 @@
 
 Admin operations: `overload {force}` adds a wrench (6 numbers, N and N·m), `freeze {on}` repeats one
 reading, `stall {on}` stops sending while the sensor's clock goes on, `state`; Bota: `saturate {on}`
-and `clock {us}`; those of the line (`PtyPort.faults`) where it has one.
+and `clock {us}`; on a serial line those of `PtyPort.faults`.
 
-An ATI Net F/T sends records by RDT on UDP and has its page on HTTP. Its further operations:
-`restart` as after a power cut: it counts anew and waits for a request, `lose {share}` of the
-datagrams, `twice {share}` sends some again, `cut {share}` of them short, `status {word}` sends this
-status, `page {words}` other elements of its page. Source: as `hilcal.drivers.netft`. pynetft, a
-client of others, is tested against it.
+An ATI Net F/T sends records by RDT on UDP and has a page on HTTP. Its additional operations:
+`restart` as after a power cut (resets the counters and waits for a request), `lose {share}` of the
+datagrams, `twice {share}` repeats some, `cut {share}` truncates some, `status {word}` sends this
+status, `page {words}` changes elements of the page. Source: as `hilcal.drivers.netft`. pynetft, an
+independent client, is tested against it.
 """
 
 import argparse
@@ -35,14 +35,14 @@ from hilcal.drivers.simulated.blackboard import Blackboard
 from hilcal.drivers.simulated.pty_port import PtyPort
 from hilcal.types import Floats
 
-TICK_S = 0.004  # frames are handed over in batches at least so far apart, as a USB adapter does
-LATE_S = 2.0  # frames that are later than this are lost: the process was suspended
+TICK_S = 0.004  # least time between batches of frames, as from a USB adapter
+LATE_S = 2.0  # frames later than this are lost: the process was suspended
 
-BIAS_STD = np.repeat((4.0, 0.2), 3)  # the zero of a sensor as delivered and bolted on, N and N·m
+BIAS_STD = np.repeat((4.0, 0.2), 3)  # zero of a new, mounted sensor, N and N·m
 DRIFT_STD = np.repeat((0.05, 0.002), 3)
 """Drift of the zero with the sensor's temperature, N/K and N·m/K."""
-WARM_K, WARM_S = 7.0, 600.0  # own heat above the air and how fast it comes (world time)
-ROOM = 22.0  # air temperature where the world does not tell, °C
+WARM_K, WARM_S = 7.0, 600.0  # final temperature above the air, and its time constant (world time)
+ROOM = 22.0  # air temperature if the world has none, °C
 
 
 @dataclass(slots=True, eq=False)
@@ -51,48 +51,48 @@ class StrainGauge:
 
     board: Blackboard
     rng: np.random.Generator
-    bias: Floats  # (6,) when the world begins, N and N·m
+    bias: Floats  # (6,) at the world's start, N and N·m
     drift: Floats  # (6,) per K
     noise: Floats  # (6,) standard deviation of one frame
     overload: Floats  # (6,) wrench added by a fault
-    on: float  # how long the sensor has been on when the world begins, s
-    frozen: Floats | None = None  # (6,) what it reads whatever it feels; None is the truth
+    on: float  # time since power-on at the world's start, s
+    frozen: Floats | None = None  # (6,) reading that is repeated; None: the truth
 
     @staticmethod
     def draw(
         board: Blackboard, noise: tuple[float, float], rng: np.random.Generator, on: float
     ) -> "StrainGauge":
-        """Return a sensor with a drawn zero; `noise` is of a force (N) and a moment (N·m)."""
+        """Return a sensor with a drawn zero; `noise`: of force (N) and moment (N·m)."""
         bias, drift = (std * rng.standard_normal(6) for std in (BIAS_STD, DRIFT_STD))
         return StrainGauge(board, rng, bias, drift, np.repeat(noise, 3), np.zeros(6), on)
 
     def temperature(self) -> float:
-        """Return the sensor's temperature, °C: it warms up above the air."""
+        """Return the sensor's temperature, °C, which rises above that of the air."""
         air = float(self.board.read("truth")["air_temperature"])
-        return float((air if air != 0.0 else ROOM) + self._own_heat(self.board.time))
+        return float((air if air != 0.0 else ROOM) + self._self_heating(self.board.time))
 
     def read(self, count: int) -> Floats:
-        """Return (count, 6) wrenches of the frames that are due now, N and N·m."""
+        """Return (count, 6) wrenches of the frames now due, N and N·m."""
         if self.frozen is not None:
             return np.tile(self.frozen, (count, 1))
         truth = self.board.read("truth")["sensor_wrench"]
-        since = self._own_heat(self.board.time) - self._own_heat(0.0)
-        mean = truth + self.bias + self.drift * since + self.overload
+        warming = self._self_heating(self.board.time) - self._self_heating(0.0)
+        mean = truth + self.bias + self.drift * warming + self.overload
         return np.asarray(mean + self.noise * self.rng.standard_normal((count, 6)))
 
     def add(self, force: Sequence[float]) -> None:
-        """Add a wrench (6,) to what it feels, N and N·m."""
+        """Set the added wrench (6,), N and N·m."""
         wrench = np.asarray(force, dtype=np.float64)
         if wrench.shape != (6,):
             raise ValueError(f"force has the shape {wrench.shape}; valid: 6 numbers")
         self.overload = wrench
 
     def freeze(self, on: bool) -> None:
-        """Repeat one reading, or no longer."""
+        """Repeat the present reading, or stop repeating."""
         self.frozen = self.read(1)[0] if on else None
 
     def faults(self, stream: object) -> dict[str, Callable[..., object]]:
-        """Return what can go wrong with a sensor and its stream, by name."""
+        """Return the faults of the sensor and of its stream, by name."""
         stall = admin.setter(stream, "stalled")
         return {"overload": self.add, "freeze": self.freeze, "stall": stall}
 
@@ -100,13 +100,13 @@ class StrainGauge:
         """Return zero and noise."""
         return {"bias": list(self.bias), "noise": list(self.noise)}
 
-    def _own_heat(self, time: float) -> float:
-        """Return by how much it is warmer than the air at a world time (s), K."""
+    def _self_heating(self, time: float) -> float:
+        """Return the temperature above the air at a world time (s), K."""
         return float(WARM_K * (1.0 - np.exp(-(time + self.on) / WARM_S)))
 
 
 class SensorProtocol:
-    """A sensor's wire protocol; this one streams from power-on and takes no commands."""
+    """A sensor's wire protocol; the base class streams from power-on and takes no commands."""
 
     baud = 0
     noise = (0.0, 0.0)
@@ -117,15 +117,15 @@ class SensorProtocol:
         self.streaming = True
 
     def frame(self, number: int, wrench: Floats, temperature: float) -> bytes:
-        """Return frame `number` since power-on of a wrench (6,) and a temperature, °C."""
+        """Return frame `number` since power-on, with a wrench (6,) and a temperature, °C."""
         raise NotImplementedError
 
     def receive(self, data: bytes, wrench: Floats) -> bytes:
-        """Take in what the client sent and return the answer, empty where there is none."""
+        """Return the answer to bytes of the client, empty if none."""
         return b""
 
     def operations(self) -> dict[str, Callable[..., object]]:
-        """Return the admin operations of this sensor's own."""
+        """Return the admin operations of this kind of sensor."""
         return {}
 
 
@@ -145,10 +145,10 @@ class Bota(SensorProtocol):
 
     def frame(self, number: int, wrench: Floats, temperature: float) -> bytes:
         """Return one frame, see `SensorProtocol.frame`."""
-        inside = np.clip(wrench, -self.full, self.full)
-        over = self.saturated or bool(np.any(inside != wrench))
+        clipped = np.clip(wrench, -self.full, self.full)
+        over = self.saturated or bool(np.any(clipped != wrench))
         time_us = (self._start_us + round(number * 1e6 / self.rate)) & 0xFFFFFFFF
-        body = self._body.pack(self.over_range if over else 0, *inside, time_us, temperature)
+        body = self._body.pack(self.over_range if over else 0, *clipped, time_us, temperature)
         return b"\xaa" + body + crc_x25(body)
 
     def operations(self) -> dict[str, Callable[..., object]]:
@@ -170,9 +170,9 @@ class Hex(SensorProtocol):
     def frame(self, number: int, wrench: Floats, temperature: float) -> bytes:
         """Return one frame, see `SensorProtocol.frame`."""
         counts = np.rint(wrench * self.scale)
-        inside = np.clip(counts, -self.most, self.most)
-        status = self.overload if np.any(inside != counts) else 0
-        values = struct.pack(">HH6h", number & 0xFFFF, status, *map(int, inside))
+        clipped = np.clip(counts, -self.most, self.most)
+        status = self.overload if np.any(clipped != counts) else 0
+        values = struct.pack(">HH6h", number & 0xFFFF, status, *map(int, clipped))
         body = b"\xaa\x07\x08\x10" + values
         return body + struct.pack(">H", sum(body) & 0xFFFF)
 
@@ -185,7 +185,7 @@ _STOP_BYTES = 50
 
 
 class Ft300(SensorProtocol):
-    """Robotiq FT 300, described in `hilcal.drivers.ft300`; it tells no time."""
+    """Robotiq FT 300, described in `hilcal.drivers.ft300`; its frames have no time."""
 
     baud = 19200
     noise = (0.1, 0.005)
@@ -198,13 +198,13 @@ class Ft300(SensorProtocol):
         self.streaming = False
         self._stop_bytes = 0
         self._inbox = bytearray()
-        fixed = {
-            500: _words("SIM-1.0.10\0\0"),  # firmware
-            510: [*_words("F3004242"), 2024],  # serial number and year
+        texts = {
+            500: _text("SIM-1.0.10\0\0"),  # firmware
+            510: [*_text("F3004242"), 2024],  # serial number and year
             _STREAM_REGISTER: [0],
         }
         self._registers = {
-            start + i: word for start, words in fixed.items() for i, word in enumerate(words)
+            start + i: value for start, values in texts.items() for i, value in enumerate(values)
         }
 
     def frame(self, number: int, wrench: Floats, temperature: float) -> bytes:
@@ -226,11 +226,11 @@ class Ft300(SensorProtocol):
         return answer
 
     def _counts(self, wrench: Floats) -> list[int]:
-        inside = np.clip(wrench, -self.full, self.full)
-        return [int(value) for value in np.rint(inside * self.scale)]
+        clipped = np.clip(wrench, -self.full, self.full)
+        return [int(value) for value in np.rint(clipped * self.scale)]
 
     def _request(self) -> bytes:
-        """Take one sound request to this slave out of the inbox; empty where there is none yet."""
+        """Remove a valid request to this slave from the inbox and return it; empty if none yet."""
         box = self._inbox
         while len(box) >= 8:
             length = 9 + box[6] if box[1] == _WRITE_MANY else 8
@@ -251,13 +251,13 @@ class Ft300(SensorProtocol):
                 _WRENCH_REGISTER + i: count & 0xFFFF for i, count in enumerate(self._counts(wrench))
             }
             registers = self._registers | live
-            wanted = range(address, address + word)
+            numbers = range(address, address + word)
             if not 1 <= word <= 125:
                 return _refusal(function, _BAD_VALUE)
-            if not all(register in registers for register in wanted):
+            if not all(register in registers for register in numbers):
                 return _refusal(function, _BAD_ADDRESS)
-            words = struct.pack(f">{word}H", *(registers[register] for register in wanted))
-            return _checked(bytes([_SLAVE, function, len(words)]) + words)
+            content = struct.pack(f">{word}H", *(registers[register] for register in numbers))
+            return _checked(bytes([_SLAVE, function, len(content)]) + content)
         if function == _WRITE_ONE:
             values = [word]
         elif function == _WRITE_MANY:
@@ -273,7 +273,7 @@ class Ft300(SensorProtocol):
         return _checked(request[:6])
 
 
-def _words(text: str) -> list[int]:
+def _text(text: str) -> list[int]:
     return [ord(a) << 8 | ord(b) for a, b in zip(text[::2], text[1::2], strict=True)]
 
 
@@ -296,13 +296,13 @@ class Stream:
     sensor: SensorProtocol
     gauge: StrainGauge
     port: PtyPort
-    stalled: bool = False  # whether frames are made but not sent
+    stalled: bool = False  # whether frames are due but not sent
     number: int = 0  # of the next frame, since power-on
-    due: float = 0.0  # when it is due, `time.monotonic`
-    lost: int = 0  # frames that came too late to be sent
+    due: float = 0.0  # when the next frame is due, `time.monotonic`
+    lost: int = 0  # frames too late to be sent
 
     def step(self) -> None:
-        """Wait for the next batch or for a request, and serve it."""
+        """Wait for the next batch or a request, and serve it."""
         until = min(self.due, self.port.next_arrival)
         data = self.port.read(max(TICK_S, until - time.monotonic()))
         if data:
@@ -313,7 +313,7 @@ class Stream:
         self.port.pump()
 
     def emit(self, now: float) -> None:
-        """Send every frame that is due; after a delay all that were missed meanwhile."""
+        """Send every frame due; after a delay also those missed, up to `LATE_S`."""
         period = 1.0 / self.sensor.rate
         if now < self.due:
             return
@@ -336,9 +336,9 @@ class Stream:
         self.due += count * period
 
     def operations(self) -> admin.Operations:
-        """Return what can be asked."""
-        own = self.gauge.faults(self) | self.sensor.operations() | self.port.faults()
-        return admin.Operations(own, self.state)
+        """Return the admin operations."""
+        functions = self.gauge.faults(self) | self.sensor.operations() | self.port.faults()
+        return admin.Operations(functions, self.state)
 
     def state(self) -> dict[str, Any]:
         """Return sensor, line and faults."""
@@ -366,22 +366,22 @@ _FACTORS = {"N": 1.0, "lbf": 1.0 / 4.4482216152605}
 
 @dataclass(slots=True, eq=False)
 class NetFt:
-    """The sensor: who is sent to, and how far it has counted."""
+    """An ATI Net F/T: its client and its counters."""
 
     gauge: StrainGauge
     rng: np.random.Generator
     rate: float
     line: socket.socket
-    client: tuple[str, int] | None = None  # address that asked for records; None is nobody
-    left: int = 0  # how many records are left to send; 0 is without end
+    client: tuple[str, int] | None = None  # address to which records are sent; None: none
+    remaining: int = 0  # number of records still to send; 0: endless
     number: int = 0
-    due: float = 0.0  # when the next one is due, `time.monotonic`
-    begun: float = field(default_factory=time.monotonic)
+    due: float = 0.0  # when the next record is due, `time.monotonic`
+    power_on: float = field(default_factory=time.monotonic)
     stalled: bool = False
     lose: float = 0.0
-    twice: float = 0.0  # share of datagrams that come again later
-    cut: float = 0.0  # share of datagrams that are cut short
-    status: int | None = None  # sent instead of its own where it is not None
+    twice: float = 0.0  # share of datagrams that are sent twice
+    cut: float = 0.0  # share of datagrams that are truncated
+    status: int | None = None  # sent in place of the true status; None: the true one
     elements: dict[str, str] = field(default_factory=dict)
 
     def page(self) -> str:
@@ -411,7 +411,7 @@ class NetFt:
         if select.select([self.line], [], [], wait)[0]:
             data, sender = self.line.recvfrom(64)
             if len(data) == 8:
-                self._asked(sender, *struct.unpack(">HHI", data))
+                self._serve(sender, *struct.unpack(">HHI", data))
         now = time.monotonic()
         if self.client is None or now < self.due:
             return
@@ -425,13 +425,13 @@ class NetFt:
             if not self.stalled:
                 self._send(wrench)
 
-    def _asked(self, sender: tuple[str, int], header: int, command: int, count: int) -> None:
+    def _serve(self, sender: tuple[str, int], header: int, command: int, count: int) -> None:
         if header != 0x1234:
             return
         if command == 0:
             self.client = None
         elif command in (2, 3):
-            self.client, self.left, self.number = sender, count, 0
+            self.client, self.remaining, self.number = sender, count, 0
             self.due = time.monotonic()
 
     def _skip(self, count: int) -> None:
@@ -439,40 +439,40 @@ class NetFt:
         self.due += count / self.rate
 
     def _send(self, wrench: Any) -> None:
-        inside = np.clip(wrench, -FULL, FULL)
-        over = SATURATED if np.any(inside != wrench) else 0
+        clipped = np.clip(wrench, -FULL, FULL)
+        over = SATURATED if np.any(clipped != wrench) else 0
         status = over if self.status is None else self.status
-        measured = int((self.due - self.begun) * MEASURING_HZ) & 0xFFFFFFFF
+        measured = int((self.due - self.power_on) * MEASURING_HZ) & 0xFFFFFFFF
         unit = np.repeat([_FACTORS[self.elements.get("scfgfu", "N")], 1.0], 3)
-        counts = np.rint(inside * unit * COUNTS).astype(int)
+        counts = np.rint(clipped * unit * COUNTS).astype(int)
         record = struct.pack(">3I6i", self.number & 0xFFFFFFFF, measured, status, *counts)
-        lost, again, cut = self.rng.random(3) < (self.lose, self.twice, self.cut)
-        with contextlib.suppress(OSError):  # nobody listens there any more
+        lost, twice, cut = self.rng.random(3) < (self.lose, self.twice, self.cut)
+        with contextlib.suppress(OSError):  # nobody listens on the client's port
             if not lost and self.client is not None:
                 self.line.sendto(record[: 20 if cut else None], self.client)
-                if again:
+                if twice:
                     self.line.sendto(record, self.client)
-        if self.left:
-            self.left -= 1
-            if not self.left:
+        if self.remaining:
+            self.remaining -= 1
+            if not self.remaining:
                 self.client = None
 
     def restart(self) -> None:
-        """Count anew, and wait for a request."""
-        self.client, self.number, self.begun = None, 0, time.monotonic()
+        """Reset the counters, and wait for a request."""
+        self.client, self.number, self.power_on = None, 0, time.monotonic()
 
     def operations(self) -> admin.Operations:
-        """Return what can be asked."""
-        own = self.gauge.faults(self) | {
+        """Return the admin operations."""
+        functions = self.gauge.faults(self) | {
             "restart": self.restart,
             **{name: admin.setter(self, name, float) for name in ("lose", "twice", "cut")},
             "status": admin.setter(self, "status", lambda word: word),
             "page": admin.setter(self, "elements", dict),
         }
-        return admin.Operations(own, self.state)
+        return admin.Operations(functions, self.state)
 
     def state(self) -> dict[str, Any]:
-        """Return what it does."""
+        """Return zero, noise and the state of sending."""
         return self.gauge.state() | {"frames": self.number, "streaming": self.client is not None}
 
 
@@ -481,35 +481,35 @@ def serve_page(sensor: NetFt, host: str, port: int) -> None:
 
     class Page(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
-            there = self.path.split("?")[0] == "/netftapi2.xml"
-            words = (sensor.page() if there else "not found").encode()
-            self.send_response(200 if there else 404)
+            known = self.path.split("?")[0] == "/netftapi2.xml"
+            content = (sensor.page() if known else "not found").encode()
+            self.send_response(200 if known else 404)
             self.send_header("Content-Type", "text/xml")
-            self.send_header("Content-Length", str(len(words)))
+            self.send_header("Content-Length", str(len(content)))
             self.end_headers()
-            self.wfile.write(words)
+            self.wfile.write(content)
 
         def log_message(self, format: str, *args: Any) -> None:
-            """Say nothing."""
+            """Log nothing."""
 
     server = HTTPServer((host, port), Page)
     threading.Thread(target=server.serve_forever, daemon=True).start()
 
 
 def start(options: argparse.Namespace) -> admin.Device:
-    """Return a sensor: of the network, which answers on HTTP already, or of a serial line."""
+    """Return a sensor in the network, with its page served, or on a serial line."""
     board = Blackboard(options.directory / "world.bin")
-    measuring, faults = np.random.default_rng(options.seed).spawn(2)
+    noise, faults = np.random.default_rng(options.seed).spawn(2)
     sensor: NetFt | Stream
     if options.kind == "netft":
         line = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         line.bind((options.host, options.port or 49152))
-        gauge = StrainGauge.draw(board, RDT_NOISE, measuring, options.on)
+        gauge = StrainGauge.draw(board, RDT_NOISE, noise, options.on)
         sensor = NetFt(gauge, faults, options.rate or 1000.0, line)
         serve_page(sensor, options.host, options.web_port)
     else:
         protocol = KINDS[options.kind](options.rate)
-        gauge = StrainGauge.draw(board, protocol.noise, measuring, options.on)
+        gauge = StrainGauge.draw(board, protocol.noise, noise, options.on)
         port = PtyPort(options.directory / "force", protocol.baud, faults)
         sensor = Stream(protocol, gauge, port, due=time.monotonic())
     return sensor.operations(), sensor.step

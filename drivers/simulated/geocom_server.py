@@ -3,14 +3,14 @@
     python -m hilcal.drivers.simulated.geocom_server --directory DIR --range-std A B
         --transverse-std C E --seed N [--baud 115200]
 
-Admin operations besides those of the line (`PtyPort.faults`): `beam {on}` blocks it, `hide
+Admin operations beside those of the line (`PtyPort.faults`): `beam {on}` blocks it, `hide
 {targets}` covers reflectors by number, `lock_lost`, `freeze {on}` repeats the last measurement,
 `stray {on}` follows a reflector at rest 0.2 m behind the target,
 `dist_error {on}`, `warn {code}` (1283 or 1284, 0 is none), `busy {on}`, `delay {rpc, seconds,
 count}` in real time, `wrong_trid {count}`, `meas_s {seconds}` of world time, `log`, `state`.
 
 Sources: Leica Geosystems, "TPS1200+ GeoCOM Reference Manual"; its chapter "ASCII protocol" has the
-lines `%R1Q,<rpc>,<trid>[,<crc>]:<p>` and `%R1P,<com>,<trid>[,<crc>]:<rc>,<p>`, whose checksum is
+lines `%R1Q,<rpc>,<trid>[,<crc>]:<p>` and `%R1P,<com>,<trid>[,<crc>]:<rc>,<p>`. Their checksum is
 CRC-16/ARC over the line without the checksum and its comma.
 """
 
@@ -51,9 +51,9 @@ class PolarPoint:
         hz, v = np.arctan2(x, y) % (2 * np.pi), np.arctan2(level, z)
         return PolarPoint(float(hz), float(v), float(np.hypot(level, z)))
 
-    def angle_to(self, other: "PolarPoint") -> float:
+    def angle_to(self, point: "PolarPoint") -> float:
         """Return the angle between two directions, rad."""
-        return float(np.arccos(np.clip(self.direction() @ other.direction(), -1.0, 1.0)))
+        return float(np.arccos(np.clip(self.direction() @ point.direction(), -1.0, 1.0)))
 
     def direction(self) -> Floats:
         """Return the unit vector (3,)."""
@@ -77,7 +77,7 @@ class Beam:
         return self.transverse_std[0] / distance + self.transverse_std[1]
 
     def observe(self, true: PolarPoint, rng: np.random.Generator) -> PolarPoint:
-        """Return one measurement of a target; every call draws anew."""
+        """Return one measurement of a target, with new noise."""
         across = self.angle_std(true.distance)
         draw = rng.standard_normal(3)
         # straight above the station the horizontal angle is arbitrary
@@ -90,64 +90,64 @@ class Beam:
 
 
 WARNINGS = (0, 1283, 1284)
-BEHIND_M = 0.2  # two reflectors are at two places
+BEHIND_M = 0.2  # distance of a stray reflector behind the target, m
 AIM_S = 0.3  # world time of a search, a fine adjustment, a lock-in or a turn, s
-FIELD_OF_VIEW = 0.026  # half angle in which the camera sees its target, rad (1.5°)
+FIELD_OF_VIEW = 0.026  # half angle of the camera's view, rad (1.5°)
 LEVEL_STD = 1e-6  # noise of the inclinations, rad
 
 
 @dataclass(slots=True, eq=False)
 class Station:
-    """A tracking station: it holds its target through jumps as long as the beam is free."""
+    """A tracking station; it holds its target through jumps while the beam is free."""
 
     board: Blackboard
     beam: Beam
     rng: np.random.Generator
     meas_s: float = 0.3  # world time of one distance measurement, s
-    locked: bool = True  # whether the target is held; no lock, no distance
-    broken: bool = False  # whether something stands in the beam
+    locked: bool = True  # whether the target is held; without lock no distance
+    broken: bool = False  # whether the beam is blocked
     dist_error: bool = False  # whether distance measurements fail (1292)
-    warning: int = 0  # code given instead of 0 with a good measurement, 0 is none
+    warning: int = 0  # code of a good measurement in place of 0
     busy: bool = False  # whether measurements are refused (1293)
     delays: dict[int, tuple[float, int]] = field(default_factory=dict)
-    """By procedure, s of real time and how many answers are late."""
-    wrong_transactions: int = 0  # so many next answers carry a wrong transaction number
-    lock_enabled: bool = True  # what 9020 has set
-    atr_enabled: bool = True  # what 9018 has set
+    """By procedure: delay in real s, and number of late answers."""
+    wrong_transactions: int = 0  # number of next answers with a wrong transaction number
+    lock_enabled: bool = True  # as set by 9020
+    atr_enabled: bool = True  # as set by 9018
     digits: int = 15  # decimals of floating-point numbers
     atmosphere: tuple[float, ...] = (658e-9, 1013.25, 20.0, 20.0)
     """Wavelength m, pressure mbar, dry and wet temperature °C."""
     settings: dict[int, str] = field(
         default_factory=lambda: {2020: "2", 17019: "0", 17021: "0", 17008: "0"}
     )
-    """Values of plain settings by the procedure that sets them."""
+    """Plain settings by the procedure that sets them."""
     pointing: PolarPoint = field(default_factory=lambda: PolarPoint(0.0, np.pi / 2, 0.0))
-    """Where the telescope looks."""
+    """Direction of the telescope."""
     distance: float = 0.0  # the last distance, m; 0 is none
-    distance_ms: int = 0  # station time of it, ms
+    distance_ms: int = 0  # station time of the last distance, ms
     ranging: float | None = None
-    """Until when a distance measurement runs, `time.monotonic`; None is not."""
-    tracking: bool = False  # whether the distance meter goes on by itself
+    """End of the running distance measurement, `time.monotonic`; None: none runs."""
+    tracking: bool = False  # whether the distance meter measures continuously
     requests: deque[tuple[int, tuple[str, ...]]] = field(
         default_factory=lambda: deque(maxlen=10_000)
     )
     measured: int = 0
-    number: int = 0  # of the target that is held, or was last
-    hidden: set[int] = field(default_factory=set)  # numbers of targets that cannot be seen
+    number: int = 0  # of the target held, or held last
+    hidden: set[int] = field(default_factory=set)  # numbers of covered targets
     several: bool = False
-    seen: PolarPoint | None = None
+    newest: PolarPoint | None = None  # the newest measurement
     stuck: PolarPoint | None = None
-    """What is measured to the last digit whatever the target does; None is the target."""
+    """The measurement that is repeated to the last digit; None: the target is measured."""
     stray: PolarPoint | None = None
-    """A reflector at rest that is followed instead; None is the target."""
+    """A reflector at rest that is followed in place of the target."""
 
     def faults(self) -> dict[str, Callable[..., None]]:
-        """Return what can go wrong between instrument and target, by name."""
+        """Return the faults between instrument and target, by name."""
         return {
             "beam": setter(self, "broken"),
             "hide": self.hide,
             "lock_lost": lambda: setattr(self, "locked", False),
-            "freeze": lambda on: setattr(self, "stuck", self.seen if on else None),
+            "freeze": lambda on: setattr(self, "stuck", self.newest if on else None),
             "stray": self.follow_stray,
         }
 
@@ -157,9 +157,9 @@ class Station:
         self.locked = self.locked and self.number not in self.hidden
 
     def follow_stray(self, on: bool) -> None:
-        """Follow a reflector at rest behind where the target is now, or the target again."""
-        seen = self.target() if on else None
-        self.stray = seen and replace(seen, distance=seen.distance + BEHIND_M)
+        """Follow a reflector at rest behind the target's present place, or the target again."""
+        target = self.target() if on else None
+        self.stray = target and replace(target, distance=target.distance + BEHIND_M)
 
     def warn(self, code: int) -> None:
         """Give a warning with every good measurement, or none (0)."""
@@ -168,25 +168,25 @@ class Station:
         self.warning = code
 
     def targets(self) -> dict[int, PolarPoint]:
-        """Return where the targets that can be seen truly are at this moment, by number."""
+        """Return the true present places of the visible targets, by number."""
         if self.broken:
             return {}
         truth = settled_truth(self.board)
         points = truth["targets"]
-        given = np.isfinite(points).all(axis=1) & points.any(axis=1)
-        self.several = bool(given.any())
+        valid = np.isfinite(points).all(axis=1) & points.any(axis=1)
+        self.several = bool(valid.any())
         if not self.several:
             points = truth["target"][None]
-            given = np.isfinite(points).all(axis=1) & points.any(axis=1)  # the world has begun
-        seen = (k for k in np.flatnonzero(given).tolist() if k not in self.hidden)
-        return {k: PolarPoint.of(points[k]) for k in seen}
+            valid = np.isfinite(points).all(axis=1) & points.any(axis=1)  # the world has started
+        visible = (k for k in np.flatnonzero(valid).tolist() if k not in self.hidden)
+        return {k: PolarPoint.of(points[k]) for k in visible}
 
     def target(self) -> PolarPoint | None:
-        """Return where its target truly is at this moment; None where it cannot be seen."""
+        """Return the true present place of its target; None if not visible."""
         return self.stray or self.targets().get(self.number)
 
     def held(self) -> PolarPoint | None:
-        """Return where the held target truly is; None without lock or sight."""
+        """Return the true place of the held target; None without lock or sight."""
         return self.target() if self.locked else None
 
     def look(self) -> PolarPoint | None:
@@ -194,27 +194,26 @@ class Station:
         true = self.held()
         if true is None:
             return None
-        seen = self.stuck or self.beam.observe(true, self.rng)
-        self.pointing = self.seen = seen
+        self.pointing = self.newest = self.stuck or self.beam.observe(true, self.rng)
         self.measured += 1
-        return seen
+        return self.newest
 
     def wait(self, world_seconds: float) -> None:
-        """Take so much world time."""
+        """Wait for `world_seconds` of world time."""
         time.sleep(max(0.0, world_seconds) / self.board.scale)
 
     def acquire(self, window: float = np.inf) -> bool:
-        """Search and hold the target that is closest to where it looks: whether there is any.
+        """Hold the target closest to the telescope's direction; return whether there is any.
 
-        Of several targets only those within `window` of that direction count, rad.
+        Of several targets only those within `window` of this direction count, rad.
         """
         self.wait(AIM_S)
-        seen = self.targets()
+        angles = {k: point.angle_to(self.pointing) for k, point in self.targets().items()}
         if self.several:
-            seen = {k: at for k, at in seen.items() if at.angle_to(self.pointing) <= window}
-        if seen:
-            self.number = min(seen, key=lambda k: seen[k].angle_to(self.pointing))
-        self.locked = bool(seen)
+            angles = {k: angle for k, angle in angles.items() if angle <= window}
+        if angles:
+            self.number = min(angles, key=lambda k: angles[k])
+        self.locked = bool(angles)
         self.look()
         return self.locked
 
@@ -224,35 +223,35 @@ class Station:
         self.ranging = time.monotonic() + self.meas_s / self.board.scale
 
     def stop_ranging(self, *, clear: bool) -> None:
-        """Measure no distance any more, and forget the last one."""
+        """Stop measuring distances; `clear`: also forget the last distance."""
         self.ranging = None
         self.distance = 0.0 if clear else self.distance
 
     def finish_ranging(self, patience: float) -> None:
         """Wait for a running distance measurement, at most `patience` s of world time."""
         if self.ranging is not None:
-            left = self.ranging - time.monotonic()
-            time.sleep(max(0.0, min(left, patience / self.board.scale)))
+            remaining = self.ranging - time.monotonic()
+            time.sleep(max(0.0, min(remaining, patience / self.board.scale)))
             self.tick()
 
     def tick(self) -> None:
-        """Take the distance if its time has come: where the target is at that moment."""
+        """Finish a distance measurement whose time is over, at the target's present place."""
         if self.ranging is None or time.monotonic() < self.ranging:
             return
         self.ranging = None
-        seen = self.look()
-        if seen is not None and not self.dist_error:
-            self.distance, self.distance_ms = seen.distance, int(self.board.time * 1e3)
+        polar = self.look()
+        if polar is not None and not self.dist_error:
+            self.distance, self.distance_ms = polar.distance, int(self.board.time * 1e3)
 
     def turn(self, hz: float, v: float) -> None:
-        """Point elsewhere; the lock ends unless the target is in the field of view there."""
+        """Turn the telescope; the lock ends unless the target is in the new field of view."""
         self.pointing = PolarPoint(hz % (2 * np.pi), v, 0.0)
         true = self.target()
         if true is None or true.angle_to(self.pointing) > FIELD_OF_VIEW:
             self.locked = False
 
     def inclination(self) -> tuple[float, float, float]:
-        """Return cross and lengthwise inclination and their accuracy, rad: it stands level."""
+        """Return cross and lengthwise inclination and their accuracy, rad; the station is level."""
         cross, length = self.rng.normal(0.0, LEVEL_STD, 2)
         return float(cross), float(length), LEVEL_STD
 
@@ -287,11 +286,11 @@ def reply(
 
 Answer = tuple[int, list[str]]
 Parameters = tuple[str, ...]
-Procedure = Callable[[Station, Parameters], Answer | None]  # none is `OK` without values
+Procedure = Callable[[Station, Parameters], Answer | None]  # None: `OK` without values
 
 
 def answer(station: Station, rpc: int, parameters: Parameters) -> Answer:
-    """Carry out a procedure; takes the time that it takes."""
+    """Carry out a procedure, in its world time."""
     procedure = _PROCEDURES.get(rpc)
     if procedure is None:
         return UNKNOWN_PROCEDURE, []
@@ -320,7 +319,7 @@ def _stored(number: int) -> Procedure:
     return lambda station, parameters: (OK, [station.settings[number]])
 
 
-def _tells(values: Callable[[Station], list[str]]) -> Procedure:
+def _query(values: Callable[[Station], list[str]]) -> Procedure:
     return lambda station, parameters: (OK, values(station))
 
 
@@ -333,8 +332,8 @@ def _set_precision(station: Station, parameters: Parameters) -> None:
 
 def _date(station: Station, parameters: Parameters) -> Answer:
     now = datetime.now(UTC)
-    rest = (now.month, now.day, now.hour, now.minute, now.second)
-    return OK, [str(now.year), *(f"'{value:02x}'" for value in rest)]
+    values = (now.month, now.day, now.hour, now.minute, now.second)
+    return OK, [str(now.year), *(f"'{value:02x}'" for value in values)]
 
 
 def _set_atmosphere(station: Station, parameters: Parameters) -> None:
@@ -360,21 +359,21 @@ def _acquire(station: Station, parameters: Parameters, window: float = np.inf) -
 
 
 def _fine_adjust(station: Station, parameters: Parameters) -> Answer:
-    """AUT_FineAdjust: within a window, rad; the reference manual's are whole widths."""
+    """AUT_FineAdjust: within a window, rad; the parameters are full widths."""
     window = 0.5 * max(float(parameters[0]), float(parameters[1]))
     return _acquire(station, parameters, window)
 
 
 def _turn(station: Station, parameters: Parameters) -> Answer | None:
     station.turn(float(parameters[0]), float(parameters[1]))
-    if len(parameters) > 3 and int(parameters[3]) == 1:  # AUT_TARGET: find it there
+    if len(parameters) > 3 and int(parameters[3]) == 1:  # AUT_TARGET: acquire the target there
         return _acquire(station, parameters)
     station.wait(AIM_S)
     return None
 
 
 def _lock_quality(station: Station, parameters: Parameters) -> Answer:
-    """0 not locked, 1 locked, 2 prediction: it was lost from sight."""
+    """0 not locked, 1 locked, 2 prediction: the target is out of sight."""
     return OK, ["0" if not station.locked else "1" if station.target() is not None else "2"]
 
 
@@ -396,14 +395,15 @@ def _start_measuring(station: Station, parameters: Parameters) -> Answer | None:
 def _angles(station: Station, parameters: Parameters) -> Answer:
     if station.busy:
         return BUSY, []
-    seen = station.look() or station.pointing
-    return station.warning, _number(station, seen.hz, seen.v)
+    polar = station.look() or station.pointing
+    return station.warning, _number(station, polar.hz, polar.v)
 
 
 def _with_distance(full: bool) -> Procedure:
-    """TMC_GetSimpleMea, and TMC_GetFullMeas: of the measurement that 2008 has started.
+    """TMC_GetSimpleMea, and TMC_GetFullMeas: of the measurement started by 2008.
 
-    hz, v, in full their accuracy, inclinations and theirs; distance, in full its time in ms.
+    Values: hz, v; if full, their accuracy, the inclinations and their accuracy; distance; if full,
+    its time, ms.
     """
 
     def measured(station: Station, parameters: Parameters) -> Answer:
@@ -414,12 +414,12 @@ def _with_distance(full: bool) -> Procedure:
         station.finish_ranging(int(parameters[0]) * 1e-3)
         if station.dist_error:
             return DISTANCE_ERROR, []
-        seen, distance = station.look() or station.pointing, station.distance
+        polar, distance = station.look() or station.pointing, station.distance
         code = station.warning if distance > 0.0 else ANGLES_ONLY
         if not full:
-            return code, _number(station, seen.hz, seen.v, distance)
+            return code, _number(station, polar.hz, polar.v, distance)
         accuracy = station.beam.angle_std(distance) if distance > 0.0 else 0.0
-        values = (seen.hz, seen.v, accuracy, *station.inclination(), distance)
+        values = (polar.hz, polar.v, accuracy, *station.inclination(), distance)
         return code, [*_number(station, *values), str(station.distance_ms)]
 
     return measured
@@ -432,11 +432,11 @@ def _measure(station: Station, parameters: Parameters) -> Answer:
     mode = int(parameters[0])
     if not 0 <= mode <= 6:
         raise ValueError
-    seen, distance = station.pointing, 0.0
+    polar, distance = station.pointing, 0.0
     if mode in (5, 6):
         station.stop_ranging(clear=mode == 5)
         station.tracking = False
-        return OK, [*_number(station, seen.hz, seen.v, 0.0), str(mode)]
+        return OK, [*_number(station, polar.hz, polar.v, 0.0), str(mode)]
     if mode >= 2:
         if not station.locked:
             station.wait(AIM_S)
@@ -445,42 +445,42 @@ def _measure(station: Station, parameters: Parameters) -> Answer:
         station.finish_ranging(station.meas_s)
         if station.dist_error:
             return DISTANCE_ERROR, []
-        seen, distance = station.pointing, station.distance
+        polar, distance = station.pointing, station.distance
     else:
-        seen = station.look() or station.pointing
+        polar = station.look() or station.pointing
         distance = station.distance if mode == 0 else 0.0
     code = station.warning if distance > 0.0 or mode == 1 else ANGLES_ONLY
-    return code, [*_number(station, seen.hz, seen.v, distance), str(mode)]
+    return code, [*_number(station, polar.hz, polar.v, distance), str(mode)]
 
 
 _PROCEDURES: dict[int, Procedure] = {
     0: _constant(),
     107: _set_precision,
-    108: _tells(lambda s: [str(s.digits)]),
+    108: _query(lambda s: [str(s.digits)]),
     110: _constant("1", "50", "0"),
     2007: _constant("1"),
     2008: _start_measuring,
     2020: _setting(2020),
     2021: _stored(2020),
-    2022: _tells(lambda s: [*_number(s, 80.0), str(int(s.board.time))]),
+    2022: _query(lambda s: [*_number(s, 80.0), str(int(s.board.time))]),
     2026: _constant("0"),
     2028: _set_atmosphere,
-    2029: _tells(lambda s: _number(s, *s.atmosphere)),
+    2029: _query(lambda s: _number(s, *s.atmosphere)),
     2107: _angles,
     2108: _with_distance(full=False),
     2167: _with_distance(full=True),
     5003: _constant(str(SERIAL)),
     5004: _constant(f'"{NAME}"'),
     5008: _date,
-    5011: _tells(lambda s: _number(s, s.temperature())),
+    5011: _query(lambda s: _number(s, s.temperature())),
     5034: _constant("6", "20", "0"),
     5039: _constant("100", "1", "1"),
     6021: _lock_quality,
     9013: _lock_in,
     9018: _switch_atr,
-    9019: _tells(lambda s: [str(int(s.atr_enabled))]),
+    9019: _query(lambda s: [str(int(s.atr_enabled))]),
     9020: _switch_lock,
-    9021: _tells(lambda s: [str(int(s.locked))]),
+    9021: _query(lambda s: [str(int(s.locked))]),
     9027: _turn,
     9037: _fine_adjust,
     11001: _constant(),
@@ -500,22 +500,22 @@ LONGEST_LINE = 1024
 
 
 def respond(station: Station, line: str) -> bytes:
-    """Return the answer to one line, empty where it is none of the protocol's."""
-    if line == "c":  # abort: there is never anything left to abort
+    """Return the answer to a line, empty if it is not of the protocol."""
+    if line == "c":  # abort: nothing is pending
         return b"?\r\n"
     if not line.startswith("%R1Q,"):
         return b""
     match = _REQUEST.fullmatch(line)
-    rpc, told, crc, rest = match.groups() if match else ("-1", "0", None, "")
-    number, parameters = int(rpc), tuple(rest.split(",")) if rest else ()
+    rpc, trid, crc, text = match.groups() if match else ("-1", "0", None, "")
+    number, parameters = int(rpc), tuple(text.split(",")) if text else ()
     station.requests.append((number, parameters))
-    transaction = int(told or 0)
+    transaction = int(trid or 0)
     if station.wrong_transactions > 0:
         station.wrong_transactions -= 1
         transaction = (transaction + 1) % 2**15
     if match is None:
         return reply(CANNOT_DECODE, transaction, 0, [], checked=False)
-    bare = f"%R1Q,{rpc},{told}:{rest}".encode("ascii", "replace")
+    bare = f"%R1Q,{rpc},{trid}:{text}".encode("ascii", "replace")
     if crc is not None and int(crc) != crc16(bare):
         return reply(BAD_CHECKSUM, transaction, 0, [], checked=True)
     code, values = answer(station, number, parameters)
@@ -527,7 +527,7 @@ def respond(station: Station, line: str) -> bytes:
 
 
 def operations(station: Station, port: PtyPort) -> admin.Operations:
-    """Return what can be asked of the station."""
+    """Return the admin operations of the station."""
 
     def delay(rpc: int, seconds: float, count: int = 1) -> None:
         station.delays[int(rpc)] = float(seconds), int(count)
@@ -541,7 +541,7 @@ def operations(station: Station, port: PtyPort) -> admin.Operations:
             "meas_s": station.meas_s,
         }
 
-    own: dict[str, Callable[..., object]] = {
+    functions: dict[str, Callable[..., object]] = {
         **station.faults(),
         "dist_error": admin.setter(station, "dist_error"),
         "warn": station.warn,
@@ -551,11 +551,11 @@ def operations(station: Station, port: PtyPort) -> admin.Operations:
         "meas_s": admin.setter(station, "meas_s", float),
         "log": lambda: [[number, *values] for number, values in list(station.requests)],
     }
-    return admin.Operations(own | port.faults(), state)
+    return admin.Operations(functions | port.faults(), state)
 
 
 def serve(station: Station, port: PtyPort, buffer: bytearray) -> None:
-    """Take what has come, with what `buffer` holds of a line, and answer."""
+    """Read requests and answer them; `buffer` keeps an incomplete line."""
     buffer += port.read(0.02)
     station.tick()
     while (end := min((i for i in map(buffer.find, b"\r\n") if i >= 0), default=-1)) >= 0:
@@ -571,7 +571,7 @@ def serve(station: Station, port: PtyPort, buffer: bytearray) -> None:
 
 
 def start(options: argparse.Namespace) -> admin.Device:
-    """Return a station on its line."""
+    """Return the station on its serial line."""
     measuring, faults = np.random.default_rng(options.seed).spawn(2)
     beam = Beam(tuple(options.range_std), tuple(options.transverse_std))
     station = Station(Blackboard(options.directory / "world.bin"), beam, measuring)

@@ -1,4 +1,4 @@
-"""Hide an effect in the simulated world: a plausible direction, at a chosen strength."""
+"""Hide an effect in the simulated world: in a plausible direction, at a chosen strength."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -15,34 +15,34 @@ from hilcal.readings.readings import States
 from hilcal.robot.arm import Arm
 from hilcal.types import Floats, Ints
 
-_GIVE = np.array([2.0e-3, 2.6e-3, 1.35e-3, 1.7e-3, 2.0e-3, 2.2e-3])
+_DEFLECTION = np.array([2.0e-3, 2.6e-3, 1.35e-3, 1.7e-3, 2.0e-3, 2.2e-3])
 
 
 def joint_compliance(arm: Arm, rng: np.random.Generator) -> Floats:
     """Draw the (n,) compliances of the drives, rad/(N·m), ±30 % per joint.
 
-    A drive gives about 2 mrad at its torque limit, whatever its size: 6 to 40 µrad/(N·m) on
-    an arm of the UR10e's size (order of magnitude of harmonic drives, e.g. the stiffnesses
-    K1..K3 against rated torque in the Harmonic Drive CSD/SHD catalogue); a slide 70 µm.
+    A drive of any size deflects by about 2 mrad at its torque limit: 6 to 40 µrad/(N·m) on an arm
+    of the UR10e's size (order of magnitude of harmonic drives, e.g. the stiffnesses K1..K3 against
+    rated torque in the Harmonic Drive CSD/SHD catalogue); a slide deflects by 70 µm.
     """
     return typical_compliance(arm) * rng.uniform(0.7, 1.3, arm.n)
 
 
 def typical_compliance(arm: Arm) -> Floats:
-    """Return the (n,) middle of the compliances that are drawn, rad/(N·m)."""
-    give = _GIVE if arm.n == len(_GIVE) else np.full(arm.n, 1.9e-3)
-    return np.asarray(np.where(arm.slides, 7e-5, give) / typical_torque(arm))
+    """Return the (n,) mean of the drawn compliances, rad/(N·m)."""
+    deflection = _DEFLECTION if arm.n == len(_DEFLECTION) else np.full(arm.n, 1.9e-3)
+    return np.asarray(np.where(arm.slides, 7e-5, deflection) / typical_torque(arm))
 
 
 def typical_torque(arm: Arm) -> Floats:
-    """Return the (n,) torque or force limits of the drives; 100 N·m, 1500 N where not known."""
+    """Return the (n,) torque or force limits of the drives; 100 N·m, 1500 N if unknown."""
     limit = np.asarray(arm.torque_max, dtype=float)
     unknown = np.where(arm.slides, 1500.0, 100.0)
     return np.asarray(np.where(np.isfinite(limit) & (limit > 0.0), limit, unknown))
 
 
 def typical_tilt(arm: Arm) -> Floats:
-    """Return the (n,) middle of twice the bearings' compliances, rad/(N·m)."""
+    """Return (n,) twice the largest compliances drawn for the bearings, rad/(N·m)."""
     carriage = 2e-3 / (0.5 * typical_torque(arm))
     return np.where(arm.slides, carriage, typical_compliance(arm))
 
@@ -52,14 +52,14 @@ class Draw:
     """Draws one effect's parameters in a plausible direction and of a plausible size."""
 
     arm: Arm
-    compliance: Floats  # (n,) the drives' compliances, which stiffening belongs to, rad/(N·m)
-    torque: Floats  # (n,) the largest torque at each drive in the states at hand, N·m
+    compliance: Floats  # (n,) the drives' compliances, for stiffening, rad/(N·m)
+    torque: Floats  # (n,) the largest torque at each drive in the states, N·m
     harmonics: int = 6  # number of harmonics of the transmission error
 
     def effect(self, name: str, rng: np.random.Generator) -> Floats:
         """Return the parameters of the named effect, shaped as in `Truth`."""
         n, typical, order = self.arm.n, typical_compliance(self.arm), self.harmonics
-        even, normal, slides = rng.uniform, rng.standard_normal, self.arm.slides
+        uniform, normal, slides = rng.uniform, rng.standard_normal, self.arm.slides
         decay = 1.0 / np.arange(1, order + 1)[:, None]
         tilt = typical_tilt(self.arm)
         plate = 0.3 * float(tilt[-1]) * np.array([0.5, 1.0])  # stiffer about its own axis
@@ -67,12 +67,12 @@ class Draw:
         draws: dict[str, Callable[[], Floats]] = {
             "joint_compliance": lambda: joint_compliance(self.arm, rng),
             "joint_stiffening": lambda: (
-                -(even(0.7, 1.0, n) / 3.0) * self.compliance / self.torque**2
+                -(uniform(0.7, 1.0, n) / 3.0) * self.compliance / self.torque**2
             ),
-            "joint_tilt_compliance": lambda: 0.5 * tilt * even(0.3, 1.0, n),
-            "base_compliance": lambda: 0.5 * float(tilt[0]) * even(0.3, 1.0, 3),
+            "joint_tilt_compliance": lambda: 0.5 * tilt * uniform(0.3, 1.0, n),
+            "base_compliance": lambda: 0.5 * float(tilt[0]) * uniform(0.3, 1.0, 3),
             "link_compliance": lambda: self._beams(rng),
-            "hysteresis": lambda: 5e-5 * even(0.3, 1.0, n),
+            "hysteresis": lambda: 5e-5 * uniform(0.3, 1.0, n),
             "encoder_offset": lambda: 2e-4 * normal(n),
             "joint_coupling": lambda: self._couplings(rng),
             "transmission_error": lambda: (
@@ -84,39 +84,39 @@ class Draw:
             "target_offset": lambda: 5e-3 * normal(3),
             "base_frame": lambda: 1e-3 * normal(6),
             "tracker_drift": lambda: np.repeat([1e-8, 3e-9], 3) * normal(6),
-            # further elasticity, and what a force sensor misreads
-            "tool_compliance": lambda: plate * even(0.5, 1.0, 2),
+            # further elasticity, and errors of a force sensor
+            "tool_compliance": lambda: plate * uniform(0.5, 1.0, 2),
             "periodic_joint_compliance": lambda: 0.1 * typical[:, None] * normal((n, 2)),
-            "backlash": lambda: 5e-5 * even(0.3, 1.0, n),
-            "creep": lambda: 0.03 * even(0.5, 1.5, 1),
+            "backlash": lambda: 5e-5 * uniform(0.3, 1.0, n),
+            "creep": lambda: 0.03 * uniform(0.5, 1.5, 1),
             "wrench_bias": lambda: np.repeat([1.0, 0.1], 3) * normal(6),
             "wrench_gain": lambda: 1e-2 * normal(6),
             "sensor_misalignment": lambda: 1e-2 * normal(3),
             # temperature (steel to aluminium), wrong masses (centres some centimetres off), scale
-            "thermal_growth": lambda: even(11e-6, 24e-6, 1),
+            "thermal_growth": lambda: uniform(11e-6, 24e-6, 1),
             "thermal_joint_drift": lambda: 5e-6 * normal(n),
             "link_mass": lambda: 0.03 * heavy * normal((n, 3)),
             "tracker_scale": lambda: (
-                5e-6 * rng.choice(np.array([-1.0, 1.0]), 1) * even(0.5, 1.5, 1)
+                5e-6 * rng.choice(np.array([-1.0, 1.0]), 1) * uniform(0.5, 1.5, 1)
             ),
         }
         return np.asarray(draws[name]())
 
     def _couplings(self, rng: np.random.Generator) -> Floats:
-        """Draw k (n, n) of joints that the one before, or the last but two, takes along."""
+        """Draw k (n, n): each joint follows its predecessor, the last one also the last but two."""
         n = self.arm.n
         out = np.diag(rng.standard_normal(n - 1), -1) if n > 1 else np.zeros((n, n))
         if n > 2:
             out[n - 1, n - 3] = rng.standard_normal()
-        alike = self.arm.slides[:, None] == self.arm.slides
-        return np.asarray(2e-4 * out * alike)
+        same_kind = self.arm.slides[:, None] == self.arm.slides
+        return np.asarray(2e-4 * out * same_kind)
 
     def _beams(self, rng: np.random.Generator) -> Floats:
-        """Draw 1/EI and 1/GJ (b, 2): a tube that gives as much as half a drive over its length."""
-        which = long_links(self.arm)
-        length = np.linalg.norm(self.arm.links[which, :3, 3], axis=1)
+        """Draw 1/EI and 1/GJ (b, 2) of tubes, each about half as compliant as a drive."""
+        links = long_links(self.arm)
+        length = np.linalg.norm(self.arm.links[links, :3, 3], axis=1)
         size = 0.5 * typical_tilt(self.arm)[:3].mean() / length
-        return np.asarray(size[:, None] * [1.0, 1.3] * rng.uniform(0.5, 1.5, (len(which), 2)))
+        return np.asarray(size[:, None] * [1.0, 1.3] * rng.uniform(0.5, 1.5, (len(links), 2)))
 
 
 _SHOWN_BY_DEFLECTIONS = (
@@ -124,32 +124,32 @@ _SHOWN_BY_DEFLECTIONS = (
     "hysteresis load_point tracker_drift tool_compliance periodic_joint_compliance backlash creep "
     "wrench_bias wrench_gain sensor_misalignment"
 )
-_OTHERS = (
+_CANCELLING = (
     "encoder_offset joint_coupling transmission_error link_geometry target_offset base_frame "
     "thermal_growth thermal_joint_drift link_mass tracker_scale"
 )
 DEFLECTION_EFFECTS = tuple(_SHOWN_BY_DEFLECTIONS.split())
-"""Effects that a deflection shows; the others cancel in it to first order.
+"""Effects that a deflection shows; all other effects cancel in it to first order.
 
-What changes with temperature changes little from an unloaded reading to the loaded ones that
-follow it; a scale of parts in a million changes a deflection by as little.
+Thermal effects change little between an unloaded reading and the loaded ones that follow; a scale
+error of parts per million changes a deflection by parts per million.
 """
-EFFECTS = (*DEFLECTION_EFFECTS, *_OTHERS.split())  # all that can be hidden in any arm
-OF_SLIDES = ("guide_error",)  # those that only arms with joints that slide have
+EFFECTS = (*DEFLECTION_EFFECTS, *_CANCELLING.split())  # all that can be hidden in any arm
+OF_SLIDES = ("guide_error",)  # only in arms with sliding joints
 ALL_EFFECTS = (*EFFECTS, *OF_SLIDES)  # every effect that can be hidden
 
 HARD_TO_SEPARATE = ("base_compliance", "link_compliance")
-"""Effects that a campaign of six poses often does not separate from each other, or from
-`joint_tilt_compliance`: `demo --ambiguous` draws arms until it does not."""
+"""Effects that a campaign of six poses often cannot separate from each other or from
+`joint_tilt_compliance`; `demo --ambiguous` draws arms until this happens."""
 RESEMBLING = (*HARD_TO_SEPARATE, "joint_tilt_compliance")
-"""Effects that few readings take for one another."""
+"""Effects that few readings cannot distinguish."""
 
-_SAID = ("wrench_bias", "wrench_gain", "sensor_misalignment")  # need something to misread
+_SENSOR_ERRORS = ("wrench_bias", "wrench_gain", "sensor_misalignment")  # need a load
 READINGS_MODES = ("absolute", "deflection")
 _TOLERANCE = 1e-4
 _TRIALS = 25
-_SOFTER = 1.5  # a gear that stiffens starts softer (catalogues: K1 is about half of K3)
-_TARGET_SCATTER = 2e-3  # m, how far an unknown target sits from its configured place
+_SOFTER = 1.5  # a stiffening gear is softer at no torque (catalogues: K1 is about half of K3)
+_TARGET_SCATTER = 2e-3  # m, scatter of an unknown target about its configured place
 
 
 def nothing_hidden(
@@ -159,10 +159,10 @@ def nothing_hidden(
     noise: SimulatedNoise | None = None,
     joint_std: float | Floats = 2e-5,
 ) -> World:
-    """Return a world whose arm has joint compliance and nothing else that is wrong.
+    """Return a world whose arm has joint compliance and no other error.
 
-    Where the cell does not know its registration or its target, the world draws its own. The arm's
-    repeatability `joint_std`, rad, is 0.02 mm to 0.03 mm at the flange of an arm of 1.3 m.
+    An unknown registration or target of the cell is drawn. The default repeatability `joint_std`,
+    rad, is 0.02 mm to 0.03 mm at the flange of an arm of 1.3 m.
     """
     registration, station = stand(cell, rng)
     truth = Truth.rigid(cell.arm)
@@ -185,7 +185,7 @@ def nothing_hidden(
 
 
 def softened(world: World, effect: object) -> World:
-    """Return a world with softer drives where `effect` is that they stiffen, as real ones do."""
+    """Return a world with softer drives if `effect` is their stiffening, as real ones have."""
     if effect != "joint_stiffening":
         return world
     softer = _SOFTER * world.physics.joint_compliance
@@ -206,18 +206,18 @@ def hide(
     cycle: Ints | None = None,
     harmonics: int = 6,
 ) -> World:
-    """Return a world in which one effect is hidden at the given strength.
+    """Return a world in which an effect is hidden at a given strength.
 
         sqrt(mean |W (r - r_0)|²) = strength_sigma
 
-    r are the noise-free readings with the effect, r_0 without, W whitens by the covariance
-    of a reading of m elements, 3 or 6; in deflection mode r is the loaded minus the unloaded
-    reading of one pose and W belongs to that difference. The direction is drawn; the length is
-    found by secants. Joints that drift with temperature do so from the states' first one on.
+    r are the noise-free readings with the effect, r_0 without; W whitens by the covariance of a
+    reading of m elements, 3 or 6. In deflection mode r is the loaded minus the unloaded reading of
+    a pose, and W whitens this difference. The direction is drawn; the length is found by the secant
+    method. The reference temperature of a thermal drift is that of the first state.
 
-    `effect` is one of `ALL_EFFECTS`, one of a user's own, or "none"; it is added to `world`, a
-    fresh one when None. `pose` and `cycle` (N,) pair the readings of deflections; equal joints are
-    one pose, and all states one cycle, when None.
+    `effect` is one of `ALL_EFFECTS`, a user's effect, or "none"; it is added to `world` (None: a
+    new one). `pose` and `cycle` (N,) pair the readings of deflections; None: equal joints are one
+    pose, and all states one cycle.
     """
     _check(effect, strength_sigma, readings_mode, m)
     if world is None:
@@ -225,19 +225,19 @@ def hide(
     if effect == "none" or strength_sigma == 0.0:
         return world
     hidden, reference = (
-        _own(effect, world, rng)
+        _user_effect(effect, world, rng)
         if isinstance(effect, OwnLaw)
-        else _simulated(effect, world, states, harmonics, rng)
+        else _shipped_effect(effect, world, states, harmonics, rng)
     )
-    before = reference.sight(states)
+    baseline = reference.sight(states)
     pairs = None if readings_mode == "absolute" else _pairs(states, pose, cycle)
-    covariance = reference.covariance(before, m)
+    covariance = reference.covariance(baseline, m)
     if pairs is not None:
         covariance = covariance[pairs[0]] + covariance[pairs[1]]
     whiten = np.linalg.inv(np.linalg.cholesky(covariance))
 
     def strength(factor: float) -> float:
-        change = _change(hidden(factor).sight(states), before, m)
+        change = _change(hidden(factor).sight(states), baseline, m)
         if pairs is not None:
             change = change[pairs[0]] - change[pairs[1]]
         return float(np.sqrt(np.mean((whiten @ change[:, :, None]) ** 2)))
@@ -246,10 +246,10 @@ def hide(
     return hidden(_scaled(strength, strength_sigma, name, readings_mode))
 
 
-def _own(
+def _user_effect(
     law: OwnLaw, world: World, rng: np.random.Generator
 ) -> tuple[Callable[[float], World], World]:
-    """Return worlds with an effect of a user's own by its strength, and the one without."""
+    """Return the world with a user's effect as a function of its strength, and without."""
     direction = law.drawn(rng)
 
     def hidden(factor: float) -> World:
@@ -258,11 +258,11 @@ def _own(
     return hidden, world
 
 
-def _simulated(
+def _shipped_effect(
     effect: str, world: World, states: States, harmonics: int, rng: np.random.Generator
 ) -> tuple[Callable[[float], World], World]:
-    """Return worlds with an effect of `EFFECTS` by its strength, and the one without."""
-    if effect in _SAID and not np.any(states.wrench):
+    """Return the world with an effect of `EFFECTS` as a function of its strength, and without."""
+    if effect in _SENSOR_ERRORS and not np.any(states.wrench):
         raise InputError(
             f"effect {effect!r} is an error of the measured load but no state has a load; "
             "valid: a wrench that is not zero in some states"
@@ -279,7 +279,7 @@ def _simulated(
     if effect == "transmission_error":
         order = max(start.shape[1], direction.shape[1])
         start, direction = _padded(start, order), _padded(direction, order)
-    if effect == "joint_compliance":  # always there; hiding it sets its size
+    if effect == "joint_compliance":  # always present; hiding it sets its size
         start = np.zeros_like(start)
     clean = world.physics.with_effect(effect, start)
 
@@ -309,7 +309,7 @@ def _check(effect: str | OwnLaw, strength: float, mode: str, m: int) -> None:
 
 
 def _pairs(states: States, pose: Ints | None, cycle: Ints | None) -> tuple[Ints, Ints]:
-    """Return the rows of the loaded readings and of the unloaded ones that they belong to."""
+    """Return the rows of the loaded readings and of their unloaded readings."""
     if pose is None:
         pose = np.unique(states.q, axis=0, return_inverse=True)[1].reshape(-1)
     if cycle is None:
@@ -332,35 +332,35 @@ def _pairs(states: States, pose: Ints | None, cycle: Ints | None) -> tuple[Ints,
     return rows, np.array([first[key] for key in keys])
 
 
-def _change(after: IdealReading, before: IdealReading, m: int) -> Floats:
-    """Return by how much the readings changed, (N, m); rotations as a small rotation."""
-    shift = after.position - before.position
+def _change(changed: IdealReading, baseline: IdealReading, m: int) -> Floats:
+    """Return the change of the readings, (N, m); rotations as rotation vectors."""
+    shift = changed.position - baseline.position
     if m == 3:
         return shift
-    turn = rotation_vector(after.rotation @ np.swapaxes(before.rotation, 1, 2))
+    turn = rotation_vector(changed.rotation @ np.swapaxes(baseline.rotation, 1, 2))
     return np.hstack([shift, turn])
 
 
 def _padded(value: Floats, order: int) -> Floats:
-    """Return (n, order, 2) harmonics, with zeros for those that are not there."""
+    """Return (n, order, 2) harmonics, padded with zeros."""
     return np.pad(value, ((0, 0), (0, order - value.shape[1]), (0, 0)))
 
 
-def _scaled(strength: Callable[[float], float], wanted: float, effect: str, mode: str) -> float:
-    """Return the factor at which `strength` is `wanted`, to 1e-4 of it, by secants."""
+def _scaled(strength: Callable[[float], float], goal: float, effect: str, mode: str) -> float:
+    """Return the factor at which `strength` is `goal`, to 1e-4 of it, by the secant method."""
     old, new = 0.0, 1e-2
     why = "valid: a smaller strength, or states that the effect acts on"
-    below, above = -wanted, strength(new) - wanted
+    residual, new_residual = -goal, strength(new) - goal
     try:
         for _ in range(_TRIALS):
-            if abs(above) <= _TOLERANCE * wanted:
+            if abs(new_residual) <= _TOLERANCE * goal:
                 return new
-            if above == below:
+            if new_residual == residual:
                 break
-            old, new = new, new - above * (new - old) / (above - below)
-            below, above = above, strength(new) - wanted
+            old, new = new, new - new_residual * (new - old) / (new_residual - residual)
+            residual, new_residual = new_residual, strength(new) - goal
     except InputError as error:
         why = f"{error}; heavier loads or steadier readings reach further"
     raise InputError(
-        f"effect {effect!r} cannot reach {wanted:g} sigma in these states ({mode} readings): {why}"
+        f"effect {effect!r} cannot reach {goal:g} sigma in these states ({mode} readings): {why}"
     )

@@ -1,4 +1,4 @@
-"""The person of a simulated cell: hangs in the simulated world what is asked for."""
+"""The person of a simulated cell, who hangs loads in the simulated world."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,32 +13,32 @@ from hilcal.errors import DeviceError
 from hilcal.measuring.devices import Clock, Report
 from hilcal.toml import Section, check_section
 
-HAND_S = 20.0  # time that a person takes to change a load, s
+HAND_S = 20.0  # time for a person to change a load, s
 
 
 @dataclass(frozen=True, slots=True)
 class SimulatedOperator:
-    """A diligent person, who errs only where the world's admin line commands it."""
+    """A person who errs only if the world's admin line commands it."""
 
     socket: Path  # the world's admin socket
-    hand: float  # time that a change of the load takes, s of cell time
+    hand: float  # time for a change of the load, s of cell time
     clock: Clock
     person: TerminalOperator | None = None
-    """Who is asked at the terminal, as in a real cell; None where nobody is."""
+    """The person asked at the terminal, as in a real cell; None: nobody."""
 
     @property
     def at_terminal(self) -> bool:
-        """Whether somebody is asked at the terminal."""
+        """Whether a person at the terminal is asked."""
         return self.person is not None
 
     def report(self) -> Report:
-        """Say who is asked, and whether the world is there to hang anything in."""
+        """Report who is asked, and a problem if the world does not answer."""
         facts: tuple[tuple[str, str], ...] = (("takes", f"{self.hand:g} s for a load"),)
         name = "simulated operator"
         problems: tuple[str, ...] = ()
         if self.person is not None:
-            asked = self.person.report()
-            name, facts, problems = f"{asked.name}, who rehearses", asked.facts, asked.problems
+            report = self.person.report()
+            name, facts, problems = f"{report.name}, who rehearses", report.facts, report.problems
         try:
             admin.ask(self.socket, "state")
         except DeviceError as error:
@@ -47,7 +47,7 @@ class SimulatedOperator:
         return Report("operator", name, facts, problems, fields)
 
     def hang(self, load: CellLoad | None, why: str) -> None:
-        """Hang a load in the simulated world, or take it off; a person is asked first."""
+        """Hang a load in the simulated world, or take it off; ask the person first, if any."""
         if self.person is not None:
             self.person.hang(load, why)
         else:
@@ -55,12 +55,12 @@ class SimulatedOperator:
         admin.ask(self.socket, "hang", name=None if load is None else load.name)
 
     def confirm(self, question: str) -> None:
-        """Say that the arm may go on; a person is asked."""
+        """Confirm that the arm may go on; ask the person, if any."""
         if self.person is not None:
             self.person.confirm(question)
 
     def close(self) -> None:
-        """Nothing to give back."""
+        """Nothing to close."""
 
 
 class SimulatedPersonOptions(Section):
@@ -84,6 +84,6 @@ def open_operator(config: CellConfig) -> SimulatedOperator:
     options = check_section(
         dict(config.operator.options), SimulatedPersonOptions, "[operator] options"
     )
-    asked = TerminalOperator(config) if options.person else None
+    person = TerminalOperator(config) if options.person else None
     clock = Clock(config.simulation.clock)
-    return SimulatedOperator(Path(options.socket), options.hand_s, clock, asked)
+    return SimulatedOperator(Path(options.socket), options.hand_s, clock, person)

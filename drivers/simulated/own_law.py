@@ -1,11 +1,11 @@
-"""An effect of a user's own, hidden in the simulated world.
+"""A user's effect, hidden in the simulated world.
 
-The world has mechanics of its own for every effect that ships, so that a diagnosis is not tested
-against itself. For a law that only the user's file knows there is nothing else to compute it by:
-**this is the only case in which the world shares a law with the model.** What the law does to the
-target, as a model of joint compliance and this law predicts it, is added to where the world's own
-mechanics hold the target. It shows whether a campaign reveals the law, not whether it is coded
-right; `hilcal.check_effect` is for that.
+For every effect that ships, the world has separate mechanics, so that a diagnosis is not tested
+against itself. A user's law exists only in the user's file: **this is the only case in which the
+world shares a law with the model.** A model of joint compliance and this law predicts the
+displacement of the target, which is added to its pose from the world's mechanics. This shows
+whether a campaign reveals the law, not whether the law is coded correctly; for that, see
+`hilcal.check_effect`.
 """
 
 import hashlib
@@ -31,7 +31,7 @@ class OwnLaw:
     """An effect with its true parameters."""
 
     effect: Effect
-    states: States  # of the campaign that it was set up for
+    states: States  # of the campaign for which the effect was set up
     catalogue: Catalogue
     theta: Floats  # (P,) its parameters, SI
 
@@ -49,33 +49,33 @@ class OwnLaw:
     def moved(
         self, cell: Cell, frame: Floats, compliance: Floats, states: States
     ) -> tuple[Floats, Floats]:
-        """Return by how much N readings are displaced (N, 3) and turned (N, 3, 3), sensor axes.
+        """Return displacements (N, 3) and rotations (N, 3, 3) of N readings, sensor axes.
 
-        `frame` is the true T_sensor_base, `compliance` (n,) that of the drives, rad/(N·m).
+        `frame`: the true T_sensor_base; `compliance` (n,): of the drives, rad/(N·m).
         """
         if not self.effect.computable(states):
             needs = ", ".join(self.effect.needs)
             raise InputError(f"effect {self.effect.name} needs {needs}, which the cell lacks")
-        where = replace(cell, registration=frame)
-        soft = JointCompliance(where, states)
-        without = Model(where, (soft,), self.catalogue)
-        within = Model(where, (soft, self.effect), self.catalogue)
-        before = without.predict(states, compliance).observation
-        after = within.predict(states, np.concatenate([compliance, self.theta])).observation
-        turn = se3.product(after.rotation, np.swapaxes(before.rotation, 1, 2))
-        return after.position - before.position, turn
+        registered = replace(cell, registration=frame)
+        soft = JointCompliance(registered, states)
+        without = Model(registered, (soft,), self.catalogue)
+        within = Model(registered, (soft, self.effect), self.catalogue)
+        base = without.predict(states, compliance).observation
+        full = within.predict(states, np.concatenate([compliance, self.theta])).observation
+        turn = se3.product(full.rotation, np.swapaxes(base.rotation, 1, 2))
+        return full.position - base.position, turn
 
     def to_json(self) -> dict[str, Any]:
-        """Return the law as JSON: its file, and what it was set up with."""
+        """Return the law as JSON: its file, options, parameters and states."""
         file = self.catalogue.file_of(self.effect.name)
-        given = {f.name: getattr(self.states, f.name) for f in fields(States)}
+        columns = {f.name: getattr(self.states, f.name) for f in fields(States)}
         return {
             "name": self.effect.name,
             "file": None if file is None else file.path,
             "sha256": None if file is None else file.sha256,
             "options": dict(self.effect.options),
             "theta": self.theta.tolist(),
-            "states": {k: np.asarray(v).tolist() for k, v in given.items() if v is not None},
+            "states": {k: np.asarray(v).tolist() for k, v in columns.items() if v is not None},
         }
 
     @staticmethod
@@ -83,7 +83,7 @@ class OwnLaw:
         """Return the law of `to_json`."""
         catalogue = installed()
         if data["file"] is not None:
-            check_hash(Path(data["file"]), data["sha256"])  # before it is run
+            check_hash(Path(data["file"]), data["sha256"])  # before its code runs
             catalogue = catalogue.with_file(Path(data["file"]))
         states = States(**{k: np.array(v) for k, v in data["states"].items()})
         effect = catalogue.make(data["name"], cell, states, data["options"])
@@ -91,7 +91,7 @@ class OwnLaw:
 
 
 def check_hash(path: Path, sha256: str) -> None:
-    """Refuse a file that is not the one that a world was made with."""
+    """Raise InputError for a file that has changed since the world was made."""
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -101,11 +101,11 @@ def check_hash(path: Path, sha256: str) -> None:
 
 
 def own_names(catalogue: Catalogue, known: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the effects of a catalogue that the world has no mechanics for."""
+    """Return the effects of a catalogue that are not `known`, without mechanics in the world."""
     return tuple(k.name for k in catalogue.with_role("effect") if k.name not in known)
 
 
 def own_law(catalogue: Catalogue, name: str, cell: Cell, states: States) -> OwnLaw:
-    """Return an effect without strength, set up for the states of a campaign."""
+    """Return an effect with all parameters 0, set up for the states of a campaign."""
     effect = catalogue.make(name, cell, states)
     return OwnLaw(effect, states, catalogue, np.zeros(len(effect.parameters)))

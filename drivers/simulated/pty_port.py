@@ -1,7 +1,7 @@
 """The serial line of a simulated instrument: a pseudo-terminal that behaves like a UART.
 
-Bytes take their time (8N1: ten bits each), a full buffer loses new frames, the client's rate
-has to be the instrument's, and the adapter can be pulled out and put in again.
+Bytes take time (8N1: ten bits each), a full buffer loses new frames, the client's rate has to be
+the instrument's, and the adapter can be unplugged and replugged.
 """
 
 import fcntl
@@ -22,19 +22,19 @@ import numpy as np
 from hilcal.drivers.simulated.admin import setter
 
 BITS_PER_BYTE = 10
-FIFO = 16384  # bytes that wait for a reader beyond what the terminal itself holds
+FIFO = 16384  # bytes that wait for a reader, beside those in the terminal's buffer
 
 _RATES = {getattr(termios, name): int(name[1:]) for name in dir(termios) if name[1:].isdigit()}
 _SPEEDS = {rate: speed for speed, rate in _RATES.items()}
-_OUTPUT_SPEED = 5  # index in what tcgetattr returns
+_OUTPUT_SPEED = 5  # index in the result of tcgetattr
 _PULSE = 0.02  # longest wait in one call, s, so that an unplugged line closes soon
 
 
 class PtyPort:
-    """One serial line under a stable name; safe to be used from several threads.
+    """A serial line under a stable name; thread-safe.
 
-    `dropped` frames are those that nobody read in time; `flip` and `cut` are the probabilities that
-    a bit of a frame is flipped, and that it is truncated.
+    `dropped`: number of frames that nobody read in time; `flip`, `cut`: probability that a bit of a
+    frame is flipped, and that the frame is truncated.
     """
 
     def __init__(self, link: Path, baud: int, rng: np.random.Generator) -> None:
@@ -50,7 +50,7 @@ class PtyPort:
         self._inbox = bytearray()
         self._queue: deque[tuple[float, bytes]] = deque()
         self._waiting = 0  # bytes in the queue
-        self._free_at = 0.0  # when the wire has finished with all that was sent
+        self._free_at = 0.0  # when all bytes sent have passed the wire
         self._master = self._slave = -1
         self.plug()
 
@@ -60,12 +60,12 @@ class PtyPort:
         return self._master >= 0
 
     def plug(self) -> None:
-        """Make a new terminal under the port's name; nothing if it is there."""
+        """Make a new terminal under the port's name, if there is none."""
         with self._lock:
             if self.plugged:
                 return
             self._master, self._slave = os.openpty()
-            tty.setraw(self._slave)  # before anybody can open it: no echo
+            tty.setraw(self._slave)  # before a client can open it: no echo
             attributes = termios.tcgetattr(self._slave)
             attributes[4] = attributes[_OUTPUT_SPEED] = _SPEEDS[self.baud]
             termios.tcsetattr(self._slave, termios.TCSANOW, attributes)
@@ -78,7 +78,7 @@ class PtyPort:
             os.replace(new, self.link)
 
     def unplug(self) -> None:
-        """Take the terminal away: the client gets a hang-up."""
+        """Remove the terminal: the client gets a hang-up."""
         with self._lock:
             if not self.plugged:
                 return
@@ -91,24 +91,23 @@ class PtyPort:
             self._free_at = 0.0
             self._inbox.clear()
 
-    def send(self, frame: bytes, born: float | None = None) -> None:
-        """Put a frame on the wire, begun when `born`; it arrives when its last bit has passed."""
+    def send(self, frame: bytes, start: float | None = None) -> None:
+        """Put a frame on the wire at `start` (None: now); it arrives with its last bit."""
         with self._lock:
             if self.mute or not self.plugged:
                 return
             self._absorb()
-            frame = self._spoilt(frame)
+            frame = self._damaged(frame)
             if self._waiting + len(frame) > FIFO:
                 self.pump()
             if self._waiting + len(frame) > FIFO:
                 self.dropped += 1
                 return
-            now = time.monotonic() if born is None else born
-            self._queue_up(frame, now)
+            self._queue_up(frame, time.monotonic() if start is None else start)
             self.sent += 1
 
     def pump(self) -> None:
-        """Hand over everything whose last bit has passed, as far as the terminal takes it."""
+        """Pass on all frames whose last bit has passed, as far as the terminal takes them."""
         with self._lock:
             self._absorb()
             now = time.monotonic()
@@ -116,33 +115,33 @@ class PtyPort:
             if not data:
                 return
             try:
-                taken = os.write(self._master, data) if self.plugged else len(data)
+                written = os.write(self._master, data) if self.plugged else len(data)
             except BlockingIOError:
-                taken = 0
+                written = 0
             except OSError:
-                taken = len(data)
-            if taken < len(data):
-                self._queue.appendleft((now, data[taken:]))
-                self._waiting += len(data) - taken
+                written = len(data)
+            if written < len(data):
+                self._queue.appendleft((now, data[written:]))
+                self._waiting += len(data) - written
 
     @property
     def next_arrival(self) -> float:
-        """When the next frame has passed the wire, `time.monotonic`; infinity if none is on it."""
+        """Arrival of the next frame, `time.monotonic`; infinity if none is on the wire."""
         with self._lock:
             return self._queue[0][0] if self._queue else float("inf")
 
     def drain(self) -> None:
-        """Wait until all that was sent has passed the wire (not: has been read)."""
+        """Wait until all frames sent have passed the wire (read or not)."""
         while True:
             self.pump()
             with self._lock:
-                left = self._free_at - time.monotonic() if self._queue else 0.0
-            if left <= 0.0:
+                remaining = self._free_at - time.monotonic() if self._queue else 0.0
+            if remaining <= 0.0:
                 return
-            time.sleep(left)
+            time.sleep(remaining)
 
     def read(self, timeout: float) -> bytes:
-        """Return what the client has sent; empty after `timeout` s (20 ms at most)."""
+        """Return the client's bytes; empty after `timeout` s (20 ms at most)."""
         pause = max(0.0, min(timeout, _PULSE))
         master = self._master
         if not self._inbox:
@@ -157,7 +156,7 @@ class PtyPort:
             return data
 
     def faults(self) -> dict[str, Callable[..., None]]:
-        """Return what can go wrong on the line, by name."""
+        """Return the faults of the line, by name."""
         return {
             "flip": setter(self, "flip", float),
             "cut": setter(self, "cut", float),
@@ -176,7 +175,7 @@ class PtyPort:
                 self._queue_up(self._rng.bytes(int(count)), time.monotonic())
 
     def set_baud(self, baud: int) -> None:
-        """Let the instrument send and hear at another rate, Bd."""
+        """Let the instrument send and receive at another rate, Bd."""
         if baud not in _SPEEDS:
             raise ValueError(f"baud = {baud}; valid: {sorted(_SPEEDS)}")
         self.baud = int(baud)
@@ -188,10 +187,10 @@ class PtyPort:
         return {**state, "waiting": self._waiting, "client_baud": self._client_baud()}
 
     def _absorb(self) -> None:
-        """Take in what the client did: packet mode puts a status byte before its data.
+        """Read the client's packets: packet mode puts a status byte before the data.
 
-        A flush of the client's input (the kernel's part of it is gone already) throws away
-        what had come by then and no more: an answer that comes after it is seen.
+        A flush by the client (the kernel has emptied its buffer already) discards the frames that
+        have arrived, and no later ones.
         """
         while self.plugged:
             try:
@@ -204,11 +203,11 @@ class PtyPort:
                 self._arrived(time.monotonic())
             elif not packet[0]:
                 data = packet[1:]
-                right = self._client_baud() == self.baud
-                self._inbox += data if right else self._rng.bytes(len(data))
+                same_rate = self._client_baud() == self.baud
+                self._inbox += data if same_rate else self._rng.bytes(len(data))
 
     def _arrived(self, now: float) -> bytes:
-        """Take out of the queue what has passed the wire by now."""
+        """Remove and return the bytes that have passed the wire at `now`."""
         out = []
         while self._queue and self._queue[0][0] <= now:
             out.append(self._queue.popleft()[1])
@@ -217,7 +216,7 @@ class PtyPort:
         return data
 
     def _client_baud(self) -> int | None:
-        """Return the rate that the client has set, None where it is no common one."""
+        """Return the rate that the client has set, None if unusual."""
         if not self.plugged:
             return None
         try:
@@ -225,11 +224,11 @@ class PtyPort:
         except termios.error:
             return None
 
-    def _spoilt(self, frame: bytes) -> bytes:
+    def _damaged(self, frame: bytes) -> bytes:
         if self.flip and self._rng.random() < self.flip:
-            spoilt = bytearray(frame)
-            spoilt[self._rng.integers(len(spoilt))] ^= 1 << int(self._rng.integers(8))
-            frame = bytes(spoilt)
+            damaged = bytearray(frame)
+            damaged[self._rng.integers(len(damaged))] ^= 1 << int(self._rng.integers(8))
+            frame = bytes(damaged)
         if self._halve:
             self._halve = False
             frame = frame[: len(frame) // 2]
@@ -242,7 +241,7 @@ class PtyPort:
         return frame
 
     def _queue_up(self, data: bytes, now: float) -> None:
-        """Let bytes follow what is on the wire: ten bits each."""
+        """Put bytes on the wire after those already there: ten bits each."""
         self._free_at = max(self._free_at, now) + len(data) * BITS_PER_BYTE / self.baud
         self._queue.append((self._free_at, data))
         self._waiting += len(data)

@@ -1,4 +1,4 @@
-"""A simulated cell with a hidden effect, and a campaign in it: behind real wires or behind none."""
+"""A simulated cell with a hidden effect; campaigns in it, with or without simulated devices."""
 
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -34,12 +34,12 @@ REGISTRATION_ROTVEC = (0.0, 0.0, 2.1)
 
 
 def choices() -> tuple[str, ...]:
-    """Effects that can be hidden: all that the world has; every arm has joint compliance."""
+    """Effects that can be hidden; joint compliance is in every arm."""
     return tuple(e for e in injected.ALL_EFFECTS if e != "joint_compliance")
 
 
 def own_choices(catalogue: Catalogue | None) -> tuple[str, ...]:
-    """Effects of a user's own that can be hidden, too; see `own_law`."""
+    """User's effects that can be hidden; see `own_law`."""
     return () if catalogue is None else own_names(catalogue, injected.ALL_EFFECTS)
 
 
@@ -49,7 +49,7 @@ def invented_law(catalogue: Catalogue) -> Catalogue:
 
 
 def check_choice(choice: str, catalogue: Catalogue | None = None) -> None:
-    """Refuse what cannot be hidden; lists the valid choices."""
+    """Raise InputError, with the valid choices, for what cannot be hidden."""
     valid = (*choices(), *own_choices(catalogue), RANDOM, NOTHING)
     if choice not in valid:
         raise InputError(f"hide {choice!r}{suggest(choice, valid)}; valid: {', '.join(valid)}")
@@ -57,31 +57,31 @@ def check_choice(choice: str, catalogue: Catalogue | None = None) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulationCase:
-    """A simulated cell with something hidden in it."""
+    """A simulated cell with a hidden effect."""
 
     config: CellConfig
     cell: Cell
     mode: Mode  # the kind of readings that shows the hidden effect
     world: World
     hidden: str  # the name of the hidden effect, or "nothing"
-    strength_sigma: float  # rms of what it does to the readings, in units of their noise
+    strength_sigma: float  # rms of its change of the readings, in units of their noise
     home: Floats | None = field(default=None, kw_only=True)
-    """(n,) where the arm stands at first; None where no plan says it."""
+    """(n,) joint values at the start; None without a plan."""
 
     def measured(self, readings: Readings, config: CellConfig | None = None) -> "Rehearsal":
-        """Return what was measured in it, with the configuration that it was measured with."""
-        kept = {f.name: getattr(self, f.name) for f in fields(SimulationCase)}
-        return Rehearsal(**{**kept, "config": config or self.config}, readings=readings)
+        """Return the campaign with these readings; `config`: None for that of the case."""
+        case = {f.name: getattr(self, f.name) for f in fields(SimulationCase)}
+        return Rehearsal(**{**case, "config": config or self.config}, readings=readings)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rehearsal(SimulationCase):
-    """A simulated campaign in such a cell."""
+    """A simulated campaign in a cell with a hidden effect."""
 
     readings: Readings
 
     def save(self, path: str | Path) -> None:
-        """Write a new campaign file of the readings, which `Campaign.open` and commands take."""
+        """Write the readings to a new campaign file."""
         CampaignFile.create(
             Path(path),
             self.config.to_json(),
@@ -94,7 +94,7 @@ class Rehearsal(SimulationCase):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CampaignStates:
-    """States of a campaign, in order, and which pose, load and cycle they belong to."""
+    """States of a campaign, in order, with the indices of pose, load and cycle."""
 
     states: States
     pose: Ints
@@ -103,32 +103,32 @@ class CampaignStates:
 
 
 def measurement_noise(config: CellConfig, samples: int = 1) -> SimulatedNoise:
-    """Return the tracker's noise of the configuration, of the mean of so many measurements."""
+    """Return the tracker's noise of the configuration, for the mean of `samples` measurements."""
     t = config.tracker
     share = config.acquire.systematic_share if samples > 1 else 0.0
-    less = float(np.sqrt(share + (1.0 - share) / samples))
+    factor = float(np.sqrt(share + (1.0 - share) / samples))
     return SimulatedNoise(
-        (less * t.range_std_m, less * t.range_std_per_m),
-        (less * t.transverse_std_m, less * t.transverse_std_per_m),
-        less * t.orientation_std_rad,
+        (factor * t.range_std_m, factor * t.range_std_per_m),
+        (factor * t.transverse_std_m, factor * t.transverse_std_per_m),
+        factor * t.orientation_std_rad,
     )
 
 
 def as_told(config: CellConfig, choice: str, catalogue: Catalogue | None = None) -> CellConfig:
-    """Return the configuration that the program is given when an effect is hidden."""
+    """Return the configuration that the program gets when an effect is hidden."""
     check_choice(choice, catalogue)
     if not config.loads and choice in injected.DEFLECTION_EFFECTS:
-        shown = ", ".join(
+        valid = ", ".join(
             (*(e for e in choices() if e not in injected.DEFLECTION_EFFECTS), NOTHING)
         )
         raise InputError(
             f"the cell has no [[loads]]; {choice}, which loads show, needs at least one; valid to "
-            f"hide: {shown}"
+            f"hide: {valid}"
         )
     if choice != "base_frame":
         return config
-    known = {"base_xyz_m": REGISTRATION_XYZ, "base_rotvec_rad": REGISTRATION_ROTVEC}
-    tracker = config.tracker.model_copy(update=known)
+    registration = {"base_xyz_m": REGISTRATION_XYZ, "base_rotvec_rad": REGISTRATION_ROTVEC}
+    tracker = config.tracker.model_copy(update=registration)
     return config.model_copy(update={"tracker": tracker})
 
 
@@ -141,25 +141,25 @@ def simulation_case(
     catalogue: Catalogue | None = None,
     base_dir: Path | None = None,
 ) -> SimulationCase:
-    """Make a simulated cell and hide an effect in it at the strength of `[simulation]`.
+    """Make a simulated cell and hide an effect in it, at the strength of `[simulation]`.
 
     `choice` is one of `choices()` or `own_choices(catalogue)`, "random" or "nothing"; the strength
-    holds at the states that `visit` returns, with the tracker's `noise` of one reading.
+    is that at the states which `visit` returns, with the tracker's `noise` of one reading.
     """
     config = as_told(config, choice, catalogue)
     cell = cell_from_config(config, base_dir)
     slides, hidden = bool(cell.arm.slides.any()), choice
     if choice in injected.OF_SLIDES and not slides:
         raise InputError(f"hide {choice}: no joint of {cell.arm.name} slides")
-    if choice == RANDOM:  # a wrong registration shows only where one is believed
-        unseen = ("base_frame", *(() if config.loads else injected.DEFLECTION_EFFECTS))
-        unseen += () if slides else injected.OF_SLIDES
-        hidden = str(rng.choice([e for e in choices() if e not in unseen]))
+    if choice == RANDOM:  # a wrong registration shows only if one is configured
+        excluded = ("base_frame", *(() if config.loads else injected.DEFLECTION_EFFECTS))
+        excluded += () if slides else injected.OF_SLIDES
+        hidden = str(rng.choice([e for e in choices() if e not in excluded]))
     v = visit(cell)
-    own = None
+    law = None
     if catalogue is not None and hidden in own_choices(catalogue):
-        own = own_law(catalogue, hidden, cell, v.states)
-    loaded = choice in injected.DEFLECTION_EFFECTS if own is None else own.effect.elastic
+        law = own_law(catalogue, hidden, cell, v.states)
+    loaded = choice in injected.DEFLECTION_EFFECTS if law is None else law.effect.elastic
     mode: Mode = "deflection" if loaded and _paired(v) else "absolute"
     joint_std = config.repeatability.per_joint(cell.arm.n)
     world = injected.nothing_hidden(cell, rng, noise=noise, joint_std=joint_std)
@@ -167,9 +167,9 @@ def simulation_case(
     if hidden != NOTHING:
         strength = config.simulation.strength_sigma
         world = injected.softened(world, hidden)
-        what = own or hidden
+        effect = law or hidden
         world = injected.hide(
-            what, cell, v.states, strength, mode, rng, world=world, pose=v.pose, cycle=v.cycle
+            effect, cell, v.states, strength, mode, rng, world=world, pose=v.pose, cycle=v.cycle
         )
     return SimulationCase(config, cell, mode, world, hidden, strength)
 
@@ -191,13 +191,13 @@ def simulate(
     rng: np.random.Generator,
     m: int = 3,
 ) -> Readings:
-    """Return what the tracker reads (m = 3 or 6) of N states, with the covariance of every reading.
+    """Return the tracker's readings of N states, m = 3 or 6, with the covariance of each.
 
-    `pose`, `load` (into `load_names`, "none" for unloaded) and `cycle` (N,) are their indices.
+    `pose`, `load` (into `load_names`, "none" for unloaded) and `cycle` (N,) are the indices.
     """
     if m not in (3, 6):
         raise InputError(f"a reading has {m} elements; valid: 3 (position) or 6 (pose)")
-    made = Readings(
+    readings = Readings(
         states=states,
         pose=np.asarray(pose, dtype=np.int64),
         load=np.asarray(load, dtype=np.int64),
@@ -210,10 +210,10 @@ def simulate(
     )
     arrival, sight = None, world.sight(states)
     if states.target is not None:
-        arrival = made.arrivals
-        made = replace(made, common=sight.jacobian[:, :m] * world.joint_std)
+        arrival = readings.arrivals
+        readings = replace(readings, common=sight.jacobian[:, :m] * world.joint_std)
     value = world.observe(states, rng, m, arrival)
-    return replace(made, value=value, covariance=world.covariance(sight, m))
+    return replace(readings, value=value, covariance=world.covariance(sight, m))
 
 
 _LOADING = 60.0  # s, to change a load
@@ -221,42 +221,42 @@ _MEASURING = 5.0  # s, to settle and to measure
 
 
 def planned_states(
-    cell: Cell, config: CellConfig, plan: Plan, begun: float = 0.0
+    cell: Cell, config: CellConfig, plan: Plan, start: float = 0.0
 ) -> CampaignStates:
-    """Return the N states of a plan's steps in order, with their times from `begun` on, s.
+    """Return the N states of a plan's steps in order, with their times from `start` on, s.
 
-    Of several targets, each is read at every step. The arm takes the route of a session; its joints
-    warm up as those of the cell behind the wires do.
+    All targets are read at every step. The arm takes the route of a session; its joints warm up as
+    with simulated devices.
     """
     names = [UNLOADED, *(load.name for load in config.loads)]
-    pulls = {load.name: load.wrench(cell.gravity) for load in config.loads}
+    wrenches = {load.name: load.wrench(cell.gravity) for load in config.loads}
     q = np.array([plan.joints(step.pose) for step in plan.steps])
-    wrench = np.array([pulls.get(step.load, np.zeros(6)) for step in plan.steps])
+    wrench = np.array([wrenches.get(step.load, np.zeros(6)) for step in plan.steps])
     load = np.array([names.index(step.load) for step in plan.steps])
-    moved = np.diff(q, axis=0, prepend=q[:1] - 1.0)
+    motion = np.diff(q, axis=0, prepend=q[:1] - 1.0)
     stops = route(plan, cell.arm, config.limits.joint_margin_rad)
     speed, acceleration = config.motion.speed_rad_s, config.motion.acceleration_rad_s2
     changed = np.diff(load, prepend=0) != 0
-    resting = _MEASURING * len(cell.all_targets)
-    lasts = np.abs(moved).max(axis=1) / speed + speed / acceleration + resting
-    time = begun + np.cumsum(lasts + _LOADING * changed)
-    hung = np.maximum.accumulate(np.where(changed, time - resting, begun))
     count = len(cell.all_targets)
-    each = np.repeat(np.arange(len(q)), count)
+    resting = _MEASURING * count
+    duration = np.abs(motion).max(axis=1) / speed + speed / acceleration + resting
+    time = start + np.cumsum(duration + _LOADING * changed)
+    hung = np.maximum.accumulate(np.where(changed, time - resting, start))
+    row = np.repeat(np.arange(len(q)), count)
     target = np.tile(np.arange(count), len(q))
-    passed = _MEASURING * target
+    delay = _MEASURING * target
     states = States(
-        q=q[each],
-        wrench=wrench[each],
-        time=time[each] + passed,
-        load_time=np.maximum(time - hung, 1.0)[each] + passed,
-        joint_temperature=warm_up(time, cell.arm.n)[each],
-        approach=approach_sides(stops)[each],
+        q=q[row],
+        wrench=wrench[row],
+        time=time[row] + delay,
+        load_time=np.maximum(time - hung, 1.0)[row] + delay,
+        joint_temperature=warm_up(time, cell.arm.n)[row],
+        approach=approach_sides(stops)[row],
         target=None if cell.targets is None else target,
     )
     pose = np.array([plan.pose_names.index(step.pose) for step in plan.steps])
     cycle = np.array([step.cycle for step in plan.steps])
-    return CampaignStates(states, pose[each], load[each], cycle[each])
+    return CampaignStates(states, pose[row], load[row], cycle[row])
 
 
 def case_of_plan(
@@ -269,12 +269,12 @@ def case_of_plan(
 ) -> SimulationCase:
     """Hide an effect in the simulated cell of a configuration.
 
-    Its strength holds for the readings of the plan, each the mean of several measurements; the
-    world's tracker has the noise of a single one.
+    Its strength is that at the readings of the plan, each the mean of several measurements; the
+    world's tracker has the noise of a single measurement.
     """
     rng = np.random.default_rng(seed)
     mean = measurement_noise(config, config.acquire.samples)
-    secret = simulation_case(
+    case = simulation_case(
         config,
         choice,
         rng,
@@ -283,15 +283,15 @@ def case_of_plan(
         catalogue,
         base_dir,
     )
-    world = replace(secret.world, noise=measurement_noise(config))
-    return replace(secret, world=world, home=plan.joints(home(plan)))
+    world = replace(case.world, noise=measurement_noise(config))
+    return replace(case, world=world, home=plan.joints(home(plan)))
 
 
-def read_plan(s: SimulationCase, plan: Plan, seed: Sequence[int], begun: float = 0.0) -> Rehearsal:
-    """Draw the readings of a plan, from the time `begun` of the campaign on, s; each is a mean."""
+def read_plan(s: SimulationCase, plan: Plan, seed: Sequence[int], start: float = 0.0) -> Rehearsal:
+    """Draw the readings of a plan, each a mean, from the time `start` of the campaign on, s."""
     config = s.config
     world = replace(s.world, noise=measurement_noise(config, config.acquire.samples))
-    v = planned_states(s.cell, config, plan, begun)
+    v = planned_states(s.cell, config, plan, start)
     names = (UNLOADED, *(load.name for load in config.loads))
     rng = np.random.default_rng(seed)
     readings = simulate(world, v.states, v.pose, v.load, v.cycle, names, rng)
@@ -300,22 +300,26 @@ def read_plan(s: SimulationCase, plan: Plan, seed: Sequence[int], begun: float =
 
 @contextmanager
 def simulated_cell(
-    secret: SimulationCase,
+    case: SimulationCase,
     seed: int,
     base_dir: Path,
     directory: Path | None = None,
     begun: float = 0.0,
 ) -> Iterator[SimulatedCell]:
-    """Run the simulated devices of a cell, which meet in `directory`; they end with the block."""
-    with tempfile.TemporaryDirectory(prefix="hilcal-") as made:
-        where = directory or Path(made)
-        with SimulatedCell.start(
-            secret.world,
-            secret.config,
-            where,
+    """Run the simulated devices of a cell, their files in `directory`, until the block ends.
+
+    The world's time starts at `begun`, s.
+    """
+    with (
+        tempfile.TemporaryDirectory(prefix="hilcal-") as temporary,
+        SimulatedCell.start(
+            case.world,
+            case.config,
+            directory or Path(temporary),
             seed,
             base_dir=base_dir,
-            begun=begun,
-            home=secret.home,
-        ) as cell:
-            yield cell
+            start_s=begun,
+            home=case.home,
+        ) as cell,
+    ):
+        yield cell

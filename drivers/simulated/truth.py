@@ -1,7 +1,7 @@
 """The hidden parameters of a simulated world, named like the effects that they cause; their laws.
 
-What a state brings about beside its load (sides, temperatures, time, the joint angles), and how a
-force sensor misreads what acts.
+The laws are those of causes beside the load (sides, temperatures, time, joint angles), and of the
+errors of a force sensor.
 """
 
 import itertools
@@ -21,11 +21,11 @@ _TURNS = ("rx", "ry", "rz")
 _TWIST = (*_AXES, *_TURNS)
 _WRENCH = ("fx", "fy", "fz", "mx", "my", "mz")
 _GUIDE = {"x": (2, 3, 4), "y": (2, 3, 4), "z": (1,)} | dict.fromkeys(_TURNS, (1, 2, 3, 4))
-"""Orders of the motion errors of a guide, by direction."""
+"""Orders of the Legendre polynomials of a guide's motion errors, by direction."""
 
 
 def long_links(arm: Arm) -> Ints:
-    """Return the numbers k of the two links between joints that are over a third of the longest."""
+    """Return the indices k of at most two links between joints, over a third of the longest."""
     lengths = np.linalg.norm(arm.links[1:-1, :3, 3], axis=1)
     longest = np.argsort(-lengths, kind="stable")[:2]
     return np.sort(longest[lengths[longest] > lengths.max() / 3.0]) + 1
@@ -33,7 +33,7 @@ def long_links(arm: Arm) -> Ints:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """What the program under test must find out; SI, all zero where nothing is hidden."""
+    """The parameters that the program under test must find; SI, all zero if nothing is hidden."""
 
     joint_compliance: Floats  # (n,) rad/(N·m)
     joint_stiffening: Floats  # (n,) s in dq = c tau + s tau³, rad/(N·m)³
@@ -45,33 +45,33 @@ class Truth:
     joint_coupling: Floats  # (n, n) k in dq_j = sum_i k_ji q_i, q as commanded, 1
     transmission_error: Floats
     """(n, h, 2) a_k, b_k in dq = sum a_k cos k q + b_k sin k q, rad; q is the commanded angle."""
-    link_geometry: Floats  # (n + 1, 6) twist of everything beyond slot k, its axes, m and rad
-    load_point: Floats  # (3,) the load acts so far from its configured point, flange axes, m
-    target_offset: Floats  # (3,) the same of the tracked target, flange axes, m
+    link_geometry: Floats  # (n + 1, 6) twist of all beyond slot k, in its axes, m and rad
+    load_point: Floats  # (3,) offset of the load's point of action, flange axes, m
+    target_offset: Floats  # (3,) offset of the tracked target, flange axes, m
     base_frame: Floats  # (6,) twist of the base against its registration, base axes, m and rad
     tracker_drift: Floats
-    """(6,) twist rate of the readings about the station, tracker axes, m/s and rad/s: the station
-    itself moves the other way."""
+    """(6,) twist rate of the readings about the station, tracker axes, m/s and rad/s; the station
+    moves in the opposite direction."""
     tool_compliance: Floats
-    """(2,) of the flange by the moment there, along and across its z axis, rad/(N·m)."""
+    """(2,) compliance of the flange to moments along and across its z axis, rad/(N·m)."""
     periodic_joint_compliance: Floats  # (n, 2) a, b in dq = tau (a cos 2q + b sin 2q), rad/(N·m)
     backlash: Floats  # (n,) b in dq = b tanh(tau / tau_0), rad
     creep: Floats  # (1,) k in dq = k c tau log10(1 + t / 1 s), 1 per decade of the load's time t
     thermal_growth: Floats  # (1,) alpha: every link's translation grows by alpha (T - 20 °C), 1/K
     thermal_joint_drift: Floats  # (n,) kappa in dq = kappa (T_j - reference), rad/K
-    link_mass: Floats  # (n, 3) first moments of the bodies beyond their own, body axes, kg·m
+    link_mass: Floats  # (n, 3) errors of the bodies' first moments, body axes, kg·m
     wrench_bias: Floats  # (6,) of the force sensor, flange axes, N and N·m
-    wrench_gain: Floats  # (6,) error of the gain of its six channels, 1
-    sensor_misalignment: Floats  # (3,) its axes are turned against the flange, rotation vector, rad
+    wrench_gain: Floats  # (6,) errors of the gains of its six channels, 1
+    sensor_misalignment: Floats  # (3,) rotation vector of its axes against the flange, rad
     guide_error: Floats
-    """(g, 19) of the g joints that slide: amplitudes of Legendre's polynomials over the travel, -1
+    """(g, 19) of the g joints that slide: amplitudes of Legendre polynomials, over the travel as -1
     to 1, of the carriage's motion: x and y of orders 2 to 4, z of order 1, m; rx, ry and rz of
     orders 1 to 4, rad."""
-    tracker_scale: Floats  # (1,) s: positions read (1 + s) times as long, 1
+    tracker_scale: Floats  # (1,) s: positions are read multiplied by 1 + s, 1
 
     @staticmethod
     def rigid(arm: Arm, harmonics: int = 0) -> "Truth":
-        """Return the truth of an arm that is perfect and rigid."""
+        """Return the truth of a perfect, rigid arm."""
 
         def zeros(effect: str) -> Floats:
             out = np.zeros([len(axis) for axis in _labels(effect, arm, harmonics)])
@@ -80,11 +80,11 @@ class Truth:
         return Truth(**{f.name: zeros(f.name) for f in fields(Truth)})
 
     def with_effect(self, effect: str, value: Floats) -> "Truth":
-        """Return the same truth with one effect's parameters replaced."""
+        """Return the truth with one effect's parameters replaced."""
         return replace(self, **{effect: value})
 
     def named(self, arm: Arm) -> dict[str, float]:
-        """Return every parameter that is not zero, as "effect.part": value in SI."""
+        """Return the parameters that are not zero, as "effect.part": value in SI."""
         out: dict[str, float] = {}
         for f in fields(self):
             axes = _labels(f.name, arm, self.transmission_error.shape[1])
@@ -126,31 +126,31 @@ def _labels(effect: str, arm: Arm, harmonics: int) -> tuple[Sequence[str], ...]:
 
 LINK_REFERENCE = 20.0  # temperature at which links have their nominal length, °C (ISO 1)
 
-_UNKNOWN_TORQUE, _UNKNOWN_FORCE = 150.0, 1500.0  # N·m and N, of a drive of unknown limit
-_CROSSING = 0.01  # of the rated torque: within it a joint crosses its play
+_UNKNOWN_TORQUE, _UNKNOWN_FORCE = 150.0, 1500.0  # N·m and N, for a drive of unknown limit
+_CROSSING = 0.01  # share of the rated torque within which a joint crosses its play
 
 
-AIR = 22.0  # air temperature of the cell behind the wires, and of a rehearsal's start, °C
+AIR = 22.0  # air temperature of the simulated devices' cell and of a rehearsal's start, °C
 
 _WARM_START = 4.0  # °C above the air at the world's start
-_WARM_RISE = np.array([9.0, 11.0, 10.0, 8.0, 8.0, 7.0])  # °C above the air in the end
+_WARM_RISE = np.array([9.0, 11.0, 10.0, 8.0, 8.0, 7.0])  # °C above the air at the end
 _WARM_TIME = 2400.0  # s, time constant of the warm-up
 
 
 def warm_up(time: Floats, n: int = 6) -> Floats:
-    """Return the (N, n) temperatures of the joints in the cell behind the wires, °C.
+    """Return the (N, n) temperatures of the joints in the simulated devices' cell, °C.
 
     T = air + rise + (start - rise) exp(-t / 2400 s), with `time` (N,) since its start, s.
     """
-    left = np.exp(-np.asarray(time) / _WARM_TIME)[:, None]
+    decay = np.exp(-np.asarray(time) / _WARM_TIME)[:, None]
     rise = np.resize(_WARM_RISE, n)
-    return np.asarray(AIR + rise + (_WARM_START - rise) * left)
+    return np.asarray(AIR + rise + (_WARM_START - rise) * decay)
 
 
-def needed(effect: str, name: str, values: Floats | None, what: str) -> Floats:
-    """Return a field of the states that a hidden effect needs; `what` tells that it is missing."""
+def needed(effect: str, name: str, values: Floats | None, lack: str) -> Floats:
+    """Return a field of the states that a hidden effect needs; `lack`: message if it is missing."""
     if values is None:
-        raise InputError(f"{name}: {effect} is hidden but the states {what}")
+        raise InputError(f"{name}: {effect} is hidden but the states {lack}")
     return values
 
 
@@ -160,12 +160,12 @@ def drive_errors(hidden: Truth, arm: Arm, states: States, reference: float) -> F
     dq_j = o_j + h_j s_j + kappa_j (T_j - reference)
            + sum_k a_jk cos k q_j + b_jk sin k q_j
 
-    Joints do not drift at the temperature `reference`, °C.
+    `reference` is the temperature without drift, °C.
     """
     error = np.broadcast_to(hidden.encoder_offset, states.q.shape).copy()
     if np.any(hidden.hysteresis):
-        what = "name no side from which the joints arrived; valid: -1 or +1 per state and joint"
-        error += hidden.hysteresis * needed("hysteresis", "approach", states.approach, what)
+        lack = "name no side from which the joints arrived; valid: -1 or +1 per state and joint"
+        error += hidden.hysteresis * needed("hysteresis", "approach", states.approach, lack)
     if np.any(hidden.thermal_joint_drift):
         error += hidden.thermal_joint_drift * (joint_temperature(states) - reference)
     order = np.arange(1, hidden.transmission_error.shape[1] + 1)
@@ -176,7 +176,7 @@ def drive_errors(hidden: Truth, arm: Arm, states: States, reference: float) -> F
 
 
 def guide_motion(hidden: Truth, arm: Arm, states: States) -> Floats | None:
-    """Return the (N, g, 6) motions of carriages by errors of their guides, z along; or None."""
+    """Return the (N, g, 6) motion errors of the carriages, z along the guide; None if zero."""
     if not np.any(hidden.guide_error):
         return None
     slides = arm.slides
@@ -192,12 +192,12 @@ def guide_motion(hidden: Truth, arm: Arm, states: States) -> Floats | None:
 
 def joint_temperature(states: States) -> Floats:
     """Return the (N, n) temperatures of the joints, °C."""
-    what = "carry no temperatures of the joints; valid: °C per state and joint"
-    return needed("thermal_joint_drift", "joint_temperature", states.joint_temperature, what)
+    lack = "carry no temperatures of the joints; valid: °C per state and joint"
+    return needed("thermal_joint_drift", "joint_temperature", states.joint_temperature, lack)
 
 
 def further_compliance(hidden: Truth, arm: Arm, states: States) -> Floats | None:
-    """Return the (N, n) compliances of the drives beyond c_j, rad/(N·m); None: none anywhere.
+    """Return the (N, n) additions to the drives' compliances c_j, rad/(N·m); None: zero.
 
     a_j cos 2 q_j + b_j sin 2 q_j + k c_j log10(1 + t / 1 s), q the commanded angle
     """
@@ -207,11 +207,11 @@ def further_compliance(hidden: Truth, arm: Arm, states: States) -> Floats | None
         angle = arm.phases(states.q)
         extra = cos * np.cos(2.0 * angle) + sin * np.sin(2.0 * angle)
     if np.any(hidden.creep):
-        what = "do not tell how long the load has hung; valid: seconds since its last change"
-        time = needed("creep", "load_time", states.load_time, what)
-        crept = hidden.creep * np.log10(1.0 + time)
-        more = crept[:, None] * hidden.joint_compliance
-        extra = more if extra is None else extra + more
+        lack = "do not tell how long the load has hung; valid: seconds since its last change"
+        time = needed("creep", "load_time", states.load_time, lack)
+        growth = hidden.creep * np.log10(1.0 + time)
+        creep = growth[:, None] * hidden.joint_compliance
+        extra = creep if extra is None else extra + creep
     return extra
 
 
@@ -230,14 +230,14 @@ def link_growth(hidden: Truth, states: States) -> Floats | None:
     temperature = states.air_temperature
     if temperature is None and states.joint_temperature is not None:
         temperature = states.joint_temperature.mean(axis=1)
-    what = "carry no temperature; valid: °C of the air, or of the joints"
-    temperature = needed("thermal_growth", "air_temperature", temperature, what)
+    lack = "carry no temperature; valid: °C of the air, or of the joints"
+    temperature = needed("thermal_growth", "air_temperature", temperature, lack)
     return np.asarray(1.0 + hidden.thermal_growth * (temperature - LINK_REFERENCE))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Misreading:
-    """acting = G (said - b), both at the load point and in the axes of the body that carries it.
+    """acting = G (reading - b), both at the load point, in the axes of the body that carries it.
 
     The sensor reads b + diag(1 + g) exp([delta])ᵀ acting, so G = exp([delta]) diag(1 / (1 + g)),
     the same rotation for force and moment.
@@ -248,7 +248,7 @@ class Misreading:
 
     @classmethod
     def of(cls, truth: Truth) -> "Misreading | None":
-        """Return that of a truth, flange axes; None where the sensor is perfect."""
+        """Return the misreading of a truth, flange axes; None for a perfect sensor."""
         parts = (truth.wrench_bias, truth.wrench_gain, truth.sensor_misalignment)
         if not any(np.any(part) for part in parts):
             return None
@@ -261,13 +261,13 @@ class Misreading:
         return cls(_both(turn) / (1.0 + truth.wrench_gain), truth.wrench_bias)
 
     def in_axes(self, axes: Floats) -> "Misreading":
-        """Return the same in other axes; `axes` (3, 3) maps present components into them."""
+        """Return the misreading in other axes; `axes` (3, 3) maps present components into them."""
         turn = _both(axes)
         return Misreading(turn @ self.gain @ turn.T, turn @ self.bias)
 
-    def acting(self, said: Floats) -> Floats:
-        """Return the (N, 6) wrenches that act where the sensor reads `said`, N and N·m."""
-        return np.asarray((said - self.bias) @ self.gain.T)
+    def acting(self, reading: Floats) -> Floats:
+        """Return the (N, 6) wrenches that act when the sensor reads `reading`, N and N·m."""
+        return np.asarray((reading - self.bias) @ self.gain.T)
 
 
 def _both(turn: Floats) -> Floats:

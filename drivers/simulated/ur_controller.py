@@ -1,15 +1,15 @@
-"""The state machine of a controller, and what asks it and gives it orders, or is told its state.
+"""The state machine of a controller, and its servers: dashboard, Robot API, primary port.
 
-Of the dashboard one line asks, one line answers. Source: Universal Robots, article "Dashboard
-Server e-Series, port 29999"; the sentence of the local mode as reported in
-Universal_Robots_ROS_Driver issue 125.
+The dashboard answers each line with a line. Source: Universal Robots, article "Dashboard Server
+e-Series, port 29999"; the answer in local mode as reported in Universal_Robots_ROS_Driver issue
+125.
 
-The Robot API of PolyScope X has the same over HTTP. Paths, bodies and the versions that have them:
-Universal Robots, "Robot API" (openapi.json of the controller), and `DashboardClientImplX` of the
-Universal Robots Client Library. Every order is refused by 403 in local mode.
+The Robot API of PolyScope X offers the same over HTTP. Paths, bodies and their versions: Universal
+Robots, "Robot API" (openapi.json of the controller), and `DashboardClientImplX` of the Universal
+Robots Client Library. In local mode every order is refused with status 403.
 
-A package of the primary port is its size (i32), its type (u8) and a body; the body of a robot state
-is a row of parts, each with size (i32), type (u8) and body. All big-endian. Part 5, of the
+A package of the primary port has a size (i32), a type (u8) and a body; the body of a robot state is
+a sequence of parts, each with size (i32), type (u8) and body. All is big-endian. Part 5, the
 kinematics, comes with the first state after a client has connected. Source: Universal Robots,
 "Remote Control via TCP/IP", and the parsers of the Universal Robots Client Library.
 """
@@ -33,20 +33,20 @@ from hilcal.drivers.simulated.ur_state import ArmState, Goal, RobotMode, Runtime
 from hilcal.types import Floats
 
 SAFETY_STOP = 15.0  # deceleration of protective and emergency stops, rad/s²
-STOP_TIME = 0.25  # world time in which any program's end brings the arm to rest, s
+STOP_TIME = 0.25  # world time within which the arm stops at the end of a program, s
 UNLOCK_AFTER = 5.0
-"""Real time before a protective stop can be unlocked, s (the dashboard's own words)."""
+"""Real time before a protective stop can be unlocked, s (from the dashboard's answer)."""
 PATIENCE = 0.5
-"""How much later than the watchdog allows a client on this machine may be, real s. A controller has
-a computer of its own; this one takes turns with its client, which would not have been late."""
+"""Additional delay of a connected client that the watchdog tolerates, real s: this controller,
+unlike a real one, shares its computer with the client."""
 _COMPILE = 0.05  # s of real time from the upload of a program to its start
-_POWER_UP = 0.3  # s of real time for each step of powering up; real arms take some seconds
+_POWER_UP = 0.3  # s of real time per step of powering up; real arms take some seconds
 _READ = 1 << 16  # bytes
-_MOST_OFTEN = 0.004  # s of real time between two writes to the blackboard
+_LEAST_INTERVAL = 0.004  # s of real time between writes to the blackboard
 
 
 class OrderResult(Enum):
-    """What became of an order."""
+    """Result of an order."""
 
     DONE = "done"
     TOO_EARLY = "too early"
@@ -60,13 +60,13 @@ _PROGRAMS: dict[str, type[programs.ControlScript | programs.WaypointProgram]] = 
 
 
 class Controller:
-    """Runs one program at a time, and stops it for every reason there is."""
+    """Runs one program at a time, and stops it for any of the controller's reasons."""
 
     def __init__(self, arm: ArmState, board: Blackboard) -> None:
         self.arm, self._board = arm, board
         self.scripts, self.unlock_after = 0, UNLOCK_AFTER
         self.hears: Callable[[int], bool] = lambda register: False
-        """Whether the client that writes an integer register has an open link."""
+        """Whether a client that writes an integer register is connected."""
         self._program: programs.ControlScript | programs.WaypointProgram | None = None
         self._compiling: tuple[float, str] | None = None
         self._powering: tuple[float, RobotMode] | None = None
@@ -78,23 +78,23 @@ class Controller:
 
     @property
     def program_runs(self) -> bool:
-        """Whether there is a program, also a paused one."""
+        """Whether there is a program, running or paused."""
         return self._program is not None or self._compiling is not None
 
     @property
     def watchdog(self) -> float:
-        """The program's watchdog, Hz; 0 is none."""
+        """The program's watchdog, Hz; 0: none."""
         return self._program.watchdog if self._program is not None else 0.0
 
     def step(self) -> None:
-        """Bring everything up to now."""
+        """Advance to the present time."""
         arm, real, motion = self.arm, time.monotonic(), self.arm.trajectory
         motion.advance(arm.clock.now)
         program, waits = self._program, False
         if program is not None and program.late and arm.runtime is Runtime.PLAYING:
-            # one whose client has an open link is late for want of a turn
-            heard = isinstance(program, programs.ControlScript) and self.hears(program.register)
-            waits = program.late < PATIENCE and heard
+            # a connected client is late because the computer is busy
+            connected = isinstance(program, programs.ControlScript) and self.hears(program.register)
+            waits = program.late < PATIENCE and connected
             if not waits:
                 self.stop_program("watchdog: no input package in time")
         motion.rate = 0.0 if waits else arm.slider * arm.scaling
@@ -116,7 +116,7 @@ class Controller:
         self.publish()
 
     def run(self, text: str) -> None:
-        """Replace the running program by another one, where that is allowed."""
+        """Replace the running program, if allowed."""
         self.scripts += 1
         if not self.arm.remote or not self.arm.able:
             why = "the robot is not ready" if self.arm.remote else "local mode"
@@ -128,7 +128,7 @@ class Controller:
             self._compiling = time.monotonic() + _COMPILE, text
 
     async def take_programs(self, reader: asyncio.StreamReader) -> None:
-        """Run every program that a client sends, until it goes."""
+        """Run every program that a client sends, until it disconnects."""
         stream = programs.ScriptStream()
         with contextlib.suppress(OSError):
             while data := await reader.read(_READ):
@@ -138,18 +138,18 @@ class Controller:
 
     def stop_program(self, why: str) -> None:
         """End the program; the arm decelerates by itself."""
-        arm, motion, ran = self.arm, self.arm.trajectory, self.arm.runtime
+        arm, motion, runtime = self.arm, self.arm.trajectory, self.arm.runtime
         if self.program_runs or motion.moving:
             arm.note(f"program stopped: {why}")
         self._program = self._compiling = self._interrupted = None
         arm.runtime = Runtime.STOPPED
         speed = float(np.max(np.abs(motion.qd)))
         motion.stop(max(programs.PROGRAM_STOP, speed / STOP_TIME), arm.clock.now)
-        if ran is not arm.runtime:
+        if runtime is not arm.runtime:
             self.publish()
 
     def play(self) -> OrderResult:
-        """Go on with a paused program, and with the motion that was cut short."""
+        """Resume a paused program and its interrupted motion."""
         arm = self.arm
         if arm.runtime is not Runtime.PAUSED or self._program is None or not arm.able:
             return OrderResult.REFUSED
@@ -161,7 +161,7 @@ class Controller:
         return OrderResult.DONE
 
     def protective_stop(self, why: str) -> None:
-        """Stop at once and pause the program, until somebody unlocks it."""
+        """Stop at once and pause the program until `unlock`."""
         arm = self.arm
         if arm.safety_mode is not SafetyMode.NORMAL:
             return
@@ -197,13 +197,13 @@ class Controller:
         self.step()
 
     def release_emergency_stop(self) -> None:
-        """Pull the button; the power stays off."""
+        """Release the button; the power stays off."""
         if self.arm.safety_mode is SafetyMode.ROBOT_EMERGENCY_STOP:
             self.arm.safety_mode = SafetyMode.NORMAL
             self.arm.note("emergency stop released")
 
     def power(self, mode: RobotMode) -> OrderResult:
-        """Go towards a power mode: on (idle), brakes released (running), or off."""
+        """Change to a power mode: on (idle), brakes released (running), or off."""
         arm = self.arm
         if mode is RobotMode.POWER_OFF:
             self.stop_program("power off")
@@ -227,25 +227,25 @@ class Controller:
         self.step()
 
     def publish(self) -> None:
-        """Write the state to the blackboard where it has changed."""
+        """Write the state to the blackboard if it has changed."""
         arm, motion = self.arm, self.arm.trajectory
         state = (motion.arrivals, motion.moving, arm.payload, *arm.payload_com.tolist())
-        often = time.monotonic() - self._published_at < _MOST_OFTEN
-        if state != self._published or (motion.moving and not often):
+        recent = time.monotonic() - self._published_at < _LEAST_INTERVAL
+        if state != self._published or (motion.moving and not recent):
             self._published, self._published_at = state, time.monotonic()
             motion.publish(self._board, arm.payload, arm.payload_com)
 
     def _start_program(self, text: str) -> None:
         self._compiling = None
-        for what, kind in _PROGRAMS.items():
+        for name, kind in _PROGRAMS.items():
             try:
                 self._program = kind(text, self.arm)
             except ValueError:
                 continue
             self.arm.runtime = Runtime.PLAYING
-            self.arm.note(f"{what} plays")
+            self.arm.note(f"{name} plays")
             return
-        # another one: it stops whatever moved, does its work and ends
+        # any other program stops the arm and ends
         self.arm.note(f"foreign program: {text[:60]!r}")
 
 
@@ -262,7 +262,7 @@ SERIAL_NUMBER = "20235500001"
 
 
 class ClientServer:
-    """Serves the clients of a controller, each until it goes."""
+    """Serves the clients of a controller, each until it disconnects."""
 
     def __init__(self, controller: Controller, model: str) -> None:
         self._controller = controller
@@ -280,18 +280,18 @@ class ClientServer:
             writer.transport.abort()
 
     async def run(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Serve a client until it goes."""
+        """Serve a client until it disconnects."""
         self._writers.add(writer)
-        gone = (OSError, ValueError, IndexError, asyncio.IncompleteReadError)
+        errors = (OSError, ValueError, IndexError, asyncio.IncompleteReadError)
         try:
-            with contextlib.suppress(*gone):
+            with contextlib.suppress(*errors):
                 await self.serve(reader, writer)
         finally:
             self._writers.discard(writer)
             writer.close()
 
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Answer what comes."""
+        """Answer the requests of a client."""
         raise NotImplementedError
 
 
@@ -299,33 +299,33 @@ class DashboardServer(ClientServer):
     """Answers the lines of every client."""
 
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Answer line by line; a connection made in local mode never gets more rights."""
+        """Answer line by line; a connection made in local mode never accepts orders."""
         local = not self._controller.arm.remote
         if not self._controller.arm.dashboard_mute:
             writer.write(f"{GREETING}\n".encode())
         while line := await reader.readline():
-            words = line.decode("utf-8", "replace").strip()
+            text = line.decode("utf-8", "replace").strip()
             if not self._controller.arm.dashboard_mute:
-                writer.write(f"{self.answer(words, local)}\n".encode())
-                if words.lower() == "quit":
+                writer.write(f"{self.answer(text, local)}\n".encode())
+                if text.lower() == "quit":
                     return
 
-    def answer(self, words: str, local: bool) -> str:
+    def answer(self, line: str, local: bool) -> str:
         """Return the answer to a line."""
-        command, arm = words.lower(), self._controller.arm
-        asked = self._questions().get(command)
-        if asked is not None:
-            return asked
-        order, done = self._orders().get(command, (None, ""))
+        command, arm = line.lower(), self._controller.arm
+        answer = self._questions().get(command)
+        if answer is not None:
+            return answer
+        order, success = self._orders().get(command, (None, ""))
         if order is None:
-            return f"could not understand: '{words}'"
+            return f"could not understand: '{line}'"
         if local or not arm.remote:
             arm.note(f"dashboard refused in local mode: {command}")
             return LOCAL
         arm.note(f"dashboard: {command}")
         result = order()
-        early = EARLY if result is OrderResult.TOO_EARLY else f"Failed to execute: {command}"
-        return done if result in (OrderResult.DONE, None) else early
+        failed = EARLY if result is OrderResult.TOO_EARLY else f"Failed to execute: {command}"
+        return success if result in (OrderResult.DONE, None) else failed
 
     def _questions(self) -> dict[str, str]:
         arm = self._controller.arm
@@ -361,7 +361,7 @@ class DashboardServer(ClientServer):
 
 BASE = "/universal-robots/robot-api"
 _API_VERSIONS = (((10, 14), "5.0.107"), ((10, 12), "3.1.4"), ((10, 11), "2.0.0"))
-_BODY = 1 << 16  # bytes of the longest body that is read
+_BODY = 1 << 16  # bytes; longest body read
 Answer = tuple[int, dict[str, Any]]
 
 
@@ -380,19 +380,19 @@ class RobotApiServer(ClientServer):
                 continue
             status, content = self.answer(line[0], line[1], body)
             text = json.dumps(content).encode()
-            words = f"HTTP/1.1 {status} {http.client.responses[status]}\r\n"
-            words += f"Content-Type: application/json\r\nContent-Length: {len(text)}\r\n\r\n"
-            writer.write(words.encode() + text)
+            lines = f"HTTP/1.1 {status} {http.client.responses[status]}\r\n"
+            lines += f"Content-Type: application/json\r\nContent-Length: {len(text)}\r\n\r\n"
+            writer.write(lines.encode() + text)
 
     def answer(self, method: str, path: str, body: bytes) -> Answer:
         """Return status and body of the answer to a request."""
-        known, orders = self._questions(), self._orders()
-        at = path.removeprefix(BASE).rstrip("/")
-        if not path.startswith(BASE) or at not in {**known, **(orders if known else {})}:
+        answers, orders = self._questions(), self._orders()
+        name = path.removeprefix(BASE).rstrip("/")
+        if not path.startswith(BASE) or name not in {**answers, **(orders if answers else {})}:
             return 404, {"message": "Not Found"}
-        if method == "GET" and at in known:
-            return 200, known[at]
-        if method != "PUT" or at not in orders:
+        if method == "GET" and name in answers:
+            return 200, answers[name]
+        if method != "PUT" or name not in orders:
             return 405, {"message": "Method Not Allowed"}
         arm = self._controller.arm
         try:
@@ -403,7 +403,7 @@ class RobotApiServer(ClientServer):
             arm.note(f"Robot API refused in local mode: {action}")
             return 403, {"message": "The robot must be in remote mode"}
         arm.note(f"Robot API: {action}")
-        order = orders[at].get(action) if isinstance(action, str) else None
+        order = orders[name].get(action) if isinstance(action, str) else None
         if order is None:
             return 422, {"message": f"no action {action}"}
         result = order()
@@ -414,7 +414,7 @@ class RobotApiServer(ClientServer):
         return 409, {"message": f"{action} is not possible now: {result.value}"}
 
     def _questions(self) -> dict[str, dict[str, Any]]:
-        """Answers to questions by path, as the version has them; of older ones nothing."""
+        """Answers to queries by path, for the version; empty for versions without the API."""
         arm, version = self._controller.arm, self._controller.arm.version[:2]
         api = next((api for since, api in _API_VERSIONS if version >= since), None)
         if api is None:
@@ -432,8 +432,7 @@ class RobotApiServer(ClientServer):
             }
         if version >= (10, 14):
             name = self._model.replace("UR8LONG", "UR8L")
-            about = {"robotType": name, "serialNumber": SERIAL_NUMBER}
-            out["/system/v1/information"] = about
+            out["/system/v1/information"] = {"robotType": name, "serialNumber": SERIAL_NUMBER}
             out["/versions/v1"] = {"marketingVersion": ".".join(map(str, arm.version[:3]))}
         return out
 
@@ -469,15 +468,15 @@ class PrimaryPort:
         self._controller, self._rows, self._status = controller, rows, status
 
     async def run(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Serve a client until it goes."""
-        telling = asyncio.create_task(self._tell(writer))
+        """Serve a client until it disconnects."""
+        sending = asyncio.create_task(self._send_states(writer))
         try:
             await self._controller.take_programs(reader)
         finally:
-            telling.cancel()
+            sending.cancel()
             writer.close()
 
-    async def _tell(self, writer: asyncio.StreamWriter) -> None:
+    async def _send_states(self, writer: asyncio.StreamWriter) -> None:
         with contextlib.suppress(OSError):
             writer.write(self._version())
             parts = self._kinematics()

@@ -1,8 +1,8 @@
-"""Programs that come in on the script port: ur_rtde's control script, and waypoints.
+"""Programs of the script port: ur_rtde's control script, and programs of waypoints.
 
 The control script takes commands through registers. The client writes a command and its arguments
-into input registers and waits until the script says 2 (done) in an output register; it takes the
-command back and waits for 1 (ready). Register numbers and commands: ur_rtde 1.6.5 (MIT), the script
+into input registers and waits for 2 (done) in an output register; then it clears the command and
+waits for 1 (ready). Register numbers and commands: ur_rtde 1.6.5 (MIT), the script
 that it uploads.
 
 A program of waypoints moves to joint values, and waits:
@@ -13,8 +13,8 @@ A program of waypoints moves to joint values, and waits:
       sleep(0.5)
     end
 
-`movel` and `movep` go there in joint space, at a joint speed of v over 1 m: where they arrive is
-right, the way is not. Blends (r) are left out: every waypoint is reached. Source: Universal Robots,
+`movel` and `movep` move in joint space, at a joint speed of v over 1 m: their goals are right,
+their paths are not. Blends (r) are ignored: every waypoint is reached. Source: Universal Robots,
 *The URScript Programming Language*.
 """
 
@@ -29,16 +29,16 @@ from hilcal.drivers.simulated.ur_state import ArmState, Goal
 from hilcal.robot.se3 import of_six, six
 from hilcal.types import Floats
 
-PROGRAM_STOP = 4.0  # deceleration when a program ends while the arm moves, rad/s²
+PROGRAM_STOP = 4.0  # deceleration at the end of a program during a motion, rad/s²
 
 _READY, _DONE = 1, 2
-_STEADY = 0.5  # s of world time at rest after which the robot says that it is steady
+_STEADY = 0.5  # world time at rest after which the robot is steady, s
 _JOINT_LIMIT = 2.0 * np.pi + 1e-6  # rad
 _STEP = 0.002  # s, the controller's cycle
 
 
 class ScriptCommand(IntEnum):
-    """Commands that are emulated."""
+    """The emulated commands."""
 
     MOVE_J = 1
     MOVE_L_FK = 4
@@ -60,7 +60,7 @@ class ScriptCommand(IntEnum):
     STOP_SCRIPT = 255
 
 
-# Commands that the script processes in every cycle, without the handshake of the others.
+# Commands processed in every cycle, without the handshake.
 REALTIME = frozenset({6, 9, 10, 11, 24, 25, 26, 27, 38, 58, 66, 67, 68, 69, 70, 71})
 
 _OFFSET = re.compile(r"global reg_offset_int =[^\n]*?\n?\s*(\d+)")
@@ -69,37 +69,37 @@ _MOVE = re.compile(r"movej\(\[([^\]]*)\],\s*a=([^,]*),\s*v=([^,]*),")
 
 
 class ProtectiveStop(Exception):  # noqa: N818 - a request, not an error
-    """The program asks for a protective stop."""
+    """The program requests a protective stop."""
 
 
 class ControlScript:
-    """The uploaded script, once it plays."""
+    """The uploaded control script while it plays."""
 
     def __init__(self, text: str, arm: ArmState) -> None:
-        found = _OFFSET.search(text)
-        if found is None:
+        match = _OFFSET.search(text)
+        if match is None:
             raise ValueError("not a control script")
         self._arm = arm
-        self.register = int(found.group(1))  # the integer register of commands
+        self.register = int(match.group(1))  # the integer register of commands
         self._path = tuple(_moves(text))
         self._executing = False
         self._work: Iterator[None] | None = None
         self._async = False
         self._async_count = self._async_number = 0
-        self.watchdog = 0.0  # least rate of input packages that the program asks for, Hz; 0 is none
+        self.watchdog = 0.0  # least rate of input packages, Hz; 0: no watchdog
         self._signal(_READY)
         self._progress(None)
 
     @property
     def late(self) -> float:
-        """How long the package with the command register is late by the watchdog, s; 0 is not."""
+        """Delay of the command register beyond the watchdog's limit, s; 0 if in time."""
         if not self.watchdog:
             return 0.0
         silence = (time.monotonic_ns() - self._arm.registers.written_ns[self.register]) * 1e-9
         return max(0.0, silence - 1.0 / self.watchdog)
 
     def poll(self) -> bool:
-        """Do what there is to do; return whether the program goes on."""
+        """Execute a cycle; return whether the program goes on."""
         if self._async and not self._arm.trajectory.moving:
             self._async = False
             self._progress(None)
@@ -125,12 +125,12 @@ class ControlScript:
         return True
 
     def _run(self, number: int) -> Iterator[None]:
-        """Carry out one command; yields while it takes time."""
+        """Carry out a command; yields until it is done."""
         arm, motion, now = self._arm, self._arm.trajectory, self._arm.clock.now
         match number:
             case ScriptCommand.MOVE_J | ScriptCommand.MOVE_L_FK | ScriptCommand.MOVE_PATH:
-                given = self._doubles(0, 8)
-                goals = [(given[:6], float(given[6]), float(given[7]))]
+                values = self._doubles(0, 8)
+                goals = [(values[:6], float(values[6]), float(values[7]))]
                 if number == ScriptCommand.MOVE_PATH:
                     goals = list(self._path)
                 for goal, speed, acceleration in goals:
@@ -143,7 +143,7 @@ class ControlScript:
                         yield
             case ScriptCommand.STOP_J | ScriptCommand.STOP_L:
                 rate = float(self._doubles(0, 1)[0])
-                # stopL's deceleration is the tool's, m/s²; the joints' is taken as the usual one
+                # stopL's deceleration is of the tool, m/s²; the default of the joints is used
                 motion.stop(
                     max(rate, 0.05) if number == ScriptCommand.STOP_J else PROGRAM_STOP, now
                 )
@@ -151,10 +151,10 @@ class ControlScript:
                 while motion.moving and not self._int(1):
                     yield
             case ScriptCommand.SET_PAYLOAD | ScriptCommand.SET_TARGET_PAYLOAD:
-                given = self._doubles(0, 4)
-                arm.payload = float(given[0])
-                if number == ScriptCommand.SET_TARGET_PAYLOAD or np.any(given[1:]):
-                    arm.payload_com = given[1:]
+                values = self._doubles(0, 4)
+                arm.payload = float(values[0])
+                if number == ScriptCommand.SET_TARGET_PAYLOAD or np.any(values[1:]):
+                    arm.payload_com = values[1:]
                 arm.note(f"payload {arm.payload:g} kg at {arm.payload_com.tolist()}")
             case ScriptCommand.SET_TCP:
                 arm.tcp = self._doubles(0, 6)
@@ -190,7 +190,7 @@ class ControlScript:
             raise ValueError(f"command {number} is not emulated")
 
     def _progress(self, value: int | None) -> None:
-        """Tell the state of asynchronous work: None is finished, 0 is begun.
+        """Set the state of an asynchronous operation; None: finished, 0: started.
 
         Bits 0-14 progress, 15 running, 16-22 count of writes, 24-30 number of the operation.
         """
@@ -218,23 +218,23 @@ class ControlScript:
 
 
 def _moves(text: str) -> Iterator[Goal]:
-    """Yield (goal, speed, acceleration) of the joint moves of an uploaded path."""
+    """Yield the joint moves of an uploaded path as (goal, speed, acceleration)."""
     body = _PATH.search(text)
     for q, acceleration, speed in _MOVE.findall(body.group(1)) if body else ():
         yield np.array([float(x) for x in q.split(",")]), float(speed), float(acceleration)
 
 
 class ScriptStream:
-    """Cuts what comes on the script port into programs."""
+    """Splits the data of the script port into programs."""
 
     def __init__(self) -> None:
         self._lines: list[str] = []
-        self._rest = ""
+        self._partial = ""
 
     def feed(self, data: bytes) -> Iterator[str]:
-        """Yield every program that is complete: `def ...` to a bare `end`, or one line."""
-        text = self._rest + data.decode("utf-8", "replace")
-        *lines, self._rest = text.split("\n")
+        """Yield every complete program: `def ...` to a bare `end`, or a line."""
+        text = self._partial + data.decode("utf-8", "replace")
+        *lines, self._partial = text.split("\n")
         for line in lines:
             if self._lines:
                 self._lines.append(line)
@@ -250,7 +250,7 @@ class ScriptStream:
 SPEEDS = {"movej": (1.4, 1.05), "movel": (1.2, 0.25), "movep": (1.2, 0.25)}
 """Default acceleration and speed of the language."""
 _LEVER = 1.0
-"""Distance of the tool from a joint that turns tool speeds into joint speeds, m; a choice."""
+"""Lever arm that converts tool speeds to joint speeds, m; a choice."""
 _WAYPOINT = re.compile(r"(movej|movel|movep)\(\s*\[([^\]]*)\]\s*((?:,[^)]*)?)\)")
 _SLEEP = re.compile(r"sleep\(\s*([0-9.eE+-]+)\s*\)")
 _IGNORED = re.compile(
@@ -259,19 +259,19 @@ _IGNORED = re.compile(
 
 
 class WaypointProgram:
-    """A program of moves, while it plays."""
+    """A program of waypoints while it plays."""
 
     watchdog = late = 0.0
 
     def __init__(self, text: str, arm: ArmState) -> None:
-        """Read the program; ValueError: statements that are not emulated, or no moves."""
+        """Read the program; raises ValueError for unknown statements, or without moves."""
         self._arm, self._steps = arm, list(_steps(text))
         if all(isinstance(step, float) for step in self._steps):
             raise ValueError("no waypoints")
         self._work = self._run()
 
     def poll(self) -> bool:
-        """Do what there is to do; return whether the program goes on."""
+        """Execute a cycle; return whether the program goes on."""
         return next(self._work, False)
 
     def _run(self) -> Iterator[bool]:
@@ -288,7 +288,7 @@ class WaypointProgram:
 
 
 def _begin(arm: ArmState, goal: Floats, speed: float, acceleration: float) -> None:
-    """Begin a motion of a program; ValueError: it is refused, and the program ends."""
+    """Start a motion of a program; raises ValueError, which ends the program, if refused."""
     if arm.refuses_motion:
         raise ValueError("the motion is refused")
     if not (0.0 < speed < np.inf and 0.0 < acceleration < np.inf):
@@ -301,7 +301,7 @@ def _begin(arm: ArmState, goal: Floats, speed: float, acceleration: float) -> No
 
 
 def _steps(text: str) -> Iterator[Goal | float]:
-    """Yield the moves, and the waits in s."""
+    """Yield the moves, and the waits, s."""
     for line in text.splitlines():
         statement = line.split("#")[0].strip()
         move, sleep = _WAYPOINT.fullmatch(statement), _SLEEP.fullmatch(statement)
@@ -317,11 +317,11 @@ def _move(function: str, numbers: str, options: str) -> Goal:
     goal = np.array([float(x) for x in numbers.split(",")])
     if goal.shape != (6,) or not np.all(np.abs(goal) <= _JOINT_LIMIT):
         raise ValueError(f"no joint values: {numbers}")
-    given = dict(re.findall(r"([avtr])\s*=\s*([0-9.eE+-]+)", options))
+    arguments = dict(re.findall(r"([avtr])\s*=\s*([0-9.eE+-]+)", options))
     lever = 1.0 if function == "movej" else _LEVER
     acceleration, speed = (
-        float(given.get(key, usual)) / lever
-        for key, usual in zip("av", SPEEDS[function], strict=True)
+        float(arguments.get(key, default)) / lever
+        for key, default in zip("av", SPEEDS[function], strict=True)
     )
     if not (0.0 < speed < np.inf and 0.0 < acceleration < np.inf):
         raise ValueError(f"move with speed {speed}, acceleration {acceleration}")

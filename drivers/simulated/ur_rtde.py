@@ -1,4 +1,4 @@
-"""RTDE v2: frames and recipes on the wire, every output variable, and the clients' links.
+"""RTDE v2: frames and recipes, the output variables, and the connections of clients.
 
 Source: Universal Robots, article "Real-Time Data Exchange (RTDE) guide".
 """
@@ -21,7 +21,7 @@ from hilcal.types import Floats
 VERSION = 2
 NOT_FOUND = "NOT_FOUND"
 IN_USE = "IN_USE"
-HEADER = struct.Struct(">HB")  # size of the whole frame in bytes, and its type
+HEADER = struct.Struct(">HB")  # size of the frame with header, bytes; type
 
 FORMATS = {
     "BOOL": "?",
@@ -89,7 +89,7 @@ def frame(kind: str, payload: bytes = b"") -> bytes:
 
 
 def outputs_since(version: tuple[int, int, int, int]) -> dict[str, str]:
-    """Return name -> type of the outputs that a controller of this version knows."""
+    """Return the types, by name, of the outputs that a controller of this version has."""
     table = dict(OUTPUTS)
     if version < (5, 9, 0, 0):
         del table["ft_raw_wrench"]
@@ -102,16 +102,16 @@ def outputs_since(version: tuple[int, int, int, int]) -> dict[str, str]:
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """Variables that travel together in one data frame."""
+    """The variables of a data frame."""
 
-    number: int  # its id on the connection, 1 or more
+    number: int  # id on the connection, 1 or more
     names: tuple[str, ...]
     kinds: tuple[str, ...]
     layout: struct.Struct
 
     @classmethod
     def of(cls, number: int, names: Iterable[str], table: dict[str, str]) -> "Recipe":
-        """Return the recipe of variables of which each is in `table`."""
+        """Return the recipe of variables, all of which are in `table`."""
         names = tuple(names)
         kinds = tuple(table[name] for name in names)
         return cls(number, names, kinds, struct.Struct(">B" + "".join(FORMATS[k] for k in kinds)))
@@ -131,9 +131,9 @@ _SPEED_STD = 2e-4  # rad/s
 _CURRENT_STD = 0.02  # A
 # Torque per motor current at the joint, N·m/A: plausible for gear ratios of about 100.
 _TORQUE_PER_AMPERE = np.array([13.0, 13.0, 11.0, 9.0, 9.0, 9.0])
-_DEVIATION_STOP = 0.1  # rad at which a controller stops the arm (C153), a guess
-_FRICTION = np.array([6.0, 6.0, 4.0, 1.2, 1.2, 1.2])  # N·m that a gear holds at rest, a guess
-_TEMPERATURES = np.array([29.0, 30.0, 30.5, 33.0, 34.0, 33.5])  # °C, a guess
+_DEVIATION_STOP = 0.1  # rad, deviation at which a controller stops the arm (C153); a guess
+_FRICTION = np.array([6.0, 6.0, 4.0, 1.2, 1.2, 1.2])  # N·m, friction of the gears at rest; a guess
+_TEMPERATURES = np.array([29.0, 30.0, 30.5, 33.0, 34.0, 33.5])  # °C; a guess
 _FORCE_OFFSET = np.array([3.1, -2.4, 4.2, 0.12, -0.21, 0.08])  # N and N·m, flange axes
 _FORCE_STD = np.array([0.4, 0.4, 0.5, 0.02, 0.02, 0.01])
 _REGISTER = re.compile(r"output_(int|double)_register_(\d+)")
@@ -147,9 +147,9 @@ _FIXED = {
 
 
 class Sensors:
-    """Values of one instant; `refresh` begins the next.
+    """Values of the output variables at one instant; `refresh` starts the next.
 
-    Where nobody has written the truth, the arm is rigid and carries what it has been told.
+    Without a truth on the blackboard, the arm is rigid and carries the payload that was set.
     """
 
     def __init__(self, arm: ur.ArmState, board: Blackboard, rng: np.random.Generator) -> None:
@@ -159,19 +159,19 @@ class Sensors:
         self.refresh()
 
     def refresh(self) -> None:
-        """Forget the last instant."""
+        """Start a new instant."""
         self._now = self._arm.clock.now
-        self._known: dict[str, Numbers] = {}
+        self._cache: dict[str, Numbers] = {}
         self._truth = self._board.read("truth")
 
     def value(self, name: str) -> Numbers:
         """Return the numbers of an output variable at this instant."""
-        if name not in self._known:
-            self._known[name] = tuple(np.asarray(self._read(name), dtype=float).tolist())
-        return self._known[name]
+        if name not in self._cache:
+            self._cache[name] = tuple(np.asarray(self._read(name), dtype=float).tolist())
+        return self._cache[name]
 
     def packed(self, name: str) -> tuple[float, ...]:
-        """Return the numbers as `struct` wants them."""
+        """Return the numbers with the types for `struct`."""
         values = self.value(name)
         return values if FORMATS[OUTPUTS[name]].endswith("d") else tuple(map(int, values))
 
@@ -235,7 +235,7 @@ class Sensors:
 
     @property
     def _has_truth(self) -> bool:
-        """Whether somebody tells the truth."""
+        """Whether the world has written the truth."""
         return bool(self._truth["flange"][3, 3] == 1.0)
 
     def _q(self) -> Floats:
@@ -248,9 +248,9 @@ class Sensors:
         return motion.q + self._noise(_ENCODER_STD)
 
     def _deviation(self) -> Numbers:
-        """Largest deviation of a joint from its command, over the one that stops the arm."""
-        off = np.abs(self._array("actual_q") - self._array("target_q"))
-        return (float(off.max() / _DEVIATION_STOP),)
+        """Largest deviation of a joint from its command, as a share of the limit."""
+        deviation = np.abs(self._array("actual_q") - self._array("target_q"))
+        return (float(deviation.max() / _DEVIATION_STOP),)
 
     def _torque(self) -> Floats:
         if self._has_truth:
@@ -262,9 +262,9 @@ class Sensors:
         return np.asarray(self._powered * self._array("target_moment") / _TORQUE_PER_AMPERE)
 
     def _measured_torque(self) -> Floats:
-        """What the drives exert against load, weight, and the friction of the arrival."""
-        held = _FRICTION[: len(self._torque())] * self._arm.trajectory.side - self._torque()
-        return np.asarray(held + _TORQUE_PER_AMPERE * self._noise(_CURRENT_STD))
+        """Torque against load, weight and friction, whose sign is that of the last motion."""
+        torque = _FRICTION[: len(self._torque())] * self._arm.trajectory.side - self._torque()
+        return np.asarray(torque + _TORQUE_PER_AMPERE * self._noise(_CURRENT_STD))
 
     def _tool_pose(self, q: Floats) -> Numbers:
         return tuple(six(self._flange(q) @ of_six(self._arm.tcp.tolist())))
@@ -273,30 +273,30 @@ class Sensors:
         if not qd.any():
             return qd
         q = self._arm.trajectory.q
-        place = self._flange(q)
-        point = place[:3, 3] + place[:3, :3] @ self._arm.tcp[:3]
+        flange = self._flange(q)
+        point = flange[:3, 3] + flange[:3, :3] @ self._arm.tcp[:3]
         return np.asarray(self._arm.kinematics.jacobian(q, point) @ qd)
 
     def _weight(self) -> Floats:
-        """Wrench of the payload that has been told, at the flange, flange axes."""
+        """Wrench of the payload as set, at the flange, flange axes."""
         arm = self._arm
         force = arm.payload * (self._flange(arm.trajectory.q)[:3, :3].T @ ur.GRAVITY)
         return np.concatenate([force, np.cross(arm.payload_com, force)])
 
     def _wrench(self) -> Floats:
-        """What the sensor in the flange feels, flange axes, with its offset and noise."""
-        felt = self._truth["sensor_wrench"] if self._has_truth else self._weight()
-        return np.asarray(felt + _FORCE_OFFSET + _FORCE_STD * self._rng.standard_normal(6))
+        """Reading of the sensor in the flange, flange axes, with offset and noise."""
+        wrench = self._truth["sensor_wrench"] if self._has_truth else self._weight()
+        return np.asarray(wrench + _FORCE_OFFSET + _FORCE_STD * self._rng.standard_normal(6))
 
     def _tool_force(self) -> Floats:
-        """Remainder after the compensation of the payload, at the tool point, base axes."""
-        left = self._array("ft_raw_wrench") - self._weight()
+        """Reading minus the payload's wrench, at the tool point, base axes."""
+        excess = self._array("ft_raw_wrench") - self._weight()
         turn = self._flange(self._arm.trajectory.q)[:3, :3]
-        moment = left[3:] - np.cross(self._arm.tcp[:3], left[:3])
-        return np.concatenate([turn @ left[:3], turn @ moment])
+        moment = excess[3:] - np.cross(self._arm.tcp[:3], excess[:3])
+        return np.concatenate([turn @ excess[:3], turn @ moment])
 
     def _flange(self, q: Floats) -> Floats:
-        """T_base_flange; a few variables of one instant ask for the same ones."""
+        """T_base_flange, cached: some variables of an instant need the same one."""
         key = q.tobytes()
         if key not in self._places:
             if len(self._places) > 4:
@@ -310,9 +310,9 @@ class Sensors:
 
 FREQUENCY = 500.0  # of the controller, Hz
 _DIGITAL_OUTPUTS = {"standard": (0, 0xFF), "configurable": (8, 0xFF), "tool": (16, 3)}
-"""First bit in `actual_digital_output_bits` and mask of each group; UR, "RTDE guide"."""
+"""By group: first bit in `actual_digital_output_bits`, and mask; UR, "RTDE guide"."""
 _INT, _DOUBLE = "input_int_register_", "input_double_register_"
-_BACKLOG = 1 << 20  # bytes that a client may leave unread before it is cut off
+_BACKLOG = 1 << 20  # bytes unread by a client, above which it is disconnected
 
 
 @dataclass(slots=True, eq=False)
@@ -321,21 +321,21 @@ class RtdeLinks:
 
     arm: ur.ArmState
     sensors: Sensors
-    taken: Callable[[], None]  # called after each input package
+    after_input: Callable[[], None]  # called after each input package
     links: set["RtdeLink"] = field(default_factory=set)
     owners: dict[str, "RtdeLink"] = field(default_factory=dict)
-    """Which connection may write an input variable."""
+    """By input variable: the connection that may write it."""
 
     def due(self) -> float:
-        """Return when the next package is due, real time in s; infinite where none is."""
+        """Return when the next package is due, `time.monotonic`, s; infinite if none is."""
         return min((link.due for link in self.links if link.started), default=float("inf"))
 
     def hears(self, register: int) -> bool:
-        """Return whether a client that writes an integer register has an open link."""
+        """Return whether a client that writes an integer register is connected."""
         return not self.arm.rtde_mute and f"{_INT}{register}" in self.owners
 
     def send(self, now: float) -> None:
-        """Send what is due."""
+        """Send the packages that are due."""
         ready = [link for link in self.links if link.started and link.due <= now]
         if ready:
             self.sensors.refresh()
@@ -356,7 +356,7 @@ class RtdeLink:
         self.started, self.due = False, float("inf")
 
     async def run(self) -> None:
-        """Serve the client until it goes."""
+        """Serve the client until it disconnects."""
         connection = self.writer.get_extra_info("socket")
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         links = self._links
@@ -381,13 +381,13 @@ class RtdeLink:
             self.writer.close()
 
     def send(self, now: float) -> None:
-        """Send one package and say when the next is due."""
+        """Send a package and set when the next is due."""
         self.due = max(self.due + self._period, now - 4 * self._period)
         if not self._links.arm.rtde_stall and not self._links.arm.rtde_mute:
             self._write(self._data())
 
     def half(self) -> None:
-        """Send the first half of a package, and nothing more."""
+        """Send the first half of a package, then nothing more."""
         data = self._data()
         self._write(data[: len(data) // 2])
         self.started = False
@@ -439,8 +439,8 @@ class RtdeLink:
     def _inputs(self, body: bytes) -> bytes:
         names = [name for name in body.decode("ascii").split(",") if name]
         owners = self._links.owners
-        taken = {name: IN_USE for name in names if owners.get(name, self) is not self}
-        kinds = [(INPUTS | taken).get(name, NOT_FOUND) for name in names]
+        in_use = {name: IN_USE for name in names if owners.get(name, self) is not self}
+        kinds = [(INPUTS | in_use).get(name, NOT_FOUND) for name in names]
         number = 0
         if NOT_FOUND not in kinds and IN_USE not in kinds:
             number = len(self._recipes) + 1
@@ -468,8 +468,8 @@ class RtdeLink:
             arm.slider = min(1.0, max(0.0, values["speed_slider_fraction"]))
         for group, (first, bits) in _DIGITAL_OUTPUTS.items():
             if f"{group}_digital_output" in values:
-                given = int(values[f"{group}_digital_output"]) & bits
+                output = int(values[f"{group}_digital_output"]) & bits
                 mask = int(values.get(f"{group}_digital_output_mask", 0)) & bits
-                kept = arm.digital_outputs & ~(mask << first)
-                arm.digital_outputs = kept | (given & mask) << first
-        self._links.taken()
+                unchanged = arm.digital_outputs & ~(mask << first)
+                arm.digital_outputs = unchanged | (output & mask) << first
+        self._links.after_input()

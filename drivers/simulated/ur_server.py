@@ -1,17 +1,18 @@
-"""A simulated Universal Robots controller on an address of its own; admin `arm.sock`.
+"""A simulated Universal Robots controller on a separate address; admin `arm.sock`.
 
     python -m hilcal.drivers.simulated.ur_server --directory DIR --host 127.A.B.C --robot ur10e
         [--version 5.11.6.1010327] [--api-port 8080] [--calibration FILE] [--seed N]
 
-Ports as on a real one: RTDE 30004, primary 30001, dashboard 29999 and script 30003; PolyScope X
-(version 10 and later) has neither of these two, but a Robot API (port 80 on a real one, which
-needs an administrator here). With a calibration its kinematics are those of the file.
+Ports as on a real controller: RTDE 30004, primary 30001, dashboard 29999 and script 30003.
+PolyScope X (version 10 and later) has a Robot API in place of the last two (port 80 on a real
+controller, which needs an administrator here). With a calibration the kinematics are those of the
+file.
 
 Admin operations: `state`, `protective_stop`, `emergency_stop`, `release_emergency_stop`,
 `local_mode`, `remote_mode`, `kill_script`; `rtde_drop`, `rtde_stall {on}`, `rtde_mute {on}`,
 `rtde_half_frame`, `dashboard_mute {on}`, `dashboard_drop`, `refuse {on}` new RTDE clients,
-`refuse_motion {on}`, `freeze {on}` the joint angles that are told while all else goes on, `jog {q}`
-as somebody who moves the arm by hand; `set {version, slider, speed_scaling, unlock_s}`, `die`,
+`refuse_motion {on}`, `freeze {on}` the reported joint angles only, `jog {q}` as if the arm is moved
+by hand; `set {version, slider, speed_scaling, unlock_s}`, `die`,
 `log`
 """
 
@@ -41,31 +42,31 @@ from hilcal.types import Floats
 DASHBOARD, PRIMARY, SCRIPT, RTDE = 29999, 30001, 30003, 30004
 API = 8080
 HOME = np.array([0.0, -1.57, 1.57, -1.57, -1.57, 0.0])
-"""Where a controller that is switched on for the first time finds its arm, rad."""
+"""Joint angles at the first power-on, rad."""
 
 _MOVING, _STILL = 0.004, 0.01  # s of real time between steps
-POLYSCOPE_X = 10  # from this version on there is a Robot API
-_LINE = 1 << 16  # bytes of the longest line
+POLYSCOPE_X = 10  # first version with a Robot API
+_LINE = 1 << 16  # bytes; longest line
 Version = tuple[int, int, int, int]
 
 
 def switched_on(
     arm: Arm, board: Blackboard, version: Version, rng: np.random.Generator
 ) -> ArmState:
-    """Return the state of a controller right after power-up; the arm stands where it stood."""
-    kept, clock = board.read("arm"), WorldClock(board)
-    known = bool(kept["alive"])
-    arrivals = int(kept["arrivals"]) + bool(kept["moving"])
-    q, side = (kept["q"], kept["side"]) if known else (HOME, rng.choice([-1.0, 1.0], arm.n))
+    """Return the state of a controller after power-on; the arm is where it stood before."""
+    last, clock = board.read("arm"), WorldClock(board)
+    alive = bool(last["alive"])
+    arrivals = int(last["arrivals"]) + bool(last["moving"])
+    q, side = (last["q"], last["side"]) if alive else (HOME, rng.choice([-1.0, 1.0], arm.n))
     state = ArmState(clock, Kinematics(arm), Trajectory(q, side, arrivals, clock.now), version)
-    if known:
-        state.payload, state.payload_com = float(kept["payload"]), kept["payload_com"].copy()
+    if alive:
+        state.payload, state.payload_com = float(last["payload"]), last["payload_com"].copy()
     state.note("switched on")
     return state
 
 
 class UrServer:
-    """Everything that answers on one address."""
+    """All servers of a controller."""
 
     def __init__(
         self,
@@ -91,39 +92,39 @@ class UrServer:
             self.controller, _rows(arm) if rows is None else rows, status
         )
         self._host, self._supervised = host, api_port if self.is_x else DASHBOARD
-        self._listening: asyncio.Server | None = None
-        self._others: list[asyncio.Server] = []
+        self._rtde_server: asyncio.Server | None = None
+        self._servers: list[asyncio.Server] = []
 
     async def open(self) -> None:
         """Listen."""
-        self._others = [
+        self._servers = [
             await self._listen(self.primary.run, PRIMARY),
             await self._listen(self.dashboard.run, self._supervised),
         ]
         if not self.is_x:
-            self._others.append(await self._listen(self._run_script, SCRIPT))
+            self._servers.append(await self._listen(self._run_script, SCRIPT))
         await self.accept(True)
 
     async def accept(self, on: bool) -> None:
-        """Take new RTDE clients, or refuse them; those that are connected stay."""
-        if on and self._listening is None:
-            self._listening = await self._listen(self._run_rtde, RTDE)
-        elif not on and self._listening is not None:
-            closing, self._listening = self._listening, None
+        """Accept new RTDE clients, or refuse them; connected ones stay."""
+        if on and self._rtde_server is None:
+            self._rtde_server = await self._listen(self._run_rtde, RTDE)
+        elif not on and self._rtde_server is not None:
+            closing, self._rtde_server = self._rtde_server, None
             loop = asyncio.get_running_loop()
             for door in closing.sockets:
                 loop.remove_reader(door)
-            # Who has just been let in gets a link first: asyncio forgets him with the server.
+            # A client just accepted gets its link first: asyncio drops it with the server.
             await asyncio.sleep(0)
             closing.close()
 
     async def run(self) -> None:
-        """Keep the controller going, for ever."""
+        """Run the controller for ever."""
         motion = self.arm.trajectory
         while True:
             self.controller.step()
             self.rtde.send(time.monotonic())
-            wait = min(_MOVING, self.arm.clock.real(motion.left)) if motion.moving else _STILL
+            wait = min(_MOVING, self.arm.clock.real(motion.remaining)) if motion.moving else _STILL
             await asyncio.sleep(max(0.0, min(wait, self.rtde.due() - time.monotonic())))
 
     async def _listen(self, client: Any, port: int) -> asyncio.Server:
@@ -146,7 +147,7 @@ class UrServer:
 
 
 def _rows(arm: Arm) -> Floats:
-    """(4, 6) θ, a, d, α of an arm, as its controller tells them."""
+    """(4, 6) θ, a, d, α of an arm, as its controller reports them."""
     from hilcal.calibration.dh_table import dh_rows  # slow to import
 
     rows = dh_rows(arm)
@@ -163,17 +164,17 @@ def read_version(text: str) -> Version:
 
 
 _QUIET = ("state", "log", "set", "release_emergency_stop", "remote_mode")
-"""Operations that are no faults."""
+"""Operations that are not faults."""
 
 
 def operations(server: UrServer, loop: asyncio.AbstractEventLoop) -> admin.Handler:
-    """Return what may be asked and switched, from other threads than that of the loop."""
+    """Return the admin operations, which other threads than the loop's may call."""
     arm, controller, links = server.arm, server.controller, server.rtde.links
 
     def switch(name: str) -> Callable[..., object]:
         return lambda on=True: setattr(arm, name, bool(on))
 
-    def each(do: Callable[[RtdeLink], None]) -> Callable[[], None]:
+    def for_all(do: Callable[[RtdeLink], None]) -> Callable[[], None]:
         def all_links() -> None:
             for link in list(links):
                 do(link)
@@ -186,7 +187,7 @@ def operations(server: UrServer, loop: asyncio.AbstractEventLoop) -> admin.Handl
     def state() -> dict[str, Any]:
         return _state(server)
 
-    known = admin.Operations(
+    requests = admin.Operations(
         {
             "protective_stop": lambda: controller.protective_stop("admin"),
             "emergency_stop": controller.emergency_stop,
@@ -194,10 +195,10 @@ def operations(server: UrServer, loop: asyncio.AbstractEventLoop) -> admin.Handl
             "local_mode": lambda: controller.set_remote(False),
             "remote_mode": lambda: controller.set_remote(True),
             "kill_script": lambda: controller.stop_program("killed"),
-            "rtde_drop": each(lambda link: link.writer.transport.abort()),
+            "rtde_drop": for_all(lambda link: link.writer.transport.abort()),
             "rtde_stall": switch("rtde_stall"),
             "rtde_mute": switch("rtde_mute"),
-            "rtde_half_frame": each(RtdeLink.half),
+            "rtde_half_frame": for_all(RtdeLink.half),
             "dashboard_mute": switch("dashboard_mute"),
             "dashboard_drop": server.dashboard.drop,
             "refuse": lambda on=True: server.accept(not on),
@@ -211,15 +212,15 @@ def operations(server: UrServer, loop: asyncio.AbstractEventLoop) -> admin.Handl
     )
 
     async def do(op: str, arguments: dict[str, Any]) -> Any:
-        if op in known.functions and op not in _QUIET:
+        if op in requests.functions and op not in _QUIET:
             if arguments.get("on", True):
                 arm.fault_ns = time.monotonic_ns()
             arm.note(f"admin: {op} {arguments or ''}".strip())
-        done = known(op, arguments)
-        if inspect.isawaitable(done):
-            await done
+        result = requests(op, arguments)
+        if inspect.isawaitable(result):
+            await result
             return state()
-        return done
+        return result
 
     def handler(op: str, arguments: dict[str, Any]) -> Any:
         if op == "die":
@@ -269,10 +270,10 @@ def _state(server: UrServer) -> dict[str, Any]:
 
 
 def _joints(q: Any) -> Floats:
-    place = np.asarray(q, dtype=np.float64)
-    if place.shape != (6,) or not np.all(np.abs(place) <= 2.0 * np.pi):
+    angles = np.asarray(q, dtype=np.float64)
+    if angles.shape != (6,) or not np.all(np.abs(angles) <= 2.0 * np.pi):
         raise InputError(f"q = {q!r}; valid: 6 numbers within a turn, rad")
-    return place
+    return angles
 
 
 def _share(key: str, value: Any) -> float:
@@ -282,7 +283,7 @@ def _share(key: str, value: Any) -> float:
 
 
 def start(options: argparse.Namespace) -> admin.Device:
-    """Return a controller that listens."""
+    """Return the controller, listening."""
     arm, factory = load_arm(options.robot), None
     if arm.n != len(HOME):
         raise InputError(f"--robot {options.robot}: {arm.n} joints; an arm of UR has {len(HOME)}")

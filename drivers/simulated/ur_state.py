@@ -1,6 +1,6 @@
-"""State of controller and arm: its kinematics, and the trajectory, lines in joint space.
+"""State of controller and arm: kinematics, and a trajectory of straight lines in joint space.
 
-All times of a trajectory are world time in s; the caller says what time it is.
+All times of a trajectory are world time, s, which the caller passes as `now`.
 """
 
 import time
@@ -24,7 +24,7 @@ Goal = tuple[Floats, float, float]
 
 
 class Kinematics:
-    """Nominal kinematics and weight of the arm, as its controller knows them, by Pinocchio."""
+    """Nominal kinematics and weight of the arm, as in its controller, by Pinocchio."""
 
     def __init__(self, arm: Arm) -> None:
         self.arm = arm
@@ -39,25 +39,24 @@ class Kinematics:
         return np.array(self._data.oMf[self._frame].homogeneous)
 
     def jacobian(self, q: Floats, point: Floats) -> Floats:
-        """Return (6, n): velocity of a point (3,), base axes, and turn, per joint speed."""
+        """Return the (6, n) Jacobian (v, omega) of a point (3,), base axes, for the joints."""
         by_angle = self._by_angle(q, point)
         return by_angle if self.arm.coupling is None else by_angle @ self.arm.coupling
 
     def weight_torque(self, q: Floats, mass: float, com: Floats) -> Floats:
-        """Return the (n,) torque that arm and payload at `com` (3,) exert at its drives, N·m."""
-        held = pin.computeGeneralizedGravity(self._model, self._data, self.arm.chain_angles(q))
-        place = self.flange(q)
-        lifted = self._by_angle(q, place[:3, :3] @ com + place[:3, 3])[:3]
-        return self.arm.drive_torques(mass * GRAVITY @ lifted - held)
+        """Return the (n,) torques of arm and payload, at `com` (3,), at the drives, N·m."""
+        gravity = pin.computeGeneralizedGravity(self._model, self._data, self.arm.chain_angles(q))
+        flange = self.flange(q)
+        jacobian = self._by_angle(q, flange[:3, :3] @ com + flange[:3, 3])[:3]
+        return self.arm.drive_torques(mass * GRAVITY @ jacobian - gravity)
 
     def _by_angle(self, q: Floats, point: Floats) -> Floats:
-        """(6, n) velocity of a point and turn per speed of the chain's angles."""
+        """(6, n) Jacobian (v, omega) of a point by the chain's angles."""
         angle, axes = self.arm.chain_angles(q), pin.LOCAL_WORLD_ALIGNED
         origin = self.flange(q)[:3, 3]
-        at = pin.computeFrameJacobian(self._model, self._data, angle, self._frame, axes)
-        return np.concatenate(
-            [at[:3] + np.cross(at[3:], (point - origin)[:, None], axis=0), at[3:]]
-        )
+        jac = pin.computeFrameJacobian(self._model, self._data, angle, self._frame, axes)
+        shift = np.cross(jac[3:], (point - origin)[:, None], axis=0)
+        return np.concatenate([jac[:3] + shift, jac[3:]])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,17 +64,17 @@ class LinearMotion:
     """A motion q(s) = origin + direction * s with a piecewise linear speed of s."""
 
     origin: Floats  # (n,) rad
-    direction: Floats  # (n,) the leading joint's element is -1 or +1
+    direction: Floats  # (n,) -1 or +1 for the leading joint
     pieces: tuple[tuple[float, float, float], ...]
     """(duration in s, speed at its start in rad/s, acceleration in rad/s²) in order."""
 
     @property
     def duration(self) -> float:
-        """How long it takes, s."""
+        """Duration, s."""
         return sum(piece[0] for piece in self.pieces)
 
     def at(self, time: float) -> tuple[float, float]:
-        """Return way and speed of the leading joint at a time since the start."""
+        """Return path and speed of the leading joint at a time since the start."""
         way = 0.0
         for duration, speed, acceleration in self.pieces:
             t = min(time, duration)
@@ -86,17 +85,17 @@ class LinearMotion:
         return way, 0.0
 
     def point(self, way: float) -> Floats:
-        """Return the joint angles (n,) there, rad."""
+        """Return the joint angles (n,) at a path of the leading joint, rad."""
         return self.origin + self.direction * way
 
     @property
     def length(self) -> float:
-        """Way of the leading joint, rad."""
+        """Path of the leading joint, rad."""
         return self.at(self.duration)[0]
 
 
 def line(origin: Floats, goal: Floats, speed: float, acceleration: float) -> LinearMotion | None:
-    """Return the motion from rest to rest; None where there is none to make.
+    """Return the motion from rest to rest; None if the goal is reached already.
 
     v = min(speed, sqrt(a d)), ramps of v / a, and d / v - v / a in between.
     """
@@ -113,9 +112,9 @@ def line(origin: Floats, goal: Floats, speed: float, acceleration: float) -> Lin
 
 
 class Trajectory:
-    """Where the commanded arm is, and from which `side` (n,), -1 or +1, each joint came there.
+    """The commanded joint angles; `side` (n,), -1 or +1: direction of each joint's last motion.
 
-    `arrivals` are motions that have ended, in whatever way; at `rate`, 0 to 1, the arm goes slower.
+    `arrivals`: number of motions ended in any way; `rate`, 0 to 1: factor on the speed.
     """
 
     def __init__(self, q: Floats, side: Floats, arrivals: int, now: float) -> None:
@@ -126,14 +125,14 @@ class Trajectory:
         self._now = now
         self._segment: LinearMotion | None = None
         self._time = 0.0  # along the segment
-        self._stands: float | None = None  # since when it stands within the segment, at rate 0
+        self._stands: float | None = None  # start of a rest within the segment, at rate 0
         self._stopping = False
         self._next: Goal | None = None
         self._goal: Goal | None = None
 
     @property
     def goal(self) -> Goal | None:
-        """That of the motion that goes on and is not being stopped."""
+        """The goal of the present motion, None if it is being stopped."""
         return None if self._segment is None or self._stopping else self._goal
 
     @property
@@ -142,15 +141,15 @@ class Trajectory:
         return self._segment is not None
 
     @property
-    def left(self) -> float:
-        """World time until the motion ends at the present rate, s; infinite at rate 0."""
+    def remaining(self) -> float:
+        """World time to the end of the motion at the present rate, s; infinite at rate 0."""
         if self._segment is None:
             return 0.0
-        left, rate = self._segment.duration - self._time, 1.0 if self._stopping else self.rate
-        return left / rate if rate > 0.0 else float("inf")
+        time, rate = self._segment.duration - self._time, 1.0 if self._stopping else self.rate
+        return time / rate if rate > 0.0 else float("inf")
 
     def start(self, goal: Floats, speed: float, acceleration: float, now: float) -> None:
-        """Go to `goal` (n,), rad; an arm that moves stops first, with this acceleration."""
+        """Move to `goal` (n,), rad; a moving arm stops first, with this acceleration."""
         self.advance(now)
         if self._segment is not None:
             self.stop(acceleration, now)
@@ -159,13 +158,13 @@ class Trajectory:
             self._begin(goal, speed, acceleration)
 
     def place(self, q: Floats) -> None:
-        """Stand at joint angles (n,), rad, at once: the arm was moved by hand."""
+        """Place the arm at joint angles (n,), rad, at once, as if moved by hand."""
         self._segment, self._next, self._stopping = None, None, False
         self.q, self.qd = np.array(q, dtype=np.float64), np.zeros_like(self.q)
         self.arrivals += 1
 
     def stop(self, deceleration: float, now: float) -> None:
-        """Decelerate along the line, rad/s² of the leading joint; forget what was next."""
+        """Decelerate along the line, rad/s² of the leading joint, and drop the next goal."""
         self.advance(now)
         self._next = None
         if self._segment is None:
@@ -177,52 +176,52 @@ class Trajectory:
             self._end(now if self._stands is None else self._stands)
             return
         if not self._stopping:
-            rest = max(self._segment.length - way, 1e-9)
-            deceleration = max(deceleration, 0.5 * speed**2 / rest)
+            distance = max(self._segment.length - way, 1e-9)
+            deceleration = max(deceleration, 0.5 * speed**2 / distance)
         elif deceleration <= -self._segment.pieces[0][2]:
-            return  # a stop is never made slower
+            return  # a stop is never slowed down
         pieces = ((speed / deceleration, speed, -deceleration),)
         self._segment = LinearMotion(self._segment.point(way), self._segment.direction, pieces)
         self._time, self._stopping = 0.0, True
 
     def advance(self, now: float) -> None:
-        """Go on to a world time."""
+        """Advance to a world time."""
         while self._segment is not None and now > self._now:
             rate = 1.0 if self._stopping else self.rate
-            step, left = (now - self._now) * rate, self._segment.duration - self._time
+            step, remaining = (now - self._now) * rate, self._segment.duration - self._time
             if rate > 0.0:
                 self._stands = None
             elif self._stands is None:
                 self._stands = self._now
-            if step < left:
+            if step < remaining:
                 self._time += step
                 way, speed = self._segment.at(self._time)
                 self.q, self.qd = self._segment.point(way), self._segment.direction * speed * rate
                 break
             self.q = self._segment.point(self._segment.length)
-            self._now += left / rate
+            self._now += remaining / rate
             self._end(self._now)
         self._now = max(self._now, now)
 
     def publish(self, board: Blackboard, payload: float, com: Floats) -> None:
-        """Write what the arm does, and the payload (kg, m) that its controller was told."""
+        """Write the state of the arm, and the payload (kg, m) as set."""
         state = {"q": self.q, "qd": self.qd, "side": self.side, "arrivals": self.arrivals}
-        carried = {"payload": payload, "payload_com": com}
-        board.write("arm", alive=1.0, moving=float(self.moving), **state, **carried)
+        load = {"payload": payload, "payload_com": com}
+        board.write("arm", alive=1.0, moving=float(self.moving), **state, **load)
 
     def _begin(self, goal: Floats, speed: float, acceleration: float) -> None:
         self._segment = line(self.q, goal, speed, acceleration)
         self._time, self._stopping, self._stands = 0.0, False, None
         self._goal = goal, speed, acceleration
         if self._segment is not None:
-            moved = np.abs(goal - self.q) > _NOTHING
-            self.side = np.where(moved, np.sign(goal - self.q), self.side)
+            moves = np.abs(goal - self.q) > _NOTHING
+            self.side = np.where(moves, np.sign(goal - self.q), self.side)
 
-    def _end(self, when: float) -> None:
+    def _end(self, time: float) -> None:
         self._segment, self._stopping = None, False
         self.qd = np.zeros_like(self.q)
         self.arrivals += 1
-        self.rest_time = when
+        self.rest_time = time
         following, self._next = self._next, None
         if following is not None:
             self._begin(*following)
@@ -249,7 +248,7 @@ class Runtime(IntEnum):
 
 
 class SafetyMode(IntEnum):
-    """RTDE `safety_mode` and `safety_status`, and the dashboard's words for them."""
+    """RTDE `safety_mode` and `safety_status`, with the names of the dashboard."""
 
     NORMAL = 1
     PROTECTIVE_STOP = 3
@@ -265,7 +264,7 @@ _BITS = {
 
 
 class WorldClock:
-    """World time since this controller was switched on, and back to real time."""
+    """World time since power-on of this controller, and its conversion to real time."""
 
     def __init__(self, board: Blackboard) -> None:
         self._start_ns, self._scale = time.monotonic_ns(), board.scale
@@ -280,7 +279,7 @@ class WorldClock:
         return self._start_ns + round(self.real(now) * 1e9)
 
     def real(self, seconds: float) -> float:
-        """Return how many real seconds so many world seconds take."""
+        """Return the real seconds of a number of world seconds."""
         return seconds / self._scale
 
 
@@ -293,7 +292,7 @@ class Registers:
     out_int: list[int] = field(default_factory=lambda: [0] * REGISTERS)
     out_double: list[float] = field(default_factory=lambda: [0.0] * REGISTERS)
     written_ns: list[int] = field(default_factory=lambda: [0] * REGISTERS)
-    """When each of `in_int` last came, `time.monotonic_ns`."""
+    """Time of the last write to each of `in_int`, `time.monotonic_ns`."""
 
 
 @dataclass(slots=True, eq=False)
@@ -305,25 +304,25 @@ class ArmState:
     trajectory: Trajectory
     version: tuple[int, int, int, int]
     registers: Registers = field(default_factory=Registers)
-    payload: float = 0.0  # what the controller has been told, kg
+    payload: float = 0.0  # as set, kg
     payload_com: Floats = field(default_factory=lambda: np.zeros(3))  # (3,) flange axes, m
     tcp: Floats = field(default_factory=lambda: np.zeros(6))  # (6,) on the flange, m and rad
     robot_mode: RobotMode = RobotMode.RUNNING
     runtime: Runtime = Runtime.STOPPED
     safety_mode: SafetyMode = SafetyMode.NORMAL
-    remote: bool = True  # whether it takes orders from the network
-    scaling: float = 1.0  # further factor on the speed, as the controller applies it by itself
+    remote: bool = True  # whether it accepts orders from the network
+    scaling: float = 1.0  # factor on the speed that the controller applies by itself
     slider: float = 1.0
     digital_outputs: int = 0  # RTDE `actual_digital_output_bits`
-    rtde_mute: bool = False  # whether RTDE answers nothing
-    rtde_stall: bool = False  # whether it sends no data
-    dashboard_mute: bool = False  # whether dashboard server or Robot API answer nothing
-    refuses_motion: bool = False  # whether a motion that is commanded ends the program instead
-    frozen_q: Floats | None = None  # (n,) told in spite of any motion, rad; None is the truth
-    fault_ns: int = 0  # `time.monotonic_ns` of the last fault that was switched on
-    input_ns: int = 0  # the same of the last input package
+    rtde_mute: bool = False  # whether RTDE gives no answers
+    rtde_stall: bool = False  # whether RTDE sends no data
+    dashboard_mute: bool = False  # whether dashboard server or Robot API gives no answers
+    refuses_motion: bool = False  # whether a commanded motion ends the program
+    frozen_q: Floats | None = None  # (n,) reported in place of the true angles, rad
+    fault_ns: int = 0  # time of the last fault switched on, `time.monotonic_ns`
+    input_ns: int = 0  # time of the last input package, `time.monotonic_ns`
     log: deque[tuple[int, str]] = field(default_factory=lambda: deque(maxlen=2000))
-    """(monotonic_ns, what happened)."""
+    """(`time.monotonic_ns`, event)."""
 
     @property
     def safety_bits(self) -> int:
@@ -332,15 +331,15 @@ class ArmState:
 
     @property
     def program_state(self) -> str:
-        """State of the program in the words of dashboard and Robot API."""
-        known = {Runtime.PLAYING: "PLAYING", Runtime.PAUSED: "PAUSED", Runtime.PAUSING: "PAUSED"}
-        return known.get(self.runtime, "STOPPED")
+        """State of the program as named by dashboard and Robot API."""
+        names = {Runtime.PLAYING: "PLAYING", Runtime.PAUSED: "PAUSED", Runtime.PAUSING: "PAUSED"}
+        return names.get(self.runtime, "STOPPED")
 
     @property
     def able(self) -> bool:
         """Whether power and safety allow a program to run."""
         return self.robot_mode is RobotMode.RUNNING and self.safety_mode is SafetyMode.NORMAL
 
-    def note(self, what: str) -> None:
-        """Remember what happened."""
-        self.log.append((time.monotonic_ns(), what))
+    def note(self, event: str) -> None:
+        """Log an event."""
+        self.log.append((time.monotonic_ns(), event))

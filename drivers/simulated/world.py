@@ -1,4 +1,4 @@
-"""The physical world: where the arm truly comes to rest, and what the tracker reads."""
+"""The physical world: the true equilibrium of the arm, and the readings of the tracker."""
 
 from dataclasses import dataclass, field
 
@@ -18,14 +18,14 @@ class SimulatedNoise:
 
         sigma_range = a + b d,   sigma_transverse = c + e d
 
-    The defaults are half of a maximum permissible error of ±15 µm + 6 µm/m across the line
-    of sight, a range that is steadier than the angles, and half of ±0.01° for the target's
-    orientation: the usual class of laser trackers with a six-degrees-of-freedom probe.
+    The defaults are half of a maximum permissible error of ±15 µm + 6 µm/m across the line of
+    sight, a less noisy range, and half of ±0.01° for the target's orientation: the usual class of
+    laser trackers with a six-degrees-of-freedom probe.
     """
 
     range_std: tuple[float, float] = (5e-6, 0.5e-6)  # (a, b) in m and m/m
     transverse_std: tuple[float, float] = (7.5e-6, 3e-6)
-    """(c, e) in m and m/m, each of the two directions across the sight."""
+    """(c, e) in m and m/m, for each of the two directions across the sight."""
     orientation_std: float = 8.7e-5  # rad, about each axis of the tracker
 
     def covariance(self, position: Floats, m: int) -> Floats:
@@ -44,11 +44,11 @@ class SimulatedNoise:
         return out
 
     def observe(self, position: Floats, rng: np.random.Generator) -> Floats:
-        """Return (N, 3) positions as read: noise on azimuth, elevation and range.
+        """Return (N, 3) positions with noise on azimuth, elevation and range.
 
-        The three are drawn in spherical coordinates, so a reading leaves the sphere's
-        tangent plane as a real one does. Both angles are great-circle angles about the line
-        of sight; near the zenith, where azimuth alone means nothing, the law still holds.
+        The noise is drawn in spherical coordinates, so a reading leaves the sphere's tangent plane
+        as a real one does. Both angles are great-circle angles about the line of sight, so the law
+        also holds near the zenith, where azimuth alone is undefined.
         """
         along, across, sight = self._spread(position)
         distance = np.linalg.norm(position, axis=1)
@@ -57,8 +57,8 @@ class SimulatedNoise:
         # turn about `up` moves the sight to the left (azimuth), about -left moves it upwards
         azimuth = up * (draw[0] * across / distance)[:, None]
         elevation = -left * (draw[1] * across / distance)[:, None]
-        seen = mech.turned(azimuth + elevation) @ sight[:, :, None]
-        return np.asarray(seen[:, :, 0] * (distance + draw[2] * along)[:, None])
+        direction = mech.turned(azimuth + elevation) @ sight[:, :, None]
+        return np.asarray(direction[:, :, 0] * (distance + draw[2] * along)[:, None])
 
     def _spread(self, position: Floats) -> tuple[Floats, Floats, Floats]:
         """Return sigma_range (N,), sigma_transverse (N,) and the line of sight (N, 3)."""
@@ -79,7 +79,7 @@ def _across(sight: Floats) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class IdealReading:
-    """What the tracker would read of N states without any noise."""
+    """Readings of N states without any noise."""
 
     position: Floats  # (N, 3) of the target, sensor axes, m
     rotation: Floats  # (N, 3, 3) of the target, sensor axes
@@ -94,20 +94,20 @@ class IdealReading:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class World:
-    """One simulated cell with everything about it that the program is not told."""
+    """A simulated cell, with all that is hidden from the program."""
 
-    cell: Cell  # the cell as configured: what the program believes
+    cell: Cell  # the cell as configured, which the program knows
     physics: laws.Truth  # the hidden parameters
     registration: Floats  # (4, 4) the true T_sensor_base, before `physics.base_frame`
-    station: Floats  # (4, 4) T_station_sensor: where the instrument stands
+    station: Floats  # (4, 4) T_station_sensor: pose of the sensor axes in the instrument's
     noise: SimulatedNoise  # the tracker's noise
     joint_std: Floats  # (n,) the arm's repeatability at each joint, rad
     joint_reference: float = 22.0  # temperature at which joints do not drift, °C
     offsets: Floats | None = None
-    """(T, 3) where each of several targets truly is beyond its configured place, flange axes, m;
-    None for none. `physics.target_offset` moves all of them."""
+    """(T, 3) displacement of each of several targets from its configured place, flange axes, m.
+    `physics.target_offset` moves all of them."""
     own: OwnLaw | None = None
-    """An effect of a user's own, on top of what the mechanics do; None for none."""
+    """A user's effect, in addition to the mechanics."""
     _tree: mech.ElasticTree = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -117,17 +117,17 @@ class World:
     @property
     def truth(self) -> dict[str, float]:
         """The hidden parameters that are not zero, as "effect.part": value in SI."""
-        own = {} if self.own is None else self.own.truth
-        return {**self.physics.named(self.cell.arm), **own}
+        law = {} if self.own is None else self.own.truth
+        return {**self.physics.named(self.cell.arm), **law}
 
     @property
     def drives(self) -> Ints:
-        """(n,) numbers of the drives among the elastic degrees of freedom of `rest`."""
+        """(n,) indices of the drives among the elastic degrees of freedom of `rest`."""
         return self._tree.drive
 
     @property
     def ages(self) -> bool:
-        """Whether the target moves while arm and load rest: with time or temperature."""
+        """Whether the target moves with time or temperature while arm and load rest."""
         causes = ("tracker_drift", "creep", "thermal_growth", "thermal_joint_drift")
         return self.own is not None or any(np.any(getattr(self.physics, c)) for c in causes)
 
@@ -138,15 +138,15 @@ class World:
                + sum_k a_jk cos k q_j + b_jk sin k q_j
         """
         arm, hidden = self.cell.arm, self.physics
-        off = laws.drive_errors(hidden, arm, states, self.joint_reference)
-        error = np.asarray(arm.driven(off) + states.q @ hidden.joint_coupling.T)
+        drive = laws.drive_errors(hidden, arm, states, self.joint_reference)
+        error = np.asarray(arm.driven(drive) + states.q @ hidden.joint_coupling.T)
         guided = laws.guide_motion(hidden, arm, states)
         if guided is not None:
             error[:, arm.slides] += guided[:, :, 2]
         return error
 
     def rest(self, states: States, slip: Floats | None = None) -> mech.Equilibrium:
-        """Return the equilibrium of N states; drives missed their command by `slip` (N, n), rad."""
+        """Return the equilibrium of N states; `slip` (N, n): error of the drives at rest, rad."""
         arm, hidden = self.cell.arm, self.physics
         q = arm.chain_angles(states.q) + self.joint_errors(states)
         guided = laws.guide_motion(hidden, arm, states)
@@ -169,12 +169,12 @@ class World:
     def sight(
         self, states: States, slip: Floats | None = None, rest: mech.Equilibrium | None = None
     ) -> IdealReading:
-        """Return what the tracker would read of N states without noise of its own.
+        """Return the readings of N states without the tracker's noise.
 
         T_sensor_target = exp(t [drift]) T_sensor_base exp([base_frame]) T_base_flange
-        T_flange_target, the target shifted by its offset; the position then 1 + s times as long,
-        about the origin of the sensor's axes. An effect of a user's own displaces the target before
-        drift and scale. `slip` is as for `rest`, which is the equilibrium where that is known.
+        T_flange_target, with the target shifted by its offset; the position is then multiplied by
+        1 + s about the origin of the sensor axes. A user's effect displaces the target before drift
+        and scale. `slip` as for `rest`; `rest`: the equilibrium, if already computed.
         """
         hidden, rest = self.physics, rest or self.rest(states, slip)
         target = np.array(self.cell.target_of(states.target))
@@ -182,23 +182,23 @@ class World:
         if self.offsets is not None:
             target[..., :3, 3] += self.offsets[0 if states.target is None else states.target]
         frame = self.registration @ mech.displacement(hidden.base_frame)
-        view = frame[:3, :3]
+        R = frame[:3, :3]
         pose = frame @ rest.flange @ target
         position, rotation = pose[:, :3, 3], pose[:, :3, :3]
         by_drive = (
             rest.jacobian if self.cell.arm.drive is None else (rest.jacobian @ self.cell.arm.drive)
         )
         jac = mech.moved_by(by_drive, (rest.flange[:, :3, :3] @ target[..., :3, 3:])[:, :, 0])
-        jac = np.concatenate([view @ jac[:, :3], view @ jac[:, 3:]], axis=1)
+        jac = np.concatenate([R @ jac[:, :3], R @ jac[:, 3:]], axis=1)
         if self.own is not None:
             shift, turn = self.own.moved(self.cell, frame, hidden.joint_compliance, states)
             position, rotation = position + shift, turn @ rotation
         if np.any(hidden.tracker_drift):
-            what = "carry no time stamps; valid: seconds since the campaign's start"
-            time = laws.needed("tracker_drift", "time", states.time, what)
-            moved = np.array([mech.displacement(hidden.tracker_drift * t) for t in time])
-            position = (moved[:, :3, :3] @ position[:, :, None])[:, :, 0] + moved[:, :3, 3]
-            rotation = moved[:, :3, :3] @ rotation
+            lack = "carry no time stamps; valid: seconds since the campaign's start"
+            time = laws.needed("tracker_drift", "time", states.time, lack)
+            drift = np.array([mech.displacement(hidden.tracker_drift * t) for t in time])
+            position = (drift[:, :3, :3] @ position[:, :, None])[:, :, 0] + drift[:, :3, 3]
+            rotation = drift[:, :3, :3] @ rotation
         if np.any(hidden.tracker_scale):
             position = position * (1.0 + hidden.tracker_scale)
             jac[:, :3] *= 1.0 + hidden.tracker_scale
@@ -217,33 +217,32 @@ class World:
     ) -> Floats:
         """Return the (N, m) readings of N states, with all noise.
 
-        The arm's repeatability is drawn in joint space and goes through the equilibrium, so
-        that it is correlated over all elements; then the tracker adds its own. Readings of one
-        `arrival` (N,) share the arm's scatter; each is one of its own where None. m is 3 or 6.
+        The arm's repeatability is drawn in joint space and passed through the equilibrium, so that
+        it is correlated over all elements; then the tracker's noise is added. Readings of the same
+        `arrival` (N,) share the arm's scatter; None: each has its own. m is 3 or 6.
         """
-        each = np.arange(len(states)) if arrival is None else arrival
-        slip = self.joint_std * rng.standard_normal((int(each.max()) + 1, states.q.shape[1]))[each]
+        k = np.arange(len(states)) if arrival is None else arrival
+        slip = self.joint_std * rng.standard_normal((int(k.max()) + 1, states.q.shape[1]))[k]
         sight = self.sight(states, slip)
-        seen = self.noise.observe(self._from_station(sight.position), rng)
-        back = mech.inverse(self.station)
-        position = seen @ back[:3, :3].T + back[:3, 3]
+        observed = self.noise.observe(self._from_station(sight.position), rng)
+        T = mech.inverse(self.station)  # T_sensor_station
+        position = observed @ T[:3, :3].T + T[:3, 3]
         if m == 3:
             return position
         turn = mech.turned(self.noise.orientation_std * rng.standard_normal((len(states), 3)))
         return np.hstack([position, mech.rotation_vector(turn @ sight.rotation)])
 
     def _from_station(self, position: Floats) -> Floats:
-        """Return sensor coordinates (N, 3) as the instrument sees them."""
+        """Return positions (N, 3) in sensor axes as positions in station axes."""
         return np.asarray(position @ self.station[:3, :3].T + self.station[:3, 3])
 
 
 def stand(cell: Cell, rng: np.random.Generator, distance: float = 3.0) -> tuple[Floats, Floats]:
     """Place the tracker: return the true T_sensor_base and T_station_sensor, (4, 4) each.
 
-    An unknown registration is drawn: the station `distance`, m, away from the base at a height
-    near the arm's, turned about the vertical at random. A known one is the truth; where its
-    origin lies within the arm's reach (readings in base axes) the instrument itself stands
-    `distance` away from it.
+    An unknown registration is drawn: the station is `distance`, m, away from the base, at a height
+    near the arm's, turned about the vertical at random. A known registration is true; if its origin
+    lies within the arm's reach (readings in base axes), the instrument stands `distance` away.
     """
     if cell.arm.slides.any():  # beside the rail, wherever on it the arm stands
         distance = max(distance, cell.arm.reach + 1.0)

@@ -1,17 +1,17 @@
-"""The process of the physical world: reads what the arm does, writes what is true.
+"""The process of the physical world: reads the arm's state, writes the truth.
 
 `python -m hilcal.drivers.simulated.world_server --directory DIR --seed N`, with DIR/world.json of
 `write_world`. Requests at DIR/world.sock:
 
-    hang {name}       hang a load, null: take it off; returns the name of what truly hangs
-    mistake {name}    the next hang hangs this one instead
-    push {wrench}     lean on the load point, six numbers, base axes, N and N·m; zeros: let go
-    swing {wrench, period, decay}  let what is hung from now on swing for a while (world time)
-    state             what is true now
-    log               what was hung and pushed, and when (world time)
+    hang {name}       hang a load, null: take it off; returns the name of the load that hangs
+    mistake {name}    the next hang hangs this load instead
+    push {wrench}     push at the load point, six numbers, base axes, N and N·m; zeros: let go
+    swing {wrench, period, decay}  from now on, loads swing after hanging (world time)
+    state             the present truth
+    log               loads and pushes with their times (world time)
     die               end at once, as in a crash
 
-The world comes as a JSON file, exactly.
+The JSON file holds the world without rounding.
 """
 
 import argparse
@@ -41,39 +41,39 @@ from hilcal.toml import suggest
 from hilcal.types import Floats
 from hilcal.whole_file import replace_file
 
-ENCODER_STD = 2e-6  # noise of a motor-side encoder at the joint, rad
+ENCODER_STD = 2e-6  # noise of a motor-side encoder, at the joint, rad
 
 _REFRESH_NS = 10_000_000  # real time between two publications of an unchanged arm
-_STRONGEST = 2000.0  # N and N·m that may push or swing
+_STRONGEST = 2000.0  # largest push or swing, N and N·m
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Swing:
-    """A load that swings after it was hung, ever less."""
+    """The decaying swing of a load after hanging."""
 
-    wrench: Floats  # (6,) in the beginning, base axes, N and N·m
+    wrench: Floats  # (6,) at the start, base axes, N and N·m
     period: float  # s
     decay: float  # time constant, s
 
     def at(self, time: float) -> Floats:
-        """Return the (6,) wrench so long after the load was hung, s."""
+        """Return the (6,) wrench at `time` s after hanging."""
         phase = 2.0 * np.pi * time / self.period
         return np.asarray(self.wrench * np.exp(-time / self.decay) * np.cos(phase))
 
     def lasts(self, time: float) -> bool:
-        """Whether it is more than a millionth of what it was, so long after the start, s."""
+        """Whether the swing is over a millionth of its start at `time` s after hanging."""
         return time < 14.0 * self.decay
 
 
 class WorldState:
-    """Looks at the arm, computes where it rests, and publishes what is true; from any thread.
+    """Reads the arm's state, computes the equilibrium, and publishes the truth; thread-safe.
 
-    The arm's repeatability: with every arrival the joints miss their command anew by
-    `joint_std`. Encoders sit at the motors: they see neither that nor the elastic deflection.
+    Repeatability: at every arrival the joints have a new error of `joint_std`. Encoders are at the
+    motors: they measure neither this error nor the elastic deflection.
     """
 
     def __init__(self, world: World, config: CellConfig, board: Blackboard, seed: int) -> None:
-        """Take over the board's truth, which a world before this one may have left."""
+        """Continue from the board's truth, which a previous world may have written."""
         if world.cell.arm.n != board.joints:
             raise InputError(
                 f"simulated cell: the arm {world.cell.arm.name} has {world.cell.arm.n} joints, "
@@ -86,87 +86,87 @@ class WorldState:
             )
         self._world, self._board, self._seed = world, board, seed
         self._loads = config.loads
-        sensor = config.force_sensor  # at the flange where there is none
-        self._sensor_at = np.array(sensor.origin_m) if sensor else np.zeros(3)
+        sensor = config.force_sensor  # None: at the flange
+        self._sensor_origin = np.array(sensor.origin_m) if sensor else np.zeros(3)
         self._sensor_turn = turned(np.array([sensor.rotvec_rad]))[0] if sensor else np.eye(3)
         self._ages = world.ages
         self._rng = np.random.default_rng([seed, 0])
         self._lock = threading.RLock()
-        left = board.read("truth")
-        self._load, self._since = int(left["load"]), float(left["load_since"])
+        truth = board.read("truth")
+        self._load, self._since = int(truth["load"]), float(truth["load_since"])
         self._push = np.zeros(6)
         self._swing: Swing | None = None
         self._mistakes: list[int] = []
         self._log: list[dict[str, Any]] = []
-        self._known: tuple[bytes, bytes, bool, int, bool] | None = None
+        self._published: tuple[bytes, bytes, bool, int, bool] | None = None
         self._computed_ns = self._written_ns = 0
-        self._seen = -1  # number of the arm's last write that was looked at and needs no more
+        self._handled = -1  # number of the arm's last write that needs no further update
         self._arm = board.read("arm")
 
     def step(self, now_ns: int) -> None:
         """Publish what has changed; `now_ns` is the real time, `time.monotonic_ns`."""
         with self._lock:
             number = self._board.written("arm")
-            if number == self._seen and now_ns - self._written_ns < _REFRESH_NS:
+            if number == self._handled and now_ns - self._written_ns < _REFRESH_NS:
                 return
-            arm = self._look()
-            seen = (arm["q"].tobytes(), arm["side"].tobytes(), self._swings())
-            known = (*seen, int(arm["arrivals"]), bool(arm["moving"]))
-            before = self._known
+            arm = self._read_arm()
+            pose = (arm["q"].tobytes(), arm["side"].tobytes(), self._swings())
+            state = (*pose, int(arm["arrivals"]), bool(arm["moving"]))
+            published = self._published
             due = now_ns - self._computed_ns >= _REFRESH_NS
-            arrived = before is None or before[3:] != known[3:]
-            if arrived or (due and (self._ages or known[2] or before != known)):
+            arrived = published is None or published[3:] != state[3:]
+            if arrived or (due and (self._ages or state[2] or published != state)):
                 try:
                     self._publish(arm)
-                except InputError as error:  # the truth stays what it was
+                except InputError as error:  # the truth stays unchanged
                     if not self._log or self._log[-1]["event"] != str(error):
                         self._note(str(error))
-                self._known, self._computed_ns = known, now_ns
+                self._published, self._computed_ns = state, now_ns
                 self._written_ns = now_ns
             elif now_ns - self._written_ns >= _REFRESH_NS:
-                self._board.write("truth", **self._passing(arm))
+                self._board.write("truth", **self._variable_fields(arm))
                 self._written_ns = now_ns
-            self._seen = number if known == self._known else -1
+            self._handled = number if state == self._published else -1
 
     def hang(self, name: str | None) -> str | None:
-        """Hang a load, or take it off (None); return what truly hangs: there are mistakes."""
+        """Hang a load, or take it off (None); return the load that hangs, by mistake another."""
         with self._lock:
-            wanted = self._number(name)
-            load = self._mistakes.pop(0) if self._mistakes else wanted
-            with self._tried():
+            requested = self._number(name)
+            load = self._mistakes.pop(0) if self._mistakes else requested
+            with self._transaction():
                 self._load, self._since = load, self._board.time
-            self._known = None  # a load that swings may be at rest by the next look
-            self._note(f"asked for {self._name(wanted)}, hung {self._name(load)}")
+            self._published = None  # a swinging load may rest by the next step
+            self._note(f"asked for {self._name(requested)}, hung {self._name(load)}")
             return None if load == 0 else self._name(load)
 
     @contextlib.contextmanager
-    def _tried(self) -> Iterator[None]:
-        """Publish what is changed inside; what the arm does not bear changes nothing."""
-        before = self._load, self._since, self._push
+    def _transaction(self) -> Iterator[None]:
+        """Publish the changes of the block; undo them if the arm has no equilibrium."""
+        saved = self._load, self._since, self._push
         try:
             yield
-            self._publish(self._look())
+            self._publish(self._read_arm())
         except InputError:
-            self._load, self._since, self._push = before
+            self._load, self._since, self._push = saved
             raise
 
     def mistake(self, name: str | None) -> None:
-        """Let the next `hang` hang this load instead, whatever it is asked for."""
+        """Let the next `hang` hang this load, whatever the request."""
         with self._lock:
             self._mistakes.append(self._number(name))
 
     def push(self, wrench: Sequence[float]) -> None:
-        """Apply a further wrench at the load point, base axes, N and N·m, until it is changed."""
-        pushed = _six("push", wrench)
+        """Apply an additional wrench at the load point, base axes, N and N·m, until changed."""
+        push = _six("push", wrench)
         with self._lock:
-            with self._tried():
-                self._push = pushed
-            self._note(f"push {pushed.tolist()}")
+            with self._transaction():
+                self._push = push
+            self._note(f"push {push.tolist()}")
 
     def swing(self, wrench: Sequence[float], period: float, decay: float) -> None:
-        """Let every load that is hung from now on swing for a while; zeros: hang still.
+        """Let every load swing after hanging from now on; zeros: no swing.
 
-        w(t) = w exp(-t / decay) cos(2 pi t / period) adds to the load, t after its change, s.
+        Adds w(t) = w exp(-t / decay) cos(2 pi t / period) to the load, t s after its change.
         """
         start = _six("swing", wrench)
         if not (period > 0.0 and decay > 0.0):
@@ -175,12 +175,12 @@ class WorldState:
             self._swing = Swing(start, period, decay) if start.any() else None
 
     def state(self) -> dict[str, Any]:
-        """Return what is true now, as JSON can hold it."""
+        """Return the present truth, for JSON."""
         with self._lock:
             truth = self._board.read("truth")
-            seen = np.isfinite(truth["targets"]).all(axis=1)
+            valid = np.isfinite(truth["targets"]).all(axis=1)
             out = {name: truth[name].tolist() for name in truth.dtype.names}
-            out["targets"] = truth["targets"][seen].tolist()
+            out["targets"] = truth["targets"][valid].tolist()
             arrivals = int(truth["arrivals"])
             return {
                 **out,
@@ -190,17 +190,17 @@ class WorldState:
             }
 
     def log(self) -> list[dict[str, Any]]:
-        """Return what happened to the load, and when."""
+        """Return the events of load and pushes, with their times."""
         with self._lock:
             return list(self._log)
 
     def slip(self, arrivals: int) -> Floats:
-        """Return (n,) how far the joints missed their command at this arrival, rad."""
+        """Return the (n,) errors of the joints at this arrival, rad."""
         rng = np.random.default_rng([self._seed, 1, arrivals])
         return np.asarray(self._world.joint_std * rng.standard_normal(self._board.joints))
 
     def _publish(self, arm: Any) -> None:
-        """Compute where the arm rests now, and write all of the truth."""
+        """Compute the present equilibrium, and write the whole truth."""
         world, now = self._world, self._board.time
         wrench = self._push.copy()
         if self._swing is not None and self._swings():
@@ -222,8 +222,8 @@ class WorldState:
             sight = world.sight(states, slip, rest)
         else:
             count = len(world.cell.targets)
-            each = replace(states[np.zeros(count, dtype=np.int64)], target=np.arange(count))
-            sight = world.sight(each, np.repeat(slip, count, axis=0))
+            repeated = replace(states[np.zeros(count, dtype=np.int64)], target=np.arange(count))
+            sight = world.sight(repeated, np.repeat(slip, count, axis=0))
             targets[:count] = sight.position
         flange = rest.flange[0]
         self._board.write(
@@ -234,42 +234,42 @@ class WorldState:
             target_rotation=sight.rotation[0],
             targets=targets,
             flange=flange,
-            sensor_wrench=self._felt(flange[:3, :3], wrench),
+            sensor_wrench=self._sensor_wrench(flange[:3, :3], wrench),
             drive_torque=world.cell.arm.drive_torques(rest.torque[0, world.drives]),
             arrivals=int(arm["arrivals"]),
-            **self._passing(arm, now),
+            **self._variable_fields(arm, now),
         )
 
-    def _felt(self, turn: Floats, wrench: Floats) -> Floats:
-        """Return the (6,) wrench of tool and load on the sensor, its axes, N and N·m.
+    def _sensor_wrench(self, turn: Floats, wrench: Floats) -> Floats:
+        """Return the (6,) wrench of tool and load on the sensor, in its axes, N and N·m.
 
         f = Rᵀ (m g + f_load),  tau = Rᵀ ((c - o) × m g + (p - o) × f_load + tau_load)
         """
-        cell, at = self._world.cell, self._sensor_at
+        cell, origin = self._world.cell, self._sensor_origin
         weight = cell.tool_mass * cell.gravity
         point = cell.load_point + self._world.physics.load_point
         moment = (
-            np.cross(turn @ (cell.tool_com - at), weight)
-            + np.cross(turn @ (point - at), wrench[:3])
+            np.cross(turn @ (cell.tool_com - origin), weight)
+            + np.cross(turn @ (point - origin), wrench[:3])
             + wrench[3:]
         )
-        back = (turn @ self._sensor_turn).T
-        return np.concatenate([back @ (weight + wrench[:3]), back @ moment])
+        to_sensor = (turn @ self._sensor_turn).T
+        return np.concatenate([to_sensor @ (weight + wrench[:3]), to_sensor @ moment])
 
-    def _look(self) -> Any:
-        """Return the arm's section, or what it was before its writer died while writing."""
+    def _read_arm(self) -> Any:
+        """Return the arm's section; the previous one if its writer died while writing."""
         with contextlib.suppress(RuntimeError):
             self._arm = self._board.read("arm")
         return self._arm
 
     def _swings(self) -> bool:
-        """Whether the load has not come to rest yet."""
+        """Whether the load still swings."""
         swing = self._swing
         if swing is None or self._load == 0:
             return False
         return swing.lasts(self._board.time - self._since)
 
-    def _passing(self, arm: Any, now: float | None = None) -> dict[str, Any]:
+    def _variable_fields(self, arm: Any, now: float | None = None) -> dict[str, Any]:
         """Return the fields that change while the arm rests."""
         time = self._board.time if now is None else now
         return {
@@ -297,22 +297,22 @@ class WorldState:
         self._log.append({"time": self._board.time, "event": event})
 
 
-def _six(what: str, wrench: Sequence[float]) -> Floats:
-    """Return a wrench that a person could exert."""
-    given = np.asarray(wrench, dtype=float)
-    if given.shape != (6,) or not np.all(np.abs(given) <= _STRONGEST):
+def _six(request: str, wrench: Sequence[float]) -> Floats:
+    """Return the wrench of a request; raises InputError if invalid or too large."""
+    values = np.asarray(wrench, dtype=float)
+    if values.shape != (6,) or not np.all(np.abs(values) <= _STRONGEST):
         raise InputError(
-            f"{what} {list(wrench)}; valid: six numbers, N and N·m, at most {_STRONGEST:g}"
+            f"{request} {list(wrench)}; valid: six numbers, N and N·m, at most {_STRONGEST:g}"
         )
-    return given
+    return values
 
 
 def write_world(path: Path, world: World, config: CellConfig, base_dir: Path | None = None) -> None:
-    """Write the world and the configuration of its cell, whole or not at all, with every bit."""
-    other = _differences(world.cell, cell_from_config(config, base_dir))
-    if other:
+    """Write the world and the configuration of its cell, atomically and without rounding."""
+    differing = _differences(world.cell, cell_from_config(config, base_dir))
+    if differing:
         raise InputError(
-            f"simulated world: its cell and the configuration differ in {', '.join(other)}; "
+            f"simulated world: its cell and the configuration differ in {', '.join(differing)}; "
             "valid: the configuration that the world was made from"
         )
     content = {
@@ -356,7 +356,7 @@ _ARM = ("links", "masses", "coms", "q_min", "q_max", "torque_max", "coupling", "
 
 
 def _listed(array: Floats | None) -> dict[str, Any] | None:
-    """Return an array as JSON; the shape apart, since one of its numbers may be 0."""
+    """Return an array as JSON, with its shape, where a dimension may be 0."""
     if array is None:
         return None
     return {"shape": list(array.shape), "values": [float(x) for x in array.ravel()]}
@@ -367,7 +367,7 @@ def _array(data: dict[str, Any] | None) -> Any:
 
 
 def _differences(a: Cell, b: Cell) -> list[str]:
-    """Return the names of what is not the same in two cells; registrations do not count."""
+    """Return the names of the fields in which two cells differ, except registrations."""
     parts: list[tuple[str, Any, Any, str]] = [(name, a, b, "") for name in _CELL]
     parts += [(name, a.arm, b.arm, "arm.") for name in _ARM]
     return [
@@ -377,33 +377,33 @@ def _differences(a: Cell, b: Cell) -> list[str]:
     ]
 
 
-_POLL = 0.0025  # s, real time between two looks at the arm
+_POLL = 0.0025  # real s between two readings of the arm's state
 
 
-def open_board(directory: Path, scale: float, begun: float = 0.0, joints: int = 6) -> Blackboard:
-    """Return the blackboard of a cell; the first who asks makes it, whole or not at all."""
+def open_board(directory: Path, scale: float, start: float = 0.0, joints: int = 6) -> Blackboard:
+    """Return the blackboard of a cell; create it, atomically, if absent."""
     path = directory / "world.bin"
     if not path.exists():
         new = path.with_name("world.bin.new")
-        board = Blackboard.create(new, scale, begun, joints)
-        new.replace(path)  # the mapping goes with the file
+        board = Blackboard.create(new, scale, start, joints)
+        new.replace(path)  # the mapping stays valid
         return board
     return Blackboard(path)
 
 
 def start(options: argparse.Namespace) -> admin.Device:
-    """Return the world of DIR/world.json, as it goes on."""
+    """Return the world of DIR/world.json, and its step."""
     world, config = read_world(options.directory / "world.json")
     board = open_board(options.directory, config.simulation.clock, joints=world.cell.arm.n)
-    living = WorldState(world, config, board, options.seed)
+    state = WorldState(world, config, board, options.seed)
 
     def step() -> None:
-        living.step(time.monotonic_ns())
+        state.step(time.monotonic_ns())
         time.sleep(_POLL)
 
-    living.step(time.monotonic_ns())
+    state.step(time.monotonic_ns())
     names = ("hang", "mistake", "push", "swing", "state", "log")
-    return admin.Operations({name: getattr(living, name) for name in names}), step
+    return admin.Operations({name: getattr(state, name) for name in names}), step
 
 
 if __name__ == "__main__":

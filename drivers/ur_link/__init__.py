@@ -1,1 +1,1 @@
-"""The link to a Universal Robots controller: child processes, sockets with deadlines, words."""
+"""The link to a Universal Robots controller: child processes, sockets with deadlines, advice."""

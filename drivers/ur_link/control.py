@@ -1,8 +1,8 @@
-"""The command of the arm through the control worker: motions, and bringing it to a stand.
+"""Motions of the arm through the control worker, and the ways to stop the arm.
 
-The third way to stop is a program on the port that takes URScript: one that arrives there replaces
-the one that runs. Source: Universal Robots, "Remote Control via TCP/IP", port 30003; the primary
-port, 30001, takes the same and is the one that PolyScope X opens.
+The third way to stop is a program sent to the port for URScript, where it replaces the running
+program. Source: Universal Robots, "Remote Control via TCP/IP", port 30003; the primary port, 30001,
+takes the same programs, and PolyScope X opens only this one.
 """
 
 import contextlib
@@ -23,16 +23,16 @@ from hilcal.types import Floats
 
 STANDS_RAD_S = 0.01  # joints slower than this stand; measured speeds are noisy, rad/s
 MARGIN_S = 5.0
-"""What a motion may take longer than it should, and how long it may be paused, real s."""
-SLACK = 1.5  # a motion may take so many times its computed time
-SLOWEST = 0.02  # a motion is not waited for at a smaller share of its speed
+"""Allowed delay of a motion, and longest pause, real s."""
+SLACK = 1.5  # allowed duration of a motion, as a multiple of the computed one
+SLOWEST = 0.02  # below this share of its speed a motion counts as paused
 _TARGET_RAD = 1e-5
 _BRAKE_S = 0.15
 _BRAKE_MIN, _BRAKE_MAX = 2.0, 10.0
 
 
 def deceleration(speed: float) -> float:
-    """Return how the leading joint brakes from a speed, rad/s²; about 0.15 s to a stand."""
+    """Return the deceleration of the leading joint, rad/s², to stop within about 0.15 s."""
     return float(np.clip(speed / _BRAKE_S, _BRAKE_MIN, _BRAKE_MAX))
 
 
@@ -42,7 +42,7 @@ def stands(reading: Reading) -> bool:
 
 
 class MotionInProgress:
-    """A commanded motion, how much of its time it has used, and how it `brake`s, rad/s²."""
+    """A commanded motion and the time spent on it; `brake`: its deceleration, rad/s²."""
 
     def __init__(
         self,
@@ -56,13 +56,13 @@ class MotionInProgress:
         """Begin, from `start` to `goal` (6,), rad; `clock` is cell seconds per real second."""
         self.brake = deceleration(speed)
         self._goal, self._arrival = goal, arrival
-        self._usual = duration(start, goal, speed, acceleration) / clock
+        self._expected = duration(start, goal, speed, acceleration) / clock
         self._spent = 0.0
-        self._looked = time.monotonic()
+        self._checked = time.monotonic()
         self._paused: float | None = None
 
     def arrived(self, reading: Reading) -> bool:
-        """Whether target and actual joints are at the goal, and stand."""
+        """Whether the target and the actual joints are at the goal, and the arm stands."""
         sample = reading.sample
         return (
             float(np.abs(sample.q_target - self._goal).max()) <= _TARGET_RAD
@@ -71,36 +71,36 @@ class MotionInProgress:
         )
 
     def overdue(self, reading: Reading) -> str | None:
-        """Return in one line why the motion is given up, or None; call at every look.
+        """Return why the motion has failed, or None; call with every reading.
 
-        Time counts by the share of the speed that the controller allows.
+        Time is weighted by the share of the speed that the controller allows.
         """
         sample, now = reading.sample, time.monotonic()
-        since, self._looked = now - self._looked, now
-        self._spent += since * max(min(sample.speed_scaling, 1.0), SLOWEST)
+        interval, self._checked = now - self._checked, now
+        self._spent += interval * max(min(sample.speed_scaling, 1.0), SLOWEST)
         if sample.speed_scaling >= SLOWEST:
             self._paused = None
         elif self._paused is None:
             self._paused = now
         elif now - self._paused > MARGIN_S:
             return f"its speed has been scaled to 0 for {MARGIN_S:g} s (speed slider, or paused)"
-        if self._spent <= SLACK * self._usual + MARGIN_S:
+        if self._spent <= SLACK * self._expected + MARGIN_S:
             return None
-        off = np.abs(sample.q - self._goal)
-        k = int(np.argmax(off))
+        error = np.abs(sample.q - self._goal)
+        k = int(np.argmax(error))
         return (
-            f"it did not arrive in time: joint {k + 1} stands {off[k]:.3g} rad off its goal "
+            f"it did not arrive in time: joint {k + 1} stands {error[k]:.3g} rad off its goal "
             f"(arrival_rad is {self._arrival:g})"
         )
 
 
-LEASE_S = 0.5  # lease of a motion: not renewed for so long, the motion is stopped, real s
+LEASE_S = 0.5  # a motion whose lease is not renewed for this time is stopped, real s
 COMMAND_S = 0.5  # deadline of a command, real s
 CONNECT_S = 8.0  # deadline for taking control, real s
 _ORPHAN_S = 1.6
 _HZ = 125.0
 _NO_COG = 1e-6
-"""Stands for a centre of mass at the flange: (0, 0, 0) keeps the old one in ur_rtde's script, m."""
+"""z of a centre of mass at the flange, m: ur_rtde's script takes (0, 0, 0) for "unchanged"."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,13 +108,13 @@ class Pulse:
     """State of the control worker."""
 
     expired: bool  # the motion was stopped because its lease was not renewed
-    late: float  # the longest pause between two signs of life that was too long, s; 0 for none
+    late: float  # the longest pause between two signs of life, if too long, s; else 0
 
 
 class Control(Worker):
-    """Commands the arm; every call may raise WorkerError, and ends by its deadline.
+    """Commands the arm; every call has a deadline, and may raise WorkerError.
 
-    Where the process is killed, the robot's watchdog stops the arm.
+    If the process is killed, the robot's watchdog stops the arm.
     """
 
     def __init__(self, host: str, generation: Generation, seconds: float) -> None:
@@ -124,27 +124,27 @@ class Control(Worker):
         super().__init__("hilcal.drivers.ur_link.control_worker", arguments, seconds)
 
     def alive(self, seconds: float = COMMAND_S) -> Pulse:
-        """Watch the motion: renew its lease; the answer comes within a deadline, real s."""
+        """Renew the lease of the motion; `seconds`: deadline of the answer, real s."""
         answer = self.call("alive", seconds)
         return Pulse(bool(answer["expired"]), float(answer["late"]))
 
     def move(self, q: Floats, speed: float, acceleration: float, brake: float) -> bool:
-        """Start a motion, rad; False where the controller does not take it."""
+        """Start a motion, rad; False if the controller does not take it."""
         how = {"speed": speed, "acceleration": acceleration, "deceleration": brake}
         return bool(self.call("move", COMMAND_S, q=q.tolist(), **how)["done"])
 
     def rest(self) -> None:
-        """Say that the motion has ended: no lease any more."""
+        """End the lease: the motion has ended."""
         self.call("rest", COMMAND_S)
 
     def stop(self, brake: float, seconds: float) -> None:
-        """Brake, rad/s² of the leading joint."""
+        """Stop the motion; `brake`: deceleration of the leading joint, rad/s²."""
         self.call("stop", seconds, deceleration=brake)
 
     def set_payload(self, mass: float, com: Floats) -> bool:
-        """Tell the payload, kg and m; whether the controller took it has to be read back."""
-        told = com.tolist() if com.any() else [0.0, 0.0, _NO_COG]
-        return bool(self.call("payload", COMMAND_S, mass=mass, com=told)["done"])
+        """Set the payload, kg and m; the caller has to read it back."""
+        cog = com.tolist() if com.any() else [0.0, 0.0, _NO_COG]
+        return bool(self.call("payload", COMMAND_S, mass=mass, com=cog)["done"])
 
     def give_back(self) -> None:
         """End the robot's program and the process; never raises."""
@@ -183,7 +183,7 @@ def take(host: str, receiver: Receiver, generation: Generation) -> Control:
 
 
 def _start(host: str, generation: Generation, end: float) -> Control:
-    """Start the worker; the registers may be ours for a moment longer, from being asked for."""
+    """Start the worker; try twice: our query of the registers may still hold them."""
     try:
         return Control(host, generation, end - time.monotonic())
     except WorkerError as error:
@@ -212,8 +212,8 @@ def _ready(host: str, receiver: Receiver) -> None:
 
 
 def _no_program(host: str, receiver: Receiver, generation: Generation) -> None:
-    """Refuse a robot that runs somebody's program; end a paused one, which a stop left behind."""
-    with contextlib.suppress(LinkError):  # an orphan of ours ends by its watchdog
+    """Refuse a robot with a running program; end a paused one, which a stop may leave."""
+    with contextlib.suppress(LinkError):  # the watchdog ends a program left by us
         _wait_for(receiver, (states.STOPPED, states.PAUSED), _ORPHAN_S)
     runtime = receiver.read().runtime
     if runtime == states.PAUSED:
@@ -224,9 +224,9 @@ def _no_program(host: str, receiver: Receiver, generation: Generation) -> None:
         raise failure(host, f"a program is on the robot ({word})", "stop it on the pendant")
 
 
-def _wait_for(receiver: Receiver, wanted: tuple[int, ...], seconds: float) -> None:
+def _wait_for(receiver: Receiver, runtimes: tuple[int, ...], seconds: float) -> None:
     end = time.monotonic() + seconds
-    while (runtime := receiver.read().runtime) not in wanted:
+    while (runtime := receiver.read().runtime) not in runtimes:
         if time.monotonic() > end:
             raise LinkError(f"the robot's program is {states.runtime_word(runtime)}")
         time.sleep(0.01)
@@ -238,8 +238,8 @@ _SURE_S = 1.0
 _AGAIN_S = 0.3
 _RENEW_S = 1.5
 _TAKEN_S = 0.05
-"""Time before the connection is closed: a program is lost where its sender has gone before it was
-taken; a choice."""
+"""Time before closing the connection, real s: the controller drops a program whose sender leaves
+before it has taken the program; a choice."""
 UNWATCHED = "nobody watched its motion for 0.5 s, so it was stopped"
 
 
@@ -247,9 +247,9 @@ UNWATCHED = "nobody watched its motion for 0.5 s, so it was stopped"
 class Halt:
     """How a stop ended."""
 
-    reading: Reading | None  # after the stop; None where the arm's state cannot be read
+    reading: Reading | None  # after the stop; None if the state cannot be read
     stands: bool
-    lost: str  # why the state could not be read before it was connected to anew; else empty
+    lost: str  # why the link was lost before it was renewed; else empty
 
 
 @dataclass(frozen=True, slots=True)
@@ -261,7 +261,7 @@ class Brakes:
     generation: Generation
 
     def ease(self, control: Control, brake: float) -> bool:
-        """Stop through the control worker and keep control; whether the arm stands."""
+        """Stop through the control worker and keep control; return whether the arm stands."""
         with contextlib.suppress(WorkerError, LinkError):
             control.stop(brake, 0.3)
             reading = self._until_still(_GENTLE_S, program=False)
@@ -273,7 +273,7 @@ class Brakes:
     def halt(self, control: Control | None, brake: float, lost: str = "") -> Halt:
         """Stop in every way, which ends control; never raises.
 
-        `brake` is the deceleration of the leading joint, rad/s²; `lost` why the link is lost.
+        `brake`: deceleration of the leading joint, rad/s²; `lost`: why the link is lost.
         """
         if control is not None:
             try:
@@ -282,8 +282,8 @@ class Brakes:
             except WorkerError:
                 pass
             finally:
-                control.kill()  # and the robot's watchdog stops it, whatever else fails
-        if not self._by_order():
+                control.kill()  # the robot's watchdog then stops the arm, whatever else fails
+        if not self._by_supervision():
             self._by_script(brake)
         try:
             if not lost:
@@ -304,14 +304,14 @@ class Brakes:
             reading = self._until_still(_SURE_S - _AGAIN_S, program=True)
         return Halt(reading or self.receiver.read(STALE_S), reading is not None, "")
 
-    def _by_order(self) -> bool:
+    def _by_supervision(self) -> bool:
         with contextlib.suppress(LinkError):
             self.generation.supervision.stop(ASK_S)
             return True
         return False
 
     def _by_script(self, brake: float) -> None:
-        """Send a program that brakes the arm along its path, rad/s² of the leading joint."""
+        """Send a program that brakes the arm along its path; `brake`: leading joint, rad/s²."""
         program = f"def stop_arm():\n  stopj({brake:.3f})\nend\n"
         with (
             contextlib.suppress(LinkError),
@@ -321,23 +321,23 @@ class Brakes:
             time.sleep(_TAKEN_S)
 
     def _until_still(self, seconds: float, *, program: bool) -> Reading | None:
-        """The second of two readings at rest in a row; with `program`, of one that ended."""
-        end, still = time.monotonic() + seconds, 0
+        """Return the second of two successive readings at rest; with `program`, of an ended one."""
+        end, count = time.monotonic() + seconds, 0
         while time.monotonic() < end:
             reading = self.receiver.read(STALE_S)
             ended = reading.runtime not in (states.PLAYING, states.RESUMING)
             safe = not program or ended or reading.sample.safety != states.NORMAL
-            still = still + 1 if stands(reading) and safe else 0
-            if still == 2:
+            count = count + 1 if stands(reading) and safe else 0
+            if count == 2:
                 return reading
         return None
 
 
-def cause_of(supervision: Supervision, halt: Halt, noticed: str) -> tuple[str, str]:
-    """Return what happened and what to do about it, after the arm has been stopped.
+def cause_of(supervision: Supervision, halt: Halt, symptom: str) -> tuple[str, str]:
+    """Return cause and advice, after the arm has been stopped.
 
-    A safety stop ends the program, and a lost link the process that commands the arm: what was
-    noticed first is reported only where nothing deeper is found.
+    A safety stop also ends the program, and a lost link the process that commands the arm. So the
+    symptom noticed first is returned only if no deeper cause is found.
     """
     reading = halt.reading
     if reading is not None and reading.sample.safety != states.NORMAL:
@@ -350,7 +350,7 @@ def cause_of(supervision: Supervision, halt: Halt, noticed: str) -> tuple[str, s
             return "it was switched to local mode", f"switch it to remote control, {RESUME}"
     if halt.lost:
         return f"the link is lost: {halt.lost}", CHECK_LINK
-    return noticed, f"look at the pendant, {RESUME}"
+    return symptom, f"look at the pendant, {RESUME}"
 
 
 def program_ended(reading: Reading, late: float) -> str:
@@ -359,15 +359,15 @@ def program_ended(reading: Reading, late: float) -> str:
     if late > 1.0 / WATCHDOG_HZ:
         return f"its watchdog stopped it: {busy}"
     word = states.runtime_word(reading.runtime)
-    told = f" ({busy})" if late > 0.0 else ""
+    hint = f" ({busy})" if late > 0.0 else ""
     return (
         f"its program is {word}: stopped by another program, on the pendant, or by its "
-        f"watchdog{told}"
+        f"watchdog{hint}"
     )
 
 
 def not_commanded(error: WorkerError) -> str:
-    """Return why a command did not get through."""
+    """Return why a command failed."""
     if error.lost:
         return f"the process that commands it ended ({error})"
     return f"it did not take a command ({error})"

@@ -1,10 +1,10 @@
-"""Child process that holds the control interface of ur_rtde, and keeps the watchdog quiet.
+"""Child process that holds the control interface of ur_rtde and serves the robot's watchdog.
 
-During a motion the controller stops its program, and so the arm, when it has heard nothing for
-0.1 s: when this process ends or hangs, or when the link breaks. (At rest it waits for 1 s, so
-that a busy computer does not lose control for nothing.) And this process stops the arm when
-its parent has not asked for `lease` seconds during a motion. Only asynchronous motions are used: a
-synchronous one returns from a broken link after 301 s.
+During a motion the controller stops its program, and so the arm, after 0.1 s without a sign of
+life: when this process ends or hangs, or when the link breaks. At rest it waits for 1 s, so that a
+busy computer does not lose control needlessly. This process stops the arm when its parent has not
+renewed the `lease` of a motion in time. Only asynchronous motions are used: a synchronous one
+returns from a broken link after 301 s.
 """
 
 import os
@@ -17,8 +17,8 @@ from hilcal.drivers.ur_link.worker import Line, answered, outliving, start, word
 WATCHDOG_HZ = 10.0
 REST_HZ = 1.0
 KICK_S = 0.02
-TAKING_S = 8.0  # how long taking control may last when the parent has ended meanwhile, s
-LATE_S = 0.8 / WATCHDOG_HZ  # a longer pause between two kicks may have set off the watchdog, s
+TAKING_S = 8.0  # longest taking of control after the end of the parent, s
+LATE_S = 0.8 / WATCHDOG_HZ  # a longer pause between two kicks may trigger the watchdog, s
 
 
 class ControlInterface:
@@ -35,7 +35,7 @@ class ControlInterface:
         self._guard(REST_HZ)
 
     def kick(self) -> None:
-        """Kick the robot's watchdog; stop the arm where the lease of its motion has expired."""
+        """Kick the robot's watchdog; stop the arm if the lease of its motion has expired."""
         now = time.monotonic()
         if now - self._kicked >= KICK_S:
             if now - self._kicked > LATE_S:
@@ -77,7 +77,7 @@ class ControlInterface:
         return {"expired": self._expired, "late": self._late}
 
     def _guard(self, hz: float) -> None:
-        """Set the least rate of signs of life, below which the controller stops its program."""
+        """Set the rate of signs of life below which the controller stops its program."""
         if not self._link.setWatchdog(hz):
             raise RuntimeError("the controller takes no watchdog")
 
@@ -92,7 +92,7 @@ def serve(line: Line, control: ControlInterface) -> None:
 
 
 def main() -> None:
-    """Take control, say so, then answer requests."""
+    """Take control, report it, then answer requests."""
     line, (host, hz, lease, relayed, upper) = start()
     try:
         from rtde_control import RTDEControlInterface as Interface
@@ -103,11 +103,11 @@ def main() -> None:
             | (int(Interface.FLAG_UPPER_RANGE_REGISTERS) if int(upper) else 0)
         )
         if int(relayed):
-            _relay, host = relay.start(host)  # kept: its input stays open as long as this process
-        # From the upload of its program to the watchdog nothing would end it but this process.
+            _relay, host = relay.start(host)  # referenced, so that its input stays open
+        # Between upload and watchdog only this process can end the robot's program.
         with outliving(TAKING_S):
             control = ControlInterface(Interface(host, float(hz), flags), float(lease))
-    except Exception as error:  # whatever it is, the parent has to know
+    except Exception as error:  # any failure is reported to the parent
         line.answer(0, error=words(error))
         return
     line.answer(0)

@@ -1,4 +1,4 @@
-"""A TCP connection on which nothing takes longer than one deadline."""
+"""A TCP connection with one deadline for all its calls."""
 
 import contextlib
 import socket
@@ -12,11 +12,11 @@ class LinkError(Exception):
 
 
 class Connection:
-    """An open connection; every call ends before the deadline, or raises LinkError."""
+    """An open connection; a call that does not end before the deadline raises LinkError."""
 
-    def __init__(self, host: str, port: int, what: str, seconds: float) -> None:
-        """Connect to the service `what`; all of it has to be done within so many seconds."""
-        self._where = f"{what} (port {port})"
+    def __init__(self, host: str, port: int, service: str, seconds: float) -> None:
+        """Connect to a service (its name for errors); the deadline is `seconds` from now."""
+        self._where = f"{service} (port {port})"
         self._seconds = seconds
         self._end = time.monotonic() + seconds
         self._buffer = b""
@@ -39,19 +39,19 @@ class Connection:
             raise LinkError(f"the {self._where}: {error.strerror or error}") from None
 
     def extend(self, seconds: float) -> None:
-        """Set a new deadline, from now."""
+        """Set a new deadline, `seconds` from now."""
         self._seconds, self._end = seconds, time.monotonic() + seconds
 
     def send(self, data: bytes) -> None:
         """Send everything."""
         with self._failures():
-            self._socket.settimeout(self._left())
+            self._socket.settimeout(self._remaining())
             self._socket.sendall(data)
 
     def read(self, count: int) -> bytes:
-        """Return exactly so many bytes."""
+        """Return exactly `count` bytes."""
         while len(self._buffer) < count:
-            self._more()
+            self._receive()
         out, self._buffer = self._buffer[:count], self._buffer[count:]
         return out
 
@@ -60,17 +60,17 @@ class Connection:
         while b"\n" not in self._buffer:
             if len(self._buffer) > 65536:
                 raise LinkError(f"the {self._where} sends something else than lines")
-            self._more()
+            self._receive()
         line, _, self._buffer = self._buffer.partition(b"\n")
         return line.decode(errors="replace").strip()
 
     def close(self) -> None:
-        """End the connection, and let the other side see it before it returns."""
+        """Close the connection, after up to 0.1 s for the other side to close it, too."""
         with contextlib.suppress(OSError), self._socket:
             self._socket.shutdown(socket.SHUT_WR)
             end = time.monotonic() + 0.1
-            while (left := end - time.monotonic()) > 0:
-                self._socket.settimeout(left)
+            while (remaining := end - time.monotonic()) > 0:
+                self._socket.settimeout(remaining)
                 if not self._socket.recv(65536):
                     break
 
@@ -80,16 +80,16 @@ class Connection:
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    def _more(self) -> None:
+    def _receive(self) -> None:
         with self._failures():
-            self._socket.settimeout(self._left())
+            self._socket.settimeout(self._remaining())
             data = self._socket.recv(65536)
         if not data:
             raise LinkError(f"the {self._where} closed the connection")
         self._buffer += data
 
-    def _left(self) -> float:
-        left = self._end - time.monotonic()
-        if left <= 0:
+    def _remaining(self) -> float:
+        seconds = self._end - time.monotonic()
+        if seconds <= 0:
             raise TimeoutError
-        return left
+        return seconds

@@ -1,10 +1,10 @@
-"""Asks the controller over RTDE what it is, before the client library meets it.
+"""Checks of the controller over RTDE, before the client library connects.
 
-The library waits for ever, and with the interpreter locked, for a controller that is mute; and
-an output that the controller does not have shifts all later fields silently. So both are
-found out here first, with a deadline; each question raises LinkError where nobody answers as a
-controller does. Frames: big-endian size (u16, header included), type
-(u8), body. Source: Universal Robots, "Real-Time Data Exchange (RTDE) Guide", protocol 2.
+The library waits for ever, with the interpreter locked, for a silent controller; and an output that
+the controller lacks silently shifts all later fields. Both are therefore checked here first, with a
+deadline; each function raises LinkError without a valid answer. Frames: big-endian size (u16,
+header included), type (u8), body. Source: Universal Robots, "Real-Time Data Exchange (RTDE) Guide",
+protocol 2.
 """
 
 import struct
@@ -25,7 +25,7 @@ class ControllerFacts:
     """Version and outputs of a controller."""
 
     version: tuple[int, ...]  # major, minor, bugfix, build
-    outputs: tuple[str, ...]  # those of the wanted outputs that it has
+    outputs: tuple[str, ...]  # the requested outputs that it has
 
 
 def controller(host: str, outputs: tuple[str, ...], seconds: float) -> ControllerFacts:
@@ -37,18 +37,18 @@ def controller(host: str, outputs: tuple[str, ...], seconds: float) -> Controlle
         kinds = _reply(line, "O", None)[1:].decode(errors="replace").split(",")
         if len(kinds) != len(outputs):
             raise LinkError("the RTDE server (port 30004) answers with a wrong number of outputs")
-        known = tuple(n for n, k in zip(outputs, kinds, strict=True) if k != NOT_FOUND)
-        return ControllerFacts(version, known)
+        available = tuple(n for n, k in zip(outputs, kinds, strict=True) if k != NOT_FOUND)
+        return ControllerFacts(version, available)
 
 
 def check_stream(host: str, seconds: float) -> None:
-    """Ask for one packet of data."""
+    """Raise LinkError if no packet of data comes in time."""
     with stream(host, _STREAM_HZ, ("timestamp",), seconds) as line:
         packet(line)
 
 
 def stream(host: str, hz: float, outputs: tuple[str, ...], seconds: float) -> Connection:
-    """Return a connection on which packets of outputs, which the controller has, come."""
+    """Return a connection that receives packets of `outputs`; the controller must have them."""
     line = _greeted(host, seconds)
     try:
         line.send(_frame("O", struct.pack(">d", hz) + ",".join(outputs).encode()))
@@ -67,7 +67,7 @@ def packet(line: Connection) -> bytes:
 
 
 def in_use(host: str, inputs: tuple[str, ...], seconds: float) -> bool:
-    """Whether somebody else holds one of the input registers that commands travel in."""
+    """Whether another client holds one of these input registers for commands."""
     with _greeted(host, seconds) as line:
         line.send(_frame("I", ",".join(inputs).encode()))
         return IN_USE in _reply(line, "I", None)[1:].decode(errors="replace").split(",")
@@ -93,10 +93,10 @@ def _frame(kind: str, body: bytes = b"") -> bytes:
 def _reply(line: Connection, kind: str, size: int | None) -> bytes:
     """Return the body of the next frame of a type; text messages in between are dropped."""
     while True:
-        length, got = _HEAD.unpack(line.read(_HEAD.size))
+        length, received = _HEAD.unpack(line.read(_HEAD.size))
         body = line.read(max(0, length - _HEAD.size))
-        if got == ord("M"):
+        if received == ord("M"):
             continue
-        if length < _HEAD.size or got != ord(kind) or (size is not None and len(body) != size):
+        if length < _HEAD.size or received != ord(kind) or (size is not None and len(body) != size):
             raise LinkError("the RTDE server (port 30004) does not answer as a controller does")
         return body

@@ -1,11 +1,11 @@
-"""State and kinematics of the arm: packets from the receive worker, each checked; the survey.
+"""State and kinematics of the arm: checked packets from the receive worker; the survey.
 
-The kinematics come from the controller's primary port. A package there is its size (i32, all
-included), its type (u8) and a body; of type 16, a robot state, the body is a row of parts of the
-same form. Part 5, the kinematics, is of checksums (6 u32), theta, a, d and alpha of classic rows
-(6 f64 each), and the status of the calibration (u32). The controller sends it when a client has
-connected. All big-endian. Source: Universal Robots, "Remote Control via TCP/IP", and
-`KinematicsInfo` of the Universal Robots Client Library.
+The kinematics come from the controller's primary port. A package there has a size (i32, header
+included), a type (u8) and a body. The body of type 16, a robot state, is a sequence of parts of the
+same form. Part 5, the kinematics, has checksums (6 u32), theta, a, d and alpha of the classic
+Denavit-Hartenberg rows (6 f64 each), and the status of the calibration (u32). The controller sends
+it to each client that connects. All is big-endian. Source: Universal Robots, "Remote Control via
+TCP/IP", and `KinematicsInfo` of the Universal Robots Client Library.
 """
 
 import math
@@ -34,7 +34,7 @@ _HEAD = struct.Struct(">iB")
 _KINEMATICS = struct.Struct(">6I24dI")
 _STATE, _PART = 16, 5
 _LONGEST = 1 << 20
-_PACKAGES = 50  # packages that are looked at: the state comes ten times a second, among messages
+_PACKAGES = 50  # packages read: the state comes ten times a second, among messages
 
 
 def read_kinematics(host: str, seconds: float) -> FactoryKinematics:
@@ -45,19 +45,19 @@ def read_kinematics(host: str, seconds: float) -> FactoryKinematics:
             if not _HEAD.size <= size <= _LONGEST:
                 raise LinkError(f"{_PRIMARY} does not answer as a controller does")
             body = line.read(size - _HEAD.size)
-            part = _find(body) if kind == _STATE else None
+            part = _kinematics_part(body) if kind == _STATE else None
             if part is None:
                 continue
-            told = _KINEMATICS.unpack_from(part)
-            rows = np.array(told[6:30]).reshape(4, 6)
+            values = _KINEMATICS.unpack_from(part)
+            rows = np.array(values[6:30]).reshape(4, 6)
             try:
-                return of_rows(rows, "the controller", told[30], tuple(told[:6]))
+                return of_rows(rows, "the controller", values[30], tuple(values[:6]))
             except InputError as error:
                 raise LinkError(f"{_PRIMARY}: {error}") from None
     raise LinkError(f"{_PRIMARY} does not tell the arm's kinematics")
 
 
-def _find(body: bytes) -> bytes | None:
+def _kinematics_part(body: bytes) -> bytes | None:
     at = 0
     while at + _HEAD.size <= len(body):
         size, kind = _HEAD.unpack_from(body, at)
@@ -72,8 +72,8 @@ def _find(body: bytes) -> bytes | None:
 N = 6  # joints of every arm of this maker
 
 OPTIONAL = frozenset({"target_speed_fraction", "payload", "payload_cog", "ft_raw_wrench"})
-"""Outputs that older controllers lack (payload and payload_cog come with 5.5.1, ft_raw_wrench
-with 5.9)."""
+"""Outputs that older controllers lack: payload and payload_cog before 5.5.1, ft_raw_wrench before
+5.9."""
 
 
 FIELDS = {
@@ -92,14 +92,13 @@ FIELDS = {
     "payload_com": ("payload_cog", 3, 100.0),
     "speed_scaling": ("speed_scaling", 0, 10.0),
 }
-"""By field of a sample: its output, how many numbers it has (0: one alone), and the magnitude
-beyond which it cannot be what an arm of this maker measures (s, rad, rad/s, N·m, A, °C, m, N, kg);
-choices, ten times and more beyond the largest of them. A packet that a fault on the way has changed
-is as a rule far outside."""
+"""For each field of a sample: its output, its length (0: a scalar), and the largest magnitude that
+is possible (s, rad, rad/s, N·m, A, °C, m, N, kg). The limits are choices, ten times and more beyond
+the largest arm; a packet damaged on the way is as a rule far outside."""
 
 STALE_S = 0.2
-"""In a motion, the link is lost when the controller's timestamp stands for so long, real s."""
-PATIENCE_S = 0.8  # at rest, new data are waited for so long, real s
+"""Age of the controller's timestamp at which the link counts as lost in a motion, real s."""
+PATIENCE_S = 0.8  # longest wait for new data at rest, real s
 _ANSWER_S = 0.3
 
 
@@ -109,7 +108,7 @@ class ReadingError(Exception):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reading:
-    """The sample for the run, and what the driver itself looks at."""
+    """The sample for the run, and the states that the driver checks."""
 
     sample: ArmSample  # the arm's state
     mode: int  # robot mode, 7 is running
@@ -118,7 +117,7 @@ class Reading:
 
 
 def read(answer: dict[str, Any]) -> Reading:
-    """Return the reading in the answer of the receive worker."""
+    """Return the reading in an answer of the receive worker; raises ReadingError."""
     fields = answer["fields"]
 
     def checked(name: str, count: int, largest: float) -> Any:
@@ -138,10 +137,10 @@ def read(answer: dict[str, Any]) -> Reading:
 
 
 class Receiver:
-    """Reads the arm's state; each reading is newer than the call for it."""
+    """Reads the arm's state; each reading is newer than its call."""
 
     def __init__(self, host: str, hz: float, outputs: tuple[str, ...], seconds: float) -> None:
-        """Connect within a deadline; each call raises LinkError where no new data come."""
+        """Connect within `seconds`; each call raises LinkError if no new data come."""
         self._host = host
         self._arguments = (host, repr(hz), ",".join(outputs))
         self._worker = self._start(seconds)
@@ -152,17 +151,17 @@ class Receiver:
         return self._worker.pid
 
     def read(self, stale: float = PATIENCE_S) -> Reading:
-        """Return the next packet, which is newer than the call, within `stale` real s."""
+        """Return the first packet newer than the call, within `stale` real s."""
         try:
             return read(self._worker.call("sample", stale + _ANSWER_S, stale=stale))
         except WorkerError as error:
-            how = "the process that receives over RTDE: " if error.lost else ""
-            raise LinkError(f"{how}{error}") from None
+            source = "the process that receives over RTDE: " if error.lost else ""
+            raise LinkError(f"{source}{error}") from None
         except ReadingError as error:
             raise LinkError(f"the RTDE data are damaged: {error}") from None
 
     def rate(self, seconds: float) -> float:
-        """Return the packets per second over a while."""
+        """Return the packets per second, counted for `seconds`."""
         try:
             deadline = seconds + PATIENCE_S + _ANSWER_S
             answer = self._worker.call("rate", deadline, window=seconds, stale=PATIENCE_S)
@@ -172,11 +171,11 @@ class Receiver:
 
     def renew(self, seconds: float) -> None:
         """Connect again, in a new process."""
-        begun = time.monotonic()
+        start = time.monotonic()
         self._worker.kill()
-        # It shows much earlier than the library does that no data come.
+        # Detects a silent controller much earlier than the library does.
         probe.check_stream(self._host, min(seconds, 0.25))
-        self._worker = self._start(seconds - (time.monotonic() - begun))
+        self._worker = self._start(seconds - (time.monotonic() - start))
 
     def close(self) -> None:
         """End the process; may be called twice."""
@@ -189,9 +188,9 @@ class Receiver:
             raise LinkError(f"no data over RTDE: {error}") from None
 
 
-_RATE_S = (0.4, 2.0)  # how long packets are counted, and again where they were too few; choices
+_RATE_S = (0.4, 2.0)  # time of counting packets, and of a second count if few; choices
 _SHARE = 0.5
-"""Of the packets that were asked for: with fewer the line is not fit for a run; a choice."""
+"""Least share of the requested packets for a run; a choice."""
 _ASK_S = 1.5
 
 
@@ -204,7 +203,7 @@ def survey(
     generation: Generation,
     silent: str,
 ) -> Report:
-    """Ask everything that can be asked without moving; `silent` is why nobody supervises."""
+    """Ask all that needs no motion; `silent`: why the supervision does not answer, else empty."""
     supervision, version = generation.supervision, states.version_word(controller.version)
     rows: list[Row] = [
         ("address", host, "address", host),
@@ -256,27 +255,27 @@ def survey(
         rows += _state(reading)
         rows.append(("RTDE rate", f"{rate:.0f} Hz of {hz:g} Hz", "rtde_rate_Hz", rate))
         rows.append(("", "", "rtde_rate_asked_Hz", hz))
-        problems += _hindrances(reading)
+        problems += _state_problems(reading)
         if rate < _SHARE * hz:
             problems.append(f"RTDE comes at {rate:.0f} Hz instead of {hz:g} Hz; check the network")
     return report_of("arm", name, rows, problems, kinematics)
 
 
 def settled_rate(count: Callable[[float], float], hz: float) -> float:
-    """Packets per second of the `hz` that were asked for; counted again for longer where few."""
+    """Return the packets per second of the requested `hz`; a low rate is counted again, longer."""
     rate = count(_RATE_S[0])
     return rate if rate >= _SHARE * hz else count(_RATE_S[1])
 
 
 def _size(model: str) -> str:
-    """Return the number in the name of an arm of this maker; UR7e and UR12e have their old one."""
-    found = re.match(r"ur(\d+)", model.lower())
-    return "" if found is None else {"7": "5", "12": "10"}.get(found[1], found[1])
+    """Return the number in an arm's name; of UR7e and UR12e the number of UR5e and UR10e."""
+    match = re.match(r"ur(\d+)", model.lower())
+    return "" if match is None else {"7": "5", "12": "10"}.get(match[1], match[1])
 
 
 def _state(reading: Reading) -> list[Row]:
     sample, mode = reading.sample, states.mode_word(reading.mode)
-    com, warm = sample.payload_com, sample.joint_temperature
+    com, celsius = sample.payload_com, sample.joint_temperature
     at = "" if com is None else f" at {_list(1e3 * com)} mm"
     mass = None if math.isnan(sample.payload) else sample.payload
     payload = "not reported" if mass is None else f"{mass:.3f} kg{at}"
@@ -285,11 +284,11 @@ def _state(reading: Reading) -> list[Row]:
         ("safety", sample.safety, "safety", sample.safety),
         ("payload", payload, "payload_kg", mass),
         ("", "", "payload_com_m", None if com is None else com.tolist()),
-        ("joint temperatures", f"{_list(warm)} °C", "joint_temperature_degC", warm.tolist()),
+        ("joint temperatures", f"{_list(celsius)} °C", "joint_temperature_degC", celsius.tolist()),
     ]
 
 
-def _hindrances(reading: Reading) -> list[str]:
+def _state_problems(reading: Reading) -> list[str]:
     out, sample = [], reading.sample
     if sample.safety != states.NORMAL:
         out.append(f"{sample.safety}: {states.safety_advice(reading.safety_bits)}")

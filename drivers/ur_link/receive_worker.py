@@ -1,8 +1,8 @@
 """Child process that holds the receive interface of ur_rtde: `sample` and `rate`.
 
-A reading is given only when it is new: the controller's timestamp has to change within the
-`stale` seconds of the request. Whether the library calls itself connected proves nothing, since
-its getters go on with the last values for ever; that it calls itself disconnected is believed.
+A reading is returned only if it is new: the controller's timestamp has to change within the `stale`
+seconds of the request. That the library reports a connection proves nothing, since its getters
+repeat the last values for ever; a reported disconnection is believed.
 """
 
 import time
@@ -16,11 +16,11 @@ _NAMES = (
     "safety_status_bits speed_scaling target_speed_fraction payload payload_cog ft_raw_wrench"
 )
 OUTPUTS = tuple(_NAMES.split())
-"""Those that are recorded; the client library knows them: another name would shift the fields
-behind it. It has a getter for each, `getActualTCPPose` for `actual_TCP_pose`."""
+"""The recorded outputs. The client library has a getter for each, e.g. `getActualTCPPose` for
+`actual_TCP_pose`; a name unknown to it would shift the fields that follow."""
 _POLL = 0.0005  # s
 _TRIES = 20
-_FIRST_S = 2.0  # until the first data come, s
+_FIRST_S = 2.0  # longest wait for the first data, s
 
 
 def _getter(output: str) -> str:
@@ -33,10 +33,10 @@ class StaleError(Exception):
 
 def _next_stamp(link: Any, seconds: float) -> float:
     """Wait until the controller's timestamp changes, and return it."""
-    before, end = link.getTimestamp(), time.monotonic() + seconds
+    first, end = link.getTimestamp(), time.monotonic() + seconds
     while True:
         stamp = link.getTimestamp()
-        if stamp != before:
+        if stamp != first:
             return float(stamp)
         if not link.isConnected():
             raise StaleError("the RTDE connection is closed")
@@ -46,28 +46,28 @@ def _next_stamp(link: Any, seconds: float) -> float:
 
 
 def _sample(link: Any, names: list[str], stale: float) -> dict[str, Any]:
-    """Return all fields of one and the same packet."""
+    """Return all fields, read from a single packet."""
     stamp = _next_stamp(link, stale)
     for _ in range(_TRIES):
         fields = {name: getattr(link, _getter(name))() for name in names}
         host_ns = time.monotonic_ns()
-        again = link.getTimestamp()
-        if again == stamp == fields["timestamp"]:
+        newest = link.getTimestamp()
+        if newest == stamp == fields["timestamp"]:
             return {"host_ns": host_ns, "fields": fields}
-        stamp = again
+        stamp = newest
     raise StaleError("the RTDE data change faster than they can be read")
 
 
 def _rate(link: Any, seconds: float, stale: float) -> dict[str, Any]:
-    count, begun = 0, time.monotonic()
-    while time.monotonic() - begun < seconds:
+    count, began = 0, time.monotonic()
+    while time.monotonic() - began < seconds:
         _next_stamp(link, stale)
         count += 1
-    return {"rate": count / (time.monotonic() - begun)}
+    return {"rate": count / (time.monotonic() - began)}
 
 
 def main() -> None:
-    """Connect, say so, then answer requests until the parent closes the line."""
+    """Connect, report it, then answer requests until the parent closes the line."""
     line, (host, hz, names_text) = start()
     names = names_text.split(",")
     try:
@@ -77,7 +77,7 @@ def main() -> None:
         if not link.isConnected():
             raise StaleError("the controller negotiates RTDE but sends no data")
         _next_stamp(link, _FIRST_S)
-    except Exception as error:  # whatever it is, the parent has to know
+    except Exception as error:  # any failure is reported to the parent
         line.answer(0, error=words(error))
         return
     line.answer(0)

@@ -1,11 +1,11 @@
-"""Process between ur_rtde and a controller of PolyScope X: programs go by the primary port.
+"""Process between ur_rtde and PolyScope X that sends programs to the primary port.
 
     python -m hilcal.drivers.ur_link.relay HOST
 
-ur_rtde sends its program to port 30003 alone, which PolyScope X does not open; its primary port,
-30001, takes the same programs, and sends the robot's state to everyone who connects, which ur_rtde
-does not read. So ur_rtde is given an address of this computer, where port 30004 is the
-controller's and port 30003 its primary one. Prints that address, and ends with its parent.
+ur_rtde sends its program to port 30003 only, which PolyScope X does not open. The primary port,
+30001, takes the same programs, but also sends the robot's state, which ur_rtde does not read. So
+ur_rtde is given an address of this computer: port 30004 there leads to the controller's 30004, port
+30003 to its 30001, and the state is dropped. Prints this address; ends with its parent.
 """
 
 import contextlib
@@ -37,7 +37,7 @@ def start(host: str) -> tuple[subprocess.Popen[str], str]:
         text=True,
     )
     assert process.stdout is not None  # noqa: S101 - for the type checker
-    # No thread: one that is left would take the signal that the worker puts off, see `outliving`.
+    # No thread: it would receive the signal that the worker blocks, see `outliving`.
     ready = select.select([process.stdout], [], [], _READY_S)[0]
     address = process.stdout.readline().strip() if ready else ""
     if not address:
@@ -46,12 +46,12 @@ def start(host: str) -> tuple[subprocess.Popen[str], str]:
     return process, address
 
 
-def _pump(source: socket.socket, sink: Callable[[bytes], Any], other: socket.socket) -> None:
-    """Pass everything on until one side ends, then end the other one."""
+def _pump(source: socket.socket, sink: Callable[[bytes], Any], peer: socket.socket) -> None:
+    """Pass data on until one side ends, then shut down both."""
     with contextlib.suppress(OSError):
         while data := source.recv(_CHUNK):
             sink(data)
-    for line in (source, other):
+    for line in (source, peer):
         with contextlib.suppress(OSError):
             line.shutdown(socket.SHUT_RDWR)
 
@@ -77,7 +77,7 @@ def _accept(door: socket.socket, host: str, port: int) -> None:
 
 
 def _doors() -> tuple[str, list[socket.socket]]:
-    """Return a loopback address with both ports free, and the sockets that listen there."""
+    """Return a loopback address where both ports are free, and the listening sockets."""
     for _ in range(_TRIES):
         parts = [str(secrets.randbelow(254) + 1) for _ in range(3)]
         address, doors = ".".join(["127", *parts]), []
@@ -96,7 +96,7 @@ def _doors() -> tuple[str, list[socket.socket]]:
 
 
 def main() -> None:
-    """Listen, say where, and pass on until the parent has ended."""
+    """Listen, print the address, and pass data on until the parent ends."""
     host = sys.argv[1]
     address, doors = _doors()
     for door, port in zip(doors, (_RTDE, _PRIMARY), strict=False):

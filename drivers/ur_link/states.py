@@ -1,4 +1,4 @@
-"""What the controller's numbers mean, in words, and what an operator can do about them.
+"""Meaning of the controller's codes for people, and advice to the operator.
 
 Source: Universal Robots, "Real-Time Data Exchange (RTDE) Guide", controller output fields.
 """
@@ -28,7 +28,7 @@ STOPPING, STOPPED, PLAYING, PAUSING, PAUSED, RESUMING = range(6)
 RUNTIME_STATES = ("stopping", "stopped", "playing", "pausing", "paused", "resuming")
 
 NORMAL = "normal"
-# (bit of safety_status_bits, words, what to do), the gravest first
+# (bit of safety_status_bits, meaning, advice), the gravest first
 _SAFETY = (
     (9, "safety fault", "restart the controller"),
     (8, "safety violation", "restart the safety system on the pendant"),
@@ -44,30 +44,30 @@ _SAFETY = (
 
 
 def safety_word(bits: int) -> str:
-    """Return the safety state in words, "normal" where all is well."""
+    """Return the name of the safety state, "normal" if no bit is set."""
     return next((word for bit, word, _ in _SAFETY if bits >> bit & 1), NORMAL)
 
 
 def safety_advice(bits: int) -> str:
-    """Return what the operator should do about the safety state; empty where all is well."""
+    """Return advice about the safety state; empty if normal."""
     return next((advice for bit, _, advice in _SAFETY if bits >> bit & 1), "")
 
 
 def mode_word(mode: int) -> str:
-    """Return a robot mode in words."""
+    """Return the name of a robot mode."""
     return ROBOT_MODES.get(mode, f"robot mode {mode}")
 
 
 def runtime_word(state: int) -> str:
-    """Return the state of the robot's program in words."""
+    """Return the name of a state of the robot's program."""
     return RUNTIME_STATES[state] if 0 <= state < len(RUNTIME_STATES) else f"state {state}"
 
 
 def version_word(version: tuple[int, ...]) -> str:
-    """Return a controller version as people write it."""
+    """Return a controller version with dots."""
     return ".".join(map(str, version))
 
 
 def failure(host: str, cause: str, advice: str = "") -> DeviceError:
-    """Return the error of a failure of the arm: which arm, what happened, what to do."""
+    """Return the error of a failure of the arm: host, cause, advice."""
     return DeviceError(f"arm at {host}: {cause}" + (f"; {advice}" if advice else ""))

@@ -1,12 +1,14 @@
-"""What answers about a controller's state and ends its program, beside RTDE.
+"""Services beside RTDE that report a controller's state and end its program.
 
 PolyScope 3 and 5 have a dashboard server (port 29999: one line per command, one per answer),
-PolyScope X from 10.11 on a Robot API (HTTP with JSON bodies); both are asked the same. Of the API,
-modes are told from 10.12 on (API 3.1.4), model, serial number and version from 10.14 on (API
-5.0.107); an order in local mode is answered by 403. They differ, too, in where programs go and in
-the registers that a client may use. Sources: Universal Robots, "Dashboard Server e-Series" and
-"Robot API" (/universal-robots/robot-api/docs on a controller), and `DashboardClientImplX` of the
-Universal Robots Client Library for paths and versions.
+PolyScope X from 10.11 on a Robot API (HTTP with JSON bodies); both have one interface here. The API
+reports modes from 10.12 on (API 3.1.4), model, serial number and version from 10.14 on (API
+5.0.107); it refuses orders in local mode with status 403. The two generations also differ in the
+port for programs and in the registers that a client may use.
+
+Sources: Universal Robots, "Dashboard Server e-Series" and "Robot API"
+(/universal-robots/robot-api/docs on a controller), and `DashboardClientImplX` of the Universal
+Robots Client Library for paths and versions.
 """
 
 import http.client
@@ -29,18 +31,18 @@ NOT_UNDERSTOOD = "could not understand"
 
 @dataclass(frozen=True, slots=True)
 class RobotFacts:
-    """State of the robot by its dashboard server or Robot API; empty where it does not say."""
+    """State of the robot from its dashboard server or Robot API; empty if not reported."""
 
     model: str  # e.g. "UR10"
     serial: str  # serial number
-    version: str  # of the software, as the robot writes it
+    version: str  # of the software, in the robot's spelling
     remote: bool | None  # whether it is in remote control; None where the robot has no such mode
     program: str  # "PLAYING", "PAUSED", "STOPPED" and the name of the loaded program
 
 
 @dataclass(frozen=True, slots=True)
 class Dashboard:
-    """The dashboard server at an address; every call raises LinkError where it fails, in time."""
+    """The dashboard server at an address; a call that fails or is late raises LinkError."""
 
     host: str
     name = "dashboard server"
@@ -50,7 +52,7 @@ class Dashboard:
         ask(self.host, ("robotmode",), seconds)
 
     def describe(self, seconds: float) -> RobotFacts:
-        """Ask for everything worth knowing."""
+        """Ask for model, serial number, version and states."""
         commands = (
             "get robot model",
             "get serial number",
@@ -58,12 +60,12 @@ class Dashboard:
             "is in remote control",
             "programState",
         )
-        model, serial, version, remote, program = map(_told, ask(self.host, commands, seconds))
+        model, serial, version, remote, program = map(_known, ask(self.host, commands, seconds))
         return RobotFacts(model, serial, version, _yes(remote), program)
 
     def in_remote_control(self, seconds: float) -> bool | None:
         """Whether programs may command the arm; None where the robot has no such mode (CB3)."""
-        return _yes(_told(*ask(self.host, ("is in remote control",), seconds)))
+        return _yes(_known(*ask(self.host, ("is in remote control",), seconds)))
 
     def stop(self, seconds: float) -> None:
         """Stop the robot's program, and with it the arm."""
@@ -75,7 +77,7 @@ class Dashboard:
 def ask(host: str, commands: tuple[str, ...], seconds: float) -> list[str]:
     """Return the answer to each command, all within one deadline."""
     with Connection(host, DASHBOARD_PORT, "dashboard server", seconds) as line:
-        line.read_line()  # it greets first
+        line.read_line()  # the greeting
         out = []
         for command in commands:
             line.send(command.encode() + b"\n")
@@ -83,8 +85,8 @@ def ask(host: str, commands: tuple[str, ...], seconds: float) -> list[str]:
         return out
 
 
-def _told(answer: str) -> str:
-    """Return an answer; nothing where the command is not known."""
+def _known(answer: str) -> str:
+    """Return an answer; empty if the server does not know the command."""
     return "" if NOT_UNDERSTOOD in answer.lower() else answer
 
 
@@ -93,32 +95,32 @@ def _yes(answer: str) -> bool | None:
 
 
 BASE = "/universal-robots/robot-api"
-_LONGEST = 1 << 20  # bytes of an answer that are read, at most; openapi.json has some 100,000
+_LONGEST = 1 << 20  # bytes read of an answer, at most; openapi.json has some 100,000
 _REDIRECTS = 3
 _ABSENT = 404
 
 
 @dataclass(frozen=True, slots=True)
 class RobotApi:
-    """The Robot API at an address; every call raises LinkError where it fails, in time."""
+    """The Robot API at an address; a call that fails or is late raises LinkError."""
 
     host: str
     port: int  # of the controller's web server, 80 on a real one
 
     @property
     def name(self) -> str:
-        """What it is, for people."""
+        """Its name, for people."""
         return f"Robot API (port {self.port})"
 
     def check(self, seconds: float) -> None:
-        """Ask whether it is there."""
+        """Raise LinkError if the API does not answer."""
         status, _ = self._ask("GET", "/openapi.json", time.monotonic() + seconds)
         if status == _ABSENT:
             raise LinkError(f"the {self.name} is not there; it needs PolyScope X 10.11 or newer")
         self._done(status, {}, "openapi.json")
 
     def describe(self, seconds: float) -> RobotFacts:
-        """Ask for everything worth knowing; what the version does not tell is empty."""
+        """Ask for model, serial number, version and states; empty if the version lacks them."""
         end = time.monotonic() + seconds
         about = self._get("/system/v1/information", end)
         return RobotFacts(
@@ -130,7 +132,7 @@ class RobotApi:
         )
 
     def in_remote_control(self, seconds: float) -> bool | None:
-        """Whether programs may command the arm; None where the version does not tell (10.11)."""
+        """Whether programs may command the arm; None if the version does not report it (10.11)."""
         return self._remote(time.monotonic() + seconds)
 
     def stop(self, seconds: float) -> None:
@@ -139,30 +141,31 @@ class RobotApi:
 
     def order(self, path: str, action: str, seconds: float) -> None:
         """Give an order, e.g. `/robotstate/v1/state` the action `POWER_ON`."""
-        status, told = self._ask("PUT", path, time.monotonic() + seconds, {"action": action})
-        self._done(status, told, action)
+        status, answer = self._ask("PUT", path, time.monotonic() + seconds, {"action": action})
+        self._done(status, answer, action)
 
     def _remote(self, end: float) -> bool | None:
         mode = self._get("/system/v1/controlmode", end).get("mode")
         return None if mode is None else bool(mode == "REMOTE")
 
     def _get(self, path: str, end: float) -> dict[str, Any]:
-        """Return an answer; nothing where the version does not have the path."""
-        status, told = self._ask("GET", path, end)
+        """Return an answer; empty if the version lacks the path."""
+        status, answer = self._ask("GET", path, end)
         if status == _ABSENT:
             return {}
-        self._done(status, told, path)
-        return told
+        self._done(status, answer, path)
+        return answer
 
-    def _done(self, status: int, told: dict[str, Any], what: str) -> None:
+    def _done(self, status: int, answer: dict[str, Any], request: str) -> None:
+        """Raise LinkError if the status is no success."""
         if not 200 <= status < 300:
-            why = _text(told, "message") or http.client.responses.get(status, "")
-            raise LinkError(f'the {self.name} answers {status} "{why}" to {what}')
+            reason = _text(answer, "message") or http.client.responses.get(status, "")
+            raise LinkError(f'the {self.name} answers {status} "{reason}" to {request}')
 
     def _ask(
         self, method: str, path: str, end: float, body: dict[str, str] | None = None
     ) -> tuple[int, dict[str, Any]]:
-        """Return status and answer; follows a path that a version has moved elsewhere."""
+        """Return status and answer; follows redirects."""
         path = BASE + path
         for _ in range(_REDIRECTS + 1):
             status, place, data = self._once(method, path, end, body)
@@ -170,12 +173,12 @@ class RobotApi:
                 break
             path = urlsplit(place).path
         try:
-            told = json.loads(data) if data else {}
+            answer = json.loads(data) if data else {}
         except (ValueError, RecursionError):
             if 200 <= status < 300:
                 raise LinkError(f"the {self.name} does not answer in JSON") from None
-            told = {}
-        return status, told if isinstance(told, dict) else {}
+            answer = {}
+        return status, answer if isinstance(answer, dict) else {}
 
     def _once(
         self, method: str, path: str, end: float, body: dict[str, str] | None
@@ -183,8 +186,8 @@ class RobotApi:
         text = None if body is None else json.dumps(body)
         head = {"Accept": "application/json"}
         head |= {} if text is None else {"Content-Type": "application/json"}
-        left = max(end - time.monotonic(), 0.01)
-        line = http.client.HTTPConnection(self.host, self.port, timeout=left)
+        timeout = max(end - time.monotonic(), 0.01)
+        line = http.client.HTTPConnection(self.host, self.port, timeout=timeout)
         try:
             line.request(method, path, text, head)
             answer = line.getresponse()
@@ -194,15 +197,15 @@ class RobotApi:
         except ConnectionRefusedError:
             raise LinkError(f"the {self.name} refuses the connection") from None
         except (OSError, http.client.HTTPException, ValueError) as error:
-            words = getattr(error, "strerror", None) or type(error).__name__
-            raise LinkError(f"the {self.name}: {words}") from None
+            reason = getattr(error, "strerror", None) or type(error).__name__
+            raise LinkError(f"the {self.name}: {reason}") from None
         finally:
             line.close()
         return answer.status, answer.headers.get("Location") or "", data
 
 
-def _text(told: dict[str, Any], key: str) -> str:
-    value = told.get(key)
+def _text(answer: dict[str, Any], key: str) -> str:
+    value = answer.get(key)
     return value if isinstance(value, str) else ""
 
 
@@ -219,28 +222,28 @@ class Generation:
     """How a controller of one generation is supervised and commanded."""
 
     supervision: Supervision
-    script_port: int  # takes programs: the real-time port, of PolyScope X the primary one
+    script_port: int  # for programs: the real-time port; of PolyScope X the primary port
     upper: bool
-    """Whether commands go by the upper half of the registers (24 to 47), which no fieldbus uses.
-    ur_rtde 1.6.5 takes them up to PolyScope 5.22 only, and the lower half on any newer one, where
-    the flag for the upper half would leave program and client apart."""
+    """Whether commands use the upper half of the registers (24 to 47), which no fieldbus uses.
+    ur_rtde 1.6.5 supports them up to PolyScope 5.22; on newer versions its program uses the lower
+    half, so the flag for the upper half would separate program and client."""
 
     @property
     def registers(self) -> tuple[str, str]:
-        """Two of the registers that ur_rtde sends its commands through."""
+        """Two of the registers through which ur_rtde sends commands."""
         first = 24 if self.upper else 0
         return f"input_int_register_{first}", f"input_double_register_{first}"
 
 
 def generation(host: str, version: tuple[int, ...], api_port: int) -> Generation:
-    """Return how the controller of a version is supervised and commanded."""
+    """Return the `Generation` of a controller of this version."""
     if version[0] >= POLYSCOPE_X:
         return Generation(RobotApi(host, api_port), PRIMARY_PORT, upper=False)
     return Generation(Dashboard(host), REALTIME_PORT, upper=version[:2] < (5, 23))
 
 
 def why_silent(supervision: Supervision, seconds: float) -> str:
-    """Return why it does not answer, which control needs; empty where it does."""
+    """Return why the supervision, which control needs, does not answer; empty if it does."""
     try:
         supervision.check(seconds)
     except LinkError as error:
@@ -265,7 +268,7 @@ class UrOptions(Section):
 
 
 def services(config: CellConfig) -> dict[int, str]:
-    """Return what the controller of a cell has to offer, by port; it is asked for its version."""
+    """Return the services that a cell's controller must offer, by port; asks for its version."""
     options = check_section(dict(config.robot.options), UrOptions, "[robot.options]")
     try:
         version = probe.controller(config.robot.host or "", ("timestamp",), _ASK_S).version

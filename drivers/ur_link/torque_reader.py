@@ -1,8 +1,8 @@
-"""The joint torques that the controller makes of its motor currents, from a child process.
+"""Joint torques that the controller computes from motor currents, read by a child process.
 
-The output `actual_current_as_torque` (PolyScope 5.23, PolyScope X 10.11 and later) is none of the
-client library's getters. The child receives it on an RTDE connection of its own, which commands
-nothing, and answers with the mean of what came since it was asked last. Source: Universal Robots,
+The output `actual_current_as_torque` (PolyScope 5.23, PolyScope X 10.11 and later) has no getter
+in the client library. The child receives it on a separate RTDE connection, which commands nothing,
+and answers with the mean since the last request. Source: Universal Robots,
 "Real-Time Data Exchange (RTDE) Guide", controller output fields.
 """
 
@@ -21,15 +21,15 @@ _LARGEST = 1e5  # N·m; no drive exerts as much
 _CONNECT_S, _ANSWER_S = 4.0, 0.3
 _STALE_S = 0.8
 _MEMORY_S = 1.0
-"""Packets older than the last ones of so long are forgotten while nobody asks; a choice."""
+"""Between requests the packets of this last time are kept, s; a choice."""
 _PACKET = struct.Struct(">B7d")
 
 
 class TorqueReader:
-    """Means of the torques that the drives exert; None where nobody tells them any more."""
+    """Mean torques of the drives; None if the link is lost."""
 
     def __init__(self, host: str, hz: float) -> None:
-        """Connect to a controller that has the output; a failure shows as no torques."""
+        """Connect to a controller that has the output; after a failure, `mean` is None."""
         self._arguments = (host, repr(hz))
         self._worker: Worker | None = None
         self.renew()
@@ -40,7 +40,7 @@ class TorqueReader:
         return () if self._worker is None else (self._worker.pid,)
 
     def renew(self) -> None:
-        """Connect again where the link is lost."""
+        """Connect again if the link is lost."""
         if self._worker is None:
             with contextlib.suppress(WorkerError):
                 self._worker = Worker(
@@ -72,7 +72,7 @@ class TorqueReader:
 
 
 def main() -> None:
-    """Connect, say so, then answer requests until the parent or the controller ends the line."""
+    """Connect, report it, then answer requests until parent or controller ends the line."""
     line, (host, hz) = start()
     names = ("timestamp", TORQUE)
     try:
@@ -82,8 +82,8 @@ def main() -> None:
         return
     line.answer(0)
     last, recent = -1.0, list[tuple[float, ...]]()
-    asked: int | None = None
-    with contextlib.suppress(LinkError, struct.error):  # the parent sees that the line ends
+    pending: int | None = None
+    with contextlib.suppress(LinkError, struct.error):  # the parent notices the end of the line
         while True:
             stream.extend(_STALE_S)
             _, stamp, *torque = _PACKET.unpack(probe.packet(stream))
@@ -91,12 +91,12 @@ def main() -> None:
                 last = stamp
                 recent.append(tuple(torque))
                 del recent[: -round(_MEMORY_S * float(hz))]
-            request = line.next(0.0) if asked is None else None
-            asked = request["number"] if request is not None else asked
-            if asked is not None and recent:
-                mean = [sum(each) / len(recent) for each in zip(*recent, strict=True)]
-                line.answer(asked, torque=mean)
-                asked = None
+            request = line.next(0.0) if pending is None else None
+            pending = request["number"] if request is not None else pending
+            if pending is not None and recent:
+                mean = [sum(values) / len(recent) for values in zip(*recent, strict=True)]
+                line.answer(pending, torque=mean)
+                pending = None
                 recent.clear()
 
 

@@ -1,10 +1,10 @@
-"""A child process that may hang or crash without harm: the parent's side, then the child's.
+"""A child process that may hang or crash without harm: first the parent's side, then the child's.
 
-The client library can hold the interpreter's lock for ever, so that no thread and no handler in
-Python can notice there that the parent is gone. Its end is therefore told by the kernel: the
-parent holds the writing end of a pipe on which nothing is ever sent; when the parent ends,
-however it ends, the pipe closes and SIGIO ends the child (fcntl(2), O_ASYNC; signal(7)). Unlike
-PR_SET_PDEATHSIG this does not depend on the thread that started the child.
+In the child the client library can hold the interpreter's lock for ever, so that no thread and no
+signal handler in Python can notice the end of the parent. The kernel therefore ends the child: the
+parent holds the writing end of a pipe on which nothing is sent; when the parent ends, in any way,
+the pipe closes and SIGIO ends the child (fcntl(2), O_ASYNC; signal(7)). Unlike PR_SET_PDEATHSIG
+this does not depend on the thread that started the child.
 """
 
 import contextlib
@@ -26,13 +26,13 @@ _ROOT = Path(__file__).resolve().parents[2]
 
 
 def environment() -> dict[str, str]:
-    """Return the environment of a child process that has to import this very program."""
+    """Return the environment of a child process that imports this installation of hilcal."""
     path = os.environ.get("PYTHONPATH")
     return {**os.environ, "PYTHONPATH": f"{_ROOT}{os.pathsep}{path}" if path else str(_ROOT)}
 
 
 class WorkerError(Exception):
-    """A worker did not carry out a request, and why; `lost`: the process is gone."""
+    """Why a worker did not carry out a request; `lost`: the process has ended."""
 
     def __init__(self, text: str, *, lost: bool) -> None:
         super().__init__(text)
@@ -40,32 +40,32 @@ class WorkerError(Exception):
 
 
 class Worker:
-    """A child process `python -m MODULE` that answers requests in JSON lines, one after the other.
+    """A child process `python -m MODULE` that answers requests in JSON lines, one at a time.
 
-    It ends when this process ends. What the client library prints is dropped.
+    It ends with this process. Output of the client library is dropped.
     """
 
     def __init__(self, module: str, arguments: tuple[str, ...], seconds: float) -> None:
-        """Start the process and wait until it reports that it is ready, for so many seconds."""
+        """Start the process; wait at most `seconds` until it reports that it is ready."""
         self._lock = threading.RLock()
         self._number = 0
         self._buffer = b""
-        self._socket, theirs = socket.socketpair()
+        self._socket, child_socket = socket.socketpair()
         life, self._life = os.pipe()
         try:
             self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
                 [sys.executable, "-P", "-m", module, str(life), str(os.getpid()), *arguments],
-                stdin=theirs.fileno(),
+                stdin=child_socket.fileno(),
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
                 pass_fds=(life,),
                 env=environment(),
             )
         except OSError as error:
-            self._let_go()
+            self._close()
             raise WorkerError(f"cannot start a process ({error.strerror})", lost=True) from None
         finally:
-            theirs.close()
+            child_socket.close()
             os.close(life)
         try:
             self._answer(0, time.monotonic() + seconds, seconds)
@@ -99,14 +99,14 @@ class Worker:
         if self._process.poll() is None:
             self._process.kill()
         self._process.wait()
-        self._let_go()
+        self._close()
 
     def _answer(self, number: int, end: float, seconds: float) -> dict[str, Any]:
         while True:
             while b"\n" not in self._buffer:
-                left = end - time.monotonic()
+                remaining = end - time.monotonic()
                 try:
-                    if left <= 0 or not select.select([self._socket], [], [], left)[0]:
+                    if remaining <= 0 or not select.select([self._socket], [], [], remaining)[0]:
                         self.kill()
                         raise WorkerError(f"no answer within {seconds:g} s", lost=True)
                     data = self._socket.recv(65536)
@@ -117,7 +117,7 @@ class Worker:
                 self._buffer += data
             line, _, self._buffer = self._buffer.partition(b"\n")
             answer: dict[str, Any] = json.loads(line)
-            if answer["number"] != number:  # of a request whose caller was interrupted
+            if answer["number"] != number:  # answers a request whose caller was interrupted
                 continue
             if "error" in answer:
                 raise WorkerError(answer["error"], lost=False)
@@ -134,7 +134,7 @@ class Worker:
             how = f"exit code {code}"
         return WorkerError(how, lost=True)
 
-    def _let_go(self) -> None:
+    def _close(self) -> None:
         self._socket.close()
         if self._life >= 0:
             life, self._life = self._life, -1
@@ -145,22 +145,22 @@ _NICE = -10
 
 
 def end_with_parent(life: int, parent: int) -> None:
-    """End this process when the parent ends, which closes the pipe `life`; never by Ctrl-C."""
+    """End this process with the parent, whose end closes the pipe `life`; ignore Ctrl-C."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGIO, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGIO})
     fcntl.fcntl(life, fcntl.F_SETOWN, os.getpid())
     fcntl.fcntl(life, fcntl.F_SETFL, fcntl.fcntl(life, fcntl.F_GETFL) | os.O_ASYNC)
     if select.select([life], [], [], 0)[0] or os.getppid() != parent:
-        os._exit(0)  # it ended meanwhile
+        os._exit(0)  # the parent has ended meanwhile
 
 
 @contextlib.contextmanager
 def outliving(seconds: float) -> Iterator[None]:
-    """Finish what must not be left half done, also when the parent ends meanwhile.
+    """Finish an indivisible task although the parent ends meanwhile.
 
-    The end is put off for at most so many seconds; then SIGALRM, which no lock holds up either,
-    ends the process whether it is done or not.
+    The end of this process is postponed by at most `seconds`; then SIGALRM, which no lock delays,
+    ends the process, finished or not.
     """
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGIO})
@@ -173,7 +173,7 @@ def outliving(seconds: float) -> Iterator[None]:
 
 
 class Line:
-    """Requests from the parent and answers to it, over the socket that is standard input."""
+    """Requests from the parent and answers, over the socket at standard input."""
 
     def __init__(self, parent: int) -> None:
         self._parent = parent
@@ -181,7 +181,7 @@ class Line:
         self._buffer = b""
 
     def next(self, seconds: float) -> dict[str, Any] | None:
-        """Return the next request, None if none came in time; ends the process at its end."""
+        """Return the next request, None if none comes in time; at the end of the line, exit."""
         while b"\n" not in self._buffer:
             if os.getppid() != self._parent:
                 os._exit(0)
@@ -199,7 +199,7 @@ class Line:
         return out
 
     def answer(self, number: int, **content: Any) -> None:
-        """Answer the request of that number; 0 is the answer to being started."""
+        """Answer the request with this number; 0 reports the start."""
         try:
             self._socket.sendall(json.dumps({"number": number, **content}).encode() + b"\n")
         except OSError:
@@ -209,7 +209,7 @@ class Line:
 def answered(
     line: Line, request: dict[str, Any], do: Callable[[dict[str, Any]], dict[str, Any]]
 ) -> bool:
-    """Answer a request by what `do` returns, or by what it raises; whether it was carried out."""
+    """Answer a request with the result or the exception of `do`; return whether it succeeded."""
     try:
         result = do(request)
     except Exception as error:
@@ -226,7 +226,7 @@ def words(error: BaseException) -> str:
 
 
 def start() -> tuple[Line, list[str]]:
-    """Begin a worker process; the line to the parent, and the other arguments."""
+    """Set up a worker process; return the line to the parent and the other arguments."""
     life, parent = int(sys.argv[1]), int(sys.argv[2])
     end_with_parent(life, parent)
     with contextlib.suppress(OSError):

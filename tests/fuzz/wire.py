@@ -270,7 +270,7 @@ def _emscon() -> Parser:
     def parse(data: bytes) -> bool:
         line = EmsconConnection.__new__(EmsconConnection)
         line.where, line.changes, line.open = "fuzz", [], True
-        line._came, line._socket = bytearray(), Socket(data[1:])  # type: ignore[assignment]
+        line._buffer, line._socket = bytearray(), Socket(data[1:])  # type: ignore[assignment]
         tracker = EmsconTracker.__new__(EmsconTracker)
         target = "pose" if data[0] else "position"
         tracker._options = emscon.EmsconOptions(target=target)  # type: ignore[arg-type]
@@ -279,7 +279,7 @@ def _emscon() -> Parser:
         tracker._clock = None  # type: ignore[assignment]
         tracker._soon = tracker._ready  # type: ignore[method-assign]
         kind, status, body = line.result(until=np.inf)
-        tracker._measure = lambda: tracker._sound(kind, status, body)  # type: ignore[method-assign]
+        tracker._measure = lambda: tracker._checked(kind, status, body)  # type: ignore[method-assign]
         sample = tracker.measure()
         if not (np.isfinite(sample.value).all() and np.linalg.eigvalsh(sample.covariance)[0] > 0.0):
             raise Accepted("emscon: a reading that cannot be")
@@ -291,7 +291,7 @@ def _emscon() -> Parser:
 def _natnet() -> Parser:
     rng = np.random.default_rng(1)
     cameras = Cameras(None, rng, None, (4, 1), 0.0, np.zeros((6, 4)), 0.0)  # type: ignore[arg-type]
-    cameras.paused, cameras.seen, cameras.others = True, (TARGET, np.array([0, 0, 0, 1.0])), 2
+    cameras.paused, cameras.newest, cameras.extra = True, (TARGET, np.array([0, 0, 0, 1.0])), 2
     cameras.board = type("Board", (), {"time": 1.0})()  # type: ignore[assignment]
     versions: tuple[nn.Version, ...] = ((3, 0), (4, 0), (4, 1), (4, 2))
     sound = [nn.message(nn.FRAME, cameras.frame(v)) for v in versions]
@@ -314,7 +314,7 @@ def _natnet() -> Parser:
             return any(b.number == BODY for b in bodies or ())
         tracker._options = type("Options", (), {"rigid_body": "tool"})()  # type: ignore[assignment]
         tracker._ask = lambda request, answer: data[5:]  # type: ignore[method-assign]
-        return tracker._found()[1] == "tool"
+        return tracker._rigid_body()[1] == "tool"
 
     return Parser("natnet", make, parse)
 
@@ -393,7 +393,7 @@ def _force(name: str) -> Parser:
 
     def parse(data: bytes) -> bool:
         stream._deframer, stream._counter = fresh(form), sensor.losses()
-        stream._kept, stream._failure = 0, ""
+        stream._count, stream._failure = 0, ""
         at, seen = 1, []
         push = stream._deframer.push
 
@@ -408,14 +408,14 @@ def _force(name: str) -> Parser:
             stream._take(data[at : at + step], time.monotonic_ns())
             at += step
         if not data[0]:
-            kept = {tuple(row) for row in stream._wrench[: min(stream._kept, RING)].tolist()}
+            kept = {tuple(row) for row in stream._wrench[: min(stream._count, RING)].tolist()}
             for body in seen:
                 if body not in sound and wrench_of(body) in kept - measured:
                     whole = [framed(one) for one in sound] if name != "hex" else []
                     raise passed(f"{name}: a frame", framed(body), whole)
-        if not stream._kept:
+        if not stream._count:
             return False
-        kept = stream._wrench[: stream._kept]
+        kept = stream._wrench[: stream._count]
         if not np.all(np.isfinite(kept)):
             raise Accepted(f"{name}: a wrench that is not finite")
         stream._running = True
@@ -492,7 +492,7 @@ def _geocom() -> Parser:
     def parse(data: bytes) -> bool:
         port.held = data[1:]
         link._instrument.transaction_counter = 0
-        tracker._full_known, tracker._last_ms = True, 0.0
+        tracker._has_full, tracker._last_ms = True, 0.0
         with quiet():
             sample = tracker.measure()
         distance = float(np.linalg.norm(sample.value))
