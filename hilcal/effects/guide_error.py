@@ -79,7 +79,7 @@ class GuideError(Effect):
             waves = legvander((2 * s.values[:, j] - low - high) / (high - low), self.orders)
             for p, (kind, k) in enumerate(self._terms, start=n * count):
                 values[:, p, KINDS.index(kind)] = waves[:, k]
-            mine = values[:, n * count : (n + 1) * count]
-            mine[..., 0] -= mine[..., 4] * travel[:, None, j]
-            mine[..., 1] += mine[..., 3] * travel[:, None, j]
+            of_slide = values[:, n * count : (n + 1) * count]
+            of_slide[..., 0] -= of_slide[..., 4] * travel[:, None, j]
+            of_slide[..., 1] += of_slide[..., 3] * travel[:, None, j]
         return (Columns("twist", np.arange(len(element)), element, values),)
