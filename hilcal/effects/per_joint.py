@@ -39,7 +39,7 @@ class JointGroups:
     group: Ints  # (J,) the group of each of them, 0..G−1
 
     @property
-    def phrases(self) -> tuple[str, ...]:
+    def words(self) -> tuple[str, ...]:
         """(G,) the groups in words, as "joint 2" or "joints 4-6"."""
         return tuple(f"joint{'' if k.isdigit() else 's'} {k}" for k in self.labels)
 
@@ -180,14 +180,14 @@ class PerJoint(Effect):
                 slides = set(self.cell.arm.slides[g.joint[g.group == k]].tolist())
                 if len(slides) > 1:
                     raise InputError(
-                        f"effect {self.name}: {g.phrases[k]} turn and slide, and share a parameter "
+                        f"effect {self.name}: {g.words[k]} turn and slide, and share a parameter "
                         f"in {unit}; valid: groups of joints of one kind"
                     )
                 units[k] = OF_SLIDES[unit] if True in slides else unit
         variants = (kinds or {"": ""}).items()
         return tuple(
             Parameter(f"j{label}{kind}", u, scale, meaning.format(joint=joints, kind=phrase))
-            for label, joints, scale, u in zip(g.labels, g.phrases, scales, units, strict=True)
+            for label, joints, scale, u in zip(g.labels, g.words, scales, units, strict=True)
             for kind, phrase in variants
         )
 
