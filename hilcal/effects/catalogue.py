@@ -57,7 +57,7 @@ class Catalogue:
     """The effects that a model can have."""
 
     effects: tuple[type[Effect], ...]  # classes with distinct names
-    files: tuple[EffectFile, ...] = ()  # the files of those that users define
+    files: tuple[EffectFile, ...] = ()  # the files of user-defined effects
 
     @property
     def names(self) -> tuple[str, ...]:

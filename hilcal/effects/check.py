@@ -36,7 +36,7 @@ ROBOT = "ur10e"
 
 
 def example_cell(joints: int | None = None, *, slides: bool = False) -> Cell:
-    """Return the cell of an example arm of so many joints, of which the first may slide."""
+    """Return the cell of an example arm with so many joints; with `slides` the first one slides."""
     cell = cell_from_config(CellConfig(robot=Robot(model=ROBOT)))
     arm = cell.arm
     rows = np.minimum(np.arange(arm.n if joints is None else joints), arm.n - 1)
@@ -107,7 +107,7 @@ def check_effect(kind: type[Effect], cell: Cell | None = None) -> None:
     used are named in `needs`.
 
     Args:
-        cell: of the arm that it is made for; an arm of six joints, or of seven, unless given.
+        cell: the cell that it is made for; unless given, an arm of six joints, or of seven.
 
     Raises:
         InputError: what is wrong, in one line: the file, the class or effect, what would be valid.

@@ -24,8 +24,8 @@ class GuideError(Effect):
 
     with s = −1 at the lower and 1 at the upper limit of the travel and Legendre's polynomials P_k,
     in axes with z along the travel, about the point of the carriage that lies on the joint's axis.
-    Constant terms, and a travel that runs askew, are those of `link_geometry`; waves along the
-    travel those of `transmission_error`. Units m and rad. Source of the names: ISO 230-1, error
+    Constant terms and the direction of the travel belong to `link_geometry`, waves along the travel
+    to `transmission_error`. Units m and rad. Source of the names: ISO 230-1, error
     motions of a linear axis (positioning, straightness, roll, pitch and yaw).
     """
 

@@ -68,7 +68,7 @@ def ordinary_give(cell: Cell) -> Floats:
 
 
 def typical_compliances(cell: Cell) -> Floats:
-    """(n,) joint compliances where nothing is known of them, rad/(N·m); of slides m/N."""
+    """(n,) typical joint compliances, rad/(N·m); of slides m/N."""
     return np.where(cell.arm.slides, TYPICAL_SHIFT, TYPICAL_TWIST) / cell.arm.ratings
 
 

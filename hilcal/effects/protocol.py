@@ -1,4 +1,4 @@
-"""What an effect is: parameters, a deviation linear in them, and the derivative of it.
+"""The protocol of effects: parameters, a deviation linear in them, and its derivative.
 
 An effect returns where it acts (a `Deviation`), not how the tool moves; the kinematic chain is
 evaluated on the sum of all deviations. A new effect is one small class in one file: `parameters`,

@@ -69,7 +69,7 @@ class DriftGroup:
 
 @dataclass(frozen=True, eq=False)
 class CarriedPrior:
-    """A posterior as prior, and the drift that it is given."""
+    """A posterior as prior, with its drift."""
 
     posterior: Posterior
     relation: Relation = "arm"  # of the same arm, or of another one of the same type
@@ -89,7 +89,7 @@ class CarriedPrior:
 
     @cached_property
     def unit(self) -> Floats:
-        """(K,) S, what a drift of 1 is: the ordinary magnitude, or the strength in a family."""
+        """(K,) S, the unit of drift: the ordinary magnitude, or the strength in a family."""
         precision = self.posterior.own_precision
         strength = 1.0 / np.sqrt(np.where(precision > 0, precision, 1.0))
         return np.where(precision > 0, strength, self.posterior.scale)

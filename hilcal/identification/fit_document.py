@@ -91,7 +91,7 @@ def prior_to_json(fit: Fit) -> dict[str, object]:
 
 
 def outliers(fit: Fit) -> list[dict[str, object]]:
-    """Readings that were set aside, with their Mahalanobis distance and what they look like."""
+    """Readings that were set aside, with their Mahalanobis distance and likely cause."""
     return [
         {"pose": g.pose, "load": g.load, "sigma": g.sigma, "reason": g.reason}
         for g in gross_errors(fit)

@@ -96,7 +96,7 @@ def error_before(fit: Fit) -> ErrorBlock:
 
 
 def residual_table(fit: Fit) -> dict[str, Column]:
-    """Return residuals, measured − predicted, with what was measured; SI, one row per reading.
+    """Return residuals, measured − predicted, by pose, load and cycle; SI, one row per reading.
 
     `residual_…` is of the fit, `left_out_…` of predictions without the reading's pose, both in
     axes of the sensor and, with `base_` in the name, of the base. `sigma` is the root of the

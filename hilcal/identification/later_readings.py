@@ -257,8 +257,8 @@ def setting(
 ) -> Setting:
     """Prepare the comparison of later readings with an earlier fit.
 
-    The tracker was set up `anew` where its place is estimated; of the later campaign's cell the
-    tool is used, and its target where that is another one.
+    With `anew` the place of the tracker is estimated. Of the later campaign's `cell` the tool is
+    used, and the targets where they differ.
 
     Raises:
         InputError: an effect needs a column that the readings lack; or, for deflections, a loaded

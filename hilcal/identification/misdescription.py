@@ -1,4 +1,4 @@
-"""Whether the readings fit the description of the arm at all, and what is wrong where they do not.
+"""Whether the readings fit the description of the arm, and what is wrong where they do not.
 
 After registration the nominal arm misses readings by its geometric errors, some mm at most. A far
 larger misfit is no effect but a wrong description. Single hypotheses (`KINDS`) are tried on some of
@@ -475,7 +475,7 @@ def examine(registered: Registration, readings: Readings) -> DescriptionFinding 
     far, rms, noise = registered.far, _size(registered.off), noise_floor(readings.covariance)
     none, fitting_rms = np.zeros_like(far), _size(registered.off[~far])
     if cell.observers:  # hypotheses are tried on positions in one frame only
-        fits = not far.any() and fitting_rms <= gate
+        fits = not (far.any() or fitting_rms > gate)
         return None if fits else DescriptionFinding(fitting_rms, gate, (), far)
     if far.any():
         search = _DescriptionSearch(cell, readings, max(3.0 * noise, fitting_rms))
@@ -637,7 +637,7 @@ class _DescriptionSearch:
         target = self._readings.target[rows]
         data = FrameData.at(d.arm, d.q[rows], d.value[rows], turn, root, target)
         cell = self._cell
-        # What was estimated with the wrong description is no start for another one.
+        # Frames estimated with the wrong description are no start for another one.
         base = cell.registration if cell.registration_known else np.eye(4)
         stated = np.array(cell.known_targets)
         frames = Frames(base, np.where(stated[:, None, None], cell.all_targets, np.eye(4)))

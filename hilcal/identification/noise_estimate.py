@@ -185,7 +185,7 @@ class _Components:
 
 
 def _components(readings: Readings, cell: Cell, config: CellConfig) -> _Components | None:
-    """Return the components of the noise, estimated; None as of `with_estimated_noise`."""
+    """Estimate the components of the noise; None as of `with_estimated_noise`."""
     if len(np.unique(readings.pose)) < FEWEST_POSES or readings.scalar.any():
         return None
     mode, share = usual_mode(readings), MOST_ROWS / readings.value.size
@@ -197,7 +197,7 @@ def _components(readings: Readings, cell: Cell, config: CellConfig) -> _Componen
 
 
 def _estimated(model: Model, readings: Readings, config: CellConfig) -> _Components | None:
-    """Return the components; None where the readings show effects beside the largest."""
+    """Return the components; None where the readings show effects in addition to the largest."""
     mode, station = usual_mode(readings), config.tracker.station_m
     joint_std = config.repeatability.per_joint(model.cell.arm.n)
     full = with_all_effects(model, readings.states, HARMONICS)
@@ -233,7 +233,7 @@ def _estimated(model: Model, readings: Readings, config: CellConfig) -> _Compone
 
 
 def _shows_several(variances: Variances) -> bool:
-    """Whether the readings show effects beside the one that moves them most."""
+    """Whether the readings show effects in addition to the one that moves them most."""
     e = variances.equations
     problem, moved = e.problem, e.rows[:, e.problem.flat :] * e.c[e.problem.flat :]
     families = problem.families.random

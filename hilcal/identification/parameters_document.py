@@ -35,7 +35,7 @@ def covariance_of(fit: Fit) -> Floats:
     """(P, P) covariance of the parameters, NaN where the readings do not determine one.
 
     C_ij = u_i ρ_ij u_j with u the standard uncertainties as stated (`Uncertainty.std`: widened
-    under a misfit, and by what is unknown of prior variances), and ρ the correlation of the
+    under a misfit, and by the uncertainty of prior variances), and ρ the correlation of the
     posterior under the stated noise.
     """
     solution, u = fit.solution, fit.uncertainty

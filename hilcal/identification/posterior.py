@@ -91,7 +91,7 @@ class Posterior(Brief):
         own_precision: (K,) the part of its diagonal that is not from the readings but from the
             effects' own priors, as the strengths of families.
         scatter: the arm's scatter, where it was estimated.
-        ranges: in what ranges the readings were taken.
+        ranges: ranges of the readings.
         prints: (M, n + 4) what identifies the readings; see `same_readings.prints`.
         source: where it is from.
     """

@@ -71,20 +71,20 @@ ITERATIONS = 20  # of the noise factor; it converges within a few
 ROUNDS = 6  # most times that the covariance is computed anew as W changes; a choice
 MOST_LEVERAGE = 0.99  # of a row; that of a row which alone determines something is 1
 ROUNDING = 1e-9  # least share of a direction's information that is not of one fold
-CHUNK = 4096  # measurements that are taken at once, for memory
+CHUNK = 4096  # measurements that are processed at once, for memory
 MOST_ROWS = 600  # elements beyond which variances count as known: of 200 poses of a real UR10
 # the factor is 1.00 to 1.06, and a draw costs the cube of the rows; a choice
 DRAWS, SEED = 30, 0  # of the posterior; a choice: 20 poses of that UR10 give 1.19 to 1.43 by seed
 # log of the largest weight of a draw over the median: tails are not normal; a choice
 HEAVIEST = 2.0
 CHANCE = 0.0005  # p-value of χ² below which there is an excess: that of `diagnosis.noise_verdict`
-SOME = 400  # measurements, evenly spaced, from which a mean leverage is taken, for speed; a choice
+SOME = 400  # measurements, evenly spaced, for a mean leverage, for speed; a choice
 SAME = 0.05  # relative change of s² and of the factor that is negligible; a choice
 
 
 @dataclass(frozen=True, slots=True)
 class Excess:
-    """What is added to the stated covariance."""
+    """An addition to the stated covariance."""
 
     position: float = 0.0  # s² of each coordinate of a measured position, m²
     attitude: float = 1.0  # factor of the variances of the attitude

@@ -125,7 +125,7 @@ def register(cell: Cell, readings: Readings) -> Registration:
 
     Raises:
         CannotAnswerError: the poses do not determine it: fewer than four distinct positions, all on
-            one line, or fewer readings of an observer than what is unknown of it.
+            one line, or fewer readings of an observer than unknowns of its place.
     """
     if readings.states.observer is not None:
         return _of_several(cell.observed_by(readings.observers), readings)
@@ -310,7 +310,7 @@ class FrameData:
     def at(
         cls, arm: Arm, q: Floats, value: Floats, turn: Floats | None, root: Floats, target: Ints
     ) -> "FrameData":
-        """Return what was read at joint values (N, n); `turn` (N, 3) the attitudes read, rad."""
+        """Return readings at joint values (N, n); `turn` (N, 3) are the attitudes, rad."""
         chain = evaluate(arm, q)
         rotation, position = (np.ascontiguousarray(x[-1]) for x in (chain.rotation, chain.position))
         attitude = None if turn is None else se3.rotation(turn)
@@ -382,7 +382,7 @@ class Placement:
         return np.concatenate([self.white.reshape(-1), -self.weight * away[self.free]])
 
     def jacobian(self) -> Floats:
-        """(R, K) derivative of what is predicted."""
+        """(R, K) derivative of the prediction."""
         rows = self.columns().reshape(self.white.size, int(np.count_nonzero(self.free)))
         if self.held is None:
             return rows
@@ -450,8 +450,8 @@ def best_placement(
 ) -> Placement:
     """Return the best placement from several starts: closed forms, then rotations of a cube.
 
-    Of these as many as `rotated` are tried, those that fit best. No other start is tried at a
-    whitened rms misfit per reading of `good`; each goes `steps` at most.
+    Of these the best `rotated` are tried. The search ends at a whitened rms misfit per reading of
+    `good`; each start takes at most `steps`.
     """
     placements: list[Placement] = []
     for start in _closed_forms(data, frames, free):
@@ -601,7 +601,7 @@ class Sightings:
 
     @classmethod
     def of(cls, cell: Cell, readings: Readings) -> "Sightings":
-        """Return readings beside the nominal arm."""
+        """Return the readings with the flange poses of the nominal arm."""
         root = inverse_roots(readings.covariance, True)
         return cls(cell, readings, replace(FrameData.of(cell.arm, readings), root=root))
 
@@ -721,7 +721,7 @@ def _starts(cell: Cell, readings: Readings) -> Iterator[Cell]:
 
 
 def _observer_placed(o: Observer, p: Floats, value: Floats) -> Observer:
-    """Place an observer by what it read (N, 3) of positions (N, 3), sensor axes."""
+    """Place an observer by its readings (N, 3) of positions (N, 3), sensor axes."""
     middle, read = p.mean(axis=0), value.mean(axis=0)
     x = p - middle
     if o.name.kind == "station":

@@ -1,11 +1,11 @@
-"""Where the robot's base and flange are: declared once, for all that a campaign hands out.
+"""The robot's base and flange, defined once for all results of a campaign.
 
 With the constant effects of a fit the arm is a chain of transforms A_k, nominally L_k,
 
     T_sensor_target = T_sensor_chain A_0 Rz(q_1) A_1 … Rz(q_n) A_n τ
 
-No reading tells a base that stands elsewhere from a first link that is longer, turned, or from
-another zero of joint 1. So the base is
+No reading distinguishes a base that stands elsewhere from a first link that is longer or turned, or
+from another zero of joint 1. So the base is
 
 - *stated* where the cell states it (a pose of the base in the tracker's frame, or positions in base
   axes). A change of it that the fit finds is then the arm's.
@@ -145,7 +145,7 @@ def _fitted(model: Model, theta: Floats) -> tuple[Floats, Floats]:
 
 
 def _constant(model: Model, theta: Floats) -> tuple[Floats, tuple[str, ...], tuple[str, ...]]:
-    """Return the links (n + 1, 4, 4) with what is constant; what is in them, and what is not.
+    """Return the links (n + 1, 4, 4) with the constant effects, and the constant and other effects.
 
         A_k = L_k exp(ξ_k) M(dq_{k+1}),      A_n = L_n exp(ξ_n)
 

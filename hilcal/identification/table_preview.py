@@ -79,7 +79,7 @@ class Preview:
     Attributes:
         rows: of the table.
         proposal: the proposed mapping: understood, unsure, unused, missing.
-        outcome: what an import into the cell gives, in sentences; None without a cell.
+        outcome: the outcome of an import into the cell, in sentences; None without a cell.
     """
 
     rows: int

@@ -45,7 +45,7 @@ class TorqueFactor:
     factor: float  # estimate; 1 where the description is right
     low: float  # lower end of its 95 % interval
     high: float  # upper end
-    stated_kg: float | None  # the mass as described; None where it is not one of a weight
+    stated_kg: float | None  # the described mass; None for a load that is no weight
     differs: bool  # whether it differs from the description
 
 

@@ -109,7 +109,7 @@ def _wider(model: Model, w: Whitening, solution: Solution, covariance: Floats) -
 
 
 def in_ordinary_magnitudes(space: Coordinates, null: Floats, scale: Floats) -> Floats:
-    """Directions (P, U) in ordinary magnitudes (P,) of the parameters, of those of y."""
+    """Directions (P, U) of y as directions of θ, in ordinary magnitudes (P,)."""
     out, index = space.transform(null).copy(), space.index
     out[index] /= scale[index, None]
     return out

@@ -235,8 +235,8 @@ class Judged:
 
     number: int | None  # of the revision; None for a baseline that is not kept
     mode: Mode
-    readings: int  # all in the other campaign
-    fitted: int  # those of them that the revision was fitted to
+    readings: int  # number of readings in the other campaign
+    fitted: int  # number of these that the revision was fitted to
     spoilt: int  # further ones whose unloaded reading was fitted
     unseen: bool  # whether those that are judged were never fitted; False where all were
     scalar: bool = False  # whether some readings are one number, a distance or a height

@@ -121,7 +121,7 @@ class Model(Brief):
         return self._slices[-1].stop if self._slices else 0
 
     def slices(self) -> tuple[slice, ...]:
-        """Where each effect's parameters lie in the vector of all."""
+        """The slice of each effect's parameters in the vector of all."""
         return self._slices
 
     def __add__(self, effect: Effect | EffectSpec | str | type[Effect]) -> "Model":

@@ -223,7 +223,7 @@ def measurement_covariance(
 
 
 def single_covariance(v: Floats, loaded: Ints, reference: Ints, weights: Floats) -> Floats:
-    """(G, L, m, m) covariance of each measurement by itself, from V (N, m, m); see above."""
+    """(G, L, m, m) covariance of each measurement by itself, from V (N, m, m)."""
     unloaded = np.einsum("lu,guij->glij", weights**2, v[reference])
     return np.asarray(v[loaded] + unloaded)
 

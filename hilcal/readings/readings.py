@@ -47,9 +47,8 @@ class States(Brief):
         joint_temperature: (N, n) °C.
         approach: (N, n) side from which each joint arrived, -1 or +1.
         q_actual: (N, n) joint angles that the encoders reported, rad.
-        torque: (N, n) static torques that the drives were measured to exert, N·m: those of load
-            and weight about the drives' axes (`Situation.torque`) with the other sign; NaN in
-            readings that lack them.
+        torque: (N, n) measured static torques of the drives, N·m: the negative of those by load
+            and weight about the drives' axes (`Situation.torque`); NaN in readings without them.
         target: (N,) number of the target that is read, in the order of `Cell.target_names`; None
             where the tool carries one target.
         observer: (N,) number of the observer, in the order of `Readings.observers`; None where one
@@ -315,7 +314,7 @@ class Readings(Tabular):
 
     @property
     def line(self) -> Ints:
-        """(N,) number of the pair of target and observer, of which deflections are taken."""
+        """(N,) number of the pair of target and observer; deflections are within one pair."""
         if self.states.observer is None:
             return self.target
         return self.target * max(len(self.observers), 1) + self.observer
@@ -381,7 +380,7 @@ def turning_variables(turns: Bools) -> frozenset[str]:
 
 
 def variables(s: States, units: Sequence[str]) -> Iterator[tuple[str, str, Floats]]:
-    """Yield name, unit, and the values (N,) of what a prediction may extrapolate in."""
+    """Yield name, unit and values (N,) of the variables in which a prediction may extrapolate."""
     for j, unit in enumerate(units):
         yield (travel_name if unit == "m" else angle_name)(j), unit, s.q[:, j]
     for name, unit, part in (("force", "N", slice(0, 3)), ("moment", "N·m", slice(3, 6))):

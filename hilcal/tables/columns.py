@@ -148,7 +148,7 @@ def _check_scalar(path: str, header: Sequence[str]) -> None:
 
 
 def _advice(name: str, valid: Sequence[str], header: Sequence[str], n: int) -> str:
-    """Return what to do about an unknown column."""
+    """Return advice on an unknown column."""
     first, _, last = name.partition("_")
     i, _, j = last.partition("_")
     if first == "cov" and f"cov_{j}_{i}" in valid:

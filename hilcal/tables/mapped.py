@@ -95,7 +95,7 @@ def mapped_table(
             "last side, the first row counts as +1"
         )
     missing_notes = _missing_positions(grid, mapping.position, raw)
-    sparse: list[str] = []  # columns of readings, of which a row has one kind
+    sparse: list[str] = []  # columns of readings; a row has one kind of reading
     if mapping.scalars:
         position = () if mapping.position is None else mapping.position.columns
         sparse = [grid.name(c) for c in (*position, *(s.column for s in mapping.scalars.values()))]
@@ -228,7 +228,7 @@ def one_target_per_row(grid: Grid, mapping: M) -> tuple[Grid, M]:
 
 
 def _put(table: ColumnTable, grid: Grid, name: str, column: Column, values: Floats) -> None:
-    """Add a column, and what the file calls it."""
+    """Add a column, and its name in the file."""
     table.number[name] = values
     table.alias[name] = grid.name(column)
 

@@ -106,7 +106,7 @@ _PREFIXES = STD | ROTATION | FORCE | MOMENT | QUATERNION | MEASURED | NOMINAL | 
 
 @dataclass(frozen=True, slots=True)
 class ColumnName:
-    """A column's name, taken apart."""
+    """A parsed name of a column."""
 
     name: str  # as the file has it
     words: tuple[str, ...]  # in small letters, without axis and number
@@ -120,7 +120,7 @@ class ColumnName:
 
 
 def parse(name: str, unit_cell: str = "") -> ColumnName:
-    """Take a column's name apart."""
+    """Parse the name of a column."""
     stem, unit = _unit(name)
     stated = UNITS.get(unit_cell.strip(" []()<>").replace("µ", "u").replace("μ", "u").lower())
     for sign, word in CHINESE.items():

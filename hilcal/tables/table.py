@@ -32,7 +32,7 @@ FORM = FileFormat(encoding="utf-8")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImportResult:
-    """Readings, and what was decided on the way."""
+    """Imported readings, and the decisions of the import."""
 
     readings: Readings  # the readings that can be used
     notes: tuple[str, ...]  # one sentence per decision
@@ -175,7 +175,7 @@ def _choose(path: str, header: Sequence[str], arm: Arm) -> tuple[Sequence[str], 
 
 
 def _index(names: list[str]) -> tuple[Ints, list[str]]:
-    """Numbers of names in order of first appearance, and those names."""
+    """Index of each name among the distinct ones, in order of appearance, and these."""
     order = {name: k for k, name in enumerate(dict.fromkeys(names))}
     return np.fromiter((order[n] for n in names), dtype=np.int64, count=len(names)), list(order)
 

@@ -96,7 +96,7 @@ def _arrow(path: Path, columns: Mapping[str, list[Any]], about: Mapping[str, obj
 
 
 def revision_table(records: Sequence[RevisionRecord], in_use: int | None) -> dict[str, Column]:
-    """Return what was fitted in each revision, and how well; SI.
+    """Return the models and errors of revisions as a table, SI.
 
     Args:
         in_use: number of the revision in use.
