@@ -50,9 +50,7 @@ class Changeable:
     cause: str = ""  # what may have done it, as a question; empty where there is nothing to say
     listed: bool = False  # whether the smallest detectable change is listed by joint
     by_frame: bool = False  # whether a frame that is estimated anew may absorb it
-    options: Mapping[str, object] = field(
-        default_factory=dict
-    )  # options of the effect that describes a change
+    options: Mapping[str, object] = field(default_factory=dict)  # of the effect that models it
     with_others: bool = False  # whether a repair changes it together with the others
     directions: "Callable[[Effect], Directions] | None" = None  # if not each parameter
 

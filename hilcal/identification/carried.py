@@ -149,7 +149,7 @@ def carried_prior(
     Raises:
         InputError: an unknown relation, an effect that is not in the catalogue, an invalid drift.
     """
-    label, effects, drifts = _called(posterior), catalogue or installed(), dict(stated or {})
+    label, effects, drifts = _label(posterior), catalogue or installed(), dict(stated or {})
     if relation not in RELATIONS:
         raise InputError(f"prior of {relation!r}; valid: {', '.join(RELATIONS)}")
     names = [e.name for e in posterior.effects]
@@ -181,7 +181,7 @@ def check_prior(prior: CarriedPrior, arm: Arm, readings: Readings) -> None:
     repeated = int(among(readings, prior.posterior.prints).sum())
     if repeated:
         raise InputError(
-            f"{_called(prior.posterior)} was learnt from {repeated} of the {len(readings)} "
+            f"{_label(prior.posterior)} was learnt from {repeated} of the {len(readings)} "
             "readings that are to be fitted; they would count twice; valid: a prior of other "
             "readings"
         )
@@ -189,7 +189,7 @@ def check_prior(prior: CarriedPrior, arm: Arm, readings: Readings) -> None:
 
 def check_arm(prior: CarriedPrior, arm: Arm) -> None:
     """Refuse a prior of an arm with other joints or other links."""
-    p, label = prior.posterior, _called(prior.posterior)
+    p, label = prior.posterior, _label(prior.posterior)
     if p.links.shape != arm.links.shape:
         raise InputError(
             f"{label} is of the arm {p.arm} with {len(p.links) - 1} joints, this one, {arm.name}, "
@@ -202,7 +202,7 @@ def check_arm(prior: CarriedPrior, arm: Arm) -> None:
         )
 
 
-def _called(p: Posterior) -> str:
+def _label(p: Posterior) -> str:
     return f"the prior{f' of {p.source.campaign}' if p.source.campaign else ''}"
 
 
@@ -217,7 +217,7 @@ class Coordinates:
     std: Floats  # (K,) standard deviations of y: 1, infinite for flat ones, 0 for those left out
     rest: Floats  # (K,) variance of θ by the coordinates that were left out, SI
 
-    def _with(self, x: Floats, values: Floats | float | bool) -> Floats:
+    def _replaced(self, x: Floats, values: Floats | float | bool) -> Floats:
         """Return x (P, ...) with values of the parameters that have a carried prior."""
         out = x.copy()
         out[self.index] = values
@@ -225,15 +225,15 @@ class Coordinates:
 
     def theta(self, y: Floats) -> Floats:
         """(P,) parameters."""
-        return self._with(y, self.mean + self.matrix @ y[self.index])
+        return self._replaced(y, self.mean + self.matrix @ y[self.index])
 
     def of_theta(self, theta: Floats) -> Floats:
         """(P,) y."""
-        return self._with(theta, self.inverse @ (theta[self.index] - self.mean))
+        return self._replaced(theta, self.inverse @ (theta[self.index] - self.mean))
 
     def transform(self, t: Floats) -> Floats:
         """(P, Q) change of θ by changes of y (P, Q)."""
-        return self._with(t, self.matrix @ t[self.index])
+        return self._replaced(t, self.matrix @ t[self.index])
 
     def columns(self, a: Floats) -> Floats:
         """(R, P) derivatives by y of derivatives by θ (R, P)."""
@@ -245,11 +245,11 @@ class Coordinates:
 
     def prior(self, std: Floats) -> Floats:
         """Prior standard deviations (P,) of y; `std` where there is no carried one."""
-        return self._with(std, self.std)
+        return self._replaced(std, self.std)
 
     def scales(self, scale: Floats) -> Floats:
         """(P,) ordinary magnitudes of y, of those of θ."""
-        return self._with(scale, 1.0)
+        return self._replaced(scale, 1.0)
 
     def carried(self, size: int) -> Bools:
         """(P,) which parameters have a carried prior."""

@@ -158,9 +158,8 @@ def gross_errors(fit: Fit) -> tuple[GrossError, ...]:
             out = fit.outlier[b.reference[g]]
             for u in np.flatnonzero(out):
                 row, affected = int(b.reference[g, u]), b.weights[:, u] > 0
-                errors[row] = _shared(
-                    e, row, measurements[affected], bool(np.all(b.weights[affected, u] == 1.0))
-                )
+                alone = bool(np.all(b.weights[affected, u] == 1.0))
+                errors[row] = _shared(e, row, measurements[affected], alone)
             # Deflections without a remaining unloaded reading are not listed one by one.
             lost = (b.weights @ out > 1.0 - 1e-9) if len(out) else np.zeros(size, dtype=bool)
             for k, r in zip(measurements[~lost], b.loaded[g, ~lost], strict=True):
@@ -187,7 +186,7 @@ def _gross_error(e: FullPrediction, row: int, off: Floats, covariance: Floats) -
         _stale(r, row)
         or _another_target(e, row, off)
         or _like_another(r, row)
-        or _off(off, covariance)
+        or _by_axis(off, covariance)
     )
     if r.states.target is not None:
         reason = f"target {r.target_names[r.target[row]]}: {reason}"
@@ -205,9 +204,8 @@ def _another_target(e: FullPrediction, row: int, off: Floats) -> str:
         for k in range(count)
     ]
     away = [float(np.linalg.norm(off[:3] - (x - places[r.target[row]]))) for x in places]
-    closest = min(
-        (k for k in range(count) if k != r.target[row]), key=lambda k: away[k], default=-1
-    )
+    candidates = [k for k in range(count) if k != r.target[row]]
+    closest = min(candidates, key=lambda k: away[k], default=-1)
     if closest < 0 or away[closest] >= SWAPPED * float(np.linalg.norm(off[:3])):
         return ""
     return f"lies where {r.target_names[closest]} is: were they swapped?"
@@ -238,7 +236,7 @@ def _like_another(r: Readings, row: int) -> str:
     return f'like the reading under "{load}": was that load hung?'
 
 
-def _off(off: Floats, covariance: Floats) -> str:
+def _by_axis(off: Floats, covariance: Floats) -> str:
     white = np.abs(off) / np.sqrt(np.maximum(np.diagonal(covariance), 1e-300))
     axis, sigma = int(np.argmax(white)), _distance(off, covariance)
     mostly = white[axis] >= MOSTLY * float(np.linalg.norm(white))

@@ -72,7 +72,7 @@ def earlier_fit(fit: Fit) -> EarlierFit:
         )
     knows = predictive_of(fit)
     beyond = max(knows.factor * knows.scatter - 1.0, 0.0)
-    shared = beyond * _shared(fit, knows, fit.readings[~fit.outlier])
+    shared = beyond * _share_by_pose(fit, knows, fit.readings[~fit.outlier])
     root = _root(knows.factor * knows.covariance)
     return EarlierFit(fit, knows, root, 1.0 + beyond - shared, shared)
 
@@ -82,7 +82,7 @@ def _root(covariance: Floats) -> Floats:
     return np.asarray(vectors[:, values > 0] * np.sqrt(values[values > 0]))
 
 
-def _shared(fit: Fit, knows: Predictive, inliers: Readings) -> float:
+def _share_by_pose(fit: Fit, knows: Predictive, inliers: Readings) -> float:
     """Share of the misfit on poses left out that all readings of a pose have in common.
 
     With r_i (3,) the residual of measurement i, predicted without its pose, V_ij the stated

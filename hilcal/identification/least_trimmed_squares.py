@@ -298,12 +298,12 @@ def _trusted(model: ReadingModel, n: int) -> int:
 
 def _trimmed(model: ReadingModel, rng: np.random.Generator) -> tuple[Bools, Floats]:
     """Least trimmed squares: the readings (N,), and δ (K,) from them."""
-    rows = _few(model, rng)
+    rows = _subset_rows(model, rng)
     part = model[rows] if len(rows) < len(model) else model
     size = (part.enough + 1) * (2 if len(part.members) else 1)
     starts = np.log(MISSED) / np.log1p(-((1.0 - MOST) ** size))
     count = int(min(np.ceil(starts), STARTS))
-    tried = [nearest(part, *part.near(_from_few(part, rng))) for _ in range(count)]
+    tried = [nearest(part, *part.near(_from_subset(part, rng))) for _ in range(count)]
     tried.sort(key=lambda t: t[1])
     best = [_concentrated(part, used) for used, _ in tried[:BEST]]
     _, used, delta = min(best, key=lambda t: t[0])
@@ -324,7 +324,7 @@ def _concentrated(model: ReadingModel, used: Bools) -> tuple[float, Bools, Float
     return lowest, used, delta
 
 
-def _few(model: ReadingModel, rng: np.random.Generator) -> Ints:
+def _subset_rows(model: ReadingModel, rng: np.random.Generator) -> Ints:
     """Rows of at most about `FEW` readings, whole groups."""
     if not len(model.members):
         return np.sort(rng.permutation(len(model))[:FEW])
@@ -333,7 +333,7 @@ def _few(model: ReadingModel, rng: np.random.Generator) -> Ints:
     return np.sort(rows[rows >= 0])
 
 
-def _from_few(model: ReadingModel, rng: np.random.Generator) -> Floats:
+def _from_subset(model: ReadingModel, rng: np.random.Generator) -> Floats:
     """δ (K,) from random readings that just determine it and one more; of groups two of each."""
     count = model.enough + 1
     if not len(model.members):

@@ -168,7 +168,7 @@ def _recounted(d: Described, h: Hypothesis) -> Described:
     return replace(d, arm=with_conventions(d.arm, sign, offset, coupling))
 
 
-def _another(d: Described, h: Hypothesis) -> Described:
+def _another_arm(d: Described, h: Hypothesis) -> Described:
     arm = load_arm(h.arm)
     return replace(d, arm=arm if d.conventions is None else as_counted(arm, d.conventions))
 
@@ -229,7 +229,7 @@ def _columns_words(h: Hypothesis) -> str:
 
 
 KINDS: dict[str, Kind] = {
-    "arm": Kind(_another, lambda h: f"the arm is another one, {h.arm}", ""),
+    "arm": Kind(_another_arm, lambda h: f"the arm is another one, {h.arm}", ""),
     "joint": Kind(_recounted, _joint_words, ""),
     "coupling": Kind(_recounted, _coupling_words, ""),
     "base_unknown": Kind(
@@ -425,9 +425,8 @@ class DescriptionFinding:
         which = np.flatnonzero(self.rows).tolist()
 
         def name(k: int) -> str:
-            label = (
-                f"{readings.pose_names[readings.pose[k]]}/{readings.load_names[readings.load[k]]}"
-            )
+            pose = readings.pose_names[readings.pose[k]]
+            label = f"{pose}/{readings.load_names[readings.load[k]]}"
             several = readings.states.target is not None
             return f"{label} {readings.target_names[readings.target[k]]}" if several else label
 

@@ -114,7 +114,7 @@ def with_estimated_noise(
     factors, estimate = components.factors, components.estimate(readings, station)
     together = SCATTER in factors and readings.states.target is None
     used = factors if together else {k: f for k, f in factors.items() if k != SCATTER}
-    estimated = _with(readings, station, used, components.model)
+    estimated = _with_factors(readings, station, used, components.model)
     covers = WHOLE if together else INSTRUMENT
     notes = tuple(n for n in imported.notes if not n.startswith(FROM_TRACKER))
     return replace(imported, readings=estimated, covers=covers, notes=notes), estimate
@@ -151,7 +151,7 @@ def with_noise_factors(
     readings: Readings, tracker: Tracker, factors: Mapping[str, float]
 ) -> Readings:
     """Return readings with the default noise of [tracker], its components times their factors."""
-    return _with(with_noise_of(tracker, readings), tracker.station_m, factors)
+    return _with_factors(with_noise_of(tracker, readings), tracker.station_m, factors)
 
 
 def _sizes(readings: Readings, station: Sequence[float] | None) -> dict[str, float]:
@@ -222,7 +222,7 @@ def _estimated(model: Model, readings: Readings, config: CellConfig) -> _Compone
             random[f.parameters] = s * f.magnitude
         effects = zip(full.effects, full.slices(), strict=True)
         by_effect = {e.name: random[rows] for e, rows in effects if e.role not in FRAME_ROLES}
-        noisy = _with(readings, station, factors, model)
+        noisy = _with_factors(readings, station, factors, model)
         if joint_std.any():
             noisy = with_joint_scatter(model.cell, noisy, joint_std)
         retained = ~fit(replace(full, random=by_effect), noisy, mode, start=theta).outlier
@@ -248,7 +248,7 @@ def _shows_several(variances: Variances) -> bool:
     return evidence(problem, smaller, rng, variances.log_std).p_value < SEVERAL
 
 
-def _with(
+def _with_factors(
     readings: Readings,
     station: Sequence[float] | None,
     factors: Mapping[str, float],

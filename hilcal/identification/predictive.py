@@ -135,7 +135,7 @@ def excess(
     `used` of the same measurements, which whitens the rows (R, P) and has the excess `previous`; a
     part with such an excess is not tested against chance again.
     """
-    spread, chosen = _spread(used, rows, root), _every(len(raw))
+    spread, chosen = _spread(used, rows, root), _spaced(len(raw))
     position, attitude = 0.0, 1.0
     for part in (slice(0, 3), slice(3, 6))[: raw.shape[1] // 3]:
         values, vectors = np.linalg.eigh(stated.covariance[:, part, part])
@@ -161,13 +161,13 @@ def excess(
     return Excess(position, attitude)
 
 
-def _every(count: int) -> Ints:
+def _spaced(count: int) -> Ints:
     return np.linspace(0, count - 1, min(count, SOME)).astype(int)
 
 
 def _spread(w: Whitening, rows: Floats, root: Floats) -> Floats:
     """J C Jᵀ (S, m, m) of some measurements, evenly spaced."""
-    measurements = _every(len(w.reading))
+    measurements = _spaced(len(w.reading))
     out, row, first = np.zeros((len(measurements), w.m, w.m)), 0, 0
     for b in w.buckets:
         groups, size = len(b.loaded), b.factor.shape[-1]

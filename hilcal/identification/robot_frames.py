@@ -161,7 +161,7 @@ def _constant(model: Model, theta: Floats) -> tuple[Floats, tuple[str, ...], tup
         d = e.deviation(theta[rows], situation)
         frames = (d.base, d.station, d.target, d.scale, d.observer)
         moves_frames = any(f is not None for f in frames)
-        constant = not e.elastic and _same(d.dq) and _same(d.twist)
+        constant = not e.elastic and _is_constant(d.dq) and _is_constant(d.twist)
         if not constant or moves_frames or d.dq is d.twist:
             beyond.append(e.name)
             continue
@@ -175,7 +175,7 @@ def _constant(model: Model, theta: Floats) -> tuple[Floats, tuple[str, ...], tup
     return links, tuple(within), tuple(beyond)
 
 
-def _same(values: Floats | None) -> bool:
+def _is_constant(values: Floats | None) -> bool:
     return values is None or bool(np.abs(values - values[:1]).max() <= SAME)
 
 

@@ -90,11 +90,11 @@ def uncertainty(
     null = in_ordinary_magnitudes(space, basis.null, scale)
     carried = space.carried(len(scale))
     identifiable = identifiable_parameters(basis, solution.prior, carried, scale, std, null)
-    std = np.where(identifiable, std * _wider(model, w, solution, covariance), np.inf)
+    std = np.where(identifiable, std * _widening_factors(model, w, solution, covariance), np.inf)
     return Uncertainty(std, formal, identifiable, misfit, name_directions(model, null))
 
 
-def _wider(model: Model, w: Whitening, solution: Solution, covariance: Floats) -> Floats:
+def _widening_factors(model: Model, w: Whitening, solution: Solution, covariance: Floats) -> Floats:
     """Factors (P,) by which the unknown prior variances of shrunk families widen `std`."""
     groups, beta = prior_of(model)[1], solution.beta
     factor = hyperparameter_factors(beta * covariance, solution.theta, solution.prior, groups)
@@ -161,11 +161,13 @@ def hyperparameter_factors(
     shrunk = (groups >= 0) & np.isfinite(prior) & (prior > 0)
     for group in np.unique(groups[shrunk]):
         rows = np.flatnonzero(shrunk & (groups == group))
-        out[rows] = _of_group(covariance[np.ix_(rows, rows)], theta[rows], float(prior[rows[0]]))
+        out[rows] = _group_factors(
+            covariance[np.ix_(rows, rows)], theta[rows], float(prior[rows[0]])
+        )
     return out
 
 
-def _of_group(covariance: Floats, theta: Floats, prior: float) -> Floats:
+def _group_factors(covariance: Floats, theta: Floats, prior: float) -> Floats:
     """Factors (n,) of one group whose covariance (n, n) is that at its prior."""
     values, axes = np.linalg.eigh(covariance)
     values = np.maximum(values, ROUNDING**2 * max(float(values[-1]), 1e-300))

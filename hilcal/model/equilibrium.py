@@ -51,14 +51,14 @@ class SlotResponse:
 
 def compliance(parts: Sequence[tuple[Effect, Floats]], s: Situation) -> list[SlotResponse]:
     """Derivative of the elastic deviations by the slot wrenches, without what is zero."""
-    blocks = (b for e, theta in parts if theta.any() for b in _of_effect(e, theta, s))
+    blocks = (b for e, theta in parts if theta.any() for b in _responses_of(e, theta, s))
     nonzero = (pruned for b in blocks if (pruned := _pruned(b)) is not None)
     halves = [part for b in nonzero for part in _halves(b)]
     drive = s.cell.arm.drive
     if drive is None:
         return halves
     borne = np.where(s.cell.arm.slides, ALONG, TORQUE).tolist()
-    return [c for b in halves for c in _of_joints(b, drive, borne)]
+    return [c for b in halves for c in _by_chain_joints(b, drive, borne)]
 
 
 def _halves(b: SlotResponse) -> Iterator[SlotResponse]:
@@ -71,7 +71,7 @@ def _halves(b: SlotResponse) -> Iterator[SlotResponse]:
     yield replace(b, components=slice(MOMENT.start, last), values=b.values[:, middle:])
 
 
-def _of_joints(b: SlotResponse, drive: Floats, borne: list[int]) -> Iterator[SlotResponse]:
+def _by_chain_joints(b: SlotResponse, drive: Floats, borne: list[int]) -> Iterator[SlotResponse]:
     """Compliance of the chain's joints, from that of the drives: D C Dᵀ by torques.
 
     Forces and moments across an axis are those of the slot itself; drives bear the components
@@ -195,7 +195,7 @@ def _norm(form: Mapping[tuple[int, bool], Floats]) -> float:
     return math.sqrt(sum(float(b @ b) for b in flat))
 
 
-def _of_effect(effect: Effect, theta: Floats, s: Situation) -> Iterator[SlotResponse]:
+def _responses_of(effect: Effect, theta: Floats, s: Situation) -> Iterator[SlotResponse]:
     """Compliance of one effect, from its response to unit wrenches."""
     count = s.wrench.shape[1]
     slots = range(count)

@@ -161,16 +161,16 @@ def arrival_factors(
 def with_scatter(readings: Readings, factor: Floats) -> Readings:
     """Return the readings with a scatter of the arm, F (N, m, k), added: V + F Fᵀ."""
     total = readings.covariance + factor @ np.swapaxes(factor, 1, 2)
-    return replace(readings, covariance=total, common=_of_arrival(readings, factor))
+    return replace(readings, covariance=total, common=_common_factor(readings, factor))
 
 
 def scatter_alone(readings: Readings, factor: Floats) -> Readings:
     """Return the readings with the covariance of a scatter F (N, m, k) of the arm alone."""
     v = factor @ np.swapaxes(factor, 1, 2)
-    return replace(readings, covariance=v, common=_of_arrival(readings, factor), serial=None)
+    return replace(readings, covariance=v, common=_common_factor(readings, factor), serial=None)
 
 
-def _of_arrival(readings: Readings, factor: Floats) -> Floats | None:
+def _common_factor(readings: Readings, factor: Floats) -> Floats | None:
     s = readings.states
     return None if s.target is None and s.observer is None else factor
 

@@ -253,10 +253,8 @@ class Observed:
 def observed_of(table: ColumnTable) -> Observed | None:
     """Return the observers of the rows; None where all are positions measured by one tracker."""
     count, station = len(table.rows), table.text.get(columns.STATION)
-    value_columns = {kind: columns.SCALAR[kind][0] for kind in KINDS}
-    read = {
-        kind: ~np.isnan(table.number[c]) for kind, c in value_columns.items() if c in table.number
-    }
+    column = {kind: columns.SCALAR[kind][0] for kind in KINDS}
+    read = {kind: ~np.isnan(table.number[c]) for kind, c in column.items() if c in table.number}
     if not read and (station is None or (len(set(station)) == 1 and "" not in station)):
         return None
     axes = [c for c in columns.POSITION if c in table.number]
@@ -264,7 +262,7 @@ def observed_of(table: ColumnTable) -> Observed | None:
     positioned = filled.any(axis=1)
     readings = np.sum([positioned, *read.values()], axis=0)
     for i in np.flatnonzero((readings != 1) | (positioned & ~filled.all(axis=1)))[:1]:
-        valid = ", ".join(["x_m, y_m, z_m"] * bool(axes) + [value_columns[kind] for kind in read])
+        valid = ", ".join(["x_m, y_m, z_m"] * bool(axes) + [column[kind] for kind in read])
         why = "a part of a position" if readings[i] == 1 else f"{readings[i]} readings"
         raise InputError(f"{table.at(int(i))}: {why}; valid: just one of {valid} in each row")
     names = []

@@ -219,7 +219,7 @@ def guess_axes(g: Guesser) -> None:
     ranked = sorted(positions, key=_rank)
     stem = ranked[0]
     names = [positions[stem][axis] for axis in "xyz"]
-    side_by_side = _several(positions, stem)
+    side_by_side = _targets_side_by_side(positions, stem)
     if side_by_side:
         names = [positions[s][axis] for s in side_by_side for axis in "xyz"]
         unit = length_unit(g, "position", names)
@@ -246,7 +246,7 @@ def guess_axes(g: Guesser) -> None:
     _std(g, complete, stem, unit)
 
 
-def _several(
+def _targets_side_by_side(
     positions: dict[tuple[object, ...], dict[str, str]], stem: tuple[object, ...]
 ) -> list[tuple[object, ...]]:
     """Return the stems of several targets' positions, which differ by a number only."""
@@ -280,12 +280,12 @@ def _covariance(g: Guesser) -> None:
 
 def _orientation(g: Guesser, complete: Group, stem: tuple[object, ...]) -> None:
     quaternions = {s: a for s, a in complete.get("quaternion", {}).items() if "w" in a}
-    best = _like(quaternions, stem)
+    best = _columns_like(quaternions, stem)
     if best is not None:
         names = [best[axis] for axis in "wxyz"]
         g.take("orientation", names, "quaternion, w first", convention="quaternion-wxyz")
         return
-    if _four_numbers(g) or _matrix(g):
+    if _numbered_quaternion(g) or _matrix(g):
         return
     angles = complete.get("angle", {})
     if stem in angles:
@@ -303,7 +303,7 @@ def _orientation(g: Guesser, complete: Group, stem: tuple[object, ...]) -> None:
     if {"roll", "pitch", "yaw"} <= set(turns):
         _angles(g, [turns[w] for w in ("roll", "pitch", "yaw")], "roll-pitch-yaw")
         return
-    axes = _like(angles, stem)
+    axes = _columns_like(angles, stem)
     if axes is not None:
         _by_axes(g, [axes[axis] for axis in "xyz"])
 
@@ -315,7 +315,7 @@ def _by_axes(g: Guesser, names: list[str]) -> None:
     _angles(g, names, "rotation-vector" if vector else "fixed-xyz")
 
 
-def _like(
+def _columns_like(
     stems: dict[tuple[object, ...], dict[str, str]], stem: tuple[object, ...]
 ) -> dict[str, str] | None:
     """Return the columns with the stem of the position, else the best ranked ones."""
@@ -331,7 +331,7 @@ def _angles(g: Guesser, names: list[str], convention: str) -> None:
     g.proposal.open_convention = True
 
 
-def _four_numbers(g: Guesser) -> bool:
+def _numbered_quaternion(g: Guesser) -> bool:
     """Quaternions q1 ... q4 (ABB) or q0 ... q3, distinguished from joints by their length."""
     groups: dict[tuple[str, ...], dict[int, str]] = {}
     for c in g.columns:
@@ -377,7 +377,7 @@ def _forces(g: Guesser, complete: Group) -> None:
 
 
 def _std(g: Guesser, complete: Group, stem: tuple[object, ...], position_unit: str) -> None:
-    axes = _like(complete.get("std", {}), stem)
+    axes = _columns_like(complete.get("std", {}), stem)
     scalar = words.DISTANCE | words.GAUGE
     columns = [c for c in g.columns if c.name in g.free and c.has(words.STD) and not c.axis]
     single = [c.name for c in columns if g.number(c.name) and not (c.numbers or c.has(scalar))]
@@ -386,7 +386,7 @@ def _std(g: Guesser, complete: Group, stem: tuple[object, ...], position_unit: s
     names = [axes[axis] for axis in "xyz"] if axes is not None else single[:1]
     first = parse(names[0])
     section: dict[str, object] = {"unit": g.unit(names, LENGTHS) or position_unit}
-    turned = _like(complete.get("std_angle", {}), stem)
+    turned = _columns_like(complete.get("std_angle", {}), stem)
     orientation = g.proposal.sections.get("orientation")
     if axes is not None and turned is not None and orientation is not None:
         names += [turned[axis] for axis in "xyz"]

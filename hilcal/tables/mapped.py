@@ -239,13 +239,10 @@ def _quantities(
     """Add the columns of numbers in SI units."""
 
     def put(
-        names: Sequence[str],
-        sources: Sequence[Column],
-        size: float | Floats = 1.0,
-        zero: float = 0.0,
+        names: Sequence[str], keys: Sequence[Column], size: float | Floats = 1.0, zero: float = 0.0
     ) -> None:
         sizes = np.broadcast_to(size, len(names)).tolist()
-        for name, column, factor in zip(names, sources, sizes, strict=True):
+        for name, column, factor in zip(names, keys, sizes, strict=True):
             _put(table, grid, name, column, factor * (raw[grid.name(column)] - zero))
 
     if m.position is not None:

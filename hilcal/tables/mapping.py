@@ -469,11 +469,8 @@ class PointMapping(Section):
     @property
     def scalars(self) -> dict[ObserverKind, OneNumber]:
         """Sections of readings that are one number, by kind of observer."""
-        sections: dict[ObserverKind, OneNumber | None] = {
-            "point": self.distance,
-            "gauge": self.gauge,
-        }
-        return {kind: section for kind, section in sections.items() if section is not None}
+        both: dict[ObserverKind, OneNumber | None] = {"point": self.distance, "gauge": self.gauge}
+        return {kind: section for kind, section in both.items() if section is not None}
 
 
 class Mapping(PointMapping):

@@ -216,14 +216,12 @@ class Proposal:
             f"# How to read {source}; proposed by `hilcal import --preview`. Check what is",
             "# marked, change what is wrong, and give this file with --format.",
         ]
-        lines += [f"# missing: {sentence}" for sentence in self.lacking]
-        absent = [
-            (about, sentence) for about, sentence in self.unsure if about not in self.sections
-        ]
-        lines += [f"# {about}: {sentence}" for about, sentence in absent]
+        lines += [f"# missing: {text}" for text in self.lacking]
+        absent = [(about, text) for about, text in self.unsure if about not in self.sections]
+        lines += [f"# {about}: {text}" for about, text in absent]
         for name, section in self.sections.items():
             lines.append("")
-            lines += [f"# check: {sentence}" for about, sentence in self.unsure if about == name]
+            lines += [f"# check: {text}" for about, text in self.unsure if about == name]
             lines.append(f"[{name}]")
             lines += [f"{key} = {inline(_escaped(value))}" for key, value in section.items()]
         if self.unused:

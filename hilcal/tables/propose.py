@@ -272,23 +272,18 @@ def guess_names(g: Guesser) -> None:
         if not values & {*UNLOADED, ""}:
             shown = ", ".join(sorted(values)[:SHOWN])
             g.unsure("load", f"which of its values means no load? Set none = [...] ({shown})")
-    _pick(g, "station", words.STATION, lambda n: not g.number(n) and _few(g, n))
+    _pick(g, "station", words.STATION, lambda n: not g.number(n) and _few_values(g, n))
     _pick(g, "cycle", words.CYCLE, lambda n: g.number(n) and _whole_numbers(g, n))
-    _pick(g, "target", words.REFLECTOR, lambda n: not g.number(n) and _few(g, n))
+    _pick(g, "target", words.REFLECTOR, lambda n: not g.number(n) and _few_values(g, n))
 
 
 def _pick(g: Guesser, section: str, vocabulary: set[str], fits: Callable[[str], bool]) -> None:
     for c in list(g.free.values()):
-        if c.has(vocabulary) and not c.axis and not c.has(words.STD) and _is_name(g, c.name):
-            if not fits(c.name):
-                continue
+        named = not g.number(c.name) or _whole_numbers(g, c.name)
+        usable = named and c.has(vocabulary) and not c.axis and not c.has(words.STD)
+        if usable and fits(c.name):
             g.take(section, [c.name], "name", column=c.name)
             return
-
-
-def _is_name(g: Guesser, name: str) -> bool:
-    """Whether a column holds text or whole numbers."""
-    return not g.number(name) or _whole_numbers(g, name)
 
 
 def _whole_numbers(g: Guesser, name: str) -> bool:
@@ -297,7 +292,7 @@ def _whole_numbers(g: Guesser, name: str) -> bool:
     return bool(np.all(finite == np.rint(finite)))
 
 
-def _few(g: Guesser, name: str) -> bool:
+def _few_values(g: Guesser, name: str) -> bool:
     count = len(set(g.grid.text(name)))
     return 1 < count <= min(20, len(g.grid.rows) // 2)
 

@@ -236,27 +236,23 @@ def check_covers(word: str, where: str) -> None:
         )
 
 
-def measured_of(
-    table: ColumnTable, arm: Arm, positioned: Bools | None = None
-) -> tuple[States, Floats]:
+def measured_of(table: ColumnTable, arm: Arm, rows: Bools | None = None) -> tuple[States, Floats]:
     """Return the states of a table's rows, and their measured values (N, m), m and rad.
 
     Args:
-        positioned: (N,) rows with a position, others are zero; all of them where None.
+        rows: (N,) rows with a position, others are zero; all of them where None.
     """
     states = _states(table, arm)
-    if positioned is not None and not positioned.all():
+    if rows is not None and not rows.all():
         value = np.zeros((len(table.rows), 3))
-        if positioned.any():
-            value[positioned] = measured_of(table.select(positioned), arm)[1]
+        if rows.any():
+            value[rows] = measured_of(table.select(rows), arm)[1]
         return states, value
     value = table.matrix(columns.POSITION)
     station = np.array(table.text.get(columns.STATION, [""] * len(value)))
     for name in dict.fromkeys(station.tolist()):
-        of_station = station == name
-        checks.check_positions(
-            table.select(of_station), value[of_station], states.q[of_station], arm
-        )
+        group = station == name
+        checks.check_positions(table.select(group), value[group], states.q[group], arm)
     if columns.ROTATION[0] in table.number:
         rotation = table.matrix(columns.ROTATION)
         checks.check_rotations(table, rotation)
@@ -383,11 +379,11 @@ def exchange_columns(
 ) -> dict[str, Column]:
     """Return the columns of an exchange table; arguments and errors as of `write_table`."""
     out: dict[str, Column] = {
-        "pose": _names(readings.pose_names, readings.pose, "pose"),
-        "load": _names(readings.load_names, readings.load, "load"),
+        "pose": _checked_names(readings.pose_names, readings.pose, "pose"),
+        "load": _checked_names(readings.load_names, readings.load, "load"),
     }
     if readings.states.target is not None:
-        out[columns.TARGET] = _names(readings.target_names, readings.target, columns.TARGET)
+        out[columns.TARGET] = _checked_names(readings.target_names, readings.target, columns.TARGET)
     if readings.states.observer is not None:
         out |= observer_columns(readings)
     if covers != INSTRUMENT:
@@ -408,7 +404,7 @@ def with_what_rounding_does(covers: str, readings: Readings) -> str:
     return covers + ROUNDING * bool(with_rounding(readings.covariance[positioned], rounding)[1])
 
 
-def _names(names: Sequence[str], index: Ints, kind: str) -> list[str]:
+def _checked_names(names: Sequence[str], index: Ints, kind: str) -> list[str]:
     used = [names[k] for k in dict.fromkeys(index.tolist())]
     for name in used:
         if not check_name(name, kind) or name != name.strip():

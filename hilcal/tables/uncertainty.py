@@ -212,7 +212,7 @@ def floored(
             i = int(np.argmax((v > 0).any(axis=1)))
             raise InputError(
                 f"{table.at(i)}: the stated standard deviations are {usual:.2g} {unit} as a rule; "
-                f"no instrument reaches {least:g} {unit}{_meant(usual) if unit == 'm' else ''}"
+                f"no instrument reaches {least:g} {unit}{_cause(usual) if unit == 'm' else ''}"
             )
         tiny[:, block] = (v >= 0) & (v < least**2)
     rows: Bools = np.asarray(tiny.any(axis=1))
@@ -236,7 +236,7 @@ def floored(
     return out, (note,)
 
 
-def _meant(usual: float) -> str:
+def _cause(usual: float) -> str:
     low, high = _PLAUSIBLE
     looks = []
     if low <= np.sqrt(usual) <= high:
