@@ -14,9 +14,9 @@ Least trimmed squares (Rousseeuw and Van Driessen, Data Mining and Knowledge Dis
 
 d²_(k) ascending squared distances of the readings from the linear model with δ, h a little more
 than half of them, so that nearly half may be wrong, by any amount. A fit to the h readings that are
-nearest to a model has a lower sum (concentration); it is begun from many random subsets that just
-determine the model, and the lowest sum of all is taken. From the bulk of the distances follows the
-limit of a gross error (`limit`).
+nearest to a model has a lower sum (concentration); it starts from many random subsets that just
+determine the model, and the lowest sum is kept. The bulk of the distances gives the limit of a
+gross error (`limit`).
 """
 
 from dataclasses import dataclass, field

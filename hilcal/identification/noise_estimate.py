@@ -65,7 +65,7 @@ SEED = 20251125  # of the poses that are chosen, and of simulated likelihood rat
 NOISE = "noise"  # key among the texts about an imported campaign, and kind of event of a measured
 # one: the estimate; absent where the noise is stated, or as the samples show it
 CONTRADICTED = 3.0  # standard errors of a factor's log by which readings contradict covariances
-LEAST_FACTOR = 1.3  # by which the noise of readings differs from that of their samples
+LEAST_FACTOR = 1.3  # from which on the noise of readings differs from that of their samples
 ALONG, ACROSS, ORIENTATION, STATED = "along", "across", "orientation", "arm as stated"
 
 

@@ -187,9 +187,9 @@ def _registration(
 
 
 def _fitted(data: "FrameData", frames: "Frames", free: Bools) -> tuple["Placement", Floats]:
-    """Return the best frames by a part of the readings, then all, and what they do not determine.
+    """Return the best frames, by a part of the readings, then by all; and undetermined directions.
 
-    The undetermined directions (6 + 6 T, U) are of unit length, in ordinary sizes.
+    The directions (6 + 6 T, U) are of unit length, in ordinary sizes.
     """
     part = data[np.unique(np.linspace(0, len(data) - 1, FEW).astype(int))]
     best = best_placement(part, frames, free, GOOD * np.sqrt(part.m), STEPS, TRIED)
@@ -301,7 +301,7 @@ class FrameData:
 
     @classmethod
     def of(cls, arm: Arm, readings: Readings) -> "FrameData":
-        """Return the readings beside the flange poses of a nominal arm."""
+        """Return the readings with the flange poses of a nominal arm."""
         value, turn = readings.value, readings.value[:, 3:] if readings.m == 6 else None
         root = inverse_roots(readings.covariance)
         return cls.at(arm, angles(readings), value[:, :3], turn, root, readings.target)
@@ -466,7 +466,7 @@ def best_placement(
 
 
 def settled(placement: Placement, frames: Frames) -> tuple[Placement, Floats]:
-    """Return a minimum whose undetermined part is held near the targets of `frames`; that part.
+    """Return the minimum, its undetermined part held near the targets of `frames`; and that part.
 
     The prior has the ordinary sizes as standard deviations. It acts along the undetermined
     directions (6 + 6 T, U) alone: along the others, the last steps go to the minimum without it.
@@ -593,7 +593,7 @@ def _far_of_several(off: Floats) -> Bools:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sightings:
-    """Readings of several observers beside the flange poses of the nominal arm."""
+    """Readings of several observers with the flange poses of the nominal arm."""
 
     cell: Cell  # with the observers of the readings
     readings: Readings

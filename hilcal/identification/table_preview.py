@@ -132,7 +132,7 @@ def _name_targets(proposal: Proposal, names: list[str]) -> None:
 def _decide_travels(proposed: Proposed, arm: Arm) -> None:
     """Decide columns and units of joints that slide, by their names and by the arm's limits.
 
-    External axes E1, E2, … stand where the arm slides. Travels beyond ten times the limits are mm.
+    External axes E1, E2, … are the joints that slide. Travels beyond ten times the limits are mm.
     """
     proposal, grid = proposed.proposal, proposed.grid
     section, slides = proposal.sections.get("joints"), np.flatnonzero(arm.slides).tolist()

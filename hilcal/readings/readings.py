@@ -375,7 +375,7 @@ def travel_name(joint: int) -> str:
 
 
 def turning_variables(turns: Bools) -> frozenset[str]:
-    """Return the variables that are periodic in whole turns, of the joints (n,) that turn."""
+    """Return the angle variables of the joints (n,) that are periodic in whole turns."""
     return frozenset(angle_name(j) for j in np.flatnonzero(turns).tolist())
 
 
