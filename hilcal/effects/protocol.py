@@ -396,8 +396,8 @@ class Effect(ABC):
     def fine(self, states: States) -> "Effect | None":
         """Return the effect as fine as it may really be; None where the readings do not limit it.
 
-        For families whose number of parameters follows from the number of poses, which may be too
-        few to resolve all of them.
+        For families whose number of parameters follows from the number of poses: further
+        parameters cannot be resolved, but may differ from zero all the same.
         """
         return None
 

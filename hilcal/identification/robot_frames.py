@@ -145,7 +145,7 @@ def _fitted(model: Model, theta: Floats) -> tuple[Floats, Floats]:
 
 
 def _constant(model: Model, theta: Floats) -> tuple[Floats, tuple[str, ...], tuple[str, ...]]:
-    """Return the links (n + 1, 4, 4) with the constant effects; names of the constant and other ones.
+    """Return the links (n + 1, 4, 4) with the constant effects, their names, and the other names.
 
         A_k = L_k exp(ξ_k) M(dq_{k+1}),      A_n = L_n exp(ξ_n)
 

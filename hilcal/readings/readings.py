@@ -104,8 +104,8 @@ class ArmScatter:
         std_error: their standard uncertainties.
         size_m: rms over the readings of the 3-D displacement of the target.
         log_evidence: log odds of this against noise of the instrument that is larger than stated.
-        instrument_factor: by how much the instrument's standard deviations were larger, then.
-        predicted_share: share of the misfit that something recorded predicts on poses left out.
+        instrument_factor: factor of the instrument's standard deviations in that alternative.
+        predicted_share: share of the misfit on poses left out that recorded variables predict.
         predicted_by: the variables that predict it, at most two.
     """
 
@@ -137,7 +137,7 @@ class SerialNoise:
         share: φ, 0 to 1.
         share_error: its standard uncertainty.
         length: τ, s or readings.
-        rho: correlation of z between consecutive readings, of the median distance in time.
+        rho: correlation of z between consecutive readings, at their median distance in time.
         rho_error: its standard uncertainty.
         log_likelihood_ratio: gain of the restricted log likelihood over white noise, both with
             every effect that the readings could show.

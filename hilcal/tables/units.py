@@ -2,7 +2,7 @@
 
 Every convention gives the rotation R that maps the target's axes into the sensor's. Angles in
 the order of their columns; "intrinsic" turns about the axes of the turned frame, "fixed" about
-those of the fixed frame:
+those of the sensor:
 
     intrinsic-zyx:  R = R_z(a) R_y(b) R_x(c)        fixed-xyz:  R = R_z(c) R_y(b) R_x(a)
 
