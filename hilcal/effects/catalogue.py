@@ -56,8 +56,8 @@ BUILT_IN: tuple[type[Effect], ...] = (
 class Catalogue:
     """The effects that a model can have."""
 
-    effects: tuple[type[Effect], ...]  # classes, each of another name
-    files: tuple[EffectFile, ...] = ()  # the files that some of them are from
+    effects: tuple[type[Effect], ...]  # classes with distinct names
+    files: tuple[EffectFile, ...] = ()  # the files of user-defined effects
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -79,8 +79,8 @@ class Catalogue:
         """Build an effect by name.
 
         Args:
-            states: those that it is set up for.
-            options: where they are not the usual ones.
+            states: for which the effect is set up.
+            options: those that are not the usual ones.
             m: 3 for readings of positions, 6 for poses.
 
         Raises:
@@ -95,7 +95,7 @@ class Catalogue:
         return tuple(kind for kind in self.effects if kind.role in roles)
 
     def unknown_frames(self, cell: Cell) -> tuple[str, ...]:
-        """Return the names of the effects of those frames that a cell leaves unknown."""
+        """Return the names of the effects whose frame a cell leaves unknown."""
         unknown = {
             "registration": not cell.registration_known,
             "target": not cell.target_known,
@@ -109,16 +109,16 @@ class Catalogue:
         Raises:
             InputError: on an effect that cannot be used, or whose name is taken.
         """
-        known = self
+        extended = self
         for kind in kinds:
             check_effect(kind)
-            if kind.name in known.names:
+            if kind.name in extended.names:
                 raise InputError(
                     f"{source_of(kind)}: class {kind.__name__}: effect {kind.name} is in the "
                     "catalogue already; choose another name"
                 )
-            known = replace(known, effects=(*known.effects, kind))
-        return known
+            extended = replace(extended, effects=(*extended.effects, kind))
+        return extended
 
     def with_file(self, path: Path) -> "Catalogue":
         """Return the catalogue with the effects of a Python file, see `read_effects`.
@@ -141,17 +141,17 @@ def installed() -> Catalogue:
     Raises:
         InputError: on an entry point that cannot be loaded, or an effect that cannot be used.
     """
-    found = Catalogue(BUILT_IN)
+    catalogue = Catalogue(BUILT_IN)
     for point in entry_points(group=ENTRY_POINT_GROUP):
         where = f"entry point {point.name} = {point.value}"
         try:
             kind = point.load()
             if not (isinstance(kind, type) and issubclass(kind, Effect)):
                 raise InputError("not an Effect class")
-            found = found.with_effects(kind)
+            catalogue = catalogue.with_effects(kind)
         except InputError as error:
             raise InputError(f"{where}: {error}") from None
         except Exception as error:
-            words = f"cannot be loaded ({type(error).__name__}: {error})"
-            raise InputError(f"{where}: {words}") from error
-    return found
+            reason = f"cannot be loaded ({type(error).__name__}: {error})"
+            raise InputError(f"{where}: {reason}") from error
+    return catalogue

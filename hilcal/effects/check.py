@@ -36,7 +36,7 @@ ROBOT = "ur10e"
 
 
 def example_cell(joints: int | None = None, *, slides: bool = False) -> Cell:
-    """Return the cell of an example arm of so many joints, of which the first may slide."""
+    """Return the cell of an example arm with so many joints; with `slides` the first one slides."""
     cell = cell_from_config(CellConfig(robot=Robot(model=ROBOT)))
     arm = cell.arm
     rows = np.minimum(np.arange(arm.n if joints is None else joints), arm.n - 1)
@@ -68,13 +68,13 @@ def example_states(cell: Cell, count: int = 30) -> States:
         q_actual=q + 1e-5 * rng.normal(size=q.shape), observer=np.arange(count) % 4,
     )  # fmt: skip
     for field in fields(states):
-        if (given := getattr(states, field.name)) is not None:
-            given.flags.writeable = False
+        if (array := getattr(states, field.name)) is not None:
+            array.flags.writeable = False
     return states
 
 
 def example_situation(cell: Cell, states: States) -> Situation:
-    """Return the states on the rigid arm, with what its weight and the loads transmit."""
+    """Return the states on the rigid arm, with the wrenches by its weight and the loads."""
     angle = states.q if states.q_actual is None else states.q_actual
     chain = chains.evaluate(cell.arm, angle)
     load = Load(states.wrench, cell.load_point, cell.tool_mass, cell.tool_com, cell.gravity)
@@ -88,9 +88,8 @@ NAME = re.compile(r"[a-z][a-z0-9_]*")
 JOINTS = (6, 7)  # of arms to try an effect on; it has to pass on one
 NEEDS = ("time", "load_time", "air_temperature", "joint_temperature", "approach", "q_actual")
 AGREES = 1e-3
-"""Share of the largest value by which a derivative may be outside of the difference quotients of
-both sides, between which it lies, at a bend as well: max(τ, 0) has its own at τ = 0. A guess, far
-above rounding."""
+"""A derivative lies between the difference quotients of both sides, also at a kink such as that of
+max(τ, 0). Share of the largest value by which it may lie outside; a guess, far above rounding."""
 ROUNDING = 1e-9  # Share of the largest value that rounding may change; a guess, far above 1e-16
 STEP = 1e-4  # of difference quotients, in ordinary magnitudes; between rounding and curvature
 _FIELDS = Deviation.__slots__
@@ -108,7 +107,7 @@ def check_effect(kind: type[Effect], cell: Cell | None = None) -> None:
     used are named in `needs`.
 
     Args:
-        cell: of the arm that it is made for; an arm of six joints, or of seven, unless given.
+        cell: the cell that it is made for; unless given, an arm of six joints, or of seven.
 
     Raises:
         InputError: what is wrong, in one line: the file, the class or effect, what would be valid.
@@ -145,8 +144,8 @@ def _is_text(value: object) -> bool:
 def _class(kind: type[Effect]) -> None:
     missing = sorted(getattr(kind, "__abstractmethods__", ()))
     _need(not missing, f"lacks {' and '.join(missing)}")
-    own = kind.deviation is Effect.deviation
-    _need(own, "overrides deviation; give columns, in whose parameters the law is linear")
+    inherited = kind.deviation is Effect.deviation
+    _need(inherited, "overrides deviation; give columns, in whose parameters the law is linear")
     flag = "True, False", lambda v: isinstance(v, bool)
     positive = (
         "a number of ordinary magnitudes, more than 0",
@@ -171,8 +170,8 @@ def _class(kind: type[Effect]) -> None:
         **dict.fromkeys(("plausible", "drift", "spread"), positive),
     }
     for key, (valid, good) in rules.items():
-        found = getattr(kind, key, None)
-        _need(good(found), f"has {key} = {found!r}; valid: {valid}")
+        value = getattr(kind, key, None)
+        _need(good(value), f"has {key} = {value!r}; valid: {valid}")
     has_priors = kind.role not in FRAME_ROLES or set(PRIOR_HELP) <= set(kind.option_help)
     _need(has_priors, f"has role = {kind.role!r}; add {' and '.join(PRIOR_HELP)} to option_help")
 
@@ -200,25 +199,25 @@ def _try(kind: type[Effect], cell: Cell) -> None:
 
 
 def _parameters(effect: Effect) -> None:
-    found: Any = effect.parameters
-    good = isinstance(found, tuple) and len(found) > 0
-    _need(good, f"parameters are {found!r}; expected a tuple of one Parameter or more")
-    for p in found:
+    parameters: Any = effect.parameters
+    good = isinstance(parameters, tuple) and len(parameters) > 0
+    _need(good, f"parameters are {parameters!r}; expected a tuple of one Parameter or more")
+    for p in parameters:
         good = isinstance(p, Parameter) and _is_text(p.name) and _is_text(p.unit)
         _need(good, f"parameters hold {p!r}; expected Parameter(name, unit, scale, meaning)")
         good = isinstance(p.scale, int | float) and 0 < p.scale < np.inf
         expected = "expected an ordinary magnitude, more than 0"
         _need(good, f"parameters {p.name}: scale = {p.scale!r}; {expected}")
-    names = [p.name for p in found]
+    names = [p.name for p in parameters]
     _need(len(set(names)) == len(names), f"parameters have a name twice: {', '.join(names)}")
 
 
 def _columns(effect: Effect, s: Situation) -> None:
-    found: Any = effect.columns(s)
-    good = isinstance(found, tuple) and all(isinstance(c, Columns) for c in found)
-    _need(good, f"columns returns {type(found).__name__}; expected a tuple of Columns")
+    columns: Any = effect.columns(s)
+    good = isinstance(columns, tuple) and all(isinstance(c, Columns) for c in columns)
+    _need(good, f"columns returns {type(columns).__name__}; expected a tuple of Columns")
     size, (count, n) = len(effect.parameters), s.angle.shape
-    for c in found:
+    for c in columns:
         valid = get_args(Field)
         _need(c.field in valid, f"columns has the field {c.field!r}; valid: {', '.join(valid)}")
         limits = {"parameter": (c.parameter, size)}
@@ -239,13 +238,13 @@ def _results(effect: Effect, theta: Floats, s: Situation) -> None:
     step, prior = np.zeros((count, 2, n + 1, 6)), effect.prior_std()
     change: Any = effect.load_change(theta)
     response: Any = effect.response(theta, s, step)
-    for method, found, expected in (
+    for method, value, expected in (
         ("load_change", change, LoadChange | None),
         ("response", response, Response),
     ):
-        wrong = f"{method} returns {type(found).__name__}; expected {expected}"
-        _need(isinstance(found, expected), wrong)
-    for what, found, shape in (
+        wrong = f"{method} returns {type(value).__name__}; expected {expected}"
+        _need(isinstance(value, expected), wrong)
+    for label, value, shape in (
         ("response has dq", response.dq, (count, 2, n)),
         ("response has twist", response.twist, (count, 2, n + 1, 6)),
         ("wrench_change is", effect.wrench_change(theta, s), (count, 6)),
@@ -255,27 +254,27 @@ def _results(effect: Effect, theta: Floats, s: Situation) -> None:
         ("groups is", effect.groups(), (size,)),
         ("prior_std is", None if prior is None else prior > 0, (size,)),
     ):
-        if found is not None:
-            _array(what, found, shape)
+        if value is not None:
+            _array(label, value, shape)
     same = type(effect)(s.cell, s.states, effect.options).parameters == effect.parameters
     _need(same, "its options do not build it again; keep in self.options what setup chooses")
 
 
-def _array(what: str, found: Any, *shapes: tuple[int, ...]) -> None:
-    good = isinstance(found, np.ndarray) and found.dtype.kind in "fiub"
-    _need(good, f"{what} of type {type(found).__name__}; expected an array of numbers")
+def _array(label: str, value: Any, *shapes: tuple[int, ...]) -> None:
+    good = isinstance(value, np.ndarray) and value.dtype.kind in "fiub"
+    _need(good, f"{label} of type {type(value).__name__}; expected an array of numbers")
     expected = " or ".join(str(shape) for shape in dict.fromkeys(shapes))
-    _need(found.shape in shapes, f"{what} of shape {found.shape}; expected {expected}")
-    _need(np.isfinite(found).all(), f"{what} of which some are not finite")
+    _need(value.shape in shapes, f"{label} of shape {value.shape}; expected {expected}")
+    _need(np.isfinite(value).all(), f"{label} of which some are not finite")
 
 
 def _states(effect: Effect, theta: Floats, s: Situation) -> None:
     """Check that the deviation of a state does not depend on the other states."""
     few = slice(0, len(s.states) // 3)
-    own = effect.deviation(theta, s)
+    full = effect.deviation(theta, s)
     alone = effect.deviation(theta, example_situation(s.cell, s.states[few]))
     for key in _FIELDS:
-        a, b = _field(alone, key), _field(own, key)[few]
+        a, b = _field(alone, key), _field(full, key)[few]
         _need(
             np.allclose(a, b, rtol=0.0, atol=ROUNDING * np.abs(a).max()),
             "columns of a state depend on the other states; take what is of all of them, as a "
@@ -291,50 +290,51 @@ def _elastic(effect: Effect, theta: Floats, s: Situation) -> None:
     for key, quotients in _quotients(effect, theta, up, s, down).items():
         still = effect.elastic or not any(map(np.any, quotients))
         _need(still, "columns follow the wrenches; set elastic = True and give response")
-        given = getattr(response, key, None)
-        found = np.zeros(1) if given is None else given[:, 0]
-        _agree("response", f"of columns by the wrenches: {key}", found, *quotients)
+        part = getattr(response, key, None)
+        derivative = np.zeros(1) if part is None else part[:, 0]
+        _agree("response", f"of columns by the wrenches: {key}", derivative, *quotients)
 
 
 def _local(effect: Effect, theta: Floats, s: Situation) -> None:
-    """Check `local_response`: each slot deviates with its own wrench alone, (1, ...) is taken."""
+    """Check `local_response`: each slot deviates with its own wrench alone, (1, ...) works."""
     n = s.angle.shape[1]
     for slot in range(n + 1):
-        one = np.zeros((1, 6, n + 1, 6))
-        one[0, :, slot] = np.eye(6)
-        found = effect.response(theta, s, one)
-        every = effect.response(theta, s, np.repeat(one, len(s.angle), axis=0))
+        step = np.zeros((1, 6, n + 1, 6))
+        step[0, :, slot] = np.eye(6)
+        response = effect.response(theta, s, step)
+        repeated = effect.response(theta, s, np.repeat(step, len(s.angle), axis=0))
         for key in ("dq", "twist"):
-            given, full = getattr(found, key), getattr(every, key)
-            if given is None:
+            part, full = getattr(response, key), getattr(repeated, key)
+            if part is None:
                 continue
-            good = given.ndim == full.ndim and np.allclose(given, full, rtol=1e-12, atol=0.0)
+            good = part.ndim == full.ndim and np.allclose(part, full, rtol=1e-12, atol=0.0)
             _need(
                 good, f"response to changes (1, P, n + 1, 6) has another {key}; expected the same"
             )
-            others = np.arange(given.shape[2]) != slot
+            elsewhere = np.arange(part.shape[2]) != slot
             wrong = f"response moves other slots than {slot} by its wrench"
-            _need(not np.any(given[:, :, others]), f"{wrong}; set local_response = False")
+            _need(not np.any(part[:, :, elsewhere]), f"{wrong}; set local_response = False")
 
 
 def _compliance(effect: Effect, theta: Floats, s: Situation) -> None:
     step = STEP * s.compliance * np.random.default_rng(4).normal(size=len(s.compliance))
     up, down = (replace(s, compliance=c) for c in (s.compliance + step, s.compliance - step))
-    found = total(effect.compliance_columns(theta, s), step, s)
+    change = total(effect.compliance_columns(theta, s), step, s)
     for key, quotients in _quotients(effect, theta, up, s, down).items():
-        what = f"of columns by the compliance: {key}"
-        _agree("compliance_columns", what, _field(found, key), *quotients)
+        label = f"of columns by the compliance: {key}"
+        _agree("compliance_columns", label, _field(change, key), *quotients)
 
 
 def _load(effect: Effect, theta: Floats, s: Situation, scale: Floats) -> None:
     step = STEP * scale * np.random.default_rng(3).normal(size=len(scale))
-    up, at, down = (_transmitted(effect, t, s) for t in (theta + step, theta, theta - step))
-    found = effect.wrench_columns(theta, s)
-    given = np.zeros(1) if found is None else np.einsum("npki,p->nki", found, step)
-    _agree("wrench_columns", "of the wrenches by the parameters: it", given, up - at, at - down)
-    if (by_load := effect.load_columns(theta, s)) is not None and found is not None:
+    up, mid, down = (_transmitted(effect, t, s) for t in (theta + step, theta, theta - step))
+    columns = effect.wrench_columns(theta, s)
+    change = np.zeros(1) if columns is None else np.einsum("npki,p->nki", columns, step)
+    _agree("wrench_columns", "of the wrenches by the parameters: it", change, up - mid, mid - down)
+    if (by_load := effect.load_columns(theta, s)) is not None and columns is not None:
         by_slots = load_wrench_change(s.chain, s.load, by_load)
-        _agree("load_columns", "of the load's wrench by the parameters: it", by_slots, found, found)
+        phrase = "of the load's wrench by the parameters: it"
+        _agree("load_columns", phrase, by_slots, columns, columns)
 
 
 def _transmitted(effect: Effect, theta: Floats, s: Situation) -> Floats:
@@ -360,23 +360,23 @@ def _needs(kind: type[Effect], cell: Cell, states: States) -> None:
 
 
 def _quotients(
-    effect: Effect, theta: Floats, up: Situation, at: Situation, down: Situation
+    effect: Effect, theta: Floats, up: Situation, mid: Situation, down: Situation
 ) -> dict[str, tuple[Floats, Floats]]:
     """Differences of the deviation to both sides of a situation, by field."""
-    a, b, c = (effect.deviation(theta, s) for s in (up, at, down))
+    a, b, c = (effect.deviation(theta, s) for s in (up, mid, down))
     return {
         key: (_field(a, key) - _field(b, key), _field(b, key) - _field(c, key)) for key in _FIELDS
     }
 
 
 def _field(deviation: Deviation, key: str) -> Floats:
-    found: Floats | None = getattr(deviation, key)
-    return np.zeros(1) if found is None else found
+    value: Floats | None = getattr(deviation, key)
+    return np.zeros(1) if value is None else value
 
 
-def _agree(method: str, of_what: str, found: Floats, above: Floats, below: Floats) -> None:
-    outside = found - np.clip(found, np.minimum(above, below), np.maximum(above, below))
-    size = float(max(np.abs(x).max() for x in (found, above, below)))
+def _agree(method: str, phrase: str, derivative: Floats, above: Floats, below: Floats) -> None:
+    outside = derivative - np.clip(derivative, np.minimum(above, below), np.maximum(above, below))
+    size = float(max(np.abs(x).max() for x in (derivative, above, below)))
     off = float(np.abs(outside).max()) / size if size > 0 else 0.0
-    wrong = f"{method} is not the derivative {of_what} is off by {100 * off:.1f} %"
+    wrong = f"{method} is not the derivative {phrase} is off by {100 * off:.1f} %"
     _need(off <= AGREES, f"{wrong} of its largest value")

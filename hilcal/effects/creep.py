@@ -38,13 +38,13 @@ class Creep(TorqueLaw):
 
     def __init__(self, cell: Cell, states: States, options: Options | None = None) -> None:
         """Build the effect; raises InputError as every effect does."""
-        given = dict(options or {})
-        if "form" in given:
-            form = choice(self.name, given, "form", (COMMON, EACH))
-            if "joints" in given:
+        chosen = dict(options or {})
+        if "form" in chosen:
+            form = choice(self.name, chosen, "form", (COMMON, EACH))
+            if "joints" in chosen:
                 raise InputError(f"effect {self.name}: form and joints; valid: joints alone")
-            given = {**{k: v for k, v in given.items() if k != "form"}, "joints": form}
-        super().__init__(cell, states, given)
+            chosen = {**{k: v for k, v in chosen.items() if k != "form"}, "joints": form}
+        super().__init__(cell, states, chosen)
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

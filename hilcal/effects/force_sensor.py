@@ -1,4 +1,4 @@
-"""What the errors of a force sensor share: its axes, and the states in which it measured."""
+"""Base of the errors of a force sensor: its axes, and the states in which it measured."""
 
 from abc import abstractmethod
 from typing import ClassVar
@@ -97,7 +97,7 @@ def _sensor(s: Situation, axes: Floats) -> Floats:
 
 
 def _turned(r: Floats, wrench: Floats) -> Floats:
-    """Force and moment (..., 6) in the axes that R (..., 3, 3) leads to."""
+    """Force and moment (..., 6), rotated by R (..., 3, 3)."""
     return np.concatenate([se3.apply(r, wrench[..., :3]), se3.apply(r, wrench[..., 3:])], axis=-1)
 
 

@@ -12,19 +12,18 @@ from hilcal import limits
 from hilcal.effects.protocol import Effect
 from hilcal.errors import InputError
 
-_OWN = "hilcal."
-
 
 def failure_of(error: Exception) -> InputError | None:
-    """Return the error of a method of a user's effect as one line; None where it is not one.
+    """Return an error raised in a method of a user's effect as one line; None for any other.
 
-    It is found from the traceback, so that calls of effects need no guard.
+    The traceback tells, so that calls of effects need no guard.
     """
     for frame, _ in traceback.walk_tb(error.__traceback__):
         effect = frame.f_locals.get("self", frame.f_locals.get("cls"))
         kind = effect if isinstance(effect, type) else type(effect)
         file = frame.f_code.co_filename
-        if issubclass(kind, Effect) and not str(frame.f_globals.get("__name__")).startswith(_OWN):
+        module = str(frame.f_globals.get("__name__"))
+        if issubclass(kind, Effect) and not module.startswith("hilcal."):
             return InputError(
                 f"{file}{line_in(error, file)}: effect {kind.name}: {frame.f_code.co_name} raises "
                 f"{type(error).__name__}: {error}"
@@ -54,7 +53,7 @@ def read_effects(path: Path) -> EffectFile:
 
 
 def effects_of(content: bytes, path: Path) -> EffectFile:
-    """Do as `read_effects` for what a file holds, or is going to hold."""
+    """Return the effects in the content of a file, see `read_effects`; it need not exist yet."""
     where = str(path)
     hashed = hashlib.sha256(content).hexdigest()
     module = ModuleType(f"effects_from_{hashed[:16]}")
@@ -101,5 +100,5 @@ def _compiled(content: bytes, where: str) -> CodeType:
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         line = getattr(error, "lineno", None)
         place = where if line is None else f"{where}, line {line}"
-        what = getattr(error, "msg", None) or str(error)
-        raise InputError(f"{place}: not Python: {what}") from None
+        reason = getattr(error, "msg", None) or str(error)
+        raise InputError(f"{place}: not Python: {reason}") from None

@@ -24,8 +24,8 @@ class GuideError(Effect):
 
     with s = −1 at the lower and 1 at the upper limit of the travel and Legendre's polynomials P_k,
     in axes with z along the travel, about the point of the carriage that lies on the joint's axis.
-    Constant terms, and a travel that runs askew, are those of `link_geometry`; waves along the
-    travel those of `transmission_error`. Units m and rad. Source of the names: ISO 230-1, error
+    Constant terms and the direction of the travel belong to `link_geometry`, waves along the travel
+    to `transmission_error`. Units m and rad. Source of the names: ISO 230-1, error
     motions of a linear axis (positioning, straightness, roll, pitch and yaw).
     """
 
@@ -79,7 +79,7 @@ class GuideError(Effect):
             waves = legvander((2 * s.values[:, j] - low - high) / (high - low), self.orders)
             for p, (kind, k) in enumerate(self._terms, start=n * count):
                 values[:, p, KINDS.index(kind)] = waves[:, k]
-            mine = values[:, n * count : (n + 1) * count]
-            mine[..., 0] -= mine[..., 4] * travel[:, None, j]
-            mine[..., 1] += mine[..., 3] * travel[:, None, j]
+            of_slide = values[:, n * count : (n + 1) * count]
+            of_slide[..., 0] -= of_slide[..., 4] * travel[:, None, j]
+            of_slide[..., 1] += of_slide[..., 3] * travel[:, None, j]
         return (Columns("twist", np.arange(len(element)), element, values),)

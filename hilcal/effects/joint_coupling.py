@@ -17,8 +17,8 @@ _PAIR = re.compile(r"([0-9]{1,3}):([0-9]{1,3})")
 class JointCoupling(Effect):
     """dq_j = Σ_i k_ji q_i, for the pairs (j, i) of the option `pairs` [rad].
 
-    q are the controller's values, so that k_ji is what the factor of a coupling in the arm's
-    description is off by (`[robot] joint_coupling`, 0 where there is none); i = j is an error of a
+    q are the controller's values, so that k_ji is the error of the coupling factor in the arm's
+    description (`[robot] joint_coupling`, 0 where there is none); i = j is an error of a
     joint's own ratio.
 
     Unless given, the pairs are those of `may_follow`: couplings that arms have. Errors of a joint's
@@ -29,7 +29,7 @@ class JointCoupling(Effect):
     name = "joint_coupling"
     summary = "dq_j = Σ k_ji q_i: a joint is taken along by another one"
     plausible = 50.0
-    """0.01: a strain wave gear of ratio 100 whose reaction on the next joint is not made up for.
+    """0.01: a strain wave gear of ratio 100 whose reaction on the next joint is not compensated.
     More is a wrong description, which the gate before the fit names."""
     option_help: ClassVar = {
         "pairs": "which joint is taken along by which, as 3:2/6:5 for joint 3 by joint 2 and joint "
@@ -43,15 +43,15 @@ class JointCoupling(Effect):
         slides = self.cell.arm.slides
         alike = [(j, i) for j, i in may_follow(n) if slides[j - 1] == slides[i - 1]]
         usual = "/".join(f"{j}:{i}" for j, i in alike) or "1:1"
-        given = self.options.setdefault("pairs", usual)
-        found = _pairs(given, n)
-        if not found:
+        text = self.options.setdefault("pairs", usual)
+        pairs = _pairs(text, n)
+        if not pairs:
             raise InputError(
-                f"effect {self.name}: pairs = {given!r}; valid: pairs of joints 1 to {n}, each "
+                f"effect {self.name}: pairs = {text!r}; valid: pairs of joints 1 to {n}, each "
                 "once, as 3:2/6:5 for joint 3 taken along by joint 2, joint 6 by joint 5"
             )
-        self.options["pairs"] = "/".join(f"{j}:{i}" for j, i in found)
-        self._pairs = np.array(found) - 1
+        self.options["pairs"] = "/".join(f"{j}:{i}" for j, i in pairs)
+        self._pairs = np.array(pairs) - 1
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -70,15 +70,15 @@ class JointCoupling(Effect):
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:
         """Controller's values: ∂dq_j/∂k_ji = q_i, a turn of slot j − 1 about the joint's axis."""
-        turned, by = self._pairs.T
-        moved = np.where(self.cell.arm.slides[turned, None], ALONG, ABOUT)
-        twist = s.values[:, by, None] * moved
-        return (Columns("twist", np.arange(len(turned)), turned, twist),)
+        driven, driving = self._pairs.T
+        axes = np.where(self.cell.arm.slides[driven, None], ALONG, ABOUT)
+        twist = s.values[:, driving, None] * axes
+        return (Columns("twist", np.arange(len(driven)), driven, twist),)
 
 
-def _pairs(given: object, n: int) -> list[tuple[int, int]]:
+def _pairs(text: object, n: int) -> list[tuple[int, int]]:
     """Return the pairs (j, i) that are written, or none where they are not valid."""
-    found = [_PAIR.fullmatch(p.strip()) for p in given.split("/")] if isinstance(given, str) else []
-    pairs = sorted((int(p[1]), int(p[2])) for p in found if p)
-    good = len(pairs) == len(found) == len(set(pairs))
+    matches = [_PAIR.fullmatch(p.strip()) for p in text.split("/")] if isinstance(text, str) else []
+    pairs = sorted((int(p[1]), int(p[2])) for p in matches if p)
+    good = len(pairs) == len(matches) == len(set(pairs))
     return pairs if good and all(1 <= k <= n for p in pairs for k in p) else []

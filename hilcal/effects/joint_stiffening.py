@@ -7,7 +7,7 @@ from hilcal.types import Floats
 
 
 class JointStiffening(TorqueLaw):
-    """dq_j = s_j τ_j³ beside the linear term; a gear that stiffens has s_j < 0."""
+    """dq_j = s_j τ_j³ in addition to the linear term; a gear that stiffens has s_j < 0."""
 
     name = "joint_stiffening"
     unit, meaning = "rad/(N·m)³", "stiffening of {joint}"

@@ -87,5 +87,5 @@ def long_links(arm: Arm) -> Ints:
     if not np.any(lengths):
         return np.array([arm.n])
     longest = np.argsort(-lengths, kind="stable")[:2]
-    kept = longest[lengths[longest] > lengths.max() / 3]
-    return np.asarray(np.sort(kept) + 1)
+    long = longest[lengths[longest] > lengths.max() / 3]
+    return np.asarray(np.sort(long) + 1)

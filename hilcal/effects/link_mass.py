@@ -18,8 +18,8 @@ from hilcal.types import Floats
 def tool_weight(effect: Effect) -> Directions:
     """Mass at the flange, and first moment of the last link: a tool that is heavier, or elsewhere.
 
-    A mass δm at the origin of slot n is carried by every link before: its first moments there are
-    δm p_k, p_k (3,) the place of slot k in the axes of link k, k = 1..n.
+    A mass δm at the origin of slot n is carried by every link before it: its first moments there
+    are δm p_k, p_k (3,) the place of slot k in the axes of link k, k = 1..n.
     """
     arm = effect.cell.arm
     scale = np.array([0.1, 5e-3, 5e-3, 5e-3])
@@ -65,5 +65,5 @@ class LinkMass(Effect):
         return first_moment_change(self.cell.arm, s.chain, s.load.gravity)
 
     def most(self) -> float:
-        """As usual; without limit where the arm was described without masses."""
+        """As usual; infinite where the arm is described without masses."""
         return super().most() if np.any(self.cell.arm.masses) else np.inf

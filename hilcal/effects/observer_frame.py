@@ -8,14 +8,14 @@ from hilcal.effects.options import PRIOR_HELP
 from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
 from hilcal.readings.readings import States
 
-_OF = ("x", "y", "z", "rx", "ry", "rz")
+_AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
 class ObserverFrame(Effect):
     """Twist of the position in the axes of an observer [m, rad], and offset of a distance [m].
 
-    Of each observer with an unknown place what is unknown of it; where all are known, all that
-    their readings can tell. A point's shift is that of the point.
+    Estimated are the unknown elements of each observer's place; where all places are known, all
+    elements that the readings determine. The shift of a point is that of the point itself.
     """
 
     name = "observer_frame"
@@ -26,18 +26,18 @@ class ObserverFrame(Effect):
     role = "observer"
 
     def setup(self, states: States) -> None:
-        """Choose what is estimated."""
-        told = {"station": range(6), "point": range(3), "gauge": (0, 4, 5)}
+        """Choose the elements that are estimated."""
+        observable = {"station": range(6), "point": range(3), "gauge": (0, 4, 5)}
         unknown = any(o.free for o in self.cell.observers)
         self.free = [
             (k, element)
             for k, o in enumerate(self.cell.observers)
-            for element in (o.free if unknown else told[o.name.kind])
+            for element in (o.free if unknown else observable[o.name.kind])
         ]
 
     @classmethod
     def computable(cls, states: States) -> bool:
-        """Whether several observe; a prediction without them needs none of it."""
+        """Whether readings name their observers; a prediction without observers needs no effect."""
         return states.observer is not None
 
     @property
@@ -45,11 +45,12 @@ class ObserverFrame(Effect):
         """Shift, turn and offset, as far as they are unknown."""
         out = []
         for k, element in self.free:
-            o, what, unit = self.cell.observers[k].name, _OF[element], "m" if element < 3 else "rad"
-            meaning = f"turn about {what[-1]}" if element > 2 else f"shift along {what}"
+            o, axis = self.cell.observers[k].name, _AXES[element]
+            unit = "m" if element < 3 else "rad"
+            meaning = f"turn about {axis[-1]}" if element > 2 else f"shift along {axis}"
             if o.kind == "point" and element == 3:
-                what, unit, meaning = "offset", "m", "offset of the distance"
-            out.append(Parameter(f"{o.name}.{what}", unit, 1e-3, f"{o}: {meaning}"))
+                axis, unit, meaning = "offset", "m", "offset of the distance"
+            out.append(Parameter(f"{o.name}.{axis}", unit, 1e-3, f"{o}: {meaning}"))
         return tuple(out)
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:

@@ -15,7 +15,7 @@ TYPICAL_TWIST, TYPICAL_SHIFT = 2e-3, 7e-5
 """Twist of a joint at its rated torque where its compliance is unknown, rad, and shift of a slide
 at its rated force, m. Guesses within the 0.3 to 5 mrad of most arms, and for racks and screws of
 10 to 100 N/µm."""
-ORDINARY_TWIST, ORDINARY_SHIFT = 3e-3, 1e-4  # ordinary ones, rad and m
+ORDINARY_TWIST, ORDINARY_SHIFT = 3e-3, 1e-4  # the ordinary ones, rad and m
 LEVER = 0.5  # Moment on a carriage per rated force of its drive, m: a choice
 
 PRIOR_HELP = dict.fromkeys(
@@ -68,19 +68,19 @@ def ordinary_give(cell: Cell) -> Floats:
 
 
 def typical_compliances(cell: Cell) -> Floats:
-    """(n,) joint compliances where nothing is known of them, rad/(N·m); of slides m/N."""
+    """(n,) typical joint compliances, rad/(N·m); of slides m/N."""
     return np.where(cell.arm.slides, TYPICAL_SHIFT, TYPICAL_TWIST) / cell.arm.ratings
 
 
 def prior_of_units(effect: str, options: Options, units: Sequence[str]) -> Floats | None:
     """(P,) `prior_m` of parameters in m, `prior_rad` of those in rad; None where not given."""
     keys = ("prior_m", "prior_rad")
-    given = [k for k in keys if k in options]
-    if not given:
+    stated = [k for k in keys if k in options]
+    if not stated:
         return None
-    if len(given) == 1:
+    if len(stated) == 1:
         raise InputError(
-            f"effect {effect}: {given[0]} alone; valid: prior_m and prior_rad, or none"
+            f"effect {effect}: {stated[0]} alone; valid: prior_m and prior_rad, or none"
         )
     values = [number(effect, options, k) for k in keys]
     if min(values) <= 0:

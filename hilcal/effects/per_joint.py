@@ -1,4 +1,4 @@
-"""What effects with parameters per joint have in common: which joints have one or share one."""
+"""Base of effects with parameters per joint: which joints have one, or share one."""
 
 import math
 import re
@@ -49,21 +49,21 @@ def joint_groups(effect: str, options: Options, count: int) -> JointGroups:
 
     Groups are separated by "/", the joints of a group by "+" or as a range.
     """
-    given = options["joints"]
-    text = str(given) if type(given) is int else given
+    option = options["joints"]
+    text = str(option) if type(option) is int else option
     if text == EACH:
         groups = [[j] for j in range(count)]
     elif text == COMMON:
         groups = [list(range(count))]
     else:
-        found, wrong = _read(text, count) if isinstance(text, str) else ([], "")
-        if not found:
+        parsed, wrong = _read(text, count) if isinstance(text, str) else ([], "")
+        if not parsed:
             raise InputError(
-                f"effect {effect}: joints = {given!r}{wrong}; valid: each, common, or joints 1 to "
+                f"effect {effect}: joints = {option!r}{wrong}; valid: each, common, or joints 1 to "
                 f"{count} in groups, as 2/3/4-6: one parameter for joint 2, one for 3, one for "
                 "4 to 6"
             )
-        groups = sorted(sorted(group) for group in found)
+        groups = sorted(sorted(group) for group in parsed)
     members = sorted((j, k) for k, group in enumerate(groups) for j in group)
     labels = tuple(_label(group) for group in groups)
     if len(members) < count or 1 < len(groups) < count:
@@ -81,10 +81,10 @@ def _read(text: str, count: int) -> tuple[list[list[int]], str]:
     for part in text.split("/"):
         groups.append([])
         for piece in part.split("+"):
-            found = _RANGE.fullmatch(piece.strip())
-            if found is None:
+            match = _RANGE.fullmatch(piece.strip())
+            if match is None:
                 return [], f", {piece.strip()!r} is no joint and no range"
-            first, last = int(found[1]), int(found[2] or found[1])
+            first, last = int(match[1]), int(match[2] or match[1])
             if last < first:
                 return [], f", {piece.strip()} runs backwards"
             for joint in range(first, last + 1):
@@ -124,7 +124,7 @@ class PerJoint(Effect):
     }
     usual_joints: ClassVar[str] = EACH
     unit: ClassVar[str]  # of the parameters of joints that turn
-    size: ClassVar[float]  # their ordinary magnitude, unless `ordinary` says more
+    size: ClassVar[float]  # their ordinary magnitude, unless `ordinary` is overridden
     meaning: ClassVar[str]  # with "{joint}" where it belongs
 
     def setup(self, states: States) -> None:
@@ -152,13 +152,14 @@ class PerJoint(Effect):
         return finer
 
     def refines(self, other: Effect) -> bool:
-        """Whether no joints that `other` sets apart share a parameter here, and fewer do."""
+        """Whether each group of joints lies in one group of `other`, and there are more of them."""
         if type(other) is not type(self) or not isinstance(other, PerJoint):
             return False
-        own, theirs = self.shared, dict(zip(other.shared.joint, other.shared.group, strict=True))
-        apart = {(k, theirs.get(j)) for j, k in zip(own.joint, own.group, strict=True)}
-        whole = set(theirs) <= set(own.joint.tolist())
-        return whole and len(apart) == len(own.labels) > len(other.shared.labels)
+        fine, coarse = self.shared, other.shared
+        coarse_group = dict(zip(coarse.joint, coarse.group, strict=True))
+        pairs = {(k, coarse_group.get(j)) for j, k in zip(fine.joint, fine.group, strict=True)}
+        covered = set(coarse_group) <= set(fine.joint.tolist())
+        return covered and len(pairs) == len(fine.labels) > len(coarse.labels)
 
     def group_parameters(
         self,
@@ -167,7 +168,7 @@ class PerJoint(Effect):
         meaning: str,  # with "{joint}" and "{kind}" where they belong
         kinds: Mapping[str, str] | None = None,  # suffixes, as ".cos2", with their words
         *,
-        of_drive: bool = True,  # of what the drive moves; else slides have the same unit
+        of_drive: bool = True,  # belongs to the drive; else slides have the same unit
     ) -> tuple[Parameter, ...]:
         """Parameters of all groups, one for each, or one for each of `kinds`."""
         g = self.shared
@@ -183,11 +184,11 @@ class PerJoint(Effect):
                         f"in {unit}; valid: groups of joints of one kind"
                     )
                 units[k] = OF_SLIDES[unit] if True in slides else unit
-        each = (kinds or {"": ""}).items()
+        variants = (kinds or {"": ""}).items()
         return tuple(
-            Parameter(f"j{label}{kind}", own, scale, meaning.format(joint=words, kind=phrase))
-            for label, words, scale, own in zip(g.labels, g.words, scales, units, strict=True)
-            for kind, phrase in each
+            Parameter(f"j{label}{kind}", u, scale, meaning.format(joint=joints, kind=phrase))
+            for label, joints, scale, u in zip(g.labels, g.words, scales, units, strict=True)
+            for kind, phrase in variants
         )
 
     def joint_columns(self, field: JointField, values: Floats) -> Columns:
@@ -210,11 +211,11 @@ class PerJoint(Effect):
         return out
 
     def of_compliance(self, columns: Columns) -> Columns:
-        """Turn columns by each joint's compliance into such by those of the groups."""
+        """Turn derivatives by each joint's compliance into those by the groups' compliances."""
         group = np.full(self.cell.arm.n, -1)
         group[self.shared.joint] = self.shared.group
-        mine = columns.only(group[columns.parameter] >= 0)
-        return replace(mine, parameter=group[mine.parameter])
+        named = columns.only(group[columns.parameter] >= 0)
+        return replace(named, parameter=group[named.parameter])
 
     def _of_named(self, values: Floats) -> Floats:
         """(N, J, ...) values of the joints that have a parameter, of (N, n, ...)."""

@@ -33,18 +33,18 @@ class PeriodicJointCompliance(PerJoint):
     def setup(self, states: States) -> None:
         """Read the orders."""
         super().setup(states)
-        given = self.options.setdefault("orders", [2])
+        orders = self.options.setdefault("orders", [2])
         if (
-            not isinstance(given, list | tuple)
-            or not given
-            or len(set(given)) < len(given)
-            or not all(type(k) is int and 1 <= k <= MOST_ORDER for k in given)
+            not isinstance(orders, list | tuple)
+            or not orders
+            or len(set(orders)) < len(orders)
+            or not all(type(k) is int and 1 <= k <= MOST_ORDER for k in orders)
         ):
             raise InputError(
-                f"effect {self.name}: orders = {given!r}; valid: a list of different whole "
+                f"effect {self.name}: orders = {orders!r}; valid: a list of different whole "
                 f"numbers, 1 to {MOST_ORDER}"
             )
-        self.orders = np.array(given)
+        self.orders = np.array(orders)
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -66,6 +66,6 @@ class PeriodicJointCompliance(PerJoint):
 
     def response(self, theta: Floats, s: Situation, change: Floats) -> Response:
         """Return the compliance at the angle times dτ_j."""
-        mine = self.of_joints(theta.reshape(-1, 2 * len(self.orders)))
-        here = np.sum(self._waves(s) * mine, axis=2)
-        return Response(dq=s.along(change) * here[:, None, :])
+        amplitudes = self.of_joints(theta.reshape(-1, 2 * len(self.orders)))
+        compliance = np.sum(self._waves(s) * amplitudes, axis=2)
+        return Response(dq=s.along(change) * compliance[:, None, :])

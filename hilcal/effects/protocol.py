@@ -1,4 +1,4 @@
-"""What an effect is: parameters, a deviation linear in them, and the derivative of it.
+"""The protocol of effects: parameters, a deviation linear in them, and its derivative.
 
 An effect returns where it acts (a `Deviation`), not how the tool moves; the kinematic chain is
 evaluated on the sum of all deviations. A new effect is one small class in one file: `parameters`,
@@ -42,15 +42,15 @@ class Directions:
 class Changeable:
     """How the parameters of an effect may have changed between two campaigns."""
 
-    # of what they are. Of a "joint" or a "link" each one's parameters, named "j3..." or "link2...",
-    # change by themselves.
+    # what the parameters belong to; those of each "joint" ("j3...") or "link" ("link2...") change
+    # independently
     kind: Kind
-    part: str = ""  # what people call it; empty for joints and links
+    part: str = ""  # the name that people use; empty for joints and links
     words: str = ""  # what has changed, e.g. "the tracker's scale", of a joint e.g. "zero"
     cause: str = ""  # what may have done it, as a question; empty where there is nothing to say
-    listed: bool = False  # whether the smallest change that shows is listed by joint
+    listed: bool = False  # whether the smallest detectable change is listed by joint
     by_frame: bool = False  # whether a frame that is estimated anew may absorb it
-    options: Mapping[str, object] = field(default_factory=dict)  # of the effect of a change
+    options: Mapping[str, object] = field(default_factory=dict)  # of the effect that models it
     with_others: bool = False  # whether a repair changes it together with the others
     directions: "Callable[[Effect], Directions] | None" = None  # if not each parameter
 
@@ -58,7 +58,7 @@ class Changeable:
 Field = Literal["dq", "twist", "base", "station", "target", "scale", "observer"]
 Role = Literal["registration", "target", "observer", "baseline", "effect"]
 FRAME_ROLES: tuple[Role, ...] = ("registration", "target", "observer")
-OWN_SPREAD = 0.7  # Of the logarithm of a pool's standard deviation, beside what is shared; a choice
+OWN_SPREAD = 0.7  # Of log(standard deviation) of a pool, without what pools share; a choice
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,15 +98,15 @@ class Situation:
 
     @property
     def torque_measured(self) -> bool:
-        """Whether the torques are those that were measured, which no change of a load changes."""
+        """Whether the torques are measured ones, which a change of the load does not change."""
         return self.cell.measured_torques and self.states.torque is not None
 
     @property
     def torque(self) -> Floats:
         """(N, n) static torques that the drives carry, N·m; about the axes unless coupled.
 
-        Of a joint that slides the force along it, N. As measured where the cell says so
-        (`Cell.measured_torques`) and they were.
+        Of a joint that slides the force along it, N. Measured values where the readings have them
+        and `Cell.measured_torques` says so.
         """
         measured = self.states.torque if self.torque_measured else None
         if measured is not None and not np.isnan(measured).any():
@@ -124,20 +124,20 @@ class Columns:
     """Derivative of one field of the deviation by P of an effect's parameters."""
 
     field: Field  # the field of `Deviation` that moves
-    parameter: Ints  # (P,) indices within the effect, also several times the same
+    parameter: Ints  # (P,) indices within the effect, which may repeat
     element: Ints  # (P,) joint (for dq) or slot (for twist) that moves; ignored otherwise
     values: Floats  # (N, P) for dq and scale, (N, P, 6) for the others; N may be 1 (constant)
 
-    def only(self, wanted: Bools) -> "Columns":
-        """Return the columns of some of the parameters."""
-        if wanted.all():
+    def only(self, chosen: Bools) -> "Columns":
+        """Return the chosen columns, by a mask (P,)."""
+        if chosen.all():
             return self
         return Columns(
-            self.field, self.parameter[wanted], self.element[wanted], self.values[:, wanted]
+            self.field, self.parameter[chosen], self.element[chosen], self.values[:, chosen]
         )
 
     def runs(self) -> Iterator[tuple[int, slice]]:
-        """Yield each joint or slot that moves, and successive columns that move it."""
+        """Yield the joint or slot of each run of successive columns, and the slice of the run."""
         end = 0
         for element, run in groupby(self.element.tolist()):
             start, end = end, end + len(list(run))
@@ -184,23 +184,23 @@ class Effect(ABC):
             An effect that is not of the last role is never removed by a diagnosis. Those of the
             first three take the options `prior_m` and `prior_rad`.
         for_missing_weight: whether a starting model has the effect where the arm is described
-            without masses and the readings tell what its weight does.
+            without masses and the readings depend on its weight.
         kinematic: whether it is an error of the unloaded arm's lengths and zeros, which a
             factory's calibration measures.
         plausible: standard deviation of the parameters over arms and cells as they are, in their
             ordinary magnitudes: the range that a suspect of this name must stay in. An effect
             that states none is plausible at any size. See `most`.
-        of_setup: whether it is of how a campaign was set up (instrument, frames, tool, load,
-            force sensor), so that another campaign of the same arm learns it anew. Effects whose
-            role is that of a frame are, too.
-        drift: standard deviation by which the parameters of one arm may well have changed from one
-            campaign to the next, in ordinary magnitudes, in a shrunk family in its strengths.
+        of_setup: whether it belongs to the setup of a campaign (instrument, frames, tool, load,
+            force sensor), so that another campaign of the same arm estimates it anew. Effects whose
+            role is that of a frame do, too.
+        drift: standard deviation of the change of an arm's parameters from one campaign to the
+            next, in ordinary magnitudes; of a shrunk family that of its strengths.
         spread: standard deviation between arms of one type, likewise.
-        change: what of it may have changed between two campaigns of an arm; None: nothing.
+        change: how the parameters may change between two campaigns of an arm; None: not at all.
 
     Attributes:
-        coarse: of an effect from `refined`, the name of the one that it is finer than; else empty.
-            Its own name has the options that make it finer, as "creep(joints=each)".
+        coarse: of an effect from `refined`, the name of the one that it refines; else empty.
+            The refined name has the options that make it finer, as "creep(joints=each)".
     """
 
     name: str
@@ -216,8 +216,8 @@ class Effect(ABC):
     plausible: ClassVar[float] = np.inf
     of_setup: ClassVar[bool] = False
     drift: ClassVar[float] = 0.1
-    """A tenth of what is ordinary, as wear and warmth make it; a choice. Where an arm was repaired
-    or hit, the readings ask for more."""
+    """A tenth of the ordinary magnitude, by wear and temperature; a choice. Where an arm was
+    repaired or hit, the readings ask for more."""
     spread: ClassVar[float] = 1.0
     """Other arms of the type have parameters of the ordinary magnitude; a choice."""
     change: ClassVar[Changeable | None] = None
@@ -247,7 +247,7 @@ class Effect(ABC):
 
     @cached_property
     def magnitudes(self) -> Floats:
-        """(P,) ordinary magnitudes of the parameters, asked for more often than their names."""
+        """(P,) ordinary magnitudes of the parameters; cached, since they are read often."""
         return np.array([p.scale for p in self.parameters], dtype=float)
 
     @abstractmethod
@@ -260,8 +260,8 @@ class Effect(ABC):
         Raises:
             InputError: a value is not finite, or the values are of another number of states.
         """
-        found = self.columns(s)
-        for c in found:
+        columns = self.columns(s)
+        for c in columns:
             if len(c.values) not in (1, len(s.angle)):
                 wrong = f"{len(c.values)} states; expected {len(s.angle)} or 1"
             elif not _finite(c.values):
@@ -272,7 +272,7 @@ class Effect(ABC):
                 f"{source_of(type(self))}: effect {self.name}: columns has {c.field} values of "
                 f"{wrong}"
             )
-        return found
+        return columns
 
     def response(self, theta: Floats, s: Situation, change: Floats) -> Response:
         """Return how the deviation changes with changes (N, P, n + 1, 6) of the slot wrenches.
@@ -288,8 +288,8 @@ class Effect(ABC):
     def wrench_change(self, theta: Floats, s: Situation) -> Floats | None:
         """Return the change (N, 6) of the load's wrench at the load point, base axes, or None.
 
-        For effects by which the recorded wrench `s.states.wrench` is not what acts; at the
-        orientation of `s.chain`. The changes of several effects add.
+        For effects by which the acting wrench differs from the recorded one, `s.states.wrench`; at
+        the orientation of `s.chain`. The changes of several effects add.
         """
         return None
 
@@ -308,7 +308,7 @@ class Effect(ABC):
         return None
 
     def compliance(self, theta: Floats) -> Floats | None:
-        """(n,) joint compliances for the laws of other effects, rad/(N·m); None where none."""
+        """(n,) joint compliances for the laws of other effects, rad/(N·m), or None."""
         return None
 
     def compliance_columns(self, theta: Floats, s: Situation) -> tuple[Columns, ...]:
@@ -321,7 +321,7 @@ class Effect(ABC):
     def of_compliance(self, columns: Columns) -> Columns:
         """Convert derivatives by the n joint compliances into those by this effect's parameters.
 
-        For effects that return a `compliance`; here parameter j is that of joint j.
+        For effects that return a `compliance`; by default parameter j is that of joint j.
         """
         return columns
 
@@ -334,19 +334,19 @@ class Effect(ABC):
         return None
 
     def pools(self) -> Ints:
-        """(P,) parameters whose groups are about equally strong, by number, from 0.
+        """(P,) pool of each parameter, from 0: the groups of a pool are about equally strong.
 
-        For effects with `groups`: what a group may be where the readings did not need it is
-        told by the groups of its pool. All groups make one pool unless overridden.
+        For effects with `groups`: the groups of a pool tell the prior of those that the readings
+        did not need. All groups make one pool unless overridden.
         """
         return np.zeros(len(self.parameters), dtype=np.int64)
 
     def log_std_prior(self, pool: int) -> tuple[float, float]:
         """Mean and spread of log s, s the standard deviation of a pool's parameters in magnitudes.
 
-        What arms are like before anything is measured: half of what is ordinary, and a factor of 2
-        either way, beside what the pools of an effect and the effects of an arm share (see
-        `hilcal.mixed.families`): a factor of 7 in all.
+        A prior before any measurement: half of the ordinary magnitude, and a factor of 2 either
+        way; together with the factors that the pools of an effect and the effects of an arm share
+        (see `hilcal.mixed.families`), a factor of 7 in all.
         """
         return -0.7, OWN_SPREAD
 
@@ -394,23 +394,23 @@ class Effect(ABC):
         return self
 
     def fine(self, states: States) -> "Effect | None":
-        """Return the effect as fine as it may really be; None where the readings do not limit that.
+        """Return the effect as fine as it may really be; None where the readings do not limit it.
 
-        For families whose number of parameters follows from the number of poses: what they cannot
-        resolve may be there all the same.
+        For families whose number of parameters follows from the number of poses: further
+        parameters cannot be resolved, but may differ from zero all the same.
         """
         return None
 
     def refined(self, states: States) -> "Effect | None":
         """Return the effect with a parameter of its own for each that shares one; None if none.
 
-        A fit with this one is diagnosed with that as a suspect: where the readings ask for it, the
-        effect is there, and its model is too coarse.
+        The refined effect is a suspect of a fit with this one: where the readings ask for it, the
+        effect is present, but its model is too coarse.
         """
         return None
 
     def refines(self, other: "Effect") -> bool:
-        """Whether this is the same effect, and its parameters can be as `other` has them."""
+        """Whether this is the same effect with finer parameters, and `other` a special case."""
         return False
 
     def with_options(self, states: States, **options: object) -> Self:
@@ -423,7 +423,7 @@ class Effect(ABC):
 
 
 def _finite(values: Floats) -> bool:
-    """Whether all values are finite: as their sum is, but where it overflows."""
+    """Whether all values are finite; a finite sum, which is quick to test, implies it."""
     with np.errstate(all="ignore"):
         return bool(np.isfinite(values.sum()) or np.isfinite(values).all())
 
@@ -436,24 +436,24 @@ def _has(states: States, need: str) -> bool:
 def total(
     columns: "tuple[Columns, ...]", theta: Floats, s: "Situation", start: Deviation | None = None
 ) -> Deviation:
-    """Return the deviation Σ columns_p θ_p of N states, added to one of them where it is given."""
+    """Return the deviation Σ columns_p θ_p of N states, added to `start` where given."""
     count, n = s.angle.shape
     width = {"dq": (n,), "twist": (n + 1, 6), "scale": ()}
     fields: dict[str, Floats] = {}
     for c in columns:
         field = fields.get(c.field)
         if field is None:
-            before = None if start is None else getattr(start, c.field)
+            initial = None if start is None else getattr(start, c.field)
             shape = (count, *width.get(c.field, (6,)))
-            field = zeros(*shape) if before is None else before.copy(order="F")
+            field = zeros(*shape) if initial is None else initial.copy(order="F")
             fields[c.field] = field
         t = theta[c.parameter]
         if c.field in ("dq", "twist"):
-            for e, mine in c.runs():
-                if mine.stop - mine.start == 1:
-                    field[:, e] += c.values[:, mine.start] * t[mine.start]
+            for e, run in c.runs():
+                if run.stop - run.start == 1:
+                    field[:, e] += c.values[:, run.start] * t[run.start]
                 else:
-                    field[:, e] += np.einsum("np...,p->n...", c.values[:, mine], t[mine])
+                    field[:, e] += np.einsum("np...,p->n...", c.values[:, run], t[run])
         else:
             field += np.einsum("np...,p->n...", c.values, t)
     return Deviation(**fields) if start is None else replace(start, **fields)

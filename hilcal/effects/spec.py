@@ -11,7 +11,7 @@ class EffectSpec:
     """An effect that a model builds for its own cell and readings when it is added."""
 
     kind: str | type[Effect]  # its name in the catalogue of the model, or its class
-    options: Options = field(default_factory=dict)  # those that are not the usual ones
+    options: Options = field(default_factory=dict)  # those that differ from the usual ones
 
     @property
     def name(self) -> str:
@@ -27,6 +27,6 @@ def effect(kind: str | type[Effect], **options: object) -> EffectSpec:
 
     Args:
         kind: a name of the model's catalogue, or a class.
-        **options: those that are not the usual ones, as `joints="each"`.
+        **options: those that differ from the usual ones, as `joints="each"`.
     """
     return EffectSpec(kind, options)

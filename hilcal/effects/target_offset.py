@@ -15,8 +15,8 @@ from hilcal.types import Floats
 class TargetOffset(Effect):
     """Displacement of the target in flange axes [m]; with `rotation`, its rotation too [rad].
 
-    Of several targets, each whose offset is not known is displaced by itself; where all are known,
-    each of them.
+    Of several targets, each one of unknown offset has its own displacement; where all offsets are
+    known, each target has.
     """
 
     name = "target_offset"
@@ -31,7 +31,7 @@ class TargetOffset(Effect):
     role = "target"
 
     def setup(self, states: States) -> None:
-        """Read whether rotations take part."""
+        """Read whether rotations are estimated."""
         rotation = self.options.get("rotation", False)
         if not isinstance(rotation, bool):
             raise InputError(f"effect {self.name}: rotation = {rotation!r}; valid: true, false")
@@ -44,14 +44,14 @@ class TargetOffset(Effect):
         """Displacement along, and with `rotation` rotation about, the flange's axes."""
         lengths = [Parameter(a, "m", 1e-3, f"offset along flange {a}") for a in "xyz"]
         turns = [Parameter(f"r{a}", "rad", 1e-3, f"turn about flange {a}") for a in "xyz"]
-        each = (lengths + turns)[: self.size]
+        axes = (lengths + turns)[: self.size]
         if self.cell.targets is None:
-            return tuple(each)
+            return tuple(axes)
         names = [self.cell.target_names[k] for k in self.moved]
         return tuple(
             replace(p, name=f"{name}.{p.name}", meaning=f"{name}: {p.meaning}")
             for name in names
-            for p in each
+            for p in axes
         )
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:

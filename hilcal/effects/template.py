@@ -28,7 +28,7 @@ from hilcal.types import Floats
 class Template(Effect):
     """dq_j = a_j sin(q_j) τ_j with q_j the angle and τ_j the static torque of joint j.
 
-    As of a bearing that is softer on one side. A class whose name begins with "_" is not taken.
+    As of a bearing that is softer on one side. A class whose name begins with "_" is ignored.
     """
 
     # What commands, files and reports call it: lower case, digits and _.
@@ -69,8 +69,8 @@ class Template(Effect):
 
         The law may use s.angle (N, n), s.torque (N, n), s.wrench (N, n + 1, 6: force and moment
         through each slot, in its axes), s.cell, and of the readings s.states.time (N,),
-        s.states.joint_temperature (N, n) and so on; each state by itself. What is of all states,
-        as the first time, belongs into `setup(self, states)`, which is called once.
+        s.states.joint_temperature (N, n) and so on; each state by itself. What depends on all
+        states, as the first time does, belongs in `setup(self, states)`, which is called once.
 
         Columns(field, parameter, element, values) is what moves:
 

@@ -13,7 +13,7 @@ from hilcal.types import Floats, Ints
 
 MOST_HARMONICS = 120
 FEWEST_HARMONICS = 4
-POSES_PER_HARMONIC = 5  # leave the data in the majority over its two amplitudes; a guess
+POSES_PER_HARMONIC = 5  # so that data outnumber its two amplitudes; a guess
 ORDINARY, ORDINARY_M = 5e-5, 1e-5  # Ordinary amplitude of a harmonic, rad; of a slide m
 SCORED_HARMONICS = 40  # Bounds the cost of scoring; a guess
 
@@ -59,10 +59,10 @@ class TransmissionError(PerJoint):
 
     @cached_property
     def magnitudes(self) -> Floats:
-        """The same for all of a joint, however many there are."""
+        """(P,) ordinary magnitudes, the same for all harmonics of a joint."""
         g = self.shared
-        each = self._ordinary[[g.joint[g.group == k][0] for k in range(len(g.labels))]]
-        return np.repeat(each, 2 * len(self.harmonics))
+        ordinary = self._ordinary[[g.joint[g.group == k][0] for k in range(len(g.labels))]]
+        return np.repeat(ordinary, 2 * len(self.harmonics))
 
     @property
     def _ordinary(self) -> Floats:
@@ -70,15 +70,15 @@ class TransmissionError(PerJoint):
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:
         """Waves: ∂dq_j/∂a_jk = cos k q_j, ∂dq_j/∂b_jk = sin k q_j."""
-        # exp(i k q), each half of the harmonics from the other: many times as fast as sines.
+        # exp(i k q), twice as many harmonics by each product: many times as fast as sines.
         count, done = len(self.harmonics), 1
         waves = np.empty((*s.angle.shape, count), dtype=np.complex128)
         waves[:, :, 0] = np.exp(1j * s.angle)
         while done < count:
-            more = min(done, count - done)
+            size = min(done, count - done)
             last = waves[:, :, done - 1 : done]
-            np.multiply(waves[:, :, :more], last, out=waves[:, :, done : done + more])
-            done += more
+            np.multiply(waves[:, :, :size], last, out=waves[:, :, done : done + size])
+            done += size
         return (self.kind_columns(waves.view(np.float64)),)
 
     def groups(self) -> Ints:
@@ -95,11 +95,11 @@ class TransmissionError(PerJoint):
         return 1.2 - 0.7 * pool, OWN_SPREAD
 
     def fine(self, states: States) -> Effect | None:
-        """As many harmonics as are scored at most, where the poses allow fewer."""
+        """Return the effect with `SCORED_HARMONICS` where the poses allow fewer."""
         if len(self.harmonics) >= SCORED_HARMONICS:
             return None
         return self.with_options(states, harmonics=SCORED_HARMONICS)
 
     def for_scoring(self, states: States) -> Effect:
-        """As a suspect, fewer harmonics are scored than a fit tries."""
+        """Return the effect with at most `SCORED_HARMONICS`, fewer than a fit tries."""
         return self.with_options(states, harmonics=min(len(self.harmonics), SCORED_HARMONICS))

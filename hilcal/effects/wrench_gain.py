@@ -12,7 +12,7 @@ class WrenchGain(ForceSensorEffect):
     """Recorded = (1 + g) true on each of the sensor's axes, exactly [1].
 
     acting = R diag(1/(1 + g)) Rᵀ w = w − R diag(g/(1 + g)) Rᵀ w. A common gain of all axes
-    is the same as a common factor on all compliances, but for what the weights do.
+    is the same as a common factor on all compliances, except for the deflection by weights.
     """
 
     name = "wrench_gain"

@@ -32,14 +32,14 @@ def read_effects_text(text: str, where: str, catalogue: Catalogue) -> dict[str, 
     """
     out: dict[str, dict[str, object]] = {}
     for part in _split(text, ",", f"{where} {text!r}", EXAMPLE):
-        found = _PART.fullmatch(part)
-        if found is None:
+        match = _PART.fullmatch(part)
+        if match is None:
             raise InputError(f"{where}: {part!r} is not an effect with its options; {EXAMPLE}")
-        name = found[1].strip()
+        name = match[1].strip()
         catalogue[name]
         if name in out:
             raise InputError(f"{where}: {name} is there twice")
-        out[name] = {} if found[2] is None else _options(found[2], f"{where}: {name}")
+        out[name] = {} if match[2] is None else _options(match[2], f"{where}: {name}")
     return out
 
 
@@ -68,7 +68,7 @@ def written(value: object) -> str:
 
 
 def chosen_options(effect: Effect, states: States, m: int) -> dict[str, object]:
-    """Options of an effect other than it has by itself on its states, without its priors."""
+    """Options of an effect that differ from its defaults on its states, without its priors."""
     usual = type(effect)(effect.cell, states, effect.usual_options(m)).options
     return {
         key: value
@@ -82,13 +82,13 @@ def option_defaults(kind: type[Effect], cell: Cell, states: States) -> dict[str,
     """Return the value of each option unless given; None where it follows from the readings."""
     if not kind.option_help:
         return {}
-    whole = kind(cell, states).options
+    full = kind(cell, states).options
     try:
         part = kind(cell, states[len(states) // 3 :]).options
     except InputError:  # fewer readings will not do
         part = {}
-    same = {name: written(whole.get(name)) == written(part.get(name)) for name in whole}
-    return {name: whole[name] if same.get(name) else None for name in kind.option_help}
+    same = {name: written(full.get(name)) == written(part.get(name)) for name in full}
+    return {name: full[name] if same.get(name) else None for name in kind.option_help}
 
 
 def _options(text: str, where: str) -> dict[str, object]:
@@ -99,12 +99,12 @@ def _options(text: str, where: str) -> dict[str, object]:
             raise InputError(f"{where}: {part!r} is not an option with a value; {EXAMPLE}")
         if key in out:
             raise InputError(f"{where}: option {key} is there twice")
-        here = f"{where}: {key}"
+        place = f"{where}: {key}"
         if value.startswith("[") and value.endswith("]"):
-            each = _split(value[1:-1], ",;", here, f"valid: {_VALUES}")
-            out[key] = [_single(v, here) for v in each]
+            values = _split(value[1:-1], ",;", place, f"valid: {_VALUES}")
+            out[key] = [_single(v, place) for v in values]
         else:
-            out[key] = _single(value, here)
+            out[key] = _single(value, place)
     return out
 
 
@@ -137,7 +137,7 @@ def _split(text: str, separators: str, where: str, valid: str) -> list[str]:
 
 
 def _outside(text: str, where: str, valid: str) -> Iterator[int]:
-    """Yield where the characters are that no quotes, parentheses or brackets enclose."""
+    """Yield the positions of characters that no quotes, parentheses or brackets enclose."""
     awaited: list[str] = []
     quote = ""
     for k, character in enumerate(text):

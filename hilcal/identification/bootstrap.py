@@ -7,8 +7,8 @@ readings, and fits the model to them:
     std(θ_p)² = Σ_b (θ*_bp − mean_b θ*_bp)² / (B − 1)
 
 It assumes that errors of different poses are independent, and nothing else of the noise. The
-standard uncertainties of a fit without a misfit assume the size of the noise and independent
-readings of a pose, too, so that the two together tell whether what is stated can be believed. With
+standard uncertainties of a fit without a misfit also assume the size of the noise and independent
+readings of a pose, so that the bootstrap tests them. With
 a misfit, neighbouring poses share errors; then the stated ones are those of a jackknife over
 regions of joint space, and the larger and better ones. With few poses for many parameters the
 bootstrap is too wide: a draw has 63 % of the poses. Strengths of shrunk families are chosen anew in
@@ -87,7 +87,7 @@ class Bootstrap(Shown):
         return np.asarray(np.quantile(self.theta, [tail, 1 - tail], axis=0))
 
     def to_dict(self) -> dict[str, object]:
-        """Return it as JSON, SI."""
+        """Return the bootstrap as JSON, SI."""
         fit, ends = self.fit, self.interval()
         units = [p.unit for e in fit.model.effects for p in e.parameters]
         rows = [
@@ -122,7 +122,7 @@ def bootstrap(
     """Draw the poses of a fit again and again, and fit its model to each draw.
 
     Readings that were set aside as gross errors are not drawn. Draw b has the random numbers of
-    (seed, b), on any number of workers; `advance` is told the number of draws that are done.
+    (seed, b), on any number of workers; `advance` is called with the number of draws just done.
 
     Raises:
         InputError: too few draws, or a negative seed.
@@ -130,8 +130,8 @@ def bootstrap(
             parameters.
     """
     check_draws(draws, seed)
-    kept = fit.readings[~fit.outlier]
-    group = distinct_poses(kept)
+    inliers = fit.readings[~fit.outlier]
+    group = distinct_poses(inliers)
     poses = int(group.max()) + 1
     if poses < LEAST_POSES:
         raise CannotAnswerError(
@@ -141,7 +141,7 @@ def bootstrap(
     drawn = partial(
         _drawn,
         model=replace(fit.model, readings=None),
-        readings=kept,
+        readings=inliers,
         group=group,
         like=(fit.mode, fit.scaling),
         start=fit.theta,
@@ -149,19 +149,19 @@ def bootstrap(
         seed=seed,
     )
     parts = [range(a, min(a + TOGETHER, draws)) for a in range(0, draws, TOGETHER)]
-    found: dict[int, Floats] = {}
+    results: dict[int, Floats] = {}
     for k, theta in engine.results(drawn, parts):
-        found[k] = theta
+        results[k] = theta
         if advance is not None:
             advance(len(parts[k]))
-    theta = np.vstack([found[k] for k in range(len(parts))])
-    told = np.isfinite(theta).all(axis=1)
-    if told.sum() < draws / 2:
+    theta = np.vstack([results[k] for k in range(len(parts))])
+    determined = np.isfinite(theta).all(axis=1)
+    if determined.sum() < draws / 2:
         raise CannotAnswerError(
-            f"{int((~told).sum())} of {draws} draws of {poses} poses do not determine the "
+            f"{int((~determined).sum())} of {draws} draws of {poses} poses do not determine the "
             "parameters that all poses together determine: measure more poses, or take effects out"
         )
-    return Bootstrap(fit, theta[told], poses, int((~told).sum()))
+    return Bootstrap(fit, theta[determined], poses, int((~determined).sum()))
 
 
 def check_draws(draws: int, seed: int) -> None:
@@ -187,11 +187,11 @@ def _drawn(
     for row, draw in enumerate(draws):
         some = again(readings, group, np.random.default_rng([seed, draw]))
         try:
-            found = solve(model, some, whitening(some, *like), start=start)
+            solution = solve(model, some, whitening(some, *like), start=start)
         except CannotAnswerError:
             continue
-        if found.converged and found.equations.basis.null.shape[1] <= null:
-            out[row] = found.theta
+        if solution.converged and solution.equations.basis.null.shape[1] <= null:
+            out[row] = solution.theta
     return out
 
 

@@ -2,12 +2,12 @@
 
     θ_B = θ_A + d,    θ_A ~ N(m, (1 + δ_0²) Λ⁻¹),    d_g ~ N(0, δ_g² S_g²)
 
-m and Λ of `Posterior`, δ_0 a doubt of the prior as a whole: that it states too small errors, as
-where its model was good enough for its own poses, but not for these. d is the drift of the arm
+m and Λ of `Posterior`, δ_0 a doubt of the prior as a whole: it may state too small errors,
+since its model was good enough for its own poses, but is not for these. d is the drift of the arm
 since then, with one strength δ per group: the parameters of an effect that belong to one joint or
 one link. S are the ordinary magnitudes of the parameters, of a shrunk family their strengths. δ_g
 is at least `least`, and beyond that what the new readings ask for (`drift`). A model that
-lacks an effect of the posterior leaves it out of the prior by marginalising it out.
+lacks an effect of the posterior has that effect marginalised out of the prior.
 
 Fits have coordinates y in which the prior is independent (`Coordinates`):
 
@@ -57,24 +57,24 @@ class DriftGroup:
 
     @property
     def joint(self) -> int | None:
-        """Number of the joint, from 1; None where they are not of one."""
-        found = _JOINT.match(self.part)
-        return int(found.group(1)) if found else None
+        """Number of the joint, from 1; None where the parameters do not belong to one."""
+        match = _JOINT.match(self.part)
+        return int(match.group(1)) if match else None
 
     @property
     def name(self) -> str:
-        """As people read it."""
+        """The name for people."""
         return f"{self.effect}.{self.part}" if self.part else self.effect
 
 
 @dataclass(frozen=True, eq=False)
 class CarriedPrior:
-    """A posterior as prior, and the drift that it is given."""
+    """A posterior as prior, with its drift."""
 
     posterior: Posterior
     relation: Relation = "arm"  # of the same arm, or of another one of the same type
     least: Mapping[str, float] = field(default_factory=dict)  # drift of each effect, in units of S
-    expected: Mapping[str, float] = field(default_factory=dict)  # that it may well have had
+    expected: Mapping[str, float] = field(default_factory=dict)  # the drift to be expected
     drift: Floats | None = None  # (1 + G,) δ_0, and δ of each of `groups`, as a fit has chosen them
 
     @cached_property
@@ -89,7 +89,7 @@ class CarriedPrior:
 
     @cached_property
     def unit(self) -> Floats:
-        """(K,) S, what a drift of 1 is: the ordinary magnitude, or the strength in a family."""
+        """(K,) S, the unit of drift: the ordinary magnitude, or the strength in a family."""
         precision = self.posterior.own_precision
         strength = 1.0 / np.sqrt(np.where(precision > 0, precision, 1.0))
         return np.where(precision > 0, strength, self.posterior.scale)
@@ -106,7 +106,7 @@ class CarriedPrior:
         return replace(self, drift=drift)
 
     def to_json(self) -> dict[str, object]:
-        """Return it as JSON, the whole posterior included."""
+        """Return the prior as JSON, the posterior included."""
         return {
             "posterior": self.posterior.to_json(),
             "relation": self.relation,
@@ -147,61 +147,62 @@ def carried_prior(
     drifted by `drift`. Drifts of effects may be stated, in units of S, where they are known better.
 
     Raises:
-        InputError: another relation, an effect that is not at hand, or a drift that cannot be.
+        InputError: an unknown relation, an effect that is not in the catalogue, an invalid drift.
     """
-    of, known, given = _called(posterior), catalogue or installed(), dict(stated or {})
+    label, effects, drifts = _label(posterior), catalogue or installed(), dict(stated or {})
     if relation not in RELATIONS:
         raise InputError(f"prior of {relation!r}; valid: {', '.join(RELATIONS)}")
     names = [e.name for e in posterior.effects]
-    missing = [name for name in names if name not in known.names]
+    missing = [name for name in names if name not in effects.names]
     if missing:
         raise InputError(
-            f"{of} has the effect {missing[0]}, which is not in the catalogue; give the file that "
-            "defines it: --effects-from FILE.py"
+            f"{label} has the effect {missing[0]}, which is not in the catalogue; give the file "
+            "that defines it: --effects-from FILE.py"
         )
-    for name, value in given.items():
+    for name, value in drifts.items():
         if name not in names:
-            raise InputError(f"drift of {name}: not in {of}; valid: {', '.join(names)}")
+            raise InputError(f"drift of {name}: not in {label}; valid: {', '.join(names)}")
         if not np.isfinite(value) or value < 0:
             raise InputError(f"drift of {name}: {value:g}; valid: a number, 0 or more")
     same = relation == "arm"
-    least = {n: 0.0 if same else known[n].spread for n in names}
-    expected = {n: known[n].drift if same else known[n].spread for n in names}
+    least = {n: 0.0 if same else effects[n].spread for n in names}
+    expected = {n: effects[n].drift if same else effects[n].spread for n in names}
     return CarriedPrior(
         posterior,
         RELATIONS[RELATIONS.index(relation)],
-        least | given,
-        expected | {n: max(v, expected[n]) for n, v in given.items()},
+        least | drifts,
+        expected | {n: max(v, expected[n]) for n, v in drifts.items()},
     )
 
 
 def check_prior(prior: CarriedPrior, arm: Arm, readings: Readings) -> None:
-    """Refuse a prior of another arm, or learnt from readings that are to be fitted."""
+    """Refuse a prior of another arm, or one estimated from readings that are to be fitted."""
     check_arm(prior, arm)
-    both = int(among(readings, prior.posterior.prints).sum())
-    if both:
+    repeated = int(among(readings, prior.posterior.prints).sum())
+    if repeated:
         raise InputError(
-            f"{_called(prior.posterior)} was learnt from {both} of the {len(readings)} readings "
-            "that are to be fitted; they would count twice; valid: a prior of other readings"
+            f"{_label(prior.posterior)} was learnt from {repeated} of the {len(readings)} "
+            "readings that are to be fitted; they would count twice; valid: a prior of other "
+            "readings"
         )
 
 
 def check_arm(prior: CarriedPrior, arm: Arm) -> None:
     """Refuse a prior of an arm with other joints or other links."""
-    p, of = prior.posterior, _called(prior.posterior)
+    p, label = prior.posterior, _label(prior.posterior)
     if p.links.shape != arm.links.shape:
         raise InputError(
-            f"{of} is of the arm {p.arm} with {len(p.links) - 1} joints, this one, {arm.name}, has "
-            f"{arm.n}; valid: a campaign of the same arm"
+            f"{label} is of the arm {p.arm} with {len(p.links) - 1} joints, this one, {arm.name}, "
+            f"has {arm.n}; valid: a campaign of the same arm"
         )
     if np.abs(p.links - arm.links).max() > SAME_M:
         raise InputError(
-            f"{of} is of the arm {p.arm}, whose nominal links are others than those of {arm.name}; "
-            "valid: a campaign of the same arm, described alike"
+            f"{label} is of the arm {p.arm}, whose nominal links are others than those of "
+            f"{arm.name}; valid: a campaign of the same arm, described alike"
         )
 
 
-def _called(p: Posterior) -> str:
+def _label(p: Posterior) -> str:
     return f"the prior{f' of {p.source.campaign}' if p.source.campaign else ''}"
 
 
@@ -209,16 +210,14 @@ def _called(p: Posterior) -> str:
 class Coordinates:
     """θ = m + U y of the K parameters at `index`, θ = y of all others."""
 
-    index: (
-        Ints  # (K,) parameters of the model with a carried prior; y has theirs at the same places
-    )
+    index: Ints  # (K,) parameters of the model with a carried prior, and their places in y
     mean: Floats  # (K,) m, SI
     matrix: Floats  # (K, K) U, SI
     inverse: Floats  # (K, K) y = inverse (θ − m)
     std: Floats  # (K,) standard deviations of y: 1, infinite for flat ones, 0 for those left out
     rest: Floats  # (K,) variance of θ by the coordinates that were left out, SI
 
-    def _with(self, x: Floats, values: Floats | float | bool) -> Floats:
+    def _replaced(self, x: Floats, values: Floats | float | bool) -> Floats:
         """Return x (P, ...) with values of the parameters that have a carried prior."""
         out = x.copy()
         out[self.index] = values
@@ -226,15 +225,15 @@ class Coordinates:
 
     def theta(self, y: Floats) -> Floats:
         """(P,) parameters."""
-        return self._with(y, self.mean + self.matrix @ y[self.index])
+        return self._replaced(y, self.mean + self.matrix @ y[self.index])
 
     def of_theta(self, theta: Floats) -> Floats:
         """(P,) y."""
-        return self._with(theta, self.inverse @ (theta[self.index] - self.mean))
+        return self._replaced(theta, self.inverse @ (theta[self.index] - self.mean))
 
     def transform(self, t: Floats) -> Floats:
         """(P, Q) change of θ by changes of y (P, Q)."""
-        return self._with(t, self.matrix @ t[self.index])
+        return self._replaced(t, self.matrix @ t[self.index])
 
     def columns(self, a: Floats) -> Floats:
         """(R, P) derivatives by y of derivatives by θ (R, P)."""
@@ -246,20 +245,20 @@ class Coordinates:
 
     def prior(self, std: Floats) -> Floats:
         """Prior standard deviations (P,) of y; `std` where there is no carried one."""
-        return self._with(std, self.std)
+        return self._replaced(std, self.std)
 
     def scales(self, scale: Floats) -> Floats:
         """(P,) ordinary magnitudes of y, of those of θ."""
-        return self._with(scale, 1.0)
+        return self._replaced(scale, 1.0)
 
     def carried(self, size: int) -> Bools:
         """(P,) which parameters have a carried prior."""
         return np.isin(np.arange(size), self.index)
 
     def felt(self, a: Floats) -> "Coordinates":
-        """Return those of which only what rows A (R, P) by θ depend on is kept.
+        """Return the coordinates reduced to those that derivatives A (R, P) by θ depend on.
 
-        The others stay where the prior has them. The same with more rows than coordinates.
+        The rest stays at the prior's mean. Unchanged where there are as many rows as coordinates.
         """
         held = np.flatnonzero(self.std == 1.0)
         if len(a) >= len(held):
@@ -268,10 +267,11 @@ class Coordinates:
         turn = sl.qr((a[:, self.index] @ u).T, mode="economic", check_finite=False)[0]
         matrix, inverse, std = self.matrix.copy(), self.inverse.copy(), self.std.copy()
         matrix[:, held], inverse[held], std[held] = 0.0, 0.0, 0.0
-        kept = held[: turn.shape[1]]
-        matrix[:, kept], inverse[kept], std[kept] = u @ turn, turn.T @ self.inverse[held], 1.0
-        rest = np.sum(u**2, axis=1) - np.sum(matrix[:, kept] ** 2, axis=1)
-        return replace(self, matrix=matrix, inverse=inverse, std=std, rest=np.maximum(rest, 0.0))
+        used = held[: turn.shape[1]]
+        matrix[:, used], inverse[used], std[used] = u @ turn, turn.T @ self.inverse[held], 1.0
+        variance = np.sum(u**2, axis=1) - np.sum(matrix[:, used] ** 2, axis=1)
+        rest = np.maximum(variance, 0.0)
+        return replace(self, matrix=matrix, inverse=inverse, std=std, rest=rest)
 
 
 def coordinates_of(model: Model) -> Coordinates:
@@ -287,8 +287,8 @@ def _coordinates(prior: CarriedPrior, names: tuple[str, ...]) -> Coordinates:
     p = prior.posterior
     index, place = prior.index_in(names)
     values, vectors = _spectrum(p, tuple(place.tolist()))
-    scale, seen = p.scale[place], values > 0
-    e, values = vectors[:, seen], values[seen]
+    scale, informed = p.scale[place], values > 0
+    e, values = vectors[:, informed], values[informed]
     root, back = e / np.sqrt(values), np.sqrt(values)[:, None] * e.T
     if prior.drift is not None and prior.drift.any():
         drift = prior.drift[1:][prior.group[place]]
@@ -297,11 +297,11 @@ def _coordinates(prior: CarriedPrior, names: tuple[str, ...]) -> Coordinates:
         low = np.linalg.cholesky(inner)
         root = e @ low
         back = sl.solve_triangular(low, e.T, lower=True, check_finite=False)
-    matrix = np.hstack([root, vectors[:, ~seen]])
-    inverse = np.vstack([back, vectors[:, ~seen].T])
-    std = np.concatenate([np.ones(root.shape[1]), np.full(int((~seen).sum()), np.inf)])
-    mean, rest = p.mean[place], np.zeros(len(index))
-    return Coordinates(index, mean, scale[:, None] * matrix, inverse / scale, std, rest)
+    matrix = np.hstack([root, vectors[:, ~informed]])
+    inverse = np.vstack([back, vectors[:, ~informed].T])
+    std = np.concatenate([np.ones(root.shape[1]), np.full(int((~informed).sum()), np.inf)])
+    mean, none = p.mean[place], np.zeros(len(index))
+    return Coordinates(index, mean, scale[:, None] * matrix, inverse / scale, std, none)
 
 
 @lru_cache(maxsize=3)

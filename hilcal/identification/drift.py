@@ -16,14 +16,14 @@ P = V⁻¹ − V⁻¹ F (Fᵀ V⁻¹ F)⁻ Fᵀ V⁻¹ the fixed point is
 and β, at least 1, follows from P y alike. The statistic yᵀ P K_g P y at v_g = 0, the others as they
 are, is a sum of weighted χ² when group g has not moved: its tail is the p-value of the group.
 
-An effect of the prior has the log evidence of the new readings that is the difference of the
-restricted log likelihoods
+The log evidence of the new readings for an effect of the prior is the difference of the restricted
+log likelihoods
 
     ℓ = −½ (log |V| + log |Fᵀ V⁻¹ F| + yᵀ P y)
 
-with the whole prior, and with what is left of it when the effect is held at zero and the others
-keep their marginal distribution. What the earlier readings said for it counts by the prior alone:
-without need its drift is zero, and readings that do not see it say nothing against it. Directions
+with the whole prior, and with the effect held at zero while the others keep their marginal
+distribution. The earlier readings count through the prior alone: without need the effect's drift is
+zero, and readings that do not depend on it say nothing against it. Directions
 of the prior without information have a standard deviation of one ordinary magnitude.
 
 Sources: Patterson and Thompson, Biometrika 58 (1971) 545-554; Polson and Scott, Bayesian Analysis 7
@@ -58,8 +58,8 @@ class Conflict:
     """How far a prior and new readings disagree about a group of parameters."""
 
     group: DriftGroup
-    p_value: float  # of what was found if they had not moved
-    drift: float  # standard deviation of the drift that the fit gave them, in units of S
+    p_value: float  # of the statistic if they had not moved
+    drift: float  # standard deviation of their drift in the fit, in units of S
 
     @property
     def moved_sigma(self) -> float:
@@ -73,9 +73,9 @@ class _Linear:
 
     y: Floats  # (Q,) residual at the prior's mean
     flat: Floats  # (Q, F) columns without a prior
-    known: Floats  # (Q, C) columns of unit variance: of the prior, and of other parameters' priors
+    random: Floats  # (Q, C) columns of unit variance: of the prior, and of other parameters' priors
     drift: tuple[Floats, ...]  # (Q, k) of the prior as a whole, and A_g S_g of each group
-    rest: int  # number of rows that no column acts on
+    noise_rows: int  # number of rows that no column acts on
     square: float  # their sum of squares
 
     def projected(self, covariance: Floats) -> tuple[Floats, Floats]:
@@ -90,26 +90,26 @@ class _Linear:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Columns:
-    """Whitened columns of a fit, by whether they have a prior of their own."""
+    """Whitened columns of a fit, by whether they have a prior."""
 
     a: Floats  # (R, P) of all parameters, zero for those that are not estimated
-    flat: Floats  # (R, F) without a carried prior, and without another
-    known: Floats  # (R, C) without a carried prior, in units of their own
-    y: Floats  # (R,) residual with every known parameter at zero
+    flat: Floats  # (R, F) of parameters without a prior
+    random: Floats  # (R, C) with a prior that is not carried, in units of its standard deviation
+    y: Floats  # (R,) residual with every parameter with a prior at zero
 
     @classmethod
-    def of(cls, model: Model, solution: Solution, w: Whitening) -> "_Columns":
-        """Return those at the fit."""
+    def at_fit(cls, model: Model, solution: Solution, w: Whitening) -> "_Columns":
+        """Return the columns at the fit."""
         s, carried = solution, solution.space.carried(model.size)
-        others = np.flatnonzero(s.estimated & ~carried)
-        used, std = np.flatnonzero(s.estimated | carried), s.prior[others]
+        index = np.flatnonzero(s.estimated & ~carried)
+        used, std = np.flatnonzero(s.estimated | carried), s.prior[index]
         free = np.isinf(std)
         a = np.zeros((len(s.white), model.size))
         a[:, used] = whitened_jacobian(model, s.prediction, s.theta, w, used)
         theta = np.where(s.estimated | carried, s.theta, 0.0)
-        theta[others[free]] = 0.0  # flat ones may stay where they are
-        known = a[:, others[~free]] * std[~free]
-        return cls(a, a[:, others[free]], known, s.white + a @ theta)
+        theta[index[free]] = 0.0  # flat ones may stay where they are
+        random = a[:, index[~free]] * std[~free]
+        return cls(a, a[:, index[free]], random, s.white + a @ theta)
 
 
 def chosen_drift(model: Model, solution: Solution, w: Whitening) -> Floats:
@@ -125,7 +125,7 @@ def chosen_drift(model: Model, solution: Solution, w: Whitening) -> Floats:
         return np.maximum(squares, 0.0), np.maximum(traces, 0.0)
 
     # No larger noise than stated to begin with: it would take the place of any drift.
-    beta, v, base = 1.0, np.zeros(len(forms)), rows.known @ rows.known.T
+    beta, v, base = 1.0, np.zeros(len(forms)), rows.random @ rows.random.T
     p, residual = rows.projected(base + np.eye(len(base)))
     squares, traces = moments(p, residual)
     slope = (squares - traces) / 2 - 1.0 / scale2
@@ -141,7 +141,7 @@ def chosen_drift(model: Model, solution: Solution, w: Whitening) -> Floats:
         squares, traces = moments(p, residual)
         new = v * np.sqrt(squares / np.maximum(traces + 2.0 / (scale2 + v), 1e-300))
         square = float(residual @ residual) + rows.square / beta**2
-        beta = max(1.0, beta * float(np.sqrt(square / (np.trace(p) + rows.rest / beta))))
+        beta = max(1.0, beta * float(np.sqrt(square / (np.trace(p) + rows.noise_rows / beta))))
         change, v = np.abs(new - v) * traces, new
         if change.max() < TOLERANCE:
             break
@@ -151,18 +151,18 @@ def chosen_drift(model: Model, solution: Solution, w: Whitening) -> Floats:
 def conflicts(model: Model, solution: Solution, w: Whitening) -> tuple[Conflict, ...]:
     """Return how far the groups of a carried prior disagree with the readings, worst first.
 
-    Each is tested beside the drift that the others were given, since a joint that has moved makes
-    its neighbours look as if they had. Groups that the readings do not see are left out.
+    Each is tested with the drift of the others in place, since a joint that has moved makes its
+    neighbours look as if they had. Groups that the readings do not depend on are left out.
     """
     if model.prior is None:
         return ()
     prior, lowest, rows = _linear(model, solution, w)
     used = lowest if model.prior.drift is None else model.prior.drift
     v = used**2 - lowest**2
-    total = rows.known @ rows.known.T + solution.beta * np.eye(len(rows.y))
-    for given in np.flatnonzero(v > NEGLIGIBLE):
-        total += v[given] * rows.drift[given] @ rows.drift[given].T
-    common, found = rows.projected(total), []
+    total = rows.random @ rows.random.T + solution.beta * np.eye(len(rows.y))
+    for moved in np.flatnonzero(v > NEGLIGIBLE):
+        total += v[moved] * rows.drift[moved] @ rows.drift[moved].T
+    common, out = rows.projected(total), []
     for k, group in enumerate(prior.groups, 1):
         x = rows.drift[k]
         p, residual = rows.projected(total - v[k] * x @ x.T) if v[k] > NEGLIGIBLE else common
@@ -172,8 +172,8 @@ def conflicts(model: Model, solution: Solution, w: Whitening) -> tuple[Conflict,
         values = np.maximum(np.linalg.eigvalsh(inner), 0.0)
         square = float(np.sum((x.T @ residual) ** 2))
         chance = ratio_tail(values[values > 0] / MANY, MANY, square / MANY**2)
-        found.append(Conflict(group, chance, float(used[k])))
-    return tuple(sorted(found, key=lambda c: c.p_value))
+        out.append(Conflict(group, chance, float(used[k])))
+    return tuple(sorted(out, key=lambda c: c.p_value))
 
 
 def least(prior: CarriedPrior) -> Floats:
@@ -185,66 +185,66 @@ def _linear(model: Model, solution: Solution, w: Whitening) -> tuple[CarriedPrio
     """The carried prior with its least drift (1 + G,), that drift, and the linear problem."""
     assert model.prior is not None  # noqa: S101 - the callers' condition
     prior = model.prior.with_drift(least(model.prior))
-    of = coordinates_of(replace(model, prior=prior))
+    space = coordinates_of(replace(model, prior=prior))
     index, place = prior.index_in(names_of(model))
-    c, held = _Columns.of(model, solution, w), of.std == 1.0
+    c, held = _Columns.at_fit(model, solution, w), space.std == 1.0
     a = c.a[:, index]
     group, unit = prior.group[place], prior.unit[place]
-    drift = [a @ of.matrix[:, held]]
-    flat, known = np.hstack([c.flat, a @ of.matrix[:, ~held]]), np.hstack([*drift, c.known])
+    drift = [a @ space.matrix[:, held]]
+    flat, random = np.hstack([c.flat, a @ space.matrix[:, ~held]]), np.hstack([*drift, c.random])
     drift += [a[:, group == g] * unit[group == g] for g in range(len(prior.groups))]
-    y = c.y - a @ of.mean
-    if len(y) <= a.shape[1] + c.flat.shape[1] + c.known.shape[1]:
-        return prior, least(prior), _Linear(y, flat, known, tuple(drift), 0, 0.0)
+    y = c.y - a @ space.mean
+    if len(y) <= a.shape[1] + c.flat.shape[1] + c.random.shape[1]:
+        return prior, least(prior), _Linear(y, flat, random, tuple(drift), 0, 0.0)
     # All columns are combinations of these; the rows beyond their span are noise.
-    every = np.hstack([a * prior.posterior.scale[place], c.flat, c.known])
-    span = sl.qr(every, mode="economic", check_finite=False)[0]
+    columns = np.hstack([a * prior.posterior.scale[place], c.flat, c.random])
+    span = sl.qr(columns, mode="economic", check_finite=False)[0]
     inside = span.T @ y
-    rest, square = max(w.rank - len(inside), 0), max(float(y @ y - inside @ inside), 0.0)
+    noise_rows, square = max(w.rank - len(inside), 0), max(float(y @ y - inside @ inside), 0.0)
     turned = tuple(span.T @ g for g in drift)
-    flat, known = np.asarray(span.T @ flat), np.asarray(span.T @ known)
-    return prior, least(prior), _Linear(inside, flat, known, turned, rest, square)
+    flat, random = np.asarray(span.T @ flat), np.asarray(span.T @ random)
+    return prior, least(prior), _Linear(inside, flat, random, turned, noise_rows, square)
 
 
 def carried_effects(model: Model) -> tuple[str, ...]:
-    """Effects of a model that are there because its carried prior has them."""
+    """Effects that a model has because its carried prior has them."""
     if model.prior is None:
         return ()
-    learnt = {e.name for e in model.prior.posterior.effects}
-    return tuple(e.name for e in model.effects if e.name in learnt and e.role == "effect")
+    carried = {e.name for e in model.prior.posterior.effects}
+    return tuple(e.name for e in model.effects if e.name in carried and e.role == "effect")
 
 
 def evidence_of_carried(
     model: Model, solution: Solution, w: Whitening, effects: Sequence[str]
 ) -> dict[str, float]:
-    """Return the log evidence of the readings for each effect, beside the others of the model."""
-    c = _Columns.of(model, solution, w)
-    y, a, flat, known = c.y, c.a, c.flat, c.known
-    whole = coordinates_of(model)
-    columns = np.hstack([flat, known, a[:, whole.index] @ whole.matrix])
+    """Return the log evidence of the readings for each effect, given the others of the model."""
+    c = _Columns.at_fit(model, solution, w)
+    y, a, flat, random = c.y, c.a, c.flat, c.random
+    full = coordinates_of(model)
+    columns = np.hstack([flat, random, a[:, full.index] @ full.matrix])
     if columns.shape[1] < len(y):
         span = sl.qr(columns, mode="economic", check_finite=False)[0]
-        y, a, flat, known = span.T @ y, span.T @ a, span.T @ flat, span.T @ known
+        y, a, flat, random = span.T @ y, span.T @ a, span.T @ flat, span.T @ random
 
-    def likelihood(of: Model, place: Ints) -> float:
+    def likelihood(reduced: Model, place: Ints) -> float:
         """ℓ with the prior of some parameters, which are at `place`."""
-        space = coordinates_of(of)
+        space = coordinates_of(reduced)
         used = a[:, place[space.index]]
-        x = np.hstack([known, used @ space.matrix])
+        x = np.hstack([random, used @ space.matrix])
         low = np.linalg.cholesky(x @ x.T + solution.beta * np.eye(len(x)))
         columns = np.column_stack([flat, y - used @ space.mean])
         white = sl.solve_triangular(low, columns, lower=True, check_finite=False)
         f, r = white[:, :-1], white[:, -1]
         values, vectors = np.linalg.eigh(f.T @ f)
-        seen = values > 1e-12 * values.max(initial=0.0)
-        along = (f @ vectors[:, seen]).T @ r / np.sqrt(values[seen])
-        log_det = 2 * float(np.log(np.diag(low)).sum()) + float(np.log(values[seen]).sum())
+        determined = values > 1e-12 * values.max(initial=0.0)
+        along = (f @ vectors[:, determined]).T @ r / np.sqrt(values[determined])
+        log_det = 2 * float(np.log(np.diag(low)).sum()) + float(np.log(values[determined]).sum())
         return -0.5 * (log_det + float(r @ r) - float(along @ along))
 
-    every = np.arange(model.size)
-    with_all, found = likelihood(model, every), {}
+    parameters = np.arange(model.size)
+    with_all, evidence = likelihood(model, parameters), {}
     for name in effects:
-        rest = replace(model, effects=tuple(e for e in model.effects if e.name != name))
-        kept = np.delete(every, model.slices()[model.names.index(name)])
-        found[name] = with_all - likelihood(rest, kept)
-    return found
+        without = replace(model, effects=tuple(e for e in model.effects if e.name != name))
+        place = np.delete(parameters, model.slices()[model.names.index(name)])
+        evidence[name] = with_all - likelihood(without, place)
+    return evidence

@@ -18,7 +18,7 @@ from hilcal.identification.registration import register
 
 
 def to_json(fit: Fit) -> dict[str, object]:
-    """Keys of the contract, and what else a script may want to know of a fit.
+    """Return the keys of the contract, and more of a fit that scripts may need.
 
     `value` and `std` are null where the data do not determine a parameter, conditions where
     there is nothing to condition.
@@ -63,19 +63,19 @@ def to_json(fit: Fit) -> dict[str, object]:
 
 def frames_to_json(fit: Fit) -> dict[str, object]:
     """Frames as fitted; residual and undetermined directions of the nominal arm's registration."""
-    found, registered = fit.frames, register(fit.model.cell, fit.readings)
-    return {**registered.to_json(found.base, found.targets), "base_is": found.base_is}
+    frames, registered = fit.frames, register(fit.model.cell, fit.readings)
+    return {**registered.to_json(frames.base, frames.targets), "base_is": frames.base_is}
 
 
 def prior_to_json(fit: Fit) -> dict[str, object]:
-    """Key `prior`: where it is from, and how far each part of it and the readings disagree.
+    """Key `prior`: its source, and how far each part of it and the readings disagree.
 
     `drift` is a standard deviation in ordinary magnitudes, in shrunk families in their strengths.
     """
     prior = fit.model.prior
     if prior is None:
         return {}
-    found = [
+    conflicts = [
         {
             "effect": c.group.effect,
             "part": c.group.part,
@@ -87,11 +87,11 @@ def prior_to_json(fit: Fit) -> dict[str, object]:
         for c in fit.conflicts
     ]
     source = asdict(prior.posterior.source)
-    return {"prior": {"source": source, "relation": prior.relation, "effects": found}}
+    return {"prior": {"source": source, "relation": prior.relation, "effects": conflicts}}
 
 
 def outliers(fit: Fit) -> list[dict[str, object]]:
-    """Readings that were set aside, with their Mahalanobis distance and what they look like."""
+    """Readings that were set aside, with their Mahalanobis distance and likely cause."""
     return [
         {"pose": g.pose, "load": g.load, "sigma": g.sigma, "reason": g.reason}
         for g in gross_errors(fit)
@@ -99,7 +99,7 @@ def outliers(fit: Fit) -> list[dict[str, object]]:
 
 
 def notes(fit: Fit) -> tuple[str, ...]:
-    """What a reader of the numbers has to know, a sentence each."""
+    """What a reader of the numbers has to know, one sentence per note."""
     out = []
     if not fit.solution.converged:
         out.append(

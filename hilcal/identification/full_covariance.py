@@ -41,7 +41,7 @@ def full_readings(
     """Return readings with their full covariance, see `readings.covariance`.
 
     The arm's repeatability is added where the covariances of a file or a table cover the instrument
-    alone; `covers` says what they cover, None for a file that does not say.
+    alone; `covers` states what they cover, None for a file that does not state it.
     """
     parts = covariance_parts(covers, config)
     joint_std = config.repeatability.per_joint(cell.arm.n)
@@ -57,17 +57,17 @@ def with_noise_of(tracker: Tracker, readings: Readings) -> Readings:
 
     A reading at the tracker's station is refused.
     """
-    whole, station = ~readings.scalar, tracker.station_m or (0.0, 0.0, 0.0)
-    if not whole.any():
+    positioned, station = ~readings.scalar, tracker.station_m or (0.0, 0.0, 0.0)
+    if not positioned.any():
         return readings
-    position, out = readings.value[whole, :3], readings.covariance.copy()
+    position, out = readings.value[positioned, :3], readings.covariance.copy()
     cov = tracker_covariance(position, tracker_noise(tracker), station, readings.m)
-    out[whole] = with_rounding(cov, rounding_variance(position, 1.0))[0]
+    out[positioned] = with_rounding(cov, rounding_variance(position, 1.0))[0]
     return replace(readings, covariance=out)
 
 
 def covariance_parts(covers: str | None, config: CellConfig) -> CovarianceParts:
-    """Return what the full covariance consists of, of stored covariances that cover `covers`."""
+    """Return the parts of the full covariance, for stored covariances that cover `covers`."""
     if covers == WHOLE:
         return "instrument and arm as stated"
     if covers != INSTRUMENT:
@@ -90,10 +90,10 @@ def with_joint_scatter(cell: Cell, readings: Readings, joint_std: Floats) -> Rea
 
 
 def with_common_scatter(cell: Cell, readings: Readings, joint_std: Floats) -> Readings:
-    """Return readings whose covariances include the joints' scatter with what arrivals share of it.
+    """Return readings whose covariances include the joints' scatter, with its factors `common`.
 
-    Only several targets share any. The factor F of a reading is shortened where F Fᵀ is more than
-    its covariance.
+    Only readings of several targets or observers have it in common. The factor F of a reading is
+    reduced where F Fᵀ exceeds its covariance.
     """
     s = readings.states
     several = s.target is not None or s.observer is not None
@@ -127,6 +127,6 @@ def joint_factors(cell: Cell, readings: Readings, joint_std: Floats) -> Floats:
     turn = cell.registration[:3, :3]
     if readings.states.observer is not None:
         cell = cell if cell.observers else register(cell, readings).cell
-        seen = Model(cell, ()).predict(readings.states, np.zeros(0)).observation
-        turn = seen.axes
+        observation = Model(cell, ()).predict(readings.states, np.zeros(0)).observation
+        turn = observation.axes
     return arrival_factors(cell.arm, readings, offset, turn, joint_std)

@@ -22,7 +22,7 @@ from hilcal.tables.write import Column
 from hilcal.types import Floats, Ints
 
 ALIKE = 1e-3  # χ² quantile of the distance below which two readings are alike; a choice
-SAME = 1e-3  # a reading that repeats another to this share of σ was not taken anew; a choice
+SAME = 1e-3  # a reading that repeats another to this share of σ is stale; a choice
 MOSTLY = 0.8  # share of the whitened error that an axis must have to be named; a choice
 SWAPPED = 0.1  # share of an error that another target's place may leave: centimetres; a choice
 AXES = ("x", "y", "z", "rotation about x", "rotation about y", "rotation about z")
@@ -83,8 +83,8 @@ def error_before(fit: Fit) -> ErrorBlock:
 
     Of deflections it is the deflection itself, which a rigid arm does not have. Of absolute
     readings it is what remains where the unknown frames (registration, target) are fitted to the
-    nominal arm alone: those of a fitted model make up for its other parameters, and are wrong for
-    the nominal arm by as much.
+    nominal arm alone: those of a fitted model belong to its other parameters, and are wrong for the
+    nominal arm.
     """
     used, w = fit.readings[~fit.outlier], fit.whitening
     frames = tuple(x for x in fit.model.effects if x.role in FRAME_ROLES)
@@ -96,7 +96,7 @@ def error_before(fit: Fit) -> ErrorBlock:
 
 
 def residual_table(fit: Fit) -> dict[str, Column]:
-    """Return residuals, measured − predicted, with what was measured; SI, one row per reading.
+    """Return residuals, measured − predicted, by pose, load and cycle; SI, one row per reading.
 
     `residual_…` is of the fit, `left_out_…` of predictions without the reading's pose, both in
     axes of the sensor and, with `base_` in the name, of the base. `sigma` is the root of the
@@ -108,8 +108,8 @@ def residual_table(fit: Fit) -> dict[str, Column]:
 
     def spread(values: Floats) -> Sequence[list[float | None]]:
         """Columns of values (D, k) at their readings, None elsewhere."""
-        at = dict(zip(w.reading.tolist(), values.tolist(), strict=True))
-        return [[at[k][c] if k in at else None for k in range(len(r))]
+        by_reading = dict(zip(w.reading.tolist(), values.tolist(), strict=True))
+        return [[by_reading[k][c] if k in by_reading else None for k in range(len(r))]
                 for c in range(values.shape[1])]  # fmt: skip
 
     table: dict[str, Column] = {
@@ -122,11 +122,11 @@ def residual_table(fit: Fit) -> dict[str, Column]:
         table["target"] = [r.target_names[k] for k in r.target.tolist()]
     table["set_aside"] = fit.outlier.astype(int)
     table["sigma"] = spread(np.sqrt(mahalanobis2(raw, w.covariance))[:, None])[0]
-    for what, values in (("residual", raw), ("left_out", all_left_out(fit)[0])):
+    for kind, values in (("residual", raw), ("left_out", all_left_out(fit)[0])):
         base = (values.reshape(len(values), -1, 3) @ fit.frames.base[:3, :3]).reshape(values.shape)
-        for frame, of in (("", values), ("base_", base)):
-            for element, column in zip(ELEMENTS, spread(of), strict=False):
-                table[f"{what}_{frame}{element}"] = column
+        for frame, components in (("", values), ("base_", base)):
+            for element, column in zip(ELEMENTS, spread(components), strict=False):
+                table[f"{kind}_{frame}{element}"] = column
     return table
 
 
@@ -149,43 +149,44 @@ def gross_errors(fit: Fit) -> tuple[GrossError, ...]:
     if not fit.outlier.any():
         return ()
     e = full_prediction(fit)
-    found: dict[int, GrossError] = {}
+    errors: dict[int, GrossError] = {}
     first = 0
     for b in e.whitening.buckets:
         size = b.loaded.shape[1]
         for g in range(len(b.loaded)):
-            at = first + g * size + np.arange(size)
+            measurements = first + g * size + np.arange(size)
             out = fit.outlier[b.reference[g]]
             for u in np.flatnonzero(out):
-                row, taken = int(b.reference[g, u]), b.weights[:, u] > 0
-                found[row] = _shared(e, row, at[taken], bool(np.all(b.weights[taken, u] == 1.0)))
-            # Deflections of which no unloaded reading is left are not listed one by one.
+                row, affected = int(b.reference[g, u]), b.weights[:, u] > 0
+                alone = bool(np.all(b.weights[affected, u] == 1.0))
+                errors[row] = _shared(e, row, measurements[affected], alone)
+            # Deflections without a remaining unloaded reading are not listed one by one.
             lost = (b.weights @ out > 1.0 - 1e-9) if len(out) else np.zeros(size, dtype=bool)
-            for k, r in zip(at[~lost], b.loaded[g, ~lost], strict=True):
+            for k, r in zip(measurements[~lost], b.loaded[g, ~lost], strict=True):
                 if fit.outlier[r]:
-                    found[int(r)] = _one(e, int(r), e.raw[k], e.whitening.covariance[k])
+                    errors[int(r)] = _gross_error(e, int(r), e.raw[k], e.whitening.covariance[k])
         first += b.loaded.size
-    return tuple(found[row] for row in sorted(found))
+    return tuple(errors[row] for row in sorted(errors))
 
 
 def _shared(e: FullPrediction, row: int, measurements: Ints, alone: bool) -> GrossError:
-    """Gross error of an unloaded reading, from the deflections that are taken from it."""
+    """Gross error of an unloaded reading, from the deflections that refer to it."""
     rows, v = e.whitening.reading[measurements], e.readings.covariance
     off, many = -np.median(e.raw[measurements], axis=0), len(rows)
-    one = _one(e, row, off, v[row] + v[rows].sum(axis=0) / many**2)
+    error = _gross_error(e, row, off, v[row] + v[rows].sum(axis=0) / many**2)
     if not alone:
-        return one
+        return error
     which = f"its {many} deflections" if many > 1 else "its deflection"
-    return replace(one, reason=f"{one.reason}; {which} set aside with it")
+    return replace(error, reason=f"{error.reason}; {which} set aside with it")
 
 
-def _one(e: FullPrediction, row: int, off: Floats, covariance: Floats) -> GrossError:
+def _gross_error(e: FullPrediction, row: int, off: Floats, covariance: Floats) -> GrossError:
     r = e.readings
     reason = (
         _stale(r, row)
         or _another_target(e, row, off)
         or _like_another(r, row)
-        or _off(off, covariance)
+        or _by_axis(off, covariance)
     )
     if r.states.target is not None:
         reason = f"target {r.target_names[r.target[row]]}: {reason}"
@@ -197,16 +198,17 @@ def _another_target(e: FullPrediction, row: int, off: Floats) -> str:
     r = e.readings
     if r.states.target is None:
         return ""
-    here, count = r.states[row : row + 1], len(r.target_names)
+    state, count = r.states[row : row + 1], len(r.target_names)
     places = [
-        e.model.predict(replace(here, target=np.array([k])), e.theta).observation.position[0]
+        e.model.predict(replace(state, target=np.array([k])), e.theta).observation.position[0]
         for k in range(count)
     ]
     away = [float(np.linalg.norm(off[:3] - (x - places[r.target[row]]))) for x in places]
-    found = min((k for k in range(count) if k != r.target[row]), key=lambda k: away[k], default=-1)
-    if found < 0 or away[found] >= SWAPPED * float(np.linalg.norm(off[:3])):
+    candidates = [k for k in range(count) if k != r.target[row]]
+    closest = min(candidates, key=lambda k: away[k], default=-1)
+    if closest < 0 or away[closest] >= SWAPPED * float(np.linalg.norm(off[:3])):
         return ""
-    return f"lies where {r.target_names[found]} is: were they swapped?"
+    return f"lies where {r.target_names[closest]} is: were they swapped?"
 
 
 def _stale(r: Readings, row: int) -> str:
@@ -218,15 +220,15 @@ def _stale(r: Readings, row: int) -> str:
 
 def _like_another(r: Readings, row: int) -> str:
     """Phrase for a reading that agrees with one under another load at the same pose, or ''."""
-    beside = (r.pose == r.pose[row]) & (r.load != r.load[row]) & (r.target == r.target[row])
+    candidates = (r.pose == r.pose[row]) & (r.load != r.load[row]) & (r.target == r.target[row])
     away = {
-        other: _distance(r.value[row] - r.value[other], r.covariance[row] + r.covariance[other])
-        for other in np.flatnonzero(beside).tolist()
+        k: _distance(r.value[row] - r.value[k], r.covariance[row] + r.covariance[k])
+        for k in np.flatnonzero(candidates).tolist()
     }
-    found = min(away, key=lambda other: away[other], default=-1)
-    if found < 0 or away[found] ** 2 >= float(chi2.isf(ALIKE, r.m)):
+    closest = min(away, key=lambda k: away[k], default=-1)
+    if closest < 0 or away[closest] ** 2 >= float(chi2.isf(ALIKE, r.m)):
         return ""
-    load = r.load_names[r.load[found]]
+    load = r.load_names[r.load[closest]]
     if load == "none":
         return "like the unloaded reading: was the load hung?"
     if r.unloaded[row]:
@@ -234,7 +236,7 @@ def _like_another(r: Readings, row: int) -> str:
     return f'like the reading under "{load}": was that load hung?'
 
 
-def _off(off: Floats, covariance: Floats) -> str:
+def _by_axis(off: Floats, covariance: Floats) -> str:
     white = np.abs(off) / np.sqrt(np.maximum(np.diagonal(covariance), 1e-300))
     axis, sigma = int(np.argmax(white)), _distance(off, covariance)
     mostly = white[axis] >= MOSTLY * float(np.linalg.norm(white))
@@ -249,18 +251,18 @@ def _distance(off: Floats, covariance: Floats) -> float:
 
 def disagreement_words(fit: Fit) -> str:
     """Return the disagreement of a fit's readings in a sentence; empty where there is none."""
-    found, readings = fit.disagreement, fit.readings
-    if found is None:
+    disagreement, readings = fit.disagreement, fit.readings
+    if disagreement is None:
         return ""
-    count = f"{len(found.rows)} of {len(readings)}"
-    if found.kind == "many":
+    count = f"{len(disagreement.rows)} of {len(readings)}"
+    if disagreement.kind == "many":
         return (
             f"more than {100 * MOST:.0f} % of the readings disagree with what the others agree on, "
             f"too many to tell wrong ones from right ones ({count} are beyond the noise): none was "
             "set aside, and nothing that is fitted to them holds; find out what went wrong in "
             "measuring"
         )
-    first, last = ("/".join(names(readings, int(found.rows[k]))) for k in (0, -1))
+    first, last = ("/".join(names(readings, int(disagreement.rows[k]))) for k in (0, -1))
     return (
         f"{count} readings, between {first} and {last}, are off by the same shift, so that they "
         "have one cause: another reflector, a target moved on the tool, a tracker that was bumped. "

@@ -1,20 +1,20 @@
-"""An earlier fit at later readings of the same arm: what it knows is the prior, frames may be new.
+"""An earlier fit as the prior of later readings of the same arm; frames may be new.
 
-With θ_A and κC the earlier estimate and the covariance of what it predicts by (`predictive`), the
-later readings are
+With the earlier estimate θ_A and its predictive covariance κC (`predictive`), the later readings
+are
 
     y = f(θ_A + R u + F b + D δ) + e + p,    R Rᵀ = κC,  u ~ N(0, 1),  b and δ flat
 
 b the twist of the base where the tracker was set up anew, δ changes of the arm (none to begin
 with), e ~ N(0, a V) the noise and p ~ N(0, c V̄) a misfit that all readings of a pose share: a few
-poses under several loads then tell less than as many poses. a + c is the factor κσ² by which the
-earlier fit missed poses that it had left out; what is beyond the stated noise, κσ² − 1, is divided
-as its residual says (`earlier_fit`). The minimum over u, p, b and δ of
+poses under several loads then tell less than as many poses. a + c is κσ², the variance factor of
+the earlier fit at poses left out; what exceeds the stated noise, κσ² − 1, is divided between a and
+c by the residual (`earlier_fit`). The minimum over u, p, b and δ of
 
     ‖y − f‖² / (a V) + ‖u‖² + ‖p‖² / (c V̄)
 
-is rᵀ M r of the linearised problem (`regression.projection`): what the earlier fit, by its own
-statement, does not explain. Without any change it follows χ² with as many degrees of freedom as
+is rᵀ M r of the linearised problem (`regression.projection`): what the earlier fit does not
+explain. Without any change it follows χ² with as many degrees of freedom as
 there are elements beyond the flat parameters.
 """
 
@@ -54,7 +54,7 @@ HALVINGS = 6  # of a step that makes the sum of squares grow
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EarlierFit:
-    """A gc-scaled fit, and what it states of readings that it has not seen."""
+    """A gc-scaled fit, and its predictive distribution for readings that were not fitted."""
 
     fit: Fit
     knows: Predictive
@@ -64,7 +64,7 @@ class EarlierFit:
 
 
 def earlier_fit(fit: Fit) -> EarlierFit:
-    """Return what a fit, which must be gc-scaled, states of readings that it has not seen."""
+    """Return a fit, which must be gc-scaled, with its predictive distribution."""
     if fit.scaling != "gc":
         raise InputError(
             f"the earlier fit has scaling {fit.scaling}; a comparison needs gc: run hilcal "
@@ -72,7 +72,7 @@ def earlier_fit(fit: Fit) -> EarlierFit:
         )
     knows = predictive_of(fit)
     beyond = max(knows.factor * knows.scatter - 1.0, 0.0)
-    shared = beyond * _shared(fit, knows, fit.readings[~fit.outlier])
+    shared = beyond * _share_by_pose(fit, knows, fit.readings[~fit.outlier])
     root = _root(knows.factor * knows.covariance)
     return EarlierFit(fit, knows, root, 1.0 + beyond - shared, shared)
 
@@ -82,7 +82,7 @@ def _root(covariance: Floats) -> Floats:
     return np.asarray(vectors[:, values > 0] * np.sqrt(values[values > 0]))
 
 
-def _shared(fit: Fit, knows: Predictive, kept: Readings) -> float:
+def _share_by_pose(fit: Fit, knows: Predictive, inliers: Readings) -> float:
     """Share of the misfit on poses left out that all readings of a pose have in common.
 
     With r_i (3,) the residual of measurement i, predicted without its pose, V_ij the stated
@@ -98,15 +98,15 @@ def _shared(fit: Fit, knows: Predictive, kept: Readings) -> float:
     if len(np.unique(fit.pose)) == len(fit.pose):
         return 0.0
     tau = np.sqrt(np.trace(w.covariance[:, :3, :3], axis1=1, axis2=2))
-    at = np.empty(len(kept), dtype=np.int64)
-    at[w.reading] = np.arange(len(off))
+    measurement = np.empty(len(inliers), dtype=np.int64)
+    measurement[w.reading] = np.arange(len(off))
     stated: dict[tuple[int, int], float] = {}
-    for bucket, block in zip(w.buckets, covariance_blocks(kept, w), strict=True):
+    for bucket, block in zip(w.buckets, covariance_blocks(inliers, w), strict=True):
         count = bucket.loaded.shape[1]
         parts = block.reshape(len(block), count, m, count, m)[:, :, :3, :, :3]
         traces = np.einsum("gaibi->gab", parts)
         a, b = np.triu_indices(count, 1)
-        for rows, trace in zip(at[bucket.loaded], traces, strict=True):
+        for rows, trace in zip(measurement[bucket.loaded], traces, strict=True):
             keys = zip(rows[a].tolist(), rows[b].tolist(), strict=True)
             stated.update(zip(keys, trace[a, b].tolist(), strict=True))
     jacobian = fit.model.jacobian(fit.solution.prediction, fit.theta, m)[:, :3]
@@ -116,8 +116,8 @@ def _shared(fit: Fit, knows: Predictive, kept: Readings) -> float:
     for rows in (np.flatnonzero(fit.pose == p) for p in np.unique(fit.pose)):
         first, second = np.triu_indices(len(rows), 1)
         i, j = rows[first], rows[second]
-        known = [stated.get((a, b), stated.get((b, a), 0.0)) for a, b in zip(i, j, strict=True)]
-        x.append(np.stack([np.array(known), tau[i] * tau[j]], axis=1).reshape(-1, 2))
+        pairs = [stated.get((a, b), stated.get((b, a), 0.0)) for a, b in zip(i, j, strict=True)]
+        x.append(np.stack([np.array(pairs), tau[i] * tau[j]], axis=1).reshape(-1, 2))
         y.append(np.sum(off[i] * off[j], axis=1) - (spread[rows] @ spread[rows].T)[first, second])
     a, c = np.linalg.lstsq(np.concatenate(x), np.concatenate(y), rcond=None)[0]
     scatter, shared = max(float(a) - 1.0, 0.0), max(float(c), 0.0)
@@ -128,13 +128,13 @@ def _shared(fit: Fit, knows: Predictive, kept: Readings) -> float:
 class Moving:
     """A change of the arm: an effect that is added, with some directions of its parameters."""
 
-    effect: Effect  # of another name than those of the model; several changes may be of one
+    effect: Effect  # with a name that the model lacks; several changes may share one
     directions: Floats  # (P, k) D, in units of the effect's parameters
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Setting:
-    """Later readings, and what is free to explain them without any change of the arm."""
+    """Later readings, and the parameters that may explain them without a change of the arm."""
 
     earlier: EarlierFit
     readings: Readings  # the later ones
@@ -156,12 +156,12 @@ class Setting:
 
 @dataclass(frozen=True, eq=False)
 class Remeasured:
-    """Later readings beside an earlier fit and some changes of the arm, at some coordinates.
+    """Later readings explained by an earlier fit and changes of the arm, at some coordinates.
 
     R whitened rows, K coordinates u, b and δ, L coordinates p, P parameters.
     """
 
-    setting: Setting  # what the readings are explained by
+    setting: Setting  # the readings and the earlier fit
     changes: tuple[Moving, ...]
     model: Model  # that of the setting, and the changes
     mean: Floats  # (P,) prior mean of its parameters
@@ -171,7 +171,7 @@ class Remeasured:
 
     @cached_property
     def theta(self) -> Floats:
-        """(P,) parameters; CannotAnswerError beyond what has a static equilibrium."""
+        """(P,) parameters; raises CannotAnswerError where they have no static equilibrium."""
         step = self.lift @ self.coordinates[: self.lift.shape[1]]
         if np.any(np.abs(step) > ABSURD * scales_of(self.model)):
             raise CannotAnswerError("a change of such a size has no static equilibrium")
@@ -209,9 +209,9 @@ class Remeasured:
 
     @property
     def square(self) -> float:
-        """What is minimised."""
-        left = self.white - self.setting.poses @ self.coordinates[self.lift.shape[1] :]
-        return float(left @ left + self.ridge @ self.coordinates**2)
+        """The minimised sum of squares."""
+        remaining = self.white - self.setting.poses @ self.coordinates[self.lift.shape[1] :]
+        return float(remaining @ remaining + self.ridge @ self.coordinates**2)
 
     @property
     def rss(self) -> float:
@@ -248,7 +248,7 @@ class Remeasured:
         return self.setting.scaled(w.whiten(raw)), raw[:, :3]
 
     def moved(self, step: Floats) -> "Remeasured":
-        """Return them after a step (K + L,)."""
+        """Return the same after a step (K + L,) of the coordinates."""
         return replace(self, coordinates=self.coordinates + step)
 
 
@@ -257,8 +257,8 @@ def setting(
 ) -> Setting:
     """Prepare the comparison of later readings with an earlier fit.
 
-    The tracker was set up `anew` where its place is estimated; of the later campaign's cell the
-    tool is used, and its target where that is another one.
+    With `anew` the place of the tracker is estimated. Of the later campaign's `cell` the tool is
+    used, and the targets where they differ.
 
     Raises:
         InputError: an effect needs a column that the readings lack; or, for deflections, a loaded
@@ -268,40 +268,40 @@ def setting(
     fit = earlier.fit
     require_columns(fit.model, readings, "later")
     flat: list[Role] = ["registration"] if anew else []
-    now = fit.model.cell
+    later_cell = fit.model.cell
     if cell is not None:
-        now = replace(
-            now, tool_mass=cell.tool_mass, tool_com=cell.tool_com, load_point=cell.load_point
+        later_cell = replace(
+            later_cell, tool_mass=cell.tool_mass, tool_com=cell.tool_com, load_point=cell.load_point
         )
         if other_target(fit.model.cell, cell):
             flat.append("target")
-            now = now.with_targets(cell.all_targets, cell.known_targets)
-    if readings.states.observer is not None:  # they are set up anew for every campaign
-        now = replace(now, observers=()).observed_by(readings.observers)
-        flat = [*(role for role in flat if role != "registration" or now.tied), "observer"]
-    now, rms = _placed(fit, now, flat, readings) if flat else (now, 0.0)
+            later_cell = later_cell.with_targets(cell.all_targets, cell.known_targets)
+    if readings.states.observer is not None:  # observers are set up anew for every campaign
+        later_cell = replace(later_cell, observers=()).observed_by(readings.observers)
+        flat = [*(role for role in flat if role != "registration" or later_cell.tied), "observer"]
+    later_cell, rms = _placed(fit, later_cell, flat, readings) if flat else (later_cell, 0.0)
     scatter = fit.readings.arm_scatter
     if scatter is not None and readings.arm_scatter is None:
-        readings = with_arm_scatter(now, readings, scatter)
+        readings = with_arm_scatter(later_cell, readings, scatter)
     w = whitening(readings, fit.mode, "gc")
     states, slices = fit.readings[~fit.outlier].states, fit.model.slices()
     parts = [p for p in zip(fit.model.effects, slices, strict=True) if p[0].role not in flat]
-    if "target" in flat and now.target_known:
+    if "target" in flat and later_cell.target_known:
         flat.remove("target")
     kinds = fit.model.catalogue.with_role(*flat) if flat else ()
-    frames = [kind(now, states) for kind in kinds]
-    effects = tuple(type(e)(now, states, e.options) for e, _ in parts)
-    model = replace(fit.model, cell=now, effects=(*effects, *frames))
+    frames = [kind(later_cell, states) for kind in kinds]
+    effects = tuple(type(e)(later_cell, states, e.options) for e, _ in parts)
+    model = replace(fit.model, cell=later_cell, effects=(*effects, *frames))
     count = sum(len(e.parameters) for e in effects)
     mean, lift = np.zeros(model.size), np.zeros((model.size, earlier.root.shape[1]))
     if parts:
         mean[:count] = np.concatenate([fit.theta[s] for _, s in parts])
         lift[:count] = np.concatenate([earlier.root[s] for _, s in parts])
-    # Directions of the prior that the readings do not see stay at its mean.
+    # Directions of the prior that do not move the readings stay at its mean.
     _, values, vectors = np.linalg.svd(_rows(model, mean, lift, readings, w), full_matrices=False)
     lift = lift @ vectors[values > LEAST * max(float(values.max(initial=0.0)), 1.0)].T
     size = scales_of(model)[count:]
-    if fit.mode == "deflection":  # deflections tell of frames only how they are turned
+    if fit.mode == "deflection":  # deflections determine only the turns of frames
         size = np.array([rms if p.unit == "m" else rms / ARM for f in frames for p in f.parameters])
     free = np.full(len(size), 1.0 if fit.mode == "deflection" else 0.0)
     ridge = np.concatenate([np.ones(lift.shape[1]), free])
@@ -310,44 +310,45 @@ def setting(
     return Setting(earlier, readings, w, model, mean, lift, ridge, poses, anew, len(mean) - count)
 
 
-def frames_alone(at: Setting) -> Setting:
-    """Return the setting in which the earlier parameters stay as they were; frames are free."""
-    moves = np.any(at.lift[len(at.mean) - at.frames :] != 0.0, axis=0)
-    return replace(at, lift=at.lift[:, moves], ridge=at.ridge[moves], poses=at.poses[:, :0])
+def frames_alone(later: Setting) -> Setting:
+    """Return the setting with the earlier parameters fixed; frames are free."""
+    moves = np.any(later.lift[len(later.mean) - later.frames :] != 0.0, axis=0)
+    none = later.poses[:, :0]
+    return replace(later, lift=later.lift[:, moves], ridge=later.ridge[moves], poses=none)
 
 
-def beside_frames(at: Setting) -> Floats:
-    """(P, K) directions of the prior, each with the motion of the free frames that absorbs most."""
-    frames = np.any(at.lift[len(at.mean) - at.frames :] != 0.0, axis=0)
-    prior = at.lift[:, ~frames]
+def beside_frames(later: Setting) -> Floats:
+    """(P, K) directions of the prior, each with the motion of frames that absorbs most of it."""
+    frames = np.any(later.lift[len(later.mean) - later.frames :] != 0.0, axis=0)
+    prior = later.lift[:, ~frames]
     if not frames.any():
         return prior
-    rows = _rows(at.model, at.mean, at.lift, at.readings, at.w)
+    rows = _rows(later.model, later.mean, later.lift, later.readings, later.w)
     absorbed = np.linalg.lstsq(rows[:, frames], rows[:, ~frames], rcond=None)[0]
-    return np.asarray(prior - at.lift[:, frames] @ absorbed)
+    return np.asarray(prior - later.lift[:, frames] @ absorbed)
 
 
-def other_target(one: Cell, other: Cell) -> bool:
-    """Whether another target is configured, or another place of it on the flange."""
+def other_target(first: Cell, second: Cell) -> bool:
+    """Whether two cells have different targets, or other places of them on the flange."""
 
     def targets(tool: Tool | None) -> object:
         return None if tool is None else (tool.target_m, tool.target_rotvec_rad, tool.targets)
 
-    before, after = (targets(c.config.tool if c.config else None) for c in (one, other))
-    return one.target_names != other.target_names or before != after
+    a, b = (targets(c.config.tool if c.config else None) for c in (first, second))
+    return first.target_names != second.target_names or a != b
 
 
-def _placed(fit: Fit, now: Cell, flat: Sequence[Role], readings: Readings) -> tuple[Cell, float]:
-    """Return the cell with frames as registered to the readings, and the rms error of that, m."""
-    held = now
+def _placed(fit: Fit, cell: Cell, flat: Sequence[Role], readings: Readings) -> tuple[Cell, float]:
+    """Return the cell registered to the readings, and the rms error of the registration, m."""
+    held = cell
     if "target" not in flat:
         placed = targets_as_fitted(fit.model, fit.theta)
-        held = now.with_targets(placed, (True,) * len(placed))
-    found = register(replace(held, registration_known="registration" not in flat), readings)
-    moved = replace(now, registration=found.cell.registration, observers=found.cell.observers)
+        held = cell.with_targets(placed, (True,) * len(placed))
+    r = register(replace(held, registration_known="registration" not in flat), readings)
+    moved = replace(cell, registration=r.cell.registration, observers=r.cell.observers)
     if "target" in flat:
-        moved = moved.with_targets(found.cell.all_targets)
-    return moved, max(found.rms, 1e-6)
+        moved = moved.with_targets(r.cell.all_targets)
+    return moved, max(r.rms, 1e-6)
 
 
 def _rows(model: Model, mean: Floats, lift: Floats, readings: Readings, w: Whitening) -> Floats:
@@ -359,47 +360,47 @@ def _rows(model: Model, mean: Floats, lift: Floats, readings: Readings, w: White
 def _pose_rows(earlier: EarlierFit, w: Whitening) -> Floats:
     """Rows (R, L) of a misfit that is common to the measurements of a pose, with its spread."""
     shared = earlier.by_pose / earlier.noise
-    poses, of = np.unique(w.group, return_inverse=True)
+    poses, pose = np.unique(w.group, return_inverse=True)
     if shared < LEAST_SHARED or len(poses) == len(w):
         return np.zeros((len(w) * w.m, 0))
     out = np.zeros((len(w), w.m, len(poses), w.m))
     std = np.sqrt(shared * np.diagonal(w.covariance, axis1=1, axis2=2))
-    each = np.arange(w.m)
-    out[np.arange(len(w))[:, None], each, of.reshape(-1)[:, None], each] = std
+    element = np.arange(w.m)
+    out[np.arange(len(w))[:, None], element, pose.reshape(-1)[:, None], element] = std
     return w.whiten(out.reshape(len(w), w.m, -1))
 
 
 def remeasure(
-    at: Setting, changes: Sequence[Moving] = (), start: Remeasured | None = None
+    later: Setting, changes: Sequence[Moving] = (), start: Remeasured | None = None
 ) -> Remeasured:
-    """Find the minimum by Gauss-Newton on the exact chain, beside flat changes of the arm.
+    """Find the minimum by Gauss-Newton on the exact chain, with flat changes of the arm.
 
-    It may start from a minimum with the first of the changes. Without a static equilibrium it
-    raises CannotAnswerError.
+    `start` may be a minimum with the first of the changes. Raises CannotAnswerError where there is
+    no static equilibrium.
     """
-    k, sizes = at.lift.shape[1], [c.directions.shape[1] for c in changes]
+    k, sizes = later.lift.shape[1], [c.directions.shape[1] for c in changes]
     effects = tuple({id(c.effect): c.effect for c in changes}.values())
-    model = replace(at.model, effects=(*at.model.effects, *effects))
+    model = replace(later.model, effects=(*later.model.effects, *effects))
     lift = np.zeros((model.size, k + sum(sizes)))
-    lift[: len(at.lift), :k] = at.lift
+    lift[: len(later.lift), :k] = later.lift
     place = dict(zip(map(id, model.effects), model.slices(), strict=True))
     for c, end in zip(changes, np.cumsum(sizes), strict=True):
         lift[place[id(c.effect)], k + end - c.directions.shape[1] : k + end] = c.directions
-    ridge = np.concatenate([at.ridge, np.zeros(sum(sizes)), np.ones(at.poses.shape[1])])
-    mean = np.concatenate([at.mean, np.zeros(len(lift) - len(at.mean))])
+    ridge = np.concatenate([later.ridge, np.zeros(sum(sizes)), np.ones(later.poses.shape[1])])
+    mean = np.concatenate([later.mean, np.zeros(len(lift) - len(later.mean))])
     x = np.zeros(len(ridge))
     if start is not None:
-        before = k + len(start.sizes)
-        x[:before] = start.coordinates[:before]
-        x[lift.shape[1] :] = start.coordinates[before:]
-    here = Remeasured(at, tuple(changes), model, mean, lift, ridge, x)
+        count = k + len(start.sizes)
+        x[:count] = start.coordinates[:count]
+        x[lift.shape[1] :] = start.coordinates[count:]
+    point = Remeasured(later, tuple(changes), model, mean, lift, ridge, x)
     for _ in range(STEPS):
-        m = here.projection
-        step = m.solve(m.rows.T @ here.target) - here.coordinates
-        if float(np.linalg.norm(m.rows @ step)) < CONVERGED * np.sqrt(len(here.target)):
+        m = point.projection
+        step = m.solve(m.rows.T @ point.target) - point.coordinates
+        if float(np.linalg.norm(m.rows @ step)) < CONVERGED * np.sqrt(len(point.target)):
             break
-        nearer = shortened(here.moved, step, HALVINGS, lambda p: p.square, here.square)
+        nearer = shortened(point.moved, step, HALVINGS, lambda p: p.square, point.square)
         if nearer is None:
             break
-        here = nearer
-    return here
+        point = nearer
+    return point

@@ -14,9 +14,9 @@ Least trimmed squares (Rousseeuw and Van Driessen, Data Mining and Knowledge Dis
 
 d²_(k) ascending squared distances of the readings from the linear model with δ, h a little more
 than half of them, so that nearly half may be wrong, by any amount. A fit to the h readings that are
-nearest to a model has a lower sum (concentration); it is begun from many random subsets that just
-determine the model, and the lowest sum of all is taken. From the bulk of the distances follows the
-limit of a gross error (`limit`).
+nearest to a model has a lower sum (concentration); it starts from many random subsets that just
+determine the model, and the lowest sum is kept. The bulk of the distances gives the limit of a
+gross error (`limit`).
 """
 
 from dataclasses import dataclass, field
@@ -41,8 +41,8 @@ MISFIT_FACTOR = 6.25  # of the limit with a misfit, 2.5 in distance: its tails a
 MISFIT = (1.25, 1.5)  # gradually between these scales of the bulk, noise alone and a sure misfit
 SINGULAR = 1e-9  # ridge, as a share of a column's square: few readings determine few columns
 AT_A_TIME = 4096  # readings whose covariance is formed at a time
-FAR = 100.0  # χ² from which on its probability is not looked at
-LEVERAGE = 1e-6  # share of a reading's information that the others must leave for a test
+FAR = 100.0  # χ² beyond which its probability is not evaluated
+LEVERAGE = 1e-6  # share of a reading's information that must remain for a test
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,9 +101,9 @@ class ReadingModel:
 
     def with_columns(self, columns: Floats) -> "ReadingModel":
         """Return the model with more whitened columns (N, m, P), of unit prior about zero."""
-        more = np.ones(columns.shape[2])
+        ones = np.ones(columns.shape[2])
         wide = np.concatenate([self.columns, columns], axis=2)
-        precision, pull = np.append(self.precision, more), np.append(self.pull, 0.0 * more)
+        precision, pull = np.append(self.precision, ones), np.append(self.pull, 0.0 * ones)
         return ReadingModel(self.residual, wide, precision, pull, self.root, self.members)
 
     def fitted(self, used: Bools) -> tuple[Floats, Floats]:
@@ -133,8 +133,8 @@ class ReadingModel:
         a = np.eye(self.m) + np.where(used, -1.0, 1.0)[:, None, None] * spread
         values, vectors = np.linalg.eigh(a)
         c = np.einsum("nij,ni->nj", vectors, r)
-        kept = values > LEVERAGE
-        t2 = np.sum(np.where(kept, c**2 / np.where(kept, values, 1.0), 0.0), axis=1)
+        regular = values > LEVERAGE
+        t2 = np.sum(np.where(regular, c**2 / np.where(regular, values, 1.0), 0.0), axis=1)
         return self._comparable(np.asarray(t2))
 
     def near(self, delta: Floats) -> tuple[Floats, Bools]:
@@ -149,13 +149,13 @@ class ReadingModel:
             back, root = self._differences
             x = (back @ r[:, :, None])[:, :, 0][self.members]
             off = root @ (x[:, :, None] - x[:, None, :])[..., None]
-            apart, there = np.sum(off[..., 0] ** 2, axis=3), self.members >= 0
-            total = np.log1p(np.where(there[:, None, :], apart, 0.0)).sum(axis=2)
-            best = np.argmin(np.where(there, total, np.inf), axis=1)
-            each = np.arange(len(best))
-            g, s = np.nonzero(there)
-            d2[self.members[g, s]] = apart[each, best][g, s]
-            centre[self.members[each, best]] = True
+            apart, present = np.sum(off[..., 0] ** 2, axis=3), self.members >= 0
+            total = np.log1p(np.where(present[:, None, :], apart, 0.0)).sum(axis=2)
+            best = np.argmin(np.where(present, total, np.inf), axis=1)
+            index = np.arange(len(best))
+            g, s = np.nonzero(present)
+            d2[self.members[g, s]] = apart[index, best][g, s]
+            centre[self.members[index, best]] = True
         return self._comparable(d2), centre
 
     def with_lone_centres(self, used: Bools, centre: Bools) -> Bools:
@@ -166,10 +166,10 @@ class ReadingModel:
         return np.asarray(used | (centre & ~has[self.group]))
 
     def _comparable(self, t2: Floats) -> Floats:
-        """(N,) squared distances as of readings of m elements.
+        """(N,) squared distances t², converted to those of readings of m elements.
 
-        Of a reading with fewer, as a distance has, χ² of the same probability; far beyond, where
-        that is rounding, as much more.
+        For a reading of fewer elements, such as a distance, χ² of the same probability; what
+        exceeds `FAR`, where that is rounding, is added.
         """
         less = (self.read > 0) & (self.read < self.m)
         if not less.any():
@@ -245,16 +245,16 @@ class Linearised(Protocol):
 L = TypeVar("L", bound=Linearised)
 
 
-def robust_start(at: L, rng: np.random.Generator) -> tuple[L, Bools]:
+def robust_start(model: L, rng: np.random.Generator) -> tuple[L, Bools]:
     """Return the linearisation that most readings agree on, and which readings do (N,)."""
-    used, delta = _trimmed(at.linear, rng)
+    used, delta = _trimmed(model.linear, rng)
     for _ in range(ANEW):
-        at = shortened(at.moved, delta, HALVINGS) or at
-        _, now, delta = _concentrated(at.linear, used)
-        if np.array_equal(now, used):
+        model = shortened(model.moved, delta, HALVINGS) or model
+        _, chosen, delta = _concentrated(model.linear, used)
+        if np.array_equal(chosen, used):
             break
-        used = now
-    return at, used
+        used = chosen
+    return model, used
 
 
 def bulk(distance2: Floats, m: int) -> float:
@@ -273,73 +273,73 @@ def limit(m: int, count: int, scale: float = 1.0) -> float:
     return far * float(MISFIT_FACTOR ** np.clip((scale - chance) / (sure - chance), 0.0, 1.0))
 
 
-def variance(of: ReadingModel, d2: Floats, centre: Bools) -> float:
+def variance(model: ReadingModel, d2: Floats, centre: Bools) -> float:
     """Variance of good readings by the median of the h least squared distances (N,)."""
-    others = np.sort(d2[of.tested & ~centre])
-    half = (_trusted(of, len(others)) + 1) // 2
-    return float(others[half - 1] / chi2.ppf(half / (len(others) + 1), of.m))
+    candidates = np.sort(d2[model.tested & ~centre])
+    half = (_trusted(model, len(candidates)) + 1) // 2
+    return float(candidates[half - 1] / chi2.ppf(half / (len(candidates) + 1), model.m))
 
 
-def nearest(of: ReadingModel, d2: Floats, centre: Bools) -> tuple[Bools, float]:
+def nearest(model: ReadingModel, d2: Floats, centre: Bools) -> tuple[Bools, float]:
     """(N,) the h readings of least squared distance (N,), and centres; and the sum of these."""
-    others = np.flatnonzero(of.tested & ~centre)
-    h = _trusted(of, len(others))
-    chosen = others[np.argpartition(d2[others], h - 1)[:h]] if h else others
+    candidates = np.flatnonzero(model.tested & ~centre)
+    h = _trusted(model, len(candidates))
+    chosen = candidates[np.argpartition(d2[candidates], h - 1)[:h]] if h else candidates
     used = centre.copy()
     used[chosen] = True
     return used, float(d2[chosen].sum())
 
 
-def _trusted(of: ReadingModel, n: int) -> int:
+def _trusted(model: ReadingModel, n: int) -> int:
     """Return h, how many of n readings that are no centres."""
-    wrong = int(MOST * np.count_nonzero(of.tested))
-    return min(max(n - wrong, -(-n // 3), of.enough + 2), n)
+    wrong = int(MOST * np.count_nonzero(model.tested))
+    return min(max(n - wrong, -(-n // 3), model.enough + 2), n)
 
 
-def _trimmed(of: ReadingModel, rng: np.random.Generator) -> tuple[Bools, Floats]:
+def _trimmed(model: ReadingModel, rng: np.random.Generator) -> tuple[Bools, Floats]:
     """Least trimmed squares: the readings (N,), and δ (K,) from them."""
-    rows = _few(of, rng)
-    part = of[rows] if len(rows) < len(of) else of
+    rows = _subset_rows(model, rng)
+    part = model[rows] if len(rows) < len(model) else model
     size = (part.enough + 1) * (2 if len(part.members) else 1)
     starts = np.log(MISSED) / np.log1p(-((1.0 - MOST) ** size))
     count = int(min(np.ceil(starts), STARTS))
-    tried = [nearest(part, *part.near(_from_few(part, rng))) for _ in range(count)]
-    tried.sort(key=lambda each: each[1])
+    tried = [nearest(part, *part.near(_from_subset(part, rng))) for _ in range(count)]
+    tried.sort(key=lambda t: t[1])
     best = [_concentrated(part, used) for used, _ in tried[:BEST]]
-    _, used, delta = min(best, key=lambda each: each[0])
-    if part is not of:
-        _, used, delta = _concentrated(of, nearest(of, *of.near(delta))[0])
+    _, used, delta = min(best, key=lambda t: t[0])
+    if part is not model:
+        _, used, delta = _concentrated(model, nearest(model, *model.near(delta))[0])
     return used, delta
 
 
-def _concentrated(of: ReadingModel, used: Bools) -> tuple[float, Bools, Floats]:
+def _concentrated(model: ReadingModel, used: Bools) -> tuple[float, Bools, Floats]:
     """Sum, readings (N,), and δ (K,) that led to them."""
     total = np.inf
     for _ in range(LAST):
-        delta = of.fitted(used)[0]
-        used, now = nearest(of, *of.near(delta))
-        if now >= total * (1 - 1e-9):
+        delta = model.fitted(used)[0]
+        used, lowest = nearest(model, *model.near(delta))
+        if lowest >= total * (1 - 1e-9):
             break
-        total = now
-    return now, used, delta
+        total = lowest
+    return lowest, used, delta
 
 
-def _few(of: ReadingModel, rng: np.random.Generator) -> Ints:
+def _subset_rows(model: ReadingModel, rng: np.random.Generator) -> Ints:
     """Rows of at most about `FEW` readings, whole groups."""
-    if not len(of.members):
-        return np.sort(rng.permutation(len(of))[:FEW])
-    groups = rng.permutation(len(of.members))[: max(FEW // of.members.shape[1], of.enough + 2)]
-    rows = of.members[groups]
+    if not len(model.members):
+        return np.sort(rng.permutation(len(model))[:FEW])
+    count = max(FEW // model.members.shape[1], model.enough + 2)
+    rows = model.members[rng.permutation(len(model.members))[:count]]
     return np.sort(rows[rows >= 0])
 
 
-def _from_few(of: ReadingModel, rng: np.random.Generator) -> Floats:
+def _from_subset(model: ReadingModel, rng: np.random.Generator) -> Floats:
     """δ (K,) from random readings that just determine it and one more; of groups two of each."""
-    count = of.enough + 1
-    if not len(of.members):
-        rows = rng.permutation(len(of))[:count]
+    count = model.enough + 1
+    if not len(model.members):
+        rows = rng.permutation(len(model))[:count]
     else:
-        groups = of.members[rng.permutation(len(of.members))[:count]]
+        groups = model.members[rng.permutation(len(model.members))[:count]]
         rows = np.concatenate([rng.permutation(g[g >= 0])[:2] for g in groups])
-    few = of[rows]
+    few = model[rows]
     return few.fitted(np.ones(len(few), dtype=np.bool_))[0]

@@ -1,7 +1,7 @@
-"""Whether the readings fit the description of the arm at all, and what is wrong where they do not.
+"""Whether the readings fit the description of the arm, and what is wrong where they do not.
 
-After registration the nominal arm misses readings by its geometric errors, some mm at most. What
-is far more is no effect but a wrong description. Single hypotheses (`KINDS`) are tried on some of
+After registration the nominal arm misses readings by its geometric errors, some mm at most. A far
+larger misfit is no effect but a wrong description. Single hypotheses (`KINDS`) are tried on some of
 the readings, then the best of them in combination (beam search), until one explains the readings.
 
 Arms of one size differ by millimetres from one generation to the next, and registration hides part
@@ -10,7 +10,7 @@ for an arm before calibration. So every arm of the catalogue with as many joints
 the readings as the described one was (`other_arm`). With e the displacements by the errors of the
 true arm and d those from one description to the other, the frames projected off, the wrong
 description leaves |e + d| and the right one |e|. One that leaves less than half of what the
-described one leaves is named. For the described arm to be the right one then, |e − d| ≤ |e|/2: its
+described one leaves is named. Were the described arm the right one then, |e − d| ≤ |e|/2: its
 errors would be larger than 2/3 |d|, and lie along d.
 """
 
@@ -61,11 +61,11 @@ FACTOR = 4.0  # how many times smaller a hypothesis must make the misfit
 CAREFUL = 10  # best ones by a rough search that are searched with care
 ALIKE = 2.0  # hypotheses that leave less than so many times the least misfit do equally well
 WRONG_ROWS = 0.2  # largest share of rows that may be wrong by themselves
-FIRST = ("shift", "columns")  # combined with others where they help by themselves, for speed
-OFF_DEG = 0.2  # zero of a single joint, degrees, that is worth a word
+FIRST = ("shift", "columns")  # combined with others only where they help by themselves; for speed
+OFF_DEG = 0.2  # zero of a single joint, degrees, that is worth mentioning
 MOST_NAMED = 8  # rows, or explanations, that are named
-ZEROS = tuple(np.radians([0.0, 45.0, -45.0, 135.0, -135.0]).tolist())  # where searches begin,
-ZERO_WIDTH, ZERO_EXACT = np.pi / 4, 1e-7  # how far they go from there, and their end, rad
+ZEROS = tuple(np.radians([0.0, 45.0, -45.0, 135.0, -135.0]).tolist())  # where searches begin
+ZERO_WIDTH, ZERO_EXACT = np.pi / 4, 1e-7  # range of a search to both sides, and its tolerance, rad
 HALF = 0.5  # share of the described arm's misfit that another may leave to be named; of 900
 # simulated arms off by 1 and 3 mm and mrad none was named another one (test_other_arm keeps some)
 BEYOND_NOISE = 3.0  # misfit in standard deviations from which on other arms are tried
@@ -100,7 +100,7 @@ class Described:
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """One thing that may be otherwise than described."""
+    """One possible error of the description."""
 
     kind: str  # key of `KINDS`
     joint: int = 0  # number from 1, where it is about one
@@ -114,18 +114,18 @@ class Hypothesis:
 
     @property
     def is_zero(self) -> bool:
-        """Whether it is the zero of a joint alone, by other than quarter turns."""
+        """Whether it is only the zero of a joint, off by other than quarter turns."""
         quarters = self.offset / (np.pi / 2)
         return self.kind == "joint" and self.sign > 0 and abs(quarters - round(quarters)) > 0.02
 
     @property
     def cost(self) -> int:
-        """How much it changes: a joint that counts from elsewhere and the other way counts two."""
+        """Number of changes: another zero together with the other sign counts two."""
         return 1 + (self.kind == "joint" and self.sign < 0 and self.offset != 0.0)
 
     @property
     def subject(self) -> tuple[str, int, int]:
-        """What it is about; two hypotheses about one thing are not combined."""
+        """The subject; two hypotheses on one subject are not combined."""
         return self.kind, self.joint, self.follows
 
     @property
@@ -141,8 +141,8 @@ class Hypothesis:
     @property
     def words(self) -> str:
         """What is wrong, in a phrase."""
-        words = KINDS[self.kind].words
-        return words if isinstance(words, str) else words(self)
+        phrase = KINDS[self.kind].words
+        return phrase if isinstance(phrase, str) else phrase(self)
 
 
 Applied = Callable[[Described, Hypothesis], Described]
@@ -168,23 +168,23 @@ def _recounted(d: Described, h: Hypothesis) -> Described:
     return replace(d, arm=with_conventions(d.arm, sign, offset, coupling))
 
 
-def _another(d: Described, h: Hypothesis) -> Described:
+def _another_arm(d: Described, h: Hypothesis) -> Described:
     arm = load_arm(h.arm)
     return replace(d, arm=arm if d.conventions is None else as_counted(arm, d.conventions))
 
 
-def _mapped(name: str, by: Callable[[Any], Any]) -> Applied:
-    """Return what maps one attribute of the description, where there is one."""
+def _mapped(name: str, change: Callable[[Any], Any]) -> Applied:
+    """Return a change of one attribute of the description, unless that is None."""
 
     def applied(d: Described, _: Hypothesis) -> Described:
-        given = getattr(d, name)
-        return d if given is None else replace(d, **{name: by(given)})
+        value = getattr(d, name)
+        return d if value is None else replace(d, **{name: change(value)})
 
     return applied
 
 
 def _angles_by(turning: Callable[[Floats], Floats], sliding: float = 1.0) -> Applied:
-    """Return what maps the values of joints that turn, and scales those of joints that slide."""
+    """Return a change of the joint values: a function of those that turn, a factor of slides."""
     return lambda d, _: replace(d, q=np.where(d.arm.slides, sliding * d.q, turning(d.q)))
 
 
@@ -224,12 +224,12 @@ def _columns_words(h: Hypothesis) -> str:
     moved = [(j, k) for j, k in enumerate(h.order, 1) if j != k]
     if len(moved) == 2:
         return f"the columns of joints {moved[0][0]} and {moved[1][0]} are exchanged"
-    each = ", ".join(f"joint {j}'s values are in the column of joint {k}" for j, k in moved)
-    return f"the columns of the joints are in another order: {each}"
+    listed = ", ".join(f"joint {j}'s values are in the column of joint {k}" for j, k in moved)
+    return f"the columns of the joints are in another order: {listed}"
 
 
 KINDS: dict[str, Kind] = {
-    "arm": Kind(_another, lambda h: f"the arm is another one, {h.arm}", ""),
+    "arm": Kind(_another_arm, lambda h: f"the arm is another one, {h.arm}", ""),
     "joint": Kind(_recounted, _joint_words, ""),
     "coupling": Kind(_recounted, _coupling_words, ""),
     "base_unknown": Kind(
@@ -282,7 +282,7 @@ OF_ATTITUDES = ("mirrored_positions", "turn_degrees", "turn_radians", "inverse",
 
 
 def hypotheses(d: Described) -> Iterator[Hypothesis]:
-    """Yield what is tried by itself."""
+    """Yield the single hypotheses."""
     n, slides = d.arm.n, d.arm.slides
     if not d.base_unknown:
         yield Hypothesis("base_unknown")
@@ -301,7 +301,7 @@ def hypotheses(d: Described) -> Iterator[Hypothesis]:
     yield from map(Hypothesis, simple if d.turn is None else [*simple, *OF_ATTITUDES])
     yield from (Hypothesis("arm", arm=arm.name) for arm in other_arms(d.arm))
     yield from (Hypothesis("shift", shift=k) for k in shifts(len(d.q)))
-    # Columns: two exchanged, or all in a turn.
+    # Columns: two exchanged, all rotated, or reversed.
     straight, orders = tuple(range(1, n + 1)), []
     for i, j in combinations(range(n), 2):
         order = list(straight)
@@ -318,7 +318,7 @@ def shifts(count: int) -> Iterator[int]:
 
 
 def pairs(n: int) -> Iterator[Way]:
-    """Yield pairs that hide behind each other: two signs, and the zeros of two neighbours."""
+    """Yield pairs that hide each other: two signs, and the zeros of two neighbours."""
     for i, j in combinations(range(1, n + 1), 2):
         yield Hypothesis("joint", i, -1), Hypothesis("joint", j, -1)
     for j in range(1, n):
@@ -334,8 +334,8 @@ def mended(way: Way, cell: Cell) -> str:
     lines += [f"[robot] {key} = {value}" for key, value in keys(way, cell).items()]
     where = [KINDS[h.kind].mended for h in way]
     lines += [line for line in where if line]
-    said = f"; in CELL.toml: {', '.join(lines)}" if lines else ""
-    return f"{said}; correct it in the table" if None in where else said
+    advice = f"; in CELL.toml: {', '.join(lines)}" if lines else ""
+    return f"{advice}; correct it in the table" if None in where else advice
 
 
 def keys(way: Way, cell: Cell) -> dict[str, str]:
@@ -400,18 +400,18 @@ class DescriptionFinding:
     def words(self, cell: Cell, readings: Readings) -> str:
         """Return in one line what is wrong, and what to write instead."""
         size, rows = length(self.rms), self._rows_named(readings)
-        after = f"({size} rms after registration)"
-        begin = f"the readings do not fit the description of the arm {after}"
+        note = f"({size} rms after registration)"
+        begin = f"the readings do not fit the description of the arm {note}"
         if self.explanations:
-            said = [
+            causes = [
                 f"{' and '.join(h.words for h in e.changes)}: {size} → {length(e.rms)} with it"
                 f"{mended(e.changes, cell)}"
                 for e in self.explanations[:MOST_NAMED]
             ]
-            line = f"{begin}: {'; or, as well: '.join(said)}"
+            line = f"{begin}: {'; or, as well: '.join(causes)}"
             return f"{line}; besides, {rows}" if rows else line
         if rows and not self.refused:
-            return f"{rows}; the others fit {after}. They are left out of a fit"
+            return f"{rows}; the others fit {note}. They are left out of a fit"
         if rows:
             return f"{begin}: {rows}; the others fit. Correct or remove them"
         return (
@@ -425,18 +425,19 @@ class DescriptionFinding:
         which = np.flatnonzero(self.rows).tolist()
 
         def name(k: int) -> str:
-            at = f"{readings.pose_names[readings.pose[k]]}/{readings.load_names[readings.load[k]]}"
+            pose = readings.pose_names[readings.pose[k]]
+            label = f"{pose}/{readings.load_names[readings.load[k]]}"
             several = readings.states.target is not None
-            return f"{at} {readings.target_names[readings.target[k]]}" if several else at
+            return f"{label} {readings.target_names[readings.target[k]]}" if several else label
 
         if not which:
             return ""
         if self.swapped:
             crossed = [f"{name(i)} with {name(j)}" for i, j in self.swapped[:MOST_NAMED]]
             return f"rows are swapped ({', '.join(crossed)})"
-        more = f" and {len(which) - MOST_NAMED} more" if len(which) > MOST_NAMED else ""
+        suffix = f" and {len(which) - MOST_NAMED} more" if len(which) > MOST_NAMED else ""
         named = ", ".join(map(name, which[:MOST_NAMED]))
-        return f"{len(which)} of {len(readings)} rows do not fit: {named}{more}"
+        return f"{len(which)} of {len(readings)} rows do not fit: {named}{suffix}"
 
     def to_json(self, cell: Cell, readings: Readings) -> dict[str, object]:
         """Return its JSON."""
@@ -466,39 +467,40 @@ def refuse_misdescribed(registered: Registration, readings: Readings) -> None:
 
 
 def examine(registered: Registration, readings: Readings) -> DescriptionFinding | None:
-    """Return what is wrong with the description, by the nominal arm's registration, if anything."""
+    """Return what is wrong with the description, by the registered nominal arm; or None."""
     cell, gate = registered.cell, max(GATE_M, GATE_REACH * registered.cell.arm.reach)
-    # A base that is told shows the whole geometric error, however close the positions lie.
+    # A known base shows the whole geometric error, however close the positions lie.
     extent = np.inf if cell.registration_known else _extent(readings.value[:, :3])
     far, rms, noise = registered.far, _size(registered.off), noise_floor(readings.covariance)
-    nothing, others = np.zeros_like(far), _size(registered.off[~far])
-    if cell.observers:  # what else the arm may be is told by positions in one frame
-        return DescriptionFinding(others, gate, (), far) if far.any() or others > gate else None
+    none, fitting_rms = np.zeros_like(far), _size(registered.off[~far])
+    if cell.observers:  # hypotheses are tried on positions in one frame only
+        fits = not (far.any() or fitting_rms > gate)
+        return None if fits else DescriptionFinding(fitting_rms, gate, (), far)
     if far.any():
-        search = _DescriptionSearch(cell, readings, max(3.0 * noise, others))
+        search = _DescriptionSearch(cell, readings, max(3.0 * noise, fitting_rms))
         shifted = search.shifted()
         if shifted:
-            return DescriptionFinding(rms, gate, shifted, nothing, (), search.tried)
+            return DescriptionFinding(rms, gate, shifted, none, (), search.tried)
         swapped = search.swapped(far)
-        return DescriptionFinding(rms if swapped else others, gate, (), far, swapped, 1)
+        return DescriptionFinding(rms if swapped else fitting_rms, gate, (), far, swapped, 1)
     if rms <= min(LOOK * gate, max(GATE_EXTENT * extent, 5.0 * noise)):
         return None
     close = max(0.02 * min(extent, cell.arm.reach), rms / 50.0)
     search = _DescriptionSearch(cell, readings, max(3.0 * noise, min(0.25 * gate, close)))
     near, bad, _ = search.robust(())
     if bad.any() and (shifted := search.shifted()):
-        return DescriptionFinding(rms, gate, shifted, nothing, (), search.tried)
+        return DescriptionFinding(rms, gate, shifted, none, (), search.tried)
     few = bool(bad.any() and bad.mean() <= WRONG_ROWS)
     if few and near <= search.enough:
         return DescriptionFinding(rms, gate, (), bad, search.swapped(bad), 1)
-    found = search.explain(gate, DEPTH if rms > gate else 1)
-    if not found and rms <= gate:
+    explanations = search.explain(gate, DEPTH if rms > gate else 1)
+    if not explanations and rms <= gate:
         return None
-    if not found and few and near <= gate:
+    if not explanations and few and near <= gate:
         return DescriptionFinding(rms, gate, (), bad, (), search.tried)
-    rows = search.robust(found[0].changes)[1] if found else nothing
-    rows = rows if rows.mean() <= WRONG_ROWS else nothing
-    return DescriptionFinding(rms, gate, found, rows, (), search.tried)
+    rows = search.robust(explanations[0].changes)[1] if explanations else none
+    rows = rows if rows.mean() <= WRONG_ROWS else none
+    return DescriptionFinding(rms, gate, explanations, rows, (), search.tried)
 
 
 class _DescriptionSearch:
@@ -507,7 +509,7 @@ class _DescriptionSearch:
     def __init__(self, cell: Cell, readings: Readings, enough: float) -> None:
         self._cell, self._readings = cell, readings
         self.enough, self.tried = enough, 0
-        self._whole = Described(
+        self._stated = Described(
             cell.arm,
             angles(readings),
             readings.value[:, :3],
@@ -516,25 +518,25 @@ class _DescriptionSearch:
             not all(cell.known_targets),
             conventions=None if cell.config is None else cell.config.robot,
         )
-        self._few = np.unique(np.linspace(0, len(readings) - 1, ROWS).astype(int))
-        flange = evaluate(cell.arm, self._whole.q).position[-1]
+        self._rows = np.unique(np.linspace(0, len(readings) - 1, ROWS).astype(int))
+        flange = evaluate(cell.arm, self._stated.q).position[-1]
         self._extent = min(_extent(readings.value[:, :3]), _extent(flange))
         self.score = lru_cache(maxsize=None)(self._score)
         self.robust = lru_cache(maxsize=None)(self._robust)
 
     def explain(self, gate: float, most: int) -> tuple[Explanation, ...]:
-        """Return the shortest combination that explains the readings, and its likes."""
+        """Return the shortest combination that explains the readings, and those that do as well."""
         base, slides = self.score(()), self._cell.arm.slides
-        singles = tuple(hypotheses(self._whole))
+        singles = tuple(hypotheses(self._stated))
         beam: list[Way] = [()]
         tried: dict[Way, float] = {}
         for depth in range(most):
-            others = [h for h in singles if depth == 0 or h.kind not in FIRST]
+            additions = [h for h in singles if depth == 0 or h.kind not in FIRST]
             ways = [
-                (*begun, h)
-                for begun in beam
-                for h in others
-                if h.subject not in [other.subject for other in begun]
+                (*partial, h)
+                for partial in beam
+                for h in additions
+                if h.subject not in [g.subject for g in partial]
             ]
             if depth == 1:
                 ways += [
@@ -544,14 +546,14 @@ class _DescriptionSearch:
                 ]
             rough = {w: self.score(w, True) for w in dict.fromkeys(map(_sorted, ways))}
             best = sorted(rough, key=lambda w: (rough[w], _cost(w)))[:CAREFUL]
-            now = {**rough, **{w: self.score(w) for w in best}}
-            if depth < 2 and min(now.values()) > self.enough:
-                now.update(self._zeros(beam[:2]))
-            tried.update(now)
-            found = self._enough(now, base)
-            if found:
-                return found
-            beam = sorted(now, key=lambda w: (now[w], _cost(w)))[: BEAM[min(depth, 1)]]
+            scores = {**rough, **{w: self.score(w) for w in best}}
+            if depth < 2 and min(scores.values()) > self.enough:
+                scores.update(self._zeros(beam[:2]))
+            tried.update(scores)
+            explanations = self._enough(scores, base)
+            if explanations:
+                return explanations
+            beam = sorted(scores, key=lambda w: (scores[w], _cost(w)))[: BEAM[min(depth, 1)]]
         return _explained(tried, min(gate, base / FACTOR))
 
     def shifted(self) -> tuple[Explanation, ...]:
@@ -570,12 +572,12 @@ class _DescriptionSearch:
         if least > min(self.enough, base / FACTOR):
             return ()
         alike = ALIKE * least + 1e-6
-        # What can be left out without loss is a gauge, or was a wrong turn.
+        # A hypothesis that can be left out without loss is undetermined, or was a wrong step.
         for way in [w for w in tried if tried[w] <= alike]:
             for h in way:
-                rest = tuple(other for other in way if other != h)
-                if rest and rest not in tried and self.score(rest) <= alike:
-                    tried = {**tried, rest: self.score(rest)}
+                shorter = tuple(g for g in way if g != h)
+                if shorter and shorter not in tried and self.score(shorter) <= alike:
+                    tried = {**tried, shorter: self.score(shorter)}
         good = sorted((w for w in tried if tried[w] <= alike), key=lambda w: (_cost(w), tried[w]))
         out: dict[tuple[object, ...], Way] = {}
         for way in good:  # of those that differ by their zeros alone, one
@@ -584,7 +586,7 @@ class _DescriptionSearch:
         return tuple(Explanation(w, tried[w]) for w in out.values())
 
     def _zeros(self, ways: list[Way]) -> dict[Way, float]:
-        """Try any constant as the zero of each joint, beside what is otherwise already."""
+        """Try any constant as the zero of each joint, in addition to each of `ways`."""
         out = {}
         for way in ways:
             counted = [h.joint for h in way if h.kind == "joint"]
@@ -603,27 +605,27 @@ class _DescriptionSearch:
             return (*way, Hypothesis("joint", joint, 1, zero))
 
         def square(zero: float) -> float:
-            return self._best(*self._problem(zeroed(zero), self._few), rough=True).square
+            return self._best(*self._problem(zeroed(zero), self._rows), rough=True).square
 
         begin = min(ZEROS, key=lambda zero: self.score(zeroed(zero), True))
         bounds = (begin - ZERO_WIDTH, begin + ZERO_WIDTH)
-        found = minimize_scalar(
+        minimum = minimize_scalar(
             square, bounds=bounds, method="bounded", options={"xatol": ZERO_EXACT}
         )
-        count = int(np.count_nonzero(self._described(way).paired[self._few]))
-        rms = float(np.sqrt(found.fun / count))
-        return float(np.arctan2(np.sin(found.x), np.cos(found.x))), rms
+        count = int(np.count_nonzero(self._described(way).paired[self._rows]))
+        rms = float(np.sqrt(minimum.fun / count))
+        return float(np.arctan2(np.sin(minimum.x), np.cos(minimum.x))), rms
 
     def _score(self, way: Way, rough: bool = False) -> float:
-        """Misfit of the nominal arm under hypotheses, m; in units of the positions as given."""
+        """Misfit of the nominal arm under hypotheses, m, scaled to the extent as stated."""
         self.tried += 1
-        at = self._best(*self._problem(way, self._few), rough)
-        size = float(np.sqrt(at.square / len(at.data)))
-        return size * max(1.0, self._extent / max(_extent(at.data.value), 1e-12))
+        placement = self._best(*self._problem(way, self._rows), rough)
+        size = float(np.sqrt(placement.square / len(placement.data)))
+        return size * max(1.0, self._extent / max(_extent(placement.data.value), 1e-12))
 
-    def _best(self, data: FrameData, given: Frames, free: Bools, rough: bool = False) -> Placement:
+    def _best(self, data: FrameData, frames: Frames, free: Bools, rough: bool = False) -> Placement:
         steps, rotated = (6, 0) if rough else (15, 2)
-        return best_placement(data, given, free, self.enough, steps, rotated)
+        return best_placement(data, frames, free, self.enough, steps, rotated)
 
     def _problem(self, way: Way, rows: Ints) -> tuple[FrameData, Frames, Bools]:
         """Flange poses and readings of some rows under some hypotheses, and what is estimated."""
@@ -634,47 +636,48 @@ class _DescriptionSearch:
         target = self._readings.target[rows]
         data = FrameData.at(d.arm, d.q[rows], d.value[rows], turn, root, target)
         cell = self._cell
-        # What was estimated with the wrong description is no start for another one.
+        # Frames estimated with the wrong description are no start for another one.
         base = cell.registration if cell.registration_known else np.eye(4)
         stated = np.array(cell.known_targets)
-        given = Frames(base, np.where(stated[:, None, None], cell.all_targets, np.eye(4)))
-        known = stated & (not d.target_unknown)
-        axes = m == 6 and (d.base_unknown or not known.all())
-        return data, given, free_parameters(d.base_unknown, ~known, axes)
+        frames = Frames(base, np.where(stated[:, None, None], cell.all_targets, np.eye(4)))
+        fixed = stated & (not d.target_unknown)
+        axes = m == 6 and (d.base_unknown or not fixed.all())
+        return data, frames, free_parameters(d.base_unknown, ~fixed, axes)
 
     def _described(self, way: Way) -> Described:
-        d = self._whole
+        d = self._stated
         for h in way:
             d = h.applied(d)
         return d
 
     def _robust(self, way: Way) -> tuple[float, Bools, Placement]:
-        """Registration by most of the rows: reweighted until the others do not matter.
+        """Register with weights by which rows that do not fit lose their influence.
 
-        Rms of the rows that fit, m; (N,) those that do not; and the frames.
+        Rms of the rows that fit, m; (N,) those that do not; and the placement.
         """
-        data, given, free = self._problem(way, np.arange(len(self._readings)))
-        at, scale = self._best(data, given, free), np.inf
+        data, frames, free = self._problem(way, np.arange(len(self._readings)))
+        placement, scale = self._best(data, frames, free), np.inf
         for _ in range(12):
-            distance = np.linalg.norm(at.white, axis=1)
+            distance = np.linalg.norm(placement.white, axis=1)
             scale = min(scale, max(float(np.median(distance)), self.enough / 10))
             weights = 1.0 / (1.0 + (distance / (2.0 * scale)) ** 2)
             weighted = replace(data, root=data.root * weights[:, None, None])
-            at = replace(at, frames=minimise(Placement(weighted, at.frames, free), steps=5).frames)
-        distance = np.linalg.norm(at.white, axis=1)
+            frames = minimise(Placement(weighted, placement.frames, free), steps=5).frames
+            placement = replace(placement, frames=frames)
+        distance = np.linalg.norm(placement.white, axis=1)
         far = distance > 8.0 * max(float(np.median(distance)), self.enough / 10)
         everywhere = np.zeros(len(self._readings), dtype=bool)
         everywhere[self._described(way).paired] = far
-        return float(np.sqrt(np.mean(distance[~far] ** 2))), everywhere, at
+        return float(np.sqrt(np.mean(distance[~far] ** 2))), everywhere, placement
 
     def swapped(self, far: Bools) -> tuple[tuple[int, int], ...]:
-        """Pairs of rows that do not fit (N,) whose readings fit each other's place."""
-        near, _, at = self.robust(())
+        """Pairs of the rows that do not fit (N,) that fit with their readings exchanged."""
+        near, _, placement = self.robust(())
         out = []
         for i, j in combinations(np.flatnonzero(far)[:30].tolist(), 2):
-            there, back = at.data[np.array([i, j])], at.data[np.array([j, i])]
-            crossed = replace(there, value=back.value, attitude=back.attitude)
-            if _size(crossed.misfit(at.frames)) <= 3.0 * max(self.enough, near):
+            pair, back = placement.data[np.array([i, j])], placement.data[np.array([j, i])]
+            crossed = replace(pair, value=back.value, attitude=back.attitude)
+            if _size(crossed.misfit(placement.frames)) <= 3.0 * max(self.enough, near):
                 out.append((i, j))
         return tuple(out)
 
@@ -712,8 +715,8 @@ class OtherArm:
     """An arm of the catalogue that fits better than the described one."""
 
     name: str
-    rms: float  # what the described arm leaves after registration, m
-    rms_with: float  # what this one leaves, m
+    rms: float  # misfit of the described arm after registration, m
+    rms_with: float  # misfit of this one, m
 
     def to_json(self) -> dict[str, object]:
         """Return its JSON."""
@@ -721,19 +724,20 @@ class OtherArm:
 
 
 def other_arm(registered: Registration, readings: Readings) -> OtherArm | None:
-    """Return the arm of the catalogue that readings are of rather than of the registered one."""
+    """Return the arm of the catalogue that fits far better than the registered one, if any."""
     cell = registered.cell
     if cell.observers or registered.rms <= BEYOND_NOISE * noise_floor(readings.covariance):
         return None
     robot = None if cell.config is None else cell.config.robot
     arms = (arm if robot is None else as_counted(arm, robot) for arm in other_arms(cell.arm))
     some = readings[np.unique(np.linspace(0, len(readings) - 1, ARM_ROWS).astype(int))]
-    tried = [(_left(cell, arm, some), arm) for arm in arms]
-    least, arm = min(tried, key=lambda each: each[0], default=(np.inf, cell.arm))
+    tried = [(_misfit_with(cell, arm, some), arm) for arm in arms]
+    least, arm = min(tried, key=lambda pair: pair[0], default=(np.inf, cell.arm))
     if least > HALF * registered.rms:
         return None
-    left = _left(cell, arm, readings)
-    return OtherArm(arm.name, registered.rms, left) if left <= HALF * registered.rms else None
+    remaining = _misfit_with(cell, arm, readings)
+    better = remaining <= HALF * registered.rms
+    return OtherArm(arm.name, registered.rms, remaining) if better else None
 
 
 def other_arm_of(cell: Cell, readings: Readings) -> OtherArm | None:
@@ -744,7 +748,7 @@ def other_arm_of(cell: Cell, readings: Readings) -> OtherArm | None:
         return None
 
 
-def _left(cell: Cell, arm: Arm, readings: Readings) -> float:
+def _misfit_with(cell: Cell, arm: Arm, readings: Readings) -> float:
     """Rms misfit of the positions with another arm, from the frames of the described one, m."""
     data = FrameData.of(arm, readings)
     off = minimise(Placement(data, *given_and_free(cell, data.m == 6)), ARM_STEPS).off

@@ -1,9 +1,9 @@
-"""The noise of readings for which nobody states it, estimated from the readings themselves.
+"""The noise of readings that nobody states, estimated from the readings themselves.
 
 The noise that [tracker] has by default is that of a laser tracker. Where neither a table nor the
 cell states another one, the standard deviations along and across the beam, and those of
-orientations, are the default's times factors that the readings tell; so is the arm's scatter, one
-σ for all joints, where [repeatability] does not state it:
+orientations, are the default's times estimated factors; the arm's scatter, one σ for all joints, is
+estimated where [repeatability] does not state it:
 
     V = f_a² V_along + f_c² V_across + f_o² V_orientation + σ_q² R J Jᵀ Rᵀ
 
@@ -11,13 +11,13 @@ They are variance components, estimated by restricted maximum likelihood togethe
 and with every effect of the catalogue as random effects (see `hilcal.mixed`), so that no effect
 counts as noise, nor noise as an effect. Gross errors are left out.
 
-Where the readings show several effects at once, as those of most real arms do, few of them tell
-noise from effects: the default stays then, and a fit of all effects estimates the noise with them
-(see `identification.background`).
+Where the readings show several effects at once, as those of most real arms do, few of them cannot
+separate noise from effects: the default stays then, and a fit of all effects estimates the noise
+with them (see `identification.background`).
 
 The covariance of a measured reading is that of the mean of its samples, of which the default is the
-prior. What the instrument errs by from pose to pose does not show in them, and where another
-instrument measures, few samples say little of it. Where the readings of a campaign contradict them,
+prior. Errors of the instrument that change from pose to pose do not show in them, and of another
+instrument few samples tell little. Where the readings of a campaign contradict them,
 f_a, f_c and f_o are stored with it (`measured_noise`), and the default's covariance times these
 takes their place when it is opened (`with_noise_factors`); the arm's scatter is left to diagnosis.
 """
@@ -65,13 +65,13 @@ SEED = 20251125  # of the poses that are chosen, and of simulated likelihood rat
 NOISE = "noise"  # key among the texts about an imported campaign, and kind of event of a measured
 # one: the estimate; absent where the noise is stated, or as the samples show it
 CONTRADICTED = 3.0  # standard errors of a factor's log by which readings contradict covariances
-LEAST_FACTOR = 1.3  # by which the noise of readings differs from that of their samples
+LEAST_FACTOR = 1.3  # from which on the noise of readings differs from that of their samples
 ALONG, ACROSS, ORIENTATION, STATED = "along", "across", "orientation", "arm as stated"
 
 
 @dataclass(frozen=True, slots=True)
 class NoiseEstimate:
-    """The noise of readings, as they tell it; standard deviations of the median reading."""
+    """The estimated noise of readings; standard deviations of the median reading."""
 
     along_m: float  # along the beam
     across_m: float  # along each axis across it
@@ -82,7 +82,7 @@ class NoiseEstimate:
     # import, the covariances of which are stored as estimated
 
     def to_json(self) -> str:
-        """Return it as a text of a campaign."""
+        """Return the estimate as a text of a campaign."""
         return json.dumps(asdict(self))
 
     @classmethod
@@ -92,38 +92,38 @@ class NoiseEstimate:
 
     @classmethod
     def of(cls, content: Mapping[str, Any]) -> "NoiseEstimate":
-        """Return what `asdict` made, which may have more keys beside it."""
+        """Return the estimate of a dictionary by `asdict`, which may have further keys."""
         values: dict[str, Any] = {f.name: content.get(f.name) for f in fields(cls)}
         return cls(**values)
 
 
 def with_estimated_noise(
-    found: ImportResult, cell: Cell, config: CellConfig
+    imported: ImportResult, cell: Cell, config: CellConfig
 ) -> tuple[ImportResult, NoiseEstimate | None]:
-    """Return an import with the noise that its readings tell, where nobody states it; the estimate.
+    """Return an import with estimated noise where nobody states it, and the estimate.
 
     The covariance of readings of one target includes the arm's scatter then. Several targets share
     it in one arrival, so that `diagnose` estimates it. None where the noise is stated, where the
     readings are fewer than `FEWEST_POSES` or show several effects, or where nothing can be fitted
     to them as they are described.
     """
-    readings, station = found.readings, config.tracker.station_m
-    told = None if found.noise_stated else _components(readings, cell, config)
-    if told is None:
-        return found, None
-    factors, estimate = told.factors, told.estimate(readings, station)
+    readings, station = imported.readings, config.tracker.station_m
+    components = None if imported.noise_stated else _components(readings, cell, config)
+    if components is None:
+        return imported, None
+    factors, estimate = components.factors, components.estimate(readings, station)
     together = SCATTER in factors and readings.states.target is None
     used = factors if together else {k: f for k, f in factors.items() if k != SCATTER}
-    whole = _with(readings, station, used, told.model)
+    estimated = _with_factors(readings, station, used, components.model)
     covers = WHOLE if together else INSTRUMENT
-    notes = tuple(n for n in found.notes if not n.startswith(FROM_TRACKER))
-    return replace(found, readings=whole, covers=covers, notes=notes), estimate
+    notes = tuple(n for n in imported.notes if not n.startswith(FROM_TRACKER))
+    return replace(imported, readings=estimated, covers=covers, notes=notes), estimate
 
 
 def measured_noise(readings: Readings, cell: Cell, config: CellConfig) -> NoiseEstimate | None:
     """Return the noise of measured readings that contradict their samples, with its factors.
 
-    None where the cell states it, where samples show it, or see `with_estimated_noise`.
+    None where the cell states it, where samples show it, or as of `with_estimated_noise`.
     """
     if config.tracker.states_noise:
         return None
@@ -132,30 +132,30 @@ def measured_noise(readings: Readings, cell: Cell, config: CellConfig) -> NoiseE
         default = with_noise_of(config.tracker, readings)
     except InputError:  # a reading at the station
         return None
-    told = _components(default, cell, config)
-    if told is None:
+    components = _components(default, cell, config)
+    if components is None:
         return None
-    factors = {k: f for k, f in told.factors.items() if k not in (SCATTER, STATED)}
-    sampled, of = _sizes(readings, station), _sizes(default, station)
+    factors = {k: f for k, f in components.factors.items() if k not in (SCATTER, STATED)}
+    sampled, default_sizes = _sizes(readings, station), _sizes(default, station)
     off = (
-        abs(np.log(f * of[k] / sampled[k]))
-        > max(np.log(LEAST_FACTOR), CONTRADICTED * told.log_errors[k])
+        abs(np.log(f * default_sizes[k] / sampled[k]))
+        > max(np.log(LEAST_FACTOR), CONTRADICTED * components.log_errors[k])
         for k, f in factors.items()
     )
     if not any(off):
         return None
-    return replace(told.estimate(default, station), joint_std_rad=None, factors=factors)
+    return replace(components.estimate(default, station), joint_std_rad=None, factors=factors)
 
 
 def with_noise_factors(
     readings: Readings, tracker: Tracker, factors: Mapping[str, float]
 ) -> Readings:
     """Return readings with the default noise of [tracker], its components times their factors."""
-    return _with(with_noise_of(tracker, readings), tracker.station_m, factors)
+    return _with_factors(with_noise_of(tracker, readings), tracker.station_m, factors)
 
 
 def _sizes(readings: Readings, station: Sequence[float] | None) -> dict[str, float]:
-    """Standard deviations of the components, m and rad: of all their axes, the median reading's."""
+    """Standard deviations of the components, m and rad: over all axes, of the median reading."""
     return {
         p.name: float(np.sqrt(np.median(np.trace(p.covariance, axis1=1, axis2=2))))
         for p in _instrument(readings, station)
@@ -164,14 +164,14 @@ def _sizes(readings: Readings, station: Sequence[float] | None) -> dict[str, flo
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Components:
-    """Components of the noise of readings, as these tell them."""
+    """Estimated components of the noise of readings."""
 
     model: Model  # frames, at which the arm's scatter is evaluated
     factors: Mapping[str, float]  # standard deviations, in those of the default and `SCATTER_RAD`
     log_errors: Mapping[str, float]  # standard errors of their logs
 
     def estimate(self, readings: Readings, station: Sequence[float] | None) -> NoiseEstimate:
-        """Return it in figures."""
+        """Return the noise in figures."""
         size = {k: self.factors[k] * s for k, s in _sizes(readings, station).items()}
         turn = size.get(ORIENTATION)
         scatter = self.factors.get(SCATTER)
@@ -185,75 +185,76 @@ class _Components:
 
 
 def _components(readings: Readings, cell: Cell, config: CellConfig) -> _Components | None:
-    """Return the components of the noise, estimated; None as of `with_estimated_noise`."""
+    """Estimate the components of the noise; None as of `with_estimated_noise`."""
     if len(np.unique(readings.pose)) < FEWEST_POSES or readings.scalar.any():
         return None
     mode, share = usual_mode(readings), MOST_ROWS / readings.value.size
     readings = readings[some_poses(readings, share, SEED, FEWEST_POSES)]
     try:
         return _estimated(baseline(cell, readings, mode), readings, config)
-    except (HilcalError, np.linalg.LinAlgError):  # said where it is fitted
+    except (HilcalError, np.linalg.LinAlgError):  # the fit says why
         return None
 
 
 def _estimated(model: Model, readings: Readings, config: CellConfig) -> _Components | None:
-    """Return the components; None where the readings show effects beside the largest."""
+    """Return the components; None where the readings show effects in addition to the largest."""
     mode, station = usual_mode(readings), config.tracker.station_m
     joint_std = config.repeatability.per_joint(model.cell.arm.n)
-    whole = with_all_effects(model, readings.states, HARMONICS)
+    full = with_all_effects(model, readings.states, HARMONICS)
     used = ~fit(model, readings, mode).outlier
     for _ in range(ROUNDS):
-        kept = readings[used]
+        inliers = readings[used]
         if joint_std.any():
-            known = with_joint_scatter(model.cell, kept, joint_std)
-            more = known.covariance - kept.covariance
-            arm = NoisePart(STATED, more, LogStdPrior(0.0, KNOWN), known.common)
+            stated = with_joint_scatter(model.cell, inliers, joint_std)
+            extra = stated.covariance - inliers.covariance
+            arm = NoisePart(STATED, extra, LogStdPrior(0.0, KNOWN), stated.common)
         else:
-            arm = scatter_part(model, kept)
-        parts = [*_instrument(kept, station), arm]
-        found, theta = variances_with_noise(whole, kept, mode, parts[:-1], arm)
-        if _shows_several(found):
+            arm = scatter_part(model, inliers)
+        parts = [*_instrument(inliers, station), arm]
+        variances, theta = variances_with_noise(full, inliers, mode, parts[:-1], arm)
+        if _shows_several(variances):
             return None
-        std, names = np.exp(found.log_std), [p.name for p in parts]
-        errors = np.sqrt(np.diagonal(found.covariance)[-len(parts) :])
+        std, names = np.exp(variances.log_std), [p.name for p in parts]
+        errors = np.sqrt(np.diagonal(variances.covariance)[-len(parts) :])
         factors = dict(zip(names, std[-len(parts) :].tolist(), strict=True))
-        random = np.full(whole.size, np.inf)
-        for f, s in zip(found.equations.problem.families.random, std, strict=False):
+        random = np.full(full.size, np.inf)
+        for f, s in zip(variances.equations.problem.families.random, std, strict=False):
             random[f.parameters] = s * f.magnitude
-        effects = zip(whole.effects, whole.slices(), strict=True)
+        effects = zip(full.effects, full.slices(), strict=True)
         by_effect = {e.name: random[rows] for e, rows in effects if e.role not in FRAME_ROLES}
-        noisy = _with(readings, station, factors, model)
+        noisy = _with_factors(readings, station, factors, model)
         if joint_std.any():
             noisy = with_joint_scatter(model.cell, noisy, joint_std)
-        now = ~fit(replace(whole, random=by_effect), noisy, mode, start=theta).outlier
-        if np.array_equal(now, used):
+        retained = ~fit(replace(full, random=by_effect), noisy, mode, start=theta).outlier
+        if np.array_equal(retained, used):
             break
-        used = now
+        used = retained
     return _Components(model, factors, dict(zip(names, errors.tolist(), strict=True)))
 
 
-def _shows_several(found: Variances) -> bool:
-    """Whether the readings show effects beside the one that moves them most."""
-    e = found.equations
+def _shows_several(variances: Variances) -> bool:
+    """Whether the readings show effects in addition to the one that moves them most."""
+    e = variances.equations
     problem, moved = e.problem, e.rows[:, e.problem.flat :] * e.c[e.problem.flat :]
     families = problem.families.random
-    of = {f.effect: np.isin(problem.family, [k for k, g in enumerate(families)
+    columns_of = {f.effect: np.isin(problem.family, [k for k, g in enumerate(families)
           if g.effect == f.effect]) for f in families}  # fmt: skip
-    if len(of) < 2:
+    if len(columns_of) < 2:
         return False
-    largest = max(of, key=lambda name: float(np.sum(moved[:, of[name]].sum(axis=1) ** 2)))
-    others = [k for k, f in enumerate(families) if f.effect != largest]
+    motion = {name: moved[:, rows].sum(axis=1) for name, rows in columns_of.items()}
+    largest = max(motion, key=lambda name: float(np.sum(motion[name] ** 2)))
+    smaller = [k for k, f in enumerate(families) if f.effect != largest]
     rng = np.random.default_rng(SEED)
-    return evidence(problem, others, rng, found.log_std).p_value < SEVERAL
+    return evidence(problem, smaller, rng, variances.log_std).p_value < SEVERAL
 
 
-def _with(
+def _with_factors(
     readings: Readings,
     station: Sequence[float] | None,
     factors: Mapping[str, float],
     model: Model | None = None,
 ) -> Readings:
-    """Return readings with the covariance that factors make of the default's."""
+    """Return readings with the default covariance, its components times factors squared."""
     parts = [*_instrument(readings, station)]
     if model is not None and SCATTER in factors:
         parts.append(scatter_part(model, readings))
@@ -266,9 +267,9 @@ def _instrument(readings: Readings, station: Sequence[float] | None) -> Iterator
     beam = _beam(readings, station)
     u = beam / np.linalg.norm(beam, axis=1)[:, None]
     line = u[:, :, None] * u[:, None, :]
-    for name, of in ((ALONG, line), (ACROSS, np.eye(3) - line)):
+    for name, projector in ((ALONG, line), (ACROSS, np.eye(3) - line)):
         part = np.zeros_like(readings.covariance)
-        part[:, :3, :3] = of @ readings.covariance[:, :3, :3] @ of
+        part[:, :3, :3] = projector @ readings.covariance[:, :3, :3] @ projector
         yield NoisePart(name, part, LogStdPrior(0.0, SPREAD))
     if readings.m == 6:
         part = np.zeros_like(readings.covariance)

@@ -20,14 +20,14 @@ MOST_LISTED = 200
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Parameters:
-    """What the document holds."""
+    """The parameters of a fit, as the document holds them."""
 
     names: tuple[str, ...]  # (P,) "effect.parameter"
     units: tuple[str, ...]  # (P,) SI
     value: Floats  # (P,) as fitted, the undetermined ones as they are in the model
-    std: Floats  # (P,) standard uncertainties, infinite where the readings do not determine it
-    identifiable: Bools  # (P,) whether they do
-    covariance: Floats  # (P, P), NaN in rows and columns of those that they do not determine
+    std: Floats  # (P,) standard uncertainties, infinite for undetermined ones
+    identifiable: Bools  # (P,) whether the readings determine it
+    covariance: Floats  # (P, P), NaN in rows and columns of undetermined ones
     about: Mapping[str, Any]  # the rest of the document
 
 
@@ -35,7 +35,7 @@ def covariance_of(fit: Fit) -> Floats:
     """(P, P) covariance of the parameters, NaN where the readings do not determine one.
 
     C_ij = u_i ρ_ij u_j with u the standard uncertainties as stated (`Uncertainty.std`: widened
-    under a misfit, and by what is unknown of prior variances), and ρ the correlation of the
+    under a misfit, and by the uncertainty of prior variances), and ρ the correlation of the
     posterior under the stated noise.
     """
     solution, u = fit.solution, fit.uncertainty
@@ -44,10 +44,10 @@ def covariance_of(fit: Fit) -> Floats:
     formal[space.index, space.index] += space.rest / solution.beta
     size = np.sqrt(np.maximum(np.diag(formal), 1e-300))
     std = np.where(np.isfinite(u.std) & u.identifiable, u.std, np.nan)
-    found = std[:, None] * (formal / np.outer(size, size)) * std
-    found = (found + found.T) / 2
-    np.fill_diagonal(found, std**2)
-    return np.asarray(found)
+    covariance = std[:, None] * (formal / np.outer(size, size)) * std
+    covariance = (covariance + covariance.T) / 2
+    np.fill_diagonal(covariance, std**2)
+    return np.asarray(covariance)
 
 
 def to_json(fit: Fit, source: Mapping[str, object]) -> dict[str, object]:
@@ -101,13 +101,13 @@ def _read(content: Mapping[str, Any]) -> Parameters:
     rows, stored = content["parameters"], content["covariance"]["lower_triangle"]
     limits.check_parameters(len(rows))
     names = tuple(row["name"] for row in rows)
-    at = [names.index(name) for name in content["covariance_of"]]
-    known = np.zeros((len(at), len(at)))
-    i, j = np.tril_indices(len(at))
+    determined = [names.index(name) for name in content["covariance_of"]]
+    block = np.zeros((len(determined), len(determined)))
+    i, j = np.tril_indices(len(determined))
     values = unpack(stored) if isinstance(stored, str) else np.array(stored, dtype=float)
-    known[i, j] = known[j, i] = values
+    block[i, j] = block[j, i] = values
     covariance = np.full((len(rows), len(rows)), np.nan)
-    covariance[np.ix_(at, at)] = known
+    covariance[np.ix_(determined, determined)] = block
     return Parameters(
         names=names,
         units=tuple(row["unit"] for row in rows),

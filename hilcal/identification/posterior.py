@@ -1,4 +1,4 @@
-"""What a campaign taught of an arm: the posterior of the arm's own parameters.
+"""The posterior of an arm's own parameters after a campaign.
 
 Of a fit with the whitened Jacobian A (R, P) of all its parameters, those of dropped families
 included,
@@ -6,11 +6,11 @@ included,
     M = (AᵀA/σ² + Λ)/κ
 
 is the information: Λ the precision of the effects' own priors, σ² the noise factor, κ ≥ 1 by how
-much poses left out were farther off than the parameters explain. The strengths of shrunk families
+much errors at poses left out exceed what the parameters explain. The strengths of shrunk families
 are those of `predictive.family_prior`: a harmonic that the readings did not need is not known to be
-zero where nobody measured. Parameters of the setup (frames, tool, instruments; `Effect.of_setup`)
-are marginalised out, by the Schur complement of M. What the readings did not determine has no
-information: not a large variance, and not a zero one.
+zero where nothing was measured. Parameters of the setup (frames, tool, instruments;
+`Effect.of_setup`) are marginalised out, by the Schur complement of M. What the readings did not
+determine has no information: not a large variance, and not a zero one.
 
 Two campaigns of one arm are compared in the same gauge (`parameter_differences`). Their likelihoods
 of the parameters that both have, without the effects' own priors and all others marginalised out,
@@ -20,10 +20,10 @@ J. Math. Anal. Appl. 26 (1969) 576-594)
     P = I_A (I_A + I_B)⁻ I_B
 
 singular along every direction that one of the campaigns did not determine: what a frame absorbs, or
-a joint that did not turn. There the two fits may stand anywhere. So each parameter, and each effect
-as a whole, is compared with all others free within f = `FREE` of their ordinary magnitudes: in
-these, S = ((P + 1/f²)⁻¹_mm)⁻¹ − 1/f² is the information on its difference. What is known less well
-than to one magnitude is not compared.
+a joint that did not turn. Along these the two fits may differ by anything. So each parameter, and
+each effect as a whole, is compared with all others free within f = `FREE` of their ordinary
+magnitudes: in these, S = ((P + 1/f²)⁻¹_mm)⁻¹ − 1/f² is the information on its difference. What is
+known less well than to one magnitude is not compared.
 """
 
 from collections.abc import Mapping
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from hilcal.identification.fit import Fit
 
 
-FREE = 10.0  # how far others may differ, in ordinary magnitudes, when one is compared; a choice
+FREE = 10.0  # how far the others may differ when one is compared, in ordinary magnitudes; a choice
 LEAST = INFORMATION**2 / 2  # from which a direction is determined, in ordinary magnitudes
 LISTED = 60  # parameters of an effect from which it is compared as a whole only; a choice
 
@@ -73,15 +73,15 @@ class Posterior(Brief):
     """A normal distribution of K parameters of an arm, in information form.
 
     >>> with hc.Campaign.open(RUN) as run:
-    ...     found = hc.fit(hc.baseline(run.cell, run.readings), run.readings)
-    >>> posterior = hc.Posterior.of(found)
+    ...     fit = hc.fit(hc.baseline(run.cell, run.readings), run.readings)
+    >>> posterior = hc.Posterior.of(fit)
     >>> posterior.names[1], bool(posterior.std[1] < 0.1 * posterior.mean[1])
     ('joint_compliance.j2', True)
 
     Attributes:
         arm: name of the arm.
         links: (n + 1, 4, 4) its nominal link transforms, which the parameters refer to.
-        mode: kind of readings that it was learnt from.
+        mode: kind of readings that were fitted.
         effects: the effects, in the order of the parameters.
         names: (K,) "effect.parameter".
         units: (K,).
@@ -91,8 +91,8 @@ class Posterior(Brief):
         own_precision: (K,) the part of its diagonal that is not from the readings but from the
             effects' own priors, as the strengths of families.
         scatter: the arm's scatter, where it was estimated.
-        ranges: in what ranges the readings were taken.
-        prints: (M, n + 4) what the readings are known by again; see `same_readings.prints`.
+        ranges: ranges of the readings.
+        prints: (M, n + 4) what identifies the readings; see `same_readings.prints`.
         source: where it is from.
     """
 
@@ -113,11 +113,11 @@ class Posterior(Brief):
 
     @classmethod
     def of(cls, fit: "Fit", source: Source | None = None) -> "Posterior":
-        """Return what a fit taught of its arm.
+        """Return the posterior of the arm's parameters after a fit.
 
         Args:
             fit: gc-scaled.
-            source: where it is from; the hash and the number of its readings are filled in.
+            source: where the fit is from; hash and number of its readings are filled in.
 
         Raises:
             InputError: a fit of another scaling than gc.
@@ -128,7 +128,7 @@ class Posterior(Brief):
         return posterior_of(fit, source)
 
     def to_json(self) -> dict[str, object]:
-        """Return it as JSON, SI, exactly; see `posterior_document`."""
+        """Return the posterior as JSON, SI, exactly; see `posterior_document`."""
         from hilcal.identification.posterior_document import to_json
 
         return to_json(self)
@@ -149,7 +149,7 @@ class Posterior(Brief):
         return np.flatnonzero([name.split(".", 1)[0] == effect for name in self.names])
 
     def marginal(self, parameters: Ints) -> Floats:
-        """Information (I, I) on some parameters, the others not known: the Schur complement."""
+        """Information (I, I) on some parameters, the others unknown: the Schur complement."""
         scaled = self.information * (self.scale[:, None] * self.scale)
         some = schur_complement(scaled, parameters)
         scale = self.scale[parameters]
@@ -159,9 +159,9 @@ class Posterior(Brief):
     def std(self) -> Floats:
         """(K,) standard deviations, SI; infinite where a direction without information enters."""
         values, vectors = spectrum(self.information * (self.scale[:, None] * self.scale))
-        seen = values > 0
-        std = np.sqrt(np.sum(vectors[:, seen] ** 2 / values[seen], axis=1))
-        moved = np.linalg.norm(vectors[:, ~seen], axis=1)
+        informed = values > 0
+        std = np.sqrt(np.sum(vectors[:, informed] ** 2 / values[informed], axis=1))
+        moved = np.linalg.norm(vectors[:, ~informed], axis=1)
         return np.where(moved <= NULL_SHARE * std, std * self.scale, np.inf)
 
 
@@ -175,13 +175,13 @@ def spectrum(information: Floats, least: float = LEAST) -> tuple[Floats, Floats]
 def determined(information: Floats) -> Floats:
     """Information (K, K), in ordinary magnitudes, without directions that are hardly determined.
 
-    A fit holds those where they are whose information is below `INFORMATION`², see
-    `regression.normal_equations`: where they stand was not learnt.
+    A fit holds directions whose information is below `INFORMATION`² where they are, see
+    `regression.normal_equations`: their values were not estimated.
     """
     values, vectors = spectrum(information, INFORMATION**2)
     root = vectors * np.sqrt(values)
-    found = root @ root.T
-    return np.asarray((found + found.T) / 2)
+    out = root @ root.T
+    return np.asarray((out + out.T) / 2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,7 +193,7 @@ class ParameterDifference:
     before: float  # of the earlier fit
     after: float  # of the later fit
     difference: float
-    std: float | None  # None where frames absorb it or a campaign does not tell
+    std: float | None  # None where frames absorb it or a campaign does not determine it
 
     @property
     def z(self) -> float | None:
@@ -231,58 +231,58 @@ class Differences:
 def parameter_differences(earlier: Posterior, later: Posterior) -> Differences:
     """Compare the parameters that two fits have in common."""
     common = [n for n in earlier.names if n in set(later.names)]
-    one, other = (
-        np.array([p.names.index(n) for n in common], dtype=np.int64) for p in (earlier, later)
-    )
-    of = [n.split(".", 1)[0] for n in common]
+    i, j = (np.array([p.names.index(n) for n in common], dtype=np.int64) for p in (earlier, later))
+    owner = [n.split(".", 1)[0] for n in common]
     every = dict.fromkeys(n.split(".", 1)[0] for n in (*earlier.names, *later.names))
-    apart = tuple(e for e in every if {len(earlier.index(e)), len(later.index(e))} != {of.count(e)})
+    sizes = {e: {len(earlier.index(e)), len(later.index(e))} for e in every}
+    apart = tuple(e for e, size in sizes.items() if size != {owner.count(e)})
     if not common:
         return Differences((), (), apart)
-    scale = earlier.scale[one]
-    first, before = _likelihood(earlier, one, scale)
-    second, after = _likelihood(later, other, scale)
+    scale = earlier.scale[i]
+    first, mean_earlier = _likelihood(earlier, i, scale)
+    second, mean_later = _likelihood(later, j, scale)
     values, vectors = spectrum(first + second)
     half = vectors[:, values > 0] / np.sqrt(values[values > 0])
     parallel = (first @ half) @ (half.T @ second)
     some = (parallel + parallel.T) / 2 + np.eye(len(common)) / FREE**2
     covariance = np.asarray(np.linalg.inv(some), dtype=float)
-    known = 1.0 / np.diag(covariance) - 1.0 / FREE**2
-    d, names = np.asarray(after - before, dtype=float), np.array(of)
-    effects = [_effect(e, covariance, d, np.flatnonzero(names == e)) for e in dict.fromkeys(of)]
+    information = 1.0 / np.diag(covariance) - 1.0 / FREE**2
+    d, names = np.asarray(mean_later - mean_earlier, dtype=float), np.array(owner)
+    effects = [_effect(e, covariance, d, np.flatnonzero(names == e)) for e in dict.fromkeys(owner)]
     rows = tuple(
         ParameterDifference(
             name=name,
-            unit=earlier.units[one[k]],
-            before=float(earlier.mean[one[k]]),
-            after=float(later.mean[other[k]]),
+            unit=earlier.units[i[k]],
+            before=float(earlier.mean[i[k]]),
+            after=float(later.mean[j[k]]),
             difference=float(scale[k] * d[k]),
-            std=float(scale[k] / np.sqrt(known[k])) if known[k] > 1.0 else None,
+            std=float(scale[k] / np.sqrt(information[k])) if information[k] > 1.0 else None,
         )
         for k, name in enumerate(common)
-        if of.count(of[k]) < LISTED
+        if owner.count(owner[k]) < LISTED
     )
     return Differences(rows, tuple(effects), apart)
 
 
 def _likelihood(p: Posterior, chosen: Ints, scale: Floats) -> tuple[Floats, Floats]:
     """Information (K, K) and mean (K,) by the readings alone, in ordinary magnitudes."""
-    whole = p.information * (p.scale[:, None] * p.scale)
-    values, vectors = spectrum(whole - np.diag(p.own_precision * p.scale**2))
+    information = p.information * (p.scale[:, None] * p.scale)
+    values, vectors = spectrum(information - np.diag(p.own_precision * p.scale**2))
     e, values = vectors[:, values > 0], values[values > 0]
-    data, mean = (e * values) @ e.T, (e / values) @ (e.T @ (whole @ (p.mean / p.scale)))
-    by = p.scale[chosen] / scale
-    return schur_complement(data, chosen) / (by[:, None] * by), mean[chosen] * by
+    data, mean = (e * values) @ e.T, (e / values) @ (e.T @ (information @ (p.mean / p.scale)))
+    ratio = p.scale[chosen] / scale
+    return schur_complement(data, chosen) / (ratio[:, None] * ratio), mean[chosen] * ratio
 
 
 def _effect(effect: str, covariance: Floats, d: Floats, rows: Ints) -> EffectDifference:
-    """Test the parameters (I,) of an effect at once, the others not known.
+    """Test the parameters (I,) of an effect jointly, the others unknown.
 
-    Of all, d (K,) is the difference, and its covariance (K, K) as far as campaigns and prior tell.
+    d (K,) are the differences of all parameters, with their covariance (K, K) by both campaigns and
+    the prior.
     """
     some = np.linalg.inv(covariance[np.ix_(rows, rows)]) - np.eye(len(rows)) / FREE**2
     values, vectors = np.linalg.eigh((some + some.T) / 2)
-    seen = values > 1.0
-    total = float(np.sum(values[seen] * (vectors[:, seen].T @ d[rows]) ** 2))
-    rank = int(seen.sum())
+    compared = values > 1.0
+    total = float(np.sum(values[compared] * (vectors[:, compared].T @ d[rows]) ** 2))
+    rank = int(compared.sum())
     return EffectDifference(effect, total, rank, float(chi2.sf(total, rank)) if rank else 1.0)

@@ -57,23 +57,25 @@ def write(p: Posterior, path: Path) -> None:
 
 
 def _read(content: Mapping[str, Any]) -> Posterior:
-    kept = content["prints"]
+    stored_prints = content["prints"]
     names, units = (decode(tuple[str, ...], content[k]) for k in ("parameters", "units"))
-    count, columns = len(names), int(kept["columns"])
+    count, columns = len(names), int(stored_prints["columns"])
     limits.check_parameters(count)
     arrays = ("links", "mean", "scale", "own_precision")
-    links, mean, scale, own = (decode(Floats, content[k]) for k in arrays)
+    links, mean, scale, precision = (decode(Floats, content[k]) for k in arrays)
     information = np.zeros((count, count))
     information[np.tril_indices(count)] = unpack(content["information"])
     information += np.tril(information, -1).T
-    prints = unpack(kept["values"]).reshape(-1, columns)
+    prints = unpack(stored_prints["values"]).reshape(-1, columns)
     if len(units) != count or len(set(names)) != count or columns < 5:
         raise ValueError("its arrays do not fit its parameters")
-    if any(a.shape != (count,) for a in (mean, scale, own)) or links.shape != (columns - 3, 4, 4):
+    shapes = {a.shape for a in (mean, scale, precision)}
+    if shapes != {(count,)} or links.shape != (columns - 3, 4, 4):
         raise ValueError("its arrays do not fit its arm and parameters")
-    if not all(np.isfinite(a).all() for a in (information, links, prints, mean, scale, own)):
+    numbers = (information, links, prints, mean, scale, precision)
+    if not all(np.isfinite(a).all() for a in numbers):
         raise ValueError("numbers that are not finite")
-    if np.any(scale <= 0) or np.any(own < 0):
+    if np.any(scale <= 0) or np.any(precision < 0):
         raise ValueError("a magnitude or precision that cannot be")
     return Posterior(
         arm=str(content["arm"]),
@@ -85,7 +87,7 @@ def _read(content: Mapping[str, Any]) -> Posterior:
         scale=scale,
         mean=mean,
         information=information,
-        own_precision=own,
+        own_precision=precision,
         scatter=decode(ArmScatter | None, content["arm_scatter"]),
         ranges=decode(tuple[Range, ...], content["ranges"]),
         prints=prints,

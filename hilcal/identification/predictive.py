@@ -1,4 +1,4 @@
-"""Covariance of predictions, also where nothing was measured, and what a fit taught of its arm.
+"""Covariance of predictions, also where nothing was measured, and the posterior of an arm.
 
 The posterior of a fit holds the strengths of shrunk families at what the evidence chose, zero for
 the groups that the readings do not need. That says nothing of joint angles that were never
@@ -11,17 +11,17 @@ A (R, P) of the fitted readings, whitened by W, σ² their noise factor, Λ the 
 
 W is the stated covariance V, with more for positions or attitudes where their residual asks for it:
 a misfit has not the shape of an instrument's noise, which is small along the beam. W, C and the
-residual that parameters with this W and Λ leave belong together; they are found by turns. Where the
+residual of parameters with this W and Λ depend on each other; they are computed in turns. Where the
 model has a background its standard deviations are in units of the instrument's noise, and σ is the
 factor of that as the mixed model estimates it; otherwise σ² is from the residual, at least 1.
 
 κ, at least 1, makes the mean variance on poses left out, in units of V, equal to the mean square
-that was found there. The variance is that of the folds as they are left out, F of rows Y, with X
+error there. The variance is that of the folds as they are left out, F of rows Y, with X
 the same whitened by W and multiplied by the root of C: the mean of Y (1 − XᵀX/σ²)⁻¹ Yᵀ. With few
-poses a fold may be all that tells of a direction; its variance is that of the prior then.
+poses one fold alone may determine a direction; its variance is that of the prior then.
 
 The uncertainty of the variances of a background makes C larger by how far it moves the parameters
-(`mixed.prediction`), and κ is at least what it makes of predictions on the whole (Kackar and
+(`mixed.prediction`), and κ is at least its mean effect on predictions (Kackar and
 Harville, JASA 79 (1984) 853). At given variances rows that are predicted without their fold are off
 by e with the variance v (`mixed.prediction.left_out`). With x = (log s, η) drawn from its
 posterior, by weights from the normal approximation at its maximum x̂, the mean square is
@@ -29,7 +29,7 @@ E[Σ v] + E|e − E e|²; its ratio to Σ v at x̂ is that least κ. Both hold t
 acts and once as a mean: with 20, 30 and 60 poses of 30 simulated arms that have all effects, 95, 92
 and 95 % of other poses are then in their 95 % band, and 93, 89 and 93 % with κ alone.
 
-What a residual has beyond the stated noise (`excess`): with r (3,) the residuals of the D
+The excess of a residual over the stated noise (`excess`): with r (3,) the residuals of the D
 positions, V their covariance, W = V + s² 1, and J C Jᵀ the covariance of their predictions, C that
 of parameters estimated with σ² W, s² solves (Mandel and Paule, Anal. Chem. 42 (1970) 1194, for the
 scatter between laboratories beyond what each states)
@@ -69,22 +69,22 @@ from hilcal.types import Floats, Ints
 
 ITERATIONS = 20  # of the noise factor; it converges within a few
 ROUNDS = 6  # most times that the covariance is computed anew as W changes; a choice
-MOST_LEVERAGE = 0.99  # of a row, since that of a row which alone tells something is 1
+MOST_LEVERAGE = 0.99  # of a row; that of a row which alone determines something is 1
 ROUNDING = 1e-9  # least share of a direction's information that is not of one fold
-CHUNK = 4096  # measurements that are taken at once, for memory
-MOST_ROWS = 600  # elements beyond which variances are taken for known: of 200 poses of a real UR10
+CHUNK = 4096  # measurements that are processed at once, for memory
+MOST_ROWS = 600  # elements beyond which variances count as known: of 200 poses of a real UR10
 # the factor is 1.00 to 1.06, and a draw costs the cube of the rows; a choice
 DRAWS, SEED = 30, 0  # of the posterior; a choice: 20 poses of that UR10 give 1.19 to 1.43 by seed
 # log of the largest weight of a draw over the median: tails are not normal; a choice
 HEAVIEST = 2.0
 CHANCE = 0.0005  # p-value of χ² below which there is an excess: that of `diagnosis.noise_verdict`
-SOME = 400  # measurements, evenly spaced, from which a mean leverage is taken, for speed; a choice
-SAME = 0.05  # relative change of s² and of the factor that makes no difference; a choice
+SOME = 400  # measurements, evenly spaced, for a mean leverage, for speed; a choice
+SAME = 0.05  # relative change of s² and of the factor that is negligible; a choice
 
 
 @dataclass(frozen=True, slots=True)
 class Excess:
-    """What is added to the stated covariance."""
+    """An addition to the stated covariance."""
 
     position: float = 0.0  # s² of each coordinate of a measured position, m²
     attitude: float = 1.0  # factor of the variances of the attitude
@@ -95,25 +95,25 @@ class Excess:
         return self.position == 0.0 and self.attitude == 1.0
 
     def near(self, other: "Excess") -> bool:
-        """Whether the difference to another one does not matter."""
+        """Whether the difference to another one is negligible."""
         a, b = self.position, other.position
         return abs(a - b) <= SAME * max(a, b) and abs(self.attitude / other.attitude - 1) <= SAME
 
     def halfway(self, other: "Excess") -> "Excess":
-        """Return one between this and another: the geometric mean, half where one has none."""
+        """Return the geometric mean of this and another one; half of s² where one has none."""
         both = self.position, other.position
         middle = float(np.sqrt(both[0] * both[1])) if min(both) > 0 else sum(both) / 2
         return Excess(middle, float(np.sqrt(self.attitude * other.attitude)))
 
     def widened(self, covariance: Floats, share: float = 1.0) -> Floats:
-        """Return covariances (N, m, m) with it; with a share of s²."""
+        """Return covariances (N, m, m) with the excess, of s² a share."""
         place = np.arange(covariance.shape[-1]) < 3
         root = np.sqrt(np.where(place, 1.0, self.attitude))
-        more = np.where(place, share * self.position, 0.0)
-        return np.asarray(covariance * root[:, None] * root + np.diag(more))
+        extra = np.where(place, share * self.position, 0.0)
+        return np.asarray(covariance * root[:, None] * root + np.diag(extra))
 
     def of_readings(self, readings: Readings, mode: Mode) -> Readings:
-        """Return readings with it; a deflection, the difference of two, has s² in all."""
+        """Return readings with the excess; a deflection, the difference of two, has s² in all."""
         share = 0.5 if mode == "deflection" else 1.0
         return replace(readings, covariance=self.widened(readings.covariance, share))
 
@@ -127,27 +127,27 @@ def excess(
     used: Whitening,
     rows: Floats,
     root: Floats,
-    before: Excess = NONE,
+    previous: Excess = NONE,
 ) -> Excess:
-    """Return what a residual (D, m) has beyond the stated noise.
+    """Return the excess of a residual (D, m) over the stated noise.
 
-    V is stated; C, of root (P, K) over its noise factor, was found with another scaling of the same
-    measurements, by which rows (R, P) are whitened, and which has some excess `before` already: a
-    part that has some is not asked for chance again.
+    V is that of `stated`. C, with the root (P, K) over its noise factor, belongs to the scaling
+    `used` of the same measurements, which whitens the rows (R, P) and has the excess `previous`; a
+    part with such an excess is not tested against chance again.
     """
-    spread, every = _spread(used, rows, root), _every(len(raw))
+    spread, chosen = _spread(used, rows, root), _spaced(len(raw))
     position, attitude = 0.0, 1.0
     for part in (slice(0, 3), slice(3, 6))[: raw.shape[1] // 3]:
         values, vectors = np.linalg.eigh(stated.covariance[:, part, part])
         if values.min() <= 0.0:
             continue
         r = raw[:, part]
-        share = np.linalg.solve(used.covariance[every, part, part], spread[:, part, part])
+        share = np.linalg.solve(used.covariance[chosen, part, part], spread[:, part, part])
         free = r.size - len(raw) * float(np.trace(share, axis1=1, axis2=2).mean())
         square = np.einsum("dij,di->dj", vectors, r) ** 2
         total = float(np.sum(square / values))
-        known = before.attitude > 1.0 if part.start else before.position > 0.0
-        if free < 1.0 or total <= free or (not known and float(chi2.sf(total, free)) >= CHANCE):
+        sure = previous.attitude > 1.0 if part.start else previous.position > 0.0
+        if free < 1.0 or total <= free or (not sure and float(chi2.sf(total, free)) >= CHANCE):
             continue
         if part.start:
             attitude = total / free
@@ -161,39 +161,39 @@ def excess(
     return Excess(position, attitude)
 
 
-def _every(count: int) -> Ints:
+def _spaced(count: int) -> Ints:
     return np.linspace(0, count - 1, min(count, SOME)).astype(int)
 
 
 def _spread(w: Whitening, rows: Floats, root: Floats) -> Floats:
     """J C Jᵀ (S, m, m) of some measurements, evenly spaced."""
-    every = _every(len(w.reading))
-    out, at, first = np.zeros((len(every), w.m, w.m)), 0, 0
+    measurements = _spaced(len(w.reading))
+    out, row, first = np.zeros((len(measurements), w.m, w.m)), 0, 0
     for b in w.buckets:
         groups, size = len(b.loaded), b.factor.shape[-1]
-        each = size // w.m
-        chosen = np.flatnonzero((every >= first) & (every < first + groups * each))
-        group, place = np.divmod(every[chosen] - first, each)
-        part = rows[at : at + groups * size].reshape(groups, size, -1)[group] @ root
+        count = size // w.m
+        chosen = np.flatnonzero((measurements >= first) & (measurements < first + groups * count))
+        group, place = np.divmod(measurements[chosen] - first, count)
+        part = rows[row : row + groups * size].reshape(groups, size, -1)[group] @ root
         part = np.linalg.pinv(b.factor[group]) @ part
-        part = part.reshape(len(chosen), each, w.m, -1)[np.arange(len(chosen)), place]
+        part = part.reshape(len(chosen), count, w.m, -1)[np.arange(len(chosen)), place]
         out[chosen] = part @ np.swapaxes(part, 1, 2)
-        at, first = at + groups * size, first + groups * each
+        row, first = row + groups * size, first + groups * count
     return out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Predictive:
-    """What a fit knows of readings that it has not seen."""
+    """The predictive distribution of a fit."""
 
     model: Model
     theta: Floats  # (P,) its parameters
     covariance: Floats  # (P, P) C
     prior: Floats  # (P,) prior standard deviations, Λ = diag(prior)⁻²
-    excess: Excess  # what W has beyond V
+    excess: Excess  # of W over V
     noise: float  # σ², noise factor of the fitted readings in units of W
     factor: float  # κ
-    least: float  # what κ is at least, by the uncertainty of the variances
+    least: float  # lower bound of κ, by the uncertainty of the variances
     leverage: Floats  # (D,) largest eigenvalue of the variance of a fitted measurement's prediction
     # over that of the noise
     scatter: float  # mean variance of the fitted readings by σ² W, in units of V
@@ -217,95 +217,95 @@ class Predictive:
 
 
 def predictive_of(fit: Fit) -> Predictive:
-    """Return what a gc-scaled fit knows of other readings."""
-    kept, sigma = fit.readings[~fit.outlier], fit.holdout.rms_sigma
-    return predictive(fit.model, fit.theta, fit.solution.prior, kept, fit.mode, sigma)
+    """Return the predictive distribution of a gc-scaled fit."""
+    inliers, sigma = fit.readings[~fit.outlier], fit.holdout.rms_sigma
+    return predictive(fit.model, fit.theta, fit.solution.prior, inliers, fit.mode, sigma)
 
 
 def predictive(
     model: Model, theta: Floats, prior: Floats, fitted: Readings, mode: Mode, left_out_sigma: float
 ) -> Predictive:
-    """Return what a gc-scaled fit knows of other readings.
+    """Return the predictive distribution of a gc-scaled fit.
 
-    Prior standard deviations (P,) of the fit are infinite for flat parameters, zero for groups that
-    were dropped; the prior that the model carries takes their place. The readings are those that it
-    was fitted to, without gross errors, and `left_out_sigma` is the rms of the whitened residual on
-    poses left out.
+    `prior` (P,) are the fit's prior standard deviations, infinite for flat parameters, zero for
+    dropped groups; the prior that the model carries takes their place. `fitted` are its readings
+    without gross errors, `left_out_sigma` the rms of the whitened residual on poses left out.
     """
     stated = whitening(fitted, mode, "gc")
     prediction = model.predict(fitted.states, theta)
     raw = residual(fitted, prediction, stated)
     fold = random_folds(distinct_poses(fitted)[stated.reading])
-    known, least, from_variances = None, 1.0, np.zeros((model.size, model.size))
+    noise_factor, least, from_variances = None, 1.0, np.zeros((model.size, model.size))
     if model.background:
         variances = mixed_fit_at(model, fitted.as_stated(), mode, theta)
-        arm = fitted.arm_scatter  # whose factor the standard deviations are in units of
-        known = (variances.std(INSTRUMENT) if arm is None else arm.instrument_factor) ** 2
-        prior = prior * np.sqrt(known)
+        arm = fitted.arm_scatter  # the standard deviations are in units of its factor
+        noise_factor = (variances.std(INSTRUMENT) if arm is None else arm.instrument_factor) ** 2
+        prior = prior * np.sqrt(noise_factor)
         least = variance_spread(variances, stated.rows_of(fold))
         e = variances.equations
-        by = e.problem.parameters(e.sensitivity, model.size)
-        from_variances = by @ variances.covariance @ by.T
-    of = coordinates_of(model)
-    chosen = of.prior(prior)
-    std = of.prior(open_prior(model, theta, prior))
+        motion = e.problem.parameters(e.sensitivity, model.size)
+        from_variances = motion @ variances.covariance @ motion.T
+    space = coordinates_of(model)
+    chosen = space.prior(prior)
+    std = space.prior(open_prior(model, theta, prior))
     std[np.isinf(std)] = 1.0
-    # What the fit's own prior pulls its parameters by, in coordinates of unit prior variance.
+    # The pull of the fit's own prior on its parameters, in coordinates of unit prior variance.
     held = np.isfinite(chosen) & (chosen > 0)
-    pull = np.where(held, of.of_theta(theta) * std / np.where(held, chosen, 1.0) ** 2, 0.0)
+    pull = np.where(held, space.of_theta(theta) * std / np.where(held, chosen, 1.0) ** 2, 0.0)
 
     def rows_in(w: Whitening) -> Floats:
         """Whitened derivatives (R, P) by coordinates of unit prior variance."""
-        return of.columns(whitened_jacobian(model, prediction, theta, w, every)) * std
+        return space.columns(whitened_jacobian(model, prediction, theta, w, parameters)) * std
 
-    every, more, w = np.arange(model.size), Excess(), stated
+    parameters, extra, w = np.arange(model.size), Excess(), stated
     for step in range(ROUNDS + 1):
         a = rows_in(w)
-        values, vectors, noise = _spectrum(a, raw, w, known)
+        values, vectors, noise = _spectrum(a, raw, w, noise_factor)
         root = vectors * np.sqrt(noise / (values + noise))
-        if known is not None or step == ROUNDS:  # known: a misfit is in the background
+        if noise_factor is not None or step == ROUNDS:  # with a background, which holds any misfit
             break
-        # Where the parameters are with this noise and this prior: a residual and its leverage.
+        # The residual of the parameters with this noise and this prior, and its leverage.
         moved = root @ (root.T @ (a.T @ w.whiten(raw).reshape(-1) / noise - pull))
-        at = model.predict(fitted.states, theta + of.transform(std * moved))
-        found = excess(residual(fitted, at, stated), stated, w, a, root / np.sqrt(noise), more)
-        if found.near(more):
+        refitted = model.predict(fitted.states, theta + space.transform(std * moved))
+        new = excess(residual(fitted, refitted, stated), stated, w, a, root / np.sqrt(noise), extra)
+        if new.near(extra):
             break
-        more = found if step == 0 else found.halfway(more)
-        w = whitening(more.of_readings(fitted, mode), mode, "gc")
+        extra = new if step == 0 else new.halfway(extra)
+        w = whitening(extra.of_readings(fitted, mode), mode, "gc")
     shares = []
     for k in range(0, len(a), CHUNK * w.m):
         part = (a[k : k + CHUNK * w.m] @ root).reshape(-1, w.m, len(root))
         shares.append(np.linalg.eigvalsh(part @ np.swapaxes(part, 1, 2)) / noise)
     leverage = np.clip(np.concatenate(shares), 0.0, MOST_LEVERAGE).max(axis=1)
-    scatter, b, wider = noise, a, more.widened(stated.covariance)
-    if not more.none:
+    scatter, b, wider = noise, a, extra.widened(stated.covariance)
+    if not extra.none:
         share = np.trace(np.linalg.solve(stated.covariance, wider), axis1=1, axis2=2)
         scatter = noise * float(share.mean()) / w.m
         b = rows_in(stated)
-    position = of.columns(w.raw(model.jacobian(prediction, theta, 3)).reshape(-1, model.size)) * std
+    position = w.raw(model.jacobian(prediction, theta, 3)).reshape(-1, model.size)
+    position = space.columns(position) * std
     rows, points = w.rows_of(fold), np.repeat(fold, 3)
     left_out, left_out_m2 = left_out_variances(
         a, rows, ((b, rows), (position, points)), root, noise
     )
     scatter_m2 = noise * float(np.trace(wider[:, :3, :3], axis1=1, axis2=2).mean())
-    root = of.transform(root * std[:, None])
+    root = space.transform(root * std[:, None])
     factor = max(least, left_out_sigma**2 / (scatter + left_out))
     return Predictive(
-        model, theta, root @ root.T + from_variances, open_prior(model, theta, prior), more, noise,
+        model, theta, root @ root.T + from_variances, open_prior(model, theta, prior), extra, noise,
         factor, least,
         leverage, scatter, left_out, scatter_m2, 3 * left_out_m2,
     )  # fmt: skip
 
 
 def _spectrum(
-    a: Floats, raw: Floats, w: Whitening, known: float | None
+    a: Floats, raw: Floats, w: Whitening, noise_factor: float | None
 ) -> tuple[Floats, Floats, float]:
-    """Eigenvalues and eigenvectors of AᵀA, and σ², which may be known."""
+    """Eigenvalues and eigenvectors of AᵀA, and σ², which may be given."""
     values, vectors = np.linalg.eigh(a.T @ a)
     values = np.maximum(values, 0.0)
-    if known is not None:
-        return values, vectors, known
+    if noise_factor is not None:
+        return values, vectors, noise_factor
     white = w.whiten(raw).reshape(-1)
     rss, noise = float(white @ white), 1.0
     for _ in range(ITERATIONS):
@@ -315,27 +315,27 @@ def _spectrum(
 
 
 def left_out_variances(
-    a: Floats, fold: Ints, asked: Sequence[tuple[Floats, Ints]], root: Floats, noise: float
+    a: Floats, fold: Ints, predicted: Sequence[tuple[Floats, Ints]], root: Floats, noise: float
 ) -> list[float]:
-    """Mean variance of rows of each fold, predicted without it.
+    """Mean variance of `predicted` rows, each predicted without its fold.
 
-    Of fitted rows (R, P) in units of W, with their folds (R,); rows (R', P) and folds are asked for
-    in other units. (P, K) root of C, and σ².
+    `a` are the fitted rows (R, P) in units of W, with their folds (R,); `predicted` are rows
+    (R', P) in other units, with folds (R',); `root` (P, K) is that of C, `noise` σ².
     """
-    total = np.zeros(len(asked))
+    total = np.zeros(len(predicted))
     for f in range(int(fold.max(initial=-1)) + 1):
         x = a[fold == f] @ root
         few = len(x) < len(root)
         values, vectors = np.linalg.eigh(x @ x.T if few else x.T @ x)
-        rest = np.maximum(1.0 - values / noise, ROUNDING)
-        for k, (b, of) in enumerate(asked):
-            y = b[of == f] @ root
+        remainder = np.maximum(1.0 - values / noise, ROUNDING)
+        for k, (b, folds) in enumerate(predicted):
+            y = b[folds == f] @ root
             if few:
                 along = y @ (x.T @ vectors)
-                total[k] += np.sum(y**2) + np.sum(along**2 / (noise * rest))
+                total[k] += np.sum(y**2) + np.sum(along**2 / (noise * remainder))
             else:
-                total[k] += np.sum((y @ vectors) ** 2 / rest)
-    return [float(t) / max(len(b), 1) for t, (b, _) in zip(total, asked, strict=True)]
+                total[k] += np.sum((y @ vectors) ** 2 / remainder)
+    return [float(t) / max(len(b), 1) for t, (b, _) in zip(total, predicted, strict=True)]
 
 
 def open_prior(model: Model, theta: Floats, prior: Floats) -> Floats:
@@ -357,8 +357,8 @@ def family_prior(model: Model, prior: Floats) -> Floats:
 def parameter_factor(p: Predictive, left_out_sigma: float) -> float:
     """Factor, at least 1, by which C is too small where the noise alone is right.
 
-    With it the mean variance on poses left out is the mean square that was found there, whose root
-    is `left_out_sigma`, whitened.
+    With it the mean variance on poses left out is the mean square of the whitened residual there,
+    `left_out_sigma`².
     """
     return max(p.least, (left_out_sigma**2 - max(p.scatter, 1.0)) / max(p.left_out, 1e-12))
 
@@ -366,28 +366,28 @@ def parameter_factor(p: Predictive, left_out_sigma: float) -> float:
 def position_factor(p: Predictive, left_out_m: float) -> float:
     """Factor, at least 1, by which C is too small for positions.
 
-    With it the mean square error of the positions left out, m², is what was found there: in metres,
-    as a band about a position is stated. In units of V the directions that an instrument measures
+    With it the stated mean square error of positions left out is the observed one, in m², as a band
+    about a position is stated. In units of V the directions that an instrument measures
     best would decide, in which misfits count most.
     """
     return max(p.least, (left_out_m**2 - p.scatter_m2) / max(p.left_out_m2, 1e-300))
 
 
-def variance_spread(found: Variances, fold: Ints) -> float:
+def variance_spread(variances: Variances, fold: Ints) -> float:
     """Return the factor, at least 1, of the variance of predictions, by the folds (R,) of rows."""
     if len(fold) > MOST_ROWS:
         return 1.0
-    _, at = left_out(found.equations, fold)
-    rng, root = np.random.default_rng(SEED), np.linalg.cholesky(found.covariance)
+    _, reference = left_out(variances.equations, fold)
+    rng, root = np.random.default_rng(SEED), np.linalg.cholesky(variances.covariance)
     variance, off, weight = [], [], []
     for _ in range(DRAWS):
         z = rng.standard_normal(len(root))
         try:
-            e = equations(found.equations.problem, found.log_std + root @ z)
-            residual, one = left_out(e, fold)
+            e = equations(variances.equations.problem, variances.log_std + root @ z)
+            residual, v = left_out(e, fold)
         except np.linalg.LinAlgError:
             continue
-        variance.append(float(one.sum()))
+        variance.append(float(v.sum()))
         off.append(residual)
         weight.append(log_posterior(e) + 0.5 * float(z @ z))
     if not weight:
@@ -396,37 +396,37 @@ def variance_spread(found: Variances, fold: Ints) -> float:
     share /= share.sum()
     away = np.array(off) - share @ np.array(off)
     mean = share @ (np.array(variance) + np.sum(away**2, axis=1))
-    return max(1.0, float(mean / at.sum()))
+    return max(1.0, float(mean / reference.sum()))
 
 
 def posterior_of(fit: Fit, source: Source | None = None) -> Posterior:
-    """Return what a fit taught of its arm; arguments and errors are those of `Posterior.of`."""
+    """Return the posterior of the arm after a fit; arguments and errors as of `Posterior.of`."""
     if fit.scaling != "gc":
         raise InputError(f"a prior needs a fit with scaling gc, this one has {fit.scaling}")
     model, cell = fit.model, fit.model.cell
-    learnt = [e for e in model.effects if of_arm(e)]
-    if not learnt:
+    effects = [e for e in model.effects if of_arm(e)]
+    if not effects:
         raise CannotAnswerError(
             f"the model {' + '.join(model.names) or 'of the nominal arm'} has no effect of the "
             "arm, only of the setup: there is nothing to carry over; run hilcal refine first"
         )
     of_arms = np.concatenate([np.full(len(e.parameters), of_arm(e)) for e in model.effects])
     interest, scale = np.flatnonzero(of_arms), scales_of(model)
-    whole, own = _information(fit, scale)
-    found = determined(schur_complement(whole, interest))
+    information, precision = _information(fit, scale)
+    marginal = determined(schur_complement(information, interest))
     scale = scale[interest]
     used, source = fit.readings[~fit.outlier], source or Source(created=utc_now())
     return Posterior(
         arm=cell.arm.name,
         links=cell.arm.links,
         mode=fit.mode,
-        effects=tuple(PosteriorEffect(e.name, dict(e.options)) for e in learnt),
-        names=tuple(f"{e.name}.{p.name}" for e in learnt for p in e.parameters),
-        units=tuple(p.unit for e in learnt for p in e.parameters),
+        effects=tuple(PosteriorEffect(e.name, dict(e.options)) for e in effects),
+        names=tuple(f"{e.name}.{p.name}" for e in effects for p in e.parameters),
+        units=tuple(p.unit for e in effects for p in e.parameters),
         scale=scale,
         mean=fit.theta[interest],
-        information=found / (scale[:, None] * scale),
-        own_precision=own[interest] / scale**2,
+        information=marginal / (scale[:, None] * scale),
+        own_precision=precision[interest] / scale**2,
         scatter=fit.readings.arm_scatter,
         ranges=ranges_of(used.states, cell.arm.units),
         prints=prints(fit.readings),
@@ -451,8 +451,8 @@ def _information(fit: Fit, scale: Floats) -> tuple[Floats, Floats]:
     a *= scale
     std = np.where(np.isinf(s.prior), np.inf, p.prior) / scale
     with np.errstate(divide="ignore"):
-        own = np.where(std > 0, 1.0 / std**2, np.inf)
-    # Of a family of which nothing is left at all: as ordinary as it starts.
-    own[np.isinf(own)] = 1.0
+        precision = np.where(std > 0, 1.0 / std**2, np.inf)
+    # A family that was dropped entirely has its ordinary magnitude.
+    precision[np.isinf(precision)] = 1.0
     kappa = parameter_factor(p, fit.holdout.rms_sigma)
-    return (a.T @ a / p.noise + np.diag(own)) / kappa, own / kappa
+    return (a.T @ a / p.noise + np.diag(precision)) / kappa, precision / kappa

@@ -8,8 +8,8 @@ R, t: the base in the sensor's frame; τ, R_τ: the target k(i) on the flange. T
 are a shift of the base at the centroid of the flange's positions and a turn, base axes; per target
 a shift and a turn, flange axes; all in ordinary sizes. Starts are closed forms (Kabsch; linear
 equations of a point, |p|² − d² being linear in it, and of a plane) and rotations of a cube.
-Readings centimetres off are found from a robust start, and left out. What the poses cannot tell
-stays near the cell's target and is listed.
+Readings that are centimetres off are detected from a robust start, and left out. Directions that
+the poses do not determine stay near the cell's targets and are listed.
 """
 
 from collections.abc import Iterator, Sequence
@@ -43,7 +43,7 @@ from hilcal.types import Bools, Floats, Ints
 # All of these are choices.
 ROUGH = (1e-4, 1e-4)  # m and rad, added to the stated noise: nominal arms are 0.1 to 3 mm off
 TARGET_M, BASE_M = 0.3, 3.0  # ordinary distances of target and flange, of tracker and base
-TELL = 0.1  # share of an ordinary size to which readings must tell a direction to determine it
+TELL = 0.1  # share of an ordinary size to which readings must determine a direction
 ALTERNATIONS = 10  # between rotation and translations; least squares follow
 HOLD = 1e-6  # weight of an ordinary size in the linear starts, against an error of 1 m
 HOLD_SEVERAL = 1e-3  # the same in whitened rows of several observers
@@ -62,14 +62,14 @@ TOLD = 0.05  # component of an undetermined direction that is worth mentioning
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Undetermined:
-    """Frame parameters that can move together without any reading telling it."""
+    """Frame parameters that can move together without a change of any reading."""
 
     target: int | None  # index of the target that moves; None where the base alone moves
     target_shift: Floats  # (3,) flange axes, m
     target_turn: Floats  # (3,) rad
     base_shift: Floats  # (3,) of the base with it, at the middle of the flange's positions, m
     base_turn: Floats  # (3,) rad
-    observers: tuple[str, ...] = ()  # what of several observers moves with it, as "point P"
+    observers: tuple[str, ...] = ()  # those of several observers that move with it, as "point P"
 
     def to_json(self) -> dict[str, object]:
         """Return its JSON."""
@@ -85,7 +85,7 @@ class Undetermined:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registration:
-    """Where base and target ended, and what the poses could not tell."""
+    """The place of base and targets, and what the poses do not determine."""
 
     cell: Cell  # with base and target in place
     off: Floats  # (N, m) measured minus predicted by the nominal arm, sensor axes, m and rad
@@ -103,11 +103,11 @@ class Registration:
         cell = self.cell
         placed = cell.all_targets if targets is None else targets
         several = cell.target_names if cell.targets is not None else ()
-        each = {name: _pose(t) for name, t in zip(several, placed, strict=False)}
+        by_name = {name: _pose(t) for name, t in zip(several, placed, strict=False)}
         return {
             "base": _pose(cell.registration if base is None else base),
             "target": _pose(placed[0]),
-            **({"targets": each} if each else {}),
+            **({"targets": by_name} if by_name else {}),
             "estimated": self.estimated,
             "rms_m": self.rms,
             "rms_rad": self.turn_rms,
@@ -125,16 +125,16 @@ def register(cell: Cell, readings: Readings) -> Registration:
 
     Raises:
         CannotAnswerError: the poses do not determine it: fewer than four distinct positions, all on
-            one line, or fewer readings of an observer than what is unknown of it.
+            one line, or fewer readings of an observer than unknowns of its place.
     """
     if readings.states.observer is not None:
         return _of_several(cell.observed_by(readings.observers), readings)
     angle, data = angles(readings), FrameData.of(cell.arm, readings)
-    given, free = given_and_free(cell, data.m == 6)
-    known = cell.registration_known and cell.target_known
-    if known:
-        at, null = Placement(data, given, np.zeros_like(free)), np.zeros((len(free), 0))
-        far = _far(readings, at)
+    frames, free = given_and_free(cell, data.m == 6)
+    fixed = cell.registration_known and cell.target_known
+    if fixed:
+        placement, null = Placement(data, frames, np.zeros_like(free)), np.zeros((len(free), 0))
+        far = _far(readings, placement)
     else:
         distinct = len(np.unique(np.round(angle, 9), axis=0))
         if distinct < MIN_POSES:
@@ -142,20 +142,21 @@ def register(cell: Cell, readings: Readings) -> Registration:
                 f"registration: {distinct} distinct poses; measure at least {MIN_POSES}, better "
                 "10, that turn the flange and do not lie on a line"
             )
-        at, null = _fitted(data, given, free)
-        far = _far(readings, at)
+        placement, null = _fitted(data, frames, free)
+        far = _far(readings, placement)
         if far.any():
-            at, null = _fitted(data[~far], given, free)
-        x = data.points(at.frames)
+            placement, null = _fitted(data[~far], frames, free)
+        x = data.points(placement.frames)
         spread = np.linalg.svd(x - x.mean(axis=0), compute_uv=False)
         if data.m == 3 and not cell.registration_known and spread[1] < NARROW * np.sqrt(len(x)):
             raise CannotAnswerError(
                 "registration: all positions lie in one point or on one line; measure poses "
                 "spread in space"
             )
-        cell = replace(cell.with_targets(at.frames.targets), registration=at.frames.base)
-    off = data.misfit(at.frames)
-    return _registration(cell, readings, off, far, far, _undetermined(null), not known)
+        frames = placement.frames
+        cell = replace(cell.with_targets(frames.targets), registration=frames.base)
+    off = data.misfit(placement.frames)
+    return _registration(cell, readings, off, far, far, _undetermined(null), not fixed)
 
 
 def targets_as_fitted(model: Model, theta: Floats) -> Floats:
@@ -185,58 +186,58 @@ def _registration(
     return Registration(cell, off, rms, turn_rms, far, undetermined, still, estimated)
 
 
-def _fitted(data: "FrameData", given: "Frames", free: Bools) -> tuple["Placement", Floats]:
-    """Return the best frames by a part of the readings, then all, and what they do not determine.
+def _fitted(data: "FrameData", frames: "Frames", free: Bools) -> tuple["Placement", Floats]:
+    """Return the best frames, by a part of the readings, then by all; and undetermined directions.
 
-    The undetermined directions (6 + 6 T, U) are of unit length, in ordinary sizes.
+    The directions (6 + 6 T, U) are of unit length, in ordinary sizes.
     """
     part = data[np.unique(np.linspace(0, len(data) - 1, FEW).astype(int))]
-    best = best_placement(part, given, free, GOOD * np.sqrt(part.m), STEPS, TRIED)
-    return settled(minimise(Placement(data, best.frames, free)), given)
+    best = best_placement(part, frames, free, GOOD * np.sqrt(part.m), STEPS, TRIED)
+    return settled(minimise(Placement(data, best.frames, free)), frames)
 
 
-def _far(readings: Readings, at: "Placement") -> Bools:
+def _far(readings: Readings, placement: "Placement") -> Bools:
     """(N,) readings far off while the others fit to within `DISTURBED`; none in other cases."""
-    data, none = at.data, np.zeros(len(readings), dtype=np.bool_)
+    data, none = placement.data, np.zeros(len(readings), dtype=np.bool_)
 
     def fits(off: Floats) -> bool:
         return bool(np.mean(np.sum(off[:, :3] ** 2, axis=1)) <= DISTURBED**2)
 
-    if fits(at.off):
+    if fits(placement.off):
         return none
-    at, used = robust_start(at, np.random.default_rng(SEED))
+    placement, used = robust_start(placement, np.random.default_rng(SEED))
     for _ in range(ROUNDS):
-        linear = at.linear
+        linear = placement.linear
         d2, _ = linear.near(np.zeros(linear.columns.shape[2]))
         far = d2 > limit(data.m, len(data), variance(linear, d2, none))
         if far.mean() > MOST:
             return none
-        at = replace(at, frames=minimise(replace(at, data=data[~far])).frames)
+        placement = replace(placement, frames=minimise(replace(placement, data=data[~far])).frames)
         if np.array_equal(far, ~used):
             break
         used = ~far
-    rows, base = np.flatnonzero(far), at.frames.base[:3, :3]
-    axes = base @ data.rotation[rows] @ at.frames.targets[data.target[rows], :3, :3]
-    alike = off_alike(readings, ~none, rows, at.off[rows, :3], axes)
-    return far if fits(at.off[~far]) and not len(alike) else none
+    rows, base = np.flatnonzero(far), placement.frames.base[:3, :3]
+    axes = base @ data.rotation[rows] @ placement.frames.targets[data.target[rows], :3, :3]
+    alike = off_alike(readings, ~none, rows, placement.off[rows, :3], axes)
+    return far if fits(placement.off[~far]) and not len(alike) else none
 
 
 def _undetermined(null: Floats) -> tuple[Undetermined, ...]:
-    """Return the undetermined directions, each with as few of a target's parameters as can be."""
+    """Return the undetermined directions, each with as few parameters of a target as possible."""
     size = len(null) // 6 - 1
     shifts = [6 + 6 * k + i for k in range(size) for i in range(3)]
-    rest = [3, 4, 5, *(9 + 6 * k + i for k in range(size) for i in range(3)), 0, 1, 2]
-    rows = echelon(null.T, (shifts, rest), TOLD)
+    turns_and_base = [3, 4, 5, *(9 + 6 * k + i for k in range(size) for i in range(3)), 0, 1, 2]
+    rows = echelon(null.T, (shifts, turns_and_base), TOLD)
     return tuple(_direction(row / np.abs(row).max()) for row in rows)
 
 
 def _direction(row: Floats, observers: tuple[str, ...] = ()) -> Undetermined:
     """Return one direction, in ordinary sizes, in m and rad."""
     moved = row * (np.abs(row) >= TOLD) * sizes(len(row) // 6 - 1)
-    each = moved[6:].reshape(-1, 6)
-    active = np.flatnonzero(np.abs(each).any(axis=1))
+    of_targets = moved[6:].reshape(-1, 6)
+    active = np.flatnonzero(np.abs(of_targets).any(axis=1))
     target = int(active[0]) if len(active) else None
-    six = each[target] if target is not None else np.zeros(6)
+    six = of_targets[target] if target is not None else np.zeros(6)
     return Undetermined(target, six[:3], six[3:], moved[:3], moved[3:6], observers)
 
 
@@ -264,7 +265,7 @@ def sizes(targets: int) -> Floats:
 
 
 def free_parameters(base: bool, targets: Bools, attitudes: bool) -> Bools:
-    """(6 + 6 T,) what is estimated where base and targets (T,) are or are not unknown.
+    """(6 + 6 T,) which parameters are estimated; of base and targets (T,), which are unknown.
 
     A target's axes show in attitudes alone, and are estimated from them even at a known offset.
     """
@@ -274,7 +275,7 @@ def free_parameters(base: bool, targets: Bools, attitudes: bool) -> Bools:
 
 
 def given_and_free(cell: Cell, attitudes: bool) -> tuple["Frames", Bools]:
-    """Return the frames of a cell, as given or as placed, and what is estimated of them."""
+    """Return the frames of a cell, and (6 + 6 T,) which of their parameters are estimated."""
     free = free_parameters(not cell.registration_known, ~np.array(cell.known_targets), attitudes)
     return Frames(cell.registration, cell.all_targets), free
 
@@ -289,7 +290,7 @@ class Frames:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameData:
-    """What the frames are found from."""
+    """The data that determine the frames."""
 
     rotation: Floats  # (N, 3, 3) nominal orientation of the flange, base axes
     position: Floats  # (N, 3) nominal position of the flange, m
@@ -300,7 +301,7 @@ class FrameData:
 
     @classmethod
     def of(cls, arm: Arm, readings: Readings) -> "FrameData":
-        """Return the readings beside the flange poses of a nominal arm."""
+        """Return the readings with the flange poses of a nominal arm."""
         value, turn = readings.value, readings.value[:, 3:] if readings.m == 6 else None
         root = inverse_roots(readings.covariance)
         return cls.at(arm, angles(readings), value[:, :3], turn, root, readings.target)
@@ -309,7 +310,7 @@ class FrameData:
     def at(
         cls, arm: Arm, q: Floats, value: Floats, turn: Floats | None, root: Floats, target: Ints
     ) -> "FrameData":
-        """Return what was read at joint values (N, n); `turn` (N, 3) the attitudes read, rad."""
+        """Return readings at joint values (N, n); `turn` (N, 3) are the attitudes, rad."""
         chain = evaluate(arm, q)
         rotation, position = (np.ascontiguousarray(x[-1]) for x in (chain.rotation, chain.position))
         attitude = None if turn is None else se3.rotation(turn)
@@ -326,8 +327,8 @@ class FrameData:
 
     def __getitem__(self, rows: Ints | Bools | slice) -> "FrameData":
         """Return the chosen readings."""
-        given = {f.name: a for f in fields(self) if (a := getattr(self, f.name)) is not None}
-        return replace(self, **{name: a[rows] for name, a in given.items()})
+        arrays = {f.name: a for f in fields(self) if (a := getattr(self, f.name)) is not None}
+        return replace(self, **{name: a[rows] for name, a in arrays.items()})
 
     def points(self, frames: Frames) -> Floats:
         """(N, 3) predicted positions of the targets, base axes, m."""
@@ -346,7 +347,7 @@ class FrameData:
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Frames beside what was read: a point of `solver.minimise`."""
+    """Frames and the data that they are fitted to: a point of `solver.minimise`."""
 
     data: FrameData
     frames: Frames
@@ -381,7 +382,7 @@ class Placement:
         return np.concatenate([self.white.reshape(-1), -self.weight * away[self.free]])
 
     def jacobian(self) -> Floats:
-        """(R, K) derivative of what is predicted."""
+        """(R, K) derivative of the prediction."""
         rows = self.columns().reshape(self.white.size, int(np.count_nonzero(self.free)))
         if self.held is None:
             return rows
@@ -398,9 +399,9 @@ class Placement:
         out[:, :3, 3:6] = -r @ se3.skew(data.points(self.frames) - self._centre)
         out[:, 3:, 3:6] = r[: data.m - 3]
         for k in range(len(self.frames.targets)):
-            rows, at = data.target == k, 6 + 6 * k
-            out[rows, :3, at : at + 3] = turned[rows]
-            out[rows, 3:, at + 3 : at + 6] = turned[rows, : data.m - 3]
+            rows, first = data.target == k, 6 + 6 * k
+            out[rows, :3, first : first + 3] = turned[rows]
+            out[rows, 3:, first + 3 : first + 6] = turned[rows, : data.m - 3]
         size = sizes(len(self.frames.targets))[self.free]
         return np.asarray(data.root @ out[:, :, self.free] * size)
 
@@ -412,12 +413,12 @@ class Placement:
 
     def moved(self, step: Floats) -> "Placement":
         """Return the placement after a step (K,)."""
-        whole = np.zeros(len(self.free))
-        whole[self.free] = sizes(len(self.frames.targets))[self.free] * step
-        targets, each = self.frames.targets.copy(), whole[6:].reshape(-1, 6)
-        targets[:, :3, 3] += each[:, :3]
-        targets[:, :3, :3] = se3.rotation(each[:, 3:]) @ targets[:, :3, :3]
-        base = self.frames.base @ _moved_about(self._centre, whole[:6])
+        full = np.zeros(len(self.free))
+        full[self.free] = sizes(len(self.frames.targets))[self.free] * step
+        targets, of_targets = self.frames.targets.copy(), full[6:].reshape(-1, 6)
+        targets[:, :3, 3] += of_targets[:, :3]
+        targets[:, :3, :3] = se3.rotation(of_targets[:, 3:]) @ targets[:, :3, :3]
+        base = self.frames.base @ _moved_about(self._centre, full[:6])
         return replace(self, frames=Frames(base, targets))
 
     def determined(self, spread: float) -> tuple[Floats, Floats]:
@@ -425,11 +426,11 @@ class Placement:
         a = self.jacobian()
         # Squared singular values up to 1e12 leave rounding of 1e-2 in those that decide, about 10.
         squares, vectors = np.linalg.eigh(a.T @ a)
-        told = squares > (spread / TELL) ** 2
-        null = np.zeros((len(self.free), np.count_nonzero(~told)))
-        null[self.free] = vectors[:, ~told]
-        part = vectors[:, told]
-        return null, part @ ((part.T @ (a.T @ self.residual)) / squares[told])
+        visible = squares > (spread / TELL) ** 2
+        null = np.zeros((len(self.free), np.count_nonzero(~visible)))
+        null[self.free] = vectors[:, ~visible]
+        part = vectors[:, visible]
+        return null, part @ ((part.T @ (a.T @ self.residual)) / squares[visible])
 
     @cached_property
     def _centre(self) -> Floats:
@@ -445,40 +446,41 @@ def _moved_about(centre: Floats, six: Floats) -> Floats:
 
 
 def best_placement(
-    data: FrameData, given: Frames, free: Bools, good: float, steps: int, rotated: int
+    data: FrameData, frames: Frames, free: Bools, good: float, steps: int, rotated: int
 ) -> Placement:
     """Return the best placement from several starts: closed forms, then rotations of a cube.
 
-    Of these as many as `rotated` are tried, those that fit best. No other start is tried at a
-    whitened rms misfit per reading of `good`; each goes `steps` at most.
+    Of these the best `rotated` are tried. The search ends at a whitened rms misfit per reading of
+    `good`; each start takes at most `steps`.
     """
-    found: list[Placement] = []
-    for start in _closed_forms(data, given, free):
-        found.append(minimise(Placement(data, start, free), steps))
-        if found[-1].square <= good**2 * len(data):
-            return min(found, key=lambda p: p.square)
+    placements: list[Placement] = []
+    for start in _closed_forms(data, frames, free):
+        placements.append(minimise(Placement(data, start, free), steps))
+        if placements[-1].square <= good**2 * len(data):
+            return min(placements, key=lambda p: p.square)
     if rotated and free[:6].any():
-        turns = (_with_translations(data, given, turn, free) for turn in cube())
-        begun = sorted((Placement(data, f, free) for f in turns), key=lambda p: p.square)
-        found += [minimise(placement, steps) for placement in begun[:rotated]]
-    return min(found, key=lambda p: p.square)
+        turns = (_with_translations(data, frames, turn, free) for turn in cube())
+        ranked = sorted((Placement(data, f, free) for f in turns), key=lambda p: p.square)
+        placements += [minimise(placement, steps) for placement in ranked[:rotated]]
+    return min(placements, key=lambda p: p.square)
 
 
-def settled(at: Placement, given: Frames) -> tuple[Placement, Floats]:
-    """Return a minimum whose undetermined part is held near the given targets, and that part.
+def settled(placement: Placement, frames: Frames) -> tuple[Placement, Floats]:
+    """Return the minimum, its undetermined part held near the targets of `frames`; and that part.
 
     The prior has the ordinary sizes as standard deviations. It acts along the undetermined
     directions (6 + 6 T, U) alone: along the others, the last steps go to the minimum without it.
     """
-    dof = max(at.data.m * len(at.data) - int(np.count_nonzero(at.free)), 1)
-    spread = max(float(np.sqrt(at.square / dof)), 1.0)
-    null, _ = at.determined(spread)
+    dof = max(placement.data.m * len(placement.data) - int(np.count_nonzero(placement.free)), 1)
+    spread = max(float(np.sqrt(placement.square / dof)), 1.0)
+    null, _ = placement.determined(spread)
     if null.size:
-        at = replace(minimise(replace(at, held=given.targets, weight=spread)), held=None)
+        held = replace(placement, held=frames.targets, weight=spread)
+        placement = replace(minimise(held), held=None)
     for _ in range(3):
-        null, step = at.determined(spread)
-        at = at.moved(step)
-    return at, null
+        null, step = placement.determined(spread)
+        placement = placement.moved(step)
+    return placement, null
 
 
 def nearest_rotation(m: Floats) -> Floats:
@@ -507,46 +509,46 @@ def cube() -> Floats:
     return np.asarray(np.round(Rotation.create_group("O").as_matrix()))
 
 
-def _closed_forms(data: FrameData, given: Frames, free: Bools) -> Iterator[Frames]:
+def _closed_forms(data: FrameData, frames: Frames, free: Bools) -> Iterator[Frames]:
     """Yield base and targets from attitudes and from positions."""
     if not free[:6].any():
-        yield _with_translations(data, given, given.base[:3, :3], free)
+        yield _with_translations(data, frames, frames.base[:3, :3], free)
         return
     if data.attitude is not None:
         first = data.target == data.target[0]
         base = rotation_of_attitudes(data.attitude[first], data.rotation[first])
-        yield _with_translations(data, given, base, free)
+        yield _with_translations(data, frames, base, free)
     # Positions alone: Procrustes for R, then linear for τ and t, a few times.
-    out, y = given, data.value - data.value.mean(axis=0)
+    out, y = frames, data.value - data.value.mean(axis=0)
     for _ in range(ALTERNATIONS):
-        x, before = data.points(out), out.targets
+        x, previous = data.points(out), out.targets
         turn = nearest_rotation(y.T @ (x - x.mean(axis=0)))
-        out = _with_translations(data, given, turn, free)
-        if np.abs(out.targets - before).max() < 1e-6:
+        out = _with_translations(data, frames, turn, free)
+        if np.abs(out.targets - previous).max() < 1e-6:
             break
     yield out
 
 
-def _with_translations(data: FrameData, given: Frames, rotation: Floats, free: Bools) -> Frames:
+def _with_translations(data: FrameData, frames: Frames, rotation: Floats, free: Bools) -> Frames:
     """Complete a rotation of the base by the best translations and the targets' axes."""
-    count, size = len(data), len(given.targets)
-    turned, of = rotation @ data.rotation, [data.target == k for k in range(size)]
+    count, size = len(data), len(frames.targets)
+    turned, rows_of = rotation @ data.rotation, [data.target == k for k in range(size)]
     a = np.zeros((count, 3, 3 + 3 * size))
     a[:, :, :3] = np.eye(3)
-    for k, rows in enumerate(of):
+    for k, rows in enumerate(rows_of):
         a[rows, :, 3 + 3 * k : 6 + 3 * k] = turned[rows]
     live = np.repeat(free[::6], 3)
-    x = np.concatenate([given.base[:3, 3], *given.targets[:, :3, 3]])
+    x = np.concatenate([frames.base[:3, 3], *frames.targets[:, :3, 3]])
     hold = np.repeat([HOLD / BASE_M] + [HOLD / TARGET_M] * size, 3)
     flat = a.reshape(-1, len(x))
-    rest = (data.value - data.position @ rotation.T).reshape(-1) - flat @ x
+    remainder = (data.value - data.position @ rotation.T).reshape(-1) - flat @ x
     if live.any():
         system = np.concatenate([flat, np.diag(hold * np.sqrt(count))])[:, live]
-        x[live] += np.linalg.lstsq(system, np.append(rest, np.zeros(len(x))), rcond=None)[0]
-    targets = given.targets.copy()
+        x[live] += np.linalg.lstsq(system, np.append(remainder, np.zeros(len(x))), rcond=None)[0]
+    targets = frames.targets.copy()
     targets[:, :3, 3] = x[3:].reshape(size, 3)
     if data.attitude is not None:
-        means = [np.einsum("nji,njk->ik", turned[rows], data.attitude[rows]) for rows in of]
+        means = [np.einsum("nji,njk->ik", turned[rows], data.attitude[rows]) for rows in rows_of]
         targets[:, :3, :3] = nearest_rotation(np.array(means))
     return Frames(se3.matrix(rotation, x[:3]), targets)
 
@@ -562,25 +564,25 @@ def _of_several(cell: Cell, readings: Readings) -> Registration:
                 f"registration: {o.name} has readings of {rows.sum()} poses, too few for the "
                 f"{len(o.free)} unknowns of its place; measure more, or state its place"
             )
-    found, off, null = _placed(cell, readings)
+    placed, off, null = _placed(cell, readings)
     far = _far_of_several(off)
     if 0 < far.mean() <= MOST:
-        found, _, null = _placed(cell, readings[~far])
-        off = Sightings.of(cell, readings).off(found)
+        placed, _, null = _placed(cell, readings[~far])
+        off = Sightings.of(cell, readings).off(placed)
         far = _far_of_several(off)
     targets, base = ~np.array(cell.known_targets), not cell.registration_known
     place = [*range(6 * base), *(6 + 6 * k + i for k in np.flatnonzero(targets) for i in range(3))]
     ends = np.cumsum([len(place), *(len(o.free) for o in cell.observers)]).tolist()
     undetermined = []
     for v in null.T:
-        whole = np.zeros(6 + 6 * len(targets))
-        whole[place] = v[: len(place)]
+        full = np.zeros(6 + 6 * len(targets))
+        full[place] = v[: len(place)]
         parts = zip(cell.observers, ends[:-1], ends[1:], strict=True)
         moved = tuple(str(o.name) for o, a, b in parts if np.any(np.abs(v[a:b]) > TOLD))
-        undetermined.append(_direction(whole / np.abs(whole).max(initial=TOLD), moved))
-    said = far if far.mean() <= MOST else np.zeros_like(far)
+        undetermined.append(_direction(full / np.abs(full).max(initial=TOLD), moved))
+    reported = far if far.mean() <= MOST else np.zeros_like(far)
     estimated = base or bool(targets.any()) or any(o.free for o in cell.observers)
-    return _registration(found, readings, off, far, said, tuple(undetermined), estimated)
+    return _registration(placed, readings, off, far, reported, tuple(undetermined), estimated)
 
 
 def _far_of_several(off: Floats) -> Bools:
@@ -591,15 +593,15 @@ def _far_of_several(off: Floats) -> Bools:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sightings:
-    """Readings of several observers beside the flange poses of the nominal arm."""
+    """Readings of several observers with the flange poses of the nominal arm."""
 
     cell: Cell  # with the observers of the readings
     readings: Readings
-    data: FrameData  # whose root is zero in the rows of what is not read
+    data: FrameData  # whose root is zero in rows that are not read
 
     @classmethod
     def of(cls, cell: Cell, readings: Readings) -> "Sightings":
-        """Return readings beside the nominal arm."""
+        """Return the readings with the flange poses of the nominal arm."""
         root = inverse_roots(readings.covariance, True)
         return cls(cell, readings, replace(FrameData.of(cell.arm, readings), root=root))
 
@@ -610,10 +612,10 @@ class Sightings:
 
     @property
     def sizes(self) -> Floats:
-        """(K,) ordinary sizes of what is unknown: base, targets, observers."""
+        """(K,) ordinary sizes of the unknowns: base, targets, observers."""
         base = [] if self.cell.registration_known else [BASE_M] * 3 + [1.0] * 3
-        by = [BASE_M if e < 3 else 1.0 for o in self.cell.observers for e in o.free]
-        return np.array([*base, *[TARGET_M] * 3 * int(self.targets.sum()), *by])
+        observers = [BASE_M if e < 3 else 1.0 for o in self.cell.observers for e in o.free]
+        return np.array([*base, *[TARGET_M] * 3 * int(self.targets.sum()), *observers])
 
     def points(self, cell: Cell) -> Floats:
         """(N, 3) predicted positions of the targets, sensor axes, m."""
@@ -637,43 +639,43 @@ class Sightings:
 
     def moved(self, cell: Cell, step: Floats) -> Cell:
         """Return a cell moved by (K,), in ordinary sizes."""
-        x, at = step * self.sizes, 0
+        x, start = step * self.sizes, 0
         if not cell.registration_known:
-            by = _moved_about(self.data.position.mean(axis=0), x[:6])
-            cell, at = replace(cell, registration=cell.registration @ by), 6
+            motion = _moved_about(self.data.position.mean(axis=0), x[:6])
+            cell, start = replace(cell, registration=cell.registration @ motion), 6
         poses = cell.all_targets.copy()
         for k in np.flatnonzero(self.targets):
-            poses[k, :3, 3] += x[at : at + 3]
-            at += 3
+            poses[k, :3, 3] += x[start : start + 3]
+            start += 3
         observers = []
         for o in cell.observers:
             six = np.zeros(6)
-            six[list(o.free)] = x[at : at + len(o.free)]
-            at += len(o.free)
+            six[list(o.free)] = x[start : start + len(o.free)]
+            start += len(o.free)
             offset, six[3] = (six[3], 0.0) if o.name.kind == "point" else (0.0, six[3])
             frame = se3.matrix(*se3.exp(six)) @ o.frame
             observers.append(replace(o, frame=frame, offset=o.offset + offset))
         return replace(cell.with_targets(poses), observers=tuple(observers))
 
-    def settled(self, begun: Cell, steps: int | None = None) -> tuple[Cell, float, Floats]:
+    def settled(self, start: Cell, steps: int | None = None) -> tuple[Cell, float, Floats]:
         """Return the minimum near a start, its sum of squares, and the Jacobian (R, K) there."""
         count = len(self.sizes)
         if not count:
-            return begun, float(np.sum(self.white(begun) ** 2)), np.zeros((0, 0))
+            return start, float(np.sum(self.white(start) ** 2)), np.zeros((0, 0))
 
         def residual(x: Floats) -> Floats:
-            return np.concatenate([self.white(self.moved(begun, x)), HOLD_SEVERAL * x])
+            return np.concatenate([self.white(self.moved(start, x)), HOLD_SEVERAL * x])
 
-        found = least_squares(residual, np.zeros(count), max_nfev=steps)
-        jacobian = np.asarray(found.jac, dtype=float)[: len(found.fun) - count]
-        return self.moved(begun, found.x), 2.0 * float(found.cost), jacobian
+        minimum = least_squares(residual, np.zeros(count), max_nfev=steps)
+        jacobian = np.asarray(minimum.jac, dtype=float)[: len(minimum.fun) - count]
+        return self.moved(start, minimum.x), 2.0 * float(minimum.cost), jacobian
 
-    def begun(self, cell: Cell) -> Cell:
-        """Return a cell with each observer where its readings have it, by closed forms."""
+    def with_observers(self, cell: Cell) -> Cell:
+        """Return a cell with its observers placed by their readings, in closed form."""
         p, r = self.points(cell), self.readings
         rows = [r.observer == k for k in range(len(cell.observers))]
         observers = (
-            _begun(o, p[k], r.value[k, :3]) if o.free and k.any() else o
+            _observer_placed(o, p[k], r.value[k, :3]) if o.free and k.any() else o
             for o, k in zip(cell.observers, rows, strict=True)
         )
         return replace(cell, observers=tuple(observers))
@@ -682,8 +684,8 @@ class Sightings:
 def _placed(cell: Cell, readings: Readings) -> tuple[Cell, Floats, Floats]:
     """Place base, targets and the observers of the readings as far as they are unknown.
 
-    The cell with all in place; (N, m) measured minus predicted; directions (K, U) of unit length,
-    in ordinary sizes, that the readings do not determine.
+    Returns the cell with all in place; (N, m) measured minus predicted; directions (K, U) of unit
+    length, in ordinary sizes, that the readings do not determine.
     """
     data, part = Sightings.of(cell, readings), np.zeros(len(readings), dtype=bool)
     for k in range(len(cell.observers)):
@@ -691,35 +693,35 @@ def _placed(cell: Cell, readings: Readings) -> tuple[Cell, Floats, Floats]:
         if len(rows):
             part[rows[np.linspace(0, len(rows) - 1, FEW_EACH).astype(int)]] = True
     few = Sightings.of(cell, readings[part])
-    begun = [few.begun(start) for start in _starts(cell, readings)]
-    begun.sort(key=lambda c: float(np.sum(few.white(c) ** 2)))
-    tried = [few.settled(c, 50) for c in begun[:FOLLOWED]]
-    found, square, jacobian = data.settled(min(tried, key=lambda t: t[1])[0])
+    starts = [few.with_observers(start) for start in _starts(cell, readings)]
+    starts.sort(key=lambda c: float(np.sum(few.white(c) ** 2)))
+    tried = [few.settled(c, 50) for c in starts[:FOLLOWED]]
+    placed, square, jacobian = data.settled(min(tried, key=lambda t: t[1])[0])
     rank = int(np.count_nonzero(np.any(data.data.root != 0, axis=2)))
     spread = max(np.sqrt(square / max(rank - jacobian.shape[1], 1)), 1.0)
     squares, vectors = np.linalg.eigh(jacobian.T @ jacobian)
-    return found, data.off(found), vectors[:, squares <= (spread / TELL) ** 2]
+    return placed, data.off(placed), vectors[:, squares <= (spread / TELL) ** 2]
 
 
 def _starts(cell: Cell, readings: Readings) -> Iterator[Cell]:
-    """Yield where base and targets may be: by the first station's readings, else all round."""
+    """Yield starts of base and targets: by stations of known place, else by rotations of a cube."""
     main = [k for k, o in enumerate(cell.observers) if o.name.kind == "station" and not o.free]
     rows = np.isin(readings.observer, main)
     if rows.any() and len(np.unique(readings.pose[rows])) >= MIN_POSES:
-        given, free = given_and_free(cell, readings.m == 6)
+        frames, free = given_and_free(cell, readings.m == 6)
         data = FrameData.of(cell.arm, readings[rows])
-        at = best_placement(data, given, free, GOOD * np.sqrt(data.m), STEPS, TRIED).frames
-        yield replace(cell.with_targets(at.targets), registration=at.base)
+        placed = best_placement(data, frames, free, GOOD * np.sqrt(data.m), STEPS, TRIED).frames
+        yield replace(cell.with_targets(placed.targets), registration=placed.base)
     elif cell.registration_known:
         yield cell
     else:
-        known = [o.frame for o in cell.observers if o.tied]
-        centre = np.mean([-f[:3, :3].T @ f[:3, 3] for f in known], axis=0)
+        tied = [o.frame for o in cell.observers if o.tied]
+        centre = np.mean([-f[:3, :3].T @ f[:3, 3] for f in tied], axis=0)
         yield from (replace(cell, registration=se3.matrix(turn, centre)) for turn in cube())
 
 
-def _begun(o: Observer, p: Floats, value: Floats) -> Observer:
-    """Place an observer by what it read (N, 3) of positions (N, 3), sensor axes."""
+def _observer_placed(o: Observer, p: Floats, value: Floats) -> Observer:
+    """Place an observer by its readings (N, 3) of positions (N, 3), sensor axes."""
     middle, read = p.mean(axis=0), value.mean(axis=0)
     x = p - middle
     if o.name.kind == "station":
@@ -732,14 +734,14 @@ def _begun(o: Observer, p: Floats, value: Floats) -> Observer:
         open_offset = 3 in o.free
         d = value[:, 0] - (0.0 if open_offset else o.offset)
         columns = [2 * x, np.ones((len(p), 1))] + ([-2 * d[:, None]] if open_offset else [])
-        found = np.linalg.lstsq(np.hstack(columns), np.sum(x**2, axis=1) - d**2, rcond=1e-6)[0]
-        frame = se3.matrix(np.eye(3), -(found[:3] + middle))
-        return replace(o, frame=frame, offset=-float(found[4]) if open_offset else o.offset)
-    if 4 not in o.free:  # of a gauge, the direction is known
+        solution = np.linalg.lstsq(np.hstack(columns), np.sum(x**2, axis=1) - d**2, rcond=1e-6)[0]
+        frame = se3.matrix(np.eye(3), -(solution[:3] + middle))
+        return replace(o, frame=frame, offset=-float(solution[4]) if open_offset else o.offset)
+    if 4 not in o.free:  # the direction of the gauge is known
         frame = o.frame.copy()
         frame[0, 3] = read[0] - frame[0, :3] @ middle
         return replace(o, frame=frame)
-    # G = n·p − h: linear in n and h; where hardly anything but a plane is touched, its normal.
+    # G = n·p − h: linear in n and h; where nearly all points lie in a plane, its normal.
     g = value[:, 0] - read[0]
     axes, linear = np.linalg.svd(x, full_matrices=True)[2], np.linalg.lstsq(x, g, rcond=1e-6)[0]
     tried = [n / np.linalg.norm(n) for n in (linear, axes[2], -axes[2]) if np.linalg.norm(n) > 1e-9]

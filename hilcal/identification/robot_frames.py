@@ -1,21 +1,21 @@
-"""Where the robot's base and flange are: declared once, for all that a campaign hands out.
+"""The robot's base and flange, defined once for all results of a campaign.
 
 With the constant effects of a fit the arm is a chain of transforms A_k, nominally L_k,
 
     T_sensor_target = T_sensor_chain A_0 Rz(q_1) A_1 … Rz(q_n) A_n τ
 
-No reading tells a base that stands elsewhere from a first link that is longer, turned, or from
-another zero of joint 1. So the base is
+No reading distinguishes a base that stands elsewhere from a first link that is longer or turned, or
+from another zero of joint 1. So the base is
 
 - *stated* where the cell states it (a pose of the base in the tracker's frame, or positions in base
-  axes). What the fit finds of it is then the arm's.
+  axes). A change of it that the fit finds is then the arm's.
 - else *mechanical*: A_0 = L_0, and A_1 has no turn about, and no shift along, the axis of joint 1
-  beyond those of L_1. It depends neither on the poses that were measured nor on how far the arm
-  sags there, as the base does that lets the nominal arm fit the readings best.
+  beyond those of L_1. Unlike the base that lets the nominal arm fit the readings best, it depends
+  neither on the measured poses nor on the sag of the arm there.
 
-With the flange it is the same: where the place of no target is stated, A_n = L_n, and A_{n−1} has
-no turn about and no shift along the axis of joint n beyond those of L_{n−1}; the targets are where
-they then are on it. Of axes parallel to the first or the last one the rest stays as it was fitted.
+The flange likewise: where the place of no target is stated, A_n = L_n, and A_{n−1} has no turn
+about and no shift along the axis of joint n beyond those of L_{n−1}; the targets are placed on it
+accordingly. What axes parallel to the first or the last one leave undetermined stays as fitted.
 """
 
 from dataclasses import dataclass, replace
@@ -29,10 +29,10 @@ from hilcal.readings.readings import FULL_TURN, States
 from hilcal.robot import se3
 from hilcal.types import Bools, Floats
 
-TRIALS = 8  # random states at which a deviation is asked whether it is constant; a choice
-SAME = 1e-15  # by how much a constant deviation may differ between states, m and rad: rounding
-SAME_ON = 1e-5  # m, and of a rotation's elements, that a prediction may differ by a whole turn on;
-# a choice, what a tracker hardly sees: a background has a coupling of joints that is smaller
+TRIALS = 8  # random states at which deviations are tested for being constant; a choice
+SAME = 1e-15  # largest difference of a constant deviation between states, m and rad: rounding
+SAME_ON = 1e-5  # m, and of a rotation's elements; largest change of a prediction by a whole turn; a
+# choice, which a tracker hardly measures: couplings of joints in a background are smaller
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,11 +41,11 @@ class RobotFrames:
 
     base: Floats  # (4, 4) T_sensor_base
     base_stated: bool  # whether the cell states it; mechanical otherwise
-    chain: Floats  # (4, 4) from the axes of the fitted chain, which the frame moved, to the base's
-    registered: Floats  # (4, 4) the same from those of the registration, where the fit began
+    chain: Floats  # (4, 4) T_base_chain, the fitted chain as moved by the effect of its frame
+    registered: Floats  # (4, 4) T_base_registered, the registration where the fit began
     flange: Floats  # (4, 4) T_chainflange_flange
     targets: Floats  # (T, 4, 4) T_flange_target as fitted
-    declared: Floats  # (T, 4, 4) the same as stated, where all of them are
+    declared: Floats  # (T, 4, 4) the same as stated where all of them are, else as fitted
     links: Floats  # (n + 1, 4, 4) the arm with its constant effects, from base to flange
     within: tuple[str, ...]  # effects that are constant, and so in `links`
     beyond: tuple[str, ...]  # effects that are not
@@ -69,16 +69,16 @@ def robot_frames(model: Model, theta: Floats) -> RobotFrames:
         first, links[1] = _split(links[1], nominal[1])
         base = cell.registration @ moved @ links[0] @ first @ se3.inverse(nominal[0])
         links[0] = nominal[0]
-    if stated:  # an offset that was fitted all the same is the flange's
+    if stated:  # a fitted offset is then the flange's
         flange = targets[0] @ se3.inverse(cell.all_targets[0])
         links[-1] = links[-1] @ flange
     elif any(cell.known_targets):
         flange = np.eye(4)
     else:
-        last, before = _split(se3.inverse(links[-2]), se3.inverse(nominal[-2]))
+        last, remainder = _split(se3.inverse(links[-2]), se3.inverse(nominal[-2]))
         flange = se3.inverse(links[-1]) @ last @ nominal[-1]
         targets = se3.product(se3.inverse(flange)[None], targets)
-        links[-2], links[-1] = se3.inverse(before), nominal[-1]
+        links[-2], links[-1] = se3.inverse(remainder), nominal[-1]
     registered = se3.inverse(base) @ cell.registration
     return RobotFrames(
         base=base,
@@ -95,39 +95,38 @@ def robot_frames(model: Model, theta: Floats) -> RobotFrames:
 
 
 def whole_turns(model: Model, theta: Floats) -> Bools:
-    """Return whether predictions stay the same a whole turn on, for each of the n joints.
+    """Return for each of the n joints whether a whole turn leaves predictions unchanged.
 
-    An arm is the same a whole turn of a joint on, and so are waves of whole turns. A law in the
-    angle itself, as a coupling of joints, is not; nor are cables, which no effect of the catalogue
-    has.
+    Kinematics and periodic laws repeat after a whole turn. A law in the angle itself, such as a
+    coupling of joints, does not; nor do cables, which no effect of the catalogue describes.
     """
     states, n = random_states(model.cell), model.cell.arm.n
-    before = model.predict(states, theta).observation
+    reference = model.predict(states, theta).observation
     out = np.zeros(n, dtype=np.bool_)
     for j in np.flatnonzero(~model.cell.arm.slides).tolist():
-        on = states.q + FULL_TURN * np.eye(n)[j]
-        after = model.predict(replace(states, q=on), theta).observation
-        moved = np.abs(after.position - before.position).max()
-        out[j] = max(moved, np.abs(after.rotation - before.rotation).max()) <= SAME_ON
+        q = states.q + FULL_TURN * np.eye(n)[j]
+        turned = model.predict(replace(states, q=q), theta).observation
+        moved = np.abs(turned.position - reference.position).max()
+        out[j] = max(moved, np.abs(turned.rotation - reference.rotation).max()) <= SAME_ON
     return out
 
 
 def one_of_each(cell: Cell) -> States:
     """Return one state that has every column, for effects that are built without readings."""
-    one, each = np.zeros(1), np.zeros((1, cell.arm.n))
+    scalar, joints = np.zeros(1), np.zeros((1, cell.arm.n))
     return States(
-        q=each,
+        q=joints,
         wrench=np.zeros((1, 6)),
-        time=one,
-        load_time=one,
-        air_temperature=one,
-        joint_temperature=each,
-        approach=each + 1,
+        time=scalar,
+        load_time=scalar,
+        air_temperature=scalar,
+        joint_temperature=joints,
+        approach=joints + 1,
     )
 
 
 def _fitted(model: Model, theta: Floats) -> tuple[Floats, Floats]:
-    """Return how far the fitted base is from its registration (4, 4), and all targets (T, 4, 4)."""
+    """Return the fitted base in its registration (4, 4), and all targets (T, 4, 4)."""
     cell, targets = model.cell, model.cell.all_targets.copy()
     states = one_of_each(cell)[np.zeros(len(targets), dtype=np.int64)]
     if cell.targets is not None:
@@ -146,7 +145,7 @@ def _fitted(model: Model, theta: Floats) -> tuple[Floats, Floats]:
 
 
 def _constant(model: Model, theta: Floats) -> tuple[Floats, tuple[str, ...], tuple[str, ...]]:
-    """Return the links (n + 1, 4, 4) with what is constant; what is in them, and what is not.
+    """Return the links (n + 1, 4, 4) with the constant effects, their names, and the other names.
 
         A_k = L_k exp(ξ_k) M(dq_{k+1}),      A_n = L_n exp(ξ_n)
 
@@ -160,9 +159,10 @@ def _constant(model: Model, theta: Floats) -> tuple[Floats, tuple[str, ...], tup
         if e.role in FRAME_ROLES:
             continue
         d = e.deviation(theta[rows], situation)
-        others = any(f is not None for f in (d.base, d.station, d.target, d.scale, d.observer))
-        constant = not e.elastic and _same(d.dq) and _same(d.twist)
-        if not constant or others or d.dq is d.twist:
+        frames = (d.base, d.station, d.target, d.scale, d.observer)
+        moves_frames = any(f is not None for f in frames)
+        constant = not e.elastic and _is_constant(d.dq) and _is_constant(d.twist)
+        if not constant or moves_frames or d.dq is d.twist:
             beyond.append(e.name)
             continue
         within.append(e.name)
@@ -175,7 +175,7 @@ def _constant(model: Model, theta: Floats) -> tuple[Floats, tuple[str, ...], tup
     return links, tuple(within), tuple(beyond)
 
 
-def _same(values: Floats | None) -> bool:
+def _is_constant(values: Floats | None) -> bool:
     return values is None or bool(np.abs(values - values[:1]).max() <= SAME)
 
 
@@ -194,7 +194,7 @@ def random_states(cell: Cell) -> States:
 
 
 def _split(link: Floats, nominal: Floats) -> tuple[Floats, Floats]:
-    """Split a link into Rz Tz and a rest that has neither beyond what the nominal one has."""
+    """Split a link into Rz Tz and a remainder with the turn and the shift of the nominal link."""
     m = link @ se3.inverse(nominal)
     turn = np.arctan2(m[1, 0] - m[0, 1], m[0, 0] + m[1, 1])
     along = np.array([0.0, 0.0, link[2, 3] - nominal[2, 3]])

@@ -1,13 +1,13 @@
-"""A proposed mapping, and what the nominal arm of a cell tells about it.
+"""A proposed mapping, checked and completed by the nominal arm of a cell.
 
-Which convention orientations are written in, the arm decides. With its nominal flange orientations
+The arm decides the convention of orientations. With its nominal flange orientations
 R_i, the orientations M_i of the right convention obey
 
     M_i = A R_i B,      y_i = A (p_i + R_i τ) + t
 
 with one rotation A (base to sensor) and one B (target on the flange) for all readings, up to the
 arm's own errors; those of a wrong convention do not. The positions are needed: a cyclic exchange of
-the axes' names turns one convention into another, and A and B take it up.
+the axes' names turns one convention into another, which A and B absorb.
 """
 
 import re
@@ -44,15 +44,15 @@ from hilcal.toml import check_section
 from hilcal.types import Floats
 
 # All of these are choices.
-CLOSE = 0.02  # part of the reach that a nominal arm may be off; arms are better by ten times
+CLOSE = 0.02  # share of the reach that a nominal arm may be off; arms are ten times better
 MOST_TRIED = 8  # choices of columns that are tried; each takes a registration
 AGREES = 0.05  # rad; nominal arms are better by far (1 mrad), other conventions worse (1 rad)
 CLEARER = 5.0  # how much worse the next choice must fit for the first to be certain
 FEWEST, MOST = 6, 300  # readings below which two rotations fit too easily; readings that are tried
 ROUNDS = 20  # steps between A and B
 _EXTERNAL = re.compile(r"e(xt)?_?[1-6]\b", re.IGNORECASE)
-_OWN = ("intrinsic-", "fixed-", "rotation-", "quaternion-")
-"""Beginnings of conventions that are no maker's."""
+_GENERIC = ("intrinsic-", "fixed-", "rotation-", "quaternion-")
+"""Beginnings of the names of conventions that belong to no maker."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,13 +60,13 @@ class Agreement:
     """How well a convention agrees with the arm."""
 
     convention: str
-    angle: float  # rms angle left, rad
-    position: float  # rms distance left, m
+    angle: float  # remaining rms angle, rad
+    position: float  # remaining rms distance, m
     rms: float  # both together, distances as parts of the arm's reach
 
     @property
     def words(self) -> str:
-        """What is left."""
+        """The remaining misfit."""
         angle, distance = float(np.rad2deg(self.angle)), 1e3 * self.position
         degrees = f"{angle:.{0 if angle >= 10 else 2}f}°"
         return f"{degrees} and {distance:.{0 if distance >= 10 else 2}f} mm"
@@ -78,8 +78,8 @@ class Preview:
 
     Attributes:
         rows: of the table.
-        proposal: the mapping in the making: understood, unsure, unused, missing.
-        outcome: what an import into the cell gives, in sentences; None without a cell.
+        proposal: the proposed mapping: understood, unsure, unused, missing.
+        outcome: the outcome of an import into the cell, in sentences; None without a cell.
     """
 
     rows: int
@@ -92,30 +92,31 @@ def preview_table(
 ) -> Preview:
     """Propose a mapping for a table of any form; nothing is written.
 
-    >>> found = hc.preview_table(TABLE, hc.Cell.load(CELL))
-    >>> found.proposal.sections["joints"]["unit"]
+    >>> preview = hc.preview_table(TABLE, hc.Cell.load(CELL))
+    >>> preview.proposal.sections["joints"]["unit"]
     'rad'
 
     Args:
         path: text, XLSX, MAT or Parquet.
-        cell: with it, the nominal arm tells the convention of orientations, and columns that
-            their values leave open.
+        cell: its nominal arm decides the convention of orientations, and columns that their
+            values leave open.
         second: a second file that holds the other columns of the same readings.
 
     Raises:
         InputError: a file that cannot be read, or two that do not belong together.
     """
     table = Path(path)
-    found = propose(table, None if second is None else Path(second), cell.arm.n if cell else None)
+    second = None if second is None else Path(second)
+    proposed = propose(table, second, cell.arm.n if cell else None)
     if cell is None:
-        return Preview(len(found.grid.rows), found.proposal, None)
+        return Preview(len(proposed.grid.rows), proposed.proposal, None)
     settings = cell.configured()
-    _name_targets(found.proposal, [target.name for target in settings.tool.targets])
-    _decide_travels(found, cell.arm)
-    outcome = _decide_columns(table, found, settings, cell)
-    outcome += _decide_convention(found, cell.arm)
-    outcome += _try(table, found.proposal, settings, cell)
-    return Preview(len(found.grid.rows), found.proposal, tuple(outcome))
+    _name_targets(proposed.proposal, [target.name for target in settings.tool.targets])
+    _decide_travels(proposed, cell.arm)
+    outcome = _decide_columns(table, proposed, settings, cell)
+    outcome += _decide_convention(proposed, cell.arm)
+    outcome += _try_import(table, proposed.proposal, settings, cell)
+    return Preview(len(proposed.grid.rows), proposed.proposal, tuple(outcome))
 
 
 def _name_targets(proposal: Proposal, names: list[str]) -> None:
@@ -123,17 +124,17 @@ def _name_targets(proposal: Proposal, names: list[str]) -> None:
     section = proposal.sections.get("position", {})
     if names and len(names) == len(section.get("targets", ())):
         section["targets"] = names
-        words = f"the targets are {', '.join(names)}, in the cell's order"
-        kept = [doubt for doubt in proposal.unsure if doubt != ("position", SIDE_BY_SIDE)]
-        proposal.unsure[:] = [*kept, ("position", words)]
+        note = f"the targets are {', '.join(names)}, in the cell's order"
+        doubts = [doubt for doubt in proposal.unsure if doubt != ("position", SIDE_BY_SIDE)]
+        proposal.unsure[:] = [*doubts, ("position", note)]
 
 
-def _decide_travels(found: Proposed, arm: Arm) -> None:
-    """Settle columns and units of joints that slide, by their names and by the arm's limits.
+def _decide_travels(proposed: Proposed, arm: Arm) -> None:
+    """Decide columns and units of joints that slide, by their names and by the arm's limits.
 
-    External axes E1, E2, … stand where the arm slides. Travels beyond ten times the limits are mm.
+    External axes E1, E2, … are the joints that slide. Travels beyond ten times the limits are mm.
     """
-    proposal, grid = found.proposal, found.grid
+    proposal, grid = proposed.proposal, proposed.grid
     section, slides = proposal.sections.get("joints"), np.flatnonzero(arm.slides).tolist()
     if section is None or not slides:
         return
@@ -142,7 +143,7 @@ def _decide_travels(found: Proposed, arm: Arm) -> None:
     if len(names) + len(external) == arm.n and len(external) == len(slides):
         for j, name in zip(slides, external, strict=True):
             names.insert(j, name)
-        proposal.unused[:] = [each for each in proposal.unused if each[0] not in external]
+        proposal.unused[:] = [(n, why) for n, why in proposal.unused if n not in external]
         counted = f"{len(names) - len(slides)} c"
         doubts = [d for d in proposal.unsure if not d[1].startswith(counted)]
         proposal.unsure[:] = [*doubts, ("joints", f"{', '.join(external)} taken for what slides")]
@@ -157,18 +158,18 @@ def _decide_travels(found: Proposed, arm: Arm) -> None:
     mm = bool(np.any(far[slides] > 10 * arm.travels[slides]))
     section |= {"columns": names, "unit": unit, "slide_unit": "mm" if mm else "m"}
     if mm:
-        words = f"what slides in mm, since it goes to {far[slides].max():.4g}"
-        proposal.unsure.append(("joints", words))
+        note = f"what slides in mm, since it goes to {far[slides].max():.4g}"
+        proposal.unsure.append(("joints", note))
     row = int(np.flatnonzero(np.isfinite(q).all(axis=1))[0])
     example = tuple(f"{grid.numbers(name)[row]:g}" for name in names)
-    k = next(k for k, told in enumerate(proposal.understood) if told.what == "joints")
+    k = next(k for k, u in enumerate(proposal.understood) if u.what == "joints")
     meaning = f"{unit}, {section['slide_unit']}"
     proposal.understood[k] = UnderstoodColumn("joints", tuple(names), meaning, example)
 
 
-def _decide_convention(found: Proposed, arm: Arm) -> list[str]:
-    """Settle a guessed convention by the nominal arm; a sentence that says so, where it does."""
-    proposal, grid = found.proposal, found.grid
+def _decide_convention(proposed: Proposed, arm: Arm) -> list[str]:
+    """Decide a guessed convention by the nominal arm; return a sentence where it is decided."""
+    proposal, grid = proposed.proposal, proposed.grid
     sections = [proposal.sections.get(name) for name in ("joints", "position", "orientation")]
     joints, position, section = sections
     if joints is None or position is None or section is None or section["convention"] == "matrix":
@@ -179,8 +180,8 @@ def _decide_convention(found: Proposed, arm: Arm) -> list[str]:
     ]
     if blocks[0].shape[1] != arm.n or blocks[1].shape[1] != 3:
         return []
-    whole = np.isfinite(np.hstack(blocks)).all(axis=1)
-    q, y, values = (block[whole] for block in blocks)
+    complete = np.isfinite(np.hstack(blocks)).all(axis=1)
+    q, y, values = (block[complete] for block in blocks)
     q, y = ANGLES[joints["unit"]] * q, LENGTHS[position["unit"]] * y
     unit = ANGLES[section.get("unit", "rad")]
     ranked = rank_conventions(arm, q, y, values, unit)
@@ -191,14 +192,14 @@ def _decide_convention(found: Proposed, arm: Arm) -> list[str]:
     best, second = ranked[:2]
     decided = clearly_best(ranked)
     if decided is None:
-        words = (
+        note = (
             f"the nominal {arm.name} does not decide the convention: "
             f"{best.convention} leaves {best.words}, {second.convention} {second.words}"
         )
-        proposal.unsure.append(("orientation", words))
+        proposal.unsure.append(("orientation", note))
         return []
-    one, other = (rotations(name, values, unit) for name in (section["convention"], decided))
-    if not np.allclose(one, other):
+    guessed, fitting = (rotations(name, values, unit) for name in (section["convention"], decided))
+    if not np.allclose(guessed, fitting):
         section["convention"] = decided
     proposal.open_convention = False
     meaning = ", ".join(str(v) for key, v in section.items() if key != "columns")
@@ -211,9 +212,9 @@ def _decide_convention(found: Proposed, arm: Arm) -> list[str]:
     ]
 
 
-def _decide_columns(table: Path, found: Proposed, settings: CellConfig, cell: Cell) -> list[str]:
-    """Choose columns that their values leave open by the nominal arm; a sentence where it tells."""
-    proposal, grid = found.proposal, found.grid
+def _decide_columns(table: Path, proposed: Proposed, settings: CellConfig, cell: Cell) -> list[str]:
+    """Decide columns that their values leave open by the nominal arm; a sentence if it decides."""
+    proposal, grid = proposed.proposal, proposed.grid
     if len(proposal.alternatives) < 2:
         return []
     fits: list[tuple[float, dict[str, dict[str, Any]]]] = []
@@ -226,7 +227,7 @@ def _decide_columns(table: Path, found: Proposed, settings: CellConfig, cell: Ce
             if columns:
                 size = max(np.nanmax(np.abs(grid.numbers(c))) for c in columns)
                 changed[name] = {"columns": columns, "unit": units[0 if size > limit else 1]}
-        rms = _left_by_the_arm(table, changed, settings, cell)
+        rms = _misfit_with(table, changed, settings, cell)
         if rms is not None:
             fits.append((rms, changed))
     fits.sort(key=lambda fit: fit[0])
@@ -242,17 +243,17 @@ def _decide_columns(table: Path, found: Proposed, settings: CellConfig, cell: Ce
             proposal.understood[k] = UnderstoodColumn(u.what, chosen, section["unit"], example)
     doubts = [d for d in proposal.unsure if RIVALS not in d[1] and BY_VALUES not in d[1]]
     proposal.unsure[:] = doubts
-    others = f", others {1e3 * fits[1][0]:.0f} mm" if len(fits) > 1 else ""
+    second = f", others {1e3 * fits[1][0]:.0f} mm" if len(fits) > 1 else ""
     return [
         f"columns: the nominal {cell.arm.name} fits best with these: "
-        f"{1e3 * fits[0][0]:.2f} mm are left{others}"
+        f"{1e3 * fits[0][0]:.2f} mm are left{second}"
     ]
 
 
-def _left_by_the_arm(
+def _misfit_with(
     table: Path, sections: dict[str, dict[str, Any]], settings: CellConfig, cell: Cell
 ) -> float | None:
-    """Rms distance, m, that the nominal arm leaves with a mapping; None where it cannot be."""
+    """Rms distance, m, that the nominal arm leaves with a mapping; None where it is refused."""
     only = {k: v for k, v in sections.items() if k in ("file", "second_file", "position", "joints")}
     try:
         mapping = check_section(only, Mapping, "the proposed mapping")
@@ -261,8 +262,8 @@ def _left_by_the_arm(
         return None
 
 
-def _try(table: Path, proposal: Proposal, settings: CellConfig, cell: Cell) -> list[str]:
-    """Import with the proposed mapping; what comes of it, in sentences."""
+def _try_import(table: Path, proposal: Proposal, settings: CellConfig, cell: Cell) -> list[str]:
+    """Import with the proposed mapping; return the outcome in sentences."""
     if proposal.lacking:
         return []
     try:
@@ -271,22 +272,22 @@ def _try(table: Path, proposal: Proposal, settings: CellConfig, cell: Cell) -> l
         return [f"refused: {error}"]
     readings = result.readings
     count = f"{len(readings)} readings of {len(np.unique(readings.pose))} poses"
-    told = [f"{count}, {_kinds(readings)}", *result.notes]
+    sentences = [f"{count}, {_kinds(readings)}", *result.notes]
     try:
         registered = register(cell, readings)
-        told.append(f"the nominal {cell.arm.name} leaves {numbers.length(registered.rms)} rms")
+        sentences.append(f"the nominal {cell.arm.name} leaves {numbers.length(registered.rms)} rms")
         if (wrong := examine(registered, readings)) is not None:
-            told.append(wrong.words(cell, readings))
+            sentences.append(wrong.words(cell, readings))
     except CannotAnswerError as error:
-        told.append(str(error))
-    return told
+        sentences.append(str(error))
+    return sentences
 
 
 def _kinds(readings: Readings) -> str:
     if readings.m == 6:
         return "positions and orientations"
-    words = {"station": "positions", "point": "distances", "gauge": "heights"}
-    return ", ".join(dict.fromkeys(words[o.kind] for o in readings.observers)) or "positions"
+    names = {"station": "positions", "point": "distances", "gauge": "heights"}
+    return ", ".join(dict.fromkeys(names[o.kind] for o in readings.observers)) or "positions"
 
 
 def rank_conventions(
@@ -294,8 +295,8 @@ def rank_conventions(
 ) -> tuple[Agreement, ...]:
     """Rank the conventions of orientations by their agreement with the nominal arm, best first.
 
-    At joint angles (N, n) and positions (N, 3), sensor axes, of as many numbers (N, k) in a unit of
-    angles; none where the readings are too few.
+    Of the numbers (N, k), in a unit of angles, at joint angles (N, n) and positions (N, 3), sensor
+    axes; none where there are too few readings.
     """
     step = max(1, len(q) // MOST)
     q, y, values = q[::step], position[::step], values[::step]
@@ -303,18 +304,18 @@ def rank_conventions(
         return ()
     chain = evaluate(arm, q)
     flange, p = chain.rotation[-1], chain.position[-1]
-    eye, found = np.broadcast_to(np.eye(3), (len(p), 3, 3)), []
+    eye, agreements = np.broadcast_to(np.eye(3), (len(p), 3, 3)), []
     for name, kind in CONVENTIONS.items():
-        if name.startswith(_OWN) and NUMBERS.get(kind, 3) == values.shape[1]:
-            base, angle = _turned(rotations(name, values, unit), flange)
+        if name.startswith(_GENERIC) and NUMBERS.get(kind, 3) == values.shape[1]:
+            base, angle = _fit_attitudes(rotations(name, values, unit), flange)
             # y_i − A p_i = A R_i τ + t with the best τ and t
-            rest = (y - p @ base.T).reshape(-1)
+            target = (y - p @ base.T).reshape(-1)
             design = np.concatenate([base @ flange, eye], axis=2).reshape(-1, 6)
-            left = rest - design @ np.linalg.lstsq(design, rest, rcond=1e-9)[0]
-            distance = float(np.sqrt(3 * np.mean(left**2)))
+            residual = target - design @ np.linalg.lstsq(design, target, rcond=1e-9)[0]
+            distance = float(np.sqrt(3 * np.mean(residual**2)))
             rms = float(np.hypot(angle, distance / arm.reach))
-            found.append(Agreement(name, angle, distance, rms))
-    return tuple(sorted(found, key=lambda a: a.rms))
+            agreements.append(Agreement(name, angle, distance, rms))
+    return tuple(sorted(agreements, key=lambda a: a.rms))
 
 
 def clearly_best(ranked: Sequence[Agreement]) -> str | None:
@@ -324,7 +325,7 @@ def clearly_best(ranked: Sequence[Agreement]) -> str | None:
     return best.convention if clear else None
 
 
-def _turned(measured: Floats, flange: Floats) -> tuple[Floats, float]:
+def _fit_attitudes(measured: Floats, flange: Floats) -> tuple[Floats, float]:
     """A and the rms angle, rad, of the best M_i = A R_i B."""
     a = rotation_of_attitudes(measured, flange)
     for _ in range(ROUNDS):

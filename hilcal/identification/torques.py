@@ -31,7 +31,7 @@ LEVEL = 0.95
 SURE = 1e-3  # two-sided p-value below which a factor differs from 1; a choice
 LEAST = 0.02  # share by which it has to differ: torque constants are known to some %; a choice
 ROUNDS = 4  # times that the noise of the drives is estimated anew; a choice
-TOLD = 1e-6  # torques below this share of the largest tell nothing of their cause: rounding
+TOLD = 1e-6  # torques below this share of the largest are rounding
 
 _Factor = tuple[float, float, float, float]
 """Estimate, lower and upper end of its interval, p-value of 1."""
@@ -45,16 +45,16 @@ class TorqueFactor:
     factor: float  # estimate; 1 where the description is right
     low: float  # lower end of its 95 % interval
     high: float  # upper end
-    stated_kg: float | None  # the mass as described; None where it is not one of a weight
-    differs: bool  # whether it is another than described
+    stated_kg: float | None  # the described mass; None for a load that is no weight
+    differs: bool  # whether it differs from the description
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TorqueCheck:
     """Measured against modelled torques."""
 
-    factors: tuple[TorqueFactor, ...]  # of loads, arm and tool, as far as the readings tell them
-    std_Nm: Floats  # (n,) standard deviation of what is left, of each drive, N·m
+    factors: tuple[TorqueFactor, ...]  # of loads, arm and tool, those that are determined
+    std_Nm: Floats  # (n,) standard deviation of the residual of each drive, N·m
 
     def to_json(self) -> dict[str, object]:
         """Return its JSON."""
@@ -66,8 +66,8 @@ def modelled_torques(cell: Cell, states: States, wrench: Floats, arm: bool, tool
     angle = states.q if states.q_actual is None else states.q_actual
     bare = cell.arm if arm else replace(cell.arm, masses=np.zeros(cell.arm.n))
     load = Load(wrench, cell.load_point, cell.tool_mass * tool, cell.tool_com, cell.gravity)
-    found = slot_wrenches(bare, evaluate(cell.arm, angle), load)[:, :-1, 5]
-    return np.asarray(cell.arm.drive_torques(found))
+    torques = slot_wrenches(bare, evaluate(cell.arm, angle), load)[:, :-1, 5]
+    return np.asarray(cell.arm.drive_torques(torques))
 
 
 def require_torques(cell: Cell, readings: Readings) -> None:
@@ -76,17 +76,17 @@ def require_torques(cell: Cell, readings: Readings) -> None:
     lost = 0 if torque is None else int(np.isnan(torque).any(axis=1).sum())
     if not cell.measured_torques or (torque is not None and not lost):
         return
-    what = "the readings have no columns tau1_Nm, ..."
+    reason = "the readings have no columns tau1_Nm, ..."
     if torque is not None:
-        what = f"{lost} of {len(readings)} readings have none"
+        reason = f"{lost} of {len(readings)} readings have none"
     raise InputError(
-        f'[robot] torques = "measured", but {what}; valid: readings with them, or torques = '
+        f'[robot] torques = "measured", but {reason}; valid: readings with them, or torques = '
         '"modelled"'
     )
 
 
 def check_torques(cell: Cell, readings: Readings) -> TorqueCheck | None:
-    """Compare measured with modelled torques, of the readings that have some; None without."""
+    """Compare measured with modelled torques; None where no reading has measured ones."""
     if readings.states.torque is None:
         return None
     readings = readings[np.flatnonzero(~np.isnan(readings.states.torque).any(axis=1))]
@@ -114,19 +114,19 @@ def check_torques(cell: Cell, readings: Readings) -> TorqueCheck | None:
     def means(parts: Mapping[str, Floats]) -> dict[str, Floats]:
         return {k: _means(x, group) for k, x in parts.items()}
 
-    told = [
+    determined = [
         np.abs(x).max() > TOLD * max(np.abs(loads[k]).max(), 1e-12)
         for k, x in centred(loads).items()
     ]
-    if loads and all(told):  # every load by differences between the readings of one pose
+    if loads and all(determined):  # every load by differences between the readings of one pose
         lost = len(np.unique(group))
         y = centred({"y": torque})["y"]
-        found, std = _fitted(y, centred(loads), centred(side), lost)
-        rest = torque - sum((found[k][0] * loads[k] for k in found), np.zeros(()))
-        found = found | _fitted(_means(rest, group), means(body), means(side), 0)[0]
+        estimates, std = _fitted(y, centred(loads), centred(side), lost)
+        remainder = torque - sum((estimates[k][0] * loads[k] for k in estimates), np.zeros(()))
+        estimates = estimates | _fitted(_means(remainder, group), means(body), means(side), 0)[0]
     else:
-        found, std = _fitted(torque, loads | body, side, 0)
-    factors = [_factor(cell, readings, k, *found[k]) for k in (*loads, *body) if k in found]
+        estimates, std = _fitted(torque, loads | body, side, 0)
+    factors = [_factor(cell, readings, k, *estimates[k]) for k in (*loads, *body) if k in estimates]
     return TorqueCheck(tuple(factors), std)
 
 
@@ -140,7 +140,7 @@ def _means(x: Floats, group: Ints) -> Floats:
 def _fitted(
     y: Floats, causes: Mapping[str, Floats], side: Mapping[str, Floats], lost: int
 ) -> tuple[dict[str, _Factor], Floats]:
-    """Factors of causes (N, n), as far as they are told apart, and the drives' noise (n,).
+    """Factors of causes (N, n), as far as they are determined, and the drives' noise (n,).
 
     Sides of the approach (N, n) are causes of no factor; centring took `lost` degrees of freedom
     from each drive, which has an offset where that is zero.
@@ -149,11 +149,11 @@ def _fitted(
     largest = max([float(np.abs(x).max()) for x in causes.values()], default=0.0)
     names = [k for k, x in causes.items() if np.abs(x).max() > TOLD * largest]
     columns = [causes[k].T.reshape(-1) for k in names]
-    one = np.eye(n)
+    unit = np.eye(n)
     if not lost:
-        columns += [np.kron(one[j], np.ones(count)) for j in range(n)]
+        columns += [np.kron(unit[j], np.ones(count)) for j in range(n)]
     columns += [
-        np.kron(one[j], s[:, j]) for s in side.values() for j in range(n) if np.ptp(s[:, j]) > 0
+        np.kron(unit[j], s[:, j]) for s in side.values() for j in range(n) if np.ptp(s[:, j]) > 0
     ]
     a = np.stack(columns, axis=1) if columns else np.zeros((n * count, 0))
     b, std = y.T.reshape(-1), np.ones(n)
@@ -161,12 +161,12 @@ def _fitted(
     for _ in range(ROUNDS):
         w = np.repeat(1.0 / std, count)
         u, s, vt = np.linalg.svd(a * w[:, None], full_matrices=False)
-        kept = s > 1e-9 * max(float(s.max(initial=0.0)), 1e-300)
-        back = vt[kept].T / s[kept]
-        x, cov = back @ (u[:, kept].T @ (b * w)), back @ back.T
+        regular = s > 1e-9 * max(float(s.max(initial=0.0)), 1e-300)
+        back = vt[regular].T / s[regular]
+        x, cov = back @ (u[:, regular].T @ (b * w)), back @ back.T
         square = np.sum((b - a @ x).reshape(n, count) ** 2, axis=1)
         std = np.maximum(np.sqrt(square / dof_of_each), 1e-9 * (1 + np.abs(b).max()))
-    null = np.abs(vt[~kept]).max(axis=0, initial=0.0)
+    null = np.abs(vt[~regular]).max(axis=0, initial=0.0)
     dof = max(n * (count - lost) - a.shape[1], 1)
     half, out = float(student.ppf(0.5 + LEVEL / 2, dof)), {}
     for k, name in enumerate(names):

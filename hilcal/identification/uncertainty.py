@@ -90,11 +90,11 @@ def uncertainty(
     null = in_ordinary_magnitudes(space, basis.null, scale)
     carried = space.carried(len(scale))
     identifiable = identifiable_parameters(basis, solution.prior, carried, scale, std, null)
-    std = np.where(identifiable, std * _wider(model, w, solution, covariance), np.inf)
+    std = np.where(identifiable, std * _widening_factors(model, w, solution, covariance), np.inf)
     return Uncertainty(std, formal, identifiable, misfit, name_directions(model, null))
 
 
-def _wider(model: Model, w: Whitening, solution: Solution, covariance: Floats) -> Floats:
+def _widening_factors(model: Model, w: Whitening, solution: Solution, covariance: Floats) -> Floats:
     """Factors (P,) by which the unknown prior variances of shrunk families widen `std`."""
     groups, beta = prior_of(model)[1], solution.beta
     factor = hyperparameter_factors(beta * covariance, solution.theta, solution.prior, groups)
@@ -109,10 +109,10 @@ def _wider(model: Model, w: Whitening, solution: Solution, covariance: Floats) -
 
 
 def in_ordinary_magnitudes(space: Coordinates, null: Floats, scale: Floats) -> Floats:
-    """Directions (P, U) in ordinary magnitudes (P,) of the parameters, of those of y."""
-    found, index = space.transform(null).copy(), space.index
-    found[index] /= scale[index, None]
-    return found
+    """Directions (P, U) of y as directions of θ, in ordinary magnitudes (P,)."""
+    out, index = space.transform(null).copy(), space.index
+    out[index] /= scale[index, None]
+    return out
 
 
 def identifiable_parameters(
@@ -120,13 +120,13 @@ def identifiable_parameters(
 ) -> Bools:
     """(P,) parameters that unidentifiable directions hardly move, and that the data determine.
 
-    Of a fit with some prior (P,) of its y and parameters with a carried one (P,); `scale`, `std`
-    (P,) and directions `null` (P, U) as of `uncertainty`.
+    `prior` (P,) is that of the coordinates y, `carried` (P,) marks parameters with a carried prior;
+    `scale`, `std` (P,) and directions `null` (P, U) are as in `uncertainty`.
     """
     moved = scale * np.linalg.norm(null, axis=1)
     flat = (moved <= NULL_SHARE * std) & (std < MEANINGLESS * scale)
-    learnt = std < LEARNT * np.where(np.isinf(prior), np.inf, prior)
-    return np.where(basis.flat | carried, flat, learnt & (prior > 0))
+    narrowed = std < LEARNT * np.where(np.isinf(prior), np.inf, prior)
+    return np.where(basis.flat | carried, flat, narrowed & (prior > 0))
 
 
 def name_directions(model: Model, null: Floats, most: int = 3) -> tuple[str, ...]:
@@ -144,8 +144,8 @@ def name_directions(model: Model, null: Floats, most: int = 3) -> tuple[str, ...
             f"{'+' if row[k] > 0 else '−'} {'' if f == '1' else f'{f}·'}{names[k]}"
             for k, f in zip(strong, factors, strict=False)
         )
-        more = f" … ({len(strong) - most} more)" if len(strong) > most else ""
-        out.append(text.removeprefix("+ ") + more)
+        suffix = f" … ({len(strong) - most} more)" if len(strong) > most else ""
+        out.append(text.removeprefix("+ ") + suffix)
     return tuple(out)
 
 
@@ -154,18 +154,20 @@ def hyperparameter_factors(
 ) -> Floats:
     """Return the factors (P,), at least 1, by which standard uncertainties grow.
 
-    Of the covariance at the chosen priors, in true units of noise; of priors, the same within a
-    group, infinite or zero for parameters that are not shrunk or held at zero; groups −1 for these.
+    `covariance` is that at the chosen priors, in true units of noise. `prior` is the same within a
+    group; infinite or zero for parameters that are not shrunk or held at zero, whose group is −1.
     """
     out = np.ones(len(theta))
     shrunk = (groups >= 0) & np.isfinite(prior) & (prior > 0)
     for group in np.unique(groups[shrunk]):
         rows = np.flatnonzero(shrunk & (groups == group))
-        out[rows] = _of_group(covariance[np.ix_(rows, rows)], theta[rows], float(prior[rows[0]]))
+        out[rows] = _group_factors(
+            covariance[np.ix_(rows, rows)], theta[rows], float(prior[rows[0]])
+        )
     return out
 
 
-def _of_group(covariance: Floats, theta: Floats, prior: float) -> Floats:
+def _group_factors(covariance: Floats, theta: Floats, prior: float) -> Floats:
     """Factors (n,) of one group whose covariance (n, n) is that at its prior."""
     values, axes = np.linalg.eigh(covariance)
     values = np.maximum(values, ROUNDING**2 * max(float(values[-1]), 1e-300))
@@ -192,22 +194,23 @@ def dropped_group_factors(
 ) -> Floats:
     """Return the factors (P,), at least 1, by which groups that were dropped widen all others.
 
-    Of parameters per coordinate z (P, K), the model by z, whitened derivatives D (R, Q) by the
-    dropped parameters, and their groups (Q,).
+    `transform` (P, K) gives the parameters by coordinates z, `p` is the model by z, `columns` are
+    the whitened derivatives D (R, Q) by the dropped parameters, `groups` (Q,) their groups.
     """
-    cross, own_gram = p.rows.T @ columns, columns.T @ columns
-    norm2 = np.diag(own_gram)
+    cross, gram = p.rows.T @ columns, columns.T @ columns
+    norm2 = np.diag(gram)
     free = np.maximum(norm2 - np.sum((p.inverse_root @ cross) ** 2, axis=0), 0.0)
     reach = np.bincount(groups, weights=free) / np.maximum(np.bincount(groups), 1)
-    # Columns in the span of the others have no information of their own: left out.
-    seen = reach[groups] > ROUNDING * np.maximum(norm2, 1e-300)
-    if not seen.any():
+    # Columns in the span of the others add no information, and are left out.
+    informed = reach[groups] > ROUNDING * np.maximum(norm2, 1e-300)
+    if not informed.any():
         return np.ones(len(transform))
-    hidden = own_gram[np.ix_(seen, seen)] + np.diag(beta * reach[groups][seen] / HIDDEN)
-    own = p.rows.T @ p.rows + np.diag(p.ridge)
-    explained = inverse_root(hidden) @ cross[:, seen].T
-    wide = inverse_root(own - explained.T @ explained)
-    before = np.sum((transform @ p.inverse_root.T) ** 2, axis=1)
-    after = np.sum((transform @ wide.T) ** 2, axis=1)
-    there = before > 0
-    return np.sqrt(np.where(there, np.maximum(after / np.where(there, before, 1.0), 1.0), 1.0))
+    hidden = gram[np.ix_(informed, informed)] + np.diag(beta * reach[groups][informed] / HIDDEN)
+    precision = p.rows.T @ p.rows + np.diag(p.ridge)
+    explained = inverse_root(hidden) @ cross[:, informed].T
+    wide = inverse_root(precision - explained.T @ explained)
+    variance = np.sum((transform @ p.inverse_root.T) ** 2, axis=1)
+    widened = np.sum((transform @ wide.T) ** 2, axis=1)
+    positive = variance > 0
+    ratio = widened / np.where(positive, variance, 1.0)
+    return np.sqrt(np.where(positive, np.maximum(ratio, 1.0), 1.0))

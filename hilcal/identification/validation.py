@@ -1,10 +1,10 @@
-"""Prediction of readings that a model was never fitted to, what lies outside, and what is passed.
+"""Prediction of readings that a model was never fitted to: errors, extrapolation, acceptance.
 
 A model may be wrong wherever nothing was measured, however well it predicts poses left out among
-those that were. A variable is left where a reading is beyond the fitted ones' smallest or largest
-value by more than `MARGIN` of their range; an angle is where it is whole turns on, too, unless the
-model tells them apart (`whole_turns`). Joint angles inside of their ranges can be far from all
-fitted ones as well; then the leverage of a reading is large: the variance of its prediction over
+those that were. A reading is outside where one of its variables exceeds the range of the fitted
+readings by more than `MARGIN` of that range; angles count modulo whole turns, unless the model
+distinguishes these (`whole_turns`). Joint angles inside of their ranges can be far from all fitted
+ones as well; then the leverage of a reading is large: the variance of its prediction over
 that of the noise, (J C Jᵀ) V⁻¹ σ⁻² with the largest eigenvalue, compared with h/(1 − h) of the
 fitted measurements, each predicted without itself.
 """
@@ -61,7 +61,7 @@ def validate(
     *,
     registered: bool = False,
 ) -> Validation:
-    """Predict other readings, which took no part, with a model that was fitted to some.
+    """Predict other readings, which were not fitted, with a fitted model.
 
     With `registered` the tracker was set up anew: `base_frame`, and nothing else, is estimated from
     the other readings first.
@@ -102,14 +102,14 @@ def _register(
     """Closed-form registration to the other readings, then Gauss-Newton on `base_frame`."""
     targets = targets_as_fitted(model, theta)
     held = model.cell.with_targets(targets, known=(True,) * len(targets))
-    found = register(replace(held, registration_known=False), other)
-    cell = replace(model.cell, registration=found.cell.registration)
+    registered = register(replace(held, registration_known=False), other)
+    cell = replace(model.cell, registration=registered.cell.registration)
     parts = zip(model.effects, model.slices(), strict=True)
-    kept = [(e, theta[s]) for e, s in parts if e.role != "registration"]
-    effects: list[Effect] = [type(e)(cell, fitted.states, e.options) for e, _ in kept]
+    retained = [(e, theta[s]) for e, s in parts if e.role != "registration"]
+    effects: list[Effect] = [type(e)(cell, fitted.states, e.options) for e, _ in retained]
     frame = model.catalogue.with_role("registration")[0](cell, fitted.states)
     moved = replace(model, cell=cell, effects=(*effects, frame))
-    values = np.concatenate([*(t for _, t in kept), np.zeros(6)])
+    values = np.concatenate([*(t for _, t in retained), np.zeros(6)])
     for _ in range(STEPS):
         prediction = moved.predict(other.states, values)
         white = w.whiten(residual(other, prediction, w)).reshape(-1)
@@ -138,11 +138,11 @@ class Beyond:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Extrapolation:
-    """What a fit states of readings that it has not seen, and which of them lie outside."""
+    """The stated errors of predictions of new readings, and which of these lie outside."""
 
     outside: Bools  # (D,) measurements that lie outside in any variable
-    variables: tuple[Beyond, ...]  # those that are left, most measurements first
-    stated_m: Floats  # (D,) standard deviation that the fit states of the 3-D position error, m
+    variables: tuple[Beyond, ...]  # those that are exceeded, most measurements first
+    stated_m: Floats  # (D,) stated standard deviation of the 3-D position error, m
     z: Floats  # (D,) error over the stated standard deviation, rms of the elements
     inside_error: ErrorBlock | None  # of the measurements inside; None where there are none
     outside_error: ErrorBlock | None  # of those outside
@@ -176,23 +176,24 @@ def _rms(x: Floats) -> float:
     return float(np.sqrt(np.mean(x**2)))
 
 
-def extrapolation(p: Predictive, fitted: Readings, found: Validation) -> Extrapolation:
-    """Compare other readings, predicted, with those that a model was fitted to."""
-    w, other, raw, units = found.whitening, found.readings, found.raw, p.model.cell.arm.units
-    prediction = p.model.predict(other.states, p.theta)
+def extrapolation(p: Predictive, fitted: Readings, validation: Validation) -> Extrapolation:
+    """Compare predicted readings with those that a model was fitted to."""
+    w, readings, raw = validation.whitening, validation.readings, validation.raw
+    units = p.model.cell.arm.units
+    prediction = p.model.predict(readings.states, p.theta)
     spread, noise = p.of_prediction(prediction, w), p.of_noise(w)
     root = inverse_root(noise)
     leverage = np.linalg.eigvalsh(root @ spread @ np.swapaxes(root, 1, 2))[:, -1]
     beyond, outside = [], np.zeros(len(w.reading), dtype=np.bool_)
-    known = {r.variable: r for r in ranges_of(fitted.states, units)}
+    ranges = {r.variable: r for r in ranges_of(fitted.states, units)}
     turning = turning_variables(whole_turns(p.model, p.theta))
-    for name, unit, values in variables(other.states, units):
-        if name not in known:
+    for name, unit, values in variables(readings.states, units):
+        if name not in ranges:
             continue
-        r, after, turns = known[name], values[w.reading], name in turning
-        far = r.beyond(after, turning=turns)
+        r, x, turns = ranges[name], values[w.reading], name in turning
+        far = r.beyond(x, turning=turns)
         if far.any():
-            most = float(r.over(after[far], turning=turns).max())
+            most = float(r.over(x[far], turning=turns).max())
             beyond.append(Beyond(name, unit, r.low, r.high, int(far.sum()), most))
         outside |= far
     limit = FAR * float(np.quantile(p.leverage / (1 - p.leverage), 0.99))
@@ -234,8 +235,8 @@ class Judged:
 
     number: int | None  # of the revision; None for a baseline that is not kept
     mode: Mode
-    readings: int  # all in the other campaign
-    fitted: int  # those of them that the revision was fitted to
+    readings: int  # number of readings in the other campaign
+    fitted: int  # number of these that the revision was fitted to
     spoilt: int  # further ones whose unloaded reading was fitted
     unseen: bool  # whether those that are judged were never fitted; False where all were
     scalar: bool = False  # whether some readings are one number, a distance or a height
@@ -257,12 +258,12 @@ class Judged:
 class Share:
     """The measurements of one load, or of one pose."""
 
-    name: str  # of the load or the pose
+    name: str  # name of the load or the pose
     count: int
     rms_m: float  # root mean square of their 3-D position error, m
     max_m: float  # the largest, m
     worst: str  # load (or pose) of the largest
-    stated_m: float  # rms of the standard deviation that the fit states for them, m
+    stated_m: float  # rms of their stated standard deviation, m
     z: float  # rms of error over stated standard deviation, per element
     within: float  # share inside of their 95 % region, rᵀ C⁻¹ r ≤ χ²(0.95, m), C as stated
 
@@ -296,9 +297,9 @@ class Acceptance:
         """Return the keys of `validate --json` on loads, poses and the limit."""
         limit = self.limit_m
 
-        def document(s: Share, kind: str, other: str) -> dict[str, object]:
+        def document(s: Share, kind: str, opposite: str) -> dict[str, object]:
             d = {kind if k == "name" else k: v for k, v in asdict(s).items()}
-            d[f"worst_{other}"] = d.pop("worst")
+            d[f"worst_{opposite}"] = d.pop("worst")
             return d if limit is None else {**d, "passed": s.passes(limit)}
 
         return {
@@ -318,7 +319,7 @@ class CampaignValidation(Shown):
     model: Model  # of the revision
     judged: Judged  # which of the readings are judged
     prediction: Validation  # of these
-    beyond: Extrapolation  # what the fit states of them, and which lie outside
+    beyond: Extrapolation  # their stated errors, and which of them lie outside
     shares: Acceptance  # errors by load and by pose, and against a limit
 
     def _brief(self) -> dict[str, str]:
@@ -333,32 +334,32 @@ class CampaignValidation(Shown):
 
 
 def acceptance(
-    found: Validation, beyond: Extrapolation, limit_m: float | None = None
+    validation: Validation, beyond: Extrapolation, limit_m: float | None = None
 ) -> Acceptance:
-    """Divide prediction errors by load and by pose, against a largest one that is allowed, m."""
-    r, rows = found.readings, found.whitening.reading
-    error = np.linalg.norm(found.raw[:, :3], axis=1)
-    variance = np.diagonal(found.whitening.covariance, axis1=1, axis2=2)
+    """Divide prediction errors by load and by pose, and compare them with a limit, m."""
+    r, rows = validation.readings, validation.whitening.reading
+    error = np.linalg.norm(validation.raw[:, :3], axis=1)
+    variance = np.diagonal(validation.whitening.covariance, axis1=1, axis2=2)
     read = np.maximum(np.count_nonzero(variance > 0, axis=1), 1)
     inside = beyond.z**2 * read <= chi2.ppf(BAND, read)
     load, pose = (r.load[rows], r.load_names), (r.pose[rows], r.pose_names)
 
-    def share(name: str, of: Bools, other: tuple[Ints, Sequence[str]]) -> Share:
-        worst = int(np.argmax(np.where(of, error, -1.0)))
+    def share(name: str, members: Bools, opposite: tuple[Ints, Sequence[str]]) -> Share:
+        worst = int(np.argmax(np.where(members, error, -1.0)))
         return Share(
             name=name,
-            count=int(of.sum()),
-            rms_m=_rms(error[of]),
+            count=int(members.sum()),
+            rms_m=_rms(error[members]),
             max_m=float(error[worst]),
-            worst=other[1][other[0][worst]],
-            stated_m=_rms(beyond.stated_m[of]),
-            z=_rms(beyond.z[of]),
-            within=float(inside[of].mean()),
+            worst=opposite[1][opposite[0][worst]],
+            stated_m=_rms(beyond.stated_m[members]),
+            z=_rms(beyond.z[members]),
+            within=float(inside[members].mean()),
         )
 
     loads, poses = (
-        [share(by[1][k], by[0] == k, other) for k in np.unique(by[0]).tolist()]
-        for by, other in ((load, pose), (pose, load))
+        [share(groups[1][k], groups[0] == k, opposite) for k in np.unique(groups[0]).tolist()]
+        for groups, opposite in ((load, pose), (pose, load))
     )
     return Acceptance(
         loads=tuple(loads),
@@ -366,5 +367,5 @@ def acceptance(
         everything=share("all", np.ones(len(rows), dtype=np.bool_), pose),
         limit_m=limit_m,
         over=0 if limit_m is None else int(np.sum(error > limit_m)),
-        noise_m=found.noise_floor,
+        noise_m=validation.noise_floor,
     )

@@ -1,4 +1,4 @@
-"""The static equilibrium differentiated: how a reading moves where the arm yields to its motion.
+"""Derivative of the static equilibrium: how a reading moves as the arm yields to its motion.
 
 The elastic deviation f depends on the slot wrenches W, these on the deviated chain, and the chain
 on the deviation D: D = f(θ, W(D)). With the reading y(D), the derivatives C = ∂f/∂W (compliance)
@@ -41,8 +41,8 @@ FORCE, MOMENT = slice(0, 3), slice(3, 6)  # Components of a slot's wrench
 class SlotResponse:
     """Derivative of the deviation at one slot by the wrench through one slot."""
 
-    slot: int  # whose wrench
-    to: int  # which joint (index) or slot deviates
+    slot: int  # index of the slot of the wrench
+    deviating: int  # index of the joint or slot that deviates
     joint: bool  # whether it is a joint displacement, else a twist
     components: slice  # range of the components of the wrench: of its force, or of its moment
     elements: slice  # range of the elements of the deviation
@@ -51,14 +51,14 @@ class SlotResponse:
 
 def compliance(parts: Sequence[tuple[Effect, Floats]], s: Situation) -> list[SlotResponse]:
     """Derivative of the elastic deviations by the slot wrenches, without what is zero."""
-    blocks = (b for e, theta in parts if theta.any() for b in _of_effect(e, theta, s))
-    whole = (pruned for b in blocks if (pruned := _pruned(b)) is not None)
-    found = [part for b in whole for part in _halves(b)]
+    blocks = (b for e, theta in parts if theta.any() for b in _responses_of(e, theta, s))
+    nonzero = (pruned for b in blocks if (pruned := _pruned(b)) is not None)
+    halves = [part for b in nonzero for part in _halves(b)]
     drive = s.cell.arm.drive
     if drive is None:
-        return found
+        return halves
     borne = np.where(s.cell.arm.slides, ALONG, TORQUE).tolist()
-    return [c for b in found for c in _of_joints(b, drive, borne)]
+    return [c for b in halves for c in _by_chain_joints(b, drive, borne)]
 
 
 def _halves(b: SlotResponse) -> Iterator[SlotResponse]:
@@ -71,7 +71,7 @@ def _halves(b: SlotResponse) -> Iterator[SlotResponse]:
     yield replace(b, components=slice(MOMENT.start, last), values=b.values[:, middle:])
 
 
-def _of_joints(b: SlotResponse, drive: Floats, borne: list[int]) -> Iterator[SlotResponse]:
+def _by_chain_joints(b: SlotResponse, drive: Floats, borne: list[int]) -> Iterator[SlotResponse]:
     """Compliance of the chain's joints, from that of the drives: D C Dᵀ by torques.
 
     Forces and moments across an axis are those of the slot itself; drives bear the components
@@ -82,36 +82,36 @@ def _of_joints(b: SlotResponse, drive: Floats, borne: list[int]) -> Iterator[Slo
         return
     by_torque = b.slot < len(drive) and b.components.stop == borne[b.slot] + 1
     last = b.components.stop - by_torque
-    for to in np.flatnonzero(drive[:, b.to]):
-        moved = replace(b, to=int(to), values=drive[to, b.to] * b.values)
+    for joint in np.flatnonzero(drive[:, b.deviating]):
+        block = replace(b, deviating=int(joint), values=drive[joint, b.deviating] * b.values)
         if last > b.components.start:
-            rest = slice(b.components.start, last)
-            yield replace(moved, components=rest, values=moved.values[:, : last - rest.start])
+            across = slice(b.components.start, last)
+            yield replace(block, components=across, values=block.values[:, : last - across.start])
         if by_torque:
             for slot in np.flatnonzero(drive[:, b.slot]):
-                values = drive[slot, b.slot] * moved.values[:, -1:]
-                at = slice(borne[slot], borne[slot] + 1)
-                yield replace(moved, slot=int(slot), components=at, values=values)
+                values = drive[slot, b.slot] * block.values[:, -1:]
+                component = slice(borne[slot], borne[slot] + 1)
+                yield replace(block, slot=int(slot), components=component, values=values)
 
 
 def at_equilibrium(
     moves: ReadingDerivative, stiffness: GeometricStiffness, blocks: list[SlotResponse]
 ) -> ReadingDerivative:
-    """Add to the motions of a reading, wrenches held, how the arm yields to their change."""
+    """Add the yielding of the arm to the motions of a reading at fixed wrenches."""
     term = wrench_form(moves, blocks)
-    form, whole = dict(term), _norm(term)
-    before = whole
+    form, total = dict(term), _norm(term)
+    previous = total
     for _ in range(MAX_TERMS):
         gradient = stiffness.gradient(term)
         term = by_wrenches(blocks, gradient.joint, partial(_by_twist, gradient, moves.frames))
         for place, b in term.items():
             form[place] = form[place] + b
-        now = _norm(term)
-        # The terms shrink by one factor; what is missing of B is about the next one, and of A
+        size = _norm(term)
+        # The terms shrink by one factor; the error of B is about the next term, that of A
         # smaller by that factor once more.
-        if now**3 <= TOLERANCE * whole * before**2:
+        if size**3 <= TOLERANCE * total * previous**2:
             break
-        before = now
+        previous = size
     yielding = stiffness.gradient(form)
     dq = moves.dq.copy(order="F")
     for j in range(dq.shape[2]):
@@ -160,27 +160,27 @@ def by_wrenches(
     used: dict[int, slice] = {}
     for b in blocks:
         if not b.joint:
-            old = used.get(b.to, b.elements)
+            old = used.get(b.deviating, b.elements)
             start, stop = min(old.start, b.elements.start), max(old.stop, b.elements.stop)
-            used[b.to] = slice(start, stop)
-    twists = {to: by_slot(to, elements) for to, elements in used.items()}
+            used[b.deviating] = slice(start, stop)
+    twists = {slot: by_slot(slot, elements) for slot, elements in used.items()}
     out: dict[tuple[int, bool], Floats] = {}
     for b in blocks:
         if b.joint:
-            found = by_joint(b.to)[..., None]
+            rows = by_joint(b.deviating)[..., None]
         else:
-            e = used[b.to].start
-            found = twists[b.to][..., b.elements.start - e : b.elements.stop - e]
+            e = used[b.deviating].start
+            rows = twists[b.deviating][..., b.elements.start - e : b.elements.stop - e]
         moment = b.components.start >= MOMENT.start
         first = MOMENT.start if moment else FORCE.start
         if (b.slot, moment) not in out:
-            out[b.slot, moment] = zeros(*found.shape[:2], 3)
-        to = out[b.slot, moment][..., b.components.start - first : b.components.stop - first]
+            out[b.slot, moment] = zeros(*rows.shape[:2], 3)
+        part = out[b.slot, moment][..., b.components.start - first : b.components.stop - first]
         if len(b.values) > 1:
-            to += np.einsum("nme,nie->nmi", found, b.values)
+            part += np.einsum("nme,nie->nmi", rows, b.values)
             continue
         for i, element in zip(*np.nonzero(b.values[0]), strict=True):
-            to[..., i] += found[..., element] * b.values[0, i, element]
+            part[..., i] += rows[..., element] * b.values[0, i, element]
     return out
 
 
@@ -195,45 +195,45 @@ def _norm(form: Mapping[tuple[int, bool], Floats]) -> float:
     return math.sqrt(sum(float(b @ b) for b in flat))
 
 
-def _of_effect(effect: Effect, theta: Floats, s: Situation) -> Iterator[SlotResponse]:
+def _responses_of(effect: Effect, theta: Floats, s: Situation) -> Iterator[SlotResponse]:
     """Compliance of one effect, from its response to unit wrenches."""
-    slots = s.wrench.shape[1]
-    every = range(slots)
-    groups = [every] if effect.local_response else [range(k, k + 1) for k in every]
+    count = s.wrench.shape[1]
+    slots = range(count)
+    groups = [slots] if effect.local_response else [range(k, k + 1) for k in slots]
     for group in groups:
-        units = zeros(1 if effect.local_response else len(s.wrench), 6, slots, 6)
+        units = zeros(1 if effect.local_response else len(s.wrench), 6, count, 6)
         for i in range(6):
             units[:, i, group, i] = 1.0
         r = effect.response(theta, s, units)
-        for to in every:
-            slot = to if effect.local_response else group[0]
+        for k in slots:
+            slot = k if effect.local_response else group[0]
             if r.twist is not None:
-                yield SlotResponse(slot, to, False, slice(0, 6), slice(0, 6), r.twist[:, :, to])
+                yield SlotResponse(slot, k, False, slice(0, 6), slice(0, 6), r.twist[:, :, k])
             follows = r.dq is not None and not s.torque_measured  # measured torques stay
-            if r.dq is not None and follows and to < r.dq.shape[2]:
-                yield SlotResponse(slot, to, True, slice(0, 6), slice(0, 1), r.dq[:, :, to, None])
+            if r.dq is not None and follows and k < r.dq.shape[2]:
+                yield SlotResponse(slot, k, True, slice(0, 6), slice(0, 1), r.dq[:, :, k, None])
 
 
 def _pruned(b: SlotResponse) -> SlotResponse | None:
     """Return the block without components and elements that are zero in all states."""
     if not b.values.any():
         return None
-    there = np.any(b.values, axis=0)
-    i, e = np.flatnonzero(there.any(axis=1)), np.flatnonzero(there.any(axis=0))
+    nonzero = np.any(b.values, axis=0)
+    i, e = np.flatnonzero(nonzero.any(axis=1)), np.flatnonzero(nonzero.any(axis=0))
     components, elements = slice(i[0], i[-1] + 1), slice(e[0], e[-1] + 1)
     return replace(
         b, components=components, elements=elements, values=b.values[:, components, elements]
     )
 
 
-WIDE = 64  # Successive parameters of one joint that are written as they are; a choice by timing
+WIDE = 64  # Successive parameters of one joint from which on they are written at once; by timing
 
 
 class ReadingColumns:
     """The derivative (N, m, L) of a chunk of readings by L parameters, sensor axes.
 
-    What moves a reading, that is joints, slots, frames and wrenches, moves it by every effect that
-    acts there: its motion is computed once, then multiplied by each parameter's share of it.
+    The motion of a reading by each joint, slot, frame or wrench is computed once for all effects,
+    then multiplied by the derivative of that joint, slot, frame or wrench by each parameter.
     """
 
     def __init__(
@@ -250,34 +250,35 @@ class ReadingColumns:
         self._sums = zeros(*out.shape)
         # which columns were added to, and which of them are written already
         self._used, self._written = np.zeros((2, out.shape[2]), dtype=np.bool_)
-        self._known: dict[str | int, Floats] = {}
+        self._motions: dict[str | int, Floats] = {}
 
-    def add(self, c: Columns, place: Ints) -> None:
-        """Add columns of an effect; `place`: which of the L each parameter is, −1 for none."""
-        c = c.only(place[c.parameter] >= 0)
-        at = place[c.parameter]
+    def add(self, c: Columns, places: Ints) -> None:
+        """Add columns of an effect; `places`: number of each parameter among the L, −1 for none."""
+        c = c.only(places[c.parameter] >= 0)
+        place = places[c.parameter]
         if c.field == "dq":
-            for joint, mine in c.runs():
-                self._add_joint(self._moves.drives[:, :, joint, None], c.values[:, mine], at[mine])
+            for joint, run in c.runs():
+                moved = self._moves.drives[:, :, joint, None]
+                self._add_joint(moved, c.values[:, run], place[run])
         elif c.field == "twist":
-            for slot, mine in c.runs():
+            for slot, run in c.runs():
                 moved = self._motion(slot, partial(self._moves.by_slot, slot))
-                self._add(_times(moved, c.values[:, mine]), at[mine])
+                self._add(_times(moved, c.values[:, run]), place[run])
         else:
             moved = self._motion(c.field, getattr(self._moves, f"by_{c.field}"))
             values = c.values[..., None] if c.field == "scale" else c.values
-            self._add(_times(moved, values), at)
+            self._add(_times(moved, values), place)
 
     def add_wrench_changes(self, change: Floats, place: Ints) -> None:
         """Add changes (N, P, n + 1, 6) of the slot wrenches by the P parameters of an effect."""
-        wanted = place >= 0
-        self._add(by_wrench_changes(self._form, change[:, wanted], self._moves.m), place[wanted])
+        used = place >= 0
+        self._add(by_wrench_changes(self._form, change[:, used], self._moves.m), place[used])
 
     def add_load_changes(self, change: Floats, place: Ints) -> None:
         """Add changes (N, P, 6) of the load's wrench at the load point, base axes."""
-        wanted = place >= 0
+        used = place >= 0
         moved = by_load(self._form, self._moves.chain, self._load, self._moves.m)
-        self._add(rows_times(moved, change[:, wanted], transposed=True), place[wanted])
+        self._add(rows_times(moved, change[:, used], transposed=True), place[used])
 
     def write(self) -> None:
         """Write the derivative by all that was added."""
@@ -291,27 +292,27 @@ class ReadingColumns:
         return wrench_form(self._moves, self._blocks)
 
     def _motion(self, key: str | int, find: Callable[[], Floats]) -> Floats:
-        if key not in self._known:
-            self._known[key] = find()
-        return self._known[key]
+        if key not in self._motions:
+            self._motions[key] = find()
+        return self._motions[key]
 
-    def _add_joint(self, moved: Floats, values: Floats, at: Ints) -> None:
-        """Add the motion (N, m, 1) by a joint, times (N or 1, P); many go where they belong."""
-        place = slice(int(at[0]), int(at[0]) + len(at))
-        if len(at) >= WIDE and np.all(np.diff(at) == 1) and not self._used[place].any():
+    def _add_joint(self, moved: Floats, values: Floats, column: Ints) -> None:
+        """Add the motion (N, m, 1) by a joint, times (N or 1, P); many are written at once."""
+        place = slice(int(column[0]), int(column[0]) + len(column))
+        if len(column) >= WIDE and np.all(np.diff(column) == 1) and not self._used[place].any():
             np.multiply(moved, (values * self._scale[place])[:, None], out=self._out[:, :, place])
             self._used[place] = self._written[place] = True
         else:
-            self._add(moved * along_states(values)[:, None], at)
+            self._add(moved * along_states(values)[:, None], column)
 
-    def _add(self, block: Floats, at: Ints) -> None:
+    def _add(self, block: Floats, places: Ints) -> None:
         """Add columns (N, m, P) at their places (P,), which may be the same."""
-        self._used[at] = True
-        for k, column in enumerate(at.tolist()):
-            if self._written[column]:
-                self._out[:, :, column] += self._scale[column] * block[:, :, k]
+        self._used[places] = True
+        for k, place in enumerate(places.tolist()):
+            if self._written[place]:
+                self._out[:, :, place] += self._scale[place] * block[:, :, k]
             else:
-                self._sums[:, :, column] += block[:, :, k]
+                self._sums[:, :, place] += block[:, :, k]
 
 
 def _times(moved: Floats, values: Floats) -> Floats:

@@ -24,7 +24,7 @@ from hilcal.robot.statics import Load, geometric_stiffness, slot_wrenches
 from hilcal.shown import Brief
 from hilcal.types import Floats, Ints
 
-if TYPE_CHECKING:  # a value that a model only carries along; fits know what it means
+if TYPE_CHECKING:  # a model only carries this value; fits interpret it
     from hilcal.identification.carried import CarriedPrior
 
 EQUILIBRIUM_TOLERANCE = 1e-13  # motion of the flange that may be missing, m
@@ -52,15 +52,15 @@ class Prediction(Brief):
     @staticmethod
     def joined(states: States, parts: "Sequence[Prediction]") -> "Prediction":
         """Return the prediction of all states from those of chunks of them."""
-        of = [p.situation for p in parts]
-        join, s = np.concatenate, of[0]
+        situations = [p.situation for p in parts]
+        join, s = np.concatenate, situations[0]
         situation = replace(
             s,
             states=states,
-            angle=join([x.angle for x in of]),
-            chain=by_field([x.chain for x in of], lambda given: join(given, axis=1)),
-            wrench=join([x.wrench for x in of]),
-            load=replace(s.load, wrench=join([x.load.wrench for x in of])),
+            angle=join([x.angle for x in situations]),
+            chain=by_field([x.chain for x in situations], lambda arrays: join(arrays, axis=1)),
+            wrench=join([x.wrench for x in situations]),
+            load=replace(s.load, wrench=join([x.load.wrench for x in situations])),
         )
         deviation = by_field([p.deviation for p in parts], join)
         return Prediction(situation, deviation, by_field([p.observation for p in parts], join))
@@ -71,24 +71,24 @@ class Model(Brief):
     """Robot and effects."""
 
     cell: Cell
-    effects: tuple[Effect, ...]  # each of another name
+    effects: tuple[Effect, ...]  # with distinct names
     catalogue: Catalogue = field(default_factory=installed)  # the effects that it could have
     readings: Readings | None = None
-    """those that effects are set up for when they are added by name; None if it was made without"""
+    """for which effects are set up when they are added by name; None for no readings"""
     prior: "CarriedPrior | None" = None
-    """what another campaign taught of the arm's parameters of the same names; None for nothing"""
+    """what another campaign has determined of parameters of the same names; None for nothing"""
     random: Mapping[str, Floats] = field(default_factory=dict)
     """by effect, the standard deviations (q,) of its parameters where they are random with a mean
     of zero, SI (see `hilcal.mixed`)"""
     background: frozenset[str] = frozenset()
-    """names of effects, among `random`, that predict with all others, and that the readings do not
-    prove one by one"""
+    """names of effects among `random` that take part in predictions although the readings do not
+    prove any of them by itself"""
     _slices: tuple[slice, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Refuse an effect that is there twice."""
         ends = accumulate((len(e.magnitudes) for e in self.effects), initial=0)
-        # Asked for at every step; an effect with a thousand parameters takes long to name them.
+        # Needed at every step; an effect with a thousand parameters takes long to name them.
         object.__setattr__(self, "_slices", tuple(slice(a, b) for a, b in pairwise(ends)))
         names = self.names
         for name in names:
@@ -121,7 +121,7 @@ class Model(Brief):
         return self._slices[-1].stop if self._slices else 0
 
     def slices(self) -> tuple[slice, ...]:
-        """Where each effect's parameters lie in the vector of all."""
+        """The slice of each effect's parameters in the vector of all."""
         return self._slices
 
     def __add__(self, effect: Effect | EffectSpec | str | type[Effect]) -> "Model":
@@ -141,16 +141,16 @@ class Model(Brief):
         catalogue, states, m = self.catalogue, self.readings.states, self.readings.m
         if not isinstance(spec.kind, str) and spec.kind not in catalogue.effects:
             catalogue = catalogue.with_effects(spec.kind)
-        made = catalogue.make(spec.name, self.cell, states, spec.options, m)
-        return replace(self, effects=(*self.effects, made), catalogue=catalogue)
+        effect = catalogue.make(spec.name, self.cell, states, spec.options, m)
+        return replace(self, effects=(*self.effects, effect), catalogue=catalogue)
 
     def predict(self, states: States, theta: Floats, near: Prediction | None = None) -> Prediction:
         """Equilibrium of N states: elastic deviations at the deflected configuration.
 
         The elastic deviations depend on the wrenches, those on the configuration, and the
         configuration on the deviations: a fixed point, which the iteration approaches by a
-        factor of about deflection/reach (1e-3) per step. It begins undeflected, or as the same
-        states are in a prediction `near`, which takes a step or two less.
+        factor of about deflection/reach (1e-3) per step. It begins undeflected, or with a
+        prediction `near` of the same states, which saves a step or two.
 
         Raises:
             CannotAnswerError: the deviations grow instead of settling.
@@ -175,19 +175,19 @@ class Model(Brief):
         s = Situation(cell, states, turned, chain, nothing, recorded, self._compliance(theta))
         rigid = _deviation([(e, t) for e, t in parts if not e.elastic], s)
         elastic = [(e, t) for e, t in parts if e.elastic]
-        before: float | None = None
+        previous: float | None = None
         for _ in range(MAX_EQUILIBRIUM_STEPS):
             load = self._corrected(recorded, replace(s, chain=chain), theta)
             wrench = slot_wrenches(cell.arm, chain, load)
             s = replace(s, chain=chain, wrench=wrench, load=load)
-            deviation = _deviation(elastic, s, rigid, checked=before is None)
+            deviation = _deviation(elastic, s, rigid, checked=previous is None)
             chain = chains.evaluate(cell.arm, angle, deviation, turns)
             moved = _flange_motion(s.chain, chain, cell.arm.reach)
-            # The steps shrink geometrically: what is missing is about the next one.
-            missing = moved if before is None else moved * (moved / before)
+            # The steps shrink geometrically: the error is about the next one.
+            missing = moved if previous is None else moved * (moved / previous)
             if not elastic or missing <= EQUILIBRIUM_TOLERANCE:
                 break
-            before = moved
+            previous = moved
         else:
             _deviation(elastic, s, rigid)  # refuses columns that are not finite
             raise CannotAnswerError(
@@ -215,7 +215,7 @@ class Model(Brief):
     ) -> Floats:  # fmt: skip
         """Derivative (N, m, P) of the readings by the parameters of `effects`.
 
-        `effects` may or may not be in the model; one that is not is taken at zero. Analytic:
+        `effects` need not be in the model; the parameters of one that is not are zero. Analytic:
         the static equilibrium is differentiated implicitly (`equilibrium`). With `scale`
         (P,), by the parameters in these units.
         """
@@ -243,22 +243,22 @@ class Model(Brief):
         s = prediction.situation
         moves, blocks = self._motion(prediction, theta, out.shape[1])
         columns = ReadingColumns(moves, blocks, s.load, out, scale)
-        mine = self._parts(theta)
+        parts = self._parts(theta)
         for e, place in zip(effects, places, strict=True):
             if not (place >= 0).any():
                 continue
-            at = next((t for other, t in mine if other is e), np.zeros(len(place)))
+            values = next((t for effect, t in parts if effect is e), np.zeros(len(place)))
             for c in e.checked_columns(s):
                 columns.add(c, place)
-            if e in self.effects and e.compliance(at) is not None:
-                for other, part in mine:
-                    for c in other.compliance_columns(part, s):
+            if e in self.effects and e.compliance(values) is not None:
+                for effect, t in parts:
+                    for c in effect.compliance_columns(t, s):
                         columns.add(e.of_compliance(c), place)
             if not blocks:
                 continue
-            if (change := e.load_columns(at, s)) is not None:
+            if (change := e.load_columns(values, s)) is not None:
                 columns.add_load_changes(change, place)
-            elif (change := e.wrench_columns(at, s)) is not None:
+            elif (change := e.wrench_columns(values, s)) is not None:
                 columns.add_wrench_changes(change, place)
         columns.write()
 
@@ -303,8 +303,8 @@ class Model(Brief):
 
     def _compliance(self, theta: Floats) -> Floats:
         """(n,) joint compliances in force."""
-        found = [c for e, t in self._parts(theta) if (c := e.compliance(t)) is not None]
-        return found[0] if found else typical_compliances(self.cell)
+        compliances = [c for e, t in self._parts(theta) if (c := e.compliance(t)) is not None]
+        return compliances[0] if compliances else typical_compliances(self.cell)
 
     def _load(self, states: States, theta: Floats) -> Load:
         cell, point = self.cell, self.cell.load_point
@@ -320,9 +320,9 @@ class Model(Brief):
 
     def _corrected(self, recorded: Load, s: Situation, theta: Floats) -> Load:
         """Load with the wrench that acts, at the orientation of the flange."""
-        changes = [e.wrench_change(t, s) for e, t in self._parts(theta)]
-        given = [c for c in changes if c is not None]
-        return replace(recorded, wrench=sum(given, recorded.wrench)) if given else recorded
+        changes = (e.wrench_change(t, s) for e, t in self._parts(theta))
+        wrench = sum((c for c in changes if c is not None), recorded.wrench)
+        return replace(recorded, wrench=wrench)
 
 
 def _deviation(
@@ -335,8 +335,8 @@ def _deviation(
     columns: list[Columns] = []
     first = 0
     for e, t in parts:
-        found = e.checked_columns(s) if checked else e.columns(s)
-        columns += (replace(c, parameter=c.parameter + first) for c in found)
+        of_effect = e.checked_columns(s) if checked else e.columns(s)
+        columns += (replace(c, parameter=c.parameter + first) for c in of_effect)
         first += len(t)
     theta = np.concatenate([t for _, t in parts]) if parts else np.zeros(0)
     return total(tuple(columns), theta, s, start)

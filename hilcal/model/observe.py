@@ -28,15 +28,15 @@ ALL = slice(0, 6)  # All elements of a twist
 class Observation(Brief):
     """What the sensor would read without noise."""
 
-    position: Floats  # (N, 3) what is read of the target, sensor axes, m; or see above
+    position: Floats  # (N, 3) position read, sensor axes, m; with several observers see above
     rotation: Floats  # (N, 3, 3) target axes in sensor axes
     base_position: Floats  # (N, 3) target position in the base axes of the chain, m
     # (N, 3, 3) orientation of the chain's base axes in sensor axes: the derivative of `position` by
     # displacements of the target, base axes
     axes: Floats
-    sensor: Floats | None = None  # (N, 3) target, sensor axes, m; as below of several observers
-    own: Floats | None = None  # (N, 3) the same in the axes of the observer
-    read: Floats | None = None  # (N, 3, 3) derivative of `position` by `own`
+    sensor: Floats | None = None  # (N, 3) target, sensor axes, m; None without several observers
+    local: Floats | None = None  # (N, 3) the same in the axes of the observer
+    read: Floats | None = None  # (N, 3, 3) derivative of `position` by `local`
     by_sensor: Floats | None = None  # (N, 3, 3) derivative of `position` by `sensor`
     distance: Floats | None = None  # (N,) 1 where a distance is read, which has an offset; else 0
 
@@ -46,7 +46,7 @@ def observe(
     chain: Chain,
     deviation: Deviation,
     target: Ints | None = None,  # (N,) number of the target, where there are several
-    observer: Ints | None = None,  # (N,) number of what observes it, where there are several
+    observer: Ints | None = None,  # (N,) number of the observer, where there are several
 ) -> Observation:
     """Read the target of a deviated chain."""
     pose = cell.target_of(target)
@@ -80,58 +80,59 @@ def _observed(
     cell: Cell, deviation: Deviation, observer: Ints, sensor: Floats, rotation: Floats,
     base_position: Floats, axes: Floats,
 ) -> Observation:  # fmt: skip
-    """Read what is seen in sensor axes by the observers (N,)."""
-    turn, own, offset = _in_own_axes(cell.observers, observer, sensor)
+    """Convert positions and attitudes in sensor axes into the readings of the observers (N,)."""
+    turn, local, offset = _in_observer_axes(cell.observers, observer, sensor)
     if deviation.observer is not None:
-        twist, more = _apart(deviation.observer, _distances(cell.observers, observer))
-        moved_r, moved_p = se3.exp(twist)
-        own, turn = moved_p + se3.apply(moved_r, own), se3.product(moved_r, turn)
-        offset = offset + more
-    value, read, distance = _sensed(cell.observers, observer, own, offset)
+        twist, extra = _twist_and_offset(deviation.observer, _distances(cell.observers, observer))
+        observer_r, observer_p = se3.exp(twist)
+        local, turn = observer_p + se3.apply(observer_r, local), se3.product(observer_r, turn)
+        offset = offset + extra
+    value, read, distance = _sensed(cell.observers, observer, local, offset)
     by_sensor = se3.product(read, turn)
     rotation, axes = se3.product(turn, rotation), se3.product(by_sensor, axes)
-    told = (sensor, own, read, by_sensor, distance)
-    return Observation(value, rotation, base_position, axes, *told)
+    return Observation(
+        value, rotation, base_position, axes, sensor, local, read, by_sensor, distance
+    )
 
 
 def read_by(
     observers: Sequence[Observer], number: Ints, sensor: Floats, rotation: Floats
 ) -> tuple[Floats, Floats]:
     """Return what observers (N,) read of positions (N, 3) and attitudes, sensor axes."""
-    turn, own, offset = _in_own_axes(observers, number, sensor)
-    return _sensed(observers, number, own, offset)[0], turn @ rotation
+    turn, local, offset = _in_observer_axes(observers, number, sensor)
+    return _sensed(observers, number, local, offset)[0], turn @ rotation
 
 
-def _in_own_axes(
+def _in_observer_axes(
     observers: Sequence[Observer], number: Ints, sensor: Floats
 ) -> tuple[Floats, Floats, Floats]:
     """Orientation (N, 3, 3) of the observers, positions (N, 3) in their axes, offsets (N,)."""
     frame = np.stack([o.frame for o in observers])[number]
-    own = frame[:, :3, 3] + se3.apply(frame[:, :3, :3], sensor)
-    return frame[:, :3, :3], own, np.array([o.offset for o in observers])[number]
+    local = frame[:, :3, 3] + se3.apply(frame[:, :3, :3], sensor)
+    return frame[:, :3, :3], local, np.array([o.offset for o in observers])[number]
 
 
 def _distances(observers: Sequence[Observer], number: Ints) -> Bools:
     return np.array([o.name.kind == "point" for o in observers])[number]
 
 
-def _apart(moved: Floats, far: Bools) -> tuple[Floats, Floats]:
-    """Twists (N, 6) and offsets (N,) of what observes, see `Deviation.observer`."""
+def _twist_and_offset(moved: Floats, far: Bools) -> tuple[Floats, Floats]:
+    """Twists (N, 6) and offsets (N,) of the observers, see `Deviation.observer`."""
     twist = moved.copy()
     twist[far, 3:] = 0.0
     return twist, np.where(far, moved[:, 3], 0.0)
 
 
 def _sensed(
-    observers: Sequence[Observer], number: Ints, own: Floats, offset: Floats
+    observers: Sequence[Observer], number: Ints, local: Floats, offset: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """What is read (N, 3) of positions in own axes, its derivative, and where it is a distance."""
+    """What observers read (N, 3) of local positions, the derivative, and where it is a distance."""
     kind = np.array([o.name.kind for o in observers])[number]
     far, flat = _distances(observers, number), kind == "gauge"
-    length = np.linalg.norm(own, axis=1)
-    read, value = np.tile(np.eye(3), (len(own), 1, 1)), own.copy()
+    length = np.linalg.norm(local, axis=1)
+    read, value = np.tile(np.eye(3), (len(local), 1, 1)), local.copy()
     read[far | flat], value[far | flat, 1:] = 0.0, 0.0
-    read[far, 0] = own[far] / np.maximum(length[far], 1e-12)[:, None]
+    read[far, 0] = local[far] / np.maximum(length[far], 1e-12)[:, None]
     read[flat, 0, 0] = 1.0
     value[far, 0] = length[far] + offset[far]
     return value, read, far.astype(float)
@@ -151,8 +152,8 @@ class ReadingDerivative:
     m: int
     frames: "SlotFrames"
     dq: Floats  # (N, m, n) derivative by displacements of the chain's joints
-    yielding: MotionGradient | None = None  # of what the arm yields to the motions
-    _known: dict[int, tuple[Floats, Floats]] = field(default_factory=dict, repr=False)
+    yielding: MotionGradient | None = None  # of the yielding of the arm
+    _cache: dict[int, tuple[Floats, Floats]] = field(default_factory=dict, repr=False)
 
     @property
     def drives(self) -> Floats:
@@ -166,21 +167,21 @@ class ReadingDerivative:
         if self.yielding is not None:
             w = w + self.yielding.turn(slot)
             if self.frames.need_displacement(slot, elements):
-                more = self.yielding.displacement(slot)
-                v = v if more is None else v + more
+                shift = self.yielding.displacement(slot)
+                v = v if shift is None else v + shift
         return self.frames.by_twist(slot, v, w, elements)
 
     def _rigid(self, slot: int) -> tuple[Floats, Floats]:
         """Rows (N, m, 3) by displacement and turn of all beyond a slot, as of a rigid body."""
-        if slot not in self._known:
+        if slot not in self._cache:
             o, scale = self.observation, self.deviation.scale
             axes = o.axes if scale is None else o.axes * (1 + scale[:, None, None])
             lever = o.base_position - self.chain.position[slot]
             v, w = axes, se3.cross(lever[:, None], axes)
             if self.m == 6:
                 v, w = (np.concatenate(x, axis=1) for x in ((axes, 0 * axes), (w, o.axes)))
-            self._known[slot] = v, w
-        return self._known[slot]
+            self._cache[slot] = v, w
+        return self._cache[slot]
 
     def by_base(self) -> Floats:
         """Motion (N, m, 6) by the twist of the base."""
@@ -220,28 +221,28 @@ class ReadingDerivative:
     def by_observer(self) -> Floats:
         """Motion (N, m, 6) by the twist of the observer's frame, see `Deviation.observer`."""
         moved = zeros(len(self.dq), self.m, 6)
-        at, twist = self.observation, self.deviation.observer
-        if at.own is not None and at.read is not None:
-            far = np.asarray(at.distance, dtype=float)
-            back = None if twist is None else -_apart(twist, far > 0)[0]
-            by = twist_jacobian(np.eye(3)[None], at.own, back)
-            moved[:, :3] = at.read @ by[:, :3]
-            moved[:, 3:] = by[:, 3 : self.m]
+        o, twist = self.observation, self.deviation.observer
+        if o.local is not None and o.read is not None:
+            far = np.asarray(o.distance, dtype=float)
+            back = None if twist is None else -_twist_and_offset(twist, far > 0)[0]
+            jacobian = twist_jacobian(np.eye(3)[None], o.local, back)
+            moved[:, :3] = o.read @ jacobian[:, :3]
+            moved[:, 3:] = jacobian[:, 3 : self.m]
             moved[far > 0, 0, 3:] = [1.0, 0.0, 0.0]
         return moved
 
     def _as_read(self, moved: Floats) -> Floats:
         """Motion (N, m, E) of the reading by that of the target in sensor axes."""
-        by = self.observation.by_sensor
-        if by is None:
+        by_sensor = self.observation.by_sensor
+        if by_sensor is None:
             return moved
-        blocks = [by @ moved[:, k : k + 3] for k in range(0, self.m, 3)]
+        blocks = [by_sensor @ moved[:, k : k + 3] for k in range(0, self.m, 3)]
         return np.concatenate(blocks, axis=1)
 
     def _unscaled(self) -> Floats:
         """Position (N, 3) before the scale error, sensor axes."""
-        scale, at = self.deviation.scale, self.observation
-        position = at.position if at.sensor is None else at.sensor
+        scale, o = self.deviation.scale, self.observation
+        position = o.position if o.sensor is None else o.sensor
         return position if scale is None else position / (1 + scale[:, None])
 
 
@@ -253,8 +254,8 @@ class SlotFrames:
     """
 
     chain: Chain
-    # R J and R Q (None for zero) of the slots that were asked for
-    known: dict[int, tuple[Floats, Floats | None]] = field(default_factory=dict)
+    # R J and R Q (None for zero) of the slots that were needed
+    cache: dict[int, tuple[Floats, Floats | None]] = field(default_factory=dict)
 
     def by_twist(self, slot: int, v: Floats | None, w: Floats, elements: slice = ALL) -> Floats:
         """Rows (N, m, E) by elements of the twist, from rows by v (None for zero) and ω."""
@@ -274,25 +275,25 @@ class SlotFrames:
         return out
 
     def need_displacement(self, slot: int, elements: slice) -> bool:
-        """Whether these elements of the twist of a slot displace what is beyond it."""
+        """Whether these elements of the twist of a slot displace the arm beyond it."""
         return elements.start < 3 or self._blocks(slot)[1] is not None
 
     def _blocks(self, slot: int) -> tuple[Floats, Floats | None]:
-        if slot not in self.known:
+        if slot not in self.cache:
             r, shift = self.chain.rotation[slot], None
             twist = None if self.chain.twist is None else self.chain.twist[slot]
             if twist is not None and twist.any():
                 j, q = se3.right_jacobian_blocks(twist)
                 shift = se3.product(r, q) if twist[:, :3].any() else None
                 r = se3.product(r, j)
-            self.known[slot] = r, shift
-        return self.known[slot]
+            self.cache[slot] = r, shift
+        return self.cache[slot]
 
 
 def motion(
     cell: Cell, observation: Observation, chain: Chain, deviation: Deviation, m: int
 ) -> ReadingDerivative:
-    """Prepare the motions of a reading with m elements, the wrenches held as they are."""
+    """Prepare the motions of a reading with m elements at fixed wrenches."""
     moved = joint_jacobian(chain, observation.base_position)
     dq = _to_sensor(observation, deviation, moved, m)
     return ReadingDerivative(cell, observation, chain, deviation, m, SlotFrames(chain), dq)

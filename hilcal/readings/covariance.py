@@ -8,8 +8,8 @@ the scatter of the joints from one arrival to the next, J the Jacobian of the ta
 (`joint_scatter`).
 
 The third term needs the registration; it is added when the readings are opened
-(`identification.full_covariance`), with σ_q from [repeatability]. What the stored covariances
-cover, the file states (`COVERS`):
+(`identification.full_covariance`), with σ_q from [repeatability]. The file states what the stored
+covariances cover (`COVERS`):
 
 - a measured campaign stores the first two terms: `INSTRUMENT`, the third is added;
 - an imported campaign stores what its table states, or `tracker_covariance` where the table states
@@ -17,10 +17,10 @@ cover, the file states (`COVERS`):
   covariances include the arm's scatter, its column `covers` says so ("instrument+arm", which
   `hilcal export` writes), or the cell does ([repeatability] in_tables = true): `WHOLE`, and nothing
   is added;
-- a campaign imported before the file stated it is read as it was: nothing is added.
+- to a campaign whose file does not state it, of an older version, nothing is added.
 
-Two readings have in common the scatter of an arrival and noise that is correlated along their
-order, two deflections the error of their unloaded readings (`measurement_covariance`).
+Two readings share the scatter of an arrival, and noise that is correlated along their order; two
+deflections share the error of their unloaded readings (`measurement_covariance`).
 """
 
 from collections.abc import Sequence
@@ -55,7 +55,7 @@ class TrackerNoise:
     orientation_std: float = 0.0  # of a small rotation about any axis, rad; 0 if not read
 
     def __post_init__(self) -> None:
-        """Refuse what no instrument can have."""
+        """Refuse impossible figures."""
         for f in fields(self):
             value = getattr(self, f.name)
             if not np.isfinite(value) or value < 0:
@@ -135,8 +135,8 @@ def expected_share_of_mean(samples: int, systematic_share: float) -> float:
 
 def joint_scatter(jacobian: Floats, joint_std: Floats, rotation: Floats, m: int) -> Floats:
     """Covariance (..., m, m) of a reading from the scatter of the joints: R J Σ_q Jᵀ Rᵀ."""
-    turned = scatter_factor(jacobian, joint_std, rotation, m)
-    return np.asarray(turned @ np.swapaxes(turned, -1, -2))
+    factor = scatter_factor(jacobian, joint_std, rotation, m)
+    return np.asarray(factor @ np.swapaxes(factor, -1, -2))
 
 
 def scatter_factor(jacobian: Floats, joint_std: Floats, rotation: Floats, m: int) -> Floats:
@@ -161,16 +161,16 @@ def arrival_factors(
 def with_scatter(readings: Readings, factor: Floats) -> Readings:
     """Return the readings with a scatter of the arm, F (N, m, k), added: V + F Fᵀ."""
     total = readings.covariance + factor @ np.swapaxes(factor, 1, 2)
-    return replace(readings, covariance=total, common=_of_arrival(readings, factor))
+    return replace(readings, covariance=total, common=_common_factor(readings, factor))
 
 
 def scatter_alone(readings: Readings, factor: Floats) -> Readings:
     """Return the readings with the covariance of a scatter F (N, m, k) of the arm alone."""
-    own = factor @ np.swapaxes(factor, 1, 2)
-    return replace(readings, covariance=own, common=_of_arrival(readings, factor), serial=None)
+    v = factor @ np.swapaxes(factor, 1, 2)
+    return replace(readings, covariance=v, common=_common_factor(readings, factor), serial=None)
 
 
-def _of_arrival(readings: Readings, factor: Floats) -> Floats | None:
+def _common_factor(readings: Readings, factor: Floats) -> Floats | None:
     s = readings.states
     return None if s.target is None and s.observer is None else factor
 
@@ -197,9 +197,9 @@ def measurement_covariance(
 ) -> Floats:
     """(G, L·m, L·m) covariance D C Dᵀ of the measurements of each group, D = [I, −weights].
 
-    C, of all its readings, has the blocks V_i, and F_i F_jᵀ for two readings of one arrival; where
-    their noise is correlated, φ S_i C_ij S_jᵀ more, see `readings.readings`. Of groups (G, L) of
-    loaded and (G, U) of unloaded rows.
+    C, the covariance of all readings of a group, has the blocks V_i, and F_i F_jᵀ for two readings
+    of one arrival; where their noise is correlated, φ S_i C_ij S_jᵀ is added, see
+    `readings.readings`. A group has L loaded and U unloaded rows, (G, L) and (G, U).
     """
     rows = np.concatenate([loaded, reference], axis=1)
     groups, count = rows.shape
@@ -209,12 +209,12 @@ def measurement_covariance(
         f, arrival = readings.common[rows], readings.arrivals[rows]
         together = (arrival[:, :, None] == arrival[:, None, :]).astype(float)
         np.einsum("gain,gbjn,gab->gaibj", f, f, together, out=c, optimize=True)
-    each = np.arange(count)
+    index = np.arange(count)
     if readings.serial is not None and readings.along is not None:
         root = instrument_root(readings)[rows]
         shared = readings.serial.share * readings.serial.correlation(readings.along[rows])
         c += np.einsum("gaik,gab,gbjk->gaibj", root, shared, root, optimize=True)
-    c[:, each, :, each, :] = np.moveaxis(readings.covariance[rows], 1, 0)
+    c[:, index, :, index, :] = np.moveaxis(readings.covariance[rows], 1, 0)
     if reference.shape[1]:
         d = np.concatenate([np.eye(len(weights)), -weights], axis=1)
         c = np.einsum("pa,gaibj,qb->gpiqj", d, c, d, optimize=True)
@@ -223,7 +223,7 @@ def measurement_covariance(
 
 
 def single_covariance(v: Floats, loaded: Ints, reference: Ints, weights: Floats) -> Floats:
-    """(G, L, m, m) covariance of each measurement by itself, from V (N, m, m); see above."""
+    """(G, L, m, m) covariance of each measurement by itself, from V (N, m, m)."""
     unloaded = np.einsum("lu,guij->glij", weights**2, v[reference])
     return np.asarray(v[loaded] + unloaded)
 
@@ -231,7 +231,7 @@ def single_covariance(v: Floats, loaded: Ints, reference: Ints, weights: Floats)
 def smallest_correlation(covariance: Floats) -> Floats:
     """Return the smallest eigenvalue (N,) of the correlation matrices of covariances (N, m, m).
 
-    −∞ where these are none: a covariance without variance, a negative one, or beyond ±1.
+    −∞ for a covariance without variance, a negative variance, or a correlation beyond ±1.
     """
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     scale = 1.0 / np.sqrt(np.where(variance > 0, variance, 1.0))

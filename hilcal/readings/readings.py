@@ -9,8 +9,8 @@ w_i independent of covariance V_i, each element of z an Ornstein-Uhlenbeck proce
 covariance holds for each reading. t is the time of a reading, or its number in the order, where
 z is an AR(1) process with ρ = exp(−1/τ). S_i is the symmetric root of V_i's correlation matrix
 times the standard deviations: neighbours with nearly the same V have nearly the same S, in any
-units. Of V, an estimated scatter of the arm and what targets share in one arrival are left out:
-these are of the arm, and new in each arrival.
+units. V excludes an estimated scatter of the arm and the error that targets share in one arrival:
+the arm draws these anew in each arrival.
 
 Source: Gelb (ed.), *Applied Optimal Estimation* (1974), section 3.8 (exponentially correlated
 noise).
@@ -47,12 +47,11 @@ class States(Brief):
         joint_temperature: (N, n) °C.
         approach: (N, n) side from which each joint arrived, -1 or +1.
         q_actual: (N, n) joint angles that the encoders reported, rad.
-        torque: (N, n) static torques that the drives were measured to exert, N·m: those of load
-            and weight about the drives' axes (`Situation.torque`) with the other sign; NaN in
-            readings that lack them.
+        torque: (N, n) measured static torques of the drives, N·m: the negative of those by load
+            and weight about the drives' axes (`Situation.torque`); NaN in readings without them.
         target: (N,) number of the target that is read, in the order of `Cell.target_names`; None
             where the tool carries one target.
-        observer: (N,) number of what observes, in the order of `Readings.observers`; None where one
+        observer: (N,) number of the observer, in the order of `Readings.observers`; None where one
             tracker reads all.
     """
 
@@ -74,7 +73,7 @@ class States(Brief):
 
     def __getitem__(self, rows: Ints | Bools | slice) -> "States":
         """Return the chosen states."""
-        return by_field([self], lambda given: given[0][rows])
+        return by_field([self], lambda fields: fields[0][rows])
 
     @staticmethod
     def joined(parts: Sequence["States"]) -> "States":
@@ -90,7 +89,7 @@ class ObserverName:
     name: str
 
     def __str__(self) -> str:
-        """Return both."""
+        """Return kind and name."""
         return f"{self.kind} {self.name}"
 
 
@@ -105,8 +104,8 @@ class ArmScatter:
         std_error: their standard uncertainties.
         size_m: rms over the readings of the 3-D displacement of the target.
         log_evidence: log odds of this against noise of the instrument that is larger than stated.
-        instrument_factor: by how much the instrument's standard deviations were larger, then.
-        predicted_share: share of the misfit that something recorded predicts on poses left out.
+        instrument_factor: factor of the instrument's standard deviations in that alternative.
+        predicted_share: share of the misfit on poses left out that recorded variables predict.
         predicted_by: the variables that predict it, at most two.
     """
 
@@ -138,11 +137,11 @@ class SerialNoise:
         share: φ, 0 to 1.
         share_error: its standard uncertainty.
         length: τ, s or readings.
-        rho: correlation of z between consecutive readings, of the median distance in time.
+        rho: correlation of z between consecutive readings, at their median distance in time.
         rho_error: its standard uncertainty.
-        log_likelihood_ratio: gain of the restricted log likelihood over white noise, with every
-            effect that the readings could show beside either.
-        proved: whether that is more than chance; False where effects explain the readings as well.
+        log_likelihood_ratio: gain of the restricted log likelihood over white noise, both with
+            every effect that the readings could show.
+        proved: whether that gain is significant; False where effects explain the readings as well.
         instead: what explains them as well, where it is not proved.
         wider: least and largest factor by which it changes the standard uncertainties of the
             parameters.
@@ -188,7 +187,7 @@ class Readings(Tabular):
     """N readings of the target's position (m = 3) or pose (m = 6), one per state.
 
     A distance or a height is one number: the first element of a reading of m = 3, whose others are
-    0 and have no variance, so that whitening leaves them out (`whitening.inverse_root`).
+    0 and have no variance, so that whitening drops them (`whitening.inverse_root`).
 
     Attributes:
         pose: (N,) index of the commanded pose; equal numbers mean the same pose.
@@ -204,9 +203,9 @@ class Readings(Tabular):
             Cov(i, j) = F_i F_jᵀ for two readings i, j of one arrival (see `arrivals`); F_i F_iᵀ
             is part of `covariance`. None where no such error is known.
         scatter_stated: whether the arm's own scatter is in the covariances, as far as it is known;
-            where False, `hilcal.diagnose` may find what is left to be that scatter.
-        noise_stated: whether somebody states the noise; where False, it was estimated from these
-            readings, so that χ² says nothing of what is missing.
+            where False, `hilcal.diagnose` may attribute the remaining misfit to it.
+        noise_stated: whether the noise is stated; where False, it was estimated from these
+            readings, so that χ² does not test the model.
         stated: (N, m, m) the covariance without a scatter that was estimated; None where
             `covariance` has none.
         arm_scatter: the estimate that `covariance` includes beside `stated`.
@@ -239,7 +238,7 @@ class Readings(Tabular):
 
     def __getitem__(self, rows: Ints | Bools | slice) -> "Readings":
         """Return the chosen readings; names are kept."""
-        chosen = by_field([self], lambda given: given[0][rows])
+        chosen = by_field([self], lambda fields: fields[0][rows])
         return replace(chosen, states=self.states[rows])
 
     @staticmethod
@@ -248,8 +247,8 @@ class Readings(Tabular):
         if len(parts) == 1:
             return parts[0]
         states = States.joined([p.states for p in parts])
-        whole = by_field(parts, np.concatenate)
-        return replace(whole, states=states, common=None, serial=None, along=None)
+        joined = by_field(parts, np.concatenate)
+        return replace(joined, states=states, common=None, serial=None, along=None)
 
     def as_stated(self) -> "Readings":
         """Return the readings without an estimated scatter of the arm."""
@@ -280,28 +279,28 @@ class Readings(Tabular):
     @property
     def target(self) -> Ints:
         """(N,) number of the target that is read; 0 where there is one."""
-        given = self.states.target
-        return np.zeros(len(self), dtype=np.int64) if given is None else given
+        number = self.states.target
+        return np.zeros(len(self), dtype=np.int64) if number is None else number
 
     @property
     def observer(self) -> Ints:
-        """(N,) number of what observes; 0 where one tracker reads all."""
-        given = self.states.observer
-        return np.zeros(len(self), dtype=np.int64) if given is None else given
+        """(N,) number of the observer; 0 where one tracker reads all."""
+        number = self.states.observer
+        return np.zeros(len(self), dtype=np.int64) if number is None else number
 
     def seen_by(self, observers: Sequence[ObserverName]) -> "Readings":
-        """Return the readings with observers numbered as those of others; as they are without any.
+        """Return the readings with observers numbered as in `observers`; without any unchanged.
 
         Raises:
-            InputError: one that is not among these.
+            InputError: an observer that is not in `observers`.
         """
         if self.states.observer is None or self.observers == tuple(observers):
             return self
         for name in self.observers:
             if name not in observers:
-                known = ", ".join(map(str, observers)) or "one tracker"
+                valid = ", ".join(map(str, observers)) or "one tracker"
                 raise InputError(
-                    f"{name} observed these readings, but not those that were fitted: {known}"
+                    f"{name} observed these readings, but not those that were fitted: {valid}"
                 )
         number = np.array([list(observers).index(name) for name in self.observers])
         states = replace(self.states, observer=number[self.observer])
@@ -310,12 +309,12 @@ class Readings(Tabular):
     @property
     def scalar(self) -> Bools:
         """(N,) which readings are one number: a distance or a height."""
-        one = [k for k, o in enumerate(self.observers) if o.kind != "station"]
-        return np.isin(self.observer, one) & (len(one) > 0)
+        scalar = [k for k, o in enumerate(self.observers) if o.kind != "station"]
+        return np.isin(self.observer, scalar) & (len(scalar) > 0)
 
     @property
     def line(self) -> Ints:
-        """(N,) number of the pair of target and observer, of which deflections are taken."""
+        """(N,) number of the pair of target and observer; deflections are within one pair."""
         if self.states.observer is None:
             return self.target
         return self.target * max(len(self.observers), 1) + self.observer
@@ -329,17 +328,17 @@ class Readings(Tabular):
         several times there was read in as many arrivals, in the order of the readings.
         """
         keys = np.stack([self.pose, self.load, self.cycle, self.line], axis=1)
-        _, of = np.unique(keys, axis=0, return_inverse=True)
-        of = of.reshape(-1)
-        order = np.argsort(of, kind="stable")
-        first = np.flatnonzero(np.diff(of[order], prepend=-1))
+        _, group = np.unique(keys, axis=0, return_inverse=True)
+        group = group.reshape(-1)
+        order = np.argsort(group, kind="stable")
+        first = np.flatnonzero(np.diff(group[order], prepend=-1))
         visit = np.empty(len(self), dtype=np.int64)
         visit[order] = np.arange(len(self)) - np.repeat(first, np.diff(np.append(first, len(self))))
         keys[:, 3] = visit
         return np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
 
 
-MARGIN = 0.02  # share of the fitted range by which a reading is beyond it; a choice
+MARGIN = 0.02  # share of the fitted range by which values may exceed it; a choice
 FULL_TURN = 2.0 * np.pi
 
 
@@ -376,12 +375,12 @@ def travel_name(joint: int) -> str:
 
 
 def turning_variables(turns: Bools) -> frozenset[str]:
-    """Return the variables that mean the same whole turns on, of joints (n,) that do."""
+    """Return the angle variables of the joints (n,) that are periodic in whole turns."""
     return frozenset(angle_name(j) for j in np.flatnonzero(turns).tolist())
 
 
 def variables(s: States, units: Sequence[str]) -> Iterator[tuple[str, str, Floats]]:
-    """Yield name, unit, and the values (N,) of what a prediction may extrapolate in."""
+    """Yield name, unit and values (N,) of the variables in which a prediction may extrapolate."""
     for j, unit in enumerate(units):
         yield (travel_name if unit == "m" else angle_name)(j), unit, s.q[:, j]
     for name, unit, part in (("force", "N", slice(0, 3)), ("moment", "N·m", slice(3, 6))):

@@ -1,8 +1,8 @@
 """Which readings are the same measurements, whatever file, order, names or units they came in.
 
-A reading is known by what was measured: the commanded joints, the position, the attitude where it
-was read, and whether a load was on. Names of poses and loads, times, covariances and the order of
-the rows do not count, for a table may be imported again with other ones; nor does the wrench,
+A reading is identified by what was measured: the commanded joints, the position, the attitude where
+it was read, and whether a load was on. Names of poses and loads, times, covariances and the order
+of the rows do not count, since a table may be imported again with others; nor does the wrench,
 which changes with the configured mass of a load.
 
 Numbers agree within `LENGTH_M`, `ANGLE_RAD` and `ATTITUDE_RAD`. A tracker's scatter is far
@@ -25,29 +25,29 @@ SHARED = 0.1  # share of the readings that makes two campaigns of one measuremen
 _APART = 10.0  # Distance of loaded from unloaded readings, in units of the tolerance
 
 
-def already(readings: Readings, others: Readings) -> Bools:
-    """(N,) which readings are among others; by positions where one of both has these alone."""
-    attitude = readings.m == others.m == 6
-    return _near(_coordinates(readings, attitude), _coordinates(others, attitude))
+def already(readings: Readings, reference: Readings) -> Bools:
+    """(N,) which readings are among `reference`; attitudes count where both have them."""
+    attitude = readings.m == reference.m == 6
+    return _near(_coordinates(readings, attitude), _coordinates(reference, attitude))
 
 
 def prints(readings: Readings) -> Floats:
-    """(N, n + 4) what a reading is known by, to be kept: joints, position, whether loaded."""
+    """(N, n + 4) what identifies a reading, to be stored: joints, position, whether loaded."""
     return _coordinates(readings, attitude=False)
 
 
-def among(readings: Readings, kept: Floats) -> Bools:
-    """(N,) which readings are among those whose `prints` (M, n + 4) were kept."""
-    return _near(prints(readings), kept)
+def among(readings: Readings, stored: Floats) -> Bools:
+    """(N,) which readings are among those whose `prints` (M, n + 4) were stored."""
+    return _near(prints(readings), stored)
 
 
-def _near(own: Floats, others: Floats) -> Bools:
-    """(N,) which coordinates (N, K) are among others (M, K'); none where K' is not K."""
-    if not len(own) or not len(others) or own.shape[1] != others.shape[1]:
-        return np.zeros(len(own), dtype=np.bool_)
+def _near(points: Floats, reference: Floats) -> Bools:
+    """(N,) which points (N, K) are near one of `reference` (M, K'); none where K' is not K."""
+    if not len(points) or not len(reference) or points.shape[1] != reference.shape[1]:
+        return np.zeros(len(points), dtype=np.bool_)
     from scipy.spatial import cKDTree  # slow to import
 
-    distance, _ = cKDTree(others).query(own, p=np.inf, distance_upper_bound=1.0 + 1e-9)
+    distance, _ = cKDTree(reference).query(points, p=np.inf, distance_upper_bound=1.0 + 1e-9)
     return np.asarray(np.isfinite(distance))
 
 
@@ -55,25 +55,25 @@ def shared(campaigns: Sequence[Floats]) -> tuple[int, int] | None:
     """Return the numbers of two campaigns, by their `prints`, that share readings; else None."""
     from scipy.spatial import cKDTree  # slow to import
 
-    for width in sorted({of.shape[1] for of in campaigns}):
-        own = [(k, np.unique(of, axis=0)) for k, of in enumerate(campaigns) if of.shape[1] == width]
-        of = np.concatenate([np.full(len(rows), k) for k, rows in own])
-        rows = np.concatenate([rows for _, rows in own])
+    for width in sorted({c.shape[1] for c in campaigns}):
+        same = [(k, np.unique(c, axis=0)) for k, c in enumerate(campaigns) if c.shape[1] == width]
+        campaign = np.concatenate([np.full(len(rows), k) for k, rows in same])
+        rows = np.concatenate([rows for _, rows in same])
         if len(rows) < 2:
             continue
         tree = cKDTree(rows)
         neighbours = tree.query(rows, k=2, p=np.inf, distance_upper_bound=1.0 + 1e-9)
-        here, (distance, nearest) = np.arange(len(rows)), map(np.asarray, neighbours)
-        second = (nearest[:, 0] == here).astype(int)  # one of the two is the reading itself
-        distance, nearest = distance[here, second], nearest[here, second]
-        found = np.isfinite(distance)
-        other = np.full(len(rows), -1)
-        other[found] = of[nearest[found]]
-        for k, unique in own:
-            others = other[of == k]
-            others = others[(others >= 0) & (others != k)]
-            if len(others) > SHARED * len(unique):
-                return k, int(np.bincount(others).argmax())
+        index, (distance, nearest) = np.arange(len(rows)), map(np.asarray, neighbours)
+        second = (nearest[:, 0] == index).astype(int)  # one of the two is the reading itself
+        distance, nearest = distance[index, second], nearest[index, second]
+        near = np.isfinite(distance)
+        partner = np.full(len(rows), -1)
+        partner[near] = campaign[nearest[near]]
+        for k, unique in same:
+            partners = partner[campaign == k]
+            partners = partners[(partners >= 0) & (partners != k)]
+            if len(partners) > SHARED * len(unique):
+                return k, int(np.bincount(partners).argmax())
     return None
 
 
@@ -82,18 +82,18 @@ def never_fitted(readings: Readings, fitted: Readings, deflections: bool) -> tup
 
     A deflection is unseen if neither its loaded nor an unloaded reading of it was fitted.
     """
-    known = already(readings, fitted)
+    repeated = already(readings, fitted)
     if not deflections:
-        return known, ~known
+        return repeated, ~repeated
     keys = np.stack([readings.pose, readings.cycle, readings.target], axis=1)
     _, group = np.unique(keys, axis=0, return_inverse=True)
     group = group.reshape(-1)
     spoilt = np.zeros(group.max(initial=-1) + 1, dtype=np.bool_)
-    spoilt[group[known & readings.unloaded]] = True
-    unseen = ~known & ~spoilt[group]
+    spoilt[group[repeated & readings.unloaded]] = True
+    unseen = ~repeated & ~spoilt[group]
     loaded = np.zeros(len(spoilt), dtype=np.bool_)
     loaded[group[unseen & ~readings.unloaded]] = True
-    return known, unseen & loaded[group]
+    return repeated, unseen & loaded[group]
 
 
 def _coordinates(r: Readings, attitude: bool) -> Floats:

@@ -7,8 +7,8 @@ targets were read in one arrival of the arm, they share its scatter F_i F_jᵀ (
 absolute readings have one block per arrival, deflections one per pose and cycle, all targets
 together. The blocks are kept stacked by size; nothing of size (readings)² exists. Noise that is
 correlated along the order of the readings (`Readings.serial`) makes blocks of runs of them, up to
-`RUN` measurements; what it has in common across the ends of a run is neglected. Their S is
-Cholesky's factor: the whitened rows of a measurement are what earlier ones do not predict of it.
+`RUN` measurements; the correlation across the ends of a run is neglected. Their S is Cholesky's
+factor: the whitened rows of a measurement are its innovation, which earlier ones do not predict.
 
     none   G = I
     gu     G = diag(1/M_ik), M_ik the standard deviation of element k of measurement i
@@ -42,13 +42,13 @@ def arrival_groups(readings: Readings) -> list[Group]:
     sizes = np.diff(np.append(starts, count))
     if len(starts) == count:
         order = np.arange(count)
-    found = []
+    groups = []
     for size in np.unique(sizes):
         rows = order[starts[sizes == size][:, None] + np.arange(size)]
         limits.check_shared(int(size), readings.m, len(rows))
         none = np.empty((len(rows), 0), dtype=np.int64)
-        found.append((rows, none, np.zeros((size, 0))))
-    return found
+        groups.append((rows, none, np.zeros((size, 0))))
+    return groups
 
 
 def deflection_groups(readings: Readings) -> list[Group]:
@@ -65,7 +65,7 @@ def deflection_groups(readings: Readings) -> list[Group]:
     unloaded, target = readings.unloaded[rows], readings.line[rows]
     if readings.common is None:
         keys.append(readings.line)
-    group = _numbered([k[rows] for k in keys])
+    group = _numbered([i[rows] for i in keys])
     order = np.lexsort((target, ~unloaded, group))
     starts = np.flatnonzero(np.diff(group[order], prepend=-1))
     sizes = np.diff(np.append(starts, len(rows)))
@@ -73,50 +73,50 @@ def deflection_groups(readings: Readings) -> list[Group]:
     alike = np.zeros_like(starts)
     if readings.common is not None:
         kinds: dict[bytes, int] = {}
-        for k, mine in enumerate(np.split(target[order], starts[1:])):
-            alike[k] = kinds.setdefault(mine.tobytes(), len(kinds))
+        for i, targets in enumerate(np.split(target[order], starts[1:])):
+            alike[i] = kinds.setdefault(targets.tobytes(), len(kinds))
     shapes = np.stack([sizes, count, alike], axis=1)
-    found = []
+    groups = []
     for shape in np.unique(shapes, axis=0):
         size, u = int(shape[0]), int(shape[1])
         if size == u:
             continue
-        at = order[starts[np.all(shapes == shape, axis=1)][:, None] + np.arange(size)]
-        limits.check_shared(size - u, readings.m, len(at))
+        k = order[starts[np.all(shapes == shape, axis=1)][:, None] + np.arange(size)]
+        limits.check_shared(size - u, readings.m, len(k))
         limits.check_numbers(f"{size - u} loaded times {u} unloaded readings", (size - u) * u)
-        same = target[at[0, u:], None] == target[at[0, :u]]
-        found.append((rows[at[:, u:]], rows[at[:, :u]], same / same.sum(axis=1, keepdims=True)))
-    if not found:
+        same = target[k[0, u:], None] == target[k[0, :u]]
+        groups.append((rows[k[:, u:]], rows[k[:, :u]], same / same.sum(axis=1, keepdims=True)))
+    if not groups:
         raise InputError(
             "readings = deflection: no target was read both loaded and unloaded in one pose and "
             "cycle; use absolute"
         )
-    return found
+    return groups
 
 
 def runs(readings: Readings, groups: Sequence[Group], most: int) -> list[Group]:
-    """Join groups to runs of about so many measurements along `Readings.along`; none is divided."""
-    each = [
+    """Join whole groups to runs of about `most` measurements along `Readings.along`."""
+    singles = [
         (loaded, reference, weights)
         for of_shape, references, weights in groups
         for loaded, reference in zip(of_shape, references, strict=True)
     ]
     t = np.arange(len(readings)) if readings.along is None else readings.along
-    first = np.argsort([t[loaded].min() for loaded, _, _ in each], kind="stable")
-    sizes = np.cumsum([len(each[k][0]) for k in first])
+    first = np.argsort([t[loaded].min() for loaded, _, _ in singles], kind="stable")
+    sizes = np.cumsum([len(singles[k][0]) for k in first])
     count = -(-int(sizes[-1]) // most)
-    of = (sizes - 1) * count // int(sizes[-1])
-    found = []
+    run_of = (sizes - 1) * count // int(sizes[-1])
+    joined = []
     for run in range(count):
-        parts = [each[k] for k in first[of == run]]
+        parts = [singles[k] for k in first[run_of == run]]
         if not parts:
             continue
         loaded = np.concatenate([p[0] for p in parts])
         order = np.argsort(t[loaded], kind="stable")
         weights = block_diag(*(p[2] for p in parts))[order]
         reference = np.concatenate([p[1] for p in parts])
-        found.append((loaded[order][None], reference[None], weights))
-    return found
+        joined.append((loaded[order][None], reference[None], weights))
+    return joined
 
 
 def _numbered(keys: Sequence[Ints]) -> Ints:
@@ -172,8 +172,8 @@ def inverse_root(covariance: Floats, scaling: Scaling = "gc") -> Floats:
     if scaling == "none":
         return np.broadcast_to(np.eye(k), covariance.shape)
     variance = np.diagonal(covariance, axis1=-2, axis2=-1)
-    seen = variance > 0
-    per_std = np.where(seen, 1.0, 0.0) / np.sqrt(np.where(seen, variance, 1.0))
+    positive = variance > 0
+    per_std = np.where(positive, 1.0, 0.0) / np.sqrt(np.where(positive, variance, 1.0))
     if scaling == "gu":
         return np.asarray(per_std[..., None] * np.eye(k))
     if covariance.ndim == 3 and len(covariance) >= MANY:
@@ -185,8 +185,8 @@ def _eigenvalue_roots(covariance: Floats, per_std: Floats) -> Floats:
     """S⁻¹ (..., k, k) by eigenvalues of the correlation matrix, the rule applied."""
     correlation = covariance * per_std[..., :, None] * per_std[..., None, :]
     values, vectors = np.linalg.eigh((correlation + np.swapaxes(correlation, -1, -2)) / 2)
-    kept = values > RANK_TOLERANCE * values[..., -1:]
-    per_root = np.where(kept, 1.0, 0.0) / np.sqrt(np.where(kept, values, 1.0))
+    regular = values > RANK_TOLERANCE * values[..., -1:]
+    per_root = np.where(regular, 1.0, 0.0) / np.sqrt(np.where(regular, values, 1.0))
     rows = per_root[..., :, None] * np.swapaxes(vectors, -1, -2)
     return np.asarray(rows * per_std[..., None, :])
 
@@ -214,14 +214,14 @@ class Bucket:
     loaded: Ints  # (G, L) rows of the readings
     reference: Ints  # (G, U) rows of the unloaded readings; U = 0 for absolute readings
     factor: Floats  # (G, L·m, L·m) scaling matrices
-    weights: Floats  # (L, U) of the unloaded in the mean that each is taken from
+    weights: Floats  # (L, U) of the unloaded ones in the mean to be subtracted
 
     def difference(self, x: Floats) -> Floats:
         """(G·L, ...) loaded minus the mean of the unloaded of x (N, ...)."""
         loaded = x[self.loaded]
         if self.reference.shape[1]:
             unloaded = x[self.reference]
-            if np.all(self.weights == self.weights[:1]):  # all from the same ones
+            if np.all(self.weights == self.weights[:1]):  # the same mean for all
                 loaded -= unloaded.mean(axis=1)[:, None]
             else:
                 loaded -= np.einsum("lu,gu...->gl...", self.weights, unloaded)
@@ -290,32 +290,33 @@ def whitening(readings: Readings, mode: Mode, scaling: Scaling = "gc") -> Whiten
         limits.check_shared(loaded.shape[1], m, len(loaded))
         covariance = measurement_covariance(readings, loaded, reference, weights)
         factor = _innovations(covariance) if serial else inverse_root(covariance, scaling)
-        if scaling == "none" and readings.scalar.any():  # what is not read is no residual
+        if scaling == "none" and readings.scalar.any():  # leaves out elements that are not read
             read = np.diagonal(covariance, axis1=1, axis2=2) > 0
             factor = factor * read[:, :, None]
         rank += int(np.count_nonzero(factor.any(axis=-1)))
         buckets.append(Bucket(loaded, reference, np.ascontiguousarray(factor), weights))
     reading = np.concatenate([b.loaded.ravel() for b in buckets])
-    own = np.concatenate(
+    single = np.concatenate(
         [single_covariance(v, b.loaded, b.reference, b.weights).reshape(-1, m, m) for b in buckets]
     )
-    return Whitening(mode, scaling, m, tuple(buckets), reading, own, readings.pose[reading], rank)
+    pose = readings.pose[reading]
+    return Whitening(mode, scaling, m, tuple(buckets), reading, single, pose, rank)
 
 
 def _innovations(covariance: Floats) -> Floats:
-    """S⁻¹ (1, k, k) of a run, S = D L with C = L Lᵀ; a small share of C's diagonal for the rule."""
+    """S⁻¹ (1, k, k) of a run, S = D L, C = L Lᵀ; for the rule, C's diagonal grows a little."""
     std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-    seen = std > 0
-    per = np.where(seen, 1.0, 0.0) / np.where(seen, std, 1.0)
+    positive = std > 0
+    per = np.where(positive, 1.0, 0.0) / np.where(positive, std, 1.0)
     c = covariance * per[:, :, None] * per[:, None, :]
-    c += np.where(seen, RANK_TOLERANCE, 1.0)[:, :, None] * np.eye(c.shape[1])
+    c += np.where(positive, RANK_TOLERANCE, 1.0)[:, :, None] * np.eye(c.shape[1])
     lower = np.linalg.cholesky(c)[0]
     inverse = solve_triangular(lower, np.diag(per[0]), lower=True, check_finite=False)
     return np.asarray(inverse[None])
 
 
 def measured(readings: Readings, w: Whitening) -> Floats:
-    """What was measured (D, m): values, or deflections (rotation part: Log(R_l R_uᵀ))."""
+    """Measurements (D, m): values, or deflections (rotation part: Log(R_l R_uᵀ))."""
     raw = w.raw(readings.value).copy()
     if w.m == 6 and w.mode == "deflection":
         raw[:, 3:] = relative_rotation(se3.rotation(readings.value[:, 3:]), w)
@@ -328,12 +329,12 @@ def relative_rotation(r: Floats, w: Whitening) -> Floats:
     for b in w.buckets:
         turn = np.empty((*b.loaded.shape, 3))
         for weights in np.unique(b.weights, axis=0):
-            mine = np.all(b.weights == weights, axis=1)
+            alike = np.all(b.weights == weights, axis=1)
             reference = b.reference[:, weights > 0]
             first = r[reference[:, :1]]
             apart = se3.rotation_vector(r[reference] @ np.swapaxes(first, -1, -2))
             mean = se3.rotation(apart.mean(axis=1, keepdims=True)) @ first
-            turn[:, mine] = se3.rotation_vector(r[b.loaded[:, mine]] @ np.swapaxes(mean, -1, -2))
+            turn[:, alike] = se3.rotation_vector(r[b.loaded[:, alike]] @ np.swapaxes(mean, -1, -2))
         out.append(turn.reshape(-1, 3))
     return np.concatenate(out)
 

@@ -1,7 +1,8 @@
-"""What cannot be right in a table: units, limits, covariances, names, who observed a row.
+"""Checks of a table: units, limits, covariances, names, and the observer of each row.
 
-A row has a position (x_m, y_m, z_m; by the `station` that it names), a distance (`distance_m` from
-the point `from`), or a height (`gauge_m` of the `gauge`); its other cells of these are empty.
+A row has one reading: a position (x_m, y_m, z_m, measured by its `station`), a distance
+(`distance_m` from the point `from`), or a height (`gauge_m` of the `gauge`); the other two are
+empty.
 """
 
 import re
@@ -21,7 +22,7 @@ from hilcal.tables.uncertainty import LEAST
 from hilcal.types import Bools, Floats, Ints
 
 MAX_DISTANCE = 100.0  # m; no instrument measures an arm from further away
-MAX_STD = 3e-3  # m; cameras do better; micrometres given 1000 times too large are above it
+MAX_STD = 3e-3  # m; cameras are below it, micrometres read as millimetres above it
 MAX_ANGLE_STD = 0.05  # rad, 3°; the same for an orientation, a choice
 _LIMIT_MARGIN = 1e-4  # rad; rounding of a limit written with few digits
 _TRACKING = 0.1  # rad; actual and commanded joints of an arm at rest are closer
@@ -54,10 +55,10 @@ def check_actual_joints(
     if bad.any():
         i, j = divmod(int(np.argmax(bad)), q.shape[1])
         unit = names[j].rsplit("_", 1)[1]
-        what = "joint angle" if unit == "rad" else "travel"
+        quantity = "joint angle" if unit == "rad" else "travel"
         raise InputError(
             f"{table.at(i, names[j])}: {actual[i, j]:g} {unit} is not within {_TRACKING} {unit} of "
-            f"the commanded {q[i, j]:g} {unit}; expected the {what} that was reached, in {unit}"
+            f"the commanded {q[i, j]:g} {unit}; expected the {quantity} that was reached, in {unit}"
         )
 
 
@@ -93,7 +94,7 @@ def check_positions(table: ColumnTable, position: Floats, q: Floats, arm: Arm) -
 
 
 def _looks_like(position: Floats, distance: float) -> str:
-    """Say what a position (3,) that cannot be may be: in millimetres, or a gap such as -9999."""
+    """Guess why a position (3,) is impossible: millimetres, or -9999 for no value."""
     if any(re.fullmatch("9{4,}", f"{abs(v):.12g}".replace(".", "")) for v in position):
         return " (nines for no value? leave the row out, or name them as missing in a mapping)"
     return " (looks like millimetres)" if 10.0 < distance < 1e3 * MAX_DISTANCE else ""
@@ -189,37 +190,37 @@ def check_same_pose(table: ColumnTable, pose: Ints, names: list[str], q: Floats)
         )
 
 
-MAIN = ObserverName("station", "tracker")  # The station of positions that name none
+MAIN = ObserverName("station", "tracker")  # The station of positions without a named one
 KINDS: tuple[ObserverKind, ...] = ("point", "gauge")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observed:
-    """Who observed what."""
+    """The observer of each row."""
 
-    number: Ints  # (N,) of the observer of each row
+    number: Ints  # (N,) index of the observer of each row
     names: tuple[ObserverName, ...]  # of the observers; stations come first
     scalar: Bools  # (N,) rows with one number
 
     def put(
         self, table: ColumnTable, value: Floats, cov: Floats, std: Mapping[ObserverName, float]
     ) -> tuple[Floats, Floats]:
-        """Return values (N, m) and covariances (N, m, m) with distances and heights put in."""
+        """Return values (N, m) and covariances (N, m, m) with distances and heights filled in."""
         value, cov = value.copy(), cov.copy()
         for kind in KINDS:
-            of, _, variance = columns.ONE[kind]
+            column, _, variance_column = columns.SCALAR[kind]
             rows = np.flatnonzero([self.names[k].kind == kind for k in self.number])
             if not len(rows):
                 continue
-            read = table.number[of][rows]
+            read = table.number[column][rows]
             low = 0.0 if kind == "point" else -MAX_DISTANCE
             for i in rows[(read < low) | (read > MAX_DISTANCE)][:1]:
                 raise InputError(
-                    f"{table.at(int(i), of)}: {table.number[of][i]:g} m cannot be right; expected "
-                    f"{low:g} to {MAX_DISTANCE:g} m"
+                    f"{table.at(int(i), column)}: {table.number[column][i]:g} m cannot be right; "
+                    f"expected {low:g} to {MAX_DISTANCE:g} m"
                 )
             value[rows, 0] = read
-            cov[rows, 0, 0] = self._variance(table, rows, variance, kind, std)
+            cov[rows, 0, 0] = self._variance(table, rows, variance_column, kind, std)
         return value, cov
 
     def _variance(
@@ -231,51 +232,51 @@ class Observed:
         std: Mapping[ObserverName, float],
     ) -> Floats:
         nothing = np.full(len(table.rows), np.nan)
-        found = table.number.get(column, nothing)[rows].copy()
+        variances = table.number.get(column, nothing)[rows].copy()
         for k, i in enumerate(rows.tolist()):
             name = self.names[self.number[i]]
-            if np.isnan(found[k]):
+            if np.isnan(variances[k]):
                 if name not in std:
                     raise InputError(
                         f"{table.at(i)}: nothing states the noise of {name}; give column "
                         f"'{column}', the variance in m², or [{kind}s.{name.name}] std_m"
                     )
-                found[k] = std[name] ** 2
-            if not LEAST[0] ** 2 <= found[k] <= MAX_STD**2:
+                variances[k] = std[name] ** 2
+            if not LEAST[0] ** 2 <= variances[k] <= MAX_STD**2:
                 raise InputError(
-                    f"{table.at(i, column)}: a variance of {found[k]:g} m² cannot be right; "
+                    f"{table.at(i, column)}: a variance of {variances[k]:g} m² cannot be right; "
                     f"expected standard deviations of {LEAST[0]:g} to {MAX_STD:g} m, squared"
                 )
-        return np.asarray(found)
+        return np.asarray(variances)
 
 
 def observed_of(table: ColumnTable) -> Observed | None:
-    """Return who observed the rows of a table; None where all are positions by one tracker."""
+    """Return the observers of the rows; None where all are positions measured by one tracker."""
     count, station = len(table.rows), table.text.get(columns.STATION)
-    given = {kind: columns.ONE[kind][0] for kind in KINDS}
-    read = {kind: ~np.isnan(table.number[c]) for kind, c in given.items() if c in table.number}
+    column = {kind: columns.SCALAR[kind][0] for kind in KINDS}
+    read = {kind: ~np.isnan(table.number[c]) for kind, c in column.items() if c in table.number}
     if not read and (station is None or (len(set(station)) == 1 and "" not in station)):
         return None
     axes = [c for c in columns.POSITION if c in table.number]
     filled = ~np.isnan(table.matrix(axes)) if axes else np.zeros((count, 1), dtype=np.bool_)
-    whole = filled.any(axis=1)
-    number = np.sum([whole, *read.values()], axis=0)
-    for i in np.flatnonzero((number != 1) | (whole & ~filled.all(axis=1)))[:1]:
-        what = ", ".join(["x_m, y_m, z_m"] * bool(axes) + [given[kind] for kind in read])
-        why = "a part of a position" if number[i] == 1 else f"{number[i]} readings"
-        raise InputError(f"{table.at(int(i))}: {why}; valid: just one of {what} in each row")
+    positioned = filled.any(axis=1)
+    readings = np.sum([positioned, *read.values()], axis=0)
+    for i in np.flatnonzero((readings != 1) | (positioned & ~filled.all(axis=1)))[:1]:
+        valid = ", ".join(["x_m, y_m, z_m"] * bool(axes) + [column[kind] for kind in read])
+        why = "a part of a position" if readings[i] == 1 else f"{readings[i]} readings"
+        raise InputError(f"{table.at(int(i))}: {why}; valid: just one of {valid} in each row")
     names = []
     for i in range(count):
         kind = next((kind for kind in read if read[kind][i]), None)
         if kind is not None:
-            names.append(ObserverName(kind, _name(table, i, columns.ONE[kind][1])))
+            names.append(ObserverName(kind, _name(table, i, columns.SCALAR[kind][1])))
         elif station is None:
             names.append(MAIN)
         else:
             names.append(ObserverName("station", _name(table, i, columns.STATION)))
     order = sorted(dict.fromkeys(names), key=lambda n: n.kind != "station")
-    at = {name: k for k, name in enumerate(order)}
-    return Observed(np.array([at[n] for n in names]), tuple(order), np.asarray(~whole))
+    index = {name: k for k, name in enumerate(order)}
+    return Observed(np.array([index[n] for n in names]), tuple(order), np.asarray(~positioned))
 
 
 def _name(table: ColumnTable, row: int, column: str) -> str:
@@ -287,22 +288,22 @@ def _name(table: ColumnTable, row: int, column: str) -> str:
 
 def observer_columns(readings: Readings) -> dict[str, list[str] | Floats]:
     """Return the columns that name the observers, and those of distances and heights."""
-    kind = np.array([o.kind for o in readings.observers])[readings.observer]
+    kinds = np.array([o.kind for o in readings.observers])[readings.observer]
     name = [readings.observers[k].name for k in readings.observer.tolist()]
     out: dict[str, list[str] | Floats] = {}
     stations = [o for o in readings.observers if o.kind == "station"]
     if stations and stations != [MAIN]:
-        out[columns.STATION] = _of(name, kind == "station")
-    for one in KINDS:
-        of_kind = kind == one
+        out[columns.STATION] = _names_in(name, kinds == "station")
+    for kind in KINDS:
+        of_kind = kinds == kind
         if not of_kind.any():
             continue
-        value, of, variance = columns.ONE[one]
-        out[of] = _of(name, of_kind)
+        value, observer, variance = columns.SCALAR[kind]
+        out[observer] = _names_in(name, of_kind)
         out[value] = np.where(of_kind, readings.value[:, 0], np.nan)
         out[variance] = np.where(of_kind, readings.covariance[:, 0, 0], np.nan)
     return out
 
 
-def _of(names: list[str], rows: Bools) -> list[str]:
+def _names_in(names: list[str], rows: Bools) -> list[str]:
     return [name if of_kind else "" for name, of_kind in zip(names, rows.tolist(), strict=True)]

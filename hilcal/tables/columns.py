@@ -1,4 +1,4 @@
-"""Columns of the exchange table: names, what a wrong header lacks, joints that mimic others."""
+"""Columns of the exchange table: names, checks of the header, joints that mimic others."""
 
 import re
 from collections.abc import Collection, Iterable, Sequence
@@ -17,11 +17,11 @@ WRENCH = ("fx_N", "fy_N", "fz_N", "mx_Nm", "my_Nm", "mz_Nm")
 TEXT = ("pose", "load")
 TARGET, COVERS, STATION = "target", "covers", "station"
 PREVIEW = "hilcal import TABLE --preview proposes a mapping for --format"
-ONE = {"point": ("distance_m", "from", "cov_d_d"), "gauge": ("gauge_m", "gauge", "cov_g_g")}
+SCALAR = {"point": ("distance_m", "from", "cov_d_d"), "gauge": ("gauge_m", "gauge", "cov_g_g")}
 """Columns of a reading that is one number, by kind of observer: value, observer, variance."""
 OWN_PREFIX = "x_"
 AGREES = 2e-3
-"""How far a stated value may be from what the arm's description says, rad: a tenth of a degree, to
+"""Largest difference between a stated value and the arm's description, rad: a tenth of a degree, to
 which tables round. A choice."""
 _AXES = ("x", "y", "z", "rx", "ry", "rz")
 
@@ -34,17 +34,17 @@ def _numbered(units: Units) -> list[tuple[int, str]]:
 
 
 def joint_columns(units: Units) -> tuple[str, ...]:
-    """Columns of the commanded joints, rad; of a joint that slides m."""
+    """Columns of the commanded joints, rad; of sliding joints m."""
     return tuple(f"q{i}_{unit}" for i, unit in _numbered(units))
 
 
 def actual_columns(units: Units) -> tuple[str, ...]:
-    """Columns of the joints that the encoders reported, rad; of a joint that slides m."""
+    """Columns of the joints that the encoders reported, rad; of sliding joints m."""
     return tuple(f"qa{i}_{unit}" for i, unit in _numbered(units))
 
 
 def torque_columns(units: Units) -> tuple[str, ...]:
-    """Columns of the static torques that drives exert, as measured, N·m; of slides forces, N."""
+    """Columns of the measured static torques of the drives, N·m; of sliding joints forces, N."""
     return tuple(f"tau{i}_{'N' if unit == 'm' else 'Nm'}" for i, unit in _numbered(units))
 
 
@@ -69,12 +69,12 @@ def required_columns(units: Units) -> tuple[str, ...]:
 
 
 def sparse_columns(header: Collection[str]) -> tuple[str, ...]:
-    """Columns of numbers that rows may leave empty: torques; readings, where there are kinds."""
+    """Number columns that may have empty cells: torques; readings, where some are one number."""
     torques = tuple(c for c in header if re.fullmatch(r"tau[0-9]+_Nm?", c))
-    if not any(value in header for value, _, _ in ONE.values()):
+    if not any(value in header for value, _, _ in SCALAR.values()):
         return torques
-    one = [c for value, _, variance in ONE.values() for c in (value, variance)]
-    return (*POSITION, *ROTATION, *covariance_columns(6), *one, *torques)
+    scalar = [c for value, _, variance in SCALAR.values() for c in (value, variance)]
+    return (*POSITION, *ROTATION, *covariance_columns(6), *scalar, *torques)
 
 
 def groups(units: Units) -> tuple[tuple[str, ...], ...]:
@@ -88,7 +88,7 @@ def known_columns(units: Units) -> tuple[str, ...]:
     """All columns that have a meaning for an arm."""
     return (
         *(*required_columns(units), TARGET, COVERS, STATION),
-        *(name for kind in ONE.values() for name in kind),
+        *(name for kind in SCALAR.values() for name in kind),
         *(*covariance_columns(6), *WRENCH, "cycle", "time_s", "load_time_s", "air_degC"),
         *(name for group in groups(units) for name in group),
     )
@@ -111,16 +111,16 @@ def check_header(
             raise InputError(
                 f"{path}: column '{name}' appears {header.count(name)} times; keep one"
             )
-    known, needed = known_columns(units), required_columns(units)
-    if any(name in header for kind in ONE.values() for name in kind):
-        _check_one(path, header)
+    valid, needed = known_columns(units), required_columns(units)
+    if any(name in header for kind in SCALAR.values() for name in kind):
+        _check_scalar(path, header)
     if POSITION[0] in sparse_columns(header) and POSITION[0] not in header:
         needed = needed[:-3]
     missing = [c for c in needed if c not in header and c not in spare]
     for name in header:
-        if name not in known and not name.startswith(OWN_PREFIX):
+        if name not in valid and not name.startswith(OWN_PREFIX):
             form = f"; for a table of another form: {PREVIEW}" if missing else ""
-            advice = _advice(name, known, header, len(_numbered(units)))
+            advice = _advice(name, valid, header, len(_numbered(units)))
             raise InputError(f"{path}: unknown column '{name}'{advice}{form}")
     if missing:
         hint = _hint(missing, header, units, arm)
@@ -134,10 +134,10 @@ def check_header(
             )
 
 
-def _check_one(path: str, header: Sequence[str]) -> None:
-    """Refuse distances and heights without the name of what they are of, or beside orientations."""
-    for value, of, variance in ONE.values():
-        for name, needed in ((of, value), (variance, value), (value, of)):
+def _check_scalar(path: str, header: Sequence[str]) -> None:
+    """Refuse distances and heights without the name of their observer, or beside orientations."""
+    for value, observer, variance in SCALAR.values():
+        for name, needed in ((observer, value), (variance, value), (value, observer)):
             if name in header and needed not in header:
                 raise InputError(f"{path}: column '{name}' without column '{needed}'; give both")
     if ROTATION[0] in header:
@@ -147,45 +147,45 @@ def _check_one(path: str, header: Sequence[str]) -> None:
         )
 
 
-def _advice(name: str, known: Sequence[str], header: Sequence[str], n: int) -> str:
-    """Return what to do about an unknown column."""
+def _advice(name: str, valid: Sequence[str], header: Sequence[str], n: int) -> str:
+    """Return advice on an unknown column."""
     first, _, last = name.partition("_")
     i, _, j = last.partition("_")
-    if first == "cov" and f"cov_{j}_{i}" in known:
+    if first == "cov" and f"cov_{j}_{i}" in valid:
         return f"; give the upper triangle only: 'cov_{j}_{i}'"
-    own = next((c for c in known if c.startswith(f"{first}_")), None)
-    if own is not None and re.fullmatch(r"qa?[0-9]+_(rad|m)", name):
-        return f"; this joint {'slides' if own.endswith('_m') else 'turns'}: '{own}'"
-    close = _closest(name, (c for c in known if c not in header)) or _closest(name, known)
-    own = f"columns of your own start with '{OWN_PREFIX}'"
+    column = next((c for c in valid if c.startswith(f"{first}_")), None)
+    if column is not None and re.fullmatch(r"qa?[0-9]+_(rad|m)", name):
+        return f"; this joint {'slides' if column.endswith('_m') else 'turns'}: '{column}'"
+    close = _closest(name, (c for c in valid if c not in header)) or _closest(name, valid)
+    prefix = f"columns of your own start with '{OWN_PREFIX}'"
     joints = f" (the arm has {n} joints)" if any(ch.isdigit() for ch in close or "") else ""
-    return f"; did you mean '{close}'{joints}? Else: {own}" if close else f"; {own}"
+    return f"; did you mean '{close}'{joints}? Else: {prefix}" if close else f"; {prefix}"
 
 
 def _hint(missing: Sequence[str], header: Sequence[str], units: Units, arm: str) -> str:
-    """Return what may stand in place of a missing column."""
-    own = [c for c in header if c.startswith(OWN_PREFIX)]
-    close = _closest(missing[0], own) if missing[0] not in TEXT else None
+    """Return a hint on missing columns."""
+    user_columns = [c for c in header if c.startswith(OWN_PREFIX)]
+    close = _closest(missing[0], user_columns) if missing[0] not in TEXT else None
     if close:
         return f"; '{close}' is taken as a column of your own: positions must be '{missing[0]}'"
-    others = f", and so are {len(missing) - 1} more" if len(missing) > 1 else ""
-    return f"{others}; a table for {arm} needs {', '.join(required_columns(units))}"
+    number = f", and so are {len(missing) - 1} more" if len(missing) > 1 else ""
+    return f"{number}; a table for {arm} needs {', '.join(required_columns(units))}"
 
 
 def covariance_size(path: str, header: Sequence[str]) -> int | None:
     """Size m of the covariance that the table gives, None where it gives none."""
-    given = [c for c in header if c in covariance_columns(6)]
-    if not given:
+    stated = [c for c in header if c in covariance_columns(6)]
+    if not stated:
         return None
     m = 6 if ROTATION[0] in header else 3
-    wanted = covariance_columns(m)
-    for name in wanted:
-        if name not in given:
+    needed = covariance_columns(m)
+    for name in needed:
+        if name not in stated:
             raise InputError(
                 f"{path}: column '{name}' is missing; a covariance of {m} elements needs its "
-                f"whole upper triangle: {wanted[0]} ... {wanted[-1]} ({len(wanted)} columns)"
+                f"whole upper triangle: {needed[0]} ... {needed[-1]} ({len(needed)} columns)"
             )
-    if extra := [c for c in given if c not in wanted]:
+    if extra := [c for c in stated if c not in needed]:
         raise InputError(
             f"{path}: column '{extra[0]}' needs the rotation vector {', '.join(ROTATION)}"
         )
@@ -193,26 +193,26 @@ def covariance_size(path: str, header: Sequence[str]) -> int | None:
 
 
 def following_columns(arm: Arm) -> tuple[str, ...]:
-    """Columns of joints that a table may leave out."""
+    """Columns of mimic joints, which a table may leave out."""
     names = (joint_columns(arm.units), actual_columns(arm.units))
-    return tuple(n for group in names for n, own in zip(group, arm.own, strict=True) if not own)
+    return tuple(n for group in names for n, free in zip(group, arm.own, strict=True) if not free)
 
 
-def own_columns(names: tuple[str, ...], count: int, arm: Arm) -> tuple[str, ...]:
-    """Return the names of all joints' columns, or of those with a value of their own."""
+def independent_columns(names: tuple[str, ...], count: int, arm: Arm) -> tuple[str, ...]:
+    """Return the columns of all joints, or of those that mimic no other, by their `count`."""
     if count == len(names):
         return names
-    return tuple(name for name, own in zip(names, arm.own, strict=True) if own)
+    return tuple(name for name, free in zip(names, arm.own, strict=True) if free)
 
 
 def with_following(table: ColumnTable, arm: Arm) -> ColumnTable:
-    """Return the table with the values of mimic joints as they follow; another one is refused."""
+    """Return the table with the values of mimic joints filled in; stated ones must agree."""
     number = dict(table.number)
     for names in (joint_columns(arm.units), actual_columns(arm.units)):
-        own = own_columns(names, int(arm.own.sum()), arm)
-        if arm.own.all() or not set(own) <= number.keys():
+        stated = independent_columns(names, int(arm.own.sum()), arm)
+        if arm.own.all() or not set(stated) <= number.keys():
             continue
-        nothing = np.full(len(number[own[0]]), np.nan)
+        nothing = np.full(len(number[stated[0]]), np.nan)
         q = np.stack([number.get(name, nothing) for name in names], axis=1)
         full = arm.complete(q)
         off = (np.abs(q - full) > AGREES) & ~arm.own  # False where there is no value

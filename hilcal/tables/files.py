@@ -1,7 +1,7 @@
 """Opening a file of any kind that holds a table: text, XLSX, MAT, Parquet.
 
-The kind is seen from the file's first bytes. Nothing in a file is ever executed: formulas count by
-the value that is stored with them, macros, links and pickles are not read.
+The first bytes tell the kind. Nothing in a file is ever executed: of a formula the stored value is
+read; macros, links and pickles are not.
 """
 
 import csv
@@ -49,13 +49,13 @@ def open_tables(
         if second is not None:
             raise InputError(f"{second}: the mapping has no section [second_file]")
         return first, 0
-    other = second or mapping.second_file.path
-    if other is None:
+    second_path = second or mapping.second_file.path
+    if second_path is None:
         raise InputError(
             f"{path}: the mapping has a section [second_file] without path; give it there or by "
             f"--second"
         )
-    return joined(first, open_grid(other, mapping.second_file), mapping.second_file.match)
+    return joined(first, open_grid(second_path, mapping.second_file), mapping.second_file.match)
 
 
 @limits.bounded
@@ -91,9 +91,9 @@ def kind_of(path: str, content: bytes) -> str:
     """Return the kind of a file by its first bytes: one of `READ`, else "text"."""
     if not content.strip(b"\xef\xbb\xbf \t\r\n"):
         raise InputError(f"{path}: the file is empty; expected a table of readings")
-    for magic, what in REFUSED.items():
+    for magic, description in REFUSED.items():
         if content.startswith(magic):
-            raise InputError(f"{path}: {what}; expected text, XLSX, MAT or Parquet")
+            raise InputError(f"{path}: {description}; expected text, XLSX, MAT or Parquet")
     return next((kind for magic, kind in READ.items() if content.startswith(magic)), "text")
 
 
@@ -107,21 +107,21 @@ def is_parquet(path: Path) -> bool:
 
 
 @contextmanager
-def undamaged(path: str | Path, what: str) -> Iterator[None]:
-    """Say in one line what a reader makes of a damaged file, which is not documented."""
+def undamaged(path: str | Path, complaint: str) -> Iterator[None]:
+    """Turn exceptions of a reader into one line: which ones damaged files raise is undocumented."""
     try:
         yield
     except (InputError, MemoryError):
         raise
     except Exception as e:
-        words = " ".join(str(e).split()) or type(e).__name__
-        short = words if len(words) <= 80 else words[:77] + "..."
-        raise InputError(f"{path}: {what} ({short})") from e
+        reason = " ".join(str(e).split()) or type(e).__name__
+        short = reason if len(reason) <= 80 else reason[:77] + "..."
+        raise InputError(f"{path}: {complaint} ({short})") from e
 
 
-def package(path: str | Path, name: str, what: str) -> Any:
+def package(path: str | Path, name: str, kind: str) -> Any:
     """Import a package that a kind of file needs."""
-    with needed_by(f"{path}: {what}"):
+    with needed_by(f"{path}: {kind}"):
         return import_module(name)
 
 
@@ -133,10 +133,10 @@ def _xlsx(path: str, content: bytes, how: FileFormat, check: Check | None) -> Gr
             f"{', '.join(sheets)}"
         )
     sheet = how.sheet or sheets[0]
-    found = sheet_rows(path, content, sheet, how.comment)
-    if not found:
+    rows = sheet_rows(path, content, sheet, how.comment)
+    if not rows:
         raise InputError(f"{path}: sheet '{sheet}' is empty; it has {', '.join(sheets)}")
-    return grid_of_rows(path, found, how, check)
+    return grid_of_rows(path, rows, how, check)
 
 
 def _book(path: str, content: bytes) -> Any:
@@ -155,9 +155,9 @@ def _book(path: str, content: bytes) -> Any:
 
 
 def _check_xml(path: str, name: str, stream: IO[bytes]) -> None:
-    """Count the elements of a part of a workbook, of which openpyxl keeps more than it is long.
+    """Limit the elements of a part of a workbook: openpyxl needs more memory than their text.
 
-    Of a sheet it keeps a row, of other parts all.
+    It holds one row of a sheet, and any other part as a whole.
     """
     where, sheet = f"{path}: {name}", name.startswith("xl/worksheets/")
     most = limits.COLUMNS * 10 if sheet else limits.ELEMENTS
@@ -173,11 +173,11 @@ def _check_xml(path: str, name: str, stream: IO[bytes]) -> None:
             limits.check_rows(where, rows)
         cells += sheet and tag == "c"
         if depth > limits.DEEP or elements > most:
-            what = (
+            excess = (
                 f"{depth} elements in each other" if depth > limits.DEEP else f"{elements} elements"
             )
             raise InputError(
-                f"{where}: {what}{' in a row' if sheet else ''}; valid: a workbook of readings"
+                f"{where}: {excess}{' in a row' if sheet else ''}; valid: a workbook of readings"
             )
 
     def end(_: str) -> None:
@@ -208,22 +208,22 @@ def sheet_rows(
     path: str, content: bytes, sheet: str, comment: str | None
 ) -> list[tuple[int, list[Cell]]]:
     """Rows of a sheet that are neither empty nor comments, with their numbers from 1."""
-    found: list[tuple[int, list[Cell]]] = []
-    cells = 0
+    rows: list[tuple[int, list[Cell]]] = []
+    count = 0
     with undamaged(path, "damaged, or not an XLSX file"):
         read = _book(path, content)[sheet]
-        read.reset_dimensions()  # what the file says of its size would pad every row
-        for row, given in enumerate(read.iter_rows(values_only=True), start=1):
+        read.reset_dimensions()  # the stated dimensions would pad every row
+        for row, cells in enumerate(read.iter_rows(values_only=True), start=1):
             limits.check_rows(f"{path}: sheet '{sheet}'", row)
-            plain = [_cell(c) for c in given]
+            plain = [_cell(c) for c in cells]
             while plain and plain[-1] is None:
                 plain.pop()
             remark = comment is not None and str(plain[0] if plain else "").startswith(comment)
             if plain and not remark:
-                cells += len(plain)
-                limits.check_cells(f"{path}: sheet '{sheet}'", cells)
-                found.append((row, plain))
-    return found
+                count += len(plain)
+                limits.check_cells(f"{path}: sheet '{sheet}'", count)
+                rows.append((row, plain))
+    return rows
 
 
 def _cell(value: object) -> Cell:
@@ -259,8 +259,8 @@ def _columns(
 def _parquet(path: str, content: bytes, how: FileFormat, check: Check | None) -> Grid:
     """Columns of numbers, texts and times of a Parquet file; rows count from 1.
 
-    The metadata tell how large they become. Texts stay as numbers of a dictionary until it is known
-    how long all of them are together: a file of 0.3 MB may hold one of 1 MB in each of 5,000 rows.
+    The metadata give their unpacked size. Texts are read dictionary-encoded, and their total length
+    is checked before they expand: a file of 0.3 MB may hold a text of 1 MB in each of 5,000 rows.
     """
     parquet = package(path, "pyarrow.parquet", "Parquet")
     from pyarrow import compute
@@ -274,16 +274,16 @@ def _parquet(path: str, content: bytes, how: FileFormat, check: Check | None) ->
     # By row groups: pyarrow ends the process where the statistics of a column are damaged.
     sizes = (meta.row_group(k).total_byte_size for k in range(meta.num_row_groups))
     limits.check_size(f"{path}: unpacked", sum(sizes), limits.UNPACKED)
-    found = file.read(columns=names)
+    table = file.read(columns=names)
     for name in texts:
         lengths = (
             compute.sum(compute.binary_length(part.dictionary).take(part.indices)).as_py() or 0
-            for part in found[name].chunks
+            for part in table[name].chunks
         )
         limits.check_size(f"{path}: column '{name}'", max(lengths, default=0), limits.UNPACKED // 4)
     named = [
         (name, [_cell(v) for v in column.to_pylist()])
-        for name, column in zip(found.column_names, found.columns, strict=True)
+        for name, column in zip(table.column_names, table.columns, strict=True)
     ]
     return _columns(path, named, how, check)
 
@@ -309,14 +309,14 @@ def _mat(path: str, how: FileFormat, check: Check | None) -> Grid:
     A matrix A of k > 1 columns gives "A(1)" ... "A(k)", poses T of shape (4, 4, N) give
     "T(1,1)" ..., fields of a structure "s.field".
     """
-    variables, found = matfile.read(path)
+    variables, matrices = matfile.read(path)
     if how.variable is not None and how.variable not in variables:
         raise InputError(
             f"{path}: no variable '{how.variable}'{suggest(how.variable, variables)}; it has "
             f"{', '.join(variables)}"
         )
     chosen = [how.variable] if how.variable else variables
-    blocks = [(name, values) for variable, name, values in found if variable in chosen]
+    blocks = [(name, values) for variable, name, values in matrices if variable in chosen]
     lengths = [len(values) for _, values in blocks]
     if not blocks:
         raise InputError(
@@ -340,13 +340,13 @@ BYTE_ORDER_MARKS = {b"\xef\xbb\xbf": "utf-8-sig", b"\xff\xfe": "utf-16", b"\xfe\
 def decoded(path: str, content: bytes, encoding: str | None) -> str:
     """Text of a file: by its byte order mark, else as stated, else UTF-8, else Latin-1."""
     marks = (name for mark, name in BYTE_ORDER_MARKS.items() if content.startswith(mark))
-    wanted = next(marks, encoding)
+    stated = next(marks, encoding)
     try:
-        text = content.decode(wanted or "utf-8")
+        text = content.decode(stated or "utf-8")
     except UnicodeError as e:
-        if wanted is not None:
+        if stated is not None:
             raise InputError(
-                f"{path}: not {wanted.upper()} text; a mapping states another in [file] encoding "
+                f"{path}: not {stated.upper()} text; a mapping states another in [file] encoding "
                 "(--preview proposes one): utf-8, latin-1, utf-16"
             ) from e
         text = content.decode("latin-1")
@@ -371,9 +371,9 @@ def records(path: str, text: str, how: FileFormat) -> Iterator[tuple[int, list[s
     lines = limits.Lines(path, io.StringIO(text, newline=None))
     reader = csv.reader(lines, delimiter=separator, skipinitialspace=blanks, strict=True)
     try:
-        begun = 1
+        next_row = 1
         for cells in reader:
-            row, begun = begun, reader.line_num + 1
+            row, next_row = next_row, reader.line_num + 1
             lines.row(len(cells))
             plain = [c.strip() for c in cells]
             plain = plain[: length_of(plain)] if blanks else plain
@@ -384,7 +384,7 @@ def records(path: str, text: str, how: FileFormat) -> Iterator[tuple[int, list[s
 
 
 def _header_uncommented(text: str, row: int, comment: str) -> str:
-    """Take the comment's mark off the header, as numpy.savetxt writes it."""
+    """Remove the comment mark from the header, as numpy.savetxt writes it."""
     lines = text.splitlines(keepends=True)
     if row <= len(lines) and lines[row - 1].lstrip().startswith(comment):
         lines[row - 1] = lines[row - 1].lstrip()[len(comment) :].lstrip()
@@ -393,7 +393,7 @@ def _header_uncommented(text: str, row: int, comment: str) -> str:
 
 def grid_of_rows(
     path: str,
-    found: Sequence[tuple[int, Sequence[Cell]]],
+    numbered: Sequence[tuple[int, Sequence[Cell]]],
     how: FileFormat,
     check: Check | None = None,
 ) -> Grid:
@@ -401,7 +401,7 @@ def grid_of_rows(
 
     Cells that a row has beyond the header must be empty, as trailing separators leave them.
     """
-    by_row = dict(found)
+    by_row = dict(numbered)
     if how.header_row and how.header_row not in by_row:
         raise InputError(
             f"{path}: row {how.header_row} holds no header; set [file] header_row to its row, 0 "
@@ -412,7 +412,7 @@ def grid_of_rows(
         check([text_of(c) for c in titles])
     header = [" ".join(text_of(c).split()) for c in titles]
     skipped = {how.units_row, *how.skip_rows}
-    body = [(row, c) for row, c in found if row > how.header_row and row not in skipped]
+    body = [(row, c) for row, c in numbered if row > how.header_row and row not in skipped]
     if not body:
         raise InputError(f"{path}: no readings below row {how.header_row}")
     width = len(header) or max(length_of(c) for _, c in body)

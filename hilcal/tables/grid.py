@@ -1,7 +1,7 @@
-"""A table as a file holds it, named columns of cells, and the columns that were understood.
+"""The table of a file: a `Grid` of cells, and a `ColumnTable` of columns with a meaning.
 
-Files become a `Grid` in `hilcal.tables.files`; what its columns mean is said by their names (the
-exchange table) or by a mapping, and makes a `ColumnTable` of numbers and texts of it.
+`hilcal.tables.files` reads a file into a `Grid`. The names of its columns (exchange table) or a
+mapping give them a meaning, which makes a `ColumnTable` of numbers and texts.
 """
 
 import itertools
@@ -20,10 +20,10 @@ from hilcal.types import Bools, Floats, Ints
 
 Cell = str | float | datetime | None
 Check = Callable[[Sequence[str]], object]
-"""Refuses a header that is not what it should be, before anything else is found wrong."""
+"""Refuses a wrong header, before any other check."""
 
 BLANK = ("", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--", "---")
-"""What stands for a missing number, in small letters."""
+"""Marks of a missing number, in small letters."""
 
 _PLAIN = str.maketrans({"\u2212": "-", "\u00a0": " ", "\u202f": " ", "\u2019": "'"})
 """Signs that programs write in place of minus, blank and apostrophe."""
@@ -43,7 +43,7 @@ class Grid:
     units: dict[str, str] = field(default_factory=dict)  # cells of the row of units, by column
 
     def __post_init__(self) -> None:
-        """Refuse too many columns, and names of columns that no name may be."""
+        """Refuse too many cells, and invalid names of columns."""
         limits.check_cells(self.path, len(self.rows), len(self.names))
         check_names(self.names, f"{self.path}: column")
 
@@ -61,11 +61,11 @@ class Grid:
                 )
             return self.names[column - 1]
         if column not in self.names:
-            more = len(self.names) - _SHOWN
-            rest = f" and {more} more" if more > 0 else ""
+            hidden = len(self.names) - _SHOWN
+            suffix = f" and {hidden} more" if hidden > 0 else ""
             raise InputError(
                 f"{self.path}: no column '{column}'{suggest(column, self.names)}; it has "
-                f"{', '.join(self.names[:_SHOWN])}{rest}"
+                f"{', '.join(self.names[:_SHOWN])}{suffix}"
             )
         return column
 
@@ -92,13 +92,13 @@ class Grid:
         return values
 
     def rows_with(self, keep: Bools | Ints) -> "Grid":
-        """Return the chosen rows, by a mask or by their numbers from 0, also several times."""
-        at = np.arange(len(self.rows))[keep].tolist()
-        columns = tuple([c[k] for k in at] for c in self.columns)
-        return replace(self, rows=self.rows[at], columns=columns)
+        """Return rows, chosen by a mask or by their numbers from 0, which may repeat."""
+        chosen = np.arange(len(self.rows))[keep].tolist()
+        columns = tuple([c[k] for k in chosen] for c in self.columns)
+        return replace(self, rows=self.rows[chosen], columns=columns)
 
     def with_column(self, name: str, cells: Sequence[Cell], like: str | int) -> "Grid":
-        """Return the table with a further column, written as another one is."""
+        """Return the table with a further column, in the format of the column `like`."""
         names, columns = (*self.names, name), (*self.columns, cells)
         return replace(
             self, names=names, columns=columns, formats=(*self.formats, self._format(like))
@@ -110,29 +110,29 @@ class Grid:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ColumnTable:
-    """Columns that were understood, in SI units where they are numbers."""
+    """Columns with a meaning, numbers in SI units."""
 
     path: str  # the file's name, for messages
     rows: Ints  # (N,) row of each record as an editor or a spreadsheet counts
     text: dict[str, list[str]]  # text columns by name, N cells each, without blanks around
     number: dict[str, Floats]  # (N,) number columns by name
-    alias: dict[str, str] = field(default_factory=dict)  # what the file itself calls a column
+    alias: dict[str, str] = field(default_factory=dict)  # the file's name of a column
 
     @classmethod
     def of(
         cls, grid: Grid, text: Sequence[str], number: Sequence[str], sparse: Collection[str] = ()
     ) -> "ColumnTable":
-        """Return the columns of these names; cells have a value but for `sparse` ones."""
+        """Read columns by name; only cells of `sparse` ones may be empty."""
         numbers = {name: grid.numbers(name, complete=name not in sparse) for name in number}
         return cls(grid.path, grid.rows, {name: grid.text(name) for name in text}, numbers)
 
-    def taken(self, rows: Bools) -> "ColumnTable":
+    def select(self, rows: Bools) -> "ColumnTable":
         """Return the chosen rows."""
-        at = np.flatnonzero(rows).tolist()
+        chosen = np.flatnonzero(rows).tolist()
         return replace(
             self,
             rows=self.rows[rows],
-            text={name: [cells[k] for k in at] for name, cells in self.text.items()},
+            text={name: [cells[k] for k in chosen] for name, cells in self.text.items()},
             number={name: values[rows] for name, values in self.number.items()},
         )
 
@@ -145,12 +145,12 @@ class ColumnTable:
         """(N, k) number columns side by side."""
         return np.stack([self.number[name] for name in names], axis=1)
 
-    def refuse(self, bad: Bools, names: Sequence[str], what: Callable[[float], str]) -> None:
+    def refuse(self, bad: Bools, names: Sequence[str], message: Callable[[float], str]) -> None:
         """Raise for the first true cell of an (N, k) mask over number columns."""
         if bad.any():
             i, j = divmod(int(np.argmax(bad)), bad.shape[1])
             value = float(self.number[names[j]][i])
-            raise InputError(f"{self.at(i, names[j])}: {what(value)}")
+            raise InputError(f"{self.at(i, names[j])}: {message(value)}")
 
 
 def text_of(cell: Cell) -> str:
@@ -172,8 +172,8 @@ def number(cell: Cell, how: FileFormat) -> float:
     if plain.lower() in BLANK or plain in how.missing:
         return float("nan")
     if how.thousands and how.thousands in plain:
-        whole = plain.split(how.decimal)[0].lstrip("+-").split(how.thousands)
-        if not 0 < len(whole[0]) <= 3 or any(len(part) != 3 for part in whole[1:]):
+        groups = plain.split(how.decimal)[0].lstrip("+-").split(how.thousands)
+        if not 0 < len(groups[0]) <= 3 or any(len(part) != 3 for part in groups[1:]):
             return float("inf")
         plain = plain.replace(how.thousands, "")
     if "_" in plain or (how.decimal == "," and "." in plain):
@@ -198,26 +198,25 @@ def _complaint(cell: Cell, how: FileFormat, complete: bool) -> str:
 
 
 def unique(names: Sequence[str]) -> tuple[str, ...]:
-    """Names with a number in brackets from the second of a name on: "X", "X (2)".
+    """Make names unique by a number in brackets: "X", "X (2)".
 
-    A column without a name is called by its number.
+    The name of a column without one is its number.
     """
     out: dict[str, None] = {}
-    for k, given in enumerate(names, start=1):
-        first = given or str(k)
-        others = (f"{first} ({count})" for count in itertools.count(2))
-        out[next(name for name in itertools.chain((first,), others) if name not in out)] = None
+    for k, title in enumerate(names, start=1):
+        first = title or str(k)
+        numbered = (f"{first} ({count})" for count in itertools.count(2))
+        out[next(name for name in itertools.chain((first,), numbered) if name not in out)] = None
     return tuple(out)
 
 
 def joined(
     first: Grid, second: Grid, match: tuple[str | int, str | int] | None
 ) -> tuple[Grid, int]:
-    """Return the first table with the second one's columns, and how many rows found no partner.
+    """Return the first table with the second one's columns, and the number of rows left out.
 
-    Rows belong together by number, or where a column of both holds the same text. Rows of the
-    first table without a partner are left out; columns of a name that the first one has get
-    "(2)" behind it.
+    Rows are matched by number, or by a column of each that holds the same text. Rows of the first
+    table without a partner are left out. A column name of both gets "(2)" in the second table.
     """
     if match is None:
         if len(first.rows) != len(second.rows):
@@ -226,7 +225,7 @@ def joined(
                 f"tables of the same length, or [second_file] match with the column of each "
                 f"that names the row"
             )
-        at = np.arange(len(first.rows))
+        partner = np.arange(len(first.rows))
     else:
         where: dict[str, int] = {}
         for k, key in enumerate(second.text(match[1])):
@@ -235,20 +234,20 @@ def joined(
                     f"{second.at(k, match[1])}: '{key}' is in row {second.rows[where[key]]}, too; "
                     "rows to match by must differ"
                 )
-        at = np.array([where.get(key, -1) for key in first.text(match[0])], dtype=np.int64)
-        if np.all(at < 0):
+        partner = np.array([where.get(key, -1) for key in first.text(match[0])], dtype=np.int64)
+        if np.all(partner < 0):
             raise InputError(
                 f"{first.path}: no row of column '{first.name(match[0])}' is in column "
                 f"'{second.name(match[1])}' of {second.path}"
             )
-    kept, other = first.rows_with(at >= 0), second.rows_with(at[at >= 0])
+    matched, partners = first.rows_with(partner >= 0), second.rows_with(partner[partner >= 0])
     names = unique([*first.names, *second.names])
     renamed = dict(zip(second.names, names[len(first.names) :], strict=True))
     grid = replace(
-        kept,
+        matched,
         names=names,
-        columns=(*kept.columns, *other.columns),
+        columns=(*matched.columns, *partners.columns),
         formats=(*first.formats, *second.formats),
         units=first.units | {renamed[name]: unit for name, unit in second.units.items()},
     )
-    return grid, int(np.sum(at < 0))
+    return grid, int(np.sum(partner < 0))

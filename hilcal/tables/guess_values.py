@@ -1,4 +1,4 @@
-"""Positions, orientations, forces and uncertainties by names and axes; what else values tell."""
+"""Guesses of positions, orientations, forces and uncertainties, by names, axes and values."""
 
 import re
 from datetime import datetime
@@ -45,11 +45,11 @@ _EXCEL = (30000.0, 60000.0)
 
 
 def is_quaternion(values: Floats) -> bool:
-    """Whether (N, 4) numbers are quaternions: of length 1, and not one alone."""
+    """Whether (N, 4) numbers are quaternions: some rows are complete, and these have length 1."""
     if values.shape[1] != 4:
         return False
-    known = values[np.isfinite(values).all(axis=1)]
-    return len(known) > 0 and bool(np.all(np.abs(np.linalg.norm(known, axis=1) - 1) < NORM))
+    complete = values[np.isfinite(values).all(axis=1)]
+    return len(complete) > 0 and bool(np.all(np.abs(np.linalg.norm(complete, axis=1) - 1) < NORM))
 
 
 def sentinels(position: Floats) -> list[float]:
@@ -61,7 +61,7 @@ def sentinels(position: Floats) -> list[float]:
 def time_unit(
     grid: Grid, name: str, stated: str | None, values: Floats | None
 ) -> tuple[dict[str, Any], str | None] | None:
-    """Return unit (and format) of a column of times, and what is unsure; None where it is none."""
+    """Return unit (and format) of a column of times, and a doubt; None where it holds no times."""
     cells = [c for c in grid.cells(name) if c not in (None, "")]
     if len(cells) < len(grid.rows):
         return None
@@ -97,14 +97,14 @@ def guess_by_values(g: Guesser) -> None:
     """Find positions and joints among columns whose names say nothing.
 
     Neighbouring columns are tried: positions vary by hundreds (mm) or stay small (m), joint
-    angles stay within one turn. Where several choices are as good, that is said.
+    angles stay within one turn. Where several choices are as good, a note says so.
     """
     named = words.NOMINAL | words.STD | words.TIME | words.TEMPERATURE | words.LOAD | words.MASS
     free = []
     for name, c in g.free.items():
         if g.number(name) and c.axis is None and not c.has(named | words.POSE):
             values = g.block([name])[:, 0]
-            counts = len(values) > 2 and np.all(np.diff(values) == 1)  # the rows
+            counts = len(values) > 2 and np.all(np.diff(values) == 1)  # row numbers
             if not counts and np.ptp(values[np.isfinite(values)]) > 0:
                 free.append(name)
     _orientation_by_values(g, free)
@@ -121,8 +121,8 @@ def guess_by_values(g: Guesser) -> None:
     has_joints = "joints" in g.proposal.sections
     has_position = bool({"position", "distance", "gauge"} & set(g.proposal.sections))
     ranked: list[tuple[float, list[str], list[str]]] = []
-    every = product([[]] if has_joints else runs(g.joints or 6), [[]] if has_position else runs(3))
-    for joints, position in every:
+    pairs = product([[]] if has_joints else runs(g.joints or 6), [[]] if has_position else runs(3))
+    for joints, position in pairs:
         if set(joints) & set(position) or (joints and size(joints) > 400):
             continue
         score = 0.1 * ((len(free) - len(joints) - len(position)) % 3 == 0)
@@ -138,21 +138,21 @@ def guess_by_values(g: Guesser) -> None:
     best, position, joints = ranked[0]
     near = [(p, j) for score, p, j in ranked if score >= best - RIVAL]
     g.proposal.alternatives = near
-    for what, names, unit_of in (
+    for section, names, unit_of in (
         ("position", position, length_unit),
         ("joints", joints, angle_unit),
     ):
         if names:
-            unit = unit_of(g, what, names)
-            g.take(what, names, unit, unit=unit)
-            g.unsure(what, BY_VALUES)
+            unit = unit_of(g, section, names)
+            g.take(section, names, unit, unit=unit)
+            g.unsure(section, BY_VALUES)
     if len(near) > 1:
         pair = [", ".join(part) for part in near[1] if part]
         g.unsure("joints", f"{RIVALS} {' and '.join(pair)}")
 
 
 def _orientation_by_values(g: Guesser, free: list[str]) -> None:
-    """Quaternions and rotation matrices are told by their length and orthogonality."""
+    """Find quaternions by their length, rotation matrices by their orthogonality."""
     if "orientation" in g.proposal.sections:
         return
     for k in range(len(free) - 8):
@@ -179,19 +179,19 @@ def _take_quaternion(g: Guesser, names: list[str]) -> None:
 def _kind(c: ColumnName) -> str:
     if c.has(words.STD):
         return "std_angle" if c.has(words.ROTATION) else "std"
-    for kind, known in (
+    for kind, vocabulary in (
         ("quaternion", words.QUATERNION),
         ("angle", words.ROTATION),
         ("force", words.FORCE),
         ("moment", words.MOMENT),
     ):
-        if c.has(known):
+        if c.has(vocabulary):
             return kind
     return "position"
 
 
 Group = dict[str, dict[tuple[object, ...], dict[str, str]]]
-"""Names of columns by kind, by the words and numbers of their names, by axis."""
+"""Names of columns by kind, by the stem of the name (its words and numbers), by axis."""
 _KINDS = words.STD | words.ROTATION | words.QUATERNION | words.FORCE | words.MOMENT
 
 
@@ -199,8 +199,8 @@ LARGE = 1e-6  # m²; a larger variance, of more than 1 mm, is in mm²
 
 
 def guess_axes(g: Guesser) -> None:
-    """Positions, orientations, forces and standard deviations, which come by axes."""
-    sets: dict[str, dict[tuple[object, ...], dict[str, str]]] = {}
+    """Find positions, orientations, forces and standard deviations by the axes in their names."""
+    sets: Group = {}
     _covariance(g)
     for c in g.columns:
         if c.axis and c.name in g.free and g.number(c.name) and not c.has({"cov", "kov"}):
@@ -209,17 +209,17 @@ def guess_axes(g: Guesser) -> None:
     if "force" not in sets and "moment" in sets:  # tx, ty, tz are then translations
         for stem, axes in sets.pop("moment").items():
             sets.setdefault("position", {}).setdefault(stem, axes)
-    whole = {
-        kind: {stem: axes for stem, axes in found.items() if set("xyz") <= set(axes)}
-        for kind, found in sets.items()
+    complete = {
+        kind: {stem: axes for stem, axes in stems.items() if set("xyz") <= set(axes)}
+        for kind, stems in sets.items()
     }
-    positions = whole.get("position", {})
+    positions = complete.get("position", {})
     if not positions:
         return
-    ranked = sorted(positions, key=lambda stem: _rank(stem))
+    ranked = sorted(positions, key=_rank)
     stem = ranked[0]
     names = [positions[stem][axis] for axis in "xyz"]
-    side_by_side = _several(positions, stem)
+    side_by_side = _targets_side_by_side(positions, stem)
     if side_by_side:
         names = [positions[s][axis] for s in side_by_side for axis in "xyz"]
         unit = length_unit(g, "position", names)
@@ -231,25 +231,25 @@ def guess_axes(g: Guesser) -> None:
         unit = length_unit(g, "position", names)
         g.take("position", names, unit, unit=unit)
     ranked = [s for s in ranked if s not in side_by_side]
-    others = [
+    unused = [
         positions[s]["x"] for s in ranked if s != stem and not set(map(str, s)) & words.NOMINAL
     ]
-    if others:
-        listed = ", ".join(f"'{name}' ..." for name in others[:SHOWN])
+    if unused:
+        listed = ", ".join(f"'{name}' ..." for name in unused[:SHOWN])
         g.unsure("position", f"'{names[0]}' ... are used, not {listed}")
     marks = sentinels(g.block(names))
     if marks:
         g.proposal.sections["file"] = {"missing": marks}
         g.unsure("file", f"{', '.join(map('{:g}'.format, marks))} stands for a missing point")
-    _orientation(g, whole, stem)
-    _forces(g, whole)
-    _std(g, whole, stem, unit)
+    _orientation(g, complete, stem)
+    _forces(g, complete)
+    _std(g, complete, stem, unit)
 
 
-def _several(
+def _targets_side_by_side(
     positions: dict[tuple[object, ...], dict[str, str]], stem: tuple[object, ...]
 ) -> list[tuple[object, ...]]:
-    """Positions whose names differ by a number alone, which are those of several targets."""
+    """Return the stems of several targets' positions, which differ by a number only."""
     if not stem or not isinstance(stem[-1], int):
         return []
     alike = [s for s in positions if s[:-1] == stem[:-1] and s and isinstance(s[-1], int)]
@@ -278,16 +278,16 @@ def _covariance(g: Guesser) -> None:
         g.take("covariance", names, f"upper triangle, {unit}²", unit=unit)
 
 
-def _orientation(g: Guesser, whole: Group, stem: tuple[object, ...]) -> None:
-    quaternions = {s: a for s, a in whole.get("quaternion", {}).items() if "w" in a}
-    best = _like(quaternions, stem)
+def _orientation(g: Guesser, complete: Group, stem: tuple[object, ...]) -> None:
+    quaternions = {s: a for s, a in complete.get("quaternion", {}).items() if "w" in a}
+    best = _columns_like(quaternions, stem)
     if best is not None:
         names = [best[axis] for axis in "wxyz"]
         g.take("orientation", names, "quaternion, w first", convention="quaternion-wxyz")
         return
-    if _four_numbers(g) or _matrix(g):
+    if _numbered_quaternion(g) or _matrix(g):
         return
-    angles = whole.get("angle", {})
+    angles = complete.get("angle", {})
     if stem in angles:
         _by_axes(g, [angles[stem][axis] for axis in "xyz"])
         return
@@ -303,7 +303,7 @@ def _orientation(g: Guesser, whole: Group, stem: tuple[object, ...]) -> None:
     if {"roll", "pitch", "yaw"} <= set(turns):
         _angles(g, [turns[w] for w in ("roll", "pitch", "yaw")], "roll-pitch-yaw")
         return
-    axes = _like(angles, stem)
+    axes = _columns_like(angles, stem)
     if axes is not None:
         _by_axes(g, [axes[axis] for axis in "xyz"])
 
@@ -315,14 +315,14 @@ def _by_axes(g: Guesser, names: list[str]) -> None:
     _angles(g, names, "rotation-vector" if vector else "fixed-xyz")
 
 
-def _like(
-    found: dict[tuple[object, ...], dict[str, str]], stem: tuple[object, ...]
+def _columns_like(
+    stems: dict[tuple[object, ...], dict[str, str]], stem: tuple[object, ...]
 ) -> dict[str, str] | None:
-    """Return the columns whose name agrees with that of the position, else measured ones."""
-    if stem in found:
-        return found[stem]
-    usable = [s for s in found if not {str(w) for w in s} & words.NOMINAL]
-    return found[min(usable, key=_rank)] if usable else None
+    """Return the columns with the stem of the position, else the best ranked ones."""
+    if stem in stems:
+        return stems[stem]
+    usable = [s for s in stems if not {str(w) for w in s} & words.NOMINAL]
+    return stems[min(usable, key=_rank)] if usable else None
 
 
 def _angles(g: Guesser, names: list[str], convention: str) -> None:
@@ -331,8 +331,8 @@ def _angles(g: Guesser, names: list[str], convention: str) -> None:
     g.proposal.open_convention = True
 
 
-def _four_numbers(g: Guesser) -> bool:
-    """Quaternions q1 ... q4 (ABB) or q0 ... q3, told from joints by their length."""
+def _numbered_quaternion(g: Guesser) -> bool:
+    """Quaternions q1 ... q4 (ABB) or q0 ... q3, distinguished from joints by their length."""
     groups: dict[tuple[str, ...], dict[int, str]] = {}
     for c in g.columns:
         if c.numbers and not c.axis and c.has(words.QUATERNION | {"e"}) and c.name in g.free:
@@ -351,8 +351,8 @@ def _matrix(g: Guesser) -> bool:
         by_place: dict[tuple[int, int], str] = {}
         for c in g.columns:
             if c.words[:1] == (word,) and c.axis is None and c.name in g.free:
-                at = c.numbers if len(c.numbers) == 2 else tuple(divmod(sum(c.numbers), 10))
-                by_place[int(at[0]), int(at[1])] = c.name
+                place = c.numbers if len(c.numbers) == 2 else tuple(divmod(sum(c.numbers), 10))
+                by_place[int(place[0]), int(place[1])] = c.name
         for base in (0, 1):
             places = [(i + base, j + base) for i in range(3) for j in range(3)]
             if all(place in by_place for place in places):
@@ -362,8 +362,8 @@ def _matrix(g: Guesser) -> bool:
     return False
 
 
-def _forces(g: Guesser, whole: Group) -> None:
-    force, moment = (next(iter(whole.get(k, {}).values()), None) for k in ("force", "moment"))
+def _forces(g: Guesser, complete: Group) -> None:
+    force, moment = (next(iter(complete.get(k, {}).values()), None) for k in ("force", "moment"))
     if force is None:
         return
     names = [force[axis] for axis in "xyz"]
@@ -376,17 +376,17 @@ def _forces(g: Guesser, whole: Group) -> None:
     g.take("wrench", names, ", ".join(map(str, section.values())), **section)
 
 
-def _std(g: Guesser, whole: Group, stem: tuple[object, ...], position_unit: str) -> None:
-    axes = _like(whole.get("std", {}), stem)
-    other = words.DISTANCE | words.GAUGE
-    one = [c for c in g.columns if c.name in g.free and c.has(words.STD) and not c.axis]
-    single = [c.name for c in one if g.number(c.name) and not c.numbers and not c.has(other)]
+def _std(g: Guesser, complete: Group, stem: tuple[object, ...], position_unit: str) -> None:
+    axes = _columns_like(complete.get("std", {}), stem)
+    scalar = words.DISTANCE | words.GAUGE
+    columns = [c for c in g.columns if c.name in g.free and c.has(words.STD) and not c.axis]
+    single = [c.name for c in columns if g.number(c.name) and not (c.numbers or c.has(scalar))]
     if axes is None and not single:
         return
     names = [axes[axis] for axis in "xyz"] if axes is not None else single[:1]
     first = parse(names[0])
     section: dict[str, object] = {"unit": g.unit(names, LENGTHS) or position_unit}
-    turned = _like(whole.get("std_angle", {}), stem)
+    turned = _columns_like(complete.get("std_angle", {}), stem)
     orientation = g.proposal.sections.get("orientation")
     if axes is not None and turned is not None and orientation is not None:
         names += [turned[axis] for axis in "xyz"]

@@ -1,4 +1,4 @@
-"""Import of a table in any of the formats, into the cell that it was measured in."""
+"""Import of a table in any format, with the description of its cell."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -21,12 +21,12 @@ from hilcal.tables.uncertainty import rounding_variance
 def import_readings(
     path: Path, form: str | Path | Mapping, config: CellConfig, arm: Arm, second: Path | None = None
 ) -> ImportResult:
-    """Read a table into a cell, which has its tracker's noise and place, gravity, and loads.
+    """Read a table; the cell states the tracker's noise and place, gravity, and loads.
 
     Args:
         form: "table" (the exchange table), the name of a mapping that comes with the
             program, the path of a mapping file, or a mapping.
-        second: the second file of a mapping that is for two.
+        second: the second file, for a mapping of two files.
     """
     if isinstance(form, Mapping):
         mapping: Mapping | None = form
@@ -46,10 +46,10 @@ def import_readings(
     notes = tuple(note + where * (note == FROM_TRACKER) for note in result.notes)
     stated = FROM_TRACKER not in result.notes
     covers = WHOLE if stated and config.repeatability.in_tables else result.covers
-    kept, copies = _without_copies(result.readings)
-    kept, named = _named_loads(kept, config)
+    readings, copies = _without_copies(result.readings)
+    readings, named = _named_loads(readings, config)
     return ImportResult(
-        kept, (*notes, *copies, *named), covers, stated or tracker.states_noise, not stated
+        readings, (*notes, *copies, *named), covers, stated or tracker.states_noise, not stated
     )
 
 
@@ -61,7 +61,7 @@ def _std(config: CellConfig) -> dict[ObserverName, float]:
 
 
 def _named_loads(readings: Readings, config: CellConfig) -> tuple[Readings, tuple[str, ...]]:
-    """Let loads of a table that states no force act as `[[loads]]` has them by name; say which."""
+    """Give the loads of a table without forces the wrench of the cell's `[[loads]]`, by name."""
 
     def plain(name: str) -> str:
         return "".join(name.split()).casefold()
@@ -69,41 +69,42 @@ def _named_loads(readings: Readings, config: CellConfig) -> tuple[Readings, tupl
     s, gravity = readings.states, np.asarray(config.robot.gravity_m_s2)
     if s.wrench.any():
         return readings, ()
-    known = {plain(load.name): load.wrench(gravity) for load in config.loads}
+    wrenches = {plain(load.name): load.wrench(gravity) for load in config.loads}
     wrench, notes = s.wrench.copy(), []
     for k in np.unique(readings.load):
         name = readings.load_names[k]
         if name == UNLOADED:
             continue
         where = "is not stated by the table, nor by [[loads]] of the cell: it is taken as none"
-        if plain(name) in known:
-            wrench[readings.load == k] = known[plain(name)]
+        if plain(name) in wrenches:
+            wrench[readings.load == k] = wrenches[plain(name)]
             where = "is that of [[loads]] of the cell, since the table states none"
         notes.append(f"load {name}: its force {where}")
     return replace(readings, states=replace(s, wrench=wrench)), tuple(notes)
 
 
 def _without_copies(readings: Readings) -> tuple[Readings, tuple[str, ...]]:
-    """Leave out rows that repeat an earlier one to the last digit: copies, not made again; a note.
+    """Leave out rows that are copies of another row to the last digit, with a note.
 
-    A measurement that is repeated scatters. Where positions are rounded to more than their noise,
-    or are those of another cycle, equal ones may be readings, and stay; so do rows whose pose has
-    others that are none.
+    A repeated measurement scatters, a copy does not. Equal rows may be measurements, and stay, in
+    different cycles, or where rows have no times and positions are rounded to more than their
+    noise. Copies of another pose's row stay where their pose has rows that are no copies.
     """
     s, value = readings.states, readings.value
     rounding = np.sqrt(12.0 * rounding_variance(value[:, :3], 1.0))
     noise = np.sqrt(np.median(readings.covariance[:, range(3), range(3)], axis=0))
     if s.time is None and np.any(rounding > noise):
         return readings, ()
-    given = [s.time, s.load_time, s.air_temperature]
-    columns = [s.q, s.wrench, value, *(x[:, None] for x in given if x is not None)]
+    scalars = [s.time, s.load_time, s.air_temperature]
+    columns = [s.q, s.wrench, value, *(x[:, None] for x in scalars if x is not None)]
     names = np.stack([readings.load, readings.cycle, readings.line], axis=1)
     keys = np.concatenate([*columns, names], axis=1)
-    _, first, of = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    copied = first[of.reshape(-1)] != np.arange(len(readings))
-    same = readings.pose == readings.pose[first[of.reshape(-1)]]
-    whole = ~np.isin(readings.pose, readings.pose[~copied])
-    copied &= same | whole
+    _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    original = first[inverse.reshape(-1)]
+    copied = original != np.arange(len(readings))
+    same = readings.pose == readings.pose[original]
+    only_copies = ~np.isin(readings.pose, readings.pose[~copied])
+    copied &= same | only_copies
     if not copied.any():
         return readings, ()
     k = int(np.argmax(copied))

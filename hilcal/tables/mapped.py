@@ -16,7 +16,7 @@ from hilcal.readings.readings import SAME_POSE, ObserverName, Readings
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.tables import columns, units
-from hilcal.tables.columns import own_columns
+from hilcal.tables.columns import independent_columns
 from hilcal.tables.files import open_tables
 from hilcal.tables.grid import ColumnTable, Grid
 from hilcal.tables.mapping import (
@@ -48,9 +48,9 @@ STILL = 1e-4  # rad; a joint commanded by less did not move far enough to arrive
 SIGMAS = 4.0  # Standard deviations within which two readings are the same; a choice
 REPEATED = 2e-4  # rad; rows whose joints differ by less repeat a pose; a choice
 REPEATS_TO = 4e-4
-"""m; ten times what an arm repeats to: positions of one pose that differ by more are not all right.
-A choice."""
-TOOL = 0.5  # m; the longest tool, beside the arm's reach a lever of its joints; a choice
+"""m; ten times an arm's repeatability: of positions of one pose that differ by more, some are
+wrong. A choice."""
+TOOL = 0.5  # m; the longest tool: with the arm's reach, the lever of its joints; a choice
 GRAVITY = (0.0, 0.0, -9.80665)  # m/s², base axes, of an arm that stands upright
 EPOCH = 1e8  # s; times beyond three years are counted from an epoch, not from the campaign's start
 TARGET = "target of [position]"
@@ -63,11 +63,11 @@ _LISTED = 8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MappedTable(Generic[M]):
-    """The rows of a table by their mapping, without what tells noise."""
+    """The rows of a table, read by a mapping, without their uncertainties."""
 
     table: ColumnTable  # columns of the exchange table, SI
     grid: Grid  # the rows as the file has them
-    mapping: M  # as it is used
+    mapping: M  # with one target per row, without optional columns that are absent
     raw: dict[str, Floats]  # (N,) number columns by the file's names, in its units
     angles: Floats | None  # (N, k) numbers of the orientation, in the file's unit; None without
     notes: list[str]  # one sentence for each decision
@@ -80,7 +80,7 @@ def mapped_table(
     gravity: Sequence[float] = GRAVITY,
     second: Path | None = None,
 ) -> MappedTable[M]:
-    """Read the states of a table, or of two tables, by a mapping; arguments as below."""
+    """Read the states of one table or two by a mapping; arguments are those of `import_mapped`."""
     grid, lost = open_tables(path, mapping, second)
     notes = [f"{lost} rows left out: they have no partner in the second file"] * bool(lost)
     grid, mapping = one_target_per_row(grid, mapping)
@@ -94,13 +94,13 @@ def mapped_table(
             f"approach: side of the move from the row before; moves below {STILL:g} rad keep the "
             "last side, the first row counts as +1"
         )
-    nowhere = _nowhere(grid, mapping.position, raw)
-    sparse: list[str] = []  # columns of readings, of which a row has one kind
-    if mapping.one:
+    missing_notes = _missing_positions(grid, mapping.position, raw)
+    sparse: list[str] = []  # columns of readings; a row has one kind of reading
+    if mapping.scalars:
         position = () if mapping.position is None else mapping.position.columns
-        sparse = [grid.name(c) for c in (*position, *(s.column for s in mapping.one.values()))]
+        sparse = [grid.name(c) for c in (*position, *(s.column for s in mapping.scalars.values()))]
     keep, left_out = _complete(grid, raw, sparse)
-    notes += left_out + nowhere
+    notes += left_out + missing_notes
     grid = grid.rows_with(keep)
     raw = {column: values[keep] for column, values in raw.items()}
     table = ColumnTable(grid.path, grid.rows, {}, {})
@@ -140,24 +140,24 @@ def import_mapped(
         station: (3,) where the tracker's beam starts, m; the origin where None.
         gravity: (3,) base axes, m/s²: the direction in which a hung mass pulls.
     """
-    of = mapped_table(path, mapping, arm, gravity, second)
-    mapping, grid, table, notes = of.mapping, of.grid, of.table, of.notes
-    q = _joint_units(mapping.joints, arm) * _block(of.raw, grid, mapping.joints.columns)
+    source = mapped_table(path, mapping, arm, gravity, second)
+    mapping, grid, table, notes = source.mapping, source.grid, source.table, source.notes
+    q = _joint_units(mapping.joints, arm) * _block(source.raw, grid, mapping.joints.columns)
     noise = noise if mapping.instrument is None else mapping.instrument.noise()
     covariance, rounding, stated, position = None, None, tuple[str, ...](), np.zeros((len(q), 0))
     if mapping.position is not None:
         position = table.matrix(columns.POSITION)
-        whole = np.asarray(np.isfinite(position).all(axis=1))
+        positioned = np.asarray(np.isfinite(position).all(axis=1))
         covariance, stated = mapped_covariance(
-            table.taken(whole),
-            grid.rows_with(whole),
+            table.select(positioned),
+            grid.rows_with(positioned),
             mapping,
-            position[whole],
-            of.angles,
+            position[positioned],
+            source.angles,
             noise,
             station,
         )
-        figures = _block(of.raw, grid, mapping.position.columns)[whole]
+        figures = _block(source.raw, grid, mapping.position.columns)[positioned]
         rounding = rounding_variance(figures, units.LENGTHS[mapping.position.unit])
     result = readings_of(table, arm, noise, station, covariance, targets, rounding, std)
     readings = result.readings
@@ -171,7 +171,7 @@ def import_mapped(
         notes += _stale(grid, position, q)
     notes += [*(stated or result.notes[:1]), *result.notes[1:]]
     unit, name = units.ANGLES[mapping.joints.unit], mapping.joints.unit
-    names = own_columns(columns.joint_columns(arm.units), q.shape[1], arm)
+    names = independent_columns(columns.joint_columns(arm.units), q.shape[1], arm)
     q = q[:, [k for k, column in enumerate(names) if column.endswith("_rad")]]
     notes += check_joint_rounding(q / unit, unit, name, result.readings.covariance, arm.reach)
     return ImportResult(readings, tuple(notes))
@@ -180,16 +180,16 @@ def import_mapped(
 def _observers(
     table: ColumnTable, grid: Grid, mapping: PointMapping, raw: dict[str, Floats]
 ) -> None:
-    """Add distances and heights in m, their variances, and who observed the rows."""
-    for kind, section in mapping.one.items():
-        value, of, variance = columns.ONE[kind]
+    """Add distances and heights in m, their variances, and the observers of the rows."""
+    for kind, section in mapping.scalars.items():
+        value, observer, variance = columns.SCALAR[kind]
         _put(table, grid, value, section.column, raw[grid.name(section.column)])
         table.number[value] = units.LENGTHS[section.unit] * table.number[value]
         if section.name_column is None:
-            table.text[of] = [str(section.name)] * len(grid.rows)
+            table.text[observer] = [str(section.name)] * len(grid.rows)
         else:
-            table.text[of] = grid.text(section.name_column)
-            table.alias[of] = grid.name(section.name_column)
+            table.text[observer] = grid.text(section.name_column)
+            table.alias[observer] = grid.name(section.name_column)
         if section.std_column is not None:
             std = units.LENGTHS[section.std_unit or section.unit] * grid.numbers(section.std_column)
             table.refuse(std[:, None] < 0, (value,), lambda v: "its standard deviation is below 0")
@@ -228,7 +228,7 @@ def one_target_per_row(grid: Grid, mapping: M) -> tuple[Grid, M]:
 
 
 def _put(table: ColumnTable, grid: Grid, name: str, column: Column, values: Floats) -> None:
-    """Add a column, and what the file calls it."""
+    """Add a column, and its name in the file."""
     table.number[name] = values
     table.alias[name] = grid.name(column)
 
@@ -239,18 +239,18 @@ def _quantities(
     """Add the columns of numbers in SI units."""
 
     def put(
-        names: Sequence[str], given: Sequence[Column], size: float | Floats = 1.0, zero: float = 0.0
+        names: Sequence[str], keys: Sequence[Column], size: float | Floats = 1.0, zero: float = 0.0
     ) -> None:
         sizes = np.broadcast_to(size, len(names)).tolist()
-        for name, column, one in zip(names, given, sizes, strict=True):
-            _put(table, grid, name, column, one * (raw[grid.name(column)] - zero))
+        for name, column, factor in zip(names, keys, sizes, strict=True):
+            _put(table, grid, name, column, factor * (raw[grid.name(column)] - zero))
 
     if m.position is not None:
         put(columns.POSITION, m.position.columns, units.LENGTHS[m.position.unit])
     commanded, reported = columns.joint_columns(arm.units), columns.actual_columns(arm.units)
     for s, names in ((m.joints, commanded), (m.actual_joints, reported)):
         if s is not None:
-            put(own_columns(names, len(s.columns), arm), s.columns, _joint_units(s, arm))
+            put(independent_columns(names, len(s.columns), arm), s.columns, _joint_units(s, arm))
     if m.cycle is not None:
         put(("cycle",), (m.cycle.column,))
     if m.approach is not None and m.approach.columns:
@@ -267,13 +267,13 @@ def _quantities(
 
 def _joint_units(section: Joints, arm: Arm) -> Floats:
     """(k,) rad, or m where a joint slides, per unit of each of the section's columns."""
-    names = own_columns(columns.joint_columns(arm.units), len(section.columns), arm)
+    names = independent_columns(columns.joint_columns(arm.units), len(section.columns), arm)
     angle, length = units.ANGLES[section.unit], units.LENGTHS[section.slide_unit]
     return np.array([length if name.endswith("_m") else angle for name in names])
 
 
 def _raw(grid: Grid, mapping: PointMapping, arm: Arm) -> dict[str, Floats]:
-    """Number columns that a reading cannot do without, by the file's names, in its units."""
+    """Number columns that every reading needs, by the file's names, in its units."""
     needed: list[Column] = []
     per_joint = ("joints", "actual_joints", "approach", "joint_temperatures", "torques")
     for name in (*per_joint, "position", "orientation"):
@@ -288,16 +288,16 @@ def _raw(grid: Grid, mapping: PointMapping, arm: Arm) -> dict[str, Floats]:
             )
         needed += section.columns
     needed += [s.column for s in (mapping.air, mapping.cycle) if s is not None]
-    needed += [s.column for s in mapping.one.values()]
+    needed += [s.column for s in mapping.scalars.values()]
     return {grid.name(column): grid.numbers(column) for column in needed}
 
 
-def _nowhere(grid: Grid, of: Position | None, raw: dict[str, Floats]) -> list[str]:
-    """Take positions that instruments write for no measurement for missing.
+def _missing_positions(grid: Grid, section: Position | None, raw: dict[str, Floats]) -> list[str]:
+    """Set positions to NaN that instruments write where they measured none.
 
-    Exactly 0, 0, 0, and numbers of nines that are a position three times over, as −9999.
+    These are exactly 0, 0, 0, and a number of nines, such as −9999, in all three columns.
     """
-    names = [] if of is None else [grid.name(column) for column in of.columns]
+    names = [] if section is None else [grid.name(column) for column in section.columns]
     position, notes = _block(raw, grid, names) if names else np.zeros((0, 1)), []
     for value in (0.0, *nines(position)):
         bad = np.asarray((position == value).all(axis=1))
@@ -312,14 +312,14 @@ def _nowhere(grid: Grid, of: Position | None, raw: dict[str, Floats]) -> list[st
 
 def nines(position: Floats) -> list[float]:
     """Return numbers of four nines or more, which stand for a missing value."""
-    known = np.unique(position[np.isfinite(position)])
-    return [float(v) for v in known if re.fullmatch(r"-?9{4,}(\.0)?", repr(float(v)))]
+    values = np.unique(position[np.isfinite(position)])
+    return [float(v) for v in values if re.fullmatch(r"-?9{4,}(\.0)?", repr(float(v)))]
 
 
 def _complete(grid: Grid, raw: dict[str, Floats], sparse: Sequence[str]) -> tuple[Bools, list[str]]:
-    """Rows that have a value in every column that is used, and a note on the others.
+    """Rows that have a value in every used column, and a note on the incomplete ones.
 
-    Of the `sparse` columns a row needs one value.
+    A row needs a value in one of the `sparse` columns only.
     """
     missing = np.stack([np.isnan(values) for values in raw.values()], axis=1)
     some = [k for k, name in enumerate(raw) if name in sparse]
@@ -364,8 +364,8 @@ def _rotations(
     angles = _block(raw, grid, o.columns)
     far = defect(o.convention, angles) > UNIT_LENGTH
     if far.any():
-        what = "a quaternion of length 1" if angles.shape[1] == 4 else "a rotation matrix"
-        raise InputError(f"{grid.at(int(np.argmax(far)), o.columns[0])}: not {what}")
+        valid = "a quaternion of length 1" if angles.shape[1] == 4 else "a rotation matrix"
+        raise InputError(f"{grid.at(int(np.argmax(far)), o.columns[0])}: not {valid}")
     unit = units.ANGLES[o.unit]
     turn = np.abs(unit * angles) > MOST_TURN
     if angles.shape[1] == 3 and turn.any():
@@ -421,26 +421,26 @@ def _as_commanded(table: ColumnTable, q: Floats, arm: Arm) -> None:
     first: dict[str, int] = {}
     rows = [first.setdefault(name, k) for k, name in enumerate(table.text["pose"])]
     names, reported = (
-        own_columns(of(arm.units), q.shape[1], arm)
-        for of in (columns.joint_columns, columns.actual_columns)
+        independent_columns(columns_of(arm.units), q.shape[1], arm)
+        for columns_of in (columns.joint_columns, columns.actual_columns)
     )
     for k, (name, actual) in enumerate(zip(names, reported, strict=True)):
         table.number[actual], table.alias[actual] = q[:, k], table.alias[name]
         table.number[name] = q[rows, k]
 
 
-def _poses(grid: Grid, of: PoseName | None, q: Floats | None) -> list[str]:
+def _poses(grid: Grid, section: PoseName | None, q: Floats | None) -> list[str]:
     """Names of the poses: the column's, or the row where these joints were first commanded."""
-    if of is not None and of.column is not None:
-        names = grid.text(of.column)
+    if section is not None and section.column is not None:
+        names = grid.text(section.column)
         if "" in names:
             raise InputError(
-                f"{grid.at(names.index(''), of.column)}: the pose has no name; without "
+                f"{grid.at(names.index(''), section.column)}: the pose has no name; without "
                 f"[pose], rows of the same joints are one pose"
             )
         return names
     rows = grid.rows.tolist()
-    if of is not None or q is None:
+    if section is not None or q is None:
         return [f"row {row}" for row in rows]
     keys = map(tuple, np.rint(q / (10 * SAME_POSE)).astype(np.int64).tolist())
     first: dict[tuple[int, ...], int] = {}
@@ -476,15 +476,14 @@ def seconds(grid: Grid, time: Time) -> Floats:
 
 
 def approach_by_order(q: Floats) -> Floats:
-    """(N, n) side from which each joint arrived: sign(q_i − q_{i−1}), the last where it kept still.
+    """(N, n) side from which each joint arrived: sign(q_i − q_{i−1}), the last one at rest.
 
-    The first row, and joints that have not moved yet, count as +1. Rows without a value are passed
-    over.
+    The first row, and joints that have not yet moved, count as +1. Rows without value are skipped.
     """
     import pandas as pd
 
-    known = pd.DataFrame(q).ffill().bfill().to_numpy()
-    step = np.diff(known, axis=0, prepend=known[:1])
+    filled = pd.DataFrame(q).ffill().bfill().to_numpy()
+    step = np.diff(filled, axis=0, prepend=filled[:1])
     side = np.where(np.abs(step) > STILL, np.sign(step), np.nan)
     side[0] = 1.0
     return np.asarray(pd.DataFrame(side).ffill().to_numpy(), dtype=float)
@@ -493,13 +492,13 @@ def approach_by_order(q: Floats) -> Floats:
 def _plausible(
     readings: Readings, scatter: Floats, rows: Ints, lever: float
 ) -> tuple[Readings, list[str]]:
-    """Leave out readings that cannot be; a note on each reason.
+    """Leave out implausible readings; a note on each reason.
 
-    A reading that is the one before it within the scatter (N, m, m) of both, though the joints were
-    sent elsewhere: the arm did not follow, or the tracker did not measure again. Of readings that
-    repeat a pose those whose positions disagree by more than what an arm repeats to and
-    lever · Σ|dq|, what the joints' difference moves the target by at most: which one is wrong
-    cannot be known.
+    A reading is stale where it equals the previous one within the scatter (N, m, m) of both though
+    the joints were sent elsewhere: the arm did not follow, or the tracker did not measure again.
+    Readings that repeat a pose are odd where their positions differ by more than `REPEATS_TO` +
+    lever · Σ|dq|, the most that the difference of their joints moves the target: which of them is
+    wrong cannot be known.
     """
     from scipy.spatial import cKDTree
 
@@ -526,10 +525,10 @@ def _plausible(
     ]
     if (stale | odd).all():
         raise InputError("no row can be used; expected one measured pose per row")
-    kept = readings[~(stale | odd)]
-    used, pose = np.unique(kept.pose, return_inverse=True)
-    names = tuple(kept.pose_names[k] for k in used)
-    return replace(kept, pose=pose, pose_names=names), notes
+    plausible = readings[~(stale | odd)]
+    used, pose = np.unique(plausible.pose, return_inverse=True)
+    names = tuple(plausible.pose_names[k] for k in used)
+    return replace(plausible, pose=pose, pose_names=names), notes
 
 
 def _listed(rows: Ints) -> str:

@@ -20,13 +20,13 @@ Column = Annotated[str, Field(min_length=1)] | Annotated[int, Strict(), Field(ge
 
 def _columns(*valid: int) -> AfterValidator:
     """Refuse another number of columns than the valid ones."""
-    *others, last = map(str, valid)
+    *first, last = map(str, valid)
 
-    def counted(given: tuple[Column, ...]) -> tuple[Column, ...]:
-        if len(given) not in valid:
-            words = f"{', '.join(others)} or {last}"
-            raise ValueError(f"columns: {len(given)} given; it must be {words}")
-        return given
+    def counted(columns: tuple[Column, ...]) -> tuple[Column, ...]:
+        if len(columns) not in valid:
+            counts = f"{', '.join(first)} or {last}"
+            raise ValueError(f"columns: {len(columns)} given; it must be {counts}")
+        return columns
 
     return AfterValidator(counted)
 
@@ -109,10 +109,10 @@ class Position(Section):
 
     @model_validator(mode="after")
     def _three_each(self) -> "Position":
-        wanted = 3 * max(1, len(self.targets))
-        if len(self.columns) != wanted:
+        count = 3 * max(1, len(self.targets))
+        if len(self.columns) != count:
             raise ValueError(
-                f"columns: {len(self.columns)} given; it must be {wanted}"
+                f"columns: {len(self.columns)} given; it must be {count}"
                 + (f" for {len(self.targets)} targets" if self.targets else ": x, y, z")
             )
         return self
@@ -129,17 +129,15 @@ class Orientation(Section):
     unit: Angle = Field("rad", description=_ANGLE)
 
     @model_validator(mode="after")
-    def _known(self) -> "Orientation":
+    def _valid_convention(self) -> "Orientation":
         if self.convention not in CONVENTIONS:
             raise ValueError(
                 f'convention = "{self.convention}" is unknown'
                 f"{suggest(self.convention, list(CONVENTIONS))}; valid: {', '.join(CONVENTIONS)}"
             )
-        wanted = NUMBERS.get(CONVENTIONS[self.convention], 3)
-        if len(self.columns) != wanted:
-            raise ValueError(
-                f'columns: {len(self.columns)} given; "{self.convention}" has {wanted}'
-            )
+        count = NUMBERS.get(CONVENTIONS[self.convention], 3)
+        if len(self.columns) != count:
+            raise ValueError(f'columns: {len(self.columns)} given; "{self.convention}" has {count}')
         return self
 
 
@@ -178,7 +176,7 @@ class PoseName(Section):
     )
 
     @model_validator(mode="after")
-    def _one(self) -> "PoseName":
+    def _one_source(self) -> "PoseName":
         if (self.column is None) != self.each_row:
             raise ValueError("column or each_row = true: give one of them")
         return self
@@ -259,7 +257,7 @@ class OneNumber(Section):
     std_unit: Length | None = Field(None, description=_LENGTH + "; as unit where left out")
 
     @model_validator(mode="after")
-    def _one(self) -> "OneNumber":
+    def _one_source(self) -> "OneNumber":
         if (self.name_column is None) == (self.name is None):
             raise ValueError("name_column or name: give one of them")
         if self.std_unit is not None and self.std_column is None:
@@ -296,7 +294,7 @@ class Approach(Section):
     )
 
     @model_validator(mode="after")
-    def _one(self) -> "Approach":
+    def _one_source(self) -> "Approach":
         if bool(self.columns) == self.by_order:
             raise ValueError("columns or by_order = true: give one of them")
         return self
@@ -321,7 +319,7 @@ class Instrument(Section):
     orientation_std_rad: NonNegative = Field(0.0, description="of an orientation, rad")
 
     def noise(self) -> TrackerNoise:
-        """Return it as a specification."""
+        """Return the noise as a specification."""
         return TrackerNoise(
             self.range_std_m,
             self.range_std_per_m,
@@ -370,11 +368,11 @@ class Std(Section):
     def _number(self) -> "Std":
         if bool(self.columns) == bool(self.values):
             raise ValueError("columns or values: give one of them")
-        given = len(self.columns) or len(self.values)
-        if given not in (1, 6) and (given % 3 or not given):
-            raise ValueError(f"{given} figures; it must be 1, 3 or 6, or 3 for each target")
-        if self.of == "point" and given != 1:
-            raise ValueError(f'of = "point" with {given} figures; it must be one')
+        count = len(self.columns) or len(self.values)
+        if count not in (1, 6) and (count % 3 or not count):
+            raise ValueError(f"{count} figures; it must be 1, 3 or 6, or 3 for each target")
+        if self.of == "point" and count != 1:
+            raise ValueError(f'of = "point" with {count} figures; it must be one')
         if self.values and not all(self.values):
             raise ValueError("values must be more than 0")
         if self.optional and (self.at_least is None or not self.columns):
@@ -455,7 +453,7 @@ class PointMapping(Section):
         reported = self.joints is not None and self.joints.reported
         if reported and (self.pose is None or self.actual_joints is not None):
             raise ValueError("[joints] reported = true needs [pose], and no [actual_joints]")
-        if self.one and (self.orientation or targets or self.rows):
+        if self.scalars and (self.orientation or targets or self.rows):
             raise ValueError(
                 "[distance] or [gauge] together with [orientation], [rows] or targets in "
                 "[position]; give those in a table of their own"
@@ -469,10 +467,10 @@ class PointMapping(Section):
         return self
 
     @property
-    def one(self) -> dict[ObserverKind, OneNumber]:
+    def scalars(self) -> dict[ObserverKind, OneNumber]:
         """Sections of readings that are one number, by kind of observer."""
-        given: dict[ObserverKind, OneNumber | None] = {"point": self.distance, "gauge": self.gauge}
-        return {kind: section for kind, section in given.items() if section is not None}
+        both: dict[ObserverKind, OneNumber | None] = {"point": self.distance, "gauge": self.gauge}
+        return {kind: section for kind, section in both.items() if section is not None}
 
 
 class Mapping(PointMapping):
@@ -482,7 +480,7 @@ class Mapping(PointMapping):
 
     @model_validator(mode="after")
     def _read(self) -> Self:
-        if self.position is None and not self.one:
+        if self.position is None and not self.scalars:
             raise ValueError(f"no reading: it must be {_POSITION}, or [distance] or [gauge]")
         if self.position is None and (self.std or self.covariance or self.station):
             raise ValueError("[std], [covariance] and [station] need [position]")
@@ -515,12 +513,12 @@ def load_mapping(path: Path, kind: type[M]) -> M:
     mapping = load_section(path, kind)
     if (second := mapping.second_file) is None or second.path is None:
         return mapping
-    second = second.model_copy(update={"path": str(_beside(path, str(second.path)))})
+    second = second.model_copy(update={"path": str(_second_path(path, str(second.path)))})
     return mapping.model_copy(update={"second_file": second})
 
 
-def _beside(path: Path, name: str) -> Path:
-    """Return a file that a mapping names; it may have come from somebody else."""
+def _second_path(path: Path, name: str) -> Path:
+    """Return the path of a file that a mapping names; it must not leave the mapping's folder."""
     folder = path.absolute().parent
     if not (folder / name).resolve().is_relative_to(folder.resolve()):
         raise InputError(

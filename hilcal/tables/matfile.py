@@ -2,7 +2,7 @@
 
 The compiled reader of scipy crashes on some damaged files (found by `python -m tests.fuzz mat`) and
 may ask for any amount of memory that a damaged header states. In a process of its own, with limits,
-neither ends the program. What comes back are matrices of numbers and lists of texts: no objects.
+neither ends the program. It returns matrices of numbers and lists of texts, no objects.
 """
 
 import io
@@ -31,31 +31,31 @@ Block = tuple[str, str, np.ndarray]
 def read(path: str) -> tuple[list[str], list[Block]]:
     """Return the names of all variables, and the matrices of N > 1 rows in them."""
     command = [sys.executable, "-P", "-m", __name__, str(Path(path).absolute())]
-    ours = str(Path(__file__).resolve().parents[2])
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([ours, *sys.path[1:]])}
+    root = str(Path(__file__).resolve().parents[2])
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([root, *sys.path[1:]])}
     try:
-        done = subprocess.run(  # noqa: S603 - our own interpreter and module
+        process = subprocess.run(  # noqa: S603 - our own interpreter and module
             command, capture_output=True, timeout=LIMIT_S, check=False, env=environment
         )
     except subprocess.TimeoutExpired:
         raise InputError(f"{path}: damaged: not read within {LIMIT_S} s") from None
-    if done.returncode == 0:
-        return unpacked(done.stdout)
-    words = done.stderr.decode(errors="replace").strip().rpartition("\n")[2]
-    if done.returncode == InputError.exit_code:
-        raise InputError(words)
-    words = words[:80]
-    why = "its reader crashed" if done.returncode < 0 or not words else words
+    if process.returncode == 0:
+        return unpacked(process.stdout)
+    message = process.stderr.decode(errors="replace").strip().rpartition("\n")[2]
+    if process.returncode == InputError.exit_code:
+        raise InputError(message)
+    message = message[:80]
+    why = "its reader crashed" if process.returncode < 0 or not message else message
     raise InputError(f"{path}: damaged, or not what its first bytes say ({why})")
 
 
 def packed(path: str) -> bytes:
-    """Return what `read` needs, as the process gives it."""
+    """Return the variables and matrices of a file as bytes, for `unpacked`."""
     from scipy.io import loadmat
 
-    found = loadmat(path, appendmat=False, squeeze_me=False, struct_as_record=True)
-    variables = [name for name in found if not name.startswith("__")]
-    blocks = [(v, *b) for v in variables for b in _blocks(v, np.asarray(found[v]))]
+    loaded = loadmat(path, appendmat=False, squeeze_me=False, struct_as_record=True)
+    variables = [name for name in loaded if not name.startswith("__")]
+    blocks = [(v, *b) for v in variables for b in _blocks(v, np.asarray(loaded[v]))]
     limits.check_cells(path, sum(block.size for _, _, block in blocks))
     for _, name, block in blocks:
         if block.dtype.kind == "O":
@@ -72,10 +72,10 @@ def packed(path: str) -> bytes:
 
 
 def unpacked(data: bytes) -> tuple[list[str], list[Block]]:
-    """Return what `packed` packed."""
-    with np.load(io.BytesIO(data), allow_pickle=False) as found:
-        names: dict[str, Any] = json.loads(str(found["names"]))
-        blocks = [(v, name, found[f"b{k}"]) for k, (v, name) in enumerate(names["blocks"])]
+    """Return the variables and matrices in the bytes of `packed`."""
+    with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+        names: dict[str, Any] = json.loads(str(archive["names"]))
+        blocks = [(v, name, archive[f"b{k}"]) for k, (v, name) in enumerate(names["blocks"])]
     return names["variables"], blocks
 
 
@@ -87,8 +87,8 @@ def _blocks(name: str, value: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
     elif value.dtype.kind in "fiu" and value.ndim == 3:
         last = value.shape[2]
         flat = np.moveaxis(value, 2, 0).reshape(last, -1)
-        for k, at in enumerate(np.ndindex(value.shape[:2])):
-            yield f"{name}({at[0] + 1},{at[1] + 1})", flat[:, k : k + 1]
+        for k, index in enumerate(np.ndindex(value.shape[:2])):
+            yield f"{name}({index[0] + 1},{index[1] + 1})", flat[:, k : k + 1]
     elif value.dtype.kind in "fiu" and value.ndim == 2 and value.size > 1:
         yield name, value.T if value.shape[0] == 1 else value
     elif value.dtype.kind == "O" and value.ndim == 2 and min(value.shape) == 1:
@@ -102,14 +102,14 @@ def main() -> None:
     resource.setrlimit(resource.RLIMIT_CPU, (LIMIT_S, LIMIT_S))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     try:
-        import scipy.io  # noqa: F401 - what it takes itself does not count
+        import scipy.io  # noqa: F401 - its own memory does not count
 
         with limits.memory(sys.argv[1]):
             data = packed(sys.argv[1])
     except InputError as error:
         print(error, file=sys.stderr)
         raise SystemExit(InputError.exit_code) from None
-    except BaseException as error:  # what a reader makes of a damaged file is not documented
+    except BaseException as error:  # which exceptions damaged files raise is undocumented
         print(" ".join(str(error).split()) or type(error).__name__, file=sys.stderr)
         raise SystemExit(1) from None
     sys.stdout.buffer.write(data)

@@ -1,8 +1,8 @@
 """Readings of a moving arm that do not fit into memory: a Parquet file, chunk by chunk.
 
 The columns are those of the exchange table, without `pose`, `load` and `cycle`: each row is a
-reading that stands alone. A row group of the file is what one worker reads; it is read in chunks of
-`CHUNK` rows, so that memory does not grow with the file or its row groups.
+reading that stands alone. A worker reads one row group of the file, in chunks of `CHUNK` rows, so
+that memory does not grow with the file or its row groups.
 """
 
 from collections.abc import Iterator
@@ -26,12 +26,12 @@ from hilcal.tables.uncertainty import rounding_variance
 from hilcal.types import Floats
 
 NAMES = ("pose", "load", "cycle")
-"""Columns of the exchange table that a stream may have, and that mean nothing in it."""
+"""Columns of the exchange table that a stream may have, but that have no meaning in it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReadingStream:
-    """A Parquet file of readings; nothing of it is held."""
+    """A Parquet file of readings, none of which are held in memory."""
 
     path: Path
     arm: Arm  # its number of joints, their limits and its reach are checked
@@ -59,26 +59,24 @@ class ReadingStream:
             yield self._readings(table, row)
             row += table.num_rows
 
-    def _readings(self, found: Any, row: int) -> Readings:
-        rows = np.arange(row, row + found.num_rows)
+    def _readings(self, batch: Any, row: int) -> Readings:
+        rows = np.arange(row, row + batch.num_rows)
         number = {
-            name: _numbers(self.path, name, found.column(k), row)
+            name: _numbers(self.path, name, batch.column(k), row)
             for k, name in enumerate(self.columns)
         }
         table = ColumnTable(str(self.path), rows, {}, number)
         states, value = measured_of(table, self.arm)
-        count = len(rows)
-        alone, none = np.arange(count), np.zeros(count, dtype=np.int64)
-        checks.check_wrenches(table, states.wrench, none, ["as recorded"], self.arm)
-        of = self.noise, self.station, None, self.rounding
-        covariance, *_ = covariances_of(table, value, *of)
-        return Readings(states, alone, none, none, value, covariance, ("as recorded",), ())
+        pose, zeros = np.arange(len(rows)), np.zeros(len(rows), dtype=np.int64)
+        checks.check_wrenches(table, states.wrench, zeros, ["as recorded"], self.arm)
+        covariance, *_ = covariances_of(table, value, self.noise, self.station, None, self.rounding)
+        return Readings(states, pose, zeros, zeros, value, covariance, ("as recorded",), ())
 
 
 def open_stream(
     path: Path, arm: Arm, noise: TrackerNoise | None, station: tuple[float, ...] | None
 ) -> ReadingStream:
-    """Open a Parquet file of readings; only its description and its first rows are read.
+    """Open a Parquet file of readings; only its metadata and its first rows are read.
 
     `noise` gives the covariances where the file has none; the tracker's beam starts at `station`
     (3,), m, or at the origin.
@@ -86,20 +84,20 @@ def open_stream(
     file = _opened(path)
     header = list(file.schema_arrow.names)
     # Without the names of poses and loads the header is that of an exchange table.
-    wanted = [*columns.TEXT, *(name for name in header if name not in NAMES)]
-    columns.check_header(str(path), wanted, arm.units, arm.name)
+    table_header = [*columns.TEXT, *(name for name in header if name not in NAMES)]
+    columns.check_header(str(path), table_header, arm.units, arm.name)
     if columns.TARGET in header:
         raise InputError(
             f"{path}: column '{columns.TARGET}': a stream is of one target; import a table of "
             "several with `hilcal import`"
         )
     columns.covariance_size(str(path), header)
-    known = set(columns.known_columns(arm.units)) - {*NAMES, columns.COVERS}
+    valid = set(columns.known_columns(arm.units)) - {*NAMES, columns.COVERS}
     meta = file.metadata
     rows = tuple(meta.row_group(k).num_rows for k in range(meta.num_row_groups))
     if not sum(rows):
         raise InputError(f"{path}: columns but no readings")
-    names = tuple(name for name in header if name in known)
+    names = tuple(name for name in header if name in valid)
     for name in names:
         if not is_plain(kind := file.schema_arrow.field(name).type) or "string" in str(kind):
             raise InputError(f"{path}: column '{name}' is no column of numbers")
@@ -125,19 +123,21 @@ def _opened(path: Path) -> Any:
 
 def _tables(path: Path, group: int, names: tuple[str, ...], count: int = CHUNK) -> Iterator[Any]:
     file = _opened(path)
-    left = file.metadata.row_group(group).num_rows
+    remaining = file.metadata.row_group(group).num_rows
     batches = file.iter_batches(count, row_groups=[group], columns=list(names))
-    while left > 0:
+    while remaining > 0:
         with undamaged(path, f"damaged in row group {group + 1}"), limits.memory(str(path)):
             batch = next(batches, None)
         if batch is None:
-            raise InputError(f"{path}: damaged in row group {group + 1} ({left} rows are missing)")
-        left -= batch.num_rows
+            raise InputError(
+                f"{path}: damaged in row group {group + 1} ({remaining} rows are missing)"
+            )
+        remaining -= batch.num_rows
         yield batch.select(list(names))
 
 
 def _covers(path: Path, group: int) -> str:
-    """What the covariances cover, as the first row says it."""
+    """What the covariances cover, by the first row."""
     word = str(next(_tables(path, group, (columns.COVERS,), 1)).column(0)[0].as_py())
     check_covers(word, f"{path}: row 1, column '{columns.COVERS}'")
     return word

@@ -1,4 +1,4 @@
-"""What the names of columns say, and a proposed mapping in the making."""
+"""Vocabulary and parsing of column names, and the mapping that is being proposed."""
 
 import re
 import unicodedata
@@ -67,7 +67,7 @@ TORQUE = {"tau", "torque", "drehmoment", "moment", "gelenkmoment", "achsmoment",
 DISTANCE = {"distance", "dist", "abstand", "entfernung", "length", "lange", "range", "ballbar"}
 GAUGE = {"gauge", "messuhr", "taster", "dial", "indicator", "height", "hohe", "hauteur"}
 FROM = {"from", "von", "point", "punkt", "ball", "kugel", "anchor", "bar", "plane", "ebene"}
-"""Words of what a distance or a height is of, beside those of the quantity itself."""
+"""Words of the point or plane of a distance or height, besides those of the quantity itself."""
 STATION = {"station", "standpunkt", "stationierung", "aufstellung"}
 TEMPERATURE = {"temp", "temperature", "temperatur", "temperatura"}
 APPROACH = {"approach", "richtung", "direction", "anfahrt"}
@@ -93,20 +93,20 @@ ARM_JOINTS = (
 """Joint names of Universal Robots arms under ROS, in order."""
 
 DIFFERENCE = {"dev", "delta", "diff", "difference", "error", "err", "residual", "abweichung"}
-"""Words of what is no reading but compared with one."""
+"""Words of differences, which are no readings."""
 CHINESE = {
     "关节": " joint ", "轴": " joint ", "坐标": " ", "位置": " ", "测量": " measured ",
     "温度": " temperature ", "负载": " load ", "编号": " point ", "点号": " point ",
     "时间": " time ", "实际": " actual ", "理论": " nominal ",
 }  # fmt: skip
-"""Words without letters, as those with."""
+"""Chinese words, and the English words that replace them."""
 
 _PREFIXES = STD | ROTATION | FORCE | MOMENT | QUATERNION | MEASURED | NOMINAL | {"p", "pos", "d"}
 
 
 @dataclass(frozen=True, slots=True)
 class ColumnName:
-    """A column's name, taken apart."""
+    """A parsed name of a column."""
 
     name: str  # as the file has it
     words: tuple[str, ...]  # in small letters, without axis and number
@@ -114,19 +114,19 @@ class ColumnName:
     numbers: tuple[int, ...]  # the numbers in it
     unit: str | None  # as a mapping calls it, where the name or the row of units says it
 
-    def has(self, words: set[str]) -> bool:
-        """Whether one of its words is among these."""
-        return not words.isdisjoint(self.words)
+    def has(self, vocabulary: set[str]) -> bool:
+        """Whether one of its words is in a vocabulary."""
+        return not vocabulary.isdisjoint(self.words)
 
 
 def parse(name: str, unit_cell: str = "") -> ColumnName:
-    """Take a column's name apart."""
-    rest, unit = _unit(name)
+    """Parse the name of a column."""
+    stem, unit = _unit(name)
     stated = UNITS.get(unit_cell.strip(" []()<>").replace("µ", "u").replace("μ", "u").lower())
     for sign, word in CHINESE.items():
-        rest = rest.replace(sign, word)
-    rest = re.sub(r"(?<=[a-zµ])(?=[A-Z])", " ", rest)
-    plain = unicodedata.normalize("NFKD", rest.replace("ß", "ss")).encode("ascii", "ignore")
+        stem = stem.replace(sign, word)
+    stem = re.sub(r"(?<=[a-zµ])(?=[A-Z])", " ", stem)
+    plain = unicodedata.normalize("NFKD", stem.replace("ß", "ss")).encode("ascii", "ignore")
     words: list[str] = []
     numbers: list[int] = []
     axis = None
@@ -158,9 +158,9 @@ def parse(name: str, unit_cell: str = "") -> ColumnName:
 def _unit(name: str) -> tuple[str, str | None]:
     """Name without its unit, and the unit."""
     plain = name.replace("µ", "u").replace("μ", "u").strip()
-    for found in re.finditer(r"[\[({<]\s*([^\])}>]+?)\s*[\])}>]", plain):
-        if unit := UNITS.get(found[1].lower()):
-            return plain[: found.start()] + plain[found.end() :], unit
+    for bracketed in re.finditer(r"[\[({<]\s*([^\])}>]+?)\s*[\])}>]", plain):
+        if unit := UNITS.get(bracketed[1].lower()):
+            return plain[: bracketed.start()] + plain[bracketed.end() :], unit
     ending = re.search(r"[ _/.,-]+([A-Za-z°·*]+)$", plain)
     if ending and (unit := UNITS.get(ending[1].lower())):
         single = len(ending[1]) == 1
@@ -181,7 +181,7 @@ SHOWN = 3
 
 @dataclass(frozen=True, slots=True)
 class UnderstoodColumn:
-    """One thing that the table holds."""
+    """A quantity that the table holds."""
 
     what: str  # section of the mapping
     columns: tuple[str, ...]
@@ -194,17 +194,17 @@ class Proposal:
     """A mapping in the making."""
 
     sections: dict[str, dict[str, Any]] = field(default_factory=dict)  # of the mapping, by name
-    understood: list[UnderstoodColumn] = field(default_factory=list)  # what the table holds
+    understood: list[UnderstoodColumn] = field(default_factory=list)  # quantities of the table
     unsure: list[tuple[str, str]] = field(default_factory=list)
     """sentences on what should be checked, by section."""
     unused: list[tuple[str, str]] = field(default_factory=list)
     """columns without a meaning, with the reason."""
     lacking: list[str] = field(default_factory=list)
-    """sentences on what an import needs and was not found."""
+    """sentences on quantities that an import needs and the table lacks."""
     open_convention: bool = False  # whether the orientation's convention is a guess
     alternatives: list[tuple[list[str], list[str]]] = field(default_factory=list)
     """columns of the position and of the joints that are as good by their values, the chosen ones
-    first; empty lists where names tell."""
+    first; empty lists where names decide."""
 
     def mapping(self, kind: type[M]) -> M:
         """Return the mapping, `Mapping` for readings, `PointMapping` for points."""
@@ -216,12 +216,12 @@ class Proposal:
             f"# How to read {source}; proposed by `hilcal import --preview`. Check what is",
             "# marked, change what is wrong, and give this file with --format.",
         ]
-        lines += [f"# missing: {what}" for what in self.lacking]
-        absent = [(about, words) for about, words in self.unsure if about not in self.sections]
-        lines += [f"# {about}: {words}" for about, words in absent]
+        lines += [f"# missing: {text}" for text in self.lacking]
+        absent = [(about, text) for about, text in self.unsure if about not in self.sections]
+        lines += [f"# {about}: {text}" for about, text in absent]
         for name, section in self.sections.items():
             lines.append("")
-            lines += [f"# check: {words}" for about, words in self.unsure if about == name]
+            lines += [f"# check: {text}" for about, text in self.unsure if about == name]
             lines.append(f"[{name}]")
             lines += [f"{key} = {inline(_escaped(value))}" for key, value in section.items()]
         if self.unused:
@@ -238,10 +238,10 @@ def _escaped(value: Any) -> Any:
 
 
 class Guesser:
-    """Columns that are not yet used, and the mapping that grows."""
+    """The columns that are still unused, and the mapping that is being built."""
 
     def __init__(self, grid: Grid, joints: int | None) -> None:
-        """Take the table apart."""
+        """Parse the names of the columns, and read their numbers."""
         self.grid = grid
         self.joints = joints
         self.columns = [parse(name, grid.units.get(name, "")) for name in grid.names]
@@ -263,18 +263,18 @@ class Guesser:
     def block(self, names: Iterable[str]) -> Floats:
         """(N, k) numbers of columns."""
         nothing = np.full(len(self.grid.rows), np.nan)
-        given = (self.values[name] for name in names)
-        return np.stack([nothing if v is None else v for v in given], axis=1)
+        values = (self.values[name] for name in names)
+        return np.stack([nothing if v is None else v for v in values], axis=1)
 
-    def take(self, what: str, names: Sequence[str], meaning: str, **section: object) -> None:
+    def take(self, name: str, columns: Sequence[str], meaning: str, **section: object) -> None:
         """Give columns a meaning."""
         key = "column" if "column" in section else "columns"
-        section = {key: names[0] if key == "column" else list(names)} | section
-        self.proposal.sections[what] = section
-        examples = tuple(self.grid.text(name)[0] for name in names)
-        self.proposal.understood.append(UnderstoodColumn(what, tuple(names), meaning, examples))
-        for name in names:
-            self.free.pop(name, None)
+        section = {key: columns[0] if key == "column" else list(columns)} | section
+        self.proposal.sections[name] = section
+        examples = tuple(self.grid.text(column)[0] for column in columns)
+        self.proposal.understood.append(UnderstoodColumn(name, tuple(columns), meaning, examples))
+        for column in columns:
+            self.free.pop(column, None)
 
     def unsure(self, about: str, sentence: str) -> None:
         """Note what should be checked."""
@@ -285,33 +285,33 @@ class Guesser:
         if self.free.pop(name, None) is not None:
             self.proposal.unused.append((name, why))
 
-    def unit(self, names: Sequence[str], known: Collection[str] | None = None) -> str | None:
-        """Return the unit that the names of columns, or the row of units, state: a known one."""
-        found = {self.columns[self.grid.names.index(name)].unit for name in names}
-        unit = found.pop() if len(found) == 1 else None
-        return unit if known is None or unit in known else None
+    def unit(self, names: Sequence[str], valid: Collection[str] | None = None) -> str | None:
+        """Return the valid unit that the names of columns, or the row of units, agree on."""
+        stated = {self.columns[self.grid.names.index(name)].unit for name in names}
+        unit = stated.pop() if len(stated) == 1 else None
+        return unit if valid is None or unit in valid else None
 
 
-def angle_unit(g: Guesser, what: str, names: Sequence[str]) -> str:
+def angle_unit(g: Guesser, section: str, names: Sequence[str]) -> str:
     """Return the unit of angles by name, else by size."""
     stated = g.unit(names, ANGLES)
     largest = float(np.nanmax(np.abs(g.block(names))))
     if stated is not None:
         if stated == "rad" and largest > TURN:
-            g.unsure(what, f"named rad, but up to {largest:.4g}: read as degrees")
+            g.unsure(section, f"named rad, but up to {largest:.4g}: read as degrees")
             return "deg"
         return stated
     if largest > TURN:
         return "deg"
-    g.unsure(what, f"no unit stated; rad, since no angle exceeds {largest:.3g}")
+    g.unsure(section, f"no unit stated; rad, since no angle exceeds {largest:.3g}")
     return "rad"
 
 
-def length_unit(g: Guesser, what: str, names: Sequence[str]) -> str:
+def length_unit(g: Guesser, section: str, names: Sequence[str]) -> str:
     """Return the unit of positions by name, else by size."""
     if (stated := g.unit(names, LENGTHS)) is not None:
         return stated
     largest = float(np.nanmax(np.abs(g.block(names))))
     unit = "mm" if largest > FAR else "m"
-    g.unsure(what, f"no unit stated; {unit}, since the largest is {largest:.4g}")
+    g.unsure(section, f"no unit stated; {unit}, since the largest is {largest:.4g}")
     return unit

@@ -45,46 +45,46 @@ class Proposed:
 def propose(path: Path, second: Path | None = None, joints: int | None = None) -> Proposed:
     """Look at a table, or two that hold columns of the same readings, and propose a mapping."""
     first = sniff(path)
-    grid, doubts = first.grid, [("file", words) for words in first.doubts]
-    other: dict[str, Any] | None = None
+    grid, doubts = first.grid, [("file", sentence) for sentence in first.doubts]
+    second_file: dict[str, Any] | None = None
     if second is not None:
-        found = sniff(second)
-        match = _match(grid, found.grid)
-        grid, lost = joined(grid, found.grid, match)
-        other = {"path": str(second), **found.how}
-        doubts += [("second_file", words) for words in found.doubts]
+        sniffed = sniff(second)
+        match = _match(grid, sniffed.grid)
+        grid, lost = joined(grid, sniffed.grid, match)
+        second_file = {"path": str(second), **sniffed.how}
+        doubts += [("second_file", sentence) for sentence in sniffed.doubts]
         if match is not None:
-            other["match"] = list(match)
+            second_file["match"] = list(match)
             doubts.append(("second_file", f"rows are matched by '{match[0]}' and '{match[1]}'"))
         if lost:
             doubts.append(("second_file", f"{lost} rows of the first file have no partner"))
     proposal = guess(grid, joints)
     file = {**first.how, **proposal.sections.pop("file", {})}
     head: dict[str, dict[str, Any]] = {"file": file} if file else {}
-    if other is not None:
-        head["second_file"] = other
+    if second_file is not None:
+        head["second_file"] = second_file
     proposal.sections = head | proposal.sections
     proposal.unsure[:0] = doubts
     return Proposed(grid, proposal)
 
 
 def _match(first: Grid, second: Grid) -> tuple[str, str] | None:
-    """Columns that name the rows of two tables; None where they belong together row by row."""
+    """Return the columns that match the rows of two tables; None where row numbers match them."""
     best: tuple[int, str, str] | None = None
-    for here in first.names:
-        texts = first.text(here)
-        for there in second.names:
-            keys = second.text(there)
+    for first_key in first.names:
+        texts = first.text(first_key)
+        for second_key in second.names:
+            keys = second.text(second_key)
             if len(set(keys)) < len(keys) or "" in keys or not _is_key(keys):
                 continue
             shared = sum(t in set(keys) for t in texts)
             if shared > 0.8 * len(texts) and (best is None or shared > best[0]):
-                best = shared, here, there
+                best = shared, first_key, second_key
     if best is not None:
-        _, here, there = best
-        same = first.text(here) == second.text(there)
-        if same or len(first.rows) != len(second.rows) or here == there:
-            return here, there
+        _, first_key, second_key = best
+        same = first.text(first_key) == second.text(second_key)
+        if same or len(first.rows) != len(second.rows) or first_key == second_key:
+            return first_key, second_key
     if len(first.rows) == len(second.rows):
         return None
     raise InputError(
@@ -107,7 +107,7 @@ def guess(grid: Grid, joints: int | None = None) -> Proposal:
     g = Guesser(grid, joints)
     _joints(g)
     guess_axes(g)
-    _one_number(g)
+    _scalars(g)
     read = {"position", "distance", "gauge"} & set(g.proposal.sections)
     if not read or "joints" not in g.proposal.sections:
         guess_by_values(g)
@@ -119,11 +119,11 @@ def guess(grid: Grid, joints: int | None = None) -> Proposal:
         g.unsure("file", "this is an exchange table: it is imported without --format")
     if g.proposal.open_convention:
         g.unsure("orientation", GUESSED)
-    for what, sentence in (
+    for section, sentence in (
         ("position", "no position: three columns x, y, z were not found"),
         ("joints", "no joint angles: where they are in a file of their own, give it with --second"),
     ):
-        if what not in g.proposal.sections and not (what == "position" and read):
+        if section not in g.proposal.sections and not (section == "position" and read):
             g.proposal.lacking.append(sentence)
     if "pose" not in g.proposal.sections and "joints" in g.proposal.sections:
         g.unsure("pose", "no column names the pose: rows of the same joints count as one pose")
@@ -146,7 +146,7 @@ def _why_unused(g: Guesser, column: ColumnName) -> str:
 
 
 def _joints(g: Guesser) -> None:
-    """Joint angles: columns of a joint's word and a number each, or with an arm's joint names."""
+    """Find joint angles: columns named by a joint's word and a number, or by `ARM_JOINTS`."""
     groups: dict[tuple[str, ...], dict[int, str]] = {}
     for c in g.columns:
         torque = c.has(words.TORQUE) or c.unit in MOMENTS
@@ -155,7 +155,7 @@ def _joints(g: Guesser) -> None:
             continue
         if not c.has(words.STD):
             groups.setdefault(c.words, {}).setdefault(c.numbers[-1], c.name)
-    found: list[tuple[ColumnName, list[str]]] = []
+    candidates: list[tuple[ColumnName, list[str]]] = []
     for by_number in groups.values():
         names = [by_number[k] for k in sorted(by_number)]
         first = parse(names[0])
@@ -166,38 +166,38 @@ def _joints(g: Guesser) -> None:
         if first.has(words.NO_ANGLE | words.TORQUE) or first.unit in MOMENTS:
             _per_joint(g, first, names)
         else:
-            found.append((first, names))
+            candidates.append((first, names))
     named = [_with_words(g, w) for w in words.ARM_JOINTS]
     if all(named):
-        found.append((parse("joint"), [str(name) for name in named]))
-    if not found:
+        candidates.append((parse("joint"), [str(name) for name in named]))
+    if not candidates:
         return
-    found.sort(key=lambda f: (f[0].has(words.MEASURED | {"qa"}), not f[0].has(words.NOMINAL)))
-    first, names = found[0]
+    candidates.sort(key=lambda f: (f[0].has(words.MEASURED | {"qa"}), not f[0].has(words.NOMINAL)))
+    first, names = candidates[0]
     if first.has(words.MEASURED | {"qa"}):
         g.unsure("joints", f"'{names[0]}' ... are reported angles, used as the commanded ones")
     unit = angle_unit(g, "joints", names)
     g.take("joints", names, unit, unit=unit)
     if g.joints is not None and len(names) != g.joints:
         g.unsure("joints", f"{len(names)} columns, the arm has {g.joints} joints")
-    for other, rest in found[1:]:
-        if other.has(words.MEASURED | {"qa"}) and len(rest) == len(names):
-            same = np.nanmax(np.abs(g.block(rest) - g.block(names)))
+    for parsed, reported in candidates[1:]:
+        if parsed.has(words.MEASURED | {"qa"}) and len(reported) == len(names):
+            same = np.nanmax(np.abs(g.block(reported) - g.block(names)))
             if same < (0.1 if unit == "rad" else 5.7):
-                g.take("actual_joints", rest, unit, unit=unit)
+                g.take("actual_joints", reported, unit, unit=unit)
                 break
 
 
-def _with_words(g: Guesser, wanted: tuple[str, ...]) -> str | None:
+def _with_words(g: Guesser, parts: tuple[str, ...]) -> str | None:
     for c in g.columns:
         digits = {str(k) for k in c.numbers}
-        if set(wanted) <= set(c.words) | digits and g.number(c.name) and not c.has(words.NO_ANGLE):
+        if set(parts) <= set(c.words) | digits and g.number(c.name) and not c.has(words.NO_ANGLE):
             return c.name
     return None
 
 
 def _per_joint(g: Guesser, first: ColumnName, names: list[str]) -> None:
-    """Torques, temperatures and sides of approach of the joints."""
+    """Find torques, temperatures and sides of approach of the joints."""
     values = g.block(names)
     if (first.has(words.TORQUE) or first.unit in MOMENTS) and not first.has(words.NOMINAL):
         unit = g.unit(names, MOMENTS)
@@ -214,18 +214,18 @@ def _per_joint(g: Guesser, first: ColumnName, names: list[str]) -> None:
         g.take("approach", names, "-1 or +1")
 
 
-def _one_number(g: Guesser) -> None:
-    """Distances from points and heights over planes, in rows that have no position."""
+def _scalars(g: Guesser) -> None:
+    """Find distances from points and heights over planes, in rows that have no position."""
     position = g.proposal.sections.get("position", {}).get("columns", [])
-    whole = np.isfinite(g.block(position)).any(axis=1) if position else np.zeros(1, dtype=bool)
-    for what, known in (("distance", words.DISTANCE), ("gauge", words.GAUGE)):
-        named = [c for c in g.free.values() if c.has(known) and not c.axis]
+    positioned = np.isfinite(g.block(position)).any(axis=1) if position else np.zeros(1, dtype=bool)
+    for kind, terms in (("distance", words.DISTANCE), ("gauge", words.GAUGE)):
+        named = [c for c in g.free.values() if c.has(terms) and not c.axis]
         plain = [c.name for c in named if g.number(c.name) and not c.has(words.STD | words.NOMINAL)]
-        plain = [n for n in plain if not np.any(whole & np.isfinite(g.block([n])[:, 0]))]
+        plain = [n for n in plain if not np.any(positioned & np.isfinite(g.block([n])[:, 0]))]
         if not plain:
             continue
         filled = np.isfinite(g.block(plain[:1])[:, 0])
-        unit = length_unit(g, what, plain[:1])
+        unit = length_unit(g, kind, plain[:1])
         section: dict[str, Any] = {"unit": unit}
         for c in named:
             if g.number(c.name) and c.has(words.STD) and "std_column" not in section:
@@ -234,21 +234,21 @@ def _one_number(g: Guesser) -> None:
                     section["std_unit"] = c.unit
         for c in g.free.values():
             texts = np.array(g.grid.text(c.name)) != ""
-            if not g.number(c.name) and c.has(words.FROM | known) and np.array_equal(texts, filled):
+            if not g.number(c.name) and c.has(words.FROM | terms) and np.array_equal(texts, filled):
                 section["name_column"] = c.name
                 break
         else:
-            section["name"] = "A" if what == "distance" else "G"
-            g.unsure(what, f"no column names what it is of: all count as of {section['name']}")
-        g.take(what, plain[:1], unit, column=plain[0], **section)
+            section["name"] = "A" if kind == "distance" else "G"
+            g.unsure(kind, f"no column names what it is of: all count as of {section['name']}")
+        g.take(kind, plain[:1], unit, column=plain[0], **section)
         for key in ("std_column", "name_column"):
             g.free.pop(section.get(key, ""), None)
 
 
 def guess_names(g: Guesser) -> None:
-    """Poses, loads, stations, cycles and reflectors."""
+    """Find poses, loads, stations, cycles and reflectors."""
     q = g.proposal.sections.get("joints")
-    _pick(g, "pose", words.POSE, lambda n: q is None or _one_pose_each(g, n, q))
+    _pick(g, "pose", words.POSE, lambda n: q is None or _names_poses(g, n, q))
     for c in list(g.free.values()):
         if c.has(words.MASS | words.LOAD) and g.number(c.name) and "load" not in g.free:
             mass = c.unit in ("kg", "g", "lb") or c.has(words.MASS)
@@ -272,38 +272,33 @@ def guess_names(g: Guesser) -> None:
         if not values & {*UNLOADED, ""}:
             shown = ", ".join(sorted(values)[:SHOWN])
             g.unsure("load", f"which of its values means no load? Set none = [...] ({shown})")
-    _pick(g, "station", words.STATION, lambda n: not g.number(n) and _few(g, n))
-    _pick(g, "cycle", words.CYCLE, lambda n: g.number(n) and _whole(g, n))
-    _pick(g, "target", words.REFLECTOR, lambda n: not g.number(n) and _few(g, n))
+    _pick(g, "station", words.STATION, lambda n: not g.number(n) and _few_values(g, n))
+    _pick(g, "cycle", words.CYCLE, lambda n: g.number(n) and _whole_numbers(g, n))
+    _pick(g, "target", words.REFLECTOR, lambda n: not g.number(n) and _few_values(g, n))
 
 
-def _pick(g: Guesser, what: str, known: set[str], fits: Callable[[str], bool]) -> None:
+def _pick(g: Guesser, section: str, vocabulary: set[str], fits: Callable[[str], bool]) -> None:
     for c in list(g.free.values()):
-        if c.has(known) and not c.axis and not c.has(words.STD) and _is_name(g, c.name):
-            if not fits(c.name):
-                continue
-            g.take(what, [c.name], "name", column=c.name)
+        named = not g.number(c.name) or _whole_numbers(g, c.name)
+        usable = named and c.has(vocabulary) and not c.axis and not c.has(words.STD)
+        if usable and fits(c.name):
+            g.take(section, [c.name], "name", column=c.name)
             return
 
 
-def _is_name(g: Guesser, name: str) -> bool:
-    """Whether a column holds text or whole numbers."""
-    return not g.number(name) or _whole(g, name)
-
-
-def _whole(g: Guesser, name: str) -> bool:
+def _whole_numbers(g: Guesser, name: str) -> bool:
     values = g.block([name])[:, 0]
-    known = values[np.isfinite(values)]
-    return bool(np.all(known == np.rint(known)))
+    finite = values[np.isfinite(values)]
+    return bool(np.all(finite == np.rint(finite)))
 
 
-def _few(g: Guesser, name: str) -> bool:
+def _few_values(g: Guesser, name: str) -> bool:
     count = len(set(g.grid.text(name)))
     return 1 < count <= min(20, len(g.grid.rows) // 2)
 
 
-def _one_pose_each(g: Guesser, name: str, joints: dict[str, Any]) -> bool:
-    """Whether all rows of a name command the same joints, or reported nearly the same."""
+def _names_poses(g: Guesser, name: str, joints: dict[str, Any]) -> bool:
+    """Whether rows of one name have the same joint angles, or nearly so (then: reported angles)."""
     texts = g.grid.text(name)
     if "" in texts:
         return False
@@ -322,14 +317,14 @@ def _one_pose_each(g: Guesser, name: str, joints: dict[str, Any]) -> bool:
 
 
 def guess_scalars(g: Guesser) -> None:
-    """Times and the temperature of the air."""
+    """Find times and the temperature of the air."""
     for c in list(g.free.values()):
         dated = all(isinstance(cell, datetime) for cell in g.grid.cells(c.name))
         timed = dated or (c.has(words.TIME) and not c.axis)
         if "time" not in g.proposal.sections and timed:
-            found = time_unit(g.grid, c.name, c.unit, g.values[c.name])
-            if found is not None:
-                section, doubt = found
+            guessed = time_unit(g.grid, c.name, c.unit, g.values[c.name])
+            if guessed is not None:
+                section, doubt = guessed
                 if doubt:
                     g.unsure("time", doubt)
                 g.take("time", [c.name], str(section["unit"]), column=c.name, **section)

@@ -92,10 +92,10 @@ def _dialect(path: str, lines: list[str], comment: str | None) -> dict[str, Any]
         blank = separator == "blanks" and thousands == " "
         if decimal == separator or thousands in (decimal, separator) or blank:
             continue
-        given = {"separator": separator}
-        given |= {"decimal": decimal} if decimal != "." else {}
-        given |= {"thousands": thousands} if thousands else {}
-        form = FileFormat(**{**given, "comment": comment, "header_row": 0})
+        keys = {"separator": separator}
+        keys |= {"decimal": decimal} if decimal != "." else {}
+        keys |= {"thousands": thousands} if thousands else {}
+        form = FileFormat(**{**keys, "comment": comment, "header_row": 0})
         try:
             rows = [cells for _, cells in records(path, body, form)]
         except InputError:
@@ -104,7 +104,7 @@ def _dialect(path: str, lines: list[str], comment: str | None) -> dict[str, Any]
         usual = [cells for cells in rows if len(cells) == length >= 3]
         mean = sum(_is_number(c, form) for cells in usual for c in cells) / max(len(rows), 1)
         if mean > score + 1e-9:
-            best, score = given, mean
+            best, score = keys, mean
     if not best:
         raise InputError(
             f"{path}: no columns of numbers; expected a table, one row per reading, or XLSX, MAT "
@@ -125,9 +125,9 @@ def _layout(rows: Rows, how: FileFormat) -> tuple[dict[str, Any], tuple[str, ...
         some = list(filter(filled, cells))
         share.append(sum(_is_number(c, how) for c in some) / max(len(some), 1))
     usual = float(np.median([s for s, (_, c) in zip(share, rows, strict=True) if len(c) == length]))
-    whole = [len(cells) >= length - 1 for _, cells in rows]
-    first = next((k for k in range(len(rows)) if share[k] >= 0.5 * usual and whole[k]), 0)
-    titled = [k for k in range(first) if whole[k] and sum(map(filled, rows[k][1])) > 1]
+    complete = [len(cells) >= length - 1 for _, cells in rows]
+    first = next((k for k in range(len(rows)) if share[k] >= 0.5 * usual and complete[k]), 0)
+    titled = [k for k in range(first) if complete[k] and sum(map(filled, rows[k][1])) > 1]
     above = [k for k in titled if length_of(rows[k][1]) <= length]
     out: dict[str, Any] = {"header_row": 0}
     doubts: list[str] = []
@@ -137,18 +137,18 @@ def _layout(rows: Rows, how: FileFormat) -> tuple[dict[str, Any], tuple[str, ...
         doubts.append(f"{named}: the columns are numbered")
     header: Sequence[Cell] = ()
     if above:
-        at = above[-1]
-        if len(above) > 1 and all(_UNIT.fullmatch(str(c or "")) for c in rows[at][1]):
-            out["units_row"] = rows[at][0]
-            at = above[-2]
-        out["header_row"], header = rows[at]
+        title = above[-1]
+        if len(above) > 1 and all(_UNIT.fullmatch(str(c or "")) for c in rows[title][1]):
+            out["units_row"] = rows[title][0]
+            title = above[-2]
+        out["header_row"], header = rows[title]
     width = len(header) or length
     trimmed = length_of(header) if header else width
     odd = []
     for k, (row, cells) in enumerate(rows):
-        before = k < first and row > out["header_row"] and row != out.get("units_row")
+        preamble = k < first and row > out["header_row"] and row != out.get("units_row")
         short = bool(header) and len(cells) < trimmed
-        if before or (k >= first and (short or length_of(cells) > width or cells == header)):
+        if preamble or (k >= first and (short or length_of(cells) > width or cells == header)):
             odd.append(row)
     if odd and len(odd) <= 0.1 * len(rows) + 10:
         out["skip_rows"] = odd

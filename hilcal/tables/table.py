@@ -25,14 +25,14 @@ from hilcal.types import Bools, Floats, Ints
 FROM_TABLE = "covariance: from the table"
 FROM_TRACKER = "covariance: from the tracker's noise in [tracker]"
 LONGEST = 1e12
-"""No time of a campaign is as long, s: those since 1970 are 1e9, in nanoseconds they were 1e18."""
-LARGEST_NM = 1e5  # No joint of an arm carries as much, N·m
+"""s; longer than any time of a campaign: seconds since 1970 are 1e9, nanoseconds 1e18."""
+LARGEST_NM = 1e5  # N·m; more than any joint of an arm carries
 FORM = FileFormat(encoding="utf-8")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImportResult:
-    """Readings, and what was decided on the way."""
+    """Imported readings, and the decisions of the import."""
 
     readings: Readings  # the readings that can be used
     notes: tuple[str, ...]  # one sentence per decision
@@ -87,7 +87,7 @@ def readings_of(
     Args:
         station: (3,) where the tracker's beam starts, m; the origin where None.
         covariance: (K, m, m) of the K rows with a position, in place of the table's columns.
-        rounding: (3,) variance of the positions' rounding, m²; found from the positions where None.
+        rounding: (3,) variance of the positions' rounding, m²; None: from the positions.
         std: of distances and heights, m, for a table that states none.
     """
     checks.check_names(table)
@@ -95,17 +95,18 @@ def readings_of(
     load, load_names = _index(table.text["load"])
     target = _targets(table, targets)
     observed = observed_of(table)
-    whole = np.ones(len(table.rows), dtype=np.bool_) if observed is None else ~observed.scalar
-    states, value = measured_of(table, arm, whole)
+    positioned = np.ones(len(table.rows), dtype=np.bool_) if observed is None else ~observed.scalar
+    states, value = measured_of(table, arm, positioned)
     states = replace(states, target=target, observer=None if observed is None else observed.number)
     checks.check_same_pose(table, pose, pose_names, states.q)
     checks.check_wrenches(table, states.wrench, load, load_names, arm)
     cov, notes, covers = np.zeros((len(value), 3, 3)), tuple[str, ...](), _covers(table)[0]
-    if whole.all():
+    if positioned.all():
         cov, notes, covers = covariances_of(table, value, noise, station, covariance, rounding)
-    elif whole.any():
-        some = table.taken(whole), value[whole]
-        cov[whole], notes, covers = covariances_of(*some, noise, station, covariance, rounding)
+    elif positioned.any():
+        cov[positioned], notes, covers = covariances_of(
+            table.select(positioned), value[positioned], noise, station, covariance, rounding
+        )
     if observed is not None:
         value, cov = observed.put(table, value, cov, std or {})
     readings = Readings(
@@ -140,10 +141,10 @@ def covariances_of(
     else:
         checks.check_covariances(table, stated)
         tiny = np.any(np.diagonal(stated, axis1=1, axis2=2) < min(LEAST) ** 2)
-        known = bool(tiny) and noise is not None
-        spec = _instrument_covariance(table, value, noise, station) if known else None
-        cov, more = floored(table, stated, spec)
-        notes, (covers, included) = (FROM_TABLE, *more), _covers(table)
+        use_spec = bool(tiny) and noise is not None
+        spec = _instrument_covariance(table, value, noise, station) if use_spec else None
+        cov, raised = floored(table, stated, spec)
+        notes, (covers, included) = (FROM_TABLE, *raised), _covers(table)
     if rounding is None:
         rounding = np.zeros(3) if included else rounding_variance(value[:, :3], 1.0)
     cov, rounded = with_rounding(cov, rounding)
@@ -151,15 +152,15 @@ def covariances_of(
 
 
 def _choose(path: str, header: Sequence[str], arm: Arm) -> tuple[Sequence[str], Sequence[str]]:
-    """Check the header; text and number columns to read."""
+    """Check the header; return the text and the number columns to read."""
     check_names(header, f"{path}: row 1, column")
     if len(header) == 1 and (";" in header[0] or "\t" in header[0]):
         raise InputError(
             f"{path}: columns must be separated by ',' with '.' as decimal mark; for any other "
             f"table: {columns.PREVIEW}"
         )
-    known = columns.known_columns(arm.units)
-    if not any(name in known for name in header):
+    valid = columns.known_columns(arm.units)
+    if not any(name in valid for name in header):
         raise InputError(
             f"{path}: not an exchange table: row 1 has none of its columns "
             f"({', '.join(columns.required_columns(arm.units))}); for any other table: "
@@ -167,35 +168,36 @@ def _choose(path: str, header: Sequence[str], arm: Arm) -> tuple[Sequence[str], 
         )
     columns.check_header(path, header, arm.units, arm.name, following_columns(arm))
     columns.covariance_size(path, header)
-    named = [name for _, name, _ in columns.ONE.values()]
+    named = [name for _, name, _ in columns.SCALAR.values()]
     optional = (columns.TARGET, columns.COVERS, columns.STATION, *named)
     text = (*columns.TEXT, *(name for name in header if name in optional))
-    return text, [name for name in header if name in known and name not in text]
+    return text, [name for name in header if name in valid and name not in text]
 
 
 def _index(names: list[str]) -> tuple[Ints, list[str]]:
-    """Numbers of names in order of first appearance, and those names."""
+    """Index of each name among the distinct ones, in order of appearance, and these."""
     order = {name: k for k, name in enumerate(dict.fromkeys(names))}
     return np.fromiter((order[n] for n in names), dtype=np.int64, count=len(names)), list(order)
 
 
 def _targets(table: ColumnTable, names: Sequence[str]) -> Ints | None:
     """(N,) numbers of the targets by the cell's names; None where there is one target."""
-    given = table.text.get(columns.TARGET)
-    if given is None:
+    stated = table.text.get(columns.TARGET)
+    if stated is None:
         if len(names) > 1:
             raise InputError(
                 f"{table.path}: no column '{columns.TARGET}', but the cell's targets are "
                 f"{', '.join(names)} ([[tool.targets]]); name in each row the one that was read"
             )
         return None
-    if not names and len(set(given)) > 1:
+    if not names and len(set(stated)) > 1:
         raise InputError(
             f"{table.path}: column '{columns.TARGET}' names "
-            f"{', '.join(map(repr, dict.fromkeys(given)))}, but the cell has one target; give each "
-            "a section [[tool.targets]] with its name (and target_m, where its offset is known)"
+            f"{', '.join(map(repr, dict.fromkeys(stated)))}, but the cell has one target; "
+            "give each a section [[tool.targets]] with its name (and target_m, where its offset is "
+            "known)"
         )
-    for k, name in enumerate(given):
+    for k, name in enumerate(stated):
         if not name:
             raise InputError(f"{table.at(k, columns.TARGET)}: the cell is empty; name the target")
         if names and name not in names:
@@ -205,27 +207,27 @@ def _targets(table: ColumnTable, names: Sequence[str]) -> Ints | None:
             )
     if len(names) < 2:
         return None
-    return np.array([names.index(name) for name in given], dtype=np.int64)
+    return np.array([names.index(name) for name in stated], dtype=np.int64)
 
 
 def _covers(table: ColumnTable) -> tuple[str, bool]:
-    """What the table's covariances cover, by its column `covers`, and whether rounding, too.
+    """Return what the covariances cover, by column `covers`, and whether they include rounding.
 
-    Without the column it is the instrument.
+    Without the column they cover the instrument.
     """
-    given = table.text.get(columns.COVERS, [INSTRUMENT])
-    for k, word in enumerate(given):
+    stated = table.text.get(columns.COVERS, [INSTRUMENT])
+    for k, word in enumerate(stated):
         check_covers(word, table.at(k, columns.COVERS))
-        if word != given[0]:
+        if word != stated[0]:
             raise InputError(
-                f"{table.at(k, columns.COVERS)}: {word}, but {given[0]} in the first row; all "
+                f"{table.at(k, columns.COVERS)}: {word}, but {stated[0]} in the first row; all "
                 "rows must say the same"
             )
-    return given[0].removesuffix(ROUNDING), given[0].endswith(ROUNDING)
+    return stated[0].removesuffix(ROUNDING), stated[0].endswith(ROUNDING)
 
 
 def check_covers(word: str, where: str) -> None:
-    """Refuse another word than those for what covariances cover."""
+    """Refuse an invalid word for what covariances cover."""
     if word.removesuffix(ROUNDING) not in (INSTRUMENT, WHOLE):
         raise InputError(
             f"{where}: {word!r} is unknown; valid: {INSTRUMENT} (the covariance of the tracker), "
@@ -234,23 +236,23 @@ def check_covers(word: str, where: str) -> None:
         )
 
 
-def measured_of(table: ColumnTable, arm: Arm, whole: Bools | None = None) -> tuple[States, Floats]:
-    """Return the states of a table's rows, and what was measured in them, (N, m) m and rad.
+def measured_of(table: ColumnTable, arm: Arm, rows: Bools | None = None) -> tuple[States, Floats]:
+    """Return the states of a table's rows, and their measured values (N, m), m and rad.
 
     Args:
-        whole: (N,) rows with a position, others are zero; all of them where None.
+        rows: (N,) rows with a position, others are zero; all of them where None.
     """
     states = _states(table, arm)
-    if whole is not None and not whole.all():
+    if rows is not None and not rows.all():
         value = np.zeros((len(table.rows), 3))
-        if whole.any():
-            value[whole] = measured_of(table.taken(whole), arm)[1]
+        if rows.any():
+            value[rows] = measured_of(table.select(rows), arm)[1]
         return states, value
     value = table.matrix(columns.POSITION)
     station = np.array(table.text.get(columns.STATION, [""] * len(value)))
     for name in dict.fromkeys(station.tolist()):
-        own = station == name
-        checks.check_positions(table.taken(own), value[own], states.q[own], arm)
+        group = station == name
+        checks.check_positions(table.select(group), value[group], states.q[group], arm)
     if columns.ROTATION[0] in table.number:
         rotation = table.matrix(columns.ROTATION)
         checks.check_rotations(table, rotation)
@@ -308,8 +310,8 @@ def _group(table: ColumnTable, names: Sequence[str]) -> Floats | None:
 
 def _in_range(table: ColumnTable, names: Sequence[str], low: float, high: float, unit: str) -> None:
     value = table.matrix(names)
-    words = f"{unit} cannot be right; expected {low:g} to {high:g} {unit}"
-    table.refuse((value < low) | (value > high), names, lambda v: f"{v:g} {words}")
+    complaint = f"{unit} cannot be right; expected {low:g} to {high:g} {unit}"
+    table.refuse((value < low) | (value > high), names, lambda v: f"{v:g} {complaint}")
 
 
 def _cycles(table: ColumnTable) -> Ints:
@@ -376,41 +378,41 @@ def exchange_columns(
     readings: Readings, covers: str = INSTRUMENT, units: Sequence[str] | None = None
 ) -> dict[str, Column]:
     """Return the columns of an exchange table; arguments and errors as of `write_table`."""
-    found: dict[str, Column] = {
-        "pose": _names(readings.pose_names, readings.pose, "pose"),
-        "load": _names(readings.load_names, readings.load, "load"),
+    out: dict[str, Column] = {
+        "pose": _checked_names(readings.pose_names, readings.pose, "pose"),
+        "load": _checked_names(readings.load_names, readings.load, "load"),
     }
     if readings.states.target is not None:
-        found[columns.TARGET] = _names(readings.target_names, readings.target, columns.TARGET)
+        out[columns.TARGET] = _checked_names(readings.target_names, readings.target, columns.TARGET)
     if readings.states.observer is not None:
-        found |= observer_columns(readings)
+        out |= observer_columns(readings)
     if covers != INSTRUMENT:
-        found[columns.COVERS] = [covers] * len(readings)
-    return found | _number_columns(readings, units)
+        out[columns.COVERS] = [covers] * len(readings)
+    return out | _number_columns(readings, units)
 
 
 def with_what_rounding_does(covers: str, readings: Readings) -> str:
-    """Return what complete covariances cover, as the column of that name says it.
+    """Return the word of column `covers` for complete covariances.
 
-    Where reading a table would add the variance of the positions' rounding, it says that this is in
-    them already.
+    Where reading the table would add the variance of the positions' rounding, the word says that
+    the covariances include it.
     """
-    whole = ~readings.scalar
-    if not whole.any():
+    positioned = ~readings.scalar
+    if not positioned.any():
         return covers
-    rounding = rounding_variance(readings.value[whole, :3], 1.0)
-    return covers + ROUNDING * bool(with_rounding(readings.covariance[whole], rounding)[1])
+    rounding = rounding_variance(readings.value[positioned, :3], 1.0)
+    return covers + ROUNDING * bool(with_rounding(readings.covariance[positioned], rounding)[1])
 
 
-def _names(names: Sequence[str], index: Ints, what: str) -> list[str]:
+def _checked_names(names: Sequence[str], index: Ints, kind: str) -> list[str]:
     used = [names[k] for k in dict.fromkeys(index.tolist())]
     for name in used:
-        if not check_name(name, what) or name != name.strip():
-            raise InputError(f"{what} {name!r}: a name must be not empty and not padded")
-        if what == "load" and name != "none" and name.lower() == "none":
+        if not check_name(name, kind) or name != name.strip():
+            raise InputError(f"{kind} {name!r}: a name must be not empty and not padded")
+        if kind == "load" and name != "none" and name.lower() == "none":
             raise InputError(f"load '{name}' must be spelled 'none'")
         if used.count(name) > 1:
-            raise InputError(f"{what} '{name}': two of the readings' {what}s have this name")
+            raise InputError(f"{kind} '{name}': two of the readings' {kind}s have this name")
     return [names[k] for k in index.tolist()]
 
 
@@ -419,22 +421,22 @@ def _number_columns(readings: Readings, units: Sequence[str] | None) -> dict[str
     s, m, n = readings.states, readings.m, readings.states.q.shape[1]
     i, j = np.triu_indices(m)
     value, cov = readings.value.copy(), readings.covariance[:, i, j]
-    one, of = readings.scalar, units or n
-    value[one] = cov[one] = np.nan
+    scalar, joint_units = readings.scalar, units or n
+    value[scalar] = cov[scalar] = np.nan
     loaded = np.any(s.wrench) or np.signbit(s.wrench).any()
     blocks: list[tuple[Sequence[str], Floats | Ints | None]] = [
         (("cycle",), readings.cycle),
-        (columns.joint_columns(of), s.q),
-        ((columns.POSITION + columns.ROTATION)[:m], None if one.all() else value),
-        (columns.covariance_columns(m), None if one.all() else cov),
+        (columns.joint_columns(joint_units), s.q),
+        ((columns.POSITION + columns.ROTATION)[:m], None if scalar.all() else value),
+        (columns.covariance_columns(m), None if scalar.all() else cov),
         (columns.WRENCH, s.wrench if loaded else None),
         (("time_s",), s.time),
         (("load_time_s",), s.load_time),
         (("air_degC",), s.air_temperature),
         (columns.temperature_columns(n), s.joint_temperature),
         (columns.approach_columns(n), s.approach),
-        (columns.actual_columns(of), s.q_actual),
-        (columns.torque_columns(of), s.torque),
+        (columns.actual_columns(joint_units), s.q_actual),
+        (columns.torque_columns(joint_units), s.torque),
     ]
     return {
         name: column

@@ -1,6 +1,7 @@
-"""Uncertainties that a table states: their covariances, and what cannot be right in them.
+"""Covariances of the uncertainties that a table states, and checks of them.
 
-Standard deviations, U95, variances, matrices; zero, far too small, below the values' rounding.
+Stated are standard deviations, U95, variances or matrices; checked is whether they are zero, far
+too small, or below the rounding of the values.
 """
 
 from collections.abc import Sequence
@@ -15,14 +16,14 @@ from hilcal.tables.mapping import Column, CovarianceColumns, Mapping, Std
 from hilcal.tables.units import angle_axes
 from hilcal.types import Bools, Floats
 
-FAR = 5.0  # Ratio of stated and instrument's standard deviation that is worth a word; a choice
-NEAR = 3.0  # Ratio within which another reading of the figures fits the instrument; a choice
+FAR = 5.0  # Ratio of stated and instrument's standard deviation that is worth a note; a choice
+NEAR = 3.0  # Ratio within which another interpretation of the figures fits the instrument; a choice
 LEAST = (1e-7, 1e-7)
 """m, rad; no instrument in air measures an arm to better than 0.1 µm and 0.02": a choice, about
 the resolution of the best."""
 DISTINCT = 10
-"""Different values that are needed to tell rounding: ten that end in zero by chance are one case
-in 10^10."""
+"""Distinct values needed to recognise rounding: ten that end in zero by chance have a probability
+of 10^-10."""
 COUNTS = 0.01
 """Rounding is added where its variance is more than this share of the stated one; a choice."""
 _FINEST = 1e-9
@@ -45,27 +46,27 @@ def mapped_covariance(
 
     with D the standard deviations (of the position's axes and the orientation's angles), C their
     correlation, E the axes about which the angles turn, and the instrument's covariance where the
-    mapping adds it. Orientations without a figure of their own have the instrument's. None where
+    mapping adds it. Orientations without a stated uncertainty have the instrument's. None where
     the table states none; m² and rad².
     """
     m = 3 if angles is None else 6
     if mapping.std is not None:
-        cov, words = _of_std(grid, mapping, mapping.std, len(position))
+        cov, origin = _of_std(grid, mapping, mapping.std, len(position))
     elif mapping.covariance is not None:
-        cov, words = _of_matrix(grid, mapping.covariance), "covariance: from the table"
+        cov, origin = _of_matrix(grid, mapping.covariance), "covariance: from the table"
     else:
         return None, ()
     instrument = None if noise is None else tracker_covariance(position, noise, station, m)
-    known = cov.shape[1]
+    size = cov.shape[1]
     source = "[tracker]" if mapping.instrument is None else "[instrument] of the mapping"
-    if known < m:
-        whole = np.zeros((len(position), m, m))
+    if size < m:
+        full = np.zeros((len(position), m, m))
         if instrument is None:
             raise InputError(f"{grid.path}: no uncertainty of the orientation; give six figures")
-        whole[:, 3:, 3:] = instrument[:, 3:, 3:]
-        whole[:, :3, :3] = cov
-        cov, words = whole, f"{words}; orientations: the noise in {source}"
-    if known == 6 and angles is not None and mapping.orientation is not None:
+        full[:, 3:, 3:] = instrument[:, 3:, 3:]
+        full[:, :3, :3] = cov
+        cov, origin = full, f"{origin}; orientations: the noise in {source}"
+    if size == 6 and angles is not None and mapping.orientation is not None:
         o = mapping.orientation
         axes = angle_axes(o.convention, angles, units.ANGLES[o.unit])
         turn = np.broadcast_to(np.eye(6), cov.shape).copy()
@@ -76,11 +77,11 @@ def mapped_covariance(
     if mapping.std is not None and mapping.std.add_instrument:
         if instrument is None:
             raise InputError(f"{grid.path}: [std] add_instrument needs the noise in [tracker]")
-        cov, words = cov + instrument, f"{words}, plus the noise in {source}"
+        cov, origin = cov + instrument, f"{origin}, plus the noise in {source}"
     else:
         cov, notes = floored(table, cov, instrument)
     doubt = () if instrument is None else _doubt(mapping, cov, instrument)
-    return cov, (words, *notes, *doubt)
+    return cov, (origin, *notes, *doubt)
 
 
 def _block(grid: Grid, columns: Sequence[Column]) -> Floats:
@@ -107,23 +108,23 @@ def _of_std(grid: Grid, mapping: Mapping, std: Std, count: int) -> tuple[Floats,
     missing = [name for name in std.columns if isinstance(name, str) and name not in grid.names]
     absent = std.optional and len(missing) == len(std.columns)
     if absent or not std.columns:
-        given = [0.0] * len(std.columns) if absent else std.values
-        figures = np.tile(np.array(given, dtype=float), (count, 1))
+        constants = [0.0] * len(std.columns) if absent else std.values
+        figures = np.tile(np.array(constants, dtype=float), (count, 1))
     else:
         figures = _block(grid, std.columns)
         bad = figures < 0
         if bad.any():
             i, j = divmod(int(np.argmax(bad)), figures.shape[1])
-            what = "variance" if std.kind == "variance" else "standard deviation"
+            quantity = "variance" if std.kind == "variance" else "standard deviation"
             where = grid.at(i, std.columns[j])
-            raise InputError(f"{where}: {figures[i, j]:g}: a {what} is 0 or more")
-    what = _KINDS[std.kind] + (f" (k = {std.k:g})" if std.kind == "expanded" else "")
+            raise InputError(f"{where}: {figures[i, j]:g}: a {quantity} is 0 or more")
+    label = _KINDS[std.kind] + (f" (k = {std.k:g})" if std.kind == "expanded" else "")
     sigma = np.sqrt(figures) if std.kind == "variance" else figures
     sigma = sigma / (std.k if std.kind == "expanded" else 1.0)
     if std.at_least is not None:
         sigma = np.maximum(sigma, np.repeat(std.at_least, 3)[: sigma.shape[1]])
-        what += f" (at least {std.at_least[0]:g} {std.unit}"
-        what += f", {std.at_least[1]:g} {std.angle_unit})" if sigma.shape[1] == 6 else ")"
+        label += f" (at least {std.at_least[0]:g} {std.unit}"
+        label += f", {std.at_least[1]:g} {std.angle_unit})" if sigma.shape[1] == 6 else ")"
     if sigma.shape[1] == 1:
         sigma = np.repeat(sigma, 3, axis=1) / (np.sqrt(3) if std.of == "point" else 1.0)
     m = sigma.shape[1]
@@ -140,7 +141,7 @@ def _of_std(grid: Grid, mapping: Mapping, std: Std, count: int) -> tuple[Floats,
         correlation[:, upper, right] = correlation[:, right, upper] = value
     where = "from the table" if std.columns else "the same for all readings"
     where = f"since the table has no column '{missing[0]}'" if absent else where
-    return sigma[:, :, None] * correlation * sigma[:, None, :], f"covariance: {what}, {where}"
+    return sigma[:, :, None] * correlation * sigma[:, None, :], f"covariance: {label}, {where}"
 
 
 def _scale(section: Std | CovarianceColumns, m: int) -> Floats:
@@ -154,11 +155,11 @@ def _of_matrix(grid: Grid, section: CovarianceColumns) -> Floats:
     m = 3 if k <= 9 else 6
     if k in (9, 36):
         cov = figures.reshape(count, m, m)
-        turned = np.swapaxes(cov, 1, 2)
-        bad = np.abs(cov - turned).max(axis=(1, 2)) > 1e-3 * np.abs(cov).max(axis=(1, 2))
+        transposed = np.swapaxes(cov, 1, 2)
+        bad = np.abs(cov - transposed).max(axis=(1, 2)) > 1e-3 * np.abs(cov).max(axis=(1, 2))
         for i in np.flatnonzero(bad)[:1].tolist():
             raise InputError(f"{grid.at(i, section.columns[0])}: the covariance is not symmetric")
-        cov = 0.5 * (cov + turned)
+        cov = 0.5 * (cov + transposed)
     else:
         upper, right = np.triu_indices(m)
         cov = np.zeros((count, m, m))
@@ -168,7 +169,7 @@ def _of_matrix(grid: Grid, section: CovarianceColumns) -> Floats:
 
 
 def _doubt(mapping: Mapping, cov: Floats, instrument: Floats) -> tuple[str, ...]:
-    """Return a note where the figures fit the instrument when they are read otherwise."""
+    """Return a note where another interpretation of the figures fits the instrument."""
     std = mapping.std
     if std is None or std.kind == "expanded" or std.add_instrument:
         return ()
@@ -178,13 +179,13 @@ def _doubt(mapping: Mapping, cov: Floats, instrument: Floats) -> tuple[str, ...]
     if 1 / FAR < stated / usual < FAR:
         return ()
     figure = stated / unit
-    other = unit * (figure**2 if std.kind == "variance" else np.sqrt(figure))
-    if not 1 / NEAR < other / usual < NEAR:
+    guess = unit * (figure**2 if std.kind == "variance" else np.sqrt(figure))
+    if not 1 / NEAR < guess / usual < NEAR:
         return ()
     kind = "standard deviations" if std.kind == "variance" else "variances"
     return (
         f"the stated standard deviations are {1e6 * stated:.3g} µm as a rule, the instrument's in "
-        f"[tracker] {1e6 * usual:.3g} µm; read as {kind} the figures would be {1e6 * other:.3g} "
+        f"[tracker] {1e6 * usual:.3g} µm; read as {kind} the figures would be {1e6 * guess:.3g} "
         f"µm: check [std] kind and unit",
     )
 
@@ -211,7 +212,7 @@ def floored(
             i = int(np.argmax((v > 0).any(axis=1)))
             raise InputError(
                 f"{table.at(i)}: the stated standard deviations are {usual:.2g} {unit} as a rule; "
-                f"no instrument reaches {least:g} {unit}{_meant(usual) if unit == 'm' else ''}"
+                f"no instrument reaches {least:g} {unit}{_cause(usual) if unit == 'm' else ''}"
             )
         tiny[:, block] = (v >= 0) & (v < least**2)
     rows: Bools = np.asarray(tiny.any(axis=1))
@@ -235,7 +236,7 @@ def floored(
     return out, (note,)
 
 
-def _meant(usual: float) -> str:
+def _cause(usual: float) -> str:
     low, high = _PLAUSIBLE
     looks = []
     if low <= np.sqrt(usual) <= high:
@@ -248,9 +249,9 @@ def _meant(usual: float) -> str:
 
 
 def step(values: Floats) -> float:
-    """Return the power of ten of which all values are whole multiples; 0 where there is none.
+    """Return the power of ten of which all values are whole multiples.
 
-    Fewer than `DISTINCT` different values do not tell.
+    0 where there is none, or fewer than `DISTINCT` different values.
     """
     if len(np.unique(values)) < DISTINCT:
         return 0.0

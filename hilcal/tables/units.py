@@ -2,7 +2,7 @@
 
 Every convention gives the rotation R that maps the target's axes into the sensor's. Angles in
 the order of their columns; "intrinsic" turns about the axes of the turned frame, "fixed" about
-those of the frame that stands:
+those of the sensor:
 
     intrinsic-zyx:  R = R_z(a) R_y(b) R_x(c)        fixed-xyz:  R = R_z(c) R_y(b) R_x(a)
 
@@ -66,7 +66,7 @@ def _parse(text: str, what: str, units: Mapping[str, float], valid: str) -> floa
 
 ROTATION_VECTOR, MATRIX, WXYZ, XYZW = "vector", "matrix", "wxyz", "xyzw"
 QUATERNIONS = (WXYZ, XYZW)
-NUMBERS = {ROTATION_VECTOR: 3, MATRIX: 9, WXYZ: 4, XYZW: 4}  # Numbers of what is not three angles
+NUMBERS = {ROTATION_VECTOR: 3, MATRIX: 9, WXYZ: 4, XYZW: 4}  # Where it is not three angles
 
 _ORDERS = (
     *("".join(p) for p in permutations("xyz")),
@@ -91,7 +91,7 @@ CONVENTIONS: dict[str, str] = {
     **{f"intrinsic-{order}": order.upper() for order in _ORDERS},
     **{f"fixed-{order}": order for order in _ORDERS},
 }
-"""What each name means: a word of this module, or axes as scipy writes them (capital letters:
+"""Meaning of each name: one of the kinds above, or axes as scipy writes them (capital letters:
 intrinsic). Rotations about fixed axes are intrinsic ones in the reverse order."""
 
 

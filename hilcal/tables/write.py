@@ -96,10 +96,10 @@ def _arrow(path: Path, columns: Mapping[str, list[Any]], about: Mapping[str, obj
 
 
 def revision_table(records: Sequence[RevisionRecord], in_use: int | None) -> dict[str, Column]:
-    """Return what was fitted in each revision, and how well; SI.
+    """Return the models and errors of revisions as a table, SI.
 
     Args:
-        in_use: number of the one that is used.
+        in_use: number of the revision in use.
     """
     rows = [_row(r, r.number == in_use) for r in records]
     return {name: [row[name] for row in rows] for name in (rows[0] if rows else {})}
@@ -109,8 +109,8 @@ def _row(r: RevisionRecord, used: bool) -> dict[str, object]:
     fitted: Mapping[str, Any] = r.result_json["identify"]
     judged: Mapping[str, Any] = r.result_json.get("diagnose", {})
     errors = {
-        f"{what}_{key}": _number(fitted["error"][what][key])
-        for what in ("fit", "holdout")
+        f"{readings}_{key}": _number(fitted["error"][readings][key])
+        for readings in ("fit", "holdout")
         for key in ("mean_m", "rms_m", "max_m", "rms_sigma")
     }
     return {
