@@ -129,13 +129,12 @@ def refine(
     suspect from others, the first is added: any of them lowers the error. When no suspect remains,
     every addition is reconsidered: a redundant effect is removed, and an effect that others replace
     better is exchanged for them. If the residual is then more than noise, all effects of the
-    catalogue are fitted together (`Path.take_background`). Rejected and removed effects enter the
-    history of `verdict.judge`. If the rest of the misfit is the arm's scatter, the last step is a
-    fit with the scatter in the covariance, so weights, uncertainties and p-values include it. In
-    the last fit the lines of a transmission error are shrunk to the size of their pool, which
-    predicts better than separate lines (`with_pooled_lines`). All fits include a correlation of the
-    noise along the order of the readings (see `diagnosis.serial_noise`): otherwise it would be
-    taken for effects.
+    catalogue are fitted together (`Path.take_background`). If the rest of the misfit is the arm's
+    scatter, the last step is a fit with the scatter in the covariance, so weights, uncertainties
+    and p-values include it. In the last fit the lines of a transmission error are shrunk to the
+    size of their pool, which predicts better than separate lines (`with_pooled_lines`). All fits
+    include a correlation of the noise along the order of the readings (`diagnosis.serial_noise`),
+    which would otherwise be taken for effects.
 
     Args:
         model: the starting model. Its effects stay, except those of a carried prior that the
@@ -148,8 +147,7 @@ def refine(
         laws: searches a law where the verdict is `unknown_effect`, before effects that only
             resemble the missing one are added, and where the misfit is taken for the arm's scatter;
             the law is then added and judged like any effect.
-        seen: takes each step as soon as it is judged; the verdict of the last step can still
-            change.
+        seen: takes each step as soon as it is judged; the last verdict can still change.
         background: whether a background of all effects is allowed.
 
     Raises:
@@ -320,12 +318,11 @@ class Path:
     def take_background(self) -> bool:
         """Fit all other effects of the catalogue together; whether the model has them now.
 
-        They stay as its background if the error on poses left out falls by a sufficient share. The
-        error must also fall by more than it scatters from pose to pose if the readings do not prove
-        the effects together, or if the verdict is `unknown_effect`: they may then imitate an effect
-        that the catalogue lacks. They are not tried if the stated noise explains the residual and
-        the readings do not prove them. Effects that the readings prove beside all others are then
-        named in the order of their evidence, regardless of earlier additions.
+        They are not tried if the stated noise explains the residual and the readings do not prove
+        them together. They stay as the model's background if the error on poses left out falls by
+        a share (`background_is_better`); also by more than it scatters from pose to pose, if the
+        readings do not prove them, or the verdict `unknown_effect` says that they may imitate an
+        effect that the catalogue lacks. Those proved beside all others are then named.
         """
         last = self.steps[-1]
         tried = self._background_tried or bool(last.fit.model.background)
@@ -405,10 +402,9 @@ class Path:
     def _better(self, last: RefinementStep, alternative: Alternative) -> bool:
         """Whether an alternative is worth a trial.
 
-        While the residual is not noise, its evidence must be larger by the share `FAR`. When the
-        residual is noise, several effects in the place of one must lower the rms by a share worth
-        naming: where the rms of n residuals falls by a small share δ, the log evidence grows by
-        n δ.
+        While the residual is not noise, its evidence must be larger by the share `FAR`. When it is
+        noise, several effects in the place of one must lower the rms by `LEAST_SHARE`: the log
+        evidence grows by n δ where the rms of n residuals falls by a small share δ.
         """
         least = alternative.own
         if not last.diagnosis.residual_is_noise:

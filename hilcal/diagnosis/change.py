@@ -102,16 +102,9 @@ class ChangeSize:
 
     def to_dict(self) -> dict[str, object]:
         """Return it as JSON, SI."""
-        before, before_std = self.before or (None, None)
-        return {
-            "parameter": self.parameter,
-            "unit": self.unit,
-            "value": self.value,
-            "std": self.std,
-            "z": self.z,
-            "before": before,
-            "before_std": before_std,
-        }
+        before, std = self.before or (None, None)
+        size = {"parameter": self.parameter, "unit": self.unit, "value": self.value}
+        return {**size, "std": self.std, "z": self.z, "before": before, "before_std": std}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -248,10 +248,7 @@ def rank_suspects(
 
 
 def addition(before: Fit, after: Fit) -> Suspect:
-    """Return the last effect of a refit as a suspect of the gc-scaled fit before it.
-
-    `kept` is the share of its promise that the refit kept.
-    """
+    """Return the last effect of a refit as a suspect of the gc-scaled fit before it."""
     p, effect = linearise(before), after.model.effects[-1]
     if effect.name in before.model.names:  # a finer form of it
         effect = copy(effect)
@@ -375,10 +372,7 @@ def _implausible(p: Linearisation, scored: _Scored) -> tuple[tuple[str, float, f
 
 
 def kept_by_refit(before: Fit, after: Fit, score: FamilyScore) -> float:
-    """Return the share of the promise that a refit with the effect kept; 1 without a promise.
-
-    Fits with different outliers are not compared: 1 as well.
-    """
+    """Return the share of the promise that a refit kept; 1 without one, or with other outliers."""
     promised = score.gain - score.effective
     if promised <= 0 or np.any(before.outlier != after.outlier):
         return 1.0

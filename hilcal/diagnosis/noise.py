@@ -16,9 +16,8 @@ reading k,
 
     T = Σ_k ‖d_kᵀ g_k‖²,     score statistic T / ‖y‖²
 
-which does not depend on a common factor. Its null distribution, and the distribution of T, which
-gives the factor T / E[T] of the direction, come from simulated contrasts, the same for all
-directions.
+which does not depend on a common factor. Its null distribution, and that of T for the factor
+T / E[T] of the direction, come from simulated contrasts, the same for all directions.
 
 Effects are judged against the actual scatter (F-tests), so a wrong overall size of the noise names
 no effect, but makes χ² too large or too small:
@@ -26,8 +25,7 @@ no effect, but makes χ² too large or too small:
 - too small: no model makes residuals smaller than the noise; the stated noise is too large;
 - too large, and repeats scatter as much: the stated noise is too small;
 - too large, and repeats scatter less: the model misses something;
-- too large, without enough repeats: undecidable; the noise counts as too small only where nothing
-  predicts the residual.
+- too large, with too few repeats: the noise is blamed only where nothing predicts the residual.
 """
 
 from dataclasses import dataclass, replace
@@ -317,10 +315,7 @@ def _blocks(w: Whitening, kind: Ints) -> tuple[RepeatGroup, ...]:
 
 
 def _block(groups: list[Group], number: Ints, m: int) -> RepeatGroup | None:
-    """Return the block of some groups; None where it has no contrasts.
-
-    `number` is the class of each measurement.
-    """
+    """Return the block of some groups, by the class of each measurement; None without contrasts."""
     measured = np.concatenate([rows for rows, _, _ in groups])
     column = np.unique(number[measured], return_inverse=True)[1].reshape(-1)
     if column.max() + 1 == len(measured):

@@ -57,8 +57,7 @@ class PoseAlone:
     effects: tuple[str, ...]  # those that depend on the pose alone, most parameters first
     poses: int  # number of poses that were measured
     more: int  # further poses, read unloaded, that would reveal the first effect
-    # probability that they do, for an effect as large as the misfit; None where the model has a
-    # coarser form of the effect
+    # that they do, for an effect as large as the misfit; None if the model has a coarser form of it
     chance: float | None
 
 
@@ -165,8 +164,7 @@ def chance(
 def _with_poses(first: Fit, count: int, rng: np.random.Generator) -> Fit:
     """Return the fit with unloaded readings at further poses, which the model predicts exactly."""
     readings = first.readings[~first.outlier]
-    unloaded = readings.unloaded
-    rows = np.flatnonzero(unloaded) if unloaded.any() else np.arange(len(readings))
+    rows = np.flatnonzero(readings.unloaded | ~readings.unloaded.any())
     chosen = readings[rng.choice(rows, count)]
     low, high = readings.states.q.min(axis=0), readings.states.q.max(axis=0)
     q = first.model.cell.arm.complete(rng.uniform(low, high, (count, len(low))))

@@ -7,23 +7,21 @@ columns of the model and y their residual,
 
     L y ~ N(L B θ, σ² Σ),    Σ = 1 + φ (K(τ) − K(0)) + Σ_f v_f K_f
 
-K(τ) = A (C(τ) ⊗ 1) Aᵀ is the covariance of the serial noise, A = L D S, where D forms measurements
-as differences of readings. K_f, scaled to a mean variance of 1, is the covariance of a rival:
+K(τ) = A (C(τ) ⊗ 1) Aᵀ is the covariance of the serial noise, A = L D S, where D takes differences
+of readings. K_f, scaled to a mean variance of 1, is the covariance of a rival:
 
 - each effect of the catalogue that is not in the model, Z_f Z_fᵀ;
 - motions of joints and target by powers of the time, since the catalogue has few laws of time;
-- the arm's scatter, where nothing states it and several targets are read in one arrival, which
-  correlates neighbours in the order;
-- misfits that the catalogue lacks, A (C_f ⊗ 1) Aᵀ: a smooth field over joint angles and torques,
-  and displacements of each pose, with their correlation C_f.
+- the arm's scatter, where nothing states it and several targets are read in one arrival;
+- other misfits, A (C_f ⊗ 1) Aᵀ with the correlation C_f: a smooth field over joint angles and
+  torques, and displacements of each pose.
 
 φ, τ and v_f maximise the restricted likelihood with σ² profiled out, so the tests do not depend on
-the stated size of the noise. Only the stated covariance distinguishes a long correlation of large
-noise well from a short correlation of small noise: the estimate assumes σ² = 1 unless the readings
-contradict it.
+the stated size of the noise. The estimate assumes σ² = 1 unless the readings contradict it: little
+else distinguishes a long correlation of large noise from a short correlation of small noise.
 
-The full computation is done only if the slope of ℓ by φ at white noise promises a gain, and no
-rival alone explains the readings far better: that rival should enter the model first.
+All this is computed only if the slope of ℓ by φ at white noise promises a gain, and no rival alone
+explains the readings far better: that rival should enter the model first.
 
 The serial noise is proved if it gains more than chance beside all rivals, or if it alone explains
 the readings better than all rivals by 20 : 1. If the rivals are better by 20 : 1, they explain the
@@ -334,10 +332,7 @@ class _SerialProblem:
         return rival - white >= LEAD * max(serial - white, 0.0) + CHANCE + SAME_EVIDENCE
 
     def noise(self, free: _SerialPoint, rivals: Floats, gain: float) -> SerialNoise:
-        """Return the estimate, its uncertainties from the curvature of ℓ.
-
-        `free` is the maximum with free σ², `gain` that of ℓ by the serial noise.
-        """
+        """Return the estimate from the maximum with free σ²; uncertainties by curvature of ℓ."""
         point = self.maximised(rivals, serial=True, start=free, stated=True)
         stated = free.value - point.value < AGAINST
         point = point if stated else free
@@ -365,10 +360,7 @@ class _SerialProblem:
 
 
 def _problem(white: Fit, clock: Clock) -> _SerialProblem | None:
-    """Form the rows of the likelihood; None where all t are equal, or the covariance is singular.
-
-    None as well where the model has too many parameters for the rows.
-    """
+    """Form the rows of the likelihood; None where t, covariance or their number forbid it."""
     readings, m = white.readings, POSITION
     t = readings.states.time if clock == "time" else np.arange(len(readings), dtype=float)
     assert t is not None  # noqa: S101 - the caller's condition
@@ -376,8 +368,7 @@ def _problem(white: Fit, clock: Clock) -> _SerialProblem | None:
     if np.ptp(t) == 0:
         return None
     groups = (deflection_groups if white.mode == "deflection" else arrival_groups)(along)
-    pieces = runs(along, groups, PIECE)
-    # As many evenly spaced runs as have `MOST_ROWS`.
+    pieces = runs(along, groups, PIECE)  # of which evenly spaced ones, with `MOST_ROWS`, are used
     share = min(MOST_ROWS / (m * sum(p[0].size for p in pieces)), 1.0)
     spaced = np.linspace(0, len(pieces) - 1, max(int(len(pieces) * share), 1))
     chosen = [pieces[k] for k in spaced.astype(int)]

@@ -18,9 +18,8 @@ from hilcal.types import Floats
 def add(before: Fit, effect: str, options: Options | None = None) -> Fit:
     """Refit with one more effect, starting from the parameters of the fit.
 
-    A finer form of an effect of the model replaces it, such as joint_compliance(joints=each) one
-    for all joints. An effect of the background becomes a named effect and keeps its standard
-    deviation.
+    A finer form of an effect of the model, such as joint_compliance(joints=each), replaces it. An
+    effect of the background becomes a named effect and keeps its standard deviation.
 
     Args:
         effect: its name; with options as `read_effects_text` reads them.
@@ -51,9 +50,8 @@ def _reduced(model: Model, theta: Floats, effect: str) -> tuple[Model, Floats]:
     columns = model.slices()[model.names.index(effect)]
     effects = tuple(e for e in model.effects if e.name != effect)
     random = {name: std for name, std in model.random.items() if name != effect}
-    background = model.background - {effect}
-    reduced = replace(model, effects=effects, random=random, background=background)
-    return reduced, np.delete(theta, columns)
+    model = replace(model, effects=effects, random=random, background=model.background - {effect})
+    return model, np.delete(theta, columns)
 
 
 def _grown(

@@ -80,10 +80,7 @@ class _Figure:
         return replace(stated, model=replace(stated.model, cell=cell), readings=readings)
 
     def columns(self, stated: Fit, near: Prediction) -> Floats:
-        """(R, k) whitened derivatives of the measurements by the figure.
-
-        `near` is the prediction of the same readings by the fit.
-        """
+        """(R, k) whitened derivatives of the measurements by the figure, near a prediction."""
         fitted, w, h = ~stated.outlier, stated.whitening, STEP[self.kind]
         readings = stated.readings[fitted]
         out = []
@@ -119,7 +116,7 @@ class _Figure:
         """Return the best change (k,) of the figure, from a first step on, and its fit.
 
         Raises:
-            CannotAnswerError: the arm has no equilibrium with the changed figure.
+            CannotAnswerError: no equilibrium with the changed figure.
         """
         change, refit = np.zeros(self.size), stated
         for _ in range(STEPS):
