@@ -50,7 +50,7 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RefinementStep(Brief):
-    """One revision: a fit, its diagnosis, and what was changed to get there."""
+    """One revision: a fit, its diagnosis, and the change that led to it."""
 
     fit: Fit
     diagnosis: Diagnosis

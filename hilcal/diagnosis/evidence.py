@@ -222,7 +222,7 @@ def insufficiency(
     say: Callable[[str], None] = lambda text: None,
     regressions: Regressions | None = None,
 ) -> Insufficiency | None:
-    """Return what the whole catalogue leaves of a misfit; None if that is noise."""
+    """Return the misfit that the whole catalogue leaves; None if it is noise."""
     current, names = fit, list[str]()
     misfit = fit.chi2 - fit.dof
     while True:

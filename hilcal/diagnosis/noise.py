@@ -73,7 +73,7 @@ Kind = Literal["axis", "joint", "load"]
 NoiseReason = Literal["as_stated", "repeats", "too_large", "lack_of_fit", "predictable", "unknown"]
 """Why the noise is, or is not, to blame:
 
-- as_stated: χ² is what chance allows;
+- as_stated: χ² agrees with the stated noise;
 - repeats: repeated readings scatter as much, or as little, as the residuals;
 - too_large: the residuals are smaller than stated;
 - lack_of_fit: repeated readings scatter less than the residuals;
@@ -117,7 +117,7 @@ class NoiseVerdict:
 
     @property
     def off(self) -> bool:
-        """Whether the variance factor is not what chance allows."""
+        """Whether χ² contradicts the stated noise."""
         return self.reason != "as_stated"
 
 

@@ -57,7 +57,7 @@ class PoseAlone:
     effects: tuple[str, ...]  # those that depend on the pose alone, most parameters first
     poses: int  # number of poses that were measured
     more: int  # further poses, read unloaded, that would reveal the first effect
-    # that they do, for an effect as large as the misfit; None if the model has a coarser form of it
+    # of revealing an effect as large as the misfit; None if the model has a coarser form of it
     chance: float | None
 
 

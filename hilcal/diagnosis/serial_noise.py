@@ -146,7 +146,7 @@ class _SerialProblem:
     """The restricted likelihood of R rows of N readings."""
 
     fit: Fit
-    clock: Clock  # what t counts
+    clock: Clock  # whether t is the time or the number of a reading
     rows: Ints  # (N,) indices of the readings used, among those fitted
     y: Floats  # (R,) whitened residual, at the parameters' prior mean
     columns: Floats  # (R, K) of the model, whitened

@@ -8,8 +8,8 @@ The rules, in this order:
    catalogue together leave more than noise (see `evidence`): `unknown_effect`.
 2. A suspect passes, and the readings separate it from every other: `missing_effect`; else
    `ambiguous`.
-3. No suspect passes, and χ² is what chance allows: `adequate`; or `ambiguous` where another effect
-   could replace an addition to the model.
+3. No suspect passes, and χ² is not too large: `adequate`; or `ambiguous` where another effect could
+   replace an addition to the model.
 4. χ² is too large, and something recorded predicts a share of the misfit on poses left out, or
    repeats of a pose have it in common: `unknown_effect`, with that share.
    If instead no variable predicts the misfit on poses left out beyond chance, and the misfit is the
