@@ -49,9 +49,9 @@ class RecordedVariable:
         products = self.functions[:, :, None] * self.factor.functions[:, None, :]
         return products.reshape(len(products), -1)
 
-    def exchanged(self, name: str, order: Ints) -> "RecordedVariable":
+    def permuted(self, name: str, order: Ints) -> "RecordedVariable":
         """Return the law with the values of one variable permuted between readings."""
-        factor = self.factor and self.factor.exchanged(name, order)
+        factor = self.factor and self.factor.permuted(name, order)
         functions = self.functions[order] if name == self.name else self.functions
         return replace(self, functions=functions, factor=factor)
 

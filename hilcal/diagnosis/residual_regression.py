@@ -72,7 +72,7 @@ STRENGTHS = np.logspace(-2, 3, 21)
 """Prior standard deviations that are tried: fewer than for effects, since laws are many."""
 SURE = 3.0
 """Standard errors, from pose to pose, by which laws must lower the error on poses left out; a
-choice: one campaign in a thousand then has a law by chance."""
+choice: chance then finds a law in one campaign of a thousand."""
 LITTLE = 0.1  # share predicted by smooth laws below which trees are fitted as well; a guess
 AT_ONCE = 16  # laws whose columns are computed together; a choice by memory
 DETERMINED = 2.0
@@ -179,10 +179,10 @@ class _Laws:
             out[:, law] = self.columns(law)[rows]
         return out
 
-    def exchanged(self, law: int, name: str, order: Ints, rows: Bools) -> Floats:
+    def permuted(self, law: int, name: str, order: Ints, rows: Bools) -> Floats:
         """(R', WIDTH) columns of a law in some rows, the values of one variable permuted."""
         v, motion = self.variables[self.variable[law]], self.motions[self.motion[law]]
-        return law_columns(self._p, v.exchanged(name, order), motion)[rows]
+        return law_columns(self._p, v.permuted(name, order), motion)[rows]
 
     def without(self, f: int, chosen: list[int]) -> tuple[Floats, list[Floats]]:
         """Model step (K,) and coefficients of the chosen laws, refitted without a fold."""
@@ -229,7 +229,7 @@ def smooth_laws(p: Linearisation) -> ResidualRegression:
                 permuted = base.copy()
                 for (k, c), of_law in zip(curves, names, strict=True):
                     moved = name in of_law
-                    x = laws.exchanged(k, name, order, rows) if moved else laws.chosen(k)[rows]
+                    x = laws.permuted(k, name, order, rows) if moved else laws.chosen(k)[rows]
                     permuted -= x @ c
                 loss = float(permuted @ permuted) - float(error @ error)
                 lost[name] = lost.get(name, 0.0) + loss / SHUFFLES
@@ -253,8 +253,8 @@ def _dependences(
         v = next((v for v in laws.variables if v.names == (name,)), None)
         if value >= 0.02 * total and v is not None:
             of_name = [k for k, i in enumerate(laws.variable) if name in laws.variables[i].names]
-            motion = laws.motion[_best(p, laws, of_name)]
-            out.append(_curve(p, v, motion, laws.motions[motion], share * value / total))
+            number = laws.motion[_best(p, laws, of_name)]
+            out.append(_curve(p, v, number, laws.motions[number], share * value / total))
     return tuple(out)
 
 
