@@ -1,4 +1,4 @@
-"""A misfit that depends on the pose alone, the effects that cause one, and the poses that tell.
+"""A misfit that depends on the pose alone, its possible effects, and the poses to identify them.
 
 With few poses a fine transmission error shows no pattern: every pose has an error of its own, and
 no pose predicts another. But all readings of a pose have the same error under every load. So the
@@ -8,9 +8,9 @@ The residual is split by constants of each pose, three displacements of the targ
 nearly all of the misfit and leave noise, those effects are listed whose columns are such constants
 to nearly all of their square. The parameters of a family can be separated once the poses measure
 about as many elements as the family has parameters. The proposed number of further poses is the
-smallest tried one at which the first of these effects, as large as the misfit, would pass every
-test of a suspect with the probability `SURE`. Campaigns are simulated by algebra for that, at the
-linearisation of the fit: the readings so far, and unloaded readings at further poses within the
+smallest of `SHARES` at which the first of these effects, as large as the misfit, would pass every
+test of a suspect with the probability `SURE`. To that end campaigns are simulated by algebra, at
+the linearisation of the fit: the readings so far, and unloaded readings at further poses within the
 range of the joints so far; parameters drawn with the size found; noise; all tests.
 """
 
@@ -57,7 +57,7 @@ class PoseAlone:
     effects: tuple[str, ...]  # those that depend on the pose alone, most parameters first
     poses: int  # number of poses that were measured
     more: int  # further poses, read unloaded, that would reveal the first effect
-    # of revealing an effect as large as the misfit; None if the model has a coarser form of it
+    # probability that they reveal one as large as the misfit; None if the model has a coarser form
     chance: float | None
 
 
