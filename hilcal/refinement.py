@@ -39,29 +39,29 @@ __all__ = ["Refinement", "RefinementStep", "add", "predicts_better", "refine", "
 
 MOST_REVISIONS = 15
 MOST_SCATTERS = 2
-"""Estimates of the arm's scatter at most: the first, and one more with what was added after it."""
-BACKGROUND = "background"  # what a step with a background has as its addition
+"""Estimates of the arm's scatter at most: the first, and another after further effects."""
+BACKGROUND = "background"  # `RefinementStep.added` of a step that adds a background
 FAR = 0.1
-"""Share of an effect's evidence by which others must be better while the model is not adequate;
-a guess."""
+"""Share of an effect's evidence by which the evidence of its replacements must exceed it while the
+model is not adequate; a guess."""
 
 Say = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RefinementStep(Brief):
-    """One revision: a fit, its diagnosis, and what was changed to get there."""
+    """One revision: a fit, its diagnosis, and the change that led to it."""
 
     fit: Fit
-    diagnosis: Diagnosis  # with all that the refinement learnt of the fit
-    added: str | None  # the effect that was added to the revision before, or `BACKGROUND`
+    diagnosis: Diagnosis
+    added: str | None  # effect added to the previous revision, or `BACKGROUND`
     removed: str | None = None
 
     def __repr__(self) -> str:
         """Return the step in a line."""
-        what = change(self.added, self.removed) or " + ".join(self.fit.model.names)
+        title = change(self.added, self.removed) or " + ".join(self.fit.model.names)
         error = f"{1e6 * self.fit.holdout.rms_m:.1f} µm rms on poses left out"
-        return f"RefinementStep({what}: {error}, {self.diagnosis.verdict})"
+        return f"RefinementStep({title}: {error}, {self.diagnosis.verdict})"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,12 +91,12 @@ class Refinement(Shown):
 
     @property
     def verdict(self) -> Verdict:
-        """Its verdict."""
+        """The verdict of the last diagnosis."""
         return self.diagnosis.verdict
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Effects of any of its models, each once."""
+        """Effects named in the model of any step, without duplicates."""
         return tuple(dict.fromkeys(n for s in self.steps for n in s.fit.model.named))
 
     @property
@@ -107,8 +107,7 @@ class Refinement(Shown):
     def probabilities(self, effects: Iterable[str]) -> dict[str, float]:
         """Return the probability that the arm has each effect, by name.
 
-        See `effect_probabilities`. An effect that no step tested has 0.04: prior odds of one to
-        nine, less the price of its strength.
+        See `effect_probabilities`. An effect that no step tested has the probability 0.04.
         """
         return effect_probabilities([s.diagnosis for s in self.steps], effects)
 
@@ -125,33 +124,31 @@ def refine(
 ) -> Refinement:
     """Fit, diagnose, add the first suspect, and repeat.
 
-    An effect stays only if the error on poses left out falls, and the refit keeps what the
-    linearisation promised (see `diagnosis.effect_ranking`). Where the readings do not separate
-    the first suspect from others it is added all the same, since any of them lowers the error.
-    When no suspect is left, every addition is reconsidered: a redundant one is removed, one that
-    others replace better is exchanged for them. Where more than noise is left then, and
-    `background` asks for it, all effects of the catalogue are fitted together, see
-    `Path.take_background`. Effects that were tried or taken out enter the history by which
-    `verdict.judge` judges each step. Where the arm's scatter is what is left, the last step is a
-    fit with it in the covariance, so that weights, uncertainties and p-values have it, too.
-    In the last fit the lines of a transmission error are about as large as their pools, since that
-    predicts better than if each is by itself (`with_pooled_lines`). A correlation of the noise
-    along the order of the readings is in all fits (see `diagnosis.serial_noise`): it would be taken
-    for effects.
+    An effect stays only if the error on poses left out falls and the refit keeps the promise of the
+    linearisation (see `diagnosis.effect_ranking`). If the readings do not separate the first
+    suspect from others, the first is added: any of them lowers the error. When no suspect remains,
+    every addition is reconsidered: a redundant effect is removed, and an effect that others replace
+    better is exchanged for them. If the residual is then more than noise, all effects of the
+    catalogue are fitted together (`Path.take_background`). If the rest of the misfit is the arm's
+    scatter, the last step is a fit with the scatter in the covariance, so weights, uncertainties
+    and p-values include it. In the last fit the lines of a transmission error are shrunk to the
+    size of their pool, which predicts better than separate lines (`with_pooled_lines`). All fits
+    include a correlation of the noise along the order of the readings (`diagnosis.serial_noise`),
+    which would otherwise be taken for effects.
 
     Args:
-        model: the starting model. Its effects are not taken out, but for those of a carried prior
-            that the readings speak against (`carried_evidence`). The prior, with the arm's
-            scatter where that was estimated, is in every fit.
+        model: the starting model. Its effects stay, except those of a carried prior that the
+            readings contradict (`carried_evidence`). The prior is in every fit, with the arm's
+            scatter if the earlier campaign estimated it.
         readings: all readings.
         mode: "deflection" or "absolute".
         say: takes progress, one line each.
-        history: how the starting model was reached, where it was not given.
-        laws: searches a law wherever the verdict is `unknown_effect`, before effects that only
-            resemble what is missing are added, and where the misfit is taken for the arm's scatter;
+        history: the steps that led to the starting model.
+        laws: searches a law where the verdict is `unknown_effect`, before effects that only
+            resemble the missing one are added, and where the misfit is taken for the arm's scatter;
             the law is then added and judged like any effect.
-        seen: takes each step as soon as it is judged; of the last one the verdict can still change.
-        background: whether all effects may predict together.
+        seen: takes each step as soon as it is judged; the last verdict can still change.
+        background: whether a background of all effects is allowed.
 
     Raises:
         InputError: too many readings.
@@ -160,17 +157,17 @@ def refine(
     say(f"fitting {' + '.join(model.names) or 'the bare arm'}")
     readings = with_prior_scatter(model, readings.with_serial(None))
     first = with_serial_noise(fit(model, readings, mode))
-    found = refine_from(first, say, history, laws, seen, background)
-    last = found.fit
+    refinement = refine_from(first, say, history, laws, seen, background)
+    last = refinement.fit
     if last.model.names == first.model.names:
-        return found
-    # A misfit may have hidden the correlation of the noise, or have looked like one.
+        return refinement
+    # The misfit of the first model may have hidden a correlation of the noise, or imitated one.
     white = last
     if last.readings.serial is not None:
         white = fit(last.model, last.readings.with_serial(None), mode, start=last.theta)
     noise = serial_noise(white)
     if (noise is None) == (last.readings.serial is None):
-        return found
+        return refinement
     say("the noise is correlated along the order" if noise else "the noise is white after all")
     first = fit(model, first.readings.with_serial(noise), mode)
     return refine_from(first, say, history, laws, seen, background)
@@ -181,11 +178,11 @@ def refine_from(
     say: Say = lambda text: None,
     history: History = NOTHING,
     laws: LawSearch | None = None,
-    seen: Callable[[RefinementStep], None] = lambda step: None,
+    on_step: Callable[[RefinementStep], None] = lambda step: None,
     background: bool = True,
 ) -> Refinement:
-    """Refine a fit with its noise correlated as it is in its covariance; see `refine`."""
-    path = Path(first, say, history, laws, seen)
+    """Refine a fit without estimating the correlation of its noise anew; see `refine`."""
+    path = Path(first, say, history, laws, on_step)
     changed = True
     while changed:
         path.extend()
@@ -196,25 +193,25 @@ def refine_from(
 
 
 class Path:
-    """The revisions so far, and what was tried."""
+    """The revisions so far, and the effects that were rejected or removed."""
 
     def __init__(
         self,
         first: Fit,
         say: Say = lambda text: None,
-        before: History = NOTHING,
+        history: History = NOTHING,
         laws: LawSearch | None = None,
-        seen: Callable[[RefinementStep], None] = lambda step: None,
+        on_step: Callable[[RefinementStep], None] = lambda step: None,
     ) -> None:
-        """Begin with a fit, the effects of which stay; `before` says how its model was reached."""
+        """Start with a fit whose effects stay; `history` tells how its model was reached."""
         self.steps: list[RefinementStep] = []
-        self._given, self._before, self._say = first.model.named, before, say
-        self._laws, self._seen = laws, seen
-        self._rejected, self._removed = [*before.rejected], [*before.removed]
+        self._start, self._start_history, self._say = first.model.named, history, say
+        self._laws, self._on_step = laws, on_step
+        self._rejected, self._removed = [*history.rejected], [*history.removed]
         self._add, self._regressions = cache(add), Regressions()
         self._background_tried = False
-        taken = first.readings.arm_scatter is not None
-        self._scattered = [first.model.names] if taken else []
+        scattered = first.readings.arm_scatter is not None
+        self._scattered = [first.model.names] if scattered else []
         self.append(first, None)
 
     @property
@@ -222,39 +219,43 @@ class Path:
         return len(self.steps) < MOST_REVISIONS
 
     def _evidence_of(
-        self, found: Fit, background: tuple[BackgroundEffect, ...] | None = None
+        self, fitted: Fit, background: tuple[BackgroundEffect, ...] | None = None
     ) -> Evidence:
-        return Evidence(found, self._add, self._say, self._regressions, background)
+        return Evidence(fitted, self._add, self._say, self._regressions, background)
 
-    def _history(self, of: Fit) -> History:
-        names = of.model.named
+    def _history(self, fitted: Fit) -> History:
+        names = fitted.model.named
         return History(
-            added=tuple(n for n in names if n not in self._given or n in self._before.added),
+            added=tuple(n for n in names if n not in self._start or n in self._start_history.added),
             removed=tuple(self._removed),
             rejected=tuple(n for n in self._rejected if n not in names),
         )
 
     def append(
-        self, found: Fit, added: str | None, removed: str | None = None, what: str = ""
+        self, fitted: Fit, added: str | None, removed: str | None = None, message: str = ""
     ) -> None:
-        """Say what was done, judge a fit and append it."""
-        self._say(f"{what}; diagnosing" if what else "diagnosing")
-        self._evidence = self._evidence_of(found)
-        diagnosis = judge(self._evidence, self._history(found))
-        self.steps.append(RefinementStep(found, diagnosis, added, removed))
-        self._seen(self.steps[-1])
+        """Report the change, judge the fit and append it."""
+        self._say(f"{message}; diagnosing" if message else "diagnosing")
+        self._evidence = self._evidence_of(fitted)
+        self._append(RefinementStep(fitted, self._judge(fitted), added, removed))
+
+    def _judge(self, fitted: Fit) -> Diagnosis:
+        return judge(self._evidence, self._history(fitted))
+
+    def _append(self, step: RefinementStep) -> None:
+        self.steps.append(step)
+        self._on_step(step)
 
     def extend(self) -> None:
         """Add suspects while any lowers the error on poses left out."""
-        # Where suspects are rejected, the step is judged anew: a law may be looked for after all.
-        while self._room and (self._add_law() or self._add_one() or self._add_law()):
+        # Where suspects are rejected, the step is judged anew: a law may be searched after all.
+        while self._room and (self._add_law() or self._add_suspect() or self._add_law()):
             pass
 
     def _add_law(self) -> bool:
-        """Add a law where no effect of the catalogue explains the misfit; whether one was added.
+        """Add a law if no effect of the catalogue explains the misfit; whether a law was added.
 
-        It is looked for as well where the misfit is about to be taken for the arm's scatter, which
-        is what nothing else explains.
+        A law is searched as well where the misfit would be taken for the arm's scatter.
         """
         last = self.steps[-1]
         d = last.diagnosis
@@ -264,66 +265,64 @@ class Path:
         proposed = self._laws.propose(last.fit, self._say)
         if proposed is None or not predicts_better(last.fit, proposed[0]):
             return False
-        self.append(*proposed, what=f"added {proposed[1]}")
+        self.append(*proposed, message=f"added {proposed[1]}")
         return True
 
-    def _add_one(self) -> bool:
+    def _add_suspect(self) -> bool:
         """Try the suspects, best first; returns whether one was added.
 
         The step is judged anew where suspects were rejected.
         """
-        last, found = self.steps[-1], None
-        before = len(self._rejected)
+        last, better = self.steps[-1], None
+        n_rejected = len(self._rejected)
         for s in last.diagnosis.suspects:
             if not s.passes or s.effect in self._removed:
                 continue
             self._say(f"adding {s.effect}")
             trial = self._add(last.fit, s.effect)
-            kept = kept_by_refit(last.fit, trial, s.score) >= LEAST_KEPT
-            if kept and predicts_better(last.fit, trial):
-                found = trial, s.effect
+            keeps = kept_by_refit(last.fit, trial, s.score) >= LEAST_KEPT
+            if keeps and predicts_better(last.fit, trial):
+                better = trial, s.effect
                 break
             self._rejected.append(s.effect)
-        if len(self._rejected) > before:
-            diagnosis = judge(self._evidence, self._history(last.fit))
-            self.steps[-1] = replace(last, diagnosis=diagnosis)
-        if found is None:
+        if len(self._rejected) > n_rejected:
+            self.steps[-1] = replace(last, diagnosis=self._judge(last.fit))
+        if better is None:
             return False
-        self.append(*found, what=f"added {found[1]}")
+        self.append(*better, message=f"added {better[1]}")
         return True
 
     def reconsider(self) -> bool:
         """Judge every addition anew; returns whether one was removed or exchanged."""
         last = self.steps[-1]
-        # What is named beside a background does not depend on what was added before.
+        # The effects named beside a background do not depend on earlier additions.
         if last.diagnosis.wrong_figures or last.fit.model.background:
             return False
-        added = [n for n in last.fit.model.named if n not in self._given]
+        added = [n for n in last.fit.model.named if n not in self._start]
         names = [*added, *carried_effects(last.fit.model)]
         if not names or not self._room:
             return False
         self._say(f"reconsidering {', '.join(names)}")
-        others = {a.effect: a for a in last.diagnosis.alternatives}
+        alternatives = {a.effect: a for a in last.diagnosis.alternatives}
         for name in names:
             if name in last.diagnosis.redundant:
                 without = remove(last.fit, name)
                 if not predicts_better(without, last.fit):
                     self._change(without, None, name)
                     return True
-            better = name in added and self._better(last, others[name])
-            if better and self._exchange(last, others[name]):
+            better = name in added and self._better(last, alternatives[name])
+            if better and self._exchange(last, alternatives[name]):
                 return True
         return False
 
     def take_background(self) -> bool:
-        """Fit all other effects of the catalogue together; whether they are in the model now.
+        """Fit all other effects of the catalogue together; whether the model has them now.
 
-        They stay as its background where the error on poses left out falls by a share worth it;
-        where the readings do not prove them together, or the verdict is `unknown_effect`, so that
-        they may resemble one that the catalogue does not have, also by more than it scatters from
-        pose to pose. Where the stated noise explains the residual, and the readings do not
-        prove them, they are not tried. Those that the readings prove beside all others are then
-        named, in the order of their evidence, whatever was added before.
+        They are not tried if the stated noise explains the residual and the readings do not prove
+        them together. They stay as the model's background if the error on poses left out falls by
+        a share (`background_is_better`); also by more than it scatters from pose to pose, if the
+        readings do not prove them, or the verdict `unknown_effect` says that they may imitate an
+        effect that the catalogue lacks. Those proved beside all others are then named.
         """
         last = self.steps[-1]
         tried = self._background_tried or bool(last.fit.model.background)
@@ -335,40 +334,39 @@ class Path:
             return False
         proved_together = p_value_of_others(last.fit) <= TOGETHER
         as_stated = d.residual_is_noise and last.fit.readings.arm_scatter is None
-        # What noise that is correlated along the order leaves looks like effects.
+        # The residual of serially correlated noise resembles effects.
         if as_stated and (not proved_together or last.fit.readings.serial is not None):
             return False
         self._say("fitting all effects of the catalogue together")
-        found = with_background(last.fit, self._given)
-        if found is None or not background_is_better(last.fit, found):
+        fitted = with_background(last.fit, self._start)
+        if fitted is None or not background_is_better(last.fit, fitted):
             return False
         doubtful = not proved_together or d.verdict == "unknown_effect"
-        if doubtful and not predicts_better(last.fit, found):
+        if doubtful and not predicts_better(last.fit, fitted):
             return False
         self._say("the background of all effects predicts better; diagnosing")
-        tested = background_evidence(found)
+        tested = background_evidence(fitted)
         names = proved(tested)[: MOST_REVISIONS - len(self.steps) - 1]
-        fits = [found]
-        for name in names:  # those that are proved are named
+        fits = [fitted]
+        for name in names:
             model = fits[-1].model
             model = replace(model, background=model.background - {name})
             fits.append(replace(fits[-1], model=model))
-        judged, self._evidence = judge_naming(
-            fits, tested, self._history, lambda left: self._evidence_of(fits[-1], left)
+        diagnoses, self._evidence = judge_naming(
+            fits, tested, self._history, lambda unnamed: self._evidence_of(fits[-1], unnamed)
         )
-        for one, diagnosis, name in zip(fits, judged, (BACKGROUND, *names), strict=True):
-            self.steps.append(RefinementStep(one, diagnosis, name))
-            self._seen(self.steps[-1])
+        for step in map(RefinementStep, fits, diagnoses, (BACKGROUND, *names)):
+            self._append(step)
         return True
 
     def take_scatter(self) -> bool:
-        """Fit with the arm's scatter in the covariance; returns whether anything was changed.
+        """Fit with the arm's scatter in the covariance; returns whether the covariance changed.
 
-        It is estimated anew, once, where effects were added since.
+        The scatter is estimated once more if effects were added after its first estimate.
         """
         last = self.steps[-1]
         fitted, names = last.fit, last.fit.model.names
-        if fitted.model.background:  # the scatter is in its covariance
+        if fitted.model.background:  # its covariance includes the scatter
             return False
         if not self._room or len(self._scattered) == MOST_SCATTERS or names in self._scattered:
             return False
@@ -382,62 +380,62 @@ class Path:
             return False
         self._scattered.append(names)
         readings = with_arm_scatter(fitted.model.cell, fitted.readings, judged.scatter)
-        found = fit(fitted.model, readings, fitted.mode, start=fitted.theta)
-        self.append(found, None, what="the arm's scatter enters the covariance")
+        fitted = fit(fitted.model, readings, fitted.mode, start=fitted.theta)
+        self.append(fitted, None, message="the arm's scatter enters the covariance")
         return True
 
     def pool_lines(self) -> None:
         """Fit effects of many lines anew, the size of each line near that of its pool.
 
-        The fit takes the place of the last step's. Not where the error on poses left out rises by
-        more than it scatters from pose to pose, nor where nothing was changed.
+        The fit replaces that of the last step, unless the error on poses left out rises by more
+        than it scatters from pose to pose. A path of one step stays as it is.
         """
         last = self.steps[-1]
         if len(self.steps) == 1 or last.fit.model.background or last.diagnosis.wrong_figures:
             return
-        found = with_pooled_lines(last.fit)
-        if found is None or predicts_better(found, last.fit):
+        fitted = with_pooled_lines(last.fit)
+        if fitted is None or predicts_better(fitted, last.fit):
             return
-        self._evidence = self._evidence_of(found)
-        judged = judge(self._evidence, self._history(found))
-        self.steps[-1] = replace(last, fit=found, diagnosis=judged)
+        self._evidence = self._evidence_of(fitted)
+        self.steps[-1] = replace(last, fit=fitted, diagnosis=self._judge(fitted))
 
-    def _better(self, last: RefinementStep, other: Alternative) -> bool:
-        """Whether others are worth a trial.
+    def _better(self, last: RefinementStep, alternative: Alternative) -> bool:
+        """Whether an alternative is worth a trial.
 
-        While the residual is not noise they must be far better. When it is, several in the place of
-        one must lower the error by a share worth naming: the log evidence of n residuals grows by
-        n δ where their rms falls by a small share δ.
+        While the residual is not noise, its evidence must be larger by the share `FAR`. When it is
+        noise, several effects in the place of one must lower the rms by `LEAST_SHARE`: the log
+        evidence grows by n δ where the rms of n residuals falls by a small share δ.
         """
+        least = alternative.own
         if not last.diagnosis.residual_is_noise:
-            return other.better and other.log_evidence > (1.0 + FAR) * other.own
-        worth = LEAST_SHARE * last.fit.dof if len(other.others) > 1 else 0.0
-        return other.better and other.log_evidence > other.own + worth
+            least *= 1.0 + FAR
+        elif len(alternative.others) > 1:
+            least += LEAST_SHARE * last.fit.dof
+        return alternative.better and alternative.log_evidence > least
 
-    def _exchange(self, last: RefinementStep, other: Alternative) -> bool:
-        """Put another in the place of an effect, unless the error on poses left out rises.
+    def _exchange(self, last: RefinementStep, alternative: Alternative) -> bool:
+        """Replace an effect by its alternative, unless the error on poses left out rises.
 
-        The error must fall beyond chance where several take the place of one, since a model that is
-        no better need not be larger; and while the residual is not noise, although the evidence
-        takes it for noise.
+        The error must fall beyond chance where several effects replace one, since a model that is
+        no better need not be larger; and while the residual is not noise, since the evidence
+        assumes noise.
         """
-        self._say(f"trying {' + '.join(other.others)} in place of {other.effect}")
-        first, *rest = other.others
-        trials = [exchange(last.fit, other.effect, first)]
-        for name in rest:
+        effect, (first, *further) = alternative.effect, alternative.others
+        self._say(f"trying {' + '.join(alternative.others)} in place of {effect}")
+        trials = [exchange(last.fit, effect, first)]
+        for name in further:
             trials.append(self._add(trials[-1], name))
-        found = trials[-1]
-        if last.diagnosis.residual_is_noise and not rest:
-            if found.holdout_of_all.rms_sigma > last.fit.holdout_of_all.rms_sigma:
+        if last.diagnosis.residual_is_noise and not further:
+            if trials[-1].holdout_of_all.rms_sigma > last.fit.holdout_of_all.rms_sigma:
                 return False
-        elif not predicts_better(last.fit, found):
+        elif not predicts_better(last.fit, trials[-1]):
             return False
-        self._change(trials[0], first, other.effect)
-        for name, trial in zip(rest, trials[1:], strict=True):
-            self.append(trial, name, what=f"added {name}")
+        self._change(trials[0], first, effect)
+        for name, trial in zip(further, trials[1:], strict=True):
+            self.append(trial, name, message=f"added {name}")
         return True
 
     def _change(self, trial: Fit, added: str | None, removed: str) -> None:
         self._removed.append(removed)
-        what = f"removed {removed}" if added is None else f"{added} in place of {removed}"
-        self.append(trial, added, removed, what)
+        message = f"removed {removed}" if added is None else f"{added} in place of {removed}"
+        self.append(trial, added, removed, message)

@@ -1,7 +1,7 @@
 """Which effects of a model's background the readings prove, each beside all others.
 
-The test of an effect is the restricted likelihood ratio against its standard deviation being zero,
-with those of all others estimated anew (see `mixed.variances`).
+The test of an effect is the restricted likelihood ratio of the null hypothesis that its standard
+deviation is zero; the standard deviations of all others are estimated anew (`mixed.variances`).
 """
 
 from collections.abc import Iterator
@@ -26,16 +26,16 @@ from hilcal.regression.evidence import FamilyScore
 from hilcal.types import Floats
 
 PROVED = 0.01
-"""Chance of naming any effect of the background where none is there, over all that are tested; a
-choice: that something is there has been shown by poses left out."""
+"""Chance of naming any absent effect of the background, over all tested effects; a choice: poses
+left out have shown already that something is missing."""
 WORTH = 0.05
-"""Share by which the rms error on poses left out must fall for a background; a choice: it has
-hundreds of parameters, and those that name an effect alone are easier to understand."""
+"""Share by which the rms error on poses left out must fall for a background; a choice: a background
+has hundreds of parameters, and a model of named effects alone is easier to understand."""
 TOGETHER = 0.05
-"""Chance of trying a background where nothing but noise of another size, or the arm's scatter, is
-there; a choice: the error on poses left out has to fall, too."""
+"""Chance of trying a background where the residual is only noise of another size, or the arm's
+scatter; a choice: the error on poses left out has to fall, too."""
 LIKELY = 0.1
-"""p-value below which an effect of the background is named as one that may be there; a choice."""
+"""p-value below which an effect of the background is named as possibly present; a choice."""
 SEED = 0  # of the simulated ratios, so that equal fits give equal p-values
 
 
@@ -43,46 +43,47 @@ SEED = 0  # of the simulated ratios, so that equal fits give equal p-values
 class BackgroundEffect:
     """One effect of the background."""
 
-    effect: str  # its name
-    p_value: float  # of the test against its absence
+    effect: str
+    p_value: float  # of the null hypothesis that the effect is absent
     ratio: float  # the restricted likelihood ratio
     rank: int  # number of its directions that the others do not span
-    std: float  # root of the mean square of its standard deviations, in ordinary magnitudes
-    rms_m: float  # root of the mean square of what it moves the measured positions by, m
-    share: float  # of the misfit that the background explains, in whitened squares
+    std: float  # rms of its standard deviations, in ordinary magnitudes
+    rms_m: float  # rms displacement of the measured positions by the effect, m
+    share: float  # of what the background explains, in whitened squares
     step: Floats  # (q,) its parameters, in ordinary magnitudes
 
 
-def p_value_of_others(of: Fit) -> float:
-    """p-value of all effects that are not named together, beside a noise of any size.
+def p_value_of_others(fit: Fit) -> float:
+    """Joint p-value of all effects that the model does not name, beside noise of any size.
 
-    They are tested at the fit, by one multiple of their ordinary sizes.
+    They are tested at the fit, by one common multiple of their ordinary sizes.
     """
-    kept = of.readings[~of.outlier].as_stated()
-    model = with_all_effects(of.model, kept.states)
-    known = {
+    readings = fit.readings[~fit.outlier].as_stated()
+    model = with_all_effects(fit.model, readings.states)
+    fitted = {
         (e.name, p.name): value
-        for e, mine in zip(of.model.effects, of.model.slices(), strict=True)
-        for p, value in zip(e.parameters, of.theta[mine], strict=True)
+        for e, columns in zip(fit.model.effects, fit.model.slices(), strict=True)
+        for p, value in zip(e.parameters, fit.theta[columns], strict=True)
     }
     theta = np.array(
-        [known.get((e.name, p.name), 0.0) for e in model.effects for p in e.parameters]
+        [fitted.get((e.name, p.name), 0.0) for e in model.effects for p in e.parameters]
     )
-    problem = linearised_problem(model, kept, of.mode, theta)
+    problem = linearised_problem(model, readings, fit.mode, theta)
     random = problem.families.random
-    numbers = [k for k, f in enumerate(random) if f.effect not in of.model.named]
+    unnamed = [k for k, f in enumerate(random) if f.effect not in fit.model.named]
     start = sizes_at(problem, model, theta)
-    return evidence(problem, numbers, np.random.default_rng(SEED), start).p_value
+    return evidence(problem, unnamed, np.random.default_rng(SEED), start).p_value
 
 
-def background_is_better(before: Fit, after: Fit) -> bool:
-    """Whether a background belongs to the model: `after` has one, `before` the named effects alone.
+def background_is_better(named: Fit, background: Fit) -> bool:
+    """Whether a fit with a background is better than one with the named effects alone.
 
-    The error on poses left out must fall by a share, both weighted by the noise of the latter.
+    The rms error on poses left out must fall by the share `WORTH`; both errors are whitened by the
+    noise of the fit with the background.
     """
-    raw, w = all_left_out(after)
-    one, other = (float(np.sum(w.whiten(r) ** 2)) for r in (all_left_out(before)[0], raw))
-    return other <= (1 - WORTH) ** 2 * one
+    raw, w = all_left_out(background)
+    square = float(np.sum(w.whiten(all_left_out(named)[0]) ** 2))
+    return float(np.sum(w.whiten(raw) ** 2)) <= (1 - WORTH) ** 2 * square
 
 
 def background_evidence(fit: Fit) -> tuple[BackgroundEffect, ...]:
@@ -90,23 +91,23 @@ def background_evidence(fit: Fit) -> tuple[BackgroundEffect, ...]:
     model, theta = fit.model, fit.theta
     if not model.background:
         return ()
-    found = mixed_fit_at(model, fit.readings[~fit.outlier].as_stated(), fit.mode, theta)
-    problem, log_std = found.equations.problem, found.log_std
-    rng, families = np.random.default_rng(SEED), problem.families.random
+    mixed = mixed_fit_at(model, fit.readings[~fit.outlier].as_stated(), fit.mode, theta)
+    problem, log_std = mixed.equations.problem, mixed.log_std
+    rng, random = np.random.default_rng(SEED), problem.families.random
     moves = fit.whitening.raw(model.jacobian(fit.solution.prediction, theta, 3))  # (D, 3, P)
     most = {e.name: e.most() for e in model.effects}
     tested = []
-    numbered = [(k, f) for k, f in enumerate(families) if f.effect in model.background]
-    for name, own in groupby(numbered, lambda kf: kf[1].effect):
-        numbers, mine = zip(*own, strict=True)
+    numbered = [(k, f) for k, f in enumerate(random) if f.effect in model.background]
+    for name, group in groupby(numbered, lambda kf: kf[1].effect):
+        numbers, families = zip(*group, strict=True)
         test = evidence(problem, numbers, rng, log_std, UNSURE * most[name])
         if not test.rank:
             continue
-        index = np.concatenate([f.parameters for f in mine])
-        std = np.exp(np.repeat(log_std[list(numbers)], [len(f.parameters) for f in mine]))
+        index = np.concatenate([f.parameters for f in families])
+        std = np.exp(np.repeat(log_std[list(numbers)], [len(f.parameters) for f in families]))
         moved = np.sum((moves[:, :, index] @ theta[index]) ** 2, axis=1)
         columns = np.flatnonzero(np.isin(problem.family, numbers)) + problem.flat
-        white = problem.x[:, columns] @ found.equations.coordinates[columns]
+        white = problem.x[:, columns] @ mixed.equations.coordinates[columns]
         tested.append(
             BackgroundEffect(
                 effect=name,
@@ -116,7 +117,7 @@ def background_evidence(fit: Fit) -> tuple[BackgroundEffect, ...]:
                 std=float(np.sqrt(np.mean(std**2))),
                 rms_m=float(np.sqrt(np.mean(moved))),
                 share=float(np.sum(white**2)),
-                step=theta[index] / np.concatenate([f.magnitude for f in mine]),
+                step=theta[index] / np.concatenate([f.magnitude for f in families]),
             )
         )
     total = sum(b.share for b in tested) or 1.0
@@ -124,20 +125,20 @@ def background_evidence(fit: Fit) -> tuple[BackgroundEffect, ...]:
     return tuple(sorted(shares, key=lambda b: (b.p_value, -b.rms_m)))
 
 
-def proved(found: tuple[BackgroundEffect, ...]) -> tuple[str, ...]:
-    """Names of those that are proved, the strongest evidence first.
+def proved(tested: tuple[BackgroundEffect, ...]) -> tuple[str, ...]:
+    """Names of the proved effects, the strongest evidence first.
 
-    The likelihood must rise beyond 20 : 1 at a plausible size: the p-value alone says nothing of
-    an effect that would have to be far larger.
+    The likelihood must rise beyond 20 : 1 at a plausible size, since a small p-value alone may need
+    an implausibly large effect.
     """
-    sure = [b for b in found if b.ratio > 2 * SAME_EVIDENCE]
-    return tuple(b.effect for b in sure if b.p_value * len(found) < PROVED)
+    sure = [b for b in tested if b.ratio > 2 * SAME_EVIDENCE]
+    return tuple(b.effect for b in sure if b.p_value * len(tested) < PROVED)
 
 
-def as_suspects(found: tuple[BackgroundEffect, ...]) -> Iterator[Suspect]:
-    """Yield the effects of a background as suspects: none is proved, each may be there."""
-    likely = [b.effect for b in found if b.p_value < LIKELY]
-    for b in found:
+def as_suspects(tested: tuple[BackgroundEffect, ...]) -> Iterator[Suspect]:
+    """Yield the effects of a background as suspects: none is proved, each may be present."""
+    likely = [b.effect for b in tested if b.p_value < LIKELY]
+    for b in tested:
         score = FamilyScore(
             p_value=b.p_value,
             log_evidence=0.5 * b.ratio,

@@ -1,23 +1,23 @@
-"""What has changed on an arm since an earlier campaign, and whether it is more than uncertainty.
+"""Changes of an arm since an earlier campaign, and whether they exceed the uncertainty.
 
-A candidate, what a repair, a crash or wear can change, is a set of directions of an effect's
-parameters beside the earlier fit, whether or not the effect is in its model: a change of what it
-had found is a deviation of its own. Three more kinds are no change of the arm, but look like one:
-the target on the tool, the instrument, and the temperature.
+A candidate is something that a repair, a crash or wear can change: a set of directions of an
+effect's parameters beside the earlier fit, whether or not the effect is in its model. A change of a
+fitted effect is a deviation of its own. Three more kinds of candidates are no change of the arm but
+look like one: the target on the tool, the instrument, and the temperature.
 
-At later readings the earlier fit, with its posterior as prior and the tracker's place flat where it
-was set up anew, leaves r with rᵀ M r (see `identification.later_readings`). Every candidate is
-scored by the evidence of its columns beside that, the formula of the diagnosis
-(`regression.evidence`). The scatter σ² is estimated from both: what the earlier fit states of it
-counts as ν_0 degrees of freedom beside those of r,
+At later readings the earlier fit leaves the residual r with rᵀ M r (see
+`identification.later_readings`): its posterior is the prior, and the place of a tracker that was
+set up anew is free. Every candidate is scored by the evidence of its columns beside that, as in the
+diagnosis (`regression.evidence`). The scatter σ² is estimated from r and from the earlier fit,
+whose statement counts as ν_0 degrees of freedom:
 
     ‖r‖² = rᵀ M r + ν_0,    ν = dof + ν_0
 
-so that neither a scatter that is larger than stated nor a few lucky readings make a change. The
-candidates with most evidence are added to the model and fitted exactly; the one that then has the
-most is taken if its p-value, times the number of candidates tested, is below `LEVEL`; then the
-next is looked for beside it. A change that the others make needless is taken back. Candidates with
-nearly the same evidence (odds below 20 : 1) are not told apart by these readings.
+So neither a scatter that is larger than stated nor a few lucky readings make a change. The
+candidates with most evidence are added to the model and fitted exactly. The best of these is a
+change if its p-value, times the number of candidates tested, is below `LEVEL`; then the next change
+is searched beside it. A change that the others make needless is removed. The readings do not
+separate candidates with nearly the same evidence (odds below 20 : 1).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -45,19 +45,19 @@ from hilcal.types import Floats
 PLACE = Changeable("setup", "tracker's place", "the place of the tracker, or of the base")
 SUFFIX = " changed"  # ends the name of an effect that stands for a change
 LEVEL = 0.01
-"""Of a false claim where nothing has changed, over all candidates together; a choice."""
-POWER = 0.9  # probability with which a change of the stated least size would have been claimed
+"""Probability of a false claim where nothing has changed, over all candidates; a choice."""
+POWER = 0.9  # probability that a change of the stated least size would have been claimed
 STATED_DOF = 20.0
-"""ν_0. What the earlier fit states of the scatter is taken as that of 20 degrees of freedom: good
-to a sixth, since another day and another place differ. A choice."""
-UNEXPLAINED = 1e-3  # level at which what is left after all changes is unexplained; a choice
+"""ν_0, degrees of freedom of the scatter that the earlier fit states: good to a sixth, since it
+differs with day and place. A choice."""
+UNEXPLAINED = 1e-3  # p-value below which the residual after all changes is unexplained; a choice
 TRIED = 5  # candidates with most evidence in the linearisation that are fitted exactly; a choice
 TAKEN_APART = 2
 """Joints for which zero and compliance are tried together: those of the first candidates."""
-MOST = 4  # most changes that are looked for; more is another arm; a choice
+MOST = 4  # most changes that are searched: an arm with more is another arm; a choice
 ABSORBED = 1e-4
-"""Share of a candidate's information that frames and prior must leave: with less, a hundredth of
-its motion, the readings cannot show it. A choice."""
+"""Least share of a candidate's information that frames and prior must leave, a hundredth of its
+motion, for the readings to show it. A choice."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,9 +66,9 @@ class Candidate:
 
     name: str  # effect and part, as "encoder_offset.j3"; "target_offset" for a whole effect
     effect: str
-    part: str  # what it is of: "joint 3", "link 2", "base", "tool", "target", "tracker", ...
+    part: str  # of the cell: "joint 3", "link 2", "base", "tool", "target", "tracker", ...
     joint: int  # number of the joint, from 1; 0 for none
-    change: Changeable  # how it may change
+    change: Changeable
     parameters: tuple[str, ...]  # (k,) names of the directions
     units: tuple[str, ...]
     scale: Floats  # (k,) their ordinary magnitudes, SI
@@ -76,7 +76,7 @@ class Candidate:
 
     @property
     def kind(self) -> Kind:
-        """Of what it is."""
+        """Kind of the part."""
         return self.change.kind
 
     @property
@@ -91,20 +91,20 @@ class ChangeSize:
 
     parameter: str
     unit: str  # SI
-    value: float  # by how much it has moved
+    value: float  # change of the parameter
     std: float
-    before: tuple[float, float] | None = None  # what the earlier fit found, and its deviation
+    before: tuple[float, float] | None = None  # value and standard deviation in the earlier fit
 
     @property
     def z(self) -> float:
-        """Size over its standard deviation."""
+        """Value over its standard deviation."""
         return self.value / self.std if self.std > 0 else 0.0
 
     def to_dict(self) -> dict[str, object]:
         """Return it as JSON, SI."""
         before, std = self.before or (None, None)
-        known = {"parameter": self.parameter, "unit": self.unit, "value": self.value}
-        return {**known, "std": self.std, "z": self.z, "before": before, "before_std": std}
+        size = {"parameter": self.parameter, "unit": self.unit, "value": self.value}
+        return {**size, "std": self.std, "z": self.z, "before": before, "before_std": std}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,13 +114,13 @@ class Change:
     candidate: Candidate
     sizes: tuple[ChangeSize, ...]
     p_value: float  # of the joint test when it was found, times the candidates tested, at most 1
-    log_evidence: float  # gain beside the changes found before
-    moved_m: float  # rms displacement of the target that it makes in the later readings, m
-    same_as: tuple[Candidate, ...]  # others that these readings do not tell from it
+    log_evidence: float  # gain beside the changes found before it
+    moved_m: float  # rms displacement of the target by the change in the later readings, m
+    same_as: tuple[Candidate, ...]  # candidates that these readings do not separate from it
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """The parts of the cell that it may be of, the likeliest first."""
+        """The parts of the cell that may have changed, the likeliest first."""
         return tuple(dict.fromkeys(c.part for c in (self.candidate, *self.same_as)))
 
     def to_dict(self) -> dict[str, object]:
@@ -146,11 +146,11 @@ class Limit:
     part: str  # of the cell
     change: Changeable
     unit: str  # SI
-    size: float  # infinite where these readings cannot show any of a plausible size
-    moved_m: float  # rms displacement of the target that it makes in the later readings, m
+    size: float  # infinite where these readings show no change of a plausible size
+    moved_m: float  # rms displacement of the target by the change in the later readings, m
 
     def to_dict(self) -> dict[str, object]:
-        """Return it as JSON, SI; null for what is infinite."""
+        """Return it as JSON, SI; null for infinite numbers."""
         return {
             "candidate": self.candidate,
             "part": self.part,
@@ -162,26 +162,26 @@ class Limit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Changes:
-    """What has changed since an earlier campaign."""
+    """The changes since an earlier campaign."""
 
-    before: Remeasured  # the earlier fit at the later readings, nothing changed
+    before: Remeasured  # the earlier fit at the later readings, without any change
     after: Remeasured  # with the changes
     found: tuple[Change, ...]  # strongest first
     limits: tuple[Limit, ...]  # of candidates with one parameter
-    tested: int  # number of candidates that the readings can show, and of joints
-    hidden: tuple[Candidate, ...]  # that they cannot show: the frames absorb them
-    unexplained: float  # p-value of what is left after the changes as scatter
-    scatter: float  # rms of what is left over that which the earlier fit states
+    tested: int  # number of candidates that the readings can show, plus the number of joints
+    hidden: tuple[Candidate, ...]  # that the readings cannot show: the frames absorb them
+    unexplained: float  # p-value of the residual after the changes
+    scatter: float  # rms of that residual over the scatter that the earlier fit states
     earlier: EarlierFit
 
     @property
     def explained(self) -> bool:
-        """Whether what is left is scatter as the earlier fit states it."""
+        """Whether the residual after the changes is scatter as the earlier fit states it."""
         return self.unexplained >= UNEXPLAINED
 
 
 def changing(catalogue: Catalogue) -> tuple[str, ...]:
-    """Return the names of the effects that a change may be of."""
+    """Return the names of the effects that may change."""
     return tuple(e.name for e in catalogue.effects if e.change is not None)
 
 
@@ -191,12 +191,12 @@ def candidates(
     catalogue: Catalogue,
     m: int,  # elements per reading
     *,
-    anew: bool,  # the tracker was set up anew; else its place, or the base's, may have changed
+    anew: bool,  # the tracker was set up anew; else its place, or the base's, is a candidate
 ) -> tuple[Candidate, ...]:
-    """Return what may have changed, as far as the readings have the columns for it."""
+    """Return the candidates that can be computed from the columns of the readings."""
     out: list[Candidate] = []
 
-    def made(name: str, options: Mapping[str, object] | None = None) -> Effect | None:
+    def make(name: str, options: Mapping[str, object] | None = None) -> Effect | None:
         if name not in catalogue.names or not catalogue[name].computable(states):
             return None
         effect = catalogue.make(name, cell, states, options, m)
@@ -205,33 +205,33 @@ def candidates(
 
     for name in changing(catalogue):
         change = catalogue[name].change
-        if change is None or (effect := made(name, change.options)) is None:
+        if change is None or (effect := make(name, change.options)) is None:
             continue
         if change.directions is not None:
             out.append(_candidate(name, effect, change, change.directions(effect)))
         elif change.part:
-            out.append(_candidate(name, effect, change, _each(name, effect)))
-        else:  # one of each joint or link: its parameters begin with "j3" or "link2"
+            out.append(_candidate(name, effect, change, _single(name, effect)))
+        else:  # a candidate per joint or link, whose parameters begin with "j3" or "link2"
             for label in dict.fromkeys(p.name.split(".")[0] for p in effect.parameters):
                 number = int(label.lstrip("jlink"))
                 part = replace(change, part=f"{change.kind} {number}")
                 joint = number if change.kind == "joint" else 0
-                directions = _each(f"{name}.{label}", effect, label)
+                directions = _single(f"{name}.{label}", effect, label)
                 out.append(_candidate(name, effect, part, directions, joint))
     for kind in () if anew else catalogue.with_role("registration"):
-        if (effect := made(kind.name)) is not None:
-            out.append(_candidate(kind.name, effect, PLACE, _each(kind.name, effect)))
+        if (effect := make(kind.name)) is not None:
+            out.append(_candidate(kind.name, effect, PLACE, _single(kind.name, effect)))
     return tuple(out)
 
 
-def _each(name: str, effect: Effect, label: str = "") -> Directions:
-    """Some of the parameters, or all, each by itself."""
-    every = effect.parameters
-    mine = [i for i, p in enumerate(every) if label in ("", p.name.split(".")[0])]
-    scale = np.array([every[i].scale for i in mine])
-    matrix = np.zeros((len(every), len(mine)))
-    matrix[mine, np.arange(len(mine))] = scale
-    names, units = zip(*((every[i].name, every[i].unit) for i in mine), strict=True)
+def _single(name: str, effect: Effect, label: str = "") -> Directions:
+    """A direction for each parameter, or for each whose name begins with a label."""
+    parameters = effect.parameters
+    index = [i for i, p in enumerate(parameters) if label in ("", p.name.split(".")[0])]
+    scale = np.array([parameters[i].scale for i in index])
+    matrix = np.zeros((len(parameters), len(index)))
+    matrix[index, np.arange(len(index))] = scale
+    names, units = zip(*((parameters[i].name, parameters[i].unit) for i in index), strict=True)
     return Directions(name, names, units, scale, matrix)
 
 
@@ -250,117 +250,121 @@ class _ScoredChange:
 
     candidate: Candidate
     score: FamilyScore
-    s: Floats
-    motion: Floats
-    shown: bool
+    information: Floats  # (k, k)
+    motion: Floats  # (D, 3, k)
+    shown: bool  # whether the readings can show it
 
 
 _Step = tuple[Candidate, float, float, tuple[Candidate, ...]]
-"""A change: candidate, p-value, log evidence, and what cannot be told from it."""
+"""A change: candidate, p-value, log evidence, and the candidates not separated from it."""
+_Trial = tuple[float, float, Remeasured, tuple[Candidate, ...]]
+"""Log evidence, p-value and minimum with some candidates added."""
 
 
 def find_changes(
-    at: Setting,  # later readings, none of which was fitted, beside the earlier fit
+    setting: Setting,  # later readings, none of which was fitted, beside the earlier fit
     say: Callable[[str], None] = lambda text: None,  # takes progress, one line each
 ) -> Changes:
-    """Find what has changed between an earlier fit and later readings of the same arm.
+    """Find the changes between an earlier fit and later readings of the same arm.
 
-    Too few readings, or no static equilibrium, raise CannotAnswerError.
+    Raises:
+        CannotAnswerError: too few readings, or no static equilibrium.
     """
-    earlier = at.earlier
-    before = remeasure(at)
+    earlier, w, cell = setting.earlier, setting.w, setting.model.cell
+    before = remeasure(setting)
     if before.dof < 3:
         raise CannotAnswerError(
-            f"{len(at.w)} later readings leave nothing to judge a change by; measure at least "
-            f"{-(-(before.free + 3) // at.w.m)}, better 15"
+            f"{len(w)} later readings leave nothing to judge a change by; measure at least "
+            f"{-(-(before.free + 3) // w.m)}, better 15"
         )
     catalogue = earlier.fit.model.catalogue
-    known = candidates(at.model.cell, at.readings.states, catalogue, at.w.m, anew=at.anew)
-    now, tested = before, 0
+    possible = candidates(cell, setting.readings.states, catalogue, w.m, anew=setting.anew)
+    current, tested = before, 0
     steps: list[_Step] = []
     hidden: tuple[Candidate, ...] = ()
     while len(steps) < MOST:
         say("testing what may have changed" if not steps else "testing what else may have changed")
-        scored = [_score(now, c) for c in known if all(c is not s[0] for s in steps)]
-        seen = [s for s in scored if s.shown]
+        scored = [_score(current, c) for c in possible if all(c is not s[0] for s in steps)]
+        shown = [s for s in scored if s.shown]
         if not steps:
-            tested = len(seen) + at.model.cell.arm.n
+            tested = len(shown) + cell.arm.n
             hidden = tuple(s.candidate for s in scored if not s.shown)
-        step = _best(now, [s[0] for s in steps], seen, tested)
-        if step is None:
+        best = _best(current, [s[0] for s in steps], shown, tested)
+        if best is None:
             break
-        now = step[0]
-        steps += step[1]
-    after, kept = _needed(now, steps, tested)
-    left = after.rss / after.dof if after.dof > 0 else 1.0
+        current = best[0]
+        steps += best[1]
+    after, steps = _needed(current, steps, tested)
+    factor = after.rss / after.dof if after.dof > 0 else 1.0
     return Changes(
         before=before,
         after=after,
-        found=_sized(after, kept, earlier),
-        limits=_limits(after, known, [s[0] for s in kept], tested),
+        found=_sized(after, steps, earlier),
+        limits=_limits(after, possible, [s[0] for s in steps], tested),
         tested=tested,
         hidden=hidden,
-        unexplained=float(f_distribution.sf(left, after.dof, earlier.fit.dof)),
-        scatter=float(np.sqrt(left)),
+        unexplained=float(f_distribution.sf(factor, after.dof, earlier.fit.dof)),
+        scatter=float(np.sqrt(factor)),
         earlier=earlier,
     )
 
 
-def _pooled(now: Remeasured) -> tuple[float, float]:
-    """‖r‖² and ν, with what the earlier fit states of the scatter."""
-    stated = min(STATED_DOF, now.setting.earlier.fit.dof)
-    return now.rss + stated, now.dof + stated
+def _pooled(minimum: Remeasured) -> tuple[float, float]:
+    """‖r‖² and ν, including the scatter that the earlier fit states."""
+    stated = min(STATED_DOF, minimum.setting.earlier.fit.dof)
+    return minimum.rss + stated, minimum.dof + stated
 
 
-def _least_noise(now: Remeasured) -> float:
-    """σ² for what is stated of a size: never less than the earlier fit states.
+def _least_noise(minimum: Remeasured) -> float:
+    """σ² for the uncertainty of sizes, at least that of the earlier fit.
 
-    That statement is of all directions together; a few lucky readings make none of them surer.
+    The earlier fit states it for all directions together; a few lucky readings do not lower it.
     """
-    rss, dof = _pooled(now)
+    rss, dof = _pooled(minimum)
     return max(rss / dof, 1.0)
 
 
-def _score(now: Remeasured, candidate: Candidate) -> _ScoredChange:
-    x, motion = now.columns(candidate.moving)
-    s = now.projection.information(x)
-    g = x.T @ now.projection.project_out(now.target)
-    score = score_family(s, g, *_pooled(now))
-    left = float(np.trace(s)) > ABSORBED * float(np.sum(x**2))
-    return _ScoredChange(candidate, score, s, motion, score.rank > 0 and left)
+def _score(minimum: Remeasured, candidate: Candidate) -> _ScoredChange:
+    x, motion = minimum.columns(candidate.moving)
+    s = minimum.projection.information(x)
+    g = x.T @ minimum.projection.project_out(minimum.target)
+    score = score_family(s, g, *_pooled(minimum))
+    informative = float(np.trace(s)) > ABSORBED * float(np.sum(x**2))
+    return _ScoredChange(candidate, score, s, motion, score.rank > 0 and informative)
 
 
 def _best(
-    now: Remeasured, taken: Sequence[Candidate], seen: Sequence[_ScoredChange], tested: int
+    minimum: Remeasured, changed: Sequence[Candidate], shown: Sequence[_ScoredChange], tested: int
 ) -> tuple[Remeasured, list[_Step]] | None:
     """Return the minimum with one more change, and the change; None where none is sure."""
-    order = sorted(seen, key=lambda s: -s.score.log_evidence)
+    order = sorted(shown, key=lambda s: -s.score.log_evidence)
     if not order or min(s.score.p_value for s in order) * tested >= LEVEL:
         return None
-    tried: list[tuple[float, float, Remeasured, tuple[Candidate, ...]]] = []
-    for mine in _trials([s.candidate for s in order]):
+    tried: list[_Trial] = []
+    for added in _trials([s.candidate for s in order]):
         try:
-            after = remeasure(now.setting, [c.moving for c in (*taken, *mine)], now)
+            moving = [c.moving for c in (*changed, *added)]
+            after = remeasure(minimum.setting, moving, minimum)
         except CannotAnswerError:
             continue
-        evidence, p_value = _exact(now, after, sum(len(c.parameters) for c in mine))
-        tried.append((evidence, p_value, after, mine))
+        evidence, p_value = _exact(minimum, after, sum(len(c.parameters) for c in added))
+        tried.append((evidence, p_value, after, added))
     tried.sort(key=lambda t: -t[0])
     sure = [t for t in tried if t[1] * tested < LEVEL and t[0] > 0.0]
     if not sure:
         return None
     most = sure[0][0]
 
-    def size(t: tuple[float, float, Remeasured, tuple[Candidate, ...]]) -> tuple[int, float]:
-        """Number of parameters, and their rms size beside what is plausible."""
+    def size(t: _Trial) -> tuple[int, float]:
+        """Number of parameters, and their rms in units of plausible sizes."""
         plausible = [c.moving.effect.most() for c in t[3] for _ in c.parameters]
-        beside = t[2].sizes[-len(plausible) :] / plausible
-        return len(plausible), float(np.sqrt(np.mean(beside**2)))
+        relative = t[2].sizes[-len(plausible) :] / plausible
+        return len(plausible), float(np.sqrt(np.mean(relative**2)))
 
-    # Of those that explain the readings alike, the smallest.
+    # The smallest of those that explain the readings equally well.
     evidence, p_value, after, best = min((t for t in sure if most - t[0] < SAME_EVIDENCE), key=size)
-    others = [t for t in tried if all(c is not b for c in t[3] for b in best)]
-    rivals = [(c, t[0]) for t in others for c in t[3]]
+    apart = [t for t in tried if all(c is not b for c in t[3] for b in best)]
+    rivals = [(c, t[0]) for t in apart for c in t[3]]
     rivals += [(s.candidate, s.score.log_evidence) for s in order[TRIED:]]
     same = {c.name: c for c, e in rivals if most - e < SAME_EVIDENCE}
     chance = min(p_value * tested, 1.0)
@@ -368,16 +372,16 @@ def _best(
 
 
 def _trials(order: Sequence[Candidate]) -> list[tuple[Candidate, ...]]:
-    """Return what is fitted exactly: the first candidates, and what a repair changes together.
+    """Return the first candidates, and sets that a repair changes together, to be fitted exactly.
 
-    A joint that was taken apart has another zero and another compliance. Fitted one after the
-    other, either of them, or a family of waves, would first take the part of both.
+    A joint that was taken apart has another zero and another compliance. If they were fitted one
+    after the other, either of them, or a family of waves, would first absorb both changes.
     """
     joints = list(dict.fromkeys(c.joint for c in order[:TRIED] if c.joint))[:TAKEN_APART]
-    apart = (
+    sets = (
         tuple(c for c in order if c.joint == joint and c.change.with_others) for joint in joints
     )
-    return [*((c,) for c in order[:TRIED]), *(both for both in apart if len(both) > 1)]
+    return [*((c,) for c in order[:TRIED]), *(s for s in sets if len(s) > 1)]
 
 
 def _exact(before: Remeasured, after: Remeasured, count: int) -> tuple[float, float]:
@@ -386,70 +390,70 @@ def _exact(before: Remeasured, after: Remeasured, count: int) -> tuple[float, fl
     gain = max(before.rss - after.rss, 0.0)
     s = np.linalg.pinv(after.inverse[-count:, -count:], hermitian=True)
     values, vectors = np.linalg.eigh((s + s.T) / 2)
-    seen = visible(values)
-    rank = int(seen.sum())
+    shown = visible(values)
+    rank = int(shown.sum())
     if not rank or gain <= 0.0 or dof - rank < 1:
         return 0.0, 1.0
-    explained = values[seen] * (vectors[:, seen].T @ after.sizes[-count:]) ** 2
+    explained = values[shown] * (vectors[:, shown].T @ after.sizes[-count:]) ** 2
     explained *= gain / max(float(explained.sum()), 1e-300)
-    evidence = float(log_evidence(values[seen], explained, rss, dof).max())
-    rest = max((rss - gain) / (dof - rank), 1e-300)
-    return evidence, float(f_distribution.sf(gain / rank / rest, rank, dof - rank))
+    evidence = float(log_evidence(values[shown], explained, rss, dof).max())
+    variance = max((rss - gain) / (dof - rank), 1e-300)
+    return evidence, float(f_distribution.sf(gain / rank / variance, rank, dof - rank))
 
 
-def _needed(now: Remeasured, steps: list[_Step], tested: int) -> tuple[Remeasured, list[_Step]]:
+def _needed(minimum: Remeasured, steps: list[_Step], tested: int) -> tuple[Remeasured, list[_Step]]:
     """Return the minimum and the changes without those that the others make needless."""
     while len(steps) > 1:
-        rss, dof = _pooled(now)
+        rss, dof = _pooled(minimum)
         without = []
         for k, step in enumerate(steps):
-            others = [s[0].moving for s in steps if s is not step]
-            left, count = remeasure(now.setting, others), len(step[0].parameters)
-            gain = max(left.rss - now.rss, 0.0)
+            moving = [s[0].moving for s in steps if s is not step]
+            reduced, count = remeasure(minimum.setting, moving), len(step[0].parameters)
+            gain = max(reduced.rss - minimum.rss, 0.0)
             p_value = float(f_distribution.sf(gain / count * dof / rss, count, dof))
-            without.append((p_value, k, left))
-        p_value, k, left = max(without, key=lambda w: w[0])
+            without.append((p_value, k, reduced))
+        p_value, k, reduced = max(without, key=lambda w: w[0])
         if p_value * tested < LEVEL:
             break
-        now, steps = left, [*steps[:k], *steps[k + 1 :]]
-    return now, steps
+        minimum, steps = reduced, [*steps[:k], *steps[k + 1 :]]
+    return minimum, steps
 
 
 def _sized(after: Remeasured, steps: Sequence[_Step], earlier: EarlierFit) -> tuple[Change, ...]:
     noise, fit = _least_noise(after), earlier.fit
-    found = {  # values and standard deviations of the earlier fit
+    before = {  # values and standard deviations of the earlier fit
         (e.name, p.name): (float(fit.theta[k]), float(np.linalg.norm(earlier.root[k])))
-        for e, mine in zip(fit.model.effects, fit.model.slices(), strict=True)
-        for k, p in enumerate(e.parameters, start=mine.start)
+        for e, columns in zip(fit.model.effects, fit.model.slices(), strict=True)
+        for k, p in enumerate(e.parameters, start=columns.start)
     }
-    out, at = [], 0
+    out, start = [], 0
     for c, p_value, evidence, same in steps:
-        mine = slice(at, at + len(c.parameters))
-        at = mine.stop
-        value = c.scale * after.sizes[mine]
-        std = c.scale * np.sqrt(noise * np.diag(after.inverse)[mine])
-        moved = after.columns(c.moving)[1] @ after.sizes[mine]
-        each = zip(c.parameters, c.units, value.tolist(), std.tolist(), strict=True)
-        sizes = tuple(ChangeSize(p, u, v, e, found.get((c.effect, p))) for p, u, v, e in each)
+        index = slice(start, start + len(c.parameters))
+        start = index.stop
+        value = c.scale * after.sizes[index]
+        std = c.scale * np.sqrt(noise * np.diag(after.inverse)[index])
+        moved = after.columns(c.moving)[1] @ after.sizes[index]
+        rows = zip(c.parameters, c.units, value.tolist(), std.tolist(), strict=True)
+        sizes = tuple(ChangeSize(p, u, v, e, before.get((c.effect, p))) for p, u, v, e in rows)
         moved_m = float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
         out.append(Change(c, sizes, p_value, evidence, moved_m, same))
     return tuple(sorted(out, key=lambda c: -c.log_evidence))
 
 
 def _limits(
-    after: Remeasured, known: Sequence[Candidate], found: Sequence[Candidate], tested: int
+    after: Remeasured, possible: Sequence[Candidate], changed: Sequence[Candidate], tested: int
 ) -> tuple[Limit, ...]:
-    """Return the smallest detectable changes of what was not found, of one parameter each."""
+    """Return the smallest detectable change of each unchanged candidate with one parameter."""
     noise, dof = _least_noise(after), _pooled(after)[1]
     out = []
-    for c in known:
-        if len(c.parameters) != 1 or any(c is f for f in found):
+    for c in possible:
+        if len(c.parameters) != 1 or any(c is f for f in changed):
             continue
         s = _score(after, c)
         size = np.inf
         if s.shown:
-            wanted = noncentrality_of_power(1, dof - 1, LEVEL / max(tested, 1), POWER)
-            size = float(np.sqrt(wanted * noise / s.s[0, 0]))
+            noncentrality = noncentrality_of_power(1, dof - 1, LEVEL / max(tested, 1), POWER)
+            size = float(np.sqrt(noncentrality * noise / s.information[0, 0]))
             size = size if size <= c.moving.effect.most() else np.inf
         moved = float(np.sqrt(np.mean(np.sum(s.motion[:, :, 0] ** 2, axis=1))))
         moved_m = size * moved if np.isfinite(size) else np.inf

@@ -1,11 +1,11 @@
 """Two campaigns of one arm: the earlier fit completed, its error today, the changes since.
 
-An effect that is on the arm all the time and not in the earlier model is found in later readings as
-well as in the earlier ones, and would be taken for a change. So before later readings are judged,
-the effects of the candidates are scored beside the earlier fit on its own readings, and those that
-have evidence are added. What is left then and is no stated noise is taken as scatter of the joints,
-or of the target: it has another shape than the tracker's noise, which is far smaller along the beam
-than across it, and as a multiple of that noise it would look like a change.
+An effect that the arm always had, and that the earlier model lacks, is in the later readings, too,
+and would be taken for a change. So the effects that may change are first scored beside the earlier
+fit on the earlier readings, and those with evidence are added. A residual beyond the stated noise
+is then taken as scatter of the joints, or of the target. A larger multiple of the stated noise
+would look like a change: a tracker's noise has another shape, far smaller along the beam than
+across it.
 """
 
 from collections.abc import Callable, Collection
@@ -33,21 +33,21 @@ from hilcal.shown import Shown
 
 MOST = 2
 """Most effects that are added. A choice: an earlier model that lacks more is no calibration."""
-MISFIT = 0.01  # p-value of χ² below which what is left is more than the stated noise; a choice
+MISFIT = 0.01  # p-value of χ² below which the residual exceeds the stated noise; a choice
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Today:
     """The error of the earlier calibration at the later readings.
 
-    z is the rms of the error over what the earlier fit states, all correlations counted: the root
-    of a mean square that is 1 where nothing has changed.
+    z is the rms of the error in units of its covariance as the earlier fit states it: its square
+    has the expectation 1 where nothing has changed.
     """
 
-    prediction: Validation  # nothing but the tracker's place was fitted, if that
-    beyond: Extrapolation  # what the earlier fit states of them, and which it did not measure
+    prediction: Validation  # only the tracker's place was fitted, if anything
+    beyond: Extrapolation  # stated error of the prediction, and readings outside the earlier range
     z: float
-    p_value: float  # of such an error, or a larger one, without any change
+    p_value: float  # probability of an error at least as large without any change
     drawing_m: float | None  # rms error with the arm as drawn, m; None without a registration
 
     @property
@@ -66,20 +66,20 @@ class Comparison(Shown):
     """An earlier campaign and a later one of the same arm; what `compare` returns.
 
     Attributes:
-        number: of the earlier revision; None for a baseline that is not kept.
-        fit: the earlier fit.
-        lacked: effects that its own readings ask for beside it, added for the comparison.
+        number: of the earlier revision; None for a baseline that no file keeps.
+        fit: the earlier fit, without `lacked`.
+        lacked: effects that its own readings show beside it, added for the comparison.
         mode: kind of readings that are compared: that of the earlier fit.
-        later_mode: kind of readings of the later campaign's own revision; None where it has none.
+        later_mode: kind of readings of the later campaign's revision; None where it has none.
         readings: number of later readings.
-        shared: how many of them the earlier revision was fitted to; they are left out.
-        anew: whether the tracker was taken as set up anew.
-        told: whether that was asked for, one way or the other; else it follows from the cells.
-        tool: keys of [tool] that are configured otherwise.
+        shared: number of later readings that the earlier revision was fitted to; they are left out.
+        anew: whether the tracker counts as set up anew.
+        told: whether the user stated `anew`; else it follows from the cells.
+        tool: keys of [tool] that differ.
         today: the error of the earlier calibration.
-        changes: what has changed.
-        differences: parameters of both fits, where the later campaign has one of its own that no
-            prior ties to the earlier one; else None.
+        changes: the changes since.
+        differences: parameters of both fits, where the later campaign has a fit that no prior ties
+            to the earlier one; else None.
     """
 
     number: int | None
@@ -98,12 +98,12 @@ class Comparison(Shown):
 
     @property
     def another_arm(self) -> bool:
-        """Whether the later readings look as if they were of another arm of the same type."""
+        """Whether the later readings seem to be of another arm of the same type."""
         return not self.changes.explained and not self.today.better_than_drawn
 
     def to_dict(self) -> dict[str, object]:
         """Return it as JSON, SI: the document of `compare --json` without its sentences."""
-        t, found = self.today, self.changes
+        t, c = self.today, self.changes
         return {
             "revision": self.number,
             "model": list(self.fit.model.names),
@@ -121,16 +121,16 @@ class Comparison(Shown):
             "drawing_rms_m": t.drawing_m,
             "n_outside": int(t.beyond.outside.sum()),
             "outside": [v.variable for v in t.beyond.variables],
-            "changed": bool(found.found) or not found.explained,
+            "changed": bool(c.found) or not c.explained,
             "another_arm": self.another_arm,
-            "changes": [change.to_dict() for change in found.found],
-            "explained": found.explained,
-            "left_p_value": found.unexplained,
-            "left_over_stated": found.scatter,
-            "tested": found.tested,
+            "changes": [change.to_dict() for change in c.found],
+            "explained": c.explained,
+            "left_p_value": c.unexplained,
+            "left_over_stated": c.scatter,
+            "tested": c.tested,
             "level": LEVEL,
-            "would_have_been_seen": [limit.to_dict() for limit in found.limits],
-            "not_to_be_seen": [h.name for h in found.hidden],
+            "would_have_been_seen": [limit.to_dict() for limit in c.limits],
+            "not_to_be_seen": [h.name for h in c.hidden],
             "parameters": None if self.differences is None else self.differences.to_dict(),
         }
 
@@ -138,18 +138,18 @@ class Comparison(Shown):
 def completed(
     fit: Fit, names: Collection[str], say: Callable[[str], None] = lambda text: None
 ) -> tuple[Fit, tuple[str, ...]]:
-    """Return a gc-scaled fit with those of some effects that its readings ask for, and these.
+    """Add those of some effects that the readings of a gc-scaled fit show; the fit and their names.
 
-    Its scatter is estimated, too, where it is more than the stated noise.
+    The scatter is estimated, too, where it exceeds the stated noise.
     """
     added: list[str] = []
-    while len(added) < MOST and (wanted := _most_wanted(fit, names)) is not None:
-        say(f"adding {wanted} to the earlier model, as its own readings ask for")
+    while len(added) < MOST and (effect := _most_evident(fit, names)) is not None:
+        say(f"adding {effect} to the earlier model, as its own readings ask for")
         try:
-            fit = add(fit, wanted)
+            fit = add(fit, effect)
         except HilcalError:
             break
-        added.append(wanted)
+        added.append(effect)
     if fit.readings.arm_scatter is None and chi2.sf(fit.chi2, fit.dof) <= MISFIT:
         say("estimating the scatter of the earlier readings")
         scatter = estimate_arm_scatter(fit)
@@ -160,7 +160,7 @@ def completed(
     return fit, tuple(added)
 
 
-def _most_wanted(fit: Fit, names: Collection[str]) -> str | None:
+def _most_evident(fit: Fit, names: Collection[str]) -> str | None:
     """Return the effect with most evidence that is not in the model; None where none has any."""
     p, states, model = linearise(fit), fit.readings[~fit.outlier].states, fit.model
     possible = (k for k in model.catalogue.effects if k.name in names and k.name not in model.names)
@@ -169,7 +169,7 @@ def _most_wanted(fit: Fit, names: Collection[str]) -> str | None:
         for kind in possible
         if kind.computable(states) and kind.applies(model.cell)
     ]
-    scores = {of.effect.name: p.score(of.white) for of in columns_of_each(fit, effects)}
+    scores = {x.effect.name: p.score(x.white) for x in columns_of_each(fit, effects)}
     tested = {name: score for name, score in scores.items() if score.rank}
     sure = {
         name: score.log_evidence
@@ -179,30 +179,31 @@ def _most_wanted(fit: Fit, names: Collection[str]) -> str | None:
     return max(sure, key=lambda name: sure[name], default=None)
 
 
-def error_today(at: Setting, changes: Changes, drawing: float | None) -> Today:
-    """Return the error of the earlier parameters at later readings, with the tracker as it is now.
+def error_today(setting: Setting, changes: Changes, drawing: float | None) -> Today:
+    """Return the error of the earlier parameters at later readings, with the tracker where it is.
 
     `drawing` is the rms error with the arm as drawn, m.
     """
-    found = remeasure(frames_alone(at))
-    w, raw = at.w, found.raw
-    white = w.whiten(raw).reshape(-1)
+    minimum, w = remeasure(frames_alone(setting)), setting.w
+    white = w.whiten(minimum.raw).reshape(-1)
     prediction = Validation(
-        readings=at.readings,
+        readings=setting.readings,
         whitening=w,
-        raw=raw,
-        error=error_block(raw, w),
-        variance_factor=float(white @ white) / max(w.rank - found.free, 1),
-        registered=at.anew,
+        raw=minimum.raw,
+        error=error_block(minimum.raw, w),
+        variance_factor=float(white @ white) / max(w.rank - minimum.free, 1),
+        registered=setting.anew,
     )
-    knows, lift = at.earlier.knows, beside_frames(at)
-    covariance = lift @ lift.T / knows.factor
-    here = replace(knows, model=found.model, theta=found.theta, covariance=covariance)
-    fit, before = at.earlier.fit, changes.before
+    predictive, lift = setting.earlier.knows, beside_frames(setting)
+    covariance = lift @ lift.T / predictive.factor
+    predictive = replace(
+        predictive, model=minimum.model, theta=minimum.theta, covariance=covariance
+    )
+    fit, before = setting.earlier.fit, changes.before
     ratio = before.rss / before.dof
     return Today(
         prediction=prediction,
-        beyond=extrapolation(here, fit.readings[~fit.outlier], prediction),
+        beyond=extrapolation(predictive, fit.readings[~fit.outlier], prediction),
         z=float(np.sqrt(ratio)),
         p_value=float(f_distribution.sf(ratio, before.dof, fit.dof)),
         drawing_m=drawing,

@@ -1,4 +1,4 @@
-"""The judgement of a fit: one frozen value that commands, `refine`, plans, studies and files carry.
+"""The judgement of a fit: one frozen value for commands, `refine`, plans, studies and files.
 
 It holds data only; `hilcal.present.verdict` writes its sentence.
 """
@@ -23,12 +23,11 @@ from hilcal.readings.readings import ArmScatter
 from hilcal.shown import Shown, Tabular, presenter
 
 MOST = 4
-"""Effects to separate at once at most: each pair, both ways round, is a term of the design; a
-guess."""
+"""Most effects to separate at once: each ordered pair is a term of the design; a guess."""
 PRIOR_ODDS = 1.0 / 9.0
-"""That an arm has an effect of the catalogue which readings can prove: one in ten; a choice."""
+"""Of an effect of the catalogue to be on an arm and large enough to be proved; a choice."""
 LARGEST = 30.0
-"""Log evidence from which on nothing is gained: a probability of 1 - 2e-12."""
+"""Log evidence at which the probability saturates, at 1 - 2e-12."""
 
 Verdict = Literal["adequate", "missing_effect", "ambiguous", "unknown_effect", "noise_misjudged"]
 Reason = Literal[
@@ -68,9 +67,9 @@ VERDICTS: dict[Reason, Verdict] = {
 class History:
     """How a model was reached, as far as the judgement depends on it."""
 
-    added: tuple[str, ...] = ()  # effects that earlier diagnoses chose; another may fit as well
-    removed: tuple[str, ...] = ()  # taken out of the model because others explain more
-    rejected: tuple[str, ...] = ()  # tried by a refit: the error on poses left out did not fall
+    added: tuple[str, ...] = ()  # effects that diagnoses chose; others may fit as well
+    removed: tuple[str, ...] = ()  # effects that others replaced, or that were redundant
+    rejected: tuple[str, ...] = ()  # effects whose refit did not lower the error on poses left out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,32 +78,32 @@ class Diagnosis(Shown, Tabular):
 
     Attributes:
         fit: the fit.
-        history: how its model was reached.
-        reason: which rule of `verdict.judge` decided.
+        history: the changes that led to its model.
+        reason: the rule of `verdict.judge` that decided.
         suspects: effects that are not in the model: first those that pass all tests, then those
             that explain the misfit but do not surely lower the error on poses left out, then
             the others; by decreasing evidence in each of these three groups.
         misfit_breakdown: variables that the misfit follows, largest share first.
-        predictable_share: largest share of the misfit that anything predicts on poses left out: a
-            generic regression, one variable, or one effect; 0 where there is no misfit.
-        dependences: variables that carry what is predictable, with the curve of each; those of
-            the residual after the refit where the catalogue is insufficient.
+        predictable_share: largest share of the misfit that a generic regression, one variable or
+            one effect predicts on poses left out; 0 where there is no misfit.
+        dependences: variables that carry the predictable share, with the curve of each; where the
+            catalogue is insufficient, those of the residual after the refit.
         follows: names of at most two variables that the unexplained misfit follows.
         pure_error: the scatter of repeated readings, or None without repeats.
         noise: whether the stated covariance is to blame; None where a suspect passes all tests.
         redundant: effects of the model without which the readings are explained as well.
-        separability: how each rival of the first suspect differs from it, where one of them is
-            missing.
-        insufficiency: what all effects of the catalogue together leave of the misfit, where
-            that is not noise.
+        separability: how each rival of the first suspect differs from it, where the readings do
+            not separate them.
+        insufficiency: the misfit that all effects of the catalogue together leave, where it is not
+            noise.
         alternatives: for each effect of `history.added`, the effects that could replace it.
-        scatter: the arm's scatter as estimated: where nothing else explains the residual, or in the
-            covariance of the fit.
-        pose_alone: the misfit where it is the same under every load of a pose, nothing predicts it
-            on poses left out, and more poses would tell what it is.
-        background: the effects of the model's background, those with the smallest p-values first.
-        wrong_figures: figures of the cell that seem to be entered wrongly: any one of them explains
-            the misfit. No effect is a suspect then.
+        scatter: estimate of the arm's scatter, where nothing else explains the residual, or where
+            the covariance of the fit includes it.
+        pose_alone: the misfit, where it is the same under every load of a pose, nothing predicts it
+            on poses left out, and more poses would identify its effect.
+        background: the effects of the model's background, smallest p-values first.
+        wrong_figures: figures of the cell that seem to be wrong, each of which alone explains the
+            misfit. No effect is a suspect then.
     """
 
     fit: Fit
@@ -138,7 +137,7 @@ class Diagnosis(Shown, Tabular):
 
     @property
     def verdict(self) -> Verdict:
-        """The verdict."""
+        """The verdict of `reason`."""
         return VERDICTS[self.reason]
 
     @property
@@ -150,15 +149,15 @@ class Diagnosis(Shown, Tabular):
     def not_shown(self) -> tuple[str, ...]:
         """Names of the effects that these readings would reveal at no plausible size.
 
-        Of deflections these are errors that are the same under every load, as those of geometry.
+        Deflections do not show errors that are the same under every load, such as geometry.
         """
-        predicted = {b.effect for b in self.background}
-        rest = (s for s in self.suspects if not s.passes and s.effect not in predicted)
-        return tuple(s.effect for s in rest if not s.shown)
+        background = {b.effect for b in self.background}
+        failed = (s for s in self.suspects if not s.passes and s.effect not in background)
+        return tuple(s.effect for s in failed if not s.shown)
 
     @property
     def tested(self) -> int:
-        """Number of effects that were tested; the level of the test is shared by them."""
+        """Number of effects that were tested; they share the level of the test."""
         return sum(s.score.rank > 0 for s in self.suspects)
 
     @property
@@ -180,16 +179,15 @@ class Diagnosis(Shown, Tabular):
         return self.reason in ("residual_is_noise", "inseparable_addition")
 
     def to_dict(self) -> dict[str, object]:
-        """Return the JSON document of `hilcal diagnose --json`, the sentence included."""
+        """Return the JSON document of `hilcal diagnose --json`, including the sentence."""
         return to_json(self)
 
 
 def in_doubt(d: Diagnosis, most: int = MOST) -> tuple[str, ...]:
     """Return effects that the readings do not separate; none unless the verdict is `ambiguous`.
 
-    Either they are all missing from the model, the first suspect first, or the first one is an
-    addition to the model that one of the others could replace, or they all depend on the pose
-    alone, as the misfit does.
+    They are missing from the model, the first suspect first; or the first was added to the model
+    and the others could replace it; or they all depend on the pose alone, as the misfit does.
     """
     if d.reason == "inseparable_suspects":
         return (d.suspects[0].effect, *(s.effect for s in d.separability))[:most]
@@ -200,37 +198,37 @@ def in_doubt(d: Diagnosis, most: int = MOST) -> tuple[str, ...]:
 
 
 def effect_probabilities(steps: Sequence[Diagnosis], effects: Iterable[str]) -> dict[str, float]:
-    """Return the probability that the arm has each effect, each judged by itself.
+    """Return the marginal probability of each effect to be on the arm.
 
-    The odds for an effect are the prior odds times exp(L - 1), with L its log evidence at the
-    strength that the evidence prefers, which costs one unit. L is, whichever was said last:
+    The odds for an effect are the prior odds times exp(L - 1). L is its log evidence at the most
+    evident strength, the choice of which costs one unit. L is taken from the last step that has it:
 
-        of an effect that was named: against the model without it
-        of an effect of a background: half the restricted likelihood ratio, beside all others
-        of another suspect: beside the model of the step that tested it
-        of an effect that no step tested: 0
+        an effect that was named: against the model without it
+        an effect of a background: half the restricted likelihood ratio, beside all others
+        another suspect: beside the model of the step that tested it
+        an effect that no step tested: 0
 
-    Where others explain as much as a named effect, they share the probability: the named one stays
-    with 1 / (1 + exp(L_others - L - (number of others) + 1)), and the others have the rest.
+    Where others explain as much as a named effect, they share the probability: the named effect
+    has 1 / (1 + exp(L_others - L - (number of others) + 1)), the others have the complement.
 
     Args:
-        steps: diagnoses of a refinement, in its order; the last one judges what was named.
+        steps: diagnoses of a refinement, in its order; the last one judges the named effects.
     """
-    others = steps[-1].alternatives
-    evidence = {a.effect: a.own for a in others}
+    alternatives = steps[-1].alternatives
+    evidence = {a.effect: a.own for a in alternatives}
     for d in reversed(steps):
         evidence = {b.effect: b.ratio / 2 for b in d.background} | evidence
         evidence = {s.effect: s.score.log_evidence for s in d.suspects} | evidence
-    wanted = tuple(effects)
-    p = {name: _present(evidence.get(name, 0.0)) for name in {*wanted, *evidence}}
-    for a in others:
-        away = np.clip(a.log_evidence - a.own - len(a.others) + 1, -LARGEST, LARGEST)
-        stays = float(1.0 / (1.0 + np.exp(away)))
+    names = tuple(effects)
+    p = {name: _probability(evidence.get(name, 0.0)) for name in {*names, *evidence}}
+    for a in alternatives:
+        log_odds = np.clip(a.log_evidence - a.own - len(a.others) + 1, -LARGEST, LARGEST)
+        stays = float(1.0 / (1.0 + np.exp(log_odds)))
         p |= {name: max(p.get(name, 0.0), 1.0 - stays) for name in a.others}
         p[a.effect] = min(p[a.effect], stays)
-    return {name: p[name] for name in wanted}
+    return {name: p[name] for name in names}
 
 
-def _present(log_evidence: float) -> float:
+def _probability(log_evidence: float) -> float:
     gain = np.clip(log_evidence, -LARGEST, LARGEST) - 1.0
     return float(1.0 / (1.0 + np.exp(-gain) / PRIOR_ODDS))

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def to_json(d: "Diagnosis") -> dict[str, object]:
-    """Return the keys of the contract, and all else that a diagnosis holds."""
+    """Return a diagnosis as JSON: the keys of the contract and further ones."""
     return {
         "model": list(d.fit.model.named),
         "verdict": d.verdict,
@@ -36,13 +36,13 @@ def to_json(d: "Diagnosis") -> dict[str, object]:
             for a in d.separability
         ],
         "beyond": d.insufficiency
-        and _some(d.insufficiency, "effects", "refitted", "share", "variance_factor"),
-        "background": [_some(b, "effect", "p_value", "rms_m") for b in d.background],
+        and _attributes(d.insufficiency, "effects", "refitted", "share", "variance_factor"),
+        "background": [_attributes(b, "effect", "p_value", "rms_m") for b in d.background],
         "wrong_figures": [asdict(f) for f in d.wrong_figures],
         "pose_alone": d.pose_alone and asdict(d.pose_alone),
         "rejected": list(d.history.rejected),
         "alternatives": [
-            _some(a, "effect", "same_as", "others") for a in d.alternatives if a.inseparable
+            _attributes(a, "effect", "same_as", "others") for a in d.alternatives if a.inseparable
         ],
         "needless": list(d.redundant),
         "carriers": carriers(d.dependences),
@@ -53,7 +53,7 @@ def to_json(d: "Diagnosis") -> dict[str, object]:
 
 
 def suspect_json(s: Suspect) -> dict[str, object]:
-    """Return what is said of one suspect."""
+    """Return one suspect as JSON."""
     return {
         "effect": s.effect,
         "finer_than": s.coarse or None,
@@ -78,8 +78,8 @@ def least(s: Strength) -> dict[str, object] | None:
         return None
     finer = None
     if s.finest_m is not None:
-        seen = bool(np.isfinite(s.finest_m))
-        finer = {"visible": seen, "displacement_m": s.finest_m if seen else None}
+        visible = bool(np.isfinite(s.finest_m))
+        finer = {"visible": visible, "displacement_m": s.finest_m if visible else None}
     return {
         "displacement_m": s.displacement_m,
         "parameters": [{"unit": unit, "rms": rms} for unit, rms in s.parameters],
@@ -88,7 +88,7 @@ def least(s: Strength) -> dict[str, object] | None:
 
 
 def repeats(e: PureError) -> dict[str, object]:
-    """Return the scatter of repeats; `where` is null where it is everywhere the same."""
+    """Return the scatter of repeats; `where` is null if the scatter is the same everywhere."""
     w = e.where
     return {
         "variance_factor": e.factor,
@@ -107,12 +107,11 @@ def repeats(e: PureError) -> dict[str, object]:
     }
 
 
-def carriers(found: Sequence[Dependence]) -> list[dict[str, object]]:
-    """Return variables that carry what is predictable, with their curves, SI units."""
+def carriers(dependences: Sequence[Dependence]) -> list[dict[str, object]]:
+    """Return the variables that carry the predictable share, with their curves, SI units."""
     names = ("variable", "unit", "share", "moves", "direction", "labels", "x", "y", "error")
-    return [_some(v, *names, "y_unit", "determined") for v in found]
+    return [_attributes(v, *names, "y_unit", "determined") for v in dependences]
 
 
-def _some(of: object, *names: str) -> dict[str, object]:
-    """Return some attributes by name."""
-    return {name: encode(getattr(of, name)) for name in names}
+def _attributes(value: object, *names: str) -> dict[str, object]:
+    return {name: encode(getattr(value, name)) for name in names}

@@ -1,30 +1,31 @@
 """Which effects of the catalogue could be missing, best first.
 
-A suspect passes all tests where the F-test over the whole catalogue rejects that it is absent,
-its evidence is positive, it explains a share of the misfit on poses left out, the error there
-falls by more than it scatters from pose to pose, its parameters need not be larger than is
-plausible, and the exact model keeps what the linearisation promised.
+A suspect passes all tests if the F-test rejects its absence at a level for the whole catalogue, its
+evidence is positive, it explains a share of the misfit on poses left out, the error there falls by
+more than it scatters from pose to pose, plausible parameters explain as much as any, and the exact
+model keeps the promise of the linearisation.
 
-Plausible sizes. The standard deviation of the parameters is at most what the effect states, and
-what absolute positions allow: deflections show errors of geometry and encoders in the second order
-only, their unloaded readings in the first. With the frames estimated, the displacements there can
-hardly be larger than what the model misses,
+Plausible sizes. The standard deviation of the parameters is limited by the effect itself, and by
+absolute positions: deflections show errors of geometry and encoders in the second order only, their
+unloaded readings in the first. With the frames estimated, an effect should hardly displace the
+unloaded readings by more than the model misses there,
 
     t g ≤ `ALLOWED` s,    s² = mean |P y|²,    g² = mean Σ_p |P x_p|²
 
 y the residual of the unloaded readings, x_p their displacement by an ordinary magnitude of
-parameter p, P the projection off the frames. Elastic effects are not held to that: a controller may
-compensate for what gravity does. Where more than a share `LOST` of the evidence needs larger sizes,
-the effect is implausible, and the size that it would need is stated.
+parameter p, P the projection off the frames. Elastic effects are exempt: a controller may
+compensate the effect of gravity. If more than a share `LOST` of the evidence needs larger sizes,
+the effect is implausible, and the size that it needs is stated.
 
-Promise. Columns hold for small parameters. So the step that the score promises is taken, with the
-model's own parameters beside it, and the exact model is evaluated there; where that loses much of
-the promise, a refit decides. Promise and what was kept are reductions of ‖r‖² − dof.
+Promise. Columns hold for small parameters. So the exact model is evaluated at the step that the
+score promises, with the model's own parameters adapted. If that loses much of the promise, a refit
+decides. The promise, and the part of it that is kept, are reductions of ‖r‖² − dof.
 
-Unloaded arms. Absolute readings without a load show a compliance by the torque of the arm's own
-mass alone, a smooth function of the joint angles, as a wrong geometry is. So a suspect that acts
-through loads must there explain the readings beside all effects that are constant in the arm's axes
-(link geometry, zero offsets): with evidence at 20 : 1, and on poses left out.
+Unloaded arms. Absolute readings without a load show a compliance only by the torque of the arm's
+own mass, a smooth function of the joint angles, as the effect of a wrong geometry is. In such
+readings a suspect that acts through loads must explain the readings beside all effects that are
+constant in the arm's axes (link geometry, zero offsets): with evidence at 20 : 1, and on poses left
+out.
 """
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
@@ -61,41 +62,41 @@ from hilcal.shown import Brief
 from hilcal.types import Floats
 
 ALLOWED = 2.0
-"""Displacement that an effect may make in unloaded readings, in units of what the model misses
-there: as much again may be hidden by other errors. A choice."""
+"""Most displacement of unloaded readings by an effect, in units of the model's error there: other
+errors may hide as much again. A choice."""
 ROUNDING = 1e-9
 LEAST_KEPT = 0.5  # share of a promise that must be kept; true effects of 3 σ keep 0.9; a choice
 SAME_EVIDENCE = 3.0  # suspects whose evidence differs by less, e³ = 20 : 1, are inseparable
 FALSE_ALARM = 0.001
-"""Chance of naming any effect where none is missing, over the whole catalogue."""
+"""Probability of naming an effect where none is missing, over the whole catalogue."""
 LOST = 0.2
 """Share of its evidence that an effect may lose at plausible sizes. A choice: a prior that is too
 narrow by half costs a few units however strong the evidence is."""
 SURE = 3.1
-"""Standard errors, from pose to pose, by which the error on poses left out must fall: a chance of
-one in a thousand, since a dozen effects of the load try."""
+"""Standard errors, from pose to pose, by which an effect of the load must lower the error on poses
+left out beside geometry: p = 0.001, since a dozen of them are tested."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Suspect(Brief):
-    """An effect that is not in the model, and what it would explain.
+    """An effect that is not in the model, and the part of the misfit that it would explain.
 
-    What no verdict depends on is a function: it is computed when it is first asked for.
+    Functions stand for statistics that not every verdict needs; they compute on first use.
     """
 
     effect: str  # canonical name
     score: FamilyScore  # the joint test of the whole family
-    share: float  # share of the misfit it explains
-    left_out: Callable[[], HeldOut]  # what it explains on poses left out
-    explains: bool  # whether it passes the tests of the fitted readings and of its share
-    detection: Callable[[], Strength]  # the smallest one that these readings would reveal
-    # where it is implausible: (unit, rms of the parameters that it needs, plausible rms), SI
+    share: float  # of the misfit that the effect explains
+    left_out: Callable[[], HeldOut]  # part of the error on poses left out that it explains
+    explains: bool  # whether it passes the tests of the fitted readings and of `holdout_share`
+    detection: Callable[[], Strength]  # the smallest strength that these readings would reveal
+    # for an implausible effect: (unit, rms of the parameters that it needs, plausible rms), SI
     needs: tuple[tuple[str, float, float], ...] = ()
-    kept: float = 1.0  # share of the promise that the exact model keeps; 1 where it fails anyway
-    refuted: bool = False  # beside geometry on unloaded arms, or by a refit: predicts no better
+    kept: float = 1.0  # share of the promise that the exact model keeps; 1 if another test fails
+    refuted: bool = False  # predicts no better beside geometry on unloaded arms, or after a refit
     most: float = np.inf  # largest plausible strength, in ordinary magnitudes
-    same_as: tuple[str, ...] = ()  # other suspects that these readings do not separate from it
-    coarse: str = ""  # effect of the model that it is finer than; empty where it has none
+    same_as: tuple[str, ...] = ()  # suspects that these readings do not separate from it
+    coarse: str = ""  # coarser form of the effect in the model; empty for none
 
     def __repr__(self) -> str:
         """Return the suspect in a line."""
@@ -104,7 +105,7 @@ class Suspect(Brief):
 
     @property
     def holdout_share(self) -> float:
-        """Share of the misfit that it explains on poses left out."""
+        """Share of the misfit on poses left out that the effect explains."""
         return self.left_out().share
 
     @property
@@ -114,17 +115,17 @@ class Suspect(Brief):
 
     @property
     def least(self) -> Strength:
-        """The smallest strength of it that these readings would reveal."""
+        """The smallest strength of the effect that these readings would reveal."""
         return self.detection()
 
     @property
     def shown(self) -> bool:
-        """Whether these readings would reveal it at a plausible size."""
+        """Whether these readings would reveal the effect at a plausible size."""
         return self.least.visible and self.least.ordinary <= self.most
 
     @property
     def passes(self) -> bool:
-        """Whether it passes all tests."""
+        """Whether the suspect passes all tests."""
         return self.explains and self.sure and self.plausible and self.keeps
 
     @property
@@ -134,12 +135,12 @@ class Suspect(Brief):
 
     @property
     def keeps(self) -> bool:
-        """Whether the exact model keeps what the linearisation promised."""
+        """Whether the exact model keeps the promise of the linearisation."""
         return self.kept >= LEAST_KEPT
 
 
 def candidates(fit: Fit) -> tuple[Effect, ...]:
-    """Effects that are not in the model, or are finer than one of it, and can be computed.
+    """Effects that can be computed and are not in the model, or refine an effect of the model.
 
     Raises:
         InputError: `[plausible]` or `[ordinary]` of the cell names an effect that the catalogue
@@ -152,19 +153,18 @@ def candidates(fit: Fit) -> tuple[Effect, ...]:
             if name not in model.catalogue.names:
                 valid = ", ".join(model.catalogue.names)
                 raise InputError(f"[{section}] {name}: no such effect; valid: {valid}")
-    others = (kind for kind in model.catalogue.effects if kind.name not in model.names)
-    made = (
+    new = (
         model.catalogue.make(kind.name, model.cell, states, m=fit.whitening.m)
-        for kind in others
-        if kind.computable(states) and kind.applies(model.cell)
+        for kind in model.catalogue.effects
+        if kind.name not in model.names and kind.computable(states) and kind.applies(model.cell)
     )
-    beside = model.random if model.background else ()
-    finer = (e.refined(states) for e in model.effects if e.name not in beside)
-    return (*(e.for_scoring(states) for e in made), *(e for e in finer if e is not None))
+    random = model.random if model.background else ()
+    finer = (e.refined(states) for e in model.effects if e.name not in random)
+    return (*(e.for_scoring(states) for e in new), *(e for e in finer if e is not None))
 
 
 def catalogue_columns(fit: Fit) -> tuple[Floats, dict[str, slice], dict[str, float]]:
-    """Return the columns (R, P) of all `candidates`, which are whose, and how large each may be."""
+    """Return columns (R, P) of all `candidates`, and slice and plausible strength of each."""
     families = list(columns_of_each(fit, candidates(fit)))
     ends = np.cumsum([0] + [len(f.scale) for f in families]).tolist()
     columns = np.hstack([np.zeros((len(fit.white), 0)), *(f.white for f in families)])
@@ -182,7 +182,7 @@ class Unloaded:
     """The unloaded readings of a campaign of deflections."""
 
     frames: Floats  # (K, F) orthonormal displacements by the frames
-    missed: float  # s, m
+    missed: float  # s, rms of their residual beside the frames, m
 
 
 def frame_effects(fit: Fit) -> tuple[Effect, ...]:
@@ -195,31 +195,32 @@ def frame_effects(fit: Fit) -> tuple[Effect, ...]:
 
 
 def unloaded_readings(fit: Fit, frames: Sequence[EffectColumns] | None = None) -> Unloaded | None:
-    """Return the unloaded readings; None for absolute readings, which show all themselves."""
+    """Return the unloaded readings; None for absolute readings, which show all errors."""
     if fit.mode == "absolute":
         return None
     if frames is None:
         frames = list(columns_of_each(fit, frame_effects(fit)))
     readings = fit.readings[~fit.outlier]
     rows = readings.unloaded
-    columns = np.concatenate([each.unloaded for each in frames], axis=2)
+    columns = np.concatenate([frame.unloaded for frame in frames], axis=2)
     u, s, _ = np.linalg.svd(columns.reshape(3 * int(rows.sum()), -1), full_matrices=False)
     u = u[:, s > ROUNDING * s.max(initial=0.0)]
-    off = readings.value[:, :3] - fit.solution.prediction.observation.position
-    y = off[rows].reshape(-1)
+    error = readings.value[:, :3] - fit.solution.prediction.observation.position
+    y = error[rows].reshape(-1)
     missed = y - u @ (u.T @ y)
     return Unloaded(u, float(np.sqrt(missed @ missed / max(len(y) - u.shape[1], 1))))
 
 
-def most(of: EffectColumns, bare: Unloaded | None) -> float:
+def most(family: EffectColumns, bare: Unloaded | None) -> float:
     """Return the largest plausible strength of an effect, in ordinary magnitudes."""
-    own = of.effect.most()
-    if bare is None or of.effect.elastic:
-        return own
-    x = of.unloaded.reshape(-1, len(of.scale))
+    largest = family.effect.most()
+    if bare is None or family.effect.elastic:
+        return largest
+    x = family.unloaded.reshape(-1, len(family.scale))
     free = (x - bare.frames @ (bare.frames.T @ x)).ravel()
     moved = float(np.sqrt(free @ free / len(x)))
-    return min(own, ALLOWED * bare.missed / moved) if moved > ROUNDING * bare.missed else own
+    limited = moved > ROUNDING * bare.missed
+    return min(largest, ALLOWED * bare.missed / moved) if limited else largest
 
 
 def rank_suspects(
@@ -228,28 +229,28 @@ def rank_suspects(
     refit: Callable[[Fit, str], Fit] = add,  # returns a fit with one more effect
 ) -> tuple[Suspect, ...]:
     """Score all effects; best first, see `ranked`."""
-    found = [_suspect(p, s, len(effects)) for part in _scored(p, effects) for s in part]
-    tested = max(sum(s.score.rank > 0 for s in found), 1)
+    suspects = [_suspect(p, s, len(effects)) for part in _scored(p, effects) for s in part]
+    tested = max(sum(s.score.rank > 0 for s in suspects), 1)
     no_load = p.fit.mode == "absolute" and not p.fit.solution.prediction.situation.load.wrench.any()
     geometry = cache(lambda: geometry_columns(p, effects))
     out: list[Suspect] = []
-    for effect, s in zip(effects, found, strict=True):
+    for effect, s in zip(effects, suspects, strict=True):
         explains = s.score.p_value * tested < FALSE_ALARM and s.score.log_evidence > 0
         s = replace(s, explains=explains and s.holdout_share >= LEAST_SHARE)
         if s.passes:
-            own = effect_columns(p.fit, effect)
+            family = effect_columns(p.fit, effect)
             if no_load and through_load(effect):
-                s = replace(s, refuted=not beyond_geometry(p, own, geometry()))
+                s = replace(s, refuted=not beyond_geometry(p, family, geometry()))
             if s.passes:
-                s = replace(s, kept=kept(p, own, s.score, refit))
+                s = replace(s, kept=kept(p, family, s.score, refit))
         out.append(s)
     return ranked(out)
 
 
 def addition(before: Fit, after: Fit) -> Suspect:
-    """Return what a gc-scaled fit let expect of the last effect of the next, and what that kept."""
+    """Return the last effect of a refit as a suspect of the gc-scaled fit before it."""
     p, effect = linearise(before), after.model.effects[-1]
-    if effect.name in before.model.names:  # a finer form took its place
+    if effect.name in before.model.names:  # a finer form of it
         effect = copy(effect)
         effect.name, effect.coarse = f"{effect.name}, finer", effect.name
     (s,) = rank_suspects(p, [effect], refit=lambda fit, name: after)
@@ -263,72 +264,73 @@ def ranked(suspects: Iterable[Suspect], rejected: Collection[str] = ()) -> tuple
     lower the error on poses left out, then the others; by evidence in each of these groups.
 
     Args:
-        rejected: names of those whose addition did not lower the error on poses left out.
+        rejected: names of effects whose addition did not lower the error on poses left out.
     """
-    found = [replace(s, refuted=True) if s.effect in rejected else s for s in suspects]
-    found.sort(key=lambda s: (-s.passes, -s.explains, -s.score.log_evidence, s.score.p_value))
-    evident = [s for s in found if s.score.log_evidence > SAME_EVIDENCE]
-    others = [s for s in evident if s.plausible and s.keeps and s.effect not in rejected]
+    order = [replace(s, refuted=True) if s.effect in rejected else s for s in suspects]
+    order.sort(key=lambda s: (-s.passes, -s.explains, -s.score.log_evidence, s.score.p_value))
+    evident = [s for s in order if s.score.log_evidence > SAME_EVIDENCE]
+    rivals = [s for s in evident if s.plausible and s.keeps and s.effect not in rejected]
 
     def same_as(s: Suspect) -> tuple[str, ...]:
-        own = s.score.log_evidence
-        near = (o for o in others if abs(o.score.log_evidence - own) < SAME_EVIDENCE)
-        return tuple(o.effect for o in near if o is not s)
+        evidence = s.score.log_evidence
+        near = (r for r in rivals if abs(r.score.log_evidence - evidence) < SAME_EVIDENCE)
+        return tuple(r.effect for r in near if r is not s)
 
-    return tuple(replace(s, same_as=same_as(s) if s in evident else ()) for s in found)
+    return tuple(replace(s, same_as=same_as(s) if s in evident else ()) for s in order)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Scored:
-    """An effect that was scored, and what it was scored by."""
+    """An effect with its score and the statistics behind it."""
 
-    of: EffectColumns
+    family: EffectColumns
     information: Floats  # (P, P) S
     spectrum: Spectrum  # of S
     gradient: Floats  # (P,) g
     largest: float  # largest plausible strength
     score: FamilyScore
-    held: HeldOut | None = None  # None where the fitted readings rule the effect out
+    held_out: HeldOut | None = None  # None where the fitted readings rule the effect out
 
 
 def _scored(p: Linearisation, effects: Sequence[Effect]) -> Iterator[list[_Scored]]:
-    """Score effects, those together that were whitened together."""
+    """Score effects in parts that are whitened together."""
     frames = frame_effects(p.fit)
     of_frames: list[EffectColumns] = []
     bare: Unloaded | None = None
     for part in columns_in_parts(p.fit, (*frames, *effects)):
-        rest = len(frames) - len(of_frames)
-        of_frames += part[:rest]
+        missing = len(frames) - len(of_frames)
+        of_frames += part[:missing]
+        families = part[missing:]
         if len(of_frames) == len(frames) and bare is None:
             bare = unloaded_readings(p.fit, of_frames)
         scored = []
-        for of, (s, g) in zip(part[rest:], p.families(part[rest:]), strict=True):
-            of_s, largest = spectrum(s), most(of, bare)
-            scored.append(_Scored(of, s, of_s, g, largest, p.score_of(of_s, g, largest)))
+        for family, (s, g) in zip(families, p.families(families), strict=True):
+            of_s, largest = spectrum(s), most(family, bare)
+            scored.append(_Scored(family, s, of_s, g, largest, p.score_of(of_s, g, largest)))
         able = [c for c in scored if c.score.p_value < FALSE_ALARM and c.score.log_evidence > 0]
-        held = iter(_left_out(p, [(c.of.white, c.score) for c in able]))
-        yield [replace(c, held=next(held)) if c in able else c for c in scored]
+        held_out = iter(_left_out(p, [(c.family.white, c.score) for c in able]))
+        yield [replace(c, held_out=next(held_out)) if c in able else c for c in scored]
 
 
 def _suspect(p: Linearisation, scored: _Scored, count: int) -> Suspect:
     """Describe one of `count` effects that are tested together.
 
-    Columns are large: they are computed again where something that is asked for later needs them.
+    Columns are large, so later statistics compute them again instead of keeping them.
     """
-    of_s, result, effect = scored.spectrum, scored.score, scored.of.effect
-    s, largest, known = scored.information, scored.largest, scored.held
+    of_s, result, effect = scored.spectrum, scored.score, scored.family.effect
+    s, largest, held_out = scored.information, scored.largest, scored.held_out
 
     @cache
     def left_out() -> HeldOut:
-        return known or _left_out(p, [(effect_columns(p.fit, effect).white, result)])[0]
+        return held_out or _left_out(p, [(effect_columns(p.fit, effect).white, result)])[0]
 
     @cache
     def least() -> Strength:
-        own = effect_columns(p.fit, effect)
+        x = effect_columns(p.fit, effect)
         units = tuple(q.unit for q in effect.parameters)
-        noise, each = max(p.fit.variance_factor, 1.0), FALSE_ALARM / count
-        found = least_strength(s, own.motion, own.scale, units, p.fit.dof, noise, each, of_s.rank)
-        return least_of_family(p, own, of_s, found, each, largest)
+        noise, level = max(p.fit.variance_factor, 1.0), FALSE_ALARM / count
+        start = least_strength(s, x.motion, x.scale, units, p.fit.dof, noise, level, of_s.rank)
+        return least_of_family(p, x, of_s, start, level, largest)
 
     return Suspect(
         effect=effect.name,
@@ -351,64 +353,61 @@ def _left_out(p: Linearisation, families: Sequence[tuple[Floats, FamilyScore]]) 
 
 
 def _implausible(p: Linearisation, scored: _Scored) -> tuple[tuple[str, float, float], ...]:
-    """Size that an effect needs where plausible ones explain less, and plausible sizes, by unit."""
-    of, at_most = scored.of, scored.score
-    if not at_most.bounded:
+    """Sizes that an implausible effect needs, and plausible ones, by unit; see `Suspect.needs`."""
+    scale, bounded = scored.family.scale, scored.score
+    if not bounded.bounded:
         return ()
     free = p.score_of(scored.spectrum, scored.gradient)
-    if free.log_evidence - at_most.log_evidence <= max(SAME_EVIDENCE, LOST * free.log_evidence):
+    if free.log_evidence - bounded.log_evidence <= max(SAME_EVIDENCE, LOST * free.log_evidence):
         return ()
-    units = np.array([q.unit for q in of.effect.parameters])
+    units = np.array([q.unit for q in scored.family.effect.parameters])
 
     def rms(x: Floats, unit: str) -> float:
         return float(np.sqrt(np.mean(x[units == unit] ** 2)))
 
     return tuple(
-        (unit, rms(of.scale * free.step, unit), scored.largest * rms(of.scale, unit))
+        (unit, rms(scale * free.step, unit), scored.largest * rms(scale, unit))
         for unit in dict.fromkeys(units.tolist())
     )
 
 
 def kept_by_refit(before: Fit, after: Fit, score: FamilyScore) -> float:
-    """Return the share of the promise that a refit with the effect kept; 1 where none was made.
-
-    Fits that set other readings aside are not compared.
-    """
+    """Return the share of the promise that a refit kept; 1 without one, or with other outliers."""
     promised = score.gain - score.effective
     if promised <= 0 or np.any(before.outlier != after.outlier):
         return 1.0
     return ((before.chi2 - before.dof) - (after.chi2 - after.dof)) / promised
 
 
-def kept_by_step(p: Linearisation, of: EffectColumns, score: FamilyScore) -> float:
+def kept_by_step(p: Linearisation, family: EffectColumns, score: FamilyScore) -> float:
     """Return the share of an effect's promise that the exact model keeps at the promised step."""
     fit, s = p.fit, p.fit.solution
-    aim = s.white - of.white @ score.step
+    aim = s.white - family.white @ score.step
     z = p.projection.solve(p.rows.T @ aim - p.projection.ridge * s.coordinates())
-    model = replace(fit.model, effects=(*fit.model.effects, of.effect))
-    theta = np.concatenate([s.theta + s.transform @ z, of.scale * score.step])
+    model = replace(fit.model, effects=(*fit.model.effects, family.effect))
+    theta = np.concatenate([s.theta + s.transform @ z, family.scale * score.step])
     try:
-        found = model.predict(s.prediction.situation.states, theta, near=s.prediction)
+        prediction = model.predict(s.prediction.situation.states, theta, near=s.prediction)
     except CannotAnswerError:
         return 0.0
     w, readings = fit.whitening, fit.readings[~fit.outlier]
     linear = float(np.sum((aim - p.rows @ z) ** 2))
-    exact = float(np.sum(w.whiten(residual(readings, found, w)) ** 2))
+    exact = float(np.sum(w.whiten(residual(readings, prediction, w)) ** 2))
     return (fit.chi2 - exact) / max(fit.chi2 - linear, 1e-300)
 
 
 def kept(
-    p: Linearisation, of: EffectColumns, score: FamilyScore, refit: Callable[[Fit, str], Fit]
+    p: Linearisation, family: EffectColumns, score: FamilyScore, refit: Callable[[Fit, str], Fit]
 ) -> float:
-    """Return the share of the promise that the step keeps, or where that is little a refit."""
-    share = kept_by_step(p, of, score)
+    """Return the share of the promise that the step keeps, or a refit where the step keeps less."""
+    share = kept_by_step(p, family, score)
     if share >= LEAST_KEPT:
         return share
-    return max(share, kept_by_refit(p.fit, refit(p.fit, of.effect.name), score))
+    return max(share, kept_by_refit(p.fit, refit(p.fit, family.effect.name), score))
 
 
 def through_load(effect: Effect) -> bool:
-    """Whether an effect acts through what loads or weights do."""
+    """Whether an effect acts through loads or weights."""
     return effect.elastic or effect.load_change(np.zeros(len(effect.parameters))) is not None
 
 
@@ -422,41 +421,41 @@ def geometry_columns(p: Linearisation, effects: Sequence[Effect]) -> Floats:
         return bool(columns) and fields and not effect.elastic
 
     families = columns_of_each(p.fit, [e for e in effects if constant(e)])
-    return np.hstack([np.zeros((len(p.residual), 0)), *(of.white for of in families)])
+    return np.hstack([np.zeros((len(p.residual), 0)), *(f.white for f in families)])
 
 
-def beyond_geometry(p: Linearisation, of: EffectColumns, geometry: Floats) -> bool:
-    """Whether a family explains the readings beside geometry, beyond doubt."""
+def beyond_geometry(p: Linearisation, family: EffectColumns, geometry: Floats) -> bool:
+    """Whether a family explains the readings beside geometry (R, Q), beyond doubt."""
     q, fit = geometry.shape[1], p.fit
     if not q:
         return True
-    x = np.hstack([geometry, of.white])
+    x = np.hstack([geometry, family.white])
     s, g = p.information(x), x.T @ p.residual
     first = score_family(s[:q, :q], g[:q], p.rss, fit.dof)
     if first.rank == 0:
         return True
-    rest, gradient, rss = eliminate(s, g, p.rss, slice(0, q), first.ridge)
-    largest = of.effect.most()
-    found = score_family(rest[q:, q:], gradient[q:], rss, fit.dof, first.effective, largest)
-    if found.rank == 0 or found.log_evidence <= SAME_EVIDENCE:
+    s, g, rss = eliminate(s, g, p.rss, slice(0, q), first.ridge)
+    largest = family.effect.most()
+    second = score_family(s[q:, q:], g[q:], rss, fit.dof, first.effective, largest)
+    if second.rank == 0 or second.log_evidence <= SAME_EVIDENCE:
         return False
     # One ridge for both: columns in units of their strength.
-    both = np.hstack([geometry / np.sqrt(first.ridge), of.white / np.sqrt(found.ridge)])
-    before, after = (
+    both = np.hstack([geometry / np.sqrt(first.ridge), family.white / np.sqrt(second.ridge)])
+    without, with_family = (
         by_pose(fit, left_out_residual(p.folds, p.projection, fit.white, columns, 1.0))
         for columns in (both[:, :q], both)
     )
-    return improves(before, after, SURE)
+    return improves(without, with_family, SURE)
 
 
 def added_variable(fit: Fit, suspect: Suspect) -> tuple[Floats, Floats] | None:
-    """(K,) what the suspect would explain, and the residual along it, m.
+    """Return the points (K,) of the added-variable plot of a suspect: abscissa and ordinate, m.
 
-    With X the suspect's columns, freed of what the fitted model can do, and s its estimated
-    parameters, c = X s is what it would explain of each measurement (3-vectors, raw). Taken are |c|
-    and the residual along c, both with the sign of c along the direction in which the c spread
-    most. Where the suspect is right the points lie on the line of slope 1. None where it explains
-    nothing, or is no effect that could be added.
+    With X the suspect's columns, projected off the fitted model, and s its estimated parameters,
+    c = X s is its contribution to each measurement (3-vectors, raw). The abscissa is |c|, the
+    ordinate the residual along c, both with the sign of c along the principal direction of all c.
+    If the suspect is right, the points lie on the line of slope 1. None where it explains nothing,
+    or cannot be added.
 
     Source: Cook and Weisberg, *Residuals and Influence in Regression*, 1982.
     """
@@ -475,10 +474,10 @@ def added_variable(fit: Fit, suspect: Suspect) -> tuple[Floats, Floats] | None:
         contribution[:, :3] += w.raw(shift)
     c = contribution[:, :3]
     size = np.linalg.norm(c, axis=1)
-    seen = size > 1e-9 * max(float(size.max(initial=0.0)), 1e-15)
-    if not seen.any():
+    moved = size > 1e-9 * max(float(size.max(initial=0.0)), 1e-15)
+    if not moved.any():
         return None
     main = np.linalg.svd(c, full_matrices=False)[2][0]
-    side = np.where(c @ main < 0, -1.0, 1.0)[seen]
-    along = np.sum(fit.raw[seen, :3] * c[seen], axis=1) / size[seen]
-    return side * size[seen], side * along
+    side = np.where(c @ main < 0, -1.0, 1.0)[moved]
+    along = np.sum(fit.raw[moved, :3] * c[moved], axis=1) / size[moved]
+    return side * size[moved], side * along

@@ -1,27 +1,28 @@
-"""What the readings say of a fit, each part computed when it is first needed, and once.
+"""The statistics of a fit that a judgement needs, each computed once, on first use.
 
-Alternatives. A refit without an effect, and with others in its place, takes seconds to minutes on a
-large campaign, and hardly ever explains as much. So the effect is eliminated, and the others enter
-by forward selection, by algebra alone (`regression.forward_selection`). An effect that was added in
-place of another that was found later is often redundant in the end: it is where its F-test against
-the model without it, at the same linearisation, is not significant.
+Alternatives. Refits without an effect and with others in its place take seconds to minutes on a
+large campaign, and the others hardly ever explain as much. So the effect is eliminated, and the
+others enter by forward selection, both by algebra (`regression.forward_selection`). An effect that
+was added in place of one found later is often redundant: its F-test against the model without it,
+at the same linearisation, is not significant.
 
-Separability. Suppose suspect A is the cause, with the parameters β that are estimated: it adds
-βᵀ S_A β to the whitened sum of squares beside the fitted model, S_A the information on A. The share
+Separability. Suppose suspect A with the estimated parameters β is the cause. It adds βᵀ S_A β to
+the whitened sum of squares beside the fitted model, S_A the information on A. When suspect B is
+fitted instead, the share
 
-    u = βᵀ S_A|B β / βᵀ S_A β,
+    u = βᵀ S_A|B β / βᵀ S_A β
 
-S_A|B the Schur complement of suspect B, remains when B is fitted instead: λ = βᵀ S_A|B β is the
-non-centrality of the test of A beyond B, as in planning. With k times as many readings like these
-it is k λ; the two are separated when it reaches `NEEDED`.
+remains, S_A|B the Schur complement of B: λ = βᵀ S_A|B β is the non-centrality of the test of A
+beyond B, as in planning. k times as many readings like these give k λ, and separate A from B when
+k λ reaches `NEEDED`.
 
-Sufficiency. An effect outside of the catalogue resembles some that are in it: a base that sways
-with the air's temperature looks like a tracker that drifts. The best suspect then explains a good
-part of the misfit, passes every test, and is wrong. So the model takes all significant effects, one
-after the other, by algebra. Where that leaves noise, the catalogue is sufficient. Where it does
-not, the linearisation may be too coarse: the best effect is added by a refit, and the selection is
-repeated from there. A residual that remains after two refits, and that repeats or a generic
-regression show not to be noise, no effect of the catalogue explains.
+Sufficiency. An effect outside the catalogue resembles effects of the catalogue: a base that sways
+with the air temperature looks like a drifting tracker. The best suspect then explains a good part
+of the misfit, passes every test, and is wrong. So all significant effects enter the model, one
+after the other, by algebra. If the residual is then noise, the catalogue is sufficient. Otherwise
+the linearisation may be too coarse: the best effect is added by a refit, and the selection is
+repeated. The catalogue is insufficient if a residual remains after two refits, and repeats or a
+generic regression show that it is not noise.
 """
 
 from collections.abc import Callable, Collection
@@ -78,29 +79,29 @@ from hilcal.regression.schur import schur_complement
 
 MOST_INSTEAD = 3  # effects that are tried together in place of one; a choice
 PRICE = 1.0
-"""Evidence that each further effect costs: its strength was chosen by the data, too; a guess."""
+"""Evidence that each further effect costs: the data chose its strength, too; a guess."""
 NEEDED = 12.0
-"""Sum of squares, in σ², by which the right one of two suspects fits better when it is found in
-nine cases of ten at odds of 20 : 1: the difference scatters by twice the root of it."""
+"""Sum of squares, in σ², by which the right one of two suspects must fit better to be identified in
+nine cases of ten at odds of 20 : 1: the difference scatters by twice its square root."""
 ALIKE = 1e-3
 """Share below which no number of readings like these separates two effects; a guess."""
 LEAST_REMAINDER = 0.02
 """Share of the misfit that must remain for the first suspect to be in doubt; set by the study of
-the diagnosis, effects outside of the catalogue against hidden ones."""
+the diagnosis: effects outside the catalogue against hidden effects of the catalogue."""
 MOST_REFITS = 2
 MOST_TOGETHER = 6
-CHANCE = 0.01  # an effect with a smaller p-value is kept
+CHANCE = 0.01  # p-value above which an effect is redundant
 
 
 @dataclass(frozen=True, slots=True)
 class Alternative:
-    """Other effects in place of one."""
+    """Other effects that could replace an effect of the model."""
 
-    effect: str  # the one
-    own: float  # its log evidence against the model without it
-    same_as: tuple[str, ...]  # single effects that the readings do not separate from it
-    others: tuple[str, ...]  # that explain together what it does, in the order of adding them
-    log_evidence: float  # of all of them together
+    effect: str
+    own: float  # log evidence of the effect, against the model without it
+    same_as: tuple[str, ...]  # single effects that the readings do not separate from the effect
+    others: tuple[str, ...]  # effects that replace it together, in the order of their addition
+    log_evidence: float  # of the others together
 
     @property
     def better(self) -> bool:
@@ -109,12 +110,12 @@ class Alternative:
 
     @property
     def as_good(self) -> bool:
-        """Whether the others explain as much as the one."""
+        """Whether the others explain as much as the effect."""
         return self.log_evidence > self.own - SAME_EVIDENCE
 
     @property
     def inseparable(self) -> bool:
-        """Whether the readings do not separate the one from another, or several together."""
+        """Whether the readings do not separate the effect from another, or from several."""
         return bool(self.same_as) or (self.as_good and len(self.others) > 1)
 
 
@@ -122,35 +123,35 @@ class StepwiseAlternatives:
     """Alternatives to the effects of a fitted model, from the catalogue."""
 
     def __init__(self, fit: Fit) -> None:
-        """Compute the columns of the model and of all effects that are not in it."""
+        """Compute the columns of the model and of all candidates."""
         self._fit, self._model = fit, model_columns(fit)
         self._x, self._columns, self._most = catalogue_columns(fit)
         self._gram, self._products = self._x.T @ self._x, self._model.white.T @ self._x
 
     def of(self, effect: str, excluded: Collection[str] = ()) -> Alternative:
-        """Return the other effects, but for some, that explain together what one does."""
+        """Return the effects, without the excluded ones, that together replace one."""
         reduced = eliminate_effect(self._fit, self._model, effect)
-        own = reduced.score().log_evidence
+        evidence = reduced.score().log_evidence
         information = reduced.information(self._x, self._gram, self._products)
         families = families_beside(
             information, reduced.residual, reduced.dof, self._x, self._columns, self._most
         )
-        # What an effect does, a finer form of it does as well: no alternative.
+        # A finer form of an effect is no alternative: it contains the effect.
         barred = {*excluded, *(name for name in self._columns if name.startswith(f"{effect}("))}
         same: tuple[str, ...] = ()
-        others: list[str] = []
+        names: list[str] = []
         total = 0.0
         for step in forward_selection(families.without(barred), MOST_INSTEAD):
-            if not others and own > SAME_EVIDENCE:
-                evidence = [(n, s.log_evidence) for n, s in step.scores.items()]
-                same = tuple(n for n, e in evidence if abs(e - own) < SAME_EVIDENCE < e)
+            if not names and evidence > SAME_EVIDENCE:
+                single = [(n, s.log_evidence) for n, s in step.scores.items()]
+                same = tuple(n for n, e in single if abs(e - evidence) < SAME_EVIDENCE < e)
             if step.score.log_evidence <= SAME_EVIDENCE:
                 break
-            total += step.score.log_evidence - (PRICE if others else 0.0)
-            others.append(step.name)
-            if total > own + SAME_EVIDENCE:
+            total += step.score.log_evidence - (PRICE if names else 0.0)
+            names.append(step.name)
+            if total > evidence + SAME_EVIDENCE:
                 break
-        return Alternative(effect, own, same, tuple(others), total)
+        return Alternative(effect, evidence, same, tuple(names), total)
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,8 +159,8 @@ class Separability:
     """How a rival differs from a suspect."""
 
     effect: str  # the rival
-    unlike: float  # u, the share of the suspect's sum of squares that it cannot explain
-    times: float  # k, how many times as many readings separate them; infinite for no number
+    unlike: float  # u, the share of the suspect's sum of squares that the rival cannot explain
+    times: float  # k, factor of the number of readings that separates them; infinite for none
 
     @property
     def possible(self) -> bool:
@@ -170,15 +171,15 @@ class Separability:
 def separability(
     p: Linearisation, lead: Suspect, effects: tuple[Effect, ...]
 ) -> tuple[Separability, ...]:
-    """Return how each rival in `lead.same_as` differs from the leading one of some suspects."""
+    """Return how each rival in `lead.same_as` differs from the leading suspect."""
     by_name = {e.name: e for e in effects}
-    own, beta = effect_columns(p.fit, by_name[lead.effect]).white, lead.score.step
-    effect = np.arange(own.shape[1])
+    x, beta = effect_columns(p.fit, by_name[lead.effect]).white, lead.score.step
+    of_lead = np.arange(x.shape[1])
     out = []
     for name in lead.same_as:
-        s = p.information(np.hstack([own, effect_columns(p.fit, by_name[name]).white]))
-        total = float(beta @ s[np.ix_(effect, effect)] @ beta)
-        unlike = float(beta @ schur_complement(s, effect) @ beta) / max(total, 1e-300)
+        s = p.information(np.hstack([x, effect_columns(p.fit, by_name[name]).white]))
+        total = float(beta @ s[np.ix_(of_lead, of_lead)] @ beta)
+        unlike = float(beta @ schur_complement(s, of_lead) @ beta) / max(total, 1e-300)
         times = np.inf if unlike < ALIKE else NEEDED / max(unlike * total, 1e-300)
         out.append(Separability(name, unlike, times))
     return tuple(out)
@@ -186,18 +187,18 @@ def separability(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Insufficiency:
-    """What all significant effects of the catalogue together leave of a misfit."""
+    """The part of a misfit that all significant effects of the catalogue together leave."""
 
     effects: tuple[str, ...]  # the best first
-    refitted: int  # how many of them were added by a refit, the others by algebra
+    refitted: int  # how many of them were added by a refit; the others were added by algebra
     share: float  # of the misfit that remains
     variance_factor: float  # of the remaining residual
-    dependences: tuple[Dependence, ...]  # what carries what is predictable of the refit's residual
-    noise: NoiseVerdict  # whether the stated covariance is to blame for that; it is not
+    dependences: tuple[Dependence, ...]  # variables that predict the residual of the last refit
+    noise: NoiseVerdict  # shows that the stated covariance is not to blame
 
 
 def whole_catalogue(fit: Fit) -> tuple[tuple[str, ...], float, float]:
-    """Add all significant effects by algebra; their names, ‖r‖² with them, its degrees of freedom.
+    """Add all significant effects by algebra; return their names, ‖r‖² and its degrees of freedom.
 
     The effect of largest evidence comes first.
     """
@@ -221,7 +222,7 @@ def insufficiency(
     say: Callable[[str], None] = lambda text: None,
     regressions: Regressions | None = None,
 ) -> Insufficiency | None:
-    """Return what the whole catalogue leaves of a misfit with a suspect; None for noise."""
+    """Return the misfit that the whole catalogue leaves; None if it is noise."""
     current, names = fit, list[str]()
     misfit = fit.chi2 - fit.dof
     while True:
@@ -249,15 +250,15 @@ def insufficiency(
 
 
 class Evidence:
-    """Statistics of a fit that a judgement combines; they do not depend on the model's history."""
+    """Statistics of a fit that a judgement combines, independent of the model's history."""
 
     def __init__(
         self,
         fit: Fit,
         refit: Callable[[Fit, str], Fit] = add,  # returns a fit with one more effect
         say: Callable[[str], None] = lambda text: None,  # takes progress, one line each
-        regressions: Regressions | None = None,  # of residuals, those that were made
-        background: tuple[BackgroundEffect, ...] | None = None,  # where they were tested
+        regressions: Regressions | None = None,  # cache
+        background: tuple[BackgroundEffect, ...] | None = None,  # if tested already
     ) -> None:
         """Take a fit.
 
@@ -269,11 +270,11 @@ class Evidence:
         self.fit, self._refit, self._say = fit, refit, say
         self._regressions = regressions or Regressions()
         self._background = background
-        self._known: dict[tuple[str, frozenset[str]], Alternative] = {}
+        self._alternatives: dict[tuple[str, frozenset[str]], Alternative] = {}
 
     @cached_property
     def linearisation(self) -> Linearisation:
-        """The fitted model's part of the regression."""
+        """The linearisation of the fit."""
         return linearise(self.fit)
 
     @cached_property
@@ -283,12 +284,12 @@ class Evidence:
 
     @cached_property
     def suspects(self) -> tuple[Suspect, ...]:
-        """All of them scored."""
+        """`effects`, scored; best first."""
         return rank_suspects(self.linearisation, self.effects, refit=self._refit)
 
     @cached_property
     def wrong_figures(self) -> tuple[WrongFigure, ...]:
-        """Figures of the cell that seem to be entered wrongly."""
+        """Figures of the cell that seem to be wrong."""
         if self.misfit or self.fit.outlier.any() or not self.fit.readings.noise_stated:
             return wrong_figures(self.fit, self.suspects)
         return ()
@@ -320,12 +321,12 @@ class Evidence:
 
     @cached_property
     def regression(self) -> ResidualRegression:
-        """What smooth laws, or trees, predict of the misfit on poses left out."""
+        """The share of the misfit on poses left out that smooth laws, or trees, predict."""
         return self._regressions.of(self.linearisation)
 
     @cached_property
     def arm_scatter(self) -> ArmScatter | None:
-        """The arm's scatter, if it is what is left; None where the residual shows none."""
+        """The arm's scatter that would explain the misfit; None where the residual shows none."""
         return estimate_arm_scatter(self.fit)
 
     @cached_property
@@ -336,21 +337,21 @@ class Evidence:
 
     @cached_property
     def by_arrivals(self) -> "Evidence | None":
-        """The evidence with the arm's estimated scatter in the covariance; None where it is this.
+        """The evidence with the arm's estimated scatter in the covariance; None if not needed.
 
-        Several targets that are read in one arrival are displaced together by the arm's scatter.
-        Where nothing states that scatter, tests that take their readings for independent count
-        one arrival as several, and find causes in chance.
+        The arm's scatter displaces all targets that are read in one arrival together. Where
+        nothing states the scatter, tests that treat these readings as independent would find
+        causes in chance.
         """
         readings, model = self.fit.readings, self.fit.model
-        known = readings.scatter_stated or readings.arm_scatter is not None
-        if readings.states.target is None or known or not self.misfit or self.arm_scatter is None:
+        in_covariance = readings.scatter_stated or readings.arm_scatter is not None
+        if readings.states.target is None or in_covariance or not self.misfit:
             return None
-        if instrument_instead(self.arm_scatter):
+        if self.arm_scatter is None or instrument_instead(self.arm_scatter):
             return None
         scattered = with_arm_scatter(model.cell, readings, self.arm_scatter)
-        found = fit(model, scattered, self.fit.mode, start=self.fit.theta)
-        return Evidence(found, self._refit, self._say, self._regressions)
+        fitted = fit(model, scattered, self.fit.mode, start=self.fit.theta)
+        return Evidence(fitted, self._refit, self._say, self._regressions)
 
     @cached_property
     def redundant(self) -> tuple[str, ...]:
@@ -359,52 +360,53 @@ class Evidence:
 
     @cached_property
     def insufficiency(self) -> Insufficiency | None:
-        """What all effects of the catalogue together leave, where it is not noise."""
+        """The misfit that all effects of the catalogue together leave; None if it is noise."""
         return insufficiency(self.fit, self._refit, self._say, self._regressions)
 
     def tree_share(self, beyond: float) -> float:
-        """Return the share of the misfit that trees predict, where that is more than another."""
+        """Return the share of the misfit that trees predict; see `residual_regression`."""
         return self._regressions.tree_share(self.linearisation, beyond)
 
     def alternatives(
         self, effects: Collection[str], excluded: Collection[str]
     ) -> tuple[Alternative, ...]:
-        """Return what could replace effects of the model, but for some that are excluded."""
+        """Return the alternatives of effects of the model, without the excluded effects."""
         keys = [(name, frozenset(excluded)) for name in effects]
-        if any(key not in self._known for key in keys):
-            # Not kept: the columns of the whole catalogue are the largest arrays of a judgement.
+        if any(key not in self._alternatives for key in keys):
+            # Not cached: the columns of the catalogue are the largest arrays of a judgement.
             algebra = StepwiseAlternatives(self.fit)
-            self._known |= {key: algebra.of(key[0], excluded) for key in keys}
-        return tuple(self._known[key] for key in keys)
+            self._alternatives |= {key: algebra.of(key[0], excluded) for key in keys}
+        return tuple(self._alternatives[key] for key in keys)
 
 
 def backward_elimination(fit: Fit) -> dict[str, FamilyScore]:
     """Return the redundant effects, each scored against the model without it; weakest first.
 
-    Those with a carried prior are judged by `spoken_against`: other readings speak for them; random
-    ones beside a background by `background_evidence`.
+    Effects with a carried prior are judged by `spoken_against`, since other readings support them;
+    random effects of a model with a background are judged by `background_evidence`.
     """
     carried = fit.solution.space.carried(fit.model.size)
-    beside = fit.model.random if fit.model.background else ()
+    random = fit.model.random if fit.model.background else ()
     judged = [
         e.name
-        for e, mine in zip(fit.model.effects, fit.model.slices(), strict=True)
-        if e.role == "effect" and e.name not in beside and not carried[mine].any()
+        for e, columns in zip(fit.model.effects, fit.model.slices(), strict=True)
+        if e.role == "effect" and e.name not in random and not carried[columns].any()
     ]
     if not judged:
         return {}
     x = model_columns(fit)
     scores = {n: eliminate_effect(fit, x, n).score() for n in judged}
-    found = [n for n in judged if scores[n].p_value > CHANCE]
-    return {n: scores[n] for n in sorted(found, key=lambda n: -scores[n].p_value)}
+    redundant = [n for n in judged if scores[n].p_value > CHANCE]
+    return {n: scores[n] for n in sorted(redundant, key=lambda n: -scores[n].p_value)}
 
 
 def spoken_against(fit: Fit) -> tuple[str, ...]:
-    """Return effects of a carried prior that the new readings speak against, the most so first.
+    """Return effects of a carried prior that the new readings contradict, the strongest first.
 
-    As after a repair: at odds of 20 : 1 they are likelier without the effect than with what the
-    earlier readings said of it.
+    At odds of 20 : 1 the readings, for instance after a repair, are likelier without the effect
+    than with the carried prior of its parameters.
     """
     names = carried_effects(fit.model) if fit.scaling == "gc" else ()
-    of = evidence_of_carried(fit.model, fit.solution, fit.whitening, names) if names else {}
-    return tuple(n for n in sorted(of, key=lambda n: of[n]) if of[n] < -SAME_EVIDENCE)
+    evidence = evidence_of_carried(fit.model, fit.solution, fit.whitening, names) if names else {}
+    against = [n for n in evidence if evidence[n] < -SAME_EVIDENCE]
+    return tuple(sorted(against, key=lambda n: evidence[n]))

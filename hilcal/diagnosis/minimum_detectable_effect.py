@@ -1,18 +1,16 @@
 """Minimum detectable effect: the smallest strength of an effect that a campaign would reveal.
 
 A family with the parameters t β in ordinary magnitudes adds the non-centrality t² βᵀ S β to its
-F-test (see `regression.evidence`). The strength stated is the t at which the test, at the level of
-naming an effect, has the power `POWER` for a typical direction β: the median over random ones. At
-the tool it is the rms displacement that these parameters make at the measured target, beyond what
-the fitted model can explain.
+F-test (see `regression.evidence`). The stated strength is the t at which the test, at the level of
+naming an effect, has the power `POWER` for a typical direction β: the median over random
+directions. The same strength at the tool is the rms displacement of the measured target.
 
-The F-test alone says little of a family of many parameters: it rejects its absence where no pose
-predicts another yet, and a family that the poses limit, as a transmission error with more waves
-than they resolve, is scored by a part of its parameters. So whole campaigns are simulated by
-algebra, at the linearisation of the fit: parameters β ~ N(0, t² 1) of the family, noise of the size
-found, and every test that a suspect must pass, poses left out included. The size stated is the
-smallest of a grid at which nine draws in ten pass; that of the family at its finest is stated
-beside it.
+The F-test alone is no measure for a family of many parameters. It rejects the null hypothesis
+before any pose predicts another. If the poses resolve only a part of the family, as of the waves
+of a transmission error, only that part is scored. So campaigns are simulated by algebra, at the
+linearisation of the fit: parameters β ~ N(0, t² 1) of the family, noise of the size found, and
+every test that a suspect must pass, poses left out included. The stated size is the smallest on a
+grid at which nine draws in ten pass; the size for the family at its finest is stated as well.
 """
 
 from dataclasses import dataclass, replace
@@ -37,7 +35,7 @@ LEAST_SHARE = 0.01
 """An effect that explains less of the misfit on poses left out is not worth adding; a guess."""
 DIRECTIONS = 64
 DRAWS = 16  # campaigns at each size; a choice, for time
-GRID = np.logspace(0.0, 1.5, 7)  # sizes, in units of that which the F-test reveals; a choice
+GRID = np.logspace(0.0, 1.5, 7)  # sizes, in units of the size that the F-test reveals; a choice
 SEED, SEED_OF_FAMILY = 20240611, 20240612
 
 
@@ -45,13 +43,13 @@ SEED, SEED_OF_FAMILY = 20240611, 20240612
 class Strength:
     """The smallest strength of an effect that would have been revealed.
 
-    `finest_m` is the displacement from which the effect would have been revealed were it finer than
-    the poses resolve (see `Effect.fine`), infinite where never; None where no such limit is.
+    `finest_m` is the least displacement that would reveal the effect if it were finer than the
+    poses resolve (see `Effect.fine`): infinite if none would, None if the poses resolve the effect.
     """
 
-    displacement_m: float  # rms, of the target (of the deflection), m; infinite for never
+    displacement_m: float  # rms displacement or deflection of the target, m; infinite for never
     parameters: tuple[tuple[str, float], ...]  # (unit, rms of the parameters), SI
-    ordinary: float = np.inf  # the same in the effect's ordinary magnitudes
+    ordinary: float = np.inf  # rms of the parameters, in the effect's ordinary magnitudes
     finest_m: float | None = None
 
     @property
@@ -66,17 +64,17 @@ def least_strength(
     scale: Floats,  # (P,) ordinary magnitudes, SI
     units: tuple[str, ...],  # (P,) physical units
     dof: float,  # degrees of freedom of the fit
-    variance: float,  # its variance factor, at least 1
+    variance: float,  # variance factor of the fit, at least 1
     level: float,  # of the test, between 0 and 1
     rank: int,  # number of directions that can be tested
 ) -> Strength:
-    """Return the smallest strength of a family that would be revealed."""
+    """Return the smallest strength of a family that the F-test would reveal."""
     beta = np.random.default_rng(SEED).standard_normal((DIRECTIONS, len(s)))
     gain = np.sum(beta @ s * beta, axis=1)
     if rank == 0 or dof - rank < 1 or float(np.median(gain)) <= 0.0:
         return _never(units)
-    wanted = noncentrality_of_power(rank, dof - rank, level, POWER)
-    t = np.sqrt(wanted * variance / np.maximum(gain, 1e-300))
+    noncentrality = noncentrality_of_power(rank, dof - rank, level, POWER)
+    t = np.sqrt(noncentrality * variance / np.maximum(gain, 1e-300))
     flat = motion.reshape(-1, motion.shape[2])
     gram = flat.T @ flat / len(motion)
     moved = t * np.sqrt(np.sum(beta @ gram * beta, axis=1))
@@ -88,29 +86,29 @@ def _never(units: tuple[str, ...]) -> Strength:
 
 
 def _strength(moved: float, t: float, scale: Floats, units: tuple[str, ...]) -> Strength:
-    """Return the strength of a displacement by t ordinary magnitudes."""
+    """Return the strength of t ordinary magnitudes, which displace the target by `moved`."""
     names = np.array(units)
     rms = {u: float(np.sqrt(np.mean(scale[names == u] ** 2))) for u in dict.fromkeys(units)}
-    return Strength(moved, tuple((u, t * own) for u, own in rms.items()), t)
+    return Strength(moved, tuple((u, t * size) for u, size in rms.items()), t)
 
 
 def least_of_family(
     p: Linearisation,  # of the fit
-    of: EffectColumns,  # the family, as it is scored
-    s: Spectrum,  # of its information
-    start: Strength,  # what the F-test alone would reveal
+    family: EffectColumns,  # as it is scored
+    s: Spectrum,  # of the family's information
+    start: Strength,  # that the F-test alone would reveal
     level: float,  # of the test, between 0 and 1
     largest: float,  # largest plausible strength
 ) -> Strength:
     """Return the smallest strength of a family that all tests would reveal.
 
-    Of one that is small against the degrees of freedom that is what the F-test alone would reveal.
+    For a family that is small against the degrees of freedom, the F-test alone decides.
     """
     if not start.visible or s.rank <= LARGE_FAMILY * p.fit.dof:
         return start
-    fine = of.effect.fine(p.fit.readings[~p.fit.outlier].states)
-    tests = SuspectTests(p, of, s, level, largest)
-    least = _least(tests, of, start.displacement_m)
+    fine = family.effect.fine(p.fit.readings[~p.fit.outlier].states)
+    tests = SuspectTests(p, family, s, level, largest)
+    least = _least(tests, family, start.displacement_m)
     if fine is None:
         return least
     finest = _least(tests, effect_columns(p.fit, fine), start.displacement_m)
@@ -118,7 +116,7 @@ def least_of_family(
 
 
 def _least(tests: "SuspectTests", full: EffectColumns, start: float) -> Strength:
-    """`least_of_family` where the parameters of `full` are there and those of a family scored."""
+    """`least_of_family` where the arm has the effect `full` and the tests score their family."""
     rng = np.random.default_rng(SEED_OF_FAMILY)
     beta = rng.standard_normal((len(full.scale), DRAWS))
     signal = full.white @ beta
@@ -128,36 +126,35 @@ def _least(tests: "SuspectTests", full: EffectColumns, start: float) -> Strength
     units = tuple(q.unit for q in full.effect.parameters)
     for displacement in (GRID * start).tolist():
         t = displacement / float(moved)
-        if np.mean(tests.found(t * signal + error, POWER)) >= POWER:
+        if np.mean(tests.passed(t * signal + error, POWER)) >= POWER:
             return _strength(displacement, t, full.scale, units)
     return _never(units)
 
 
 @dataclass(frozen=True, eq=False)
 class SuspectTests:
-    """The tests that a suspect must pass, of simulated residuals; see `least_of_family`."""
+    """The tests that a suspect must pass, applied to simulated residuals; see `least_of_family`."""
 
     p: Linearisation
-    of: EffectColumns
+    family: EffectColumns
     s: Spectrum
     level: float
     largest: float
 
     @cached_property
     def _folds(self) -> tuple[FamilyFolds, FamilyFolds]:
-        """The model without each fold, without the family and with it."""
-        p = self.p
-        return FamilyFolds(p.folds, p.projection), FamilyFolds(p.folds, p.projection, self.of.white)
+        """The model fitted without each fold, without the family and with it."""
+        p, x = self.p, self.family.white
+        return FamilyFolds(p.folds, p.projection), FamilyFolds(p.folds, p.projection, x)
 
-    def found(self, y: Floats, enough: float = 0.0) -> list[bool]:
+    def passed(self, y: Floats, enough: float = 0.0) -> list[bool]:
         """Whether each of K simulated residuals y (R, K) would reveal the family.
 
-        Once a share of `enough` is out of reach, the remaining ones are not looked at and count as
-        not revealing it.
+        Once a share of `enough` is out of reach, the remaining residuals count as failed.
         """
         p = self.p
         r = p.project_out(y)
-        g, rss = self.of.white.T @ r, np.sum(r * y, axis=0)
+        g, rss = self.family.white.T @ r, np.sum(r * y, axis=0)
         scores: list[FamilyScore] = []
         able = [False] * y.shape[1]
         for k in range(len(able)):
@@ -170,10 +167,10 @@ class SuspectTests:
         if np.mean(able) < POWER:
             return able
         ridge = float(np.median([c.ridge for c in scores]))
-        before, after = (of.left_out(y, ridge) for of in self._folds)
+        without, with_family = (folds.left_out(y, ridge) for folds in self._folds)
         out = []
         for k, fit_able in enumerate(able):
-            a, b = by_pose(p.fit, before[:, k]), by_pose(p.fit, after[:, k])
+            a, b = by_pose(p.fit, without[:, k]), by_pose(p.fit, with_family[:, k])
             share = float(a.sum() - b.sum()) / max(float(a.sum()) - p.fit.whitening.rank, 1.0)
             out.append(fit_able and share >= LEAST_SHARE and improves(a, b))
         return out

@@ -1,24 +1,24 @@
 """Where the model fails: the share of the misfit that follows each recorded variable.
 
-For a variable x, a generic family asks whether *any* joint's angle, or the target's position,
-errs as a smooth function of x: columns φ_k(x) times the motion of each joint and times each
-base axis. Of several targets, "target" asks whether one of them is displaced on the flange. The
-family is scored like a suspect, so its p-value is exact; its share is the part of the misfit that
-it predicts on poses left out. It names no cause.
+For a variable x, a generic family tests whether any joint angle, or the target's position, has an
+error that is a smooth function of x: its columns are φ_k(x) times the motion of each joint and of
+the target along each base axis. With several targets, "target" tests whether one of them is
+displaced on the flange. The family is scored like a suspect, so its p-value is exact; its share is
+the part of the misfit that it predicts on poses left out. It names no cause.
 
 Constants of each pose, three displacements of the target, are columns C, whitened and orthonormal;
 each has rows in one pose alone. Beside the model they are M C, with M = 1 − Q Qᵀ (see
-`regression.projection`), and with W = CᵀQ their Gram matrix is the identity less one of no more
-than the model's rank,
+`regression.projection`). With W = CᵀQ their Gram matrix is the identity less a matrix of at most
+the model's rank,
 
     CᵀM²C = 1 − W (2 − QᵀQ) Wᵀ = 1 − V Vᵀ,    VᵀV = diag(t)
 
-What they take of a vector x is ‖Uᵀx‖² of an orthonormal basis U of their span: with z = CᵀM x
+They explain ‖Uᵀx‖² of a vector x, U an orthonormal basis of their span. With z = CᵀM x that is
 
     zᵀ (CᵀM²C)⁺ z = ‖z‖² + Σ_{t_k < 1} (v_kᵀ z)² / (1 − t_k) − Σ_{t_k = 1} (v_kᵀ z)²
 
-where t = 1 is a direction that the model holds already. Thousands of poses cost a small
-factorisation each and one of the model's size.
+where t = 1 is a direction that the model has already. So each pose costs a small factorisation, and
+all together one of the model's size.
 """
 
 from collections.abc import Iterable, Iterator
@@ -38,16 +38,17 @@ from hilcal.types import Floats, Ints
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-DETERMINED = 1e-6  # singular value of a determined direction over the largest; below: rounding
-HELD = 1.0 - DETERMINED**2  # t from which on the model holds a direction already
+DETERMINED = 1e-6  # least singular value of a direction, over the largest; below: rounding
+HELD = 1.0 - DETERMINED**2  # t from which the model has a direction already
 POLYNOMIAL = 3
 MANY = 4000  # degrees of freedom from which the families of joint angles are finer
 MOST_AT_ONCE = 8_000_000
-"""Numbers of the columns that are scored together, 64 MB; a choice."""
+"""Elements of the columns that are scored together, 64 MB; a choice."""
 
 Group = Literal["joints", "load and target", "time and air", "pose", "direction"]
-"""Kinds of variables. The share of a pose is what its readings have in common, that of a direction
-what points along it; the shares of the others are predicted on poses left out, and overlap."""
+"""Kinds of variables. The share of "pose" is the misfit that the readings of a pose have in common,
+that of a direction its component along it; the other shares are predicted on poses left out, and
+overlap."""
 _GROUPS: dict[str, Group] = {
     "joint": "joints",
     "load": "load and target",
@@ -63,26 +64,26 @@ class MisfitShare:
     """How far the misfit follows one variable."""
 
     variable: str  # e.g. "joint 2 angle", "joint 2 torque", "load", "time"
-    share: float  # of the misfit that it predicts on poses left out; see `Group` for others
+    share: float  # of the misfit that the variable predicts on poses left out, but see `Group`
     p_value: float  # of the joint test
 
     @property
     def group(self) -> Group:
-        """What kind of variable it is."""
+        """Kind of the variable."""
         return _GROUPS.get(self.variable.split()[0], "time and air")
 
 
 def misfit_breakdown(p: Linearisation) -> tuple[MisfitShare, ...]:
     """Score all variables that vary in these readings; largest share first."""
     fit, w = p.fit, p.fit.whitening
-    at, model = fit.solution.prediction, fit.model
-    moves = motion(model.cell, at.observation, at.situation.chain, at.deviation, w.m)
-    axes = np.zeros((len(at.situation.angle), w.m, 3))
-    axes[:, :3] = at.observation.axes
+    s = fit.solution.prediction
+    moves = motion(fit.model.cell, s.observation, s.situation.chain, s.deviation, w.m)
+    axes = np.zeros((len(s.situation.angle), w.m, 3))
+    axes[:, :3] = s.observation.axes
     # Motions of ordinary size: 1 mrad of a joint, 1 mm of the target.
     generic = 1e-3 * np.concatenate([moves.drives, axes], axis=2)
 
-    def raws() -> Iterator[_Named]:
+    def raw_columns() -> Iterator[_Named]:
         for name, basis, follows_load in _variables(p):
             if follows_load:
                 yield name, w.raw(_times(generic, basis))
@@ -93,14 +94,14 @@ def misfit_breakdown(p: Linearisation) -> tuple[MisfitShare, ...]:
             member = (target[:, None] == np.unique(target)).astype(float)
             yield "target", 1e-3 * _times(moves.by_target()[w.reading, :, :3], member)
 
-    columns = ((n, w.whiten(raw).reshape(-1, raw.shape[2])) for n, raw in raws())
+    columns = ((n, w.whiten(raw).reshape(-1, raw.shape[2])) for n, raw in raw_columns())
     out = [share for batch in _batches(columns) for share in _shares(p, batch)]
     out += [*_poses(p), *_axes(p)]
     return tuple(sorted(out, key=lambda v: (-v.share, v.p_value)))
 
 
 def _batches(columns: Iterable[_Named]) -> Iterator[list[_Named]]:
-    """Collect named columns up to `MOST_AT_ONCE` numbers."""
+    """Collect named columns up to `MOST_AT_ONCE` elements."""
     batch: list[_Named] = []
     for name, x in columns:
         if batch and sum(y.size for _, y in batch) + x.size > MOST_AT_ONCE:
@@ -114,11 +115,11 @@ def _batches(columns: Iterable[_Named]) -> Iterator[list[_Named]]:
 def _shares(p: Linearisation, batch: list[_Named]) -> list[MisfitShare]:
     """Score named columns (R, F)."""
     products = p.products(x for _, x in batch)
-    scores = [p.score(x, p.information(of)) for (_, x), of in zip(batch, products, strict=True)]
-    held = p.held_out(list(zip(products, scores, strict=True)))
+    scores = [p.score(x, p.information(xs)) for (_, x), xs in zip(batch, products, strict=True)]
+    held_out = p.held_out(list(zip(products, scores, strict=True)))
     return [
-        MisfitShare(name, max(of.share, 0.0), score.p_value)
-        for (name, _), score, of in zip(batch, scores, held, strict=True)
+        MisfitShare(name, max(h.share, 0.0), score.p_value)
+        for (name, _), score, h in zip(batch, scores, held_out, strict=True)
     ]
 
 
@@ -129,7 +130,7 @@ def _times(motions: Floats, basis: Floats) -> Floats:
 
 
 def _variables(p: Linearisation) -> Iterator[tuple[str, Floats, bool]]:
-    """Yield name, functions (N, F), and whether a deflection takes their difference."""
+    """Yield name, functions (N, F), and whether both readings of a deflection contribute."""
     fit, situation = p.fit, p.fit.solution.prediction.situation
     harmonics = np.arange(1, 3 if fit.dof < MANY else 7)
     for v in state_variables(p):
@@ -150,29 +151,29 @@ def _variables(p: Linearisation) -> Iterator[tuple[str, Floats, bool]]:
 
 
 def _powers(x: Floats, centre: float | None = None) -> Floats:
-    """(N, 3) powers of x about a centre (its median unless given), scaled to at most 1."""
-    away = x - (np.median(x) if centre is None else centre)
-    scaled = away / max(float(np.abs(away).max()), 1e-300)
+    """(N, 3) powers of x about a centre, by default its median, scaled to at most 1."""
+    centred = x - (np.median(x) if centre is None else centre)
+    scaled = centred / max(float(np.abs(centred).max()), 1e-300)
     return np.asarray(scaled[:, None] ** np.arange(1, POLYNOMIAL + 1))
 
 
 def _poses(p: Linearisation) -> list[MisfitShare]:
-    """How far the misfit is common to all readings of a pose, where poses have several.
+    """Share of the misfit that is common to all readings of a pose, where poses have several.
 
-    A pose that is left out cannot be predicted from itself, so the share is in-sample, less
-    what as many columns explain by chance.
+    A pose left out cannot predict itself, so the share is in-sample, less the part that as many
+    columns explain by chance.
     """
-    found = pose_constants(p)
-    if found is None:
+    c = pose_constants(p)
+    if c is None:
         return []
-    within = max((p.rss - found.gain) / (p.fit.dof - found.rank), 1e-300)
-    return [MisfitShare("pose", p.share(found.gain - found.rank * within), found.p_value)]
+    within = max((p.rss - c.gain) / (p.fit.dof - c.rank), 1e-300)
+    return [MisfitShare("pose", p.share(c.gain - c.rank * within), c.p_value)]
 
 
 def _axes(p: Linearisation) -> list[MisfitShare]:
     """Directions: towards the base axis, around it, and up."""
     fit, w = p.fit, p.fit.whitening
-    # What readings have in common counts as one, not as many; a distance has no direction.
+    # χ² of correlated readings needs more than their variances; a distance has no direction.
     if fit.readings.serial is not None or fit.readings.scalar.any():
         return []
     o = fit.solution.prediction.observation
@@ -211,10 +212,10 @@ class PoseConstants:
     t: Floats  # (K,) squares of its columns, which are orthogonal
     rank: int  # number of directions beside the model
     gain: float  # reduction of ‖r‖² by them
-    p_value: float  # of that
+    p_value: float  # of the gain
 
     def square(self, x: Floats) -> float:
-        """Return the square ‖Uᵀx‖² of whitened columns x (R, P) that the constants take."""
+        """Return the square ‖Uᵀx‖² of whitened columns x (R, P) that the constants explain."""
         z = np.asarray(self.columns.T @ self.projection.project_out(x))
         return _square(z, self.shared, self.t)
 
@@ -227,7 +228,7 @@ def pose_constants(p: Linearisation) -> PoseConstants | None:
         return None
     axes = np.zeros((len(fit.pose), w.m, 3))
     axes[:, :3] = 1e-3 * fit.solution.prediction.observation.axes[w.reading]
-    columns, there = _orthonormal(w.whiten(axes), w.rows_of(fit.pose))
+    columns, determined = _orthonormal(w.whiten(axes), w.rows_of(fit.pose))
     b, inverse_root = p.projection.rows, p.projection.inverse_root
     values, vectors = np.linalg.eigh(
         2.0 * np.eye(len(inverse_root)) - inverse_root @ (b.T @ b) @ inverse_root.T
@@ -235,37 +236,37 @@ def pose_constants(p: Linearisation) -> PoseConstants | None:
     shared = np.asarray(columns.T @ b) @ inverse_root.T @ (vectors * np.sqrt(np.abs(values)))
     t, turn = np.linalg.eigh(shared.T @ shared)
     shared = shared @ turn
-    rank = there - int(np.count_nonzero(t >= HELD))
+    rank = determined - int(np.count_nonzero(t >= HELD))
     if rank <= 0 or fit.dof - rank <= 0:
         return None
     gain = _square(np.asarray(columns.T @ p.project_out(p.residual[:, None])), shared, t)
     within = (p.rss - gain) / (fit.dof - rank)
-    nothing_else = np.inf if gain > 0 else 0.0  # what poses that repeat exactly leave
-    ratio = gain / rank / within if within > 0 else nothing_else
+    exact = np.inf if gain > 0 else 0.0  # where readings of a pose agree exactly
+    ratio = gain / rank / within if within > 0 else exact
     p_value = float(f_distribution.sf(ratio, rank, fit.dof - rank))
     return PoseConstants(p.projection, columns, shared, t, rank, gain, p_value)
 
 
 def _orthonormal(columns: Floats, pose: Ints) -> "tuple[csr_array, int]":
-    """Columns (R, 3 poses) of columns (R, 3) that each pose has alone, orthonormal; their rank."""
+    """Orthonormal columns (R, 3 poses) of each pose from common ones (R, 3), and their rank."""
     from scipy.sparse import csr_array  # slow to import
 
     values = np.zeros_like(columns)
     order = np.argsort(pose, kind="stable")
     parts = np.split(order, np.flatnonzero(np.diff(pose[order])) + 1)
-    found = [np.linalg.svd(columns[rows], full_matrices=False) for rows in parts]
-    least = DETERMINED * max(float(s.max(initial=0.0)) for _, s, _ in found)
-    for rows, (u, s, _) in zip(parts, found, strict=True):
+    decomposed = [np.linalg.svd(columns[rows], full_matrices=False) for rows in parts]
+    least = DETERMINED * max(float(s.max(initial=0.0)) for _, s, _ in decomposed)
+    for rows, (u, s, _) in zip(parts, decomposed, strict=True):
         values[np.ix_(rows, s > least)] = u[:, s > least]
-    there = sum(int(np.count_nonzero(s > least)) for _, s, _ in found)
-    at = 3 * pose[:, None] + np.arange(3)
+    rank = sum(int(np.count_nonzero(s > least)) for _, s, _ in decomposed)
+    index = 3 * pose[:, None] + np.arange(3)
     start = 3 * np.arange(len(pose) + 1)
     shape = len(pose), 3 * (int(pose.max()) + 1)
-    return csr_array((values.reshape(-1), at.reshape(-1), start), shape=shape), there
+    return csr_array((values.reshape(-1), index.reshape(-1), start), shape=shape), rank
 
 
 def _square(z: Floats, shared: Floats, t: Floats) -> float:
-    """Return zᵀ (1 − V Vᵀ)⁺ z, of all columns of z."""
+    """Return zᵀ (1 − V Vᵀ)⁺ z, summed over the columns of z."""
     along = np.sum((shared.T @ z) ** 2, axis=1)
     held = t >= HELD
     return float(np.sum(z**2) + np.sum(along[~held] / (1.0 - t[~held])) - np.sum(along[held]))

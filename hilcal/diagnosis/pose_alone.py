@@ -1,17 +1,17 @@
-"""A misfit that is the same under every load of a pose, which effects do that, and how many poses.
+"""A misfit that depends on the pose alone, its possible effects, and the poses to identify them.
 
-With few poses a fine transmission error is no pattern: every pose errs by itself, and no pose
-predicts another. But all readings of a pose err alike, whatever hangs on the arm. That alone says
-much: what is missing depends on the pose, and on nothing else that changed within it.
+With few poses a fine transmission error shows no pattern: every pose has an error of its own, and
+no pose predicts another. But all readings of a pose have the same error under every load. So the
+missing effect depends on the pose, and on nothing else that changed within a pose.
 
-The residual is split by constants of each pose, three displacements of the target. Where they leave
-noise and take nearly all of the misfit, the effects are listed whose own columns are such constants
-to nearly all of their square. The parameters of a family can be told apart once the poses measure
-about as many elements as the family has parameters. The number of further poses that is proposed is
-the smallest of the numbers tried at which the first of these effects, as large as the misfit, would
-pass every test of a suspect with a probability of `SURE`. For that campaigns are simulated by
-algebra, at the linearisation of the fit: the readings so far, and unloaded ones at further poses
-within the range of the joints so far; parameters drawn with the size found; noise; all tests.
+The residual is split by constants of each pose, three displacements of the target. If they explain
+nearly all of the misfit and leave noise, those effects are listed whose columns are such constants
+to nearly all of their square. The parameters of a family can be separated once the poses measure
+about as many elements as the family has parameters. The proposed number of further poses is the
+smallest of `SHARES` at which the first of these effects, as large as the misfit, would pass every
+test of a suspect with the probability `SURE`. To that end campaigns are simulated by algebra, at
+the linearisation of the fit: the readings so far, and unloaded readings at further poses within the
+range of the joints so far; parameters drawn with the size found; noise; all tests.
 """
 
 from collections.abc import Iterator, Sequence
@@ -36,15 +36,15 @@ from hilcal.regression.evidence import spectrum
 from hilcal.robot import se3
 
 LEAST = 0.9
-"""Share of the misfit that pose constants must take; a choice, they take 0.99 of a transmission
-error of 2 σ."""
+"""Share of the misfit that pose constants must explain; a choice: they explain 0.99 of a
+transmission error of 2 σ."""
 ALIKE = 0.98
-"""Share of the square of an effect's columns that pose constants take where it depends on the pose
-alone; a choice."""
-DRAWS = 24  # simulated campaigns of a number of poses; a choice: 0.9 is known to 0.06
-SURE = 0.9  # chance from which on poses are enough; a choice
+"""Share of the square of an effect's columns that pose constants must explain for the effect to
+depend on the pose alone; a choice."""
+DRAWS = 24  # simulated campaigns per number of poses; a choice: 0.9 is known to 0.06
+SURE = 0.9  # probability at which poses are enough; a choice
 SHARES = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0)
-"""Numbers of poses that are tried, in units of those that would measure as many elements as the
+"""Tried numbers of further poses, in units of the number that would measure as many elements as the
 family has parameters. A choice."""
 _SEED = 20240613
 
@@ -53,21 +53,21 @@ _SEED = 20240613
 class PoseAlone:
     """A misfit that depends on the pose alone."""
 
-    share: float  # of the misfit that constants of each pose take, less what chance would
+    share: float  # of the misfit that constants of each pose explain beyond chance
     effects: tuple[str, ...]  # those that depend on the pose alone, most parameters first
     poses: int  # number of poses that were measured
-    more: int  # how many more poses, read unloaded, tell of the first of them
-    # that they do, where it is as large as the misfit; None where the model holds a coarser one
+    more: int  # further poses, read unloaded, that would reveal the first effect
+    # probability that they reveal one as large as the misfit; None if the model has a coarser form
     chance: float | None
 
 
 class PosePower(NamedTuple):
-    """Chance that an effect passes every test of a suspect beside a rival that is fitted."""
+    """Chance that an effect passes every test of a suspect beside a rival in the model."""
 
-    effect: str  # which is there with the size that explains the misfit
-    rival: str  # the one that the model holds
-    now: float  # with the readings so far
-    then: float  # with further poses as well
+    effect: str  # present with the size that explains the misfit
+    rival: str  # in the model
+    now: float  # chance with the readings so far
+    then: float  # chance with further poses as well
 
 
 def pose_alone(
@@ -75,62 +75,62 @@ def pose_alone(
     effects: Sequence[Effect],  # that are not in the model
     level: float,  # of the test of a suspect, between 0 and 1
 ) -> PoseAlone | None:
-    """Return a misfit that depends on the pose alone; None where it does not, or no effect does."""
-    found = pose_constants(p)
-    if found is None:
+    """Return a misfit that depends on the pose alone, and its effects; None without either."""
+    constants = pose_constants(p)
+    if constants is None:
         return None
-    fit, rank = p.fit, found.rank
-    rest = p.rss - found.gain
-    share = p.share(found.gain - rank * rest / (fit.dof - rank))
-    if share < LEAST or float(chi2.sf(rest, fit.dof - rank)) < MISFIT_ALARM:
+    fit, rank = p.fit, constants.rank
+    remainder = p.rss - constants.gain
+    share = p.share(constants.gain - rank * remainder / (fit.dof - rank))
+    if share < LEAST or float(chi2.sf(remainder, fit.dof - rank)) < MISFIT_ALARM:
         return None
     able, states = [], fit.readings[~fit.outlier].states
     for e in (*(e for e in fit.model.effects if e.fine(states)), *effects):
         full = e.fine(states) or e
         x = p.project_out(effect_columns(fit, full).white)
         square = float(np.sum(x**2))
-        if square > 0 and found.square(x) >= ALIKE * square:
+        if square > 0 and constants.square(x) >= ALIKE * square:
             able.append((len(full.parameters), e))
     able.sort(key=lambda pair: -pair[0])
     poses = int(fit.pose.max()) + 1
-    about = int(np.ceil(able[0][0] / fit.whitening.m)) - poses if able else 0
-    if about <= 0:
+    missing = int(np.ceil(able[0][0] / fit.whitening.m)) - poses if able else 0
+    if missing <= 0:
         return None
     names, first = tuple(e.name for _, e in able), able[0][1]
     if first.name in fit.model.names:
-        return PoseAlone(share, names, poses, about, None)
-    more, sure = about, 0.0
+        return PoseAlone(share, names, poses, missing, None)
+    further, power = missing, 0.0
     for part in SHARES:
-        more = max(int(np.ceil(part * about)), 1)
-        sure = chance(p, first, more, level)
-        if sure >= SURE:
+        further = max(int(np.ceil(part * missing)), 1)
+        power = chance(p, first, further, level)
+        if power >= SURE:
             break
-    return PoseAlone(share, names, poses, more, sure)
+    return PoseAlone(share, names, poses, further, power)
 
 
 def pose_powers(
-    before: Fit,  # of a model without the effects
+    fit: Fit,  # of a model without the effects
     effects: Sequence[str],  # two or more that depend on the pose alone
-    more: int,  # further poses, read unloaded
+    further: int,  # poses, read unloaded
 ) -> Iterator[PosePower]:
-    """Yield how well the first of some effects is told from each of the others."""
-    states, model = before.readings[~before.outlier].states, before.model
+    """Yield how well the first of some effects is separated from each of the others."""
+    states, model = fit.readings[~fit.outlier].states, fit.model
     first, *rivals = effects
-    made = model.catalogue.make(first, model.cell, states, m=before.readings.m)
-    possible = [kind for kind in model.catalogue.effects if kind.applies(made.cell)]
+    effect = model.catalogue.make(first, model.cell, states, m=fit.readings.m)
+    possible = [kind for kind in model.catalogue.effects if kind.applies(effect.cell)]
     level = FALSE_ALARM / max(len(possible) - len(model.effects), 1)
-    strength = strength_of(linearise(before), made)
+    strength = strength_of(linearise(fit), effect)
     for rival in rivals:
         try:
-            p = linearise(add(before, rival))
+            p = linearise(add(fit, rival))
         except HilcalError:
             continue
-        now, then = (chance(p, made, n, level, strength) for n in (0, more))
+        now, then = (chance(p, effect, n, level, strength) for n in (0, further))
         yield PosePower(first, rival, now, then)
 
 
 def strength_of(p: Linearisation, effect: Effect) -> float:
-    """Return the strength with which an effect, as fine as it may be, explains the misfit."""
+    """Return the strength with which an effect in its finest form explains the misfit."""
     full = effect.fine(p.fit.readings[~p.fit.outlier].states) or effect
     square = float(np.sum(p.project_out(effect_columns(p.fit, full).white) ** 2))
     return min(float(np.sqrt(p.misfit() / square)), full.most()) if square > 0.0 else 0.0
@@ -139,46 +139,46 @@ def strength_of(p: Linearisation, effect: Effect) -> float:
 def chance(
     p: Linearisation,  # of the fit so far
     effect: Effect,
-    more: int,  # further poses, read unloaded
+    further: int,  # poses, read unloaded
     level: float,  # of the test of a suspect, between 0 and 1
-    strength: float | None = None,  # of its parameters; that which explains the misfit unless given
+    strength: float | None = None,  # of its parameters; by default as large as the misfit
 ) -> float:
-    """Return the chance that a family passes every test with so many more poses."""
+    """Return the chance that a family passes every test with a number of further poses."""
     rng = np.random.default_rng(_SEED)
     t = strength_of(p, effect) if strength is None else strength
     full = effect.fine(p.fit.readings[~p.fit.outlier].states) or effect
     try:
-        then = _with(p.fit, more, rng) if more else p.fit
+        extended = _with_poses(p.fit, further, rng) if further else p.fit
     except HilcalError:
         return 0.0
-    q, states = linearise(then), then.readings[~then.outlier].states
-    scored = effect_columns(then, type(effect)(effect.cell, states).for_scoring(states))
-    there = effect_columns(then, full.with_options(states)).white
-    signal = t * there @ rng.standard_normal((there.shape[1], DRAWS))
+    q, states = linearise(extended), extended.readings[~extended.outlier].states
+    scored = effect_columns(extended, type(effect)(effect.cell, states).for_scoring(states))
+    x = effect_columns(extended, full.with_options(states)).white
+    signal = t * x @ rng.standard_normal((x.shape[1], DRAWS))
     y = signal + rng.standard_normal(signal.shape)
     s = spectrum(q.information(scored.white))
-    largest = most(scored, unloaded_readings(then))
-    return float(np.mean(SuspectTests(q, scored, s, level, largest).found(y)))
+    largest = most(scored, unloaded_readings(extended))
+    return float(np.mean(SuspectTests(q, scored, s, level, largest).passed(y)))
 
 
-def _with(before: Fit, more: int, rng: np.random.Generator) -> Fit:
+def _with_poses(first: Fit, count: int, rng: np.random.Generator) -> Fit:
     """Return the fit with unloaded readings at further poses, which the model predicts exactly."""
-    now = before.readings[~before.outlier]
-    rows = np.flatnonzero(now.unloaded) if now.unloaded.any() else np.arange(len(now))
-    chosen = now[rng.choice(rows, more)]
-    low, high = now.states.q.min(axis=0), now.states.q.max(axis=0)
-    q = before.model.cell.arm.complete(rng.uniform(low, high, (more, len(low))))
+    readings = first.readings[~first.outlier]
+    rows = np.flatnonzero(readings.unloaded | ~readings.unloaded.any())
+    chosen = readings[rng.choice(rows, count)]
+    low, high = readings.states.q.min(axis=0), readings.states.q.max(axis=0)
+    q = first.model.cell.arm.complete(rng.uniform(low, high, (count, len(low))))
     actual = None if chosen.states.q_actual is None else q.copy()
-    names = (*now.pose_names, *(f"further {k + 1}" for k in range(more)))
+    names = (*readings.pose_names, *(f"further {k + 1}" for k in range(count)))
     further = replace(
         chosen,
         states=replace(chosen.states, q=q, q_actual=actual),
-        pose=len(now.pose_names) + np.arange(more),
+        pose=len(readings.pose_names) + np.arange(count),
         pose_names=names,
     )
-    joined = Readings.joined([replace(now, pose_names=names), further])
-    seen = before.model.predict(joined.states, before.theta).observation
-    value = seen.position
-    if now.m == 6:
-        value = np.hstack([value, se3.rotation_vector(seen.rotation)])
-    return fit(before.model, replace(joined, value=value), before.mode)
+    joined = Readings.joined([replace(readings, pose_names=names), further])
+    predicted = first.model.predict(joined.states, first.theta).observation
+    value = predicted.position
+    if readings.m == 6:
+        value = np.hstack([value, se3.rotation_vector(predicted.rotation)])
+    return fit(first.model, replace(joined, value=value), first.mode)

@@ -1,4 +1,4 @@
-"""Recorded variables of the state as smooth functions, and the possible motions of the target."""
+"""Recorded variables of the state, smooth functions of them, and motions of the target."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -12,12 +12,12 @@ from hilcal.readings.readings import angle_name, travel_name
 from hilcal.types import Floats, Ints
 
 ROW_ORDER = "row order"
-"""The variable in place of the time where the readings do not state it: a drift shows by it."""
-ROUNDING = 1e-9  # share of the largest value within which a variable does not vary
+"""Replaces the time where the readings do not state it, so that a drift shows."""
+ROUNDING = 1e-9  # least variation of a variable, as a share of its largest value
 HARMONICS = 4
 POWERS = 4
 WIDTH = 9
-"""Columns of a law at most: functions of one joint, or three functions along three axes."""
+"""Most columns of a law: functions of one joint, or three functions along three axes."""
 BINS = 8
 PER_MOTION = 1e-3
 """An ordinary motion: 1 mrad of a joint, 1 mm of the target."""
@@ -25,63 +25,66 @@ PER_MOTION = 1e-3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedVariable:
-    """Values (N,) and functions (N, F) of a recorded variable; products with those of another."""
+    """A recorded variable and functions of it, of which a law is a linear combination.
+
+    The functions of a law of two variables are the products of both variables' functions.
+    """
 
     name: str
     unit: str
-    values: Floats
-    functions: Floats
-    other: "RecordedVariable | None" = None
+    values: Floats  # (N,)
+    functions: Floats  # (N, F)
+    factor: "RecordedVariable | None" = None  # second variable of the law
     labels: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of what the law depends on."""
-        return (self.name,) if self.other is None else (self.name, self.other.name)
+        """Names of the variables of the law."""
+        return (self.name,) if self.factor is None else (self.name, self.factor.name)
 
     def product(self) -> Floats:
         """(N, F) functions of the law."""
-        if self.other is None:
+        if self.factor is None:
             return self.functions
-        both = self.functions[:, :, None] * self.other.functions[:, None, :]
-        return both.reshape(len(both), -1)
+        products = self.functions[:, :, None] * self.factor.functions[:, None, :]
+        return products.reshape(len(products), -1)
 
-    def exchanged(self, name: str, order: Ints) -> "RecordedVariable":
-        """Return the law with the values of one variable taken from other readings."""
-        out = self if self.other is None else replace(self, other=self.other.exchanged(name, order))
-        return replace(out, functions=out.functions[order]) if name == self.name else out
+    def permuted(self, name: str, order: Ints) -> "RecordedVariable":
+        """Return the law with the values of one variable permuted between readings."""
+        factor = self.factor and self.factor.permuted(name, order)
+        functions = self.functions[order] if name == self.name else self.functions
+        return replace(self, functions=functions, factor=factor)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StateVariable:
-    """A number that is recorded of the state of each reading."""
+    """A variable that is recorded of the state of each reading."""
 
     name: str  # e.g. "joint 2 angle"
     unit: str  # SI
     kind: str  # "angle", "travel", "torque", "approach" or "other"
     values: Floats  # (N,)
-    joint: int = 0  # number from 0, where it is of one
+    joint: int = 0  # index of the joint, if the variable belongs to one
 
 
 def state_variables(p: Linearisation) -> Iterator[StateVariable]:
-    """Yield the position of each joint, and all else that is recorded of the states and varies."""
-    fit, at = p.fit, p.fit.solution.prediction.situation
+    """Yield the position of each joint, and every other recorded variable that varies."""
+    fit, situation = p.fit, p.fit.solution.prediction.situation
     s = fit.readings[~fit.outlier].states
     approach, temperature = (x if x is None else x.T for x in (s.approach, s.joint_temperature))
-    for j, slides in enumerate(at.cell.arm.slides.tolist()):
-        name, joint = travel_name(j) if slides else angle_name(j), f"joint {j + 1}"
+    for j, slides in enumerate(situation.cell.arm.slides.tolist()):
         if slides:
-            yield StateVariable(name, "m", "travel", at.values[:, j], j)
+            yield StateVariable(travel_name(j), "m", "travel", situation.values[:, j], j)
         else:
-            yield StateVariable(name, "rad", "angle", at.angle[:, j], j)
+            yield StateVariable(angle_name(j), "rad", "angle", situation.angle[:, j], j)
         load = ("force", "N") if slides else ("torque", "N·m")
-        for what, unit, kind, values in (
-            (*load, "torque", at.torque[:, j]),
+        for quantity, unit, kind, values in (
+            (*load, "torque", situation.torque[:, j]),
             ("approach", "side", "approach", None if approach is None else approach[j]),
             ("temperature", "°C", "other", None if temperature is None else temperature[j]),
         ):
             if values is not None and _varies(values):
-                yield StateVariable(f"{joint} {what}", unit, kind, values, j)
+                yield StateVariable(f"joint {j + 1} {quantity}", unit, kind, values, j)
     rows = np.flatnonzero(~fit.outlier).astype(float)
     for name, unit, values in (
         (ROW_ORDER, "row", rows) if s.time is None else ("time", "s", s.time),
@@ -96,39 +99,39 @@ def _varies(values: Floats) -> bool:
     return bool(np.ptp(values) > ROUNDING * max(float(np.abs(values).max()), 1.0))
 
 
-def recorded(p: Linearisation) -> list[RecordedVariable]:
-    """Everything recorded of the state that varies."""
+def law_variables(p: Linearisation) -> list[RecordedVariable]:
+    """Variables of all laws: every recorded variable, and products with load and of two angles."""
     readings = p.fit.readings[~p.fit.outlier]
     situation = p.fit.solution.prediction.situation
     force = np.linalg.norm(readings.states.wrench, axis=1)
     pull = force / max(float(force.max()), 1e-300)
-    hung = RecordedVariable("load", "", pull, pull[:, None])
+    load = RecordedVariable("load", "", pull, pull[:, None])
     out: list[RecordedVariable] = []
     turns: list[RecordedVariable] = []
 
     def smooth(v: StateVariable, centre: float) -> None:
-        away = v.values - centre
-        away = away / np.abs(away).max()
-        # Higher powers are the less likely ones.
-        powers = np.stack([away**k / max(k, 1) for k in range(POWERS + 1)], axis=1)
+        x = v.values - centre
+        x = x / np.abs(x).max()
+        # Higher powers are less likely.
+        powers = np.stack([x**k / max(k, 1) for k in range(POWERS + 1)], axis=1)
         # The straight line by itself, too: it is simpler than a curve of another variable.
         out.extend(RecordedVariable(v.name, v.unit, v.values, f) for f in (powers, powers[:, :2]))
 
     for v in state_variables(p):
-        one = np.ones(len(v.values))
-        if v.kind in ("angle", "travel"):  # laws go by the phase of a travel, people by the travel
+        ones = np.ones(len(v.values))
+        if v.kind in ("angle", "travel"):  # laws use the phase of a travel, reports the travel
             angle, k = situation.angle[:, v.joint, None], np.arange(1, HARMONICS + 1)
             waves = np.stack([np.cos(angle * k) / k, np.sin(angle * k) / k], axis=2)
-            waves = np.column_stack([one, waves.reshape(len(one), -1)])
+            waves = np.column_stack([ones, waves.reshape(len(ones), -1)])
             out.append(RecordedVariable(v.name, v.unit, v.values, waves))
             if np.ptp(pull) > 0.01:
-                out.append(replace(out[-1], other=hung))
-            first = np.column_stack([one, np.cos(angle), np.sin(angle)])
+                out.append(replace(out[-1], factor=load))
+            first = np.column_stack([ones, np.cos(angle), np.sin(angle)])
             turns.append(RecordedVariable(v.name, v.unit, v.values, first))
             if v.kind == "travel" and _varies(v.values):
                 smooth(v, float(situation.cell.arm.usual_range[0][v.joint]))
         elif v.kind == "approach":
-            sides = np.stack([one, v.values], axis=1)
+            sides = np.stack([ones, v.values], axis=1)
             out.append(RecordedVariable(v.name, v.unit, v.values, sides))
         else:
             smooth(v, 0.0 if v.kind == "torque" else float(np.median(v.values)))
@@ -138,42 +141,35 @@ def recorded(p: Linearisation) -> list[RecordedVariable]:
         names = tuple(readings.load_names[k] for k in loads)
         index = np.searchsorted(loads, readings.load).astype(float)
         out.append(RecordedVariable("load", "", index, member, None, names))
-    return out + [replace(a, other=b) for a, b in combinations(turns, 2)]
+    return out + [replace(a, factor=b) for a, b in combinations(turns, 2)]
 
 
 def motions(p: Linearisation) -> list[Floats]:
     """(N, m, 1) motion by each joint, and (N, m, 3) of the target along base axes."""
-    fit, m = p.fit, p.fit.whitening.m
-    prediction = fit.solution.prediction
-    moves = motion(
-        fit.model.cell,
-        prediction.observation,
-        prediction.situation.chain,
-        prediction.deviation,
-        m,
-    ).drives
-    axes = np.zeros((len(moves), m, 3))
-    axes[:, :3] = prediction.observation.axes
-    return [PER_MOTION * moves[:, :, [j]] for j in range(moves.shape[2])] + [PER_MOTION * axes]
+    fit, m, s = p.fit, p.fit.whitening.m, p.fit.solution.prediction
+    drives = motion(fit.model.cell, s.observation, s.situation.chain, s.deviation, m).drives
+    axes = np.zeros((len(drives), m, 3))
+    axes[:, :3] = s.observation.axes
+    return [PER_MOTION * drives[:, :, [j]] for j in range(drives.shape[2])] + [PER_MOTION * axes]
 
 
-def law_columns(p: Linearisation, v: RecordedVariable, way: Floats) -> Floats:
-    """(R, WIDTH) whitened columns of one law, zeros where it has fewer."""
+def law_columns(p: Linearisation, v: RecordedVariable, moves: Floats) -> Floats:
+    """(R, WIDTH) whitened columns of a law with one of the `motions`, padded with zeros."""
     w = p.fit.whitening
-    functions = v.product()[:, : WIDTH // way.shape[2]]
-    raw = (way[:, :, :, None] * functions[:, None, None, :]).reshape(*way.shape[:2], -1)
+    functions = v.product()[:, : WIDTH // moves.shape[2]]
+    raw = (moves[:, :, :, None] * functions[:, None, None, :]).reshape(*moves.shape[:2], -1)
     out = np.zeros((w.m * len(w), WIDTH))
     out[:, : raw.shape[2]] = w.whiten(w.raw(raw)).reshape(len(out), -1)
     return out
 
 
 def bins_of(v: RecordedVariable) -> tuple[Floats, Floats]:
-    """Bin of each reading and the mean of each bin; equal numbers of readings in each."""
+    """Bin (N,) of each reading and mean (K,) of each bin; about as many readings in every bin."""
     distinct = np.unique(v.values)
     if v.labels or len(distinct) <= BINS:
         return np.searchsorted(distinct, v.values).astype(float), distinct
     edges = np.unique(np.quantile(v.values, np.linspace(0, 1, BINS + 1)[1:-1]))
     index = np.searchsorted(edges, v.values, side="right")
     filled = np.unique(index)
-    place = np.searchsorted(filled, index)
-    return place.astype(float), np.array([v.values[place == k].mean() for k in range(len(filled))])
+    bins = np.searchsorted(filled, index)
+    return bins.astype(float), np.array([v.values[bins == k].mean() for k in range(len(filled))])

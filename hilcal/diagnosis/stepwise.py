@@ -1,4 +1,4 @@
-"""Changes of a model: an effect more, one less, one in place of another."""
+"""Changes of a model: add an effect, remove one, exchange one for another."""
 
 from dataclasses import replace
 
@@ -16,18 +16,17 @@ from hilcal.types import Floats
 
 
 def add(before: Fit, effect: str, options: Options | None = None) -> Fit:
-    """Refit with one more effect, from where the fit stands.
+    """Refit with one more effect, starting from the parameters of the fit.
 
-    One that is finer than an effect of the model, as joint_compliance(joints=each) where the model
-    has one for all joints, takes its place. One of the background becomes a named one, and keeps
-    its standard deviation.
+    A finer form of an effect of the model, such as joint_compliance(joints=each), replaces it. An
+    effect of the background becomes a named effect and keeps its standard deviation.
 
     Args:
         effect: its name; with options as `read_effects_text` reads them.
         options: of the effect, where they are not the usual ones.
 
     Raises:
-        InputError: unknown effect, one that is there already, or one that these readings
+        InputError: unknown effect, one that the model has already, or one that these readings
             cannot show; an unknown option, or a bad value.
     """
     model, start = _grown(before.model, before.theta, effect, before.readings, options)
@@ -35,62 +34,63 @@ def add(before: Fit, effect: str, options: Options | None = None) -> Fit:
 
 
 def remove(before: Fit, effect: str) -> Fit:
-    """Refit without an effect, from where the fit stands.
+    """Refit without an effect, starting from the parameters of the fit.
 
     Raises:
-        InputError: an effect that is not there.
+        InputError: an effect that the model lacks.
     """
-    model, start = _rest(before.model, before.theta, effect)
+    model, start = _reduced(before.model, before.theta, effect)
     return fit(model, before.readings, before.mode, before.scaling, start)
 
 
-def _rest(model: Model, theta: Floats, effect: str) -> tuple[Model, Floats]:
+def _reduced(model: Model, theta: Floats, effect: str) -> tuple[Model, Floats]:
     """Return the model without an effect, and its parameters."""
     if effect not in model.names:
         raise InputError(f"effect {effect} is not in the model: {', '.join(model.names)}")
-    place = model.names.index(effect)
-    rest = tuple(e for e in model.effects if e.name != effect)
+    columns = model.slices()[model.names.index(effect)]
+    effects = tuple(e for e in model.effects if e.name != effect)
     random = {name: std for name, std in model.random.items() if name != effect}
-    left = replace(model, effects=rest, random=random, background=model.background - {effect})
-    return left, np.delete(theta, model.slices()[place])
+    model = replace(model, effects=effects, random=random, background=model.background - {effect})
+    return model, np.delete(theta, columns)
 
 
 def _grown(
     model: Model, theta: Floats, effect: str, readings: Readings, options: Options | None = None
 ) -> tuple[Model, Floats]:
     """Return the model with one more effect, or a finer one, and parameters to start from."""
-    ((name, given),) = read_effects_text(effect, "effect", model.catalogue).items()
-    given = {**given, **(options or {})}
-    if name in model.background and not given:
+    ((name, in_text),) = read_effects_text(effect, "effect", model.catalogue).items()
+    merged = {**in_text, **(options or {})}
+    if name in model.background and not merged:
         return replace(model, background=model.background - {name}), theta
     if name in model.names:
         present = model.effects[model.names.index(name)]
-        made = present.with_options(readings.states, **given)
-        if not made.refines(present):
+        added = present.with_options(readings.states, **merged)
+        if not added.refines(present):
             raise InputError(f"effect {name} is in the model already: {', '.join(model.names)}")
-        model, theta = _rest(model, theta, name)
+        model, theta = _reduced(model, theta, name)
     else:
-        made = model.catalogue.make(name, model.cell, readings.states, given, readings.m)
-    grown = model + made
+        added = model.catalogue.make(name, model.cell, readings.states, merged, readings.m)
+    grown = model + added
     return grown, np.concatenate([theta, np.zeros(grown.size - model.size)])
 
 
-def exchange(before: Fit, effect: str, other: str) -> Fit:
-    """Refit with another effect in the place of one, from where the fit stands.
+def exchange(before: Fit, effect: str, replacement: str) -> Fit:
+    """Refit with an effect replaced by another, starting from the parameters of the fit.
 
     Raises:
-        InputError: an effect that is not there, or another that is.
+        InputError: an effect that the model lacks, or a replacement that the model has already.
     """
-    rest, start = _rest(before.model, before.theta, effect)
-    if other in before.model.names:
-        raise InputError(f"effect {other} is in the model already: {', '.join(before.model.names)}")
-    model, start = _grown(rest, start, other, before.readings)
+    model, start = _reduced(before.model, before.theta, effect)
+    names = before.model.names
+    if replacement in names:
+        raise InputError(f"effect {replacement} is in the model already: {', '.join(names)}")
+    model, start = _grown(model, start, replacement, before.readings)
     return fit(model, before.readings, before.mode, before.scaling, start)
 
 
 def predicts_better(before: Fit, after: Fit) -> bool:
     """Whether the error on poses left out falls, by more than it scatters from pose to pose."""
     if np.any(before.outlier != after.outlier):
-        one, other = before.holdout_of_all.rms_sigma, after.holdout_of_all.rms_sigma
-        return other < (1 - LEAST_GAIN) * one
+        limit = (1 - LEAST_GAIN) * before.holdout_of_all.rms_sigma
+        return after.holdout_of_all.rms_sigma < limit
     return improves(left_out_by_pose(before), left_out_by_pose(after))

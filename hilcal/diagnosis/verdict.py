@@ -2,53 +2,52 @@
 
 The rules, in this order:
 
-0. A figure of the cell that was entered otherwise explains the misfit (see `wrong_figures`):
-   `ambiguous`, until that is settled; nothing else is looked for.
+0. A wrong figure of the cell explains the misfit (see `wrong_figures`): `ambiguous`, until the
+   figure is corrected or confirmed; no effect is searched.
 1. A suspect passes all tests (see `effect_ranking.Suspect.passes`), and all effects of the
    catalogue together leave more than noise (see `evidence`): `unknown_effect`.
 2. A suspect passes, and the readings separate it from every other: `missing_effect`; else
    `ambiguous`.
-3. None passes, and χ² is what chance allows: `adequate`; or `ambiguous` where another effect could
-   replace one that an earlier diagnosis chose.
+3. No suspect passes, and χ² is not too large: `adequate`; or `ambiguous` where another effect could
+   replace an addition to the model.
 4. χ² is too large, and something recorded predicts a share of the misfit on poses left out, or
    repeats of a pose have it in common: `unknown_effect`, with that share.
-   Where χ² is too large, no variable predicts the misfit on poses left out beyond chance, and it
-   is the same under every load of a pose, so that more poses would tell (see `pose_alone`):
-   `ambiguous`.
-5. χ² is too large, nothing predicts the residual (no suspect, no learner, no variable) or repeated
-   readings scatter as much, and the arm's own scatter is not in the stated covariance. It is
-   estimated (see `arm_scatter`), before rule 4. Where something predicts no more of the
-   misfit than is negligible in an uncertainty budget (`noise.PREDICTABLE`), c holds too,
-   and the share is said; a and b then leave it to rule 4:
+   If instead no variable predicts the misfit on poses left out beyond chance, and the misfit is the
+   same under every load of a pose, more poses would identify it (see `pose_alone`): `ambiguous`.
+5. χ² is too large, the arm's own scatter is not in the stated covariance, and nothing predicts the
+   residual (no suspect, no regression, no variable), or repeated readings scatter as much. The
+   arm's scatter is then estimated (see `arm_scatter`), before rule 4:
    a. the readings prefer a noisier instrument at more than 20 : 1: `noise_misjudged`;
-   b. the scatter is larger than an arm's repeatability can be (see `noise`):
-      `noise_misjudged`, be it the instrument, or an arm or a target that was loose;
-   c. else `adequate`. An arm whose scatter is not stated was taken for one without any, which no
-      arm is; so where the readings do not tell its scatter from a noisier instrument, that is said
-      and the verdict stays.
+   b. the scatter is larger than the repeatability of any arm (see `noise`): `noise_misjudged`,
+      whether the cause is the instrument, a loose arm or a loose target;
+   c. else `adequate`. The fit assumed an arm without scatter, which no arm is. If the readings do
+      not distinguish its scatter from a noisier instrument, the message says so and the verdict
+      stays.
+   If a share of the misfit is predicted that is negligible in an uncertainty budget
+   (`noise.PREDICTABLE`), c holds as well, with that share; rule 4 applies instead of a and b.
 6. Otherwise the stated noise is too small, or too large: `noise_misjudged` (see `noise`).
-   This holds where the arm's repeatability is stated, too: the noise is then complete, and wrong.
+   If the arm's repeatability is stated, the rule holds, too: the noise is then complete, and wrong.
 
-A noise that was estimated from the readings (`Readings.noise_stated`) is too large where something
-is missing that the catalogue does not have, so that χ² does not show it: 4 holds as well where laws
+Noise that was estimated from the readings (`Readings.noise_stated`) is too large where an effect
+outside the catalogue is missing, so χ² does not show the effect: rule 4 holds as well where laws
 surely predict the residual on poses left out.
 
-Of several targets that are read in one arrival, where the arm's scatter is not stated and χ² is too
-large, the rules hold for the fit with the estimated scatter in its covariance (see
+If several targets are read in one arrival, the arm's scatter is not stated and χ² is too large, the
+rules are applied to the fit with the estimated scatter in its covariance (see
 `Evidence.by_arrivals`), and 3 becomes 5b or 5c.
 
-Noise that is correlated along the order of the readings is in the covariance of the fit before it
-is judged (see `serial_noise`). Where it is not proved, since effects explain the readings as well,
+The covariance of a judged fit includes a correlation of the noise along the order of the readings
+(see `serial_noise`). If the correlation is not proved, since effects explain the readings as well,
 3 and 5c become `ambiguous`.
 
-Where the model has a background, its residual is noise of any size, or the arm's scatter, and the
-readings prove the effects of the background together, effects of the catalogue are there that the
-readings do not prove one by one: 3, 5 and 6 become `ambiguous`, the suspects are those of the
-background, and the size of the noise is said.
+If the model has a background, its residual is noise of any size or the arm's scatter, and the
+readings prove the effects of the background together, then effects of the catalogue are present
+that the readings do not prove one by one: 3, 5 and 6 become `ambiguous`, the suspects are those of
+the background, and the size of the noise is stated.
 
-A fit whose covariance has the estimated scatter in it (`Readings.arm_scatter`) is judged by the
-same rules, but that it may be smaller than its noise: the scatter is never negative, so that an
-instrument whose noise is stated too large, in some of its elements, shows only then. That is said.
+A fit whose covariance includes the estimated scatter (`Readings.arm_scatter`) is judged by the same
+rules, but its residual may be smaller than its noise: the scatter is never negative, so instrument
+noise that is stated too large, in some elements, shows only then. The message says so.
 """
 
 from collections.abc import Callable, Sequence
@@ -72,15 +71,16 @@ from hilcal.diagnosis.residual_regression import ResidualRegression
 from hilcal.identification.fit import Fit
 
 NOTHING = History()
-IN_SAMPLE = ("pose", "direction")  # first words of variables whose share is not of poses left out
+IN_SAMPLE = ("pose", "direction")  # first words of variables whose share is of the fitted poses
 MOST_NAMED = 2  # variables that a sentence names
 BESIDE_A_BACKGROUND: tuple[Reason, ...] = (
     "residual_is_noise", "inseparable_addition", "arm_scatter", "misjudged_noise",
 )  # fmt: skip
-"""Reasons that are not the whole truth where effects are proved together, not one by one."""
+"""Reasons that the reason "background" overrides where effects are proved together, not one by
+one."""
 SAME_IN_POSE = 0.5
-"""Share of the misfit in common to all readings of a pose from which on it is not the scatter of
-single arrivals; a choice."""
+"""Share of the misfit that all readings of a pose have in common, above which it is not the scatter
+of single arrivals; a choice."""
 
 
 def diagnose(
@@ -90,7 +90,7 @@ def diagnose(
 
     Args:
         fit: the fit.
-        history: how its model was reached.
+        history: the changes that led to its model.
         say: takes progress, one line each.
 
     Raises:
@@ -101,37 +101,37 @@ def diagnose(
 
 
 def judge_naming(
-    fits: Sequence[Fit],  # of models that differ in what they name
-    tested: Sequence[BackgroundEffect],  # of the first one's background, see `background_evidence`
-    history: Callable[[Fit], History],  # of each of them
-    evidence: Callable[[tuple[BackgroundEffect, ...]], Evidence],  # of the last one
+    fits: Sequence[Fit],  # of models that differ only in the effects they name
+    tested: Sequence[BackgroundEffect],  # of the first background, see `background_evidence`
+    history: Callable[[Fit], History],  # of a fit
+    evidence: Callable[[tuple[BackgroundEffect, ...]], Evidence],  # of the last fit
 ) -> tuple[tuple[Diagnosis, ...], Evidence]:
-    """Judge one fit with a background and the same fit with more and more of it named.
+    """Judge a fit with a background, and the same fit with more and more of its effects named.
 
-    What is predicted is the same, so that the last is judged, and the others follow from it. A
-    diagnosis of each is returned, and the evidence for the last.
+    All predict the same, so the last fit is judged, and the diagnoses of the others are derived
+    from it. Returns the diagnoses, and the evidence of the last fit.
     """
-    left = [tuple(b for b in tested if b.effect in f.model.background) for f in fits]
-    e = evidence(left[-1])
+    unnamed = [tuple(b for b in tested if b.effect in f.model.background) for f in fits]
+    e = evidence(unnamed[-1])
     last = judge(e, history(fits[-1]))
-    named = {b.effect for b in last.background}
-    others = [s for s in last.suspects if s.effect not in named]
-    before = (
+    background = {b.effect for b in last.background}
+    suspects = [s for s in last.suspects if s.effect not in background]
+    derived = (
         replace(
             last,
             fit=f,
             history=history(f),
             reason="background",
-            suspects=(*as_suspects(own), *others),
-            background=own,
+            suspects=(*as_suspects(effects), *suspects),
+            background=effects,
         )
-        for f, own in zip(fits[:-1], left, strict=False)
+        for f, effects in zip(fits[:-1], unnamed, strict=False)
     )
-    return (*before, last), e
+    return (*derived, last), e
 
 
 def judge(e: Evidence, history: History) -> Diagnosis:
-    """Combine the evidence of a fit with what is known of the way to its model."""
+    """Judge a fit by its evidence and the history of its model."""
     if e.wrong_figures:
         return Diagnosis(
             fit=e.fit,
@@ -142,30 +142,28 @@ def judge(e: Evidence, history: History) -> Diagnosis:
             pure_error=e.pure_error,
             wrong_figures=e.wrong_figures,
         )
-    found = _with_arrivals(e, history)
-    if e.fit.disagreement is not None and not any(s.passes for s in found.suspects):
-        return replace(found, reason="readings_disagree")
-    return found
+    diagnosis = _with_arrivals(e, history)
+    if e.fit.disagreement is not None and not any(s.passes for s in diagnosis.suspects):
+        return replace(diagnosis, reason="readings_disagree")
+    return diagnosis
 
 
 def _with_arrivals(e: Evidence, history: History) -> Diagnosis:
-    """Judge; where readings of one arrival share its scatter, by arrivals."""
-    inner = e.by_arrivals
-    if inner is None or e.arm_scatter is None:
+    """Judge; with the arm's scatter in the covariance where readings of one arrival share it."""
+    if e.by_arrivals is None or e.arm_scatter is None:
         return _judged(e, history)
-    found = _judged(inner, history)
-    share, by = found.predictable_share, found.follows
-    scatter = replace(e.arm_scatter, predicted_share=share, predicted_by=by)
-    found = replace(found, fit=e.fit, scatter=scatter)
-    if found.reason != "residual_is_noise":
-        return found
-    size = of_repeatability_size(scatter, e.fit.model.cell.arm)
+    d = _judged(e.by_arrivals, history)
+    scatter = replace(e.arm_scatter, predicted_share=d.predictable_share, predicted_by=d.follows)
+    d = replace(d, fit=e.fit, scatter=scatter)
+    if d.reason != "residual_is_noise":
+        return d
+    plausible = of_repeatability_size(scatter, e.fit.model.cell.arm)
     noise = judge_noise(e.fit, e.pure_error, False)
-    return replace(found, reason="arm_scatter" if size else "misjudged_noise", noise=noise)
+    return replace(d, reason="arm_scatter" if plausible else "misjudged_noise", noise=noise)
 
 
 def _judged(e: Evidence, history: History) -> Diagnosis:
-    """Judge by the evidence as it is."""
+    """Judge by rules 1 to 6, with the covariance of the fit."""
     readings, arm = e.fit.readings, e.fit.model.cell.arm
     added = () if e.fit.model.background else history.added
     suspects = ranked(e.suspects, history.rejected)
@@ -186,7 +184,7 @@ def _judged(e: Evidence, history: History) -> Diagnosis:
             reason = "inseparable_suspects" if rivals else "one_suspect"
         follows = _carrying(regression)
     else:
-        # A noise that was estimated with something missing is too large to show it.
+        # Noise that was estimated while an effect is missing is too large to show the effect.
         hidden = not readings.noise_stated and e.regression.sure
         regression = e.regression if e.misfit or hidden else ResidualRegression(0.0, ())
         significant = _significant(e.misfit_breakdown)
@@ -194,7 +192,7 @@ def _judged(e: Evidence, history: History) -> Diagnosis:
         sizes = [v.share for v in significant]
         sizes += [s.holdout_share for s in suspects if s.explains]
         predicted = max([regression.share, *sizes]) if e.misfit or hidden else 0.0
-        # What an implausible size would explain is no noise either.
+        # A misfit that an effect of implausible size would explain is no noise either.
         patterns = [
             s.holdout_share
             for s in suspects
@@ -205,15 +203,15 @@ def _judged(e: Evidence, history: History) -> Diagnosis:
         in_fit = readings.arm_scatter is not None
         little = noise.reason == "predictable" and max(predicted, *patterns, 0.0) <= PREDICTABLE
         may = e.misfit and (noise.misjudged or little) and _may_scatter(e)
-        found = e.arm_scatter if may else None
+        estimate = e.arm_scatter if may else None
         by_arm = (
-            found is not None
-            and not instrument_instead(found)
-            and of_repeatability_size(found, arm)
+            estimate is not None
+            and not instrument_instead(estimate)
+            and of_repeatability_size(estimate, arm)
         )
-        if found is not None and (by_arm or noise.misjudged):
-            by = follows[:MOST_NAMED]
-            scatter = replace(found, predicted_share=predicted, predicted_by=by)
+        if estimate is not None and (by_arm or noise.misjudged):
+            names = follows[:MOST_NAMED]
+            scatter = replace(estimate, predicted_share=predicted, predicted_by=names)
         if hidden and predicted > PREDICTABLE:
             reason = "no_suspect"
         elif by_arm:
@@ -228,8 +226,8 @@ def _judged(e: Evidence, history: History) -> Diagnosis:
         serial = readings.serial
         if reason in ("residual_is_noise", "arm_scatter") and serial and not serial.proved:
             reason = "serial_or_effect"
-        beside = reason == "misjudged_noise" or reason in BESIDE_A_BACKGROUND
-        if beside and e.background and (reason == "misjudged_noise" or e.background_proved):
+        overridden = reason in BESIDE_A_BACKGROUND and bool(e.background)
+        if overridden and (reason == "misjudged_noise" or e.background_proved):
             reason, suspects = "background", (*as_suspects(e.background), *suspects)
     alone = None
     if reason in ("misjudged_noise", "no_suspect") and e.misfit and not _predicted(e, regression):
@@ -257,7 +255,7 @@ def _judged(e: Evidence, history: History) -> Diagnosis:
 
 
 def _may_scatter(e: Evidence) -> bool:
-    """Whether what is left can be the arm's scatter: not stated, and not the same within a pose."""
+    """Whether the misfit may be the arm's scatter: not stated, and not the same within a pose."""
     same = any(
         v.variable == "pose" and v.share > SAME_IN_POSE and v.p_value < FALSE_ALARM
         for v in e.misfit_breakdown
@@ -269,20 +267,20 @@ def _may_scatter(e: Evidence) -> bool:
 def _predicted(e: Evidence, regression: ResidualRegression) -> bool:
     """Whether something recorded predicts the misfit on poses left out.
 
-    Where every pose errs by itself, n of them follow a variable by chance to a share of 1/√n.
+    If every pose has an error of its own, n poses follow a variable by chance to a share of 1/√n.
     """
     shares = (v.share for v in e.misfit_breakdown if v.variable.split()[0] not in IN_SAMPLE)
     chance = 2.0 / np.sqrt(int(e.fit.pose.max()) + 1)
     return regression.share > PREDICTABLE or max(shares, default=0.0) > chance
 
 
-def _carrying(of: ResidualRegression) -> tuple[str, ...]:
+def _carrying(regression: ResidualRegression) -> tuple[str, ...]:
     """Variables that carry a share worth naming, largest first."""
-    return tuple(v.variable for v in of.dependences if v.share >= LEAST_SHARE)
+    return tuple(v.variable for v in regression.dependences if v.share >= LEAST_SHARE)
 
 
-def _significant(found: tuple[MisfitShare, ...]) -> tuple[MisfitShare, ...]:
+def _significant(breakdown: tuple[MisfitShare, ...]) -> tuple[MisfitShare, ...]:
     """Variables that predict a share of the misfit worth naming, beyond chance among all."""
-    kinds = [v for v in found if v.variable.split()[0] not in IN_SAMPLE]
-    alarm = FALSE_ALARM / max(len(kinds), 1)
-    return tuple(v for v in kinds if v.p_value < alarm and v.share >= LEAST_SHARE)
+    predictors = [v for v in breakdown if v.variable.split()[0] not in IN_SAMPLE]
+    alarm = FALSE_ALARM / max(len(predictors), 1)
+    return tuple(v for v in predictors if v.p_value < alarm and v.share >= LEAST_SHARE)

@@ -1,11 +1,10 @@
-"""Figures of the cell that were entered wrongly: a load's mass, the tool's mass or its centre.
+"""Wrong figures of the cell: a load's mass, the tool's mass or its centre of mass.
 
-Each is tried before any effect is named: a factor of all wrenches of one load, of the tool's mass,
-and a shift of its centre of mass. With x the derivative of the readings by it, projected off the
-model, Gauss-Newton finds the figure; the model is refitted with it each time. A figure is named
-where χ² falls to less than half, by nearly all of the misfit, by more than any effect of the
-catalogue in terms of the Bayesian information criterion, and where it is further off than anybody
-would round it.
+They are tried before any effect is named: a factor of all wrenches of one load, a factor of the
+tool's mass, and a shift of its centre of mass. Gauss-Newton estimates the figure from the
+derivative of the readings by it, projected off the model; the model is refitted in every step. A
+figure is named if it explains nearly all of the misfit, is better than any effect of the catalogue
+by the Bayesian information criterion, and differs from the stated figure by more than rounding.
 """
 
 from collections.abc import Iterator, Sequence
@@ -25,37 +24,37 @@ from hilcal.types import Floats
 
 FigureKind = Literal["load", "tool_mass", "tool_com"]
 LEAST_SHARE = 0.8
-"""Share of the misfit that a wrong figure must explain; a choice: it is what remains to be seen of
-ordinary effects beside a mistake."""
+"""Share of the misfit that a wrong figure must explain; a choice: ordinary effects may explain the
+remainder."""
 MOST_LEFT = 0.7
-"""Share of χ² that may be left where the noise was estimated, and says nothing of a misfit."""
+"""Share of χ² that may remain where the noise was estimated, so that χ² shows no misfit."""
 MARGIN = 10.0
-"""Of the criterion: figures within it of the best are named as well; very strong evidence (Kass
-and Raftery, *Bayes factors*, J. Am. Stat. Assoc. 90 (1995) 773)."""
+"""Difference of the criterion within which other figures are named beside the best one; very strong
+evidence (Kass and Raftery, *Bayes factors*, J. Am. Stat. Assoc. 90 (1995) 773)."""
 PROMISING = 0.2  # share of χ² that the first step must promise for a refit; a choice
-AS_PROMISING = 0.5  # the same as a share of what the best one promises
+AS_PROMISING = 0.5  # the same, as a share of the largest promise
 STEPS = 5  # most refits of a figure; a choice, two or three are usual
-SMALL = 1.0  # step, in those of the derivative, that is not worth another refit
+SMALL = 1.0  # largest step that needs no further refit, in units of `STEP`
 OFF = {"load": 1.2, "tool_mass": 1.3}
-"""Factor from which on a mass is a mistake; choices: scales are better, guesses are not."""
-LARGEST = 0.5  # share of a mass that one step takes away at most; it doubles or trebles at most
-HANGS = 0.999  # cosine to gravity from which on a force is that of a mass
-OFF_M = 0.02  # shift from which on a centre of mass is a mistake, m; a choice
+"""Factor from which a mass is a mistake; choices: scales are more accurate, guesses are not."""
+LARGEST = 0.5  # most of a mass that one step removes, as a share; a step trebles it at most
+HANGS = 0.999  # cosine to gravity from which a force is a weight
+OFF_M = 0.02  # shift from which a centre of mass is a mistake, m; a choice
 STEP: dict[FigureKind, float] = {"load": 1e-2, "tool_mass": 1e-1, "tool_com": 1e-2}
-"""Steps of the derivatives: of the wrench and the mass as a share, of the centre in m."""
+"""Steps of the derivatives: relative for wrench and mass, m for the centre of mass."""
 
 
 @dataclass(frozen=True, slots=True)
 class WrongFigure:
-    """A figure that seems to be another one than was entered."""
+    """A figure that seems to be wrong."""
 
     kind: FigureKind  # a load's mass or pull, the tool's mass, or its centre of mass
-    load: str  # name of the load, where it is one
+    load: str  # name of the load; "" for the tool
     stated: tuple[float, ...]  # as it was entered: kg, N for a pull, or the centre, flange axes, m
-    found: tuple[float, ...]  # as the readings tell it
+    found: tuple[float, ...]  # as estimated from the readings
     unit: str  # of both
-    rms_m: float  # of the residual's positions, m
-    rms_with_m: float  # with the figure that was found
+    rms_m: float  # position error of the fit, m
+    rms_with_m: float  # the same with the estimated figure
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,144 +66,146 @@ class _Figure:
     def size(self) -> int:
         return 3 if self.kind == "tool_com" else 1
 
-    def changed(self, of: Fit, by: Floats) -> Fit:
-        """Return a fit with another figure in its cell, or its readings; nothing is fitted yet."""
-        cell, readings = of.model.cell, of.readings
+    def applied(self, stated: Fit, change: Floats) -> Fit:
+        """Return a fit with the figure changed in its cell or readings; nothing is refitted."""
+        cell, readings = stated.model.cell, stated.readings
         if self.kind == "tool_mass":
-            cell = replace(cell, tool_mass=cell.tool_mass * (1.0 + float(by[0])))
+            cell = replace(cell, tool_mass=cell.tool_mass * (1.0 + float(change[0])))
         elif self.kind == "tool_com":
-            cell = replace(cell, tool_com=cell.tool_com + by)
+            cell = replace(cell, tool_com=cell.tool_com + change)
         else:
             wrench = readings.states.wrench.copy()
-            wrench[readings.load == self.load] *= 1.0 + by[0]
+            wrench[readings.load == self.load] *= 1.0 + change[0]
             readings = replace(readings, states=replace(readings.states, wrench=wrench))
-        return replace(of, model=replace(of.model, cell=cell), readings=readings)
+        return replace(stated, model=replace(stated.model, cell=cell), readings=readings)
 
-    def columns(self, of: Fit, near: Prediction) -> Floats:
-        """(R, k) whitened derivatives of what is read, from a prediction of the same readings."""
-        kept, h = of.readings[~of.outlier], STEP[self.kind]
+    def columns(self, stated: Fit, near: Prediction) -> Floats:
+        """(R, k) whitened derivatives of the measurements by the figure, near a prediction."""
+        fitted, w, h = ~stated.outlier, stated.whitening, STEP[self.kind]
+        readings = stated.readings[fitted]
         out = []
-        for by in h * np.eye(self.size):
-            there = self.changed(of, by)
-            ahead = there.model.predict(there.readings[~of.outlier].states, of.theta, near)
-            out.append((of.raw - residual(kept, ahead, of.whitening)) / h)
-        return np.stack([of.whitening.whiten(x).reshape(-1) for x in out], axis=1)
+        for change in h * np.eye(self.size):
+            changed = self.applied(stated, change)
+            ahead = changed.model.predict(changed.readings[fitted].states, stated.theta, near)
+            raw = (stated.raw - residual(readings, ahead, w)) / h
+            out.append(w.whiten(raw).reshape(-1))
+        return np.stack(out, axis=1)
 
-    def step(self, of: Fit) -> tuple[Floats, float]:
-        """Gauss-Newton's step (k,) beside the model, and the share of χ² that it takes."""
-        p = linearise(of)
-        x = self.columns(of, of.solution.prediction)
+    def step(self, stated: Fit) -> tuple[Floats, float]:
+        """Gauss-Newton step (k,) beside the model, and the share of χ² that it explains."""
+        p = linearise(stated)
+        x = self.columns(stated, stated.solution.prediction)
         g = x.T @ p.residual
         step = np.linalg.pinv(p.information(x), rcond=1e-9, hermitian=True) @ g
         return step, float(step @ g) / p.rss
 
-    def first_step(self, of: Fit) -> tuple[Floats, float]:
-        """`step`, or where most readings under a load were set aside, what they ask for."""
-        mine = of.readings.load == self.load
-        aside = np.count_nonzero(of.outlier & mine)
-        if self.kind != "load" or 2 * aside <= np.count_nonzero(mine):
-            return self.step(of)
-        raw, w = with_outliers(of)
-        prediction = of.model.predict(of.readings.states, of.theta)
-        whole = replace(of, outlier=np.zeros_like(of.outlier), raw=raw, whitening=w)
-        x, r = self.columns(whole, prediction)[:, 0], w.whiten(raw).reshape(-1)
+    def first_step(self, stated: Fit) -> tuple[Floats, float]:
+        """`step`; the figure alone on all readings where most under its load are outliers."""
+        of_load = stated.readings.load == self.load
+        outliers = np.count_nonzero(stated.outlier & of_load)
+        if self.kind != "load" or 2 * outliers <= np.count_nonzero(of_load):
+            return self.step(stated)
+        raw, w = with_outliers(stated)
+        prediction = stated.model.predict(stated.readings.states, stated.theta)
+        everything = replace(stated, outlier=np.zeros_like(stated.outlier), raw=raw, whitening=w)
+        x, r = self.columns(everything, prediction)[:, 0], w.whiten(raw).reshape(-1)
         size = float(x @ r) / max(float(x @ x), 1e-300)
         return np.array([size]), size * float(x @ r) / max(float(r @ r), 1e-300)
 
-    def refitted(self, of: Fit, step: Floats) -> tuple[Floats, Fit]:
-        """Return the change (k,) that fits best, from a first step on, and the fit with it.
+    def refitted(self, stated: Fit, step: Floats) -> tuple[Floats, Fit]:
+        """Return the best change (k,) of the figure, from a first step on, and its fit.
 
         Raises:
-            CannotAnswerError: the arm has no equilibrium with it.
+            CannotAnswerError: no equilibrium with the changed figure.
         """
-        by, now = np.zeros(self.size), of
+        change, refit = np.zeros(self.size), stated
         for _ in range(STEPS):
             if self.kind == "tool_com":
-                by = by + step
+                change = change + step
             else:  # no mass changes its sign
-                by = (1.0 + by) * (1.0 + np.clip(step, -LARGEST, 2.0)) - 1.0
-            changed = self.changed(of, by)
-            now = fit(changed.model, changed.readings, of.mode, start=now.theta)
-            step, _ = self.step(now)
+                change = (1.0 + change) * (1.0 + np.clip(step, -LARGEST, 2.0)) - 1.0
+            changed = self.applied(stated, change)
+            refit = fit(changed.model, changed.readings, stated.mode, start=refit.theta)
+            step, _ = self.step(refit)
             if np.abs(step).max() < SMALL * STEP[self.kind]:
                 break
-        return by, now
+        return change, refit
 
-    def off(self, by: Floats) -> bool:
-        """Whether so much is a mistake."""
+    def mistaken(self, change: Floats) -> bool:
+        """Whether a change (k,) is too large for rounding."""
         if self.kind == "tool_com":
-            return float(np.linalg.norm(by)) > OFF_M
-        factor = 1.0 + float(by[0])
+            return float(np.linalg.norm(change)) > OFF_M
+        factor = 1.0 + float(change[0])
         return max(factor, 1.0 / factor) > OFF[self.kind]
 
-    def named(self, of: Fit, by: Floats, now: Fit) -> WrongFigure:
-        """Return what a change (k,) of the figure of a fit says, and the fit with it."""
-        cell, readings, load = of.model.cell, of.readings, ""
+    def named(self, stated: Fit, change: Floats, refit: Fit) -> WrongFigure:
+        """Return the figure as stated and as changed by (k,), with the errors of both fits."""
+        cell, readings, load = stated.model.cell, stated.readings, ""
         if self.kind == "tool_com":
-            stated, found, unit = cell.tool_com, cell.tool_com + by, "m"
+            figure, estimate, unit = cell.tool_com, cell.tool_com + change, "m"
         else:
-            stated, unit = np.array([cell.tool_mass]), "kg"
+            figure, unit = np.array([cell.tool_mass]), "kg"
             if self.kind == "load":
                 load = readings.load_names[self.load]
                 force = readings.states.wrench[readings.load == self.load, :3].mean(axis=0)
                 size, g = float(np.linalg.norm(force)), float(np.linalg.norm(cell.gravity))
                 hangs = g > 0.0 and float(force @ cell.gravity) > HANGS * size * g
-                stated, unit = np.array([size / g if hangs else size]), "kg" if hangs else "N"
-            found = stated * (1.0 + by)
-        figures = tuple(stated.tolist()), tuple(found.tolist())
-        return WrongFigure(self.kind, load, *figures, unit, of.error.rms_m, now.error.rms_m)
+                figure, unit = np.array([size / g if hangs else size]), "kg" if hangs else "N"
+            estimate = figure * (1.0 + change)
+        values = tuple(figure.tolist()), tuple(estimate.tolist())
+        return WrongFigure(self.kind, load, *values, unit, stated.error.rms_m, refit.error.rms_m)
 
 
-def wrong_figures(of: Fit, suspects: Sequence[Suspect]) -> tuple[WrongFigure, ...]:
-    """Return the figures that explain the misfit, the best first; any one of several does.
+def wrong_figures(fit: Fit, suspects: Sequence[Suspect]) -> tuple[WrongFigure, ...]:
+    """Return the figures each of which alone explains the misfit, the best first.
 
-    None of a model with a background: that was asked before it was fitted.
+    A model with a background has none: they were tested before the background was fitted.
     """
-    if of.model.background:
+    if fit.model.background:
         return ()
     best = min((s.score.delta_bic for s in suspects if s.score.rank), default=0.0)
     tried: list[tuple[_Figure, Floats, float]] = []
-    for figure in _figures(of):
-        # A fit may be so close to the largest load that more of it has no equilibrium.
+    for figure in _figures(fit):
+        # Close to the largest load that the arm can bear, a larger one has no equilibrium.
         with suppress(CannotAnswerError):
-            tried.append((figure, *figure.first_step(of)))
+            tried.append((figure, *figure.first_step(fit)))
     most = max((share for _, _, share in tried), default=0.0)
-    found: list[tuple[float, WrongFigure]] = []
+    named: list[tuple[float, WrongFigure]] = []
     for figure, step, share in tried:
         if share < max(PROMISING, AS_PROMISING * most):
             continue
         try:
-            by, now = figure.refitted(of, step)
-        except CannotAnswerError:  # no equilibrium with it: it explains nothing
+            change, refit = figure.refitted(fit, step)
+        except CannotAnswerError:  # a figure without an equilibrium explains nothing
             continue
-        bic = _criterion(of, now, figure.size)
-        if bic is not None and figure.off(by) and bic < min(best, -MARGIN):
-            found.append((bic, figure.named(of, by, now)))
-    found.sort(key=lambda f: f[0])
-    return tuple(figure for bic, figure in found if bic <= found[0][0] + MARGIN)
+        bic = _criterion(fit, refit, figure.size)
+        if bic is not None and figure.mistaken(change) and bic < min(best, -MARGIN):
+            named.append((bic, figure.named(fit, change, refit)))
+    named.sort(key=lambda pair: pair[0])
+    return tuple(figure for bic, figure in named if bic <= named[0][0] + MARGIN)
 
 
-def _figures(of: Fit) -> Iterator[_Figure]:
-    """Yield the figures that these readings depend on."""
-    loads = np.unique(of.readings.load[np.any(of.readings.states.wrench != 0, axis=1)])
-    # Of deflections under one load it is a common factor of all compliances.
-    if len(loads) > 1 or of.mode == "absolute":
+def _figures(fit: Fit) -> Iterator[_Figure]:
+    """Yield the figures that the readings depend on."""
+    loads = np.unique(fit.readings.load[np.any(fit.readings.states.wrench != 0, axis=1)])
+    # In deflections under a single load, its mass is a common factor of all compliances.
+    if len(loads) > 1 or fit.mode == "absolute":
         yield from (_Figure("load", int(k)) for k in loads)
-    if of.mode == "absolute" and of.model.cell.tool_mass > 0.0:
+    if fit.mode == "absolute" and fit.model.cell.tool_mass > 0.0:
         yield from (_Figure("tool_mass"), _Figure("tool_com"))
 
 
-def _criterion(before: Fit, after: Fit, size: int) -> float | None:
+def _criterion(stated: Fit, refit: Fit, size: int) -> float | None:
     """Change of the Bayesian information criterion by a figure; None where it explains too little.
 
-    On the readings that fit with the figure: without it they may look like gross errors.
+    Only inliers of the refit count: with the stated figure they may look like gross errors.
     """
-    kept, w = before.readings[~after.outlier], after.whitening
-    there = before.model.predict(kept.states, before.theta)
-    chi2, dof = float(np.sum(w.whiten(residual(kept, there, w)) ** 2)), after.dof
-    least = chi2 - LEAST_SHARE * max(chi2 - dof, LEAST_MISFIT * np.sqrt(2 * dof))
-    if not before.readings.noise_stated:
-        least = min(least, MOST_LEFT * chi2)
-    if after.chi2 > least:
+    readings, w = stated.readings[~refit.outlier], refit.whitening
+    prediction = stated.model.predict(readings.states, stated.theta)
+    chi2, dof = float(np.sum(w.whiten(residual(readings, prediction, w)) ** 2)), refit.dof
+    most = chi2 - LEAST_SHARE * max(chi2 - dof, LEAST_MISFIT * np.sqrt(2 * dof))
+    if not stated.readings.noise_stated:
+        most = min(most, MOST_LEFT * chi2)
+    if refit.chi2 > most:
         return None
-    return float(w.rank * np.log(max(after.chi2, 1e-300) / chi2) + size * np.log(w.rank))
+    return float(w.rank * np.log(max(refit.chi2, 1e-300) / chi2) + size * np.log(w.rank))
