@@ -1,8 +1,8 @@
-"""Laws of other mechanics for the study of `discover`, drawn at random; the catalogue has none.
+"""Random laws outside of the catalogue, for the study of `discover`.
 
-Each is a cause with its own few lines of mechanics, computed from where the simulated arm comes to
-rest (Pinocchio): which joint, which side, which level is drawn. It displaces the target; the study
-scales that to so many σ. Several have no exact counterpart among the functions that are searched.
+Each law is a cause with a few lines of mechanics, computed from the simulated arm at rest
+(Pinocchio); joint, side and size are drawn. It displaces the target, and the study scales the
+displacement to so many σ. Several laws have no exact counterpart among the searched functions.
 """
 
 from collections.abc import Callable
@@ -18,13 +18,13 @@ ABSOLUTE, DEFLECTION = "absolute", "deflection"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Foreign:
-    """A law as it was drawn.
+    """A drawn law.
 
     Attributes:
         words: the law in one line.
-        displaced: (N, 3) of the target, sensor axes, at any size.
-        sites: words with which a right answer's site begins; several where they are the same.
-        variables: what it depends on.
+        displaced: (N, 3) displacement of the target, sensor axes, in any unit.
+        sites: beginnings of the names of right sites; several where sites are equivalent.
+        variables: variables of the law.
     """
 
     words: str
@@ -279,8 +279,8 @@ def _soft_play(rng: np.random.Generator) -> Foreign:
 
     def displaced(s: Scene) -> Floats:
         torque = s.torque[:, j - 1]
-        whole = np.median(np.abs(s.first.torque[:, j - 1]))
-        return s.of_joint(j, np.arctan(torque / (share * whole)))
+        ordinary = np.median(np.abs(s.first.torque[:, j - 1]))
+        return s.of_joint(j, np.arctan(torque / (share * ordinary)))
 
     words = f"dq_{j} = c atan(tau_{j}/tau0)"
     return Foreign(words, displaced, (f"joint {j}",), frozenset({_torque(j)}))
@@ -337,7 +337,7 @@ BLIND: dict[str, tuple[str, Draw]] = {
     "warming up": (ABSOLUTE, _warming_up),
     "yielding bench": (DEFLECTION, _yielding_bench),
 }
-"""Laws that were written after the search had been frozen, and tried once; as `KINDS`."""
+"""Laws written after the search was frozen, and tried once; in the form of `KINDS`."""
 KINDS: dict[str, tuple[str, Draw]] = {
     "one-sided compliance": (DEFLECTION, _one_sided),
     "preload": (DEFLECTION, _dead_zone),
@@ -358,4 +358,4 @@ KINDS: dict[str, tuple[str, Draw]] = {
     "wrist bundle": (ABSOLUTE, _wrist_bundle),
     **BLIND,
 }
-"""Laws by name: the readings that show them, and how one is drawn."""
+"""Laws by name: mode of the readings that show them, and function that draws one."""

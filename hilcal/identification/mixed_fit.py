@@ -37,7 +37,7 @@ CONVERGED = 0.02
 HALVINGS = 6
 """Most trials of a step, each half as long as the previous one; a choice."""
 SCATTER_RAD = 3e-5
-"""Ordinary scatter of a joint, rad: 30 µm at 1 m, as makers state it; its η has the prior mean 0."""
+"""Ordinary scatter of a joint, rad: 30 µm at 1 m, as makers state it; the prior mean of η is 0."""
 INSTRUMENT, SCATTER = "instrument", "arm's scatter"
 """Names of the components of the noise."""
 UNSEEN = -0.5
