@@ -41,7 +41,7 @@ def gross_errors(
     as_json: Json = False,
     keep_file: Keep = None,
 ) -> None:
-    """Spoil readings of campaigns, refine their models, and count readings that were set aside."""
+    """Spoil readings of campaigns, refine their models, and count what was set aside."""
     t = terminal(as_json)
     kinds = [(share, size) for share, size, _ in ARMS] + [(0.0, 5e-3), (TOO_MANY, 5e-3)]
     every = [

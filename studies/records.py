@@ -121,7 +121,7 @@ def results(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Kept figures, *.json.")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="F.md", help="The page.")],
 ) -> None:
-    """Make the page of results from the records of the studies."""
+    """Make the page of results from what the studies kept."""
     replace_file(output, page(folder))
 
 

@@ -36,7 +36,7 @@ def serial_noise(
     keep_file: Keep = None,
     as_json: Json = False,
 ) -> None:
-    """Fit campaigns with AR(1) noise of the stated variance, as white noise and as AR(1) noise."""
+    """Fit campaigns of AR(1) noise of the stated variance, taken for white and as it is."""
     t = terminal(as_json)
     run = partial(
         serial_case, config=load_config(configs_dir() / "cells" / CELL), robot=robot, poses=poses
