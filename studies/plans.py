@@ -1,11 +1,10 @@
-"""What planning buys: real errors of planned, random and hand-made campaigns.
+"""Gain by planning: true errors of planned, random and hand-made campaigns.
 
-Plans of the same number of readings are carried out on simulated arms that hide nothing beyond
-the model, and each campaign is identified. Two claims are tested: the real errors of parameters
-and positions are those that were predicted, so that they shrink as predicted from plan to plan;
-and the planner needs at most half of the readings of a random plan for the same accuracy at the
-test poses. The arms come from outside, so that the plan is tested against mechanics that it
-does not know.
+Plans of the same number of readings are carried out on simulated arms without effects beyond the
+model, and each campaign is identified. Two claims are tested: the true errors of parameters and
+positions agree with the predicted ones, so that they shrink as predicted from plan to plan; and the
+planner needs at most half of the readings of a random plan for the same accuracy at the test poses.
+The arms come from an external function, so that the plan is tested against independent mechanics.
 """
 
 from collections.abc import Callable, Mapping
@@ -26,7 +25,7 @@ RANDOM, GRID = "random", "grid"
 DOUBLE = "random, twice"
 ROBUST = ", robust"
 TOLERANCE = 0.1
-"""How far real errors may be from predicted ones."""
+"""Largest accepted relative deviation of true from predicted errors."""
 
 MakeArm = Callable[[Cell, CellConfig, int], Arm]
 """Make a simulated arm by its number: equal numbers give equal arms."""
@@ -116,11 +115,11 @@ class PlansStudy:
 
     @property
     def planned(self) -> tuple[Line, ...]:
-        """Those of the planner."""
+        """Lines of the planner's plans."""
         return tuple(line for line in self.lines if line.efficiency is not None)
 
     def shrinkage(self) -> tuple[Shrinkage, ...]:
-        """Return by how much each of the planner's plans is better than random ones."""
+        """Return the gain of each of the planner's plans over random plans."""
         base, twice = self.of(RANDOM).result, self.of(DOUBLE).result
         return tuple(
             Shrinkage(
@@ -149,19 +148,18 @@ def plans_study(
 ) -> PlansStudy:
     """Compare plans on one robot.
 
-    Every campaign has an arm of its own, the same for all kinds of plans; random plans are
-    drawn anew for each.
+    Each campaign number has one arm for all kinds of plans, and a newly drawn random plan.
 
     Args:
         cell: the cell.
         config: its configuration.
         make_arm: makes simulated arms.
-        readings: of each plan, the unloaded ones included.
-        campaigns: of each kind of plan.
-        candidates: poses that plans choose from; as configured by default.
-        seed: of everything.
-        engine: what the campaigns run on; this process by default.
-        advance: told of each campaign that is done.
+        readings: number of readings of each plan with the unloaded ones.
+        campaigns: number of campaigns of each kind of plan.
+        candidates: number of candidate poses; as configured by default.
+        seed: of everything random.
+        engine: runs the campaigns; this process by default.
+        advance: called after each campaign.
 
     Raises:
         CannotAnswerError: from the cell, where it leaves no pose, or from a fit.
@@ -202,7 +200,7 @@ def plans_study(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Campaign:
-    """A plan, the arm that it is carried out on, and the noise."""
+    """A plan, the arm to measure, and the generator of the noise."""
 
     plan: Prepared
     arm: Subject
@@ -214,10 +212,10 @@ def _run(asked: _Campaign, cell: Cell, config: CellConfig) -> Errors:
 
 
 def kinds_of(config: CellConfig) -> tuple[str, ...]:
-    """Kinds of plans that are compared."""
-    own = (TEST, PARAMETERS)
-    robust = tuple(kind + ROBUST for kind in own) if config.planning.against else ()
-    return (*own, *robust, RANDOM, GRID, DOUBLE)
+    """Return the compared kinds of plans."""
+    planned = (TEST, PARAMETERS)
+    robust = tuple(kind + ROBUST for kind in planned) if config.planning.against else ()
+    return (*planned, *robust, RANDOM, GRID, DOUBLE)
 
 
 def _needs(
@@ -229,9 +227,9 @@ def _needs(
     *,
     others: float | None = 0.0,
 ) -> int | None:
-    """Readings that random plans need for the accuracy that is predicted of a planner's plan.
+    """Number of readings that random plans need for the predicted accuracy of a planner's plan.
 
-    With `others` for that accuracy, where the potential terms have to be estimated too.
+    If `others` is not zero, it is this accuracy, with the potential terms estimated, too.
     """
     if kind not in fixed or fixed[kind].efficiency is None or others is None:
         return None
