@@ -95,12 +95,12 @@ def diagnosis(
         first_seed=first_seed,
         again=again,
     )
-    asked = questions(extent)
-    begun = time.monotonic()
-    with counting(t.progress, "campaigns", len(asked)) as advance:
+    cases = questions(extent)
+    start = time.monotonic()
+    with counting(t.progress, "campaigns", len(cases)) as advance:
         run = partial(run_case, simulate=simulate, more=more, refined=refine)
-        outcomes, complete = run_all(asked, run, jobs, advance, scheduler)
-    t.notice(f"{len(outcomes)} of {len(asked)} campaigns in {time.monotonic() - begun:.0f} s")
+        outcomes, complete = run_all(cases, run, jobs, advance, scheduler)
+    t.notice(f"{len(outcomes)} of {len(cases)} campaigns in {time.monotonic() - start:.0f} s")
     if outcomes:
         t.show(report(outcomes))
         t.show("")
@@ -122,13 +122,13 @@ def diagnosis(
 
 
 def simulate(asked: Asked) -> Sample:
-    """Measure what a question asks for in the simulated world."""
+    """Measure the campaign of a case in the simulated world."""
     c = _case(asked)
     return Sample(c.cell, c.readings, c.noise, c.world.truth, c.variables)
 
 
 def more(asked: Asked, diagnosis: Diagnosis) -> Readings | None:
-    """Measure what separates the suspects of a diagnosis, in the same world."""
+    """Measure readings that separate the suspects of a diagnosis, in the same world."""
     return measure_more(_config(), asked.robot, _case(asked), diagnosis, asked.seed)
 
 

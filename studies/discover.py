@@ -122,17 +122,17 @@ def run_case(config: CellConfig, asked: Asked) -> Outcome:
         out = replace(out, formula=d.laws[0].formula, p_value=d.laws[0].p_value)
     if law is None:
         return out
-    error = error_at(before, c.fresh)
+    without_law = error_at(before, c.fresh)
     if d.reason == "catalogue":
-        return with_catalogue(replace(out, before=error), law, before, d.catalogue, c)
+        return with_catalogue(replace(out, before=without_law), law, before, d.catalogue, c)
     if not d.laws or d.after is None:
-        return replace(out, before=error, after=error)
+        return replace(out, before=without_law, after=without_law)
     return replace(
         out,
         site=_right_site(law, d.laws[0]),
         variables=_same_quantities(d.laws[0].variables) == _same_quantities(law.variables),
         correlation=agreement(before, d.after, c.first.moved),
-        before=error,
+        before=without_law,
         after=error_at(d.after, c.fresh),
     )
 

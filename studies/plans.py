@@ -36,13 +36,13 @@ class Line:
     """One kind of plan on one robot.
 
     Attributes:
-        kind: "test" and "D" by these criteria; the same ", robust" where power is kept against
+        kind: "test" and "D" by these criteria; with ", robust" for plans that keep power against
             the effects of `[planning] against`; "random", "grid".
-        efficiency: certified, of the planner's; None for others.
-        position_open: predicted RMS error at the test poses where the potential terms have to
-            be estimated too, m; None of random plans and grids.
-        random_readings: readings that random plans need for the position that is predicted of
-            it; None where that is not asked, or not reached.
+        efficiency: certified by the planner; None for other plans.
+        position_open: predicted RMS error at the test poses with potential terms estimated, too,
+            m; None for random plans and grids.
+        random_readings: number of readings that random plans need for the predicted error at the
+            test poses; None if not computed or not reached.
         random_readings_open: the same for `position_open`.
         result: of the campaigns.
     """
@@ -57,16 +57,16 @@ class Line:
 
 @dataclass(frozen=True, slots=True)
 class Shrinkage:
-    """How the errors shrink from the random plan to another of as many readings.
+    """Ratios of the errors of the random plan to those of another plan of as many readings.
 
     Attributes:
-        kind: the other plan.
-        parameter: predicted ratio of the random plan's parameter error to its own.
+        kind: of the other plan.
+        parameter: predicted ratio of the parameter errors.
         parameter_real: ratio of the true errors.
         position: predicted ratio of the errors at the test poses.
         position_real: ratio of the true errors.
-        twice: true error at the test poses of random plans with twice the readings, over its
-            own: at least 1 where it needs at most half of the readings.
+        twice: ratio of the true errors at the test poses for random plans with twice the
+            readings: at least 1 if the plan needs at most half of the readings.
     """
 
     kind: str
@@ -96,9 +96,9 @@ class PlansStudy:
     Attributes:
         robot: its model.
         mode: readings, "deflection" or "absolute".
-        readings: of each plan, the unloaded ones included.
-        campaigns: of each kind of plan.
-        where: what is predicted at the test poses, in words.
+        readings: number of readings of each plan with the unloaded ones.
+        campaigns: number of campaigns of each kind of plan.
+        where: text on the predicted quantity at the test poses.
         lines: the kinds of plans.
     """
 
