@@ -104,14 +104,14 @@ def _noise(cases: Sequence[Outcome]) -> Iterable[Claim]:
 
 
 def _pairs(cases: Sequence[Outcome]) -> Iterable[Claim]:
-    words = "two hidden effects: both in the refined model"
-    yield Claim("pairs", f"{words}, or not told from what is", rate(cases, both_found), 0.9)
-    yield Claim("pairs", words, rate(cases, both_added))
+    claim = "two hidden effects: both in the refined model"
+    yield Claim("pairs", f"{claim}, or not told from what is", rate(cases, both_found), 0.9)
+    yield Claim("pairs", claim, rate(cases, both_added))
 
 
 def _outside(cases: Sequence[Outcome]) -> Iterable[Claim]:
-    what = "an effect outside of the catalogue"
-    yield Claim("outside", f"{what}: unknown_effect, in the end", rate(cases, unknown), 0.9)
-    yield Claim("outside", f"{what}: unknown_effect, at once", rate(cases, unknown_at_once), 0.9)
-    words = "its variable among the first two"
-    yield Claim("outside", words, rate(cases, followed), 0.9)
+    law = "an effect outside of the catalogue"
+    yield Claim("outside", f"{law}: unknown_effect, in the end", rate(cases, unknown), 0.9)
+    yield Claim("outside", f"{law}: unknown_effect, at once", rate(cases, unknown_at_once), 0.9)
+    variable = "its variable among the first two"
+    yield Claim("outside", variable, rate(cases, followed), 0.9)

@@ -170,28 +170,28 @@ def _check_numbers(
             raise InputError(f"--strength {sigma:g}; valid: a number over 0, in σ")
 
 
-def _kinds(given: list[str] | None) -> tuple[Kind, ...]:
-    _all_valid("", given, KINDS)
-    return tuple(k for k in KINDS if not given or k in given)
+def _kinds(options: list[str] | None) -> tuple[Kind, ...]:
+    _all_valid("", options, KINDS)
+    return tuple(k for k in KINDS if not options or k in options)
 
 
-def _robots(given: list[str] | None) -> tuple[str, ...]:
-    _all_valid("--robot ", given, robot_names())
-    return tuple(dict.fromkeys(given)) if given else ROBOTS
+def _robots(options: list[str] | None) -> tuple[str, ...]:
+    _all_valid("--robot ", options, robot_names())
+    return tuple(dict.fromkeys(options)) if options else ROBOTS
 
 
-def _modes(given: list[str] | None) -> tuple[Mode, ...]:
-    _all_valid("--readings ", given, MODES)
-    return tuple(m for m in MODES if not given or m in given)
+def _modes(options: list[str] | None) -> tuple[Mode, ...]:
+    _all_valid("--readings ", options, MODES)
+    return tuple(m for m in MODES if not options or m in options)
 
 
-def _effects(given: list[str] | None, modes: tuple[Mode, ...]) -> tuple[str, ...]:
+def _effects(options: list[str] | None, modes: tuple[Mode, ...]) -> tuple[str, ...]:
     shown = tuple(dict.fromkeys(e for m in modes for e in effects_shown(m)))
-    _all_valid("--effect ", given, shown)
-    return tuple(given) if given else shown
+    _all_valid("--effect ", options, shown)
+    return tuple(options) if options else shown
 
 
-def _all_valid(option: str, given: list[str] | None, valid: tuple[str, ...]) -> None:
-    for word in given or ():
+def _all_valid(option: str, options: list[str] | None, valid: tuple[str, ...]) -> None:
+    for word in options or ():
         if word not in valid:
             raise InputError(f"{option}{word!r}{suggest(word, valid)}; valid: {', '.join(valid)}")

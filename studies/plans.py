@@ -166,36 +166,36 @@ def plans_study(
         InputError: from the configuration.
     """
     rng = np.random.default_rng(seed)
-    of = scene(cell, config, candidates or config.planning.candidates, rng)
-    fixed: dict[str, Chosen] = {GRID: grid(of, readings)}
-    for robust in (False, True)[: 1 if of.robust is None else 2]:
+    s = scene(cell, config, candidates or config.planning.candidates, rng)
+    fixed: dict[str, Chosen] = {GRID: grid(s, readings)}
+    for robust in (False, True)[: 1 if s.robust is None else 2]:
         for criterion in (TEST, PARAMETERS):
             name = criterion + (ROBUST if robust else "")
-            fixed[name] = optimal(of, criterion, readings, rng, robust=robust)
+            fixed[name] = optimal(s, criterion, readings, rng, robust=robust)
     many = {RANDOM: readings, DOUBLE: 2 * readings}
     kinds = kinds_of(config)
     asked: list[_Campaign] = []
     for number in range(campaigns):
-        arm = subject(of, make_arm(cell, config, number))
+        arm = subject(s, make_arm(cell, config, number))
         for index, kind in enumerate(kinds):
             noise = np.random.default_rng([seed, number, index])
-            chosen = fixed[kind] if kind in fixed else at_random(of, many[kind], noise)
+            chosen = fixed[kind] if kind in fixed else at_random(s, many[kind], noise)
             asked.append(_Campaign(prepared(chosen), arm, noise))
     done = engine.map(partial(_run, cell=cell, config=config), asked, advance=advance)
     errors = {kind: done[index :: len(kinds)] for index, kind in enumerate(kinds)}
-    opened = {k: of.with_others(fixed[k]) if k in fixed else None for k in kinds}
+    opened = {k: s.with_others(fixed[k]) if k in fixed else None for k in kinds}
     lines = tuple(
         Line(
             kind=kind,
             efficiency=fixed[kind].efficiency if kind in fixed else None,
             position_open=opened[kind],
-            random_readings=_needs(of, kind, fixed, readings, seed),
-            random_readings_open=_needs(of, kind, fixed, readings, seed, others=opened[kind]),
+            random_readings=_needs(s, kind, fixed, readings, seed),
+            random_readings_open=_needs(s, kind, fixed, readings, seed, others=opened[kind]),
             result=summary(errors[kind]),
         )
         for kind in kinds
     )
-    return PlansStudy(config.robot.model, of.exact.mode, readings, campaigns, of.work.what, lines)
+    return PlansStudy(config.robot.model, s.exact.mode, readings, campaigns, s.work.what, lines)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -219,7 +219,7 @@ def kinds_of(config: CellConfig) -> tuple[str, ...]:
 
 
 def _needs(
-    of: Scene,
+    s: Scene,
     kind: str,
     fixed: Mapping[str, Chosen],
     readings: int,
@@ -235,7 +235,7 @@ def _needs(
         return None
     position = others or fixed[kind].predicted.position
     rng = np.random.default_rng([seed, 1])
-    return None if position is None else matching(of, position, readings, rng, others=others > 0)
+    return None if position is None else matching(s, position, readings, rng, others=others > 0)
 
 
 def _ratio(a: Measured, b: Measured) -> Measured:

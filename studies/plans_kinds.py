@@ -115,33 +115,33 @@ def without_potential(config: CellConfig) -> CellConfig:
 
 
 def optimal(
-    of: Scene, criterion: str, budget: int, rng: np.random.Generator, *, robust: bool = False
+    s: Scene, criterion: str, budget: int, rng: np.random.Generator, *, robust: bool = False
 ) -> Chosen:
     """Return the planner's plan of so many readings.
 
     Args:
-        of: the cell.
+        s: the cell.
         criterion: "D", "test", ...
         budget: number of readings with the unloaded ones.
         rng: generator.
         robust: whether the plan keeps power against the potential terms.
     """
-    of_plan, config = of.exact, without_potential(of.config)
-    if robust and of.robust is not None:
-        of_plan, config = of.robust, of.config
-    objective = compound_objective(of_plan, config, criterion, of.work, float(budget), rng)
+    of_plan, config = s.exact, without_potential(s.config)
+    if robust and s.robust is not None:
+        of_plan, config = s.robust, s.config
+    objective = compound_objective(of_plan, config, criterion, s.work, float(budget), rng)
     design = choose(objective, float(budget), rng)
     counts = np.asarray(design.counts, dtype=float)
-    return Chosen(of_plan, counts, predicted(of_plan, counts, work=of.work), design.efficiency)
+    return Chosen(of_plan, counts, predicted(of_plan, counts, work=s.work), design.efficiency)
 
 
-def at_random(of: Scene, budget: int, rng: np.random.Generator) -> Chosen:
+def at_random(s: Scene, budget: int, rng: np.random.Generator) -> Chosen:
     """Return a plan of random feasible poses, each under every load that it bears."""
-    order = rng.permutation(len(of.exact.candidates))
-    return _of_poses(of.exact, cycle(order.tolist()), budget, of.work)
+    order = rng.permutation(len(s.exact.candidates))
+    return _of_poses(s.exact, cycle(order.tolist()), budget, s.work)
 
 
-def grid(of: Scene, budget: int) -> Chosen:
+def grid(s: Scene, budget: int) -> Chosen:
     """Return a plan as made by hand: the feasible poses of a regular grid in joint space.
 
     The coarsest grid with enough poses is thinned evenly to the number of readings; each pose is
@@ -150,7 +150,7 @@ def grid(of: Scene, budget: int) -> Chosen:
     Raises:
         CannotAnswerError: no pose of the finest grid is feasible.
     """
-    space = of.space
+    space = s.space
     for levels in LEVELS:
         share = (np.arange(levels) + 0.5) / levels
         unit = np.stack(np.meshgrid(*[share] * len(space.low), indexing="ij"), axis=-1)
@@ -159,16 +159,16 @@ def grid(of: Scene, budget: int) -> Chosen:
         allowed = np.ones((len(q), len(space.loads)), dtype=np.bool_)
         for k, load in enumerate(space.loads[1:], start=1):
             allowed[:, k] = space.allowed(q, load)
-        some = allowed[:, 1:].any(axis=1) | (of.exact.mode == "absolute")
+        some = allowed[:, 1:].any(axis=1) | (s.exact.mode == "absolute")
         q, allowed = q[some], allowed[some]
         if allowed.sum() >= budget:
             break
     if not len(q):
         raise CannotAnswerError("no pose of a regular grid in joint space is feasible")
-    of_grid = problem(of.nominal, without_potential(of.config), q, allowed)
+    of_grid = problem(s.nominal, without_potential(s.config), q, allowed)
     poses = next((n for n in range(1, len(q)) if allowed[_even(len(q), n)].sum() >= budget), len(q))
     order = _even(len(q), poses)
-    return _of_poses(of_grid, cycle(order.tolist()), budget, of.work)
+    return _of_poses(of_grid, cycle(order.tolist()), budget, s.work)
 
 
 def _even(count: int, number: int) -> Ints:
@@ -177,7 +177,7 @@ def _even(count: int, number: int) -> Ints:
 
 
 def matching(
-    of: Scene, position: float, budget: int, rng: np.random.Generator, *, others: bool = False
+    s: Scene, position: float, budget: int, rng: np.random.Generator, *, others: bool = False
 ) -> int | None:
     """Return the number of readings that random plans need for an accuracy at the test poses.
 
@@ -185,20 +185,20 @@ def matching(
     None where `MOST` times the budget does not suffice.
 
     Args:
-        of: the cell.
+        s: the cell.
         position: required RMS standard deviation, m.
         budget: number of readings to start from.
         rng: generator.
         others: whether the potential terms are estimated, too.
     """
-    orders = [rng.permutation(len(of.exact.candidates)).tolist() for _ in range(MATCHED)]
-    judge = of.robust if others and of.robust is not None else of.exact
+    orders = [rng.permutation(len(s.exact.candidates)).tolist() for _ in range(MATCHED)]
+    judge = s.robust if others and s.robust is not None else s.exact
 
     def reached(readings: int) -> bool:
         positions = []
         for order in orders:
-            counts = _of_poses(of.exact, cycle(order), readings, of.work).counts
-            p = predicted(judge, counts, work=of.work)
+            counts = _of_poses(s.exact, cycle(order), readings, s.work).counts
+            p = predicted(judge, counts, work=s.work)
             positions.append(p.position_open if others else p.position)
         return rms(np.array(positions, dtype=float)) <= position
 
@@ -214,22 +214,22 @@ def matching(
 
 
 def _of_poses(
-    of: DesignProblem, order: Iterable[int], budget: int, work: PredictionPoses
+    design_problem: DesignProblem, order: Iterable[int], budget: int, work: PredictionPoses
 ) -> Chosen:
     """Add poses in order, each with as many loads as it bears, until the budget is used."""
-    counts, remaining = np.zeros(len(of.units)), float(budget)
-    pose = np.array([p for p, _ in of.what])
-    cost, least = of.units.cost, float(of.units.cost.min())
+    counts, remaining = np.zeros(len(design_problem.units)), float(budget)
+    pose = np.array([p for p, _ in design_problem.what])
+    cost, least = design_problem.units.cost, float(design_problem.units.cost.min())
     for p in order:
         if remaining < least:
             break
         first, last = np.searchsorted(pose, [p, p + 1])
         units = np.arange(first, last)
-        if of.mode == "deflection" and len(units):
+        if design_problem.mode == "deflection" and len(units):
             units = units[cost[units] <= remaining]
             units = units[[int(np.argmax(cost[units]))]] if len(units) else units
         for k in units:
             if cost[k] <= remaining:
                 counts[k] += 1.0
                 remaining -= float(cost[k])
-    return Chosen(of, counts, predicted(of, counts, work=work))
+    return Chosen(design_problem, counts, predicted(design_problem, counts, work=work))

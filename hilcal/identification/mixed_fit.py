@@ -159,7 +159,7 @@ def linearised_problem(model: Model, readings: Readings, mode: Mode, theta: Floa
 def sizes_at(problem: MixedProblem, model: Model, theta: Floats) -> Floats:
     """Log s and η (F + N,) from the standard deviations of the model, or else from theta (P,).
 
-    For families without parameters, and for the noise, the priors' means.
+    For families that are zero or of known size, and for the noise, the priors' means.
     """
     std = theta.copy()
     for effect, rows in zip(model.effects, model.slices(), strict=True):

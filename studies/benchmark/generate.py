@@ -188,8 +188,8 @@ def generate(
         valid = "none" if part == PUBLIC else "--key KEY, another than that of the public part"
         raise InputError(f"key {key!r} for the {part} part; valid: {valid}")
     every = ("elastic", "mujoco", "law", *real.SERIES)
-    wanted = tuple(tracks.split(",")) if tracks else every
-    for track in wanted:
+    chosen = tuple(tracks.split(",")) if tracks else every
+    for track in chosen:
         if track not in every:
             raise InputError(f"track {track!r}; valid: {', '.join(every)}")
         lacks = _lacking(track)

@@ -24,11 +24,9 @@ def library(angles: int, all_: int) -> Any:
     waves, wave_texts = zip(*(wave(f, k) for k in (1, 2, 3) for f in ("sin", "cos")), strict=True)
     powers = [lambda x: x, lambda x: x**2, lambda x: np.abs(x)]
     power_texts = [lambda x: x, lambda x: f"{x}**2", lambda x: f"abs({x})"]
-    libraries = [
-        ps.CustomLibrary([*waves], [*wave_texts]), ps.CustomLibrary(powers, power_texts),
-    ]  # fmt: skip
+    both = [ps.CustomLibrary([*waves], [*wave_texts]), ps.CustomLibrary(powers, power_texts)]
     parts = [list(range(angles)), list(range(angles, all_))]
-    return ps.GeneralizedLibrary(libraries, [[1, 1]], inputs_per_library=parts)
+    return ps.GeneralizedLibrary(both, [[1, 1]], inputs_per_library=parts)
 
 
 def model(sought: Any, threshold: float) -> Any:
