@@ -1,10 +1,10 @@
 """`python -m studies all-effects`: arms that have every effect at once, and the best predictor.
 
-As real arms: all families of the catalogue that unloaded readings allow, u ~ N(0, (k s)² D), s
-their ordinary sizes and k one factor for the arm, 1 unless `--sizes` spreads it. A few random poses
-are refined as `hilcal refine` does; 300 others are predicted. The best linear predictor knows all
-standard deviations and the noise, and is linearised at the truth: nothing predicts better on
-average.
+Like real arms, the simulated ones have all families of the catalogue that unloaded readings allow,
+u ~ N(0, (k s)² D), with their ordinary sizes s and one factor k for the arm, 1 unless `--sizes`
+spreads it. A few random poses are refined as by `hilcal refine`; 300 others are predicted. The best
+linear predictor has the true standard deviations and noise, and is linearised at the truth: no
+predictor is better on average.
 """
 
 from collections.abc import Sequence
@@ -46,20 +46,20 @@ TEST = 300
 INSTRUMENT_M, SCATTER = 1e-5, 1e-5
 """Standard deviations of a coordinate, m, and of a joint's arrival, rad."""
 TURN = 2.5
-"""Joints lie within ± so much, rad."""
+"""Largest absolute joint angle, rad."""
 MOST_RATIO = 1.1
 BAND = (0.93, 0.97)
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """Some poses of a simulated arm.
+    """A campaign on a simulated arm.
 
     Attributes:
-        poses: how many are fitted.
+        poses: number of fitted poses.
         seed: of arm, poses and noise.
-        factor: k, of all sizes.
-        without: whether it is refined without a background, too.
+        factor: factor k of all sizes.
+        without: whether the poses are also refined without a background.
     """
 
     poses: int
@@ -70,18 +70,18 @@ class Case:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """What came of a case.
+    """Result of a case.
 
     Attributes:
-        poses: how many were fitted.
+        poses: number of fitted poses.
         factor: k.
-        rms_m: rms error of positions at other poses.
-        best_m: that of the best linear predictor.
-        inside: share of the others within their 95 % band.
-        best_inside: share within that of the best linear predictor: which way these arms fell.
-        named: effects that the last model names.
-        verdict: of it.
-        without_m: rms error without a background; None where that was not asked for.
+        rms_m: rms error of predicted positions.
+        best_m: rms error of the best linear predictor.
+        inside: share of the predicted positions within their 95 % band.
+        best_inside: share within the band of the best linear predictor, with the same arms.
+        named: named effects of the last model.
+        verdict: of the last model.
+        without_m: rms error without a background; None where this was not requested.
     """
 
     poses: int
@@ -122,18 +122,18 @@ def all_effects(
         counting(t.progress, "arms", len(cases)) as advance,
     ):
         done: Sequence[Found | None] = engine.map(refined, cases, advance=advance)
-    known = [d for d in done if d is not None]
-    figures = [f for n in counts for f in _figures(n, [d for d in known if d.poses == n])]
-    if refused := len(done) - len(known):
+    answered = [d for d in done if d is not None]
+    figures = [f for n in counts for f in _figures(n, [d for d in answered if d.poses == n])]
+    if refused := len(done) - len(answered):
         figures.append(Figure("campaigns refused: the arm is not as described", f"{refused}"))
     for f in figures:
         t.show(f"{f.what}: {f.measured}")
     keep(keep_file, f"All effects at once, sizes 1/{sizes:g} to {sizes:g} times ordinary", figures)
-    t.document({"cases": [asdict(d) for d in known]})
+    t.document({"cases": [asdict(d) for d in answered]})
 
 
 def refined(case: Case) -> Found | None:
-    """Refine the poses of a case, and predict the others; None where the program refuses them."""
+    """Refine the poses of a case, and predict others; None where the program refuses them."""
     rng = np.random.default_rng(case.seed)
     cell = cell_from_config(
         CellConfig.model_validate(
@@ -151,15 +151,15 @@ def refined(case: Case) -> Found | None:
     except InputError:
         return None
     last = refine(start, some, "absolute")
-    off = test.value - last.fit.model.predict(test.states, last.fit.theta).observation.position
-    inside = share_in_band(last.fit, test, off)
+    error = test.value - last.fit.model.predict(test.states, last.fit.theta).observation.position
+    inside = share_in_band(last.fit, test, error)
     problem = linearised_problem(model, some, "absolute", theta)
     noise = [0.0, float(np.log(SCATTER / SCATTER_RAD))][: len(problem.noise)]
     best = equations(problem, np.concatenate([log_std, noise]))
-    known = problem.parameters(best.coordinates, model.size)
-    ideal_prediction = model.predict(test.states, known)
+    best_theta = problem.parameters(best.coordinates, model.size)
+    ideal_prediction = model.predict(test.states, best_theta)
     ideal = test.value - ideal_prediction.observation.position
-    x = problem.coordinates(model.jacobian(ideal_prediction, known, 3))
+    x = problem.coordinates(model.jacobian(ideal_prediction, best_theta, 3))
     moved = joint_factors(cell, test, np.full(cell.arm.n, SCATTER))
     band = x @ best.covariance @ np.swapaxes(x, 1, 2) + moved @ np.swapaxes(moved, 1, 2)
     band += INSTRUMENT_M**2 * np.eye(3)
@@ -173,7 +173,7 @@ def refined(case: Case) -> Found | None:
     return Found(
         case.poses,
         case.factor,
-        _rms(off),
+        _rms(error),
         _rms(ideal),
         inside,
         float(np.mean(square < chi2.ppf(0.95, 3))),
@@ -186,10 +186,9 @@ def refined(case: Case) -> Found | None:
 def _measured(
     cell: Cell, q: Floats, factor: float, rng: np.random.Generator
 ) -> tuple[Readings, Model, Floats, Floats]:
-    """Readings at q (N, n), the true model, its parameters (P,), and log s (F,)."""
-    chain = evaluate(cell.arm, q)
-    at = chain.point(np.array([0.05, 0.02, 0.1]))
-    plain = readings_of(q, at, np.full(3, INSTRUMENT_M))
+    """Return readings at q (N, n), the true model, its parameters (P,), and log s (F,)."""
+    target = evaluate(cell.arm, q).point(np.array([0.05, 0.02, 0.1]))
+    plain = readings_of(q, target, np.full(3, INSTRUMENT_M))
     model = with_all_effects(baseline(cell, plain, "absolute"), plain.states)
     families = families_of(model).random
     log_std = np.array([f.prior.mean + (0.0 if f.known else np.log(factor)) for f in families])
@@ -200,36 +199,36 @@ def _measured(
     moved = joint_factors(cell, plain, np.full(cell.arm.n, SCATTER))
     value = value + INSTRUMENT_M * rng.standard_normal(value.shape)
     value += np.einsum("nij,nj->ni", moved, rng.standard_normal((len(q), moved.shape[2])))
-    found = readings_of(q, value, np.full(3, INSTRUMENT_M))
-    return replace(found, scatter_stated=False), model, theta, log_std
+    readings = readings_of(q, value, np.full(3, INSTRUMENT_M))
+    return replace(readings, scatter_stated=False), model, theta, log_std
 
 
-def _rms(off: Floats) -> float:
-    return float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
+def _rms(error: Floats) -> float:
+    return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
 
 
-def _figures(poses: int, found: list[Found]) -> list[Figure]:
+def _figures(poses: int, results: list[Found]) -> list[Figure]:
     """Figures of the arms of one number of poses."""
-    ratio = np.array([f.rms_m / f.best_m for f in found])
-    inside = float(np.mean([f.inside for f in found]))
-    verdicts = [f.verdict for f in found]
-    each = ", ".join(f"{verdicts.count(v)} {v}" for v in dict.fromkeys(verdicts))
+    ratio = np.array([f.rms_m / f.best_m for f in results])
+    inside = float(np.mean([f.inside for f in results]))
+    verdicts = [f.verdict for f in results]
+    counted = ", ".join(f"{verdicts.count(v)} {v}" for v in dict.fromkeys(verdicts))
     middle = float(np.exp(np.mean(np.log(ratio))))
-    best = 1e6 * float(np.median([f.best_m for f in found]))
-    least = min(f.inside for f in found)
-    ideal, lowest = np.mean([f.best_inside for f in found]), min(f.best_inside for f in found)
-    beside = np.array([f.rms_m / f.without_m for f in found if f.without_m])
-    more = []
-    if len(beside):
-        mean = float(np.exp(np.mean(np.log(beside))))
-        what = "error by that of refine without a background, geometric mean (largest)"
-        words = f"{mean:.2f} ({beside.max():.2f})"
-        more.append(Figure(f"{poses} positions: {what}", words, "at most 1", mean <= 1.0))
+    best = 1e6 * float(np.median([f.best_m for f in results]))
+    least = min(f.inside for f in results)
+    ideal, lowest = np.mean([f.best_inside for f in results]), min(f.best_inside for f in results)
+    gains = np.array([f.rms_m / f.without_m for f in results if f.without_m])
+    out = []
+    if len(gains):
+        mean = float(np.exp(np.mean(np.log(gains))))
+        title = "error by that of refine without a background, geometric mean (largest)"
+        measured = f"{mean:.2f} ({gains.max():.2f})"
+        out.append(Figure(f"{poses} positions: {title}", measured, "at most 1", mean <= 1.0))
     return [
-        *more,
+        *out,
         Figure(
             f"{poses} positions: error at {TEST} others by that of the best linear predictor, "
-            f"geometric mean of {len(found)} arms (largest)",
+            f"geometric mean of {len(results)} arms (largest)",
             f"{middle:.2f} ({ratio.max():.2f}); the best leaves {best:.0f} µm (median)",
             f"at most {MOST_RATIO}",
             middle <= MOST_RATIO,
@@ -244,5 +243,5 @@ def _figures(poses: int, found: list[Found]) -> list[Figure]:
             f"{poses} positions: of the best linear predictor's errors, within its own (least arm)",
             f"{ideal:.0%} ({lowest:.0%})",
         ),
-        Figure(f"{poses} positions: verdicts", each),
+        Figure(f"{poses} positions: verdicts", counted),
     ]

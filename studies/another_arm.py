@@ -1,8 +1,8 @@
 """`python -m studies.another_arm F.csv`: the table of the tutorial on another arm.
 
-A simulated ABB IRB 120 whose joint zeros are off, whose gears are not even, and whose drives give
-way; a laser tracker reads its target at 75 poses, unloaded and under 2.5 kg. The table is written
-as laboratories write theirs: degrees, millimetres, a decimal comma, semicolons, names of its own.
+A simulated ABB IRB 120 with errors of joint zeros and gears and with compliant drives; a laser
+tracker measures its target at 75 poses, unloaded and under 2.5 kg. The table has the form of a
+laboratory's: degrees, millimetres, a decimal comma, semicolons, other column names.
 """
 
 import sys
@@ -20,9 +20,9 @@ from studies.random_campaigns import rehearsal_states
 CELL = Path(__file__).parents[1] / "docs" / "tutorials" / "data" / "irb120.toml"
 SEED, POSES = 120, 75
 ZEROS = 1e-3 * np.array([0.4, -0.9, 1.4, 0.6, -0.8, 0.5])
-"""Of the joints, rad: some hundredths of a degree, as after a motor was changed."""
+"""Errors of the joint zeros, rad: hundredths of a degree, as after a change of a motor."""
 GEARS = 1e-4 * np.array([[1.5, -0.8], [2.0, 1.2], [-1.2, 1.6], [0, 0], [0, 0], [0, 0]])
-"""Amplitudes of cos q and sin q in the error of each joint, rad: a gear that is off its centre."""
+"""Amplitudes of cos q and sin q in the error of each joint, rad, as of an eccentric gear."""
 EMPTY = "empty"
 
 
@@ -32,14 +32,14 @@ def table(cell: Cell) -> str:
     hung = [(load.name, load.wrench(cell.gravity)) for load in config.loads]
     states, pose, load, cycle = rehearsal_states(cell, POSES, hung, rng)
     states = replace(states, q=np.radians(np.round(np.degrees(states.q), 3)))
-    made = nothing_hidden(
+    plain = nothing_hidden(
         cell,
         rng,
         noise=measurement_noise(config),
         joint_std=config.repeatability.per_joint(cell.arm.n),
     )
-    truth = made.physics.with_effect("encoder_offset", ZEROS)
-    world = replace(made, physics=truth.with_effect("transmission_error", GEARS[:, None]))
+    truth = plain.physics.with_effect("encoder_offset", ZEROS)
+    world = replace(plain, physics=truth.with_effect("transmission_error", GEARS[:, None]))
     names = ("none", *(load.name for load in config.loads))
     read = simulate(world, states, pose, load, cycle, names, rng)
     axes = [f"A{k} [deg]" for k in range(1, cell.arm.n + 1)]

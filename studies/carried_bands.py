@@ -1,11 +1,11 @@
-"""Simulated arms that are measured twice in other joint ranges, the first time as prior.
+"""Simulated arms that are measured twice in different joint ranges, the first time as prior.
 
-A real arm is one draw: its errors where it was not measured have a few dozen degrees of freedom,
-and so has the share of its poses within a stated band. Whether bands are true is a question about
-many arms. Each has transmission errors, link and joint zero errors and joint compliance of its own
-by the mechanics of the simulated cell, and half of them something that the model lacks. Campaign A
-takes poses with joint 2 in one range, campaign B in another one that hardly meets it; tracker and
-target are set up anew.
+A real arm is a single draw: its errors outside of the measured range have a few dozen degrees of
+freedom, and so has the share of its poses within a stated band. Only many arms show whether bands
+are right. Each arm has transmission errors, link and joint zero errors and joint compliance by the
+mechanics of the simulated cell; every other arm has an effect that the model lacks. In campaign A
+joint 2 is in one range, in campaign B in another one with hardly any overlap; tracker and target
+are set up anew.
 """
 
 from collections.abc import Sequence
@@ -30,13 +30,13 @@ from studies.study_cases import with_study_loads
 
 POSES_A = 250
 TESTED = 200
-"""Poses of B that a fit is tested on."""
+"""Number of poses of B that test a fit."""
 JOINT = 1
-"""The joint, from 0, whose range the campaigns do not share: joint 2, as in the IPA's series."""
+"""Index of the joint with different ranges: joint 2, as in the IPA's series."""
 RANGES = ((-2.25, 0.07), (-3.14, -1.92))
-"""Of A and of B, rad: those of series B and C of the IPA UR10, which share a few degrees."""
+"""Ranges of A and of B, rad: of series B and C of the IPA UR10, which share a few degrees."""
 LACKING = ("joint_tilt_compliance", "link_compliance")
-"""What the model of every other arm lacks."""
+"""Effects, one of which the model of every other arm lacks."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,10 +45,10 @@ class BandCase:
 
     Attributes:
         seed: of the arm.
-        lacking: what its model lacks; empty for nothing.
+        lacking: effect that the model lacks; empty for none.
         poses: N.
-        mean_m: mean 3-D error of the poses it is tested on.
-        inside: share of them in the stated 95 % band.
+        mean_m: mean 3-D error of the tested poses.
+        inside: share of the tested poses in the stated 95 % band.
     """
 
     seed: int
@@ -71,9 +71,12 @@ def band_cases(
         first: poses of campaign A.
     """
     rng = np.random.default_rng([seed, 20261123])
-    own, _ = with_study_loads(config, robot)
-    cell = cell_from_config(own)
-    noise, joints = measurement_noise(own), own.repeatability.per_joint(cell.arm.n)
+    robot_config, _ = with_study_loads(config, robot)
+    cell = cell_from_config(robot_config)
+    noise, joints = (
+        measurement_noise(robot_config),
+        robot_config.repeatability.per_joint(cell.arm.n),
+    )
     world = nothing_hidden(cell, rng, noise=noise, joint_std=joints)
     draw = Draw(cell.arm, world.physics.joint_compliance, typical_torque(cell.arm))
     lacking = LACKING[seed // 2 % len(LACKING)] if seed % 2 else ""
@@ -83,23 +86,22 @@ def band_cases(
         physics = physics.with_effect(name, draw.effect(name, rng))
     world = replace(world, physics=physics)
     readings = measured(_within(world, 0), [], first, rng)
-    learnt = fit(with_effects(cell, readings, "absolute", GEOMETRY), readings, "absolute")
-    prior = carried_prior(Posterior.of(learnt))
+    first_fit = fit(with_effects(cell, readings, "absolute", GEOMETRY), readings, "absolute")
+    prior = carried_prior(Posterior.of(first_fit))
     registration, station = stand(cell, rng)
     again = _within(replace(world, registration=registration, station=station), 1)
     second = measured(again, [], max(numbers) + TESTED, rng)
-    # A calibration states the arm's scatter itself; what it is tested by adds the tracker's.
+    # The band of a calibration contains the arm's scatter; the tested readings add the tracker's.
     tracker = replace(again, joint_std=np.zeros(cell.arm.n))
     tracker_alone = tracker.covariance(again.sight(second.states), second.m)
     out = []
     for n in numbers:
         order = rng.permutation(len(second))
-        some, rest = second[np.sort(order[:n])], np.sort(order[n:][:TESTED])
-        tested = replace(second[rest], covariance=tracker_alone[rest])
+        some, rows = second[np.sort(order[:n])], np.sort(order[n:][:TESTED])
+        tested = replace(second[rows], covariance=tracker_alone[rows])
         model = baseline(cell, some, "absolute", prior=prior)
-        found = fit(model, with_prior_scatter(model, some), "absolute")
-        of = Calibration.of(found)
-        errors, inside = judged(of, of.predict(tested.states.q, tested.states.wrench), tested)
+        c = Calibration.of(fit(model, with_prior_scatter(model, some), "absolute"))
+        errors, inside = judged(c, c.predict(tested.states.q, tested.states.wrench), tested)
         out.append(BandCase(seed, lacking, n, float(errors.mean()), float(inside.mean())))
     return out
 

@@ -40,8 +40,8 @@ def carried_bands(
         open_engine(jobs, scheduler) as engine,
         counting(t.progress, "arms", arms) as advance,
     ):
-        found = engine.map(run, range(first_seed, first_seed + arms), advance=advance)
-    cases = [case for of_arm in found for case in of_arm]
+        by_arm = engine.map(run, range(first_seed, first_seed + arms), advance=advance)
+    cases = [case for of_arm in by_arm for case in of_arm]
     figures = list(_figures(cases, numbers))
     for f in figures:
         t.show(f"{f.what}: {f.measured}")
@@ -51,23 +51,23 @@ def carried_bands(
 
 
 def _figures(cases: Sequence[BandCase], numbers: Iterable[int]) -> Iterable[Figure]:
-    """Yield the share in the band over the arms, and between which shares nine arms in ten lie."""
+    """Yield the share in the band over the arms, and the range of nine arms in ten."""
     low, high = WANTED
     for n in numbers:
-        mine = [c for c in cases if c.poses == n]
-        share = np.array([c.inside for c in mine])
+        of_number = [c for c in cases if c.poses == n]
+        share = np.array([c.inside for c in of_number])
         mean = float(share.mean())
         ends = np.quantile(share, [0.05, 0.95])
-        lacking = np.array([bool(c.lacking) for c in mine])
+        lacking = np.array([bool(c.lacking) for c in of_number])
         parts = [
-            f"{words} {100 * float(share[which].mean()):.1f} %"
-            for words, which in (("complete models", ~lacking), ("one effect lacking", lacking))
+            f"{models} {100 * float(share[which].mean()):.1f} %"
+            for models, which in (("complete models", ~lacking), ("one effect lacking", lacking))
             if which.any()
         ]
         yield Figure(
             f"{n} poses: share of other poses in the stated 95 % band",
-            f"{100 * mean:.1f} % over {len(mine)} arms ({'; '.join(parts)}); nine single arms in "
-            f"ten {100 * ends[0]:.1f} to {100 * ends[1]:.1f} %",
+            f"{100 * mean:.1f} % over {len(of_number)} arms ({'; '.join(parts)}); "
+            f"nine single arms in ten {100 * ends[0]:.1f} to {100 * ends[1]:.1f} %",
             f"{100 * low:.0f} to {100 * high:.0f} %",
             low <= mean <= high,
         )

@@ -32,10 +32,10 @@ from studies.compensation_command import judged
 from studies.records import Figure, Keep, keep
 
 TURN, FAR_M, OFFSET_M = np.pi, 3.0, 0.05
-"""Tracker and target are set up anew: turned by up to half a turn, the tracker shifted by up to 3 m
-along each axis, the target by up to 5 cm."""
+"""Changes of a new setup: tracker and target turn by up to half a turn; along each axis the tracker
+moves by up to 3 m, the target by up to 5 cm."""
 MOST_TESTED = 400
-"""Poses that a fit is tested on, at random from the rest."""
+"""Most poses that test a fit, at random from those that are not fitted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,8 +43,8 @@ class Outcome:
     """One fit to N poses.
 
     Attributes:
-        mean_m: mean 3-D error of the poses it is tested on.
-        inside: share of them in the 95 % band of its calibration.
+        mean_m: mean 3-D error of the tested poses.
+        inside: share of the tested poses in the 95 % band of the calibration.
     """
 
     mean_m: float
@@ -71,15 +71,15 @@ def carry(
 ) -> None:
     """Fit N poses of the IPA UR10 with and without half of Series B as prior."""
     t = terminal(as_json)
-    known = _without_of(before)
+    recorded = _without_of(before)
     cell = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")
     figures: list[Figure] = []
     points: list[Point] = []
     with working(t.progress) as say:
         say("refining half of the first series")
-        mine = _readings("half of B", first)
-        learnt = refine(baseline(cell, mine, "absolute"), mine, "absolute").fit
-        prior = carried_prior(Posterior.of(learnt))
+        half = _readings("half of B", first)
+        refined = refine(baseline(cell, half, "absolute"), half, "absolute").fit
+        prior = carried_prior(Posterior.of(refined))
     cases = [("B", first, n) for n in _numbers(poses)]
     if second is not None:
         cases += [("C", second, n) for n in _numbers(other_poses)]
@@ -90,8 +90,8 @@ def carry(
     ):
         done = engine.map(run, cases, advance=advance)
     for (name, _, n), (with_it, alone) in zip(cases, done, strict=True):
-        figures += _figures(name, n, with_it, alone, known.get((name, n)))
-        errors = [o.mean_m for o in alone] or known.get((name, n), [])
+        figures += _figures(name, n, with_it, alone, recorded.get((name, n)))
+        errors = [o.mean_m for o in alone] or recorded.get((name, n), [])
         points.append(Point(name, n, [o.mean_m for o in with_it], errors))
         t.show(f"{figures[-1].what}: {figures[-1].measured}")
     title = "A real UR10 measured again: half of Series B as prior, tracker and target set up anew"
@@ -100,8 +100,8 @@ def carry(
             "A real UR10 measured again elsewhere: half of Series B as prior of Series C, "
             "frames anew"
         )
-    more = {"picture": PICTURE, "points": [asdict(p) for p in points]}
-    keep(keep_file, title, figures, more)
+    content = {"picture": PICTURE, "points": [asdict(p) for p in points]}
+    keep(keep_file, title, figures, content)
     t.document({"figures": [{"what": f.what, "measured": f.measured} for f in figures]})
 
 
@@ -138,7 +138,7 @@ def _drawn(
 
 
 def set_up_anew(readings: Readings, rng: np.random.Generator) -> Readings:
-    """Return poses as another tracker would have read another target, unknown to each other."""
+    """Return the readings as of another tracker and another target, with unknown frames."""
     turn = Rotation.from_rotvec(rng.uniform(-TURN, TURN, 3) / np.sqrt(3))
     mount = Rotation.from_rotvec(rng.uniform(-TURN, TURN, 3) / np.sqrt(3))
     place, offset = rng.uniform(-FAR_M, FAR_M, 3), rng.uniform(-OFFSET_M, OFFSET_M, 3)
@@ -157,12 +157,12 @@ def set_up_anew(readings: Readings, rng: np.random.Generator) -> Readings:
     return replace(readings, value=value, covariance=(covariance + covariance.swapaxes(1, 2)) / 2)
 
 
-def outcome(found: Fit | None, tested: Readings) -> Outcome:
-    """Predict other poses by the calibration; nothing found counts as an infinite error."""
-    if found is None:
+def outcome(fitted: Fit | None, tested: Readings) -> Outcome:
+    """Predict tested poses by the calibration of a fit; without a fit the error is infinite."""
+    if fitted is None:
         return Outcome(float("inf"), 0.0)
-    of = Calibration.of(found)
-    errors, inside = judged(of, of.predict(tested.states.q, tested.states.wrench), tested)
+    c = Calibration.of(fitted)
+    errors, inside = judged(c, c.predict(tested.states.q, tested.states.wrench), tested)
     return Outcome(float(errors.mean()), float(inside.mean()))
 
 
@@ -179,7 +179,7 @@ def _alone(cell: Cell, some: Readings) -> Fit | None:
 
 
 def _without_of(record: Path | None) -> dict[tuple[str, int], list[float]]:
-    """Mean errors without a prior, m, by series and N, that an earlier record has."""
+    """Mean errors without a prior, m, by series and N, from a record of a previous run."""
     if record is None:
         return {}
     points = json.loads(record.read_text())["points"]
@@ -191,32 +191,32 @@ def _figures(
     n: int,
     with_it: list[Outcome],
     alone: list[Outcome],
-    known: list[float] | None = None,
+    recorded: list[float] | None = None,
 ) -> list[Figure]:
     errors = np.array([o.mean_m for o in with_it])
     shares = np.array([o.inside for o in with_it])
     inside = float(shares.mean())
-    words = _um(errors)
+    text = _um(errors)
     met, required = None, ""
     if name == "B" and n == 20:
         met, required = bool(errors.mean() <= 1.2e-4), "120 µm at most"
     if alone:
-        other = np.array([o.mean_m for o in alone])
-        ratio = float(np.mean(errors / other))
-        words += f"; without prior {_um(other)}"
+        without = np.array([o.mean_m for o in alone])
+        ratio = float(np.mean(errors / without))
+        text += f"; without prior {_um(without)}"
         if name != "B":
-            words += f"; ratio {ratio:.2f}, worst {float((errors / other).max()):.2f}"
+            text += f"; ratio {ratio:.2f}, worst {float((errors / without).max()):.2f}"
             met, required = ratio <= 1.05, "ratio 1.05 at most"
-    elif known:
-        mean = float(np.mean(known))
-        words += f"; without prior {1e6 * mean:.0f} µm (an earlier run)"
+    elif recorded:
+        mean = float(np.mean(recorded))
+        text += f"; without prior {1e6 * mean:.0f} µm (an earlier run)"
         if name != "B":
             ratio = float(errors.mean()) / mean
-            words += f"; ratio {ratio:.2f}"
+            text += f"; ratio {ratio:.2f}"
             met, required = ratio <= 1.05, "ratio 1.05 at most"
-    what = f"{n} poses of {'the other half of B' if name == 'B' else name}: mean error with prior"
+    title = f"{n} poses of {'the other half of B' if name == 'B' else name}: mean error with prior"
     return [
-        Figure(what, words, required, met),
+        Figure(title, text, required, met),
         Figure(
             f"{n} poses of {'B' if name == 'B' else name}: share in the stated 95 % band",
             f"{100 * inside:.1f} % ({len(shares)} draws: {100 * shares.min():.1f} to "

@@ -1,4 +1,4 @@
-"""The error against the number of poses, with and without prior, of what `studies carry` kept."""
+"""Chart of the error against the number of poses, with and without prior, of `studies carry`."""
 
 import json
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from hilcal.present.charts import GREY, HOLDOUT, LIGHT, MEASURED, figure
 from studies.picture import HEIGHT, WIDTH
 
 PICTURE = "../images/carry-over.svg"
-"""Its place from the page of results."""
+"""Path of the picture relative to the page of results."""
 SERIES = {
     "B": ("the other half of Series B", MEASURED, "circle"),
     "C": ("Series C, other joint ranges", HOLDOUT, "diamond"),
@@ -27,7 +27,7 @@ class Point:
         series: "B" or "C".
         poses: N.
         with_m: error of each draw with the prior, m.
-        without_m: without; empty where it was not measured.
+        without_m: error of each draw without the prior, m; empty if not measured.
     """
 
     series: str
@@ -36,27 +36,27 @@ class Point:
     without_m: list[float]
 
 
-def carry_points(kept: Path) -> list[Point]:
-    """Return the points that `carry` kept.
+def carry_points(record: Path) -> list[Point]:
+    """Return the points of a record of `carry`.
 
     Raises:
-        InputError: a file that it did not keep.
+        InputError: a file that is no such record.
     """
     try:
-        return [Point(**p) for p in json.loads(kept.read_text(encoding="utf-8"))["points"]]
+        return [Point(**p) for p in json.loads(record.read_text(encoding="utf-8"))["points"]]
     except (OSError, KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{kept}: not kept by studies carry ({error})") from None
+        raise InputError(f"{record}: not kept by studies carry ({error})") from None
 
 
 def chart(points: Sequence[Point]) -> go.Figure:
     """Return the figure: lines through the means, bars from the least to the largest draw."""
     traces = []
     for series, (name, colour, symbol) in SERIES.items():
-        mine = sorted((p for p in points if p.series == series), key=lambda p: p.poses)
+        of_series = sorted((p for p in points if p.series == series), key=lambda p: p.poses)
         for which, dash, mark in (("with prior", "solid", colour), ("without", "dot", GREY)):
             drawn = [
                 (p.poses, errors)
-                for p in mine
+                for p in of_series
                 if (errors := p.with_m if which == "with prior" else p.without_m)
             ]
             if not drawn:

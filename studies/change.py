@@ -1,10 +1,10 @@
 """Simulated arms that are measured, changed or not, and measured again with a few readings.
 
-The world is the simulated cell with its own mechanics: links off by tenths of a millimetre, joint
-zeros, compliances, transmission errors of six harmonics. Campaign A, of ordinary size, is fitted
-once for each arm; the few readings of B are drawn anew for each case: other poses, loads, time and
-temperatures, and another place of the tracker where it was set up anew. Some arms have more that
-the first model of A does not: what its own readings ask for is added, as `compare` does.
+The world is the simulated cell with independent mechanics: errors of links of tenths of a
+millimetre, joint zeros, compliances, transmission errors of six harmonics. Campaign A, of ordinary
+size, is fitted once for each arm. The few readings of B are drawn for each case: other poses,
+loads, times and temperatures, and another place of the tracker where it is set up anew. Some arms
+have further effects, which the readings of A add to its model, as in `compare`.
 """
 
 from collections.abc import Sequence
@@ -40,10 +40,10 @@ REPAIRS: tuple[Repair, ...] = ("zero", "compliance", "zero and compliance", "gea
 POSES_A = 40
 READINGS_B = 15
 WARMER = 5.0
-"""By how much it is warmer in some later campaigns, K."""
+"""Increase of the temperature in some later campaigns, K."""
 GEOMETRY = ("link_geometry", "transmission_error", "joint_compliance")
 ZERO_RAD = (0.3e-3, 5e-3)
-"""How far a repair moves a joint's zero: mastered with a gauge, or to a mark; log-uniform."""
+"""Change of a joint's zero by a repair, mastered with a gauge or to a mark; log-uniform."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,8 +55,8 @@ class StudiedArm:
         cell: as configured.
         world: the truth.
         loads: names and wrenches (6,) of that campaign.
-        others: loads that it had not.
-        earlier: what the fit of its campaign states.
+        others: further loads.
+        earlier: result of the fit of that campaign.
     """
 
     robot: str
@@ -73,24 +73,25 @@ class Case:
 
     Attributes:
         robot: name of the arm.
-        repair: what was done.
-        joint: number of the joint, from 1; 0 where nothing was done.
+        repair: kind of repair.
+        joint: number of the joint, from 1; 0 without a repair.
         anew: whether the tracker was set up anew.
         seed: of the case.
-        size_rad: by how much the zero was moved.
-        factor: what the compliance was multiplied by.
-        other: whether B has loads that A had not, and is 5 K warmer.
-        moved_m: rms displacement of the target that the change makes in the readings of B, m.
-        strength: the same beside what the tracker's place and A's uncertainty absorb, in σ of all
-            readings together: the root of the non-centrality of a test that knows its shape.
-        limit: strength from which a change of one parameter is claimed in nine cases of ten.
-        parts: what the program names: the first change; empty where none.
+        size_rad: change of the joint's zero.
+        factor: factor of the compliance.
+        other: whether B has other loads than A and is 5 K warmer.
+        moved_m: rms displacement of the target by the change in the readings of B, m.
+        strength: the displacement without the part that the tracker's place and A's uncertainty
+            absorb, in σ of all readings together: the root of the non-centrality of a test that
+            knows its shape.
+        limit: strength above which a change of one parameter is claimed in nine cases of ten.
+        parts: part of the first change that the program names; empty for none.
         others: parts of further changes.
-        same_as: parts that it cannot tell from the first.
+        same_as: parts that it cannot distinguish from the first.
         z: (estimated − true)/standard deviation of the zero and of the compliance, where found.
         of_arm: whether a change of the arm itself is named.
-        explained: whether what is left is scatter.
-        failure: why there is no answer.
+        explained: whether the residual is scatter.
+        failure: reason for no answer.
     """
 
     robot: str
@@ -114,19 +115,19 @@ class Case:
 
     @property
     def found(self) -> bool:
-        """Whether the joint is named, and it alone."""
+        """Whether only the repaired joint is named."""
         return self.parts == f"joint {self.joint}" and not self.others
 
     @property
     def visible(self) -> bool:
-        """Whether the change is larger than what the program states that it can show."""
+        """Whether the change exceeds the program's stated limit of detection."""
         return self.strength > self.limit
 
 
 def studied_arm(
     config: CellConfig, robot: str, seed: int, poses: int = POSES_A, more: Sequence[str] = ()
 ) -> StudiedArm:
-    """Measure an arm with all its errors, and fit what a refinement would end with.
+    """Measure an arm with all its errors, and fit the model that a refinement would reach.
 
     Args:
         config: the cell; robot and loads are replaced.
@@ -136,10 +137,13 @@ def studied_arm(
         more: further effects of the arm.
     """
     rng = np.random.default_rng([seed, 20261122])
-    own, loads = with_study_loads(config, robot)
+    robot_config, loads = with_study_loads(config, robot)
     chosen = [loads[0], loads[1], loads[4]]
-    cell = cell_from_config(own)
-    noise, joints = measurement_noise(own), own.repeatability.per_joint(cell.arm.n)
+    cell = cell_from_config(robot_config)
+    noise, joints = (
+        measurement_noise(robot_config),
+        robot_config.repeatability.per_joint(cell.arm.n),
+    )
     world = nothing_hidden(cell, rng, noise=noise, joint_std=joints)
     draw = Draw(cell.arm, world.physics.joint_compliance, typical_torque(cell.arm))
     physics = world.physics
@@ -148,8 +152,8 @@ def studied_arm(
     world = replace(world, physics=physics)
     readings = measured(world, chosen, poses, rng)
     model = with_effects(cell, readings, "absolute", GEOMETRY)
-    found, _ = completed(fit(model, readings, "absolute"), changing(model.catalogue))
-    return StudiedArm(robot, cell, world, chosen, loads[2:4], earlier_fit(found))
+    fitted, _ = completed(fit(model, readings, "absolute"), changing(model.catalogue))
+    return StudiedArm(robot, cell, world, chosen, loads[2:4], earlier_fit(fitted))
 
 
 def measured(
@@ -175,11 +179,11 @@ def remeasured(
         loads: names and wrenches (6,).
         count: number of readings.
         rng: generator.
-        warmer: by how much it is than the study's usual temperatures, K.
+        warmer: increase above the study's usual temperatures, K.
     """
     pulls = [(name, float(rng.uniform(0.5, 1.0)) * wrench) for name, wrench in loads]
     states, pose, load, cycle = rehearsal_states(world.cell, count, pulls, rng)
-    each = np.arange(count) * (1 + len(pulls)) + rng.integers(0, 1 + len(pulls), count)
+    chosen = np.arange(count) * (1 + len(pulls)) + rng.integers(0, 1 + len(pulls), count)
     if states.air_temperature is not None and states.joint_temperature is not None:
         states = replace(
             states,
@@ -187,7 +191,7 @@ def remeasured(
             joint_temperature=states.joint_temperature + warmer,
         )
     names = ("none", *(name for name, _ in pulls))
-    return simulate(world, states[each], pose[each], load[each], cycle[each], names, rng)
+    return simulate(world, states[chosen], pose[chosen], load[chosen], cycle[chosen], names, rng)
 
 
 def case(
@@ -204,11 +208,11 @@ def case(
 
     Args:
         arm: the arm and its earlier campaign.
-        repair: what is done.
+        repair: kind of repair.
         joint: number of the joint, from 1; 0 for nothing.
         anew: whether the tracker is set up anew.
         seed: of everything random.
-        other: whether B has loads that A had not, and is 5 K warmer.
+        other: whether B has other loads than A and is 5 K warmer.
         count: number of readings.
     """
     rng = np.random.default_rng([seed, joint, len(repair), anew])
@@ -238,47 +242,47 @@ def case(
     readings = remeasured(changed, loads, count, rng, warmer)
     moved = changed.sight(readings.states).position - world.sight(readings.states).position
     rms = float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
-    asked = Case(arm.robot, repair, joint, anew, seed, size, factor, other, rms)
+    repaired = Case(arm.robot, repair, joint, anew, seed, size, factor, other, rms)
     try:
-        found = find_changes(setting(arm.earlier, readings, anew=anew))
+        changes = find_changes(setting(arm.earlier, readings, anew=anew))
     except HilcalError as error:
-        return replace(asked, failure=str(error))
-    return judged(asked, found, moved, change)
+        return replace(repaired, failure=str(error))
+    return judged(repaired, changes, moved, change)
 
 
-def judged(asked: Case, found: Changes, moved: Floats, change: float) -> Case:
-    """Return the case with what the program says.
+def judged(repaired: Case, changes: Changes, moved: Floats, change: float) -> Case:
+    """Return the case with the answer of the program.
 
     Args:
-        asked: the case.
-        found: what the program found.
-        moved: (N, 3) by how much the change moves the target in each reading, m.
+        repaired: the case.
+        changes: the answer.
+        moved: (N, 3) displacement of the target by the change in each reading, m.
         change: of the joint's compliance, rad/(N·m).
     """
-    before, first = found.before, found.found[0] if found.found else None
-    w = before.setting.w
-    x = w.whiten(w.raw(moved)[:, :, None])[:, 0] / np.sqrt(before.setting.earlier.noise)
-    level = LEVEL / found.tested
-    wanted = noncentrality_of_power(1, before.dof + STATED_DOF - 1, level, POWER)
-    truth = {"encoder_offset": asked.size_rad, "joint_compliance": change}
+    test, first = changes.before, changes.found[0] if changes.found else None
+    w = test.setting.w
+    x = w.whiten(w.raw(moved)[:, :, None])[:, 0] / np.sqrt(test.setting.earlier.noise)
+    level = LEVEL / changes.tested
+    noncentrality = noncentrality_of_power(1, test.dof + STATED_DOF - 1, level, POWER)
+    truth = {"encoder_offset": repaired.size_rad, "joint_compliance": change}
     z = tuple(
         (s.value - truth[c.candidate.effect]) / s.std
-        for c in found.found
-        if c.candidate.effect in truth and c.candidate.joint == asked.joint
+        for c in changes.found
+        if c.candidate.effect in truth and c.candidate.joint == repaired.joint
         for s in c.sizes
     )
     return replace(
-        asked,
-        strength=float(np.sqrt(max(x @ before.projection.project_out(x), 0.0))),
-        limit=float(np.sqrt(wanted)),
+        repaired,
+        strength=float(np.sqrt(max(x @ test.projection.project_out(x), 0.0))),
+        limit=float(np.sqrt(noncentrality)),
         parts="" if first is None else first.candidate.part,
         others=tuple(
             c.candidate.part
-            for c in found.found[1:]
+            for c in changes.found[1:]
             if first is not None and c.candidate.part != first.candidate.part
         ),
         same_as=() if first is None else first.parts[1:],
-        of_arm=any(c.candidate.of_arm for c in found.found),
+        of_arm=any(c.candidate.of_arm for c in changes.found),
         z=z,
-        explained=found.explained,
+        explained=changes.explained,
     )

@@ -28,9 +28,9 @@ ARMS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("ur5e", ("hysteresis", "joint_tilt_compliance")),
     ("ur10e", ("thermal_growth", "backlash")),
 )
-"""Robots, and what they have beside geometry, transmission errors and joint compliance."""
+"""Robots, and their effects besides geometry, transmission errors and joint compliance."""
 WILSON = 1.959964
-"""Half of a 95 % interval, in standard deviations."""
+"""Half width of a 95 % interval, in standard deviations."""
 
 
 def change(
@@ -59,26 +59,26 @@ def change(
         ):
             compare = partial(real_case, study=study)
             halves = engine.map(compare, range(2 * seeds), advance=advance)
-        _tell(t, real_figures(halves), [asdict(c) for c in halves])
+        _show(t, real_figures(halves), [asdict(c) for c in halves])
         keep(
             keep_file,
             f"What has changed on a real arm, by {readings} readings",
             real_figures(halves),
         )
         return
-    asked = [(True, k) for k in range(seeds)] + [(False, k) for k in range(nothing)]
+    comparisons = [(True, k) for k in range(seeds)] + [(False, k) for k in range(nothing)]
     run = partial(_case, first=first_seed, count=readings)
     with (
         open_engine(jobs, scheduler) as engine,
-        counting(t.progress, "comparisons", len(asked)) as advance,
+        counting(t.progress, "comparisons", len(comparisons)) as advance,
     ):
-        cases = engine.map(run, asked, advance=advance)
+        cases = engine.map(run, comparisons, advance=advance)
     figures = figures_of(cases)
-    _tell(t, figures, [asdict(c) for c in cases])
+    _show(t, figures, [asdict(c) for c in cases])
     keep(keep_file, f"What has changed on an arm, by {readings} readings", figures)
 
 
-def _tell(t: Terminal, figures: Sequence[Figure], cases: list[dict[str, object]]) -> None:
+def _show(t: Terminal, figures: Sequence[Figure], cases: list[dict[str, object]]) -> None:
     out = table("what", "measured", "required", left=(0, 1, 2))
     for f in figures:
         out.add(f.what, f.measured, f.required)
@@ -87,7 +87,7 @@ def _tell(t: Terminal, figures: Sequence[Figure], cases: list[dict[str, object]]
 
 
 def real_figures(cases: Sequence[RealCase]) -> list[Figure]:
-    """Return what was counted on a real arm."""
+    """Return the figures of a real arm."""
     quiet, moved = [c for c in cases if not c.joint], [c for c in cases if c.joint]
     silent = [not c.parts and c.explained for c in quiet]
     named = [c.parts == (f"joint {c.joint}",) for c in moved]
@@ -109,9 +109,9 @@ def _arms() -> tuple[StudiedArm, ...]:
     return tuple(studied_arm(config, robot, k, more=more) for k, (robot, more) in enumerate(ARMS))
 
 
-def _case(asked: tuple[bool, int], first: int, count: int) -> Case:
-    """Return the k-th repair, or the k-th comparison of an arm that nobody repaired."""
-    repaired, k = asked
+def _case(comparison: tuple[bool, int], first: int, count: int) -> Case:
+    """Return the k-th case with a repair, or the k-th case without."""
+    repaired, k = comparison
     arms = _arms()
     if repaired:
         return _repaired(arms, k, first, count)
@@ -129,7 +129,7 @@ def _repaired(arms: Sequence[StudiedArm], k: int, first: int, count: int) -> Cas
 
 
 def figures_of(cases: Sequence[Case]) -> list[Figure]:
-    """Return what was counted."""
+    """Return the figures of simulated arms."""
     quiet = [c for c in cases if c.repair == "nothing"]
     repaired = [c for c in cases if c.repair != "nothing"]
     visible = [c for c in repaired if c.visible]
@@ -145,12 +145,12 @@ def figures_of(cases: Sequence[Case]) -> list[Figure]:
             ),
         ]
         for kind in REPAIRS:
-            mine = [c for c in repaired if c.repair == kind]
-            out.append(_rate(f"… of all: {kind}", mine, [c.found for c in mine]))
+            of_kind = [c for c in repaired if c.repair == kind]
+            out.append(_rate(f"… of all: {kind}", of_kind, [c.found for c in of_kind]))
         for anew in (False, True):
-            mine = [c for c in visible if c.anew == anew]
-            words = "set up anew" if anew else "where it was"
-            out.append(_rate(f"… of those, tracker {words}", mine, [c.found for c in mine]))
+            chosen = [c for c in visible if c.anew == anew]
+            place = "set up anew" if anew else "where it was"
+            out.append(_rate(f"… of those, tracker {place}", chosen, [c.found for c in chosen]))
         wrong = [bool(c.parts) and c.parts != f"joint {c.joint}" for c in repaired]
         out.append(_rate("another part than the joint is named first", repaired, wrong))
         out += _missed([c for c in repaired if not c.found])
@@ -168,19 +168,19 @@ def figures_of(cases: Sequence[Case]) -> list[Figure]:
         arm = [not c.of_arm and not c.failure for c in quiet]
         out.append(_rate("… no change of the arm itself", quiet, arm))
         for other in (False, True):
-            mine = [c for c in quiet if c.other == other]
-            words = "other loads, 5 K warmer" if other else "loads and temperature as before"
-            silent = [not c.parts and c.explained and not c.failure for c in mine]
-            out.append(_rate(f"… {words}: nothing is claimed", mine, silent))
+            chosen = [c for c in quiet if c.other == other]
+            setting = "other loads, 5 K warmer" if other else "loads and temperature as before"
+            silent = [not c.parts and c.explained and not c.failure for c in chosen]
+            out.append(_rate(f"… {setting}: nothing is claimed", chosen, silent))
     return out
 
 
 def _missed(cases: Sequence[Case]) -> list[Figure]:
-    """Say what these readings cannot show, and what they miss all the same."""
+    """Count missed changes that these readings cannot show, and other missed ones."""
     hidden = [c for c in cases if not c.visible]
     turned = [c for c in hidden if c.size_rad and c.joint == 1 and c.anew]
     small = [c for c in hidden if all(c is not t for t in turned)]
-    rest = len(cases) - len(turned) - len(small)
+    further = len(cases) - len(turned) - len(small)
     out = [
         Figure(
             "not found: zero of joint 1, which a new place of the tracker absorbs", str(len(turned))
@@ -194,20 +194,20 @@ def _missed(cases: Sequence[Case]) -> list[Figure]:
         out.append(
             Figure("not found: smaller than these readings can show (rms at the target)", which)
         )
-    return [*out, Figure("not found: others", str(rest))]
+    return [*out, Figure("not found: others", str(further))]
 
 
 def _rate(
-    what: str, of: Sequence[object], hits: Iterable[bool], least: float | None = None
+    name: str, cases: Sequence[object], hits: Iterable[bool], least: float | None = None
 ) -> Figure:
     """Return a share with its 95 % interval by Wilson."""
-    count, hit = len(of), sum(hits)
+    count, hit = len(cases), sum(hits)
     if not count:
-        return Figure(what, "no case")
+        return Figure(name, "no case")
     share, z2 = hit / count, WILSON**2
     middle = (share + z2 / (2 * count)) / (1 + z2 / count)
     half = WILSON * np.sqrt(share * (1 - share) / count + z2 / (4 * count**2)) / (1 + z2 / count)
-    words = f"{hit} of {count} ({100 * (middle - half):.0f} to {100 * (middle + half):.0f} %)"
+    text = f"{hit} of {count} ({100 * (middle - half):.0f} to {100 * (middle + half):.0f} %)"
     if least is None:
-        return Figure(what, words)
-    return Figure(what, words, f"{100 * least:g} %", share >= least)
+        return Figure(name, text)
+    return Figure(name, text, f"{100 * least:g} %", share >= least)

@@ -1,7 +1,7 @@
-"""A real arm against itself: half of its poses as the earlier campaign, 15 others as the later one.
+"""A real arm against itself: half of its poses are the earlier campaign, 15 others the later one.
 
-Nothing has changed between them, so nothing must be claimed. Then a joint's zero is moved in the
-later readings by the fitted model, and must be found.
+Nothing changed between the two, so no change must be claimed. Then a joint's zero is moved in the
+later readings by the fitted model; this change must be found.
 """
 
 from dataclasses import dataclass, replace
@@ -22,9 +22,9 @@ from hilcal.robot import se3
 from hilcal.robot.catalogue import configs_dir
 
 EFFECTS = ("transmission_error", "link_geometry", "link_compliance", "joint_tilt_compliance")
-"""What a refinement of the whole series ends with (`studies real`)."""
+"""Result of a refinement of the whole series (`studies real`)."""
 ZERO_RAD = 0.5e-3
-"""By how much a joint's zero is moved: half a millimetre at one metre."""
+"""Change of a joint's zero: half a millimetre at one metre."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,11 +32,11 @@ class RealCase:
     """One comparison on real readings.
 
     Attributes:
-        joint: whose zero was moved in them; 0 for none.
+        joint: joint with a moved zero; 0 for none.
         anew: whether the tracker's place was estimated anew.
-        parts: that the program names.
-        explained: whether what is left is scatter.
-        z: (found − true)/std of the zero, where that is what is named.
+        parts: parts that the program names.
+        explained: whether the residual is scatter.
+        z: (estimated − true)/std of the zero, if it is named.
     """
 
     joint: int
@@ -48,11 +48,11 @@ class RealCase:
 
 @dataclass(frozen=True, slots=True)
 class RealStudy:
-    """What is compared.
+    """Settings of the study.
 
     Attributes:
         path: `measurements_joint_configurations.csv` of the IPA UR10 accuracy data.
-        count: comparisons of each kind, those without a change first.
+        count: number of comparisons without a change, which come first, and of those with one.
         seed: of halves and draws.
         count_b: readings of the later campaign.
     """
@@ -64,45 +64,45 @@ class RealStudy:
 
 
 def real_case(k: int, study: RealStudy) -> RealCase:
-    """Compare readings of one half of a series with the other half, for the k-th time."""
-    earlier, draws = _begun(study)
+    """Return the k-th comparison of readings of one half of a series with the other half."""
+    earlier, draws = _halves(study)
     later, joint = draws[k]
     anew = bool(k % 2)
     if joint:
         later = _moved(earlier, later, joint - 1)
-    found = find_changes(setting(earlier, later, anew=anew))
+    changes = find_changes(setting(earlier, later, anew=anew))
     z = [
         (c.sizes[0].value - ZERO_RAD) / c.sizes[0].std
-        for c in found.found
+        for c in changes.found
         if c.candidate.name == f"encoder_offset.j{joint}"
     ]
-    parts = tuple(dict.fromkeys(c.candidate.part for c in found.found))
-    return RealCase(joint, anew, parts, found.explained, z[0] if z else None)
+    parts = tuple(dict.fromkeys(c.candidate.part for c in changes.found))
+    return RealCase(joint, anew, parts, changes.explained, z[0] if z else None)
 
 
 @cache
-def _begun(study: RealStudy) -> tuple[EarlierFit, list[tuple[Readings, int]]]:
+def _halves(study: RealStudy) -> tuple[EarlierFit, list[tuple[Readings, int]]]:
     """Fit one half, and draw later readings and a joint, or 0, for each comparison.
 
-    Once in each process: what is fitted is larger than what it takes to fit it.
+    Cached in each process, as sending the fit would take longer than computing it.
     """
     cell = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")
     readings, rng = read_table(study.path, cell, "ipa-ur10"), np.random.default_rng(study.seed)
     poses = rng.permutation(np.unique(readings.pose))
     half = np.isin(readings.pose, poses[: len(poses) // 2])
     model = with_effects(cell, readings[half], "absolute", EFFECTS)
-    found, _ = completed(fit(model, readings[half], "absolute"), (), lambda words: None)
-    earlier, others = earlier_fit(found), np.flatnonzero(~half)
+    fitted, _ = completed(fit(model, readings[half], "absolute"), (), lambda _: None)
+    earlier, other_half = earlier_fit(fitted), np.flatnonzero(~half)
     out = []
     for k in range(2 * study.count):
-        later = readings[np.sort(rng.choice(others, study.count_b, replace=False))]
+        later = readings[np.sort(rng.choice(other_half, study.count_b, replace=False))]
         joint = int(rng.integers(2 if k % 2 else 1, 7)) if k >= study.count else 0
         out.append((later, joint))
     return earlier, out
 
 
 def _moved(earlier: EarlierFit, later: Readings, j: int) -> Readings:
-    """Return the readings as they were, had the zero of a joint moved: by the fitted model."""
+    """Return the readings as if the zero of a joint had moved, by the fitted model."""
     model, theta, s = earlier.fit.model, earlier.fit.theta, later.states
     step = ZERO_RAD * np.eye(s.q.shape[1])[j]
     actual = None if s.q_actual is None else s.q_actual + step

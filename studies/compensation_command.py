@@ -1,10 +1,9 @@
 """`python -m studies compensation`: corrections by the model at poses that were never fitted.
 
-A real series is split; one part is fitted, from the arm's type alone, and the calibration that
-comes out corrects the other part. The correction is nominal − predicted, so what is left of the
-error is measured − predicted, in base axes of the fit. It is counted as within its band where it is
-no longer than the radius that 95 % of errors with the covariance Σ + V have, Σ of the calibration
-and V of the instrument that measured it.
+A real series is split. One part is fitted, from the arm's type only, and the resulting calibration
+corrects the other part. The correction is nominal − predicted, so the remaining error is
+measured − predicted, in base axes of the fit. It is within its band if it is within the radius of
+95 % of errors with the covariance Σ + V, Σ of the calibration and V of the instrument.
 """
 
 from collections.abc import Iterator, Mapping
@@ -35,9 +34,9 @@ from hilcal.types import Bools, Floats
 from studies.records import Figure, Keep, keep
 
 WANTED_M = 75e-6
-"""Mean error that is to be left; the project's goal for this arm."""
+"""Largest accepted mean of the remaining error; the project's goal for this arm."""
 WANTED_BAND = (0.90, 0.97)
-"""Share of poses within their 95 % band that counts as true; the project's goal."""
+"""Accepted share of poses within their 95 % band; the project's goal."""
 FINAL, PLAIN = "as refine ends", "before the arm's scatter was estimated"
 HALF = 0.5
 ENVIRONMENT = ("time", "load_time", "air_temperature", "joint_temperature", "approach")
@@ -45,22 +44,22 @@ ENVIRONMENT = ("time", "load_time", "air_temperature", "joint_temperature", "app
 
 @dataclass(frozen=True, slots=True)
 class Left:
-    """What a calibration leaves of the error of poses that it was not fitted to.
+    """Remaining errors of a calibration at poses that were not fitted.
 
     Attributes:
-        split: how the series was split.
-        model: whose calibration it is, `FINAL` or `PLAIN`.
-        scatter: whether it has the arm's scatter, estimated.
+        split: name of the split.
+        model: revision of the calibration, `FINAL` or `PLAIN`.
+        scatter: whether the calibration has an estimated scatter of the arm.
         poses: number of poses.
-        before_m: mean error of the nominal arm, in the frames of a fit of frames alone.
-        mean_m: mean error that is left.
-        worst_m: largest.
+        before_m: mean error of the nominal arm, with only the frames fitted.
+        mean_m: mean remaining error.
+        worst_m: largest remaining error.
         inside: share of poses within their band.
-        beyond: share of poses that the calibration says are outside of what was measured.
-        beyond_mean_m: mean error that is left at these.
-        beyond_inside: share of these within their band.
-        near_mean_m: mean error that is left at the others.
-        near_inside: share of the others within their band.
+        beyond: share of poses that the calibration calls outside of the measured range.
+        beyond_mean_m: mean remaining error at these poses.
+        beyond_inside: share of these poses within their band.
+        near_mean_m: mean remaining error at all other poses.
+        near_inside: share of all other poses within their band.
         verdict: of the refinement.
     """
 
@@ -112,9 +111,9 @@ def compensation(
     figures: list[Figure] = []
     document: list[dict[str, object]] = []
     for path in series:
-        found = [x for (of, _), left in zip(cases, done, strict=True) if of == path for x in left]
-        figures += _figures(path.parent.name, found)
-        document.append({"series": path.parent.name, "splits": [asdict(x) for x in found]})
+        results = [x for (p, _), split in zip(cases, done, strict=True) if p == path for x in split]
+        figures += _figures(path.parent.name, results)
+        document.append({"series": path.parent.name, "splits": [asdict(x) for x in results]})
     for f in figures:
         t.show(f"{f.what}: {f.measured}")
     part = "" if share == HALF else f", {100 * share:.0f} % fitted"
@@ -123,7 +122,7 @@ def compensation(
 
 
 def _split(case: tuple[Path, int], splits: int, share: float, folder: Path | None) -> list[Left]:
-    """Fit the k-th part of a series, and correct the rest."""
+    """Fit the k-th part of a series, and correct the other poses."""
     path, k = case
     cell = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")
     readings = read_table(path, cell, "ipa-ur10")
@@ -135,7 +134,7 @@ def _split(case: tuple[Path, int], splits: int, share: float, folder: Path | Non
 
 
 def _parts(count: int, splits: int, share: float) -> Iterator[tuple[str, Bools]]:
-    """Yield names and rows (N,) of what is fitted."""
+    """Yield names and fitted rows (N,) of the splits."""
     fitted = int(share * count)
     for seed in range(1, splits + 1):
         rows = np.zeros(count, dtype=np.bool_)
@@ -148,7 +147,7 @@ def _parts(count: int, splits: int, share: float) -> Iterator[tuple[str, Bools]]
 def _calibrations(
     cell: Cell, readings: Readings, folder: Path | None, stem: str
 ) -> Mapping[str, Calibration]:
-    """Calibrations of the last revision, and of the last one without the arm's scatter."""
+    """Calibrations of the last revision, and of the last revision without the arm's scatter."""
     ends = {FINAL: ".json", PLAIN: "-plain.json"}
     paths = {which: folder / f"{stem}{end}" for which, end in ends.items()} if folder else {}
     if paths and paths[FINAL].exists():
@@ -157,24 +156,24 @@ def _calibrations(
     fits = {FINAL: path.fit}
     if path.fit.readings.arm_scatter is not None:
         fits[PLAIN] = [s.fit for s in path.steps if s.fit.readings.arm_scatter is None][-1]
-    found = {which: Calibration.of(f, {"verdict": path.verdict}) for which, f in fits.items()}
+    out = {which: Calibration.of(f, {"verdict": path.verdict}) for which, f in fits.items()}
     for which, path_ in paths.items():
-        if which in found:
-            found[which].save(path_)
-    return found
+        if which in out:
+            out[which].save(path_)
+    return out
 
 
-def _before(cell: Cell, fitted: Readings, others: Readings) -> Floats:
-    """(N,) errors of the nominal arm at other poses, in frames that were fitted alone."""
-    found = fit(baseline(cell, fitted, "absolute"), fitted, "absolute")
-    predicted = found.predict(others.states).position
-    return np.asarray(np.linalg.norm(others.value[:, :3] - predicted, axis=1))
+def _before(cell: Cell, fitted: Readings, tested: Readings) -> Floats:
+    """(N,) errors of the nominal arm at tested poses, with only the frames fitted."""
+    frames = fit(baseline(cell, fitted, "absolute"), fitted, "absolute")
+    predicted = frames.predict(tested.states).position
+    return np.asarray(np.linalg.norm(tested.value[:, :3] - predicted, axis=1))
 
 
-def _left(name: str, which: str, c: Calibration, others: Readings, before: Floats) -> Left:
-    recorded = {k: v for k in ENVIRONMENT if (v := getattr(others.states, k)) is not None}
-    p = c.predict(others.states.q, others.states.wrench, recorded=recorded)
-    errors, inside = judged(c, p, others)
+def _left(name: str, which: str, c: Calibration, tested: Readings, before: Floats) -> Left:
+    recorded = {k: v for k in ENVIRONMENT if (v := getattr(tested.states, k)) is not None}
+    p = c.predict(tested.states.q, tested.states.wrench, recorded=recorded)
+    errors, inside = judged(c, p, tested)
     beyond = np.zeros(len(errors), dtype=np.bool_)
     for o in p.outside:
         beyond |= o.points
@@ -200,13 +199,13 @@ def _left(name: str, which: str, c: Calibration, others: Readings, before: Float
     )
 
 
-def judged(c: Calibration, p: ToolPoses, others: Readings) -> tuple[Floats, Bools]:
-    """Errors (N,) that are left, m, and whether they are within their band.
+def judged(c: Calibration, p: ToolPoses, tested: Readings) -> tuple[Floats, Bools]:
+    """Return the remaining errors (N,), m, and whether they are within their band.
 
     Args:
         c: the calibration.
-        p: what it says of the readings' states, with uncertainties.
-        others: N readings.
+        p: its predictions in the states of the readings, with uncertainties.
+        tested: N readings.
 
     Raises:
         InputError: the uncertainties were left out.
@@ -215,59 +214,59 @@ def judged(c: Calibration, p: ToolPoses, others: Readings) -> tuple[Floats, Bool
         raise InputError("the poses were predicted without their uncertainty")
     base = c.base_in_tracker()
     turn = base[:3, :3]
-    measured = (others.value[:, :3] - base[:3, 3]) @ turn
+    measured = (tested.value[:, :3] - base[:3, 3]) @ turn
     errors = np.linalg.norm(measured - p.position, axis=1)
-    instrument = turn.T @ others.covariance[:, :3, :3] @ turn
+    instrument = turn.T @ tested.covariance[:, :3, :3] @ turn
     return np.asarray(errors), np.asarray(errors <= band(p.covariance + instrument))
 
 
-def _figures(series: str, found: list[Left]) -> Iterator[Figure]:
-    """Yield mean and worst over the random halves, and the first half by itself."""
+def _figures(series: str, results: list[Left]) -> Iterator[Figure]:
+    """Yield mean and worst over the random halves, and the first half alone."""
     low, high = WANTED_BAND
-    kinds = dict.fromkeys(x.split.rstrip("0123456789 ") for x in found)
+    kinds = dict.fromkeys(x.split.rstrip("0123456789 ") for x in results)
     for kind in kinds:
         for which in (FINAL, PLAIN):
-            parts = [x for x in found if x.model == which and x.split.startswith(kind)]
+            parts = [x for x in results if x.model == which and x.split.startswith(kind)]
             if not parts:
                 continue
             final = which == FINAL
-            what = f"{series}, {kind} fitted, {which}"
+            title = f"{series}, {kind} fitted, {which}"
             if final:
-                what += f" (scatter estimated in {sum(x.scatter for x in parts)} of {len(parts)})"
+                title += f" (scatter estimated in {sum(x.scatter for x in parts)} of {len(parts)})"
             errors, shares = [x.mean_m for x in parts], [x.inside for x in parts]
             before = float(np.mean([x.before_m for x in parts]))
             yield Figure(
-                f"{what}: mean error before → left, worst split",
+                f"{title}: mean error before → left, worst split",
                 f"{length(before)} → {length(float(np.mean(errors)))}, {length(max(errors))}; "
                 f"largest of a pose {length(max(x.worst_m for x in parts))}",
                 f"≤ {length(WANTED_M)}" if final else "",
                 max(errors) <= WANTED_M if final else None,
             )
             yield Figure(
-                f"{what}: poses within their {100 * BAND:.0f} % band, mean (least to most)",
+                f"{title}: poses within their {100 * BAND:.0f} % band, mean (least to most)",
                 f"{100 * np.mean(shares):.1f} % ({100 * min(shares):.1f} to "
                 f"{100 * max(shares):.1f} %)",
                 f"{100 * low:.0f} to {100 * high:.0f} %" if final else "",
                 all(low <= s <= high for s in shares) if final else None,
             )
             if final and any(x.beyond for x in parts):
-                yield Figure(f"{what}: refused as outside of what was measured", _beyond(parts))
+                yield Figure(f"{title}: refused as outside of what was measured", _beyond(parts))
             if final:
-                yield Figure(f"{what}: verdicts", ", ".join(x.verdict for x in parts))
+                yield Figure(f"{title}: verdicts", ", ".join(x.verdict for x in parts))
 
 
 def _beyond(parts: list[Left]) -> str:
-    """Say what is left at poses that the program refuses, and at the others."""
+    """Describe the remaining error at poses that the program refuses, and at all others."""
     share = 100 * np.mean([x.beyond for x in parts])
-    words = [f"{share:.1f} % of poses"]
-    for what, errors, inside in (
+    clauses = [f"{share:.1f} % of poses"]
+    for place, errors, inside in (
         ("left there", "beyond_mean_m", "beyond_inside"),
         ("at the others", "near_mean_m", "near_inside"),
     ):
         values = [getattr(x, errors) for x in parts if getattr(x, errors) is not None]
         shares = [getattr(x, inside) for x in parts if getattr(x, inside) is not None]
         if values:
-            words.append(
-                f"{what} {length(float(np.mean(values)))}, {100 * np.mean(shares):.1f} % in band"
+            clauses.append(
+                f"{place} {length(float(np.mean(values)))}, {100 * np.mean(shares):.1f} % in band"
             )
-    return "; ".join(words)
+    return "; ".join(clauses)

@@ -1,14 +1,14 @@
-"""`python -m studies corrected`: arms moved to corrected joint targets, measured there.
+"""`python -m studies corrected`: arms moved to corrected joint targets, and measured there.
 
-Simulated cells with a hidden effect each, calibrated by the steps of `hilcal calibrate` through the
-real drivers, on simulated devices over their protocols. The validation poses are loaded with 60 %
-of the payload; nothing is fitted to them. Counted is the error that the tracker measures at their
-uncorrected and at their corrected joint values, in its own frame by the fitted registration.
+Simulated cells with one hidden effect each are calibrated by the steps of `hilcal calibrate`
+through the real drivers, on simulated devices over their protocols. The validation poses are loaded
+with 60 % of the payload and never fitted. The result is the error that the tracker measures at
+their uncorrected and corrected joint values, in its frame, by the fitted registration.
 
-Every cell is a case of its own, on the engine: its devices are processes of the worker's machine,
-on a loopback address and in a folder of their own, and end with the case or with the worker. They
-run in real time, so that readings depend on the load of the machine, as those of real devices do:
-the draws are the same on any number of workers, the figures agree within the noise.
+Each cell is a case for the engine. Its devices are processes on the worker's machine, with a
+loopback address and a folder of their own, and end with the case or with the worker. They run in
+real time, so that readings depend on the load of the machine, as with real devices: the draws are
+the same on any number of workers, the figures agree within the noise.
 """
 
 import fcntl
@@ -56,19 +56,19 @@ HIDDEN = (
 )
 """Eight effects of different kinds: elastic ones, of the geometry, of the gears."""
 SHARE = 0.6
-"""Of the payload."""
+"""Load as a share of the payload."""
 POSES = 25
-"""Size of the plan that is fitted."""
+"""Number of poses of the fitted plan."""
 WANTED = 0.95
-"""Share of what exceeds the noise that is to be gone; the project's goal."""
+"""Required reduction of the error beyond the noise; the project's goal."""
 WANTED_BAND = (0.93, 0.97)
-"""Share of points within their 95 % band that counts as true; the project's goal."""
+"""Accepted share of points within their 95 % band; the project's goal."""
 CLOCK = 50.0
-"""How much faster than real time the simulated worlds go."""
+"""Speed of the simulated worlds over real time."""
 CANDIDATES = 120
 STARTS = 3
-"""Of the devices of a cell: a busy machine gives them no turn for seconds, and a controller whose
-program was left running wants its pendant. A choice."""
+"""Most starts of the devices of a cell: on a busy machine they may not run for seconds, and a
+controller whose program was left running then needs its pendant. A choice."""
 SEED = 11
 
 
@@ -77,12 +77,12 @@ class Case:
     """One cell.
 
     Attributes:
-        arm: of the catalogue.
-        hidden: the effect.
-        found: the errors before and after.
+        arm: name of the arm.
+        hidden: the hidden effect.
+        found: the errors before and after correction.
         verdict: of the refinement.
-        model: its effects.
-        seconds: that it took.
+        model: effects of the refined model.
+        seconds: duration.
     """
 
     arm: str
@@ -112,15 +112,15 @@ def corrected(
     """Calibrate simulated cells through the drivers, and measure at corrected targets."""
     t = terminal(as_json)
     folder.mkdir(parents=True, exist_ok=True)
-    asked = [(arm, hidden) for hidden in effects.split(",") for arm in arms.split(",")]
+    cells = [(arm, hidden) for hidden in effects.split(",") for arm in arms.split(",")]
     run = partial(case, folder=folder.absolute(), points=points, poses=poses)
     done: dict[int, Case] = {}
     cases: list[Case] = []
     with open_engine(*one_by_default(jobs, scheduler)) as engine:
-        for number, found in engine.results(run, asked):
-            done[number] = found
+        for number, finished in engine.results(run, cells):
+            done[number] = finished
             cases = [done[k] for k in sorted(done)]
-            t.notice(f"{words(found)} ({found.seconds:.0f} s)")
+            t.notice(f"{words(finished)} ({finished.seconds:.0f} s)")
             keep(keep_file, "Moved to corrected joint targets, measured there", figures(cases))
     for f in figures(cases):
         t.show(f"{f.what}: {f.measured}")
@@ -134,20 +134,20 @@ def corrected(
     )
 
 
-def case(of: tuple[str, str], folder: Path, points: int, poses: int = POSES) -> Case:
-    """Calibrate one cell, or go on where its files end.
+def case(cell: tuple[str, str], folder: Path, points: int, poses: int = POSES) -> Case:
+    """Calibrate one cell, or continue where its files end.
 
     Args:
-        of: the arm and the hidden effect.
+        cell: the arm and the hidden effect.
         folder: of the campaigns.
-        points: validation poses.
-        poses: of the plan that is fitted.
+        points: number of validation poses.
+        poses: number of poses of the fitted plan.
 
     Raises:
-        DeviceError: a device failed, again and again.
+        DeviceError: devices failed at every start.
     """
-    arm, hidden = of
-    begun = time.monotonic()
+    arm, hidden = cell
+    start = time.monotonic()
     seed = zlib.crc32(f"{SEED} {arm} {hidden}".encode())  # independent draws in each cell
     settings = Settings(
         poses=poses, validation=points, seed=seed, readings="absolute", hide=hidden,
@@ -159,16 +159,16 @@ def case(of: tuple[str, str], folder: Path, points: int, poses: int = POSES) -> 
         quiet = Console(file=log, width=100)
         t = Terminal(json=False, people=quiet, progress=quiet, out=sys.stderr)
         p = _calibrated(t, run, config, settings)
-    found = p.compare()
+    improvement = p.compare()
     record = p.record()
     verdict = str(record.result_json.get("diagnose", {}).get("verdict", ""))
-    return Case(arm, hidden, found, verdict, record.effects, time.monotonic() - begun)
+    return Case(arm, hidden, improvement, verdict, record.effects, time.monotonic() - start)
 
 
 def _calibrated(t: Terminal, run: Path, config: CellConfig, settings: Settings) -> Procedure:
-    """Do what is missing of a calibration, on devices started anew where some have failed."""
+    """Do the missing steps of a calibration; devices that failed are started again."""
     cell, catalogue = cell_from_config(config), installed()
-    for left in reversed(range(STARTS)):
+    for starts_left in reversed(range(STARTS)):
         if run.exists():
             p = continued(run, cell, config, catalogue)
         else:
@@ -177,7 +177,7 @@ def _calibrated(t: Terminal, run: Path, config: CellConfig, settings: Settings) 
             try:
                 CalibrationOperator(t, p, stack, rehearse=True, yes=True).to_the_end()
             except DeviceError as error:
-                if not left:
+                if not starts_left:
                     raise
                 t.notice(f"note: {error}")
                 t.notice("going on with devices started anew")
@@ -188,10 +188,10 @@ def _calibrated(t: Terminal, run: Path, config: CellConfig, settings: Settings) 
 
 @contextmanager
 def _alone(path: Path) -> Iterator[TextIO]:
-    """Open a log to append to, when nobody else has it open by this.
+    """Open a log for appending, with an exclusive lock.
 
-    A cluster does not end what its workers compute when the study is stopped: the next one waits
-    for the case, and goes on where it ended. The kernel lets go of a file with its process.
+    When a study is stopped, a cluster finishes the cases in progress: the next study waits for such
+    a case, and continues after it. The kernel releases the lock with the process.
     """
     with path.open("a", encoding="utf-8") as log:
         fcntl.flock(log, fcntl.LOCK_EX)
@@ -229,11 +229,11 @@ def words(c: Case) -> str:
 
 
 def figures(cases: list[Case]) -> list[Figure]:
-    """Return what is counted of all cases, and of each."""
-    each = [c.found.everything for c in cases]
-    removed = [e.removed for e in each if e.removed is not None]
-    inside, points = sum(e.inside for e in each), sum(e.count for e in each)
-    share, left = inside / points, sum(len(c.found.left_out) for c in cases)
+    """Return the figures of all cases together, and of each case."""
+    results = [c.found.everything for c in cases]
+    removed = [e.removed for e in results if e.removed is not None]
+    inside, points = sum(e.inside for e in results), sum(e.count for e in results)
+    share, left_out = inside / points, sum(len(c.found.left_out) for c in cases)
     band = f"{100 * WANTED_BAND[0]:.0f} to {100 * WANTED_BAND[1]:.0f} %"
     out = [
         Figure(
@@ -249,9 +249,9 @@ def figures(cases: list[Case]) -> list[Figure]:
             band,
             WANTED_BAND[0] <= share <= WANTED_BAND[1],
         ),
-        Figure("points that could not be corrected or reached", str(left)),
+        Figure("points that could not be corrected or reached", str(left_out)),
     ]
-    for c, e in zip(cases, each, strict=True):
+    for c, e in zip(cases, results, strict=True):
         gone = "" if e.removed is None else f"; {100 * e.removed:.1f} % gone"
         out.append(
             Figure(

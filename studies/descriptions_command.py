@@ -26,25 +26,25 @@ def descriptions(
 ) -> None:
     """Draw arms, poses, noise and errors of description; count what is registered and named."""
     t = terminal(as_json)
-    right, seen, named, exact = 0, Counter[str](), Counter[str](), Counter[str]()
+    right, visible, named, exact = 0, Counter[str](), Counter[str](), Counter[str]()
     missed: list[int] = []
-    begun = time.monotonic()
+    start = time.monotonic()
     every = range(first, first + cases)
     with open_engine(jobs, scheduler) as engine, counting(t.progress, "cases", cases) as advance:
         judged = engine.map(_judged, every, advance=advance)
     for seed, (error, outcome) in zip(every, judged, strict=True):
         right += outcome.right
         if outcome.named is not None and error is not None:
-            seen[error] += 1
+            visible[error] += 1
             named[error] += outcome.named
             exact[error] += outcome.exact
         if not outcome.right or outcome.named is False:
             missed.append(seed)
     out = table("error of description", "visible", "named", "of these the very one")
-    for kind in sorted(seen):
-        out.add(kind, str(seen[kind]), str(named[kind]), str(exact[kind]))
+    for kind in sorted(visible):
+        out.add(kind, str(visible[kind]), str(named[kind]), str(exact[kind]))
     t.show(out)
-    whole, found = sum(seen.values()), sum(named.values())
+    total, hits = sum(visible.values()), sum(named.values())
     figures = [
         Figure(
             "registered to the noise, or refused for the right reason",
@@ -54,12 +54,12 @@ def descriptions(
         ),
         Figure(
             "error of description named, where the frames do not hide it",
-            f"{found} of {whole}",
+            f"{hits} of {total}",
             "95 %",
-            found >= 0.95 * whole,
+            hits >= 0.95 * total,
         ),
         Figure(
-            "of these the very error, not an equivalent one", f"{sum(exact.values())} of {found}"
+            "of these the very error, not an equivalent one", f"{sum(exact.values())} of {hits}"
         ),
     ]
     t.show([f"{f.what}: {f.measured}" for f in figures])
@@ -67,17 +67,17 @@ def descriptions(
         {
             "cases": cases,
             "right": right,
-            "visible": dict(seen),
+            "visible": dict(visible),
             "named": dict(named),
             "exact": dict(exact),
             "missed_seeds": missed,
-            "seconds": time.monotonic() - begun,
+            "seconds": time.monotonic() - start,
         }
     )
     keep(keep_file, "Errors of description", figures)
 
 
 def _judged(seed: int) -> tuple[str | None, Outcome]:
-    """Draw a case and judge it: the error that it has, and what became of it."""
+    """Draw a case, and return its error and the program's answer."""
     case = draw(np.random.default_rng(seed))
     return case.error, judge(case)[0]

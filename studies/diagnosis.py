@@ -1,8 +1,8 @@
 """One case of the study of the diagnosis: a simulated campaign, its diagnosis and refinement.
 
-Campaigns come from outside (`Simulate`), from mechanics that the program does not know. Only the
-public results of diagnosis and refinement are read. A case in which the program fails is an
-outcome, too: it counts as a miss, and says why.
+Campaigns come from an external function (`Simulate`) with independent mechanics. Only the public
+results of diagnosis and refinement are read. A case in which the program fails is an outcome, too:
+it counts as a miss and states the reason.
 """
 
 from collections.abc import Callable, Mapping
@@ -28,28 +28,28 @@ from hilcal.types import Floats
 Kind = Literal["hidden", "nothing", "noise", "pairs", "outside"]
 KINDS: tuple[Kind, ...] = ("hidden", "nothing", "noise", "pairs", "outside")
 MOST = 3
-"""A set of effects that cannot be told apart counts as an answer up to this size."""
+"""Largest size of a set of inseparable effects that counts as an answer."""
 NAMING = ("missing_effect", "ambiguous")
 LEADING = 2
-"""Variables of each list that count."""
+"""Number of variables of each list that count."""
 INTERVAL = 1.959964
-"""Half of a 95 % interval, standard uncertainties."""
+"""Half width of a 95 % interval, standard uncertainties."""
 
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """What a campaign hides, and how it is measured.
+    """Settings of a case.
 
     Attributes:
-        kind: what is asked of it.
+        kind: kind of the case.
         robot: name of the arm.
-        mode: readings.
-        hidden: effects, or the law outside of the catalogue; empty for nothing.
+        mode: of the readings.
+        hidden: hidden effects, or the hidden law outside of the catalogue; empty for nothing.
         strength: of each, rms in units of the noise.
         seed: of the simulation.
         stated: stated over true standard deviation of the noise.
-        cycles: how often all is measured.
-        again: measure once more what separates the suspects.
+        cycles: number of times that all poses are measured.
+        again: whether readings that separate the suspects are measured in a further round.
     """
 
     kind: Kind
@@ -68,11 +68,11 @@ class Sample:
     """A simulated campaign.
 
     Attributes:
-        cell: as the program is told.
-        readings: what was measured.
-        noise: (N, m) what noise did to each reading.
-        truth: true parameters that are not zero, by the program's names of them.
-        variables: what a law outside of the catalogue depends on.
+        cell: as given to the program.
+        readings: the readings.
+        noise: (N, m) noise of each reading.
+        truth: true parameters that are not zero, by the program's names.
+        variables: variables of a law outside of the catalogue.
     """
 
     cell: Cell
@@ -83,23 +83,23 @@ class Sample:
 
 
 Simulate = Callable[[Asked], Sample]
-"""Simulate a campaign; equal questions give equal campaigns."""
+"""Simulate a campaign; equal settings give equal campaigns."""
 
 More = Callable[[Asked, Diagnosis], Readings | None]
-"""Measure what separates the suspects of a diagnosis: all readings, the earlier ones first; None
-where nothing is in doubt or to be had."""
+"""Measure readings that separate the suspects of a diagnosis, and return all readings, those of the
+campaign first; None where nothing is in doubt or can be separated."""
 
 
 @dataclass(frozen=True, slots=True)
 class Judgement:
-    """The diagnosis of a model, as far as a case keeps it.
+    """The part of a diagnosis that a case needs.
 
     Attributes:
         verdict: in a word.
         lead: the first suspect.
-        same_as: the suspects that the readings do not separate from it.
-        variables: those that the residual follows most.
-        carriers: those that carry what can be predicted of it.
+        same_as: suspects that the readings do not separate from it.
+        variables: variables that the residual follows most.
+        carriers: variables that carry the predictable part of the residual.
         message: the verdict in a sentence.
         variance_factor: of the fit.
     """
@@ -118,7 +118,7 @@ class Judgement:
         return self.verdict in NAMING
 
     def finds(self, effect: str) -> bool:
-        """Whether an effect is first, or one of at most three that cannot be told apart."""
+        """Whether an effect is first, or one of at most three inseparable first ones."""
         return effect == self.lead or (effect in self.same_as and len(self.same_as) < MOST)
 
     def follows(self, variables: tuple[str, ...]) -> bool:
@@ -128,7 +128,7 @@ class Judgement:
 
 @dataclass(frozen=True, slots=True)
 class Added:
-    """An effect that a refinement added, and what it could as well have been."""
+    """An effect that a refinement added, and the effects inseparable from it."""
 
     effect: str
     same_as: tuple[str, ...]
@@ -136,7 +136,7 @@ class Added:
 
 @dataclass(frozen=True, slots=True)
 class Inside:
-    """How many identifiable true parameters of an effect lie in their 95 % intervals."""
+    """Number of identifiable true parameters of an effect inside their 95 % intervals."""
 
     effect: str
     inside: int
@@ -145,15 +145,15 @@ class Inside:
 
 @dataclass(frozen=True, slots=True)
 class Refined:
-    """What a refinement came to.
+    """Result of a refinement.
 
     Attributes:
-        judgement: on the last model.
-        added: effects, in order.
+        judgement: of the last model.
+        added: added effects, in order.
         model: effects of the last model.
         holdout: error on poses left out over the stated noise floor.
-        holdout_real: the same over what the noise was in these readings.
-        intervals: of the parameters of the last model's effects that are in the truth.
+        holdout_real: error on poses left out over the true noise of these readings.
+        intervals: of the true effects in the last model.
     """
 
     judgement: Judgement
@@ -164,7 +164,7 @@ class Refined:
     intervals: tuple[Inside, ...]
 
     def finds(self, effect: str) -> bool:
-        """Whether an effect is in the model, or cannot be told from one that was added."""
+        """Whether an effect is in the model, or inseparable from an added one."""
         return effect in self.model or any(
             effect in a.same_as and len(a.same_as) < MOST for a in self.added
         )
@@ -175,13 +175,13 @@ class Outcome:
     """A case.
 
     Attributes:
-        asked: the question.
-        first: judgement on the baseline; None where the case failed.
-        refined: None where it was not asked for.
-        again: judgement on the baseline after a round of further measurements.
-        variables: what a law outside of the catalogue depends on.
-        failure: why there is no answer; empty where there is one.
-        impossible: why there is no such campaign; it does not count.
+        asked: its settings.
+        first: judgement of the baseline; None where the case failed.
+        refined: result of the refinement; None without one.
+        again: judgement of the baseline after a round of further readings.
+        variables: variables of a law outside of the catalogue.
+        failure: reason for no answer; empty where there is one.
+        impossible: reason why there is no such campaign; the case then does not count.
     """
 
     asked: Asked
@@ -199,10 +199,10 @@ def run_case(
     """Simulate, fit the baseline, diagnose as `diagnose` does, and refine as `refine` does.
 
     Args:
-        asked: the question.
-        simulate: makes its campaign.
-        more: measures once more, where that is asked.
-        refined: whether hidden effects are added as well.
+        asked: settings of the case.
+        simulate: makes the campaign.
+        more: measures a further round, if the settings ask for it.
+        refined: whether the model is refined, too.
     """
     try:
         sample = simulate(asked)
@@ -225,7 +225,7 @@ def _run(asked: Asked, sample: Sample, more: More | None, refined: bool) -> Outc
     if refined and asked.kind not in ("nothing", "noise"):
         r = refine(model, sample.readings, asked.mode)
         diagnosis, result = r.steps[0].diagnosis, _refined(r, sample)
-        if diagnosis.history.rejected:  # what `diagnose` cannot know
+        if diagnosis.history.rejected:  # `diagnose` alone has no such history
             diagnosis = diagnose(diagnosis.fit)
     else:
         diagnosis, result = (
@@ -236,14 +236,14 @@ def _run(asked: Asked, sample: Sample, more: More | None, refined: bool) -> Outc
     if more is not None and asked.again:
         readings, later = more(asked, diagnosis), diagnosis
         if readings is not None:
-            known = baseline(sample.cell, readings, asked.mode)
-            later = diagnose(fit(known, readings, asked.mode))
+            later_model = baseline(sample.cell, readings, asked.mode)
+            later = diagnose(fit(later_model, readings, asked.mode))
         again = judgement(later)
     return Outcome(asked, judgement(diagnosis), result, again, sample.variables)
 
 
 def judgement(d: Diagnosis) -> Judgement:
-    """Return what a case keeps of a diagnosis."""
+    """Return the part of a diagnosis that a case needs."""
     lead = d.suspects[0] if d.suspects else None
     kinds = [
         v.variable for v in d.misfit_breakdown if v.variable.split()[0] not in ("pose", "direction")
@@ -281,26 +281,26 @@ def _same_as(d: Diagnosis, effect: str) -> tuple[str, ...]:
 
 
 def _floors(f: Fit, sample: Sample) -> tuple[float, float]:
-    """Root mean square position error of the stated noise, and of what the noise was, m."""
+    """Root mean square position error by the stated noise, and by the true noise, m."""
     e = full_prediction(f)
     noise = e.whitening.raw(sample.noise)[:, :3]
     return e.noise_floor, float(np.sqrt(np.mean(np.sum(noise**2, axis=1))))
 
 
 def intervals(f: Fit, truth: Mapping[str, float]) -> tuple[Inside, ...]:
-    """Count true parameters in their 95 % intervals, of effects that are in the truth.
+    """Count true parameters in their 95 % intervals, of effects in the truth.
 
-    Those that are not identifiable have no interval. Frames that are registered anew have no
-    true value.
+    Parameters that are not identifiable have no interval. Newly registered frames have no true
+    value.
     """
-    there = {name.split(".")[0] for name in truth}
+    true_effects = {name.split(".")[0] for name in truth}
     out = []
     for effect, rows in zip(f.model.effects, f.model.slices(), strict=True):
-        if effect.name not in there:
+        if effect.name not in true_effects:
             continue
         true = np.array([truth.get(f"{effect.name}.{p.name}", 0.0) for p in effect.parameters])
-        seen = f.uncertainty.identifiable[rows]
-        off = np.abs(f.theta[rows] - true)[seen]
-        inside = off <= INTERVAL * f.uncertainty.std[rows][seen]
-        out.append(Inside(effect.name, int(inside.sum()), int(seen.sum())))
+        identifiable = f.uncertainty.identifiable[rows]
+        error = np.abs(f.theta[rows] - true)[identifiable]
+        inside = error <= INTERVAL * f.uncertainty.std[rows][identifiable]
+        out.append(Inside(effect.name, int(inside.sum()), int(identifiable.sum())))
     return tuple(out)

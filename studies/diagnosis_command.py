@@ -95,12 +95,12 @@ def diagnosis(
         first_seed=first_seed,
         again=again,
     )
-    asked = questions(extent)
-    begun = time.monotonic()
-    with counting(t.progress, "campaigns", len(asked)) as advance:
+    cases = questions(extent)
+    start = time.monotonic()
+    with counting(t.progress, "campaigns", len(cases)) as advance:
         run = partial(run_case, simulate=simulate, more=more, refined=refine)
-        outcomes, complete = run_all(asked, run, jobs, advance, scheduler)
-    t.notice(f"{len(outcomes)} of {len(asked)} campaigns in {time.monotonic() - begun:.0f} s")
+        outcomes, complete = run_all(cases, run, jobs, advance, scheduler)
+    t.notice(f"{len(outcomes)} of {len(cases)} campaigns in {time.monotonic() - start:.0f} s")
     if outcomes:
         t.show(report(outcomes))
         t.show("")
@@ -122,13 +122,13 @@ def diagnosis(
 
 
 def simulate(asked: Asked) -> Sample:
-    """Measure what a question asks for in the simulated world."""
+    """Measure the campaign of a case in the simulated world."""
     c = _case(asked)
     return Sample(c.cell, c.readings, c.noise, c.world.truth, c.variables)
 
 
 def more(asked: Asked, diagnosis: Diagnosis) -> Readings | None:
-    """Measure what separates the suspects of a diagnosis, in the same world."""
+    """Measure readings that separate the suspects of a diagnosis, in the same world."""
     return measure_more(_config(), asked.robot, _case(asked), diagnosis, asked.seed)
 
 
@@ -170,28 +170,28 @@ def _check_numbers(
             raise InputError(f"--strength {sigma:g}; valid: a number over 0, in σ")
 
 
-def _kinds(given: list[str] | None) -> tuple[Kind, ...]:
-    _all_valid("", given, KINDS)
-    return tuple(k for k in KINDS if not given or k in given)
+def _kinds(options: list[str] | None) -> tuple[Kind, ...]:
+    _all_valid("", options, KINDS)
+    return tuple(k for k in KINDS if not options or k in options)
 
 
-def _robots(given: list[str] | None) -> tuple[str, ...]:
-    _all_valid("--robot ", given, robot_names())
-    return tuple(dict.fromkeys(given)) if given else ROBOTS
+def _robots(options: list[str] | None) -> tuple[str, ...]:
+    _all_valid("--robot ", options, robot_names())
+    return tuple(dict.fromkeys(options)) if options else ROBOTS
 
 
-def _modes(given: list[str] | None) -> tuple[Mode, ...]:
-    _all_valid("--readings ", given, MODES)
-    return tuple(m for m in MODES if not given or m in given)
+def _modes(options: list[str] | None) -> tuple[Mode, ...]:
+    _all_valid("--readings ", options, MODES)
+    return tuple(m for m in MODES if not options or m in options)
 
 
-def _effects(given: list[str] | None, modes: tuple[Mode, ...]) -> tuple[str, ...]:
+def _effects(options: list[str] | None, modes: tuple[Mode, ...]) -> tuple[str, ...]:
     shown = tuple(dict.fromkeys(e for m in modes for e in effects_shown(m)))
-    _all_valid("--effect ", given, shown)
-    return tuple(given) if given else shown
+    _all_valid("--effect ", options, shown)
+    return tuple(options) if options else shown
 
 
-def _all_valid(option: str, given: list[str] | None, valid: tuple[str, ...]) -> None:
-    for word in given or ():
+def _all_valid(option: str, options: list[str] | None, valid: tuple[str, ...]) -> None:
+    for word in options or ():
         if word not in valid:
             raise InputError(f"{option}{word!r}{suggest(word, valid)}; valid: {', '.join(valid)}")

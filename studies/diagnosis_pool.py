@@ -1,4 +1,4 @@
-"""Cases on several processes or a cluster: stoppable, and the same results every time."""
+"""Cases on several processes or a cluster: can be stopped, and give reproducible results."""
 
 from collections.abc import Callable, Sequence
 
@@ -15,23 +15,23 @@ def run_all(
     advance: Advance,
     scheduler: str | None = None,
 ) -> tuple[tuple[Outcome, ...], bool]:
-    """Run all cases; those that are done, in order of the questions, and whether that is all.
+    """Run cases, and return the finished ones in the order of the questions, and whether all are.
 
-    Ctrl-C ends it: cases that are running are let go, those that are done are returned.
+    Ctrl-C ends the run: running cases are dropped, finished ones are returned.
 
     Args:
-        questions: what to ask.
+        questions: settings of the cases.
         run: runs a case; a function of a module, which other processes find by its name.
-        jobs: processes; 1 runs all in this one, None on every processor.
-        advance: told of each case that is done.
-        scheduler: address of a cluster, in place of processes of this machine.
+        jobs: number of processes; 1 runs all in this one, None one on each processor.
+        advance: called after each case.
+        scheduler: address of a cluster, instead of processes of this machine.
     """
-    found: dict[int, Outcome] = {}
+    finished: dict[int, Outcome] = {}
     try:
         with open_engine(jobs, scheduler) as engine:
             for number, outcome in engine.results(run, questions):
-                found[number] = outcome
+                finished[number] = outcome
                 advance(1)
     except KeyboardInterrupt:
         pass
-    return tuple(found[k] for k in sorted(found)), len(found) == len(questions)
+    return tuple(finished[k] for k in sorted(finished)), len(finished) == len(questions)

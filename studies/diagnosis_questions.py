@@ -1,4 +1,4 @@
-"""The questions of the study of the diagnosis: what to hide, on which arm, how often."""
+"""The cases of the study of the diagnosis: hidden effects, arms, and numbers of campaigns."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,21 +19,21 @@ AGAIN = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Extent:
-    """How much is asked.
+    """Extent of the study.
 
     Attributes:
-        kinds: what is asked.
-        robots: arms.
-        modes: readings.
-        effects: by readings, what can be hidden.
-        laws: by readings, effects outside of the catalogue.
+        kinds: kinds of cases.
+        robots: names of the arms.
+        modes: of the readings.
+        effects: effects that can be hidden, by mode.
+        laws: laws outside of the catalogue, by mode.
         strengths: of one hidden effect, σ.
-        seeds: campaigns per effect, strength, arm and readings; of laws as well.
-        nothing: campaigns that hide nothing, per readings.
-        noise: campaigns of each misjudged noise, per readings.
-        pairs: campaigns with two effects, per readings.
+        seeds: campaigns per effect or law, strength, arm and mode.
+        nothing: campaigns that hide nothing, per mode.
+        noise: campaigns of each misjudged noise, per mode.
+        pairs: campaigns with two effects, per mode.
         first_seed: of the simulation.
-        again: measure a further round at 0.5 σ.
+        again: whether a further round is measured at 0.5 σ.
     """
 
     kinds: tuple[Kind, ...]
@@ -51,19 +51,19 @@ class Extent:
 
 
 def questions(extent: Extent) -> tuple[Asked, ...]:
-    """Return all questions, kind by kind; arms take turns where the number is a total."""
-    asked = {
+    """Return the settings of all cases, kind by kind; arms take turns where numbers are totals."""
+    makers = {
         "hidden": _hidden,
         "nothing": _nothing,
         "noise": _noise,
         "pairs": _pairs,
         "outside": _outside,
     }
-    return tuple(q for kind in extent.kinds for q in asked[kind](extent))
+    return tuple(q for kind in extent.kinds for q in makers[kind](extent))
 
 
 def _hidden(e: Extent) -> Iterator[Asked]:
-    # Seeds come first, so that a study that is stopped has asked of everything.
+    # Seeds are the outer loop, so that a stopped study has cases of all effects.
     for seed, mode in product(_seeds(e, e.seeds), e.modes):
         for effect, robot, strength in product(e.effects[mode], e.robots, e.strengths):
             again = e.again and strength == AGAIN

@@ -1,4 +1,4 @@
-"""What the cases of the study of the diagnosis add up to."""
+"""Rates over the cases of the study of the diagnosis."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
@@ -10,19 +10,19 @@ from hilcal.readings.whitening import Mode
 from studies.diagnosis import Judgement, Outcome, Refined
 
 HELD_OUT = 1.05
-"""Held-out error over the noise floor that a right model has at most."""
+"""Largest ratio of held-out error to noise floor of a right model."""
 
 
 @dataclass(frozen=True, slots=True)
 class Rate:
-    """A share of so many cases; nothing is said of none."""
+    """A share of a number of cases."""
 
     hits: int
     cases: int
 
     @property
     def share(self) -> float:
-        """The share, nan of no cases."""
+        """The share; nan without cases."""
         return self.hits / self.cases if self.cases else float("nan")
 
     def to_json(self) -> dict[str, object]:
@@ -31,35 +31,35 @@ class Rate:
 
 
 def rate(outcomes: Iterable[Outcome], hit: Callable[[Outcome], bool]) -> Rate:
-    """Count; a case that failed is no hit, and one that cannot be is no case."""
-    asked = tuple(o for o in outcomes if not o.impossible)
-    return Rate(sum(not o.failure and hit(o) for o in asked), len(asked))
+    """Return the rate of hits; a failed case is no hit, an impossible case does not count."""
+    possible = tuple(o for o in outcomes if not o.impossible)
+    return Rate(sum(not o.failure and hit(o) for o in possible), len(possible))
 
 
 def found(o: Outcome) -> bool:
-    """Whether each hidden effect is first, or in a set of at most three that is."""
+    """Whether each hidden effect is first, or in a first set of at most three."""
     return o.first is not None and all(o.first.finds(e) for e in o.asked.hidden)
 
 
 def named(o: Outcome) -> bool:
-    """Whether it is found, and the verdict names it."""
+    """Whether the hidden effect is found, and the verdict names it."""
     return found(o) and o.first is not None and o.first.named
 
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """One effect, hidden in readings of one kind at one strength.
+    """Rates of one effect, hidden in readings of one mode at one strength.
 
     Attributes:
-        effect: what was hidden.
-        mode: readings.
+        effect: the hidden effect.
+        mode: of the readings.
         strength: σ.
-        found: first, or in a set of at most three that is.
-        named: found by a verdict that names an effect.
-        size: mean size of the set that is first, where it is found.
-        instead: what was first where it was not found, most frequent first.
-        again: found after a further round; no cases where there was none.
-        size_again: mean size of the set then.
+        found: rate of cases in which the effect is first, or in a first set of at most three.
+        named: rate of cases in which it is found and the verdict names an effect.
+        size: mean size of the first set where the effect is found.
+        instead: first effects where it is not found, most frequent first.
+        again: rate of finding it after a further round; no cases without such a round.
+        size_again: mean size of the first set after this round.
     """
 
     effect: str
@@ -102,7 +102,7 @@ def _size(judgements: Iterable[Judgement | None]) -> float:
 
 
 def _instead(group: Iterable[Outcome]) -> tuple[tuple[str, int], ...]:
-    """What led where the hidden effect did not; a set that is too large, and failures, too."""
+    """Count the first effects where the hidden one is not found, too large sets, and failures."""
     count: Counter[str] = Counter()
     for o in group:
         if o.impossible:
@@ -122,10 +122,10 @@ class Afterwards:
 
     Attributes:
         strength: σ.
-        right: the model has what is hidden, and nothing else was added.
-        holdout: error on poses left out at most 1.05 × the stated noise floor.
-        holdout_real: the same against what the noise was in these readings.
-        intervals: true parameters in their 95 % intervals.
+        right: rate of models to which only the hidden effects were added.
+        holdout: rate of errors on poses left out of at most 1.05 × the stated noise floor.
+        holdout_real: the same with the true noise of these readings.
+        intervals: rate of true parameters in their 95 % intervals.
     """
 
     strength: float
@@ -143,8 +143,8 @@ def afterwards(outcomes: Iterable[Outcome]) -> tuple[Afterwards, ...]:
         if named(o) and o.refined is not None:
             key = o.asked.strength
             groups.setdefault(key, []).append(o.refined)
-            mine = {a.effect for a in o.refined.added} == set(o.asked.hidden)
-            right[key] = right.get(key, 0) + mine
+            exact = {a.effect for a in o.refined.added} == set(o.asked.hidden)
+            right[key] = right.get(key, 0) + exact
     return tuple(
         Afterwards(
             strength,
@@ -158,9 +158,9 @@ def afterwards(outcomes: Iterable[Outcome]) -> tuple[Afterwards, ...]:
 
 
 def coverage(refined: Iterable[Refined], effect: str | None = None) -> Rate:
-    """True parameters in their intervals: of one effect, or of all."""
-    mine = [i for r in refined for i in r.intervals if effect in (None, i.effect)]
-    return Rate(sum(i.inside for i in mine), sum(i.parameters for i in mine))
+    """Return the rate of true parameters in their intervals, of one effect or of all."""
+    intervals = [i for r in refined for i in r.intervals if effect in (None, i.effect)]
+    return Rate(sum(i.inside for i in intervals), sum(i.parameters for i in intervals))
 
 
 def coverage_by_effect(outcomes: Iterable[Outcome]) -> tuple[tuple[str, Rate], ...]:
@@ -171,7 +171,7 @@ def coverage_by_effect(outcomes: Iterable[Outcome]) -> tuple[tuple[str, Rate], .
 
 
 def both_found(o: Outcome) -> bool:
-    """Whether a refinement has both hidden effects, or what cannot be told from them."""
+    """Whether a refinement finds both hidden effects, or effects inseparable from them."""
     return o.refined is not None and all(o.refined.finds(e) for e in o.asked.hidden)
 
 
@@ -181,13 +181,13 @@ def both_added(o: Outcome) -> bool:
 
 
 def unknown(o: Outcome) -> bool:
-    """Whether the program says, before or after refining, that no effect of the catalogue does."""
+    """Whether the verdict is `unknown_effect`, before or after refining."""
     judged = (o.first, o.refined.judgement if o.refined is not None else None)
     return any(j is not None and j.verdict == "unknown_effect" for j in judged)
 
 
 def unknown_at_once(o: Outcome) -> bool:
-    """Whether the first diagnosis says so."""
+    """Whether the first verdict is `unknown_effect`."""
     return o.first is not None and o.first.verdict == "unknown_effect"
 
 

@@ -1,4 +1,4 @@
-"""The study of the diagnosis as tables for people."""
+"""Tables of the study of the diagnosis."""
 
 from collections.abc import Iterable, Iterator, Sequence
 
@@ -31,26 +31,26 @@ _NAMES = 3  # effects that a row lists
 
 
 def report(outcomes: Sequence[Outcome]) -> Iterator[Table | Text | str]:
-    """Yield the tables of the cases that were run, and what they add up to."""
+    """Yield the tables of the cases, and their totals."""
     hidden = [o for o in outcomes if o.asked.kind == "hidden"]
     effects = by_effect(hidden)
     for mode in dict.fromkeys(f.mode for f in effects):
         yield _title(f"effects hidden in {mode} readings: found")
-        mine = [f for f in effects if f.mode == mode]
-        yield _effects(mine)
+        of_mode = [f for f in effects if f.mode == mode]
+        yield _effects(of_mode)
         yield ""
-        if any(f.instead for f in mine):
+        if any(f.instead for f in of_mode):
             yield _title("first instead")
-            yield _others(mine)
+            yield _first_instead(of_mode)
             yield ""
     if len({o.asked.robot for o in hidden}) > 1:
         yield _title("found, by arm")
         yield _robots(hidden)
         yield ""
-    told = coverage_by_effect(hidden)
-    if told:
+    covered = coverage_by_effect(hidden)
+    if covered:
         yield _title("true parameters in 95 % intervals, by effect")
-        yield _coverage(told)
+        yield _coverage(covered)
         yield ""
     pairs = [o for o in outcomes if o.asked.kind == "pairs"]
     if pairs:
@@ -67,23 +67,21 @@ def report(outcomes: Sequence[Outcome]) -> Iterator[Table | Text | str]:
     impossible = [o for o in outcomes if o.impossible]
     if impossible:
         yield ""
-        yield f"{len(impossible)} campaigns cannot be; the first: {_said(impossible[0])}"
+        yield f"{len(impossible)} campaigns cannot be; the first: {_case(impossible[0])}"
     failures = [o for o in outcomes if o.failure]
     if failures:
         yield ""
-        yield f"{len(failures)} cases failed and count as misses; the first: {_said(failures[0])}"
+        yield f"{len(failures)} cases failed and count as misses; the first: {_case(failures[0])}"
 
 
-def _said(o: Outcome) -> str:
+def _case(o: Outcome) -> str:
     a = o.asked
-    what = " + ".join(a.hidden) or "nothing"
-    return (
-        f"{what}, {a.robot}, {a.mode}, {a.strength:g} σ, seed {a.seed}: {o.failure or o.impossible}"
-    )
+    hidden, reason = " + ".join(a.hidden) or "nothing", o.failure or o.impossible
+    return f"{hidden}, {a.robot}, {a.mode}, {a.strength:g} σ, seed {a.seed}: {reason}"
 
 
-def _title(words: str) -> Text:
-    return Text(words, style="bold")
+def _title(text: str) -> Text:
+    return Text(text, style="bold")
 
 
 def _effects(rows: Sequence[Found]) -> Table:
@@ -93,23 +91,23 @@ def _effects(rows: Sequence[Found]) -> Table:
     out = _table("hidden", "n", *names, *(["next", "set"] if again else []))
     cell = {(f.effect, f.strength): f for f in rows}
     for effect in dict.fromkeys(f.effect for f in rows):
-        mine = [cell[effect, s] for s in strengths if (effect, s) in cell]
-        shown = {f.strength: (_share(f.found), _share(f.named), _size(f.size)) for f in mine}
+        of_effect = [cell[effect, s] for s in strengths if (effect, s) in cell]
+        shown = {f.strength: (_share(f.found), _share(f.named), _size(f.size)) for f in of_effect}
         values = [value for s in strengths for value in shown.get(s, ("", "", ""))]
         if again:
-            last = next((f for f in mine if f.again.cases), None)
+            last = next((f for f in of_effect if f.again.cases), None)
             values += ["", ""] if last is None else [_share(last.again), _size(last.size_again)]
-        out.add_row(effect, str(max(f.found.cases for f in mine)), *values)
+        out.add_row(effect, str(max(f.found.cases for f in of_effect)), *values)
     return out
 
 
-def _others(rows: Sequence[Found]) -> Table:
+def _first_instead(rows: Sequence[Found]) -> Table:
     out = _table("hidden", "what led, and how often")
     out.columns[-1].justify = "left"
     for effect in dict.fromkeys(f.effect for f in rows):
-        others = _instead([f for f in rows if f.effect == effect])
-        if others:
-            out.add_row(effect, others)
+        instead = _instead([f for f in rows if f.effect == effect])
+        if instead:
+            out.add_row(effect, instead)
     return out
 
 
@@ -119,18 +117,18 @@ def _instead(rows: Iterable[Found]) -> str:
         for name, number in row.instead:
             count[name] = count.get(name, 0) + number
     order = sorted(count.items(), key=lambda item: (-item[1], item[0]))
-    more = sum(number for _, number in order[_NAMES:])
+    further = sum(number for _, number in order[_NAMES:])
     shown = [f"{name} {number}" for name, number in order[:_NAMES]]
-    return ", ".join([*shown, *([f"others {more}"] if more else [])])
+    return ", ".join([*shown, *([f"others {further}"] if further else [])])
 
 
 def _robots(cases: Sequence[Outcome]) -> Table:
     strengths = sorted({o.asked.strength for o in cases}, reverse=True)
     out = _table("arm", "n", *(f"{s:g} σ" for s in strengths))
     for robot in dict.fromkeys(o.asked.robot for o in cases):
-        mine = [o for o in cases if o.asked.robot == robot and not o.impossible]
-        shares = [rate([o for o in mine if o.asked.strength == s], found) for s in strengths]
-        out.add_row(robot, str(len(mine)), *(_share(r) for r in shares))
+        of_robot = [o for o in cases if o.asked.robot == robot and not o.impossible]
+        shares = [rate([o for o in of_robot if o.asked.strength == s], found) for s in strengths]
+        out.add_row(robot, str(len(of_robot)), *(_share(r) for r in shares))
     return out
 
 
@@ -144,9 +142,9 @@ def _coverage(rows: Iterable[tuple[str, Rate]]) -> Table:
 def _pairs(cases: Sequence[Outcome]) -> Table:
     out = _table("one of them", "n", "both found", "both in the model")
     for effect in sorted({e for o in cases for e in o.asked.hidden}):
-        mine = [o for o in cases if effect in o.asked.hidden and not o.impossible]
-        shares = (_share(rate(mine, both_found)), _share(rate(mine, both_added)))
-        out.add_row(effect, str(len(mine)), *shares)
+        of_effect = [o for o in cases if effect in o.asked.hidden and not o.impossible]
+        shares = (_share(rate(of_effect, both_found)), _share(rate(of_effect, both_added)))
+        out.add_row(effect, str(len(of_effect)), *shares)
     return out
 
 
@@ -154,27 +152,27 @@ def _outside(cases: Sequence[Outcome]) -> Table:
     out = _table("law", "readings", "n", "unknown_effect", "its variable", "first instead")
     out.columns[1].justify = out.columns[-1].justify = "left"
     for law, mode in dict.fromkeys((o.asked.hidden[0], o.asked.mode) for o in cases):
-        mine = [o for o in cases if (o.asked.hidden[0], o.asked.mode) == (law, mode)]
+        of_law = [o for o in cases if (o.asked.hidden[0], o.asked.mode) == (law, mode)]
         count: dict[str, int] = {}
-        for o in mine:
+        for o in of_law:
             if o.first is not None and not followed(o):
-                words = " and ".join(o.first.variables)
-                count[words] = count.get(words, 0) + 1
+                names = " and ".join(o.first.variables)
+                count[names] = count.get(names, 0) + 1
         order = sorted(count.items(), key=lambda item: (-item[1], item[0]))
-        instead = ", ".join(f"{words} {number}" for words, number in order[:_NAMES])
-        shares = (_share(rate(mine, unknown)), _share(rate(mine, followed)))
-        out.add_row(law, mode, str(len(mine)), *shares, instead)
+        instead = ", ".join(f"{names} {number}" for names, number in order[:_NAMES])
+        shares = (_share(rate(of_law, unknown)), _share(rate(of_law, followed)))
+        out.add_row(law, mode, str(len(of_law)), *shares, instead)
     return out
 
 
 def _claims(rows: Iterable[Claim]) -> Table:
     out = _table("", "n", "share", "asked", "so")
     for c in rows:
-        asked = "" if c.least is None else f"≥ {100 * c.least:g} %"
+        required = "" if c.least is None else f"≥ {100 * c.least:g} %"
         if c.least is not None and c.most < 1.0:
-            asked = f"{100 * c.least:g} to {100 * c.most:g} %"
+            required = f"{100 * c.least:g} to {100 * c.most:g} %"
         so = "" if c.met is None else ("yes" if c.met else "no")
-        out.add_row(c.words, str(c.rate.cases), _share(c.rate, 1), asked, so)
+        out.add_row(c.words, str(c.rate.cases), _share(c.rate, 1), required, so)
     return out
 
 
@@ -189,7 +187,7 @@ def _size(value: float) -> str:
 def _table(*columns: str) -> Table:
     out = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
     for k, name in enumerate(columns):
-        # Names of effects stay whole; the words of the last table do not fit on a line.
-        whole = k == 0 and bool(name)
-        out.add_column(name, justify="right" if k else "left", overflow="fold", no_wrap=whole)
+        # Names of effects are not wrapped; the texts of the last table do not fit on a line.
+        no_wrap = k == 0 and bool(name)
+        out.add_column(name, justify="right" if k else "left", overflow="fold", no_wrap=no_wrap)
     return out

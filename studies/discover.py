@@ -34,17 +34,17 @@ CAUSES = {
     "transmission_error": ("angle",),
     "periodic_joint_compliance": ("torque", "angle"),
 }
-"""Quantities of its own joint that an effect of the catalogue depends on."""
+"""Quantities of the joint that an effect of the catalogue depends on."""
 LAST_AXIS = "axis of joint 6 to gravity"
 CLEAR = 3.0
-"""Standard uncertainties from which a parameter of an effect counts as found."""
+"""Value of a parameter, in standard uncertainties, above which it counts as found."""
 
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """What is hidden: a law of `KINDS`, an effect of the catalogue, or nothing.
+    """A case: a hidden law of `KINDS`, a hidden effect of the catalogue, or nothing.
 
-    `loads` counts those of the study that are used; None for all.
+    `loads` is the number of the study's loads that are used; None for all.
     """
 
     robot: str
@@ -60,20 +60,20 @@ class Asked:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What came of it.
+    """Result of a case.
 
     Attributes:
-        asked: the question.
+        asked: the case.
         reason: of the search.
         formula: of the first law; empty for none.
-        truth: the law that was hidden.
+        truth: the hidden law.
         site: whether the site is right.
-        variables: whether the variables are exactly those.
-        correlation: of what the law explains with what was hidden, the model projected out.
-        before: error at fresh poses over the noise there, of the model alone.
-        after: the same with the first law; as before, where there is none.
+        variables: whether the variables are exactly right.
+        correlation: of the displacements by the law and the hidden one, the model projected out.
+        before: error at fresh poses over their noise, by the model alone.
+        after: the same with the first law, if any.
         p_value: of the first law.
-        impossible: why there is no such campaign.
+        impossible: reason why there is no such campaign.
     """
 
     asked: Asked
@@ -91,7 +91,7 @@ class Outcome:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Campaign:
-    """Readings with the law in them; what law and noise did, (N, 3); where the arm rested."""
+    """Readings with the law; displacements (N, 3) by law and noise; the arm at rest."""
 
     readings: Readings
     moved: Floats
@@ -101,7 +101,7 @@ class Campaign:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Simulated:
-    """Campaigns with the same law in them, None for none, and the fit that the law is hidden in."""
+    """Two campaigns with the same law, or None, and the fit of the first without the law."""
 
     law: Foreign | None
     before: Fit
@@ -122,17 +122,17 @@ def run_case(config: CellConfig, asked: Asked) -> Outcome:
         out = replace(out, formula=d.laws[0].formula, p_value=d.laws[0].p_value)
     if law is None:
         return out
-    off = error_at(before, c.fresh)
+    without_law = error_at(before, c.fresh)
     if d.reason == "catalogue":
-        return with_catalogue(replace(out, before=off), law, before, d.catalogue, c)
+        return with_catalogue(replace(out, before=without_law), law, before, d.catalogue, c)
     if not d.laws or d.after is None:
-        return replace(out, before=off, after=off)
+        return replace(out, before=without_law, after=without_law)
     return replace(
         out,
         site=_right_site(law, d.laws[0]),
         variables=_same_quantities(d.laws[0].variables) == _same_quantities(law.variables),
         correlation=agreement(before, d.after, c.first.moved),
-        before=off,
+        before=without_law,
         after=error_at(d.after, c.fresh),
     )
 
@@ -149,22 +149,25 @@ def simulated(config: CellConfig, asked: Asked) -> Simulated:
             *(crc32(w.encode()) for w in (asked.robot, asked.mode, asked.law, asked.effect)),
         ]
     )
-    own, loads = with_study_loads(config, asked.robot)
+    robot_config, loads = with_study_loads(config, asked.robot)
     loads = loads[: asked.loads]
-    cell = cell_from_config(own)
+    cell = cell_from_config(robot_config)
     world = nothing_hidden(
-        cell, rng, noise=measurement_noise(own), joint_std=own.repeatability.per_joint(cell.arm.n)
+        cell,
+        rng,
+        noise=measurement_noise(robot_config),
+        joint_std=robot_config.repeatability.per_joint(cell.arm.n),
     )
     law = KINDS[asked.law][1](rng) if asked.law else None
-    made = rehearsal_states(cell, asked.poses, loads, rng)
+    campaign = rehearsal_states(cell, asked.poses, loads, rng)
     if asked.effect:
-        states, pose, _, cycle = made
+        states, pose, _, cycle = campaign
         world = hide(
             asked.effect, cell, states, asked.strength, asked.mode, rng,
             world=world, pose=pose, cycle=cycle,
         )  # fmt: skip
     names = ("none", *(name for name, _ in loads))
-    first = _measured(world, made, names, rng, law, asked.stated)
+    first = _measured(world, campaign, names, rng, law, asked.stated)
     size = 1.0
     if law is not None:
         w = whitening(first.readings, asked.mode)
@@ -179,7 +182,7 @@ def simulated(config: CellConfig, asked: Asked) -> Simulated:
 
 
 def _same_quantities(names: Iterable[str]) -> frozenset[str]:
-    """Call the axis of the last joint what it is as well: an axis of the flange."""
+    """Replace the axis of the last joint by the equivalent attitude of the flange."""
     return frozenset("flange attitude" if n == LAST_AXIS else n for n in names)
 
 
@@ -190,7 +193,7 @@ def with_catalogue(
     names: Sequence[str],
     c: Simulated,
 ) -> Outcome:
-    """The error after adding what the answer names: effects of the catalogue."""
+    """Return the outcome after adding the effects of the catalogue that the answer names."""
     model = before.model
     for name in names:
         model = model + EffectSpec(name)
@@ -216,14 +219,14 @@ def with_catalogue(
 
 def _measured(
     world: World,
-    made: tuple[States, Ints, Ints, Ints],
+    campaign: tuple[States, Ints, Ints, Ints],
     names: Sequence[str],
     rng: np.random.Generator,
     law: Foreign | None,
     stated: float = 1.0,
     before: Scene | None = None,
 ) -> Campaign:
-    states, pose, load, cycle = made
+    states, pose, load, cycle = campaign
     readings = simulate(world, states, pose, load, cycle, names, rng)
     s = scene(world, states, before)
     moved = np.zeros_like(s.seen) if law is None else law.displaced(s)
@@ -237,15 +240,15 @@ def _scaled(c: Campaign, size: float) -> Campaign:
     return replace(c, readings=replace(c.readings, value=c.readings.value + moved), moved=moved)
 
 
-def _right_site(law: Foreign, found: Law) -> bool:
-    """Whether all that a law moves is what was hidden, or the same by geometry."""
-    return all(any(words.startswith(site) for site in law.sites) for words in found.acts_on)
+def _right_site(law: Foreign, proposed: Law) -> bool:
+    """Whether all sites of a proposed law are right, or equivalent by geometry."""
+    return all(any(place.startswith(site) for site in law.sites) for place in proposed.acts_on)
 
 
-def error_at(of: Fit, fresh: Campaign) -> float:
-    """Rms error at fresh readings over that of their noise."""
-    w = whitening(fresh.readings, of.mode)
-    prediction = of.model.predict(fresh.readings.states, of.theta)
-    off = residual(fresh.readings, prediction, w)[:, :3]
+def error_at(f: Fit, fresh: Campaign) -> float:
+    """Return the rms error at fresh readings over the rms of their noise."""
+    w = whitening(fresh.readings, f.mode)
+    prediction = f.model.predict(fresh.readings.states, f.theta)
+    error = residual(fresh.readings, prediction, w)[:, :3]
     noise = w.raw(fresh.noise)[:, :3]
-    return float(np.sqrt(np.sum(off**2) / np.sum(noise**2)))
+    return float(np.sqrt(np.sum(error**2) / np.sum(noise**2)))

@@ -25,9 +25,9 @@ from studies.study_cases import effects_shown
 
 ROBOTS = ("ur3e", "ur5e", "ur10e")
 FLOOR, SAME = 1.15, 0.98
-"""Error over the noise floor, and correlation of formulas, that the claims ask for."""
+"""Limits of the claims: error over the noise floor, and correlation of formulas."""
 PLAIN = 0.95
-"""Share that all claims ask for of laws at 10 σ with 100 poses."""
+"""Required share in all claims about laws at 10 σ with 100 poses."""
 
 
 def discover(
@@ -80,9 +80,9 @@ def discover(
         if o.asked.law or o.formula:
             right = [("no", "yes")[x] for x in (o.site, o.variables)]
             error = f"{o.before:.2f} → {o.after:.2f}"
-            found = o.formula or f"({o.reason})"
+            answer = o.formula or f"({o.reason})"
             rows.add(
-                o.truth or "nothing", o.asked.robot, *right, f"{o.correlation:.3f}", error, found
+                o.truth or "nothing", o.asked.robot, *right, f"{o.correlation:.3f}", error, answer
             )
     t.show(rows)
     figures = list(claims(outcomes))
@@ -104,23 +104,23 @@ def _run(
     t: Terminal,
     workers: tuple[int | None, str | None],
 ) -> list[Outcome]:
-    """Run the cases on several workers; each is in the file of cases as soon as it is done."""
-    found: dict[int, Outcome] = {}
+    """Run the cases on several workers, and append each to the file of cases when it is done."""
+    outcomes: dict[int, Outcome] = {}
     with (
         open_engine(*workers) as engine,
         counting(t.progress, "campaigns", len(asked)) as advance,
     ):
         for k, outcome in engine.results(partial(run_case, config), asked):
-            found[k] = outcome
+            outcomes[k] = outcome
             if cases is not None:
                 with cases.open("a", encoding="utf-8") as stream:
                     stream.write(json.dumps(asdict(outcome)) + "\n")
             advance(1)
-    return [found[k] for k in range(len(asked))]
+    return [outcomes[k] for k in range(len(asked))]
 
 
 def _brief(o: Outcome) -> dict[str, object]:
-    """Return a case as it is kept."""
+    """Return a case for the record."""
     hidden = o.asked.law or o.asked.effect or "nothing"
     return {**asdict(o), "asked": f"{hidden}, {o.asked.robot}, seed {o.asked.seed}"}
 
@@ -161,7 +161,7 @@ def _mode(name: str) -> Mode:
 
 
 def claims(outcomes: Sequence[Outcome]) -> Iterator[Figure]:
-    """Yield what is claimed of a search, with the counts."""
+    """Yield the claims about the search, with counts."""
     laws = [o for o in outcomes if o.asked.law]
     plain = bool(laws) and all(map(_plain, laws))
     of_law: tuple[tuple[str, float, Callable[[Outcome], bool]], ...] = (
@@ -171,8 +171,8 @@ def claims(outcomes: Sequence[Outcome]) -> Iterator[Figure]:
         ("variables right", 0.85, lambda o: o.variables),
         ("formula equivalent (correlation 0.98)", 0.70, lambda o: o.correlation >= SAME),
     )
-    for what, least, holds in of_law:
-        yield _figure(what, [holds(o) for o in laws], PLAIN if plain else least)
+    for claim, least, holds in of_law:
+        yield _figure(claim, [holds(o) for o in laws], PLAIN if plain else least)
     silent = (
         ("no law where an effect of the catalogue is hidden", lambda o: bool(o.asked.effect)),
         ("no law where nothing is hidden", lambda o: _bare(o) and o.asked.stated == 1.0),
@@ -181,11 +181,11 @@ def claims(outcomes: Sequence[Outcome]) -> Iterator[Figure]:
             lambda o: _bare(o) and o.asked.stated != 1.0,
         ),
     )
-    for words, mine in silent:
-        least = 1.0 if "misjudged" in words else 0.99
-        held = [not o.formula for o in outcomes if mine(o)]
+    for claim, applies in silent:
+        least = 1.0 if "misjudged" in claim else 0.99
+        held = [not o.formula for o in outcomes if applies(o)]
         if held:
-            yield _figure(words, held, least)
+            yield _figure(claim, held, least)
 
 
 def _plain(o: Outcome) -> bool:
@@ -200,7 +200,7 @@ def _halved(o: Outcome) -> bool:
     return o.after > 0 and o.after - 1.0 <= 0.5 * max(o.before - 1.0, 0.0)
 
 
-def _figure(what: str, held: Sequence[bool], least: float) -> Figure:
+def _figure(claim: str, held: Sequence[bool], least: float) -> Figure:
     share = sum(held) / max(len(held), 1)
     measured = f"{100 * share:.3g} % ({sum(held)} of {len(held)})"
-    return Figure(what, measured, f"{100 * least:g} %", share >= least if held else None)
+    return Figure(claim, measured, f"{100 * least:g} %", share >= least if held else None)

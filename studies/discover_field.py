@@ -1,9 +1,9 @@
-"""`python -m studies discover-field`: laws hidden in an arm's readings, by hilcal and by others.
+"""`python -m studies discover-field`: laws hidden in an arm's readings, by hilcal and others.
 
-The others are given what they can read: hilcal's own residual at each reading, taken to the site
-where the law truly acts, its covariance by the noise, and all quantities that hilcal knows. The
-site is told to them; hilcal has to find it. A formula of theirs is then given hilcal's own
-treatment: its size and the model's parameters are refitted together. All readings are absolute.
+The other programs get hilcal's residual at each reading, converted to a displacement at the true
+site of the law, its covariance by the noise, and all quantities that hilcal uses. They are given
+the site; hilcal has to find it. Their formulas are then treated as those of hilcal: size and model
+parameters are refitted together. All readings are absolute.
 """
 
 from collections.abc import Iterator, Sequence
@@ -40,13 +40,13 @@ POSES, LOADS = 16, 2
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """A searcher's answer.
+    """Answer of a program.
 
     Attributes:
-        formula: or why there is none.
-        correlation: of what it does with what was hidden, the model projected out.
-        error: at fresh poses over that of their noise.
-        seconds: of the processor.
+        formula: the formula, or the reason for none.
+        correlation: of its displacement with the hidden one, the model projected out.
+        error: at fresh poses, in units of their noise.
+        seconds: processor time.
     """
 
     formula: str
@@ -56,7 +56,7 @@ class Told:
 
 
 def run_case(config: CellConfig, case: Asked, python: Path | None) -> dict[str, Told]:
-    """Hide one law, and ask every searcher."""
+    """Hide one law, and let every program search it."""
     c = simulated(config, case)
     start = process_time()
     d = discover(c.before)
@@ -75,62 +75,62 @@ def run_case(config: CellConfig, case: Asked, python: Path | None) -> dict[str, 
 
 
 def _by_peer(c: Simulated, python: Path, peer: str, alone: float) -> Told:
-    before, fresh = c.before, c.fresh.readings
-    linear, w = linearise(before), before.whitening
-    truth = w.whiten_readings(c.first.moved[~before.outlier])
+    f, fresh = c.before, c.fresh.readings
+    linear, w = linearise(f), f.whitening
+    truth = w.whiten_readings(c.first.moved[~f.outlier])
     k, motion = _site(c, truth)
-    own = w.whiten_readings(_each(motion))
-    square = np.maximum(np.sum(own**2, axis=0), 1e-12)
-    at = before.model.predict(fresh.states, before.theta)
-    now, then = before.solution.prediction.situation, at.situation
-    known = variables(now)
+    columns = w.whiten_readings(_of_each(motion))
+    square = np.maximum(np.sum(columns**2, axis=0), 1e-12)
+    prediction = f.model.predict(fresh.states, f.theta)
+    situation = f.solution.prediction.situation
+    quantities = variables(situation)
     problem: dict[str, object] = {
-        "quantities": {v.symbol: v.read(now).tolist() for v in known},
-        "angles": [v.symbol for v in known if v.kind in ("angle", "sum", "sight")],
-        "target": (own.T @ linear.residual / square).tolist(),
+        "quantities": {v.symbol: v.read(situation).tolist() for v in quantities},
+        "angles": [v.symbol for v in quantities if v.kind in ("angle", "sum", "sight")],
+        "target": (columns.T @ linear.residual / square).tolist(),
         "covariance": np.diag(1.0 / square).tolist(),
-        "fresh": {v.symbol: v.read(then).tolist() for v in known},
+        "fresh": {v.symbol: v.read(prediction.situation).tolist() for v in quantities},
     }
-    told: dict[str, Any] = asked(python, peer, problem)
-    if "error" in told:
-        return Told(f"not run: {told['error']}", 0.0, alone, 0.0)
-    x = w.whiten_readings(motion * np.array(told["fitted"])[:, None])
+    reply: dict[str, Any] = asked(python, peer, problem)
+    if "error" in reply:
+        return Told(f"not run: {reply['error']}", 0.0, alone, 0.0)
+    x = w.whiten_readings(motion * np.array(reply["fitted"])[:, None])
     free = linear.project_out(x)
-    by = float(x @ linear.residual) / max(float(x @ free), 1e-300)
+    factor = float(x @ linear.residual) / max(float(x @ free), 1e-300)
     hidden = linear.project_out(truth)
     size = float(np.linalg.norm(free) * np.linalg.norm(hidden))
-    there = motions_of(before.model, at, before.theta, w.m)[1][:, :, k]
-    v = whitening(fresh, before.mode)
-    moved = v.raw(there * np.array(told["fresh"])[:, None])
-    base = v.raw(before.model.jacobian(at, before.theta, w.m)) @ before.solution.transform
+    fresh_motion = motions_of(f.model, prediction, f.theta, w.m)[1][:, :, k]
+    v = whitening(fresh, f.mode)
+    moved = v.raw(fresh_motion * np.array(reply["fresh"])[:, None])
+    base = v.raw(f.model.jacobian(prediction, f.theta, w.m)) @ f.solution.transform
     moved = moved - base @ linear.projection.solve(linear.rows.T @ x)
-    off, noise = residual(fresh, at, v) - by * moved, v.raw(c.fresh.noise)
-    error = float(np.sqrt(np.sum(off[:, :3] ** 2) / np.sum(noise[:, :3] ** 2)))
-    same = by * float(free @ hidden) / max(abs(by) * size, 1e-300)
-    return Told(str(told["formula"]), same, error, told["seconds"])
+    left, noise = residual(fresh, prediction, v) - factor * moved, v.raw(c.fresh.noise)
+    error = float(np.sqrt(np.sum(left[:, :3] ** 2) / np.sum(noise[:, :3] ** 2)))
+    same = factor * float(free @ hidden) / max(abs(factor) * size, 1e-300)
+    return Told(str(reply["formula"]), same, error, reply["seconds"])
 
 
 def _site(c: Simulated, truth: Floats) -> tuple[int, Floats]:
-    """Return the true site of the law, the axis that explains most of it, and its motion (N, m)."""
+    """Return the axis at the law's true site that explains it best, and its motion (N, m)."""
     sites, motion = site_motions(c.before)
-    words = c.law.sites if c.law else ()
-    mine = [k for k, s in enumerate(sites) if s.words.startswith(tuple(words)) and s.takes(False)]
-    exact = [k for k in mine if sites[k].field == "dq"] or mine
+    names = c.law.sites if c.law else ()
+    right = [k for k, s in enumerate(sites) if s.words.startswith(tuple(names)) and s.takes(False)]
+    exact = [k for k in right if sites[k].field == "dq"] or right
     w = c.before.whitening
 
     def explained(k: int) -> float:
-        own = w.whiten_readings(_each(motion[:, :, k]))
-        return float(np.sum((own.T @ truth) ** 2 / np.maximum(np.sum(own**2, axis=0), 1e-12)))
+        x = w.whiten_readings(_of_each(motion[:, :, k]))
+        return float(np.sum((x.T @ truth) ** 2 / np.maximum(np.sum(x**2, axis=0), 1e-12)))
 
     best = max(exact, key=explained)
     return best, np.asarray(motion[:, :, best])
 
 
-def _each(motion: Floats) -> Floats:
-    """(N, m, N) motion of each reading by itself."""
+def _of_each(motion: Floats) -> Floats:
+    """(N, m, N) columns that move a single reading each."""
     out = np.zeros((*motion.shape, len(motion)))
-    each = np.arange(len(motion))
-    out[each, :, each] = motion
+    row = np.arange(len(motion))
+    out[row, :, row] = motion
     return out
 
 
@@ -166,23 +166,27 @@ def discover_field(
     figures = list(claims(done))
     for f in figures:
         t.show(f"{f.what}: {f.measured}")
-    kept = [{"law": n, "answers": {k: asdict(a) for k, a in of.items()}} for n, of in done]
+    content = [
+        {"law": n, "answers": {k: asdict(a) for k, a in answers.items()}} for n, answers in done
+    ]
     title = f"Laws in an arm's readings, by hilcal and by others ({strength:g} σ, {POSES} poses)"
-    keep(keep_file, title, figures, {"cases": kept})
-    t.document({"cases": kept, "figures": [asdict(f) for f in figures]})
+    keep(keep_file, title, figures, {"cases": content})
+    t.document({"cases": content, "figures": [asdict(f) for f in figures]})
 
 
 def claims(done: Sequence[tuple[str, dict[str, Told]]]) -> Iterator[Figure]:
-    """Yield of each searcher how often values and formulas are right."""
+    """Yield how often values and formulas of each program are right."""
     for who in done[0][1]:
-        of = [answers[who] for _, answers in done]
-        if all(a.formula.startswith("not run") for a in of):
-            yield Figure(who, "not run: needs Julia" if who == "pysr" else of[0].formula)
+        given = [answers[who] for _, answers in done]
+        if all(a.formula.startswith("not run") for a in given):
+            yield Figure(who, "not run: needs Julia" if who == "pysr" else given[0].formula)
             continue
-        near, same = sum(a.error <= FLOOR for a in of), sum(a.correlation >= SAME for a in of)
+        near = sum(a.error <= FLOOR for a in given)
+        same = sum(a.correlation >= SAME for a in given)
+        error, seconds = (np.median([getattr(a, k) for a in given]) for k in ("error", "seconds"))
         yield Figure(
             who,
-            f"error at fresh poses within {FLOOR:g} times the noise: {near} of {len(of)}; formula "
-            f"equivalent (correlation {SAME:g}): {same} of {len(of)}; median error "
-            f"{np.median([a.error for a in of]):.2f}, {np.median([a.seconds for a in of]):.1f} s",
+            f"error at fresh poses within {FLOOR:g} times the noise: {near} of {len(given)}; "
+            f"formula equivalent (correlation {SAME:g}): {same} of {len(given)}; median error "
+            f"{error:.2f}, {seconds:.1f} s",
         )

@@ -1,7 +1,7 @@
-"""Searchers of others, each by a problem's file: `python discover_peers.py NAME IN.json OUT.json`.
+"""Other search programs, run on a problem's file: `python discover_peers.py NAME IN.json OUT.json`.
 
-Runs in an environment of its own with numpy and the searcher (`pip install pysindy gplearn
-pyoperon`; PySR installs Julia by itself), without hilcal.
+Runs without hilcal, in an environment with numpy and the program (`pip install pysindy gplearn
+pyoperon`; PySR installs Julia itself).
 
 A problem is JSON: `quantities` {name: (N,) values}, `angles` [names], `target` (N,), `covariance`
 (N, N) of it, and `fresh` {name: (M,) values}. An answer has `formula`, `fitted` (N,) and `fresh`
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 GENERATIONS, EVALUATIONS, SECONDS = 12, 200_000, 60
-"""Of a search, so that each takes some seconds of one processor."""
+"""Limits of a search, so that each program takes some seconds of one processor."""
 MOST_TERMS = 4
 SEED = 20261126
 
@@ -25,27 +25,28 @@ SEED = 20261126
 def pysindy(x: Any, y: Any, weight: Any, fresh: Any, names: list[str]) -> tuple[str, Any, Any]:
     """Sparse regression: forward orthogonal least squares on products of two; terms by BIC.
 
-    Sums of angles are left to products of sines and cosines, for the size of the library.
+    Columns of sums of angles are left out to limit the library: products of sines and cosines
+    replace them.
     """
     ps = importlib.import_module("pysindy")
-    kept = [k for k, name in enumerate(names) if "(q_" not in name]
-    x, fresh, names = x[:, kept], fresh[:, kept], [names[k] for k in kept]
+    used = [k for k, name in enumerate(names) if "(q_" not in name]
+    x, fresh, names = x[:, used], fresh[:, used], [names[k] for k in used]
     library = ps.PolynomialLibrary(degree=2).fit(x)
     a, b = (np.asarray(library.transform(v)) for v in (x, fresh))
-    # It stops at columns that depend on those chosen, as cos² on sin² and one.
+    # FROLS stops at columns that depend on chosen ones, as cos² on sin² and 1.
     a = a * (1.0 + 1e-9 * np.random.default_rng(SEED).standard_normal(a.shape))
     scale = np.sqrt(weight)[:, None]
     model = ps.FROLS(max_iter=MOST_TERMS, alpha=1e-10)
     model.fit(scale * a, scale[:, 0] * y)
-    found = []
+    fits = []
     for which in (np.flatnonzero(np.asarray(coef).ravel()) for coef in model.history_):
-        by = np.zeros(a.shape[1])
-        by[which] = np.linalg.lstsq(scale * a[:, which], scale[:, 0] * y, rcond=None)[0]
-        left = float(np.sum(weight * (y - a @ by) ** 2))
-        found.append((len(y) * np.log(left) + len(which) * np.log(len(y)), len(which), by))
-    by = min(found, key=lambda f: f[:2])[2]
-    terms = zip(by, library.get_feature_names(names), strict=True)
-    return " + ".join(f"{c:.4g}*{name}" for c, name in terms if c), a @ by, b @ by
+        c = np.zeros(a.shape[1])
+        c[which] = np.linalg.lstsq(scale * a[:, which], scale[:, 0] * y, rcond=None)[0]
+        rss = float(np.sum(weight * (y - a @ c) ** 2))
+        fits.append((len(y) * np.log(rss) + len(which) * np.log(len(y)), len(which), c))
+    best = min(fits, key=lambda f: f[:2])[2]
+    terms = zip(best, library.get_feature_names(names), strict=True)
+    return " + ".join(f"{c:.4g}*{name}" for c, name in terms if c), a @ best, b @ best
 
 
 def gplearn(x: Any, y: Any, weight: Any, fresh: Any, names: list[str]) -> tuple[str, Any, Any]:
@@ -89,9 +90,9 @@ def pysr(x: Any, y: Any, weight: Any, fresh: Any, names: list[str]) -> tuple[str
 PEERS = {"pysindy": pysindy, "gplearn": gplearn, "operon": operon, "pysr": pysr}
 
 
-def main(name: str, given: str, out: str) -> None:
-    """Search one problem; quantities by their size, and beside angles their sine and cosine."""
-    problem = json.loads(Path(given).read_text())
+def main(name: str, question: str, out: str) -> None:
+    """Search one problem, with quantities divided by their rms; angles with sine and cosine."""
+    problem = json.loads(Path(question).read_text())
     y, std = np.array(problem["target"]), np.sqrt(np.diag(np.array(problem["covariance"])))
     columns, names = [], []
     for key, values in problem["quantities"].items():
@@ -104,8 +105,7 @@ def main(name: str, given: str, out: str) -> None:
             names.append(key)
     x, size = np.array(columns).T, float(np.std(y))
     weight = (size / std) ** 2
-    found = PEERS[name](x[: len(y)], y / size, weight, x[len(y) :], names)
-    formula, fitted, fresh = found
+    formula, fitted, fresh = PEERS[name](x[: len(y)], y / size, weight, x[len(y) :], names)
     answer = {"formula": formula, "fitted": (size * fitted).tolist()}
     Path(out).write_text(json.dumps({**answer, "fresh": (size * fresh).tolist()}))
 

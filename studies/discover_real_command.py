@@ -29,12 +29,12 @@ from studies.records import Figure, Keep, keep
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Series:
-    """What a series came to.
+    """Result of a series.
 
     Attributes:
         name: of its folder.
-        left: the fit after refinement, its noise as stated: without an estimated scatter.
-        regression: share of the misfit that a regression of everything recorded predicts.
+        left: the fit after refinement, with the stated noise, without an estimated scatter.
+        regression: share of the misfit predicted by a regression on everything recorded.
         found: the search for a law.
     """
 
@@ -73,9 +73,9 @@ def _searched(path: Path) -> Series:
     cell = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")
     readings = read_table(path, cell, "ipa-ur10")
     last = refine(baseline(cell, readings, "absolute"), readings, "absolute").fit
-    left = fit(last.model, last.readings.as_stated(), last.mode, start=last.theta)
-    found = discover(left)
-    return Series(path.parent.name, left, residual_regression(linearise(left)).share, found)
+    stated = fit(last.model, last.readings.as_stated(), last.mode, start=last.theta)
+    law = discover(stated)
+    return Series(path.parent.name, stated, residual_regression(linearise(stated)).share, law)
 
 
 def _of_series(s: Series) -> list[Figure]:
@@ -109,7 +109,7 @@ def _of_series(s: Series) -> list[Figure]:
 
 
 def _carried(a: Series, b: Series) -> Figure:
-    """What the law of one series explains of the other, its coefficients as found."""
+    """Share of the other series' misfit that the law of one series explains, without a refit."""
     law = a.found.laws[0]
     linear, w = linearise(b.left), b.left.whitening
     states = b.left.solution.prediction.situation.states
@@ -117,11 +117,11 @@ def _carried(a: Series, b: Series) -> Figure:
     values = np.array([c.value for c in law.parameters])
     prediction, theta = b.left.solution.prediction, b.left.theta
     moved = b.left.model.jacobian_of((effect,), prediction, theta, w.m) @ values
-    told = w.whiten(w.raw(moved)).reshape(-1)
-    free = linear.project_out(told)
-    along = float(told @ linear.residual)
-    gain = 2.0 * along - float(told @ free)
-    cosine = along / max(float(np.sqrt((told @ free) * linear.rss)), 1e-300)
+    predicted = w.whiten(w.raw(moved)).reshape(-1)
+    free = linear.project_out(predicted)
+    along = float(predicted @ linear.residual)
+    gain = 2.0 * along - float(predicted @ free)
+    cosine = along / max(float(np.sqrt((predicted @ free) * linear.rss)), 1e-300)
     return Figure(
         f"law of {a.name}, coefficients as found there, on {b.name}",
         f"explains {100 * gain / (linear.rss - b.left.dof):.1f} % of the misfit; correlation with "

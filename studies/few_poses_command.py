@@ -1,9 +1,9 @@
 """`python -m studies few-poses`: a few poses of a real arm, refined, and the others predicted.
 
-Random poses of a public series are refined as `hilcal refine` does from the arm's type alone; 500
-others are predicted by the last fit, with its bands. `SKETCH_MM` is what the sketch of a mixed
-model leaves of the same draws, mean of ten; it knows geometry, gear waves and compliance. With
-`--planned` the poses are chosen by criterion I among all that are not predicted.
+Random poses of a public series are refined as by `hilcal refine`, from the arm's type only; the
+last fit predicts 500 others, with bands. `SKETCH_MM` is the error of the sketch of a mixed model
+for the same draws, mean of ten; its effects are geometry, gear waves and compliance. With
+`--planned` the poses are chosen by criterion I among all poses that are not predicted.
 """
 
 import tempfile
@@ -43,9 +43,9 @@ from studies.records import Figure, Keep, keep
 
 TEST = 500
 BAND = (0.90, 0.98)
-"""Share of the others within their 95 % band that counts as true."""
+"""Accepted share of predicted poses within their 95 % band."""
 PROBABLE = 0.05
-"""p-value below which an effect of the background is counted as being among the ambiguous."""
+"""p-value below which an effect of the background counts as ambiguous."""
 SKETCH_MM = {
     "Series_B": {20: 0.352, 30: 0.267, 60: 0.177, 120: 0.134},
     "Series_C": {20: 0.358, 30: 0.257, 60: 0.158, 120: 0.120},
@@ -61,19 +61,19 @@ com_m = [0.0, 0.0, 0.03]
 [tracker]
 frame = "tracker"
 """
-"""The cell of the UR5; its tool and tracker are not published but for the tracker's type."""
+"""The cell of the UR5; of its tool and tracker only the tracker's type is published."""
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """Some poses of a series.
+    """Fitted poses of a series.
 
     Attributes:
         path: of the series.
-        poses: how many are fitted.
-        draw: of them.
+        poses: number of fitted poses.
+        draw: number of the draw.
         attitudes: whether attitudes are fitted, too.
-        planned: whether they are chosen by the planner, not at random.
+        planned: whether the planner chooses the poses.
     """
 
     path: Path
@@ -85,17 +85,17 @@ class Case:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """What came of a case.
+    """Result of a case.
 
     Attributes:
         series: name of its folder.
-        poses: how many were fitted.
-        draw: of them.
-        mean_m: mean error of positions at other poses.
+        poses: number of fitted poses.
+        draw: number of the draw.
+        mean_m: mean error of predicted positions.
         inside: share of these within their 95 % band.
-        named: effects that the last model names.
-        verdict: of it.
-        suspects: effects that it says may be there.
+        named: named effects of the last model.
+        verdict: of the last model.
+        suspects: suspected effects of the last model.
     """
 
     series: str
@@ -125,8 +125,7 @@ def few_poses(
     """Refine few random poses of real series, and predict 500 others."""
     t = terminal(as_json)
     counts = [int(n) for n in poses.split(",")]
-    each = product(series, counts, range(draws))
-    cases = [Case(p, n, d, attitudes, planned) for p, n, d in each]
+    cases = [Case(p, n, d, attitudes, planned) for p, n, d in product(series, counts, range(draws))]
     with (
         open_engine(*one_by_default(jobs, scheduler)) as engine,
         counting(t.progress, "fits", len(cases)) as advance,
@@ -134,8 +133,8 @@ def few_poses(
         done: Sequence[Found] = engine.map(refined, cases, advance=advance)
     figures = []
     for path, n in product(series, counts):
-        own = [f for f in done if (f.series, f.poses) == (path.parent.name, n)]
-        figures += _figures(path.parent.name, n, own, attitudes=attitudes, planned=planned)
+        results = [f for f in done if (f.series, f.poses) == (path.parent.name, n)]
+        figures += _figures(path.parent.name, n, results, attitudes=attitudes, planned=planned)
     for f in figures:
         t.show(f"{f.what}: {f.measured}")
     title = "Few poses of real arms, chosen by the planner" if planned else "Few poses of real arms"
@@ -144,55 +143,55 @@ def few_poses(
 
 
 def refined(case: Case) -> Found:
-    """Refine the poses of a case, and predict the others."""
+    """Refine the poses of a case, and predict others."""
     cell, readings = series_of(case.path)
     if not case.attitudes:
         value, covariance = readings.value[:, :3], readings.covariance[:, :3, :3]
         readings = replace(readings, value=value, covariance=covariance)
     order = np.random.default_rng(3 + case.draw).permutation(len(readings))
     tested = order[len(order) // 2 :][:TEST]
-    rest = np.setdiff1d(order, tested)
-    chosen = _planned(cell, readings[rest], case) if case.planned else order[: case.poses]
-    test, some = readings[tested], readings[rest[chosen] if case.planned else chosen]
+    available = np.setdiff1d(order, tested)
+    chosen = _planned(cell, readings[available], case) if case.planned else order[: case.poses]
+    test, some = readings[tested], readings[available[chosen] if case.planned else chosen]
     last = refine(baseline(cell, some, "absolute"), some, "absolute")
     f, d = last.fit, last.diagnosis
-    off = test.value[:, :3] - f.model.predict(test.states, f.theta).observation.position
+    error = test.value[:, :3] - f.model.predict(test.states, f.theta).observation.position
     return Found(
         case.path.parent.name,
         case.poses,
         case.draw,
-        float(np.linalg.norm(off, axis=1).mean()),
-        share_in_band(f, test, off),
+        float(np.linalg.norm(error, axis=1).mean()),
+        share_in_band(f, test, error),
         tuple(n for n in f.model.named if n not in ("base_frame", "target_offset")),
         last.verdict,
         (*d.significant, *(b.effect for b in d.background if b.p_value < PROBABLE)),
     )
 
 
-def share_in_band(of: Fit, test: Readings, off: Floats) -> float:
-    """Return the share of others whose errors (N, 3), m, are within the 95 % band of a fit."""
-    known = predictive(
-        of.model, of.theta, of.solution.prior, of.readings[~of.outlier], "absolute",
-        of.holdout.rms_sigma,
+def share_in_band(fitted: Fit, test: Readings, error: Floats) -> float:
+    """Return the share of test readings with errors (N, 3), m, within the 95 % band of a fit."""
+    band = predictive(
+        fitted.model, fitted.theta, fitted.solution.prior, fitted.readings[~fitted.outlier],
+        "absolute", fitted.holdout.rms_sigma,
     )  # fmt: skip
-    prediction = of.model.predict(test.states, of.theta)
-    if of.readings.arm_scatter is not None:
-        test = with_arm_scatter(of.model.cell, test, of.readings.arm_scatter)
-    total = known.of_reading(prediction, whitening(test, "absolute", "gc"))[:, :3, :3]
-    square = np.einsum("ni,nij,nj->n", off, np.linalg.inv(total), off)
+    prediction = fitted.model.predict(test.states, fitted.theta)
+    if fitted.readings.arm_scatter is not None:
+        test = with_arm_scatter(fitted.model.cell, test, fitted.readings.arm_scatter)
+    total = band.of_reading(prediction, whitening(test, "absolute", "gc"))[:, :3, :3]
+    square = np.einsum("ni,nij,nj->n", error, np.linalg.inv(total), error)
     return float(np.mean(square < chi2.ppf(0.95, 3)))
 
 
 def _planned(cell: Cell, readings: Readings, case: Case) -> Ints:
-    """Which of the readings a plan for predictions at all of them would take."""
+    """Return the readings that a plan for predictions at all of them chooses."""
     config = cell.configured()
     planning = config.planning.model_copy(update={"readings": "absolute"})
     config = config.model_copy(update={"loads": [], "planning": planning})
     q, m = readings.states.q, readings.value.shape[1]
-    of, _ = without_undetermined(problem(nominal_model(cell, config, m), config, q))
-    work = prediction_poses(of.nominal, config, q)
-    asked = objective_of(of, config, "I", work)
-    design = choose(asked, float(case.poses), np.random.default_rng(case.draw))
+    design_problem, _ = without_undetermined(problem(nominal_model(cell, config, m), config, q))
+    work = prediction_poses(design_problem.nominal, config, q)
+    objective = objective_of(design_problem, config, "I", work)
+    design = choose(objective, float(case.poses), np.random.default_rng(case.draw))
     return np.flatnonzero(design.counts)
 
 
@@ -219,32 +218,32 @@ def series_of(path: Path) -> tuple[Cell, Readings]:
 
 
 def _figures(
-    series: str, poses: int, found: list[Found], *, attitudes: bool, planned: bool
+    series: str, poses: int, results: list[Found], *, attitudes: bool, planned: bool
 ) -> list[Figure]:
-    what = f"{series}, {poses} {'planned ' * planned}{'poses' if attitudes else 'positions'}"
-    mean = 1e3 * float(np.mean([f.mean_m for f in found]))
-    worst = 1e3 * max(f.mean_m for f in found)
-    inside = float(np.mean([f.inside for f in found]))
-    least = min(f.inside for f in found)
+    title = f"{series}, {poses} {'planned ' * planned}{'poses' if attitudes else 'positions'}"
+    mean = 1e3 * float(np.mean([f.mean_m for f in results]))
+    worst = 1e3 * max(f.mean_m for f in results)
+    inside = float(np.mean([f.inside for f in results]))
+    least = min(f.inside for f in results)
     most = SKETCH_MM.get(series, {}).get(poses)
-    verdicts = [f.verdict for f in found]
-    each = ", ".join(f"{verdicts.count(v)} {v}" for v in dict.fromkeys(verdicts))
-    said = [name for f in found for name in {*f.named, *f.suspects}]
-    often = sorted(set(said), key=lambda name: (-said.count(name), name))
-    words = ", ".join(f"{name} {said.count(name)}" for name in often) or "nothing"
+    verdicts = [f.verdict for f in results]
+    counted = ", ".join(f"{verdicts.count(v)} {v}" for v in dict.fromkeys(verdicts))
+    named = [name for f in results for name in {*f.named, *f.suspects}]
+    by_count = sorted(set(named), key=lambda name: (-named.count(name), name))
+    effects = ", ".join(f"{name} {named.count(name)}" for name in by_count) or "nothing"
     return [
         Figure(
-            f"{what}: mean error at {TEST} others, mean of {len(found)} draws (worst)",
+            f"{title}: mean error at {TEST} others, mean of {len(results)} draws (worst)",
             f"{mean:.3f} mm ({worst:.3f} mm)",
             "" if most is None else f"{most:.3f} mm, the sketch's",
             None if most is None else mean <= most,
         ),
         Figure(
-            f"{what}: of them within their 95 % band (least draw)",
+            f"{title}: of them within their 95 % band (least draw)",
             f"{inside:.0%} ({least:.0%})",
             f"{BAND[0]:.0%} to {BAND[1]:.0%}",
             BAND[0] <= inside <= BAND[1],
         ),
-        Figure(f"{what}: verdicts", each),
-        Figure(f"{what}: named, or among the ambiguous", words),
+        Figure(f"{title}: verdicts", counted),
+        Figure(f"{title}: named, or among the ambiguous", effects),
     ]

@@ -1,4 +1,4 @@
-"""The error against the number of poses, of what `python -m studies few-poses` kept."""
+"""Chart of the error against the number of poses, from records of `python -m studies few-poses`."""
 
 import json
 import re
@@ -30,22 +30,22 @@ FRAMES_MM = {
 of the same positions each."""
 
 
-def few_poses_errors(kept: Sequence[Path]) -> dict[str, dict[int, float]]:
-    """Return the mean errors, mm, by series and number of poses, that studies kept.
+def few_poses_errors(records: Sequence[Path]) -> dict[str, dict[int, float]]:
+    """Return the mean errors, mm, by series and number of poses, of records of `few-poses`.
 
     Raises:
-        InputError: a file that `few-poses` did not keep.
+        InputError: a file that is no such record.
     """
     errors: dict[str, dict[int, float]] = {}
-    for path in kept:
+    for path in records:
         try:
             figures = json.loads(path.read_text(encoding="utf-8"))["figures"]
         except (OSError, KeyError, ValueError) as error:
             raise InputError(f"{path}: not kept by studies few-poses ({error})") from None
         for f in figures:
-            if found := MEAN.fullmatch(f["what"]):
+            if match := MEAN.fullmatch(f["what"]):
                 mean = float(f["measured"].split()[0])
-                errors.setdefault(found[1], {})[int(found[2])] = mean
+                errors.setdefault(match[1], {})[int(match[2])] = mean
     return errors
 
 
@@ -53,15 +53,15 @@ def chart(errors: dict[str, dict[int, float]]) -> go.Figure:
     """Return the figure of mean errors, mm, by series and number of poses."""
     traces: list[go.Scatter] = []
     for series, (name, colour, symbol) in SERIES.items():
-        for words, found, dash, ink in (
+        for model, means, dash, ink in (
             ("hilcal", errors.get(series, {}), "solid", colour),
             ("sketch", SKETCH_MM.get(series, {}), "dot", colour),
             ("geometry, ridge", RIDGE_MM.get(series, {}), "dash", GREY),
             ("frames alone", FRAMES_MM.get(series, {}), "longdash", GREY),
         ):
-            if found:
-                traces.append(_line(f"{name}: {words}", found, dash, ink, symbol))
-    ticks: Sequence[int] = sorted({n for found in errors.values() for n in found})
+            if means:
+                traces.append(_line(f"{name}: {model}", means, dash, ink, symbol))
+    ticks: Sequence[int] = sorted({n for means in errors.values() for n in means})
     out = figure(
         "All effects at once, from few poses.",
         "random positions fitted",
@@ -77,11 +77,11 @@ def chart(errors: dict[str, dict[int, float]]) -> go.Figure:
     return out
 
 
-def _line(name: str, found: dict[int, float], dash: str, colour: str, symbol: str) -> go.Scatter:
-    at = sorted(found)
+def _line(name: str, means: dict[int, float], dash: str, colour: str, symbol: str) -> go.Scatter:
+    poses = sorted(means)
     return go.Scatter(
-        x=at,
-        y=[found[n] for n in at],
+        x=poses,
+        y=[means[n] for n in poses],
         mode="lines+markers",
         name=name,
         line={"color": colour, "dash": dash},

@@ -1,8 +1,8 @@
-"""Laws of other mechanics for the study of `discover`, drawn at random; the catalogue has none.
+"""Random laws outside of the catalogue, for the study of `discover`.
 
-Each is a cause with its own few lines of mechanics, computed from where the simulated arm comes to
-rest (Pinocchio): which joint, which side, which level is drawn. It displaces the target; the study
-scales that to so many σ. Several have no exact counterpart among the functions that are searched.
+Each law is a cause with a few lines of mechanics, computed from the simulated arm at rest
+(Pinocchio); joint, side and size are drawn. It displaces the target, and the study scales the
+displacement to so many σ. Several laws have no exact counterpart among the searched functions.
 """
 
 from collections.abc import Callable
@@ -18,13 +18,13 @@ ABSOLUTE, DEFLECTION = "absolute", "deflection"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Foreign:
-    """A law as it was drawn.
+    """A drawn law.
 
     Attributes:
         words: the law in one line.
-        displaced: (N, 3) of the target, sensor axes, at any size.
-        sites: words with which a right answer's site begins; several where they are the same.
-        variables: what it depends on.
+        displaced: (N, 3) displacement of the target, sensor axes, in any unit.
+        sites: beginnings of the names of right sites; several where sites are equivalent.
+        variables: variables of the law.
     """
 
     words: str
@@ -69,8 +69,8 @@ def _dead_zone(rng: np.random.Generator) -> Foreign:
         preload = 0.5 * float(np.median(np.abs(s.first.torque[:, j - 1])))
         return s.of_joint(j, np.sign(torque) * np.maximum(np.abs(torque) - preload, 0.0))
 
-    words = f"dq_{j} = c (tau_{j} beyond a preload)"
-    return Foreign(words, displaced, (f"joint {j}",), frozenset({_torque(j)}))
+    text = f"dq_{j} = c (tau_{j} beyond a preload)"
+    return Foreign(text, displaced, (f"joint {j}",), frozenset({_torque(j)}))
 
 
 def _by_another(rng: np.random.Generator) -> Foreign:
@@ -83,8 +83,8 @@ def _by_another(rng: np.random.Generator) -> Foreign:
         soft = np.cos((s.states.q[:, k - 1] - turn) / 2) ** 2
         return s.of_joint(j, s.torque[:, j - 1] * soft)
 
-    words = f"dq_{j} = c tau_{j} cos²((q_{k} - {turn:.1f})/2)"
-    return Foreign(words, displaced, (f"joint {j}",), frozenset({_torque(j), _angle(k)}))
+    text = f"dq_{j} = c tau_{j} cos²((q_{k} - {turn:.1f})/2)"
+    return Foreign(text, displaced, (f"joint {j}",), frozenset({_torque(j), _angle(k)}))
 
 
 def _hose(rng: np.random.Generator) -> Foreign:
@@ -95,8 +95,8 @@ def _hose(rng: np.random.Generator) -> Foreign:
         turn = s.states.q[:, 5]
         return s.of_joint(5, np.sign(turn) * np.maximum(np.abs(turn) - slack, 0.0))
 
-    words = f"dq_5 = c (q_6 beyond a slack of {slack:.1f})"
-    return Foreign(words, displaced, ("joint 5",), frozenset({_angle(6)}))
+    text = f"dq_5 = c (q_6 beyond a slack of {slack:.1f})"
+    return Foreign(text, displaced, ("joint 5",), frozenset({_angle(6)}))
 
 
 def _cable(rng: np.random.Generator) -> Foreign:
@@ -119,8 +119,8 @@ def _warm_base(rng: np.random.Generator) -> Foreign:
         warm = _given(s.states.air_temperature) - 22.0
         return s.in_base(warm[:, None] * np.cross(axis, s.place))
 
-    words = f"the base tilts with the air about {turn:.1f} rad"
-    return Foreign(words, displaced, ("base, tilt",), frozenset({"air temperature"}))
+    text = f"the base tilts with the air about {turn:.1f} rad"
+    return Foreign(text, displaced, ("base, tilt",), frozenset({"air temperature"}))
 
 
 def _sinking(rng: np.random.Generator) -> Foreign:
@@ -131,8 +131,8 @@ def _sinking(rng: np.random.Generator) -> Foreign:
         reach = np.hypot(s.place[:, 0], s.place[:, 1])
         return s.in_base(reach[:, None] ** power * np.array([0.0, 0.0, -1.0]))
 
-    words = f"the bench sinks with the reach to the power {power:.0f}"
-    return Foreign(words, displaced, ("base", "tracker"), frozenset({"reach"}))
+    text = f"the bench sinks with the reach to the power {power:.0f}"
+    return Foreign(text, displaced, ("base", "tracker"), frozenset({"reach"}))
 
 
 def _wear(rng: np.random.Generator) -> Foreign:
@@ -193,8 +193,8 @@ def _mount(rng: np.random.Generator) -> Foreign:
         axis = s.rest.flange[:, :3, c]
         return s.in_base(-axis[:, 2:3] * axis)
 
-    words = f"the target bends along {'xyz'[c]} of the flange with gravity"
-    return Foreign(words, displaced, ("target",), frozenset({"flange attitude"}))
+    text = f"the target bends along {'xyz'[c]} of the flange with gravity"
+    return Foreign(text, displaced, ("target",), frozenset({"flange attitude"}))
 
 
 def _refraction(rng: np.random.Generator) -> Foreign:
@@ -217,8 +217,8 @@ def _power(rng: np.random.Generator) -> Foreign:
         torque = s.torque[:, j - 1]
         return s.of_joint(j, np.sign(torque) * np.abs(torque) ** power)
 
-    words = f"dq_{j} = c |tau_{j}|^{power:.2f}"
-    return Foreign(words, displaced, (f"joint {j}",), frozenset({_torque(j)}))
+    text = f"dq_{j} = c |tau_{j}|^{power:.2f}"
+    return Foreign(text, displaced, (f"joint {j}",), frozenset({_torque(j)}))
 
 
 def _scale_waves(rng: np.random.Generator) -> Foreign:
@@ -268,8 +268,8 @@ def _wrist_bundle(rng: np.random.Generator) -> Foreign:
         return s.of_joint(j - 1, np.exp(np.cos(turn - phase)))
 
     names = frozenset({_angle(j), _angle(k)})
-    words = f"dq_{j - 1} = c exp(cos(q_{j} + q_{k} - {phase:.1f}))"
-    return Foreign(words, displaced, (f"joint {j - 1}",), names)
+    text = f"dq_{j - 1} = c exp(cos(q_{j} + q_{k} - {phase:.1f}))"
+    return Foreign(text, displaced, (f"joint {j - 1}",), names)
 
 
 def _soft_play(rng: np.random.Generator) -> Foreign:
@@ -279,11 +279,11 @@ def _soft_play(rng: np.random.Generator) -> Foreign:
 
     def displaced(s: Scene) -> Floats:
         torque = s.torque[:, j - 1]
-        whole = np.median(np.abs(s.first.torque[:, j - 1]))
-        return s.of_joint(j, np.arctan(torque / (share * whole)))
+        ordinary = np.median(np.abs(s.first.torque[:, j - 1]))
+        return s.of_joint(j, np.arctan(torque / (share * ordinary)))
 
-    words = f"dq_{j} = c atan(tau_{j}/tau0)"
-    return Foreign(words, displaced, (f"joint {j}",), frozenset({_torque(j)}))
+    text = f"dq_{j} = c atan(tau_{j}/tau0)"
+    return Foreign(text, displaced, (f"joint {j}",), frozenset({_torque(j)}))
 
 
 def _taut_hose(rng: np.random.Generator) -> Foreign:
@@ -298,8 +298,8 @@ def _taut_hose(rng: np.random.Generator) -> Foreign:
         return s.of_joint(4, np.maximum(length(s) - np.quantile(length(s.first), 0.3), 0.0))
 
     names = frozenset({_angle(5), _angle(6)})
-    words = f"dq_4 = c (a hose over joints 5 and 6, lever {lever:.1f}, taut beyond its length)"
-    return Foreign(words, displaced, ("joint 4",), names)
+    text = f"dq_4 = c (a hose over joints 5 and 6, lever {lever:.1f}, taut beyond its length)"
+    return Foreign(text, displaced, ("joint 4",), names)
 
 
 def _warming_up(rng: np.random.Generator) -> Foreign:
@@ -314,8 +314,8 @@ def _warming_up(rng: np.random.Generator) -> Foreign:
         return s.of_joint(j, warm * np.cos(s.states.q[:, j - 1]))
 
     names = frozenset({_angle(j), "time"})
-    words = f"dq_{j} = c (1 - exp(-t/T)) cos q_{j}"
-    return Foreign(words, displaced, (f"joint {j}",), names)
+    text = f"dq_{j} = c (1 - exp(-t/T)) cos q_{j}"
+    return Foreign(text, displaced, (f"joint {j}",), names)
 
 
 def _yielding_bench(rng: np.random.Generator) -> Foreign:
@@ -327,8 +327,8 @@ def _yielding_bench(rng: np.random.Generator) -> Foreign:
         pull = np.linalg.norm(s.states.wrench[:, :3], axis=1)
         return s.in_base((pull * reach**power)[:, None] * np.array([0.0, 0.0, -1.0]))
 
-    words = f"the bench sinks with load × reach to the power {power:.1f}"
-    return Foreign(words, displaced, ("base",), frozenset({"load", "reach"}))
+    text = f"the bench sinks with load × reach to the power {power:.1f}"
+    return Foreign(text, displaced, ("base",), frozenset({"load", "reach"}))
 
 
 BLIND: dict[str, tuple[str, Draw]] = {
@@ -337,7 +337,7 @@ BLIND: dict[str, tuple[str, Draw]] = {
     "warming up": (ABSOLUTE, _warming_up),
     "yielding bench": (DEFLECTION, _yielding_bench),
 }
-"""Laws that were written after the search had been frozen, and tried once; as `KINDS`."""
+"""Laws written after the search was frozen, and tried once; in the form of `KINDS`."""
 KINDS: dict[str, tuple[str, Draw]] = {
     "one-sided compliance": (DEFLECTION, _one_sided),
     "preload": (DEFLECTION, _dead_zone),
@@ -358,4 +358,4 @@ KINDS: dict[str, tuple[str, Draw]] = {
     "wrist bundle": (ABSOLUTE, _wrist_bundle),
     **BLIND,
 }
-"""Laws by name: the readings that show them, and how one is drawn."""
+"""Laws by name: mode of the readings that show them, and function that draws one."""

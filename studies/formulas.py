@@ -1,10 +1,10 @@
-"""`python -m studies formulas`: the search of laws on formulas of physics, beside other searchers.
+"""`python -m studies formulas`: the search of laws and other programs on formulas of physics.
 
 Formulas of Feynman's lectures with ranges of ordinary size and up to three dummy variables, as in
-SRSD-Feynman (Matsubara et al. 2024, J. Data-centric Machine Learning Research), drawn here anew.
-The target has noise of a share of its root mean square. A searcher gives values at 200 further
-points, and at 200 from the range doubled: a formula that explains 99.9 % of the variance in both is
-counted as equivalent.
+SRSD-Feynman (Matsubara et al. 2024, J. Data-centric Machine Learning Research), with newly drawn
+values. The target has noise of a share of its rms. A program predicts 200 further points, and 200
+points from the doubled range: a formula that explains 99.9 % of the variance of both counts as
+equivalent.
 """
 
 import json
@@ -41,7 +41,7 @@ from studies.records import Cases, Figure, Keep, keep, resumed
 
 POINTS, FRESH = 200, 200
 VALUE = 1e-3
-"""Share of the variance that may be left."""
+"""Largest unexplained share of the variance."""
 PEERS = ("pysindy", "gplearn", "operon", "pysr")
 Peers = Annotated[
     Path | None,
@@ -51,7 +51,7 @@ Peers = Annotated[
 
 @dataclass(frozen=True, slots=True)
 class Formula:
-    """A formula: its place in the lectures, text, quantities with ranges, values, why it may fail.
+    """A formula: its number in the lectures, text, ranges, values, and expected reason of failure.
 
     A quantity whose name begins with θ or φ is an angle, rad.
     """
@@ -106,7 +106,7 @@ Table = dict[str, Floats]
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What a searcher came to: its formula, shares of the variance left, seconds."""
+    """Answer of a program: its formula, unexplained shares of the variance, seconds."""
 
     formula: str
     left: float = 1.0
@@ -115,115 +115,119 @@ class Answer:
 
     @property
     def value(self) -> bool:
-        """Whether its values are right at fresh points."""
+        """Whether the values at fresh points are right."""
         return self.left < VALUE
 
     @property
     def equivalent(self) -> bool:
-        """Whether they are right beyond the range as well."""
+        """Whether the values beyond the range are right, too."""
         return self.value and self.left_beyond < VALUE
 
 
-def drawn(of: Formula, count: int, wider: float, rng: np.random.Generator) -> tuple[Table, Floats]:
+def drawn(
+    formula: Formula, count: int, wider: float, rng: np.random.Generator
+) -> tuple[Table, Floats]:
     """Draw quantities with 1 to 3 dummies, and the target without noise."""
-    dummies = {f"dummy{k}": (1.0, 5.0) for k in range(1 + len(of.text) % 3)}
+    dummies = {f"dummy{k}": (1.0, 5.0) for k in range(1 + len(formula.text) % 3)}
     out = {}
-    for name, (low, high) in {**of.ranges, **dummies}.items():
+    for name, (low, high) in {**formula.ranges, **dummies}.items():
         high = low + wider * (high - low)
         out[name] = rng.uniform(low, high, count)
-    return out, of.value(*(out[name] for name in of.ranges))
+    return out, formula.value(*(out[name] for name in formula.ranges))
 
 
 def hilcal(
     x: Table, y: Floats, std: float, reciprocals: bool
 ) -> tuple[str, Callable[[Table], Floats]]:
-    """Search a law of a table: one site that moves each value by itself, beside a constant."""
+    """Search a law of a table, for a model that is a constant; its site moves each value alone."""
     count = len(y)
-    known = [_variable(name, v, "") for name, v in x.items()]
+    variables = [_variable(name, v, "") for name, v in x.items()]
     if reciprocals:
-        known += [_variable(name, v, "1/") for name, v in x.items() if v.min() > 0]
+        variables += [_variable(name, v, "1/") for name, v in x.items() if v.min() > 0]
     situation = _situation(x)
     ones = np.ones((count, 1)) / std
     whitening = SimpleNamespace(m=1, whiten_readings=lambda v: v.reshape(count, -1) / std)
-    own = projection(ones, np.zeros(1))
+    constant = projection(ones, np.zeros(1))
     solution = SimpleNamespace(prediction=SimpleNamespace(situation=situation))
     fit = SimpleNamespace(whitening=whitening, dof=count - 1.0, white=y / std, solution=solution)
-    linear = Linearisation(cast(Any, fit), own, own.project_out(y / std))
+    linear = Linearisation(cast(Any, fit), constant, constant.project_out(y / std))
     site = Site("base", 0, 0, "table", "table", "y", "y", "1")
     motion = np.full((count, 1, 1), float(np.std(y)))
-    words = grammar(known, situation)
-    s = screened(linear, words, (site,), motion, np.ones(count, dtype=np.bool_), np.arange(count))
-    found = search(SearchProblem(s))
-    if not found:
+    every_row = np.ones(count, dtype=np.bool_)
+    s = screened(
+        linear, grammar(variables, situation), (site,), motion, every_row, np.arange(count)
+    )
+    selections = search(SearchProblem(s))
+    if not selections:
         return "", lambda table: np.full(len(next(iter(table.values()))), float(y.mean()))
-    form = refine(s, form_of(s, max(found, key=lambda f: f.total).terms))
+    form = refine(s, form_of(s, max(selections, key=lambda f: f.total).terms))
 
-    def columns(of: Table) -> Floats:
-        size = len(next(iter(of.values())))
-        own = form.motion((site,), np.ones((size, 1, 1)), _situation(of))[:, 0]
-        return np.hstack([np.ones((size, 1)), own])
+    def columns(table: Table) -> Floats:
+        size = len(next(iter(table.values())))
+        of_law = form.motion((site,), np.ones((size, 1, 1)), _situation(table))[:, 0]
+        return np.hstack([np.ones((size, 1)), of_law])
 
-    by = np.linalg.lstsq(columns(x), y, rcond=None)[0]
-    return form.text(), lambda table: np.asarray(columns(table) @ by)
-
-
-def _situation(of: Table) -> Any:
-    return SimpleNamespace(table=of, angle=np.zeros((len(next(iter(of.values()))), 1)))
+    coefficients = np.linalg.lstsq(columns(x), y, rcond=None)[0]
+    return form.text(), lambda table: np.asarray(columns(table) @ coefficients)
 
 
-def _variable(name: str, values: Floats, before: str) -> Variable:
+def _situation(table: Table) -> Any:
+    return SimpleNamespace(table=table, angle=np.zeros((len(next(iter(table.values()))), 1)))
+
+
+def _variable(name: str, values: Floats, prefix: str) -> Variable:
     kind: Any = "angle" if name[0] in "θφ" else "place" if values.min() > 0 else "torque"
-    symbol = f"(1/{name})" if before else name
-    return Variable(kind, (name,), symbol, symbol, "1", f"{before}s.table[{name!r}]")
+    symbol = f"(1/{name})" if prefix else name
+    return Variable(kind, (name,), symbol, symbol, "1", f"{prefix}s.table[{name!r}]")
 
 
 def asked(python: Path, peer: str, problem: dict[str, object]) -> dict[str, Any]:
-    """Return a peer's answer to a problem, see `discover_peers`; its error where it has none.
+    """Return a program's answer to a problem, see `discover_peers`, or its error.
 
-    `seconds` are of the processor.
+    `seconds` is processor time.
     """
     with tempfile.TemporaryDirectory() as folder:
-        given, out = Path(folder, "problem.json"), Path(folder, "answer.json")
-        replace_file(given, json.dumps(problem))
+        question, answer = Path(folder, "problem.json"), Path(folder, "answer.json")
+        replace_file(question, json.dumps(problem))
         script = Path(__file__).with_name("discover_peers.py")
-        words = [str(python), str(script), peer, str(given), str(out)]
-        before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
-        done = subprocess.run(words, capture_output=True, text=True, check=False)  # noqa: S603
+        command = [str(python), str(script), peer, str(question), str(answer)]
+        start = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
+        done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
         if done.returncode:
             return {"error": (done.stderr.strip().splitlines() or ["?"])[-1]}
-        seconds = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before
-        return {**json.loads(out.read_text()), "seconds": seconds}
+        seconds = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - start
+        return {**json.loads(answer.read_text()), "seconds": seconds}
 
 
-def run_case(of: Formula, noise: float, seed: int, python: Path | None) -> dict[str, Answer]:
-    """Give one formula to every searcher."""
-    rng = np.random.default_rng([seed, *of.name.encode(), int(1e6 * noise)])
-    x, truth = drawn(of, POINTS, 1.0, rng)
+def run_case(formula: Formula, noise: float, seed: int, python: Path | None) -> dict[str, Answer]:
+    """Give one formula to every program."""
+    rng = np.random.default_rng([seed, *formula.name.encode(), int(1e6 * noise)])
+    x, truth = drawn(formula, POINTS, 1.0, rng)
     std = noise * float(np.sqrt(np.mean(truth**2)))
     y = truth + std * rng.standard_normal(POINTS)
-    within, beyond = drawn(of, FRESH, 1.0, rng), drawn(of, FRESH, 2.0, rng)
+    within, beyond = drawn(formula, FRESH, 1.0, rng), drawn(formula, FRESH, 2.0, rng)
     out = {}
-    for name, more in (("hilcal", False), ("hilcal, given 1/x", True)):
+    for name, reciprocals in (("hilcal", False), ("hilcal, given 1/x", True)):
         start = process_time()
-        text, values = hilcal(x, y, std, more)
-        left = [_left(values(of_table), exact) for of_table, exact in (within, beyond)]
-        out[name] = Answer(text, left[0], left[1], process_time() - start)
+        text, values = hilcal(x, y, std, reciprocals)
+        shares = [_unexplained(values(table), exact) for table, exact in (within, beyond)]
+        out[name] = Answer(text, shares[0], shares[1], process_time() - start)
     both = {k: np.concatenate([within[0][k], beyond[0][k]]).tolist() for k in x}
     angles = [k for k in x if k[0] in "θφ"]
     problem = {"quantities": {k: v.tolist() for k, v in x.items()}, "angles": angles, "fresh": both,
                "target": y.tolist(), "covariance": (std**2 * np.eye(POINTS)).tolist()}  # fmt: skip
     for peer in PEERS if python else ():
-        told = asked(cast(Path, python), peer, problem)
-        if "error" in told:
-            out[peer] = Answer(f"not run: {told['error']}")
+        reply = asked(cast(Path, python), peer, problem)
+        if "error" in reply:
+            out[peer] = Answer(f"not run: {reply['error']}")
             continue
-        fresh = np.array(told["fresh"])
-        left = [_left(fresh[:FRESH], within[1]), _left(fresh[FRESH:], beyond[1])]
-        out[peer] = Answer(told["formula"], left[0], left[1], told["seconds"])
+        fresh = np.array(reply["fresh"])
+        shares = [_unexplained(fresh[:FRESH], within[1]), _unexplained(fresh[FRESH:], beyond[1])]
+        out[peer] = Answer(reply["formula"], shares[0], shares[1], reply["seconds"])
     return out
 
 
-def _left(values: Floats, exact: Floats) -> float:
+def _unexplained(values: Floats, exact: Floats) -> float:
     share = float(np.mean((values - exact) ** 2) / np.var(exact))
     return share if np.isfinite(share) else np.inf
 
@@ -253,23 +257,23 @@ def formulas(
             done.append((*every[str(case["case"])], {k: Answer(**v) for k, v in answers.items()}))
             advance(1)
     rows = table("formula", "noise", "searcher", "found", left=(0, 2, 3))
-    for of, n, answers in done:
+    for formula, n, answers in done:
         for name, a in answers.items():
-            rows.add(of.text, f"{100 * n:g} %", name, f"{mark(a)} {a.formula}"[:100])
+            rows.add(formula.text, f"{100 * n:g} %", name, f"{mark(a)} {a.formula}"[:100])
     t.show(rows)
     figures = list(claims(done))
     for f in figures:
         t.show(f"{f.what}: {f.measured}")
-    kept = [
+    content = [
         {"formula": f.text, "noise": n, "answers": {k: asdict(a) for k, a in answers.items()}}
         for f, n, answers in done
     ]
-    keep(keep_file, "Formulas of physics with dummy variables", figures, {"cases": kept})
-    t.document({"cases": kept, "figures": [asdict(f) for f in figures]})
+    keep(keep_file, "Formulas of physics with dummy variables", figures, {"cases": content})
+    t.document({"cases": content, "figures": [asdict(f) for f in figures]})
 
 
 def mark(a: Answer) -> str:
-    """Return how right an answer is, as a sign."""
+    """Return a sign for the quality of an answer."""
     return "=" if a.equivalent else "≈" if a.value else "-"
 
 
@@ -277,20 +281,21 @@ Done = Sequence[tuple[Formula, float, dict[str, Answer]]]
 
 
 def claims(done: Done) -> Iterator[Figure]:
-    """Yield counts of each searcher, by noise, and what hilcal loses."""
+    """Yield counts of each program by noise, and the formulas that hilcal does not find."""
     for n in dict.fromkeys(n for _, n, _ in done):
-        mine = [answers for _, m, answers in done if m == n]
-        for name in mine[0]:
-            of = [answers[name] for answers in mine]
-            what = f"{name}, noise {100 * n:g} %"
-            if all(a.formula.startswith("not run") for a in of):
-                yield Figure(what, of[0].formula if name != "pysr" else "not run: needs Julia")
+        of_noise = [answers for _, m, answers in done if m == n]
+        for name in of_noise[0]:
+            given = [answers[name] for answers in of_noise]
+            title = f"{name}, noise {100 * n:g} %"
+            if all(a.formula.startswith("not run") for a in given):
+                yield Figure(title, given[0].formula if name != "pysr" else "not run: needs Julia")
                 continue
-            equal, value = sum(a.equivalent for a in of), sum(a.value for a in of)
+            equal, value = sum(a.equivalent for a in given), sum(a.value for a in given)
+            total = len(given)
             yield Figure(
-                what,
-                f"equivalent {equal} of {len(of)}, values at fresh points {value} of {len(of)}, "
-                f"{np.median([a.seconds for a in of]):.1f} s",
+                title,
+                f"equivalent {equal} of {total}, values at fresh points {value} of {total}, "
+                f"{np.median([a.seconds for a in given]):.1f} s",
             )
     lost = {f.text: f.reason or "?" for f, _, answers in done if not answers["hilcal"].equivalent}
     for text, reason in lost.items():

@@ -1,4 +1,4 @@
-"""Campaigns with gross errors in a share of their readings, and what a refinement makes of them."""
+"""Refinements of campaigns with gross errors in a share of their readings."""
 
 from dataclasses import dataclass, replace
 
@@ -16,9 +16,9 @@ from studies.study_cases import study_case
 
 ARMS = ("ur3", "ur3e", "ur5", "ur5e", "ur10", "ur10e", "ur16e", "ur20", "ur30")
 POSES = (4, 6, 10, 20, 30)
-"""Of six readings each."""
+"""Numbers of poses, with six readings each."""
 STRENGTHS = (3.0, 10.0, 20.0)
-"""Of what is hidden, in units of the noise: 20 is about 0.4 mm."""
+"""Strengths of the hidden effect in units of the noise: 20 is about 0.4 mm."""
 
 
 HIDDEN: dict[Mode, tuple[str, ...]] = {
@@ -41,12 +41,12 @@ HIDDEN: dict[Mode, tuple[str, ...]] = {
 
 @dataclass(frozen=True, slots=True)
 class Spoilt:
-    """What is asked of one campaign.
+    """Settings of a campaign.
 
     Attributes:
-        share: of the readings that are wrong.
-        size_m: of each error, m.
-        seed: of all that is drawn.
+        share: share of the readings with a gross error.
+        size_m: size of each error, m.
+        seed: of everything random.
     """
 
     share: float
@@ -56,18 +56,18 @@ class Spoilt:
 
 @dataclass(frozen=True, slots=True)
 class Counted:
-    """What a refinement made of one campaign.
+    """Result of the refinement of a campaign.
 
     Attributes:
-        asked: the campaign.
-        mode: its readings.
+        asked: settings of the campaign.
+        mode: of its readings.
         readings: number of readings.
-        wrong: of these with a gross error.
-        found: of these set aside.
-        false: good readings that were listed as gross errors.
-        said: whether it is said that too many readings disagree.
-        outcome: the verdict, "refused" where the program declined to fit or judge.
-        what: arm, number of poses, what was hidden, and the message of a refusal.
+        wrong: number of gross errors.
+        found: number of gross errors set aside.
+        false: number of good readings listed as gross errors.
+        said: whether the program reports that too many readings disagree.
+        outcome: the verdict; "refused" where the program declined to fit or judge.
+        what: arm, number of poses, hidden effect, and the message of a refusal.
     """
 
     asked: Spoilt
@@ -84,11 +84,12 @@ class Counted:
 def spoil(
     readings: Readings, share: float, size: float, rng: np.random.Generator
 ) -> tuple[Readings, Ints]:
-    """Shift a share of the readings, every third in one coordinate alone, else in any direction."""
+    """Shift a share of the readings, a third of these in one coordinate, else in any direction."""
     rows = rng.choice(len(readings), round(share * len(readings)), replace=False)
     shift = rng.normal(size=(len(rows), 3))
-    one = rng.random(len(rows)) < 1 / 3
-    shift[one] = np.eye(3)[rng.integers(3, size=one.sum())] * rng.choice([-1, 1], (one.sum(), 1))
+    axial = rng.random(len(rows)) < 1 / 3
+    count = axial.sum()
+    shift[axial] = np.eye(3)[rng.integers(3, size=count)] * rng.choice([-1, 1], (count, 1))
     sizes = size * 1.25 ** rng.uniform(-1, 1, (len(rows), 1))
     value = readings.value.copy()
     value[rows, :3] += sizes * shift / np.linalg.norm(shift, axis=1, keepdims=True)
@@ -96,7 +97,7 @@ def spoil(
 
 
 def count(config: CellConfig, asked: Spoilt) -> Counted:
-    """Draw a campaign, refine it as a user does, and count what was set aside."""
+    """Draw a campaign, refine it as a user does, and count the readings set aside."""
     rng = np.random.default_rng([30, asked.seed])
     robot, mode = str(rng.choice(ARMS)), MODES[asked.seed % 2]
     poses = int(rng.choice(POSES))
@@ -104,21 +105,21 @@ def count(config: CellConfig, asked: Spoilt) -> Counted:
     strength = float(rng.choice(STRENGTHS))
     case = study_case(config, robot, mode, hidden, strength, asked.seed, n_poses=poses)
     readings, wrong = spoil(case.readings, asked.share, asked.size_m, rng)
-    what = f"{robot}, {poses} poses, {' + '.join(hidden) or 'nothing'} hidden ({strength:g} σ)"
+    text = f"{robot}, {poses} poses, {' + '.join(hidden) or 'nothing'} hidden ({strength:g} σ)"
     try:
-        found = refine(baseline(case.cell, readings, mode), readings, mode)
+        refined = refine(baseline(case.cell, readings, mode), readings, mode)
     except (InputError, CannotAnswerError) as error:
-        what = f"{what}: {error}"
-        return Counted(asked, mode, len(readings), len(wrong), 0, 0, False, "refused", what)
-    listed = {g.row for g in gross_errors(found.fit)}
+        text = f"{text}: {error}"
+        return Counted(asked, mode, len(readings), len(wrong), 0, 0, False, "refused", text)
+    listed = {g.row for g in gross_errors(refined.fit)}
     return Counted(
         asked,
         mode,
         len(readings),
         len(wrong),
-        int(found.fit.outlier[wrong].sum()),
+        int(refined.fit.outlier[wrong].sum()),
         len(listed.difference(wrong.tolist())),
-        found.fit.disagreement is not None,
-        found.verdict,
-        what,
+        refined.fit.disagreement is not None,
+        refined.verdict,
+        text,
     )

@@ -25,11 +25,11 @@ ARMS: tuple[tuple[float, float, float | None], ...] = (
     (0.2, 5e-2, None),
     (0.4, 5e-2, None),
 )
-"""Share of the readings, size of the errors in m, and which share of them has to be found."""
+"""Share of the readings, size of the errors in m, and the share of them that must be found."""
 FALSE = 0.01
-"""Share of the good readings that may be set aside."""
+"""Largest share of the good readings that may be set aside."""
 TOO_MANY = 0.6
-"""Share of the readings of which nothing can be told."""
+"""Share of gross errors with which no answer is possible."""
 
 
 def gross_errors(
@@ -57,44 +57,45 @@ def gross_errors(
     figures = []
     out = table("wrong", "size", "campaigns", "readings", "found", "false", "verdicts")
     for k, (share, size) in enumerate(kinds):
-        mine = counted[k * campaigns : (k + 1) * campaigns]
-        figures += _figures(mine, share, size)
-        found, wrong = sum(c.found for c in mine), sum(c.wrong for c in mine)
-        readings, false = sum(c.readings for c in mine), sum(c.false for c in mine)
-        row = (len(mine), readings, f"{found} of {wrong}", false, _verdicts(mine))
+        of_kind = counted[k * campaigns : (k + 1) * campaigns]
+        figures += _figures(of_kind, share, size)
+        hits, wrong = sum(c.found for c in of_kind), sum(c.wrong for c in of_kind)
+        readings, false = sum(c.readings for c in of_kind), sum(c.false for c in of_kind)
+        row = (len(of_kind), readings, f"{hits} of {wrong}", false, _verdicts(of_kind))
         out.add(f"{100 * share:.0f} %", f"{1e3 * size:g} mm", *(str(x) for x in row))
     t.show(out)
     t.document({"campaigns": [_row(c) for c in counted]})
     keep(keep_file, "Gross errors", figures)
 
 
-def _counted(asked: Spoilt) -> Counted:
-    return count(load_config(configs_dir() / "cells" / CELL), asked)
+def _counted(campaign: Spoilt) -> Counted:
+    return count(load_config(configs_dir() / "cells" / CELL), campaign)
 
 
-def _figures(mine: Sequence[Counted], share: float, size: float) -> list[Figure]:
+def _figures(campaigns: Sequence[Counted], share: float, size: float) -> list[Figure]:
     """Figures of the campaigns of one share and size."""
-    readings, wrong = sum(c.readings for c in mine), sum(c.wrong for c in mine)
-    found, false = sum(c.found for c in mine), sum(c.false for c in mine)
-    of = f"{100 * share:.0f} % of the readings {1e3 * size:g} mm off"
-    where = f"{len(mine)} campaigns of {readings} readings"
-    adequate = sum(c.outcome == "adequate" for c in mine)
-    verdicts = Figure(f"{of}: verdicts", _verdicts(mine))
+    total = len(campaigns)
+    readings, wrong = sum(c.readings for c in campaigns), sum(c.wrong for c in campaigns)
+    hits, false = sum(c.found for c in campaigns), sum(c.false for c in campaigns)
+    kind = f"{100 * share:.0f} % of the readings {1e3 * size:g} mm off"
+    where = f"{total} campaigns of {readings} readings"
+    adequate = sum(c.outcome == "adequate" for c in campaigns)
+    verdicts = Figure(f"{kind}: verdicts", _verdicts(campaigns))
     if share > 0.45:
-        said = sum(c.said or c.outcome == "refused" for c in mine)
+        reported = sum(c.said or c.outcome == "refused" for c in campaigns)
         return [
             Figure(
-                f"{of}: said, of {where}",
-                f"{said} of {len(mine)}",
-                f"{len(mine)}",
-                said == len(mine),
+                f"{kind}: said, of {where}",
+                f"{reported} of {total}",
+                f"{total}",
+                reported == total,
             ),
-            Figure(f"{of}: adequate", f"{adequate} of {len(mine)}", "0", adequate == 0),
+            Figure(f"{kind}: adequate", f"{adequate} of {total}", "0", adequate == 0),
             verdicts,
         ]
     right = readings - wrong
     false_share = Figure(
-        f"{of}: good readings set aside",
+        f"{kind}: good readings set aside",
         f"{false} of {right} ({100 * false / right:.2f} %)",
         f"{100 * FALSE:.0f} %",
         false <= FALSE * right,
@@ -104,18 +105,18 @@ def _figures(mine: Sequence[Counted], share: float, size: float) -> list[Figure]
     required = next(r for s, z, r in ARMS if (s, z) == (share, size))
     return [
         Figure(
-            f"{of}: found, in {where}",
-            f"{found} of {wrong} ({100 * found / wrong:.1f} %)",
+            f"{kind}: found, in {where}",
+            f"{hits} of {wrong} ({100 * hits / wrong:.1f} %)",
             "" if required is None else f"{100 * required:.0f} %",
-            None if required is None else found >= required * wrong,
+            None if required is None else hits >= required * wrong,
         ),
         false_share,
         verdicts,
     ]
 
 
-def _verdicts(mine: Sequence[Counted]) -> str:
-    return ", ".join(f"{n} {v}" for v, n in Counter(c.outcome for c in mine).most_common())
+def _verdicts(campaigns: Sequence[Counted]) -> str:
+    return ", ".join(f"{n} {v}" for v, n in Counter(c.outcome for c in campaigns).most_common())
 
 
 def _row(c: Counted) -> dict[str, object]:

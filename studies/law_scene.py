@@ -1,4 +1,4 @@
-"""Where the simulated arm comes to rest, for a hidden law to look at."""
+"""The simulated arm at rest, as the input of hidden laws."""
 
 from dataclasses import dataclass
 
@@ -12,17 +12,17 @@ from hilcal.types import Floats
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """Where the arm rests in N states, for a law to look at.
+    """The arm at rest in N states.
 
     Attributes:
         states: the states.
         rest: equilibrium of the simulated arm.
-        torque: (N, n) at the drives, N·m.
-        place: (N, 3) of the target, base axes, m.
-        seen: (N, 3) of the target, sensor axes, m.
+        torque: (N, n) torque of the drives, N·m.
+        place: (N, 3) position of the target, base axes, m.
+        seen: (N, 3) position of the target, sensor axes, m.
         by_joint: (N, 3, n) motion of the target by each drive, sensor axes.
         view: (3, 3) base axes in sensor axes.
-        before: the states in which the law was first seen; None where these are they.
+        before: scene of the first campaign with the law; None for the first campaign itself.
     """
 
     states: States
@@ -36,7 +36,7 @@ class Scene:
 
     @property
     def first(self) -> "Scene":
-        """The states from which a law takes its levels: it is the same law at fresh poses."""
+        """Scene that determines the constants of a law, so that fresh poses have the same law."""
         return self.before or self
 
     def of_joint(self, j: int, angle: Floats) -> Floats:
@@ -44,17 +44,17 @@ class Scene:
         return np.asarray(self.by_joint[:, :, j - 1] * angle[:, None])
 
     def in_base(self, shift: Floats) -> Floats:
-        """(N, 3) displacement in sensor axes of one in base axes."""
+        """(N, 3) displacement in sensor axes, from one in base axes."""
         return np.asarray(shift @ self.view.T)
 
 
 def scene(world: World, states: States, before: Scene | None = None) -> Scene:
-    """Return where the arm rests.
+    """Return the arm at rest.
 
     Args:
         world: the simulated arm.
         states: the states.
-        before: those in which a law was first seen, if others.
+        before: scene of the first campaign with the same law, if this is another one.
     """
     rest, sight = world.rest(states), world.sight(states)
     flange = rest.flange

@@ -1,7 +1,8 @@
-"""`python -m studies made-of`: what a real arm is made of, by sixty of its poses.
+"""`python -m studies made-of`: sizes of all effects of a real arm, by sixty of its poses.
 
-Random positions of a public series are refined as by `few-poses`, its first draw; the sizes of all
-families of effects are kept for the picture of the page on naming and predicting.
+Random positions of a public series, the first draw of `few-poses`, are refined as by `few-poses`.
+The sizes of all families of effects are recorded for the chart of the page on naming and
+predicting.
 """
 
 from dataclasses import replace
@@ -36,16 +37,16 @@ def made_of(
     value, covariance = readings.value[:, :3], readings.covariance[:, :3, :3]
     readings = replace(readings, value=value, covariance=covariance)
     chosen = readings[np.random.default_rng(DRAW).permutation(len(readings))[:poses]]
-    found = refine(baseline(cell, chosen, "absolute"), chosen, "absolute").fit
-    sizes = [s.to_json() for s in family_sizes(found)]
+    fitted = refine(baseline(cell, chosen, "absolute"), chosen, "absolute").fit
+    sizes = [s.to_json() for s in family_sizes(fitted)]
     if not sizes:
         raise CannotAnswerError(f"{series}: {poses} positions give no background")
-    by = {str(s["name"]): float(s["std"]) / float(s["ordinary"]) for s in sizes}  # type: ignore[arg-type]
-    low, high = min(by, key=lambda n: by[n]), max(by, key=lambda n: by[n])
+    ratio = {str(s["name"]): float(s["std"]) / float(s["ordinary"]) for s in sizes}  # type: ignore[arg-type]
+    low, high = min(ratio, key=lambda n: ratio[n]), max(ratio, key=lambda n: ratio[n])
     figures = [
         Figure("families of effects whose size was estimated", str(len(sizes))),
-        Figure("smallest, by that of an ordinary arm", f"{low}, {by[low]:.2f}"),
-        Figure("largest", f"{high}, {by[high]:.2f}"),
+        Figure("smallest, by that of an ordinary arm", f"{low}, {ratio[low]:.2f}"),
+        Figure("largest", f"{high}, {ratio[high]:.2f}"),
     ]
     for f in figures:
         t.show(f"{f.what}: {f.measured}")

@@ -1,11 +1,11 @@
-"""`python -m studies odds`: whether laws said to have a probability are right as often.
+"""`python -m studies odds`: stated probabilities of laws against the frequency of right ones.
 
-Laws are drawn as the priors of the search have it: complexity c with probability ∝ 2⁻ᶜ, all
-candidates of it alike; in one case of four two of them, which it holds for 1 in 21. Each is added
-with noise to the linear problem of a simulated campaign, at a strength from 0.5 σ to 2 σ. Where the
-search chooses a law, the structures that are listed are compared with what was drawn; and so are
-predictions of fresh poses, by the chosen law alone and averaged over the listed ones, with the
-truth there.
+Laws are drawn from the priors of the search: complexity c with probability ∝ 2⁻ᶜ, all candidates of
+a complexity alike. One law in four has two terms, for which the prior of the search is 1 in 21.
+Each law is added with noise to the linear problem of a simulated campaign, at a strength from 0.5 σ
+to 2 σ. Where the search chooses a law, the listed structures are compared with the drawn one.
+Predictions of fresh poses, by the chosen law alone and averaged over the listed ones, are compared
+with the truth.
 """
 
 from collections.abc import Iterator, Sequence
@@ -53,12 +53,12 @@ BINS = (0.0, 0.05, 0.2, 0.5, 0.8, 0.95, 1.0)
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """What came of one drawn law.
+    """Result of one drawn law.
 
     Attributes:
         truth: its formula.
-        found: that of the proposed law; empty for none.
-        said: probability of each listed structure, and whether it is what was drawn.
+        found: formula of the proposed law; empty for none.
+        said: probability of each listed structure, and whether it is the drawn one.
         alone: rms error at fresh poses by the proposed law, m, and share of elements within 95 %.
         average: the same of the average over the listed structures.
         before: rms error without a law, m.
@@ -74,14 +74,17 @@ class Drawn:
 
 @cache
 def _campaign(number: int) -> tuple[Screen, Readings]:
-    """Return all candidates of a simulated campaign, and readings of as many fresh poses."""
+    """Return the screen of a simulated campaign, and readings of as many fresh poses."""
     rng = np.random.default_rng([20261126, number])
     config = load_config(configs_dir() / "cells" / CELL)
-    own, loads = with_study_loads(config, ROBOTS[number % len(ROBOTS)])
+    robot_config, loads = with_study_loads(config, ROBOTS[number % len(ROBOTS)])
     mode, loads = MODES[number % len(MODES)], loads[:LOADS]
-    cell = cell_from_config(own)
+    cell = cell_from_config(robot_config)
     world = nothing_hidden(
-        cell, rng, noise=measurement_noise(own), joint_std=own.repeatability.per_joint(cell.arm.n)
+        cell,
+        rng,
+        noise=measurement_noise(robot_config),
+        joint_std=robot_config.repeatability.per_joint(cell.arm.n),
     )
     names = ("none", *(name for name, _ in loads))
     readings, fresh = (
@@ -98,45 +101,47 @@ def run_case(seed: int) -> Drawn:
     terms = _drawn(bare, rng)
     form, situation = form_of(bare, terms), base.solution.prediction.situation
     x = form.columns(bare, situation)
-    by = rng.standard_normal(form.count)
-    size = float(np.sqrt(np.mean(linear.project_out(x @ by) ** 2)))
-    by *= np.exp(rng.uniform(*np.log(STRENGTHS))) / size
+    coefficients = rng.standard_normal(form.count)
+    size = float(np.sqrt(np.mean(linear.project_out(x @ coefficients) ** 2)))
+    coefficients *= np.exp(rng.uniform(*np.log(STRENGTHS))) / size
     noise = rng.standard_normal(len(x))
-    left = linear.project_out(x @ by + noise)
-    s = replace(bare, linear=Linearisation(replace(base, white=left), linear.projection, left))
+    residual = linear.project_out(x @ coefficients + noise)
+    fitted = Linearisation(replace(base, white=residual), linear.projection, residual)
+    s = replace(bare, linear=fitted)
     problem = SearchProblem(s)
     selections = search(problem)
     if not selections:
         return Drawn(form.text())
-    found = structures(problem, selections)
+    listed = structures(problem, selections)
     chosen = {structure_of(s, f.terms) for f in selections[-1:]}
-    (law,) = (f for f in found if f.kind in chosen)
+    (law,) = (f for f in listed if f.kind in chosen)
     truth = structure_of(bare, terms)
-    # The model was fitted with the law and the noise in the readings: it has taken part of both.
-    at = base.model.predict(fresh.states, base.theta)
+    # The model was fitted to readings with the law and the noise, and absorbed a part of both.
+    prediction = base.model.predict(fresh.states, base.theta)
     w = whitening(fresh, base.mode)
-    there = form.motion(*motions_of(base.model, at, base.theta, w.m), at.situation)
-    known = w.raw(base.model.jacobian(at, base.theta, w.m)) @ base.solution.transform
-    taken = linear.projection.solve(linear.rows.T @ (x @ by + noise))
-    off = w.raw(there @ by) - known @ taken
+    motions = motions_of(base.model, prediction, base.theta, w.m)
+    by_law = form.motion(*motions, prediction.situation)
+    by_model = w.raw(base.model.jacobian(prediction, base.theta, w.m)) @ base.solution.transform
+    absorbed = linear.projection.solve(linear.rows.T @ (x @ coefficients + noise))
+    error = w.raw(by_law @ coefficients) - by_model @ absorbed
     return Drawn(
         form.text(),
         law.form.text(),
-        tuple((f.probability, f.kind == truth) for f in found),
-        _errors(off, *averaged(base, [law], fresh)),
-        _errors(off, *averaged(base, found, fresh)),
-        float(np.sqrt(np.mean(np.sum(off**2, axis=1)))),
+        tuple((f.probability, f.kind == truth) for f in listed),
+        _errors(error, *averaged(base, [law], fresh)),
+        _errors(error, *averaged(base, listed, fresh)),
+        float(np.sqrt(np.mean(np.sum(error**2, axis=1)))),
     )
 
 
-def _errors(left: Floats, mean: Floats, std: Floats) -> tuple[float, float]:
-    off = left - mean[:, :3]
-    inside = np.abs(off) <= COVERED * std[:, :3]
-    return float(np.sqrt(np.mean(np.sum(off**2, axis=1)))), float(np.mean(inside))
+def _errors(truth: Floats, mean: Floats, std: Floats) -> tuple[float, float]:
+    error = truth - mean[:, :3]
+    inside = np.abs(error) <= COVERED * std[:, :3]
+    return float(np.sqrt(np.mean(np.sum(error**2, axis=1)))), float(np.mean(inside))
 
 
 def _drawn(s: Screen, rng: np.random.Generator) -> tuple[LawTerm, ...]:
-    """Draw the terms of a law among all that the model does not describe."""
+    """Draw the terms of a law among all candidates that the model does not explain."""
     out: list[LawTerm] = []
     costs = np.arange(1, int(s.grammar.cost.max()) + 1)
     count = 1 + (rng.random() < SECOND)
@@ -173,25 +178,25 @@ def odds(
 
 def claims(done: Sequence[dict[str, Any]]) -> Iterator[Figure]:
     """Yield frequencies by probability, and errors of one law and of the average."""
-    found = [o for o in done if o["said"]]
-    yield Figure("laws drawn, and proposed", f"{len(done)}, {len(found)}")
-    said = np.array([p for o in found for p in o["said"]]).reshape(-1, 2)
+    proposed = [o for o in done if o["said"]]
+    yield Figure("laws drawn, and proposed", f"{len(done)}, {len(proposed)}")
+    stated = np.array([p for o in proposed for p in o["said"]]).reshape(-1, 2)
     for low, high in pairwise(BINS):
-        mine = said[(said[:, 0] > low) & (said[:, 0] <= high)]
-        if len(mine):
-            right, mean = int(mine[:, 1].sum()), float(mine[:, 0].mean())
+        in_bin = stated[(stated[:, 0] > low) & (stated[:, 0] <= high)]
+        if len(in_bin):
+            right, mean = int(in_bin[:, 1].sum()), float(in_bin[:, 0].mean())
             yield Figure(
                 f"structures said to have a probability of {100 * low:.0f} % to {100 * high:.0f} %",
-                f"right {right} of {len(mine)} ({100 * right / len(mine):.0f} %); "
+                f"right {right} of {len(in_bin)} ({100 * right / len(in_bin):.0f} %); "
                 f"said on average {100 * mean:.0f} %",
             )
-    if not found:
+    if not proposed:
         return
     for count, two in (
         ("one term", False),
         ("two terms, which the prior of the search doubts", True),
     ):
-        first = [o["said"][0] for o in found if ("b·" in o["truth"]) == two]
+        first = [o["said"][0] for o in proposed if ("b·" in o["truth"]) == two]
         expected = sum(p for p, _ in first)
         spread = float(np.sqrt(sum(p * (1 - p) for p, _ in first)))
         right = sum(hit for _, hit in first)
@@ -201,16 +206,17 @@ def claims(done: Sequence[dict[str, Any]]) -> Iterator[Figure]:
             "" if two else "within 2 standard deviations",
             None if two else abs(right - expected) <= 2 * spread,
         )
-    alone, average = (np.array([o[k] for o in found]) for k in ("alone", "average"))
+    alone, average = (np.array([o[k] for o in proposed]) for k in ("alone", "average"))
     ratio = np.log(average[:, 0] / alone[:, 0])
     better = int(np.count_nonzero(ratio < 0))
     yield Figure(
         "error at fresh poses, averaged over that of the first law alone",
-        f"{float(np.exp(ratio.mean())):.3f} (geometric mean), smaller in {better} of {len(found)}",
+        f"{float(np.exp(ratio.mean())):.3f} (geometric mean), "
+        f"smaller in {better} of {len(proposed)}",
         "below 1", bool(ratio.mean() < 0),
     )  # fmt: skip
-    for name, of in (("the first law alone", alone), ("the average", average)):
+    for name, errors in (("the first law alone", alone), ("the average", average)):
         yield Figure(
             f"elements of fresh poses inside the 95 % interval of {name}",
-            f"{100 * float(of[:, 1].mean()):.1f} %",
+            f"{100 * float(errors[:, 1].mean()):.1f} %",
         )

@@ -1,6 +1,6 @@
-"""The figures of the pages of explanation, drawn from small simulated campaigns and kept results.
+"""Figures of the pages of explanation, from small simulated campaigns and records of studies.
 
-`figures` returns them by the place of their picture in docs/; the build of the site draws them.
+`figures` returns them by the path of their picture in docs/; the build of the site draws them.
 """
 
 import json
@@ -38,13 +38,13 @@ from studies import carry_picture, few_poses_picture
 SEED = 7
 POSES = 15
 CANDIDATES = 120
-"""Poses that plans are chosen from: planning takes some seconds."""
+"""Candidate poses of plans: planning takes some seconds."""
 RUNS = 400
-"""Of the study of scaling: coverage is known to half a per cent."""
+"""Runs of the study of scaling, which give the coverage to half a per cent."""
 RANDOM = 400
-"""Random plans beside a chosen one."""
+"""Number of random plans compared with a chosen one."""
 FACTORS = (0.5, 0.7, 1.0, 1.4, 2.0)
-"""By which the simulated noise is larger than it is stated."""
+"""Ratios of simulated to stated noise."""
 NAMES = tuple(
     f"images/{name}.svg"
     for name in (
@@ -53,7 +53,7 @@ NAMES = tuple(
         "carry-over",
     )
 )  # fmt: skip
-"""Their places in docs/."""
+"""Paths of the pictures in docs/."""
 COVERED = re.compile(
     r"ρ = ([\d.]+): true predictions within 95 % intervals\|white ([\d.]+) %, as it is ([\d.]+) %"
 )
@@ -63,15 +63,15 @@ def figures(measured: Path) -> dict[str, go.Figure]:
     """Return all figures by the path of their picture below docs/.
 
     Args:
-        measured: the folder of what studies kept.
+        measured: the folder of the records of studies.
 
     Raises:
-        InputError: a kept file that is not one.
+        InputError: a file that is no record.
     """
     cell = _cell()
     planned = make(cell, cell.configured(), Request(POSES), np.random.default_rng(SEED))
     readings = _readings(cell, planned)
-    kept = [measured / f"1-few-poses{more}.json" for more in ("", "-250")]
+    records = [measured / f"1-few-poses{suffix}.json" for suffix in ("", "-250")]
     return dict(
         zip(
             NAMES,
@@ -84,7 +84,7 @@ def figures(measured: Path) -> dict[str, go.Figure]:
                 random_plans(planned),
                 certificate(planned),
                 sample_sizes(cell, planned),
-                few_poses_picture.chart(few_poses_picture.few_poses_errors(kept)),
+                few_poses_picture.chart(few_poses_picture.few_poses_errors(records)),
                 _made_of(measured / "1-made-of.json"),
                 carry_picture.chart(carry_picture.carry_points(measured / "7-carry.json")),
             ),
@@ -94,7 +94,7 @@ def figures(measured: Path) -> dict[str, go.Figure]:
 
 
 def _cell() -> Cell:
-    """The cell of `hilcal demo`, whose plans take seconds."""
+    """The cell of `hilcal demo`, with few candidates, so that planning takes seconds."""
     cell = Cell.load(configs_dir() / "cells" / "demo_ur10e.toml")
     config = cell.configured()
     few = config.planning.model_copy(update={"candidates": CANDIDATES, "against": ()})
@@ -102,7 +102,7 @@ def _cell() -> Cell:
 
 
 def _readings(cell: Cell, planned: Planned, factor: float = 1.0) -> Readings:
-    """Readings of an arm with compliant joints and nothing else, of a noise `factor` as large."""
+    """Readings of an arm with compliant joints only, with `factor` times the stated noise."""
     config = cell.configured()
     t, std = config.tracker, config.repeatability.per_joint(cell.arm.n)[0]
     noise = {name: factor * getattr(t, name) for name in Tracker.model_fields if "_std" in name}
@@ -126,9 +126,9 @@ def scalings() -> go.Figure:
         ("gu", style.AMBER, "diamond"),
         ("gc", style.NOISE, "circle"),
     ):
-        mine = [c for c in study.cells if c.scaling == name]
-        x = np.array([c.error_over_bound for c in mine])
-        y = 100 * np.array([c.coverage for c in mine])
+        cells = [c for c in study.cells if c.scaling == name]
+        x = np.array([c.error_over_bound for c in cells])
+        y = 100 * np.array([c.coverage for c in cells])
         traces.append(style.marks(x, y, color, symbol, 10, name=name))
     out = style.figure(
         "gc reaches the bound, and its intervals hold what they state.",
@@ -141,24 +141,24 @@ def scalings() -> go.Figure:
 
 
 def noise_terms(cell: Cell, readings: Readings) -> go.Figure:
-    """What the covariance of each reading is made of: instrument along and across, and the arm."""
+    """Parts of the covariance of each reading: instrument along and across the beam, and arm."""
     config = cell.configured()
     t = tracker_noise(config.tracker)
     value = readings.value[:, :3]
     along = tracker_covariance(value, replace(t, **_none("transverse"))).trace(axis1=1, axis2=2)
     across = tracker_covariance(value, replace(t, **_none("range"))).trace(axis1=1, axis2=2)
     share = config.acquire.systematic_share
-    kept = share + (1 - share) / config.acquire.samples
-    arm = readings.covariance.trace(axis1=1, axis2=2) - kept * (along + across)
+    averaged = share + (1 - share) / config.acquire.samples
+    arm = readings.covariance.trace(axis1=1, axis2=2) - averaged * (along + across)
     distance = np.linalg.norm(value, axis=1)
     _, first = np.unique(readings.pose, return_index=True)
     order = first[np.argsort(distance[first])]
-    at = [f"{d:.3f}" for d in distance[order]]
+    x = [f"{d:.3f}" for d in distance[order]]
     traces = [
-        go.Bar(x=at, y=1e12 * variance[order], name=name, marker={"color": color, "pattern": mark})
+        go.Bar(x=x, y=1e12 * variance[order], name=name, marker={"color": color, "pattern": mark})
         for name, variance, color, mark in (
-            ("instrument, along the beam", kept * along, style.MEASURED, {"shape": ""}),
-            ("instrument, across it", kept * across, style.AMBER, {"shape": "/"}),
+            ("instrument, along the beam", averaged * along, style.MEASURED, {"shape": ""}),
+            ("instrument, across it", averaged * across, style.AMBER, {"shape": "/"}),
             ("the arm's scatter", arm, style.HOLDOUT, {"shape": "."}),
         )
     ]
@@ -173,7 +173,7 @@ def noise_terms(cell: Cell, readings: Readings) -> go.Figure:
 
 
 def _none(which: str) -> dict[str, float]:
-    """Noise of one kind that is as good as none: `TrackerNoise` refuses zero."""
+    """Negligible noise of one kind, as `TrackerNoise` refuses zero."""
     names = [name for name in TrackerNoise.__slots__ if name.startswith(which)]
     return dict.fromkeys(names, 1e-15)
 
@@ -182,9 +182,9 @@ def shared_errors(readings: Readings) -> go.Figure:
     """Correlation of the deflections of one pose, which share their unloaded reading."""
     poses, counts = np.unique(readings.pose[readings.load > 0], return_counts=True)
     pose = poses[int(np.argmax(counts))]
-    here = np.flatnonzero(readings.pose == pose)
-    here = here[readings.cycle[here] == readings.cycle[here[-1]]]
-    loaded, unloaded = here[readings.load[here] > 0], here[readings.load[here] == 0][:1]
+    rows = np.flatnonzero(readings.pose == pose)
+    rows = rows[readings.cycle[rows] == readings.cycle[rows[-1]]]
+    loaded, unloaded = rows[readings.load[rows] > 0], rows[readings.load[rows] == 0][:1]
     weights = np.ones((len(loaded), 1))
     v = measurement_covariance(readings, loaded[None], unloaded[None], weights)[0]
     std = np.sqrt(np.diag(v))
@@ -201,20 +201,20 @@ def shared_errors(readings: Readings) -> go.Figure:
 
 
 def misjudged(cell: Cell, planned: Planned, stated: Readings) -> go.Figure:
-    """Variance factor of fits by a stated noise that is too small, right or too large."""
+    """Variance factor of fits with a stated noise that is too small, right or too large."""
     points = []
     for factor in FACTORS:
         loud = _readings(cell, planned, factor)
-        said = replace(loud, covariance=stated.covariance)
-        found = fit(baseline(cell, said, "deflection"), said, "deflection")
-        points.append((found.variance_factor, *found.variance_factor_interval, diagnose(found)))
+        readings = replace(loud, covariance=stated.covariance)
+        f = fit(baseline(cell, readings, "deflection"), readings, "deflection")
+        points.append((f.variance_factor, *f.variance_factor_interval, diagnose(f)))
     value, low, high = (np.array([p[k] for p in points]) for k in range(3))
     bars = {"type": "data", "symmetric": False, "array": high - value, "arrayminus": value - low}
-    words = [p[3].verdict.replace("_", " ") for p in points]
+    verdicts = [p[3].verdict.replace("_", " ") for p in points]
     x = np.array(FACTORS)
     traces = [
         style.marks(
-            x, value, size=9, error_y=bars, text=words, textposition="middle right",
+            x, value, size=9, error_y=bars, text=verdicts, textposition="middle right",
             mode="markers+text", name="fitted, with its 95 % interval",
         ),
         style.line(x, x**2, "the factor's square", dash="dash"),
@@ -230,18 +230,20 @@ def misjudged(cell: Cell, planned: Planned, stated: Readings) -> go.Figure:
 
 
 def serial_noise(measured: Path) -> go.Figure:
-    """Coverage of predictions where noise is correlated along the order, taken for white or not."""
+    """Coverage of predictions under serial noise that is assumed white, and that is estimated."""
     rows = set()
     for path in sorted(measured.glob("5-serial-noise*.json")):
         for f in json.loads(path.read_text(encoding="utf-8"))["figures"]:
-            if found := COVERED.fullmatch(f"{f['what']}|{f['measured']}"):
-                rows.add(tuple(float(x) for x in found.groups()))
-    rho, white, known = (np.array(x) for x in zip(*sorted(rows), strict=True))
+            if match := COVERED.fullmatch(f"{f['what']}|{f['measured']}"):
+                rows.add(tuple(float(x) for x in match.groups()))
+    rho, white, estimated = (np.array(x) for x in zip(*sorted(rows), strict=True))
     traces = [
         style.marks(
             rho, white, style.RED, "x", 10, name="taken for white noise", mode="lines+markers"
         ),
-        style.marks(rho, known, style.NOISE, "circle", 10, name="estimated", mode="lines+markers"),
+        style.marks(
+            rho, estimated, style.NOISE, "circle", 10, name="estimated", mode="lines+markers"
+        ),
     ]
     out = style.figure(
         "Serial noise that is taken for white makes bands too narrow.",
@@ -253,7 +255,7 @@ def serial_noise(measured: Path) -> go.Figure:
 
 
 def _weights(planned: Planned) -> tuple[Floats, Floats]:
-    """Weights of the continuous optimum (U,), and prices (U,), of the usable units."""
+    """Weights (U,) of the continuous optimum, and prices (U,), of the usable units."""
     relaxed = planned.design.relaxed
     weight = np.zeros(len(relaxed.price))
     weight[relaxed.index] = relaxed.weight
@@ -263,14 +265,14 @@ def _weights(planned: Planned) -> tuple[Floats, Floats]:
 def certificate(planned: Planned) -> go.Figure:
     """Price of each unit per reading, at the continuous optimum."""
     weight, price = _weights(planned)
-    per = price / planned.asked.units.cost[planned.usable]
-    per = per / per.max()
-    order = np.argsort(-per)
-    rank = np.arange(1, len(order) + 1)
-    taken = weight[order] > 0.05 * weight.max()
+    price = price / planned.asked.units.cost[planned.usable]
+    price = price / price.max()
+    order = np.argsort(-price)
+    rank, price = np.arange(1, len(order) + 1), price[order]
+    chosen = weight[order] > 0.05 * weight.max()
     traces = [
-        style.marks(rank[~taken], per[order][~taken], style.GREY, "circle", 4, name="not taken"),
-        style.marks(rank[taken], per[order][taken], style.MEASURED, "diamond", 8, name="taken"),
+        style.marks(rank[~chosen], price[~chosen], style.GREY, "circle", 4, name="not taken"),
+        style.marks(rank[chosen], price[chosen], style.MEASURED, "diamond", 8, name="taken"),
     ]
     out = style.figure(
         "Only units of the highest price per reading are taken: no plan is better.",
@@ -283,19 +285,21 @@ def certificate(planned: Planned) -> go.Figure:
 
 
 def random_plans(planned: Planned) -> go.Figure:
-    """Efficiency of random plans of the same cost, and of the chosen one, by the bound."""
+    """Efficiency of random plans of the same cost, and of the chosen one, against the bound."""
     rng, units = np.random.default_rng(SEED), planned.asked.units
     usable = np.flatnonzero(planned.usable)
     spent = float(planned.design.cost)
-    found = []
+    efficiency = []
     for _ in range(RANDOM):
         order = rng.permutation(usable)
-        kept = order[np.cumsum(units.cost[order]) <= spent]
-        m = planned.asked.prior + units.information(np.ones(len(kept)), kept)
-        found.append(float(planned.asked.criterion.value(m)) / planned.design.bound)
+        plan = order[np.cumsum(units.cost[order]) <= spent]
+        m = planned.asked.prior + units.information(np.ones(len(plan)), plan)
+        efficiency.append(float(planned.asked.criterion.value(m)) / planned.design.bound)
     bins = {"start": 0, "end": 100, "size": 2}
     traces = [
-        go.Histogram(x=100 * np.array(found), xbins=bins, marker_color=style.GREY, name="random")
+        go.Histogram(
+            x=100 * np.array(efficiency), xbins=bins, marker_color=style.GREY, name="random"
+        )
     ]
     out = style.figure(
         f"{RANDOM} random plans of as many readings, and the chosen one.",
@@ -313,10 +317,10 @@ def sample_sizes(cell: Cell, planned: Planned) -> go.Figure:
     summary = summarise(planned, cell.configured(), np.random.default_rng(SEED), compare=True)
     poses = np.array([p.poses for p in summary.curve], dtype=float)
     std = 1e6 * np.array([p.position_std_m for p in summary.curve])
-    own = float(np.interp(POSES, poses, std))
+    of_plan = float(np.interp(POSES, poses, std))
     traces = [
         style.marks(poses, std, size=9, mode="lines+markers", name="best plan of so many poses"),
-        style.line(poses, own * np.sqrt(POSES / poses), "1/√poses", style.GREY, "dash"),
+        style.line(poses, of_plan * np.sqrt(POSES / poses), "1/√poses", style.GREY, "dash"),
     ]
     out = style.figure(
         "What more poses would give, known before any is measured.",
@@ -327,6 +331,6 @@ def sample_sizes(cell: Cell, planned: Planned) -> go.Figure:
     return out.update_yaxes(rangemode="tozero")
 
 
-def _made_of(kept: Path) -> go.Figure:
-    sizes: list[Mapping[str, object]] = json.loads(kept.read_text(encoding="utf-8"))["sizes"]
+def _made_of(record: Path) -> go.Figure:
+    sizes: list[Mapping[str, object]] = json.loads(record.read_text(encoding="utf-8"))["sizes"]
     return made_of([FamilySize(**s) for s in sizes])  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""Charts as SVG: plotly draws them in one headless chromium; no network is needed."""
+"""Charts as SVG, drawn by plotly in a headless chromium without a network."""
 
 import json
 import shutil
@@ -12,7 +12,7 @@ from hilcal.errors import InputError
 from hilcal.present.charts import LIGHT
 
 WIDTH, HEIGHT = 720, 400
-"""CSS pixels, where a figure says nothing else."""
+"""Default size of a figure, CSS pixels."""
 _DRAW = """async figures => {
   const out = [];
   for (const f of figures) {
@@ -27,10 +27,10 @@ _DRAW = """async figures => {
 
 
 def svgs(figures: Sequence[go.Figure]) -> list[str]:
-    """Draw figures as SVG texts, on white paper unless they have their own.
+    """Draw figures as SVG texts, on a white background unless their layout has another one.
 
     Args:
-        figures: each of the size of its layout, else `WIDTH` × `HEIGHT`.
+        figures: with the size of their layout, or else `WIDTH` × `HEIGHT`.
 
     Raises:
         InputError: no chromium, or no playwright.
@@ -44,15 +44,15 @@ def svgs(figures: Sequence[go.Figure]) -> list[str]:
         raise InputError(
             "no playwright found, which draws charts: pip install playwright"
         ) from None
-    told = []
+    documents = []
     for f in figures:
         size = {"width": f.layout.width or WIDTH, "height": f.layout.height or HEIGHT}
-        made = go.Figure(f).update_layout(paper_bgcolor=f.layout.paper_bgcolor or LIGHT, **size)
-        told.append(json.loads(made.to_json()))
+        sized = go.Figure(f).update_layout(paper_bgcolor=f.layout.paper_bgcolor or LIGHT, **size)
+        documents.append(json.loads(sized.to_json()))
     with sync_playwright() as p:
         browser = p.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
         page = browser.new_page()
         page.add_script_tag(content=get_plotlyjs())
-        drawn: list[str] = page.evaluate(_DRAW, told)
+        drawn: list[str] = page.evaluate(_DRAW, documents)
         browser.close()
     return [unquote(text.partition(",")[2]) + "\n" for text in drawn]

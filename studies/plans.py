@@ -1,11 +1,10 @@
-"""What planning buys: real errors of planned, random and hand-made campaigns.
+"""Gain by planning: true errors of planned, random and hand-made campaigns.
 
-Plans of the same number of readings are carried out on simulated arms that hide nothing beyond
-the model, and each campaign is identified. Two claims are tested: the real errors of parameters
-and positions are those that were predicted, so that they shrink as predicted from plan to plan;
-and the planner needs at most half of the readings of a random plan for the same accuracy at the
-test poses. The arms come from outside, so that the plan is tested against mechanics that it
-does not know.
+Plans of the same number of readings are carried out on simulated arms without effects beyond the
+model, and each campaign is identified. Two claims are tested: the true errors of parameters and
+positions agree with the predicted ones, so that they shrink as predicted from plan to plan; and the
+planner needs at most half of the readings of a random plan for the same accuracy at the test poses.
+The arms come from an external function, so that the plan is tested against independent mechanics.
 """
 
 from collections.abc import Callable, Mapping
@@ -26,7 +25,7 @@ RANDOM, GRID = "random", "grid"
 DOUBLE = "random, twice"
 ROBUST = ", robust"
 TOLERANCE = 0.1
-"""How far real errors may be from predicted ones."""
+"""Largest accepted relative deviation of true from predicted errors."""
 
 MakeArm = Callable[[Cell, CellConfig, int], Arm]
 """Make a simulated arm by its number: equal numbers give equal arms."""
@@ -37,13 +36,13 @@ class Line:
     """One kind of plan on one robot.
 
     Attributes:
-        kind: "test" and "D" by these criteria; the same ", robust" where power is kept against
+        kind: "test" and "D" by these criteria; with ", robust" for plans that keep power against
             the effects of `[planning] against`; "random", "grid".
-        efficiency: certified, of the planner's; None for others.
-        position_open: predicted RMS error at the test poses where the potential terms have to
-            be estimated too, m; None of random plans and grids.
-        random_readings: readings that random plans need for the position that is predicted of
-            it; None where that is not asked, or not reached.
+        efficiency: certified by the planner; None for other plans.
+        position_open: predicted RMS error at the test poses with potential terms estimated, too,
+            m; None for random plans and grids.
+        random_readings: number of readings that random plans need for the predicted error at the
+            test poses; None if not computed or not reached.
         random_readings_open: the same for `position_open`.
         result: of the campaigns.
     """
@@ -58,16 +57,16 @@ class Line:
 
 @dataclass(frozen=True, slots=True)
 class Shrinkage:
-    """How the errors shrink from the random plan to another of as many readings.
+    """Ratios of the errors of the random plan to those of another plan of as many readings.
 
     Attributes:
-        kind: the other plan.
-        parameter: predicted ratio of the random plan's parameter error to its own.
+        kind: of the other plan.
+        parameter: predicted ratio of the parameter errors.
         parameter_real: ratio of the true errors.
         position: predicted ratio of the errors at the test poses.
         position_real: ratio of the true errors.
-        twice: true error at the test poses of random plans with twice the readings, over its
-            own: at least 1 where it needs at most half of the readings.
+        twice: ratio of the true errors at the test poses for random plans with twice the
+            readings: at least 1 if the plan needs at most half of the readings.
     """
 
     kind: str
@@ -97,9 +96,9 @@ class PlansStudy:
     Attributes:
         robot: its model.
         mode: readings, "deflection" or "absolute".
-        readings: of each plan, the unloaded ones included.
-        campaigns: of each kind of plan.
-        where: what is predicted at the test poses, in words.
+        readings: number of readings of each plan with the unloaded ones.
+        campaigns: number of campaigns of each kind of plan.
+        where: text on the predicted quantity at the test poses.
         lines: the kinds of plans.
     """
 
@@ -116,11 +115,11 @@ class PlansStudy:
 
     @property
     def planned(self) -> tuple[Line, ...]:
-        """Those of the planner."""
+        """Lines of the planner's plans."""
         return tuple(line for line in self.lines if line.efficiency is not None)
 
     def shrinkage(self) -> tuple[Shrinkage, ...]:
-        """Return by how much each of the planner's plans is better than random ones."""
+        """Return the gain of each of the planner's plans over random plans."""
         base, twice = self.of(RANDOM).result, self.of(DOUBLE).result
         return tuple(
             Shrinkage(
@@ -149,60 +148,59 @@ def plans_study(
 ) -> PlansStudy:
     """Compare plans on one robot.
 
-    Every campaign has an arm of its own, the same for all kinds of plans; random plans are
-    drawn anew for each.
+    Each campaign number has one arm for all kinds of plans, and a newly drawn random plan.
 
     Args:
         cell: the cell.
         config: its configuration.
         make_arm: makes simulated arms.
-        readings: of each plan, the unloaded ones included.
-        campaigns: of each kind of plan.
-        candidates: poses that plans choose from; as configured by default.
-        seed: of everything.
-        engine: what the campaigns run on; this process by default.
-        advance: told of each campaign that is done.
+        readings: number of readings of each plan with the unloaded ones.
+        campaigns: number of campaigns of each kind of plan.
+        candidates: number of candidate poses; as configured by default.
+        seed: of everything random.
+        engine: runs the campaigns; this process by default.
+        advance: called after each campaign.
 
     Raises:
         CannotAnswerError: from the cell, where it leaves no pose, or from a fit.
         InputError: from the configuration.
     """
     rng = np.random.default_rng(seed)
-    of = scene(cell, config, candidates or config.planning.candidates, rng)
-    fixed: dict[str, Chosen] = {GRID: grid(of, readings)}
-    for robust in (False, True)[: 1 if of.robust is None else 2]:
+    s = scene(cell, config, candidates or config.planning.candidates, rng)
+    fixed: dict[str, Chosen] = {GRID: grid(s, readings)}
+    for robust in (False, True)[: 1 if s.robust is None else 2]:
         for criterion in (TEST, PARAMETERS):
             name = criterion + (ROBUST if robust else "")
-            fixed[name] = optimal(of, criterion, readings, rng, robust=robust)
+            fixed[name] = optimal(s, criterion, readings, rng, robust=robust)
     many = {RANDOM: readings, DOUBLE: 2 * readings}
     kinds = kinds_of(config)
     asked: list[_Campaign] = []
     for number in range(campaigns):
-        arm = subject(of, make_arm(cell, config, number))
+        arm = subject(s, make_arm(cell, config, number))
         for index, kind in enumerate(kinds):
             noise = np.random.default_rng([seed, number, index])
-            chosen = fixed[kind] if kind in fixed else at_random(of, many[kind], noise)
+            chosen = fixed[kind] if kind in fixed else at_random(s, many[kind], noise)
             asked.append(_Campaign(prepared(chosen), arm, noise))
     done = engine.map(partial(_run, cell=cell, config=config), asked, advance=advance)
     errors = {kind: done[index :: len(kinds)] for index, kind in enumerate(kinds)}
-    opened = {k: of.with_others(fixed[k]) if k in fixed else None for k in kinds}
+    opened = {k: s.with_others(fixed[k]) if k in fixed else None for k in kinds}
     lines = tuple(
         Line(
             kind=kind,
             efficiency=fixed[kind].efficiency if kind in fixed else None,
             position_open=opened[kind],
-            random_readings=_needs(of, kind, fixed, readings, seed),
-            random_readings_open=_needs(of, kind, fixed, readings, seed, others=opened[kind]),
+            random_readings=_needs(s, kind, fixed, readings, seed),
+            random_readings_open=_needs(s, kind, fixed, readings, seed, others=opened[kind]),
             result=summary(errors[kind]),
         )
         for kind in kinds
     )
-    return PlansStudy(config.robot.model, of.exact.mode, readings, campaigns, of.work.what, lines)
+    return PlansStudy(config.robot.model, s.exact.mode, readings, campaigns, s.work.what, lines)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Campaign:
-    """A plan, the arm that it is carried out on, and the noise."""
+    """A plan, the arm to measure, and the generator of the noise."""
 
     plan: Prepared
     arm: Subject
@@ -214,14 +212,14 @@ def _run(asked: _Campaign, cell: Cell, config: CellConfig) -> Errors:
 
 
 def kinds_of(config: CellConfig) -> tuple[str, ...]:
-    """Kinds of plans that are compared."""
-    own = (TEST, PARAMETERS)
-    robust = tuple(kind + ROBUST for kind in own) if config.planning.against else ()
-    return (*own, *robust, RANDOM, GRID, DOUBLE)
+    """Return the compared kinds of plans."""
+    planned = (TEST, PARAMETERS)
+    robust = tuple(kind + ROBUST for kind in planned) if config.planning.against else ()
+    return (*planned, *robust, RANDOM, GRID, DOUBLE)
 
 
 def _needs(
-    of: Scene,
+    s: Scene,
     kind: str,
     fixed: Mapping[str, Chosen],
     readings: int,
@@ -229,15 +227,15 @@ def _needs(
     *,
     others: float | None = 0.0,
 ) -> int | None:
-    """Readings that random plans need for the accuracy that is predicted of a planner's plan.
+    """Number of readings that random plans need for the predicted accuracy of a planner's plan.
 
-    With `others` for that accuracy, where the potential terms have to be estimated too.
+    If `others` is not zero, it is this accuracy, with the potential terms estimated, too.
     """
     if kind not in fixed or fixed[kind].efficiency is None or others is None:
         return None
     position = others or fixed[kind].predicted.position
     rng = np.random.default_rng([seed, 1])
-    return None if position is None else matching(of, position, readings, rng, others=others > 0)
+    return None if position is None else matching(s, position, readings, rng, others=others > 0)
 
 
 def _ratio(a: Measured, b: Measured) -> Measured:

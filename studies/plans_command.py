@@ -31,7 +31,7 @@ from studies.records import Figure, Keep, keep
 
 ROBOTS = ("ur10e", "ur5e")
 FRAMES = ("base_frame", "target_offset")
-"""Their true values are relative to a registration that identification makes anew."""
+"""Effects whose true values are relative to a registration, which identification repeats."""
 
 
 def plans(
@@ -59,16 +59,16 @@ def plans(
     """Carry out planned, random and grid plans on simulated arms and compare their true errors."""
     t = terminal(as_json)
     if readings < 1 or campaigns < 2 or seed < 0 or (candidates is not None and candidates < 1):
-        given = "" if candidates is None else f"--candidates {candidates}, "
+        option = "" if candidates is None else f"--candidates {candidates}, "
         raise InputError(
-            f"{given}--readings {readings}, --campaigns {campaigns}, --seed {seed}; valid: whole "
+            f"{option}--readings {readings}, --campaigns {campaigns}, --seed {seed}; valid: whole "
             "numbers from 1, at least 2 campaigns, a seed from 0"
         )
     path = configs_dir() / "cells" / CELL if cell is None else cell
-    here = load_config(path)
-    models = robot or (list(ROBOTS) if cell is None else [here.robot.model])
+    config_of_cell = load_config(path)
+    models = robot or (list(ROBOTS) if cell is None else [config_of_cell.robot.model])
     base = path.absolute().parent
-    settings = [with_robot(here, model, base) for model in models]
+    settings = [with_robot(config_of_cell, model, base) for model in models]
     total = sum(campaigns * len(kinds_of(config)) for config in settings)
     studies = []
     with (
@@ -93,19 +93,19 @@ def plans(
 
 def _figures(study: PlansStudy) -> Iterator[Figure]:
     for line in study.lines:
-        of = f"{study.robot}, {study.readings} {study.mode} readings, plan {line.kind}"
+        plan = f"{study.robot}, {study.readings} {study.mode} readings, plan {line.kind}"
         spread = line.result.spread
         ratio = f"{spread.value:.2f} ± {spread.std:.2f}"
-        yield Figure(f"{of}: true over predicted error of the parameters", ratio)
+        yield Figure(f"{plan}: true over predicted error of the parameters", ratio)
         if line.efficiency is not None:
-            yield Figure(f"{of}: certified efficiency", f"{100 * line.efficiency:.1f} %")
+            yield Figure(f"{plan}: certified efficiency", f"{100 * line.efficiency:.1f} %")
         if line.random_readings is not None:
             times = line.random_readings / study.readings
-            yield Figure(f"{of}: readings that a random plan needs", f"{times:.1f} times")
+            yield Figure(f"{plan}: readings that a random plan needs", f"{times:.1f} times")
 
 
 def document(study: PlansStudy) -> dict[str, object]:
-    """Return a study as a JSON document says it."""
+    """Return the JSON document of a study."""
     shrinkage = [
         {**asdict(s), "as_predicted": as_predicted(s.agreement), "half": halved(study, s)}
         for s in study.shrinkage()
@@ -114,12 +114,12 @@ def document(study: PlansStudy) -> dict[str, object]:
 
 
 def with_robot(config: CellConfig, model: str, base_dir: Path | None = None) -> CellConfig:
-    """Return the cell with another robot; its loads scaled by the payload."""
-    own = config.robot
-    if model == own.model:
+    """Return the cell with another robot, and with loads scaled by the payload."""
+    old = config.robot
+    if model == old.model:
         return config
-    new = own.model_copy(update={"model": model, "base_link": None, "tip_link": None})
-    old_arm = load_arm(own.model, base_dir, base_link=own.base_link, tip_link=own.tip_link)
+    new = old.model_copy(update={"model": model, "base_link": None, "tip_link": None})
+    old_arm = load_arm(old.model, base_dir, base_link=old.base_link, tip_link=old.tip_link)
     share = load_arm(model, base_dir).payload / old_arm.payload
     if not np.isfinite(share) or share <= 0.0:
         raise InputError(f"--robot {model}: loads cannot be scaled, a payload is not known")
@@ -134,14 +134,14 @@ def with_robot(config: CellConfig, model: str, base_dir: Path | None = None) -> 
         )
         for load in config.loads
     )
-    names = {old.name: scaled.name for old, scaled in zip(config.loads, loads, strict=True)}
+    names = {load.name: scaled.name for load, scaled in zip(config.loads, loads, strict=True)}
     work_load = names.get(config.planning.work_load, config.planning.work_load)
     planning = config.planning.model_copy(update={"work_load": work_load})
     return config.model_copy(update={"robot": new, "loads": loads, "planning": planning})
 
 
 def arms(seed: int) -> MakeArm:
-    """Return what makes arms by number."""
+    """Return a function that makes arms by number."""
 
     def make(cell: Cell, config: CellConfig, number: int) -> SimulatedArm:
         return SimulatedArm(world(cell, config, np.random.default_rng([seed, number, 99])))
@@ -151,7 +151,7 @@ def arms(seed: int) -> MakeArm:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulatedArm:
-    """A simulated arm as the study asks it."""
+    """A simulated arm for the study."""
 
     world: World
 
@@ -163,7 +163,7 @@ class SimulatedArm:
         return {name: np.asarray(getattr(physics, name)).reshape(-1) for name in names}
 
     def measure(self, asked: Asked, rng: np.random.Generator) -> Readings:
-        """Return what the tracker reads of it."""
+        """Return simulated readings of the tracker."""
         return simulate(
             self.world, asked.states, asked.pose, asked.load, asked.cycle, asked.load_names, rng
         )
@@ -174,10 +174,10 @@ class SimulatedArm:
 
 
 def world(cell: Cell, config: CellConfig, rng: np.random.Generator) -> World:
-    """Return an arm that hides nothing, measured as configured.
+    """Return an arm without hidden effects, measured as configured.
 
-    The tracker stands where the plan takes it to be, turned about the vertical at random; a
-    reading is the mean of so many samples, with the noise that a plan assumes of it.
+    The tracker has the position that the plan assumes, and a random rotation about the vertical.
+    A reading is the mean of the configured number of samples, with the noise that a plan assumes.
     """
     noise = measurement_noise(config, config.acquire.samples)
     drawn = nothing_hidden(

@@ -1,4 +1,4 @@
-"""Simulated campaigns of a plan, and how far what is identified lies from the truth."""
+"""Simulated campaigns of a plan, and the errors of the identified parameters."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ from studies.plans_kinds import Chosen, Scene
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Asked:
-    """N readings that a plan takes, as `Readings` describes them.
+    """The N readings of a plan, in the form of `Readings`.
 
     Attributes:
         states: the N states.
@@ -42,14 +42,14 @@ class Asked:
 
 
 class Arm(Protocol):
-    """A simulated arm, whose truth is known."""
+    """A simulated arm with known parameters."""
 
     @property
     def parameters(self) -> Mapping[str, Floats]:
         """True parameters by effect, SI."""
 
     def measure(self, asked: Asked, rng: np.random.Generator) -> Readings:
-        """Return what the tracker reads of it."""
+        """Return simulated readings of the tracker."""
 
     def position(self, states: States) -> Floats:
         """Return (N, 3) true positions of the target, sensor axes, m."""
@@ -57,7 +57,7 @@ class Arm(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Errors:
-    """One campaign: true errors, and what was predicted of them.
+    """True and predicted errors of a campaign.
 
     Attributes:
         parameter: (P,) estimate minus truth, SI.
@@ -80,7 +80,7 @@ class Errors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Subject:
-    """An arm, and how its target truly moves at the test poses.
+    """An arm, and the true motion of its target at the test poses.
 
     Attributes:
         arm: the arm.
@@ -95,15 +95,15 @@ class Subject:
     truth: Floats
 
 
-def subject(of: Scene, arm: Arm) -> Subject:
-    """Ask for the truth once, for all plans."""
-    candidates, work_load = of.exact.candidates, of.config.planning.work_load
-    deflection = of.exact.mode == "deflection"
+def subject(scene: Scene, arm: Arm) -> Subject:
+    """Compute the truth at the test poses, once for all plans."""
+    candidates, work_load = scene.exact.candidates, scene.config.planning.work_load
+    deflection = scene.exact.mode == "deflection"
     if deflection and work_load == UNLOADED:
         loads = np.arange(1, len(candidates.loads))
     else:
         loads = np.array([candidates.loads.index(work_load)])
-    q, count = of.work.q, len(of.work.q) // len(loads)
+    q, count = scene.work.q, len(scene.work.q) // len(loads)
     wrench = np.repeat(candidates.wrench[loads], count, axis=0)
     unloaded = np.zeros(0, dtype=np.int64)
     if deflection:
@@ -123,7 +123,7 @@ def _of_interest(position: Floats, unloaded: Ints) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prepared:
-    """What a campaign needs of a plan; it travels to other processes.
+    """Data of a plan for its campaigns, which is sent to other processes.
 
     Attributes:
         asked: the readings.
@@ -143,14 +143,14 @@ class Prepared:
 
 
 def prepared(chosen: Chosen) -> Prepared:
-    """Return what a campaign needs of a plan."""
-    told = chosen.predicted
-    assert told.position is not None  # noqa: S101 - every scene has test poses
+    """Return the data of a plan for its campaigns."""
+    prediction = chosen.predicted
+    assert prediction.position is not None  # noqa: S101 - every scene has test poses
     return Prepared(
         asked=readings_asked(chosen),
-        std=told.by_name(),
+        std=prediction.by_name(),
         ordinary={t.name: t.scale for t in chosen.problem.terms if not t.potential},
-        position=told.position,
+        position=prediction.position,
         readings=chosen.readings,
         poses=chosen.poses,
     )
@@ -161,7 +161,7 @@ def run_campaign(
 ) -> Errors:
     """Simulate a campaign of a plan, identify, and compare with the truth.
 
-    Compared are the parameters of the planned effects; those of the frames show in the
+    The parameters of the planned effects are compared; errors of the frames appear in the
     positions.
 
     Raises:
@@ -169,26 +169,26 @@ def run_campaign(
     """
     mode, names = config.planning.readings, planned_effects(config, installed())
     readings = subject.arm.measure(plan.asked, rng)
-    found = fit(with_effects(cell, readings, mode, names, names), readings, mode)
-    at_test = found.model.predict(subject.test, found.theta).observation.position
+    f = fit(with_effects(cell, readings, mode, names, names), readings, mode)
+    at_test = f.model.predict(subject.test, f.theta).observation.position
     error = _of_interest(at_test, subject.unloaded) - subject.truth
     true = subject.arm.parameters
-    off: dict[str, float] = {}
-    for e, s in zip(found.model.effects, found.model.slices(), strict=True):
+    errors: dict[str, float] = {}
+    for e, s in zip(f.model.effects, f.model.slices(), strict=True):
         if e.name in names and len(true.get(e.name, ())) == len(e.parameters):
-            own = (f"{e.name}.{p.name}" for p in e.parameters)
-            off |= dict(zip(own, found.theta[s] - true[e.name], strict=True))
-    if not off:
+            parameters = (f"{e.name}.{p.name}" for p in e.parameters)
+            errors |= dict(zip(parameters, f.theta[s] - true[e.name], strict=True))
+    if not errors:
         raise CannotAnswerError(f"of {', '.join(names)} the simulated arm knows no true parameters")
-    if unknown := [name for name in off if not np.isfinite(plan.std.get(name, np.inf))]:
+    if unknown := [name for name in errors if not np.isfinite(plan.std.get(name, np.inf))]:
         raise CannotAnswerError(
             f"{plan.readings} readings of a plan do not determine {', '.join(unknown)}; "
             "compare plans of more readings"
         )
     return Errors(
-        parameter=np.array([off[k] for k in off]),
-        std=np.array([plan.std[k] for k in off]),
-        ordinary=np.array([plan.ordinary[k] for k in off]),
+        parameter=np.array(list(errors.values())),
+        std=np.array([plan.std[k] for k in errors]),
+        ordinary=np.array([plan.ordinary[k] for k in errors]),
         position=rms(np.linalg.norm(error, axis=1)),
         position_std=plan.position,
         readings=plan.readings,
@@ -197,25 +197,25 @@ def run_campaign(
 
 
 def readings_asked(chosen: Chosen) -> Asked:
-    """Return the readings that a plan takes; a unit that is taken again is a cycle of its own."""
+    """Return the readings of a plan; each repetition of a unit is a further cycle."""
     source: DesignProblem = chosen.problem
     mode: Mode = "deflection" if source.mode == "deflection" else "absolute"
     names = source.candidates.loads
     pose: list[int] = []
     load: list[int] = []
     cycle: list[int] = []
-    seen: dict[object, int] = {}
+    last_cycle: dict[object, int] = {}
     for k in np.flatnonzero(chosen.counts):
-        at, _ = source.what[k]
+        candidate, _ = source.what[k]
         loads = readings_of(source.what[k], mode)
         for _ in range(int(chosen.counts[k])):
-            # Absolute readings of one cycle are of different loads.
-            key = at if mode == "deflection" else (at, loads)
-            number = seen[key] = seen.get(key, -1) + 1
-            pose += [at] * len(loads)
+            # Absolute readings of one cycle have different loads.
+            key = candidate if mode == "deflection" else (candidate, loads)
+            number = last_cycle[key] = last_cycle.get(key, -1) + 1
+            pose += [candidate] * len(loads)
             load += [names.index(name) for name in loads]
             cycle += [number] * len(loads)
     used, index = np.unique(pose, return_inverse=True)
-    of = source.candidates
-    states = nominal_states(of.q[used][index], of.wrench[np.array(load)])
+    candidates = source.candidates
+    states = nominal_states(candidates.q[used][index], candidates.wrench[np.array(load)])
     return Asked(states, index, np.array(load), np.array(cycle), names)

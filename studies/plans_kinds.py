@@ -1,4 +1,4 @@
-"""The plans that are compared: of the planner, at random, and a grid as made by hand."""
+"""The compared plans: of the planner, at random, and a grid as made by hand."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -23,18 +23,18 @@ from hilcal.errors import CannotAnswerError
 from hilcal.types import Floats, Ints
 
 LEVELS = (3, 4, 5, 6)
-"""Levels per joint of a grid: the coarsest that has enough feasible poses."""
+"""Levels per joint of a grid; the coarsest grid with enough feasible poses is used."""
 TEST_POSES = 50
-"""Test poses that are drawn where the configuration names none."""
+"""Number of drawn test poses where the configuration names none."""
 MATCHED = 20
-"""Random plans by which the readings are found that equal a planned accuracy."""
+"""Random plans that determine the number of readings for a planned accuracy."""
 MOST = 20
-"""Readings are looked for up to so many times those of the plan."""
+"""Largest number of readings that is tried, as a multiple of the plan's."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """A cell that is planned for.
+    """A cell to plan for.
 
     Attributes:
         cell: the cell.
@@ -42,8 +42,8 @@ class Scene:
         space: its feasible states.
         nominal: the model.
         exact: the design problem of the model alone.
-        robust: the same with the potential terms of the configuration; None without any.
-        work: test poses; drawn apart from the candidates where the configuration names none.
+        robust: the problem with the potential terms of the configuration; None without any.
+        work: test poses; drawn independently of the candidates where the configuration names none.
     """
 
     cell: Cell
@@ -55,7 +55,7 @@ class Scene:
     work: PredictionPoses
 
     def with_others(self, chosen: "Chosen") -> float | None:
-        """RMS position, m, where potential terms are estimated too; of the candidates' units."""
+        """Predicted RMS position error, m, with potential terms estimated, too; else None."""
         if self.robust is None or chosen.problem not in (self.exact, self.robust):
             return None
         if self.robust.what != self.exact.what:
@@ -68,10 +68,10 @@ class Chosen:
     """A plan.
 
     Attributes:
-        problem: whose units it takes.
-        counts: (K,) how often it takes each.
-        predicted: what it will know.
-        efficiency: certified by the planner; None for a plan of another make.
+        problem: the design problem of its units.
+        counts: (K,) number of repetitions of each unit.
+        predicted: predicted uncertainty.
+        efficiency: certified by the planner; None for other plans.
     """
 
     problem: DesignProblem
@@ -115,43 +115,42 @@ def without_potential(config: CellConfig) -> CellConfig:
 
 
 def optimal(
-    of: Scene, criterion: str, budget: int, rng: np.random.Generator, *, robust: bool = False
+    s: Scene, criterion: str, budget: int, rng: np.random.Generator, *, robust: bool = False
 ) -> Chosen:
     """Return the planner's plan of so many readings.
 
     Args:
-        of: the cell.
+        s: the cell.
         criterion: "D", "test", ...
-        budget: readings, the unloaded ones included.
+        budget: number of readings with the unloaded ones.
         rng: generator.
-        robust: whether it keeps power against the potential terms.
+        robust: whether the plan keeps power against the potential terms.
     """
-    of_plan, config = of.exact, without_potential(of.config)
-    if robust and of.robust is not None:
-        of_plan, config = of.robust, of.config
-    asked = compound_objective(of_plan, config, criterion, of.work, float(budget), rng)
-    design = choose(asked, float(budget), rng)
+    of_plan, config = s.exact, without_potential(s.config)
+    if robust and s.robust is not None:
+        of_plan, config = s.robust, s.config
+    objective = compound_objective(of_plan, config, criterion, s.work, float(budget), rng)
+    design = choose(objective, float(budget), rng)
     counts = np.asarray(design.counts, dtype=float)
-    told = predicted(of_plan, counts, work=of.work)
-    return Chosen(of_plan, counts, told, design.efficiency)
+    return Chosen(of_plan, counts, predicted(of_plan, counts, work=s.work), design.efficiency)
 
 
-def at_random(of: Scene, budget: int, rng: np.random.Generator) -> Chosen:
-    """Return random feasible poses, each under every load that it bears."""
-    order = rng.permutation(len(of.exact.candidates))
-    return _of_poses(of.exact, cycle(order.tolist()), budget, of.work)
+def at_random(s: Scene, budget: int, rng: np.random.Generator) -> Chosen:
+    """Return a plan of random feasible poses, each under every load that it bears."""
+    order = rng.permutation(len(s.exact.candidates))
+    return _of_poses(s.exact, cycle(order.tolist()), budget, s.work)
 
 
-def grid(of: Scene, budget: int) -> Chosen:
-    """Return a plan as made by hand: a regular grid in joint space, its feasible poses kept.
+def grid(s: Scene, budget: int) -> Chosen:
+    """Return a plan as made by hand: the feasible poses of a regular grid in joint space.
 
-    The coarsest grid with enough poses, evenly thinned to the readings wanted; each pose under
-    every load that it bears.
+    The coarsest grid with enough poses is thinned evenly to the number of readings; each pose is
+    read under every load that it bears.
 
     Raises:
         CannotAnswerError: no pose of the finest grid is feasible.
     """
-    space = of.space
+    space = s.space
     for levels in LEVELS:
         share = (np.arange(levels) + 0.5) / levels
         unit = np.stack(np.meshgrid(*[share] * len(space.low), indexing="ij"), axis=-1)
@@ -160,49 +159,48 @@ def grid(of: Scene, budget: int) -> Chosen:
         allowed = np.ones((len(q), len(space.loads)), dtype=np.bool_)
         for k, load in enumerate(space.loads[1:], start=1):
             allowed[:, k] = space.allowed(q, load)
-        some = allowed[:, 1:].any(axis=1) | (of.exact.mode == "absolute")
+        some = allowed[:, 1:].any(axis=1) | (s.exact.mode == "absolute")
         q, allowed = q[some], allowed[some]
         if allowed.sum() >= budget:
             break
     if not len(q):
         raise CannotAnswerError("no pose of a regular grid in joint space is feasible")
-    of_grid = problem(of.nominal, without_potential(of.config), q, allowed)
+    of_grid = problem(s.nominal, without_potential(s.config), q, allowed)
     poses = next((n for n in range(1, len(q)) if allowed[_even(len(q), n)].sum() >= budget), len(q))
     order = _even(len(q), poses)
-    return _of_poses(of_grid, cycle(order.tolist()), budget, of.work)
+    return _of_poses(of_grid, cycle(order.tolist()), budget, s.work)
 
 
-def _even(count: int, wanted: int) -> Ints:
-    """Indices (wanted,) spread evenly over so many."""
-    return np.asarray(np.floor((np.arange(wanted) + 0.5) * count / wanted), dtype=np.int64)
+def _even(count: int, number: int) -> Ints:
+    """Indices (number,) spread evenly over `count`."""
+    return np.asarray(np.floor((np.arange(number) + 0.5) * count / number), dtype=np.int64)
 
 
 def matching(
-    of: Scene, position: float, budget: int, rng: np.random.Generator, *, others: bool = False
+    s: Scene, position: float, budget: int, rng: np.random.Generator, *, others: bool = False
 ) -> int | None:
-    """Return how many readings random plans need for an accuracy at the test poses.
+    """Return the number of readings that random plans need for an accuracy at the test poses.
 
-    The least number whose predicted mean square over random plans, each extended reading by
-    reading, is as small; None where `most` times the budget does not do.
+    It is the least number for which the predicted mean square over random plans is small enough;
+    None where `MOST` times the budget does not suffice.
 
     Args:
-        of: the cell.
-        position: RMS standard deviation wanted, m.
-        budget: readings to start from.
+        s: the cell.
+        position: required RMS standard deviation, m.
+        budget: number of readings to start from.
         rng: generator.
-        others: whether the potential terms have to be estimated too.
+        others: whether the potential terms are estimated, too.
     """
-    orders = [rng.permutation(len(of.exact.candidates)).tolist() for _ in range(MATCHED)]
-
-    judge = of.robust if others and of.robust is not None else of.exact
+    orders = [rng.permutation(len(s.exact.candidates)).tolist() for _ in range(MATCHED)]
+    judge = s.robust if others and s.robust is not None else s.exact
 
     def reached(readings: int) -> bool:
-        got = []
+        positions = []
         for order in orders:
-            counts = _of_poses(of.exact, cycle(order), readings, of.work).counts
-            told = predicted(judge, counts, work=of.work)
-            got.append(told.position_open if others else told.position)
-        return rms(np.array(got, dtype=float)) <= position
+            counts = _of_poses(s.exact, cycle(order), readings, s.work).counts
+            p = predicted(judge, counts, work=s.work)
+            positions.append(p.position_open if others else p.position)
+        return rms(np.array(positions, dtype=float)) <= position
 
     low, high = 1, budget
     while not reached(high):
@@ -216,22 +214,22 @@ def matching(
 
 
 def _of_poses(
-    of: DesignProblem, order: Iterable[int], budget: int, work: PredictionPoses
+    design_problem: DesignProblem, order: Iterable[int], budget: int, work: PredictionPoses
 ) -> Chosen:
-    """Take poses in order, each with as many loads as it bears, until the readings are used."""
-    counts, left = np.zeros(len(of.units)), float(budget)
-    pose = np.array([p for p, _ in of.what])
-    cost, least = of.units.cost, float(of.units.cost.min())
+    """Add poses in order, each with as many loads as it bears, until the budget is used."""
+    counts, remaining = np.zeros(len(design_problem.units)), float(budget)
+    pose = np.array([p for p, _ in design_problem.what])
+    cost, least = design_problem.units.cost, float(design_problem.units.cost.min())
     for p in order:
-        if left < least:
+        if remaining < least:
             break
         first, last = np.searchsorted(pose, [p, p + 1])
-        mine = np.arange(first, last)
-        if of.mode == "deflection" and len(mine):
-            mine = mine[cost[mine] <= left]
-            mine = mine[[int(np.argmax(cost[mine]))]] if len(mine) else mine
-        for k in mine:
-            if cost[k] <= left:
+        units = np.arange(first, last)
+        if design_problem.mode == "deflection" and len(units):
+            units = units[cost[units] <= remaining]
+            units = units[[int(np.argmax(cost[units]))]] if len(units) else units
+        for k in units:
+            if cost[k] <= remaining:
                 counts[k] += 1.0
-                left -= float(cost[k])
-    return Chosen(of, counts, predicted(of, counts, work=work))
+                remaining -= float(cost[k])
+    return Chosen(design_problem, counts, predicted(design_problem, counts, work=work))

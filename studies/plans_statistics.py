@@ -1,4 +1,4 @@
-"""What many simulated campaigns of a plan say, with the uncertainty of the simulation."""
+"""Statistics of many simulated campaigns of a plan, with the uncertainty of the simulation."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ class Summary:
     """Campaigns of one kind of plan.
 
     Attributes:
-        campaigns: how many.
+        campaigns: number of campaigns.
         readings: mean number of readings.
         poses: mean number of different poses.
         parameter: predicted error, geometric mean over the parameters of RMS over campaigns,
@@ -54,21 +54,21 @@ class Summary:
 def summary(errors: Sequence[Errors]) -> Summary:
     """Summarise campaigns.
 
-    The uncertainty of a root of a mean of n squares s_c is std(s) / (2 sqrt(mean(s) n)); that
-    of the geometric mean is of the logarithms' means, to first order.
+    The uncertainty of a root of a mean of n squares s_c is std(s) / (2 sqrt(mean(s) n)); that of
+    the geometric mean follows to first order from the mean of logarithms.
     """
     square = np.array([e.parameter**2 for e in errors])
     std2 = np.array([e.std**2 for e in errors])
     ordinary = errors[0].ordinary
     real = np.sqrt(square.mean(axis=0)) / ordinary
-    told = np.sqrt(std2.mean(axis=0)) / ordinary
+    predicted = np.sqrt(std2.mean(axis=0)) / ordinary
     mean = float(np.exp(np.mean(np.log(real))))
     influence = 0.5 * (square / square.mean(axis=0)).mean(axis=1)
     return Summary(
         campaigns=len(errors),
         readings=float(np.mean([e.readings for e in errors])),
         poses=float(np.mean([e.poses for e in errors])),
-        parameter=float(np.exp(np.mean(np.log(told)))),
+        parameter=float(np.exp(np.mean(np.log(predicted)))),
         parameter_real=Measured(mean, mean * _of_mean(influence)),
         spread=_root((square / std2).mean(axis=1)),
         position=rms(np.array([e.position_std for e in errors])),
@@ -83,7 +83,7 @@ def _root(squares: Floats) -> Measured:
 
 
 def _of_mean(values: Floats) -> float:
-    """Standard uncertainty of a mean; not known of a single value."""
+    """Standard uncertainty of a mean; nan for a single value."""
     if len(values) < 2:
         return float("nan")
     return float(np.std(values, ddof=1) / np.sqrt(len(values)))

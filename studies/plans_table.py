@@ -1,4 +1,4 @@
-"""The comparison of plans as tables for people."""
+"""Tables of the comparison of plans."""
 
 from collections.abc import Iterator
 
@@ -11,7 +11,7 @@ from studies.plans_statistics import Measured
 
 
 def report(study: PlansStudy) -> Iterator[Table | Text | str]:
-    """Yield the tables of one robot, and what they say."""
+    """Yield the tables of one robot."""
     yield Text(
         f"{study.robot}: {study.readings} {study.mode} readings, {study.campaigns} simulated "
         f"campaigns per plan; {study.where}",
@@ -102,17 +102,17 @@ def _readings(study: PlansStudy) -> Table:
 
 
 def _needed(study: PlansStudy, needs: int | None) -> tuple[str, str]:
-    """Readings of random plans, and the plan's share of them."""
+    """Number of readings of random plans, and the plan's share of it."""
     return ("-", "-") if needs is None else (f"{needs}", f"{100 * study.readings / needs:.0f} %")
 
 
 def as_predicted(ratio: Measured) -> str:
-    """Judge a ratio that should be 1 within 10 %: yes, no, or unclear for want of campaigns."""
+    """Judge a ratio that should be 1 within 10 %: yes, no, or unclear with too few campaigns."""
     return _verdict(TOLERANCE - abs(ratio.value - 1.0), ratio.std)
 
 
 def halved(study: PlansStudy, s: Shrinkage) -> str:
-    """Judge whether at most half of a random plan's readings do, as predicted and in truth."""
+    """Judge whether half of a random plan's readings suffice, as predicted and in truth."""
     needs = study.of(s.kind).random_readings
     if needs is not None and needs < 2 * study.readings:
         return "no"
@@ -120,7 +120,7 @@ def halved(study: PlansStudy, s: Shrinkage) -> str:
 
 
 def _verdict(room: float, std: float) -> str:
-    """Judge what holds where `room` is not negative, known to within `std`."""
+    """Judge a claim that holds where `room`, of standard uncertainty `std`, is not negative."""
     if room >= 0.0:
         return "yes"
     return "unclear" if room + 2.0 * std >= 0.0 else "no"

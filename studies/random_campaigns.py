@@ -1,4 +1,4 @@
-"""Campaigns drawn at random: well-spread poses, the loads on them, and the readings."""
+"""Random campaigns: well-spread poses, loads on them, and readings."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -24,11 +24,11 @@ from studies.temperatures import air, joints
 POSES = 30
 UNLOADED = "none"
 _READING = 20.0  # s from one reading to the next
-_LOADING = 30.0  # s that it takes to change the load
-_MOVING = 15.0  # s that the arm takes to the next pose
-_SETTLING = (5.0, 300.0)  # s that the load has hung when the reading is taken
+_LOADING = 30.0  # s, change of the load
+_MOVING = 15.0  # s, motion to the next pose
+_SETTLING = (5.0, 300.0)  # s, time under load at a reading
 _MARGIN = 0.9  # share of the joint range and of the torque limits that is used
-_CANDIDATES = 12  # poses drawn per pose that is kept
+_CANDIDATES = 12  # drawn poses per chosen pose
 _ROUNDS = 60
 
 
@@ -47,19 +47,18 @@ def rehearsal_states(
     Poses are feasible (joint and torque limits with a margin, the target and every joint
     above the floor, away from the base's column, not stretched out) and spread over the
     joint space. A joint's approach side is the direction of its last motion: that of the
-    move to the pose and, after a change of the load, for about half of the joints that of
-    the change of torque, in which the joint gives way. Some readings are taken as soon as the
-    load has come to rest, some after minutes: the time under load is log-uniform, 5 s to 300 s.
+    move to the pose or, for about half of the joints after a change of the load, that of
+    the change of torque. The time under load is log-uniform from 5 s to 300 s.
 
     Args:
         cell: the cell.
         n_poses: number of poses.
         wrenches: (name, wrench (6,)) of each load at the load point, base axes, N and N·m.
         rng: generator.
-        approach: whether the states tell the approach sides.
-        cycles: how often the whole campaign is measured.
-        temperatures: whether the states tell those of air and joints; they are drawn apart, so
-            that all else is the same with and without.
+        approach: whether the states have approach sides.
+        cycles: number of times that all poses are measured.
+        temperatures: whether the states have temperatures of air and joints; these have a separate
+            generator, so that everything else is the same without them.
 
     Returns:
         The N = cycles * n_poses * (1 + loads) states with time, load time, approach and
@@ -82,8 +81,8 @@ def rehearsal_states(
     sides = _sides(poses[pose], torque[pose, load], moves, rng)
     shortest, longest = _SETTLING
     hung = shortest * (longest / shortest) ** rng.random(len(pose))
-    taken = _READING + _LOADING * changes + _MOVING * moves
-    time = np.cumsum(np.maximum(taken, (hung + _LOADING) * changes))
+    duration = _READING + _LOADING * changes + _MOVING * moves
+    time = np.cumsum(np.maximum(duration, (hung + _LOADING) * changes))
     changed = np.maximum.accumulate(np.where(changes, time - hung, time[0] - hung[0]))
     states = States(
         q=poses[pose],
@@ -116,33 +115,33 @@ def spread_poses(cell: Cell, count: int, pulls: Floats, rng: np.random.Generator
     Args:
         cell: the cell.
         count: number of poses.
-        pulls: (L, 6) wrenches that every pose has to bear.
+        pulls: (L, 6) wrenches that every pose must bear.
         rng: generator.
 
     Raises:
-        InputError: when the limits leave no room.
+        InputError: too few feasible poses within the limits.
     """
     low = _MARGIN * np.maximum(cell.arm.q_min, -np.pi)
     high = _MARGIN * np.minimum(cell.arm.q_max, np.pi)
-    found = np.empty((0, cell.arm.n))
+    feasible = np.empty((0, cell.arm.n))
     for _ in range(_ROUNDS):
-        if len(found) >= _CANDIDATES * count:
+        if len(feasible) >= _CANDIDATES * count:
             break
         drawn = rng.uniform(low, high, (max(4 * count, 60), cell.arm.n))
-        found = np.vstack([found, drawn[_feasible(cell, drawn, pulls)]])
-    if len(found) < count:
+        feasible = np.vstack([feasible, drawn[_feasible(cell, drawn, pulls)]])
+    if len(feasible) < count:
         raise InputError(
-            f"poses: only {len(found)} of {count} feasible poses in the joint limits under "
+            f"poses: only {len(feasible)} of {count} feasible poses in the joint limits under "
             "these loads; valid: fewer poses, lighter loads or wider limits"
         )
-    # farthest point first: every next pose is the candidate farthest from those kept
-    points = np.hstack([np.cos(found), np.sin(found)])
-    kept = [0]
+    # The next pose is always the candidate farthest from all chosen ones.
+    points = np.hstack([np.cos(feasible), np.sin(feasible)])
+    chosen = [0]
     distance = np.linalg.norm(points - points[0], axis=1)
-    while len(kept) < count:
-        kept.append(int(np.argmax(distance)))
-        distance = np.minimum(distance, np.linalg.norm(points - points[kept[-1]], axis=1))
-    return np.asarray(found[kept])
+    while len(chosen) < count:
+        chosen.append(int(np.argmax(distance)))
+        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return np.asarray(feasible[chosen])
 
 
 def _feasible(cell: Cell, q: Floats, pulls: Floats) -> Bools:
@@ -179,8 +178,8 @@ def _rigid(cell: Cell, q: Floats, pull: Floats) -> tuple[Floats, Floats]:
 
     `pull`: (6,) or (N, 6) wrench.
     """
-    here, none = np.eye(4), np.zeros(cell.arm.n)
-    rigid = World(cell, Truth.rigid(cell.arm), here, here, SimulatedNoise(), none)
+    origin, none = np.eye(4), np.zeros(cell.arm.n)
+    rigid = World(cell, Truth.rigid(cell.arm), origin, origin, SimulatedNoise(), none)
     rest = rigid.rest(States(q=q, wrench=np.broadcast_to(pull, (len(q), 6))))
     return rest.flange, rest.torque[:, rigid.drives]
 
@@ -227,9 +226,9 @@ def _about_z(angle: Floats) -> Floats:
 def rehearse(config: CellConfig, choice: str, seed: int, n_poses: int = POSES) -> Rehearsal:
     """Measure a campaign in a simulated cell: each pose unloaded, then under each load.
 
-    A known registration is told to the program only where the error hides in it. What a
-    deflection shows is measured in deflections, the rest in absolute positions; what was
-    drawn at random, and nothing at all, in absolute positions, which give nothing away.
+    The program gets a known registration only where the error is in it. Effects that deflections
+    show are measured in deflections, others in absolute positions. "random" and "nothing" are
+    measured in absolute positions, so that the mode gives no hint.
 
     Args:
         config: the cell; its loads are all used.

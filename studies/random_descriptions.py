@@ -1,8 +1,8 @@
-"""Random arms, registrations and errors of description, for the gate after registration.
+"""Random arms, registrations and errors of description, for the check after registration.
 
 Each case draws an arm (DH rows, signs, couplings, with or without masses, or one of the catalogue),
 poses of one kind, frames, noise, geometric errors of an uncalibrated arm, and in half of the cases
-one error of description. Readings are made with the arm as it truly is.
+one error of description. Readings are computed with the true arm.
 """
 
 from dataclasses import dataclass, replace
@@ -44,12 +44,12 @@ class Case:
     """One draw.
 
     Attributes:
-        cell: as it is described.
-        readings: as they were given.
-        truth: what is otherwise than described; empty where nothing is, or rows are swapped.
+        cell: as described.
+        readings: as given to the program.
+        truth: differences from the description; empty without any, or where rows are swapped.
         error: kind of the error, or None.
         poses: kind of the poses.
-        best: misfit with the true description, m; attitudes count with the gate's lever.
+        best: misfit with the true description, m; attitudes count with a lever.
         hidden: whether the frames hide the error in these poses.
     """
 
@@ -63,7 +63,7 @@ class Case:
 
 
 def random_arm(rng: np.random.Generator) -> Arm:
-    """Return an arm of six joints with rows as industrial arms have them."""
+    """Return an arm of six joints with rows as of industrial arms."""
     turns = rng.choice([0.0, np.pi / 2, -np.pi / 2], 6, p=[0.3, 0.35, 0.35])
     turns[[0, 4]] = rng.choice([np.pi / 2, -np.pi / 2], 2)  # no two parallel axes in a wrist
     turns[3] = rng.choice([np.pi / 2, -np.pi / 2])
@@ -96,7 +96,7 @@ def random_arm(rng: np.random.Generator) -> Arm:
 
 
 def random_error(kind: str, arm: Arm, rng: np.random.Generator) -> tuple[Hypothesis, ...]:
-    """Return what is truly otherwise than described."""
+    """Return the differences of the true arm or readings from the description."""
     j = int(rng.integers(1, 7))
     if kind == "sign":
         return (Hypothesis("joint", j, -1),)
@@ -157,7 +157,7 @@ def random_poses(kind: str, arm: Arm, count: int, rng: np.random.Generator) -> F
 
 
 def draw(rng: np.random.Generator) -> Case:
-    """Draw a case; one whose poses do not register at all is drawn anew."""
+    """Draw a case, anew where the poses do not allow a registration."""
     while True:
         case = _draw(rng)
         if case is not None:
@@ -187,14 +187,14 @@ def _draw(rng: np.random.Generator) -> Case | None:
     noise = 10 ** rng.uniform(-5, -3.7)
     sigma = np.repeat([noise, 2 * noise], 3)[:m]
     geometry = rng.choice([0.0, 2e-4])
-    own = [se3.matrix(*se3.exp(t)) for t in geometry * rng.normal(size=(7, 6))]
-    bent = replace(true_arm, links=true_arm.links @ np.array(own))
+    errors = [se3.matrix(*se3.exp(t)) for t in geometry * rng.normal(size=(7, 6))]
+    bent = replace(true_arm, links=true_arm.links @ np.array(errors))
     base, target = _pose(rng, 3.0), _pose(rng, 0.2)
     if cell.registration_known:
         base = cell.registration
     if cell.target_known:
         target[:3, 3] = cell.target[:3, 3]
-        if cell.registration_known:  # then nothing is estimated, the target's axes neither
+        if cell.registration_known:  # then the target's axes are not estimated either
             target = cell.target
     value = read(bent, q, base, target, m)
     error_m = rng.normal(size=value.shape) * sigma
@@ -203,14 +203,14 @@ def _draw(rng: np.random.Generator) -> Case | None:
         turned = se3.rotation(error_m[:, 3:]) @ se3.rotation(value[:, 3:])
         value[:, 3:] = se3.rotation_vector(turned)
     clean = readings_of(q, value, sigma)
-    given = _misdescribed(clean, error, rng)
+    wrong = _misdescribed(clean, error, rng)
     true_cell = replace(cell, arm=true_arm)
     try:
         best = _size(true_cell, clean)
-        seen = _size(cell, given)
+        size = _size(cell, wrong)
     except CannotAnswerError:
         return None
-    return Case(cell, given, truth, error, kind, best, seen < 3.0 * best + 1e-6)
+    return Case(cell, wrong, truth, error, kind, best, size < 3.0 * best + 1e-6)
 
 
 def _cell(arm: Arm, rng: np.random.Generator) -> Cell:
@@ -237,18 +237,18 @@ def _pose(rng: np.random.Generator, size: float) -> Floats:
 
 
 def read(arm: Arm, q: Floats, base: Floats, target: Floats, m: int) -> Floats:
-    """Readings of an arm without noise, by products of homogeneous matrices."""
+    """Return noiseless readings (N, m) of an arm, by products of homogeneous matrices."""
     theta = arm.chain_angles(q)
-    at = np.broadcast_to(base @ arm.links[0], (len(q), 4, 4))
+    pose = np.broadcast_to(base @ arm.links[0], (len(q), 4, 4))
     for k in range(6):
         turn = np.tile(np.eye(4), (len(q), 1, 1))
         turn[:, 0, 0] = turn[:, 1, 1] = np.cos(theta[:, k])
         turn[:, 1, 0] = np.sin(theta[:, k])
         turn[:, 0, 1] = -turn[:, 1, 0]
-        at = at @ turn @ arm.links[k + 1]
-    at = at @ target
-    turn_vector = se3.rotation_vector(np.ascontiguousarray(at[:, :3, :3]))
-    return np.hstack([at[:, :3, 3], turn_vector])[:, :m]
+        pose = pose @ turn @ arm.links[k + 1]
+    pose = pose @ target
+    turn_vector = se3.rotation_vector(np.ascontiguousarray(pose[:, :3, :3]))
+    return np.hstack([pose[:, :3, 3], turn_vector])[:, :m]
 
 
 def readings_of(q: Floats, value: Floats, sigma: Floats) -> Readings:
@@ -268,7 +268,7 @@ def readings_of(q: Floats, value: Floats, sigma: Floats) -> Readings:
 
 
 def _misdescribed(clean: Readings, error: str | None, rng: np.random.Generator) -> Readings:
-    """Return the readings as they are given, with the error in the table."""
+    """Return the readings with an error of the table."""
     value, q = clean.value.copy(), clean.states.q
     mirror = np.array([1.0, -1.0, 1.0])
     if error == "degrees":
@@ -291,20 +291,19 @@ def _misdescribed(clean: Readings, error: str | None, rng: np.random.Generator) 
 
 
 def _size(cell: Cell, readings: Readings) -> float:
-    found = register(cell, readings)
-    lever = 0.3 if found.turn_rms is not None else 0.0
-    return float(np.hypot(found.rms, lever * (found.turn_rms or 0.0)))
+    registered = register(cell, readings)
+    return float(np.hypot(registered.rms, 0.3 * (registered.turn_rms or 0.0)))
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What the program said of a case.
+    """Answer of the program to a case.
 
     Attributes:
-        right: registered to the noise, or refused with a reason that is right.
-        named: the error was named, or an equivalent that fits as well with no more changes; None
-            where there is none, or the frames hide it.
-        exact: the very error was among those named.
+        right: whether it registered to the noise, or refused with a right reason.
+        named: whether it named the error, or an equivalent one that fits as well with no more
+            changes; None without an error, or where the frames hide it.
+        exact: whether it named the true error among others.
     """
 
     right: bool
@@ -314,20 +313,20 @@ class Outcome:
 
 def judge(case: Case) -> tuple[Outcome, DescriptionFinding | None]:
     """Run the program on a case."""
-    found = examine(register(case.cell, case.readings), case.readings)
-    refused = found is not None and found.refused
+    finding = examine(register(case.cell, case.readings), case.readings)
+    refused = finding is not None and finding.refused
     if case.error is None or case.hidden:
-        return Outcome(not refused, None, False), found
+        return Outcome(not refused, None, False), finding
     if case.error == "swapped rows":
-        named = found is not None and bool(found.rows.any()) and not found.explanations
-        return Outcome(named, named, named), found
-    ways = [] if found is None else list(found.explanations)
-    exact = any(_about(e.changes) == _about(case.truth) for e in ways)
-    fits = bool(ways) and ways[0].rms < 3.0 * case.best + 1e-6
-    fewer = bool(ways) and len(ways[0].changes) <= len(case.truth)
+        named = finding is not None and bool(finding.rows.any()) and not finding.explanations
+        return Outcome(named, named, named), finding
+    explanations = [] if finding is None else list(finding.explanations)
+    exact = any(_keys(e.changes) == _keys(case.truth) for e in explanations)
+    fits = bool(explanations) and explanations[0].rms < 3.0 * case.best + 1e-6
+    fewer = bool(explanations) and len(explanations[0].changes) <= len(case.truth)
     named = exact or (fits and fewer)
-    return Outcome(named or (refused and fits), named, exact), found
+    return Outcome(named or (refused and fits), named, exact), finding
 
 
-def _about(changes: tuple[Hypothesis, ...]) -> list[tuple[object, ...]]:
+def _keys(changes: tuple[Hypothesis, ...]) -> list[tuple[object, ...]]:
     return sorted((c.kind, c.joint, c.follows, c.sign, c.factor, c.arm) for c in changes)

@@ -22,15 +22,15 @@ from studies.records import Figure, Keep, keep
 
 @dataclass(frozen=True, slots=True)
 class Refined:
-    """What the refinement of a series came to.
+    """Result of the refinement of a series.
 
     Attributes:
         series: name of its folder.
-        readings: their number.
+        readings: number of readings.
         mean_m: mean error of poses left out, of the baseline and of the last model.
         model: effects of the last model.
-        verdict: of it.
-        seconds: that it took.
+        verdict: of the last model.
+        seconds: duration.
     """
 
     series: str
@@ -80,12 +80,12 @@ def real(
 
 def refined(path: Path) -> Refined:
     """Read a series and refine its model."""
-    begun = time.monotonic()
+    start = time.monotonic()
     cell = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")
     readings = read_table(path, cell, "ipa-ur10")
-    found = refine(baseline(cell, readings, "absolute"), readings, "absolute")
-    first, last = (f.holdout.mean_m for f in (found.steps[0].fit, found.fit))
+    r = refine(baseline(cell, readings, "absolute"), readings, "absolute")
+    first, last = (f.holdout.mean_m for f in (r.steps[0].fit, r.fit))
     return Refined(
-        path.parent.name, len(readings), (first, last), found.fit.model.names, found.verdict,
-        time.monotonic() - begun,
+        path.parent.name, len(readings), (first, last), r.fit.model.names, r.verdict,
+        time.monotonic() - start,
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""What a study measured, kept as a file, and the page that is made of these files."""
+"""Records of studies as files, and the page of results made from them."""
 
 import json
 import shlex
@@ -30,19 +30,19 @@ Cases = Annotated[
 def resumed(
     path: Path | None, keys: Sequence[str], run: Callable[[str], dict[str, object]]
 ) -> Iterator[dict[str, object]]:
-    """Yield what each case came to; one that is in the file is not run again.
+    """Yield the result of each case; cases in the file are not run again.
 
-    Without keys, all that are in the file.
+    Without keys, all cases of the file.
     """
     lines = path.read_text(encoding="utf-8").splitlines() if path and path.exists() else []
-    known: dict[str, dict[str, object]] = {c["case"]: c for c in map(json.loads, lines)}
-    for key in keys or [*known]:
-        if key not in known:
-            known[key] = {"case": key, **run(key)}
+    cases: dict[str, dict[str, object]] = {c["case"]: c for c in map(json.loads, lines)}
+    for key in keys or [*cases]:
+        if key not in cases:
+            cases[key] = {"case": key, **run(key)}
             if path:
                 with path.open("a", encoding="utf-8") as stream:
-                    stream.write(json.dumps(known[key]) + "\n")
-        yield known[key]
+                    stream.write(json.dumps(cases[key]) + "\n")
+        yield cases[key]
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,10 +50,10 @@ class Figure:
     """One figure of a study.
 
     Attributes:
-        what: what was counted or measured.
-        measured: the figure in words.
-        required: what is required of it; empty where nothing is.
-        met: whether it is reached; None where nothing is required.
+        what: name of the quantity.
+        measured: its value as text.
+        required: required value as text; empty where nothing is required.
+        met: whether the requirement is met; None without one.
     """
 
     what: str
@@ -68,10 +68,10 @@ class Record:
 
     Attributes:
         title: of the study.
-        command: that measured it.
-        date: when, ISO 8601.
+        command: command line of the run.
+        date: of the run, ISO 8601.
         version: of the program.
-        figures: what it measured.
+        figures: results.
     """
 
     title: str
@@ -87,34 +87,34 @@ def keep(
     figures: Sequence[Figure],
     more: Mapping[str, object] | None = None,
 ) -> None:
-    """Write the figures of the study that runs in this process, where asked for.
+    """Write the figures of the study that runs in this process.
 
     Args:
-        path: of the file; None where it is not asked for.
+        path: of the file; None writes nothing.
         title: of the study.
-        figures: what it measured.
-        more: numbers that a picture is made of; "picture" is its place from the page of results.
+        figures: results.
+        more: data of a picture; "picture" is its path relative to the page of results.
 
     Raises:
         InputError: the file cannot be written.
     """
     if path is None:
         return
-    command = f"python -m studies {shlex.join(_kept_words(sys.argv[1:]))}"
+    command = f"python -m studies {shlex.join(_kept_arguments(sys.argv[1:]))}"
     date = datetime.now(UTC).date().isoformat()
     record = Record(title, command, date, __version__, tuple(figures))
     content = {**asdict(record), **(more or {})}
     replace_file(path, json.dumps(content, indent=1, ensure_ascii=False) + "\n")
 
 
-def _kept_words(given: Sequence[str]) -> list[str]:
-    """Return the words of a command without `--keep F.json`, files by their names."""
-    words = list(given)
-    if "--keep" in words:
-        at = words.index("--keep")
-        del words[at : at + 2]
-    words = [word for word in words if not word.startswith("--keep=")]
-    return [Path(w).name if Path(w).exists() else w for w in words]
+def _kept_arguments(arguments: Sequence[str]) -> list[str]:
+    """Return arguments of a command without `--keep F.json`, and files without their folders."""
+    kept = list(arguments)
+    if "--keep" in kept:
+        k = kept.index("--keep")
+        del kept[k : k + 2]
+    kept = [argument for argument in kept if not argument.startswith("--keep=")]
+    return [Path(a).name if Path(a).exists() else a for a in kept]
 
 
 def results(

@@ -23,19 +23,19 @@ def scaling(
     """Show what the scalings none, gu and gc do to the same data."""
     t = terminal(False)
     check(runs)
-    what = f"experiments of {runs} campaigns, each with every scaling"
+    steps = f"experiments of {runs} campaigns, each with every scaling"
     with (
         open_engine(*one_by_default(jobs, scheduler)) as engine,
-        counting(t.progress, what, experiments()) as advance,
+        counting(t.progress, steps, experiments()) as advance,
     ):
         rng = np.random.default_rng(1)
         study = scaling_study(rng, runs, engine=engine, advance=advance)
     t.show(table(study))
     figures = []
     for name in SCALINGS:
-        mine = [c for c in study.cells if c.scaling == name]
-        ratios = [c.error_over_bound for c in mine]
-        coverage = [100 * c.coverage for c in mine]
+        cells = [c for c in study.cells if c.scaling == name]
+        ratios = [c.error_over_bound for c in cells]
+        coverage = [100 * c.coverage for c in cells]
         figures += [
             Figure(
                 f"{name}: error over the Cramér-Rao bound",

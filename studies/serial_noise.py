@@ -1,4 +1,4 @@
-"""Campaigns whose noise is correlated along their order: intervals, verdicts, effects named."""
+"""Campaigns with noise correlated along their order: intervals, verdicts, named effects."""
 
 from dataclasses import dataclass, replace
 
@@ -20,20 +20,20 @@ from studies.study_cases import StudyCase, study_case, with_study_loads
 
 NORMAL_95 = 1.959963985
 STRENGTH = 2.0
-"""Of an effect that is hidden, σ."""
+"""Strength of a hidden effect, σ."""
 FRESH = 20
-"""Poses, with all loads, that are predicted."""
+"""Number of predicted poses, each with all loads."""
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What a refinement came to.
+    """Result of a refinement.
 
     Attributes:
         verdict: of the refined model.
         added: effects that were added.
-        parameters: true joint compliances within the stated intervals, and how many there are.
-        predictions: the same of coordinates of fresh states.
+        parameters: number of true joint compliances within the stated intervals, and of all.
+        predictions: the same for coordinates at fresh states.
     """
 
     verdict: str
@@ -49,11 +49,11 @@ class SerialCase:
     Attributes:
         seed: of the campaign.
         rho: correlation of consecutive readings.
-        hidden: effect that is hidden in it; empty for none.
-        before: with noise that is taken for white.
-        after: as it is.
-        found: ρ as estimated; None for white noise.
-        proved: whether it is.
+        hidden: hidden effect; empty for none.
+        before: result with noise assumed white.
+        after: result with serial noise.
+        found: estimate of ρ; None for white noise.
+        proved: whether the correlation is proved.
     """
 
     seed: int
@@ -66,7 +66,7 @@ class SerialCase:
 
 
 def serial_readings(case: StudyCase, rho: float, rng: np.random.Generator) -> Readings:
-    """Return the readings of a campaign with AR(1) noise of the stated covariance instead."""
+    """Return the readings of a campaign with their noise replaced by AR(1) noise."""
     r = case.readings
     z = rng.standard_normal((len(r), r.m))
     for k in range(1, len(z)):
@@ -80,14 +80,14 @@ def serial_case(
 ) -> SerialCase:
     """Measure a campaign with serial noise, and fit and refine it.
 
-    Absolute readings where the seed's half is even, or where a drift is hidden; else deflections.
-    Odd seeds do not tell their times, but where a drift is hidden.
+    With a hidden drift readings are absolute and have times. Otherwise readings are absolute where
+    half of the seed, rounded down, is even, else deflections; those of odd seeds have no times.
 
     Args:
-        asked: seed of everything random, ρ, and an effect that is hidden, or "".
+        asked: seed of everything random, ρ, and the hidden effect or "".
         config: the cell; robot and loads are replaced.
         robot: name of the arm.
-        poses: how many, each without a load and under five; twice as many where a drift is hidden.
+        poses: number of poses, each unloaded and under five loads; doubled with a hidden drift.
     """
     seed, rho, hidden = asked
     mode: Mode = "deflection" if seed // 2 % 2 and not hidden else "absolute"
@@ -101,8 +101,8 @@ def serial_case(
         readings = replace(readings, states=replace(readings.states, time=None))
     start = baseline(case.cell, readings, mode)
     white = refine_from(fit(start, readings, mode))
-    found = refine(start, readings, mode)
-    serial = found.fit.readings.serial
+    refined = refine(start, readings, mode)
+    serial = refined.fit.readings.serial
     _, loads = with_study_loads(config, robot)
     states, pose, load, cycle = rehearsal_states(case.cell, FRESH, loads, rng)
     if readings.states.time is None:
@@ -114,39 +114,37 @@ def serial_case(
         rho=rho,
         hidden=hidden,
         before=_outcome(white, start, case, clean),
-        after=_outcome(found, start, case, clean),
+        after=_outcome(refined, start, case, clean),
         found=None if serial is None else serial.rho,
         proved=serial is not None and serial.proved,
     )
 
 
-def _outcome(of: Refinement, start: Model, case: StudyCase, clean: Readings) -> Outcome:
+def _outcome(refined: Refinement, start: Model, case: StudyCase, clean: Readings) -> Outcome:
     return Outcome(
-        of.verdict,
-        tuple(n for n in of.fit.model.names if n not in start.names),
-        _parameters(of.fit, case),
-        _predicted(of.fit, clean),
+        refined.verdict,
+        tuple(n for n in refined.fit.model.names if n not in start.names),
+        _parameters(refined.fit, case),
+        _predicted(refined.fit, clean),
     )
 
 
-def _parameters(found: Fit, case: StudyCase) -> tuple[int, int]:
+def _parameters(fitted: Fit, case: StudyCase) -> tuple[int, int]:
     true = case.world.physics.joint_compliance
     inside = count = 0
-    for p in found.parameters:
+    for p in fitted.parameters:
         if p.name.startswith("joint_compliance.j") and p.value is not None and p.std is not None:
             inside += bool(abs(p.value - true[int(p.name[-1]) - 1]) <= NORMAL_95 * p.std)
             count += 1
     return inside, count
 
 
-def _predicted(found: Fit, clean: Readings) -> tuple[int, int]:
+def _predicted(f: Fit, clean: Readings) -> tuple[int, int]:
     """Count coordinates of measured quantities at fresh states within their intervals."""
-    kept = found.readings[~found.outlier]
-    of = predictive(
-        found.model, found.theta, found.solution.prior, kept, found.mode, found.holdout.rms_sigma
-    )
-    w = whitening(clean, found.mode)
-    prediction = found.model.predict(clean.states, found.theta)
-    away = residual(clean, prediction, w)
-    std = np.sqrt(np.diagonal(of.of_prediction(prediction, w), axis1=1, axis2=2))
-    return int(np.sum(np.abs(away) <= NORMAL_95 * std)), away.size
+    inliers = f.readings[~f.outlier]
+    p = predictive(f.model, f.theta, f.solution.prior, inliers, f.mode, f.holdout.rms_sigma)
+    w = whitening(clean, f.mode)
+    prediction = f.model.predict(clean.states, f.theta)
+    error = residual(clean, prediction, w)
+    std = np.sqrt(np.diagonal(p.of_prediction(prediction, w), axis1=1, axis2=2))
+    return int(np.sum(np.abs(error) <= NORMAL_95 * std)), error.size

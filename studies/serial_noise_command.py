@@ -19,7 +19,7 @@ from studies.records import Figure, Keep, keep
 from studies.serial_noise import Outcome, SerialCase, serial_case
 
 HELD = 0.93
-"""Share of true values within 95 % intervals that is required of strongly correlated noise."""
+"""Required share of true values within 95 % intervals for strongly correlated noise."""
 STRONG = 0.9
 DRIFT = "tracker_drift"
 
@@ -42,7 +42,7 @@ def serial_noise(
         serial_case, config=load_config(configs_dir() / "cells" / CELL), robot=robot, poses=poses
     )
     values = [float(rho) for rho in rhos.split(",")]
-    asked = [
+    settings = [
         (first_seed + k, rho, hidden)
         for rho in values
         for hidden, count in (("", campaigns), (DRIFT, drifts))
@@ -50,9 +50,9 @@ def serial_noise(
     ]
     with (
         open_engine(jobs, scheduler) as engine,
-        counting(t.progress, "campaigns", len(asked)) as advance,
+        counting(t.progress, "campaigns", len(settings)) as advance,
     ):
-        cases = engine.map(run, asked, advance=advance)
+        cases = engine.map(run, settings, advance=advance)
     figures = list(_figures(cases, values))
     for f in figures:
         t.show(f"{f.what}: {f.measured}")
@@ -63,11 +63,11 @@ def serial_noise(
 
 def _figures(cases: Sequence[SerialCase], rhos: Sequence[float]) -> Iterator[Figure]:
     for rho in rhos:
-        own = [c for c in cases if c.rho == rho]
-        mine = [c for c in own if not c.hidden]
-        if mine:
-            yield from _of_noise(mine, rho)
-        drifts = [c for c in own if c.hidden]
+        of_rho = [c for c in cases if c.rho == rho]
+        plain = [c for c in of_rho if not c.hidden]
+        if plain:
+            yield from _of_noise(plain, rho)
+        drifts = [c for c in of_rho if c.hidden]
         if drifts:
             named = [_share(drifts, lambda o: o.added == (DRIFT,), w) for w in (False, True)]
             yield Figure(
@@ -76,40 +76,38 @@ def _figures(cases: Sequence[SerialCase], rhos: Sequence[float]) -> Iterator[Fig
             )
 
 
-def _of_noise(mine: Sequence[SerialCase], rho: float) -> Iterator[Figure]:
-    for words, part in (("parameters", "parameters"), ("predictions", "predictions")):
+def _of_noise(cases: Sequence[SerialCase], rho: float) -> Iterator[Figure]:
+    for part in ("parameters", "predictions"):
         shares = []
         for which in ("before", "after"):
-            counts = np.array([getattr(getattr(c, which), part) for c in mine])
+            counts = np.array([getattr(getattr(c, which), part) for c in cases])
             shares.append(float(counts[:, 0].sum() / counts[:, 1].sum()))
         strong = rho >= STRONG
         yield Figure(
-            f"ρ = {rho:g}: true {words} within 95 % intervals",
+            f"ρ = {rho:g}: true {part} within 95 % intervals",
             f"white {100 * shares[0]:.1f} %, as it is {100 * shares[1]:.1f} %",
             f"≥ {100 * HELD:.0f} %" if strong else "",
             shares[1] >= HELD if strong else None,
         )
-    for words, of in (
+    for title, holds in (
         ("adequate", lambda o: o.verdict == "adequate"),
         ("an effect is named falsely", lambda o: bool(o.added) or o.verdict == "missing_effect"),
         ("unknown_effect", lambda o: o.verdict == "unknown_effect"),
     ):
-        shares_of = [_share(mine, of, w) for w in (False, True)]
-        yield Figure(
-            f"ρ = {rho:g}: {words}", f"white {shares_of[0]}, as it is {shares_of[1]} of {len(mine)}"
-        )
-    found = [c.found for c in mine if c.found is not None and c.proved]
-    doubt = sum(c.found is not None and not c.proved for c in mine)
-    spread = f", ρ = {np.mean(found):.3f} ± {np.std(found):.3f}" if found else ""
+        white, serial = (_share(cases, holds, w) for w in (False, True))
+        yield Figure(f"ρ = {rho:g}: {title}", f"white {white}, as it is {serial} of {len(cases)}")
+    estimates = [c.found for c in cases if c.found is not None and c.proved]
+    doubt = sum(c.found is not None and not c.proved for c in cases)
+    spread = f", ρ = {np.mean(estimates):.3f} ± {np.std(estimates):.3f}" if estimates else ""
     none = rho == 0.0
     yield Figure(
         f"ρ = {rho:g}: correlation found",
-        f"{len(found)} of {len(mine)}{spread}; {doubt} in doubt",
+        f"{len(estimates)} of {len(cases)}{spread}; {doubt} in doubt",
         "≤ 1 %" if none else "",
-        len(found) + doubt <= 0.01 * len(mine) if none else None,
+        len(estimates) + doubt <= 0.01 * len(cases) if none else None,
     )
 
 
-def _share(cases: Sequence[SerialCase], of: Callable[[Outcome], bool], after: bool) -> str:
-    true = [of(c.after if after else c.before) for c in cases]
+def _share(cases: Sequence[SerialCase], holds: Callable[[Outcome], bool], serial: bool) -> str:
+    true = [holds(c.after if serial else c.before) for c in cases]
     return f"{100 * float(np.mean(true)):.0f} %"

@@ -1,4 +1,4 @@
-"""Simulated campaigns for the study of the diagnosis: 30 poses, five loads, anything hidden."""
+"""Simulated campaigns for the study of the diagnosis: 30 poses, five loads, hidden effects."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -35,19 +35,19 @@ _LOADS: tuple[tuple[str, tuple[float, float, float], tuple[float, float, float]]
     ("pull along y", (0.0, 0.65, 0.0), (1.0, 0.0, 1.0)),
     ("pull aslant", (-0.4, -0.4, 0.35), (-1.0, 1.0, 0.5)),
 )
-"""Force in shares of what the arm may carry beside its tool, moment in levers of that."""
+"""Force in units of the payload left by the tool, moment in units of this force times the lever."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StudyCase:
-    """A campaign, and all that the program is not told of it.
+    """A campaign with its truth, which the program does not get.
 
     Attributes:
         cell: the cell as configured.
         world: the truth.
-        readings: what was measured.
-        noise: (N, 3) what noise did to each reading, m.
-        variables: what an effect outside of the catalogue depends on.
+        readings: the measured readings.
+        noise: (N, 3) noise of each reading, m.
+        variables: variables of a hidden effect outside of the catalogue.
     """
 
     cell: Cell
@@ -67,14 +67,14 @@ def with_study_loads(config: CellConfig, robot: str) -> tuple[CellConfig, list[t
     room = arm.payload - config.tool.mass_kg
     if not np.isfinite(room) or room <= 0.0:
         raise InputError(f"robot {robot}: a payload of {arm.payload:g} kg leaves no load to hang")
-    own = config.robot.model_copy(update={"model": robot, "base_link": None, "tip_link": None})
+    section = config.robot.model_copy(update={"model": robot, "base_link": None, "tip_link": None})
     weight = _G * room
     lever = _LEVER * arm.reach
     loads = [
         (name, weight * np.array([*force, *(lever * np.array(moment))]))
         for name, force, moment in _LOADS
     ]
-    return config.model_copy(update={"robot": own}), loads
+    return config.model_copy(update={"robot": section}), loads
 
 
 def effects_shown(mode: Mode) -> tuple[str, ...]:
@@ -102,18 +102,18 @@ def study_case(
 ) -> StudyCase:
     """Measure a campaign that hides effects, or a law outside of the catalogue.
 
-    Equal arguments give equal campaigns; those that differ in strength alone share poses, arm
+    Equal arguments give equal campaigns. Campaigns that differ only in strength share poses, arm
     and noise.
 
     Args:
         config: the cell; robot and loads are replaced.
         robot: name of the arm.
         mode: the kind of readings in which the strength holds.
-        hidden: effects of `EFFECTS` or names of `LAWS`; none of them hides nothing.
-        strength: of each, rms in units of the noise.
+        hidden: effects of `EFFECTS` or names of `LAWS`; empty hides nothing.
+        strength: of each effect or law, rms in units of the noise.
         seed: of everything random.
         stated: stated over true standard deviation of the noise.
-        cycles: how often all is measured.
+        cycles: number of times that all poses are measured.
         n_poses: number of poses.
 
     Raises:
@@ -121,12 +121,15 @@ def study_case(
     """
     names = "+".join(hidden)
     rng = np.random.default_rng([seed, cycles, *(crc32(w.encode()) for w in (robot, mode, names))])
-    own, loads = with_study_loads(config, robot)
-    cell = cell_from_config(as_told(own, "base_frame" if "base_frame" in hidden else "nothing"))
+    robot_config, loads = with_study_loads(config, robot)
+    cell = cell_from_config(
+        as_told(robot_config, "base_frame" if "base_frame" in hidden else "nothing")
+    )
     states, pose, load, cycle = rehearsal_states(cell, n_poses, loads, rng, cycles=cycles)
     world = nothing_hidden(
         cell, rng,
-        noise=measurement_noise(own), joint_std=own.repeatability.per_joint(cell.arm.n),
+        noise=measurement_noise(robot_config),
+        joint_std=robot_config.repeatability.per_joint(cell.arm.n),
     )  # fmt: skip
     if "joint_stiffening" in hidden:
         softer = _SOFTER * world.physics.joint_compliance

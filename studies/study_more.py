@@ -1,4 +1,4 @@
-"""A further round in the study of the diagnosis: what `next` plans, measured in the same world."""
+"""A further round in the study of the diagnosis: the plan of `next`, measured in the same world."""
 
 from dataclasses import fields, replace
 from typing import Any
@@ -19,9 +19,9 @@ from studies.temperatures import air, joints
 
 POSES = 20
 MOST = 3
-"""Suspects that are told apart."""
+"""Number of suspects to separate."""
 CANDIDATES = 120
-"""Poses that the plan chooses from: hundreds of plans are made."""
+"""Candidate poses of a plan; few, as hundreds of plans are made."""
 _PAUSE = 600.0  # s between the rounds
 
 
@@ -33,9 +33,9 @@ def measure_more(
     seed: int,
     poses: int = POSES,
 ) -> Readings | None:
-    """Plan what separates the leading suspects, and measure it.
+    """Plan and measure readings that separate the leading suspects.
 
-    Where no effect is significant, it is the suspects of most evidence.
+    Where no effect is significant, these are the suspects with most evidence.
 
     Args:
         config: the cell; robot and loads are replaced.
@@ -43,33 +43,33 @@ def measure_more(
         case: the campaign so far.
         diagnosis: of it, on the baseline.
         seed: of everything random.
-        poses: as many readings as so many poses take under every load.
+        poses: number of poses; the plan has as many readings as they have under every load.
 
     Returns:
-        All readings, the earlier ones first; None where nothing is in doubt, and where no
+        All readings, those of the campaign first; None where nothing is in doubt, or where no
         measurement separates the suspects.
     """
     names = suspects(diagnosis)
     if len(names) < 2:
         return None
     rng = np.random.default_rng([seed, len(case.readings)])
-    own, pulls = with_study_loads(config, robot)
+    robot_config, pulls = with_study_loads(config, robot)
     loads = tuple(
         CellLoad(name=name, force_N=tuple(map(float, w[:3])), moment_Nm=tuple(map(float, w[3:])))
         for name, w in pulls
     )
-    planning = own.planning.model_copy(update={"candidates": CANDIDATES})
-    own = own.model_copy(update={"loads": list(loads), "planning": planning})
-    # Instead of leaving out loads, one after the other, which takes long.
-    asked = Request(poses, readings=poses * (1 + len(loads)))
+    planning = robot_config.planning.model_copy(update={"candidates": CANDIDATES})
+    robot_config = robot_config.model_copy(update={"loads": list(loads), "planning": planning})
+    # A limit on readings is faster than leaving out loads one by one.
+    request = Request(poses, readings=poses * (1 + len(loads)))
     try:
-        found = measure_next(case.cell, own, diagnosis.fit, names, asked, rng)
+        separating = measure_next(case.cell, robot_config, diagnosis.fit, names, request, rng)
     except CannotAnswerError:
         return None
-    before = case.readings
-    begun = float(np.asarray(before.states.time).max()) + _PAUSE
-    visit = planned_states(case.cell, own, found.planned.ordered.plan, begun)
-    since = np.asarray(visit.states.time) - begun
+    before, plan = case.readings, separating.planned.ordered.plan
+    start = float(np.asarray(before.states.time).max()) + _PAUSE
+    visit = planned_states(case.cell, robot_config, plan, start)
+    since = np.asarray(visit.states.time) - start
     states = replace(
         visit.states,
         air_temperature=air(since, rng),
@@ -78,18 +78,17 @@ def measure_more(
     hung = ("none", *(load.name for load in loads))
     number = visit.pose + len(before.pose_names)
     after = simulate(case.world, states, number, visit.load, visit.cycle, hung, rng)
-    plan = found.planned.ordered.plan
     return joined(before, after, tuple(f"next {name}" for name in plan.pose_names))
 
 
 def suspects(d: Diagnosis) -> tuple[str, ...]:
-    """Return the effects in doubt, or those of most evidence where no suspect passes all tests."""
+    """Return the effects in doubt; those with most evidence where no suspect passes all tests."""
     best = tuple(s.effect for s in d.suspects)[:MOST]
     return in_doubt(d, MOST) or d.significant[:1] or best
 
 
 def joined(a: Readings, b: Readings, poses: tuple[str, ...]) -> Readings:
-    """One after the other; what only one of them has is left out."""
+    """Return the readings of both; quantities that only one of them has are left out."""
 
     def both(name: str) -> Floats | None:
         parts = [getattr(r.states, name) for r in (a, b)]

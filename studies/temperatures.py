@@ -1,27 +1,27 @@
-"""Temperatures of joints and air over a campaign that is drawn at random."""
+"""Random temperatures of joints and air over a campaign."""
 
 import numpy as np
 
 from hilcal.drivers.simulated.truth import AIR
 from hilcal.types import Floats
 
-_RISE = (5.0, 20.0)  # °C that a joint warms up by, in a rehearsal
-_RISE_TIME = (1500.0, 4500.0)  # s, time constant of it
+_RISE = (5.0, 20.0)  # °C, rise of a joint's temperature in a rehearsal
+_RISE_TIME = (1500.0, 4500.0)  # s, its time constant
 _JOINT_STD = 0.05  # °C, noise of a sensor in a joint
 _DAY = 86400.0  # s
-_DAY_SWING = (0.5, 1.5)  # °C, half of what a day brings
-_ROOM_RISE = (0.5, 2.5)  # °C that the machines warm the room by
-_ROOM_TIME = (3600.0, 10800.0)  # s, time constant of it
+_DAY_SWING = (0.5, 1.5)  # °C, amplitude of the daily cycle
+_ROOM_RISE = (0.5, 2.5)  # °C, rise of the room's temperature by the machines
+_ROOM_TIME = (3600.0, 10800.0)  # s, its time constant
 _CYCLE = (1200.0, 2700.0)  # s, period of the air conditioning
-_CYCLE_SWING = (0.05, 0.25)  # °C, half of its swing
+_CYCLE_SWING = (0.05, 0.25)  # °C, its amplitude
 _AIR_STD = 0.02  # °C, noise of an air thermometer
 
 
 def joints(time: Floats, n: int, rng: np.random.Generator) -> Floats:
-    """Return the (N, n) temperatures that the joints of an arm tell, °C.
+    """Return the (N, n) measured temperatures of the joints of an arm, °C.
 
-    T_j = 22 °C + r_j (1 - exp(-t / tau_j)) and noise: an arm that was at rest begins to work;
-    its joints warm up by 5 to 20 °C within some hours, each by its own.
+    T_j = 22 °C + r_j (1 - exp(-t / tau_j)) plus noise: the joints of an arm that was at rest warm
+    up by 5 to 20 °C within some hours, each by another amount.
 
     Args:
         time: (N,) since the arm was switched on, s.
@@ -34,10 +34,10 @@ def joints(time: Floats, n: int, rng: np.random.Generator) -> Floats:
 
 
 def air(time: Floats, rng: np.random.Generator) -> Floats:
-    """Return the (N,) temperatures of the air in a hall, °C: a slow drift of a few °C.
+    """Return the (N,) measured temperatures of the air in a hall, °C, which drift by a few °C.
 
-    The hour of the day, the machines that warm the room, the cycle of its air conditioning,
-    and noise.
+    They are the sum of a daily cycle, warming by machines, the cycle of the air conditioning, and
+    noise.
 
     Args:
         time: (N,) since the campaign's start, s.

@@ -1,8 +1,8 @@
-"""Laws that no catalogue knows: what an effect outside of it does to the readings.
+"""Laws outside of the catalogue, and their displacement of readings.
 
-A law moves joints or the target by something that is recorded, in a way that no effect of the
-catalogue describes: a joint errs with the angle of another, a bench sways with the air. It is
-added to readings to first order, r + J dq + d, at the strength that is asked for.
+A law moves joints or the target as a function of recorded quantities that no effect of the
+catalogue has: the error of a joint depends on the angle of another one, a bench rises with the air
+temperature. It is added to readings to first order, r + J dq + d, at a given strength.
 """
 
 from collections.abc import Callable
@@ -26,11 +26,11 @@ class UnmodelledLaw:
     """An effect outside of the catalogue.
 
     Attributes:
-        name: a few words.
+        name: short name.
         law: the law in one line.
-        variables: what it depends on, as a diagnosis would call it.
-        readings: kinds of readings that show it.
-        motion: the law, at any size.
+        variables: its variables, by their names in a diagnosis.
+        readings: modes of readings that show it.
+        motion: the law, in any unit.
         resembles: effects of the catalogue that describe it nearly as well.
     """
 
@@ -56,14 +56,14 @@ def _upwards(states: States, values: Floats) -> Floats:
     return out
 
 
-def _given(values: Floats | None, what: str) -> Floats:
+def _given(values: Floats | None, name: str) -> Floats:
     """Return a column that the law depends on.
 
     Raises:
-        InputError: the states lack it.
+        InputError: the states lack the column.
     """
     if values is None:
-        raise InputError(f"states: no {what}; valid: states that tell it")
+        raise InputError(f"states: no {name}; valid: states that tell it")
     return values
 
 
@@ -180,7 +180,7 @@ LAWS: tuple[UnmodelledLaw, ...] = (
         "hose spring", "dq_5 = a |f| q_6", ("joint 6 angle", "load"), (DEFLECTION,), _hose
     ),
 )
-"""Every law, by what shows it."""
+"""All laws."""
 
 
 def law_named(name: str) -> UnmodelledLaw:
@@ -204,13 +204,13 @@ def shift(
     pose: Ints,
     cycle: Ints,
 ) -> Floats:
-    """Return (N, 3) by how much the law moves the readings, sensor axes, m.
+    """Return the displacement (N, 3) of the readings by the law, sensor axes, m.
 
-    The size is such that sqrt(mean |W d|²) = strength_sigma, as in `injected_effects.hide`: d is
+    Its size is such that sqrt(mean |W d|²) = strength_sigma, as in `injected_effects.hide`: d is
     the change of a reading, or of a loaded minus its unloaded reading; W whitens it.
 
     Raises:
-        InputError: a mode that does not show the law, or states that lack what it depends on.
+        InputError: a mode that does not show the law, or states that lack a variable of the law.
     """
     if mode not in law.readings:
         raise InputError(f"law {law.name!r} needs readings {' or '.join(law.readings)}, not {mode}")
@@ -232,7 +232,7 @@ def shift(
 
 
 def _pairs(loaded: Bools, pose: Ints, cycle: Ints) -> tuple[Ints, Ints]:
-    """Return rows of loaded readings, and of the unloaded one of their pose and cycle.
+    """Return the rows of loaded readings, and those of the unloaded readings to subtract.
 
     Raises:
         InputError: no loaded reading, or a pose without an unloaded one.

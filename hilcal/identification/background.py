@@ -1,12 +1,12 @@
 """Random effects of a model: its background, and the lines of shrunk effects.
 
-Every arm has every effect, most of them too small to name. A model with a background has all
-effects of its catalogue that the readings allow, random with a mean of zero and the standard
-deviations that the mixed model estimates (see `hilcal.mixed`). Those that people see as the model
-are named; the others are its background. The prediction is that of all of them.
+Every arm has every effect; most effects are too small to be proved. A model with a background has
+all effects of its catalogue that the readings allow, as random effects of zero mean with the
+standard deviations that the mixed model estimates (see `hilcal.mixed`). Reports show the named
+effects as the model; the others are its background. All of them predict.
 
-Where no background is needed, effects of many small parameters, as the lines of a gear, are random
-all the same, see `with_pooled_lines`.
+Without a background, effects of many small parameters, as the lines of a gear, are random, too: see
+`with_pooled_lines`.
 """
 
 from collections.abc import Collection
@@ -33,27 +33,27 @@ from hilcal.readings.readings import ArmScatter
 from hilcal.types import Floats
 
 MOST_ROWS = 1500
-"""Elements of readings up to which a background is fitted: with more, effects are named one by one
-until nothing is left, and the equations cost the cube of the columns. A choice."""
+"""Most elements of readings for which a background is fitted: with more, single effects are added
+until the model is adequate, and the cost grows as the cube of the columns. A choice."""
 MOST_ROWS_OF_LINES = 2000
-"""The same up to which lines are pooled; a choice, some seconds."""
+"""Most elements of readings for which lines are pooled; a choice: it takes some seconds."""
 UNSURE = 2.0
-"""Factor to which few readings tell a standard deviation: it may be so much more than plausible; a
-choice."""
+"""Factor by which an estimated standard deviation may exceed the plausible one, as few readings
+determine it to such a factor only; a choice."""
 
 WIDTH = 1.96
-"""Standard errors of log s that a 95 % interval reaches on either side."""
+"""Half width of a 95 % interval, in standard errors of log s."""
 
 
 @dataclass(frozen=True, slots=True)
 class BackgroundPart:
-    """The parameters of one effect of a background that have one unit.
+    """The parameters of one effect of a background that have the same unit.
 
     Attributes:
-        effect: its name.
-        std: root of the mean square of their standard deviations, SI.
+        effect: name of the effect.
+        std: rms of the parameters' standard deviations, SI.
         unit: SI unit.
-        rms_m: root of the mean square of what they move the measured positions by, m.
+        rms_m: rms displacement of the measured positions by the parameters, m.
     """
 
     effect: str
@@ -64,14 +64,14 @@ class BackgroundPart:
 
 @dataclass(frozen=True, slots=True)
 class Background:
-    """What a background moves; effects that the readings do not tell apart can cancel in it."""
+    """Displacement by a background; inseparable effects can cancel in the sum."""
 
     rms_m: float  # of all its effects together, m
-    parts: tuple[BackgroundPart, ...]  # of each, what moves most first
+    parts: tuple[BackgroundPart, ...]  # largest displacement first
 
     @property
     def effects(self) -> tuple[str, ...]:
-        """Names of its effects."""
+        """Names of the effects."""
         return tuple(dict.fromkeys(p.effect for p in self.parts))
 
     def to_json(self) -> dict[str, object]:
@@ -80,27 +80,28 @@ class Background:
 
 
 def background_of(fit: Fit) -> Background:
-    """Return what the background of a fit moves; nothing where its model has none."""
+    """Return the displacement by the background of a fit; zero where its model has none."""
     model = fit.model
     if not model.background:
         return Background(0.0, ())
     jacobian = model.jacobian(fit.solution.prediction, fit.theta, 3)
     moves, parts = fit.whitening.raw(jacobian) * fit.theta, []
     inside = np.zeros(model.size, dtype=bool)
-    for effect, mine in zip(model.effects, model.slices(), strict=True):
+    for effect, columns in zip(model.effects, model.slices(), strict=True):
         if effect.name not in model.background:
             continue
-        inside[mine] = True
+        inside[columns] = True
         units, std = [p.unit for p in effect.parameters], model.random[effect.name]
         for unit in dict.fromkeys(units):
-            own = np.array([u == unit for u in units])
-            rms = float(np.sqrt(np.mean(std[own] ** 2)))
-            parts.append(BackgroundPart(effect.name, rms, unit, _rms(moves[:, :, mine][:, :, own])))
+            of_unit = np.array([u == unit for u in units])
+            rms = float(np.sqrt(np.mean(std[of_unit] ** 2)))
+            moved = _rms(moves[:, :, columns][:, :, of_unit])
+            parts.append(BackgroundPart(effect.name, rms, unit, moved))
     return Background(_rms(moves[:, :, inside]), tuple(sorted(parts, key=lambda p: -p.rms_m)))
 
 
 def _rms(moves: Floats) -> float:
-    """Root of the mean square of the displacements that columns (D, 3, q) add up to."""
+    """Return the rms of the sum of the displacements (D, 3, q) over the columns."""
     return float(np.sqrt(np.mean(np.sum(moves.sum(axis=2) ** 2, axis=1))))
 
 
@@ -114,9 +115,9 @@ class FamilySize:
     std: float  # root of the mean square over the parameters
     low: float  # lower end of its 95 % interval
     high: float  # upper end
-    ordinary: float  # the same of an ordinary arm
+    ordinary: float  # std of an ordinary arm
     unit: str
-    moves_m: float  # rms of what its estimated parameters move the measured positions by, m
+    moves_m: float  # rms displacement of the measured positions by its estimated parameters, m
 
     def to_json(self) -> dict[str, object]:
         """Return the attributes by name, SI."""
@@ -124,18 +125,18 @@ class FamilySize:
 
 
 def family_sizes(fit: Fit) -> tuple[FamilySize, ...]:
-    """Return the size of each family of a fit with a background; what moves most comes first.
+    """Return the size of each family of a fit with a background, largest displacement first.
 
-    It is estimated with those of all others (see `mixed.variances`); the curvature of the log
-    posterior gives its interval.
+    The sizes of all families are estimated together (see `mixed.variances`); the curvature of the
+    log posterior gives the intervals.
     """
     model = fit.model
     if not model.background:
         return ()
-    kept = fit.readings[~fit.outlier].as_stated()
-    found = mixed_fit_at(model, kept, fit.mode, fit.theta)
-    problem, log_std = found.equations.problem, found.log_std
-    error = np.sqrt(np.diag(found.covariance))
+    inliers = fit.readings[~fit.outlier].as_stated()
+    variances = mixed_fit_at(model, inliers, fit.mode, fit.theta)
+    problem, log_std = variances.equations.problem, variances.log_std
+    error = np.sqrt(np.diag(variances.covariance))
     jacobian = model.jacobian(fit.solution.prediction, fit.theta, 3)
     moves = fit.whitening.raw(jacobian) * fit.theta
     units = [p.unit for e in model.effects for p in e.parameters]
@@ -162,87 +163,88 @@ def family_sizes(fit: Fit) -> tuple[FamilySize, ...]:
     return tuple(sorted(out, key=lambda s: -s.moves_m))
 
 
-def allows_background(of: Fit) -> bool:
-    """Whether the readings are few enough for a background, and no other campaign is the prior.
+def allows_background(fitted: Fit) -> bool:
+    """Whether a background can be fitted.
 
-    A prior of another campaign says of its own effects how large they are. A model that was made
-    without readings cannot take effects by name.
+    The readings must be few enough. A model with the prior of another campaign has none, as the
+    prior states the sizes of its effects; nor has a model without readings, as no effect can be
+    added to it by name.
     """
-    return len(of.white) <= MOST_ROWS and _alone(of)
+    return len(fitted.white) <= MOST_ROWS and _extensible(fitted.model)
 
 
-def _alone(of: Fit) -> bool:
-    return of.model.prior is None and of.model.readings is not None
+def _extensible(model: Model) -> bool:
+    return model.prior is None and model.readings is not None
 
 
-def with_background(of: Fit, named: Collection[str]) -> Fit | None:
-    """Fit all effects of the catalogue; None where one of them would be implausibly large.
+def with_background(fitted: Fit, named: Collection[str]) -> Fit | None:
+    """Fit all effects of the catalogue; None where an added one becomes implausibly large.
 
-    Such an effect (`Effect.most`) stands in for one that the catalogue lacks, and may be so large
-    that the arm has no equilibrium; those of the model, which were proved, may be as large as they
-    are.
+    Such an effect (see `Effect.most`) stands in for one that the catalogue lacks, and may be so
+    large that the arm has no equilibrium. The effects of the model are proved: their size is not
+    limited.
 
-    The noise is as the mixed model estimates it: the arm's scatter is in the covariance, and a
-    factor of the instrument's makes the standard deviations of the effects smaller by as much,
-    which is the same fit. Readings that were set aside as gross errors stay so. The `named` effects
-    are not of the background.
+    The noise is that of the mixed model. The arm's scatter is added to the covariance. Instead of
+    multiplying the instrument's noise by its estimated factor, the standard deviations of the
+    effects are divided by this factor, which gives the same fit. Gross errors stay set aside. The
+    `named` effects do not belong to the background.
     """
-    readings = of.readings.as_stated()
+    readings = fitted.readings.as_stated()
     try:
-        found = mixed_fit(of.model, readings[~of.outlier], of.mode)
-        if _implausible(found) - set(of.model.names):
+        mixed = mixed_fit(fitted.model, readings[~fitted.outlier], fitted.mode)
+        if _implausible(mixed) - set(fitted.model.names):
             return None
         if not readings.scatter_stated:
-            readings = with_arm_scatter(found.model.cell, readings, _scatter(found))
-        return fit(background_model(found, named), readings, of.mode, start=found.theta)
+            readings = with_arm_scatter(mixed.model.cell, readings, _scatter(mixed))
+        return fit(background_model(mixed, named), readings, fitted.mode, start=mixed.theta)
     except CannotAnswerError:
         return None
 
 
-def with_pooled_lines(of: Fit) -> Fit | None:
-    """Fit shrunk effects anew, the size of each line near that of its pool.
+def with_pooled_lines(fitted: Fit) -> Fit | None:
+    """Fit shrunk effects anew, with the size of each line near that of its pool.
 
-    A fit chooses the variance of each line (`Effect.groups`), as a wave of one gear, of its few
-    parameters alone: it drops true ones by chance, and keeps false ones. With what the lines of a
-    pool (`Effect.pools`) share, see `mixed.families`, simulated transmission errors were predicted
-    with 0.9 of the error at fresh poses. The noise is that of the fit.
+    An ordinary fit chooses the variance of each line (`Effect.groups`), as a wave of one gear, from
+    its few parameters alone, so that it drops real lines and retains false ones by chance. With a
+    prior size common to the lines of a pool (`Effect.pools`, see `mixed.families`) the error of
+    simulated transmission errors at fresh poses fell to 0.9. The noise is that of the fit.
 
     Returns:
         The fit; None where the model has no such effect, or the readings are too many.
     """
-    model = of.model
+    model = fitted.model
     shrunk = {e.name for e in model.effects if e.groups() is not None} - set(model.random)
-    if not shrunk or not _alone(of) or len(of.white) > MOST_ROWS_OF_LINES:
+    if not shrunk or not _extensible(model) or len(fitted.white) > MOST_ROWS_OF_LINES:
         return None
-    # What the fit knows of the arm's scatter is in the covariance.
-    kept = replace(of.readings[~of.outlier], scatter_stated=True)
+    # The covariance contains the arm's scatter as the fit has it.
+    inliers = replace(fitted.readings[~fitted.outlier], scatter_stated=True)
     try:
-        found = mixed_fit_of(model, kept, of.mode, set(model.names) - shrunk, shrunk)
-        std = found.prior_std() / found.std(INSTRUMENT)
+        mixed = mixed_fit_of(model, inliers, fitted.mode, set(model.names) - shrunk, shrunk)
+        std = mixed.prior_std() / mixed.std(INSTRUMENT)
         parts = zip(model.effects, model.slices(), strict=True)
-        random = {**model.random, **{e.name: std[own] for e, own in parts if e.name in shrunk}}
-        return fit(replace(model, random=random), of.readings, of.mode, start=found.theta)
+        random = {**model.random, **{e.name: std[rows] for e, rows in parts if e.name in shrunk}}
+        return fit(replace(model, random=random), fitted.readings, fitted.mode, start=mixed.theta)
     except CannotAnswerError:
         return None
 
 
-def _implausible(found: MixedFit) -> set[str]:
-    """Names of the effects some of whose standard deviations are larger than is plausible."""
-    std = found.prior_std()
+def _implausible(mixed: MixedFit) -> set[str]:
+    """Names of the effects with a standard deviation above the plausible size."""
+    std = mixed.prior_std()
     return {
         effect.name
-        for effect, mine in zip(found.model.effects, found.model.slices(), strict=True)
+        for effect, rows in zip(mixed.model.effects, mixed.model.slices(), strict=True)
         if effect.role not in FRAME_ROLES
-        and np.any(std[mine] > UNSURE * effect.most() * effect.magnitudes)
+        and np.any(std[rows] > UNSURE * effect.most() * effect.magnitudes)
     }
 
 
-def _scatter(found: MixedFit) -> ArmScatter:
+def _scatter(mixed: MixedFit) -> ArmScatter:
     """Return the arm's scatter of a mixed fit, in units of the instrument's noise."""
-    noise = found.std(INSTRUMENT)
-    k = found.problem.names.index(SCATTER)
-    std, error = found.std(SCATTER) / noise * SCATTER_RAD, found.variances.covariance[k, k] ** 0.5
-    moved = joint_factors(found.model.cell, found.readings, np.full(found.model.cell.arm.n, std))
+    noise = mixed.std(INSTRUMENT)
+    k = mixed.problem.names.index(SCATTER)
+    std, error = mixed.std(SCATTER) / noise * SCATTER_RAD, mixed.variances.covariance[k, k] ** 0.5
+    moved = joint_factors(mixed.model.cell, mixed.readings, np.full(mixed.model.cell.arm.n, std))
     return ArmScatter(
         kind="joints",
         std=(float(std),),
@@ -253,12 +255,12 @@ def _scatter(found: MixedFit) -> ArmScatter:
     )
 
 
-def background_model(found: MixedFit, named: Collection[str]) -> Model:
-    """Return the model of a mixed fit with the effects that are not named as its background."""
-    std = found.prior_std() / found.std(INSTRUMENT)
+def background_model(mixed: MixedFit, named: Collection[str]) -> Model:
+    """Return the model of a mixed fit, whose background are all effects except the named ones."""
+    std = mixed.prior_std() / mixed.std(INSTRUMENT)
     random = {
-        effect.name: std[mine]
-        for effect, mine in zip(found.model.effects, found.model.slices(), strict=True)
+        effect.name: std[rows]
+        for effect, rows in zip(mixed.model.effects, mixed.model.slices(), strict=True)
         if effect.role not in FRAME_ROLES
     }
-    return replace(found.model, random=random, background=frozenset(random) - frozenset(named))
+    return replace(mixed.model, random=random, background=frozenset(random) - frozenset(named))

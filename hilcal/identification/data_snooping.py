@@ -1,21 +1,24 @@
-"""Which readings are gross errors: data snooping from a robust start.
+"""Detection of gross errors: data snooping from a robust start.
 
-Least trimmed squares finds the readings, more than half, that agree best on the model. What a model
-without some effect leaves of them sizes smooth nuisance functions that stand in for it, as random
-effects: joint displacements by functions of the joint's angle, torque and side of approach, link
-twists, constant and by the moments that the link carries, a drift of the target with time. Then
-readings join or leave by their distance t² from the fit to the others, which is χ²_m of a good
-reading, until none does (Baarda, *A testing procedure for use in geodetic networks*, 1968).
+Least trimmed squares finds more than half of the readings that agree best with the model. An effect
+that the model lacks is represented by smooth nuisance functions, as random effects: joint
+displacements as functions of the joint's angle, torque and side of approach; constant link twists,
+and link twists proportional to the moments that the link carries; a drift of the target with time.
+The residual of the robust start gives their variance. Then readings enter or leave by their
+distance t² from the fit to the others, which is χ²_m distributed for a good reading, until the set
+does not change (Baarda, *A testing procedure for use in geodetic networks*, 1968).
 
-Readings that are off for one cause are no gross errors: those off by the same shift in a row, in
-the axes of the sensor or of the target, as by another reflector, a target that was moved on the
-tool, a tracker that was bumped (`off_alike`); and those off along what one site of the arm can do.
-What a law of a joint, of a link that bends or of the force sensor does to a reading goes along one
-direction there, whatever the law depends on; a gross error goes anywhere. Of a random error in m
-dimensions the share beside a direction is sin² ~ Beta((m − 1)/2, 1/2), with p its distribution
-function uniform. So n of F gross errors are as near to a site's direction as p_(n), ascending, with
-the probability P(B(F, p_(n)) ≥ n), times F and the number of sites for the least of all. Where that
-is too small, what is along the site, at two poses at least, is a law's (`along_one_site`).
+Readings that deviate by one common cause are no gross errors. Such are readings in a row with the
+same shift in the axes of the sensor or of the target, as by another reflector, a target that was
+moved on the tool, or a bumped tracker (`off_alike`); and readings with shifts along the directions
+of one site of the arm (`along_one_site`). A law of a joint, of a link that bends, or of the force
+sensor moves each reading along one direction, whatever the law depends on; a gross error has any
+direction. For a random error in m dimensions the share of its square normal to a direction is
+sin² ~ Beta((m − 1)/2, 1/2), so that its distribution function p is uniform. With p_(n) ascending, n
+of F gross errors are as near to the directions of a site as p_(n) with the probability
+P(B(F, p_(n)) ≥ n). Its minimum over n and the sites is multiplied by F and the number of sites.
+Where the product is too small, the readings near these directions, if of at least two poses, are
+ascribed to a law.
 """
 
 from dataclasses import dataclass, replace
@@ -46,29 +49,29 @@ from hilcal.robot import se3
 from hilcal.types import Bools, Floats, Ints
 
 # All of these are choices.
-SMALLEST = 3e-3  # share of the largest used t² below which none leaves before a new fit
-ACCIDENT = 1e-3  # probability of so many shared unloaded readings that are off: a misfit
-CORE = 0.99  # of the χ² quantile up to which readings join the robust start
-MOST_COLUMNS = 200  # parameters fitted anew with each choice; of more, those without a prior
-ROUGH_M = 1e-3  # scatter of most readings, m, from which on they disagree: no arm leaves as much
-ROUNDS = 20  # most rounds in which readings join and leave
-WHITENED = 4096  # readings that are whitened at a time
-EXACT = 1e-6  # share of a group's mean covariance that each has: exact unloaded readings stay so
+SMALLEST = 3e-3  # share of the largest t² in the fit below which no reading leaves in one round
+ACCIDENT = 1e-3  # probability of so many shared unloaded readings among gross errors: a misfit
+CORE = 0.99  # probability of the χ² quantile up to which readings enter the robust start
+MOST_COLUMNS = 200  # parameters fitted anew with each set; of more, only those without a prior
+ROUGH_M = 1e-3  # scatter of most readings, m, that no arm reaches: the readings disagree
+ROUNDS = 20  # most rounds in which readings enter and leave
+WHITENED = 4096  # readings whitened at a time
+EXACT = 1e-6  # share of a group's mean covariance added to each reading, as exact ones have none
 MOST_SHARE = 0.35  # most nuisance columns, as a share of the whitened rows
-SAME = 0.25  # largest difference of two shifts that are the same one, as a share of the larger
-BETWEEN = 1  # readings between two alike ones that may be off otherwise
-RUN = 4  # fewest readings that are off alike: two in a row agree by chance
-ACCIDENTAL = 0.05  # share of readings up to which those off alike count as gross errors
-CHANCE = 1e-2  # that so many are along any one site; that noise moves one beside its law so far
-FEWEST = 2  # poses that a law moves at least: axes may agree at one
-ROUGH = 0.05  # share of a law's shift that may be beside its direction, as the model is linear
+SAME = 0.25  # largest difference of two equal shifts, as a share of the larger one
+BETWEEN = 1  # most readings with another shift between two with equal shifts
+RUN = 4  # fewest readings with an equal shift: two in a row agree by chance
+ACCIDENTAL = 0.05  # share of readings up to which those with equal shifts count as gross errors
+CHANCE = 1e-2  # of so many near one site by chance, and of noise so far from a law's direction
+FEWEST = 2  # poses that a law must move: at one pose directions of sites may coincide
+ROUGH = 0.05  # share of a law's shift normal to its direction that the linearisation may cause
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Disagreement:
-    """Readings (rows) that are far off, and no gross errors that could be set aside.
+    """Readings (rows) that deviate strongly, but cannot be set aside as gross errors.
 
-    "many": more are off than can be told from good ones; "alike": in a row, by the same shift.
+    "many": too many to be distinguished from good ones; "alike": in a row, by the same shift.
     """
 
     kind: Literal["many", "alike"]
@@ -77,122 +80,125 @@ class Disagreement:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Screened:
-    """Readings that were tested for gross errors."""
+    """Result of the test for gross errors."""
 
-    agree: Bools  # (N,) that agree with the model
-    used: Bools  # (N,) to fit to: these, and those of a disagreement; without deflections from an
-    # unloaded reading that is off
-    misfit: float  # variance of what the model leaves of good readings, in units of the noise
-    disagreement: Disagreement | None = None  # readings that are off and yet used
+    agree: Bools  # (N,) readings that agree with the model
+    used: Bools  # (N,) readings to fit: these and those of a disagreement, without deflections
+    # from an unloaded reading that is a gross error
+    misfit: float  # variance of the residual of good readings, in units of the noise
+    disagreement: Disagreement | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Snooping:
-    """The readings of a fit, as they are tested for gross errors."""
+    """Test of the readings of a fit for gross errors."""
 
     model: Model
-    readings: Readings  # all of them
+    readings: Readings  # all
     mode: Mode
-    solution: Solution  # of some of them
-    y: Floats  # (P,) coordinates that the model is linearised at
+    solution: Solution  # of a part of the readings
+    y: Floats  # (P,) coordinates at which the model is linearised
 
     def begin(self, rng: np.random.Generator) -> Screened:
-        """Test all readings from a robust start; the solution may be of bad readings, too."""
+        """Test all readings from a robust start; `solution` may be fitted to gross errors, too."""
         every = np.ones(len(self.readings), dtype=np.bool_)
         if self._all_noise():
             return Screened(every, every, 1.0)
-        at, used = robust_start(linearised(self, self.y), rng)
-        of = at.linear
-        d2, centre = of.near(of.fitted(used)[0])
-        misfit = variance(of, d2, centre)
-        of = at.with_nuisance(misfit)
+        point, used = robust_start(linearised(self, self.y), rng)
+        linear = point.linear
+        d2, centre = linear.near(linear.fitted(used)[0])
+        misfit = variance(linear, d2, centre)
+        linear = point.with_nuisance(misfit)
         for _ in range(ROUNDS):
-            t2, centre = _tested(of, used)
-            now, _ = nearest(of, t2, centre)
-            if np.array_equal(now, used):
+            t2, centre = _tested(linear, used)
+            updated, _ = nearest(linear, t2, centre)
+            if np.array_equal(updated, used):
                 break
-            used = now
-        core = float(chi2.ppf(CORE, of.m)) * variance(of, t2, centre)
-        return self._screened(at, (t2 <= core) | centre, misfit)
+            used = updated
+        core = float(chi2.ppf(CORE, linear.m)) * variance(linear, t2, centre)
+        return self._screened(point, (t2 <= core) | centre, misfit)
 
     def _all_noise(self) -> bool:
-        """Whether smooth functions beside the model leave noise of each reading: none is off."""
-        at = linearised(self, self.solution.y)
-        of = at.with_nuisance(float(np.mean(at.linear.residuals(at.linear.tested) ** 2)))
-        t2 = of.distances(of.tested)[of.tested]
-        return bool(t2.max() <= limit(of.m, len(t2)))
+        """Whether model and smooth functions explain all readings to the noise."""
+        point = linearised(self, self.solution.y)
+        residual = point.linear.residuals(point.linear.tested)
+        linear = point.with_nuisance(float(np.mean(residual**2)))
+        t2 = linear.distances(linear.tested)[linear.tested]
+        return bool(t2.max() <= limit(linear.m, len(t2)))
 
-    def again(self, before: Screened) -> Screened:
-        """Test them from the readings that agreed before, whose solution this is."""
-        return self._screened(linearised(self, self.y), before.agree, before.misfit)
+    def again(self, screened: Screened) -> Screened:
+        """Repeat the test, from the readings that agreed in `screened` and their solution."""
+        return self._screened(linearised(self, self.y), screened.agree, screened.misfit)
 
-    def _screened(self, at: "_LinearModel", used: Bools, misfit: float) -> Screened:
+    def _screened(self, point: "_LinearModel", used: Bools, misfit: float) -> Screened:
         readings = self.readings
-        every, kept = np.ones_like(used), np.zeros_like(used)
-        count = int(np.count_nonzero(at.linear.tested))
+        every, of_law = np.ones_like(used), np.zeros_like(used)
+        count = int(np.count_nonzero(point.linear.tested))
         while True:
-            of = at.with_nuisance(misfit)
-            used, t2, scale = self._snooped(of, used | kept, kept)
-            agree = used | ~of.tested
+            linear = point.with_nuisance(misfit)
+            used, t2, scale = self._snooped(linear, used | of_law, of_law)
+            agree = used | ~linear.tested
             off = np.flatnonzero(~agree)
-            if self._accident(of, off):
+            if self._accident(linear, off):
                 return Screened(every, every, misfit)
             size = np.sqrt(scale * np.mean(np.trace(readings.covariance[:, :3, :3], 0, 1, 2)))
             if len(off) > MOST * count or (scale > MISFIT[1] and size > ROUGH_M):
-                off = np.flatnonzero((t2 > limit(of.m, count)) & of.tested)
+                off = np.flatnonzero((t2 > limit(linear.m, count)) & linear.tested)
                 return Screened(every, every, misfit, Disagreement("many", off))
             if not len(off):
                 return Screened(agree, every, misfit)
-            white = of.residuals(used)[off, :, None]
-            shift = (np.linalg.pinv(of.root[off]) @ white)[:, :, 0]
+            white = linear.residuals(used)[off, :, None]
+            shift = (np.linalg.pinv(linear.root[off]) @ white)[:, :, 0]
             axes = self.model.predict(readings.states[off], self.solution.theta).observation
-            alike = off_alike(readings, of.tested, off, shift[:, :3], axes.rotation)
-            rest = ~np.isin(off, alike) & ~readings.scalar[off]  # no direction to tell
-            rows = off[rest]
+            alike = off_alike(readings, linear.tested, off, shift[:, :3], axes.rotation)
+            single = ~np.isin(off, alike) & ~readings.scalar[off]  # a distance has no direction
+            rows = off[single]
             unit = _units(readings.covariance[rows])
-            sites = at.sites[rows] / unit[:, :, None]
-            law = rows[along_one_site(shift[rest] / unit, sites, readings.pose[rows])]
+            sites = point.sites[rows] / unit[:, :, None]
+            law = rows[along_one_site(shift[single] / unit, sites, readings.pose[rows])]
             if not len(law):
                 fitted = agree | np.isin(np.arange(len(agree)), alike)
-                found = Disagreement("alike", alike) if len(alike) else None
-                return Screened(agree, self._fittable(of, fitted), misfit, found)
-            kept[law] = True
-            left = at.linear.residuals(used | kept)[used | kept]
-            misfit = max(misfit, float(np.mean(left**2)))
+                disagreement = Disagreement("alike", alike) if len(alike) else None
+                return Screened(agree, self._fittable(linear, fitted), misfit, disagreement)
+            of_law[law] = True
+            residual = point.linear.residuals(used | of_law)[used | of_law]
+            misfit = max(misfit, float(np.mean(residual**2)))
 
-    def _snooped(self, of: ReadingModel, used: Bools, kept: Bools) -> tuple[Bools, Floats, float]:
-        """Readings (N,) that are not off, t² (N,) from the fit to them, and the scale of its bulk.
+    def _snooped(
+        self, linear: ReadingModel, used: Bools, of_law: Bools
+    ) -> tuple[Bools, Floats, float]:
+        """Return the good readings (N,), t² (N,) from the fit to them, and the scale of its bulk.
 
-        It begins with the `used` ones (N,), of which those that are `kept` (N,) stay.
+        The iteration starts with the `used` readings (N,); those `of_law` (N,) always stay.
         """
-        count = int(np.count_nonzero(of.tested))
+        count = int(np.count_nonzero(linear.tested))
         for _ in range(ROUNDS):
-            t2, centre = _tested(of, used)
+            t2, centre = _tested(linear, used)
             judged = t2[used & (t2 > 0)]
-            scale = bulk(judged, of.m) if len(judged) else 1.0
-            far = max(limit(of.m, count, scale), SMALLEST * float(t2[used].max()))
-            now = of.with_lone_centres(((t2 <= far) & of.tested) | kept, centre)
-            if np.array_equal(now, used):
+            scale = bulk(judged, linear.m) if len(judged) else 1.0
+            far = max(limit(linear.m, count, scale), SMALLEST * float(t2[used].max()))
+            updated = linear.with_lone_centres(((t2 <= far) & linear.tested) | of_law, centre)
+            if np.array_equal(updated, used):
                 break
-            used = now
+            used = updated
         return used, t2, scale
 
-    def _accident(self, of: ReadingModel, off: Ints) -> bool:
-        """Whether unloaded readings that deflections share are too many of those that are off."""
-        shared = self.readings.unloaded & of.tested & (of.group >= 0)
+    def _accident(self, linear: ReadingModel, off: Ints) -> bool:
+        """Whether too many of the rows `off` are unloaded readings that deflections share."""
+        shared = self.readings.unloaded & linear.tested & (linear.group >= 0)
         unloaded = int(np.count_nonzero(shared[off]))
-        share = float(np.mean(shared[of.tested]))
+        share = float(np.mean(shared[linear.tested]))
         return unloaded > 0 and float(binom.sf(unloaded - 1, len(off), share)) < ACCIDENT
 
-    def _fittable(self, of: ReadingModel, agree: Bools) -> Bools:
-        """(N,) readings without deflections of which the loaded or all unloaded ones are off."""
-        if not len(of.members):
+    def _fittable(self, linear: ReadingModel, agree: Bools) -> Bools:
+        """Return `agree` (N,) without groups that lack a good loaded or a good unloaded reading."""
+        if not len(linear.members):
             return agree
-        unloaded, used = self.readings.unloaded[of.members], agree.copy()
-        good = agree[of.members] & (of.members >= 0)
+        unloaded, used = self.readings.unloaded[linear.members], agree.copy()
+        good = agree[linear.members] & (linear.members >= 0)
         lost = ~((good & unloaded).any(axis=1) & (good & ~unloaded).any(axis=1))
-        gone = of.members[lost]
-        used[gone[gone >= 0]] = False
+        rows = linear.members[lost]
+        used[rows[rows >= 0]] = False
         return used
 
 
@@ -200,48 +206,49 @@ class Snooping:
 class _LinearModel:
     """The linear model of all readings at coordinates y (P,)."""
 
-    of: Snooping
+    snooping: Snooping
     y: Floats
-    live: Ints  # (K,) those that are estimated, and the columns of `linear`
+    live: Ints  # (K,) indices of the estimated coordinates, which are the columns of `linear`
     scale: Floats  # (K,) their ordinary magnitudes, the units of the columns
     prediction: Prediction
     linear: ReadingModel
 
     def moved(self, delta: Floats) -> "_LinearModel":
-        """Return it after a step δ (K,)."""
+        """Return the linear model after a step δ (K,)."""
         y = self.y.copy()
         y[self.live] += self.scale * delta
-        return linearised(self.of, y)
+        return linearised(self.snooping, y)
 
     @cached_property
     def sites(self) -> Floats:
         """(N, m, P) changes of the readings by each site of a law."""
-        theta = self.of.solution.space.theta(self.y)
-        return site_columns(self.of.model, theta, self.prediction, self.of.readings)
+        s = self.snooping
+        return site_columns(s.model, s.solution.space.theta(self.y), self.prediction, s.readings)
 
     def with_nuisance(self, misfit: float) -> ReadingModel:
-        """Return the linear model with smooth nuisance columns of some variance above the noise."""
-        of, rank = self.of, int(self.linear.read[self.linear.tested].sum())
-        columns = smooth_nuisance_columns(of.model, self.prediction, of.readings, rank)
-        for k in range(0, len(columns), WHITENED):  # in place: they are the largest array of a fit
+        """Return the linear model with smooth nuisance columns of variance `misfit` − 1."""
+        s, rank = self.snooping, int(self.linear.read[self.linear.tested].sum())
+        columns = smooth_nuisance_columns(s.model, self.prediction, s.readings, rank)
+        for k in range(0, len(columns), WHITENED):  # in place: the largest array of a fit
             rows = slice(k, k + WHITENED)
             columns[rows] = self.linear.root[rows] @ columns[rows]
         count = max(columns.shape[0] * columns.shape[1], 1)
         length = np.sqrt(np.einsum("nip,nip->p", columns, columns) / count)
-        kept = length > 1e-9 * length.max(initial=0.0)
-        size = np.sqrt(max(misfit - 1.0, 0.0) / max(int(np.count_nonzero(kept)), 1))
-        columns *= np.where(kept, size / np.where(kept, length, 1.0), 0.0)
-        return self.linear.with_columns(columns if kept.all() else columns[:, :, kept])
+        nonzero = length > 1e-9 * length.max(initial=0.0)
+        size = np.sqrt(max(misfit - 1.0, 0.0) / max(int(np.count_nonzero(nonzero)), 1))
+        columns *= np.where(nonzero, size / np.where(nonzero, length, 1.0), 0.0)
+        return self.linear.with_columns(columns if nonzero.all() else columns[:, :, nonzero])
 
 
-def linearised(of: Snooping, y: Floats) -> _LinearModel:
+def linearised(snooping: Snooping, y: Floats) -> _LinearModel:
     """Return the linear model of all readings at the coordinates y (P,)."""
-    model, readings, s = of.model, of.readings, of.solution
+    model, readings, s = snooping.model, snooping.readings, snooping.solution
     theta = s.space.theta(y)
     prediction = model.predict(readings.states, theta)
-    members = _groups(readings) if of.mode == "deflection" else np.zeros((0, 0), dtype=np.int64)
+    no_groups = np.zeros((0, 0), dtype=np.int64)
+    members = _groups(readings) if snooping.mode == "deflection" else no_groups
     root = inverse_root(_covariance(readings, members))
-    off = _off(readings, prediction, members)
+    residual = _residual(readings, prediction, members)
     live = np.flatnonzero(s.prior > 0)
     if len(live) > MOST_COLUMNS:
         live = np.flatnonzero(np.isinf(s.prior))
@@ -252,18 +259,18 @@ def linearised(of: Snooping, y: Floats) -> _LinearModel:
         jacobian = s.space.columns(jacobian.reshape(-1, model.size))[:, live]
     precision = s.beta * (scale / s.prior[live]) ** 2
     linear = ReadingModel(
-        residual=(root @ off[:, :, None])[:, :, 0],
-        columns=root @ (jacobian * scale).reshape(*off.shape, len(live)),
+        residual=(root @ residual[:, :, None])[:, :, 0],
+        columns=root @ (jacobian * scale).reshape(*residual.shape, len(live)),
         precision=precision,
         pull=precision * y[live] / scale,
         root=root,
         members=members,
     )
-    return _LinearModel(of, y, live, scale, prediction, linear)
+    return _LinearModel(snooping, y, live, scale, prediction, linear)
 
 
 def _groups(readings: Readings) -> Ints:
-    """(G, S) rows that share unloaded readings, unloaded first, −1 beyond the last."""
+    """(G, S) rows that share unloaded readings, unloaded first, filled up with −1."""
     rows = [
         np.concatenate([unloaded, loaded], axis=1)
         for loaded, unloaded, _ in deflection_groups(replace(readings, common=None))
@@ -276,12 +283,12 @@ def _groups(readings: Readings) -> Ints:
 
 
 def _covariance(readings: Readings, members: Ints) -> Floats:
-    """(N, m, m) covariances, of a group's readings none zero."""
+    """(N, m, m) covariances, made positive for all readings of groups."""
     v = readings.covariance
     if not len(members):
         return v
-    there = (members >= 0)[:, :, None, None]
-    mean = np.sum(v[members] * there, axis=1) / there.sum(axis=1)
+    present = (members >= 0)[:, :, None, None]
+    mean = np.sum(v[members] * present, axis=1) / present.sum(axis=1)
     out = v.copy()
     g, s = np.nonzero(members >= 0)
     out[members[g, s]] += EXACT * mean[g]
@@ -289,14 +296,14 @@ def _covariance(readings: Readings, members: Ints) -> Floats:
 
 
 def _units(covariance: Floats) -> Floats:
-    """(F, m) standard deviations of a reading, the same for all directions."""
+    """(F, m) standard deviations of readings: the rms over directions, lengths and angles apart."""
     m = covariance.shape[1]
     variance = np.diagonal(covariance, axis1=1, axis2=2).reshape(len(covariance), m // 3, 3)
     return np.asarray(np.repeat(np.sqrt(variance.mean(axis=2)), 3, axis=1))
 
 
-def _off(readings: Readings, prediction: Prediction, members: Ints) -> Floats:
-    """(N, m) measured minus predicted; turns of deflections relative to an unloaded reading."""
+def _residual(readings: Readings, prediction: Prediction, members: Ints) -> Floats:
+    """(N, m) measured minus predicted; rotations of groups relative to an unloaded reading."""
     o = prediction.observation
     position = readings.value[:, :3] - o.position
     if readings.m == 3:
@@ -314,69 +321,77 @@ def _off(readings: Readings, prediction: Prediction, members: Ints) -> Floats:
     return np.concatenate([position, measured - predicted], axis=1)
 
 
-def _tested(of: ReadingModel, used: Bools) -> tuple[Floats, Bools]:
+def _tested(linear: ReadingModel, used: Bools) -> tuple[Floats, Bools]:
     """t² (N,) of all readings, and the centres of groups (N,)."""
-    if not len(of.members):
-        return of.distances(used), np.zeros_like(used)
-    _, centre = of.near(of.fitted(used)[0])
-    return of.distances(of.with_lone_centres(used, centre)), centre
+    if not len(linear.members):
+        return linear.distances(used), np.zeros_like(used)
+    _, centre = linear.near(linear.fitted(used)[0])
+    return linear.distances(linear.with_lone_centres(used, centre)), centre
 
 
 def smooth_nuisance_columns(
     model: Model, prediction: Prediction, readings: Readings, rank: int
 ) -> Floats:
-    """Columns (N, m, P); only the simplest ones where the `rank` of the readings is small."""
-    at, s = prediction.situation, readings.states
-    moves = motion(model.cell, prediction.observation, at.chain, prediction.deviation, readings.m)
-    functions = [np.ones_like(at.angle), at.torque]
+    """Columns (N, m, P) of smooth functions; the simplest ones where the `rank` is small."""
+    situation, s = prediction.situation, readings.states
+    moves = motion(
+        model.cell, prediction.observation, situation.chain, prediction.deviation, readings.m
+    )
+    functions = [np.ones_like(situation.angle), situation.torque]
     if s.approach is not None:
         functions.append(s.approach)
-    functions += [np.cos(at.angle), np.sin(at.angle)]
+    functions += [np.cos(situation.angle), np.sin(situation.angle)]
     joints = [moves.drives * f[:, None, :] for f in functions]
-    links = [moves.by_slot(k) for k in range(at.wrench.shape[1])]
-    loads = [x[:, :, 3:5] * at.wrench[:, k, None, 3:5] for k, x in enumerate(links)]
+    links = [moves.by_slot(k) for k in range(situation.wrench.shape[1])]
+    loads = [x[:, :, 3:5] * situation.wrench[:, k, None, 3:5] for k, x in enumerate(links)]
     drift = [] if s.time is None else [moves.by_station() * (s.time - s.time.mean())[:, None, None]]
-    harmonics = [moves.drives * f(2 * at.angle)[:, None, :] for f in (np.cos, np.sin)]
+    harmonics = [moves.drives * f(2 * situation.angle)[:, None, :] for f in (np.cos, np.sin)]
     most = int(MOST_SHARE * rank)
     return np.concatenate([*joints, *drift, *loads, *harmonics, *links], axis=2)[:, :, :most]
 
 
 def off_alike(readings: Readings, tested: Bools, off: Ints, shift: Floats, axes: Floats) -> Ints:
-    """Return the rows that are off alike, more than `ACCIDENTAL` of the tested ones (N,), or none.
+    """Return the rows in runs with the same shift; none up to `ACCIDENTAL` of the tested ones.
 
-    Of rows `off` (F,), ascending, with their shifts (F, 3) and the target's axes (F, 3, 3), both in
-    axes of the sensor.
+    Args:
+        tested: (N,) readings that were tested.
+        off: (F,) rows of readings that deviate, ascending.
+        shift: (F, 3) their shifts, sensor axes.
+        axes: (F, 3, 3) rotations of the target, sensor axes.
     """
     order = np.zeros(len(readings), dtype=np.int64)
-    found = np.zeros(len(off), dtype=np.bool_)
+    alike = np.zeros(len(off), dtype=np.bool_)
     target = readings.target
     for k in np.unique(target[off]):
         rows = tested & (target == k)
         order[rows] = np.arange(np.count_nonzero(rows))
-        at = np.flatnonzero(target[off] == k)
-        turned = (shift[at, None] @ axes[at])[:, 0]
-        found[at] = _in_a_row(order[off[at]], shift[at]) | _in_a_row(order[off[at]], turned)
-    few = np.count_nonzero(found) <= ACCIDENTAL * np.count_nonzero(tested)
-    return off[:0] if few else off[found]
+        i = np.flatnonzero(target[off] == k)
+        turned = (shift[i, None] @ axes[i])[:, 0]
+        alike[i] = _in_a_row(order[off[i]], shift[i]) | _in_a_row(order[off[i]], turned)
+    few = np.count_nonzero(alike) <= ACCIDENTAL * np.count_nonzero(tested)
+    return off[:0] if few else off[alike]
 
 
 def _in_a_row(order: Ints, shift: Floats) -> Bools:
-    """(F,) which shifts (F, 3) are the same as `RUN` in a row, all readings between off as well."""
+    """(F,) which shifts (F, 3) belong to a run of at least `RUN` equal ones.
+
+    The readings between two of them, at most `BETWEEN`, deviate as well.
+    """
     count = len(shift)
     run, size = np.arange(count), np.linalg.norm(shift, axis=1)
     for ahead in range(1, BETWEEN + 2):
         for k in range(count - ahead):
-            then = k + ahead
-            apart = np.linalg.norm(shift[then] - shift[k])
-            if order[then] - order[k] == ahead and apart <= SAME * max(size[k], size[then]):
-                run[run == run[then]] = run[k]
+            j = k + ahead
+            distance = np.linalg.norm(shift[j] - shift[k])
+            if order[j] - order[k] == ahead and distance <= SAME * max(size[k], size[j]):
+                run[run == run[j]] = run[k]
     return np.asarray(np.bincount(run, minlength=count)[run] >= RUN)
 
 
 def site_columns(model: Model, theta: Floats, prediction: Prediction, readings: Readings) -> Floats:
-    """(N, m, P) changes of N readings by each site; last by 1 N and 1 N·m on the force sensor."""
-    p, states, at, m = prediction, readings.states, prediction.observation, readings.m
-    moves = motion(model.cell, at, p.situation.chain, p.deviation, m)
+    """(N, m, P) changes of readings by each site, at last by 1 N and 1 N·m on the force sensor."""
+    p, states, observation, m = prediction, readings.states, prediction.observation, readings.m
+    moves = motion(model.cell, observation, p.situation.chain, p.deviation, m)
     turns = [moves.by_slot(k, slice(3, 6)) for k in range(p.situation.wrench.shape[1])]
     sensor = []
     for part in (slice(0, 3), slice(3, 6)):
@@ -385,28 +400,31 @@ def site_columns(model: Model, theta: Floats, prediction: Prediction, readings: 
             wrench[:, part] += axis
             try:
                 o = model.predict(replace(states, wrench=wrench), theta, p).observation
-            except CannotAnswerError:  # parameters so large that more load has no equilibrium
+            except CannotAnswerError:  # parameters so large that there is no equilibrium
                 continue
-            turn = se3.rotation_vector(o.rotation @ at.rotation.swapaxes(1, 2))
-            sensor.append(np.concatenate([o.position - at.position, turn], axis=1)[:, :m])
+            turn = se3.rotation_vector(o.rotation @ observation.rotation.swapaxes(1, 2))
+            sensor.append(np.concatenate([o.position - observation.position, turn], axis=1)[:, :m])
     columns = [*turns, *(column[:, :, None] for column in sensor)]
     return np.concatenate(columns, axis=2)
 
 
 def along_one_site(shift: Floats, columns: Floats, pose: Ints) -> Bools:
-    """(F,) which readings that are off a law moves.
+    """(F,) which deviating readings are ascribed to a law.
 
-    Shifts (F, m) and the changes by each site (F, m, P) are in units of the noise, the same for all
-    directions: random ones are not drawn to those of little noise. `pose` (F,) is where they are.
+    Args:
+        shift: (F, m) in units of the noise, equal for all directions, so that random shifts have no
+            preferred direction.
+        columns: (F, m, P) changes by each site, in the same units.
+        pose: (F,) number of the pose.
     """
     count, m, sites = columns.shape
     if not count:
         return np.zeros(0, dtype=np.bool_)
     square, length = np.sum(shift**2, axis=1), np.linalg.norm(columns, axis=1)
     along = np.einsum("fi,fip->fp", shift, columns) / np.where(length > 0, length, np.inf)
-    beside = np.maximum(square[:, None] - along**2, 0.0)
-    near = beside <= (chi2.isf(CHANCE, m - 1) + ROUGH**2 * square)[:, None]
-    p = np.where(near, beta.cdf(beside / square[:, None], (m - 1) / 2, 0.5), 1.0)
+    normal = np.maximum(square[:, None] - along**2, 0.0)
+    near = normal <= (chi2.isf(CHANCE, m - 1) + ROUGH**2 * square)[:, None]
+    p = np.where(near, beta.cdf(normal / square[:, None], (m - 1) / 2, 0.5), 1.0)
     ascending: Floats = np.sort(p[_different(shift, pose)], axis=0)
     count = len(ascending)
     so_many = np.asarray(binom.sf(np.arange(count)[:, None], count, ascending))
@@ -420,11 +438,11 @@ def along_one_site(shift: Floats, columns: Floats, pose: Ints) -> Bools:
 
 
 def _different(shift: Floats, pose: Ints) -> Bools:
-    """(F,) readings without the shift of an earlier one at their pose, which has one cause."""
+    """(F,) readings whose shift no previous one at their pose has: a common cause counts once."""
     out = np.ones(len(pose), dtype=np.bool_)
     for rows in (np.flatnonzero(pose == p) for p in np.unique(pose)):
         size = np.linalg.norm(shift[rows], axis=1)
-        apart = np.linalg.norm(shift[rows, None] - shift[rows], axis=2)
-        same = apart <= SAME * np.maximum(size[:, None], size)
+        distance = np.linalg.norm(shift[rows, None] - shift[rows], axis=2)
+        same = distance <= SAME * np.maximum(size[:, None], size)
         out[rows] = ~np.tril(same, -1).any(axis=1)
     return out

@@ -1,11 +1,12 @@
-"""The columns of effects that are not in a fitted model, at the parameters of the fit.
+"""The columns of effects outside of a fitted model, at the parameters of the fit.
 
-Those of many effects are computed and whitened together.
+The columns of many effects are computed and whitened together.
 """
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from hilcal.identification.fit import Fit
 from hilcal.readings.whitening import Whitening
 from hilcal.types import Bools, Floats
 
-TOGETHER = 4_000_000  # numbers of columns computed together, 32 MB, kept while one effect is
+TOGETHER = 4_000_000  # most numbers computed together, 32 MB; freed with the last effect of them
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,11 +24,11 @@ class EffectColumns:
 
     effect: Effect
     scale: Floats  # (P,) ordinary magnitudes, SI
-    together: Floats  # (R, Q) whitened columns of all effects that were whitened together
-    within: slice  # which of them are this effect's, P
+    together: Floats  # (R, Q) columns of all effects whitened together
+    within: slice  # the P columns of this effect
     of_readings: Floats  # (N, m, P) motion of the fitted readings, sensor axes, m and rad
     whitening: Whitening  # of the readings
-    bare: Bools  # (N,) which readings are unloaded
+    bare: Bools  # (N,) unloaded readings
 
     @property
     def white(self) -> Floats:
@@ -51,33 +52,34 @@ def computable(fit: Fit, effect: Effect) -> bool:
 
 
 def effect_columns(fit: Fit, effect: Effect) -> EffectColumns:
-    """Return the columns of an effect that is not in the model, at the parameters of the fit."""
+    """Return the columns of an effect outside of the model, at the parameters of the fit."""
     return next(columns_of_each(fit, (effect,)))
 
 
 def columns_of_each(fit: Fit, effects: Sequence[Effect]) -> Iterator[EffectColumns]:
     """Yield `effect_columns` of several effects."""
-    return (of for part in columns_in_parts(fit, effects) for of in part)
+    return chain.from_iterable(columns_in_parts(fit, effects))
 
 
 def columns_in_parts(fit: Fit, effects: Sequence[Effect]) -> Iterator[tuple[EffectColumns, ...]]:
-    """Yield `effect_columns` of several effects in order, those computed together in one part.
+    """Yield `effect_columns` of several effects in order, in parts that are computed together.
 
-    The equilibrium is differentiated, and columns are whitened, once for as many of them as have
-    `TOGETHER` numbers.
+    A part has up to `TOGETHER` numbers; the equilibrium is differentiated once for each part.
     """
     w, s = fit.whitening, fit.solution
     count, bare = len(s.prediction.situation.angle) * w.m, fit.readings[~fit.outlier].unloaded
     ends = np.cumsum([0, *(count * len(e.magnitudes) for e in effects)])
     start = 0
     while start < len(effects):
-        more = int(np.searchsorted(ends, ends[start] + TOGETHER, side="right")) - 1
-        stop = max(more, start + 1)
+        fitting = int(np.searchsorted(ends, ends[start] + TOGETHER, side="right")) - 1
+        stop = max(fitting, start + 1)
         part, start = tuple(effects[start:stop]), stop
-        scale = np.concatenate([e.magnitudes for e in part])
-        columns = fit.model.jacobian_of(part, s.prediction, s.theta, w.m, scale=scale)
-        white, at = w.whiten_readings(columns), np.cumsum([0, *(len(e.magnitudes) for e in part)])
+        scales = [e.magnitudes for e in part]
+        columns = fit.model.jacobian_of(
+            part, s.prediction, s.theta, w.m, scale=np.concatenate(scales)
+        )
+        white, edges = w.whiten_readings(columns), np.cumsum([0, *map(len, scales)])
         yield tuple(
             EffectColumns(e, e.magnitudes, white, within, columns[:, :, within], w, bare)
-            for e, within in zip(part, map(slice, at[:-1], at[1:]), strict=True)
+            for e, within in zip(part, map(slice, edges[:-1], edges[1:]), strict=True)
         )

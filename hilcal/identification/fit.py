@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 Frame = Literal["sensor", "base"]
 OUTLIER_ROUNDS = 6  # most fits without gross errors, each followed by a new test; a choice
 SEED = 0  # of the random subsets of the robust start, so that equal readings give equal fits
-DRIFT_ROUNDS = 2  # most choices of the drift of a carried prior: the first is at a linearisation
-DRIFT_CHANGED = 0.1  # that it hardly changes; change, as a share of the largest, worth another fit
+DRIFT_ROUNDS = 2  # most choices of a carried prior's drift, which hardly moves the linearisation
+DRIFT_CHANGED = 0.1  # change of the drift, as a share of the largest, above which the fit is redone
 
 _Solved = tuple[Whitening, Solution]
 
@@ -49,7 +49,7 @@ class Estimate:
     identifiable: bool  # whether the data determine it
 
     def line(self, width: int = 0) -> str:
-        """Return it in a line, the name padded to a width."""
+        """Return the parameter as a line, the name padded to a width."""
         value = "not determined"
         if self.value is not None and self.std is not None:
             value = f"{self.value: .4e} ± {self.std:.1e} {self.unit}"
@@ -58,18 +58,15 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True)
 class Estimates(Sequence[Estimate]):
-    """The fitted parameters, in the order of the model; those of dropped groups are left out."""
+    """The fitted parameters, in the order of the model, without those of dropped groups."""
 
     rows: tuple[Estimate, ...]
 
     @classmethod
     def of(
-        cls, model: Model, theta: Floats, std: Floats, identifiable: Bools, kept: Bools
+        cls, model: Model, theta: Floats, std: Floats, identifiable: Bools, shown: Bools
     ) -> "Estimates":
-        """Return the parameters (P,) of a model that are `kept`.
-
-        A standard uncertainty (P,) that is infinite stands for none.
-        """
+        """Return the `shown` parameters (P,) of a model; an infinite `std` (P,) means unknown."""
         names = [(f"{e.name}.{p.name}", p.unit) for e in model.effects for p in e.parameters]
         stated = identifiable & np.isfinite(std)
         return cls(
@@ -82,20 +79,21 @@ class Estimates(Sequence[Estimate]):
                     bool(identifiable[k]),
                 )
                 for k, (name, unit) in enumerate(names)
-                if kept[k]
+                if shown[k]
             )
         )
 
     def lines(self, most: int | None = None) -> list[str]:
-        """Return a line for each, or for the first of them."""
+        """Return a line for each parameter, or for the first `most`."""
         width = max((len(row.name) for row in self.rows), default=0)
         return [row.line(width) for row in self.rows[:most]]
 
     def __repr__(self) -> str:
-        """Return the first parameters, a line each."""
+        """Return lines of the first parameters."""
         lines = self.lines(12)
-        left = len(self.rows) - len(lines)
-        return "\n".join(["Estimates(", *lines, *([f"  ... and {left} more"] * bool(left)), ")"])
+        hidden = len(self.rows) - len(lines)
+        tail = [f"  ... and {hidden} more"] * bool(hidden)
+        return "\n".join(["Estimates(", *lines, *tail, ")"])
 
     def __len__(self) -> int:
         """Return the number of parameters."""
@@ -110,7 +108,7 @@ class Estimates(Sequence[Estimate]):
     @overload
     def __getitem__(self, key: slice) -> Sequence[Estimate]: ...
     def __getitem__(self, key: int | str | slice) -> Estimate | Sequence[Estimate]:
-        """Return a parameter by place or by name, which is refused where there is none."""
+        """Return a parameter by place or by name; an unknown name is an InputError."""
         if isinstance(key, int | slice):
             return self.rows[key]
         for row in self.rows:
@@ -120,11 +118,11 @@ class Estimates(Sequence[Estimate]):
         raise InputError(f"no parameter {key!r}{suggest(key, names)}; valid: {', '.join(names)}")
 
     def to_dicts(self) -> list[dict[str, object]]:
-        """Return one dictionary per parameter, as JSON documents hold them."""
+        """Return one dictionary per parameter, as in JSON documents."""
         return [asdict(row) for row in self.rows]
 
     def to_frame(self) -> "pd.DataFrame":
-        """Return a pandas data frame, indexed by the names.
+        """Return a pandas data frame, indexed by name.
 
         Raises:
             InputError: pandas is not installed.
@@ -138,28 +136,27 @@ class Estimates(Sequence[Estimate]):
 class Fit(WithVarianceFactor, Tabular):
     """A model fitted to readings.
 
-    D is the number of measurements (readings or deflections), m their elements, P the
-    number of parameters.
+    D is the number of measurements (readings or deflections), m the number of their elements, P
+    the number of parameters.
 
     Attributes:
         model: robot and effects.
         readings: all readings.
         mode: "deflection" or "absolute".
         scaling: "none", "gu" or "gc".
-        whitening: gc-scaling of the readings that were fitted.
+        whitening: gc-scaling of the fitted readings.
         fitted: their scaling in the fit.
-        solution: the minimum that Gauss-Newton reached.
+        solution: minimum found by Gauss-Newton.
         pose: (D,) distinct pose of each fitted measurement.
         raw: (D, m) residual.
         white: (R,) gc-whitened residual.
-        outlier: (N,) readings that were set aside as gross errors.
+        outlier: (N,) readings set aside as gross errors.
         chi2: whitened sum of squares.
         dof: degrees of freedom.
-        error: error block of the fit; as `holdout`, of the readings that were not set aside.
-        disagreement: readings that are far off and yet fitted; None where there are none.
+        error: error block of the fit; like `holdout`, without the readings set aside.
+        disagreement: readings that deviate strongly, but are fitted; None without any.
 
-    What takes long, and is of no use for a fit that is only tried, is computed when it is asked
-    for: `left_out`, `holdout`, `uncertainty`.
+    `left_out`, `holdout` and `uncertainty`, which take long, are computed at the first access.
     """
 
     model: Model
@@ -201,20 +198,20 @@ class Fit(WithVarianceFactor, Tabular):
 
     @cached_property
     def holdout_of_all(self) -> ErrorBlock:
-        """The same with what was set aside, by which fits that set others aside are compared."""
+        """`holdout` with the gross errors; compares fits with different gross errors."""
         return error_block(*all_left_out(self))
 
     @cached_property
     def uncertainty(self) -> Uncertainty:
         """Standard uncertainties and identifiable parameters."""
-        kept = self.readings[~self.outlier]
+        inliers = self.readings[~self.outlier]
         return uncertainty(
-            self.model, kept, self.fitted, self.solution, self.pose, self.chi2, self.dof
+            self.model, inliers, self.fitted, self.solution, self.pose, self.chi2, self.dof
         )
 
     @cached_property
     def conflicts(self) -> tuple[Conflict, ...]:
-        """How far a carried prior and the readings disagree, worst first; empty without one."""
+        """Conflicts between a carried prior and the readings, worst first; empty without one."""
         return conflicts(self.model, self.solution, self.whitening)
 
     @property
@@ -229,27 +226,27 @@ class Fit(WithVarianceFactor, Tabular):
 
     @property
     def mahalanobis2(self) -> Floats:
-        """(D,) squared Mahalanobis distance of each measurement by itself."""
+        """(D,) squared Mahalanobis distance of each measurement alone."""
         return mahalanobis2(self.raw, self.whitening.covariance)
 
     @property
     def parameters(self) -> Estimates:
         """The parameters of the named effects with their standard uncertainties.
 
-        Those of dropped groups are left out.
+        Parameters of dropped groups are left out.
         """
-        u, kept = self.uncertainty, self.solution.estimated.copy()
+        u, shown = self.uncertainty, self.solution.estimated.copy()
         for name, rows in zip(self.model.names, self.model.slices(), strict=True):
-            kept[rows] &= name not in self.model.background
-        return Estimates.of(self.model, self.theta, u.std, u.identifiable, kept)
+            shown[rows] &= name not in self.model.background
+        return Estimates.of(self.model, self.theta, u.std, u.identifiable, shown)
 
     def summary(self) -> str:
         """Return the model, its errors and its parameters as plain text."""
         model = " + ".join(self.model.named) or "nominal arm"
         lines = [f"{model}, fitted to {len(self.raw)} {self.mode} readings, scaling {self.scaling}"]
-        for what, e in (("fitted poses", self.error), ("poses left out", self.holdout)):
+        for poses, e in (("fitted poses", self.error), ("poses left out", self.holdout)):
             lines.append(
-                f"  error on {what}: {1e6 * e.rms_m:.1f} µm rms, {1e6 * e.max_m:.1f} µm largest, "
+                f"  error on {poses}: {1e6 * e.rms_m:.1f} µm rms, {1e6 * e.max_m:.1f} µm largest, "
                 f"{e.rms_sigma:.2f} σ"
             )
         low, high = self.variance_factor_interval
@@ -267,7 +264,7 @@ class Fit(WithVarianceFactor, Tabular):
         return robot_frames(self.model, self.theta)
 
     def predict(self, at: States | Readings) -> Observation:
-        """Predict what the sensor reads in N states, or in those of readings.
+        """Predict the readings of the sensor in N states, or in the states of readings.
 
         Raises:
             InputError: no static equilibrium.
@@ -279,19 +276,19 @@ class Fit(WithVarianceFactor, Tabular):
 class Residuals(Sequence[Floats]):
     """Residuals of a fit, measured − predicted, m and rad.
 
-    They are of `readings[~outlier][whitening.reading]`: of deflections the loaded readings, which
-    are not in the order of the campaign. Also a sequence and an array (D, m) in sensor axes.
+    Their readings are `readings[~outlier][whitening.reading]`: for deflections the loaded readings,
+    which are not in the order of the campaign. Also a sequence and an array (D, m) in sensor axes.
     """
 
-    def __init__(self, of: Fit) -> None:
-        """Take the fit."""
-        self._fit = of
+    def __init__(self, fit: Fit) -> None:
+        """Take the residuals of a fit."""
+        self._fit = fit
 
     def __call__(self, frame: Frame = "sensor") -> Floats:
-        """Return them as an array (D, m).
+        """Return an array (D, m).
 
         Args:
-            frame: axes that they are given in: "sensor", or "base" of the arm.
+            frame: axes of the residuals: of the "sensor", or of the arm's "base".
 
         Raises:
             InputError: another frame.
@@ -321,7 +318,7 @@ class Residuals(Sequence[Floats]):
     @overload
     def __getitem__(self, key: slice) -> Sequence[Floats]: ...
     def __getitem__(self, key: int | slice) -> Any:
-        """Return that of one measurement (m,), or of some."""
+        """Return the residual of one measurement (m,), or of several."""
         return self._fit.raw[key]
 
     def __repr__(self) -> str:
@@ -346,15 +343,14 @@ def fit(
 ) -> Fit:
     """Fit a model to readings.
 
-    `start` and `prior` of an earlier fit reproduce it in few steps. The prior that the model
-    carries gets the drift that the readings ask for; where `prior` is given it keeps its own.
+    `start` and `prior` of a previous fit reproduce it in few steps. The drift of a carried prior is
+    estimated from the readings, unless `prior` is given.
 
     Gross errors are set aside: they stay in the file and are listed, but are not fitted.
 
     Raises:
         CannotAnswerError: fewer measured elements than identifiable parameters.
-        InputError: from `whitening`, where a deflection lacks its unloaded reading; or too many
-            readings.
+        InputError: a deflection without its unloaded reading, or too many readings.
     """
     limits.check_fitted(len(readings), readings.m)
     if model.prior is not None and prior is None:
@@ -367,12 +363,12 @@ def fit(
             if change <= DRIFT_CHANGED * drift.max(initial=0.0):
                 break
             model = replace(model, prior=model.prior.with_drift(drift))
-            begun = solution.theta
-            used, disagreement, (w, solution) = _set_aside(model, readings, mode, begun, None)
-    kept, fitted = readings[used], w
+            restart = solution.theta
+            used, disagreement, (w, solution) = _set_aside(model, readings, mode, restart, None)
+    inliers, fitted = readings[used], w
     if scaling != "gc":
-        fitted, solution = _solve(model, kept, mode, scaling, start, prior)
-        w = whitening(kept, mode, "gc")
+        fitted, solution = _solve(model, inliers, mode, scaling, start, prior)
+        w = whitening(inliers, mode, "gc")
     white = w.whiten(solution.raw).reshape(-1)
     return Fit(
         model=model,
@@ -382,7 +378,7 @@ def fit(
         whitening=w,
         fitted=fitted,
         solution=solution,
-        pose=distinct_poses(kept)[w.reading],
+        pose=distinct_poses(inliers)[w.reading],
         raw=solution.raw,
         white=white,
         outlier=~used,
@@ -396,21 +392,21 @@ def fit(
 def _set_aside(
     model: Model, readings: Readings, mode: Mode, start: Floats | None, prior: Floats | None
 ) -> tuple[Bools, Disagreement | None, _Solved]:
-    """Readings (N,) without gross errors, what they disagree in, their solution in scaling gc."""
+    """Readings (N,) without gross errors, their disagreement, and their gc-scaled solution."""
     used = np.ones(len(readings), dtype=bool)
     w, solution = _solve(model, readings, mode, "gc", start, prior)
     distance2 = mahalanobis2(solution.raw, w.covariance)
     if distance2.max() <= limit(w.m, len(distance2)):
         return used, None, (w, solution)
     y = np.zeros(model.size) if start is None else solution.space.of_theta(start)
-    found = Snooping(model, readings, mode, solution, y).begin(np.random.default_rng(SEED))
+    screened = Snooping(model, readings, mode, solution, y).begin(np.random.default_rng(SEED))
     for _ in range(OUTLIER_ROUNDS):
-        if np.array_equal(found.used, used):
+        if np.array_equal(screened.used, used):
             break
-        used = found.used
+        used = screened.used
         w, solution = _solve(model, readings[used], mode, "gc", solution.theta, prior)
-        found = Snooping(model, readings, mode, solution, solution.y).again(found)
-    return used, found.disagreement, (w, solution)
+        screened = Snooping(model, readings, mode, solution, solution.y).again(screened)
+    return used, screened.disagreement, (w, solution)
 
 
 def _solve(
@@ -425,29 +421,29 @@ def _solve(
     solution = solve(model, readings, w, start, prior)
     free = solution.equations.basis.structural
     if w.rank <= free:
-        what = "loaded readings with their unloaded ones" if mode == "deflection" else "readings"
+        noun = "loaded readings with their unloaded ones" if mode == "deflection" else "readings"
         raise CannotAnswerError(
             f"{w.rank} measured elements for {free} parameters: nothing is left to judge the model "
-            f"by; measure at least {free // w.m + 2} {what}, better {3 * free // w.m + 1}"
+            f"by; measure at least {free // w.m + 2} {noun}, better {3 * free // w.m + 1}"
         )
     return w, solution
 
 
-def with_outliers(of: Fit) -> tuple[Floats, Whitening]:
-    """Residual of all readings, and their gc-scaling; of the fitted ones where they are all."""
-    if not of.outlier.any():
-        return of.raw, of.whitening
-    w = whitening(of.readings, of.mode, "gc")
-    prediction = of.model.predict(of.readings.states, of.theta)
-    return residual(of.readings, prediction, w), w
+def with_outliers(fitted: Fit) -> tuple[Floats, Whitening]:
+    """Residual (D, m) of all readings, gross errors included, and their gc-scaling."""
+    if not fitted.outlier.any():
+        return fitted.raw, fitted.whitening
+    w = whitening(fitted.readings, fitted.mode, "gc")
+    prediction = fitted.model.predict(fitted.readings.states, fitted.theta)
+    return residual(fitted.readings, prediction, w), w
 
 
-def all_left_out(of: Fit) -> tuple[Floats, Whitening]:
-    """The same of the residual predicted without the pose of each measurement."""
-    raw, w = with_outliers(of)
-    if w is of.whitening:
-        return of.left_out, w
-    place = np.full(len(of.readings), -1)
-    place[np.flatnonzero(~of.outlier)[of.whitening.reading]] = np.arange(len(of.raw))
-    at = place[w.reading]
-    return np.where((at >= 0)[:, None], of.left_out[at], raw), w
+def all_left_out(fitted: Fit) -> tuple[Floats, Whitening]:
+    """Residual (D, m) of all readings, those fitted predicted without their pose; its scaling."""
+    raw, w = with_outliers(fitted)
+    if w is fitted.whitening:
+        return fitted.left_out, w
+    place = np.full(len(fitted.readings), -1)
+    place[np.flatnonzero(~fitted.outlier)[fitted.whitening.reading]] = np.arange(len(fitted.raw))
+    row = place[w.reading]
+    return np.where((row >= 0)[:, None], fitted.left_out[row], raw), w

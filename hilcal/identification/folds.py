@@ -1,15 +1,14 @@
-"""Prediction of poses that were left out, and what leaving out does to the parameters.
+"""Prediction of poses that are left out, and changes of the parameters by leaving them out.
 
-Whole poses are left out, never single readings: readings of one pose share its errors. Two
-commanded poses that agree in every joint within `SAME_POSE` are one pose here, whatever their
-names: a repeated pose that is left out must not be predicted from its repetition. Each fold is
-refitted by one Gauss-Newton step from the full fit, in which the fold's rows are taken out of the
-normal equations exactly. The strengths of shrunk families are chosen anew in each fold
-(`regression.fold_evidence`).
+Whole poses are left out, never single readings, as readings of one pose share its errors. Commanded
+poses that agree in every joint within `SAME_POSE` count as one pose, whatever their names, so that
+no repeated pose is predicted from its repetition. A fold is left out by one Gauss-Newton step from
+the full fit, with its rows subtracted exactly from the normal equations. The strengths of shrunk
+families are chosen anew for each fold (`regression.empirical_bayes`).
 
 Without a fold the flat parameters have a prior about zero (see `regression.leave_out`), whose
 standard deviation is their ordinary magnitude, or the rms of the effect's parameters in the full
-fit where that is more.
+fit if that is larger.
 """
 
 import numpy as np
@@ -27,12 +26,12 @@ from hilcal.types import Floats, Ints
 # All of these are choices.
 SAME_POSE = 2e-3  # difference of joint angles within which two poses are one, rad
 FOLDS = 10  # the usual number
-MOST_ELEMENTS = 5e7  # of the columns of dropped groups up to which they may enter again in a fold,
-# for memory; with more readings a fold of a tenth hardly decides what is dropped
+MOST_ELEMENTS = 5e7  # of the columns of dropped groups up to which these may enter again in a fold,
+# for memory; with more readings a fold of a tenth hardly decides which groups are dropped
 
 
 def distinct_poses(readings: Readings) -> Ints:
-    """(N,) number of the distinct pose of each reading, in order of first appearance."""
+    """(N,) number of the distinct pose of each reading, in the order of first appearance."""
     _, row, name = np.unique(readings.pose, return_index=True, return_inverse=True)
     label = groups_within(readings.states.q[row], SAME_POSE)[name.reshape(-1)]
     _, index, inverse = np.unique(label, return_index=True, return_inverse=True)
@@ -40,20 +39,20 @@ def distinct_poses(readings: Readings) -> Ints:
 
 
 def random_folds(pose: Ints, count: int = FOLDS) -> Ints:
-    """Fold of each measurement from its distinct pose: at random, from a fixed seed."""
+    """Random fold of each measurement (D,) from its distinct pose (D,), from a fixed seed."""
     total = int(pose.max()) + 1
     deal = np.random.default_rng(20240607).permutation(total) % min(count, total)
     return np.asarray(deal[pose])
 
 
 def block_folds(pose: Ints, count: int = FOLDS) -> Ints:
-    """Fold of each measurement: consecutive poses are in one fold."""
+    """Fold of each measurement (D,): consecutive poses are in one fold."""
     total = int(pose.max()) + 1
     return np.asarray(np.arange(total) * min(count, total) // total)[pose]
 
 
 def region_folds(angle: Floats, pose: Ints, count: int = FOLDS) -> Ints:
-    """Fold of each measurement: poses close to each other in joint space are in one fold.
+    """Fold of each measurement (D,): poses close to each other in joint space are in one fold.
 
     The largest group of poses is halved, repeatedly, across the first principal component of its
     joint angles (D, n).
@@ -76,13 +75,13 @@ def region_folds(angle: Floats, pose: Ints, count: int = FOLDS) -> Ints:
 
 
 def folds_of(model: Model, solution: Solution, fold: Ints) -> tuple[Fold, ...]:
-    """Return the normal equations of a fit without each fold, of fold (R,) of each row."""
+    """Return the normal equations of a fit without each fold; `fold` (R,) numbers them by row."""
     s, magnitude = solution, ordinary_y(model, solution)
     return folds(s.projection(), s.white, s.equations, s.y, s.prior, magnitude, s.beta, fold)
 
 
 def ordinary(model: Model, theta: Floats) -> Floats:
-    """Magnitude (P,) of each parameter: the ordinary one, or the rms over its effect if more."""
+    """Magnitude (P,) of each parameter: the ordinary one, or the rms over its effect if larger."""
     out = scales_of(model)
     for rows in model.slices():
         out[rows] *= max(1.0, float(np.sqrt(np.mean((theta[rows] / out[rows]) ** 2))))
@@ -90,13 +89,13 @@ def ordinary(model: Model, theta: Floats) -> Floats:
 
 
 def ordinary_y(model: Model, solution: Solution) -> Floats:
-    """(P,) the same for the coordinates y."""
+    """`ordinary` (P,) of the coordinates y of a solution."""
     return solution.space.scales(ordinary(model, solution.theta))
 
 
 def changes(model: Model, solution: Solution, fold: Ints, w: Whitening) -> Floats:
     """Return the parameters without each fold (D,) minus those with it (F, P)."""
-    steps = [one.step() for one in folds_of(model, solution, w.rows_of(fold))]
+    steps = [f.step() for f in folds_of(model, solution, w.rows_of(fold))]
     return np.asarray(np.array(steps) @ solution.transform.T)
 
 
@@ -110,50 +109,52 @@ def leave_out(model: Model, solution: Solution, fold: Ints, w: Whitening) -> Flo
     moved = np.flatnonzero(np.any(change != 0, axis=0))
     columns = w.raw(model.jacobian(solution.prediction, solution.theta, w.m, moved))
     predicted = solution.raw.copy()
-    for f, by in enumerate(change[:, moved]):
-        predicted[fold == f] -= columns[fold == f] @ by
+    for f, step in enumerate(change[:, moved]):
+        predicted[fold == f] -= columns[fold == f] @ step
     return predicted
 
 
 def _with_families(
     model: Model, solution: Solution, fold: Ints, w: Whitening, groups: Ints
 ) -> Floats:
-    """`changes` for a model with shrunk families, whose strengths each fold chooses."""
+    """`changes` for a model with shrunk families, with strengths chosen for each fold."""
     s, basis = solution, solution.equations.basis
     flat, count = len(basis.singular), len(basis.prior_precision)
     dropped = np.flatnonzero((groups >= 0) & (s.prior == 0))
     if len(dropped) * s.raw.size > MOST_ELEMENTS:
         dropped = dropped[:0]
     guess = FIRST_GUESS * scales_of(model)[dropped]
-    more = whitened_jacobian(model, s.prediction, s.theta, w, dropped)
-    shrunk = groups[basis.held] >= 0
-    kept = flat + np.flatnonzero(shrunk)
-    others = np.concatenate([np.arange(flat), flat + np.flatnonzero(~shrunk)])
-    family = np.concatenate([groups[basis.held[shrunk]], groups[dropped]])
-    coordinates, order = s.coordinates(), np.concatenate([others, kept])
-    # Flat parameters have the prior about zero of `folds_of`, unshrunk ones their own.
+    dropped_columns = whitened_jacobian(model, s.prediction, s.theta, w, dropped)
+    in_family = groups[basis.held] >= 0
+    shrunk = flat + np.flatnonzero(in_family)
+    unshrunk = np.concatenate([np.arange(flat), flat + np.flatnonzero(~in_family)])
+    family = np.concatenate([groups[basis.held[in_family]], groups[dropped]])
+    coordinates, order = s.coordinates(), np.concatenate([unshrunk, shrunk])
+    # Flat parameters have the prior about zero of `folds_of`; other unshrunk ones have their prior.
     magnitude = ordinary_y(model, s)
-    per = basis.transform[:, :flat] / magnitude[:, None]
-    stand = np.where(basis.flat, s.y / magnitude, 0.0)
-    ridge = s.beta * np.eye(len(others))
-    ridge[:flat, :flat] = s.beta * per.T @ per
-    rows = s.rows  # copied only where it must be: it may take a gigabyte
+    per_magnitude = basis.transform[:, :flat] / magnitude[:, None]
+    fitted = np.where(basis.flat, s.y / magnitude, 0.0)
+    ridge = s.beta * np.eye(len(unshrunk))
+    ridge[:flat, :flat] = s.beta * per_magnitude.T @ per_magnitude
+    pull = np.zeros(len(unshrunk))
+    pull[:flat] = -s.beta * per_magnitude.T @ fitted
+    rows = s.rows  # copied only if necessary: it may take a gigabyte
     if len(dropped) or np.any(np.diff(order) != 1):
-        rows = np.hstack([rows[:, order], more * guess])
-    found = solutions(
+        rows = np.hstack([rows[:, order], dropped_columns * guess])
+    u = solutions(
         FamilyProblem(
             rows=rows,
             target=s.white + s.rows @ coordinates,
             ridge=ridge,
-            pull=np.concatenate([-s.beta * per.T @ stand, np.zeros(len(others) - flat)]),
+            pull=pull,
             groups=np.unique(family, return_inverse=True)[1],
-            std=np.concatenate([np.ones(len(kept)), np.zeros(len(dropped))]),
+            std=np.concatenate([np.ones(len(shrunk)), np.zeros(len(dropped))]),
             beta=s.beta,
         ),
         w.rows_of(fold),
     )
-    z = np.empty((len(found), count))
-    z[:, order] = found[:, :count]
+    z = np.empty((len(u), count))
+    z[:, order] = u[:, :count]
     change = (z - coordinates) @ s.transform.T
-    change[:, dropped] = found[:, count:] * guess
+    change[:, dropped] = u[:, count:] * guess
     return np.asarray(change)

@@ -2,14 +2,14 @@
 
     minimise ‖w(θ)‖² + β ‖y/σ‖²,    θ = m + U y
 
-w (R,) whitened residual, y coordinates in which the prior is independent and about zero, θ itself
-without a carried prior (`carried.Coordinates`), σ their prior standard deviations. The noise factor
-β they are weighed against is the variance of the residual in units of the stated noise, at least 1.
-Priors of shrunk families maximise the evidence (`regression.empirical_bayes`). The rank counts the
-flat directions that the data determine against the residual.
+with w (R,) the whitened residual; y coordinates in which the prior is independent and about zero,
+θ itself without a carried prior (`carried.Coordinates`); σ their prior standard deviations. The
+noise factor β is the variance of the residual in units of the stated noise, at least 1. Priors of
+shrunk families maximise the evidence (`regression.empirical_bayes`). The rank is the number of flat
+directions that the data determine better than the residual's scatter.
 
-What a problem has to say of itself is `NewtonProblem`: the objective at a point, and the linear
-problem there, whose rows may be any that have the same products.
+A `NewtonProblem` states the objective at a point and the linear problem there, whose rows may be
+replaced by any rows with the same products.
 """
 
 from dataclasses import dataclass, replace
@@ -38,43 +38,43 @@ from hilcal.types import Bools, Floats, Ints
 
 # All of these are choices.
 MAX_ITERATIONS = 20  # steps; the tests of convergence allow 8
-CONVERGED = 1e-5  # a step that moves the whitened readings by less than this, in units of the noise
-SETTLED = 0.02  # priors and rank are chosen until the residual changes by less than this share from
-# one step to the next, or is within the noise; then they are kept
-DEPTH = 3  # earlier steps that a step is combined with: there are as few weak directions
+CONVERGED = 1e-5  # motion of the whitened readings by the last step, in units of the noise
+SETTLED = 0.02  # priors and rank are chosen anew until the residual changes by less than this share
+# in a step, or is within the noise
+DEPTH = 3  # previous steps that a step is combined with: weak directions are as few
 HALVINGS = 8  # most step lengths of a line search
 NOISE_STEPS, NOISE_TOLERANCE = 50, 1e-9  # iterations of the noise factor, and relative change
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearProblem:
-    """Minimise ‖y − A (θ − θ_0)‖² over live parameters: whitened, at one point."""
+    """Minimise ‖y − A (θ − θ_0)‖² over live parameters; A and y are whitened."""
 
     live: Ints  # (L,) indices of the parameters that are not held at zero
     origin: Floats  # (P,) θ_0: the point for flat parameters, zero for those with a prior
-    a: Floats  # (R', L) A, or rows that have the same products with each other and with y
+    a: Floats  # (R', L) A, or rows with the same products AᵀA and Aᵀy
     gram: Floats  # (L, L) AᵀA
     target: Floats  # (R',) y
     rank: int  # number of rows that carry information
-    noise: float  # variance of the rows: 1 where the scaling whitens, else that of the residual
+    noise: float  # variance of the rows: 1 if whitened, else that of the residual
     whitened: bool  # whether rows are in units of the stated noise
     rows: Floats  # (R, L) A itself, one row per element of the readings
 
     def restricted(self, prior: Floats) -> "LinearProblem":
         """Return the problem without the parameters that a prior (P,) of zero holds at zero."""
-        kept = prior[self.live] > 0
-        if kept.all():
+        free = prior[self.live] > 0
+        if free.all():
             return self
-        a = self.a[:, kept]
-        rows = a if self.rows is self.a else self.rows[:, kept]
+        a = self.a[:, free]
+        rows = a if self.rows is self.a else self.rows[:, free]
         return replace(
-            self, live=self.live[kept], a=a, gram=self.gram[np.ix_(kept, kept)], rows=rows
+            self, live=self.live[free], a=a, gram=self.gram[np.ix_(free, free)], rows=rows
         )
 
     def basis(self, scale: Floats, prior: Floats, spread: float) -> Basis:
-        """Return identifiable coordinates for magnitudes (P,), priors (P,), and the residual's σ.
+        """Return identifiable coordinates for magnitudes (P,), priors (P,) and the residual's σ.
 
-        Without whitening only rounding decides the rank.
+        Unless rows are whitened, only rounding decides the rank.
         """
         threshold = spread if self.whitened else None
         return find_basis(self.a, scale[self.live], prior[self.live], threshold)
@@ -91,10 +91,10 @@ class LinearProblem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Regularisation:
-    """What a linear problem is solved with."""
+    """Priors, noise factor and rank of a linear problem."""
 
     prior: Floats  # (P,) prior standard deviations (infinite: flat, zero: held at zero)
-    beta: float  # noise variance factor that the priors are weighed against
+    beta: float  # noise variance factor that multiplies the prior precisions
     basis: Basis  # identifiable coordinates of the parameters that are not held at zero
 
 
@@ -103,10 +103,14 @@ def regularise(
 ) -> Regularisation:
     """Choose priors, noise factor and rank for a linear problem.
 
-    From ordinary magnitudes, priors so far and shrinkage groups or −1 (P,); the evidence chooses
-    the priors of shrunk families where asked to.
+    Args:
+        p: the problem.
+        scale: (P,) ordinary magnitudes.
+        prior: (P,) current prior standard deviations.
+        groups: (P,) shrinkage groups, or −1.
+        choose: whether the evidence chooses the priors of shrunk families.
     """
-    # Rms of the residual at the solution: it does not depend on where the linearisation started.
+    # The rms residual at the solution does not depend on the point of linearisation.
     basis = p.basis(scale, prior, 1.0)
     equations = p.equations(basis)
     rss = p.rss(equations, equations.solve(p.noise))
@@ -121,64 +125,67 @@ def regularise(
 def _family_priors(
     p: LinearProblem, scale: Floats, prior: Floats, groups: Ints, spread: float
 ) -> tuple[Floats, float]:
-    """Priors (P,) with those of the shrunk families chosen, and the noise factor."""
+    """Return the priors (P,) with chosen ones of shrunk families, and the noise factor."""
     beta = max(spread**2, 1.0)
     family = np.isin(np.arange(len(prior)), p.live) & (groups >= 0)
     if not family.any():
         return prior, beta
-    # The families' columns unscaled, all others in well-conditioned coordinates.
+    # The families' columns are unscaled, all others in well-conditioned coordinates.
     basis = p.basis(scale, np.where(family, 1.0, prior), spread)
     equations = p.equations(basis)
     of_family = np.append(np.zeros(len(basis.singular), dtype=bool), family[p.live[basis.held]])
-    order, others = np.argsort(of_family, kind="stable"), int(np.sum(~of_family))
+    order, unshrunk = np.argsort(of_family, kind="stable"), int(np.sum(~of_family))
     gram = equations.gram[np.ix_(order, order)]
-    gram[np.arange(others), np.arange(others)] += beta * basis.prior_precision[order[:others]]
+    gram[np.arange(unshrunk), np.arange(unshrunk)] += beta * basis.prior_precision[order[:unshrunk]]
     square, rhs = float(p.target @ p.target), equations.rhs[order]
-    found = maximise_evidence(
-        gram, rhs, square, p.rank, others, groups[family], prior[family], beta
+    best = maximise_evidence(
+        gram, rhs, square, p.rank, unshrunk, groups[family], prior[family], beta
     )
     out = prior.copy()
-    out[family] = found.std
-    return out, found.beta
+    out[family] = best.std
+    return out, best.beta
 
 
 def noise_factor(p: LinearProblem, equations: NormalEquations, beta: float = 1.0) -> float:
-    """Fixed point of β = max(1, RSS(β) / (R − effective parameters)), from β on, given priors."""
+    """Fixed point of β = max(1, RSS(β) / (R − effective parameters)), with fixed priors."""
     for _ in range(NOISE_STEPS):
         root = equations.inverse_root(beta)
         z = root.T @ (root @ equations.rhs)
         free = max(p.rank - effective_parameters(equations, beta, root), 1.0)
-        beta, before = max(1.0, p.rss(equations, z) / free), beta
-        if abs(beta - before) < NOISE_TOLERANCE * beta:
+        beta, previous = max(1.0, p.rss(equations, z) / free), beta
+        if abs(beta - previous) < NOISE_TOLERANCE * beta:
             break
     return beta
 
 
 def effective_parameters(equations: NormalEquations, beta: float, root: Floats) -> float:
-    """Effective number of parameters: flat directions + Σ (1 − β Λ_kk H⁻¹_kk) over the others.
+    """Number of flat directions plus Σ (1 − β Λ_kk H⁻¹_kk) over parameters with a prior.
 
-    With (K, K) T, Tᵀ T = H⁻¹.
+    Args:
+        root: (K, K) T with Tᵀ T = H⁻¹.
     """
     return len(equations.basis.singular) + float(np.sum(_determined(equations, beta, root)))
 
 
 def spent_parameters(equations: NormalEquations, beta: float, groups: Ints) -> float:
-    """Degrees of freedom that a fit spends: `effective_parameters`, and the choice of strengths.
+    """Degrees of freedom that a fit uses: `effective_parameters` and the choice of strengths.
 
-    Of normal equations over all parameters, with their shrinkage groups or −1 (P,).
+    Args:
+        equations: over all parameters.
+        groups: (P,) shrinkage groups, or −1.
     """
     group = groups[equations.basis.held]
     determined = _determined(equations, beta, equations.inverse_root(beta))
     chosen = group >= 0
-    others = float(np.sum(determined[~chosen])) + len(equations.basis.singular)
+    unshrunk = float(np.sum(determined[~chosen])) + len(equations.basis.singular)
     place = np.unique(group[chosen], return_inverse=True)[1]
     size = np.bincount(place)
     share = np.bincount(place, weights=determined[chosen]) / size
-    return others + float(np.sum(spent_by_groups(share, size)))
+    return unshrunk + float(np.sum(spent_by_groups(share, size)))
 
 
 def _determined(equations: NormalEquations, beta: float, root: Floats) -> Floats:
-    """Share (H,) of each parameter with a prior that the data determine: 1 − β Λ_kk H⁻¹_kk."""
+    """Share 1 − β Λ_kk H⁻¹_kk (H,) that the data determine, of each parameter with a prior."""
     flat, precision = len(equations.basis.singular), equations.basis.prior_precision
     variance = np.sum(root[:, flat:] ** 2, axis=0)
     return np.asarray(1 - beta * precision[flat:] * variance)
@@ -191,15 +198,15 @@ class NewtonPoint:
     y: Floats  # (P,) coordinates
     theta: Floats  # (P,) parameters
     rss: float  # sum of squares of the whitened residual
-    elements: int  # its number of elements
+    elements: int  # number of elements of the residual
 
     def objective(self, by: Regularisation) -> float:
-        """Return ‖w‖² + β ‖y/σ‖² over the y that have a prior."""
+        """Return ‖w‖² + β ‖y/σ‖² over the y with a prior."""
         held = np.isfinite(by.prior) & (by.prior > 0)
         return self.rss + by.beta * float(np.sum((self.y[held] / by.prior[held]) ** 2))
 
     def mean_square(self, parameters: int = 0) -> float:
-        """Return the mean square of the whitened residual with some parameters estimated."""
+        """Return ‖w‖² over the degrees of freedom, with a number of estimated parameters."""
         return max(self.rss / max(self.elements - parameters, 1), 1e-300)
 
 
@@ -207,21 +214,21 @@ P = TypeVar("P", bound=NewtonPoint)
 
 
 class Minimum(NamedTuple, Generic[P]):
-    """Where the steps ended."""
+    """End of the iteration."""
 
     point: P
     by: Regularisation  # of the last linear problem
     iterations: int
     converged: bool  # whether the last step was negligible
-    rows: Floats | None  # (R, L) of the last linearisation, where the point is as near to it
+    rows: Floats | None  # (R, L) of the last linearisation if it is valid at the point
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NewtonProblem(Generic[P]):
-    """A model, its coordinates, and the readings that it is fitted to."""
+    """A model, its coordinates, and the readings of the fit."""
 
     same_rows: ClassVar[bool] = True
-    """Whether row i of every linearisation is of the same element of the readings."""
+    """Whether row i belongs to the same element of the readings in every linearisation."""
 
     model: Model
     coordinates: Coordinates
@@ -247,11 +254,11 @@ def linear_problem(
 ) -> LinearProblem:
     """Return the linear problem of whitened rows (R, L) and residual (R,) at a point.
 
-    Flat parameters step from where they are, so that unidentifiable directions stay put; those with
-    a prior are solved for as a whole, since the prior is about zero.
+    The unknowns are steps of flat parameters, so that unidentifiable directions do not move, and
+    values of parameters with a prior, as the prior is about zero.
 
-    Many rows are reduced to a triangle once, which rank analysis, priors and solution then take in
-    place of them; unless most columns have a prior, whose products alone cost less.
+    Many rows are reduced to a triangle once, which replaces them in rank analysis, choice of priors
+    and solution; unless most columns have a prior, as their products cost less.
     """
     live, rows = np.flatnonzero(prior > 0), a
     origin = np.where(np.isinf(prior), point.y, 0.0)
@@ -263,11 +270,12 @@ def linear_problem(
 
 
 def minimum(problem: NewtonProblem[P], start: Floats | None, prior: Floats | None) -> Minimum[P]:
-    """Return the minimum from a start (P,) on, with priors (P,) that are kept where given."""
-    model, of = problem.model, problem.coordinates
+    """Return the minimum reached from a start (P,); `prior` (P,) fixes the priors."""
+    model, space = problem.model, problem.coordinates
     sigma, groups = prior_of(model)
     choose = prior is None and bool((groups >= 0).any())
-    sigma, scale = of.prior(sigma if prior is None else prior), of.scales(scales_of(model))
+    sigma = space.prior(sigma if prior is None else prior)
+    scale = space.scales(scales_of(model))
     y = np.zeros(model.size) if start is None else start
     point = problem.at(np.where(sigma > 0, y, 0.0))
     by: Regularisation  # set in the first step
@@ -279,43 +287,45 @@ def minimum(problem: NewtonProblem[P], start: Floats | None, prior: Floats | Non
             sigma = by.prior
         linear = linear.restricted(sigma)
         equations = linear.equations(by.basis)
-        if (groups[linear.live] >= 0).any() or len(of.index):  # priors that are weighed
+        if (groups[linear.live] >= 0).any() or len(space.index):  # priors that β multiplies
             by = replace(by, beta=noise_factor(linear, equations, by.beta))
         aim = linear.origin.copy()
         aim[linear.live] += by.basis.transform @ equations.solve(by.beta)
         moved = linear.rows @ (aim - point.y)[linear.live]
         shortcut = path.accelerated(aim, moved) if settled and problem.same_rows else None
-        begin, point = point, _line_search(problem, point, aim, by, shortcut)
-        before, square = square, point.mean_square(len(by.basis.singular))
+        start_point, point = point, _line_search(problem, point, aim, by, shortcut)
+        previous, square = square, point.mean_square(len(by.basis.singular))
         noise = max(square, by.beta) * linear.rank
         if settled and float(moved @ moved) <= CONVERGED**2 * noise:
-            moved = linear.rows @ (point.y - begin.y)[linear.live]
+            moved = linear.rows @ (point.y - start_point.y)[linear.live]
             near = float(moved @ moved) <= CONVERGED**2 * noise
             return Minimum(point, by, iterations, True, linear.rows if near else None)
-        del linear  # before the next one is made
-        settled = (problem.whitened and square < 1) or abs(square / before - 1) <= SETTLED
+        del linear  # frees memory for the next one
+        settled = (problem.whitened and square < 1) or abs(square / previous - 1) <= SETTLED
     return Minimum(point, by, iterations, False, None)
 
 
 class Acceleration:
-    """Anderson's acceleration of the steps that follow once priors and rank are settled.
+    """Anderson's acceleration of the steps after priors and rank have settled.
 
-    Where a residual remains, steps in a weakly determined direction shrink by a constant factor
-    only. With f_i the motion of the whitened readings by step i, and g_i where it leads to, the
-    combination Σ α_i f_i, Σ α_i = 1, of the last steps that is shortest leads to Σ α_i g_i.
+    Where a residual remains, steps in a weakly determined direction shrink only by a constant
+    factor. Step i leads to g_i and moves the whitened readings by f_i. With α_i, Σ α_i = 1, that
+    minimise ‖Σ α_i f_i‖ over the last steps, the accelerated step leads to Σ α_i g_i.
 
     Source: Walker and Ni, *Anderson acceleration for fixed-point iterations*, SIAM J. Numer. Anal.
     49 (2011) 1715-1735.
     """
 
     def __init__(self) -> None:
-        """Begin without steps."""
+        """Start without steps."""
         self._steps: list[tuple[Floats, Floats]] = []
 
     def accelerated(self, aim: Floats, moved: Floats) -> Floats | None:
-        """Return where the steps so far lead to; None after the first.
+        """Add a step and return the accelerated aim (P,); None after the first step.
 
-        A step leads to `aim` (P,) by itself, and moves the whitened readings by `moved` (R,).
+        Args:
+            aim: (P,) where the step alone leads to.
+            moved: (R,) motion of the whitened readings by the step.
         """
         self._steps = [*self._steps[-DEPTH:], (aim, moved)]
         if len(self._steps) == 1:
@@ -328,38 +338,38 @@ class Acceleration:
 def _line_search(
     problem: NewtonProblem[P], point: P, aim: Floats, by: Regularisation, shortcut: Floats | None
 ) -> P:
-    """Go to the `shortcut` (P,), unless the objective grows; else towards `aim` (P,).
+    """Go to the `shortcut` (P,) if the objective does not grow; else towards `aim` (P,).
 
-    On the way to `aim` half as far each time while the objective grows: the chain may be strongly
-    nonlinear along a step in a weakly determined direction.
+    The step towards `aim` is halved while the objective grows, as the chain may be strongly
+    nonlinear along a weakly determined direction.
     """
 
     def cost(trial: P) -> float:
         return trial.objective(by)
 
-    now, begin = cost(point), np.where(by.prior > 0, point.y, 0.0)
-    found = None if shortcut is None else shortened(problem.at, shortcut, 1, cost, now)
-    if found is None:
-        limit = now * (1 + 1e-9) + 1e-12
-        found = shortened(lambda step: problem.at(begin + step), aim - begin, HALVINGS, cost, limit)
-    return problem.at(begin) if found is None else found
+    current, y = cost(point), np.where(by.prior > 0, point.y, 0.0)
+    reached = None if shortcut is None else shortened(problem.at, shortcut, 1, cost, current)
+    if reached is None:
+        limit = current * (1 + 1e-9) + 1e-12
+        reached = shortened(lambda step: problem.at(y + step), aim - y, HALVINGS, cost, limit)
+    return problem.at(y) if reached is None else reached
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """The minimum that Gauss-Newton reached."""
+    """The minimum reached by Gauss-Newton."""
 
     theta: Floats  # (P,) parameters
-    y: Floats  # (P,) the same in coordinates in which the prior is independent
-    space: Coordinates  # these coordinates
+    y: Floats  # (P,) coordinates in which the prior is independent
+    space: Coordinates  # mapping between y and theta
     prior: Floats  # (P,) prior standard deviations of y (infinite: flat, zero: held at zero)
-    beta: float  # noise variance factor that the priors were weighed against
+    beta: float  # noise variance factor that multiplies the prior precisions
     equations: NormalEquations  # at the solution, in identifiable coordinates z of y
     rows: Floats  # (R, K) whitened derivative of the measurements by z
     prediction: Prediction
     raw: Floats  # (D, m) residual
     white: Floats  # (R,) whitened residual
-    effective: float  # degrees of freedom that the fit spends, the choice of strengths included
+    effective: float  # degrees of freedom that the fit uses, with the choice of strengths
     iterations: int
     converged: bool  # whether the last step was negligible
 
@@ -384,13 +394,13 @@ class Solution:
         return projection(self.rows, ridge, self.equations.gram)
 
     def coordinates(self) -> Floats:
-        """Return z (K,) of the parameters that have a prior; zero for flat directions."""
+        """Return z (K,) of the parameters with a prior; zero for flat directions."""
         return prior_coordinates(self.equations.basis, self.y, self.prior)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Iterate(NewtonPoint):
-    """A point with the prediction there, the residual (D, m), also whitened (R,)."""
+    """A point with its prediction, residual (D, m), and whitened residual (R,)."""
 
     prediction: Prediction
     raw: Floats
@@ -399,7 +409,7 @@ class _Iterate(NewtonPoint):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Problem(NewtonProblem[_Iterate]):
-    """Readings that fit into memory, and their scaling."""
+    """A fit of readings in memory, with their scaling."""
 
     readings: Readings
     w: Whitening
@@ -430,8 +440,13 @@ def solve(
 ) -> Solution:
     """Fit all parameters of the model to the readings.
 
-    They start at zero, or at the mean of a carried prior, unless a start (P,) is given. Given prior
-    standard deviations (P,) are kept; otherwise the evidence chooses those of shrunk families.
+    Args:
+        model: the model.
+        readings: without gross errors.
+        w: scaling of the readings.
+        start: (P,) first parameters; else zero, or the mean of a carried prior.
+        prior: (P,) fixed prior standard deviations; else the evidence chooses those of shrunk
+            families.
     """
     space = coordinates_of(model)
     if len(space.index):
@@ -440,12 +455,12 @@ def solve(
         a = whitened_jacobian(model, prediction, theta, w, np.arange(model.size))
         space = space.felt(a)
     problem = _Problem(model, space, w.scaling != "none", readings, w)
-    found = minimum(problem, None if start is None else space.of_theta(start), prior)
-    point, by = found.point, found.by
+    end = minimum(problem, None if start is None else space.of_theta(start), prior)
+    point, by = end.point, end.by
     live = np.flatnonzero(by.prior > 0)
-    rows = by.basis.rows(problem.columns(point, live) if found.rows is None else found.rows)
+    rows = by.basis.rows(problem.columns(point, live) if end.rows is None else end.rows)
     beta = point.mean_square(len(by.basis.singular)) if w.scaling == "none" else by.beta
-    # Formed anew at the solution, so that folds can be taken out of them exactly.
+    # Formed from the rows themselves, so that folds can be subtracted exactly.
     basis = over_all_parameters(by.basis, live, model.size)
     target = point.white + rows @ prior_coordinates(basis, point.y, by.prior)
     equations = NormalEquations(basis, rows.T @ rows, rows.T @ target)
@@ -461,8 +476,8 @@ def solve(
         raw=point.raw,
         white=point.white,
         effective=spent_parameters(equations, beta, prior_of(model)[1]),
-        iterations=found.iterations,
-        converged=found.converged,
+        iterations=end.iterations,
+        converged=end.converged,
     )
 
 
@@ -485,20 +500,20 @@ def columns_of(
     if not len(space.index):
         return whitened_jacobian(model, prediction, theta, w, live)
     needed = np.union1d(live, space.index)
-    found = whitened_jacobian(model, prediction, theta, w, needed)
-    a = np.zeros((len(found), model.size))
-    a[:, needed] = found
+    columns = whitened_jacobian(model, prediction, theta, w, needed)
+    a = np.zeros((len(columns), model.size))
+    a[:, needed] = columns
     return space.columns(a)[:, live]
 
 
 def prior_coordinates(basis: Basis, y: Floats, prior: Floats) -> Floats:
-    """Return z (K,) of the y that have a prior; zero for flat directions."""
+    """Return z (K,) of the y with a prior; zero for flat directions."""
     flat = np.zeros(len(basis.singular))
     return np.concatenate([flat, y[basis.held] / prior[basis.held]])
 
 
 def over_all_parameters(basis: Basis, live: Ints, size: int) -> Basis:
-    """Express a basis over the live parameters over all of them."""
+    """Extend a basis over the live parameters to all parameters."""
     transform = np.zeros((size, basis.transform.shape[1]))
     null, flat = np.zeros((size, basis.null.shape[1])), np.zeros(size, dtype=bool)
     transform[live], null[live], flat[live] = basis.transform, basis.null, basis.flat

@@ -1,16 +1,16 @@
 """The linearisation of a fit: evidence and predictions of effects that are not in the model.
 
 The ranking of effects that could be missing and the planning of measurements that separate them
-both use it, so that the planner's power and the diagnosis's test are of the same information.
+both use it, so that the power of the plan and the test of the diagnosis have the same information.
 
-A fitted linear model without some of its columns; no refit is needed.
-
-With A the whitened columns that stay, H = AᵀA + β diag(1/σ²) and y the residual that the
-eliminated columns are part of,
+A column can also be eliminated from a fitted model without a refit. With A the whitened columns
+that stay, H = AᵀA + β diag(1/σ²), and y the residual plus the contribution of the eliminated
+columns,
 
     r₀ = y − A H⁻¹ Aᵀ y
 
-is the residual that the eliminated columns are scored by, and so is what could replace them.
+is the residual against which the eliminated columns, and columns that could replace them, are
+scored.
 """
 
 from collections.abc import Iterable, Sequence
@@ -37,16 +37,16 @@ from hilcal.regression.normal_equations import Basis, find_basis, normal_equatio
 from hilcal.regression.projection import Projection
 from hilcal.types import Bools, Floats, Ints
 
-LEAST_MISFIT = 3.0  # standard deviations of χ² that a misfit counts as at least; a choice
+LEAST_MISFIT = 3.0  # least value of a misfit, in standard deviations of χ²; a choice
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReducedModel:
-    """A model without some of its columns, which are not copied: they can be many."""
+    """A fitted linear model with some of its columns eliminated; columns are not copied."""
 
     columns: Floats  # (R, P) all columns of the model
-    out: Bools  # (P,) the eliminated ones
-    basis: Basis  # coordinates of those that stay, flat ones first
+    out: Bools  # (P,) eliminated columns
+    basis: Basis  # coordinates of the columns that stay, flat ones first
     flat: Floats  # (R, F) rows by the flat coordinates
     inverse_root: Floats  # (K, K) T with Tᵀ T = H⁻¹
     gram: Floats  # (P, P) of all columns
@@ -61,7 +61,10 @@ class ReducedModel:
     def information(self, x: Floats, gram: Floats, products: Floats) -> Floats:
         """Return Xᵀ M X (Q, Q), M the projection off the columns that stay.
 
-        Of whitened columns X (R, Q), with XᵀX (Q, Q) and products (P, Q) of the model's with X.
+        Args:
+            x: (R, Q) whitened columns X.
+            gram: (Q, Q) XᵀX.
+            products: (P, Q) of the model's columns with X.
         """
         return self._information(self.flat.T @ x, gram, products)
 
@@ -75,7 +78,7 @@ class ReducedModel:
     def score(self) -> FamilyScore:
         """Score the eliminated columns against the model without them."""
         products = self.gram[:, self.out]
-        # Of all columns: those that are taken out would be copied.
+        # Products with all columns, as selecting columns would copy them.
         flat = (self.flat.T @ self.columns)[:, self.out]
         s = self._information(flat, products[self.out], products)
         slope = (self.columns.T @ self.residual)[self.out]
@@ -86,8 +89,8 @@ class ReducedModel:
 class HeldOut:
     """Reduction of the held-out error by a family."""
 
-    share: float  # of the misfit; negative where it makes predictions worse
-    sure: bool  # whether the error falls by more than it scatters from pose to pose
+    share: float  # of the misfit; negative where predictions become worse
+    sure: bool  # whether the reduction is significant against the scatter from pose to pose
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,8 +115,8 @@ class Linearisation:
     def left_out(self) -> Floats:
         """(poses,) squared whitened residual of each pose, predicted without it.
 
-        With the strengths of the fit, as `held_out` predicts with one family more; those of
-        `Fit.left_out` are chosen without the pose.
+        The strengths are those of the fit, as in `held_out`; `Fit.left_out` has strengths chosen
+        without the pose.
         """
         white = left_out_residual(self.folds, self.projection, self.fit.white)
         return by_pose(self.fit, white)
@@ -135,17 +138,17 @@ class Linearisation:
         return self.projection.information(x)
 
     def products(self, families: Iterable[Floats]) -> list[FamilyProducts]:
-        """Return the products of families of whitened columns, which `held_out` needs."""
+        """Return the products of families of whitened columns, for `held_out`."""
         return family_products(self.folds, self.projection, self.fit.white, families)
 
     def score(
         self, x: Floats, s: Floats | Spectrum | None = None, most: float = np.inf
     ) -> FamilyScore:
-        """Score whitened columns X (R, P) beside the model.
+        """Score whitened columns X (R, P) as an addition to the model.
 
         Args:
             x: X.
-            s: (P, P) S where it is known, or its spectrum.
+            s: (P, P) S or its spectrum, if computed before.
             most: largest plausible strength.
         """
         s = self.information(x) if s is None else s
@@ -159,40 +162,41 @@ class Linearisation:
         """Return S (P, P) and g = Xᵀ r (P,) of effects whose columns were whitened together."""
         if not columns:
             return []
-        own = np.column_stack([self.rows, self.residual])
-        of_all = own.T @ columns[0].together
+        model_rows = np.column_stack([self.rows, self.residual])
+        products = model_rows.T @ columns[0].together
         out = []
-        for of in columns:
-            both = of_all[:, of.within]
-            lifted = self.projection.inverse_root @ both[:-1]
-            out.append((of.white.T @ of.white - lifted.T @ lifted, both[-1]))
+        for c in columns:
+            of_effect = products[:, c.within]
+            lifted = self.projection.inverse_root @ of_effect[:-1]
+            out.append((c.white.T @ c.white - lifted.T @ lifted, of_effect[-1]))
         return out
 
     def misfit(self) -> float:
-        """‖r‖² − dof, the misfit beyond the noise, at least `LEAST_MISFIT` of its σ."""
+        """‖r‖² − dof, the misfit beyond the noise, at least `LEAST_MISFIT` times its σ."""
         dof = self.fit.dof
         return float(max(self.rss - dof, LEAST_MISFIT * np.sqrt(2 * dof)))
 
     def share(self, gain: float) -> float:
-        """Share of the misfit that a reduction of ‖r‖² is, within [0, 1]."""
+        """Return a reduction of ‖r‖² as a share of the misfit, within [0, 1]."""
         return float(np.clip(gain / self.misfit(), 0.0, 1.0))
 
     def held_out(self, families: Sequence[tuple[FamilyProducts, FamilyScore]]) -> list[HeldOut]:
-        """Return the reductions of the held-out error by families, each beside the model by itself.
+        """Return the reduction of the held-out error by each family alone.
 
-        A family is its products and its score, for the ridge; see `regression.leave_out`.
+        A family is given by its products, and its score, which has its ridge; see
+        `regression.leave_out`.
         """
-        seen = [(of, found.ridge) for of, found in families if found.rank]
-        left = iter(left_out_of_families(self.folds, self.projection, self.fit.white, seen))
+        visible = [(products, score.ridge) for products, score in families if score.rank]
+        residuals = iter(left_out_of_families(self.folds, self.projection, self.fit.white, visible))
         return [
-            self._held_out(next(left)) if found.rank else HeldOut(0.0, False)
-            for _, found in families
+            self._held_out(next(residuals)) if score.rank else HeldOut(0.0, False)
+            for _, score in families
         ]
 
-    def _held_out(self, left: Floats) -> HeldOut:
-        """Compare residuals (R,) predicted without their poses with those of the model alone."""
+    def _held_out(self, residual: Floats) -> HeldOut:
+        """Compare a residual (R,) predicted without each pose with that of the model alone."""
         noise = self.fit.whitening.rank
-        before, after = self.left_out, by_pose(self.fit, left)
+        before, after = self.left_out, by_pose(self.fit, residual)
         misfit = max(float(before.sum()) - noise, LEAST_MISFIT * np.sqrt(2 * noise))
         gain = float(before.sum() - after.sum())
         return HeldOut(float(np.clip(gain / misfit, -1.0, 1.0)), improves(before, after))
@@ -201,17 +205,17 @@ class Linearisation:
 def linearise(fit: Fit) -> Linearisation:
     """Return the linearisation of a gc-scaled fit."""
     s = fit.solution
-    off = s.projection()
-    return Linearisation(fit, off, off.residual(s.white, s.coordinates()))
+    projection = s.projection()
+    return Linearisation(fit, projection, projection.residual(s.white, s.coordinates()))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModelColumns:
     """The columns of a fitted model in ordinary magnitudes of its parameters.
 
-    Parameters that are held at zero have no column, unless a test of their effect needs it
+    Parameters held at zero have no column, unless a test of their effect needs it
     (`Effect.for_scoring`). With a carried prior, columns are derivatives by the coordinates in
-    which that prior is independent.
+    which the prior is independent.
     """
 
     parameter: Ints  # (L,) indices of the parameters, or coordinates, ascending
@@ -229,15 +233,14 @@ def model_columns(fit: Fit) -> ModelColumns:
         names = {p.name for p in effect.for_scoring(states).parameters}
         scored += [p.name in names for p in effect.parameters]
     carried = s.space.carried(model.size)
-    kept = (s.prior > 0) | (np.array(scored, dtype=np.bool_) & ~carried)
-    parameter = np.flatnonzero(kept)
+    parameter = np.flatnonzero((s.prior > 0) | (np.array(scored, dtype=np.bool_) & ~carried))
     scale = s.space.scales(scales_of(model))[parameter]
     columns = columns_of(model, s.space, s.prediction, s.theta, w, parameter) * scale
     return ModelColumns(parameter, scale, columns, columns.T @ columns)
 
 
 def eliminate_effect(fit: Fit, columns: ModelColumns, effect: str) -> ReducedModel:
-    """Take an effect of its model out of a fit, at the same linearisation."""
+    """Eliminate an effect of the model from a fit, at the same linearisation."""
     place = fit.model.slices()[fit.model.names.index(effect)]
     index, scale, s = columns.parameter, columns.scale, fit.solution
     theta, prior = s.y[index] / scale, s.prior[index] / scale
@@ -268,16 +271,23 @@ def eliminate_columns(
     beta: float,
     rank: int,
 ) -> ReducedModel:
-    """Take some (P,) of the whitened columns A (R, P), with gram AᵀA, out of a fitted model.
+    """Eliminate columns from a fitted linear model.
 
-    Of the fit: whitened residual (R,), parameters (P,) and their prior standard deviations,
-    infinite for flat ones, zero for held ones; noise factor, and rank: rows with information.
+    Args:
+        columns: (R, P) whitened columns A.
+        gram: (P, P) AᵀA.
+        white: (R,) whitened residual of the fit.
+        theta: (P,) parameters of the fit.
+        prior: (P,) prior standard deviations, infinite for flat parameters, zero for held ones.
+        out: (P,) columns to eliminate.
+        beta: noise factor of the fit.
+        rank: number of rows with information.
     """
     stay = ~out & (prior > 0)
     basis = find_basis(columns, np.ones(columns.shape[1]), np.where(stay, prior, 0.0))
     y = white + columns @ np.where(out, theta, 0.0)
     equations = normal_equations(columns, y, basis, gram)
-    # Priors pull to zero, not to where the fit stands.
+    # Priors are about zero, not about the parameters of the fit.
     count, ridge = len(basis.singular), beta * basis.prior_precision
     z = np.zeros(len(ridge))
     z[count:] = (theta / np.where(stay, prior, 1.0))[basis.held]

@@ -1,8 +1,8 @@
 """The mixed model of effects, fitted to readings.
 
-Every effect of the model takes part, most often each of the catalogue that the readings allow, and
-each of its families with a variance of its own (see `hilcal.mixed`). The rows are linearised at the
-joint optimum: at the parameters that the mixed model predicts, again until they stay.
+The model contains its effects, usually all of the catalogue that the readings allow, and each of
+their families has a variance (see `hilcal.mixed`). The rows are linearised repeatedly at the
+parameters that the mixed model predicts, until these converge.
 """
 
 from collections.abc import Collection, Sequence
@@ -26,46 +26,47 @@ from hilcal.readings.whitening import Mode, Whitening, whitening
 from hilcal.types import Floats
 
 HARMONICS = 64
-"""Harmonics of a transmission error, whatever the number of poses: those that few poses cannot
-resolve are there all the same, and act as scatter. A choice: teeth of strain wave gears err once a
-turn of the motor, 100 and more times a turn of the joint, by less than any tracker sees."""
+"""Harmonics of a transmission error, whatever the number of poses: the arm also has those that few
+poses cannot resolve, where they act as scatter. A choice: errors of the teeth of strain wave gears
+have the period of a turn of the motor, 100 and more in a turn of the joint, and are too small for
+any tracker."""
 ROUNDS = 5
 """Most linearisations; a choice, three are usual."""
 CONVERGED = 0.02
-"""Change of the predicted readings, in units of their noise, at which the linearisation stays."""
+"""Change of the predicted readings, in units of their noise, that ends the linearisations."""
 HALVINGS = 6
-"""Most trials of a step, each half as long as the one before; a choice."""
+"""Most trials of a step, each half as long as the previous one; a choice."""
 SCATTER_RAD = 3e-5
-"""Ordinary scatter of a joint, rad: 30 µm at 1 m, as makers state it; η of it is about zero."""
+"""Ordinary scatter of a joint, rad: 30 µm at 1 m, as makers state it; the prior mean of η is 0."""
 INSTRUMENT, SCATTER = "instrument", "arm's scatter"
 """Names of the components of the noise."""
 UNSEEN = -0.5
-"""`independent_rows` gives a row that is not seen the variance -1."""
+"""Threshold for rows that are not measured, to which `independent_rows` gives the variance -1."""
 LITTLE = 1e-3
-"""Share by which the arm's scatter turns rows that the instrument's parts leave alike."""
+"""Weight of the arm's scatter in the matrix whose eigenvectors turn the rows: it decides where the
+instrument's parts are isotropic."""
 NOISE_SPREAD = 1.5
-"""Of the log of the noise: a factor of 4.5 either way; a choice."""
+"""Spread of the log standard deviation of the noise: a factor of 4.5 either way; a choice."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NoisePart:
     """A part of the noise of N readings."""
 
-    name: str  # of it
-    covariance: Floats  # (N, m, m) of a part of ordinary size
-    prior: LogStdPrior  # of the log of the standard deviation, in that size
-    # (N, m, n) F of what readings of one arrival have in common; see `Readings.common`
-    common: Floats | None = None
+    name: str
+    covariance: Floats  # (N, m, m) at its ordinary size
+    prior: LogStdPrior  # of the log standard deviation, in ordinary sizes
+    common: Floats | None = None  # (N, m, n) F of the noise of one arrival; see `Readings.common`
 
 
 @dataclass(frozen=True, eq=False)
 class MixedFit:
-    """All effects at once, fitted to readings."""
+    """A mixed model fitted to readings."""
 
     model: Model  # with all effects
-    readings: Readings  # that it was fitted to
+    readings: Readings  # the fitted ones
     theta: Floats  # (P,) parameters
-    variances: Variances  # those of the families and of the noise, at the last linearisation
+    variances: Variances  # of the families and of the noise, at the last linearisation
     covariance: Floats  # (K, K) of the errors of the coordinates
 
     @property
@@ -88,7 +89,7 @@ class MixedFit:
 def with_all_effects(model: Model, states: States, harmonics: int = HARMONICS) -> Model:
     """Return a model with every effect of its catalogue that the states allow.
 
-    Waves that few poses cannot resolve are there all the same; `harmonics` of them are kept.
+    Effects with harmonics have at least `harmonics` of them, even if few poses cannot resolve them.
     """
     model = with_all_harmonics(model, states, harmonics)
     for kind in model.catalogue.effects:
@@ -102,9 +103,9 @@ def with_all_effects(model: Model, states: States, harmonics: int = HARMONICS) -
 
 
 def with_all_harmonics(model: Model, states: States, harmonics: int = HARMONICS) -> Model:
-    """Return a model whose waves have at least so many harmonics.
+    """Return a model whose effects with harmonics have at least so many.
 
-    Standard deviations of an effect that gets finer are not kept.
+    Effects whose harmonics change lose their stated standard deviations.
     """
     finer = tuple(
         e.with_options(states, harmonics=harmonics)
@@ -112,13 +113,13 @@ def with_all_harmonics(model: Model, states: States, harmonics: int = HARMONICS)
         else e
         for e in model.effects
     )
-    kept = {e.name for e, old in zip(finer, model.effects, strict=True) if e is old}
-    random = {name: std for name, std in model.random.items() if name in kept}
+    unchanged = {e.name for e, old in zip(finer, model.effects, strict=True) if e is old}
+    random = {name: std for name, std in model.random.items() if name in unchanged}
     return replace(model, effects=finer, random=random)
 
 
 def mixed_fit(model: Model, readings: Readings, mode: Mode) -> MixedFit:
-    """Fit all effects of the catalogue at once, beside those of a model; see `mixed_fit_of`."""
+    """Fit the effects of a model and all others of its catalogue; see `mixed_fit_of`."""
     return mixed_fit_of(with_all_effects(model, readings.states), readings, mode)
 
 
@@ -127,43 +128,43 @@ def mixed_fit_of(
     readings: Readings,
     mode: Mode,
     flat: Collection[str] = (),  # effects whose parameters have no prior
-    lines: Collection[str] = (),  # effects of which each group has a size of its own
+    lines: Collection[str] = (),  # effects of which each group is a family
 ) -> MixedFit:
-    """Fit the effects of a model at once, to readings without gross errors.
+    """Fit the effects of a model together to readings without gross errors.
 
     Raises:
         CannotAnswerError: no static equilibrium, or no likelihood.
         InputError: a deflection without its unloaded reading.
     """
     w = whitening(readings, mode, "gc")
-    found, theta = _iterated(model, readings, w, families_of(model, flat, lines))
-    return MixedFit(model, readings, theta, found, coordinates_covariance(found))
+    variances, theta = _iterated(model, readings, w, families_of(model, flat, lines))
+    return MixedFit(model, readings, theta, variances, coordinates_covariance(variances))
 
 
 def mixed_fit_at(model: Model, readings: Readings, mode: Mode, theta: Floats) -> Variances:
-    """Estimate the variances of a model's effects at parameters theta (P,), without moving them.
+    """Estimate the variances of a model's effects, linearised at fixed parameters theta (P,).
 
-    The readings are without gross errors, with their stated covariance.
+    The readings have no gross errors, and their stated covariance.
     """
     problem = linearised_problem(model, readings, mode, theta)
     return estimate_variances(problem, sizes_at(problem, model, theta))
 
 
 def linearised_problem(model: Model, readings: Readings, mode: Mode, theta: Floats) -> MixedProblem:
-    """Return the linear problem of a model at parameters theta (P,); arguments as above."""
+    """Return the linear problem of a model at theta (P,), for readings as in `mixed_fit_at`."""
     w = whitening(readings, mode, "gc")
     return _linearise(model, readings, w, theta).problem
 
 
 def sizes_at(problem: MixedProblem, model: Model, theta: Floats) -> Floats:
-    """Log s and η (F + N,) of a fit: of the standard deviations of its model, else of theta (P,).
+    """Log s and η (F + N,) from the standard deviations of the model, or else from theta (P,).
 
-    The priors' means for families that are not in it.
+    For families that are zero or of known size, and for the noise, the priors' means.
     """
     std = theta.copy()
-    for effect, mine in zip(model.effects, model.slices(), strict=True):
+    for effect, rows in zip(model.effects, model.slices(), strict=True):
         if effect.name in model.random:
-            std[mine] = model.random[effect.name]
+            std[rows] = model.random[effect.name]
     out = problem.log_std_prior[0].copy()
     for k, f in enumerate(problem.families.random):
         size = float(np.sqrt(np.mean((std[f.parameters] / f.magnitude) ** 2)))
@@ -175,10 +176,10 @@ def sizes_at(problem: MixedProblem, model: Model, theta: Floats) -> Floats:
 def variances_with_noise(
     model: Model, readings: Readings, mode: Mode, instrument: Sequence[NoisePart], arm: NoisePart
 ) -> tuple[Variances, Floats]:
-    """Estimate the variances of effects, of parts of the instrument's noise and of the arm's.
+    """Estimate the variances of effects, of parts of the instrument's noise, and of the arm's.
 
-    The readings, without gross errors, have the covariance of the instrument, which its parts add
-    up to. The parameters (P,) that the variances predict are returned with them.
+    The readings have no gross errors, and the covariance of the instrument, which is the sum of its
+    parts. The parameters (P,) predicted with the variances are returned, too.
     """
     return _iterated(model, readings, whitening(readings, mode, "gc"), None, (*instrument, arm))
 
@@ -190,50 +191,48 @@ def _iterated(
     families: Families | None = None,
     parts: Sequence[NoisePart] = (),
 ) -> tuple[Variances, Floats]:
-    """Estimate the variances, linearised at the parameters (P,) that they predict; and those.
+    """Return the variances and the parameters (P,) predicted with them, linearised there.
 
-    A step that makes the penalised squares larger is halved: large parameters that cancel in the
-    linear model do not do so exactly.
+    A step that increases the penalised squares is halved, as large parameters that cancel in the
+    linear model do not cancel exactly.
     """
     theta, start = np.zeros(model.size), None
-    here, rounds = _linearise(model, readings, w, theta, families, parts), 0
+    point, rounds = _linearise(model, readings, w, theta, families, parts), 0
     while True:
-        found = estimate_variances(here.problem, start, search=True)
-        start, rounds = found.log_std, rounds + 1
-        before = here.penalised(theta, found.equations)
-        step = here.problem.parameters(found.equations.coordinates, model.size) - theta
+        variances = estimate_variances(point.problem, start, search=True)
+        start, rounds = variances.log_std, rounds + 1
+        square = point.penalised(theta, variances.equations)
+        step = point.problem.parameters(variances.equations.coordinates, model.size) - theta
         for k in range(HALVINGS):
-            trial = theta + 0.5**k * step
+            reached = theta + 0.5**k * step
             try:
-                there = _linearise(model, readings, w, trial, families, parts)
-            except CannotAnswerError:  # no equilibrium so far away
+                trial = _linearise(model, readings, w, reached, families, parts)
+            except CannotAnswerError:  # no equilibrium: the step is too long
                 continue
-            if there.penalised(trial, found.equations) <= before:
+            if trial.penalised(reached, variances.equations) <= square:
                 break
         else:
-            return found, theta
-        moved = float(np.sqrt(np.mean((there.white - here.white) ** 2)))
-        theta, here = trial, there
+            return variances, theta
+        moved = float(np.sqrt(np.mean((trial.white - point.white) ** 2)))
+        theta, point = reached, trial
         if rounds == ROUNDS or moved < CONVERGED:
-            return found, theta
+            return variances, theta
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Linearised:
     """A linear problem at some parameters."""
 
-    problem: MixedProblem  # of it
-    white: Floats  # (R,) residual there, in the rows of the problem
+    problem: MixedProblem
+    white: Floats  # (R,) residual at the parameters, in the rows of the problem
 
-    def penalised(self, theta: Floats, at: Equations) -> float:
-        """Squares of the residual and of the parameters (P,), each in its standard deviations."""
-        p = self.problem
-        std = np.exp(at.log_std)
-        sizes = sum(
+    def penalised(self, theta: Floats, equations: Equations) -> float:
+        """Squares of the residual and of the parameters (P,), in their standard deviations."""
+        penalty = sum(
             float(np.sum((theta[f.parameters] / (s * f.magnitude)) ** 2))
-            for f, s in zip(p.families.random, std, strict=False)
+            for f, s in zip(self.problem.families.random, np.exp(equations.log_std), strict=False)
         )
-        return float(np.sum((self.white / at.noise_std) ** 2)) + sizes
+        return float(np.sum((self.white / equations.noise_std) ** 2)) + penalty
 
 
 def _linearise(
@@ -246,9 +245,9 @@ def _linearise(
 ) -> _Linearised:
     """Linearise at theta (P,)."""
     prediction = model.predict(readings.states, theta)
-    now = w.whiten(residual(readings, prediction, w)).reshape(-1)
+    white = w.whiten(residual(readings, prediction, w)).reshape(-1)
     jacobian = w.whiten_readings(model.jacobian(prediction, theta, w.m))
-    rows = np.column_stack([now, jacobian])
+    rows = np.column_stack([white, jacobian])
     if parts:
         rows, noise = _noise_of(parts, readings, w, rows)
     else:
@@ -263,18 +262,18 @@ def _linearise(
 def _noise(
     model: Model, readings: Readings, w: Whitening, rows: Floats
 ) -> tuple[Floats, list[Noise]]:
-    """Whitened rows (R, ...), turned so that all noise is diagonal, and its components.
+    """Return whitened rows (R, ...), turned so that all noise is diagonal, and its components.
 
-    They are the instrument's, and the arm's scatter where the readings do not state it.
+    The components are the instrument and, unless stated in the readings, the arm's scatter.
     """
     prior = LogStdPrior(0.0, NOISE_SPREAD)
-    seen = [np.any(b.factor != 0, axis=2) for b in w.buckets]
+    measured = [np.any(b.factor != 0, axis=2) for b in w.buckets]
     if readings.scatter_stated:
-        whole = np.concatenate([s.reshape(-1) for s in seen]).astype(np.float64)
-        return rows, [Noise(INSTRUMENT, whole, prior)]
-    of = scatter_alone(readings, _scatter_factors(model, readings))
-    blocks = zip(whitened_blocks(of, w), seen, strict=True)
-    bases, variances = zip(*(independent_rows(c, s) for c, s in blocks), strict=True)
+        unit = np.concatenate([m.reshape(-1) for m in measured]).astype(np.float64)
+        return rows, [Noise(INSTRUMENT, unit, prior)]
+    scatter = scatter_alone(readings, _scatter_factors(model, readings))
+    blocks = zip(whitened_blocks(scatter, w), measured, strict=True)
+    bases, variances = zip(*(independent_rows(c, m) for c, m in blocks), strict=True)
     variance = np.concatenate([v.reshape(-1) for v in variances])
     instrument = Noise(INSTRUMENT, (variance > UNSEEN).astype(np.float64), prior)
     return _turned(rows, bases), [instrument, Noise(SCATTER, np.maximum(variance, 0.0), prior)]
@@ -283,26 +282,25 @@ def _noise(
 def _noise_of(
     parts: Sequence[NoisePart], readings: Readings, w: Whitening, rows: Floats
 ) -> tuple[Floats, list[Noise]]:
-    """Whitened rows (R, ...), turned so that the parts of the noise are diagonal, and these.
+    """Return whitened rows (R, ...), turned so that the parts of the noise are diagonal; the parts.
 
-    The instrument's parts add up to what the rows are whitened by, so that they share their
-    eigenvectors; of the arm's, the last one, what is correlated between two of these parts is left
-    out.
+    The sum of the instrument's parts whitens the rows, so that the parts share their eigenvectors.
+    Of the last part, the arm's, correlations between different instrument parts are neglected.
     """
-    of_parts = [
+    part_blocks = [
         whitened_blocks(replace(readings, covariance=p.covariance, common=p.common, serial=None), w)
         for p in parts
     ]
     bases = []
     variances: list[list[Floats]] = [[] for _ in parts]
-    for blocks in zip(*of_parts, strict=True):
+    for blocks in zip(*part_blocks, strict=True):
         *instrument, arm = blocks
         size = max(float(np.abs(arm).max(initial=0.0)), 1e-300)
-        apart = sum((j * x for j, x in enumerate(instrument, 1)), LITTLE * arm / size)
-        u = np.linalg.eigh(apart)[1]
+        weighted = sum((j * x for j, x in enumerate(instrument, 1)), LITTLE * arm / size)
+        u = np.linalg.eigh(weighted)[1]
         bases.append(u)
-        for of_part, x in zip(variances, blocks, strict=True):
-            of_part.append(np.einsum("gij,gik,gkj->gj", u, x, u).reshape(-1))
+        for variance, x in zip(variances, blocks, strict=True):
+            variance.append(np.einsum("gij,gik,gkj->gj", u, x, u).reshape(-1))
     return _turned(rows, bases), [
         Noise(p.name, np.maximum(np.concatenate(v), 0.0), p.prior)
         for p, v in zip(parts, variances, strict=True)
@@ -310,7 +308,7 @@ def _noise_of(
 
 
 def _turned(rows: Floats, bases: Sequence[Floats]) -> Floats:
-    """Rows (R, ...) by the axes U (G, S, S) of each bucket."""
+    """Uᵀ times the rows (R, ...) of each bucket, for its bases U (G, S, S)."""
     out, start = np.empty_like(rows), 0
     for u in bases:
         stop = start + u.shape[0] * u.shape[1]
@@ -322,11 +320,12 @@ def _turned(rows: Floats, bases: Sequence[Floats]) -> Floats:
 
 def scatter_part(model: Model, readings: Readings) -> NoisePart:
     """Return the arm's scatter, of `SCATTER_RAD` in each joint, as a part of the noise."""
-    of = scatter_alone(readings, _scatter_factors(model, readings))
-    return NoisePart(SCATTER, of.covariance, LogStdPrior(0.0, NOISE_SPREAD), of.common)
+    scatter = scatter_alone(readings, _scatter_factors(model, readings))
+    prior = LogStdPrior(0.0, NOISE_SPREAD)
+    return NoisePart(SCATTER, scatter.covariance, prior, scatter.common)
 
 
 def _scatter_factors(model: Model, readings: Readings) -> Floats:
-    """(N, m, n) F of the arm's scatter by joints of `SCATTER_RAD` each."""
+    """(N, m, n) F of the arm's scatter with `SCATTER_RAD` in each joint."""
     n = model.cell.arm.n
     return joint_factors(model.cell, readings, np.full(n, SCATTER_RAD))

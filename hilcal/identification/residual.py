@@ -1,4 +1,4 @@
-"""Residuals, measured − predicted, of readings or deflections, and the errors that they make."""
+"""Residuals, measured − predicted, of readings or deflections, and their error blocks."""
 
 from dataclasses import asdict, dataclass
 
@@ -44,7 +44,7 @@ class ErrorBlock:
 
     @classmethod
     def of(cls, raw: Floats, white: Floats, rank: int) -> "ErrorBlock":
-        """Summarise residuals (D, m), by their whitened elements, of which `rank` tell anything."""
+        """Summarise residuals (D, m) and whitened elements, `rank` of them with information."""
         distance = np.linalg.norm(raw[:, :3], axis=1)
         return cls(
             rms_m=float(np.sqrt(np.mean(distance**2))),
@@ -69,7 +69,7 @@ def noise_floor(covariance: Floats) -> float:
 
 
 class WithVarianceFactor(Shown):
-    """What has a whitened sum of squares and its degrees of freedom."""
+    """Base of classes with a whitened sum of squares and its degrees of freedom."""
 
     __slots__ = ()
 

@@ -1,8 +1,8 @@
-"""Damped Gauss-Newton (Levenberg, Marquardt): a least sum of squares from a point that can move.
+"""Damped Gauss-Newton (Levenberg, Marquardt) for points that move by more than addition.
 
     minimise ‖r(p)‖²,    r(p ⊕ δ) = r(p) − J δ + …,    (JᵀJ + λ diag JᵀJ) δ = Jᵀr
 
-p ⊕ δ need be no sum: frames turn. A prior about zero is one more row of r.
+p ⊕ δ need not be a sum, as frames rotate. A prior about zero is a further row of r.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,11 +13,11 @@ import numpy as np
 from hilcal.errors import CannotAnswerError
 from hilcal.types import Floats
 
-# Choices, but for the last one, which is rounding.
-STEPS = 40  # at most
+# The first three are choices; the last one is rounding.
+STEPS = 40  # most steps
 DAMPING = 1e-3  # λ of the first step
-SETTLED = 1e-9  # share of the sum of squares by which a last step lowers it
-SMALL = 1e-12  # a step below this in every coordinate ends the search
+SETTLED = 1e-9  # relative decrease of the sum of squares below which the iteration ends
+SMALL = 1e-12  # largest element of a step below which the iteration ends
 
 
 class SolverPoint(Protocol):
@@ -28,7 +28,7 @@ class SolverPoint(Protocol):
         """(R,) r, whitened."""
 
     def jacobian(self) -> Floats:
-        """(R, K) J, derivative of what is predicted."""
+        """(R, K) J, whitened derivative of the predictions."""
 
     def moved(self, step: Floats) -> Self:
         """Return p ⊕ δ (K,)."""
@@ -39,7 +39,7 @@ T = TypeVar("T")
 
 
 def minimise(at: P, steps: int = STEPS) -> P:
-    """Return the point of least squares that a start leads to."""
+    """Return the point of least squares that is reached from a start."""
     square, normal, damping = float(at.residual @ at.residual), None, DAMPING
     for _ in range(steps):
         if normal is None:
@@ -48,15 +48,15 @@ def minimise(at: P, steps: int = STEPS) -> P:
         h, gradient = normal
         if not len(h):
             break
-        # In units of each column as well, so that nothing runs away.
+        # Damped in units of each column, too, so that no coordinate diverges.
         largest = h.diagonal().max()
         guard = damping * (h.diagonal() + 1e-6 * largest) + 1e-12 * largest + 1e-300
         step: Floats = np.asarray(np.linalg.solve(h + np.diag(guard), gradient), dtype=float)
         trial = at.moved(step)
-        now = float(trial.residual @ trial.residual)
-        if now <= square:
-            done = square - now <= SETTLED * square + 1e-12 * len(a) and damping <= DAMPING
-            at, square, normal = trial, now, None
+        reduced = float(trial.residual @ trial.residual)
+        if reduced <= square:
+            done = square - reduced <= SETTLED * square + 1e-12 * len(a) and damping <= DAMPING
+            at, square, normal = trial, reduced, None
             damping = max(0.1 * damping, 1e-9)
             if done or np.abs(step).max() < SMALL:
                 break
@@ -74,15 +74,16 @@ def shortened(
     cost: Callable[[T], float] | None = None,
     limit: float = np.inf,
 ) -> T | None:
-    """Return what the whole step, half of it, a quarter … first leads to; None for nothing good.
+    """Return the first acceptable result of the full step, half of it, a quarter, …; else None.
 
-    `moved` and `cost`, which must not exceed the limit, may raise CannotAnswerError.
+    A result is acceptable if its cost is at most the limit. `moved` and `cost` may raise
+    CannotAnswerError.
     """
     for halving in range(most):
         try:
-            found = moved(0.5**halving * step)
-            if cost is None or cost(found) <= limit:
-                return found
+            reached = moved(0.5**halving * step)
+            if cost is None or cost(reached) <= limit:
+                return reached
         except CannotAnswerError:
             continue
     return None
@@ -91,7 +92,8 @@ def shortened(
 def echelon(rows: Floats, blocks: Sequence[Sequence[int]], least: float = 0.0) -> Floats:
     """Bring directions (U, P) to reduced echelon form, so that each involves few parameters.
 
-    Columns of a block are pivots before those of the next; elements up to `least` are none.
+    Columns of a block become pivots before those of the next one; elements up to `least` are no
+    pivots.
     """
     rows, done = rows.copy(), 0
     for block in blocks:
@@ -103,7 +105,7 @@ def echelon(rows: Floats, blocks: Sequence[Sequence[int]], least: float = 0.0) -
             pivot = block[int(j)]
             rows[[done, done + int(i)]] = rows[[done + int(i), done]]
             rows[done] /= rows[done, pivot]
-            others = np.arange(len(rows)) != done
-            rows[others] -= rows[others, pivot][:, None] * rows[done]
+            remaining = np.arange(len(rows)) != done
+            rows[remaining] -= rows[remaining, pivot][:, None] * rows[done]
             done += 1
     return rows

@@ -1,21 +1,21 @@
-"""Henderson's mixed-model equations at given variances, and the restricted likelihood's slopes.
+"""Henderson's mixed-model equations at given variances, and slopes of the restricted likelihood.
 
-With S the standard deviations s_f of the random columns (1 for the frames), R = Σ_k exp(2 η_k) R_k
-the noise, diagonal, and rows T = R^−½ X S, t = R^−½ y,
+S is diagonal, s_f for random columns and 1 for the frames; R = Σ_k exp(2 η_k) R_k is the diagonal
+covariance of the noise. With T = R^−½ X S and t = R^−½ y,
 
     C = Tᵀ T + E,    E = 1 for random columns, 0 for the frames
     C c = Tᵀ t,      coordinates S c
     P = 1 − T C⁻¹ Tᵀ,   e = P t
     −2 ℓ = log det R + log det C + tᵀ e
 
-and, γ_f = Σ_i T_iᵀ P T_i over its columns the parameters that family f spends,
+With γ_f = Σ_i T_iᵀ P T_i over the columns of family f, its effective number of parameters,
 
     ∂ℓ/∂log s_f = c_fᵀ c_f − γ_f
     ∂ℓ/∂η_k     = eᵀ W_k e − tr(P W_k),    W_k = exp(2 η_k) R_k R⁻¹
     AI_ij       = ½ v_iᵀ P v_j,    v_f = 2 T_f c_f,    v_k = 2 W_k e
 
-P is formed by rows where they are fewer than the columns, P = N⁻¹ − B (Qᵀ N⁻¹ Q)⁻¹ Bᵀ with
-N = 1 + Z Zᵀ, B = N⁻¹ Q, Q and Z the frames' and the random columns of T; else by columns.
+Where T has fewer rows than columns, P = N⁻¹ − B (Qᵀ N⁻¹ Q)⁻¹ Bᵀ is used, with N = 1 + Z Zᵀ and
+B = N⁻¹ Q, Q the frames' and Z the random columns of T; else Cholesky's factor of C.
 
 Sources: Henderson, *Best linear unbiased estimation and prediction under a selection model*,
 Biometrics 31 (1975) 423; Gilmour, Thompson and Cullis, *Average information REML*, Biometrics 51
@@ -52,7 +52,7 @@ class _ByColumns:
 
     @cached_property
     def spent(self) -> Floats:
-        """(K,) T_iᵀ P T_i of random columns, which is 1 − (C⁻¹)_ii."""
+        """(K,) T_iᵀ P T_i = 1 − (C⁻¹)_ii; holds for random columns only."""
         root = solve_triangular(self.factor[0], np.eye(len(self.factor[0])), lower=True)
         return np.asarray(1.0 - np.einsum("ij,ij->j", root, root))
 
@@ -88,7 +88,7 @@ class _ByRows:
 
     @cached_property
     def p(self) -> Floats:
-        """(R, R) P; a trial of a step does not need it."""
+        """(R, R) P; not needed to try a step."""
         inverse, _ = dpotri(self._factor[0], lower=True)
         inverse = np.tril(inverse) + np.tril(inverse, -1).T
         inverse -= self.b @ self.frames @ self.b.T
@@ -123,7 +123,7 @@ class _ByRows:
 
 @dataclass(frozen=True, eq=False)
 class Equations:
-    """The equations of a problem at logarithms of the standard deviations."""
+    """Mixed-model equations of a problem at log s and η."""
 
     problem: MixedProblem  # rows, columns and noise
     log_std: Floats  # (F + N,) log s of the families, η of the noise
@@ -150,7 +150,7 @@ class Equations:
 
     @cached_property
     def c(self) -> Floats:
-        """(K,) solution, in standard deviations."""
+        """(K,) solution c, in units of the standard deviations S."""
         q, z = self.rows[:, : self.problem.flat], self.rows[:, self.problem.flat :]
         random = z.T @ self.residual
         frames = np.linalg.lstsq(q, self.target - z @ random, rcond=None)[0]
@@ -164,14 +164,14 @@ class Equations:
 
     @cached_property
     def spent(self) -> Floats:
-        """(F,) γ_f, parameters that each family spends."""
+        """(F,) γ_f, effective number of parameters of each family."""
         p = self.problem
-        own = self.projection.spent[p.flat :]
-        return np.bincount(p.family, own, minlength=self._count).astype(np.float64)
+        weights = self.projection.spent[p.flat :]
+        return np.bincount(p.family, weights, minlength=self._count).astype(np.float64)
 
     @cached_property
     def slope(self) -> Floats:
-        """(F + N,) ∂ℓ by log s and η."""
+        """(F + N,) derivatives of ℓ by log s and η."""
         p = self.problem
         square = np.bincount(p.family, self.c[p.flat :] ** 2, minlength=self._count)
         noise = (self.residual**2 - self.projection.diagonal) @ self._white_noise
@@ -187,12 +187,12 @@ class Equations:
 
     @cached_property
     def working(self) -> Floats:
-        """(R, F + N) v."""
+        """(R, F + N) working variates v."""
         p, first = self.problem, self._count
         out = np.zeros((len(self.target), len(self.log_std)))
         for f in range(first):
-            own = np.flatnonzero(p.family == f) + p.flat
-            out[:, f] = 2.0 * (self.rows[:, own] @ self.c[own])
+            columns = np.flatnonzero(p.family == f) + p.flat
+            out[:, f] = 2.0 * (self.rows[:, columns] @ self.c[columns])
         out[:, first:] = 2.0 * self._white_noise * self.residual[:, None]
         return out
 
@@ -203,7 +203,7 @@ class Equations:
 
     @property
     def coordinates(self) -> Floats:
-        """(K,) S c: frames' coordinates and u in ordinary magnitudes."""
+        """(K,) S c: coordinates of the frames, and u in ordinary magnitudes."""
         return self.scale * self.c
 
     @cached_property
@@ -221,19 +221,19 @@ class Equations:
         return np.asarray(self.scale[:, None] * (self.projection.inverse @ rhs))
 
     def profile(self, family: int, log_std: Floats) -> Floats:
-        """Gain of ℓ (G,) where one family has other sizes log s (G,), exactly.
+        """Exact gain of ℓ (G,) when the size of one family is changed to log s (G,).
 
-        With Z_fᵀ P Z_f = U diag(μ) Uᵀ, κ = 1 − s_f² μ and g = Uᵀ Z_fᵀ P y, without the family the
-        eigenvalues are μ/κ and 2 ℓ(s) = Σ [g²/(μ κ) s² μ/κ / (1 + s² μ/κ) − log(1 + s² μ/κ)].
+        With Z_fᵀ P Z_f = U diag(μ) Uᵀ, κ = 1 − s_f² μ and g = Uᵀ Z_fᵀ P y, the eigenvalues without
+        the family are μ/κ, and 2 ℓ(s) = Σ [g²/(μ κ) s² μ/κ / (1 + s² μ/κ) − log(1 + s² μ/κ)].
         """
-        own = self.problem.family == family
-        inner, score = self.score(self.problem.x[:, self.problem.flat :][:, own])
+        columns = self.problem.x[:, self.problem.flat :][:, self.problem.family == family]
+        inner, score = self.score(columns)
         mu, u = np.linalg.eigh((inner + inner.T) / 2)
-        seen = mu > EIGENVALUE * max(float(mu.max(initial=0.0)), 1e-300)
-        mu, g = mu[seen], u[:, seen].T @ score
-        own_size = float(self.log_std[family])
-        kappa = np.maximum(1.0 - np.exp(2 * own_size) * mu, EIGENVALUE)
-        without = np.exp(2 * np.append(log_std, own_size))[:, None] * mu / kappa
+        visible = mu > EIGENVALUE * max(float(mu.max(initial=0.0)), 1e-300)
+        mu, g = mu[visible], u[:, visible].T @ score
+        present = float(self.log_std[family])
+        kappa = np.maximum(1.0 - np.exp(2 * present) * mu, EIGENVALUE)
+        without = np.exp(2 * np.append(log_std, present))[:, None] * mu / kappa
         twice = (g**2 / (mu * kappa) * without / (1 + without) - np.log1p(without)).sum(axis=1)
         return np.asarray((twice[:-1] - twice[-1]) / 2)
 
@@ -247,11 +247,12 @@ def equations(problem: MixedProblem, log_std: Floats) -> Equations:
     """Return the equations at log s and η (F + N,).
 
     Raises:
-        numpy.linalg.LinAlgError: standard deviations so different that a matrix has no factor.
+        numpy.linalg.LinAlgError: Cholesky's factorisation fails, as the standard deviations differ
+            too much.
     """
     eta = log_std[len(problem.families.random) :]
     variance = sum(np.exp(2 * e) * n.variance for n, e in zip(problem.noise, eta, strict=True))
-    # A row without noise is one that carries no information.
+    # Rows without variance carry no information.
     noise_std = np.sqrt(np.where(variance == 0.0, 1.0, variance))
     rows, target = problem.x / noise_std[:, None], problem.y / noise_std
     rows[:, problem.flat :] *= np.exp(log_std)[problem.family]
@@ -260,7 +261,7 @@ def equations(problem: MixedProblem, log_std: Floats) -> Equations:
 
 
 def left_out(e: Equations, fold: Ints) -> tuple[Floats, Floats]:
-    """Predict rows without their fold F, at given variances.
+    """Predict the rows of each fold F from all other rows, at the same variances.
 
         y_F − ŷ_F = D (P_FF)⁻¹ P_F t,    covariance D (P_FF)⁻¹ D,    D² = R_FF
 
@@ -269,13 +270,13 @@ def left_out(e: Equations, fold: Ints) -> tuple[Floats, Floats]:
         fold: (R,) number of each row's fold.
 
     Returns:
-        (R,) measured minus predicted, and (R,) its variance, that of the noise included.
+        (R,) measured minus predicted, and (R,) its variance with that of the noise.
     """
     p = e.projection.project(np.eye(len(fold)))
-    off, variance = np.empty(len(fold)), np.empty(len(fold))
+    error, variance = np.empty(len(fold)), np.empty(len(fold))
     for f in range(int(fold.max()) + 1):
-        mine = fold == f
-        inverse, std = np.linalg.inv(p[np.ix_(mine, mine)]), e.noise_std[mine]
-        off[mine] = std * (inverse @ e.residual[mine])
-        variance[mine] = std**2 * np.diagonal(inverse)
-    return off, variance
+        in_fold = fold == f
+        inverse, std = np.linalg.inv(p[np.ix_(in_fold, in_fold)]), e.noise_std[in_fold]
+        error[in_fold] = std * (inverse @ e.residual[in_fold])
+        variance[in_fold] = std**2 * np.diagonal(inverse)
+    return error, variance

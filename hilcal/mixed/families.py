@@ -1,17 +1,16 @@
 """Families: the parameters of a model that share one standard deviation.
 
-What arms are like before anything is measured: log standard deviations, normal and correlated.
+The prior of the log standard deviations, before anything is measured, is normal and correlated:
 
     log s_f = mean_f + a + b_effect(f) + c_f
     a ~ N(0, ARM²),  b ~ N(0, EFFECT²),  c_f ~ N(0, spread_f²)
 
-A family may be divided into lines k, each of a size of its own: log s_k = log s_f + d_k,
-d_k ~ N(0, LINE²).
+A family may be divided into lines k with log s_k = log s_f + d_k, d_k ~ N(0, LINE²).
 
-An arm is precise or not in most of its parts (a), and the families of one effect, as the octaves of
-a gear's error, are large or small together (b). With few poses this keeps one octave from taking
-what others explain; independent priors of the same spread predicted 4 % worse with 20 poses of the
-real UR10 and of a real UR5. Components of the noise have their own spread alone.
+Most parts of an arm are about equally precise (a), and the families of one effect, as the octaves
+of a gear's error, are large or small together (b). With few poses this keeps one octave from
+absorbing the errors of others: independent priors of the same spread predicted 4 % worse with
+20 poses of the real UR10 and of a real UR5. Components of the noise share nothing.
 """
 
 from collections.abc import Collection, Sequence
@@ -25,42 +24,41 @@ from hilcal.types import Floats, Ints
 
 KNOWN = 1e-3  # spread of the logarithm of a standard deviation that is known
 ARM = 1.5
-"""Of an arm as a whole: a factor of 4.5 either way, so that one whose errors are a tenth or ten
-times the ordinary ones is no surprise; a choice."""
-EFFECT = 1.0  # of an effect beside its arm: a factor of 2.7; a choice
+"""Spread between arms: a factor of 4.5 either way, so that errors of a tenth or of ten times the
+ordinary ones are plausible; a choice."""
+EFFECT = 1.0  # spread between the effects of an arm: a factor of 2.7; a choice
 LINE = 0.7
-"""Of a line of an effect, as one wave of one gear, beside its pool: a factor of 2; a choice. With
-0.5 to 1 simulated transmission errors were predicted alike."""
+"""Spread between the lines of a pool, as the waves of one gear: a factor of 2; a choice. Any value
+of 0.5 to 1 predicted simulated transmission errors equally well."""
 
 
 @dataclass(frozen=True, slots=True)
 class LogStdPrior:
-    """What is known of the logarithm of a standard deviation before it is estimated: normal."""
+    """Normal prior of the logarithm of a standard deviation."""
 
     mean: float  # of log s, s in ordinary magnitudes
-    # standard deviation of what is its own; see `mixed.families` for what families share
-    spread: float
+    spread: float  # standard deviation without the terms a, b that families share
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Family:
     """Parameters u ~ N(0, s² D) of one effect."""
 
-    name: str  # the effect's, with what sets the family apart where the effect has several
+    name: str  # of the effect, with unit and pool where the effect has several families
     effect: str
     parameters: Ints  # (q,) indices of the parameters in the model
     magnitude: Floats  # (q,) root of D's diagonal: ordinary magnitudes, SI
-    prior: LogStdPrior  # what is known of log s
-    known: bool = False  # whether s is known, and shares nothing with other families
-    pool: str = ""  # what families of one effect belong to that are lines of it; empty for others
-    pool_spread: float = 0.0  # of what the log s of the families of a pool share
+    prior: LogStdPrior  # of log s
+    known: bool = False  # whether s is known; its log s is then independent of other families'
+    pool: str = ""  # pool that the family is a line of; empty where it is none
+    pool_spread: float = 0.0  # spread of the term that the log s of a pool's lines share
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Families:
     """All parameters of a model."""
 
-    frames: Ints  # (F,) indices of those without a prior: registration and target, flat effects
+    frames: Ints  # (F,) indices of parameters without a prior: frames and flat effects
     random: tuple[Family, ...]
 
     @property
@@ -72,18 +70,18 @@ class Families:
 def families_of(model: Model, flat: Collection[str] = (), lines: Collection[str] = ()) -> Families:
     """Return the families of a model.
 
-    Parameters of one effect with the same unit make a family, in an effect with pools (as the
-    octaves of harmonics) each pool one. A frame with a prior (`Effect.prior_std`), as deflections
-    need, is a family of known standard deviation.
+    The parameters of one effect with the same unit and in the same pool (as an octave of
+    harmonics) are a family. A frame with a prior (`Effect.prior_std`), as deflections need, is a
+    family of known standard deviation.
 
     Args:
-        flat: effects of it whose parameters have no prior.
-        lines: effects of which each group is a family, about the size of its pool.
+        flat: effects whose parameters have no prior.
+        lines: effects of which each group is a family, a line of its pool.
     """
     frames: list[Ints] = []
     random: list[Family] = []
-    for effect, mine in zip(model.effects, model.slices(), strict=True):
-        index = np.arange(mine.start, mine.stop)
+    for effect, columns in zip(model.effects, model.slices(), strict=True):
+        index = np.arange(columns.start, columns.stop)
         std = effect.prior_std() if effect.role in FRAME_ROLES else None
         if std is not None:
             known = LogStdPrior(0.0, KNOWN)
@@ -96,7 +94,7 @@ def families_of(model: Model, flat: Collection[str] = (), lines: Collection[str]
 
 
 def expected_sizes(effect: Effect) -> tuple[tuple[str, float, str], ...]:
-    """Return what is expected of the families of an effect: name, standard deviation (SI), unit."""
+    """Return name, expected standard deviation (SI) and unit of each family of an effect."""
     if effect.role in FRAME_ROLES:
         return ()
     units, index = [p.unit for p in effect.parameters], np.arange(len(effect.parameters))
@@ -113,29 +111,32 @@ def _of_effect(effect: Effect, index: Ints) -> list[Family]:
     several_units, several_pools = len(set(units)) > 1, len(set(pools.tolist())) > 1
     out = []
     for key in dict.fromkeys(keys):
-        own = np.array([k == key for k in keys])
+        in_family = np.array([k == key for k in keys])
         unit, pool = key
         parts = [unit] * several_units + [str(pool)] * several_pools
         name = f"{effect.name}[{', '.join(parts)}]" if parts else effect.name
         prior = effect.expected_log_std(pool)
         out.append(
-            Family(name, effect.name, index[own], effect.magnitudes[own], LogStdPrior(*prior))
-        )
+            Family(
+                name, effect.name, index[in_family], effect.magnitudes[in_family],
+                LogStdPrior(*prior),
+            )
+        )  # fmt: skip
     return out
 
 
 def _lines(effect: Effect, index: Ints) -> list[Family]:
     groups, out = effect.groups(), []
     for pool in _of_effect(effect, index):
-        own = np.isin(index, pool.parameters)
+        in_pool = np.isin(index, pool.parameters)
         group = np.zeros(len(index), dtype=np.int64) if groups is None else groups
-        for k in np.unique(group[own]):
-            mine = own & (group == k)
+        for k in np.unique(group[in_pool]):
+            in_line = in_pool & (group == k)
             prior = LogStdPrior(pool.prior.mean, LINE)
             name = f"{pool.name}, line {k}"
             out.append(
                 Family(
-                    name, effect.name, index[mine], effect.magnitudes[mine], prior,
+                    name, effect.name, index[in_line], effect.magnitudes[in_line], prior,
                     pool=pool.name, pool_spread=pool.prior.spread,
                 )
             )  # fmt: skip
@@ -145,7 +146,7 @@ def _lines(effect: Effect, index: Ints) -> list[Family]:
 def log_std_prior(
     priors: Sequence[LogStdPrior], families: Sequence[Family]
 ) -> tuple[Floats, Floats]:
-    """Mean (F + N,) and precision (F + N, F + N) of log s of families and of η."""
+    """Prior mean (F + N,) and precision (F + N, F + N) of log s and η."""
     covariance = np.diag([p.spread**2 for p in priors])
     effect = np.array([f.effect for f in families])
     unknown = np.array([not f.known for f in families], dtype=float)

@@ -2,10 +2,10 @@
 
     y = A b + Σ_f Z_f u_f + e,    e ~ N(0, Σ_k exp(2 η_k) R_k)
 
-All R_k are diagonal. Rows whitened by the stated covariance have R_0 = 1, the instrument; where R_1
-is block diagonal, as the arm's scatter, its eigenvectors turn the rows so that both are diagonal
-(`independent_rows`). Columns are kept in ordinary magnitudes, X = [Q | Z D^½] with Q an orthonormal
-basis of the frames' columns.
+All R_k are diagonal. For rows whitened by the stated covariance R_0 = 1, the instrument; R_1, the
+arm's scatter, is block diagonal, and its eigenvectors turn the rows so that both are diagonal
+(`independent_rows`). Columns are scaled to ordinary magnitudes, X = [Q | Z D^½] with Q an
+orthonormal basis of the frames' columns.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from hilcal.types import Bools, Floats, Ints
 
 FRAMES_TOLERANCE = 1e-9
 """Share of the largest singular value of the frames' columns, scaled to unit length, below which a
-direction counts as not moved by the readings (the gauge of base and target)."""
+direction counts as undetermined by the readings (the gauge of base and target)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,7 +28,7 @@ class Noise:
 
     name: str
     variance: Floats  # (R,) diagonal of R_k
-    prior: LogStdPrior  # what is known of η
+    prior: LogStdPrior  # of η
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,9 +37,9 @@ class MixedProblem:
 
     y: Floats  # (R,) measured minus what the model predicts without frames and families
     x: Floats  # (R, K) columns [Q | Z D^½]
-    frames: Floats  # (F, k) b of the first k coordinates: b = frames @ coordinates
+    frames: Floats  # (F, k): b = frames @ the first k coordinates
     families: Families  # of the other columns
-    family: Ints  # (K − k,) family of each of them
+    family: Ints  # (K − k,) family of each other column
     noise: tuple[Noise, ...]  # components, that of the instrument first
 
     @property
@@ -49,12 +49,12 @@ class MixedProblem:
 
     @property
     def priors(self) -> tuple[LogStdPrior, ...]:
-        """What is known of each log s and η, families first."""
+        """Priors of log s and η, families first."""
         return (*(f.prior for f in self.families.random), *(n.prior for n in self.noise))
 
     @cached_property
     def log_std_prior(self) -> tuple[Floats, Floats]:
-        """Mean (F + N,) and precision (F + N, F + N) of log s and η."""
+        """Prior mean (F + N,) and precision (F + N, F + N) of log s and η."""
         return log_std_prior(self.priors, self.families.random)
 
     @property
@@ -83,17 +83,17 @@ class MixedProblem:
     def without(self, numbers: Sequence[int]) -> "MixedProblem":
         """Return the problem without the columns of some families."""
         random = tuple(f for k, f in enumerate(self.families.random) if k not in numbers)
-        kept = ~np.isin(self.family, numbers)
-        x = np.hstack([self.x[:, : self.flat], self.x[:, self.flat :][:, kept]])
-        place = np.cumsum(~np.isin(np.arange(len(self.families.random)), numbers)) - 1
+        retained = ~np.isin(self.family, numbers)
+        x = np.hstack([self.x[:, : self.flat], self.x[:, self.flat :][:, retained]])
+        renumbered = np.cumsum(~np.isin(np.arange(len(self.families.random)), numbers)) - 1
         return MixedProblem(
             self.y, x, self.frames, Families(self.families.frames, random),
-            place[self.family[kept]], self.noise,
+            renumbered[self.family[retained]], self.noise,
         )  # fmt: skip
 
 
 def mixed_problem(
-    y: Floats,  # (R,) as in `MixedProblem`
+    y: Floats,  # (R,)
     jacobian: Floats,  # (R, P) whitened derivative by all parameters of the model
     families: Families,
     noise: Sequence[Noise],  # components, that of the instrument first
@@ -109,24 +109,24 @@ def mixed_problem(
     return MixedProblem(y, x, frames, families, problem.family, problem.noise)
 
 
-def independent_rows(covariance: Floats, seen: Bools) -> tuple[Floats, Floats]:
-    """Return U (G, S, S) and the variances (G, S) of rows Uᵀ y with some covariance (G, S, S).
+def independent_rows(covariance: Floats, measured: Bools) -> tuple[Floats, Floats]:
+    """Return U (G, S, S) and the variances (G, S) of rows Uᵀ y with a covariance (G, S, S).
 
-    Rows that are not seen (G, S), of covariance zero, stay apart from those that are.
+    Rows that are not measured (G, S), of covariance zero, are not mixed with measured ones.
     """
-    each = np.arange(seen.shape[1])
+    diagonal = np.arange(measured.shape[1])
     marked = covariance.copy()
-    marked[:, each, each] -= ~seen
+    marked[:, diagonal, diagonal] -= ~measured
     variance, u = np.linalg.eigh(marked)
     return np.asarray(u), np.asarray(variance)
 
 
 def _frame_basis(a: Floats) -> Floats:
-    """(F, k) such that the columns of A @ basis are orthonormal and span those of A."""
+    """Basis (F, k): the columns of A @ basis are orthonormal and span those of A."""
     if not a.shape[1]:
         return np.zeros((0, 0))
     length = np.linalg.norm(a, axis=0)
     scale = np.where(length > 0, length, 1.0)
     _, values, v = np.linalg.svd(a / scale, full_matrices=False)
-    kept = values > FRAMES_TOLERANCE * values[0]
-    return np.asarray((v[kept].T / values[kept]) / scale[:, None])
+    moving = values > FRAMES_TOLERANCE * values[0]
+    return np.asarray((v[moving].T / values[moving]) / scale[:, None])

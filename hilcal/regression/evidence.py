@@ -1,16 +1,16 @@
-"""Test, power and evidence of a family of columns beside a fitted model; no refit is needed.
+"""Test, power and evidence of a family of columns that a fitted model lacks, without a refit.
 
 With r the whitened residual of the model, M the projection off its columns (`projection`) and
 X (R, P) the family's columns in ordinary magnitudes, everything follows from
 
     S = Xᵀ M X,    g = Xᵀ r,    ‖r‖²
 
-The whole family is judged at once:
+The family is judged as a whole:
 
 - p-value: F-test of all P columns; for a family that is large against the degrees of freedom,
   the variance-component test gᵀ g / ‖r‖² (Rao score of a common variance), whose null
   distribution is a ratio of quadratic forms. Both are exact for normal errors, also when the
-  noise is misjudged by a common factor.
+  stated noise is wrong by a common factor.
 - power: parameters β add the non-centrality λ = βᵀ S β to the reduction of the sum of squares. The
   F-test with k directions and ν − k degrees of freedom then follows the noncentral F distribution;
   where the noise is known (ν infinite) the test is the χ² test.
@@ -21,12 +21,12 @@ The whole family is judged at once:
       −½ log det(1 + t² S) − ½ ν log(‖r‖²_t / ‖r‖²),    ‖r‖²_t = ‖r‖² − gᵀ (S + t⁻²)⁻¹ g
 
   and β | r is Student's with ν degrees of freedom, mean (S + t⁻²)⁻¹ g and scale matrix
-  (‖r‖²_t / ν) (S + t⁻²)⁻¹. This is exact for a model without priors; where it has some, ‖r‖²
-  stands for rᵀ M⁻¹ r, which is larger by the penalty. t is where the evidence is largest. Of two
-  families that explain the same, the smaller one has more evidence.
+  (‖r‖²_t / ν) (S + t⁻²)⁻¹. This is exact for a model without priors; for one with priors, ‖r‖²
+  stands for rᵀ M⁻¹ r, which is larger by the penalty. t maximises the evidence. Of two families
+  that explain the same, the smaller one has more evidence.
 
-Diagnosis and planning use this one formula. With the stated noise taken for the true one (σ² = 1) a
-misfit of variance factor φ would overstate the evidence of each direction by about φ.
+Diagnosis and planning use the same formula. If σ² = 1 were assumed, a misfit of variance factor φ
+would overstate the evidence of each direction by about φ.
 
 Sources: O'Hagan and Forster, *Bayesian Inference* (2004), chapter 11; Goeman, van de Geer and van
 Houwelingen, *Testing against a high dimensional alternative*, J. R. Stat. Soc. B 68 (2006) 477-493;
@@ -44,15 +44,15 @@ from scipy.stats import f as f_distribution
 from hilcal.types import Bools, Floats
 
 VISIBLE = 1e-4
-"""Eigenvalues of S below this are left out of tests: such a direction moves all data together by
-less than 0.01 σ at ordinary magnitude; a guess."""
+"""Eigenvalues of S below this are not tested: an ordinary magnitude along such a direction moves
+all data together by less than 0.01 σ; a guess."""
 RELATIVE = 1e-10  # eigenvalues of S below this share of the largest are rounding
 NEAR_MEAN = 2e-3
 """Distance from the mean, in standard deviations, within which Lugannani's formula loses digits."""
 LARGE_FAMILY = 0.1  # share of the degrees of freedom from which a family is large; a guess
 ROUNDING = 1e-12
 STRENGTHS = np.logspace(-3, 3, 61)
-"""Prior standard deviations τ that are tried, in ordinary magnitudes; t² = τ² ν / ‖r‖²."""
+"""Tried prior standard deviations τ, in ordinary magnitudes; t² = τ² ν / ‖r‖²."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,17 +60,17 @@ class Spectrum:
     """Eigenvalues and eigenvectors of S = U Λ Uᵀ (P, P)."""
 
     values: Floats  # (P,) ascending
-    seen: Bools  # (P,) which belong to directions that can be tested
+    testable: Bools  # (P,) which of them are visible
     vectors: Floats  # (P, P) U, eigenvectors in columns
 
     @property
     def rank(self) -> int:
-        """Number of directions that can be tested."""
-        return int(np.count_nonzero(self.seen))
+        """Number of visible directions."""
+        return int(np.count_nonzero(self.testable))
 
 
 def visible(values: Floats) -> Bools:
-    """Return which eigenvalues (..., P) of S belong to directions that can be tested."""
+    """Return which eigenvalues (..., P) of S are large enough for a test of their directions."""
     largest = values.max(axis=-1, keepdims=True, initial=0.0)
     return np.asarray(values > np.maximum(VISIBLE, RELATIVE * largest))
 
@@ -79,7 +79,7 @@ def spectrum(s: Floats) -> Spectrum:
     """Return the spectrum of S (P, P).
 
     Raises:
-        LinAlgError: the eigenvalues do not converge, as where S is not finite.
+        LinAlgError: the eigenvalues do not converge, for example as S is not finite.
     """
     values, vectors = np.linalg.eigh((s + s.T) / 2)
     return Spectrum(values, visible(values), vectors)
@@ -87,39 +87,39 @@ def spectrum(s: Floats) -> Spectrum:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FamilyScore:
-    """What a family explains."""
+    """Test and evidence of a family."""
 
     p_value: float  # of the joint test
     log_evidence: float  # gain in log evidence by adding the family
-    strength: float  # τ where the evidence is largest
-    ridge: float  # t⁻² there, the parameters' prior precision; infinite for nothing visible
+    strength: float  # τ of the largest evidence
+    ridge: float  # t⁻² at it, the parameters' prior precision; infinite where nothing is visible
     rank: int  # number of visible directions of the family
     effective: float  # effective number of parameters at that strength
     gain: float  # reduction of ‖r‖² at that strength
-    delta_bic: float  # change of the Bayesian information criterion; negative speaks for it
+    delta_bic: float  # change of the Bayesian information criterion; negative favours the family
     step: Floats  # (P,) posterior mean of the parameters, in ordinary magnitudes
     spectrum: Spectrum | None  # of S; None where no direction is visible
     noise: float  # ‖r‖²_t / ν
-    bounded: bool = False  # whether a larger strength than is plausible has more evidence
-    by_strength: Floats = field(default_factory=lambda: np.zeros(0))  # (T,) log evidence at each
+    bounded: bool = False  # whether a strength above the largest plausible one has more evidence
+    by_strength: Floats = field(default_factory=lambda: np.zeros(0))  # (T,) log evidence at each τ
 
     @property
     def marginal(self) -> float:
-        """Log evidence averaged over the strengths, each order of magnitude as likely a priori.
+        """Log of the evidence averaged over strengths with a log-uniform prior.
 
-        Under no effect exp(marginal) is 1 on average; that of the best strength is more, and the
-        more the more families are tried.
+        Without an effect exp(marginal) is 1 on average. The evidence at the best strength is
+        larger, and grows with the number of families tried.
         """
         t = self.by_strength
         return float(np.logaddexp.reduce(t) - np.log(len(t))) if len(t) else 0.0
 
     @property
     def root(self) -> Floats:
-        """(P, P) root of the parameters' posterior scale matrix; empty for no visible direction."""
-        of = self.spectrum
-        if of is None:
+        """(P, P) root of the posterior scale matrix; (0, 0) where no direction is visible."""
+        s = self.spectrum
+        if s is None:
             return np.zeros((0, 0))
-        return of.vectors * np.sqrt(self.noise / (np.where(of.seen, of.values, 0.0) + self.ridge))
+        return s.vectors * np.sqrt(self.noise / (np.where(s.testable, s.values, 0.0) + self.ridge))
 
 
 NOTHING = FamilyScore(1.0, 0.0, 0.0, np.inf, 0, 0.0, 0.0, 0.0, np.zeros(0), None, 0.0)
@@ -141,9 +141,9 @@ def _evidence(
 ) -> tuple[Floats, Floats]:
     """`log_evidence`, and ‖r‖²_t / ‖r‖² (T, ...)."""
     grown = 1.0 + np.multiply.outer(strengths**2 * (dof / rss), lam)
-    left = rss - explained.sum(axis=-1) + (explained / grown).sum(axis=-1)
-    left = np.maximum(left / rss, ROUNDING)
-    return -0.5 * np.log(grown).sum(axis=-1) - 0.5 * dof * np.log(left), left
+    remaining = rss - explained.sum(axis=-1) + (explained / grown).sum(axis=-1)
+    remaining = np.maximum(remaining / rss, ROUNDING)
+    return -0.5 * np.log(grown).sum(axis=-1) - 0.5 * dof * np.log(remaining), remaining
 
 
 def score_family(
@@ -157,37 +157,36 @@ def score_family(
     """Score a family.
 
     Args:
-        spent: effective number of parameters of families with a prior that are in the model
-            beside those that `dof` counts. They lower the degrees of freedom of the test; in the
-            evidence their determinant has counted already, where they were added.
-        most: largest plausible standard deviation of the parameters; the test does not depend on
-            it.
+        spent: effective number of parameters of the model's families with a prior that `dof` does
+            not count. They lower the degrees of freedom of the test; the evidence of their addition
+            already contains their determinant.
+        most: largest plausible standard deviation of the parameters, for the evidence only.
     """
-    of = s if isinstance(s, Spectrum) else spectrum(s)
-    seen, rank, free = of.seen, of.rank, dof - spent
+    eigen = s if isinstance(s, Spectrum) else spectrum(s)
+    testable, rank, free = eigen.testable, eigen.rank, dof - spent
     if rank == 0 or rss <= 0 or free <= 1:
         return NOTHING
-    lam, c = of.values[seen], (of.vectors.T @ g)[seen]
+    lam, c = eigen.values[testable], (eigen.vectors.T @ g)[testable]
     explained, small = c**2 / lam, rank <= LARGE_FAMILY * free
     if small:
         gain = min(float(explained.sum()), (1 - ROUNDING) * rss)
-        rest = max((rss - gain) / (free - rank), 1e-300)
-        p_value = float(f_distribution.sf(gain / rank / rest, rank, free - rank))
+        variance = max((rss - gain) / (free - rank), 1e-300)
+        p_value = float(f_distribution.sf(gain / rank / variance, rank, free - rank))
     else:
         p_value = ratio_tail(lam, free, float(c @ c) / rss)
-    evidence, left = _evidence(lam, explained, rss, dof, STRENGTHS)
-    freely = int(np.argmax(evidence))
+    evidence, remaining = _evidence(lam, explained, rss, dof, STRENGTHS)
+    unbounded = int(np.argmax(evidence))
     if np.isfinite(most):
-        # τ is t σ for the σ of the residual without the family, which holds what it explains.
-        evidence = np.where(STRENGTHS * np.sqrt(left) <= most, evidence, -np.inf)
+        # τ = t σ with σ² = ‖r‖²/ν, which contains what the family explains: use ‖r‖²_t instead.
+        evidence = np.where(STRENGTHS * np.sqrt(remaining) <= most, evidence, -np.inf)
         evidence[0] = max(evidence[0], -1e300)
     best = int(np.argmax(evidence))
     ridge = rss / (dof * float(STRENGTHS[best]) ** 2)
     shrunk = lam / (lam + ridge)
     effective, gain = float(shrunk.sum()), float(shrunk @ explained)
     full, count = (float(explained.sum()), rank) if small else (gain, effective)
-    step = np.zeros(len(seen))
-    step[seen] = shrunk * c / lam
+    step = np.zeros(len(testable))
+    step[testable] = shrunk * c / lam
     return FamilyScore(
         p_value=p_value,
         log_evidence=float(evidence[best]),
@@ -197,10 +196,10 @@ def score_family(
         effective=effective,
         gain=gain,
         delta_bic=dof * float(np.log(max(1 - full / rss, 1e-300))) + count * float(np.log(dof)),
-        step=of.vectors @ step,
-        spectrum=of,
+        step=eigen.vectors @ step,
+        spectrum=eigen,
         noise=max(rss - gain, ROUNDING * rss) / dof,
-        bounded=best != freely,
+        bounded=best != unbounded,
         by_strength=evidence,
     )
 
@@ -208,7 +207,7 @@ def score_family(
 def ratio_tail(eigenvalues: Floats, dimension: float, c: float) -> float:
     """Probability that a ratio of quadratic forms zᵀ L z / zᵀ z of z ~ N(0, I_R) exceeds c.
 
-    It is P(Σ (λ_i − c) χ²_1 > 0), by the saddlepoint approximation of Lugannani and Rice.
+    This is P(Σ (λ_i − c) χ²_1 > 0), by the saddlepoint approximation of Lugannani and Rice.
 
     Args:
         eigenvalues: (K,) non-zero eigenvalues λ of L.
@@ -232,7 +231,7 @@ def ratio_tail(eigenvalues: Floats, dimension: float, c: float) -> float:
     def slope(t: float) -> float:
         return float(np.sum(weight * d / (1 - 2 * t * d)))
 
-    # The cumulant generating function lives on 1/(2 d_min) < t < 1/(2 d_max).
+    # The cumulant generating function is finite for 1/(2 d_min) < t < 1/(2 d_max).
     low, high = 0.5 / d.min(), 0.5 / d.max()
     inside = 1 - 1e-9
     t = float(brentq(slope, low * inside, high * inside, xtol=1e-14, maxiter=500))
@@ -241,12 +240,12 @@ def ratio_tail(eigenvalues: Floats, dimension: float, c: float) -> float:
     w = np.sign(t) * np.sqrt(max(-2 * cumulant, 0.0))
     v = t * np.sqrt(curvature)
     if abs(w) < NEAR_MEAN:
-        # The formula is 0/0 at the mean: go straight from one side of it to the other.
+        # The formula is 0/0 at the mean: interpolate linearly across it.
         total = float(weight.sum())
         mean = float(eigenvalues.sum()) / total
         spread = np.sqrt(2 * float(np.sum(weight * (scale * d + c - mean) ** 2))) / total
         low, high = mean - 3 * NEAR_MEAN * spread, mean + 3 * NEAR_MEAN * spread
-        p_low, p_high = (ratio_tail(eigenvalues, dimension, at) for at in (low, high))
+        p_low, p_high = (ratio_tail(eigenvalues, dimension, end) for end in (low, high))
         return float(p_low + (p_high - p_low) * (c - low) / (high - low))
     if w > 8:
         # Deep tail, in logarithms: sf(w) + φ(w) (1/v − 1/w)
@@ -255,7 +254,7 @@ def ratio_tail(eigenvalues: Floats, dimension: float, c: float) -> float:
 
 
 def family_power(s: Floats, beta: Floats, level: float, dof: float = np.inf) -> float:
-    """Return the probability that the test at `level` finds a family with the parameters β.
+    """Return the power of the test at `level` against the parameters β of a family.
 
     Args:
         s: (P, P) S.
@@ -263,31 +262,31 @@ def family_power(s: Floats, beta: Floats, level: float, dof: float = np.inf) -> 
         level: of the test; returned where no direction of the family is visible.
         dof: degrees of freedom of the residual without the family; infinite for known noise.
     """
-    of = spectrum(s)
-    if of.rank == 0 or dof - of.rank < 1:
+    eigen = spectrum(s)
+    if eigen.rank == 0 or dof - eigen.rank < 1:
         return level
-    noncentrality = float((of.values * (of.vectors.T @ beta) ** 2)[of.seen].sum())
-    return power_of_test(noncentrality, of.rank, dof - of.rank, level)
+    noncentrality = float((eigen.values * (eigen.vectors.T @ beta) ** 2)[eigen.testable].sum())
+    return power_of_test(noncentrality, eigen.rank, dof - eigen.rank, level)
 
 
-def power_of_test(noncentrality: float, rank: int, rest: float, level: float) -> float:
-    """Return the power of the F-test with `rank` and `rest` degrees of freedom."""
+def power_of_test(noncentrality: float, rank: int, dof: float, level: float) -> float:
+    """Return the power of the F-test with `rank` and `dof` degrees of freedom."""
     if noncentrality <= 0.0:
         return level
-    if np.isinf(rest):
+    if np.isinf(dof):
         return float(ncx2.sf(chi2.isf(level, rank), rank, noncentrality))
-    return float(ncf.sf(f_distribution.isf(level, rank, rest), rank, rest, noncentrality))
+    return float(ncf.sf(f_distribution.isf(level, rank, dof), rank, dof, noncentrality))
 
 
-def noncentrality_of_power(rank: int, rest: float, level: float, power: float) -> float:
+def noncentrality_of_power(rank: int, dof: float, level: float, power: float) -> float:
     """Return the non-centrality at which the F-test at `level` has the given power."""
     from scipy.optimize import brentq  # slow to import
 
-    high = 10.0 * (rank + 1.0) + 4.0 * rank * float(f_distribution.isf(level, rank, rest))
+    high = 10.0 * (rank + 1.0) + 4.0 * rank * float(f_distribution.isf(level, rank, dof))
 
-    def lacks(value: float) -> float:
-        return power_of_test(value, rank, rest, level) - power
+    def excess(value: float) -> float:
+        return power_of_test(value, rank, dof, level) - power
 
-    while lacks(high) < 0.0:
+    while excess(high) < 0.0:
         high *= 2.0
-    return float(brentq(lacks, 0.0, high, xtol=1e-6 * high))
+    return float(brentq(excess, 0.0, high, xtol=1e-6 * high))

@@ -1,15 +1,15 @@
 """Prediction of rows that are left out, with the model and a family of columns refitted.
 
-Each fold is refitted by one Gauss-Newton step from the fit to all rows, in which the fold's rows
-are taken out of the normal equations exactly. A residual of the fit to all rows would already know
-of those left out.
+Each fold is left out by one Gauss-Newton step from the fit to all rows, with the fold's rows
+subtracted exactly from the normal equations. The residual of the fit to all rows would be too
+small, as it was fitted to the fold, too.
 
-A single pose may be the only one that determines a direction. A flat estimate along it from the
-other poses would be noise, magnified without limit, and one such pose would outweigh all others in
-the error. So without a fold the flat parameters have a prior about zero (empirical Bayes), whose
+A single pose may be the only one that determines a direction. A flat estimate along this direction
+from the other poses would be noise, magnified without limit, and one such pose would dominate the
+error. So without a fold the flat parameters have a prior about zero (empirical Bayes), whose
 standard deviation is their magnitude in the full fit. A direction that the other rows determine to
-1/s of this magnitude shrinks by the share 1/(1 + s²): not at all where it is well determined, to
-the model without it where it is not.
+1/s of this magnitude shrinks by the share 1/(1 + s²): not at all where s is large, to zero where s
+is small.
 """
 
 from collections.abc import Iterable, Sequence
@@ -27,24 +27,23 @@ from hilcal.types import Bools, Floats, Ints
 LEAST_GAIN = 0.002
 """Share by which the rms error on poses left out must fall for an effect to stay ..."""
 SURE = 2.0
-"""... and by how many of its standard errors, from pose to pose; or as surely by its ranks."""
-FEWEST = 8  # poses from which ranks are judged
+"""... and the number of standard errors, from pose to pose, or the same level by signed ranks."""
+FEWEST = 8  # least number of poses for the test by ranks
 ROUNDING = 1e-6  # ridge of flat directions, whose gram is the identity
 FAMILY_ROUNDING = 1e-10  # least ridge of a family, as a share of the largest square of a column
 
 
 def improves(before: Floats, after: Floats, sure: float = SURE) -> bool:
-    """Compare the squared whitened residuals of poses (P,), each predicted without itself.
+    """Return whether squared whitened residuals of poses left out became smaller.
 
-    The gain must be certain from pose to pose: by its mean, or where few poses gain very much
-    (then the mean scatters, however sure the gain is) by Wilcoxon's signed ranks, at the same
-    level. Source: Wilcoxon, *Individual comparisons by ranking methods*, Biometrics Bulletin 1
-    (1945) 80-83.
+    The gain over the poses must be significant: by its mean, or by Wilcoxon's signed ranks at the
+    same level, as the mean scatters where few poses gain very much. Source: Wilcoxon, *Individual
+    comparisons by ranking methods*, Biometrics Bulletin 1 (1945) 80-83.
 
     Args:
-        before: (P,) of the model as it was.
-        after: (P,) of the changed one.
-        sure: how many standard errors the gain must be.
+        before: (P,) of the model before the change.
+        after: (P,) of the changed model.
+        sure: least gain in standard errors.
     """
     if float(np.sum(after)) >= (1 - LEAST_GAIN) ** 2 * float(np.sum(before)):
         return False
@@ -62,8 +61,8 @@ class Fold:
     """The model's normal equations without one fold."""
 
     out: Bools  # (R,) rows of the fold
-    inverse_root: Floats  # (K, K) T with Tᵀ T = H⁻¹ without them
-    rhs: Floats  # (K,) right-hand side without them, for a step from the fit
+    inverse_root: Floats  # (K, K) T with Tᵀ T = H⁻¹ of the other rows
+    rhs: Floats  # (K,) right-hand side of the other rows, for a step from the fit
 
     def rows(self, p: Projection) -> Floats:
         """Return the model's columns in the rows of the fold."""
@@ -80,15 +79,15 @@ class Fold:
 
 def folds(
     p: Projection,  # the fit's columns by identifiable coordinates, with the ridge of its priors
-    white: Floats,  # (R,) its whitened residual
-    equations: NormalEquations,  # its normal equations, over all parameters
-    theta: Floats,  # (P,) its parameters
+    white: Floats,  # (R,) whitened residual of the fit
+    equations: NormalEquations,  # of the fit, over all parameters
+    theta: Floats,  # (P,) parameters of the fit
     prior: Floats,  # (P,) their prior standard deviations, infinite for flat ones
-    magnitude: Floats,  # (P,) standard deviations that flat parameters have without a fold
-    beta: float,  # noise variance factor that priors are weighed against
+    magnitude: Floats,  # (P,) prior standard deviations of flat parameters without a fold
+    beta: float,  # noise variance factor that multiplies the prior precisions
     fold: Ints,  # (R,) fold of each row, from 0
 ) -> tuple[Fold, ...]:
-    """Return the normal equations of a step from a fit without each fold."""
+    """Return for each fold the normal equations of a step from the fit without it."""
     basis = equations.basis
     flat, held = slice(0, len(basis.singular)), basis.held
     h = equations.gram + np.diag(p.ridge + np.where(p.ridge > 0, 0.0, ROUNDING))
@@ -100,10 +99,10 @@ def folds(
     rhs = p.rows.T @ white - beta * pull
 
     def without(f: int) -> Fold:
-        mine = fold == f
-        rows = p.rows[mine]
+        out = fold == f
+        rows = p.rows[out]
         root = inverse_root(h - rows.T @ rows)
-        return Fold(mine, root, rhs - rows.T @ white[mine])
+        return Fold(out, root, rhs - rows.T @ white[out])
 
     return tuple(without(f) for f in range(int(fold.max()) + 1))
 
@@ -117,13 +116,12 @@ def left_out_residual(
 ) -> Floats:
     """Return the residual (R,) of each row, predicted without its fold by model and family."""
     if x is None:
-        left = np.zeros(len(white))
+        residual = np.zeros(len(white))
         for fold in folds:
-            left[fold.out] = white[fold.out] - fold.rows(p) @ fold.step()
-        return left
-    return left_out_of_families(
-        folds, p, white, [(of, ridge) for of in family_products(folds, p, white, [x])]
-    )[0]
+            residual[fold.out] = white[fold.out] - fold.rows(p) @ fold.step()
+        return residual
+    products = family_products(folds, p, white, [x])[0]
+    return left_out_of_families(folds, p, white, [(products, ridge)])[0]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,10 +135,7 @@ class Products:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FamilyProducts:
-    """Products of a family's columns with themselves and with the model's.
-
-    Those of all rows serve the tests of the whole family.
-    """
+    """Products of a family's columns with themselves and with the model's."""
 
     x: Floats  # (R, F) whitened columns
     parts: tuple[Products, ...]  # of each fold
@@ -151,19 +146,22 @@ def family_products(
     folds: tuple[Fold, ...], p: Projection, white: Floats, families: Iterable[Floats]
 ) -> list[FamilyProducts]:
     """Form the products of families of whitened columns (R, F) with residuals (R,)."""
-    every = list(families)
-    parts: list[list[Products]] = [[] for _ in every]
+    columns = list(families)
+    parts: list[list[Products]] = [[] for _ in columns]
     for fold in folds:
-        own, y = fold.rows(p), white[fold.out]
-        for x, of in zip(every, parts, strict=True):
-            mine = x[fold.out]
-            of.append(Products(own.T @ mine, mine.T @ mine, mine.T @ y))
+        model, y = fold.rows(p), white[fold.out]
+        for x, of_folds in zip(columns, parts, strict=True):
+            family = x[fold.out]
+            of_folds.append(Products(model.T @ family, family.T @ family, family.T @ y))
 
-    def whole(of: list[Products]) -> Products:
-        each = ([getattr(part, f.name) for part in of] for f in fields(Products))
-        return Products(*(reduce(np.add, parts) for parts in each))
+    def total(products: list[Products]) -> Products:
+        by_field = ([getattr(part, f.name) for part in products] for f in fields(Products))
+        return Products(*(reduce(np.add, values) for values in by_field))
 
-    return [FamilyProducts(x, tuple(of), whole(of)) for x, of in zip(every, parts, strict=True)]
+    return [
+        FamilyProducts(x, tuple(of_folds), total(of_folds))
+        for x, of_folds in zip(columns, parts, strict=True)
+    ]
 
 
 def left_out_of_families(
@@ -172,26 +170,26 @@ def left_out_of_families(
     white: Floats,
     families: Sequence[tuple[FamilyProducts, float]],
 ) -> list[Floats]:
-    """Return `left_out_residual` (R,) of each family with its ridge, beside the model by itself."""
-    found = [np.zeros(len(white)) for _ in families]
+    """Return `left_out_residual` (R,) of the model with each family alone, with its ridge."""
+    residuals = [np.zeros(len(white)) for _ in families]
     for f, fold in enumerate(folds):
-        out, own = fold.out, fold.rows(p)
+        out, model = fold.out, fold.rows(p)
         size = fold.inverse_root @ fold.rhs
-        for (of, ridge), left in zip(families, found, strict=True):
-            whole, part = of.whole, of.parts[f]
-            # Eliminate the model's own coordinates, then solve for the family.
-            along = fold.inverse_root @ (whole.cross - part.cross)
-            h = whole.gram - along.T @ along - part.gram
-            largest = float(np.diagonal(whole.gram).max(initial=0.0))
+        for (family, ridge), residual in zip(families, residuals, strict=True):
+            total, part = family.whole, family.parts[f]
+            # Eliminate the model's coordinates, then solve for the family.
+            along = fold.inverse_root @ (total.cross - part.cross)
+            h = total.gram - along.T @ along - part.gram
+            largest = float(np.diagonal(total.gram).max(initial=0.0))
             h[np.diag_indices_from(h)] += max(ridge, FAMILY_ROUNDING * largest)
-            step = positive_solve(h, whole.rhs - part.rhs - along.T @ size)
+            step = positive_solve(h, total.rhs - part.rhs - along.T @ size)
             back = fold.inverse_root.T @ (size - along @ step)
-            left[out] = white[out] - own @ back - of.x[out] @ step
-    return found
+            residual[out] = white[out] - model @ back - family.x[out] @ step
+    return residuals
 
 
 class FamilyFolds:
-    """Model and family without each fold, for any residuals and ridges: products formed once."""
+    """Model and family without each fold: products formed once, for any residuals and ridges."""
 
     def __init__(self, folds: tuple[Fold, ...], p: Projection, x: Floats | None = None) -> None:
         """Form the products of a family X (R, F), or of the model alone."""
@@ -199,27 +197,27 @@ class FamilyFolds:
         self._folds, self._p = folds, p
         gram, cross = x.T @ x, p.rows.T @ x
         self._rounding = FAMILY_ROUNDING * float(gram.max(initial=0.0))
-        self._of = []
+        self._products = []
         for fold in folds:
             out = x[fold.out]
             c = cross - fold.rows(p).T @ out
-            at = fold.solve(c)
-            self._of.append((c, at, gram - out.T @ out - c.T @ at))
+            solved = fold.solve(c)
+            self._products.append((c, solved, gram - out.T @ out - c.T @ solved))
 
     def left_out(self, y: Floats, ridge: float = 0.0) -> Floats:
-        """Return `left_out_residual` (R, K) of K simulated residuals y (R, K) of models at zero."""
+        """Return `left_out_residual` (R, K) of K simulated residuals y (R, K), for θ = 0."""
         x, p = self._x, self._p
         total, rhs = p.rows.T @ y, x.T @ y
         left = np.zeros(y.shape)
-        for fold, (c, at, gram) in zip(self._folds, self._of, strict=True):
-            out, own, r = x[fold.out], fold.rows(p), y[fold.out]
-            steps = fold.solve(total - own.T @ r)
-            left[fold.out] = r - own @ steps
+        for fold, (c, solved, gram) in zip(self._folds, self._products, strict=True):
+            out, model, r = x[fold.out], fold.rows(p), y[fold.out]
+            steps = fold.solve(total - model.T @ r)
+            left[fold.out] = r - model @ steps
             if x.shape[1]:
                 h, b = gram.copy(), rhs - out.T @ r - c.T @ steps
                 h[np.diag_indices_from(h)] += max(ridge, self._rounding)
                 family = positive_solve(h, b)
-                left[fold.out] += own @ (at @ family) - out @ family
+                left[fold.out] += model @ (solved @ family) - out @ family
         return left
 
 

@@ -3,22 +3,21 @@
     minimise ‖r − A δ‖² + β ‖(θ + δ − 0)/σ‖²  over δ
 
 A (R, P) whitened Jacobian, r (R,) whitened residual, σ (P,) prior standard deviations
-(infinite for flat), β the noise variance factor that the prior is weighed against.
+(infinite for flat parameters), β the noise variance factor that multiplies the prior precision.
 
-Parameter scaling: columns are multiplied by an ordinary magnitude of their parameter, so
-that singular values are pure numbers: s = by how many σ all data together move when the
-parameters move along a direction by an ordinary amount. Directions with s below
-`INFORMATION` (or below rounding) are not identifiable and are held at zero; the other flat
-directions are rotated and scaled to be orthonormal before the normal equations are formed,
-so that forming them costs no accuracy.
+Parameter scaling: columns are multiplied by the ordinary magnitude of their parameter, so that a
+singular value is a pure number: s σ is the motion of all data together for an ordinary magnitude
+along its direction. Directions with s below `INFORMATION`, or below rounding, are not identifiable
+and are held at zero. The other flat directions are rotated and scaled to be orthonormal before the
+normal equations are formed, so that forming them costs no accuracy.
 
-Of a tall matrix whose rows come a few at a time only the triangle of its QR is kept,
+A tall matrix whose rows arrive a few at a time is reduced to the triangle of its QR,
 
     [R; rows] = Q R'
 
-by Householder reflections (LAPACK's `tpqrt`), so that R'ᵀ R' is the sum of all products of rows
-without ever being formed: columns that are nearly dependent lose no digits. Triangles of parts of
-the rows are combined in the same way (TSQR). Source: Demmel, Grigori, Hoemmen and Langou,
+by Householder reflections (LAPACK's `tpqrt`). R'ᵀ R' equals the sum of all products of rows, but is
+never formed: nearly dependent columns lose no digits. Triangles of parts of the rows are combined
+in the same way (TSQR). Source: Demmel, Grigori, Hoemmen and Langou,
 *Communication-optimal parallel and sequential QR and LU factorizations*, SIAM J. Sci. Comput. 34
 (2012) A206-A239.
 """
@@ -34,26 +33,25 @@ from hilcal.regression.schur import inverse_root, positive_solve
 from hilcal.types import Bools, Floats, Ints
 
 INFORMATION = 0.2
-"""In units of the residual's spread: a direction is estimated where five times the ordinary
-magnitude along it would move all data together by one σ."""
+"""Least singular value s of an identifiable direction, in units of the residual's spread."""
 NULL_SHARE = 0.1
-"""Share of its standard uncertainty by which an unidentifiable direction, off by an ordinary
-magnitude, may move an identifiable parameter; a choice, no study set it."""
+"""Share of its standard uncertainty by which an identifiable parameter may move for an ordinary
+magnitude along an unidentifiable direction; a choice, no study set it."""
 ROUNDING = 1e-10
 TALL = 10_000
-"""Rows from which on the QR is done in parts that stay in the processor's cache: a third of the
-time for 300,000 rows of 30; a choice by timing."""
-_ROWS = 4096  # rows that are worked on at a time; a choice by memory
+"""Number of rows from which the QR is done in parts that fit into the processor's cache: a third of
+the time for 300,000 rows of 30; a choice by timing."""
+_ROWS = 4096  # rows multiplied at a time; a choice by memory
 ROWS = 3072
-"""Rows that are reduced at a time; a choice by timing: they stay in the processor's cache."""
+"""Rows reduced at a time, which fit into the processor's cache; a choice by timing."""
 BLOCK = 8  # columns whose reflections are applied together; a choice by timing
 
 
 class Triangle:
-    """The triangle R (K, K) of all rows so far."""
+    """The triangle R (K, K) of the QR of all rows added so far."""
 
     def __init__(self, size: int) -> None:
-        """Begin without rows, of K columns."""
+        """Start with K columns and no rows."""
         self._r = np.zeros((size, size), order="F")
 
     @property
@@ -62,11 +60,11 @@ class Triangle:
         return np.triu(self._r)
 
     def add(self, rows: Floats, right: Floats | None = None) -> None:
-        """Reduce rows (N, K); (N, K − 1) with the last column `right` (N,) given apart."""
+        """Reduce rows (N, K), or rows (N, K − 1) and their last column `right` (N,)."""
         block = min(BLOCK, len(self._r))
         for start in range(0, len(rows), ROWS):
             some = slice(start, start + ROWS)
-            part = np.empty((len(rows[some]), len(self._r)), order="F")  # it is overwritten
+            part = np.empty((len(rows[some]), len(self._r)), order="F")  # overwritten by LAPACK
             part[:, : rows.shape[1]] = rows[some]
             if right is not None:
                 part[:, -1] = right[some]
@@ -76,50 +74,48 @@ class Triangle:
 
 
 def triangle_of(a: Floats, right: Floats) -> Floats:
-    """Return the triangle (P + 1, P + 1) of a matrix A (R, P) and a column b (R,) beside it.
+    """Return the triangle T (P + 1, P + 1) of [A, b], A (R, P) and b (R,).
 
-    Its rows have the products of those of [A, b]: they can be solved in place of them.
+    TᵀT = [A, b]ᵀ [A, b], so that the rows of T can replace those of [A, b] in a least-squares
+    problem.
     """
-    whole = Triangle(a.shape[1] + 1)
-    whole.add(a, right)
-    return whole.r
+    triangle = Triangle(a.shape[1] + 1)
+    triangle.add(a, right)
+    return triangle.r
 
 
 def combined(parts: Iterable[Floats], size: int) -> Floats:
-    """Return the triangle (K, K) of triangles (K, K), in their order."""
-    whole = Triangle(size)
+    """Return the triangle (K, K) of all rows of triangles (K, K), in their order."""
+    triangle = Triangle(size)
     for part in parts:
-        whole.add(part)
-    return whole.r
+        triangle.add(part)
+    return triangle.r
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Basis:
     """Coordinates z of the identifiable subspace: θ = T z."""
 
-    transform: Floats  # (P, K) columns of θ per z; prior columns are scaled units
+    transform: Floats  # (P, K) T; parameters with a prior are only scaled by σ
     prior_precision: Floats  # (K,) 1/σ² in z coordinates (zero for flat ones)
-    # (P, U) unit directions, in units of the ordinary magnitudes, that are not identifiable
-    null: Floats
+    null: Floats  # (P, U) unidentifiable unit directions, in ordinary magnitudes
     flat: Bools  # (P,) parameters without a prior
     held: Ints  # indices of the parameters with a prior, in the order of their z
-    singular: Floats  # (K_flat,) singular values that were kept
-    # number of directions of the flat parameters that the columns span, up to rounding,
-    # identifiable under the noise or not
-    structural: int
+    singular: Floats  # (K_flat,) singular values of the identifiable directions
+    structural: int  # rank of the flat parameters' columns up to rounding, whatever the noise
     condition_unscaled: float  # condition number of A in physical units, identifiable part
     condition_scaled: float  # the same after parameter scaling
 
-    def restricted(self, kept: Bools) -> "Basis":
-        """Return the basis over some of the parameters (P,), where the others are held at zero."""
-        if kept.all():
+    def restricted(self, free: Bools) -> "Basis":
+        """Return the basis over the free parameters (P,) where the others are held at zero."""
+        if free.all():
             return self
-        place = np.cumsum(kept) - 1
+        place = np.cumsum(free) - 1
         return replace(
             self,
-            transform=self.transform[kept],
-            null=self.null[kept],
-            flat=self.flat[kept],
+            transform=self.transform[free],
+            null=self.null[free],
+            flat=self.flat[free],
             held=place[self.held],
         )
 
@@ -129,10 +125,10 @@ class Basis:
         return np.asarray(a[:, flat] @ self.transform[flat, : len(self.singular)])
 
     def rows(self, a: Floats) -> Floats:
-        """Return rows (R, K) by z of rows A (R, P) by the parameters: A T.
+        """Return A T (R, K), the derivatives by z, of A (R, P), those by the parameters.
 
-        A column with a prior is only scaled, and a part of the rows is worked on at a time: for a
-        thousand columns of many rows, products with all of T take long, and copies much memory.
+        To save time and memory, columns with a prior are only scaled, and the rows are multiplied
+        in parts.
         """
         count, flat = len(self.singular), np.flatnonzero(self.flat)
         out = np.empty((len(a), self.transform.shape[1]))
@@ -150,9 +146,9 @@ def find_basis(
     scale: Floats,  # (P,) ordinary magnitudes
     prior: Floats,
     spread: float | None = 1.0,
-    triangle: Floats | None = None,  # what `flat_triangle` returns, where it is known
+    triangle: Floats | None = None,  # of `flat_triangle`, where it was computed before
 ) -> Basis:
-    """Rank analysis of A (R, P): the identifiable directions of the flat parameters.
+    """Find the identifiable directions of the flat parameters of A (R, P).
 
     Args:
         prior: (P,) prior standard deviations, infinite for flat parameters, zero for parameters
@@ -169,14 +165,14 @@ def find_basis(
     s = np.concatenate([s, np.zeros(len(columns) - len(s))])
     floor = ROUNDING * s.max(initial=0.0)
     keep = s > (floor if spread is None else max(INFORMATION * max(spread, 1.0), floor))
-    transform = np.zeros((p, int(keep.sum()) + len(held)))
-    kept = int(keep.sum())
-    transform[columns, :kept] = scale[columns, None] * vt[keep].T / s[keep]
-    transform[held, kept + np.arange(len(held))] = prior[held]
-    null = np.zeros((p, len(columns) - kept))
+    rank = int(keep.sum())
+    transform = np.zeros((p, rank + len(held)))
+    transform[columns, :rank] = scale[columns, None] * vt[keep].T / s[keep]
+    transform[held, rank + np.arange(len(held))] = prior[held]
+    null = np.zeros((p, len(columns) - rank))
     null[columns] = vt[~keep].T
-    precision = np.concatenate([np.zeros(kept), np.ones(len(held))])
-    conditions = _conditions(r, scale[columns], kept)
+    precision = np.concatenate([np.zeros(rank), np.ones(len(held))])
+    conditions = _conditions(r, scale[columns], rank)
     structural = int(np.count_nonzero(s > floor))
     return Basis(transform, precision, null, flat, held, s[keep], structural, *conditions)
 
@@ -184,9 +180,9 @@ def find_basis(
 def flat_triangle(a: Floats, columns: Ints, scale: Floats) -> Floats:
     """Return R of the QR of some columns of A (R, P), multiplied by their magnitudes (P,)."""
     if len(a) > TALL and len(columns):
-        whole = Triangle(len(columns))
-        whole.add(a if len(columns) == a.shape[1] else a[:, columns])
-        return np.asarray(whole.r * scale[columns])
+        triangle = Triangle(len(columns))
+        triangle.add(a if len(columns) == a.shape[1] else a[:, columns])
+        return np.asarray(triangle.r * scale[columns])
     scaled = a[:, columns] * scale[columns]
     return np.asarray(sl.qr(scaled, mode="r", check_finite=False)[0], dtype=float)[: len(columns)]
 
@@ -207,11 +203,11 @@ class NormalEquations:
 
     basis: Basis
     gram: Floats  # (K, K) Tᵀ AᵀA T
-    # (K,) Tᵀ Aᵀ target; z is a step for flat directions, absolute for those with a prior
+    # (K,) Tᵀ Aᵀ target; z is a step along flat directions, absolute for parameters with a prior
     rhs: Floats
 
     def inverse_root(self, beta: float) -> Floats:
-        """T (K, K) with Tᵀ T = H⁻¹, by the rule of `schur` where H is singular."""
+        """W (K, K) with Wᵀ W = H⁻¹, by the rule of `schur` where H is singular."""
         return inverse_root(self._h(beta))
 
     def _h(self, beta: float) -> Floats:
@@ -229,45 +225,23 @@ class NormalEquations:
         return np.asarray(root.T @ root)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FlatProducts:
-    """Products of the rows by F flat coordinates, from which normal equations are put together."""
-
-    own: Floats  # (F, F) with each other
-    all: Floats  # (F, P) with all columns of A
-    target: Floats  # (F,) with the target
-    columns: Floats  # (P,) of all columns of A with the target
-
-    def restricted(self, kept: Bools) -> "FlatProducts":
-        """Return those over some columns (P,) of A, which the flat coordinates are made of."""
-        return replace(self, all=self.all[:, kept], columns=self.columns[kept])
-
-
-def flat_products(a: Floats, target: Floats, basis: Basis) -> FlatProducts:
-    """Form the products of the flat coordinates of a basis: the rows are orthonormal."""
-    rows = basis.flat_rows(a)
-    return FlatProducts(rows.T @ rows, rows.T @ a, rows.T @ target, a.T @ target)
-
-
-def normal_equations(
-    a: Floats, target: Floats, basis: Basis, gram: Floats, known: FlatProducts | None = None
-) -> NormalEquations:
+def normal_equations(a: Floats, target: Floats, basis: Basis, gram: Floats) -> NormalEquations:
     """Form the normal equations of A (R, P), with AᵀA (P, P), in the coordinates of a basis.
 
-    The flat directions are formed from their rows, which are orthonormal, so that squaring
-    costs no accuracy; columns with a prior are taken from AᵀA, for speed.
+    Flat directions are formed from their rows, whose columns are orthonormal, so that squaring
+    costs no accuracy; parameters with a prior from AᵀA, for speed.
     """
-    flat, of = len(basis.singular), flat_products(a, target, basis) if known is None else known
-    held = basis.held
+    flat, held, rows = len(basis.singular), basis.held, basis.flat_rows(a)
     sigma = basis.transform[held, flat + np.arange(len(held))]
     size = basis.transform.shape[1]
     full = np.empty((size, size))
-    full[:flat, :flat] = of.own
+    full[:flat, :flat] = rows.T @ rows
     if not len(held):
-        return NormalEquations(basis, full, of.target)
-    full[:flat, flat:] = of.all[:, held] * sigma
+        return NormalEquations(basis, full, rows.T @ target)
+    full[:flat, flat:] = (rows.T @ a)[:, held] * sigma
     full[flat:, :flat] = full[:flat, flat:].T
     inner = gram[np.ix_(held, held)]
     inner *= sigma
     np.multiply(inner, sigma[:, None], out=full[flat:, flat:])
-    return NormalEquations(basis, full, np.concatenate([of.target, sigma * of.columns[held]]))
+    rhs = np.concatenate([rows.T @ target, sigma * (a.T @ target)[held]])
+    return NormalEquations(basis, full, rhs)

@@ -1,13 +1,13 @@
-"""What a fitted linear model cannot explain: the projection off its columns, priors included.
+"""Projection off the columns of a fitted linear model, with their priors.
 
 With B (R, K) the whitened columns of the model and Λ (K,) the ridge of their priors, zero for a
-column without one,
+column without a prior,
 
     M = 1 − B H⁻¹ Bᵀ,    H = BᵀB + diag(Λ)
 
 is the marginal precision of the data when the model's parameters are integrated out. Without
-priors it is the orthogonal projection off the columns of B; with priors it is none: M M ≠ M.
-Columns may depend on each other: H⁻¹ is then the inverse where they are determined, see `schur`.
+priors M is the orthogonal projection off the columns of B; with priors M is no projection: M M ≠ M.
+Columns may be linearly dependent: H⁻¹ is then the generalised inverse of `schur`.
 """
 
 from dataclasses import dataclass
@@ -39,10 +39,9 @@ class Projection:
 
         Args:
             x: (R, P) whitened columns.
-            gram: (P, P) XᵀX where it is known.
+            gram: (P, P) XᵀX, if it was computed before.
         """
-        own = x.T @ x if gram is None else gram
-        return self.schur(own, self.rows.T @ x)
+        return self.schur(x.T @ x if gram is None else gram, self.rows.T @ x)
 
     def schur(self, gram: Floats, cross: Floats) -> Floats:
         """Return Xᵀ M X (P, P) from XᵀX (P, P) and BᵀX (K, P)."""
@@ -50,16 +49,16 @@ class Projection:
         return np.asarray(gram - lifted.T @ lifted)
 
     def residual(self, y: Floats, z: Floats) -> Floats:
-        """Return the residual (R,) after the model's own remaining step.
+        """Return the residual (R,) after the remaining Gauss-Newton step of the model.
 
             y − B H⁻¹ (Bᵀ y − Λ z)
 
-        A column that the model nearly explains would else be credited with the step that the
-        model itself could still take, divided by the little of it that the model cannot explain.
+        Else this step would be ascribed to a column that the model nearly explains, divided by the
+        small part of the column that the model does not explain.
 
         Args:
-            y: (R,) residual where the model stands.
-            z: (K,) coordinates where the model stands; of use only where they have a prior.
+            y: (R,) residual of the model.
+            z: (K,) its coordinates; used only where they have a prior.
         """
         return np.asarray(y - self.rows @ self.solve(self.rows.T @ y - self.ridge * z))
 
@@ -76,6 +75,6 @@ class Projection:
 
 
 def projection(rows: Floats, ridge: Floats, gram: Floats | None = None) -> Projection:
-    """Return M of the columns B (R, K) with the ridge Λ (K,), from BᵀB (K, K) where it is known."""
+    """Return M of the columns B (R, K) with the ridge Λ (K,); `gram` is BᵀB (K, K) if computed."""
     h = (rows.T @ rows if gram is None else gram) + np.diag(ridge)
     return Projection(rows, ridge, inverse_root(h))

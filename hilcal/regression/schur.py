@@ -1,10 +1,10 @@
 """The Schur complement of nuisance parameters, with a rule for singular information matrices.
 
-For the parameters of interest i beside the nuisance parameters n
+For parameters of interest i and nuisance parameters n
 
     S = M_ii − M_in M_nn⁻ M_ni = min over U of Uᵀ M U, U the identity at i and zero outside of i, n
 
-is the information on i when n is estimated as well. With U at its minimum, (1, −M_nn⁻ M_ni), and
+is the information on i when n is estimated as well. With U = (1, −M_nn⁻ M_ni) at the minimum, and
 Y = M_nn⁻ at n and zero elsewhere, S is a concave function of M = Σ w_k H_k with
 
     ∂S/∂w_k = Uᵀ H_k U,    ∂²S/∂w_k∂w_l = −Uᵀ (H_k Y H_l + H_l Y H_k) U.
@@ -23,12 +23,12 @@ import scipy.linalg as sl
 
 from hilcal.types import Bools, Floats, Ints
 
-# Least eigenvalue of an information matrix of unit diagonal that counts as information. Products of
-# double precision leave about 1e-16 times the number of rows in place of a zero; at 1e-12 a
-# parameter's standard uncertainty is a million times what it were if the others were known
+# Least eigenvalue of an information matrix of unit diagonal that counts as information. Rounding of
+# double precision turns a zero into about 1e-16 times the number of rows; at 1e-12 a parameter's
+# standard uncertainty is a million times that with all other parameters known.
 DETERMINED = 1e-12
 _SOUND = 1e-2
-"""Share of the largest admissible inverse, 1/`DETERMINED`, up to which Cholesky's factor serves."""
+"""Share of the largest inverse allowed, 1/`DETERMINED`, up to which Cholesky's factor is used."""
 
 
 def inverse_root(block: Floats) -> Floats:
@@ -46,24 +46,24 @@ def inverse_root(block: Floats) -> Floats:
     out, sound = _triangular(scaled)
     for k in np.flatnonzero(~sound):
         values, vectors = np.linalg.eigh(scaled[k])
-        kept = values > DETERMINED
-        inverse = np.where(kept, 1.0 / np.sqrt(np.where(kept, values, 1.0)), 0.0)
+        determined = values > DETERMINED
+        inverse = np.where(determined, 1.0 / np.sqrt(np.where(determined, values, 1.0)), 0.0)
         out[k] = inverse[:, None] * vectors.T
     return np.asarray((out / root[:, None, :]).reshape(block.shape))
 
 
 def _triangular(scaled: Floats) -> tuple[Floats, Bools]:
-    """Inverse Cholesky factors of blocks (N, F, F), and which of them serve."""
+    """Inverse Cholesky factors of blocks (N, F, F), and which of them are accurate (N,)."""
     if len(scaled) == 1:
         low, failed = sl.lapack.dpotrf(scaled[0].T, lower=1, clean=1)
         out = (np.zeros_like(low) if failed else sl.lapack.dtrtri(low, lower=1)[0])[None]
     else:
         try:
             out = np.linalg.inv(np.linalg.cholesky(scaled))
-        except np.linalg.LinAlgError:  # one of them is singular: all by eigenvalues
+        except np.linalg.LinAlgError:  # one is singular: use eigenvalues for all
             return np.zeros_like(scaled), np.zeros(len(scaled), dtype=np.bool_)
         failed = False
-    # The trace of the inverse is at least the inverse of the least eigenvalue.
+    # The trace of an inverse is at least the inverse of the least eigenvalue.
     trace = np.einsum("nij,nij->n", out, out)
     return out, np.asarray((trace < _SOUND / DETERMINED) & (not failed))
 
@@ -71,7 +71,7 @@ def _triangular(scaled: Floats) -> tuple[Floats, Bools]:
 def positive_solve(m: Floats, rhs: Floats) -> Floats:
     """Return M⁻ times (P,) or (P, K), M (P, P) positive semidefinite.
 
-    By Cholesky's factor itself where LAPACK's estimate of the condition says that no direction is
+    Cholesky's factor is used where LAPACK's estimate of the condition shows that no direction is
     near the limit: the trace of an inverse (F, F) is at most F times its 1-norm.
     """
     scale = np.sqrt(np.maximum(np.diagonal(m), 0.0))
@@ -83,8 +83,8 @@ def positive_solve(m: Floats, rhs: Floats) -> Floats:
         if not failed:
             condition, _ = sl.lapack.dpocon(low, norm, uplo="L")
             if condition * norm > len(m) * DETERMINED / _SOUND:
-                by = scale if rhs.ndim == 1 else scale[:, None]
-                return np.asarray(sl.lapack.dpotrs(low, rhs / by, lower=1)[0] / by)
+                divisor = scale if rhs.ndim == 1 else scale[:, None]
+                return np.asarray(sl.lapack.dpotrs(low, rhs / divisor, lower=1)[0] / divisor)
     root = inverse_root(m)
     return np.asarray(root.T @ (root @ rhs))
 
@@ -103,23 +103,23 @@ def schur_complement(m: Floats, interest: Ints, nuisance: Ints | None = None) ->
     Args:
         m: symmetric, positive semidefinite.
         interest: (I,) indices of the parameters of interest.
-        nuisance: (N,) indices of those that are estimated as well; all others by default.
+        nuisance: (N,) indices of the parameters estimated as well; all others by default.
     """
     if nuisance is None:
         nuisance = np.setdiff1d(np.arange(m.shape[-1]), interest)
-    own = m[..., interest[:, None], interest]
     block = m[..., nuisance[:, None], nuisance]
     explained = inverse_root(block) @ m[..., nuisance[:, None], interest]
-    return np.asarray(own - np.swapaxes(explained, -1, -2) @ explained)
+    inner = m[..., interest[:, None], interest]
+    return np.asarray(inner - np.swapaxes(explained, -1, -2) @ explained)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SchurComplement:
-    """S at one M, with what its derivatives by M need."""
+    """S of a matrix M, with U and Y for its derivatives by M."""
 
     matrix: Floats  # (I, I) S
     lift: Floats  # (P, I) U
-    inverse: Floats | None  # (P, P) Y; None where there is no nuisance parameter
+    inverse: Floats | None  # (P, P) Y; None without nuisance parameters
 
     def embed(self, inner: Floats) -> Floats:
         """Return U G Uᵀ (P, P) of G (I, I): the gradient by M of tr(G S)."""
@@ -127,12 +127,11 @@ class SchurComplement:
 
 
 def differentiable_schur_complement(m: Floats, interest: Ints | None) -> SchurComplement:
-    """Return S of one M (P, P) beside all other parameters; M itself where no interest is given."""
+    """Return S of M (P, P), with all other parameters as nuisance; M itself without `interest`."""
     size = len(m)
     if interest is None or len(interest) == size:
         return SchurComplement(m, np.eye(size), None)
-    others = np.setdiff1d(np.arange(size), interest)
-    inverse = nuisance_inverse(m, others)
+    inverse = nuisance_inverse(m, np.setdiff1d(np.arange(size), interest))
     lift = np.zeros((size, len(interest)))
     lift[interest] = np.eye(len(interest))
     lift -= inverse @ m[:, interest]
@@ -150,18 +149,20 @@ def eliminate(
         G ← G − G_o (G_oo + λ 1)⁻ G_oᵀ,   b ← b − G_o (G_oo + λ 1)⁻ b_o,
         ‖y‖² ← ‖y‖² − b_oᵀ (G_oo + λ 1)⁻ b_o
 
-    are those of the other columns beside them, and the penalised sum of squares that they leave.
+    are the normal equations of the other columns after elimination of o, and the penalised sum of
+    squares that remains.
 
     Args:
         gram: (P, P) G.
         rhs: (P,) b.
         square: ‖y‖².
-        ridge: λ, inverse of their prior variance in units of the noise.
+        out: o.
+        ridge: λ, inverse of the prior variance of o in units of the noise.
 
     Returns:
-        (P, P), (P,) and the sum of squares; the rows of the eliminated columns are of no use.
+        (P, P), (P,) and the sum of squares; the rows at o are meaningless.
     """
     inner = gram[out, out] + ridge * np.eye(len(rhs[out]))
     solved = inverse_root(inner) @ np.column_stack([gram[out], rhs[out]])
-    cross, own = solved[:, :-1], solved[:, -1]
-    return gram - cross.T @ cross, rhs - cross.T @ own, square - float(own @ own)
+    cross, side = solved[:, :-1], solved[:, -1]
+    return gram - cross.T @ cross, rhs - cross.T @ side, square - float(side @ side)

@@ -1,4 +1,4 @@
-"""A simulated task before anything is hidden in it: an arm, states to learn from and to predict."""
+"""A simulated task without hidden effects: an arm, training states, and states to predict."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -20,31 +20,31 @@ ARMS = ("ur10e", "ur5e", "xarm6", "irb120")
 SIGMA = 2e-5
 """Standard deviation of the noise of one reading, each axis, m."""
 FRESH = 200
-"""Poses that are predicted."""
+"""Number of poses to predict."""
 TARGET_SCATTER = 2e-3
-"""How far a target sits from its nominal place, standard deviation per axis, m."""
+"""Standard deviation per axis of a target from its nominal position, m."""
 CANDIDATES = (
     "joint_stiffening", "joint_tilt_compliance", "base_compliance", "link_compliance",
     "tool_compliance", "periodic_joint_compliance", "backlash", "load_point", "tracker_drift",
     "wrench_bias", "wrench_gain", "sensor_misalignment", "encoder_offset", "joint_coupling",
     "transmission_error", "link_geometry", "link_mass", "tracker_scale",
 )  # fmt: skip
-"""Effects that may be hidden in a task whose effects are to be named."""
+"""Effects that may be hidden in tasks with naming."""
 CONTAINED = {"link_geometry": ("encoder_offset", "tracker_scale")}
-"""Effects that a hidden one contains, so that nobody can say whether they are there as well."""
+"""Effects that a hidden effect contains, so that their presence cannot be decided."""
 _PASSING = 30.0  # s from one reading to the next
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Campaign:
-    """States of a task, first those that are trained on, in the numbers that its files hold.
+    """States of a task, the training rows first, rounded as in its files.
 
     Attributes:
         cell: the arm with its tool, target and load point.
         states: joints, wrenches and times.
         pose: name of each row's pose.
         load: name of each row's load.
-        n_train: rows that are trained on; the others are predicted.
+        n_train: number of training rows; the others are to be predicted.
     """
 
     cell: Cell
@@ -56,14 +56,14 @@ class Campaign:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Made:
-    """A task that is complete but for its noise.
+    """A task without noise.
 
     Attributes:
         campaign: its states.
-        position: (N, 3) what the instrument would read without noise, m.
+        position: (N, 3) readings of the instrument without noise, m.
         truth: the content of truth.json.
         columns: (N,) further columns by name.
-        about: what task.json has beyond what all tasks have.
+        about: keys of task.json that not all tasks have.
         sigma: noise of one reading and axis, m.
     """
 
@@ -76,14 +76,14 @@ class Made:
 
 
 def campaign(robot: str, poses: int, rng: np.random.Generator) -> Campaign:
-    """Plan a campaign: each pose unloaded and under one load, fresh ones in one of both.
+    """Plan a campaign: training poses unloaded and under one load, poses to predict in one state.
 
-    Poses are feasible and spread over the joint space. The fresh ones are visited in between, in
-    random order, so that what drifts in time is not extrapolated.
+    Poses are feasible and spread over the joint space. All poses are visited in random order, so
+    that drifts in time are not extrapolated.
     """
     config = load_config(configs_dir() / "cells" / "demo_ur10e.toml")
-    own, pulls = with_study_loads(config, robot)
-    cell = cell_from_config(own)
+    robot_config, pulls = with_study_loads(config, robot)
+    cell = cell_from_config(robot_config)
     every = np.array([np.zeros(6), *(np.round(wrench, 2) for _, wrench in pulls)])
     names = ("none", *(name.replace(" ", "_") for name, _ in pulls))
     loads = len(pulls)
@@ -105,7 +105,7 @@ def campaign(robot: str, poses: int, rng: np.random.Generator) -> Campaign:
 
 
 def named(hidden: list[str], strength: float, parameters: dict[str, Any]) -> dict[str, Any]:
-    """Return the truth of a task whose effects are to be named, and the kind that it is of."""
+    """Return the truth of a task with naming."""
     either = {name for effect in hidden for name in CONTAINED.get(effect, ())}
     return {
         "kind": ("none", "one")[len(hidden)] if len(hidden) < 2 else "several",
@@ -120,7 +120,7 @@ def hide_each(choice: Sequence[str], count: int, hide: Callable[[str], None]) ->
     """Hide the first `count` effects of a choice that can be hidden, and return their names.
 
     Raises:
-        InputError: fewer can, e.g. since a gear would have to stiffen to nothing.
+        InputError: fewer can be hidden, e.g. as a gear would become infinitely stiff.
     """
     hidden: list[str] = []
     for name in choice:

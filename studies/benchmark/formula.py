@@ -1,4 +1,4 @@
-"""Formulas of laws: read safely, evaluated, and compared with the truth; numpy alone.
+"""Formulas of laws: safe parsing, evaluation, and comparison with the truth; needs only numpy.
 
 A formula is an arithmetic expression of numbers and of a task's quantities, e.g.
 "0.001*sin(3*q4) + 2e-6*tau2**2".
@@ -30,7 +30,7 @@ _OPERATORS: dict[type[ast.operator], Any] = {
 }
 _LONGEST, _DEEPEST = 2000, 60
 MOST_CONSTANTS = 10
-"""A formula of more numbers is not compared by form: it would fit any law."""
+"""A formula with more constants is not equivalent: it could fit any law."""
 EQUIVALENT = 0.01
 """Largest deviation of an equivalent formula, as a share of the law's largest value."""
 _ROUNDS = 200
@@ -46,8 +46,8 @@ class Formula:
     """An expression whose numbers can be replaced.
 
     Attributes:
-        text: as it was written.
-        constants: its numbers from left to right; whole exponents and pi are no constants.
+        text: as written.
+        constants: numbers from left to right, without whole exponents and pi.
     """
 
     text: str
@@ -59,7 +59,7 @@ class Formula:
         """Read a formula of the named quantities.
 
         Raises:
-            FormulaError: what is not such an expression.
+            FormulaError: the text is no such expression.
         """
         if not isinstance(text, str) or not 0 < len(text) <= _LONGEST:
             raise FormulaError(f"formula: valid is a text of 1 to {_LONGEST} characters")
@@ -67,22 +67,22 @@ class Formula:
             tree = ast.parse(text.strip(), mode="eval").body
             constants = tuple(_checked(tree, {*names, "pi"}))
         except (SyntaxError, ValueError, OverflowError, RecursionError, MemoryError) as error:
-            what = " ".join(str(error).split())
-            raise FormulaError(f"formula {text[:80]!r}: {what}") from error
+            reason = " ".join(str(error).split())
+            raise FormulaError(f"formula {text[:80]!r}: {reason}") from error
         return cls(text, constants, tree)
 
     @property
     def variables(self) -> set[str]:
-        """Names of the quantities in it."""
+        """Names of the quantities in the formula."""
         named = {node.id for node in ast.walk(self._tree) if isinstance(node, ast.Name)}
         return named - {*FUNCTIONS, "pi"}
 
     def value(self, columns: Mapping[str, Floats], constants: Floats | None = None) -> Floats:
-        """Return its (N,) values at the columns (N,) of the quantities; not finite where undefined.
+        """Return the values (N,), not finite where undefined.
 
         Args:
-            columns: quantities by name.
-            constants: in the place of its own.
+            columns: (N,) quantities by name.
+            constants: replace those of the formula.
         """
         numbers = iter(self.constants if constants is None else constants.tolist())
         rows = next(iter(columns.values())).shape
@@ -92,7 +92,7 @@ class Formula:
 
 
 def _checked(node: ast.expr, names: set[str], depth: int = 0) -> Iterator[float]:
-    """Yield the constants, and refuse everything else that is not valid."""
+    """Yield the constants, and refuse invalid parts."""
     if depth > _DEEPEST:
         raise FormulaError(f"nested more than {_DEEPEST} deep")
     match node:
@@ -109,18 +109,18 @@ def _checked(node: ast.expr, names: set[str], depth: int = 0) -> Iterator[float]
             yield from _checked(left, names, depth + 1)
             if not _whole_exponent(node):
                 yield from _checked(right, names, depth + 1)
-        case ast.Call(func=ast.Name(id=name), args=given, keywords=[]) if name in FUNCTIONS:
-            if len(given) != FUNCTIONS[name][1]:
+        case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]) if name in FUNCTIONS:
+            if len(arguments) != FUNCTIONS[name][1]:
                 raise FormulaError(f"{name} takes {FUNCTIONS[name][1]} argument(s)")
-            for each in given:
-                yield from _checked(each, names, depth + 1)
+            for argument in arguments:
+                yield from _checked(argument, names, depth + 1)
         case _:
             valid = f"+ - * / **, {', '.join(FUNCTIONS)}, numbers and the task's quantities"
             raise FormulaError(f"{ast.unparse(node)[:40]!r} is not allowed; valid: {valid}")
 
 
 def _whole_exponent(node: ast.BinOp) -> bool:
-    """Whether it is a power by a whole number: part of the form, not a constant."""
+    """Whether a node is a power with a whole exponent, which is part of the form, no constant."""
     right = node.right
     if isinstance(right, ast.UnaryOp):
         right = right.operand
@@ -146,20 +146,20 @@ def _value(node: ast.expr, columns: Mapping[str, Floats], numbers: Iterator[floa
             whole = _whole_exponent(node)
             second = float(ast.literal_eval(right)) if whole else _value(right, columns, numbers)
             return _OPERATORS[type(operator)](first, second)
-        case ast.Call(func=ast.Name(id=name), args=given):
-            return FUNCTIONS[name][0](*(_value(each, columns, numbers) for each in given))
+        case ast.Call(func=ast.Name(id=name), args=arguments):
+            return FUNCTIONS[name][0](*(_value(a, columns, numbers) for a in arguments))
     raise FormulaError("an expression that was not checked")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Comparison:
-    """A law that was found beside the true one, at N states.
+    """Comparison of a proposed formula with the true law at N states.
 
-    What a joint's zero and its compliance can stand for is no part of a law: a constant and, where
-    it acts on joint j, a multiple of tau_j. Both values are compared with these projected out.
+    A joint's zero and compliance absorb a constant and, for a law of joint j, a multiple of tau_j.
+    These are projected out of both values.
 
     Attributes:
-        found: the formula that was found.
+        found: the proposed formula.
         true: the law.
         columns: (N,) quantities by name.
         acts_on: "q1" to "q6", or another site.
@@ -170,55 +170,55 @@ class Comparison:
     columns: Mapping[str, Floats]
     acts_on: str
 
-    def _own(self, values: Floats) -> Floats:
-        beside = [np.ones(len(values))]
+    def _projected(self, values: Floats) -> Floats:
+        absorbed = [np.ones(len(values))]
         if self.acts_on.startswith("q"):
-            beside.append(self.columns[f"tau{self.acts_on[1:]}"])
-        basis = np.linalg.qr(np.column_stack(beside))[0]
+            absorbed.append(self.columns[f"tau{self.acts_on[1:]}"])
+        basis = np.linalg.qr(np.column_stack(absorbed))[0]
         with np.errstate(all="ignore"):
             return np.asarray(values - basis @ (basis.T @ values))
 
     def error(self) -> float:
         """Return rms(f - f_true) / rms(f_true); infinite where f is undefined."""
-        true = self._own(self.true.value(self.columns))
-        off = self._own(self.found.value(self.columns)) - true
-        ratio = float(np.sqrt(np.mean(off**2) / np.mean(true**2)))
+        true = self._projected(self.true.value(self.columns))
+        error = self._projected(self.found.value(self.columns)) - true
+        ratio = float(np.sqrt(np.mean(error**2) / np.mean(true**2)))
         return ratio if np.isfinite(ratio) else float("inf")
 
     def equivalent(self) -> bool:
-        """Whether g f(constants), all refitted, agrees with the law to 1 % at every state.
+        """Whether g f(constants), with refitted g and constants, is the law to 1 % at every state.
 
-        It has to be of the same quantities, so that a term that would have to vanish counts as
-        wrong. Levenberg-Marquardt from the formula's own constants.
+        Both must have the same quantities, so that a formula with a superfluous term is wrong. The
+        fit is Levenberg-Marquardt's, from the formula's constants.
         """
-        true = self._own(self.true.value(self.columns))
+        true = self._projected(self.true.value(self.columns))
         true /= np.abs(true).max()
-        beside = {f"tau{self.acts_on[1:]}"}
+        absorbed = {f"tau{self.acts_on[1:]}"}
         if len(self.found.constants) > MOST_CONSTANTS or (
-            self.found.variables - beside != self.true.variables - beside
+            self.found.variables - absorbed != self.true.variables - absorbed
         ):
             return False
 
-        def off(theta: Floats) -> Floats:
-            found = self.found.value(self.columns, theta[1:])
-            return np.asarray(theta[0] * self._own(found) - true)
+        def residual(theta: Floats) -> Floats:
+            values = self.found.value(self.columns, theta[1:])
+            return np.asarray(theta[0] * self._projected(values) - true)
 
-        own = self._own(self.found.value(self.columns))
-        size = float(own @ own)
+        proposed = self._projected(self.found.value(self.columns))
+        size = float(proposed @ proposed)
         if not np.isfinite(size) or size == 0.0:
             return False
-        theta = np.array([float(own @ true) / size, *self.found.constants])
-        r, damping = off(theta), 1e-3
+        theta = np.array([float(proposed @ true) / size, *self.found.constants])
+        r, damping = residual(theta), 1e-3
         for _ in range(_ROUNDS):
             step = _STEP * np.maximum(np.abs(theta), 1e-6)
-            J = np.column_stack([(off(theta + h) - r) / h.sum() for h in np.diag(step)])
+            J = np.column_stack([(residual(theta + h) - r) / h.sum() for h in np.diag(step)])
             if not np.all(np.isfinite(J)) or np.abs(r).max() < 0.1 * EQUIVALENT:
                 break
             scale = np.sqrt((J**2).sum(axis=0)) + 1e-300
             A = np.vstack([J / scale, np.sqrt(damping) * np.eye(len(theta))])
             move = np.linalg.lstsq(A, -np.append(r, np.zeros(len(theta))), rcond=None)[0] / scale
-            tried = off(theta + move)
-            with np.errstate(over="ignore"):  # a step too far
+            tried = residual(theta + move)
+            with np.errstate(over="ignore"):  # too long a step
                 better = bool(np.all(np.isfinite(tried)) and tried @ tried < r @ r)
             if better:
                 theta, r, damping = theta + move, tried, max(damping / 5.0, 1e-12)

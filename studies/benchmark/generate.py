@@ -1,9 +1,9 @@
 """`python -m studies.benchmark.generate`: make tasks from a key, the same bytes for the same key.
 
 Everything random in a task comes from HMAC-SHA256(key, id of the task). The public tasks are
-those of the key "public"; those of another key cannot be known before it is. Which effects a task
-hides, and how strongly, follows from the key as well: an id tells its track alone, and an entrant
-cannot tell a private task from a public one.
+those of the key "public"; those of another key are unknown until the key is known. The key
+also determines which effects a task hides, and how strongly: an id contains only its track, and an
+entrant cannot distinguish a private task from a public one.
 
 Needs hilcal; track mujoco also `mujoco`; the real tracks the folder HILCAL_DATA.
 """
@@ -43,15 +43,15 @@ _DECIMALS = {**dict.fromkeys(JOINTS, 7), **dict.fromkeys(POSITION, 6)}
 
 @dataclass(frozen=True, slots=True)
 class Spec:
-    """A task that is to be made.
+    """Specification of a task.
 
     Attributes:
-        id: its name.
+        id: name of the task.
         track: "elastic", "mujoco", "law", "ur10" or "ur5".
-        number: of the task among those of its track, from 0, in the order of cells.
-        poses: how many are trained on.
+        number: of the task within its track, from 0, in the order of cells.
+        poses: number of training poses.
         strength: of each effect; 0 for none.
-        count: effects that are hidden.
+        count: number of hidden effects.
     """
 
     id: str
@@ -65,7 +65,7 @@ class Spec:
 def specs(part: str, key: str, tracks: Sequence[str], rounds: int) -> Iterator[Spec]:
     """Yield all tasks of a part, each cell of N, strength and kind `rounds` times.
 
-    Ids are given out in an order that the key decides.
+    The key determines the order of the ids.
     """
     for track in tracks:
         cells: list[tuple[int, float, int]]
@@ -78,13 +78,13 @@ def specs(part: str, key: str, tracks: Sequence[str], rounds: int) -> Iterator[S
             cells += [(n, 0.0, 0) for n in POSES]
         cells = cells * rounds
         order = seeded(key, f"{part} {track}").permutation(len(cells))
-        for number, (at, (n, strength, count)) in enumerate(zip(order, cells, strict=True)):
-            yield Spec(f"{track}-{at + 1:03d}", track, number, n, strength, count)
+        for number, (place, (n, strength, count)) in enumerate(zip(order, cells, strict=True)):
+            yield Spec(f"{track}-{place + 1:03d}", track, number, n, strength, count)
 
 
-def seeded(key: str, what: str) -> np.random.Generator:
-    """Return the generator of one thing under a key."""
-    digest = hmac.new(key.encode(), what.encode(), "sha256").digest()
+def seeded(key: str, name: str) -> np.random.Generator:
+    """Return the generator of a name under a key."""
+    digest = hmac.new(key.encode(), name.encode(), "sha256").digest()
     return np.random.default_rng(int.from_bytes(digest, "big"))
 
 
@@ -126,14 +126,14 @@ def make(spec: Spec, part: str, key: str) -> dict[str, str]:
     if c.states.time is not None:
         further["time_s"] = c.states.time
     further |= task.columns
-    seen = {name: read[:, j] for j, name in enumerate(POSITION)}
+    measured = {name: read[:, j] for j, name in enumerate(POSITION)}
     true = {name: task.position[:, j] for j, name in enumerate(POSITION)}
     first, last = slice(0, c.n_train), slice(c.n_train, None)
     labels = {"pose": c.pose, "load": c.load}
     return {
         "task.json": json.dumps(about, indent=1) + "\n",
         "robot.urdf": urdf(cell.arm),
-        "train.csv": _csv(labels, {**states, **seen, **further}, first),
+        "train.csv": _csv(labels, {**states, **measured, **further}, first),
         "test.csv": _csv(labels, {**states, **further}, last),
         "truth.json": json.dumps({"part": part, **task.truth}, indent=1) + "\n",
         "truth.csv": _csv({}, true, last, decimals=7),
@@ -141,7 +141,7 @@ def make(spec: Spec, part: str, key: str) -> dict[str, str]:
 
 
 def _simulated(spec: Spec, part: str, key: str, rng: np.random.Generator) -> Made:
-    """Make a simulated task; over the tasks of a track effects come in turn, arms at random."""
+    """Make a simulated task; over the tasks of a track effects take turns, arms are random."""
     turn = seeded(key, f"{part} {spec.track} effects")
     c = campaign(str(rng.choice(ARMS)), spec.poses, rng)
     if spec.track == "law":
@@ -188,8 +188,8 @@ def generate(
         valid = "none" if part == PUBLIC else "--key KEY, another than that of the public part"
         raise InputError(f"key {key!r} for the {part} part; valid: {valid}")
     every = ("elastic", "mujoco", "law", *real.SERIES)
-    wanted = tuple(tracks.split(",")) if tracks else every
-    for track in wanted:
+    chosen = tuple(tracks.split(",")) if tracks else every
+    for track in chosen:
         if track not in every:
             raise InputError(f"track {track!r}; valid: {', '.join(every)}")
         lacks = _lacking(track)
@@ -205,7 +205,7 @@ def generate(
 
 
 def _lacking(track: str) -> str:
-    """Return what a track needs and is not there, in words; empty where all is."""
+    """Return what a track lacks, as text; empty where nothing is missing."""
     if track == "mujoco" and find_spec("mujoco") is None:
         return "it needs `pip install mujoco`"
     if track in real.SERIES and not os.environ.get("HILCAL_DATA"):

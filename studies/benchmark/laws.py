@@ -1,4 +1,4 @@
-"""Track law: laws that no catalogue has, each a formula of what is recorded."""
+"""Track law: laws outside of every catalogue, formulas of recorded quantities."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ QUANTITIES = {
     "time": "time_s",
     "air": "air_degC",
 }
-"""What a law may depend on: the name in a formula, and the column that holds it."""
+"""Quantities of laws: name in a formula, and name of the column."""
 LAWS: tuple[tuple[str, str], ...] = (
     ("q2", "sin(3*q4)"),
     ("q3", "tanh((time - {t40:.4g})/{t10:.4g})"),
@@ -35,14 +35,14 @@ LAWS: tuple[tuple[str, str], ...] = (
     ("q2", "arctan(tau2/{half:.4g})"),
     ("q3", "tau3*(air - 22)"),
 )
-"""What each acts on, and its form; the gain is found, constants in braces are drawn."""
+"""Site and form of each law; the gain follows from the strength, constants in braces are drawn."""
 
 
 def law(c: Campaign, number: int, strength: float, rng: np.random.Generator) -> Made:
-    """Hide law `number` at a strength: rms of its motion of the trained readings over the noise.
+    """Hide law `number` at a strength, its rms motion of the training readings over the noise.
 
-    A joint's law adds to its angle, exactly, before the arm gives way; "base_z" displaces the
-    target along z of the base. The law's quantities are the columns as they are written.
+    The law of a joint is added to its angle before the elastic deflection; "base_z" displaces the
+    target along z of the base. The quantities have the rounded values of the written columns.
 
     Raises:
         InputError: a law that moves nothing in these states.
@@ -55,8 +55,8 @@ def law(c: Campaign, number: int, strength: float, rng: np.random.Generator) -> 
         "x_force_N": np.round(np.linalg.norm(c.states.wrench[:, :3], axis=1), 3),
         "air_degC": np.round(air(time, rng), 2),
     }
-    known = {f"q{j + 1}_rad": c.states.q[:, j] for j in range(6)} | {"time_s": time} | further
-    columns = {name: known[column] for name, column in QUANTITIES.items()}
+    written = {f"q{j + 1}_rad": c.states.q[:, j] for j in range(6)} | {"time_s": time} | further
+    columns = {name: written[column] for name, column in QUANTITIES.items()}
     acts_on, form = LAWS[number % len(LAWS)]
     last = float(time.max())
     form = form.format(

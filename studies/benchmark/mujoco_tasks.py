@@ -26,27 +26,27 @@ SHOWN = (
     "encoder_offset", "joint_coupling", "transmission_error", "link_geometry", "link_mass",
 )  # fmt: skip
 """Effects that this arm can have."""
-_START = 0.05  # of the size that is drawn; the strength decides
+_START = 0.05  # first trial, as a share of the drawn size
 _ROUNDS = 6
-_CLOSE = 1e-3  # of the strength
+_CLOSE = 1e-3  # relative tolerance of the strength
 
 
 def mujoco_task(
     c: Campaign, choice: Sequence[str], count: int, strength: float, rng: np.random.Generator
 ) -> Made:
-    """Hide effects, each of a strength: rms motion of the trained readings over the noise.
+    """Hide effects of a strength, the rms motion of the training readings over the noise.
 
     Directions are drawn as for the other simulated arm; no mechanics are shared.
 
     Args:
         c: the campaign.
         choice: effects in the order in which they are tried.
-        count: how many are hidden.
-        strength: of each.
+        count: number of hidden effects.
+        strength: of each effect.
         rng: generator.
 
     Raises:
-        InputError: fewer of them can be hidden so.
+        InputError: fewer of them can be hidden.
     """
     cell, train = c.cell, c.states[: c.n_train]
     soft = joint_compliance(cell.arm, rng)
@@ -59,10 +59,10 @@ def mujoco_task(
     registration, _ = stand(cell, rng)
     draw = Draw(cell.arm, soft, typical_torque(cell.arm))
 
-    def seen(more: Hidden, states: States) -> Floats:
+    def position(further: Hidden, states: States) -> Floats:
         arm = Springs(
             urdf(cell.arm), cell.tool_mass, cell.tool_com, cell.load_point, cell.target[:3, 3],
-            cell.gravity, {**hidden, **more}, registration,
+            cell.gravity, {**hidden, **further}, registration,
         )  # fmt: skip
         try:
             return arm.read(states.q, states.wrench, np.asarray(states.time))
@@ -70,9 +70,9 @@ def mujoco_task(
             raise InputError(f"no equilibrium: {error}; valid: weaker effects") from error
 
     def hide(name: str) -> None:
-        before, value = seen({}, train), _START * draw.effect(name, rng)
+        without, value = position({}, train), _START * draw.effect(name, rng)
         for _ in range(_ROUNDS):
-            size = float(np.sqrt(np.mean((seen({name: value}, train) - before) ** 2)))
+            size = float(np.sqrt(np.mean((position({name: value}, train) - without) ** 2)))
             if abs(size / (strength * SIGMA) - 1.0) < _CLOSE:
                 hidden[name] = value
                 return
@@ -81,4 +81,4 @@ def mujoco_task(
 
     names = hide_each(choice, count, hide)
     parameters = {name: np.array(v).tolist() for name, v in hidden.items()}
-    return Made(c, seen({}, c.states), named(names, strength, parameters))
+    return Made(c, position({}, c.states), named(names, strength, parameters))

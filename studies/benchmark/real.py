@@ -1,4 +1,4 @@
-"""Tracks ur10 and ur5: few poses of real arms, and others to predict.
+"""Tracks ur10 and ur5: few poses of real arms to train on, and others to predict.
 
 The readings are public (MIT licence) but not part of this repository: HILCAL_DATA names a folder
 with `ipa_ur10` (github.com/christianlandgraf/ipa-robot-accuracy) and `jacobi_ur5`
@@ -35,8 +35,9 @@ _CARRIED: dict[str, tuple[float, list[float], list[float], float]] = {
 }
 """Mass, kg, centre of mass and nominal target, m, and noise of one reading and axis, m.
 
-Of the UR10 as its data say, 0.017 mm in three dimensions; the UR5's tool is not published and
-assumed, its noise is half of the tracker's maximum permissible error, 15 µm + 6 µm/m, at 1.5 m.
+The noise of the UR10 is that stated with its data, 0.017 mm in three dimensions. The tool of the
+UR5 is not published, but assumed; its noise is half of the tracker's maximum permissible error,
+15 µm + 6 µm/m, at 1.5 m.
 """
 
 
@@ -44,7 +45,7 @@ def real_task(track: str, number: int, poses: int, rng: np.random.Generator) -> 
     """Make a task: `poses` readings drawn from a series, and others to predict.
 
     UR10: 200 others of series B (even numbers) or C (odd). UR5: 200 others of the grid (even), or
-    the 20 test poses of random.csv (odd). The truth is what was read there, with its noise.
+    the 20 test poses of random.csv (odd). The truth are the readings there, with their noise.
 
     Raises:
         InputError: files that are missing or damaged.

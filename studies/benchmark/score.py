@@ -1,15 +1,15 @@
-"""Score results against the truth; numpy alone. `python -m benchmark.score TASKS RESULTS > F.json`.
+"""Score results against the truth, with numpy only: `python -m benchmark.score TASKS RESULTS`.
 
-RESULTS holds a folder of each entrant with a file TASK.json of each task.
+RESULTS has a folder for each entrant, with a file TASK.json for each task. The scores are JSON.
 
 Errors are distances at the test rows. Coverage is the share of coordinates within 1.96 standard
 deviations; the interval score of these 95 % intervals is proper, so that wide ones do not win:
 
-    S = (upper - lower) + (2 / 0.05) (what the truth lies outside by)
+    S = (upper - lower) + (2 / 0.05) (distance of the truth from the interval)
 
 (Gneiting and Raftery, Strictly proper scoring rules, J. Am. Stat. Assoc. 102, 2007). On real arms
-the truth was read with noise, which is added to the entrant's variance. The log score of the
-naming is the mean over candidates of log p of what is the case, p at least 0.01; 0 is perfect,
+the truth has noise, whose variance is added to the entrant's. The log score of the naming is the
+mean over candidates of log p, p the stated probability of the truth, at least 0.01; 0 is perfect,
 and 0.5 for everything gives -0.69.
 """
 
@@ -27,25 +27,25 @@ from .task import BenchmarkError, Result, Task, Truth, folders, read_result, rea
 
 REAL = ("ur10", "ur5")
 Z = 1.959964
-"""Half of a 95 % interval, standard deviations."""
+"""Half width of a 95 % interval, standard deviations."""
 OUTSIDE = 0.05
 LEAST = 0.01
-"""Probability below which a wrong answer costs no more."""
+"""Least probability in the log score."""
 PRESENT = 0.5
-"""Probability over which an effect counts as named."""
+"""Probability above which an effect counts as named."""
 TINY = 1e-9
-"""Least error that is told apart, m."""
+"""Smaller errors count as equal to this one, m."""
 RESAMPLED = 2000
 """Bootstrap samples of tasks."""
 Row = dict[str, Any]
 MEANS = (
     "coverage", "interval_score_in_noise", "log_score", "false_alarms", "found", "law_equivalent",
 )  # fmt: skip
-"""Scores whose mean over tasks is told, with its interval."""
+"""Scores reported as the mean over tasks, with its interval."""
 
 
 def score(task: Task, truth: Truth, result: Result) -> Row:
-    """Return the scores of one result; None where the entrant, or the task, has nothing of it.
+    """Return the scores of one result; None where entrant or task lacks the data of a score.
 
     Raises:
         BenchmarkError: a law that cannot be read.
@@ -76,31 +76,33 @@ def score(task: Task, truth: Truth, result: Result) -> Row:
 
 
 def _naming(p: Mapping[str, float], truth: Truth) -> Row:
-    there = set(truth.about["effects"])
+    present = set(truth.about["effects"])
     scored = {name: value for name, value in p.items() if name not in truth.about["either"]}
-    right = [value if name in there else 1.0 - value for name, value in scored.items()]
-    absent = [value for name, value in scored.items() if name not in there]
+    right = [value if name in present else 1.0 - value for name, value in scored.items()]
+    absent = [value for name, value in scored.items() if name not in present]
     return {
         "log_score": float(np.mean(np.log(np.maximum(right, LEAST)))),
         "false_alarms": float(np.mean(np.array(absent) > PRESENT)),
-        "found": float(np.mean([p[name] > PRESENT for name in there])) if there else None,
+        "found": float(np.mean([p[name] > PRESENT for name in present])) if present else None,
     }
 
 
-def _law(said: object, true: Mapping[str, str], columns: Mapping[str, Floats]) -> Row:
+def _law(answer: object, true: Mapping[str, str], columns: Mapping[str, Floats]) -> Row:
     try:
-        formula, law = (Formula.parse(text, columns) for text in (said, true["formula"]))
+        formula, law = (Formula.parse(text, columns) for text in (answer, true["formula"]))
     except FormulaError as error:
         raise BenchmarkError(f"law: {error}") from error
-    found = Comparison(formula, law, columns, true["acts_on"])
-    return {"law_error": found.error(), "law_equivalent": float(found.equivalent())}
+    comparison = Comparison(formula, law, columns, true["acts_on"])
+    return {
+        "law_error": comparison.error(), "law_equivalent": float(comparison.equivalent()),
+    }  # fmt: skip
 
 
 def score_all(tasks: Path, results: Path) -> dict[str, Any]:
-    """Return {"tasks": a row of each entrant and task, "groups": what they come to}.
+    """Return {"tasks": a row of each entrant and task, "groups": their summaries}.
 
-    A run that failed, or whose file is not as the format says, is a row with its reason: "failed".
-    Who answers a law in any task has not found those of the tasks where it answers none.
+    A run that failed, or whose file is invalid, is a row with its reason as "failed". For an
+    entrant that answers a law in any task, a task without an answer counts as not equivalent.
 
     Raises:
         BenchmarkError: no tasks, no entrants, or a task that cannot be read.
@@ -138,21 +140,21 @@ def score_all(tasks: Path, results: Path) -> dict[str, Any]:
 
 
 def groups(rows: Sequence[Row]) -> list[Row]:
-    """Return what the scores come to: per track, N and strength, and per track as a whole.
+    """Summarise the scores by track, number of poses and strength, and by track alone.
 
     `error_m` and `relative` are geometric means over the tasks that an entrant did; `relative` is
-    to the best entrant's error in each task. Errors under a nanometre count as one. Intervals are
-    of 95 %, by bootstrap over tasks.
-    `log_score_of_the_rate` is that of saying how often candidates are present, of each the same.
+    the error divided by the best entrant's error in each task. Errors under a nanometre count as
+    one. Intervals are 95 % intervals by bootstrap over tasks. `log_score_of_the_rate` is the score
+    of stating the share of present candidates as the probability of each candidate.
     """
     out = []
     for track in dict.fromkeys(row["track"] for row in rows):
-        own = [row for row in rows if row["track"] == track]
-        cells = sorted({(row["poses"], row["strength"]) for row in own})
-        out.append(_group(own, {"track": track, "poses": None, "strength": None}))
+        of_track = [row for row in rows if row["track"] == track]
+        cells = sorted({(row["poses"], row["strength"]) for row in of_track})
+        out.append(_group(of_track, {"track": track, "poses": None, "strength": None}))
         out += [
             _group(
-                [row for row in own if (row["poses"], row["strength"]) == cell],
+                [row for row in of_track if (row["poses"], row["strength"]) == cell],
                 {"track": track, "poses": cell[0], "strength": cell[1]},
             )
             for cell in cells
@@ -166,13 +168,14 @@ def _group(rows: Sequence[Row], name: Row) -> Row:
         if row["failed"] is None:
             best[row["task"]] = min(best.get(row["task"], np.inf), max(row["rms_m"], TINY))
     rate = float(np.mean([row["present"] for row in rows]))
-    known = rate if 0.0 < rate < 1.0 else 1.0
-    chance = rate * np.log(known) + (1.0 - rate) * (np.log(1.0 - rate) if known < 1.0 else 0.0)
+    mixed = 0.0 < rate < 1.0
+    chance = rate * np.log(rate) + (1.0 - rate) * np.log(1.0 - rate) if mixed else 0.0
     entrants = []
     for entrant in dict.fromkeys(row["entrant"] for row in rows):
-        own = [row for row in rows if row["entrant"] == entrant]
-        done = [row for row in own if row["failed"] is None]
-        entry: Row = {"entrant": entrant, "tasks": len(own), "failed": len(own) - len(done)}
+        of_entrant = [row for row in rows if row["entrant"] == entrant]
+        done = [row for row in of_entrant if row["failed"] is None]
+        count = len(of_entrant)
+        entry: Row = {"entrant": entrant, "tasks": count, "failed": count - len(done)}
         if done:
             error = np.log([max(row["rms_m"], TINY) for row in done])
             least = np.log([best[row["task"]] for row in done])
@@ -192,7 +195,7 @@ def _group(rows: Sequence[Row], name: Row) -> Row:
 
 
 def _columns(rows: Sequence[Row], keys: Sequence[str]) -> Iterator[tuple[str, Floats]]:
-    """Yield the scores that are there."""
+    """Yield the scores that some row has."""
     for key in keys:
         values = [row[key] for row in rows if row[key] is not None]
         if values:
@@ -200,7 +203,7 @@ def _columns(rows: Sequence[Row], keys: Sequence[str]) -> Iterator[tuple[str, Fl
 
 
 def _interval(values: Floats, back: Any) -> Row:
-    """Return the mean over tasks and its 95 % interval by bootstrap, each through `back`."""
+    """Return the mean over tasks and its 95 % interval by bootstrap, transformed by `back`."""
     rng = np.random.default_rng(0)
     drawn = rng.integers(len(values), size=(RESAMPLED, len(values)))
     low, high = np.quantile(values[drawn].mean(axis=1), (0.025, 0.975))
@@ -210,13 +213,13 @@ def _interval(values: Floats, back: Any) -> Row:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Score, print JSON, and return the exit code: 2 for input that is not as it should be."""
+    """Score, print JSON, and return the exit code: 2 for wrong input."""
     parser = argparse.ArgumentParser(prog="score", description="Score results of the benchmark.")
     parser.add_argument("tasks", type=Path, help="folder of tasks with their truth")
     parser.add_argument("results", type=Path, help="folder of a folder of each entrant")
-    given = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
     try:
-        document = score_all(given.tasks, given.results)
+        document = score_all(options.tasks, options.results)
     except BenchmarkError as error:
         print(f"score: {error}", file=sys.stderr)
         return 2

@@ -1,4 +1,4 @@
-"""Read a task of the benchmark, and what an entrant answered; numpy alone."""
+"""Read tasks of the benchmark and answers of entrants; needs only numpy."""
 
 import csv
 import json
@@ -17,13 +17,13 @@ POSITION = ("x_m", "y_m", "z_m")
 WRENCH = ("fx_N", "fy_N", "fz_N", "mx_Nm", "my_Nm", "mz_Nm")
 TOLD = ("id", "track", "n_poses", "n_train", "n_test", "noise", "candidates")
 HIDDEN = ("part", "kind", "strength_sigma", "effects", "either")
-"""Keys of task.json and truth.json that are used here."""
+"""Required keys of task.json and truth.json."""
 SECRET = ("truth.json", "truth.csv")
-"""Files of a task that no entrant sees."""
+"""Files of a task that entrants do not get."""
 
 
 class BenchmarkError(ValueError):
-    """A file that is not as the format says; one line: what, where, what would be valid."""
+    """A file with a wrong format; the message is one line: what, where, what would be valid."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,12 +47,12 @@ class Table:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Task:
-    """A task as an entrant sees it.
+    """A task for an entrant.
 
     Attributes:
-        folder: where it lies.
+        folder: of the task.
         about: the content of task.json.
-        train: readings to learn from.
+        train: training readings.
         test: states to predict.
     """
 
@@ -63,19 +63,19 @@ class Task:
 
     @property
     def candidates(self) -> tuple[str, ...]:
-        """Effects among which a naming entrant distributes probability; empty: no naming."""
+        """Effects whose probabilities are asked for; empty for tasks without naming."""
         return tuple(c["effect"] for c in self.about["candidates"])
 
     @property
     def quantities(self) -> dict[str, Floats]:
-        """(N_test,) values of what a law may depend on, by the names that formulas use."""
+        """(N_test,) values of the quantities of laws, by their names in formulas."""
         named: Mapping[str, str] = self.about.get("quantities", {})
         return {name: self.test.numbers[column] for name, column in named.items()}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """What is scored against.
+    """The truth of a task.
 
     Attributes:
         about: the content of truth.json.
@@ -88,14 +88,14 @@ class Truth:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Result:
-    """What an entrant answered.
+    """Answer of an entrant.
 
     Attributes:
-        prediction: (N_test, 3), m.
-        std: (N_test, 3) standard deviations of its errors, m; or None.
+        prediction: (N_test, 3) positions, m.
+        std: (N_test, 3) standard deviations of their errors, m; or None.
         effects: probability that each candidate is present; or None.
-        law: its formula; or None.
-        seconds: wall time of its work.
+        law: formula; or None.
+        seconds: duration.
     """
 
     prediction: Floats
@@ -111,17 +111,17 @@ def folders(tasks: Path) -> Iterator[Path]:
     Raises:
         BenchmarkError: there is none.
     """
-    found = sorted(path.parent for path in Path(tasks).glob("*/task.json"))
-    if not found:
+    paths = sorted(path.parent for path in Path(tasks).glob("*/task.json"))
+    if not paths:
         raise BenchmarkError(f"{tasks}: no task here; valid: a folder of folders with a task.json")
-    yield from found
+    yield from paths
 
 
 def read_task(folder: Path) -> Task:
     """Read a task.
 
     Raises:
-        BenchmarkError: a file that is missing or not as the format says.
+        BenchmarkError: a file that is missing or has a wrong format.
     """
     about = _about(folder / "task.json", TOLD)
     train = _table(folder / "train.csv", (*JOINTS, *POSITION, *WRENCH))
@@ -133,7 +133,7 @@ def read_truth(folder: Path) -> Truth:
     """Read the truth of a task.
 
     Raises:
-        BenchmarkError: a file that is missing or not as the format says.
+        BenchmarkError: a file that is missing or has a wrong format.
     """
     about = _about(folder / "truth.json", HIDDEN)
     return Truth(about, _table(folder / "truth.csv", POSITION).of(POSITION))
@@ -145,26 +145,26 @@ def for_entrants(folder: Path, to: Path) -> None:
 
 
 def read_result(path: Path, task: Task) -> Result:
-    """Read what an entrant answered to a task.
+    """Read the answer of an entrant to a task.
 
     Raises:
         BenchmarkError: no file, a run that failed, wrong shapes, numbers that are not finite,
             probabilities outside of 0 to 1, candidates that are missing or unknown.
     """
-    said = _json(path)
-    if not isinstance(said, dict) or "failed" in said:
-        why = said["failed"] if isinstance(said, dict) else "not a JSON object"
+    answer = _json(path)
+    if not isinstance(answer, dict) or "failed" in answer:
+        why = answer["failed"] if isinstance(answer, dict) else "not a JSON object"
         raise BenchmarkError(f"{path}: failed: {' '.join(str(why).split())}")
     rows = len(task.test.pose)
-    prediction, std = _rows(said.get("prediction_m"), rows, "prediction_m", path), None
-    if said.get("std_m") is not None:
-        std = _rows(said["std_m"], rows, "std_m", path)
+    prediction, std = _rows(answer.get("prediction_m"), rows, "prediction_m", path), None
+    if answer.get("std_m") is not None:
+        std = _rows(answer["std_m"], rows, "std_m", path)
         if np.any(std < 0.0):
             raise BenchmarkError(f"{path}: std_m has negative numbers; valid: 0 or more, m")
-    effects = said.get("effects")
+    effects = answer.get("effects")
     if effects is not None and task.candidates:
         effects = _probabilities(effects, task.candidates, path)
-    law, seconds = said.get("law"), said.get("seconds")
+    law, seconds = answer.get("law"), answer.get("seconds")
     if law is not None and not (isinstance(law, dict) and "formula" in law):
         raise BenchmarkError(f'{path}: law; valid: {{"formula": TEXT}} or null')
     if not isinstance(seconds, int | float) or not 0.0 <= seconds < np.inf:
@@ -228,10 +228,10 @@ def _table(path: Path, needed: Sequence[str]) -> Table:
         raise BenchmarkError(f"{path}: no table with a header ({error})") from error
     if not rows or {len(row) for row in rows} != {len(header)}:
         raise BenchmarkError(f"{path}: rows of other lengths than the header's {len(header)}")
-    words = dict(zip(header, zip(*rows, strict=True), strict=True))
-    texts = [words.pop(name, ("",) * len(rows)) for name in ("pose", "load")]
+    cells = dict(zip(header, zip(*rows, strict=True), strict=True))
+    texts = [cells.pop(name, ("",) * len(rows)) for name in ("pose", "load")]
     try:
-        numbers = {name: np.array(column, dtype=float) for name, column in words.items()}
+        numbers = {name: np.array(column, dtype=float) for name, column in cells.items()}
     except ValueError as error:
         raise BenchmarkError(f"{path}: {error}; valid: numbers") from error
     lacking = [name for name in needed if name not in numbers]

@@ -18,9 +18,9 @@ from studies.benchmark.campaign import (
 
 
 def bare(cell: Cell, rng: np.random.Generator) -> World:
-    """Return a world of compliant joints, an unknown registration and an unknown target alone.
+    """Return a world with compliant joints, unknown registration and unknown target only.
 
-    Its noise is the same in all directions, and the arm repeats exactly.
+    Its noise is isotropic, and the arm repeats exactly.
     """
     noise = SimulatedNoise((SIGMA, 0.0), (SIGMA, 0.0))
     world = nothing_hidden(cell, rng, noise=noise, joint_std=0.0)
@@ -36,12 +36,12 @@ def elastic(
     Args:
         c: the campaign.
         choice: effects in the order in which they are tried.
-        count: how many are hidden.
-        strength: rms of what each moves the trained readings by, over the noise.
+        count: number of hidden effects.
+        strength: rms motion of the training readings by each effect, over the noise.
         rng: generator.
 
     Raises:
-        InputError: fewer of them can be hidden so.
+        InputError: fewer of them can be hidden.
     """
     world = bare(c.cell, rng)
     if "joint_stiffening" in choice[:count]:

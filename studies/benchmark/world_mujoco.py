@@ -1,11 +1,10 @@
 """Track mujoco: an elastic arm in MuJoCo, which shares no mechanics with any entrant.
 
-The arm is the URDF as MuJoCo reads it, rebuilt with springs: behind every commanded hinge a second
-one about the same axis that is held by a spring, and where they give way spring hinges across the
-axes (bearings), at the base, at the flange and in pieces along the long links (beams). Static
-equilibrium is where all springs carry what gravity and load exert on them.
+The arm is the URDF as MuJoCo reads it, rebuilt with springs: each commanded hinge is followed by a
+spring hinge about the same axis. Compliant bearings, base, flange and long links (beams, in pieces)
+are spring hinges, too. In static equilibrium all springs carry the moments of gravity and load.
 
-Needs mujoco and numpy alone.
+Needs only mujoco and numpy.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,13 +17,13 @@ import numpy as np
 from .formula import Floats
 
 PIECES = 8
-"""Spring hinges that stand for the bending of a beam."""
+"""Number of pieces of a beam, each with spring hinges."""
 _ROUNDS = 60
-_STILL = 1e-13  # rad: no spring moves any more
+_STILL = 1e-13  # rad, motion of a spring below which the iteration ends
 _LIGHT = 1e-9  # kg and kg·m², of bodies that only carry hinges
 _ROTOR = 1e-2  # kg·m², for MuJoCo's mass matrix, which statics does not use
 Hidden = Mapping[str, Floats]
-"""Parameters of effects by name, SI; what is not named is zero:
+"""Parameters of effects by name, SI; missing ones are zero:
 
 joint_compliance (6,), joint_stiffening (6,) s in dq = c tau + s tau³, joint_tilt_compliance (6,),
 base_compliance (3,), tool_compliance (2,) along and across, periodic_joint_compliance (6, 2) of
@@ -42,12 +41,12 @@ class Springs:
 
     Attributes:
         urdf: the nominal arm.
-        tool_mass: what the flange carries, kg.
-        tool_com: (3,) its centre of mass, flange axes, m.
-        load_point: (3,) where loads act, flange axes, m, before its effect.
-        target: (3,) flange axes, m, before its effect.
+        tool_mass: mass of the tool, kg.
+        tool_com: (3,) centre of mass of the tool, flange axes, m.
+        load_point: (3,) nominal point of load, flange axes, m.
+        target: (3,) nominal target, flange axes, m.
         gravity: (3,) base axes, m/s².
-        hidden: what the arm has that its description does not tell.
+        hidden: hidden effects.
         registration: (4, 4) base in the instrument's axes.
     """
 
@@ -100,11 +99,11 @@ class Springs:
         for axis, c in zip(np.eye(3), self._of("base_compliance", 3), strict=True):
             hinge(body, f"base{axis.argmax()}", axis, c)
         for k in range(7):
-            own = number[f"link_{k + 1}" if k < 6 else "tool0"]
-            pos, quat = self._displaced(nominal.body_pos[own], nominal.body_quat[own], geometry[k])
+            i = number[f"link_{k + 1}" if k < 6 else "tool0"]
+            pos, quat = self._displaced(nominal.body_pos[i], nominal.body_quat[i], geometry[k])
             if k in bent:
                 body, pos = self._beam(body, pos, beams[bent.index(k)], hinge, carrier)
-            mass, com = float(nominal.body_mass[own]), nominal.body_ipos[own]
+            mass, com = float(nominal.body_mass[i]), nominal.body_ipos[i]
             if k < 6:
                 com = com + moments[k] / mass
             else:
@@ -126,7 +125,7 @@ class Springs:
         return spec.compile()
 
     def _displaced(self, pos: Floats, quat: Floats, twist: Floats) -> tuple[Floats, Floats]:
-        """Return place and attitude (w, x, y, z) after a shift and a turn in their own axes."""
+        """Return position and attitude (w, x, y, z) after a twist in the body's axes."""
         mj, shift, turn, out = self._mujoco, np.zeros(3), np.zeros(4), np.zeros(4)
         mj.mju_rotVecQuat(shift, twist[:3], quat)
         size = float(np.linalg.norm(twist[3:]))
@@ -137,7 +136,7 @@ class Springs:
     def _beam(
         self, body: Any, tip: Floats, compliance: Floats, hinge: Any, carrier: Any
     ) -> tuple[Any, Floats]:
-        """Cut the way to the next joint into pieces with spring hinges in their middles.
+        """Divide the link to the next joint into pieces with spring hinges in their middles.
 
         A piece of length l bends by l/EI M and twists by l/GJ M.
         """
@@ -154,19 +153,19 @@ class Springs:
         return body, 0.5 * tip / PIECES
 
     def flange(self, q: Floats, wrench: Floats) -> tuple[Floats, Floats]:
-        """Return places (N, 3) and attitudes (N, 3, 3) of the flange at rest, base axes, m.
+        """Return positions (N, 3) and attitudes (N, 3, 3) of the flange at rest, base axes, m.
 
-        With K the springs' stiffness, delta their deflections and f what gravity and load exert on
-        them there: K (delta - delta_0) = f, by delta <- delta_0 + f(delta) / K until nothing
-        moves. K is that of MuJoCo's model; where a gear stiffens or its compliance depends on the
-        angle, it is set to what it is in that state.
+        With K the stiffness of the springs, delta their deflections and f the moments of gravity
+        and load on them, K (delta - delta_0) = f is solved by the iteration
+        delta <- delta_0 + f(delta) / K. K is that of MuJoCo's model; a stiffness that depends on
+        torque or angle is set for each state.
 
         Args:
             q: (N, 6) commanded joint angles, rad.
             wrench: (N, 6) force and moment as read, base axes, at the load point, N and N·m.
 
         Raises:
-            RuntimeError: springs that do not come to rest, or that stiffen to nothing.
+            RuntimeError: springs that do not come to rest, or a compliance that is not positive.
         """
         mj, m = self._mujoco, self._model
         d = mj.MjData(m)
@@ -174,7 +173,7 @@ class Springs:
         springs = np.setdiff1d(np.arange(m.nv), command)
         names = [m.joint(int(i)).name for i in springs]
         drives = [(i, int(n[5:])) for i, n in enumerate(names) if n.startswith("drive")]
-        at, gear = (np.array([pair[k] for pair in drives], dtype=int) for k in (0, 1))
+        drive, gear = (np.array([pair[k] for pair in drives], dtype=int) for k in (0, 1))
         stiffening = self._of("joint_stiffening", 6)[gear]
         compliance = self._compliance(q)[:, gear]
         hand, angle = m.body("body6").id, q + self._errors(q)
@@ -194,10 +193,10 @@ class Springs:
                     where = d.xpos[hand] + turn @ point
                     mj.mj_applyFT(m, d, acts[:3], acts[3:], where, hand, force)
                 exerted = force[springs]
-                more = stiffening * exerted[at] ** 2
-                if np.any(compliance[row] + 3.0 * more <= 0.0):
+                change = stiffening * exerted[drive] ** 2
+                if np.any(compliance[row] + 3.0 * change <= 0.0):
                     raise RuntimeError(f"state {row}: a gear would spring back under more torque")
-                soft[at] = compliance[row] + more
+                soft[drive] = compliance[row] + change
                 m.jnt_stiffness[springs] = 1.0 / soft
                 moved = soft * exerted - d.qpos[springs]
                 d.qpos[springs] += moved
@@ -215,7 +214,7 @@ class Springs:
         return np.asarray(self._of("joint_compliance", 6) + waves)
 
     def _errors(self, q: Floats) -> Floats:
-        """Return (N, 6) errors of the joints' angles that do not depend on the load, rad."""
+        """Return (N, 6) errors of the joint angles that are independent of the load, rad."""
         waves = self._of("transmission_error", 6, 1, 2)
         phase = q[:, :, None] * np.arange(1, waves.shape[1] + 1)
         error = self._of("encoder_offset", 6) + q @ self._of("joint_coupling", 6, 6).T
@@ -232,15 +231,15 @@ class Springs:
         """
         place, turn = self.flange(q, wrench)
         place = place + turn @ (self.target + self._of("target_offset", 3))
-        seen = place @ self.registration[:3, :3].T + self.registration[:3, 3]
+        position = place @ self.registration[:3, :3].T + self.registration[:3, 3]
         drift = self._of("tracker_drift", 6)
-        return np.asarray(seen + time[:, None] * (drift[:3] + np.cross(drift[3:], seen)))
+        return np.asarray(position + time[:, None] * (drift[:3] + np.cross(drift[3:], position)))
 
 
 def _long(lengths: Floats) -> list[int]:
-    """Return the numbers of the joints that the two longest links lead to, the lower first.
+    """Return the numbers of the joints at the ends of the two longest links, ascending.
 
-    A link shorter than a third of the longest is none; the way from the base to joint 0 as well.
+    Links shorter than a third of the longest one, and the link to joint 0, are ignored.
     """
     longest = 1 + np.argsort(-lengths[1:], kind="stable")[:2]
     return sorted(int(k) for k in longest if lengths[k] > lengths[1:].max() / 3.0)

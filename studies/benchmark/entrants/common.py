@@ -1,12 +1,12 @@
-"""What the simple entrants share, with numpy alone: a task, an arm, and its fit by least squares.
+"""Common parts of the simple entrants, with numpy only: task, arm, and fit by least squares.
 
 The model of a reading of a target t on the flange, in the tracker's frame:
 
     y = R_b F(q + dq) t + p_b,    dq_j = o_j + c_j τ_j,    F = Π_j T_j X_j Rot(a_j, q_j) · T_tool
 
 R_b, p_b: registration; T_j: nominal placement of joint j, X_j: a small displacement and rotation
-there; c_j: compliance of joint j; τ_j: torque about its axis of the links' weight, the tool's and
-the load's, on the nominal arm. Parameters are fitted by Gauss-Newton on
+of it; c_j: compliance of joint j; τ_j: torque about its axis by the weights of links and tool and
+by the load, on the nominal arm. Parameters are fitted by Gauss-Newton on
 
     Σ |y − f(θ)|² / σ² + Σ (θ_i / s_i)²,    s_i = ∞: free; s_i = 0: held at zero.
 """
@@ -39,7 +39,7 @@ ORDINARY = np.r_[np.tile([5e-4] * 6, 6), np.full(6, 2e-5)]
 compliance of a gear of a mid-sized arm; choices."""
 UNITS = (("q", "_rad"), ("tau", ""))
 MULTIPLES = (0.1, 0.3, 1.0, 3.0, 10.0)
-"""Of `ORDINARY`, that are tried on poses left out."""
+"""Multiples of `ORDINARY` that are tried on poses left out."""
 
 
 @dataclass(frozen=True)
@@ -47,11 +47,11 @@ class ArmRows:
     """N readings.
 
     Attributes:
-        pose: (N,) names of their poses.
+        pose: (N,) names of the poses.
         q: (N, 6) joint angles, rad.
-        torque: (N, 6) about each joint's axis, of the nominal arm, N m.
-        y: (N, 3) positions that were read, m; NaN where they are to be predicted.
-        columns: all columns of numbers, by name; `tau1` ... are those of `torque`.
+        torque: (N, 6) torque about each joint's axis, of the nominal arm, N m.
+        y: (N, 3) measured positions, m; NaN where they are to be predicted.
+        columns: all columns of numbers by name; `tau1`, … are those of `torque`.
     """
 
     pose: npt.NDArray[Any]
@@ -66,8 +66,8 @@ class ArmRows:
         q, nothing = table.of(JOINTS), np.full((len(table.pose), 3), np.nan)
         y = table.of(POSITION) if POSITION[0] in table.numbers else nothing
         torque = arm.torques(q, table.of(WRENCH))
-        own = {f"tau{j + 1}": torque[:, j] for j in range(6)}
-        return cls(np.array(table.pose), q, torque, y, {**table.numbers, **own})
+        torques = {f"tau{j + 1}": torque[:, j] for j in range(6)}
+        return cls(np.array(table.pose), q, torque, y, {**table.numbers, **torques})
 
     def __getitem__(self, i: npt.NDArray[Any]) -> "ArmRows":
         """Return the chosen readings."""
@@ -77,7 +77,7 @@ class ArmRows:
 
 @dataclass(frozen=True)
 class Asked:
-    """A task: its description, rows to learn from and to predict, the nominal arm."""
+    """A task: its description, rows to train on and to predict, the nominal arm."""
 
     task: Task
     train: ArmRows
@@ -129,7 +129,7 @@ class NominalArm:
 
     @classmethod
     def read(cls, urdf: Path, info: dict[str, Any]) -> "NominalArm":
-        """Read it from a URDF and the `arm` of a task."""
+        """Read the arm from a URDF and the `arm` of a task."""
         root = ET.parse(urdf).getroot()  # noqa: S314  (the task's own file)
         above = {j.find("child").get("link"): j for j in root.findall("joint")}  # type: ignore[union-attr]
         links = {x.get("name"): x for x in root.findall("link")}
@@ -159,7 +159,7 @@ class NominalArm:
         return cls(np.array(placements), np.array(axes), T, tuple(bodies), target, load, down)
 
     def frames(self, q: Floats, shifts: Floats | None = None) -> tuple[Floats, Floats]:
-        """(N, 6, 4, 4) joints' placements before and after their turns, base axes.
+        """(N, 6, 4, 4) frames of the joints before and after their rotation, base axes.
 
         Args:
             q: (N, 6) joint angles.
@@ -193,9 +193,9 @@ class NominalArm:
             out[:, j] = np.sum(axis * moment, axis=1)
         return out
 
-    def predict(self, theta: Floats, rows: ArmRows, more: Floats | None = None) -> Floats:
-        """(N, 3) positions of the target in the tracker's frame; more: (N, 6) joint angles."""
-        q = rows.q + theta[COMPLIANCE] * rows.torque + (0.0 if more is None else more)
+    def predict(self, theta: Floats, rows: ArmRows, added: Floats | None = None) -> Floats:
+        """(N, 3) positions of the target in the tracker's frame; `added`: (N, 6) joint angles."""
+        q = rows.q + theta[COMPLIANCE] * rows.torque + (0.0 if added is None else added)
         F = self.frames(q, theta[GEOMETRY].reshape(6, 6))[1][:, 5] @ self.tool
         x = F[:, :3, :3] @ (self.target + theta[6:9]) + F[:, :3, 3]
         return np.asarray(x @ rotation(theta[:3]).T + theta[3:6])
@@ -212,11 +212,11 @@ class NominalArm:
         out[:, :, :3] = np.stack(turned, axis=-1)
         out[:, :, 3:6], out[:, :, 6:9] = np.eye(3), R @ flange[:, :3, :3]
         for j in range(6):
-            at, away = FRAMES + 6 * j, x - before[:, j, :3, 3]
+            start, lever = FRAMES + 6 * j, x - before[:, j, :3, 3]
             axes = before[:, j, :3, :3]
-            out[:, :, at : at + 3] = R @ axes
-            out[:, :, at + 3 : at + 6] = R @ np.cross(axes, away[:, :, None], axis=1)
-            joints[:, :, j] = np.cross(axes @ self.axes[j], away) @ R.T
+            out[:, :, start : start + 3] = R @ axes
+            out[:, :, start + 3 : start + 6] = R @ np.cross(axes, lever[:, :, None], axis=1)
+            joints[:, :, j] = np.cross(axes @ self.axes[j], lever) @ R.T
         out[:, :, COMPLIANCE] = joints * rows.torque[:, None]
         return out, joints
 
@@ -236,14 +236,14 @@ class NominalArm:
     def fit(self, rows: ArmRows, prior: Floats, sigma: float, steps: int = 6) -> Floats:
         """Return θ (51,) by Gauss-Newton; prior (42,): s of geometry and compliance."""
         theta, std = self.registered(rows), np.r_[np.full(FRAMES, np.inf), prior]
-        of = np.flatnonzero(std > 0)
-        scale = np.where(np.isinf(std), 1.0, std)[of]
-        held = np.diag(np.where(np.isinf(std[of]), 0.0, 1.0))
+        free = np.flatnonzero(std > 0)
+        scale = np.where(np.isinf(std), 1.0, std)[free]
+        held = np.diag(np.where(np.isinf(std[free]), 0.0, 1.0))
         for _ in range(steps):
-            A = self.jacobian(theta, rows)[0][:, :, of].reshape(-1, len(of)) * scale / sigma
+            A = self.jacobian(theta, rows)[0][:, :, free].reshape(-1, len(free)) * scale / sigma
             r = (rows.y - self.predict(theta, rows)).ravel() / sigma
-            b = np.r_[r, -held @ (theta[of] / scale)]
-            theta[of] += scale * np.linalg.lstsq(np.vstack([A, held]), b, rcond=1e-12)[0]
+            b = np.r_[r, -held @ (theta[free] / scale)]
+            theta[free] += scale * np.linalg.lstsq(np.vstack([A, held]), b, rcond=1e-12)[0]
         return theta
 
 
@@ -260,7 +260,7 @@ def _origin(origin: Any) -> Floats:
 
 
 Fitter = Callable[[ArmRows, ArmRows], Floats]
-"""Predicts the positions (M, 3) of other rows from rows that were read."""
+"""Predicts the positions (M, 3) of the second rows by a fit to the first ones."""
 
 
 def left_out(rows: ArmRows, predict: Fitter, folds: int = 5) -> Floats:
@@ -269,13 +269,13 @@ def left_out(rows: ArmRows, predict: Fitter, folds: int = 5) -> Floats:
     fold = (np.random.default_rng(0).permutation(len(names)) % folds)[pose]
     out = np.zeros_like(rows.y)
     for k in range(folds):
-        there = fold == k
-        out[there] = rows.y[there] - predict(rows[~there], rows[there])
+        tested = fold == k
+        out[tested] = rows.y[tested] - predict(rows[~tested], rows[tested])
     return out
 
 
 def spread(residual: Floats, asked: Asked) -> Floats:
-    """(M, 3) standard deviation of predictions: rms of poses left out, less the noise."""
+    """(M, 3) standard deviation of predictions: rms on poses left out, without the noise."""
     variance = max(float(np.mean(residual**2)) - asked.sigma**2, (0.1 * asked.sigma) ** 2)
     return np.full((len(asked.test.q), 3), np.sqrt(variance))
 
@@ -283,27 +283,27 @@ def spread(residual: Floats, asked: Asked) -> Floats:
 def chosen(
     asked: Asked, settings: Sequence[float], predict: Callable[[float, ArmRows, ArmRows], Floats]
 ) -> tuple[float, Floats]:
-    """Return the setting that predicts poses left out best, and the residual (N, 3) of them."""
+    """Return the setting that predicts poses left out best, and their residual (N, 3)."""
     tried = [left_out(asked.train, partial(predict, setting)) for setting in settings]
     best = int(np.argmin([np.sum(r**2) for r in tried]))
     return settings[best], tried[best]
 
 
 def ridge(asked: Asked) -> tuple[Callable[[ArmRows], Floats], Floats]:
-    """Choose the prior's multiple for geometry and compliance that poses left out ask for.
+    """Choose the multiple of the prior of geometry and compliance on poses left out.
 
     Returns:
-        A function that fits θ (51,) to rows with it, and the residual (N, 3) of poses left out.
+        A function that fits θ (51,) to rows, and the residual (N, 3) of poses left out.
     """
 
     def fit(multiple: float, rows: ArmRows, steps: int = 4) -> Floats:
         return asked.arm.fit(rows, ORDINARY * multiple, asked.sigma, steps)
 
-    def predict(multiple: float, rows: ArmRows, other: ArmRows) -> Floats:
-        return asked.arm.predict(fit(multiple, rows, 3), other)
+    def predict(multiple: float, rows: ArmRows, tested: ArmRows) -> Floats:
+        return asked.arm.predict(fit(multiple, rows, 3), tested)
 
-    best, off = chosen(asked, MULTIPLES, predict)
-    return lambda rows: fit(best, rows), off
+    best, residual = chosen(asked, MULTIPLES, predict)
+    return lambda rows: fit(best, rows), residual
 
 
 def families(
@@ -313,7 +313,7 @@ def families(
 
     Args:
         asked: the task.
-        theta: (51,) where the arm is linearised.
+        theta: (51,) point of linearisation.
         rows: N readings.
         waves: K; waves of the joints, sin k q and cos k q, k = 1 ... K.
 
@@ -321,20 +321,20 @@ def families(
         (3N, 9) of the frames, and (3N, q) of each family in ordinary magnitudes: link lengths, link
         angles, compliances, and the waves, each octave a family.
     """
-    by, joints = asked.arm.jacobian(theta, rows)
-    each = by[:, :, GEOMETRY].reshape(len(by), 3, 6, 6)
-    z = {"length": 5e-4 * each[..., :3], "angle": 5e-4 * each[..., 3:]}
-    z["give"] = 1e-5 * by[:, :, COMPLIANCE]
+    columns, joints = asked.arm.jacobian(theta, rows)
+    links = columns[:, :, GEOMETRY].reshape(len(columns), 3, 6, 6)
+    z = {"length": 5e-4 * links[..., :3], "angle": 5e-4 * links[..., 3:]}
+    z["give"] = 1e-5 * columns[:, :, COMPLIANCE]
     for k in range(1, waves + 1):
         name = f"octave {int(np.ceil(np.log2(k)))}"
         two = [1e-4 * joints * f(k * rows.q)[:, None] for f in (np.sin, np.cos)]
         z[name] = np.concatenate([*([z[name]] if name in z else []), *two], axis=-1)
-    frames = by[:, :, :FRAMES].reshape(-1, FRAMES)
-    return frames, {n: c.reshape(3 * len(by), -1) for n, c in z.items()}
+    frames = columns[:, :, :FRAMES].reshape(-1, FRAMES)
+    return frames, {n: c.reshape(3 * len(columns), -1) for n, c in z.items()}
 
 
 def wave(name: str, k: int) -> tuple[Callable[[Floats], Floats], Callable[[str], str]]:
-    """Return sine or cosine of k x, and how it is written."""
+    """Return sine or cosine of k x, and its text."""
     f = getattr(np, name)
     return lambda x: np.asarray(f(k * x)), lambda x: f"{name}({k}*{x})"
 
@@ -342,30 +342,30 @@ def wave(name: str, k: int) -> tuple[Callable[[Floats], Floats], Callable[[str],
 def learnt(
     asked: Asked, fit: Callable[[ArmRows], Floats], make: Callable[[], Any]
 ) -> dict[str, Any]:
-    """Add to a fit what a regression learns of its residual, in the tracker's axes.
+    """Add a regression of the residual, in the tracker's axes, to a fit.
 
     Args:
         asked: the task.
         fit: fits θ (51,) to rows.
-        make: makes a regression with `fit` and `predict`, of sines and cosines of the joint angles,
-            torques, and what else the task says that a law may depend on.
+        make: makes a regression with `fit` and `predict`, on sines and cosines of the joint angles,
+            torques, and the task's other quantities of laws.
     """
     named = [c for c in asked.task.about.get("quantities", {}).values() if "_rad" not in c]
 
     def features(rows: ArmRows) -> Floats:
-        more = [rows.columns[name][:, None] for name in named]
-        return np.hstack([np.sin(rows.q), np.cos(rows.q), rows.torque, *more])
+        further = [rows.columns[name][:, None] for name in named]
+        return np.hstack([np.sin(rows.q), np.cos(rows.q), rows.torque, *further])
 
-    seen = features(asked.train)
-    mean, scale = seen.mean(0), np.maximum(seen.std(0), 1e-9)
+    trained = features(asked.train)
+    mean, scale = trained.mean(0), np.maximum(trained.std(0), 1e-9)
 
-    def predict(rows: ArmRows, other: ArmRows) -> Floats:
+    def predict(rows: ArmRows, tested: ArmRows) -> Floats:
         theta = fit(rows)
-        off = rows.y - asked.arm.predict(theta, rows)
-        size = np.sqrt(np.mean(off**2))
-        made = make().fit((features(rows) - mean) / scale, off / size)
-        more = size * made.predict((features(other) - mean) / scale)
-        return np.asarray(asked.arm.predict(theta, other) + more)
+        residual = rows.y - asked.arm.predict(theta, rows)
+        size = np.sqrt(np.mean(residual**2))
+        regression = make().fit((features(rows) - mean) / scale, residual / size)
+        correction = size * regression.predict((features(tested) - mean) / scale)
+        return np.asarray(asked.arm.predict(theta, tested) + correction)
 
     std = spread(left_out(asked.train, predict), asked)
     return {"prediction_m": predict(asked.train, asked.test), "std_m": std}
@@ -373,17 +373,17 @@ def learnt(
 
 @dataclass(frozen=True)
 class Sought:
-    """What a search for formulas is given: quantities, and what a fit leaves, as a value.
+    """Input of a search for formulas: quantities, and a value from the residual of a fit.
 
-    In a task with a law the value is that law's: v = D r / D D of the residuals r, D what they
-    move by with the joint or along the axis that the law acts on; else it is r in three columns.
+    In a task with a law the value is v = D·r / D·D, with the residual r and its derivative D by the
+    joint or along the axis that the law acts on; else the values are the three columns of r.
 
     Attributes:
-        names: of the quantities, each divided by its largest value, as a formula says it.
+        names: texts of the quantities in a formula, each divided by its largest value.
         x: (N, m) quantities of the rows.
         y: (N, k) values, in units of their root mean square.
-        size: that root mean square.
-        moves: (N, 3, k) what a value moves a reading by.
+        size: this root mean square.
+        moves: (N, 3, k) derivative of the positions by the values.
         known: (N, 3) positions by the fit.
     """
 
@@ -396,7 +396,7 @@ class Sought:
 
     @classmethod
     def of(cls, asked: Asked, theta: Floats, rows: ArmRows) -> "Sought":
-        """Prepare rows; their values are NaN where they are to be predicted."""
+        """Prepare rows; values are NaN in rows to be predicted."""
         named = asked.task.about.get("quantities")
         named = named or {f"{n}{j}": f"{n}{j}{u}" for n, u in UNITS for j in range(1, 7)}
         names, x = [], []
@@ -418,20 +418,20 @@ class Sought:
         return cls(names, np.stack(x, axis=1), y / size, size, moves, known)
 
     def law(self, factors: Floats, terms: Sequence[str]) -> dict[str, str] | None:
-        """Return Σ factor · term as a law, terms products of its quantities; None for nothing."""
+        """Return the law Σ factor · term, with terms that are products of quantities; else None."""
         named = zip(factors * self.size, terms, strict=True)
-        words = [f"{c:.4g}*{term.replace(' ', '*')}" for c, term in named if c != 0.0]
-        return {"formula": " + ".join(words)} if words else None
+        texts = [f"{c:.4g}*{term.replace(' ', '*')}" for c, term in named if c != 0.0]
+        return {"formula": " + ".join(texts)} if texts else None
 
     def positions(self, value: Floats) -> Floats:
-        """(N, 3) positions with values (N, k), in their units, beside the fit."""
+        """(N, 3) positions of the fit plus the motion by values (N, k), in units of `size`."""
         return np.asarray(self.known + self.size * np.einsum("nik,nk->ni", self.moves, value))
 
 
 def enter(entrant: Callable[[Asked], dict[str, Any]]) -> None:
     """Run an entrant as the command `python entrant.py TASK_DIR OUT.json`.
 
-    Its seconds are those of the processor, which do not depend on what else the machine does.
+    Its seconds are processor time, which does not depend on other load of the machine.
     """
     began = time.process_time()
     result: dict[str, Any] = {"std_m": None, "effects": None, "law": None, "note": ""}

@@ -1,13 +1,13 @@
-"""Run the entrants, each in an environment of its own, on tasks; keep, score and tell the results.
+"""Run the entrants on tasks, each in its own environment; store, score and print the results.
 
     python -m studies.benchmark.entrants.run TASKS -o RESULTS [--entrants a,b] [--tasks GLOB]
         [--beside KEPT]
 
 An entrant is a folder beside this file with entrant.py and requirements.txt. Its environment is
-made once. It sees a copy of the task without the truth. What stops it (a crash, the limit of time,
-an answer that is not as the format says) is kept as {"failed": reason}; with exit code 3 it says
-that it cannot run here at all, and is not tried on other tasks. Results that are there already are
-not made again, so that a run that was stopped goes on.
+made once. It gets a copy of the task without the truth. A failure (crash, time limit, answer with a
+wrong format) is stored as {"failed": reason}. Exit code 3 means that the entrant cannot run on this
+machine; it is then not tried on other tasks. Existing results are not computed again, so that a
+stopped run continues.
 """
 
 import argparse
@@ -39,14 +39,14 @@ ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_
 
 @dataclass(frozen=True, slots=True)
 class Entrants:
-    """Who enters, and how each is run.
+    """The entrants and their environments.
 
     Attributes:
-        home: folder of a folder of each entrant.
-        envs: folder of their environments.
-        given: interpreters by entrant, in the place of an environment.
-        limit: seconds that an entrant has for a task.
-        unable: reasons of those that cannot run here; filled as they say so.
+        home: folder with a folder for each entrant.
+        envs: folder of the environments.
+        given: interpreters by entrant, instead of an environment.
+        limit: time limit for a task, s.
+        unable: reasons by entrant that cannot run on this machine; filled during the run.
     """
 
     home: Path
@@ -60,7 +60,7 @@ class Entrants:
         return sorted(path.parent.name for path in self.home.glob("*/entrant.py"))
 
     def prepare(self, name: str) -> None:
-        """Make the environment of an entrant, unless it is there; note why it cannot be made."""
+        """Make the environment of an entrant, unless it exists; store the reason of a failure."""
         if name in self.given:
             return
         needs = self.home / name / "requirements.txt"
@@ -77,9 +77,9 @@ class Entrants:
             "-r",
             str(needs.absolute()),
         ]
-        made = subprocess.run(pip, capture_output=True, text=True, cwd=ROOT, check=False)  # noqa: S603
-        if made.returncode:
-            self.unable[name] = f"its environment cannot be made: {_last(made.stderr, 'ERROR')}"
+        done = subprocess.run(pip, capture_output=True, text=True, cwd=ROOT, check=False)  # noqa: S603
+        if done.returncode:
+            self.unable[name] = f"its environment cannot be made: {_last(done.stderr, 'ERROR')}"
         else:
             _put(mark, stamp)
 
@@ -88,7 +88,7 @@ class Entrants:
         return self.given.get(name, self.envs.absolute() / name / "bin" / "python")
 
     def run(self, name: str, task: Path, out: Path) -> None:
-        """Run an entrant on a task and keep what it answered, or why it did not."""
+        """Run an entrant on a task, and store its answer or the reason of its failure."""
         reason = self.unable.get(name) or self._answer(name, task, out)
         if reason:
             _put(out, json.dumps({"failed": reason}))
@@ -104,15 +104,15 @@ class Entrants:
                 env=env | ONE_THREAD, start_new_session=True,
             ) as process:  # fmt: skip
                 try:
-                    said = process.communicate(timeout=self.limit)[1]
+                    stderr = process.communicate(timeout=self.limit)[1]
                 except subprocess.TimeoutExpired:
                     os.killpg(process.pid, signal.SIGKILL)
                     return f"no answer within {self.limit:g} s"
             if process.returncode == CANNOT_RUN:
-                self.unable[name] = _last(said)
+                self.unable[name] = _last(stderr)
                 return self.unable[name]
             if process.returncode:
-                return f"exit code {process.returncode}: {_last(said)}"
+                return f"exit code {process.returncode}: {_last(stderr)}"
             try:
                 read_result(new, read_task(copy))
             except BenchmarkError as error:
@@ -122,7 +122,7 @@ class Entrants:
 
 
 def scores(tasks: Path, results: Path) -> list[dict[str, Any]]:
-    """Return a row of scores of each entrant and task that was run.
+    """Return a row of scores for each entrant and task that was run.
 
     Raises:
         BenchmarkError: as `score_all`.
@@ -140,25 +140,25 @@ def scores(tasks: Path, results: Path) -> list[dict[str, Any]]:
 
 
 def _put(path: Path, text: str) -> None:
-    """Write a file beside its place and put it there when it is complete."""
+    """Write a file under a temporary name, and rename it when it is complete."""
     new = path.with_name(f".{path.name}.new")
     new.write_text(text, encoding="utf-8")
     new.replace(path)
 
 
 def _last(text: str, word: str = "") -> str:
-    """Return the last line that has a word, or anything."""
+    """Return the last line with a word, or the last one that is not blank."""
     lines = [line for line in text.splitlines() if line.strip() and word in line]
     return lines[-1][:300] if lines else "no words"
 
 
-def _pairs(given: Sequence[str]) -> dict[str, Path]:
-    pairs = [text.partition("=") for text in given]
+def _pairs(options: Sequence[str]) -> dict[str, Path]:
+    pairs = [text.partition("=") for text in options]
     return {name: Path(path) for name, _, path in pairs}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run, score and tell; exit code 2 for what is not as it should be."""
+    """Run, score and print; exit code 2 for wrong input."""
     p = argparse.ArgumentParser(prog="run", description="Run the benchmark's entrants.")
     p.add_argument("folder", metavar="TASKS", type=Path, help="folder of tasks with their truth")
     p.add_argument("-o", "--output", metavar="RESULTS", type=Path, required=True)
@@ -168,55 +168,57 @@ def main(arguments: Sequence[str] | None = None) -> int:
     p.add_argument("--limit", type=float, default=900.0, help="seconds for a task")
     p.add_argument("--home", type=Path, default=HERE, help="folder of the entrants")
     p.add_argument("--envs", type=Path, default=Path(".benchmark-envs"), help="of environments")
-    instead = "an interpreter for an entrant, in the place of its environment"
-    p.add_argument("--python", action="append", default=[], metavar="NAME=PATH", help=instead)
+    python_help = "an interpreter for an entrant, in the place of its environment"
+    p.add_argument("--python", action="append", default=[], metavar="NAME=PATH", help=python_help)
     p.add_argument("--score", action="store_true", help="run nothing, score what is there")
     p.add_argument("--keep", type=Path, help="keep the scores, JSON")
-    others = "scores that were kept: in the table, entrants that were not run stand beside"
-    p.add_argument("--beside", metavar="KEPT", type=Path, help=others)
+    beside_help = "scores that were kept: in the table, entrants that were not run stand beside"
+    p.add_argument("--beside", metavar="KEPT", type=Path, help=beside_help)
     p.add_argument("--page", type=Path, help="write the page of tables, Markdown")
-    given = p.parse_args(arguments)
-    entrants = Entrants(given.home, given.envs, _pairs(given.python), given.limit)
+    options = p.parse_args(arguments)
+    entrants = Entrants(options.home, options.envs, _pairs(options.python), options.limit)
     try:
-        beside = _kept(given.beside) if given.beside else []
-        known = entrants.names()
-        names = given.entrants.split(",") if given.entrants else known
-        if unknown := [*{*names, *entrants.given} - {*known}]:
-            raise BenchmarkError(f"entrant {unknown[0]!r} is unknown; valid: {', '.join(known)}")
-        tasks = [t for t in folders(given.folder) if t.match(given.tasks)]
+        stored = _kept(options.beside) if options.beside else []
+        valid = entrants.names()
+        names = options.entrants.split(",") if options.entrants else valid
+        if unknown := [*{*names, *entrants.given} - {*valid}]:
+            raise BenchmarkError(f"entrant {unknown[0]!r} is unknown; valid: {', '.join(valid)}")
+        tasks = [t for t in folders(options.folder) if t.match(options.tasks)]
         if not tasks:
-            raise BenchmarkError(f"--tasks {given.tasks}: no task of {given.folder} is called so")
-        wanted = [(n, t, given.output / n / f"{t.name}.json") for t in tasks for n in names]
-        missing = [(n, t, out) for n, t, out in wanted if not (given.score or out.exists())]
+            raise BenchmarkError(
+                f"--tasks {options.tasks}: no task of {options.folder} is called so"
+            )
+        attempts = [(n, t, options.output / n / f"{t.name}.json") for t in tasks for n in names]
+        missing = [(n, t, out) for n, t, out in attempts if not (options.score or out.exists())]
         for name in dict.fromkeys(n for n, _, _ in missing):
             print(f"preparing {name}", file=sys.stderr, flush=True)
             entrants.prepare(name)
-            (given.output / name).mkdir(parents=True, exist_ok=True)
-        with ThreadPoolExecutor(max(given.jobs, 1)) as pool:
+            (options.output / name).mkdir(parents=True, exist_ok=True)
+        with ThreadPoolExecutor(max(options.jobs, 1)) as pool:
             runs = [(n, t, pool.submit(entrants.run, n, t, out)) for n, t, out in missing]
             for k, (name, task, run) in enumerate(runs, start=1):
                 run.result()
                 print(f"{k}/{len(runs)} {name} {task.name}", file=sys.stderr, flush=True)
-        rows = scores(given.folder, given.output)
+        rows = scores(options.folder, options.output)
     except BenchmarkError as error:
         print(f"run: {error}", file=sys.stderr)
         return 2
     date = datetime.now(UTC).date().isoformat()
-    if given.keep:
+    if options.keep:
         names = list(dict.fromkeys(name for row in rows for name in row))
         lines = ",\n".join(json.dumps([row.get(name) for name in names]) for row in rows)
         head = json.dumps({"date": date, "columns": names})[:-1]
-        _put(given.keep, f'{head}, "rows": [\n{lines}\n]}}\n')
-    if given.page:
-        _put(given.page, page(date, rows, given.home))
+        _put(options.keep, f'{head}, "rows": [\n{lines}\n]}}\n')
+    if options.page:
+        _put(options.page, page(date, rows, options.home))
     ran, done = {row["entrant"] for row in rows}, {(row["task"], row["part"]) for row in rows}
-    more = [r for r in beside if r["entrant"] not in ran and (r["task"], r["part"]) in done]
-    print(block(rows + more))
+    added = [r for r in stored if r["entrant"] not in ran and (r["task"], r["part"]) in done]
+    print(block(rows + added))
     return 0
 
 
 def _kept(path: Path) -> list[dict[str, Any]]:
-    """Return the rows of scores that were kept.
+    """Return the rows of stored scores.
 
     Raises:
         BenchmarkError: a file that holds no scores.

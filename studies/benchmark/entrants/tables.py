@@ -1,4 +1,4 @@
-"""The benchmark's scores as Markdown: the page of the docs, and the block for the README."""
+"""The scores of the benchmark as Markdown: the page of the docs, and the table of the README."""
 
 import json
 import re
@@ -18,28 +18,29 @@ TRACKS = {
 }
 """Name of each track in the tables."""
 REASONS = "not-first.md"
-"""Beside the entrants: where hilcal is not first, and why; people write it."""
+"""Hand-written file beside the entrants: where hilcal is not first, and why."""
 Group = dict[str, Any]
 
 
 def kept(path: Path) -> tuple[str, list[Group]]:
     """Return date and rows of the scores that `--keep` wrote."""
-    found = json.loads(path.read_text(encoding="utf-8"))
-    return found["date"], [dict(zip(found["columns"], row, strict=True)) for row in found["rows"]]
+    record = json.loads(path.read_text(encoding="utf-8"))
+    rows = [dict(zip(record["columns"], row, strict=True)) for row in record["rows"]]
+    return record["date"], rows
 
 
 def block(rows: Sequence[Group]) -> str:
     """Return the small table: errors relative to the best, coverage, naming and time."""
-    whole = {g["track"]: _by_name(g) for g in groups(rows) if g["poses"] is None}
-    tracks = [t for t in TRACKS if t in whole]
-    names = [*dict.fromkeys(name for t in tracks for name in whole[t])]
-    order = sorted(names, key=lambda n: _key([whole[t].get(n, {}) for t in tracks]))
+    by_track = {g["track"]: _by_name(g) for g in groups(rows) if g["poses"] is None}
+    tracks = [t for t in TRACKS if t in by_track]
+    names = [*dict.fromkeys(name for t in tracks for name in by_track[t])]
+    order = sorted(names, key=lambda n: _key([by_track[t].get(n, {}) for t in tracks]))
     lines = []
     for name in order:
-        own = [whole[t].get(name, {}) for t in tracks]
+        entries = [by_track[t].get(name, {}) for t in tracks]
         every = [row for row in rows if row["entrant"] == name and not row["failed"]]
         lines.append(
-            [name, *(_value(e, "relative") for e in own), _mean(every, "coverage", "{:.0%}"),
+            [name, *(_value(e, "relative") for e in entries), _mean(every, "coverage", "{:.0%}"),
              _mean(every, "log_score", "{:.2f}"), _mean(every, "law_equivalent", "{:.0%}"),
              _middle([row["seconds"] for row in every])]
         )  # fmt: skip
@@ -48,9 +49,9 @@ def block(rows: Sequence[Group]) -> str:
 
 
 def page(date: str, rows: Sequence[Group], home: Path) -> str:
-    """Return the page: a table of each track, by poses and strength, and what failed."""
+    """Return the page: a table of each track, by poses and strength, and the failures."""
     did = Counter(row["entrant"] for row in rows if not row["failed"])
-    of = " that an entrant did" if len({*did.values()}) > 1 else ""
+    incomplete = " that an entrant did" if len({*did.values()}) > 1 else ""
     out = [
         "# The benchmark of hidden effects",
         "",
@@ -60,7 +61,7 @@ def page(date: str, rows: Sequence[Group], home: Path) -> str:
         block(rows),
         "",
         "Error at fresh poses: rms, over the best entrant's in each task; geometric mean over the",
-        f"tasks{of}; 1.00: always the best. In 95 % band: share of coordinates",
+        f"tasks{incomplete}; 1.00: always the best. In 95 % band: share of coordinates",
         "within the stated band. Log score: mean log probability of what is the case, over the",
         "candidates; 0 is perfect. Laws: share of the tasks of their track in which the formula is",
         "equivalent to the truth, of entrants that write any. s: seconds of one processor, median.",
@@ -77,10 +78,10 @@ def page(date: str, rows: Sequence[Group], home: Path) -> str:
         out += ["", "## Where hilcal is not first", "", reasons.read_text(encoding="utf-8").strip()]
     every = groups(rows)
     for track, title in TRACKS.items():
-        own = [g for g in every if g["track"] == track]
-        if own:
-            out += ["", f"## Track {track}: {title}", "", _track(own[0])]
-            out += ["", "Error relative to the best, by poses and strength:", "", _cells(own[1:])]
+        of_track = [g for g in every if g["track"] == track]
+        if of_track:
+            out += ["", f"## Track {track}: {title}", "", _track(of_track[0]), ""]
+            out += ["Error relative to the best, by poses and strength:", "", _cells(of_track[1:])]
     failed = Counter((row["entrant"], row["failed"]) for row in rows if row["failed"])
     if failed:
         lines = [[f"`{name}`", why, str(n)] for (name, why), n in sorted(failed.items())]
@@ -94,16 +95,16 @@ def _track(g: Group) -> str:
     rows = []
     for e in sorted(g["entrants"], key=lambda e: _key([e])):
         done = e["tasks"] - e["failed"]
-        said = [f"`{e['entrant']}`", f"{done} of {e['tasks']}"]
+        row = [f"`{e['entrant']}`", f"{done} of {e['tasks']}"]
         if done:
-            said += [
+            row += [
                 _with_interval(e, "relative"), f"{1e3 * e['mean_m']:.4f} mm",
                 f"{e['in_noise']:.2f}", _value(e, "coverage", "{:.0%}"),
                 _value(e, "interval_score_in_noise"), _with_interval(e, "log_score"),
                 _value(e, "found", "{:.0%}"), _value(e, "false_alarms", "{:.1%}"),
                 _value(e, "law_equivalent", "{:.0%}"), f"{e['seconds']:.1f}",
             ]  # fmt: skip
-        rows.append(said + [""] * (len(head) - len(said)))
+        rows.append(row + [""] * (len(head) - len(row)))
     rate = g["log_score_of_the_rate"]
     note = f"\n\nSaying how often candidates are present, of each the same, has {rate:.2f}."
     return _table(head, rows) + (note if rate else "")
@@ -120,9 +121,9 @@ def _cells(cells: Sequence[Group]) -> str:
             for g in cells
         ),
     ]
-    by = [_by_name(g) for g in cells]
+    entries = [_by_name(g) for g in cells]
     return _table(
-        head, [[f"`{n}`", *(_value(c.get(n, {}), "relative") for c in by)] for n in names]
+        head, [[f"`{n}`", *(_value(e.get(n, {}), "relative") for e in entries)] for n in names]
     )
 
 
@@ -130,9 +131,9 @@ def _by_name(g: Group) -> dict[str, Group]:
     return {e["entrant"]: e for e in g["entrants"]}
 
 
-def _key(own: Sequence[Group]) -> float:
-    """Geometric mean of the relative errors; entrants that did nothing come last."""
-    values = [e["relative"]["value"] for e in own if "relative" in e]
+def _key(entries: Sequence[Group]) -> float:
+    """Geometric mean of the relative errors; infinite for an entrant without any."""
+    values = [e["relative"]["value"] for e in entries if "relative" in e]
     product = 1.0
     for value in values:
         product *= value ** (1 / len(values))
@@ -160,12 +161,9 @@ def _middle(values: Sequence[float]) -> str:
 
 def _summary(path: Path) -> str:
     """Return the first sentence of an entrant's docstring."""
-    found = (
-        re.match(r'"""(.+?)\.?(\n|""")', path.read_text(encoding="utf-8"))
-        if path.exists()
-        else None
-    )
-    return found[1] if found else ""
+    text = path.read_text(encoding="utf-8") if path.exists() else ""
+    match = re.match(r'"""(.+?)\.?(\n|""")', text)
+    return match[1] if match else ""
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -50,9 +50,9 @@ def geometry(asked: Asked) -> dict[str, Any]:
         arm.calib_config |= {"known_baseframe": False, "known_tipframe": False}
         arm.initialize()
         var = arm.solve(enable_logging=False).x
-    there = arm.predicted(var, asked.test.q).reshape(3, -1).T
-    left = arm.cost_function(var).reshape(3, -1).T
-    return {"prediction_m": there, "std_m": spread(left, asked), "note": "std from the fit itself"}
+    prediction = arm.predicted(var, asked.test.q).reshape(3, -1).T
+    std = spread(arm.cost_function(var).reshape(3, -1).T, asked)
+    return {"prediction_m": prediction, "std_m": std, "note": "std from the fit itself"}
 
 
 if __name__ == "__main__":

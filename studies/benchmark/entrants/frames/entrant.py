@@ -14,8 +14,8 @@ def frames(asked: Asked) -> dict[str, Any]:
     """Fit the nine parameters of the frames."""
     arm, rigid = asked.arm, np.zeros(42)
 
-    def predict(rows: Any, other: Any) -> Any:
-        return arm.predict(arm.fit(rows, rigid, asked.sigma), other)
+    def predict(rows: Any, tested: Any) -> Any:
+        return arm.predict(arm.fit(rows, rigid, asked.sigma), tested)
 
     std = spread(left_out(asked.train, predict), asked)
     return {"prediction_m": predict(asked.train, asked.test), "std_m": std}

@@ -24,7 +24,7 @@ repeatability.joint_std_rad = {r}
 
 
 def calibrated(asked: Asked) -> dict[str, Any]:
-    """Refine from the baseline, or from the law that is found beside it."""
+    """Refine from the baseline, or from the baseline with a discovered law."""
     about, law, note = asked.task.about, None, ""
     r = 0.0 if about["track"] in ("ur10", "ur5") else 1e-9  # no arm scatters in a simulated task
     with TemporaryDirectory() as folder:
@@ -41,12 +41,12 @@ def calibrated(asked: Asked) -> dict[str, Any]:
             note, law = f"; {d.laws[0].formula}", d.laws[0].expressions.get(site)
             model = d.after.model
     path = hc.refine(model, readings, "absolute")
-    of, names = asked.task.test, {"time": "time_s", "air_temperature": "air_degC"}
-    recorded = {n: of.numbers[c] for n, c in names.items() if c in of.numbers}
-    states = hc.States(of.of(JOINTS), of.of(WRENCH), **recorded)
-    known = hc.Calibration.of(path.fit)
-    turn = known.base_in_tracker()[:3, :3]
-    covariance = known.predict(states.q, states.wrench, recorded=recorded).covariance
+    test, names = asked.task.test, {"time": "time_s", "air_temperature": "air_degC"}
+    recorded = {n: test.numbers[c] for n, c in names.items() if c in test.numbers}
+    states = hc.States(test.of(JOINTS), test.of(WRENCH), **recorded)
+    calibration = hc.Calibration.of(path.fit)
+    turn = calibration.base_in_tracker()[:3, :3]
+    covariance = calibration.predict(states.q, states.wrench, recorded=recorded).covariance
     return {
         "prediction_m": path.fit.predict(states).position,
         "std_m": np.sqrt(np.diagonal(turn @ covariance @ turn.T, axis1=1, axis2=2)),

@@ -22,7 +22,7 @@ OFTEN: Any = {"maxiter": 4, "xtol": 0.05, "ftol": 1e-4}
 
 
 def mixed(asked: Asked) -> dict[str, Any]:
-    """Estimate the variances, predict by the BLUP, and say how far it may be off."""
+    """Estimate the variances, predict by the BLUP, and state its standard deviation."""
     theta = ridge(asked)[0](asked.train)
     theta[9:] = 0.0
     (a, z), (at, zt) = (families(asked, theta, r, WAVES) for r in (asked.train, asked.test))
@@ -47,13 +47,13 @@ def mixed(asked: Asked) -> dict[str, Any]:
     s = minimize(cost, mean, method="Powell", bounds=bounds, options=OFTEN).x
     root, inner, b, w = solved(s)
     size = np.repeat(np.exp(s[:-1]), [c.shape[1] for c in z.values()])
-    own, other = (np.hstack([*c.values()]) * size for c in (z, zt))
-    across = other @ own.T
-    rest = at - across @ cho_solve(root, a)
-    variance = np.sum(other**2, 1) - np.sum(across * cho_solve(root, across.T).T, 1)
-    std = np.sqrt(np.maximum(variance + np.sum((rest @ inner) * rest, 1), 0.0))
-    there = asked.arm.predict(theta, asked.test) + (at @ b + across @ w).reshape(-1, 3)
-    return {"prediction_m": there, "std_m": std.reshape(-1, 3)}
+    train, test = (np.hstack([*c.values()]) * size for c in (z, zt))
+    across = test @ train.T
+    frames = at - across @ cho_solve(root, a)
+    variance = np.sum(test**2, 1) - np.sum(across * cho_solve(root, across.T).T, 1)
+    std = np.sqrt(np.maximum(variance + np.sum((frames @ inner) * frames, 1), 0.0))
+    position = asked.arm.predict(theta, asked.test) + (at @ b + across @ w).reshape(-1, 3)
+    return {"prediction_m": position, "std_m": std.reshape(-1, 3)}
 
 
 if __name__ == "__main__":

@@ -21,35 +21,36 @@ THRESHOLDS = (0.1, 0.2, 0.3, 0.5, 10.0)  # least share of a term in what is expl
 
 def library(angles: int, all_: int) -> Any:
     """Waves of angles, powers and moduli of the others, and products of one of each."""
-    waves, said = zip(*(wave(f, k) for k in (1, 2, 3) for f in ("sin", "cos")), strict=True)
+    waves, wave_texts = zip(*(wave(f, k) for k in (1, 2, 3) for f in ("sin", "cos")), strict=True)
     powers = [lambda x: x, lambda x: x**2, lambda x: np.abs(x)]
-    words = [lambda x: x, lambda x: f"{x}**2", lambda x: f"abs({x})"]
-    both = [ps.CustomLibrary([*waves], [*said]), ps.CustomLibrary(powers, words)]
+    power_texts = [lambda x: x, lambda x: f"{x}**2", lambda x: f"abs({x})"]
+    both = [ps.CustomLibrary([*waves], [*wave_texts]), ps.CustomLibrary(powers, power_texts)]
     parts = [list(range(angles)), list(range(angles, all_))]
     return ps.GeneralizedLibrary(both, [[1, 1]], inputs_per_library=parts)
 
 
-def model(at: Any, threshold: float) -> Any:
-    """Fit SINDy to the values of what is sought."""
-    optimizer = ps.STLSQ(threshold * len(at.x) ** 0.5, alpha=0.1, normalize_columns=True)
-    made = ps.SINDy(optimizer, library(6, at.x.shape[1]))
-    return made.fit(at.x, t=1.0, x_dot=at.y, feature_names=at.names)
+def model(sought: Any, threshold: float) -> Any:
+    """Fit SINDy to the values of the law or residual."""
+    optimizer = ps.STLSQ(threshold * len(sought.x) ** 0.5, alpha=0.1, normalize_columns=True)
+    sindy = ps.SINDy(optimizer, library(6, sought.x.shape[1]))
+    return sindy.fit(sought.x, t=1.0, x_dot=sought.y, feature_names=sought.names)
 
 
 def sparse(asked: Asked) -> dict[str, Any]:
     """Choose the threshold on poses left out."""
     fit, _ = ridge(asked)
 
-    def predict(threshold: float, rows: Any, other: Any) -> Any:
+    def predict(threshold: float, rows: Any, tested: Any) -> Any:
         theta = fit(rows)
-        at, there = Sought.of(asked, theta, rows), Sought.of(asked, theta, other)
-        return replace(there, size=at.size).positions(model(at, threshold).predict(there.x))
+        train, test = Sought.of(asked, theta, rows), Sought.of(asked, theta, tested)
+        return replace(test, size=train.size).positions(model(train, threshold).predict(test.x))
 
-    best, off = chosen(asked, THRESHOLDS, predict)
-    out = {"prediction_m": predict(best, asked.train, asked.test), "std_m": spread(off, asked)}
+    best, residual = chosen(asked, THRESHOLDS, predict)
+    out = {"prediction_m": predict(best, asked.train, asked.test), "std_m": spread(residual, asked)}
     if "acts_on" in asked.task.about:
-        found = model(at := Sought.of(asked, fit(asked.train), asked.train), best)
-        out["law"] = at.law(found.coefficients()[0], found.get_feature_names())
+        train = Sought.of(asked, fit(asked.train), asked.train)
+        sindy = model(train, best)
+        out["law"] = train.law(sindy.coefficients()[0], sindy.get_feature_names())
     return out
 
 

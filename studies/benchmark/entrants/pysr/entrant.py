@@ -31,20 +31,20 @@ def regression() -> Any:
 def symbolic(asked: Asked) -> dict[str, Any]:
     """Search a formula of each column of the values."""
     search = regression()
-    fit, off = ridge(asked)
+    fit, residual = ridge(asked)
     theta = fit(asked.train)
-    at, there = Sought.of(asked, theta, asked.train), Sought.of(asked, theta, asked.test)
-    names = [f"x{k}" for k in range(at.x.shape[1])]
-    value, words = np.zeros((len(there.x), at.y.shape[1])), ""
-    for k in range(at.y.shape[1]):
-        search.fit(at.x, at.y[:, k], variable_names=names)
-        value[:, k] = at.size * search.predict(there.x)
-        words = f"{at.size!r}*({search.sympy()})".replace("Max", "max").replace("Abs", "abs")
-    for name, plain in sorted(zip(names, at.names, strict=True), reverse=True):
-        words = words.replace(name, plain)
-    law = {"formula": words} if "acts_on" in asked.task.about else None
-    moved = there.known + np.einsum("nik,nk->ni", there.moves, value)
-    return {"prediction_m": moved, "std_m": spread(off, asked), "law": law}
+    train, test = Sought.of(asked, theta, asked.train), Sought.of(asked, theta, asked.test)
+    names = [f"x{k}" for k in range(train.x.shape[1])]
+    value, text = np.zeros((len(test.x), train.y.shape[1])), ""
+    for k in range(train.y.shape[1]):
+        search.fit(train.x, train.y[:, k], variable_names=names)
+        value[:, k] = train.size * search.predict(test.x)
+        text = f"{train.size!r}*({search.sympy()})".replace("Max", "max").replace("Abs", "abs")
+    for name, plain in sorted(zip(names, train.names, strict=True), reverse=True):
+        text = text.replace(name, plain)
+    law = {"formula": text} if "acts_on" in asked.task.about else None
+    moved = test.known + np.einsum("nik,nk->ni", test.moves, value)
+    return {"prediction_m": moved, "std_m": spread(residual, asked), "law": law}
 
 
 if __name__ == "__main__":

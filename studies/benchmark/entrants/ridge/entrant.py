@@ -10,9 +10,9 @@ from benchmark.entrants.common import Asked, enter, ridge, spread  # type: ignor
 
 def geometry(asked: Asked) -> dict[str, Any]:
     """Fit 51 parameters."""
-    fit, off = ridge(asked)
-    there = asked.arm.predict(fit(asked.train), asked.test)
-    return {"prediction_m": there, "std_m": spread(off, asked)}
+    fit, residual = ridge(asked)
+    position = asked.arm.predict(fit(asked.train), asked.test)
+    return {"prediction_m": position, "std_m": spread(residual, asked)}
 
 
 if __name__ == "__main__":
