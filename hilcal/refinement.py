@@ -18,9 +18,10 @@ from hilcal.diagnosis.effect_ranking import LEAST_KEPT, LEAST_SHARE, kept_by_ref
 from hilcal.diagnosis.evidence import Alternative, Evidence
 from hilcal.diagnosis.residual_regression import Regressions
 from hilcal.diagnosis.serial_noise import serial_noise, with_serial_noise
-from hilcal.diagnosis.stepwise import add, exchange, predicts_better, remove
+from hilcal.diagnosis.stepwise import add, exchange, predicts_better, remove, trial
 from hilcal.diagnosis.verdict import NOTHING, judge, judge_naming
 from hilcal.discovery.discovery import LawSearch
+from hilcal.errors import CannotAnswerError
 from hilcal.identification.arm_scatter import with_arm_scatter, with_prior_scatter
 from hilcal.identification.background import (
     allows_background,
@@ -211,7 +212,7 @@ class Path:
         self._given, self._before, self._say = first.model.named, before, say
         self._laws, self._seen = laws, seen
         self._rejected, self._removed = [*before.rejected], [*before.removed]
-        self._add, self._regressions = cache(add), Regressions()
+        self._trial, self._regressions = cache(trial), Regressions()
         self._background_tried = False
         taken = first.readings.arm_scatter is not None
         self._scattered = [first.model.names] if taken else []
@@ -224,7 +225,7 @@ class Path:
     def _evidence_of(
         self, found: Fit, background: tuple[BackgroundEffect, ...] | None = None
     ) -> Evidence:
-        return Evidence(found, self._add, self._say, self._regressions, background)
+        return Evidence(found, self._trial, self._say, self._regressions, background)
 
     def _history(self, of: Fit) -> History:
         names = of.model.named
@@ -278,10 +279,13 @@ class Path:
             if not s.passes or s.effect in self._removed:
                 continue
             self._say(f"adding {s.effect}")
-            trial = self._add(last.fit, s.effect)
-            kept = kept_by_refit(last.fit, trial, s.score) >= LEAST_KEPT
-            if kept and predicts_better(last.fit, trial):
-                found = trial, s.effect
+            larger = self._trial(last.fit, s.effect)
+            if (
+                larger is not None
+                and kept_by_refit(last.fit, larger, s.score) >= LEAST_KEPT
+                and predicts_better(last.fit, larger)
+            ):
+                found = larger, s.effect
                 break
             self._rejected.append(s.effect)
         if len(self._rejected) > before:
@@ -375,8 +379,11 @@ class Path:
         judged = last.diagnosis
         if fitted.readings.arm_scatter is not None:
             stated = fitted.readings.as_stated()
-            fitted = fit(fitted.model, stated, fitted.mode, start=fitted.theta)
-            evidence = Evidence(fitted, self._add, regressions=self._regressions)
+            try:
+                fitted = fit(fitted.model, stated, fitted.mode, start=fitted.theta)
+            except CannotAnswerError:  # no more elements than parameters are determined
+                return False
+            evidence = Evidence(fitted, self._trial, regressions=self._regressions)
             judged = judge(evidence, self._history(fitted))
         if judged.reason != "arm_scatter" or judged.scatter is None:
             return False
@@ -423,9 +430,12 @@ class Path:
         """
         self._say(f"trying {' + '.join(other.others)} in place of {other.effect}")
         first, *rest = other.others
-        trials = [exchange(last.fit, other.effect, first)]
-        for name in rest:
-            trials.append(self._add(trials[-1], name))
+        try:
+            trials = [exchange(last.fit, other.effect, first)]
+            for name in rest:
+                trials.append(add(trials[-1], name))
+        except CannotAnswerError:  # too many parameters, or no equilibrium
+            return False
         found = trials[-1]
         if last.diagnosis.residual_is_noise and not rest:
             if found.holdout_of_all.rms_sigma > last.fit.holdout_of_all.rms_sigma:
@@ -433,11 +443,11 @@ class Path:
         elif not predicts_better(last.fit, found):
             return False
         self._change(trials[0], first, other.effect)
-        for name, trial in zip(rest, trials[1:], strict=True):
-            self.append(trial, name, what=f"added {name}")
+        for name, larger in zip(rest, trials[1:], strict=True):
+            self.append(larger, name, what=f"added {name}")
         return True
 
-    def _change(self, trial: Fit, added: str | None, removed: str) -> None:
+    def _change(self, changed: Fit, added: str | None, removed: str) -> None:
         self._removed.append(removed)
         what = f"removed {removed}" if added is None else f"{added} in place of {removed}"
-        self.append(trial, added, removed, what)
+        self.append(changed, added, removed, what)
