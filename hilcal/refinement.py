@@ -18,9 +18,10 @@ from hilcal.diagnosis.effect_ranking import LEAST_KEPT, LEAST_SHARE, kept_by_ref
 from hilcal.diagnosis.evidence import Alternative, Evidence
 from hilcal.diagnosis.residual_regression import Regressions
 from hilcal.diagnosis.serial_noise import serial_noise, with_serial_noise
-from hilcal.diagnosis.stepwise import add, exchange, predicts_better, remove
+from hilcal.diagnosis.stepwise import add, exchange, predicts_better, remove, trial
 from hilcal.diagnosis.verdict import NOTHING, judge, judge_naming
 from hilcal.discovery.discovery import LawSearch
+from hilcal.errors import CannotAnswerError
 from hilcal.identification.arm_scatter import with_arm_scatter, with_prior_scatter
 from hilcal.identification.background import (
     allows_background,
@@ -208,7 +209,7 @@ class Path:
         self._start, self._start_history, self._say = first.model.named, history, say
         self._laws, self._on_step = laws, on_step
         self._rejected, self._removed = [*history.rejected], [*history.removed]
-        self._add, self._regressions = cache(add), Regressions()
+        self._trial, self._regressions = cache(trial), Regressions()
         self._background_tried = False
         scattered = first.readings.arm_scatter is not None
         self._scattered = [first.model.names] if scattered else []
@@ -221,7 +222,7 @@ class Path:
     def _evidence_of(
         self, fitted: Fit, background: tuple[BackgroundEffect, ...] | None = None
     ) -> Evidence:
-        return Evidence(fitted, self._add, self._say, self._regressions, background)
+        return Evidence(fitted, self._trial, self._say, self._regressions, background)
 
     def _history(self, fitted: Fit) -> History:
         names = fitted.model.named
@@ -279,10 +280,13 @@ class Path:
             if not s.passes or s.effect in self._removed:
                 continue
             self._say(f"adding {s.effect}")
-            trial = self._add(last.fit, s.effect)
-            keeps = kept_by_refit(last.fit, trial, s.score) >= LEAST_KEPT
-            if keeps and predicts_better(last.fit, trial):
-                better = trial, s.effect
+            larger = self._trial(last.fit, s.effect)
+            if (
+                larger is not None
+                and kept_by_refit(last.fit, larger, s.score) >= LEAST_KEPT
+                and predicts_better(last.fit, larger)
+            ):
+                better = larger, s.effect
                 break
             self._rejected.append(s.effect)
         if len(self._rejected) > n_rejected:
@@ -373,8 +377,11 @@ class Path:
         judged = last.diagnosis
         if fitted.readings.arm_scatter is not None:
             stated = fitted.readings.as_stated()
-            fitted = fit(fitted.model, stated, fitted.mode, start=fitted.theta)
-            evidence = Evidence(fitted, self._add, regressions=self._regressions)
+            try:
+                fitted = fit(fitted.model, stated, fitted.mode, start=fitted.theta)
+            except CannotAnswerError:  # no more elements than parameters are determined
+                return False
+            evidence = Evidence(fitted, self._trial, regressions=self._regressions)
             judged = judge(evidence, self._history(fitted))
         if judged.reason != "arm_scatter" or judged.scatter is None:
             return False
@@ -422,20 +429,23 @@ class Path:
         """
         effect, (first, *further) = alternative.effect, alternative.others
         self._say(f"trying {' + '.join(alternative.others)} in place of {effect}")
-        trials = [exchange(last.fit, effect, first)]
-        for name in further:
-            trials.append(self._add(trials[-1], name))
+        try:
+            trials = [exchange(last.fit, effect, first)]
+            for name in further:
+                trials.append(add(trials[-1], name))
+        except CannotAnswerError:  # too many parameters, or no equilibrium
+            return False
         if last.diagnosis.residual_is_noise and not further:
             if trials[-1].holdout_of_all.rms_sigma > last.fit.holdout_of_all.rms_sigma:
                 return False
         elif not predicts_better(last.fit, trials[-1]):
             return False
         self._change(trials[0], first, effect)
-        for name, trial in zip(further, trials[1:], strict=True):
-            self.append(trial, name, message=f"added {name}")
+        for name, larger in zip(further, trials[1:], strict=True):
+            self.append(larger, name, message=f"added {name}")
         return True
 
-    def _change(self, trial: Fit, added: str | None, removed: str) -> None:
+    def _change(self, changed: Fit, added: str | None, removed: str) -> None:
         self._removed.append(removed)
         message = f"removed {removed}" if added is None else f"{added} in place of {removed}"
-        self.append(trial, added, removed, message)
+        self.append(changed, added, removed, message)

@@ -43,7 +43,7 @@ from hilcal.diagnosis.minimum_detectable_effect import (
     least_of_family,
     least_strength,
 )
-from hilcal.diagnosis.stepwise import add
+from hilcal.diagnosis.stepwise import trial
 from hilcal.effects.protocol import Effect
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.effect_columns import (
@@ -226,7 +226,7 @@ def most(family: EffectColumns, bare: Unloaded | None) -> float:
 def rank_suspects(
     p: Linearisation,
     effects: Sequence[Effect],  # that are not in the model
-    refit: Callable[[Fit, str], Fit] = add,  # returns a fit with one more effect
+    refit: Callable[[Fit, str], Fit | None] = trial,  # returns a fit with one more effect
 ) -> tuple[Suspect, ...]:
     """Score all effects; best first, see `ranked`."""
     suspects = [_suspect(p, s, len(effects)) for part in _scored(p, effects) for s in part]
@@ -397,13 +397,17 @@ def kept_by_step(p: Linearisation, family: EffectColumns, score: FamilyScore) ->
 
 
 def kept(
-    p: Linearisation, family: EffectColumns, score: FamilyScore, refit: Callable[[Fit, str], Fit]
+    p: Linearisation,
+    family: EffectColumns,
+    score: FamilyScore,
+    refit: Callable[[Fit, str], Fit | None],
 ) -> float:
     """Return the share of the promise that the step keeps, or a refit where the step keeps less."""
     share = kept_by_step(p, family, score)
     if share >= LEAST_KEPT:
         return share
-    return max(share, kept_by_refit(p.fit, refit(p.fit, family.effect.name), score))
+    after = refit(p.fit, family.effect.name)
+    return share if after is None else max(share, kept_by_refit(p.fit, after, score))
 
 
 def through_load(effect: Effect) -> bool:

@@ -58,7 +58,7 @@ from hilcal.diagnosis.noise import (
 )
 from hilcal.diagnosis.pose_alone import PoseAlone, pose_alone
 from hilcal.diagnosis.residual_regression import Dependence, Regressions, ResidualRegression
-from hilcal.diagnosis.stepwise import add
+from hilcal.diagnosis.stepwise import trial
 from hilcal.diagnosis.wrong_figures import WrongFigure, wrong_figures
 from hilcal.effects.protocol import Effect
 from hilcal.errors import InputError
@@ -218,7 +218,7 @@ def whole_catalogue(fit: Fit) -> tuple[tuple[str, ...], float, float]:
 
 def insufficiency(
     fit: Fit,
-    refit: Callable[[Fit, str], Fit],
+    refit: Callable[[Fit, str], Fit | None],
     say: Callable[[str], None] = lambda text: None,
     regressions: Regressions | None = None,
 ) -> Insufficiency | None:
@@ -233,7 +233,10 @@ def insufficiency(
         if not effects or len(names) == MOST_REFITS:
             break
         say(f"testing the whole catalogue: adding {effects[0]}")
-        current = refit(current, effects[0])
+        larger = refit(current, effects[0])
+        if larger is None:
+            break
+        current = larger
         names.append(effects[0])
     regression = (regressions or Regressions()).of(linearise(current))
     noise = judge_noise(current, pure_error(current), regression.share > PREDICTABLE)
@@ -255,7 +258,7 @@ class Evidence:
     def __init__(
         self,
         fit: Fit,
-        refit: Callable[[Fit, str], Fit] = add,  # returns a fit with one more effect
+        refit: Callable[[Fit, str], Fit | None] = trial,  # returns a fit with one more effect
         say: Callable[[str], None] = lambda text: None,  # takes progress, one line each
         regressions: Regressions | None = None,  # cache
         background: tuple[BackgroundEffect, ...] | None = None,  # if tested already

@@ -6,7 +6,7 @@ import numpy as np
 
 from hilcal.effects.options import Options
 from hilcal.effects.written import read_effects_text
-from hilcal.errors import InputError
+from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.linearisation import left_out_by_pose
 from hilcal.model.model import Model
@@ -31,6 +31,17 @@ def add(before: Fit, effect: str, options: Options | None = None) -> Fit:
     """
     model, start = _grown(before.model, before.theta, effect, before.readings, options)
     return fit(model, before.readings, before.mode, before.scaling, start)
+
+
+def trial(before: Fit, effect: str) -> Fit | None:
+    """Refit with one more effect, see `add`; None where the readings do not allow it.
+
+    They are too few to determine its parameters, or the arm has no equilibrium with it.
+    """
+    try:
+        return add(before, effect)
+    except CannotAnswerError:
+        return None
 
 
 def remove(before: Fit, effect: str) -> Fit:

@@ -14,12 +14,12 @@ from hilcal.diagnosis.evidence import (
     backward_elimination,
 )
 from hilcal.diagnosis.minimum_detectable_effect import least_strength
-from hilcal.diagnosis.stepwise import add, exchange, remove
+from hilcal.diagnosis.stepwise import add, exchange, remove, trial
 from hilcal.drivers.simulated.injected_effects import hide
-from hilcal.errors import InputError
+from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.effect_columns import effect_columns
 from hilcal.identification.linearisation import linearise
-from hilcal.refinement import Path
+from hilcal.refinement import Path, refine
 from hilcal.regression.evidence import spectrum
 from tests.support.campaigns import NOTHING, campaign, measured, plan, world_of
 from tests.support.diagnosis_cases import fitted
@@ -32,6 +32,17 @@ def work(c, *effects):
     for name in effects:
         path.append(add(path.steps[-1].fit, name), name)
     return path
+
+
+def test_an_effect_of_more_parameters_than_readings_is_no_trial():
+    """It does not end a refinement: as few poses are predicted with all effects together."""
+    c = campaign("link_geometry", "absolute", 1, poses=12, strength=3.0)
+    few = c.readings[c.readings.unloaded][np.arange(8)]
+    before = fitted(c, readings=few)
+    assert trial(before, "link_geometry") is None
+    with pytest.raises(CannotAnswerError, match="nothing is left to judge the model by"):
+        add(before, "link_geometry")
+    assert refine(before.model, few, "absolute").fit.theta.size
 
 
 # --- needless -------------------------------------------------------------------------------
