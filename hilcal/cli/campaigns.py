@@ -34,7 +34,7 @@ from hilcal.present.registration import (
 from hilcal.readings.covariance import COVERS
 from hilcal.readings.readings import Readings
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.kept_texts import ROBOT_FILE
+from hilcal.store.kept_texts import CALIBRATION_FILE, ROBOT_FILE, check_robot
 from hilcal.store.overview import overview, to_json
 from hilcal.store.repair import put_robot
 from hilcal.store.repair import repair as repaired
@@ -171,7 +171,9 @@ def info(run: Path, as_json: bool = False) -> None:
         content = overview(file)
         parts = covariance_parts(file.about(COVERS), content.config)
         noise = estimated_noise(file)
-        cell = cell_from_config(content.config, None, file.about(ROBOT_FILE))
+        robot_texts = file.about(ROBOT_FILE), file.about(CALIBRATION_FILE)
+        check_robot(run, file.config_json, *robot_texts)
+        cell = cell_from_config(content.config, None, *robot_texts)
     torques = None if content.readings is None else check_torques(cell, content.readings)
     t.show(info_report(content, run.name, covariance_words(parts, noise)))
     t.show(torque_lines(torques))

@@ -85,10 +85,12 @@ def check_positions(table: ColumnTable, position: Floats, q: Floats, arm: Arm) -
             f"is {arm.reach:.3g} m{_looks_like(position[i], distance[i])}; positions must be in m"
         )
     spread = float(away.max())
-    travel = float(np.ptp(q, axis=0).max())
-    if spread < 1e-3 * arm.reach and travel > 0.1 and len(np.unique(q, axis=0)) >= 5:
+    travel = np.ptp(q, axis=0)
+    joint = int(np.argmax(travel))
+    if spread < 1e-3 * arm.reach and travel[joint] > 0.1 and len(np.unique(q, axis=0)) >= 5:
+        by = f"{travel[joint]:.2g} {arm.unit(joint)}"
         raise InputError(
-            f"{table.path}: columns {', '.join(POSITION)}: the joints move by {travel:.2g} rad but "
+            f"{table.path}: columns {', '.join(POSITION)}: the joints move by {by} but "
             f"all positions lie within {spread:.2g} m; expected the measured positions in m"
         )
 
@@ -177,7 +179,7 @@ def check_names(table: ColumnTable) -> None:
         raise InputError(f"{table.at(i, 'load')}: '{odd[0]}' must be spelled 'none'")
 
 
-def check_same_pose(table: ColumnTable, pose: Ints, names: list[str], q: Floats) -> None:
+def check_same_pose(table: ColumnTable, pose: Ints, names: list[str], q: Floats, arm: Arm) -> None:
     """Refuse a pose whose commanded joints (N, n) differ between its rows."""
     first = np.unique(pose, return_index=True)[1]
     bad = np.abs(q - q[first][pose]) > SAME_POSE
@@ -185,8 +187,8 @@ def check_same_pose(table: ColumnTable, pose: Ints, names: list[str], q: Floats)
         i, j = divmod(int(np.argmax(bad)), q.shape[1])
         k = int(first[pose[i]])
         raise InputError(
-            f"{table.at(i)}: pose '{names[pose[i]]}' commands joint {j + 1} to {q[i, j]:.9g} rad, "
-            f"row {table.rows[k]} to {q[k, j]:.9g}; give another pose another name"
+            f"{table.at(i)}: pose '{names[pose[i]]}' commands joint {j + 1} to {q[i, j]:.9g} "
+            f"{arm.unit(j)}, row {table.rows[k]} to {q[k, j]:.9g}; give another pose another name"
         )
 
 

@@ -98,7 +98,7 @@ def readings_of(
     positioned = np.ones(len(table.rows), dtype=np.bool_) if observed is None else ~observed.scalar
     states, value = measured_of(table, arm, positioned)
     states = replace(states, target=target, observer=None if observed is None else observed.number)
-    checks.check_same_pose(table, pose, pose_names, states.q)
+    checks.check_same_pose(table, pose, pose_names, states.q, arm)
     checks.check_wrenches(table, states.wrench, load, load_names, arm)
     cov, notes, covers = np.zeros((len(value), 3, 3)), tuple[str, ...](), _covers(table)[0]
     if positioned.all():

@@ -20,7 +20,7 @@ from hilcal.present.html.report import page
 from hilcal.readings.covariance import COVERS, INSTRUMENT
 from hilcal.robot.catalogue import configs_dir, load_arm
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.kept_texts import COMMAND, ROBOT_FILE, typed, typed_now
+from hilcal.store.kept_texts import CALIBRATION_FILE, COMMAND, ROBOT_FILE, typed, typed_now
 from hilcal.store.overview import overview
 from hilcal.store.plan import Plan, Step
 from hilcal.store.run_log import RunLog, check_same_cell, create_run
@@ -274,6 +274,22 @@ def test_a_campaign_reads_no_file_that_it_names(sent, tmp_path):
     assert not np.allclose(
         cell_from_config(config, place).arm.links, cell_from_config(config, None, kept).arm.links
     )
+
+
+def test_info_reads_the_kinematics_that_the_campaign_keeps(tmp_path, capsys, monkeypatch):
+    """From whatever folder it is asked, and no file of the same name that is there."""
+    config = load_config(configs_dir() / "cells" / "demo_ur10e.toml")
+    robot = config.robot.model_copy(update={"calibration": "k.conf"})
+    config = config.model_copy(update={"robot": robot})
+    rows = "".join(f"delta_{n} = [0, 0, 0, 0, 0, 0]\n" for n in ("theta", "a", "d", "alpha"))
+    (tmp_path / "k.conf").write_text(f"[mounting]\n{rows}", encoding="utf-8")
+    path = tmp_path / "run.hilcal"
+    with CampaignFile.create(path, config.to_json(), str(tmp_path), "made") as file:
+        file.append_readings(simulated().readings)
+        assert file.about(CALIBRATION_FILE)
+    (tmp_path / "k.conf").unlink()
+    monkeypatch.chdir(tmp_path)
+    ok(capsys, "info", path)
 
 
 def test_a_calibration_has_the_robot_beside_the_cell_that_is_given(tmp_path):
