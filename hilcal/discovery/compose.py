@@ -31,7 +31,7 @@ from hilcal.discovery.shapes import Shape
 from hilcal.types import Floats
 
 if TYPE_CHECKING:
-    from hilcal.discovery.problem import Candidates
+    from hilcal.discovery.problem import CandidateTerms
     from hilcal.discovery.screen import LawTerm, ScreenedTerm
 
 BEST, EXTENDED = 10, 3  # Bends, and products of each, that are extended; a choice, by time
@@ -69,7 +69,7 @@ class _Bent:
 class SiteSums:
     """Products of any amplitude at one site, beside the model and chosen terms."""
 
-    def __init__(self, candidates: Candidates, s: int) -> None:
+    def __init__(self, candidates: CandidateTerms, s: int) -> None:
         """Project the chosen terms out."""
         screen = candidates.problem.screen
         form = screen.form[s]
@@ -111,7 +111,7 @@ def _better(
     return np.maximum(alone, np.where(both, evidence(gain, 2) - LOG2, -np.inf))
 
 
-def composed_terms(candidates: Candidates) -> list[LawTerm]:
+def composed_terms(candidates: CandidateTerms) -> list[LawTerm]:
     """Return terms of functions of composed quantities."""
     single = _screened(candidates)
     sums_of = {s: SiteSums(candidates, s) for s in {b.s for b in single}}
@@ -136,7 +136,7 @@ def _best_of_argument(bent: list[_Bent]) -> list[_Bent]:
     return list(out.values())
 
 
-def _screened(candidates: Candidates) -> list[_Bent]:
+def _screened(candidates: CandidateTerms) -> list[_Bent]:
     """Return the best bends of single products."""
     p = candidates.problem
     screen, bends = p.screen, p.screen.bends
@@ -182,7 +182,7 @@ def _screened(candidates: Candidates) -> list[_Bent]:
     return list(out.values())
 
 
-def _values(candidates: Candidates, which: tuple[int, ...]) -> Floats:
+def _values(candidates: CandidateTerms, which: tuple[int, ...]) -> Floats:
     """(P, K) products at the readings of the screening, in their own units."""
     screen = candidates.problem.screen
     indices = list(which)
@@ -190,7 +190,7 @@ def _values(candidates: Candidates, which: tuple[int, ...]) -> Floats:
     return np.asarray(values, dtype=float)
 
 
-def _extended(candidates: Candidates, site: SiteSums, b: _Bent) -> list[_Bent]:
+def _extended(candidates: CandidateTerms, site: SiteSums, b: _Bent) -> list[_Bent]:
     """Return the argument extended by the best further products, each at the best level."""
     grammar = candidates.problem.screen.grammar
     quantities = frozenset[str]().union(*(grammar.depends[k] for k in b.which))
@@ -243,7 +243,7 @@ def _gains(site: SiteSums, x: Floats) -> tuple[Floats, Floats]:
 
 
 def _leveled(
-    candidates: Candidates, site: SiteSums, b: _Bent, further: int, weight: float, choices: int
+    candidates: CandidateTerms, site: SiteSums, b: _Bent, further: int, weight: float, choices: int
 ) -> _Bent:
     """Return the argument with a further product, at the best of some weights and levels."""
     grammar = candidates.problem.screen.grammar
@@ -267,7 +267,7 @@ def _leveled(
     )
 
 
-def _terms(candidates: Candidates, site: SiteSums, b: _Bent) -> list[LawTerm]:
+def _terms(candidates: CandidateTerms, site: SiteSums, b: _Bent) -> list[LawTerm]:
     """Return terms with refined numbers, also with an exponent, without and with a constant."""
     screen = candidates.problem.screen
     price_of_number = 0.5 * float(np.log(candidates.dof))
@@ -288,7 +288,7 @@ def _terms(candidates: Candidates, site: SiteSums, b: _Bent) -> list[LawTerm]:
     return out
 
 
-def _refined(candidates: Candidates, site: SiteSums, b: _Bent) -> Amplitude:
+def _refined(candidates: CandidateTerms, site: SiteSums, b: _Bent) -> Amplitude:
     """Return the amplitude with the weights, levels and exponent of the largest evidence."""
     from scipy.optimize import minimize  # slow to import
 
@@ -336,7 +336,7 @@ RETAINED = 24  # Best of either that are scored in full; a choice
 FACTORS = (0.35, 0.5, 0.7, 0.85, 1.2, 1.4, 2.0, 2.8)  # by which numbers are varied; a choice
 
 
-def grown(candidates: Candidates, best: list[ScreenedTerm]) -> list[LawTerm]:
+def grown(candidates: CandidateTerms, best: list[ScreenedTerm]) -> list[LawTerm]:
     """Return the best of the screening with further factors, and with other numbers."""
     distinct = list({(x.s, x.f): x for x in best}.values())
     products = [(x.s, a, 0.0) for x in distinct[:GROWN] for a in _products(candidates, x.s, x.f)]
@@ -344,7 +344,7 @@ def grown(candidates: Candidates, best: list[ScreenedTerm]) -> list[LawTerm]:
     return [*_best_terms(candidates, products), *_best_terms(candidates, numbers)]
 
 
-def _products(candidates: Candidates, s: int, f: int) -> list[Amplitude]:
+def _products(candidates: CandidateTerms, s: int, f: int) -> list[Amplitude]:
     screen = candidates.problem.screen
     a = screen.grammar.at(f)
     if not a.factors or len(a.factors) >= MOST_FACTORS:
@@ -362,7 +362,7 @@ def _products(candidates: Candidates, s: int, f: int) -> list[Amplitude]:
     return out
 
 
-def _numbers(candidates: Candidates, f: int) -> list[tuple[Amplitude, float]]:
+def _numbers(candidates: CandidateTerms, f: int) -> list[tuple[Amplitude, float]]:
     grammar = candidates.problem.screen.grammar
     a = grammar.at(f)
     out = []
@@ -385,7 +385,9 @@ def _other_values(factor: Factor, n: int, x: Floats) -> list[float]:
     return sorted({float(f"{v:.2g}") for v in values} - {factor.numbers[n]})
 
 
-def _best_terms(candidates: Candidates, pool: list[tuple[int, Amplitude, float]]) -> list[LawTerm]:
+def _best_terms(
+    candidates: CandidateTerms, pool: list[tuple[int, Amplitude, float]]
+) -> list[LawTerm]:
     screen = candidates.problem.screen
     ranked: list[tuple[float, int, Amplitude, float]] = []
     for s in dict.fromkeys(s for s, _, _ in pool):

@@ -84,9 +84,9 @@ class SearchProblem:
         """(R', P) whitened columns of a term in the rows that are used."""
         return self.screen.columns_of(term)[self.rows]
 
-    def beside(self, chosen: Sequence[LawTerm]) -> "Candidates":
+    def beside(self, chosen: Sequence[LawTerm]) -> "CandidateTerms":
         """Return the candidates beside chosen terms."""
-        return Candidates(self, tuple(chosen))
+        return CandidateTerms(self, tuple(chosen))
 
     def scored(self, chosen: tuple[LawTerm, ...] = ()) -> list[Scored]:
         """Return the short list beside chosen terms, the best odds first; cached."""
@@ -98,7 +98,7 @@ class SearchProblem:
         return self._scored[key]
 
 
-class Candidates:
+class CandidateTerms:
     """The candidates beside a model and chosen terms, whose coefficients are free."""
 
     def __init__(self, problem: SearchProblem, chosen: tuple[LawTerm, ...]) -> None:
