@@ -379,7 +379,7 @@ class Path:
             stated = fitted.readings.as_stated()
             try:
                 fitted = fit(fitted.model, stated, fitted.mode, start=fitted.theta)
-            except CannotAnswerError:  # no more elements than parameters are determined
+            except CannotAnswerError:  # as many parameters as measured elements
                 return False
             evidence = Evidence(fitted, self._trial, regressions=self._regressions)
             judged = judge(evidence, self._history(fitted))

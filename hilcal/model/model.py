@@ -29,6 +29,9 @@ if TYPE_CHECKING:  # a model only carries this value; fits interpret it
 
 EQUILIBRIUM_TOLERANCE = 1e-13  # motion of the flange that may be missing, m
 MAX_EQUILIBRIUM_STEPS = 30
+DIVERGED = 1e3
+"""Motion of the flange in one step, in reaches of the arm, that ends the iteration; a choice: far
+beyond any arm, and long before numbers overflow, for which an effect would be blamed."""
 FLANGE_STEP = 1e-4  # of a quotient, m or rad: rounding 1e-12, higher terms 1e-9 of it
 
 
@@ -187,14 +190,12 @@ class Model(Brief):
             missing = moved if previous is None else moved * (moved / previous)
             if not elastic or missing <= EQUILIBRIUM_TOLERANCE:
                 break
+            if moved > DIVERGED * cell.arm.reach:
+                raise _no_equilibrium(elastic)
             previous = moved
         else:
             _deviation(elastic, s, rigid)  # refuses columns that are not finite
-            raise CannotAnswerError(
-                "no static equilibrium: with these parameters the elastic deviations of "
-                f"{', '.join(e.name for e, _ in elastic)} grow instead of settling; measure "
-                "poses and loads that determine them, or leave an effect out"
-            )
+            raise _no_equilibrium(elastic)
         s = replace(s, chain=chain)
         return Prediction(
             s, deviation, observe(cell, chain, deviation, states.target, states.observer)
@@ -340,6 +341,14 @@ def _deviation(
         first += len(t)
     theta = np.concatenate([t for _, t in parts]) if parts else np.zeros(0)
     return total(tuple(columns), theta, s, start)
+
+
+def _no_equilibrium(elastic: list[tuple[Effect, Floats]]) -> CannotAnswerError:
+    return CannotAnswerError(
+        "no static equilibrium: with these parameters the elastic deviations of "
+        f"{', '.join(e.name for e, _ in elastic)} grow instead of settling; measure "
+        "poses and loads that determine them, or leave an effect out"
+    )
 
 
 def _flange_motion(a: Chain, b: Chain, reach: float) -> float:

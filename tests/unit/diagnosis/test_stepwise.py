@@ -34,8 +34,8 @@ def work(c, *effects):
     return path
 
 
-def test_an_effect_of_more_parameters_than_readings_is_no_trial():
-    """It does not end a refinement: as few poses are predicted with all effects together."""
+def test_an_effect_that_the_readings_cannot_determine_is_rejected():
+    """The refinement goes on; with so few poses all effects predict together."""
     c = campaign("link_geometry", "absolute", 1, poses=12, strength=3.0)
     few = c.readings[c.readings.unloaded][np.arange(8)]
     before = fitted(c, readings=few)
