@@ -56,7 +56,6 @@ class Calibration:
     """Starts `calibrate` in a session of its own, as often as it takes."""
 
     def __init__(self, directory: Path) -> None:
-        """Write the cell; nothing is started."""
         self.toml, self.run = directory / "cell.toml", directory / "run.hilcal"
         self.log = directory / "calibrate.log"
         self.toml.write_text(CELL, encoding="utf-8")
@@ -95,13 +94,11 @@ class Calibration:
         return not ended
 
     def finish(self) -> None:
-        """Let it go on to its end."""
         process = self.start()
         assert process.wait(LONGEST) == 0, self.words
 
     @property
     def words(self) -> str:
-        """What it has said."""
         return self.log.read_text(encoding="utf-8", errors="replace")[-4000:]
 
     def left_behind(self) -> list[str]:
@@ -122,7 +119,6 @@ class Calibration:
         return count
 
     def stored(self) -> int:
-        """Return how many readings the campaign holds, each once."""
         if not self.run.exists():
             return 0
         with CampaignFile.open(self.run, read_only=True) as campaign:
@@ -139,7 +135,6 @@ class Calibration:
                     assert len(RunLog(campaign).details()) == campaign.n_readings
 
     def look(self, pid: int) -> None:
-        """Remember the processes that it has started."""
         try:
             children = psutil.Process(pid).children(recursive=True)
         except psutil.Error:

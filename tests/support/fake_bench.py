@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -110,7 +110,6 @@ class World:
         self.calls.clear()
 
     def joints(self) -> Floats:
-        """Where the joints are now, rad."""
         if self.is_moving:
             share = min(1.0, (self.time - self.begun) / self.lasts)
             self.q = self.start + share * (self.goal - self.start)
@@ -178,28 +177,18 @@ class MemoryStore:
         rows = [reading for _, reading, _ in self.rows]
         poses = tuple(dict.fromkeys(r.pose_names[0] for r in rows))
         loads = tuple(dict.fromkeys(r.load_names[0] for r in rows))
-        states = {
-            name: np.concatenate([getattr(r.states, name) for r in rows])
-            for name in rows[0].states.__dataclass_fields__
-            if getattr(rows[0].states, name) is not None
-        }
-        return Readings(
-            states=type(rows[0].states)(**states),
+        return replace(
+            Readings.joined(rows),
             pose=np.array([poses.index(r.pose_names[0]) for r in rows]),
             load=np.array([loads.index(r.load_names[0]) for r in rows]),
-            cycle=np.concatenate([r.cycle for r in rows]),
-            value=np.concatenate([r.value for r in rows]),
-            covariance=np.concatenate([r.covariance for r in rows]),
             load_names=loads,
             pose_names=poses,
         )
 
     def kinds(self) -> list[str]:
-        """Kinds of the events, in order."""
         return [kind for kind, _ in self.events]
 
     def last(self, kind: str) -> dict[str, Any]:
-        """The newest event of a kind."""
         return next(content for k, content in reversed(self.events) if k == kind)
 
 
@@ -213,7 +202,6 @@ class Notes:
         self.told.append(event)
 
     def of(self, kind: type) -> list[Any]:
-        """What was told of one kind."""
         return [event for event in self.told if isinstance(event, kind)]
 
 
@@ -223,8 +211,6 @@ TORQUE = np.array([3.0, -40.0, 20.0, 5.0, 1.0, -0.5])  # N·m, of every pose
 
 @dataclass
 class FakeArm:
-    """An arm that moves in straight lines."""
-
     world: World
 
     def report(self) -> Report:
@@ -432,7 +418,6 @@ POSES = {
 
 
 def plan_of(*steps: tuple[str, str, int], poses: dict[str, Any] | None = None) -> Plan:
-    """A plan with steps over `POSES`."""
     poses = POSES if poses is None else poses
     return Plan(tuple(poses), np.array(list(poses.values())), tuple(Step(*step) for step in steps))
 
@@ -481,12 +466,10 @@ def changed(device: Any, call: str, by: Callable[[Any], Any]) -> None:
 
 
 def asked_for(b: Bench) -> list[str]:
-    """Names of the loads that were asked for, in order."""
     return [name for name, _ in b.operator.asked]
 
 
 def remarks(b: Bench, words: str = "") -> list[str]:
-    """Remarks that hold some words."""
     return [note.text for note in b.notes.of(Remark) if words in note.text]
 
 
@@ -510,5 +493,4 @@ def interrupt(b: Bench, stored: int, plan: Plan | None = None, **more: Any) -> N
 
 
 def rows(readings: Readings, load: str) -> Bools:
-    """Which readings were taken under a load."""
     return readings.load == readings.load_names.index(load)

@@ -68,7 +68,6 @@ def urdf_of(maker: str, limit: float = 2.9, wrist: float = 5.9) -> str:
 
 
 def maker_arm(maker: str, folder: Path) -> Arm:
-    """The arm of it."""
     path = folder / f"{maker}.urdf"
     path.write_text(urdf_of(maker), encoding="utf-8")
     return arm_from_urdf(path)

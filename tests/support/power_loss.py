@@ -72,7 +72,6 @@ int close(int fd) { if (fd >= 0 && fd < 1024) names[fd][0] = 0; return syscall(S
 
 
 def compiled(folder: Path) -> Path:
-    """Compile the recorder."""
     source, library = folder / "record.c", folder / "record.so"
     source.write_text(SOURCE)
     command = ["gcc", "-shared", "-fPIC", "-O1", "-w", "-o", str(library), str(source), "-ldl"]
@@ -139,7 +138,6 @@ class Disk:
     moves: list[Op] = field(default_factory=list)
 
     def do(self, op: Op) -> None:
-        """Follow the program."""
         match op.kind:
             case "sync" if op.path.rstrip("/") == self.folder:
                 self.durable, self.moves = dict(self.names), []

@@ -41,7 +41,6 @@ def make_arm(n: int = 6) -> Arm:
 
 
 def floats(shape: tuple[int, ...], size: float) -> st.SearchStrategy[Floats]:
-    """Arrays of any doubles within ±size."""
     return arrays(np.float64, shape, elements=st.floats(-size, size, allow_nan=False))
 
 
@@ -92,7 +91,6 @@ def readings(draw: st.DrawFn, n: int = 6) -> Readings:
 
 
 def first_seen(numbers: list[int]) -> np.ndarray:
-    """Renumber in order of first appearance."""
     order = {k: i for i, k in enumerate(dict.fromkeys(numbers))}
     return np.array([order[k] for k in numbers], dtype=np.int64)
 
@@ -120,7 +118,6 @@ def made(q: Floats, value: Floats, **more: Any) -> Readings:
 
 
 def simple(count: int, m: int = 3, seed: int = 0) -> Readings:
-    """Readings of `count` poses without a load."""
     rng = np.random.default_rng(seed)
     q, time = rng.uniform(-3, 3, (count, 6)), np.arange(count, dtype=float)
     return made(q, rng.uniform(-1, 1, (count, m)), time=time, std=1e-9**0.5)

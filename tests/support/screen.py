@@ -130,7 +130,6 @@ class AtTerminal:
         assert self.text.count(words) >= times, f"wiped away: {words!r}\n" + "\n".join(self.lines)
 
     def wait(self, holds: Callable[[], bool], what: str) -> None:
-        """Wait until something holds."""
         end = time.monotonic() + DEADLINE
         while not holds():
             there = self.look()
@@ -140,11 +139,9 @@ class AtTerminal:
             assert time.monotonic() < end, f"never {what}:\n" + "\n".join(self.lines)
 
     def types(self, keys: str) -> None:
-        """Press keys."""
         os.write(self._master, keys.encode())
 
     def ends(self, within: float = DEADLINE) -> int:
-        """Wait for the end, so many s; returns the exit code."""
         end = time.monotonic() + within
         while self.look(0.2):
             assert time.monotonic() < end, "it does not end:\n" + "\n".join(self.lines)

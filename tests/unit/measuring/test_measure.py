@@ -42,9 +42,6 @@ def covered(rng, count, windows, share=0.0, worse=1.0):
     return inside / windows
 
 
-# the law
-
-
 def test_samples_that_agree_have_the_posterior_covariance():
     mean = average(samples_of([PLACE] * 5))
     assert mean.value == pytest.approx(PLACE, abs=1e-15)
@@ -65,9 +62,6 @@ def test_systematic_share_is_not_averaged_away():
     covariance = average(samples_of(values), 0.3).covariance
     assert np.trace(covariance) == pytest.approx(0.3 * np.trace(V), rel=0.01)
     assert average(samples_of([PLACE] * 10), 1.0).covariance == pytest.approx(V, rel=1e-12)
-
-
-# calibration
 
 
 @pytest.mark.parametrize(
@@ -107,9 +101,6 @@ def test_scatter_is_how_much_worse_it_is():
     assert "3.0 times" in result.warnings[0]
 
 
-# poses
-
-
 def test_rotations_average_on_the_sphere_also_across_the_half_turn():
     rng = np.random.default_rng(5)
     middle = Rotation.from_rotvec([0.0, 0.0, np.pi - 1e-5])  # rotation vectors flip about here
@@ -133,9 +124,6 @@ def test_deviations_of_poses_turn_with_the_sensor_axes():
     assert residuals_seen[:, 3:] == pytest.approx(frame.apply(residuals[:, 3:]), abs=1e-10)
     there = frame * Rotation.from_rotvec(mean[3:])
     assert Rotation.from_rotvec(mean_seen[3:]).as_matrix() == pytest.approx(there.as_matrix())
-
-
-# outliers and remarks
 
 
 def test_gross_outlier_is_left_out_and_named():

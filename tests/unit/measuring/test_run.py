@@ -46,9 +46,6 @@ def ran():
     return b
 
 
-# what is stored
-
-
 def test_readings_are_what_the_world_is(ran):
     b, plan, readings = ran, usual_plan(), ran.store.readings()
     assert [s for s, _, _ in b.store.rows] == list(plan.steps)
@@ -64,27 +61,19 @@ def test_readings_are_what_the_world_is(ran):
     assert np.all(ratio < 1.3)
 
 
-def test_wrench_is_measured_for_pulls_and_told_for_weights(b):
+@pytest.mark.parametrize(
+    ("use", "mass", "pull"), [("all", 3.03, 38.0), ("verify", 3.0, 40.0), ("pulls", 3.0, 38.0)]
+)
+def test_wrench_is_measured_or_told_as_the_cell_says(use, mass, pull):
     """The rope pulls 5 % less than asked for, and the weight is 1 % too heavy."""
+    b = Bench(force_sensor=ForceSensor(driver="fake", port="nowhere", use=use))
     loads = (CellLoad(name="3kg", mass_kg=3.03), CellLoad(name="pull", force_N=(38.0, 0.0, 0.0)))
     b.world.config = b.config.model_copy(update={"loads": loads})
     readings = measure(b)
-    weight, pull = readings.states.wrench[rows(readings, "3kg")], rows(readings, "pull")
-    assert np.array_equal(weight, np.tile([0, 0, -3.0 * 9.80665, 0, 0, 0], (4, 1)))
-    felt = readings.states.wrench[pull]
-    assert np.allclose(felt, [38.0, 0, 0, 0, 0, 0], atol=1e-6)
-    assert not np.any(readings.states.wrench[rows(readings, "none")])
-
-
-@pytest.mark.parametrize(("use", "force"), [("all", 3.03), ("verify", 3.0), ("pulls", 3.0)])
-def test_use_of_the_force_sensor(use, force):
-    settings = ForceSensor(driver="fake", port="nowhere", use=use)
-    b = Bench(force_sensor=settings)
-    loads = (CellLoad(name="3kg", mass_kg=3.03),)
-    b.world.config = b.config.model_copy(update={"loads": loads})
-    readings = measure(b, plan_of(*((p, x, 0) for x in ("none", "3kg") for p in POSES)))
-    loaded = readings.states.wrench[rows(readings, "3kg")]
-    assert np.allclose(loaded[:, 2], -force * 9.80665, atol=1e-6)
+    weight = [0, 0, -mass * 9.80665, 0, 0, 0]
+    for load, wrench in (("none", np.zeros(6)), ("3kg", weight), ("pull", [pull, 0, 0, 0, 0, 0])):
+        felt = readings.states.wrench[rows(readings, load)]
+        assert np.allclose(felt, wrench, atol=1e-6 if use in ("all", "pulls") else 0.0)
 
 
 def test_wrench_is_that_at_the_load_point_wherever_the_sensor_sits(b):
@@ -152,11 +141,13 @@ def test_nothing_moves_between_measuring_and_storing(ran):
         assert "arm.start_move" not in calls[last:z]
 
 
-# people
-
-
 def test_progress(ran):
+    """What is as configured is not remarked."""
     b, plan = ran, usual_plan()
+    drifts = [content for kind, content in b.store.events if kind == "drift"]
+    assert [d["over"] for d in drifts] == [False, False]
+    assert not remarks(b, "has moved")
+    assert not remarks(b, "[tool]")
     taken = b.notes.of(ReadingStored)
     assert [t.done for t in taken] == list(range(1, len(plan.steps) + 1))
     assert {t.total for t in taken} == {len(plan.steps)}
@@ -167,12 +158,8 @@ def test_progress(ran):
         else:
             force = 3.0 * 9.80665 if t.step.load == "3kg" else 40.0
             assert t.deflection == pytest.approx(SAG * force, abs=6 * STD)
-    ended = b.world.time
-    assert taken[9].left_cell == pytest.approx(ended - _time_of(b, 10), rel=0.5)
-
-
-def _time_of(b, done):
-    return json.loads(b.store.rows[done - 1][2])["tracker"][-1]["host_ns"] * 1e-9
+    tenth = json.loads(b.store.rows[9][2])["tracker"][-1]["host_ns"] * 1e-9
+    assert taken[9].left_cell == pytest.approx(b.world.time - tenth, rel=0.5)
 
 
 def test_the_judge_sees_all_readings_and_may_not_know(b):
@@ -192,7 +179,6 @@ def test_the_judge_sees_all_readings_and_may_not_know(b):
 
 
 def test_drift_of_the_reference_pose_is_told(b):
-
     def shift(*_):
         if len(b.store.rows) == 6:
             b.world.shift = np.array([0.0, 0.0, 4e-4])
@@ -204,14 +190,6 @@ def test_drift_of_the_reference_pose_is_told(b):
     said = remarks(b, "reference pose has moved")
     assert len(said) == 2
     assert any(word in said[0] for word in ("by 39", "by 40", "by 41"))
-
-
-def test_what_is_as_configured_is_not_remarked(ran):
-    b = ran
-    drifts = [content for kind, content in b.store.events if kind == "drift"]
-    assert [d["over"] for d in drifts] == [False, False]
-    assert not remarks(b, "has moved")
-    assert not remarks(b, "[tool]")
 
 
 @pytest.mark.long
@@ -275,9 +253,6 @@ def test_a_cell_without_a_tool():
     assert b.world.payload[0] == 0.0
 
 
-# loads
-
-
 def test_a_wrong_load_is_asked_for_again_with_the_reason(b):
     b.world.wrong = ["none", "6kg"]  # the first answer is that to "take everything off"
     readings = measure(b)
@@ -295,14 +270,11 @@ def test_three_wrong_loads_end_the_run(b):
     assert len(b.store.rows) == 5
     assert b.world.calls[-2] == "arm.stop"
     b.world.again()
+    b.world.wrong = ["none", "3kg", "3kg"]  # one that is not taken off is noticed
+    asked = len(b.operator.asked)
     assert len(measure(b)) == len(usual_plan().steps)
-
-
-def test_a_load_that_is_not_taken_off_is_noticed(b):
-    b.world.wrong = ["none", "3kg", "3kg"]
-    measure(b)
-    assert asked_for(b) == ["none", "3kg", "none", "none", "pull", "none"]
-    assert "3.0 kg still hangs" in b.operator.asked[3][1]
+    assert asked_for(b)[asked:] == ["none", "3kg", "none", "none", "pull", "none"]
+    assert "3.0 kg still hangs" in b.operator.asked[asked + 3][1]
 
 
 @pytest.mark.long
@@ -351,11 +323,8 @@ def test_unloaded_poses_that_do_not_tell_the_tool_are_no_failure(b):
     assert remarks(b, "not identified")
 
 
-# going on
-
-
-def test_resume_measures_exactly_what_is_missing_and_time_goes_on():
-    b, plan = Bench(), usual_plan()
+def test_resume_measures_exactly_what_is_missing_and_time_goes_on(b):
+    plan = usual_plan()
     day = [1000.0]
 
     def wall():
@@ -377,27 +346,25 @@ def test_resume_measures_exactly_what_is_missing_and_time_goes_on():
 
 
 @pytest.mark.long
-def test_time_never_goes_back_whatever_the_clock_on_the_wall_does():
-    b, plan = Bench(), usual_plan()
-    interrupt(b, 4, plan, wall=lambda: 5000.0 + b.world.time)
-    readings = measure(b, plan, wall=lambda: 1000.0 + b.world.time)
+def test_time_never_goes_back_whatever_the_clock_on_the_wall_does(b):
+    interrupt(b, 4, wall=lambda: 5000.0 + b.world.time)
+    readings = measure(b, wall=lambda: 1000.0 + b.world.time)
     assert np.all(np.diff(readings.states.time) > 0)
 
 
 @pytest.mark.long
-def test_a_load_that_still_hangs_at_a_resume_is_noticed():
-    b, plan = Bench(), usual_plan()
-    interrupt(b, 7, plan)
+def test_a_load_that_still_hangs_at_a_resume_is_noticed(b):
+    interrupt(b, 7)
     assert b.world.load == "3kg"
     b.world.wrong = ["3kg"]  # the first answer is wrong
     # the sensor was off meanwhile
     b.world.offset = b.world.offset + np.array([2.0, 2.0, -2.0, 0, 0, 0])
     seen = len(b.operator.asked)
-    measure(b, plan)
+    measure(b)
     asked = b.operator.asked[seen:]
     assert [name for name, _ in asked[:3]] == ["none", "none", "3kg"]
     assert "3kg seems to hang still" in asked[1][1]
-    assert [s for s, _, _ in b.store.rows] == list(plan.steps)
+    assert [s for s, _, _ in b.store.rows] == list(usual_plan().steps)
 
 
 def test_a_load_left_on_at_the_very_beginning_is_asked_about_said_and_found_in_motion(b):
@@ -417,16 +384,14 @@ def test_a_finished_campaign_touches_nothing(b):
 
 
 @pytest.mark.long
-def test_the_tool_is_known_from_an_earlier_session_after_the_sensor_was_off():
+def test_the_tool_is_known_from_an_earlier_session_after_the_sensor_was_off(b):
     """Another bias in the second session: the pulls are measured right nevertheless."""
-    b, plan = Bench(), usual_plan()
     b.world.tool_mass = 1.4
-    interrupt(b, 7, plan)
+    interrupt(b, 7)
     b.world.offset = -b.world.offset
-    readings = measure(b, plan)
-    assert np.allclose(
-        readings.states.wrench[rows(readings, "pull")], [40.0, 0, 0, 0, 0, 0], atol=1e-6
-    )
+    readings = measure(b)
+    felt = readings.states.wrench[rows(readings, "pull")]
+    assert np.allclose(felt, [40.0, 0, 0, 0, 0, 0], atol=1e-6)
 
 
 LOST = "no longer tells the torques"

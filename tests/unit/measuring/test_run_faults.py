@@ -275,9 +275,6 @@ def test_a_target_that_is_not_where_it_is_said_refuses_no_reading(known, off_m):
 LIMIT = ForceSensor(driver="fake", port="nowhere", max_force_N=120.0)
 
 
-# order and safety
-
-
 def test_order_of_the_start(b):
     """The hook is cleared before anything moves, the tare comes before the first reading."""
     measure(b)
@@ -400,9 +397,6 @@ def test_a_motion_that_never_ends_is_given_up(b):
     assert b.world.calls[-2] == "arm.stop"
 
 
-# the target
-
-
 def test_a_lost_target_is_found_again(b):
     b.world.lost = 3  # at both stops of the approach, where nothing is read, and at the reading
     readings = measure(b)
@@ -429,9 +423,6 @@ def test_another_reflector_is_not_believed(b):
     before(b.store, "event", other)
     refusal_of(DeviceError, "another reflector", measure, b)
     assert len(b.store.rows) == 5
-
-
-# settling
 
 
 def test_readings_that_drift_are_waited_for_and_given_up():

@@ -40,9 +40,6 @@ def is_home(b):
     return b.world.load == "none" and np.allclose(b.world.q, HOME) and not b.world.is_moving
 
 
-# the way home
-
-
 def test_a_goal_that_is_met_under_a_load():
     """The load is taken off at the reference pose, and the drift of so far is read."""
     b, plan = Bench(), usual_plan()
@@ -109,9 +106,6 @@ def test_the_way_home_is_clear(b):
     assert [s.name for s in free] == ["reference"]
 
 
-# going on
-
-
 @pytest.mark.long
 def test_what_was_left_out_is_measured_on_resuming():
     b, plan = Bench(), usual_plan()
@@ -148,9 +142,6 @@ def test_a_goal_that_is_never_met():
     told = b.store.last("goal")
     assert (told["met"], told["readings"], told["planned"]) == (False, 15, 15)
     assert not b.notes.of(GoalMet)
-
-
-# interrupted on the way home
 
 
 def short():

@@ -64,9 +64,6 @@ KNOWN = {("none", 0.8), ("3kg", 3.8), ("pull", 0.8)}
 SHORT = plan_of(("p1", "none", 0), ("p1", "3kg", 0), ("reference", "none", 1))
 
 
-# moved by hand
-
-
 @pytest.mark.parametrize("load", ["none", "3kg"])
 def test_an_arm_jogged_into_a_blocked_place_during_a_question_is_not_moved(b, load):
     jogged(b, load, FOLDED)
@@ -165,9 +162,6 @@ def test_an_arm_that_is_moved_at_rest_is_named_at_the_next_look(b, change, said)
     assert b.world.calls[-2] == "arm.stop"
 
 
-# in motion
-
-
 def in_motion(b, change, motion=4):
     """Change samples of the arm from the first look on of a motion; returns when that began."""
     begun = []
@@ -218,9 +212,6 @@ def test_a_motion_at_the_slowest_slider_does_not_stand_still(b):
     changed(b.rig.arm, "sample", lambda here: replace(here, speed_scaling=0.02))
     poses = {"reference": POSES["reference"], "p1": tuple(near)}
     measure(b, plan_of(("reference", "none", 0), ("p1", "none", 0), poses=poses))
-
-
-# loads
 
 
 def falls_in_motion(b, *wrong):
@@ -439,9 +430,6 @@ def test_a_load_that_stays_wrong_ends_the_run(b):
     falls_in_motion(b, "none", "none", "none")
     refusal_of(DeviceError, r"asked 3 times to hang 3kg.*--resume$", measure, b)
     assert len(b.store.rows) == 7
-
-
-# devices that repeat themselves
 
 
 def test_a_tracker_whose_target_does_not_move_with_the_arm_is_named_before_any_reading(b):

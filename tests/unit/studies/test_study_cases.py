@@ -13,11 +13,7 @@ from hilcal.readings.whitening import whitening
 from hilcal.robot.catalogue import configs_dir
 from studies.diagnosis import intervals
 from studies.random_campaigns import dead_weights
-from studies.study_cases import (
-    effects_shown,
-    study_case,
-    with_study_loads,
-)
+from studies.study_cases import effects_shown, study_case, with_study_loads
 from studies.study_more import measure_more, suspects
 from studies.unmodelled_laws import LAWS, law_named, shift
 from tests.support.effect_cases import make

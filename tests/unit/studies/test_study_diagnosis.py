@@ -8,15 +8,7 @@ from rich.console import Console
 
 from hilcal.errors import InputError
 from hilcal.readings.whitening import MODES
-from studies.diagnosis import (
-    Added,
-    Asked,
-    Inside,
-    Judgement,
-    Outcome,
-    Refined,
-    run_case,
-)
+from studies.diagnosis import Added, Asked, Inside, Judgement, Outcome, Refined, run_case
 from studies.diagnosis_claims import claims
 from studies.diagnosis_document import document
 from studies.diagnosis_pool import run_all
